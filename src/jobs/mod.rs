@@ -1,0 +1,1 @@
+//! The worker pool. No HTTP type, no wgpu.

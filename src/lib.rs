@@ -1,0 +1,21 @@
+//! molmesh: molecules in, proven surface meshes out.
+//!
+//! The crate is a meshing core ([`surface`]) with rooms around it: [`structure`] reads files into spheres,
+//! [`formats`] writes meshes, [`pipeline`] ties the three together, and the `server` feature adds the HTTP
+//! service. `ARCHITECTURE.md` is the map; lengths are ångström everywhere.
+
+pub mod formats;
+pub mod pipeline;
+pub mod structure;
+pub mod surface;
+
+#[cfg(feature = "server")]
+pub mod config;
+#[cfg(feature = "gpu")]
+pub mod gpu;
+#[cfg(feature = "server")]
+pub mod http;
+#[cfg(feature = "server")]
+pub mod jobs;
+#[cfg(feature = "server")]
+pub mod telemetry;

@@ -1,0 +1,3 @@
+//! The `molmesh` command.
+
+fn main() {}

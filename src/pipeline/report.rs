@@ -1,0 +1,164 @@
+//! The report of a job: what was read, which grid, what the mesh is, how long each stage took.
+
+use serde::Serialize;
+use serde_json::{Map, Value};
+
+use super::{Choice, Job};
+use crate::structure::{Selected, Structure, radii};
+use crate::surface::{Measures, Meshed};
+
+/// One connected component.
+#[derive(Debug, Clone, Serialize)]
+pub struct ComponentReport {
+    /// Its triangles.
+    pub triangles: u64,
+    /// Its vertices.
+    pub vertices: u64,
+    /// Å².
+    pub area: f64,
+    /// Å³, negative for a cavity.
+    pub volume: f64,
+}
+
+/// A job's report. Field names are the JSON names.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    /// PDB id or data block name.
+    pub id: Option<String>,
+    /// Title of the structure.
+    pub title: Option<String>,
+    /// `pdb` or `mmcif`.
+    pub source_format: &'static str,
+    /// Atoms meshed.
+    pub atoms: u64,
+    /// Atoms in the file, all models.
+    pub atoms_in_file: u64,
+    /// The model that was taken.
+    pub model: i32,
+    /// The table of radii.
+    pub radii: &'static str,
+    /// Kernel function.
+    pub kernel: &'static str,
+    /// Preset.
+    pub preset: &'static str,
+    /// Grid spacing, Å.
+    pub resolution: f64,
+    /// Isovalue.
+    pub isovalue: f64,
+    /// The Gaussian's smoothness; absent for other kernels and raw parameters.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub smoothness: Option<f64>,
+    /// Bricks that some atom reaches.
+    pub bricks: u64,
+    /// Bricks with surface.
+    pub surface_bricks: u64,
+    /// Samples evaluated.
+    pub samples: u64,
+    /// Cells that a dense grid would have had.
+    pub box_cells: u64,
+    /// Vertices.
+    pub vertices: u64,
+    /// Triangles.
+    pub triangles: u64,
+    /// No boundary.
+    pub closed: bool,
+    /// Consistent winding.
+    pub oriented: bool,
+    /// Manifold edges and vertices.
+    pub manifold: bool,
+    /// V − E + F.
+    pub euler: i64,
+    /// Number of connected components.
+    pub components: u64,
+    /// Components with negative volume.
+    pub cavities: u64,
+    /// The largest components, at most 100.
+    pub component_list: Vec<ComponentReport>,
+    /// Å².
+    pub area: f64,
+    /// Å³.
+    pub volume: f64,
+    /// The backend that ran.
+    pub backend: &'static str,
+    /// What it ran on.
+    pub device: String,
+    /// Why it was taken.
+    pub backend_reason: String,
+    /// Wall time per stage, ms.
+    pub timings_ms: Map<String, Value>,
+}
+
+impl Report {
+    pub(super) fn new(
+        structure: &Structure,
+        selected: &Selected,
+        job: &Job,
+        choice: &Choice<'_>,
+        meshed: &Meshed,
+        measures: &Measures,
+        timings: Vec<(&'static str, f64)>,
+    ) -> Self {
+        let params = &job.params;
+        let gaussian = params.kernel == crate::surface::Kernel::Gaussian && params.paper.is_none();
+        let list = measures.components.iter().take(100);
+        Self {
+            id: structure.id.clone(),
+            title: structure.title.clone(),
+            source_format: structure.format.name(),
+            atoms: selected.atoms.len() as u64,
+            atoms_in_file: structure.len() as u64,
+            model: selected.model,
+            radii: radii::TABLE,
+            kernel: params.kernel.name(),
+            preset: params.preset.name(),
+            resolution: params.resolution,
+            isovalue: params.isovalue,
+            smoothness: gaussian.then_some(params.smoothness),
+            bricks: meshed.grid.bricks,
+            surface_bricks: meshed.grid.surface_bricks,
+            samples: meshed.grid.samples,
+            box_cells: meshed.grid.box_cells,
+            vertices: meshed.mesh.n_vertices() as u64,
+            triangles: meshed.mesh.n_triangles() as u64,
+            closed: measures.closed,
+            oriented: measures.oriented,
+            manifold: measures.manifold,
+            euler: measures.euler,
+            components: measures.components.len() as u64,
+            cavities: measures.components.iter().filter(|c| c.volume < 0.0).count() as u64,
+            component_list: list
+                .map(|c| ComponentReport {
+                    triangles: c.triangles,
+                    vertices: c.vertices,
+                    area: c.area,
+                    volume: c.volume,
+                })
+                .collect(),
+            area: measures.area,
+            volume: measures.volume,
+            backend: choice.backend.name(),
+            device: choice.backend.describe(),
+            backend_reason: choice.reason.to_owned(),
+            timings_ms: timings
+                .into_iter()
+                .map(|(name, ms)| (name.to_owned(), Value::from((ms * 1e3).round() / 1e3)))
+                .collect(),
+        }
+    }
+
+    /// Adds a stage that ran after the job, such as `encode`.
+    pub fn add_timing(&mut self, stage: &str, ms: f64) {
+        self.timings_ms.insert(stage.to_owned(), Value::from((ms * 1e3).round() / 1e3));
+    }
+
+    /// The report as a mesh file's extras: without what differs from run to run, so that the same input gives
+    /// the same bytes.
+    #[must_use]
+    pub fn extras(&self) -> Map<String, Value> {
+        let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
+        for run_dependent in ["timings_ms", "device", "backend_reason"] {
+            map.remove(run_dependent);
+        }
+        map
+    }
+}

@@ -1,0 +1,52 @@
+//! What a backend is: something that turns spheres into a mesh.
+
+use super::control::Control;
+use super::error::SurfaceError;
+use super::mesh::Mesh;
+use super::params::{SurfaceLimits, SurfaceParams};
+use super::spheres::Spheres;
+
+/// What the grid of a run looked like.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct GridStats {
+    /// Bricks (8 × 8 × 8 cells) that some sphere's support reaches.
+    pub bricks: u64,
+    /// Bricks that the surface passes through.
+    pub surface_bricks: u64,
+    /// Samples at which the density was evaluated, each counted once.
+    pub samples: u64,
+    /// Cells of the box around the structure, had the grid been dense.
+    pub box_cells: u64,
+    /// Sphere–brick pairs: the work of the field stage is 512 evaluations for each.
+    pub candidates: u64,
+}
+
+/// A finished run.
+#[derive(Debug, Clone)]
+pub struct Meshed {
+    /// The mesh.
+    pub mesh: Mesh,
+    /// Its grid.
+    pub grid: GridStats,
+}
+
+/// Turns spheres into a mesh. The same input gives the same bytes, whatever the thread count.
+pub trait Backend: Send + Sync {
+    /// Short stable name: `cpu`, `reference`, `gpu`.
+    fn name(&self) -> &'static str;
+
+    /// What it runs on, for people: threads and vector extension, or the adapter's name.
+    fn describe(&self) -> String;
+
+    /// Meshes `spheres`.
+    ///
+    /// # Errors
+    /// Any [`SurfaceError`]; limits are checked before memory is allocated for them.
+    fn run(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<Meshed, SurfaceError>;
+}

@@ -1,0 +1,122 @@
+//! How a caller watches and stops a meshing run. The core reads no clock: the observer does.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use super::error::SurfaceError;
+
+/// The stages of a meshing run, in order; `measure` is the proof that follows them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Stage {
+    /// Atoms to occupied bricks and their candidate lists.
+    Bin,
+    /// Density at every sample of every occupied brick.
+    Field,
+    /// Inside bits, crossing edges and cell cases.
+    Classify,
+    /// Exclusive scan over bricks: where each brick's vertices and triangles go.
+    Scan,
+    /// Vertex positions and normals.
+    Interpolate,
+    /// Triangle indices.
+    Emit,
+    /// Area, volume, components, closedness.
+    Measure,
+}
+
+impl Stage {
+    /// Every stage, in the order in which they run.
+    pub const ALL: [Self; 7] =
+        [Self::Bin, Self::Field, Self::Classify, Self::Scan, Self::Interpolate, Self::Emit, Self::Measure];
+
+    /// The stage's name, as shaders, reports and `Server-Timing` spell it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Bin => "bin",
+            Self::Field => "field",
+            Self::Classify => "classify",
+            Self::Scan => "scan",
+            Self::Interpolate => "interpolate",
+            Self::Emit => "emit",
+            Self::Measure => "measure",
+        }
+    }
+}
+
+/// Watches a run. Called from several threads at once, a few thousand times a run at most.
+pub trait Observer: Sync {
+    /// Runs `work` as (a part of) `stage`; an observer with a clock times the call.
+    fn span(&self, stage: Stage, work: &mut dyn FnMut()) {
+        let _ = stage;
+        work();
+    }
+
+    /// `done` of `total` parts of `stage` are finished.
+    fn progress(&self, stage: Stage, done: usize, total: usize) {
+        let _ = (stage, done, total);
+    }
+}
+
+/// An observer that does nothing.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Silent;
+
+impl Observer for Silent {}
+
+/// A flag shared between whoever runs a mesh and whoever may stop it.
+#[derive(Debug, Clone, Default)]
+pub struct CancelToken(Arc<AtomicBool>);
+
+impl CancelToken {
+    /// Asks the run to stop at its next check (between stages and every few bricks).
+    pub fn cancel(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether somebody asked the run to stop.
+    #[must_use]
+    pub fn is_cancelled(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// What a caller hands to a backend besides the work itself.
+#[derive(Clone)]
+pub struct Control<'a> {
+    /// Checked between stages and every few bricks.
+    pub cancel: CancelToken,
+    /// Told of stages and progress.
+    pub observer: &'a dyn Observer,
+}
+
+impl Default for Control<'_> {
+    fn default() -> Self {
+        Self { cancel: CancelToken::default(), observer: &Silent }
+    }
+}
+
+impl Control<'_> {
+    /// Fails with [`SurfaceError::Cancelled`] once the token is cancelled.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
+    pub fn check(&self) -> Result<(), SurfaceError> {
+        if self.cancel.is_cancelled() { Err(SurfaceError::Cancelled) } else { Ok(()) }
+    }
+
+    /// Times `work` as a part of `stage` and returns its value.
+    pub fn span<T>(&self, stage: Stage, work: impl FnOnce() -> T) -> T {
+        let mut work = Some(work);
+        let mut value = None;
+        self.observer.span(stage, &mut || {
+            if let Some(work) = work.take() {
+                value = Some(work());
+            }
+        });
+        match value {
+            Some(value) => value,
+            None => unreachable!("an observer's span must call the work it is given"),
+        }
+    }
+}

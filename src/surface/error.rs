@@ -1,0 +1,68 @@
+//! Why a surface could not be made. Each variant carries the numbers that a caller needs to do better.
+
+use thiserror::Error;
+
+/// Errors of the meshing core.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum SurfaceError {
+    /// There is nothing to mesh.
+    #[error("no spheres to mesh")]
+    NoSpheres,
+    /// A sphere's centre or radius is not usable.
+    #[error("sphere {index}: {what} is {value}, expected {expected}")]
+    BadSphere {
+        /// Index of the sphere in the input.
+        index: usize,
+        /// `x`, `y`, `z` or `radius`.
+        what: &'static str,
+        /// The offending value.
+        value: f64,
+        /// What was expected, in words.
+        expected: &'static str,
+    },
+    /// A parameter is out of its range, or does not go with another one.
+    #[error("parameter `{name}`: {value} is not allowed; expected {expected}")]
+    BadParameter {
+        /// The parameter's name as query, JSON and command line spell it.
+        name: &'static str,
+        /// The offending value as text.
+        value: String,
+        /// What was expected, in words.
+        expected: String,
+    },
+    /// More grid samples than allowed would be needed.
+    #[error(
+        "the grid would need {samples} samples at {resolution} Å, the limit is {limit}; {suggested_resolution} Å would fit"
+    )]
+    GridTooLarge {
+        /// Samples needed (a lower bound: counting stops soon after the limit).
+        samples: u64,
+        /// Samples allowed.
+        limit: u64,
+        /// The spacing asked for, in Å.
+        resolution: f64,
+        /// A spacing that would fit, in Å.
+        suggested_resolution: f64,
+    },
+    /// The mesh would take more bytes than allowed.
+    #[error("the mesh would take {bytes} bytes, the limit is {limit}; {suggested_resolution} Å would fit")]
+    MeshTooLarge {
+        /// Bytes of vertices and triangles.
+        bytes: u64,
+        /// Bytes allowed.
+        limit: u64,
+        /// A spacing that would fit, in Å.
+        suggested_resolution: f64,
+    },
+    /// No sample reaches the isovalue.
+    #[error("no surface at isovalue {isovalue}: the density reaches {max_density} at most on this grid")]
+    NoSurface {
+        /// The isovalue asked for.
+        isovalue: f64,
+        /// The highest density that was seen.
+        max_density: f64,
+    },
+    /// The run was cancelled by its caller.
+    #[error("cancelled")]
+    Cancelled,
+}

@@ -1,0 +1,21 @@
+//! The meshing core: spheres and parameters in, a closed triangle mesh out.
+//!
+//! It knows nothing of files, clocks, async, serialisation, GPUs or molecules. Lengths are ångström (Å),
+//! areas Å², volumes Å³. Density grows inwards; a sample is inside when its density is at least the isovalue;
+//! triangles wind counter-clockwise seen from outside and normals point outwards.
+
+pub mod backend;
+pub mod control;
+pub mod error;
+pub mod measure;
+pub mod mesh;
+pub mod params;
+pub mod spheres;
+
+pub use backend::{Backend, GridStats, Meshed};
+pub use control::{CancelToken, Control, Observer, Stage};
+pub use error::SurfaceError;
+pub use measure::{Component, Measures};
+pub use mesh::Mesh;
+pub use params::{Kernel, PaperParams, Preset, SurfaceLimits, SurfaceOptions, SurfaceParams};
+pub use spheres::Spheres;

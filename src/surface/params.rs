@@ -1,0 +1,289 @@
+//! Parameters of a surface: what a caller may ask for, and the validated form that the core uses.
+
+use std::fmt;
+use std::str::FromStr;
+
+use super::error::SurfaceError;
+
+/// Finest grid spacing that is accepted, Å.
+pub const MIN_RESOLUTION: f64 = 0.01;
+/// Coarsest grid spacing that is accepted, Å.
+pub const MAX_RESOLUTION: f64 = 20.0;
+/// Radius of support of the soft-object and inverse-square kernels, in radii.
+pub const SUPPORT_RADII: f64 = 2.0;
+
+/// The density that one atom contributes, as a function of the distance to its centre.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum Kernel {
+    /// Blinn 1982: exp(−a(d²/r² − 1)), with a C¹ cut-off.
+    #[default]
+    Gaussian,
+    /// Wyvill, McPheeters, Wyvill 1986: a sextic with compact support.
+    SoftObject,
+    /// C/d², windowed.
+    InverseSquare,
+}
+
+/// A named set of parameters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum Preset {
+    /// Smoothness 1.25 at isovalue 1: close to the solvent-excluded surface in volume.
+    #[default]
+    Default,
+    /// Smoothness 0.75 at isovalue 1.9: area and volume of the solvent-excluded surface (1.4 Å probe).
+    SesLike,
+    /// Smoothness 5 at isovalue 1.06: close to the union of van der Waals spheres.
+    VdwLike,
+    /// Smoothness 1.5.
+    Molstar,
+    /// Smoothness 2.5.
+    Blinn,
+    /// Smoothness 0.5 at isovalue 0.824: the density that VMD's QuickSurf draws by default.
+    Quicksurf,
+}
+
+macro_rules! named {
+    ($type:ident, $what:literal, $($variant:ident => $name:literal),+ $(,)?) => {
+        impl $type {
+            /// Every value, in documentation order.
+            pub const ALL: &'static [Self] = &[$(Self::$variant),+];
+
+            /// The value's name in query, JSON and on the command line.
+            #[must_use]
+            pub const fn name(self) -> &'static str {
+                match self { $(Self::$variant => $name),+ }
+            }
+        }
+
+        impl fmt::Display for $type {
+            fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str(self.name())
+            }
+        }
+
+        impl FromStr for $type {
+            type Err = SurfaceError;
+
+            fn from_str(text: &str) -> Result<Self, Self::Err> {
+                Self::ALL.iter().copied().find(|v| v.name() == text).ok_or_else(|| SurfaceError::BadParameter {
+                    name: $what,
+                    value: format!("`{text}`"),
+                    expected: format!("one of {}", [$($name),+].join(", ")),
+                })
+            }
+        }
+    };
+}
+
+named!(Kernel, "kernel", Gaussian => "gaussian", SoftObject => "soft-object", InverseSquare => "inverse-square");
+named!(Preset, "preset", Default => "default", SesLike => "ses-like", VdwLike => "vdw-like", Molstar => "molstar",
+    Blinn => "blinn", Quicksurf => "quicksurf");
+
+/// The raw parameters of Dias, Bora and Gomes (HPDC 2010): the same formula with the same constants for every
+/// atom, radii unused. The threshold T is the isovalue.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PaperParams {
+    /// `b · exp(−a d²)`; `a` in Å⁻².
+    Gaussian {
+        /// Decay, Å⁻².
+        a: f64,
+        /// Height.
+        b: f64,
+    },
+    /// `a · (1 − 4/9 s³ + 17/9 s² − 22/9 s)`, `s = d²/b²`.
+    SoftObject {
+        /// Height.
+        a: f64,
+        /// Radius of support, Å.
+        b: f64,
+    },
+    /// `(c/d²)(1 − d²/b²)²`: the window is part of the definition, as the bare sum has no limit.
+    InverseSquare {
+        /// Strength, Å², in ]0, 1].
+        c: f64,
+        /// Radius of the window, Å.
+        b: f64,
+    },
+}
+
+/// What a caller may ask for; `None` takes the preset's or the default value.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct SurfaceOptions {
+    /// Kernel function; Gaussian by default.
+    pub kernel: Option<Kernel>,
+    /// Grid spacing, Å; 0.5 by default.
+    pub resolution: Option<f64>,
+    /// Level of the density that is the surface; 1 is the surface of an isolated atom at its radius.
+    pub isovalue: Option<f64>,
+    /// The Gaussian's `a` (Blinn's blobbiness without its sign); 1.25 by default. Gaussian only.
+    pub smoothness: Option<f64>,
+    /// Radii are multiplied by this first; 1 by default.
+    pub radius_scale: Option<f64>,
+    /// Then this is added, Å; 0 by default.
+    pub radius_offset: Option<f64>,
+    /// Where the Gaussian is cut off, as a fraction of its value at the radius; 0.01 by default. Gaussian only.
+    pub cutoff_tolerance: Option<f64>,
+    /// Values for the parameters that are not given.
+    pub preset: Option<Preset>,
+    /// The paper's `a` (Gaussian: decay in Å⁻²; soft object: height).
+    pub paper_a: Option<f64>,
+    /// The paper's `b` (Gaussian: height; soft object: support in Å; inverse square: window in Å).
+    pub paper_b: Option<f64>,
+    /// The paper's `c` (inverse square: strength in Å²).
+    pub paper_c: Option<f64>,
+    /// Find the nearest atom of every vertex.
+    pub atom_ids: bool,
+}
+
+/// Parameters of a run, validated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SurfaceParams {
+    /// Kernel function.
+    pub kernel: Kernel,
+    /// Grid spacing, Å.
+    pub resolution: f64,
+    /// Level of the density that is the surface.
+    pub isovalue: f64,
+    /// The Gaussian's `a`.
+    pub smoothness: f64,
+    /// Radii are multiplied by this first.
+    pub radius_scale: f64,
+    /// Then this is added, Å.
+    pub radius_offset: f64,
+    /// Where the Gaussian is cut off, as a fraction of its value at the radius.
+    pub cutoff_tolerance: f64,
+    /// The preset that filled in the values that were not given.
+    pub preset: Preset,
+    /// The paper's raw parameters, which replace radii and smoothness.
+    pub paper: Option<PaperParams>,
+    /// Find the nearest atom of every vertex.
+    pub atom_ids: bool,
+}
+
+/// Limits of a run, checked before memory is allocated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SurfaceLimits {
+    /// Grid samples in occupied bricks.
+    pub max_samples: u64,
+    /// Bytes of vertices and triangles.
+    pub max_mesh_bytes: u64,
+}
+
+impl Default for SurfaceLimits {
+    fn default() -> Self {
+        Self { max_samples: 4 << 30, max_mesh_bytes: 8 << 30 }
+    }
+}
+
+impl Default for SurfaceParams {
+    fn default() -> Self {
+        match Self::new(&SurfaceOptions::default()) {
+            Ok(params) => params,
+            Err(_) => unreachable!("the defaults are valid: a test says so"),
+        }
+    }
+}
+
+fn bad(name: &'static str, value: impl fmt::Display, expected: impl Into<String>) -> SurfaceError {
+    SurfaceError::BadParameter { name, value: value.to_string(), expected: expected.into() }
+}
+
+/// `value` if it is finite and within `[lo, hi]`.
+fn within(name: &'static str, value: f64, lo: f64, hi: f64) -> Result<f64, SurfaceError> {
+    if (lo..=hi).contains(&value) { Ok(value) } else { Err(bad(name, value, format!("a number from {lo} to {hi}"))) }
+}
+
+impl SurfaceParams {
+    /// Fills in defaults and validates everything, once.
+    ///
+    /// # Errors
+    /// [`SurfaceError::BadParameter`] names the first parameter that is out of range or does not go with the
+    /// kernel or with the paper's raw parameters.
+    pub fn new(options: &SurfaceOptions) -> Result<Self, SurfaceError> {
+        let kernel = options.kernel.unwrap_or_default();
+        let preset = options.preset.unwrap_or_default();
+        let paper = paper_params(kernel, options)?;
+        if kernel != Kernel::Gaussian {
+            if let Some(preset) = options.preset.filter(|&p| p != Preset::Default) {
+                return Err(bad(
+                    "preset",
+                    format!("`{preset}`"),
+                    format!("no preset with kernel {kernel}: presets set the Gaussian's smoothness"),
+                ));
+            }
+            for (name, value) in [("smoothness", options.smoothness), ("cutoff_tolerance", options.cutoff_tolerance)] {
+                if let Some(value) = value {
+                    return Err(bad(
+                        name,
+                        value,
+                        format!("no value with kernel {kernel}: it shapes the gaussian kernel only"),
+                    ));
+                }
+            }
+        }
+        if paper.is_some() {
+            let fixed = [
+                ("smoothness", options.smoothness),
+                ("radius_scale", options.radius_scale),
+                ("radius_offset", options.radius_offset),
+            ];
+            if let Some((name, Some(value))) = fixed.into_iter().find(|(_, v)| v.is_some()) {
+                return Err(bad(
+                    name,
+                    value,
+                    "no value together with paper_a, paper_b or paper_c: they replace radii and smoothness",
+                ));
+            }
+        }
+        let (smoothness, isovalue) = match preset {
+            Preset::Default => (1.25, 1.0),
+            Preset::SesLike => (0.75, 1.9),
+            Preset::VdwLike => (5.0, 1.06),
+            Preset::Molstar => (1.5, 1.0),
+            Preset::Blinn => (2.5, 1.0),
+            Preset::Quicksurf => (0.5, 0.824),
+        };
+        Ok(Self {
+            kernel,
+            resolution: within("resolution", options.resolution.unwrap_or(0.5), MIN_RESOLUTION, MAX_RESOLUTION)?,
+            isovalue: within("isovalue", options.isovalue.unwrap_or(isovalue), 1e-3, 1e6)?,
+            smoothness: within("smoothness", options.smoothness.unwrap_or(smoothness), 0.1, 50.0)?,
+            radius_scale: within("radius_scale", options.radius_scale.unwrap_or(1.0), 0.1, 10.0)?,
+            radius_offset: within("radius_offset", options.radius_offset.unwrap_or(0.0), -5.0, 10.0)?,
+            cutoff_tolerance: within("cutoff_tolerance", options.cutoff_tolerance.unwrap_or(0.01), 1e-6, 0.2)?,
+            preset,
+            paper,
+            atom_ids: options.atom_ids,
+        })
+    }
+}
+
+/// The paper's raw parameters, if any of them is given.
+fn paper_params(kernel: Kernel, options: &SurfaceOptions) -> Result<Option<PaperParams>, SurfaceError> {
+    let (a, b, c) = (options.paper_a, options.paper_b, options.paper_c);
+    if a.is_none() && b.is_none() && c.is_none() {
+        return Ok(None);
+    }
+    let need = |name: &'static str, value: Option<f64>, lo: f64, hi: f64| match value {
+        Some(value) => within(name, value, lo, hi),
+        None => Err(bad(name, "nothing", format!("a number, as the paper's {kernel} kernel needs it"))),
+    };
+    let refuse = |name: &'static str, value: Option<f64>| match value {
+        Some(value) => Err(bad(name, value, format!("no value: the paper's {kernel} kernel has no such parameter"))),
+        None => Ok(()),
+    };
+    Ok(Some(match kernel {
+        Kernel::Gaussian => {
+            refuse("paper_c", c)?;
+            PaperParams::Gaussian { a: need("paper_a", a, 1e-3, 100.0)?, b: need("paper_b", b, 1e-2, 1e6)? }
+        }
+        Kernel::SoftObject => {
+            refuse("paper_c", c)?;
+            PaperParams::SoftObject { a: need("paper_a", a, 1e-2, 1e6)?, b: need("paper_b", b, 0.1, 50.0)? }
+        }
+        Kernel::InverseSquare => {
+            refuse("paper_a", a)?;
+            PaperParams::InverseSquare { c: need("paper_c", c, 1e-6, 1.0)?, b: need("paper_b", b, 0.1, 50.0)? }
+        }
+    }))
+}
