@@ -290,6 +290,7 @@ fn build(
         triangles: Column::zeroed(totals.triangles),
         atom_ids: atom_ids.then(|| Column::zeroed(totals.vertices)),
         colors: None,
+        parts: done.iter().map(|tile| (tile.first_vertex as usize, tile.first_triangle as usize)).collect(),
     };
     let mut work = Vec::with_capacity(done.len());
     let (mut positions, mut normals) = (&mut mesh.positions[..], &mut mesh.normals[..]);
