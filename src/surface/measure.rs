@@ -8,6 +8,7 @@ use rustc_hash::FxHashMap;
 
 use super::control::Control;
 use super::error::SurfaceError;
+use super::labels::Labels;
 use super::mesh::Mesh;
 use super::simd::dispatched;
 use super::topology;
@@ -141,8 +142,9 @@ fn edge_share(from: u32, to: u32) -> u64 {
     if from < to { key } else { key.wrapping_neg() }
 }
 
-/// Triangles whose geometry is computed together: one AVX-512 vector.
-const LANES: usize = 16;
+/// Triangles whose geometry is computed together: enough that what was gathered lane by lane has left the store
+/// buffer when it is read back as vectors.
+const LANES: usize = 128;
 
 /// Area and volume of up to [`LANES`] triangles, each. Missing ones are zero.
 type Lanes = [[f32; LANES]; 2];
@@ -157,15 +159,15 @@ fn sum_block(positions: &[[f32; 3]], block: &[[u32; 3]], labels: &Labels) -> Blo
         sums.checksum = sums.checksum.wrapping_add(shares);
         sums.degenerate |= degenerate;
         let [area, volume] = geometry(positions, batch);
-        let root = labels.root_of(batch[0][0]);
-        if root == run.0 && batch.iter().all(|t| labels.root_of(t[0]) == root) {
+        let root = labels.component(batch[0][0]);
+        if root == run.0 && batch.iter().all(|t| labels.component(t[0]) == root) {
             run.1.triangles += batch.len() as u64;
             run.1.area += area.iter().map(|&a| f64::from(a)).sum::<f64>();
             run.1.volume += volume.iter().map(|&v| f64::from(v)).sum::<f64>();
             continue;
         }
         for (t, (&area, &volume)) in batch.iter().zip(area.iter().zip(&volume)) {
-            let root = labels.root_of(t[0]);
+            let root = labels.component(t[0]);
             if root != run.0 {
                 if run.1.triangles > 0 {
                     sums.components.push(run);
@@ -224,144 +226,6 @@ fn geometry(positions: &[[f32; 3]], batch: &[[u32; 3]]) -> Lanes {
         volume[i] = (ax[i] * nx + ay[i] * ny + az[i] * nz) * (1.0 / 6.0);
     }
     [area, volume]
-}
-
-/// Connected components of the vertices: a union–find whose sets are named by one of their vertices.
-///
-/// Each part of the mesh joins its own vertices, in parallel and in cache; edges that leave a part are joined
-/// afterwards. One entry is one step from its set's name after [`Labels::of`].
-struct Labels(Vec<u32>);
-
-/// The vertices and triangles of one part of a mesh.
-struct PartWork<'a> {
-    first: u32,
-    labels: &'a mut [u32],
-    triangles: &'a [[u32; 3]],
-}
-
-impl Labels {
-    fn of(mesh: &Mesh) -> Self {
-        let mut labels = vec![0_u32; mesh.n_vertices()];
-        let leaving: Vec<Vec<[u32; 2]>> =
-            split_parts(mesh, &mut labels).into_par_iter().map(|mut part| part.join()).collect();
-        let mut labels = Self(labels);
-        let mut last = [u32::MAX; 2];
-        for &[a, b] in leaving.iter().flatten() {
-            // Neighbouring triangles mostly ask for what the last one asked for.
-            let pair = [labels.0[a as usize], labels.0[b as usize]];
-            if pair[0] != pair[1] && pair != last {
-                labels.join(a, b);
-                last = pair;
-            }
-        }
-        labels
-    }
-
-    fn find(&self, mut v: u32) -> u32 {
-        while self.0[v as usize] != v {
-            v = self.0[v as usize];
-        }
-        v
-    }
-
-    fn join(&mut self, a: u32, b: u32) {
-        let (root_a, root_b) = (self.find(a), self.find(b));
-        let low = root_a.min(root_b);
-        // The four entries on the way are as good as the whole path: parts are shallow.
-        for v in [a, b, root_a, root_b] {
-            self.0[v as usize] = low;
-        }
-    }
-
-    /// The name of a vertex's set.
-    fn root_of(&self, v: u32) -> u32 {
-        self.find(self.0[v as usize])
-    }
-
-    /// Adds the vertices of each component; returns how many belong to any triangle.
-    fn count_vertices(&self, components: &mut FxHashMap<u32, Component>) -> u64 {
-        let mut counts: FxHashMap<u32, u64> = FxHashMap::default();
-        for run in self.0.chunk_by(|a, b| a == b) {
-            *counts.entry(run[0]).or_default() += run.len() as u64;
-        }
-        let mut used = 0;
-        let mut counts: Vec<(u32, u64)> = counts.into_iter().collect();
-        counts.sort_unstable();
-        for (name, n) in counts {
-            if let Some(component) = components.get_mut(&self.find(name)) {
-                component.vertices += n;
-                used += n;
-            }
-        }
-        used
-    }
-}
-
-/// Cuts the label array and the triangles into the mesh's parts; one part where it names none.
-fn split_parts<'a>(mesh: &'a Mesh, labels: &'a mut [u32]) -> Vec<PartWork<'a>> {
-    let whole = [(0, 0)];
-    let starts = if mesh.parts.is_empty() { &whole[..] } else { &mesh.parts[..] };
-    let mut rest = labels;
-    let mut parts = Vec::with_capacity(starts.len());
-    for (i, &(first, triangle)) in starts.iter().enumerate() {
-        let (v, t) = starts.get(i + 1).copied().unwrap_or((mesh.n_vertices(), mesh.n_triangles()));
-        let (own, after) = std::mem::take(&mut rest).split_at_mut(v - first);
-        rest = after;
-        let first = u32::try_from(first).unwrap_or(u32::MAX);
-        parts.push(PartWork { first, labels: own, triangles: &mesh.triangles[triangle..t] });
-    }
-    parts
-}
-
-impl PartWork<'_> {
-    /// Joins the part's own vertices and returns the edges that leave it.
-    fn join(&mut self) -> Vec<[u32; 2]> {
-        let mut leaving = Vec::new();
-        for (label, i) in self.labels.iter_mut().zip(0..) {
-            *label = i;
-        }
-        let n = self.labels.len();
-        for &[a, b, c] in self.triangles {
-            let [i, j, k] = [a, b, c].map(|v| v.wrapping_sub(self.first) as usize);
-            if i < n && j < n && k < n {
-                self.join_own(i, j);
-                self.join_own(j, k);
-            } else {
-                for (p, q, edge) in [(i, j, [a, b]), (j, k, [b, c])] {
-                    if p < n && q < n { self.join_own(p, q) } else { leaving.push(edge) }
-                }
-            }
-        }
-        // Lower vertices are flat before higher ones look at them: a parent is always lower.
-        for i in 0..n {
-            let parent = self.labels[i] as usize;
-            self.labels[i] = self.labels[parent].min(self.labels[i]);
-        }
-        self.labels.iter_mut().for_each(|label| *label += self.first);
-        leaving
-    }
-
-    fn find_own(&mut self, mut v: usize) -> usize {
-        loop {
-            let parent = self.labels[v] as usize;
-            let above = self.labels[parent];
-            if above as usize == parent {
-                return parent;
-            }
-            self.labels[v] = above;
-            v = above as usize;
-        }
-    }
-
-    #[inline(always)]
-    fn join_own(&mut self, a: usize, b: usize) {
-        if self.labels[a] == self.labels[b] {
-            return;
-        }
-        let (a, b) = (self.find_own(a), self.find_own(b));
-        let (low, high) = (a.min(b), a.max(b));
-        self.labels[high] = self.labels[low];
-    }
 }
 
 #[cfg(test)]

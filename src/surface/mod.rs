@@ -11,6 +11,7 @@ pub mod control;
 pub mod cpu;
 pub mod error;
 pub mod kernel;
+mod labels;
 pub mod lattice;
 pub mod measure;
 pub mod mesh;
