@@ -1,70 +1,32 @@
 //! Meshes to bytes. Pure: a mesh and an `io::Write` in, no paths, no HTTP.
+//!
+//! A file is made in two steps, so that whoever sends it knows its length first: [`Encoder::new`] checks the mesh
+//! and lays the file out without writing a byte, [`Encoder::write`] streams it. The mesh is never copied as a
+//! whole: columns that the format holds as they are go to the writer as they lie in memory, everything else
+//! passes through one block of [`block::BLOCK_BYTES`].
+//!
+//! One unit is one ångström in every format. glTF holds positions relative to [`Mesh::centre`] under a node
+//! translated by it; PLY, STL and OBJ have no nodes and hold the structure file's own coordinates.
+
+mod block;
+mod check;
+mod error;
+mod format;
+mod gltf;
+mod obj;
+mod ply;
+mod stl;
+mod text;
 
 use std::io::{self, Write};
-use std::str::FromStr;
 
-use thiserror::Error;
+pub use error::FormatError;
+pub use format::{Format, UnknownFormat};
 
 use crate::surface::Mesh;
 
-/// A mesh file format.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub enum Format {
-    /// glTF 2.0, binary container.
-    #[default]
-    Glb,
-    /// glTF 2.0, JSON with the buffer embedded as a data URI.
-    Gltf,
-    /// PLY, binary little-endian.
-    Ply,
-    /// STL, binary.
-    Stl,
-    /// Wavefront OBJ.
-    Obj,
-}
-
-/// No format has this name.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("unknown format `{0}`; expected one of glb, gltf, ply, stl, obj")]
-pub struct UnknownFormat(pub String);
-
-impl Format {
-    /// Every format.
-    pub const ALL: [Self; 5] = [Self::Glb, Self::Gltf, Self::Ply, Self::Stl, Self::Obj];
-
-    /// File extension and name, without a dot.
-    #[must_use]
-    pub const fn extension(self) -> &'static str {
-        match self {
-            Self::Glb => "glb",
-            Self::Gltf => "gltf",
-            Self::Ply => "ply",
-            Self::Stl => "stl",
-            Self::Obj => "obj",
-        }
-    }
-
-    /// Media type.
-    #[must_use]
-    pub const fn media_type(self) -> &'static str {
-        match self {
-            Self::Glb => "model/gltf-binary",
-            Self::Gltf => "model/gltf+json",
-            Self::Ply => "application/ply",
-            Self::Stl => "model/stl",
-            Self::Obj => "model/obj",
-        }
-    }
-}
-
-impl FromStr for Format {
-    type Err = UnknownFormat;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let lower = text.to_ascii_lowercase();
-        Self::ALL.into_iter().find(|f| f.extension() == lower).ok_or_else(|| UnknownFormat(text.to_owned()))
-    }
-}
+/// Program and version, as every format that has room for it says it.
+const GENERATOR: &str = concat!("molmesh ", env!("CARGO_PKG_VERSION"));
 
 /// What a file says about its mesh besides the mesh.
 #[derive(Debug, Clone, Default)]
@@ -78,8 +40,102 @@ pub struct Meta {
 /// Writes `mesh` as `format`.
 ///
 /// # Errors
-/// Those of `out`, and `InvalidInput` where the format cannot hold the mesh (a GLB of 4 GiB).
+/// Those of `out`, and `InvalidInput` around a [`FormatError`] where the mesh is broken or the format cannot hold
+/// it (a GLB of 4 GiB); then nothing has been written.
 pub fn write(format: Format, mesh: &Mesh, meta: &Meta, out: &mut dyn Write) -> io::Result<()> {
-    let _ = (format, mesh, meta);
-    out.flush()
+    Encoder::new(format, mesh, meta)?.write(out)
+}
+
+/// Bytes that [`write`] will write, exactly; `None` where it would refuse the mesh, and for OBJ, whose length is
+/// known only once every number is text: see [`encoded_len_bound`].
+///
+/// [`Encoder`] tells the length and writes the file at the price of one check of the mesh.
+#[must_use]
+pub fn encoded_len(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
+    Encoder::new(format, mesh, meta).ok()?.len()
+}
+
+/// Bytes that [`write`] will write at most: exact wherever [`encoded_len`] is; `None` where it would refuse.
+#[must_use]
+pub fn encoded_len_bound(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
+    Some(Encoder::new(format, mesh, meta).ok()?.len_bound())
+}
+
+/// A file that is laid out and not yet written.
+#[derive(Debug)]
+pub struct Encoder<'a> {
+    mesh: &'a Mesh,
+    plan: Plan,
+}
+
+/// What is known of a file before it is written.
+#[derive(Debug)]
+enum Plan {
+    Glb(gltf::GlbPlan),
+    Gltf(gltf::GltfPlan),
+    Ply(ply::PlyPlan),
+    Stl(stl::StlPlan),
+    Obj(obj::ObjPlan),
+}
+
+impl<'a> Encoder<'a> {
+    /// Checks `mesh` and lays the file out. Reads every column of the mesh once, on rayon's pool if it is large.
+    ///
+    /// # Errors
+    /// Any [`FormatError`].
+    pub fn new(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
+        let summary = check::check(mesh)?;
+        let plan = match format {
+            Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, &summary, meta)?),
+            Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, &summary, meta)?),
+            Format::Ply => Plan::Ply(ply::PlyPlan::new(mesh, meta)),
+            Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, meta)?),
+            Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, &summary, meta)?),
+        };
+        Ok(Self { mesh, plan })
+    }
+
+    /// Bytes of the file, exactly; `None` for OBJ.
+    #[must_use]
+    pub fn len(&self) -> Option<u64> {
+        match &self.plan {
+            Plan::Glb(plan) => Some(plan.len()),
+            Plan::Gltf(plan) => Some(plan.len()),
+            Plan::Ply(plan) => Some(plan.len()),
+            Plan::Stl(plan) => Some(plan.len()),
+            Plan::Obj(_) => None,
+        }
+    }
+
+    /// No format has files without bytes.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        false
+    }
+
+    /// Bytes of the file at most; exact where [`Self::len`] is.
+    #[must_use]
+    pub fn len_bound(&self) -> u64 {
+        match &self.plan {
+            Plan::Obj(plan) => plan.len_bound(),
+            _ => self.len().unwrap_or(u64::MAX),
+        }
+    }
+
+    /// Writes the file and flushes `out`. The same mesh and meta give the same bytes.
+    ///
+    /// Blocks are large: `out` needs no buffer of its own.
+    ///
+    /// # Errors
+    /// Those of `out`.
+    pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
+        match &self.plan {
+            Plan::Glb(plan) => plan.write(self.mesh, out),
+            Plan::Gltf(plan) => plan.write(self.mesh, out),
+            Plan::Ply(plan) => plan.write(self.mesh, out),
+            Plan::Stl(plan) => plan.write(self.mesh, out),
+            Plan::Obj(plan) => plan.write(self.mesh, out),
+        }?;
+        out.flush()
+    }
 }

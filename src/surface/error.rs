@@ -55,12 +55,10 @@ pub enum SurfaceError {
         suggested_resolution: f64,
     },
     /// No sample reaches the isovalue.
-    #[error("no surface at isovalue {isovalue}: the density reaches {max_density} at most on this grid")]
+    #[error("no sample of the grid reaches the isovalue {isovalue}: lower it, or refine the resolution")]
     NoSurface {
         /// The isovalue asked for.
         isovalue: f64,
-        /// The highest density that was seen.
-        max_density: f64,
     },
     /// The run was cancelled by its caller.
     #[error("cancelled")]

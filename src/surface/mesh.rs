@@ -1,5 +1,9 @@
 //! The output of the core: an indexed triangle mesh with normals.
 
+use rustc_hash::FxHashMap;
+
+use super::lattice::to_f32;
+
 /// An indexed triangle mesh. Vertex `i` lies at `centre + positions[i]`, in Å.
 ///
 /// Invariants of every mesh that a backend returns: each index is in range, normals have length 1 and point
@@ -40,6 +44,38 @@ impl Mesh {
         self.positions.iter().fold([first, first], |[lo, hi], p| {
             [std::array::from_fn(|k| lo[k].min(p[k])), std::array::from_fn(|k| hi[k].max(p[k]))]
         })
+    }
+
+    /// Gives every vertex whose normal is zero the area-weighted mean normal of its triangles: at a saddle of the
+    /// density the gradient vanishes and has no direction.
+    pub(super) fn fill_flat_normals(&mut self) {
+        let flat: FxHashMap<u32, usize> =
+            (0_u32..).zip(&self.normals).filter(|(_, n)| **n == [0.0; 3]).zip(0..).map(|((v, _), i)| (v, i)).collect();
+        let mut sums = vec![[0.0_f64; 3]; flat.len()];
+        for t in &self.triangles {
+            for v in t {
+                if let Some(&i) = flat.get(v) {
+                    let normal = self.face_normal(*t);
+                    (0..3).for_each(|k| sums[i][k] += normal[k]);
+                }
+            }
+        }
+        let mut order: Vec<_> = flat.into_iter().collect();
+        order.sort_unstable();
+        for (v, i) in order {
+            let length = sums[i].iter().map(|c| c * c).sum::<f64>().sqrt();
+            // A vertex whose triangles cancel to nothing still needs a unit vector.
+            let unit = if length > 0.0 { sums[i].map(|c| c / length) } else { [0.0, 0.0, 1.0] };
+            self.normals[v as usize] = unit.map(to_f32);
+        }
+    }
+
+    /// Twice the area of a triangle times its unit normal, Å².
+    #[must_use]
+    pub fn face_normal(&self, triangle: [u32; 3]) -> [f64; 3] {
+        let [a, b, c] = triangle.map(|v| self.positions[v as usize].map(f64::from));
+        let (u, v): ([f64; 3], [f64; 3]) = (std::array::from_fn(|k| b[k] - a[k]), std::array::from_fn(|k| c[k] - a[k]));
+        [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
     }
 
     /// Bytes of positions, normals and indices for so many vertices and triangles.

@@ -5,8 +5,12 @@
 //! triangles wind counter-clockwise seen from outside and normals point outwards.
 
 pub mod backend;
+pub mod cases;
 pub mod control;
+pub mod cpu;
 pub mod error;
+pub mod kernel;
+pub mod lattice;
 pub mod measure;
 pub mod mesh;
 pub mod params;

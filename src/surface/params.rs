@@ -247,7 +247,7 @@ impl SurfaceParams {
             kernel,
             resolution: within("resolution", options.resolution.unwrap_or(0.5), MIN_RESOLUTION, MAX_RESOLUTION)?,
             isovalue: within("isovalue", options.isovalue.unwrap_or(isovalue), 1e-3, 1e6)?,
-            smoothness: within("smoothness", options.smoothness.unwrap_or(smoothness), 0.1, 50.0)?,
+            smoothness: within("smoothness", options.smoothness.unwrap_or(smoothness), 0.1, 40.0)?,
             radius_scale: within("radius_scale", options.radius_scale.unwrap_or(1.0), 0.1, 10.0)?,
             radius_offset: within("radius_offset", options.radius_offset.unwrap_or(0.0), -5.0, 10.0)?,
             cutoff_tolerance: within("cutoff_tolerance", options.cutoff_tolerance.unwrap_or(0.01), 1e-6, 0.2)?,

@@ -1,0 +1,254 @@
+//! Stage `bin`: atoms to tiles, and within a tile to bricks.
+//!
+//! A tile is 8 × 8 × 8 bricks, the unit of parallel work. Work inside a tile also sees one layer of bricks beyond
+//! its upper faces (index 8), of which it needs the face samples only: they belong to the next tile, which
+//! computes the same bits.
+
+use rustc_hash::FxHashMap;
+
+use crate::surface::control::Control;
+use crate::surface::error::SurfaceError;
+use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32};
+use crate::surface::params::SurfaceLimits;
+
+/// Bricks along a tile's edge with the layer beyond.
+pub(super) const SIDE: usize = 9;
+/// Bricks of a tile with the layer beyond.
+pub(super) const SLOTS: usize = SIDE * SIDE * SIDE;
+/// Marks a candidate that reaches no sample of the brick, only the space up to its neighbours' first samples: it
+/// matters to normals, not to the field.
+pub(super) const NORMAL_ONLY: u32 = 1 << 31;
+/// Atoms are indexed with 31 bits.
+pub(super) const MAX_ATOMS: usize = (1 << 31) - 1;
+
+/// The tiles that some atom reaches, in canonical order, with their atoms.
+#[derive(Debug)]
+pub(super) struct Tiles {
+    /// Tile coordinates, ordered by z, y, x.
+    pub(super) coords: Vec<[i32; 3]>,
+    /// Index of a tile by its coordinates.
+    pub(super) index: FxHashMap<[i32; 3], u32>,
+    /// Where each tile's atoms begin; one more entry than tiles.
+    starts: Vec<usize>,
+    /// Atom indices, ascending within a tile.
+    atoms: Vec<u32>,
+}
+
+/// First and last tile per axis whose samples, with the layer beyond, the atom reaches.
+fn tile_range(atom: &LatticeAtom, reach: f64) -> [[i32; 2]; 3] {
+    let side = f64::from(TILE);
+    std::array::from_fn(|k| {
+        let c = atom.position(k);
+        [to_i32(((c - reach) / side - 1.0).ceil()), to_i32(((c + reach) / side).floor())]
+    })
+}
+
+fn boxed(range: [[i32; 2]; 3]) -> impl Iterator<Item = [i32; 3]> {
+    let [x, y, z] = range;
+    (z[0]..=z[1]).flat_map(move |tz| (y[0]..=y[1]).flat_map(move |ty| (x[0]..=x[1]).map(move |tx| [tx, ty, tz])))
+}
+
+impl Tiles {
+    /// Assigns atoms to tiles.
+    ///
+    /// # Errors
+    /// [`SurfaceError::GridTooLarge`] before memory is allocated beyond what the limit allows, and
+    /// [`SurfaceError::Cancelled`].
+    pub(super) fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
+        let mut index: FxHashMap<[i32; 3], u32> = FxHashMap::default();
+        let mut pairs = 0_u64;
+        // Every tile in reach holds at least one occupied brick, and no grid within the limit has more pairs of
+        // atoms and tiles than this: both bound what is allocated below.
+        let max_tiles = limits.max_samples / 512 + 1;
+        let max_pairs = limits.max_samples.saturating_mul(4).max(1 << 16);
+        let mut last = [i32::MAX; 3];
+        for (i, atom) in lattice.atoms.iter().enumerate() {
+            let range = tile_range(atom, lattice.reach(atom));
+            let n: u64 = range.iter().map(|[lo, hi]| u64::from(lo.abs_diff(*hi)) + 1).product();
+            pairs += n;
+            if n > max_tiles || pairs > max_pairs || index.len() as u64 > max_tiles {
+                let samples = n.max(index.len() as u64).saturating_mul(512).max(pairs / 4);
+                return Err(too_large(lattice, samples, limits));
+            }
+            for tile in boxed(range) {
+                if tile != last {
+                    index.entry(tile).or_default();
+                    last = tile;
+                }
+            }
+            if i % 65_536 == 0 {
+                control.check()?;
+            }
+        }
+        let mut coords: Vec<[i32; 3]> = index.keys().copied().collect();
+        coords.sort_unstable_by_key(|&t| tile_order(t));
+        for (rank, tile) in (0..).zip(&coords) {
+            index.insert(*tile, rank);
+        }
+        let mut counts = vec![0_u32; coords.len()];
+        let mut each = |visit: &mut dyn FnMut(u32, usize)| {
+            let (mut last, mut last_ix) = ([i32::MAX; 3], 0);
+            for (i, atom) in (0_u32..).zip(&lattice.atoms) {
+                for tile in boxed(tile_range(atom, lattice.reach(atom))) {
+                    if tile != last {
+                        (last, last_ix) = (tile, index[&tile] as usize);
+                    }
+                    visit(i, last_ix);
+                }
+            }
+        };
+        each(&mut |_, tile| counts[tile] += 1);
+        let mut starts = Vec::with_capacity(coords.len() + 1);
+        let mut total = 0;
+        for &n in &counts {
+            starts.push(total);
+            total += n as usize;
+        }
+        starts.push(total);
+        let mut cursor = starts.clone();
+        let mut atoms = vec![0_u32; total];
+        each(&mut |atom, tile| {
+            atoms[cursor[tile]] = atom;
+            cursor[tile] += 1;
+        });
+        Ok(Self { coords, index, starts, atoms })
+    }
+
+    /// Number of tiles.
+    pub(super) fn len(&self) -> usize {
+        self.coords.len()
+    }
+
+    /// The atoms that reach tile `t`, ascending.
+    pub(super) fn atoms(&self, t: usize) -> &[u32] {
+        &self.atoms[self.starts[t]..self.starts[t + 1]]
+    }
+}
+
+/// The refusal of more atoms than 31-bit indices can number.
+pub(super) fn too_many_atoms(n: usize) -> SurfaceError {
+    let expected = format!("at most {MAX_ATOMS} spheres");
+    SurfaceError::BadParameter { name: "spheres", value: n.to_string(), expected }
+}
+
+/// The refusal of a grid of (at least) `samples` samples.
+pub(super) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
+    let excess = samples as f64 / limits.max_samples.max(1) as f64;
+    SurfaceError::GridTooLarge {
+        samples,
+        limit: limits.max_samples,
+        resolution: lattice.spacing,
+        suggested_resolution: super::roomier(lattice.spacing * excess.max(1.0).cbrt()),
+    }
+}
+
+/// A tile's bricks and their candidate atoms. Kept and refilled from tile to tile.
+#[derive(Debug)]
+pub(super) struct Bricks {
+    /// Where each slot's candidates begin in `candidates`; one more entry than slots.
+    pub(super) starts: Vec<u32>,
+    /// Atom indices, ascending within a slot, some marked [`NORMAL_ONLY`].
+    pub(super) candidates: Vec<u32>,
+    /// Per slot the number of candidates that reach a sample.
+    pub(super) reaching: Vec<u32>,
+    hits: Vec<(u16, u32)>,
+}
+
+impl Default for Bricks {
+    fn default() -> Self {
+        Self { starts: vec![0; SLOTS + 1], candidates: Vec::new(), reaching: vec![0; SLOTS], hits: Vec::new() }
+    }
+}
+
+/// Squared distances along one axis from an atom to the samples of each of the 9 brick layers, and to the closed
+/// box that also holds the next brick's first sample. The layer beyond the tile has its first sample only.
+struct AxisReach {
+    first: usize,
+    last: usize,
+    samples: [f32; SIDE],
+    closed: [f32; SIDE],
+}
+
+impl AxisReach {
+    fn new(local: f32, reach: f32) -> Self {
+        let mut axis = Self { first: SIDE, last: 0, samples: [0.0; SIDE], closed: [0.0; SIDE] };
+        for b in 0..SIDE {
+            let lo = (b * 8) as f32;
+            let beyond = b == SIDE - 1;
+            let gap = |hi: f32| (lo - local).max(local - hi).max(0.0);
+            let (samples, closed) = if beyond { (gap(lo), gap(lo)) } else { (gap(lo + 7.0), gap(lo + 8.0)) };
+            (axis.samples[b], axis.closed[b]) = (samples * samples, closed * closed);
+            if closed <= reach {
+                (axis.first, axis.last) = (axis.first.min(b), b + 1);
+            }
+        }
+        axis
+    }
+}
+
+impl Bricks {
+    /// Finds the candidates of every brick of a tile.
+    pub(super) fn fill(&mut self, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
+        self.starts.iter_mut().for_each(|n| *n = 0);
+        self.reaching.iter_mut().for_each(|n| *n = 0);
+        self.hits.clear();
+        let origin = tile.map(|t| t * TILE);
+        for &ix in atoms {
+            let atom = &lattice.atoms[ix as usize];
+            // A little more than the support: rounding must not lose a pair, and a pair too many adds zero.
+            let reach = to_f32(lattice.reach(atom) * (1.0 + 1e-5)) + 1e-3;
+            let local = |k: usize| (atom.cell[k] - origin[k]) as f32 + atom.frac[k];
+            let [x, y, z] = std::array::from_fn(|k| AxisReach::new(local(k), reach));
+            let reach2 = reach * reach;
+            for bz in z.first..z.last {
+                for by in y.first..y.last {
+                    let closed = y.closed[by] + z.closed[bz];
+                    let samples = y.samples[by] + z.samples[bz];
+                    let row = (bz * SIDE + by) * SIDE;
+                    // The layer beyond feeds no vertex of this tile: only its samples matter.
+                    let beyond = bz == SIDE - 1 || by == SIDE - 1;
+                    for bx in x.first..x.last {
+                        if closed + x.closed[bx] > reach2 {
+                            continue;
+                        }
+                        let reaches = samples + x.samples[bx] <= reach2;
+                        if !reaches && (beyond || bx == SIDE - 1) {
+                            continue;
+                        }
+                        let slot = row + bx;
+                        self.starts[slot + 1] += 1;
+                        self.reaching[slot] += u32::from(reaches);
+                        self.hits.push((slot as u16, if reaches { ix } else { ix | NORMAL_ONLY }));
+                    }
+                }
+            }
+        }
+        for slot in 0..SLOTS {
+            self.starts[slot + 1] += self.starts[slot];
+        }
+        self.candidates.clear();
+        self.candidates.resize(self.hits.len(), 0);
+        let mut cursor: [u32; SLOTS] = std::array::from_fn(|slot| self.starts[slot]);
+        for &(slot, candidate) in &self.hits {
+            let at = &mut cursor[usize::from(slot)];
+            self.candidates[*at as usize] = candidate;
+            *at += 1;
+        }
+    }
+
+    /// The candidates of a slot.
+    pub(super) fn of(&self, slot: usize) -> &[u32] {
+        &self.candidates[self.starts[slot] as usize..self.starts[slot + 1] as usize]
+    }
+}
+
+/// A slot's brick index within the tile, 0 to 8 per axis.
+pub(super) fn slot_brick(slot: usize) -> [usize; 3] {
+    [slot % SIDE, slot / SIDE % SIDE, slot / (SIDE * SIDE)]
+}
+
+/// First sample of a slot's brick.
+pub(super) fn slot_origin(tile: [i32; 3], slot: usize) -> [i32; 3] {
+    let brick = slot_brick(slot);
+    std::array::from_fn(|k| tile[k] * TILE + brick[k] as i32 * BRICK)
+}

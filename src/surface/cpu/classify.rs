@@ -1,0 +1,174 @@
+//! Stage `classify`: inside bits, crossing edges with their parameters, active cells with their cases.
+//!
+//! A brick's samples are eight 64-bit words, one per z layer, bit `8·y + x`. Every test on them is a shift.
+
+use super::field::Samples;
+use super::simd::dispatched;
+use crate::surface::cases::CASES;
+use crate::surface::lattice::BRICK_SAMPLES;
+
+/// Inside bits of a brick: word z, bit `8·y + x`.
+pub(super) type Inside = [u64; 8];
+
+/// Edge parameters are kept this far from both ends, so that no triangle degenerates and no two vertices of
+/// different edges coincide.
+pub(super) const EDGE_MARGIN: f32 = 1.0 / 1024.0;
+
+/// A brick that the surface passes through, as the later stages need it.
+#[derive(Debug, Clone)]
+pub(super) struct SurfaceBrick {
+    /// Slot within the tile (0 to 8 per axis; 8 never occurs here).
+    pub(super) slot: u16,
+    /// Crossing edges: word `3·z + axis`, bit `8·y + x` of the owning sample. Vertices are numbered in this order.
+    pub(super) crossing: [u64; 24],
+    /// Vertices of the brick before each word.
+    pub(super) before: [u16; 24],
+    /// Active cells: word z, bit `8·y + x`.
+    pub(super) active: [u64; 8],
+    /// First vertex, counted within the tile.
+    pub(super) vertex: u32,
+    /// First triangle, counted within the tile.
+    pub(super) triangle: u32,
+    /// First case of the brick in the tile's list.
+    pub(super) case: u32,
+    /// Candidates in the tile's list of kept candidates.
+    pub(super) candidates: [u32; 2],
+}
+
+/// What `classify` finds in the bricks of one tile, appended brick by brick.
+#[derive(Debug, Default)]
+pub(super) struct Found {
+    /// The bricks with surface, by slot.
+    pub(super) bricks: Vec<SurfaceBrick>,
+    /// Parameter of each vertex along its edge, from the owning sample, in vertex order.
+    pub(super) t: Vec<f32>,
+    /// Case of each active cell, in cell order.
+    pub(super) cases: Vec<u8>,
+    /// Vertices so far.
+    pub(super) vertices: u32,
+    /// Triangles so far.
+    pub(super) triangles: u32,
+    /// Candidates of the bricks with surface.
+    pub(super) candidates: Vec<u32>,
+}
+
+/// A brick's samples with those of the seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
+#[derive(Clone, Copy)]
+pub(super) struct Around<'a> {
+    /// Inside bits of the brick and its neighbours.
+    pub(super) inside: [&'a Inside; 8],
+    /// Densities likewise.
+    pub(super) samples: [&'a Samples; 8],
+}
+
+dispatched! {
+/// Inside bits of a brick.
+pub(super) fn inside_bits(samples: &Samples, iso: f32) -> Inside {
+    std::array::from_fn(|z| {
+        let mut word = 0;
+        for y in 0..8 {
+            let mut row = 0_u64;
+            for x in 0..8 {
+                row |= u64::from(samples[z * 64 + y * 8 + x] >= iso) << x;
+            }
+            word |= row << (8 * y);
+        }
+        word
+    })
+}
+}
+
+/// Inside bits shifted by one sample along the axes of `shift` (bit 0 x, 1 y, 2 z), for layer z.
+#[inline(always)]
+fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
+    const FIRST_COLUMN: u64 = 0x0101_0101_0101_0101;
+    let (z, far_z) = if shift & 4 != 0 { ((z + 1) % 8, if z == 7 { 4 } else { 0 }) } else { (z, 0) };
+    let word = |near: usize| inside[near | far_z][z];
+    let along_x = |near: usize| (word(near) >> 1 & !(FIRST_COLUMN << 7)) | (word(near | 1) & FIRST_COLUMN) << 7;
+    match shift & 3 {
+        0 => word(0),
+        1 => along_x(0),
+        2 => word(0) >> 8 | word(2) << 56,
+        _ => along_x(0) >> 8 | along_x(2) << 56,
+    }
+}
+
+impl Found {
+    /// Classifies one brick and appends what it holds.
+    pub(super) fn add(&mut self, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) {
+        classify(self, slot, around, iso, candidates);
+    }
+}
+
+dispatched! {
+fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) {
+    let corners: [[u64; 8]; 8] = std::array::from_fn(|z| std::array::from_fn(|c| shifted(&around.inside, c, z)));
+    let active = corners.map(|c| c.iter().fold(0, |m, w| m | w) & !c.iter().fold(u64::MAX, |m, w| m & w));
+    if active == [0; 8] {
+        return;
+    }
+    let mut brick = SurfaceBrick {
+        slot: slot as u16,
+        crossing: [0; 24],
+        before: [0; 24],
+        active,
+        vertex: found.vertices,
+        triangle: found.triangles,
+        case: found.cases.len() as u32,
+        candidates: [found.candidates.len() as u32, (found.candidates.len() + candidates.len()) as u32],
+    };
+    found.candidates.extend_from_slice(candidates);
+    let mut n = 0_u16;
+    for z in 0..8 {
+        for axis in 0..3 {
+            let word = corners[z][0] ^ corners[z][1 << axis];
+            let w = 3 * z + axis;
+            (brick.crossing[w], brick.before[w]) = (word, n);
+            n += word.count_ones() as u16;
+        }
+    }
+    edge_parameters(&brick.crossing, n, &around.samples, iso, &mut found.t);
+    let count = &CASES.count;
+    for z in 0..8 {
+        let mut cells = active[z];
+        while cells != 0 {
+            let bit = cells.trailing_zeros();
+            cells &= cells - 1;
+            let case = (0..8).fold(0, |case, c| case | (corners[z][c] >> bit & 1) << c) as u8;
+            found.cases.push(case);
+            found.triangles += u32::from(count[usize::from(case)]);
+        }
+    }
+    found.vertices += u32::from(n);
+    found.bricks.push(brick);
+}
+}
+
+/// Where along each crossing edge the density is `iso`, by linear interpolation.
+#[inline(always)]
+fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, t: &mut Vec<f32>) {
+    const STEP: [usize; 3] = [1, 8, 64];
+    let first = t.len();
+    // Densities at both ends first, one division per vector afterwards: `t` holds F(owner) − iso meanwhile.
+    let mut drop = [0.0_f32; 3 * BRICK_SAMPLES];
+    let mut k = 0;
+    t.reserve(usize::from(n));
+    for (w, &word) in crossing.iter().enumerate() {
+        let (z, axis) = (w / 3, w % 3);
+        let mut edges = word;
+        while edges != 0 {
+            let bit = edges.trailing_zeros() as usize;
+            edges &= edges - 1;
+            let at = z * 64 + bit;
+            let coordinate = [bit & 7, bit >> 3, z][axis];
+            let (far, next) = if coordinate == 7 { (1 << axis, at - 7 * STEP[axis]) } else { (0, at + STEP[axis]) };
+            let (f0, f1) = (samples[0][at & 511], samples[far][next & 511]);
+            t.push(f0 - iso);
+            drop[k] = f0 - f1;
+            k += 1;
+        }
+    }
+    for (t, drop) in t[first..].iter_mut().zip(&drop) {
+        *t = (*t / drop).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
+    }
+}

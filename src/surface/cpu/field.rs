@@ -1,0 +1,212 @@
+//! Stage `field`: the density at the 8 × 8 × 8 samples of a brick.
+//!
+//! Each sample's density is a sum over the brick's candidates in ascending order, and each term is a function of
+//! the atom and the sample alone. An atom out of reach adds an exact zero. So a sample has the same bits
+//! whichever tile computes it and however generous the candidate list is: neighbours never disagree on a sign.
+
+use super::bin::NORMAL_ONLY;
+use super::simd::{dispatched, exp2, fma};
+use crate::surface::kernel::{MIN_DISTANCE2, Profile};
+use crate::surface::lattice::{BRICK_SAMPLES, LatticeAtom, to_f32};
+use crate::surface::params::Kernel;
+
+/// Densities of a brick, x fastest: index `(z·8 + y)·8 + x`.
+pub(super) type Samples = [f32; BRICK_SAMPLES];
+
+/// Exponents are not let below this: products of two stay normal numbers, as subnormal ones cost hundreds of
+/// cycles. Terms that small lie beyond the cut-off for every smoothness that is accepted.
+const MIN_EXPONENT: f32 = -62.0;
+
+/// A kernel's constants in the form that the inner loops want.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Constants {
+    kernel: Kernel,
+    /// u from which on the density is 0.
+    support: f32,
+    /// Gaussian: the exponent of 2 is `share − rate·u` per axis; the three shares carry the amplitude.
+    share: f32,
+    rate: f32,
+    /// Gaussian: the C¹ cut-off's linear term is `tail_share + tail_rate·u` per axis.
+    tail_share: f32,
+    tail_rate: f32,
+    /// Gaussian: the linear term's value at the support.
+    tail_end: f32,
+    /// Soft object, inverse square: factor of the density.
+    amplitude: f32,
+    /// Inverse square: least u, per 1/ρ².
+    u_min: f32,
+}
+
+impl Constants {
+    /// Constants of `profile` on a lattice of `spacing` Å.
+    pub(super) fn new(profile: &Profile, spacing: f64) -> Self {
+        let gaussian = profile.kernel == Kernel::Gaussian;
+        let support = profile.support();
+        let factor = if gaussian { profile.amplitude / profile.cutoff_norm() } else { profile.amplitude };
+        let rate = profile.decay * std::f64::consts::LOG2_E;
+        let tail_rate = factor * profile.tolerance * profile.decay;
+        let tail_offset = -factor * profile.tolerance * (1.0 + profile.decay * support);
+        Self {
+            kernel: profile.kernel,
+            support: to_f32(support),
+            share: to_f32((factor.log2() + rate) / 3.0),
+            rate: to_f32(rate),
+            tail_share: to_f32(tail_offset / 3.0),
+            tail_rate: to_f32(tail_rate),
+            tail_end: to_f32(-factor * profile.tolerance),
+            amplitude: to_f32(factor),
+            u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
+        }
+    }
+}
+
+/// Which samples of a brick are needed: all, or only the first layer along some axes.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Need {
+    /// Row pairs along y: 4, or 1 for the first layer.
+    pub(super) y_pairs: usize,
+    /// Layers along z: 8, or 1.
+    pub(super) z_layers: usize,
+}
+
+/// One atom as a brick sees it: the range of rows in reach, and u along each axis.
+struct Seen {
+    z: [usize; 2],
+    y: [usize; 2],
+    u: [[f32; 8]; 3],
+}
+
+#[inline(always)]
+fn see(atom: &LatticeAtom, origin: [i32; 3], support: f32, need: Need) -> Seen {
+    let reach = (support / atom.inv_length2).sqrt() + 1e-3;
+    let base: [f32; 3] = std::array::from_fn(|k| (origin[k] - atom.cell[k]) as f32);
+    let range = |k: usize, n: usize| {
+        let c = atom.frac[k] - base[k];
+        let lo = (c - reach).ceil().max(0.0) as usize;
+        let hi = ((c + reach).floor() + 1.0).max(0.0) as usize;
+        [lo.min(n), hi.min(n)]
+    };
+    let [y0, y1] = range(1, 8);
+    let mut u = [[0.0; 8]; 3];
+    for k in 0..3 {
+        for (i, u) in u[k].iter_mut().enumerate() {
+            // Whole numbers are exact in f32 here, so this rounds once and depends on sample and atom only.
+            let d = (base[k] + i as f32) - atom.frac[k];
+            *u = d * d * atom.inv_length2;
+        }
+    }
+    let y = [(y0 / 2).min(need.y_pairs), y1.div_ceil(2).min(need.y_pairs)];
+    Seen { z: range(2, need.z_layers), y, u }
+}
+
+#[inline(always)]
+fn gaussian<const FMA: bool>(
+    c: &Constants,
+    atoms: &[LatticeAtom],
+    candidates: &[u32],
+    origin: [i32; 3],
+    need: Need,
+    out: &mut Samples,
+) {
+    for &candidate in candidates {
+        if candidate & NORMAL_ONLY != 0 {
+            continue;
+        }
+        let atom = &atoms[candidate as usize];
+        let seen = see(atom, origin, c.support, need);
+        // One batch for the three axes fills the vectors.
+        let (mut e, mut w) = ([[0.0_f32; 8]; 4], [[0.0_f32; 8]; 4]);
+        for k in 0..3 {
+            for i in 0..8 {
+                e[k][i] = exp2::<FMA>(fma::<FMA>(-c.rate, seen.u[k][i], c.share).max(MIN_EXPONENT));
+                w[k][i] = fma::<FMA>(c.tail_rate, seen.u[k][i], c.tail_share);
+            }
+        }
+        let (mut exy, mut wxy) = ([[0.0_f32; 16]; 4], [[0.0_f32; 16]; 4]);
+        for pair in 0..4 {
+            for i in 0..16 {
+                exy[pair][i] = e[0][i % 8] * e[1][2 * pair + i / 8];
+                wxy[pair][i] = w[0][i % 8] + w[1][2 * pair + i / 8];
+            }
+        }
+        for z in seen.z[0]..seen.z[1] {
+            let (ez, wz) = (e[2][z & 7], w[2][z & 7]);
+            for pair in seen.y[0]..seen.y[1] {
+                let (exy, wxy) = (&exy[pair & 3], &wxy[pair & 3]);
+                let at = (z * 4 + pair) * 16;
+                let Some(row) = out.get_mut(at..at + 16) else { continue };
+                for i in 0..16 {
+                    let tail = wxy[i] + wz;
+                    let value = fma::<FMA>(exy[i], ez, tail);
+                    row[i] += if tail < c.tail_end { value } else { 0.0 };
+                }
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn compact<const FMA: bool, const INVERSE: bool>(
+    c: &Constants,
+    atoms: &[LatticeAtom],
+    candidates: &[u32],
+    origin: [i32; 3],
+    need: Need,
+    out: &mut Samples,
+) {
+    for &candidate in candidates {
+        if candidate & NORMAL_ONLY != 0 {
+            continue;
+        }
+        let atom = &atoms[candidate as usize];
+        let seen = see(atom, origin, c.support, need);
+        let u_min = c.u_min * atom.inv_length2;
+        let mut uxy = [[0.0_f32; 16]; 4];
+        for pair in 0..4 {
+            for i in 0..16 {
+                uxy[pair][i] = seen.u[0][i % 8] + seen.u[1][2 * pair + i / 8];
+            }
+        }
+        for z in seen.z[0]..seen.z[1] {
+            let uz = seen.u[2][z & 7];
+            for pair in seen.y[0]..seen.y[1] {
+                let uxy = &uxy[pair & 3];
+                let at = (z * 4 + pair) * 16;
+                let Some(row) = out.get_mut(at..at + 16) else { continue };
+                for i in 0..16 {
+                    let u = uxy[i] + uz;
+                    let t = (1.0 - u).max(0.0);
+                    let t2 = t * t * c.amplitude;
+                    row[i] += if INVERSE { t2 / u.max(u_min) } else { t2 * fma::<FMA>(u, -4.0 / 9.0, 1.0) };
+                }
+            }
+        }
+    }
+}
+
+dispatched! {
+/// Adds the densities of `candidates` to `out`, for the brick whose first sample is `origin`.
+pub(super) fn evaluate(
+    c: &Constants,
+    atoms: &[LatticeAtom],
+    candidates: &[u32],
+    origin: [i32; 3],
+    need: Need,
+    out: &mut Samples,
+) {
+
+    if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
+        match c.kernel {
+            Kernel::Gaussian => gaussian::<true>(c, atoms, candidates, origin, need, out),
+            Kernel::SoftObject => compact::<true, false>(c, atoms, candidates, origin, need, out),
+            Kernel::InverseSquare => compact::<true, true>(c, atoms, candidates, origin, need, out),
+        }
+    } else {
+        match c.kernel {
+            Kernel::Gaussian => gaussian::<false>(c, atoms, candidates, origin, need, out),
+            Kernel::SoftObject => compact::<false, false>(c, atoms, candidates, origin, need, out),
+            Kernel::InverseSquare => compact::<false, true>(c, atoms, candidates, origin, need, out),
+        }
+    }
+}
+}

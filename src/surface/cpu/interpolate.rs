@@ -1,0 +1,225 @@
+//! Stage `interpolate`: vertex positions on crossing edges, analytic normals, and nearest atoms on request.
+
+use super::bin::{NORMAL_ONLY, slot_origin};
+use super::classify::SurfaceBrick;
+use super::simd::{dispatched, exp2, fma};
+use crate::surface::kernel::{MIN_DISTANCE2, Profile};
+use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
+use crate::surface::params::Kernel;
+
+/// Vertices are shaded in batches of this many: one AVX-512 vector, two AVX ones.
+const LANES: usize = 16;
+
+/// Constants of the slope −dF/du of a kernel.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SlopeConstants {
+    kernel: Kernel,
+    support: f32,
+    /// Gaussian: the exponent of 2 is `offset − rate·u`; the factor's logarithm is in `offset`.
+    offset: f32,
+    rate: f32,
+    /// Gaussian: what the C¹ cut-off takes away.
+    tail: f32,
+    amplitude: f32,
+    u_min: f32,
+}
+
+impl SlopeConstants {
+    /// Constants of `profile` on a lattice of `spacing` Å. The amplitude is irrelevant to a direction, so it is
+    /// left out: numbers stay near 1.
+    pub(super) fn new(profile: &Profile, spacing: f64) -> Self {
+        let rate = profile.decay * std::f64::consts::LOG2_E;
+        Self {
+            kernel: profile.kernel,
+            support: to_f32(profile.support()),
+            offset: to_f32(rate),
+            rate: to_f32(rate),
+            tail: to_f32(profile.tolerance),
+            amplitude: 1.0,
+            u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
+        }
+    }
+}
+
+/// Vertices of one brick in its own coordinates, spacings from its first sample.
+#[derive(Debug)]
+pub(super) struct Batch {
+    p: [Vec<f32>; 3],
+    n: [Vec<f32>; 3],
+}
+
+impl Default for Batch {
+    fn default() -> Self {
+        Self { p: std::array::from_fn(|_| Vec::new()), n: std::array::from_fn(|_| Vec::new()) }
+    }
+}
+
+impl Batch {
+    /// Lays out a brick's vertices in order; rounds the count up to whole vectors by repeating the last one.
+    fn place(&mut self, brick: &SurfaceBrick, t: &[f32]) {
+        self.p.iter_mut().for_each(Vec::clear);
+        let mut t = t.iter();
+        for (w, &word) in brick.crossing.iter().enumerate() {
+            let (z, axis) = (w / 3, w % 3);
+            let mut edges = word;
+            while edges != 0 {
+                let bit = edges.trailing_zeros();
+                edges &= edges - 1;
+                let mut p = [(bit & 7) as f32, (bit >> 3) as f32, z as f32];
+                p[axis] += t.next().copied().unwrap_or_default();
+                for k in 0..3 {
+                    self.p[k].push(p[k]);
+                }
+            }
+        }
+        for p in &mut self.p {
+            let padded = p.len().next_multiple_of(LANES);
+            let last = p.last().copied().unwrap_or_default();
+            p.resize(padded, last);
+        }
+        let padded = self.p[0].len();
+        self.n.iter_mut().for_each(|n| n.resize(padded, 0.0));
+    }
+}
+
+/// Where a brick's vertices go.
+pub(super) struct Target<'a> {
+    /// Positions relative to the mesh's centre, Å.
+    pub(super) positions: &'a mut [[f32; 3]],
+    /// Unit normals; zero where the gradient vanishes, to be filled from the triangles.
+    pub(super) normals: &'a mut [[f32; 3]],
+    /// Nearest sphere of each vertex, in the caller's numbering.
+    pub(super) atom_ids: Option<&'a mut [u32]>,
+}
+
+/// Computes the vertices of one brick. Returns how many have no gradient to take a normal from.
+pub(super) fn interpolate(
+    lattice: &Lattice,
+    slope: &SlopeConstants,
+    tile: [i32; 3],
+    brick: &SurfaceBrick,
+    candidates: &[u32],
+    t: &[f32],
+    batch: &mut Batch,
+    target: Target<'_>,
+) -> usize {
+    let origin = slot_origin(tile, usize::from(brick.slot));
+    batch.place(brick, t);
+    gradients(slope, &lattice.atoms, candidates, origin, &batch.p, &mut batch.n);
+    if let Some(ids) = target.atom_ids {
+        nearest_atoms(&lattice.atoms, candidates, origin, &batch.p, ids);
+    }
+    let offset: [f64; 3] = std::array::from_fn(|k| f64::from(origin[k] - lattice.centre[k]));
+    finish(lattice.spacing, offset, batch, target.positions, target.normals)
+}
+
+dispatched! {
+/// Positions in Å and normals of length 1, row by row.
+fn finish(spacing: f64, offset: [f64; 3], batch: &Batch, positions: &mut [[f32; 3]], normals: &mut [[f32; 3]]) -> usize {
+    // Whole lattice steps are exact in f32; the fraction is added before the one multiplication.
+    let (h, offset) = (to_f32(spacing), offset.map(to_f32));
+    let ([px, py, pz], [nx, ny, nz]) = (&batch.p, &batch.n);
+    for (row, ((x, y), z)) in positions.iter_mut().zip(px.iter().zip(py).zip(pz)) {
+        *row = [(offset[0] + x) * h, (offset[1] + y) * h, (offset[2] + z) * h];
+    }
+    let mut flat = 0;
+    for (row, ((x, y), z)) in normals.iter_mut().zip(nx.iter().zip(ny).zip(nz)) {
+        let length2 = x * x + y * y + z * z;
+        // Below this, single precision has no direction left.
+        let usable = length2 > 1e-14;
+        flat += usize::from(!usable);
+        let scale = if usable { length2.sqrt().recip() } else { 0.0 };
+        *row = [x * scale, y * scale, z * scale];
+    }
+    flat
+}
+}
+
+/// Sum of −∇F over the candidates at each vertex, up to a common factor.
+#[inline(always)]
+fn sum_gradients<const FMA: bool>(
+    c: &SlopeConstants,
+    atoms: &[LatticeAtom],
+    candidates: &[u32],
+    origin: [i32; 3],
+    p: &[Vec<f32>; 3],
+    n: &mut [Vec<f32>; 3],
+) {
+    let [px, py, pz] = p;
+    let [nx, ny, nz] = n;
+    let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
+    let outs = nx.chunks_exact_mut(LANES).zip(ny.chunks_exact_mut(LANES)).zip(nz.chunks_exact_mut(LANES));
+    for (((px, py), pz), ((nx, ny), nz)) in lanes.zip(outs) {
+        let mut sum = [[0.0_f32; LANES]; 3];
+        for &candidate in candidates {
+            let atom = &atoms[(candidate & !NORMAL_ONLY) as usize];
+            let a: [f32; 3] = std::array::from_fn(|k| (atom.cell[k] - origin[k]) as f32 + atom.frac[k]);
+            let (inv, u_min) = (atom.inv_length2, c.u_min * atom.inv_length2);
+            for i in 0..LANES {
+                let (dx, dy, dz) = (px[i] - a[0], py[i] - a[1], pz[i] - a[2]);
+                let u = fma::<FMA>(dx, dx, fma::<FMA>(dy, dy, dz * dz)) * inv;
+                let slope = match c.kernel {
+                    Kernel::Gaussian => exp2::<FMA>(fma::<FMA>(-c.rate, u, c.offset).max(-100.0)) - c.tail,
+                    Kernel::SoftObject => (1.0 - u) * fma::<FMA>(u, -6.0, 11.0),
+                    Kernel::InverseSquare => {
+                        let u = u.max(u_min);
+                        (1.0 - u * u) / (u * u)
+                    }
+                };
+                let slope = if u < c.support { slope * inv } else { 0.0 };
+                sum[0][i] = fma::<FMA>(slope, dx, sum[0][i]);
+                sum[1][i] = fma::<FMA>(slope, dy, sum[1][i]);
+                sum[2][i] = fma::<FMA>(slope, dz, sum[2][i]);
+            }
+        }
+        nx.copy_from_slice(&sum[0]);
+        ny.copy_from_slice(&sum[1]);
+        nz.copy_from_slice(&sum[2]);
+    }
+}
+
+dispatched! {
+fn gradients(
+    c: &SlopeConstants,
+    atoms: &[LatticeAtom],
+    candidates: &[u32],
+    origin: [i32; 3],
+    p: &[Vec<f32>; 3],
+    n: &mut [Vec<f32>; 3],
+) {
+    if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
+        match c.kernel {
+            Kernel::Gaussian => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::Gaussian, ..*c }, atoms, candidates, origin, p, n),
+            Kernel::SoftObject => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::SoftObject, ..*c }, atoms, candidates, origin, p, n),
+            Kernel::InverseSquare => {
+                sum_gradients::<true>(&SlopeConstants { kernel: Kernel::InverseSquare, ..*c }, atoms, candidates, origin, p, n);
+            }
+        }
+    } else {
+        sum_gradients::<false>(c, atoms, candidates, origin, p, n);
+    }
+}
+}
+
+dispatched! {
+/// The candidate whose centre is nearest to each vertex; among equals the first in canonical order.
+fn nearest_atoms(atoms: &[LatticeAtom], candidates: &[u32], origin: [i32; 3], p: &[Vec<f32>; 3], ids: &mut [u32]) {
+    let [px, py, pz] = p;
+    let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
+    for (ids, ((px, py), pz)) in ids.chunks_mut(LANES).zip(lanes) {
+        let (mut best, mut source) = ([f32::MAX; LANES], [0_u32; LANES]);
+        for &candidate in candidates {
+            let atom = &atoms[(candidate & !NORMAL_ONLY) as usize];
+            let a: [f32; 3] = std::array::from_fn(|k| (atom.cell[k] - origin[k]) as f32 + atom.frac[k]);
+            for i in 0..LANES {
+                let (dx, dy, dz) = (px[i] - a[0], py[i] - a[1], pz[i] - a[2]);
+                let d2 = dx * dx + dy * dy + dz * dz;
+                let closer = d2 < best[i];
+                best[i] = if closer { d2 } else { best[i] };
+                source[i] = if closer { atom.source } else { source[i] };
+            }
+        }
+        ids.copy_from_slice(&source[..ids.len()]);
+    }
+}
+}

@@ -1,0 +1,40 @@
+//! Stage `scan`: the exclusive scan over tiles that tells each brick where its vertices and triangles go.
+
+use super::Tile;
+use crate::surface::error::SurfaceError;
+use crate::surface::mesh::Mesh;
+use crate::surface::params::SurfaceLimits;
+
+/// Totals of a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Totals {
+    /// Vertices.
+    pub(super) vertices: usize,
+    /// Triangles.
+    pub(super) triangles: usize,
+}
+
+/// Gives every tile its first vertex and triangle.
+///
+/// # Errors
+/// [`SurfaceError::MeshTooLarge`] where the mesh would exceed the limit, or 32-bit indices.
+pub(super) fn scan(tiles: &mut [Tile], spacing: f64, limits: &SurfaceLimits) -> Result<Totals, SurfaceError> {
+    let (mut vertices, mut triangles) = (0_u64, 0_u64);
+    for tile in &mut *tiles {
+        (tile.first_vertex, tile.first_triangle) = (vertices, triangles);
+        vertices += u64::from(tile.found.vertices);
+        triangles += u64::from(tile.found.triangles);
+    }
+    let bytes = Mesh::bytes_for(vertices, triangles);
+    // The highest value of an index is the primitive restart of graphics interfaces.
+    let most = limits.max_mesh_bytes.min(Mesh::bytes_for(u64::from(u32::MAX), 0));
+    match (usize::try_from(vertices), usize::try_from(triangles)) {
+        (Ok(vertices), Ok(triangles)) if bytes <= most => Ok(Totals { vertices, triangles }),
+        _ => {
+            // Areas stay while cells shrink: bytes grow with the inverse square of the spacing.
+            let excess = bytes as f64 / most.max(1) as f64;
+            let suggested_resolution = super::roomier(spacing * excess.sqrt());
+            Err(SurfaceError::MeshTooLarge { bytes, limit: most, suggested_resolution })
+        }
+    }
+}

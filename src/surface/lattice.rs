@@ -1,0 +1,189 @@
+//! The sampling lattice: spheres in units of the grid spacing, in one canonical order.
+//!
+//! Samples lie at multiples of the spacing, so the lattice is the same wherever a structure is cut into tiles.
+//! A sphere's centre is a lattice cell plus a fraction: the distance from a sample to a centre is then a function
+//! of the two alone, bit for bit, whichever brick or tile evaluates it, without 64-bit arithmetic.
+
+use bytemuck::{Pod, Zeroable};
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::error::SurfaceError;
+use super::kernel::Profile;
+use super::params::SurfaceParams;
+use super::spheres::Spheres;
+
+/// Samples along a brick's edge.
+pub const BRICK: i32 = 8;
+/// Samples in a brick.
+pub const BRICK_SAMPLES: usize = 512;
+/// Samples along a tile's edge: 8 bricks.
+pub const TILE: i32 = 64;
+
+/// A sphere on the lattice. 32 bytes, the layout that the shaders share.
+#[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
+#[repr(C)]
+pub struct LatticeAtom {
+    /// The sample nearest to the centre.
+    pub cell: [i32; 3],
+    /// 1/ρ² in units of the spacing: u = d² × this.
+    pub inv_length2: f32,
+    /// The centre's offset from `cell`, in [−½, ½] spacings.
+    pub frac: [f32; 3],
+    /// Index of the sphere in the caller's input.
+    pub source: u32,
+}
+
+impl LatticeAtom {
+    /// The centre in spacings from the origin.
+    #[must_use]
+    pub fn position(&self, axis: usize) -> f64 {
+        f64::from(self.cell[axis]) + f64::from(self.frac[axis])
+    }
+}
+
+/// Spheres on a lattice, in canonical order: by tile, brick, cell and offset, whatever the input's order was.
+#[derive(Debug, Clone)]
+pub struct Lattice {
+    /// Spacing, Å.
+    pub spacing: f64,
+    /// The sample that mesh positions are relative to.
+    pub centre: [i32; 3],
+    /// The spheres.
+    pub atoms: Vec<LatticeAtom>,
+    /// The kernel's constants.
+    pub profile: Profile,
+    /// u from which on a sphere's density is 0.
+    pub support: f64,
+    /// Cells of the box around all supports.
+    pub box_cells: u64,
+}
+
+impl Lattice {
+    /// Places `spheres` on the lattice of `params.resolution`.
+    ///
+    /// # Errors
+    /// [`SurfaceError::NoSpheres`]; [`SurfaceError::BadParameter`] if scale and offset leave a radius of 0 or less.
+    pub fn new(spheres: &Spheres, params: &SurfaceParams) -> Result<Self, SurfaceError> {
+        let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
+        let spacing = params.resolution;
+        let profile = Profile::new(params);
+        let smallest = spheres.radii().iter().copied().fold(f32::MAX, f32::min);
+        let effective = |r: f32| f64::from(r) * params.radius_scale + params.radius_offset;
+        if effective(smallest) < 0.05 {
+            return Err(SurfaceError::BadParameter {
+                name: "radius_offset",
+                value: params.radius_offset.to_string(),
+                expected: format!("an offset that leaves every radius at 0.05 Å or more; the smallest is {smallest} Å"),
+            });
+        }
+        let mut atoms: Vec<LatticeAtom> = (0..spheres.len())
+            .into_par_iter()
+            .with_min_len(4096)
+            .map(|i| {
+                let length = profile.length(effective(spheres.radius(i))) / spacing;
+                let scaled = spheres.centre(i).map(|c| c / spacing);
+                let cell = scaled.map(f64::round);
+                LatticeAtom {
+                    cell: cell.map(to_i32),
+                    inv_length2: to_f32((length * length).recip()),
+                    frac: std::array::from_fn(|k| to_f32(scaled[k] - cell[k])),
+                    source: u32::try_from(i).unwrap_or(u32::MAX),
+                }
+            })
+            .collect();
+        sort_canonically(&mut atoms);
+        let reach = spheres.radii().iter().copied().fold(0.0, f32::max);
+        let margin = 2.0 * profile.reach(profile.length(effective(reach)));
+        let box_cells = (0..3).map(|k| ((hi[k] - lo[k] + margin) / spacing).ceil()).product::<f64>();
+        Ok(Self {
+            spacing,
+            centre: std::array::from_fn(|k| to_i32((0.5 * (lo[k] + hi[k]) / spacing).round())),
+            atoms,
+            profile,
+            support: profile.support(),
+            // Saturates: a sparse assembly's box may hold more cells than any integer type.
+            box_cells: to_u64(box_cells),
+        })
+    }
+
+    /// Distance in spacings from which on an atom's density is 0.
+    #[must_use]
+    pub fn reach(&self, atom: &LatticeAtom) -> f64 {
+        (self.support / f64::from(atom.inv_length2)).sqrt()
+    }
+
+    /// What mesh positions are relative to, Å.
+    #[must_use]
+    pub fn centre(&self) -> [f64; 3] {
+        self.centre.map(|c| f64::from(c) * self.spacing)
+    }
+}
+
+/// Sorts by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order last.
+fn sort_canonically(atoms: &mut Vec<LatticeAtom>) {
+    let mut tiles: FxHashMap<[i32; 3], u64> = FxHashMap::default();
+    for atom in atoms.iter() {
+        tiles.entry(tile_of(atom.cell)).or_default();
+    }
+    let mut order: Vec<[i32; 3]> = tiles.keys().copied().collect();
+    order.sort_unstable_by_key(|&t| tile_order(t));
+    for (rank, tile) in (0..).zip(&order) {
+        tiles.insert(*tile, rank);
+    }
+    let mut keyed: Vec<(u64, u32)> = (0..)
+        .zip(atoms.iter())
+        .map(|(i, atom)| {
+            let local = atom.cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
+            let brick = local.map(|c| c / BRICK.unsigned_abs());
+            let cell = local.map(|c| c % BRICK.unsigned_abs());
+            let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
+            (tiles[&tile_of(atom.cell)] << 18 | pack(brick) << 9 | pack(cell), i)
+        })
+        .collect();
+    keyed.par_sort_unstable();
+    let tie = |a: &LatticeAtom, b: &LatticeAtom| {
+        let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
+        axis(2).then(axis(1)).then(axis(0)).then(a.inv_length2.total_cmp(&b.inv_length2)).then(a.source.cmp(&b.source))
+    };
+    let mut sorted: Vec<LatticeAtom> = keyed.iter().map(|&(_, i)| atoms[i as usize]).collect();
+    let mut start = 0;
+    for run in keyed.chunk_by(|a, b| a.0 == b.0) {
+        if run.len() > 1 {
+            sorted[start..start + run.len()].sort_unstable_by(tie);
+        }
+        start += run.len();
+    }
+    *atoms = sorted;
+}
+
+/// The tile that a sample belongs to.
+#[must_use]
+pub fn tile_of(cell: [i32; 3]) -> [i32; 3] {
+    cell.map(|c| c.div_euclid(TILE))
+}
+
+/// Tiles are ordered by z, then y, then x.
+#[must_use]
+pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
+    [tile[2], tile[1], tile[0]]
+}
+
+/// `v` as f32; the loss of digits is meant.
+#[expect(clippy::cast_possible_truncation, reason = "rounding to single precision is the point")]
+pub(super) fn to_f32(v: f64) -> f32 {
+    v as f32
+}
+
+/// `v`, an integer value, as i32. Coordinates are at most 1e5 Å and the spacing at least 0.01 Å: 1e7 fits.
+#[expect(clippy::cast_possible_truncation, reason = "validated spheres and spacings keep it within ±1e7")]
+pub(super) fn to_i32(v: f64) -> i32 {
+    debug_assert!(v.abs() < 1e9);
+    v as i32
+}
+
+/// `v` as u64, saturating at both ends.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
+pub(super) fn to_u64(v: f64) -> u64 {
+    v as u64
+}

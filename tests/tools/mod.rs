@@ -1,0 +1,169 @@
+//! Outside oracles for integration tests: trimesh and the Khronos glTF validator, installed by `setup.sh`.
+//!
+//! A test says `mod tools;` and calls [`trimesh`] or [`gltf_validate`], or [`python`] with a script of its own.
+//! Without the tools these return `None` after a line that begins with `SKIPPED:` on standard error, and panic
+//! where the environment says that they must be there: `CI` or `MOLMESH_REQUIRE_TOOLS`.
+#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
+
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use serde::Deserialize;
+use serde::de::DeserializeOwned;
+
+/// What trimesh says of a file. Only `file` and `error` are set where it could not be read.
+#[derive(Debug, Clone, Default, Deserialize, PartialEq)]
+#[serde(default)]
+pub struct TrimeshReport {
+    pub file: String,
+    /// Why it could not be read.
+    pub error: Option<String>,
+    pub vertices: u64,
+    pub faces: u64,
+    /// No faces: nothing below is set.
+    pub empty: bool,
+    /// STL only: vertices with equal coordinates were made one.
+    pub welded: bool,
+    /// Every edge belongs to two faces.
+    pub watertight: bool,
+    pub winding_consistent: bool,
+    /// Watertight, wound consistently, outwards.
+    pub is_volume: bool,
+    pub euler: i64,
+    pub area: f64,
+    pub volume: f64,
+    pub bodies: u64,
+    pub bounds: [[f64; 3]; 2],
+    /// Coordinates and normal components that are not finite.
+    pub nan_count: u64,
+    pub unused_vertices: u64,
+    pub duplicate_faces: u64,
+    pub degenerate_faces: u64,
+    /// Edges with one face, or more than two.
+    pub bad_edges: u64,
+    /// Largest distance of a written normal's length from 1; `None` in a file without vertex normals.
+    pub max_normal_error: Option<f64>,
+    /// Least cosine between a written normal and the area-weighted mean of its faces' normals.
+    pub min_normal_dot: Option<f64>,
+    /// STL only: least cosine between a written face normal and the face, sizeable faces only.
+    pub min_face_normal_dot: Option<f64>,
+    /// Names of custom vertex attributes, such as `_ATOM`.
+    pub attributes: Vec<String>,
+}
+
+/// What the glTF validator says of a file. Only `file` and `error` are set where it is no glTF.
+#[derive(Debug, Clone, Default, Deserialize, PartialEq)]
+#[serde(default)]
+pub struct GltfReport {
+    pub file: String,
+    /// Why it could not be read.
+    pub error: Option<String>,
+    pub errors: u64,
+    pub warnings: u64,
+    pub infos: u64,
+    pub hints: u64,
+    /// Issue codes with the number of times each was raised.
+    pub codes: BTreeMap<String, u64>,
+    /// The first few issues in words.
+    pub messages: Vec<String>,
+    pub vertices: u64,
+    pub triangles: u64,
+}
+
+impl TrimeshReport {
+    /// Panics unless the file holds a closed, oriented, manifold surface with unit normals that point outwards.
+    #[track_caller]
+    pub fn assert_proper(&self) {
+        assert_eq!(self.error, None, "{self:#?}");
+        assert!(!self.empty && self.watertight && self.winding_consistent && self.is_volume, "{self:#?}");
+        let faults = [self.nan_count, self.duplicate_faces, self.degenerate_faces, self.bad_edges];
+        assert_eq!(faults, [0; 4], "{self:#?}");
+        assert!(self.max_normal_error.is_none_or(|e| e < 2e-4), "{self:#?}");
+        assert!(self.min_normal_dot.is_none_or(|d| d > 0.0), "{self:#?}");
+        assert!(self.min_face_normal_dot.is_none_or(|d| d > 0.0), "{self:#?}");
+    }
+}
+
+impl GltfReport {
+    /// Panics unless the validator has nothing to say.
+    #[track_caller]
+    pub fn assert_clean(&self) {
+        assert_eq!((&self.error, self.errors, self.warnings), (&None, 0, 0), "{self:#?}");
+    }
+}
+
+/// Looks at mesh files of any format with trimesh, one report per path, in their order.
+pub fn trimesh(paths: &[impl AsRef<Path>]) -> Option<Vec<TrimeshReport>> {
+    python("check_mesh.py", paths)
+}
+
+/// Looks at `.glb` and `.gltf` files with the Khronos validator, one report per path, in their order.
+pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
+    if !installed_here().join("node/node_modules/gltf-validator").is_dir() {
+        return missing("gltf-validator");
+    }
+    Some(ask(Path::new("node"), "validate_gltf.mjs", paths))
+}
+
+/// Gives paths to a script of `tests/tools` run by the Python with the pinned packages, one path per line, and
+/// takes one line of JSON per path.
+pub fn python<T: DeserializeOwned>(script: &str, paths: &[impl AsRef<Path>]) -> Option<Vec<T>> {
+    match python_interpreter() {
+        Some(python) => Some(ask(&python, script, paths)),
+        None => missing(script),
+    }
+}
+
+/// The Python with the pinned packages, if `setup.sh` has run.
+pub fn python_interpreter() -> Option<PathBuf> {
+    let venv = installed_here().join("venv");
+    let python = ["bin/python", "Scripts/python.exe"].map(|p| venv.join(p)).into_iter().find(|p| p.is_file());
+    // The stamp is written when every package is in place.
+    python.filter(|_| venv.join(".stamp").is_file())
+}
+
+/// Says that a tool is missing: panics where it must not be, else skips loudly.
+pub fn missing<T>(tool: &str) -> Option<T> {
+    let required = ["CI", "MOLMESH_REQUIRE_TOOLS"].into_iter().find(|v| std::env::var_os(v).is_some_and(|v| v != ""));
+    if let Some(variable) = required {
+        panic!("{tool} is not installed and {variable} is set: run tests/tools/setup.sh");
+    }
+    let test = std::thread::current().name().unwrap_or("a test").to_owned();
+    // Not `eprintln!`: the harness would swallow it while the test passes.
+    writeln!(std::io::stderr(), "SKIPPED: {test}: {tool} is not installed; run tests/tools/setup.sh").unwrap();
+    None
+}
+
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+}
+
+fn installed_here() -> PathBuf {
+    root().join("target/test-tools")
+}
+
+/// Runs a script of this folder on paths; answers are matched with questions by their order and count.
+fn ask<T: DeserializeOwned>(interpreter: &Path, script: &str, paths: &[impl AsRef<Path>]) -> Vec<T> {
+    let mut child = Command::new(interpreter)
+        .arg(root().join("tests/tools").join(script))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap_or_else(|e| panic!("cannot start {}: {e}", interpreter.display()));
+    let list: String = paths.iter().map(|p| format!("{}\n", p.as_ref().display())).collect();
+    let mut stdin = child.stdin.take().unwrap();
+    // On its own thread: with long lists both pipes could be full at once.
+    let feeder = std::thread::spawn(move || stdin.write_all(list.as_bytes()));
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success(), "{script} failed with {}", output.status);
+    feeder.join().unwrap().unwrap();
+    let lines = String::from_utf8(output.stdout).unwrap();
+    let answers: Vec<T> = lines
+        .lines()
+        .map(|line| serde_json::from_str(line).unwrap_or_else(|e| panic!("{script} answered {line}: {e}")))
+        .collect();
+    assert_eq!(answers.len(), paths.len(), "{script} answered {lines}");
+    answers
+}

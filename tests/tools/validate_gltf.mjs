@@ -1,0 +1,39 @@
+// Looks at .glb and .gltf files with the Khronos validator: the second opinion on what the product writes.
+//
+// Reads file names from the arguments, or one per line from standard input, and answers each with one line of
+// JSON: how many errors, warnings, infos and hints, their codes with a count each, and the first messages.
+// A file that the validator cannot take for a glTF at all is answered with `error`.
+import { readFileSync } from 'node:fs';
+import { createRequire } from 'node:module';
+import { createInterface } from 'node:readline';
+import { fileURLToPath } from 'node:url';
+
+// The package lies in the git-ignored target folder, away from this file.
+const tools = fileURLToPath(new URL('../../target/test-tools/node/', import.meta.url));
+const validator = createRequire(tools)('gltf-validator');
+
+async function report(file) {
+  // maxIssues 0 means all: a limit could hide an error behind warnings.
+  const result = await validator.validateBytes(new Uint8Array(readFileSync(file)), { uri: file, maxIssues: 0 });
+  const { numErrors, numWarnings, numInfos, numHints, messages } = result.issues;
+  const codes = {};
+  for (const message of messages) codes[message.code] = (codes[message.code] ?? 0) + 1;
+  return {
+    file,
+    errors: numErrors,
+    warnings: numWarnings,
+    infos: numInfos,
+    hints: numHints,
+    codes,
+    messages: messages.slice(0, 5).map((m) => `${m.code} ${m.pointer ?? ''}: ${m.message}`),
+    vertices: result.info?.totalVertexCount ?? 0,
+    triangles: result.info?.totalTriangleCount ?? 0,
+  };
+}
+
+const files = process.argv.length > 2 ? process.argv.slice(2) : createInterface({ input: process.stdin });
+for await (const file of files) {
+  if (!file) continue;
+  const answer = await report(file).catch((error) => ({ file, error: String(error) }));
+  process.stdout.write(`${JSON.stringify(answer)}\n`);
+}
