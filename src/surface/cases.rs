@@ -78,7 +78,9 @@ fn face_segments(case: u8, face: &[u8; 4]) -> Vec<(u8, u8)> {
 
 /// Bit mask of the two faces that an edge belongs to.
 fn faces_of(edge: u8) -> u8 {
-    (0..6).filter(|&f| (0..4).any(|i| edge_between(FACES[f][i], FACES[f][(i + 1) % 4]) == edge)).fold(0, |m, f| m | 1 << f)
+    (0..6)
+        .filter(|&f| (0..4).any(|i| edge_between(FACES[f][i], FACES[f][(i + 1) % 4]) == edge))
+        .fold(0, |m, f| m | 1 << f)
 }
 
 /// The loops of a case's outline, each a cycle of cell edges.
@@ -193,7 +195,11 @@ mod tests {
     fn every_case_is_a_set_of_oriented_discs_with_its_faces_segments_as_outline() {
         for case in 0..=255_u8 {
             let triangles = CASES.of(case);
-            assert_eq!(triangles.len(), loops(case).iter().map(|l| l.len() - 2).sum::<usize>(), "nothing cut off: {case}");
+            assert_eq!(
+                triangles.len(),
+                loops(case).iter().map(|l| l.len() - 2).sum::<usize>(),
+                "nothing cut off: {case}"
+            );
             assert!(half_edges(triangles).values().all(|&n| n == 1), "case {case}");
             let mut segments: Vec<_> = FACES.iter().flat_map(|f| face_segments(case, f)).collect();
             segments.sort_unstable();
@@ -264,15 +270,18 @@ mod tests {
                         }
                     }
                     pairs += 1;
-                    let in_face = |edges: (u8, u8), face: u8| faces_of(edges.0) & faces_of(edges.1) >> 0 & 1 << face != 0;
+                    let in_face =
+                        |edges: (u8, u8), face: u8| faces_of(edges.0) & faces_of(edges.1) >> 0 & 1 << face != 0;
                     let shift = |e: u8| {
                         let CellEdge { offset, axis: a } = cell_edge(e);
                         let mut corner = offset[0] | offset[1] << 1 | offset[2] << 2;
                         corner |= 1 << axis;
                         edge_between(corner, corner | 1 << a)
                     };
-                    let mine: Vec<_> = half_edges(CASES.of(low)).into_iter().filter(|(e, _)| in_face(*e, far)).collect();
-                    let theirs: Vec<_> = half_edges(CASES.of(high)).into_iter().filter(|(e, _)| in_face(*e, near)).collect();
+                    let mine: Vec<_> =
+                        half_edges(CASES.of(low)).into_iter().filter(|(e, _)| in_face(*e, far)).collect();
+                    let theirs: Vec<_> =
+                        half_edges(CASES.of(high)).into_iter().filter(|(e, _)| in_face(*e, near)).collect();
                     let mut opposite: Vec<_> = theirs.iter().map(|((a, b), n)| ((shift(*b), shift(*a)), *n)).collect();
                     opposite.sort_unstable();
                     assert_eq!(mine, opposite, "axis {axis} low {low} high {high}");

@@ -48,14 +48,10 @@ impl Profile {
                 Self { fixed, amplitude: b * (-decay).exp(), decay, tolerance: params.cutoff_tolerance, ..plain }
             }
             (_, Some(PaperParams::SoftObject { a, b })) => Self { fixed: Some(b), amplitude: a, ..plain },
-            (_, Some(PaperParams::InverseSquare { c, b })) => {
-                Self { fixed: Some(b), amplitude: c / (b * b), ..plain }
-            }
+            (_, Some(PaperParams::InverseSquare { c, b })) => Self { fixed: Some(b), amplitude: c / (b * b), ..plain },
             (Kernel::Gaussian, None) => Self { decay: params.smoothness, tolerance: params.cutoff_tolerance, ..plain },
             (Kernel::SoftObject, None) => Self { scale: SUPPORT_RADII, amplitude: 1.0 / soft_at_radius, ..plain },
-            (Kernel::InverseSquare, None) => {
-                Self { scale: SUPPORT_RADII, amplitude: 1.0 / inverse_at_radius, ..plain }
-            }
+            (Kernel::InverseSquare, None) => Self { scale: SUPPORT_RADII, amplitude: 1.0 / inverse_at_radius, ..plain },
         }
     }
 
@@ -169,7 +165,10 @@ mod tests {
                 let (u, e) = (end * f64::from(i) / 100.0, 1e-6);
                 let numeric = (profile.value(u + e, 0.0) - profile.value(u - e, 0.0)) / (2.0 * e);
                 let slope = profile.slope(u, 0.0);
-                assert!((numeric - slope).abs() <= 1e-5 * slope.abs().max(1e-2), "{profile:?} u {u}: {numeric} {slope}");
+                assert!(
+                    (numeric - slope).abs() <= 1e-5 * slope.abs().max(1e-2),
+                    "{profile:?} u {u}: {numeric} {slope}"
+                );
                 assert!(slope <= 0.0 && profile.value(u, 0.0) >= 0.0, "{profile:?} u {u}");
             }
         }

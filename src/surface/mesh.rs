@@ -2,6 +2,7 @@
 
 use rustc_hash::FxHashMap;
 
+use super::column::Column;
 use super::lattice::to_f32;
 
 /// An indexed triangle mesh. Vertex `i` lies at `centre + positions[i]`, in Å.
@@ -13,15 +14,15 @@ pub struct Mesh {
     /// What to add to a position to get the structure file's own coordinates, Å.
     pub centre: [f64; 3],
     /// Vertex positions relative to `centre`, Å.
-    pub positions: Vec<[f32; 3]>,
+    pub positions: Column<[f32; 3]>,
     /// Unit normals, one per vertex, pointing out of the molecule.
-    pub normals: Vec<[f32; 3]>,
+    pub normals: Column<[f32; 3]>,
     /// Vertex indices, counter-clockwise seen from outside.
-    pub triangles: Vec<[u32; 3]>,
+    pub triangles: Column<[u32; 3]>,
     /// Per vertex the index of the nearest sphere in the input, if it was asked for.
-    pub atom_ids: Option<Vec<u32>>,
+    pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
-    pub colors: Option<Vec<[u8; 4]>>,
+    pub colors: Option<Column<[u8; 4]>>,
 }
 
 impl Mesh {

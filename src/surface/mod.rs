@@ -6,6 +6,7 @@
 
 pub mod backend;
 pub mod cases;
+pub mod column;
 pub mod control;
 pub mod cpu;
 pub mod error;
@@ -17,6 +18,7 @@ pub mod params;
 pub mod spheres;
 
 pub use backend::{Backend, GridStats, Meshed};
+pub use column::Column;
 pub use control::{CancelToken, Control, Observer, Stage};
 pub use error::SurfaceError;
 pub use measure::{Component, Measures};

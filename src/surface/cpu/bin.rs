@@ -86,7 +86,7 @@ impl Tiles {
             index.insert(*tile, rank);
         }
         let mut counts = vec![0_u32; coords.len()];
-        let mut each = |visit: &mut dyn FnMut(u32, usize)| {
+        let each = |visit: &mut dyn FnMut(u32, usize)| {
             let (mut last, mut last_ix) = ([i32::MAX; 3], 0);
             for (i, atom) in (0_u32..).zip(&lattice.atoms) {
                 for tile in boxed(tile_range(atom, lattice.reach(atom))) {

@@ -69,11 +69,15 @@ pub(super) struct Need {
     pub(super) z_layers: usize,
 }
 
+/// Lanes for the three axes of a brick in one batch: 8 for x, 8 for y, 8 for z, 8 idle. Whole vectors.
+const AXES: usize = 32;
+
 /// One atom as a brick sees it: the range of rows in reach, and u along each axis.
 struct Seen {
     z: [usize; 2],
+    /// Pairs of rows.
     y: [usize; 2],
-    u: [[f32; 8]; 3],
+    u: [f32; AXES],
 }
 
 #[inline(always)]
@@ -87,16 +91,31 @@ fn see(atom: &LatticeAtom, origin: [i32; 3], support: f32, need: Need) -> Seen {
         [lo.min(n), hi.min(n)]
     };
     let [y0, y1] = range(1, 8);
-    let mut u = [[0.0; 8]; 3];
+    let mut u = [0.0; AXES];
     for k in 0..3 {
-        for (i, u) in u[k].iter_mut().enumerate() {
+        for i in 0..8 {
             // Whole numbers are exact in f32 here, so this rounds once and depends on sample and atom only.
-            let d = (base[k] + i as f32) - atom.frac[k];
-            *u = d * d * atom.inv_length2;
+            u[8 * k + i] = (base[k] + i as f32) - atom.frac[k];
         }
+    }
+    for u in &mut u {
+        *u = *u * *u * atom.inv_length2;
     }
     let y = [(y0 / 2).min(need.y_pairs), y1.div_ceil(2).min(need.y_pairs)];
     Seen { z: range(2, need.z_layers), y, u }
+}
+
+/// Values along x and y combined into the brick's 8 × 8 plane, as 4 pairs of rows.
+#[inline(always)]
+fn plane(axes: &[f32; AXES], combine: impl Fn(f32, f32) -> f32) -> [[f32; 16]; 4] {
+    let mut xy = [[0.0; 16]; 4];
+    for (pair, row) in xy.iter_mut().enumerate() {
+        for i in 0..8 {
+            row[i] = combine(axes[i], axes[8 + 2 * pair]);
+            row[8 + i] = combine(axes[i], axes[9 + 2 * pair]);
+        }
+    }
+    xy
 }
 
 #[inline(always)]
@@ -114,23 +133,16 @@ fn gaussian<const FMA: bool>(
         }
         let atom = &atoms[candidate as usize];
         let seen = see(atom, origin, c.support, need);
-        // One batch for the three axes fills the vectors.
-        let (mut e, mut w) = ([[0.0_f32; 8]; 4], [[0.0_f32; 8]; 4]);
-        for k in 0..3 {
-            for i in 0..8 {
-                e[k][i] = exp2::<FMA>(fma::<FMA>(-c.rate, seen.u[k][i], c.share).max(MIN_EXPONENT));
-                w[k][i] = fma::<FMA>(c.tail_rate, seen.u[k][i], c.tail_share);
-            }
+        let (mut e, mut w) = ([0.0_f32; AXES], [0.0_f32; AXES]);
+        for i in 0..AXES {
+            let exponent = fma::<FMA>(-c.rate, seen.u[i], c.share);
+            // A plain comparison: `f32::max` minds NaN and costs the vector.
+            e[i] = exp2::<FMA>(if exponent > MIN_EXPONENT { exponent } else { MIN_EXPONENT });
+            w[i] = fma::<FMA>(c.tail_rate, seen.u[i], c.tail_share);
         }
-        let (mut exy, mut wxy) = ([[0.0_f32; 16]; 4], [[0.0_f32; 16]; 4]);
-        for pair in 0..4 {
-            for i in 0..16 {
-                exy[pair][i] = e[0][i % 8] * e[1][2 * pair + i / 8];
-                wxy[pair][i] = w[0][i % 8] + w[1][2 * pair + i / 8];
-            }
-        }
+        let (exy, wxy) = (plane(&e, |x, y| x * y), plane(&w, |x, y| x + y));
         for z in seen.z[0]..seen.z[1] {
-            let (ez, wz) = (e[2][z & 7], w[2][z & 7]);
+            let (ez, wz) = (e[16 + (z & 7)], w[16 + (z & 7)]);
             for pair in seen.y[0]..seen.y[1] {
                 let (exy, wxy) = (&exy[pair & 3], &wxy[pair & 3]);
                 let at = (z * 4 + pair) * 16;
@@ -161,23 +173,22 @@ fn compact<const FMA: bool, const INVERSE: bool>(
         let atom = &atoms[candidate as usize];
         let seen = see(atom, origin, c.support, need);
         let u_min = c.u_min * atom.inv_length2;
-        let mut uxy = [[0.0_f32; 16]; 4];
-        for pair in 0..4 {
-            for i in 0..16 {
-                uxy[pair][i] = seen.u[0][i % 8] + seen.u[1][2 * pair + i / 8];
-            }
-        }
+        let uxy = plane(&seen.u, |x, y| x + y);
         for z in seen.z[0]..seen.z[1] {
-            let uz = seen.u[2][z & 7];
+            let uz = seen.u[16 + (z & 7)];
             for pair in seen.y[0]..seen.y[1] {
                 let uxy = &uxy[pair & 3];
                 let at = (z * 4 + pair) * 16;
                 let Some(row) = out.get_mut(at..at + 16) else { continue };
                 for i in 0..16 {
                     let u = uxy[i] + uz;
-                    let t = (1.0 - u).max(0.0);
+                    let t = if u < 1.0 { 1.0 - u } else { 0.0 };
                     let t2 = t * t * c.amplitude;
-                    row[i] += if INVERSE { t2 / u.max(u_min) } else { t2 * fma::<FMA>(u, -4.0 / 9.0, 1.0) };
+                    row[i] += if INVERSE {
+                        t2 / if u > u_min { u } else { u_min }
+                    } else {
+                        t2 * fma::<FMA>(u, -4.0 / 9.0, 1.0)
+                    };
                 }
             }
         }

@@ -20,7 +20,6 @@ pub(super) struct SlopeConstants {
     rate: f32,
     /// Gaussian: what the C¹ cut-off takes away.
     tail: f32,
-    amplitude: f32,
     u_min: f32,
 }
 
@@ -35,7 +34,6 @@ impl SlopeConstants {
             offset: to_f32(rate),
             rate: to_f32(rate),
             tail: to_f32(profile.tolerance),
-            amplitude: 1.0,
             u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
         }
     }
@@ -159,10 +157,13 @@ fn sum_gradients<const FMA: bool>(
                 let (dx, dy, dz) = (px[i] - a[0], py[i] - a[1], pz[i] - a[2]);
                 let u = fma::<FMA>(dx, dx, fma::<FMA>(dy, dy, dz * dz)) * inv;
                 let slope = match c.kernel {
-                    Kernel::Gaussian => exp2::<FMA>(fma::<FMA>(-c.rate, u, c.offset).max(-100.0)) - c.tail,
+                    Kernel::Gaussian => {
+                        let exponent = fma::<FMA>(-c.rate, u, c.offset);
+                        exp2::<FMA>(if exponent > -100.0 { exponent } else { -100.0 }) - c.tail
+                    }
                     Kernel::SoftObject => (1.0 - u) * fma::<FMA>(u, -6.0, 11.0),
                     Kernel::InverseSquare => {
-                        let u = u.max(u_min);
+                        let u = if u > u_min { u } else { u_min };
                         (1.0 - u * u) / (u * u)
                     }
                 };

@@ -25,6 +25,7 @@ use self::emit::{IdTable, Numbered};
 use self::field::{Constants, Need, Samples};
 use self::interpolate::{Batch, SlopeConstants, Target};
 use super::backend::{Backend, GridStats, Meshed};
+use super::column::Column;
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::lattice::{BRICK_SAMPLES, Lattice, to_f32};
@@ -243,9 +244,8 @@ fn classify_tile(bricks: &Bricks, fields: &[Samples], inside: &[Inside], slots: 
     for (at, entry) in local.iter_mut().enumerate() {
         let [x, y, z] = [at % 8, at / 8 % 8, at / 64];
         let slot = (z * SIDE + y) * SIDE + x;
-        let near: [usize; 8] = std::array::from_fn(|n| {
-            usize::from(slots[slot + ((n >> 2 & 1) * SIDE + (n >> 1 & 1)) * SIDE + (n & 1)])
-        });
+        let near: [usize; 8] =
+            std::array::from_fn(|n| usize::from(slots[slot + ((n >> 2 & 1) * SIDE + (n >> 1 & 1)) * SIDE + (n & 1)]));
         let around = Around {
             inside: near.map(|i| inside.get(i).unwrap_or(&NOWHERE)),
             samples: near.map(|i| fields.get(i).unwrap_or(&NOTHING)),
@@ -273,10 +273,10 @@ fn build(
 ) -> Result<Mesh, SurfaceError> {
     let mut mesh = Mesh {
         centre: lattice.centre(),
-        positions: vec![[0.0; 3]; totals.vertices],
-        normals: vec![[0.0; 3]; totals.vertices],
-        triangles: vec![[0; 3]; totals.triangles],
-        atom_ids: atom_ids.then(|| vec![0; totals.vertices]),
+        positions: Column::zeroed(totals.vertices),
+        normals: Column::zeroed(totals.vertices),
+        triangles: Column::zeroed(totals.triangles),
+        atom_ids: atom_ids.then(|| Column::zeroed(totals.vertices)),
         colors: None,
     };
     let mut work = Vec::with_capacity(done.len());
@@ -297,14 +297,17 @@ fn build(
     let finished = AtomicUsize::new(0);
     let flat: usize = work
         .into_par_iter()
-        .map_init(|| (Batch::default(), IdTable::default()), |(batch, table), mut part| {
-            control.check()?;
-            let flat = control.span(Stage::Interpolate, || part.interpolate(lattice, &slope, batch));
-            control.span(Stage::Emit, || part.emit(tiles, done, table));
-            let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
-            control.observer.progress(Stage::Emit, n, done.len());
-            Ok(flat)
-        })
+        .map_init(
+            || (Batch::default(), IdTable::default()),
+            |(batch, table), mut part| {
+                control.check()?;
+                let flat = control.span(Stage::Interpolate, || part.interpolate(lattice, &slope, batch));
+                control.span(Stage::Emit, || part.emit(tiles, done, table));
+                let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
+                control.observer.progress(Stage::Emit, n, done.len());
+                Ok(flat)
+            },
+        )
         .sum::<Result<usize, SurfaceError>>()?;
     if flat > 0 {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
@@ -345,7 +348,16 @@ impl TilePart<'_> {
                 normals: &mut self.normals[rows.clone()],
                 atom_ids: self.atom_ids.as_deref_mut().map(|ids| &mut ids[rows.clone()]),
             };
-            flat += interpolate::interpolate(lattice, slope, self.tile.coord, brick, candidates, &found.t[rows], batch, target);
+            flat += interpolate::interpolate(
+                lattice,
+                slope,
+                self.tile.coord,
+                brick,
+                candidates,
+                &found.t[rows],
+                batch,
+                target,
+            );
         }
         flat
     }
@@ -363,7 +375,8 @@ impl TilePart<'_> {
                 let (slot, beyond) = emit::neighbour_slot(usize::from(brick.slot), n);
                 near[beyond[0] | beyond[1] << 1 | beyond[2] << 2].and_then(|tile| tile.numbered(slot))
             });
-            let end = found.bricks.get(i + 1).map_or((found.triangles, found.cases.len()), |n| (n.triangle, n.case as usize));
+            let end =
+                found.bricks.get(i + 1).map_or((found.triangles, found.cases.len()), |n| (n.triangle, n.case as usize));
             let cases = &found.cases[brick.case as usize..end.1];
             emit::emit(table, &around, cases, &mut self.triangles[brick.triangle as usize..end.0 as usize]);
         }
