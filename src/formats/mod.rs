@@ -52,13 +52,13 @@ pub fn write(format: Format, mesh: &Mesh, meta: &Meta, out: &mut dyn Write) -> i
 /// [`Encoder`] tells the length and writes the file at the price of one check of the mesh.
 #[must_use]
 pub fn encoded_len(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
-    Encoder::new(format, mesh, meta).ok()?.len()
+    Encoder::new(format, mesh, meta).ok()?.encoded_len()
 }
 
 /// Bytes that [`write`] will write at most: exact wherever [`encoded_len`] is; `None` where it would refuse.
 #[must_use]
 pub fn encoded_len_bound(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
-    Some(Encoder::new(format, mesh, meta).ok()?.len_bound())
+    Some(Encoder::new(format, mesh, meta).ok()?.encoded_len_bound())
 }
 
 /// A file that is laid out and not yet written.
@@ -97,7 +97,7 @@ impl<'a> Encoder<'a> {
 
     /// Bytes of the file, exactly; `None` for OBJ.
     #[must_use]
-    pub fn len(&self) -> Option<u64> {
+    pub fn encoded_len(&self) -> Option<u64> {
         match &self.plan {
             Plan::Glb(plan) => Some(plan.len()),
             Plan::Gltf(plan) => Some(plan.len()),
@@ -107,18 +107,12 @@ impl<'a> Encoder<'a> {
         }
     }
 
-    /// No format has files without bytes.
+    /// Bytes of the file at most; exact where [`Self::encoded_len`] is.
     #[must_use]
-    pub const fn is_empty(&self) -> bool {
-        false
-    }
-
-    /// Bytes of the file at most; exact where [`Self::len`] is.
-    #[must_use]
-    pub fn len_bound(&self) -> u64 {
+    pub fn encoded_len_bound(&self) -> u64 {
         match &self.plan {
             Plan::Obj(plan) => plan.len_bound(),
-            _ => self.len().unwrap_or(u64::MAX),
+            _ => self.encoded_len().unwrap_or(u64::MAX),
         }
     }
 

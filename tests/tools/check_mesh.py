@@ -41,6 +41,12 @@ def weld(mesh):
     return trimesh.Trimesh(vertices[first], inverse.reshape(-1)[mesh.faces], process=False)
 
 
+def stl_normals(path):
+    """The normals as written: trimesh throws them away where it finds better ones."""
+    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    return np.fromfile(path, dtype=record, offset=84)["normal"].astype(np.float64)
+
+
 def normal_report(mesh, normals):
     """How far the written normals are from length 1, and whether they agree with the faces around them."""
     lengths = np.linalg.norm(normals, axis=1)
@@ -66,7 +72,7 @@ def report(path):
     welded = path.endswith(".stl")
     face_normals = None
     if welded:
-        face_normals = np.array(mesh._cache.cache.get("face_normals", mesh.face_normals))
+        face_normals = stl_normals(path)
         mesh = weld(mesh)
     edges = np.sort(mesh.edges, axis=1).astype(np.uint64)
     _, uses = np.unique(edges[:, 0] << np.uint64(32) | edges[:, 1], return_counts=True)
@@ -109,7 +115,17 @@ def report(path):
     return out
 
 
+def finite(value):
+    """JSON has no NaN and no infinity: null stands for both."""
+    if isinstance(value, dict):
+        return {k: finite(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [finite(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
 def main():
+    np.seterr(all="ignore")  # broken meshes are what this is for
     paths = sys.argv[1:]
     for path in paths or (line.rstrip("\n") for line in sys.stdin):
         if not path:
@@ -118,7 +134,7 @@ def main():
             answer = report(path)
         except Exception as error:  # whatever a reader says about a broken file is the answer
             answer = {"file": path, "error": f"{type(error).__name__}: {error}"}
-        print(json.dumps(answer), flush=True)
+        print(json.dumps(finite(answer), allow_nan=False), flush=True)
 
 
 if __name__ == "__main__":

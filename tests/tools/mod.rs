@@ -3,19 +3,24 @@
 //! A test says `mod tools;` and calls [`trimesh`] or [`gltf_validate`], or [`python`] with a script of its own.
 //! Without the tools these return `None` after a line that begins with `SKIPPED:` on standard error, and panic
 //! where the environment says that they must be there: `CI` or `MOLMESH_REQUIRE_TOOLS`.
-#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
+#![allow(dead_code, unreachable_pub, reason = "every test crate compiles this file and uses its own part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test says what it expects by panicking")]
+
+pub mod readers;
+pub mod shapes;
 
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use serde::Deserialize;
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Deserializer};
 
 /// What trimesh says of a file. Only `file` and `error` are set where it could not be read.
 #[derive(Debug, Clone, Default, Deserialize, PartialEq)]
 #[serde(default)]
+#[allow(clippy::struct_excessive_bools, reason = "the checker's answers are yes or no")]
 pub struct TrimeshReport {
     pub file: String,
     /// Why it could not be read.
@@ -32,9 +37,13 @@ pub struct TrimeshReport {
     /// Watertight, wound consistently, outwards.
     pub is_volume: bool,
     pub euler: i64,
+    /// NaN where coordinates are not finite; so are volume and bounds.
+    #[serde(deserialize_with = "nan_for_null")]
     pub area: f64,
+    #[serde(deserialize_with = "nan_for_null")]
     pub volume: f64,
     pub bodies: u64,
+    #[serde(deserialize_with = "nans_for_nulls")]
     pub bounds: [[f64; 3]; 2],
     /// Coordinates and normal components that are not finite.
     pub nan_count: u64,
@@ -51,6 +60,15 @@ pub struct TrimeshReport {
     pub min_face_normal_dot: Option<f64>,
     /// Names of custom vertex attributes, such as `_ATOM`.
     pub attributes: Vec<String>,
+}
+
+fn nan_for_null<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN))
+}
+
+fn nans_for_nulls<'de, D: Deserializer<'de>>(deserializer: D) -> Result<[[f64; 3]; 2], D::Error> {
+    let rows = <[[Option<f64>; 3]; 2]>::deserialize(deserializer)?;
+    Ok(rows.map(|row| row.map(|v| v.unwrap_or(f64::NAN))))
 }
 
 /// What the glTF validator says of a file. Only `file` and `error` are set where it is no glTF.
@@ -126,13 +144,15 @@ pub fn python_interpreter() -> Option<PathBuf> {
 
 /// Says that a tool is missing: panics where it must not be, else skips loudly.
 pub fn missing<T>(tool: &str) -> Option<T> {
-    let required = ["CI", "MOLMESH_REQUIRE_TOOLS"].into_iter().find(|v| std::env::var_os(v).is_some_and(|v| v != ""));
+    let required =
+        ["CI", "MOLMESH_REQUIRE_TOOLS"].into_iter().find(|v| std::env::var_os(v).is_some_and(|v| !v.is_empty()));
     if let Some(variable) = required {
         panic!("{tool} is not installed and {variable} is set: run tests/tools/setup.sh");
     }
     let test = std::thread::current().name().unwrap_or("a test").to_owned();
     // Not `eprintln!`: the harness would swallow it while the test passes.
-    writeln!(std::io::stderr(), "SKIPPED: {test}: {tool} is not installed; run tests/tools/setup.sh").unwrap();
+    let line = format!("SKIPPED: {test}: {tool} is not installed; run tests/tools/setup.sh\n");
+    std::io::stderr().write_all(line.as_bytes()).unwrap();
     None
 }
 
@@ -152,7 +172,7 @@ fn ask<T: DeserializeOwned>(interpreter: &Path, script: &str, paths: &[impl AsRe
         .stdout(Stdio::piped())
         .spawn()
         .unwrap_or_else(|e| panic!("cannot start {}: {e}", interpreter.display()));
-    let list: String = paths.iter().map(|p| format!("{}\n", p.as_ref().display())).collect();
+    let list: String = paths.iter().flat_map(|p| [p.as_ref().display().to_string(), "\n".to_owned()]).collect();
     let mut stdin = child.stdin.take().unwrap();
     // On its own thread: with long lists both pipes could be full at once.
     let feeder = std::thread::spawn(move || stdin.write_all(list.as_bytes()));

@@ -1,0 +1,212 @@
+//! One look at a mesh before it is written: refuses what no format can hold, and finds the bounds.
+//!
+//! Everything is read once, in chunks on rayon's pool, because the mesh of a large structure has hundreds of
+//! megabytes and a file that turns out to be wrong halfway cannot be taken back.
+
+use rayon::prelude::*;
+
+use super::error::FormatError;
+use crate::surface::Mesh;
+
+/// Rows looked at by one task: below that a mesh is checked on the calling thread.
+const CHUNK_ROWS: usize = 1 << 16;
+
+/// No component of a unit vector is larger, rounding included.
+const MAX_NORMAL: f32 = 1.001;
+
+/// What the formats need to know of a mesh that they can hold.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Summary {
+    /// Lowest and highest relative position per axis, Å; zeros without vertices.
+    pub(super) bounds: [[f32; 3]; 2],
+    /// Largest atom index, if the mesh has atom indices.
+    pub(super) max_atom: Option<u32>,
+    /// Whether some colour is not opaque.
+    pub(super) translucent: bool,
+}
+
+/// Checks that columns have one length, numbers are finite and indices in range.
+pub(super) fn check(mesh: &Mesh) -> Result<Summary, FormatError> {
+    let positions = &mesh.positions[..];
+    let n = positions.len();
+    let lengths = [
+        ("normals", Some(mesh.normals.len())),
+        ("atom_ids", mesh.atom_ids.as_ref().map(|c| c[..].len())),
+        ("colors", mesh.colors.as_ref().map(|c| c[..].len())),
+    ];
+    for (column, len) in lengths {
+        if let Some(len) = len.filter(|&len| len != n) {
+            return Err(FormatError::ColumnLength { column, len: len as u64, vertices: n as u64 });
+        }
+    }
+    if let Some((axis, &value)) = mesh.centre.iter().enumerate().find(|(_, v)| !v.is_finite()) {
+        return Err(FormatError::NotFinite { column: "centre", row: axis as u64, value });
+    }
+    let bounds = extent("position", positions)?.unwrap_or_default();
+    let longest = extent("normal", &mesh.normals[..])?.unwrap_or_default();
+    if let Some(&value) = longest.as_flattened().iter().find(|v| v.abs() > MAX_NORMAL) {
+        return Err(FormatError::NotUnit { value });
+    }
+    in_range(&mesh.triangles[..], n)?;
+    Ok(Summary {
+        bounds,
+        max_atom: mesh.atom_ids.as_ref().map(|ids| maximum(&ids[..]).unwrap_or(0)),
+        translucent: mesh.colors.as_ref().is_some_and(|colors| colors.iter().any(|c| c[3] != u8::MAX)),
+    })
+}
+
+/// Lowest and highest value per axis; `None` without rows. Refuses numbers that are not finite.
+fn extent(column: &'static str, rows: &[[f32; 3]]) -> Result<Option<[[f32; 3]; 2]>, FormatError> {
+    let join = |a: Extent, b: Extent| a.join(&b);
+    let all = if rows.len() <= CHUNK_ROWS {
+        Extent::of(rows)
+    } else {
+        rows.par_chunks(CHUNK_ROWS).map(Extent::of).reduce(Extent::default, join)
+    };
+    if all.poison.iter().any(|p| p.is_nan()) {
+        let found = rows.iter().enumerate().find_map(|(i, r)| r.iter().find(|v| !v.is_finite()).map(|&v| (i, v)));
+        let (row, value) = found.unwrap_or((0, f32::NAN));
+        return Err(FormatError::NotFinite { column, row: row as u64, value: f64::from(value) });
+    }
+    // Adding zero turns −0 into 0, which JSON would tell apart.
+    Ok((!rows.is_empty()).then(|| [all.low.map(|v| v + 0.0), all.high.map(|v| v + 0.0)]))
+}
+
+/// Running extremes of three axes. `poison` is NaN as soon as one value was not finite: 0 · ∞ and 0 · NaN are.
+#[derive(Debug, Clone, Copy)]
+struct Extent {
+    low: [f32; 3],
+    high: [f32; 3],
+    poison: [f32; 3],
+}
+
+impl Default for Extent {
+    fn default() -> Self {
+        Self { low: [f32::INFINITY; 3], high: [f32::NEG_INFINITY; 3], poison: [0.0; 3] }
+    }
+}
+
+impl Extent {
+    /// Four rows at a time: twelve lanes are three vectors, with the axes always in the same lanes.
+    fn of(rows: &[[f32; 3]]) -> Self {
+        let (quads, rest) = rows.as_chunks::<4>();
+        let (mut low, mut high, mut poison) = ([f32::INFINITY; 12], [f32::NEG_INFINITY; 12], [0.0_f32; 12]);
+        for quad in quads {
+            let quad: &[f32; 12] = bytemuck::must_cast_ref(quad);
+            for k in 0..12 {
+                let v = quad[k];
+                low[k] = if v < low[k] { v } else { low[k] };
+                high[k] = if v > high[k] { v } else { high[k] };
+                poison[k] += v * 0.0;
+            }
+        }
+        let lanes = (0..4).map(|q| Self {
+            low: std::array::from_fn(|k| low[3 * q + k]),
+            high: std::array::from_fn(|k| high[3 * q + k]),
+            poison: std::array::from_fn(|k| poison[3 * q + k]),
+        });
+        let rest = rest.iter().map(|&r| Self { low: r, high: r, poison: r.map(|v| v * 0.0) });
+        lanes.chain(rest).fold(Self::default(), |a, b| a.join(&b))
+    }
+
+    fn join(&self, other: &Self) -> Self {
+        Self {
+            low: std::array::from_fn(|k| if other.low[k] < self.low[k] { other.low[k] } else { self.low[k] }),
+            high: std::array::from_fn(|k| if other.high[k] > self.high[k] { other.high[k] } else { self.high[k] }),
+            poison: std::array::from_fn(|k| self.poison[k] + other.poison[k]),
+        }
+    }
+}
+
+/// Largest value; `None` without values.
+fn maximum(values: &[u32]) -> Option<u32> {
+    let of = |chunk: &[u32]| chunk.iter().copied().max();
+    if values.len() <= CHUNK_ROWS { of(values) } else { values.par_chunks(CHUNK_ROWS).map(of).max().flatten() }
+}
+
+/// Refuses triangles that name vertices which do not exist.
+fn in_range(triangles: &[[u32; 3]], n_vertices: usize) -> Result<(), FormatError> {
+    let beyond = |index: u32| index as usize >= n_vertices;
+    if !maximum(triangles.as_flattened()).is_some_and(beyond) {
+        return Ok(());
+    }
+    let first = triangles.iter().enumerate().find_map(|(i, t)| t.iter().find(|&&v| beyond(v)).map(|&v| (i, v)));
+    let (triangle, index) = first.unwrap_or_default();
+    Err(FormatError::IndexOutOfRange { triangle: triangle as u64, index, vertices: n_vertices as u64 })
+}
+
+#[cfg(test)]
+#[expect(clippy::cast_precision_loss, reason = "small integers are exact")]
+mod tests {
+    use super::*;
+
+    /// Rows whose extremes are known: a ramp with one low and one high outlier.
+    fn rows(n: usize) -> Vec<[f32; 3]> {
+        let mut rows: Vec<[f32; 3]> = (0..n).map(|i| [i as f32, -(i as f32), 0.5]).collect();
+        rows[n / 3][2] = -7.0;
+        rows[2 * n / 3][2] = 9.0;
+        rows
+    }
+
+    #[test]
+    fn extent_is_exact_for_every_remainder_and_beyond_one_chunk() {
+        for n in [3, 4, 5, 6, 7, 8, 101, CHUNK_ROWS, CHUNK_ROWS + 1, 3 * CHUNK_ROWS + 2] {
+            let high = (n - 1) as f32;
+            assert_eq!(extent("position", &rows(n)), Ok(Some([[0.0, -high, -7.0], [high, 0.0, 9.0]])), "{n}");
+        }
+        assert_eq!(extent("position", &[]), Ok(None));
+    }
+
+    #[test]
+    fn a_number_that_is_not_finite_is_found_wherever_it_is() {
+        for n in [1, 5, 2 * CHUNK_ROWS + 3] {
+            for row in [0, n / 2, n - 1] {
+                for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+                    let mut rows = vec![[1.0; 3]; n];
+                    rows[row][row % 3] = value;
+                    match extent("normal", &rows) {
+                        Err(FormatError::NotFinite { column: "normal", row: found, .. }) => {
+                            assert_eq!(found, row as u64);
+                        }
+                        other => panic!("{value} in row {row} of {n}: {other:?}"),
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn bounds_have_no_negative_zero() {
+        let found = extent("position", &[[-0.0; 3]]).unwrap().unwrap();
+        assert!(found.as_flattened().iter().all(|v| v.is_sign_positive()));
+    }
+
+    #[test]
+    fn indices_are_checked_to_the_last_one() {
+        let mut triangles = vec![[0, 1, 2]; CHUNK_ROWS + 7];
+        assert_eq!(in_range(&triangles, 3), Ok(()));
+        *triangles.last_mut().unwrap() = [0, 3, 2];
+        let triangle = triangles.len() as u64 - 1;
+        assert_eq!(in_range(&triangles, 3), Err(FormatError::IndexOutOfRange { triangle, index: 3, vertices: 3 }));
+        assert_eq!(in_range(&[], 0), Ok(()));
+    }
+
+    #[test]
+    fn columns_of_different_lengths_are_refused() {
+        let whole = Mesh { positions: vec![[0.0; 3]; 2], normals: vec![[0.0, 0.0, 1.0]; 2], ..Mesh::default() };
+        assert!(check(&whole).is_ok());
+        let broken = [
+            ("normals", Mesh { normals: vec![[0.0; 3]], ..whole.clone() }),
+            ("atom_ids", Mesh { atom_ids: Some(vec![1]), ..whole.clone() }),
+            ("colors", Mesh { colors: Some(vec![[0; 4]; 3]), ..whole.clone() }),
+        ];
+        for (name, mesh) in broken {
+            assert!(
+                matches!(check(&mesh), Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name),
+                "{name}"
+            );
+        }
+        let adrift = Mesh { centre: [0.0, f64::NAN, 0.0], ..whole };
+        assert!(matches!(check(&adrift), Err(FormatError::NotFinite { column: "centre", row: 1, .. })));
+    }
+}

@@ -1,0 +1,69 @@
+//! The bytes of the buffer, in the order of the layout.
+
+use std::io::{self, Write};
+
+use super::layout::{AtomType, IndexType, Layout};
+use crate::formats::block::{convert_words, write_floats, write_integers};
+use crate::surface::Mesh;
+
+/// Writes the buffer of `mesh`: `layout.len` bytes.
+pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
+    write_floats(out, &mesh.positions[..])?;
+    write_floats(out, &mesh.normals[..])?;
+    if let Some(colors) = &mesh.colors {
+        let linear = linear_of_srgb();
+        convert_words(out, &colors[..], |[r, g, b, a]| {
+            [linear[usize::from(r)], linear[usize::from(g)], linear[usize::from(b)], a]
+        })?;
+    }
+    if let (Some(ids), Some((atom_type, _))) = (&mesh.atom_ids, layout.atoms) {
+        match atom_type {
+            // A small 32-bit integer, low byte first, is a 16-bit integer and two zero bytes.
+            AtomType::U16 => write_integers(out, &ids[..])?,
+            AtomType::F32 => convert_words(out, &ids[..], exact_f32_bytes)?,
+        }
+    }
+    let indices = mesh.triangles[..].as_flattened();
+    match layout.indices.0 {
+        IndexType::U8 => convert_words(out, indices, |i| [i.to_le_bytes()[0]]),
+        IndexType::U16 => convert_words(out, indices, |i| {
+            let [low, high, ..] = i.to_le_bytes();
+            [low, high]
+        }),
+        IndexType::U32 => write_integers(out, indices),
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "the layout takes floats only where they are exact")]
+fn exact_f32_bytes(value: u32) -> [u8; 4] {
+    (value as f32).to_le_bytes()
+}
+
+/// sRGB to linear light, both as bytes: glTF multiplies linear colours (transfer function of IEC 61966-2-1).
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a number from 0 to 255 that was rounded")]
+fn linear_of_srgb() -> [u8; 256] {
+    std::array::from_fn(|byte| {
+        let s = f64::from(u8::try_from(byte).unwrap_or(u8::MAX)) / 255.0;
+        let linear = if s <= 0.04045 { s / 12.92 } else { ((s + 0.055) / 1.055).powf(2.4) };
+        (linear * 255.0).round() as u8
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn colours_become_linear_light() {
+        let table = linear_of_srgb();
+        assert_eq!((table[0], table[128], table[188], table[255]), (0, 55, 128, 255));
+        assert!(table.is_sorted());
+    }
+
+    #[test]
+    fn atoms_as_floats_are_exact_to_their_limit() {
+        for value in [0, 65_536, 16_777_215, 16_777_216] {
+            assert_eq!(f32::from_le_bytes(exact_f32_bytes(value)).to_string(), value.to_string());
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! The JSON of a glTF: one scene, one node moved to the mesh's centre, one mesh with one primitive.
+
+use std::collections::BTreeMap;
+
+use gltf_json::accessor::{ComponentType, GenericComponentType, Type};
+use gltf_json::buffer::{Stride, Target, View};
+use gltf_json::material::{AlphaMode, PbrBaseColorFactor, PbrMetallicRoughness, StrengthFactor};
+use gltf_json::mesh::{Mode, Primitive, Semantic};
+use gltf_json::validation::Checked::Valid;
+use gltf_json::validation::USize64;
+use gltf_json::{Accessor, Asset, Buffer, Index, Material, Mesh as GltfMesh, Node, Root, Scene};
+use serde_json::{Map, Value};
+
+use super::layout::{AtomType, IndexType, Layout, Span};
+use crate::formats::check::Summary;
+use crate::formats::{FormatError, GENERATOR, Meta};
+use crate::surface::Mesh;
+
+/// A calm blue, linear light. Like every constant here it is a short binary fraction, so JSON shows it short.
+const BASE_COLOR: [f32; 4] = [0.156_25, 0.390_625, 0.718_75, 1.0];
+/// White leaves the mesh's own colours as they are.
+const WHITE: [f32; 4] = [1.0; 4];
+/// Between chalk and plastic: highlights show the shape and do not hide it.
+const ROUGHNESS: f32 = 0.625;
+
+/// The document as a JSON object. With a layout it has one buffer, without a URI: the caller adds what its
+/// wrapping needs.
+pub(super) fn document(
+    mesh: &Mesh,
+    summary: &Summary,
+    layout: Option<&Layout>,
+    meta: &Meta,
+) -> Result<Map<String, Value>, FormatError> {
+    let name = meta.name.clone().filter(|name| !name.is_empty());
+    let mut root = Root {
+        asset: Asset { generator: Some(GENERATOR.to_owned()), ..Asset::default() },
+        scene: Some(Index::new(0)),
+        ..Root::default()
+    };
+    let drawn = layout.map(|layout| {
+        let primitive = primitive(&mut root, layout, summary);
+        root.push(GltfMesh {
+            primitives: vec![primitive],
+            name: name.clone(),
+            weights: None,
+            extensions: None,
+            extras: None,
+        })
+    });
+    let node = root.push(Node { mesh: drawn, name, translation: Some([0.0; 3]), ..Node::default() });
+    root.push(Scene { nodes: vec![node], name: None, extensions: None, extras: None });
+
+    let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };
+    let mut value = serde_json::to_value(&root).map_err(json)?;
+    // The crate's translation is single precision, which would move a structure far from the origin by up to 1e-5 Å.
+    value["nodes"][0]["translation"] = Value::from(mesh.centre.to_vec());
+    value["asset"]["extras"] = Value::Object(extras(mesh, meta));
+    match value {
+        Value::Object(map) => Ok(map),
+        _ => Err(FormatError::Json { reason: "the document is no object".to_owned() }),
+    }
+}
+
+/// What the file says of itself: units first, then parameters and report.
+fn extras(mesh: &Mesh, meta: &Meta) -> Map<String, Value> {
+    let mut extras = Map::new();
+    extras.insert("units".to_owned(), Value::from("angstrom"));
+    extras.insert("unit_scale".to_owned(), Value::from(1.0));
+    extras.insert("centre".to_owned(), Value::from(mesh.centre.to_vec()));
+    for (key, value) in &meta.extras {
+        if !extras.contains_key(key) {
+            extras.insert(key.clone(), value.clone());
+        }
+    }
+    extras
+}
+
+/// Adds buffer, views, accessors and material, and gives the primitive that uses them.
+fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
+    let buffer =
+        root.push(Buffer { byte_length: USize64(layout.len), name: None, uri: None, extensions: None, extras: None });
+    let n = layout.n_vertices;
+    let mut attribute = |semantic: Semantic, span: Span, component: ComponentType, shape: Type| {
+        let stride = matches!(component, ComponentType::U16).then_some(Stride(4));
+        let view = view(root, buffer, span, stride, Target::ArrayBuffer);
+        let mut accessor = accessor(view, n, component, shape);
+        accessor.normalized = matches!(component, ComponentType::U8);
+        if semantic == Semantic::Positions {
+            // As double-precision numbers these are exactly the values in the buffer.
+            let [low, high] = summary.bounds.map(|row| Value::from(row.map(f64::from).to_vec()));
+            (accessor.min, accessor.max) = (Some(low), Some(high));
+        }
+        (Valid(semantic), root.push(accessor))
+    };
+    let mut attributes = BTreeMap::from([
+        attribute(Semantic::Positions, layout.positions, ComponentType::F32, Type::Vec3),
+        attribute(Semantic::Normals, layout.normals, ComponentType::F32, Type::Vec3),
+    ]);
+    attributes.extend(layout.colors.map(|span| attribute(Semantic::Colors(0), span, ComponentType::U8, Type::Vec4)));
+    attributes.extend(layout.atoms.map(|(atom_type, span)| {
+        let component = match atom_type {
+            AtomType::U16 => ComponentType::U16,
+            AtomType::F32 => ComponentType::F32,
+        };
+        attribute(Semantic::Extras("ATOM".to_owned()), span, component, Type::Scalar)
+    }));
+    let (index_type, span) = layout.indices;
+    let component = match index_type {
+        IndexType::U8 => ComponentType::U8,
+        IndexType::U16 => ComponentType::U16,
+        IndexType::U32 => ComponentType::U32,
+    };
+    let indices = view(root, buffer, span, None, Target::ElementArrayBuffer);
+    let indices = root.push(accessor(indices, 3 * layout.n_triangles, component, Type::Scalar));
+    let material = root.push(material(layout.colors.is_some(), summary.translucent));
+    Primitive {
+        attributes,
+        indices: Some(indices),
+        material: Some(material),
+        mode: Valid(Mode::Triangles),
+        targets: None,
+        extensions: None,
+        extras: None,
+    }
+}
+
+fn view(root: &mut Root, buffer: Index<Buffer>, span: Span, stride: Option<Stride>, target: Target) -> Index<View> {
+    root.push(View {
+        buffer,
+        byte_length: USize64(span.len),
+        byte_offset: (span.offset > 0).then_some(USize64(span.offset)),
+        byte_stride: stride,
+        target: Some(Valid(target)),
+        name: None,
+        extensions: None,
+        extras: None,
+    })
+}
+
+fn accessor(view: Index<View>, count: u64, component: ComponentType, shape: Type) -> Accessor {
+    Accessor {
+        buffer_view: Some(view),
+        byte_offset: None,
+        count: USize64(count),
+        component_type: Valid(GenericComponentType(component)),
+        type_: Valid(shape),
+        min: None,
+        max: None,
+        normalized: false,
+        sparse: None,
+        name: None,
+        extensions: None,
+        extras: None,
+    }
+}
+
+fn material(coloured: bool, translucent: bool) -> Material {
+    Material {
+        name: Some("surface".to_owned()),
+        alpha_mode: Valid(if translucent { AlphaMode::Blend } else { AlphaMode::Opaque }),
+        double_sided: false,
+        pbr_metallic_roughness: PbrMetallicRoughness {
+            base_color_factor: PbrBaseColorFactor(if coloured { WHITE } else { BASE_COLOR }),
+            metallic_factor: StrengthFactor(0.0),
+            roughness_factor: StrengthFactor(ROUGHNESS),
+            ..PbrMetallicRoughness::default()
+        },
+        ..Material::default()
+    }
+}

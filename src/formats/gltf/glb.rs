@@ -1,0 +1,96 @@
+//! GLB: a header of 12 bytes, a chunk with the JSON, a chunk with the buffer; lengths are 32 bits wide.
+
+use std::io::{self, Write};
+
+use super::buffer::write_buffer;
+use super::document::document;
+use super::layout::Layout;
+use crate::formats::check::Summary;
+use crate::formats::{FormatError, Meta};
+use crate::surface::Mesh;
+
+const MAGIC: u32 = u32::from_le_bytes(*b"glTF");
+const VERSION: u32 = 2;
+const JSON: u32 = u32::from_le_bytes(*b"JSON");
+const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
+/// Bytes of the file header, and of a chunk's.
+const HEADER_BYTES: u64 = 12;
+const CHUNK_HEADER_BYTES: u64 = 8;
+
+/// A GLB that is laid out.
+#[derive(Debug)]
+pub(in crate::formats) struct GlbPlan {
+    /// Everything before the buffer.
+    head: Vec<u8>,
+    layout: Option<Layout>,
+    len: u32,
+}
+
+impl GlbPlan {
+    pub(in crate::formats) fn new(mesh: &Mesh, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
+        let layout = Layout::of(mesh, summary)?;
+        let document = document(mesh, summary, layout.as_ref(), meta)?;
+        let json = serde_json::to_vec(&document).map_err(|e| FormatError::Json { reason: e.to_string() })?;
+        Self::wrap(json, layout)
+    }
+
+    fn wrap(mut json: Vec<u8>, layout: Option<Layout>) -> Result<Self, FormatError> {
+        json.resize(json.len().next_multiple_of(4), b' ');
+        let json_len = json.len() as u64;
+        let bin_len = layout.map(|layout| layout.len.next_multiple_of(4));
+        let bytes = HEADER_BYTES + CHUNK_HEADER_BYTES + json_len + bin_len.map_or(0, |len| CHUNK_HEADER_BYTES + len);
+        let fits = |n: u64| {
+            u32::try_from(n).map_err(|_overflow| FormatError::GlbTooLarge { bytes, limit: u64::from(u32::MAX) })
+        };
+        let len = fits(bytes)?;
+        let mut head = Vec::with_capacity(json.len() + 28);
+        for word in [MAGIC, VERSION, len, fits(json_len)?, JSON] {
+            head.extend_from_slice(&word.to_le_bytes());
+        }
+        head.append(&mut json);
+        if let Some(bin_len) = bin_len {
+            for word in [fits(bin_len)?, BIN] {
+                head.extend_from_slice(&word.to_le_bytes());
+            }
+        }
+        Ok(Self { head, layout, len })
+    }
+
+    pub(in crate::formats) fn len(&self) -> u64 {
+        u64::from(self.len)
+    }
+
+    pub(in crate::formats) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
+        out.write_all(&self.head)?;
+        let Some(layout) = &self.layout else { return Ok(()) };
+        write_buffer(mesh, layout, out)?;
+        let padding = layout.len.next_multiple_of(4) - layout.len;
+        out.write_all(&[0; 3][..usize::try_from(padding).unwrap_or(0)])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_glb_of_four_gibibytes_is_refused_with_numbers() {
+        // 24 bytes per vertex and 12 per triangle, two triangles per vertex: 48 bytes a vertex.
+        let fits = Layout::plain(89_000_000, 178_000_000).unwrap();
+        assert_eq!(GlbPlan::wrap(vec![b' '; 1000], Some(fits)).unwrap().len(), 48 * 89_000_000 + 1028);
+        let large = Layout::plain(90_000_000, 180_000_000).unwrap();
+        let refusal = GlbPlan::wrap(vec![b' '; 1000], Some(large)).unwrap_err();
+        assert_eq!(refusal, FormatError::GlbTooLarge { bytes: 4_320_001_028, limit: 4_294_967_295 });
+        assert!(refusal.to_string().contains("4320001028"));
+        assert_eq!(io::Error::from(refusal).kind(), io::ErrorKind::InvalidInput);
+    }
+
+    #[test]
+    fn the_limit_is_met_to_the_byte() {
+        // A GLB's length is a multiple of 4: the largest is 4,294,967,292 bytes.
+        let layout = Layout::plain(89_000_000, 178_000_000).unwrap();
+        let json = usize::try_from(4_294_967_292 - 28 - layout.len).unwrap();
+        assert_eq!(GlbPlan::wrap(vec![b' '; json - 3], Some(layout)).unwrap().len(), 4_294_967_292);
+        assert!(GlbPlan::wrap(vec![b' '; json + 1], Some(layout)).is_err());
+    }
+}

@@ -1,0 +1,55 @@
+//! `.gltf`: the document as JSON text, with the buffer in it as a base64 data URI, encoded as it is written.
+
+use std::io::{self, Write};
+
+use serde_json::Value;
+
+use super::base64::{Base64Writer, encoded_len};
+use super::buffer::write_buffer;
+use super::document::document;
+use super::layout::Layout;
+use crate::formats::check::Summary;
+use crate::formats::{FormatError, Meta};
+use crate::surface::Mesh;
+
+/// A `.gltf` that is laid out.
+#[derive(Debug)]
+pub(in crate::formats) struct GltfPlan {
+    /// The text before the base64, or all of it if there is no buffer.
+    before: Vec<u8>,
+    /// The text after the base64.
+    after: &'static [u8],
+    layout: Option<Layout>,
+}
+
+impl GltfPlan {
+    pub(in crate::formats) fn new(mesh: &Mesh, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
+        let layout = Layout::of(mesh, summary)?;
+        let mut document = document(mesh, summary, layout.as_ref(), meta)?;
+        // The buffer's entry comes last and is written by hand, so that its text can be left open.
+        document.shift_remove("buffers");
+        let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };
+        let mut before = serde_json::to_vec(&Value::Object(document)).map_err(json)?;
+        let Some(open) = &layout else { return Ok(Self { before, after: b"", layout: None }) };
+        before.pop();
+        let length = open.len;
+        let entry = format!(r#","buffers":[{{"byteLength":{length},"uri":"data:application/octet-stream;base64,"#);
+        before.extend_from_slice(entry.as_bytes());
+        Ok(Self { before, after: br#""}]}"#, layout })
+    }
+
+    pub(in crate::formats) fn len(&self) -> u64 {
+        let text = (self.before.len() + self.after.len()) as u64;
+        text + self.layout.map_or(0, |layout| encoded_len(layout.len))
+    }
+
+    pub(in crate::formats) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
+        out.write_all(&self.before)?;
+        if let Some(layout) = &self.layout {
+            let mut base64 = Base64Writer::new(out);
+            write_buffer(mesh, layout, &mut base64)?;
+            base64.finish()?;
+        }
+        out.write_all(self.after)
+    }
+}

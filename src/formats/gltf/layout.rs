@@ -1,0 +1,172 @@
+//! What lies where in the buffer of a glTF. Pure arithmetic on counts, so that files of any size can be planned.
+
+use crate::formats::FormatError;
+use crate::formats::check::Summary;
+use crate::surface::Mesh;
+
+/// Largest integer below which every integer is a 32-bit float.
+const MAX_EXACT_F32: u32 = 1 << 24;
+
+/// Component type of the indices.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum IndexType {
+    U8,
+    U16,
+    U32,
+}
+
+impl IndexType {
+    /// The smallest type that holds the indices of so many vertices; `None` beyond 32 bits. The largest value of
+    /// each type means "restart" to graphics hardware and is no index.
+    pub(super) fn for_vertices(n_vertices: u64) -> Option<Self> {
+        match n_vertices {
+            0..=0xff => Some(Self::U8),
+            0x100..=0xffff => Some(Self::U16),
+            0x1_0000..=0xffff_ffff => Some(Self::U32),
+            _ => None,
+        }
+    }
+
+    const fn bytes(self) -> u64 {
+        match self {
+            Self::U8 => 1,
+            Self::U16 => 2,
+            Self::U32 => 4,
+        }
+    }
+}
+
+/// Component type of `_ATOM`. glTF has no 32-bit integers as vertex attributes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum AtomType {
+    /// 16-bit integers, each followed by two zero bytes: rows of attributes start at multiples of 4.
+    U16,
+    /// Floats, exact up to 2^24.
+    F32,
+}
+
+impl AtomType {
+    /// The type that holds atom indices up to `max`.
+    pub(super) fn for_largest(max: u32) -> Result<Self, FormatError> {
+        if u16::try_from(max).is_ok() {
+            Ok(Self::U16)
+        } else if max <= MAX_EXACT_F32 {
+            Ok(Self::F32)
+        } else {
+            Err(FormatError::AtomIndexTooLarge { atom: max, limit: MAX_EXACT_F32 })
+        }
+    }
+}
+
+/// A range of the buffer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Span {
+    /// First byte; a multiple of 4.
+    pub(super) offset: u64,
+    /// Bytes.
+    pub(super) len: u64,
+}
+
+/// The buffer: attributes, four bytes or a multiple of them per vertex, then indices, which need not end at a
+/// multiple of four and therefore come last.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Layout {
+    pub(super) n_vertices: u64,
+    pub(super) n_triangles: u64,
+    pub(super) positions: Span,
+    pub(super) normals: Span,
+    pub(super) colors: Option<Span>,
+    pub(super) atoms: Option<(AtomType, Span)>,
+    pub(super) indices: (IndexType, Span),
+    /// Bytes of the whole buffer.
+    pub(super) len: u64,
+}
+
+impl Layout {
+    /// The layout of `mesh`; `None` if there is nothing to draw, as glTF knows no empty accessors.
+    pub(super) fn of(mesh: &Mesh, summary: &Summary) -> Result<Option<Self>, FormatError> {
+        let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
+        if n_triangles == 0 {
+            return Ok(None);
+        }
+        let atoms = summary.max_atom.map(AtomType::for_largest).transpose()?;
+        Self::new(n_vertices, n_triangles, mesh.colors.is_some(), atoms).map(Some)
+    }
+
+    fn new(n_vertices: u64, n_triangles: u64, colors: bool, atoms: Option<AtomType>) -> Result<Self, FormatError> {
+        let index_type = IndexType::for_vertices(n_vertices).ok_or(FormatError::TooMany {
+            format: "glTF",
+            what: "vertices",
+            count: n_vertices,
+            limit: u64::from(u32::MAX),
+        })?;
+        let mut end = 0;
+        let mut span = |len: u64| {
+            let offset = end;
+            end += len;
+            Span { offset, len }
+        };
+        let positions = span(12 * n_vertices);
+        let normals = span(12 * n_vertices);
+        let colors = colors.then(|| span(4 * n_vertices));
+        let atoms = atoms.map(|atom_type| (atom_type, span(4 * n_vertices)));
+        let indices = (index_type, span(3 * n_triangles * index_type.bytes()));
+        Ok(Self { n_vertices, n_triangles, positions, normals, colors, atoms, indices, len: end })
+    }
+
+    /// A layout by counts alone, for meshes that tests cannot hold in memory.
+    #[cfg(test)]
+    pub(super) fn plain(n_vertices: u64, n_triangles: u64) -> Result<Self, FormatError> {
+        Self::new(n_vertices, n_triangles, false, None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_restart_value_is_never_an_index() {
+        let cases = [
+            (3, Some(IndexType::U8)),
+            (255, Some(IndexType::U8)),
+            (256, Some(IndexType::U16)),
+            (65_535, Some(IndexType::U16)),
+            (65_536, Some(IndexType::U32)),
+            (u64::from(u32::MAX), Some(IndexType::U32)),
+            (u64::from(u32::MAX) + 1, None),
+        ];
+        for (n_vertices, expected) in cases {
+            assert_eq!(IndexType::for_vertices(n_vertices), expected, "{n_vertices}");
+            if let Some(index_type) = expected {
+                assert!(n_vertices - 1 < (1 << (8 * index_type.bytes())) - 1, "{n_vertices}");
+            }
+        }
+        assert!(matches!(Layout::plain(1 << 32, 1), Err(FormatError::TooMany { count: 0x1_0000_0000, .. })));
+    }
+
+    #[test]
+    fn atom_indices_are_exact_or_refused() {
+        assert_eq!(AtomType::for_largest(0), Ok(AtomType::U16));
+        assert_eq!(AtomType::for_largest(65_535), Ok(AtomType::U16));
+        assert_eq!(AtomType::for_largest(65_536), Ok(AtomType::F32));
+        assert_eq!(AtomType::for_largest(16_777_216), Ok(AtomType::F32));
+        assert_eq!(
+            AtomType::for_largest(16_777_217),
+            Err(FormatError::AtomIndexTooLarge { atom: 16_777_217, limit: 16_777_216 })
+        );
+    }
+
+    #[test]
+    fn spans_are_aligned_and_follow_each_other() {
+        let layout = Layout::new(5, 3, true, Some(AtomType::U16)).unwrap();
+        let spans =
+            [layout.positions, layout.normals, layout.colors.unwrap(), layout.atoms.unwrap().1, layout.indices.1];
+        let mut end = 0;
+        for span in spans {
+            assert_eq!((span.offset, span.offset % 4), (end, 0));
+            end += span.len;
+        }
+        assert_eq!((end, layout.len), (60 + 60 + 20 + 20 + 9, 169));
+    }
+}

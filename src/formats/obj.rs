@@ -1,0 +1,230 @@
+//! Wavefront OBJ: text, one line per vertex, normal and triangle; indices count from 1.
+//!
+//! Coordinates have four decimals (1e-4 Å, a thousandth of a bond and a tenth of what structure files hold), so
+//! vertices closer than that may get the same coordinates; they stay different vertices, and the surface closed.
+
+use std::io::{self, Write};
+
+use super::block::{BLOCK_BYTES, absolute};
+use super::check::Summary;
+use super::error::FormatError;
+use super::{Meta, text};
+use crate::surface::Mesh;
+
+/// Decimals, and ten to their power.
+const DECIMALS: usize = 4;
+const SCALE: f64 = 1e4;
+
+/// Coordinates beyond this are refused: a metre would still fit.
+const MAX_COORDINATE: f64 = 1e9;
+
+/// Room for the longest line: `f` and three times `4294967296//4294967296` are 71 bytes, `v` and three
+/// coordinates of 16 characters 53.
+const LINE_BYTES: usize = 80;
+
+/// An OBJ file that is laid out.
+#[derive(Debug)]
+pub(super) struct ObjPlan {
+    header: String,
+    len_bound: u64,
+}
+
+impl ObjPlan {
+    pub(super) fn new(mesh: &Mesh, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
+        let mut extreme = 0.0_f64;
+        for row in summary.bounds {
+            for (relative, centre) in row.into_iter().zip(mesh.centre) {
+                let value = centre + f64::from(relative);
+                if value.abs() > MAX_COORDINATE {
+                    return Err(FormatError::CoordinateTooLarge { value, limit: MAX_COORDINATE });
+                }
+                extreme = extreme.max(value.abs());
+            }
+        }
+        let header = header(mesh, meta);
+        let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
+        // Rounding up can add a digit, hence the one.
+        let number = |largest: f64| format!("-{:.*}", DECIMALS, largest + 1.0).len() as u64;
+        let vertex = "v   \n".len() as u64 + 3 * number(extreme);
+        let normal = "vn   \n".len() as u64 + 3 * number(1.0);
+        let face = "f //  //  //\n".len() as u64 + 6 * n_vertices.to_string().len() as u64;
+        Ok(Self { len_bound: header.len() as u64 + (vertex + normal) * n_vertices + face * n_triangles, header })
+    }
+
+    pub(super) fn len_bound(&self) -> u64 {
+        self.len_bound
+    }
+
+    pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
+        out.write_all(self.header.as_bytes())?;
+        let mut lines = Lines::new(out, self.len_bound);
+        for &position in &mesh.positions[..] {
+            lines.push(|line| line.vector(b"v", absolute(mesh, position)))?;
+        }
+        for &normal in &mesh.normals[..] {
+            lines.push(|line| line.vector(b"vn", normal))?;
+        }
+        for &triangle in &mesh.triangles[..] {
+            lines.push(|line| line.face(triangle))?;
+        }
+        lines.finish()
+    }
+}
+
+fn header(mesh: &Mesh, meta: &Meta) -> String {
+    let facts = text::facts(mesh, meta, Some("0.0001"));
+    let mut header: String = facts.into_iter().flat_map(|fact| ["# ".to_owned(), fact, "\n".to_owned()]).collect();
+    header += "o ";
+    header += &text::word(meta);
+    header += "\n";
+    header
+}
+
+/// Lines gathered into blocks, each written with one call.
+struct Lines<'a> {
+    out: &'a mut dyn Write,
+    block: Vec<u8>,
+    used: usize,
+}
+
+impl<'a> Lines<'a> {
+    fn new(out: &'a mut dyn Write, len_bound: u64) -> Self {
+        // A small mesh needs a small block; the line that is being made always has room.
+        let small = usize::try_from(len_bound).unwrap_or(usize::MAX).saturating_add(LINE_BYTES);
+        Self { out, block: vec![0; small.min(BLOCK_BYTES)], used: 0 }
+    }
+
+    fn push(&mut self, make: impl FnOnce(&mut Line<'_>)) -> io::Result<()> {
+        if self.used + LINE_BYTES > self.block.len() {
+            self.flush()?;
+        }
+        let mut line = Line { bytes: &mut self.block[self.used..self.used + LINE_BYTES], used: 0 };
+        make(&mut line);
+        self.used += line.used;
+        Ok(())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.out.write_all(&self.block[..self.used])?;
+        self.used = 0;
+        Ok(())
+    }
+
+    fn finish(mut self) -> io::Result<()> {
+        self.flush()
+    }
+}
+
+/// One line in the making.
+struct Line<'a> {
+    bytes: &'a mut [u8],
+    used: usize,
+}
+
+impl Line<'_> {
+    fn put(&mut self, text: &[u8]) {
+        self.bytes[self.used..self.used + text.len()].copy_from_slice(text);
+        self.used += text.len();
+    }
+
+    fn vector(&mut self, keyword: &[u8], row: [f32; 3]) {
+        self.put(keyword);
+        for value in row {
+            self.put(b" ");
+            self.fixed(value);
+        }
+        self.put(b"\n");
+    }
+
+    fn face(&mut self, triangle: [u32; 3]) {
+        self.put(b"f");
+        let mut digits = itoa::Buffer::new();
+        for index in triangle {
+            let number = digits.format(u64::from(index) + 1).as_bytes();
+            self.put(b" ");
+            self.put(number);
+            self.put(b"//");
+            self.put(number);
+        }
+        self.put(b"\n");
+    }
+
+    /// A number with [`DECIMALS`] decimals, halves away from zero, without a negative zero.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "at most 1e13 by MAX_COORDINATE; the fraction is cut on purpose"
+    )]
+    fn fixed(&mut self, value: f32) {
+        let scaled = f64::from(value) * SCALE;
+        let rounded = (scaled + 0.5_f64.copysign(scaled)) as i64;
+        if rounded < 0 {
+            self.put(b"-");
+        }
+        let (whole, fraction) = (rounded.unsigned_abs() / 10_000, rounded.unsigned_abs() % 10_000);
+        self.put(itoa::Buffer::new().format(whole).as_bytes());
+        let digit = |power: u64| b'0' + (fraction / power % 10) as u8;
+        self.put(&[b'.', digit(1000), digit(100), digit(10), digit(1)]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fixed(value: f32) -> String {
+        let mut bytes = [0; LINE_BYTES];
+        let mut line = Line { bytes: &mut bytes, used: 0 };
+        line.fixed(value);
+        let used = line.used;
+        String::from_utf8(bytes[..used].to_vec()).unwrap()
+    }
+
+    #[test]
+    fn numbers_have_four_decimals_and_no_negative_zero() {
+        let cases = [
+            (0.0, "0.0000"),
+            (-0.0, "0.0000"),
+            (-0.000_01, "0.0000"),
+            (-0.000_06, "-0.0001"),
+            (0.000_25, "0.0003"),
+            (-123.456_78, "-123.4568"),
+            (9.999_96, "10.0000"),
+            (1e9, "1000000000.0000"),
+        ];
+        for (value, text) in cases {
+            assert_eq!(fixed(value), text, "{value}");
+        }
+    }
+
+    #[test]
+    fn numbers_agree_with_the_standard_library() {
+        let mut bits = 12_345_u32;
+        for _ in 0..20_000 {
+            bits = bits.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            let value = f32::from(bits.to_be_bytes()[0]) - 128.0 + f32::from_bits(0x3f80_0000 | (bits & 0x7f_ffff));
+            let difference = fixed(value).parse::<f64>().unwrap() - format!("{value:.4}").parse::<f64>().unwrap();
+            // The standard library rounds exact ties to even, we away from zero.
+            assert!(difference.abs() < 1.000_1e-4, "{value}");
+            assert!((fixed(value).parse::<f64>().unwrap() - f64::from(value)).abs() <= 0.500_01e-4, "{value}");
+        }
+    }
+
+    #[test]
+    fn the_longest_lines_have_room() {
+        let mut bytes = [0; LINE_BYTES];
+        let mut line = Line { bytes: &mut bytes, used: 0 };
+        line.face([u32::MAX; 3]);
+        assert_eq!(&line.bytes[..line.used], format!("f{}\n", " 4294967296//4294967296".repeat(3)).as_bytes());
+        line.used = 0;
+        line.vector(b"vn", [-1e9; 3]);
+        assert_eq!(line.used, "vn".len() + 3 * " -1000000000.0000".len() + 1);
+    }
+
+    #[test]
+    fn coordinates_without_room_are_refused() {
+        let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]], ..Mesh::default() };
+        let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: None, translucent: false };
+        let refusal = ObjPlan::new(&mesh, &summary, &Meta::default()).unwrap_err();
+        assert_eq!(refusal, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });
+    }
+}

@@ -1,0 +1,227 @@
+//! Small readers of the five formats, written from their specifications and strict: they panic on anything that
+//! the product has no reason to write.
+
+#![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "indices that were integers before")]
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use serde_json::Value;
+
+/// What a file holds. Positions are as they stand in the file: relative to `translation` in glTF.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Contents {
+    pub translation: [f64; 3],
+    pub positions: Vec<[f32; 3]>,
+    pub normals: Vec<[f32; 3]>,
+    pub triangles: Vec<[u32; 3]>,
+    pub atoms: Option<Vec<u32>>,
+    /// As in the file: linear light in glTF, sRGB in PLY.
+    pub colors: Option<Vec<[u8; 4]>>,
+}
+
+/// The two chunks of a GLB.
+pub struct Glb {
+    pub json: Value,
+    /// Where the buffer begins in the file; its end if there is none.
+    pub bin_at: usize,
+    pub bin: Vec<u8>,
+}
+
+pub fn u32_at(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
+}
+
+fn f32x3(bytes: &[u8]) -> [f32; 3] {
+    std::array::from_fn(|k| f32::from_bits(u32_at(bytes, 4 * k)))
+}
+
+pub fn split_glb(bytes: &[u8]) -> Glb {
+    assert_eq!((&bytes[..4], u32_at(bytes, 4)), (&b"glTF"[..], 2));
+    assert_eq!(u32_at(bytes, 8) as usize, bytes.len());
+    let json_len = u32_at(bytes, 12) as usize;
+    assert_eq!((json_len % 4, &bytes[16..20]), (0, &b"JSON"[..]));
+    let json: Value = serde_json::from_slice(&bytes[20..20 + json_len]).unwrap();
+    let rest = 20 + json_len;
+    if rest == bytes.len() {
+        return Glb { json, bin_at: rest, bin: Vec::new() };
+    }
+    let bin_len = u32_at(bytes, rest) as usize;
+    assert_eq!((bin_len % 4, &bytes[rest + 4..rest + 8]), (0, &b"BIN\0"[..]));
+    assert_eq!(rest + 8 + bin_len, bytes.len());
+    let bin = bytes[rest + 8..].to_vec();
+    let used = usize::try_from(json["buffers"][0]["byteLength"].as_u64().unwrap()).unwrap();
+    assert!(bin_len - used < 4 && bin[used..].iter().all(|&b| b == 0), "padding");
+    Glb { json, bin_at: rest + 8, bin }
+}
+
+pub fn split_gltf(bytes: &[u8]) -> (Value, Vec<u8>) {
+    let json: Value = serde_json::from_slice(bytes).unwrap();
+    let Some(uri) = json["buffers"][0]["uri"].as_str() else { return (json, Vec::new()) };
+    let bin = STANDARD.decode(uri.strip_prefix("data:application/octet-stream;base64,").unwrap()).unwrap();
+    assert_eq!(json["buffers"][0]["byteLength"].as_u64().unwrap(), bin.len() as u64);
+    (json, bin)
+}
+
+/// The one mesh of a glTF document and its buffer.
+pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
+    let node = &json["nodes"][0];
+    let translation = std::array::from_fn(|k| node["translation"][k].as_f64().unwrap());
+    let mut contents = Contents { translation, ..Contents::default() };
+    if json.get("meshes").is_none() {
+        assert!(node.get("mesh").is_none() && json.get("buffers").is_none() && json.get("accessors").is_none());
+        return contents;
+    }
+    let primitive = &json["meshes"][0]["primitives"][0];
+    let attributes = &primitive["attributes"];
+    let rows = |accessor: &Value, component: u64, shape: &str, bytes: usize| {
+        rows(json, bin, accessor, component, shape, bytes)
+    };
+    contents.positions = rows(&attributes["POSITION"], 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
+    contents.normals = rows(&attributes["NORMAL"], 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
+    if let Some(accessor) = attributes.get("COLOR_0") {
+        assert_eq!(accessor_of(json, accessor)["normalized"], true);
+        contents.colors = Some(rows(accessor, 5121, "VEC4", 4).iter().map(|r| (*r).try_into().unwrap()).collect());
+    }
+    if let Some(accessor) = attributes.get("_ATOM") {
+        contents.atoms = Some(match accessor_of(json, accessor)["componentType"].as_u64().unwrap() {
+            5123 => rows(accessor, 5123, "SCALAR", 2)
+                .iter()
+                .map(|r| u32::from(u16::from_le_bytes((*r).try_into().unwrap())))
+                .collect(),
+            _ => rows(accessor, 5126, "SCALAR", 4).iter().map(|r| f32::from_bits(u32_at(r, 0)) as u32).collect(),
+        });
+    }
+    let indices: Vec<u32> = match accessor_of(json, &primitive["indices"])["componentType"].as_u64().unwrap() {
+        5121 => rows(&primitive["indices"], 5121, "SCALAR", 1).iter().map(|r| u32::from(r[0])).collect(),
+        5123 => rows(&primitive["indices"], 5123, "SCALAR", 2)
+            .iter()
+            .map(|r| u32::from(u16::from_le_bytes([r[0], r[1]])))
+            .collect(),
+        _ => rows(&primitive["indices"], 5125, "SCALAR", 4).iter().map(|r| u32_at(r, 0)).collect(),
+    };
+    contents.triangles = indices.as_chunks::<3>().0.to_vec();
+    contents
+}
+
+pub fn accessor_of<'a>(json: &'a Value, index: &Value) -> &'a Value {
+    &json["accessors"][usize::try_from(index.as_u64().unwrap()).unwrap()]
+}
+
+/// Where an accessor begins in the buffer.
+pub fn accessor_offset(json: &Value, index: &Value) -> usize {
+    let view = &json["bufferViews"][usize::try_from(accessor_of(json, index)["bufferView"].as_u64().unwrap()).unwrap()];
+    usize::try_from(view["byteOffset"].as_u64().unwrap_or(0)).unwrap()
+}
+
+fn rows<'a>(json: &Value, bin: &'a [u8], index: &Value, component: u64, shape: &str, bytes: usize) -> Vec<&'a [u8]> {
+    let accessor = accessor_of(json, index);
+    assert_eq!((accessor["componentType"].as_u64(), accessor["type"].as_str()), (Some(component), Some(shape)));
+    let view = &json["bufferViews"][usize::try_from(accessor["bufferView"].as_u64().unwrap()).unwrap()];
+    let number = |value: &Value, default: u64| usize::try_from(value.as_u64().unwrap_or(default)).unwrap();
+    let (offset, len) = (number(&view["byteOffset"], 0), number(&view["byteLength"], 0));
+    let stride = number(&view["byteStride"], bytes as u64);
+    let count = number(&accessor["count"], 0);
+    assert_eq!((offset % 4, len), (0, stride * count));
+    // 34962 and 34963 are OpenGL's vertex and index buffers; only vertices must keep to multiples of four.
+    let target = view["target"].as_u64().unwrap();
+    assert!((target == 34962 && stride.is_multiple_of(4)) || (target == 34963 && stride == bytes));
+    let rows: Vec<&[u8]> = bin[offset..offset + len].chunks(stride).collect();
+    assert!(rows.iter().all(|r| r[bytes..].iter().all(|&b| b == 0)), "padding between rows");
+    rows.into_iter().map(|r| &r[..bytes]).collect()
+}
+
+/// The header lines of a PLY and where its data begins.
+pub fn ply_header(bytes: &[u8]) -> (Vec<String>, usize) {
+    let end = b"end_header\n";
+    let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
+    assert!(bytes[..at].is_ascii());
+    (String::from_utf8(bytes[..at].to_vec()).unwrap().lines().map(str::to_owned).collect(), at)
+}
+
+pub fn read_ply(bytes: &[u8]) -> Contents {
+    let (header, mut at) = ply_header(bytes);
+    assert_eq!(header[..2], ["ply", "format binary_little_endian 1.0"]);
+    let count = |what: &str| -> usize {
+        let prefix = format!("element {what} ");
+        header.iter().find_map(|l| l.strip_prefix(&prefix)).unwrap().parse().unwrap()
+    };
+    let has = |line: &str| header.iter().any(|l| l == line);
+    let lines: Vec<&str> = header[2..].iter().map(String::as_str).filter(|l| !l.starts_with("comment ")).collect();
+    let (n, m) = (count("vertex"), count("face"));
+    let (colors, atoms) = (has("property uchar alpha"), has("property uint atom"));
+    let mut expected = vec![format!("element vertex {n}")];
+    expected.extend(["x", "y", "z", "nx", "ny", "nz"].map(|p| format!("property float {p}")));
+    expected.extend(["red", "green", "blue", "alpha"].iter().filter(|_| colors).map(|p| format!("property uchar {p}")));
+    expected.extend(atoms.then(|| "property uint atom".to_owned()));
+    expected.extend([
+        format!("element face {m}"),
+        "property list uchar uint vertex_indices".into(),
+        "end_header".into(),
+    ]);
+    assert_eq!(lines, expected);
+    let mut contents = Contents { colors: colors.then(Vec::new), atoms: atoms.then(Vec::new), ..Contents::default() };
+    let mut take = |n: usize| {
+        at += n;
+        &bytes[at - n..at]
+    };
+    for _ in 0..n {
+        contents.positions.push(f32x3(take(12)));
+        contents.normals.push(f32x3(take(12)));
+        if let Some(colors) = &mut contents.colors {
+            colors.push(take(4).try_into().unwrap());
+        }
+        if let Some(atoms) = &mut contents.atoms {
+            atoms.push(u32_at(take(4), 0));
+        }
+    }
+    for _ in 0..m {
+        let face = take(13);
+        assert_eq!(face[0], 3);
+        contents.triangles.push(std::array::from_fn(|k| u32_at(face, 1 + 4 * k)));
+    }
+    assert_eq!(at, bytes.len());
+    contents
+}
+
+/// Face normals and corners of an STL.
+pub fn read_stl(bytes: &[u8]) -> Vec<[[f32; 3]; 4]> {
+    assert!(!bytes.starts_with(b"solid"));
+    let (records, rest) = bytes[84..].as_chunks::<50>();
+    assert_eq!((u32_at(bytes, 80) as usize, rest.len()), (records.len(), 0));
+    records
+        .iter()
+        .map(|r| {
+            assert_eq!(r[48..], [0, 0]);
+            std::array::from_fn(|k| f32x3(&r[12 * k..]))
+        })
+        .collect()
+}
+
+pub fn read_obj(bytes: &[u8]) -> Contents {
+    let mut contents = Contents::default();
+    for line in std::str::from_utf8(bytes).unwrap().lines() {
+        let (keyword, rest) = line.split_once(' ').unwrap();
+        let floats = || -> [f32; 3] {
+            let all: Vec<f32> = rest.split(' ').map(|w| w.parse().unwrap()).collect();
+            all.try_into().unwrap()
+        };
+        match keyword {
+            "v" => contents.positions.push(floats()),
+            "vn" => contents.normals.push(floats()),
+            "f" => {
+                let corners: Vec<u32> = rest
+                    .split(' ')
+                    .map(|word| {
+                        let (vertex, normal) = word.split_once("//").unwrap();
+                        assert_eq!(vertex, normal);
+                        vertex.parse::<u32>().unwrap() - 1
+                    })
+                    .collect();
+                contents.triangles.push(corners.try_into().unwrap());
+            }
+            "#" | "o" => assert!(contents.positions.is_empty()),
+            other => panic!("{other} in {line}"),
+        }
+    }
+    contents
+}
