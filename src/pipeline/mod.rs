@@ -13,7 +13,7 @@ pub use report::Report;
 use crate::formats::Meta;
 use crate::structure::{self, ReadLimits, Selection, StructureError};
 use crate::surface::{
-    Backend, CancelToken, Control, Measures, Mesh, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, CancelToken, Control, Measures, Mesh, Proof, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 /// Everything that decides what a mesh looks like.
@@ -23,6 +23,8 @@ pub struct Job {
     pub selection: Selection,
     /// Which surface.
     pub params: SurfaceParams,
+    /// How the mesh is proven closed and manifold.
+    pub proof: Proof,
 }
 
 /// Limits of one job.
@@ -95,7 +97,7 @@ pub fn run(
         // The core speaks of spheres; people ask for atoms of the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
     }
-    let measures = clock.time(Stage::Measure.name(), || Measures::of(&meshed.mesh, &control))?;
+    let measures = clock.time(Stage::Measure.name(), || Measures::of(&meshed.mesh, job.proof, &control))?;
     let report = Report::new(&structure, &selected, job, choice, &meshed, &measures, clock.finish());
     Ok(Product { mesh: meshed.mesh, report })
 }

@@ -66,6 +66,8 @@ pub struct Report {
     pub oriented: bool,
     /// Manifold edges and vertices.
     pub manifold: bool,
+    /// How the last three were established: `checksum` or `exact`.
+    pub proof: &'static str,
     /// V − E + F.
     pub euler: i64,
     /// Number of connected components.
@@ -123,6 +125,7 @@ impl Report {
             closed: measures.closed,
             oriented: measures.oriented,
             manifold: measures.manifold,
+            proof: measures.proof.name(),
             euler: measures.euler,
             components: measures.components.len() as u64,
             cavities: measures.components.iter().filter(|c| c.volume < 0.0).count() as u64,

@@ -16,12 +16,13 @@ pub mod measure;
 pub mod mesh;
 pub mod params;
 pub mod spheres;
+pub mod topology;
 
 pub use backend::{Backend, GridStats, Meshed};
 pub use column::Column;
 pub use control::{CancelToken, Control, Observer, Stage};
 pub use error::SurfaceError;
-pub use measure::{Component, Measures};
+pub use measure::{Component, Measures, Proof};
 pub use mesh::Mesh;
 pub use params::{Kernel, PaperParams, Preset, SurfaceLimits, SurfaceOptions, SurfaceParams};
 pub use spheres::Spheres;
