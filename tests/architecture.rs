@@ -391,7 +391,9 @@ fn unfinished(sources: &[Source]) -> Vec<String> {
     let mut found = Vec::new();
     for source in sources {
         for (line, text) in code(&source.text).lines().enumerate() {
-            for mark in MARKS.iter().filter(|mark| text.contains(**mark)) {
+            // A switch with a reason is let through: the lints ask for the reason.
+            let reasoned = text.contains("reason =");
+            for mark in MARKS.iter().filter(|mark| text.contains(**mark) && !(mark.contains("allow") && reasoned)) {
                 found.push(format!("{}:{}: {mark}", source.path, line + 1));
             }
         }

@@ -146,6 +146,7 @@ pub(crate) struct SurfaceArgs {
 }
 
 /// Which atoms.
+#[expect(clippy::struct_excessive_bools, reason = "flags are what a command line has")]
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
 pub(crate) struct SelectionArgs {
@@ -176,6 +177,7 @@ pub(crate) struct SelectionArgs {
 }
 
 /// What is too much.
+#[expect(clippy::struct_field_names, reason = "the fields are named like their flags")]
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Limits")]
 pub(crate) struct LimitArgs {
@@ -211,7 +213,7 @@ pub(crate) struct ServeArgs {
     /// Configuration file (TOML)
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
-    /// Set one value of the configuration, such as limits.max_atoms=100000; may be repeated
+    /// Set one value of the configuration, such as `limits.max_atoms=100000`; may be repeated
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     pub(crate) set: Vec<String>,
     /// What runs the meshing

@@ -32,10 +32,8 @@ pub(crate) fn pick(asked: BackendName, threads: Option<usize>) -> Result<Picked,
         return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
     }
     Ok(match asked {
-        BackendName::Auto => {
-            Picked { backend: Box::new(CpuBackend::new(threads)), reason: format!("auto: no GPU, as {}", no_gpu()) }
-        }
-        BackendName::Cpu => Picked { backend: Box::new(CpuBackend::new(threads)), reason: "asked for".to_owned() },
+        BackendName::Auto => Picked { backend: cpu(threads)?, reason: format!("auto: no GPU, as {}", no_gpu()) },
+        BackendName::Cpu => Picked { backend: cpu(threads)?, reason: "asked for".to_owned() },
         BackendName::Reference => Picked { backend: Box::new(ReferenceBackend), reason: "asked for".to_owned() },
         BackendName::Gpu => return Err(CliError::NoBackend { asked: "gpu", why: no_gpu().to_owned() }),
         BackendName::Paper => return Err(CliError::NoBackend { asked: "paper", why: no_paper() }),
@@ -45,11 +43,16 @@ pub(crate) fn pick(asked: BackendName, threads: Option<usize>) -> Result<Picked,
 /// Every backend and its state.
 pub(crate) fn survey() -> Vec<Candidate> {
     vec![
-        Candidate { name: "cpu", state: Ok(CpuBackend::new(None).describe()) },
+        Candidate { name: "cpu", state: CpuBackend::new(None).map(|cpu| cpu.describe()) },
         Candidate { name: "reference", state: Ok(ReferenceBackend.describe()) },
         Candidate { name: "gpu", state: Err(no_gpu().to_owned()) },
         Candidate { name: "paper", state: Err(no_paper()) },
     ]
+}
+
+fn cpu(threads: Option<usize>) -> Result<Box<dyn Backend>, CliError> {
+    let backend = CpuBackend::new(threads).map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
+    Ok(Box::new(backend))
 }
 
 /// Why no GPU can be used.

@@ -1,13 +1,12 @@
 //! `molmesh doctor`: what this machine has, what of it is used, and why the rest is not.
 
-use std::fmt::Write;
-
 use molmesh::pipeline::JobLimits;
 use molmesh::structure::radii;
 
 use super::args::BackendName;
 use super::backend;
 use super::error::CliError;
+use super::page::Page;
 use super::style::Style;
 
 /// Runs the command.
@@ -16,11 +15,8 @@ pub(super) fn run() -> Result<(), CliError> {
 }
 
 fn text(style: Style) -> Result<String, CliError> {
-    let mut out = format!("{} {}\n", style.bold("molmesh"), env!("CARGO_PKG_VERSION"));
-    let mut line = |label: &str, value: &str| {
-        // Writing to a string cannot fail.
-        drop(writeln!(out, "  {} {value}", style.dim(&format!("{label:<10}"))));
-    };
+    let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
+    let mut line = |label: &str, value: &str| page.row(label, value);
     line("system", &format!("{} {}", std::env::consts::OS, std::env::consts::ARCH));
     let cores = std::thread::available_parallelism().map_or_else(|e| format!("unknown ({e})"), |n| n.to_string());
     line("cores", &format!("{cores} for this process"));
@@ -38,7 +34,7 @@ fn text(style: Style) -> Result<String, CliError> {
     line("limits", &format!("{} atoms, {} bytes inflated", read.max_atoms, read.max_inflated_bytes));
     line("", &format!("{} samples, {} bytes of mesh", surface.max_samples, surface.max_mesh_bytes));
     line("radii", radii::TABLE);
-    Ok(out)
+    Ok(page.finish())
 }
 
 /// The extensions that the inner loops care about, by the name that compilers give them.

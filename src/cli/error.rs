@@ -2,6 +2,7 @@
 
 use std::io::{self, Write};
 
+use molmesh::formats::FormatError;
 use molmesh::pipeline::JobError;
 use molmesh::structure::StructureError;
 use molmesh::surface::SurfaceError;
@@ -79,9 +80,9 @@ pub(crate) enum CliError {
         /// Why.
         source: JobError,
     },
-    /// A parameter is out of range.
+    /// The format cannot hold the mesh, or the mesh is broken.
     #[error(transparent)]
-    Parameter(#[from] SurfaceError),
+    Format(#[from] FormatError),
     /// The backend that was asked for is not there.
     #[error("no backend `{asked}` on this machine: {why}")]
     NoBackend {
@@ -131,11 +132,12 @@ impl CliError {
     /// The exit code.
     pub(crate) fn code(&self) -> i32 {
         match self {
-            Self::Usage { .. } | Self::Parameter(_) => code::USAGE,
+            Self::Usage { .. } => code::USAGE,
             Self::Input { .. } => code::INPUT,
             Self::InputTooLarge { .. } => code::LIMIT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
+            Self::Format(error) => format_code(error),
             Self::NoBackend { .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
             Self::Interrupted => code::INTERRUPTED,
@@ -164,10 +166,8 @@ impl CliError {
 
     /// Prints the error line and the hint line to stderr.
     pub(crate) fn print(&self, style: Style) {
-        let mut text = format!("{} {self}\n", style.red("molmesh:"));
-        if let Some(hint) = self.hint() {
-            text.push_str(&format!("{} {hint}\n", style.dim("   hint:")));
-        }
+        let hint = self.hint().map(|hint| format!("{} {hint}\n", style.dim("   hint:"))).unwrap_or_default();
+        let text = format!("{} {self}\n{hint}", style.red("molmesh:"));
         // Nobody is left to tell when stderr is closed; the exit code still speaks.
         drop(io::stderr().write_all(text.as_bytes()));
     }
@@ -190,6 +190,21 @@ fn surface_code(error: &SurfaceError) -> i32 {
     }
 }
 
+fn format_code(error: &FormatError) -> i32 {
+    match error {
+        FormatError::TooMany { .. }
+        | FormatError::GlbTooLarge { .. }
+        | FormatError::AtomIndexTooLarge { .. }
+        | FormatError::CoordinateTooLarge { .. } => code::LIMIT,
+        // A mesh that is broken is our defect, not the caller's.
+        FormatError::ColumnLength { .. }
+        | FormatError::IndexOutOfRange { .. }
+        | FormatError::NotFinite { .. }
+        | FormatError::NotUnit { .. }
+        | FormatError::Json { .. } => code::INTERNAL,
+    }
+}
+
 fn surface_hint(error: &SurfaceError) -> Option<String> {
     match error {
         SurfaceError::GridTooLarge { suggested_resolution, .. } => {
@@ -198,7 +213,7 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::MeshTooLarge { suggested_resolution, .. } => {
             Some(format!("try --resolution {suggested_resolution}, or raise --max-mesh-bytes"))
         }
-        SurfaceError::NoSurface { max_density, .. } => Some(format!("try an --isovalue below {max_density}")),
+        SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
         _ => None,
     }
 }
@@ -211,7 +226,7 @@ mod tests {
     fn every_kind_of_failure_has_its_code() {
         let job = |source: JobError| CliError::Job { name: "x".into(), source };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
-        let cases: [(CliError, i32); 11] = [
+        let cases: [(CliError, i32); 12] = [
             (CliError::Internal(String::new()), 1),
             (CliError::usage("x"), 2),
             (CliError::Input { name: "x".into(), source: missing() }, 3),
@@ -219,6 +234,7 @@ mod tests {
             (job(SurfaceError::NoSpheres.into()), 4),
             (job(StructureError::TooManyAtoms { limit: 1 }.into()), 5),
             (job(SurfaceError::MeshTooLarge { bytes: 2, limit: 1, suggested_resolution: 1.0 }.into()), 5),
+            (FormatError::GlbTooLarge { bytes: 2, limit: 1 }.into(), 5),
             (CliError::NoBackend { asked: "gpu", why: String::new() }, 6),
             (CliError::Output { name: "x".into(), source: missing() }, 7),
             (job(SurfaceError::Cancelled.into()), 130),

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::str::FromStr;
 use std::time::Instant;
 
-use molmesh::formats::{self, Format};
+use molmesh::formats::{Encoder, Format};
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, ProgressSink, Report};
 use molmesh::surface::{CancelToken, SurfaceError};
 use serde_json::{Value, json};
@@ -22,8 +22,8 @@ use super::{interrupt, request};
 
 /// Runs the command. The order is that of cost: flags, backend, output, input, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
-    let format = format(args)?;
-    let job = request::job(args)?;
+    let (job, asked) = request::parse(args)?;
+    let format = asked.map_or_else(|| format(&args.output), Ok)?;
     let limits = request::limits(&args.limits);
     let picked = backend::pick(args.backend, args.threads)?;
     let cancel = CancelToken::default();
@@ -53,21 +53,17 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     Ok(())
 }
 
-/// The output's format: what was asked for, else what its name ends with, else GLB on stdout.
-fn format(args: &MeshArgs) -> Result<Format, CliError> {
-    let unknown = |e: formats::UnknownFormat| CliError::usage(e.to_string());
-    if let Some(asked) = &args.format {
-        return Format::from_str(asked).map_err(unknown);
-    }
-    match args.output.extension() {
-        Some(extension) => Format::from_str(&extension.to_string_lossy()).map_err(|e| CliError::Usage {
-            message: format!("cannot tell the format from `{}`: {e}", args.output.display()),
-            hint: Some("name it with --format".to_owned()),
-        }),
-        None if is_stdio(&args.output) => Ok(Format::default()),
+/// The format that an output's name says: by its extension, GLB on stdout.
+fn format(output: &Path) -> Result<Format, CliError> {
+    let hint = || Some("name the format with --format".to_owned());
+    let name = output.display();
+    match output.extension() {
+        Some(extension) => Format::from_str(&extension.to_string_lossy())
+            .map_err(|e| CliError::Usage { message: format!("cannot tell the format of `{name}`: {e}"), hint: hint() }),
+        None if is_stdio(output) => Ok(Format::default()),
         None => Err(CliError::Usage {
-            message: format!("cannot tell the format from `{}`: it has no extension", args.output.display()),
-            hint: Some("name it with --format".to_owned()),
+            message: format!("cannot tell the format of `{name}`: it has no extension"),
+            hint: hint(),
         }),
     }
 }
@@ -123,7 +119,7 @@ fn mesh(
 fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<Report, CliError> {
     sink.progress("encode", 0.0);
     let start = Instant::now();
-    let written = formats::write(format, &product.mesh, &product.meta(), out);
+    let written = Encoder::new(format, &product.mesh, &product.meta())?.write(out);
     let encoding = start.elapsed().saturating_sub(out.writing);
     written.map_err(|source| out.failure(source))?;
     let mut report = product.report.clone();

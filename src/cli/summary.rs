@@ -1,9 +1,8 @@
 //! The report of a mesh on one screen, for people. Pure: a report in, text out.
 
-use std::fmt::Write;
-
 use molmesh::pipeline::Report;
 
+use super::page::Page;
 use super::style::Style;
 
 /// Cells of the longest bar.
@@ -21,60 +20,36 @@ pub(crate) struct Written<'a> {
 
 /// The summary.
 pub(crate) fn text(report: &Report, written: &Written<'_>, style: Style) -> String {
-    let mut out = String::with_capacity(2048);
-    headline(&mut out, report, style);
-    let mut line = |label: &str, value: String| push(&mut out, style, label, &value);
-    let (model, format) = (report.model, report.source_format);
-    line(
-        "atoms",
-        format!("{} of {} in the file ({format}, model {model})", grouped(report.atoms), grouped(report.atoms_in_file)),
-    );
-    line("surface", surface(report));
-    let dense = grouped(report.box_cells);
-    let (bricks, with_surface) = (grouped(report.bricks), grouped(report.surface_bricks));
-    line(
-        "grid",
-        format!(
-            "{bricks} bricks ({with_surface} with surface), {} samples; dense: {dense} cells",
-            grouped(report.samples)
-        ),
-    );
-    line("mesh", format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
-    line("proof", proof(report, style));
-    line("parts", parts(report));
-    line("area", format!("{} Å²", decimal(report.area)));
-    line("volume", format!("{} Å³", decimal(report.volume)));
-    line("backend", format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
-    line("wrote", format!("{} ({}, {} bytes)", written.name, written.format, grouped(written.bytes)));
-    timings(&mut out, report, style);
-    out
+    let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
+    let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
+    page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, model {})", report.source_format, report.model));
+    page.row("surface", &surface(report));
+    let [bricks, with_surface, samples, dense] =
+        [report.bricks, report.surface_bricks, report.samples, report.box_cells].map(grouped);
+    page.row("grid", &format!("{bricks} bricks ({with_surface} with surface), {samples} samples; box: {dense} cells"));
+    page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
+    page.row("proof", &proof(report, style));
+    page.row("parts", &parts(report));
+    page.row("area", &format!("{} Å²", decimal(report.area)));
+    page.row("volume", &format!("{} Å³", decimal(report.volume)));
+    page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
+    page.row("wrote", &format!("{} ({}, {} bytes)", written.name, written.format, grouped(written.bytes)));
+    timings(&mut page, report);
+    page.finish()
 }
 
-fn push(out: &mut String, style: Style, label: &str, value: &str) {
-    // Writing to a string cannot fail.
-    drop(writeln!(out, "  {} {value}", style.dim(&format!("{label:<9}"))));
-}
-
-fn headline(out: &mut String, report: &Report, style: Style) {
-    let id = report.id.as_deref().unwrap_or("structure");
-    out.push_str(&style.bold(id));
-    if let Some(title) = &report.title {
-        let short: String = title.chars().take(90).collect();
-        let more = if short.len() < title.len() { "…" } else { "" };
-        drop(write!(out, "  {short}{more}"));
-    }
-    out.push('\n');
+/// The structure's title, cut to one line.
+fn title(report: &Report) -> String {
+    let title = report.title.as_deref().unwrap_or_default();
+    let mut chars = title.chars();
+    let short: String = chars.by_ref().take(90).collect();
+    if chars.next().is_some() { format!("{short}…") } else { short }
 }
 
 fn surface(report: &Report) -> String {
-    let mut text = format!("{}, {} Å, isovalue {}", report.kernel, report.resolution, report.isovalue);
-    if let Some(smoothness) = report.smoothness {
-        drop(write!(text, ", smoothness {smoothness}"));
-    }
-    if report.preset != "default" {
-        drop(write!(text, " (preset {})", report.preset));
-    }
-    text
+    let smoothness = report.smoothness.map(|a| format!(", smoothness {a}")).unwrap_or_default();
+    let preset = Some(report.preset).filter(|p| *p != "default").map(|p| format!(" (preset {p})")).unwrap_or_default();
+    format!("{}, {} Å, isovalue {}{smoothness}{preset}", report.kernel, report.resolution, report.isovalue)
 }
 
 fn proof(report: &Report, style: Style) -> String {
@@ -98,15 +73,15 @@ fn parts(report: &Report) -> String {
 }
 
 /// A bar per stage, the longest stage the longest bar.
-fn timings(out: &mut String, report: &Report, style: Style) {
+fn timings(page: &mut Page, report: &Report) {
     let stages: Vec<(&str, f64)> =
         report.timings_ms.iter().filter_map(|(name, ms)| Some((name.as_str(), ms.as_f64()?))).collect();
     let total: f64 = stages.iter().map(|(_, ms)| ms).sum();
     let longest = stages.iter().map(|(_, ms)| *ms).fold(f64::MIN_POSITIVE, f64::max);
-    push(out, style, "time", &format!("{} ms", decimal(total)));
+    page.row("time", &format!("{} ms", decimal(total)));
     for (name, ms) in stages {
-        let bar = style.cyan(&bar(ms / longest));
-        drop(writeln!(out, "    {} {:>10} ms  {bar}", style.dim(&format!("{name:<12}")), decimal(ms)));
+        let (label, bar) = (page.style.dim(&format!("{name:<12}")), page.style.cyan(&bar(ms / longest)));
+        page.line(format!("    {label} {:>9} ms  {bar}", decimal(ms)));
     }
 }
 
@@ -207,7 +182,7 @@ mod tests {
     fn it_says_everything_on_one_screen() {
         let text = text(&report(), &Written { name: "a.glb", format: "glb", bytes: 720_000 }, Style::PLAIN);
         for part in [
-            "4PTI  TRYPSIN INHIBITOR",
+            "4PTI TRYPSIN INHIBITOR",
             "454 of 514",
             "300 bricks",
             "153,600 samples",
