@@ -61,7 +61,7 @@ impl Declared {
         match (self, failure) {
             (
                 Self::Foreign(essence) | Self::Structure(_, essence),
-                Failure::Job(JobError::Structure(StructureError::UnknownFormat { found })),
+                Failure::Job { error: JobError::Structure(StructureError::UnknownFormat { found }), .. },
             ) => contradiction(essence, &found),
             (_, failure) => failure.into(),
         }

@@ -7,7 +7,7 @@ use axum::http::header::{self, HeaderMap, HeaderName};
 use axum::http::HeaderValue;
 use axum::response::{IntoResponse, Response};
 
-use super::problem::Problem;
+use super::problem::{self, Problem};
 use super::state::App;
 use super::stream;
 use crate::formats::Format;
@@ -65,7 +65,11 @@ pub(super) fn report(finished: &Finished, received: Duration) -> Result<Response
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
     // Times differ from run to run, so no two reports are the same.
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
-    let body = serde_json::to_vec(report).map_err(Problem::internal)?;
+    let mut document = serde_json::to_value(report).map_err(Problem::internal)?;
+    if let (Some(diagnostics), Some(members)) = (&finished.diagnostics, document.as_object_mut()) {
+        members.insert("diagnostics".to_owned(), problem::findings(diagnostics));
+    }
+    let body = document.to_string();
     Ok((headers, body).into_response())
 }
 

@@ -54,7 +54,7 @@ pub(super) async fn create(
     let received = start.elapsed();
     let job = request.job.clone();
     let deadline = Instant::now() + app.config.jobs.deadline();
-    let ticket = app.pool.submit(Task { input: bytes, digest: None, job, deadline, lease: Some(lease) })?;
+    let ticket = app.pool.submit(Task { input: bytes, digest: None, strict: request.strict, job, deadline, lease: Some(lease) })?;
     let finished = ticket.wait().await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(finished.product.report.source_format)?;
     if request.report {

@@ -60,7 +60,8 @@ pub(super) async fn surface(
     }
     let job = request.job.clone();
     let deadline = Instant::now() + app.config.jobs.deadline();
-    let ticket = app.pool.submit(Task { input: bytes, digest: Some(digest), job, deadline, lease: Some(lease) })?;
+    let (digest, strict, lease) = (Some(digest), request.strict, Some(lease));
+    let ticket = app.pool.submit(Task { input: bytes, digest, strict, job, deadline, lease })?;
     let finished = ticket.wait().await?;
     if request.report {
         return delivery::report(&finished, received);

@@ -10,7 +10,7 @@ use axum::http::{HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use metrics::counter;
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 
 use super::kinds::Kind;
 use super::request_id::RequestId;
@@ -19,6 +19,7 @@ use crate::jobs::{Exhausted, Failure, Refusal};
 use crate::pipeline::JobError;
 use crate::pipeline::params::ParamError;
 use crate::structure::StructureError;
+use crate::structure::referee::Diagnostic;
 use crate::surface::SurfaceError;
 use crate::telemetry::REJECTED;
 
@@ -56,6 +57,11 @@ impl Problem {
     pub(super) fn retry_after(mut self, wait: std::time::Duration) -> Self {
         self.retry_after_s = Some(wait.as_secs_f64().ceil().clamp(1.0, 600.0) as u64);
         self
+    }
+
+    /// Adds what the referee found, if it found anything.
+    fn diagnosed(self, diagnostics: &[Diagnostic]) -> Self {
+        if diagnostics.is_empty() { self } else { self.with("diagnostics", findings(diagnostics)) }
     }
 
     /// The document.
@@ -119,6 +125,12 @@ fn of_library(status: StatusCode, path: &str) -> Problem {
     Problem::new(Kind::of_status(status), detail)
 }
 
+/// The referee's findings as JSON.
+pub(super) fn findings(diagnostics: &[Diagnostic]) -> Value {
+    let finding = |d: &Diagnostic| json!({ "level": d.level.name(), "line": d.line, "message": d.message });
+    diagnostics.iter().map(finding).collect()
+}
+
 impl From<ParamError> for Problem {
     fn from(error: ParamError) -> Self {
         let problem = Self::new(Kind::BadParameter, error.to_string());
@@ -159,8 +171,11 @@ impl From<Refusal> for Problem {
 impl From<Failure> for Problem {
     fn from(error: Failure) -> Self {
         match error {
-            Failure::Job(JobError::Structure(error)) => error.into(),
-            Failure::Job(JobError::Surface(error)) => error.into(),
+            Failure::Job { error: JobError::Structure(error), diagnostics } => Self::from(error).diagnosed(&diagnostics),
+            Failure::Job { error: JobError::Surface(error), .. } => error.into(),
+            Failure::Check { ref diagnostics } => {
+                Self::new(Kind::UnreadableStructure, error.to_string()).with("parameter", "check").diagnosed(diagnostics)
+            }
             Failure::Deadline { limit } => Self::new(Kind::Deadline, error.to_string())
                 .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX)),
             Failure::Memory(error) => error.into(),
@@ -217,10 +232,9 @@ impl From<SurfaceError> for Problem {
                 .with("limit", limit)
                 .with("actual", bytes)
                 .with("suggested_resolution", suggested_resolution),
-            E::NoSurface { isovalue, max_density } => Self::new(Kind::NoSurface, detail)
-                .with("parameter", "isovalue")
-                .with("isovalue", isovalue)
-                .with("max_density", max_density),
+            E::NoSurface { isovalue } => {
+                Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
+            }
             E::Cancelled => Self::from(Failure::Stopped),
         }
     }

@@ -53,12 +53,12 @@ fn write(
     let product = &finished.product;
     let resolution = product.report.resolution;
     let encoder = match Encoder::new(format, &product.mesh, &product.meta()) {
-        Ok(encoder) if encoder.len_bound() > limit => Err(problem::file_too_large(encoder.len_bound(), limit, resolution)),
+        Ok(encoder) if encoder.encoded_len_bound() > limit => Err(problem::file_too_large(encoder.encoded_len_bound(), limit, resolution)),
         Ok(encoder) => Ok(encoder),
         Err(error) => Err(problem::of_format(&error, resolution)),
     };
     let (length, encoder) = match encoder {
-        Ok(encoder) => (Ok(encoder.len()), Some(encoder)),
+        Ok(encoder) => (Ok(encoder.encoded_len()), Some(encoder)),
         Err(problem) => (Err(problem), None),
     };
     // Without a receiver the client is gone; the first piece would find out as well.
