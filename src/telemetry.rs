@@ -1,1 +1,134 @@
-//! Logs and metric names.
+//! Logs and metric names. The one place that installs global state: the log subscriber, the panic hook and the
+//! metrics recorder.
+//!
+//! Names follow Prometheus: prefix `molmesh_`, base units, `_total` on counters, no ids as labels. Durations are
+//! seconds.
+
+use std::sync::OnceLock;
+
+use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
+use thiserror::Error;
+use tracing_subscriber::EnvFilter;
+use tracing_subscriber::util::SubscriberInitExt as _;
+
+use crate::config::{LogConfig, LogFormat};
+
+/// Time of a request until its answer is sent, by method, route and status.
+pub const HTTP_DURATION: &str = "http_server_request_duration_seconds";
+/// Open connections.
+pub const CONNECTIONS: &str = "molmesh_connections";
+/// Jobs accepted, by mode.
+pub const JOBS_SUBMITTED: &str = "molmesh_jobs_submitted_total";
+/// Jobs ended, by outcome: `successful`, `failed`, `dismissed`, `panicked`.
+pub const JOBS_FINISHED: &str = "molmesh_jobs_finished_total";
+/// Time per stage.
+pub const STAGE_DURATION: &str = "molmesh_job_stage_duration_seconds";
+/// Jobs that wait.
+pub const QUEUE_DEPTH: &str = "molmesh_queue_depth";
+/// How long a job that is accepted now would wait.
+pub const QUEUE_WAIT: &str = "molmesh_queue_estimated_wait_seconds";
+/// Requests refused by a limit, by the limit's problem type.
+pub const REJECTED: &str = "molmesh_requests_rejected_total";
+/// Bytes of uploads and meshes held in memory.
+pub const MEMORY_HELD: &str = "molmesh_memory_held_bytes";
+/// Samples at which the density was evaluated.
+pub const VOXELS: &str = "molmesh_voxels_processed_total";
+/// Triangles of finished meshes.
+pub const TRIANGLES: &str = "molmesh_triangles_emitted_total";
+/// Panics that were caught, by place.
+pub const PANICS: &str = "molmesh_panics_total";
+/// 1, labelled with the version.
+pub const BUILD_INFO: &str = "molmesh_build_info";
+
+/// Buckets of durations, seconds: from a cached answer to the deadline, about three a decade.
+const BUCKETS: [f64; 16] =
+    [0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0];
+
+/// Why logs or metrics cannot be set up.
+#[derive(Debug, Error)]
+pub enum TelemetryError {
+    /// The log filter cannot be read.
+    #[error("log.filter `{filter}` is not valid: {reason}")]
+    Filter {
+        /// The filter.
+        filter: String,
+        /// The parser's words.
+        reason: String,
+    },
+    /// Another logger or recorder is installed in this process.
+    #[error("{what} cannot be installed: {reason}")]
+    Install {
+        /// `the log` or `the metrics recorder`.
+        what: &'static str,
+        /// The library's words.
+        reason: String,
+    },
+}
+
+/// Sends logs to standard error and panics to the log.
+///
+/// # Errors
+/// [`TelemetryError`].
+pub fn init_logs(config: &LogConfig) -> Result<(), TelemetryError> {
+    let filter = EnvFilter::try_new(&config.filter)
+        .map_err(|e| TelemetryError::Filter { filter: config.filter.clone(), reason: e.to_string() })?;
+    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    let installed = match config.format {
+        LogFormat::Pretty => builder.with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr())).finish().try_init(),
+        LogFormat::Json => builder.json().flatten_event(true).finish().try_init(),
+    };
+    installed.map_err(|e| TelemetryError::Install { what: "the log", reason: e.to_string() })?;
+    std::panic::set_hook(Box::new(|info| {
+        let place = info.location().map(ToString::to_string).unwrap_or_default();
+        tracing::error!(place, message = info.payload_as_str().unwrap_or("no message"), "panic");
+    }));
+    Ok(())
+}
+
+/// The recorder of this process, installed by the first caller.
+///
+/// # Errors
+/// [`TelemetryError::Install`] if somebody else installed another one.
+pub fn recorder() -> Result<PrometheusHandle, TelemetryError> {
+    static RECORDER: OnceLock<Result<PrometheusHandle, String>> = OnceLock::new();
+    let installed = RECORDER.get_or_init(|| {
+        let handle = [HTTP_DURATION, STAGE_DURATION]
+            .into_iter()
+            .try_fold(PrometheusBuilder::new(), |builder, name| {
+                builder.set_buckets_for_metric(Matcher::Full(name.to_owned()), &BUCKETS)
+            })
+            .and_then(PrometheusBuilder::install_recorder)
+            .map_err(|e| e.to_string())?;
+        describe();
+        Ok(handle)
+    });
+    installed.clone().map_err(|reason| TelemetryError::Install { what: "the metrics recorder", reason })
+}
+
+/// Gives every metric its help text, and those that exist from the start a value.
+fn describe() {
+    use metrics::{Unit, counter, describe_counter, describe_gauge, describe_histogram, gauge};
+    describe_histogram!(HTTP_DURATION, Unit::Seconds, "Time of a request until its answer is sent");
+    describe_gauge!(CONNECTIONS, "Open connections");
+    describe_counter!(JOBS_SUBMITTED, "Jobs accepted");
+    describe_counter!(JOBS_FINISHED, "Jobs ended, by outcome");
+    describe_histogram!(STAGE_DURATION, Unit::Seconds, "Time per stage of a job");
+    describe_gauge!(QUEUE_DEPTH, "Jobs that wait");
+    describe_gauge!(QUEUE_WAIT, Unit::Seconds, "How long a job that is accepted now would wait");
+    describe_counter!(REJECTED, "Requests refused by a limit");
+    describe_gauge!(MEMORY_HELD, Unit::Bytes, "Bytes of uploads and meshes held in memory");
+    describe_counter!(VOXELS, "Samples at which the density was evaluated");
+    describe_counter!(TRIANGLES, "Triangles of finished meshes");
+    describe_counter!(PANICS, "Panics that were caught");
+    describe_gauge!(BUILD_INFO, "1, labelled with the version");
+    gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
+    for gauge_name in [CONNECTIONS, QUEUE_DEPTH, QUEUE_WAIT, MEMORY_HELD] {
+        gauge!(gauge_name).set(0.0);
+    }
+    for counter_name in [VOXELS, TRIANGLES] {
+        counter!(counter_name).increment(0);
+    }
+    for place in ["job", "http"] {
+        counter!(PANICS, "place" => place).increment(0);
+    }
+}

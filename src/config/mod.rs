@@ -1,1 +1,48 @@
-//! Configuration of the service.
+//! Configuration of the service: defaults, then a TOML file, then `MOLMESH__SECTION__KEY`, then flags.
+//!
+//! One small struct per concern. Every key says its unit and why its default is what it is; keys end in their
+//! unit (`_ms`, `_bytes`). A key that does not exist is refused, whichever layer it comes from.
+
+mod archive;
+mod error;
+mod jobs;
+mod limits;
+mod load;
+mod log;
+mod server;
+
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+pub use archive::ArchiveConfig;
+pub use error::ConfigError;
+pub use jobs::JobsConfig;
+pub use limits::LimitsConfig;
+pub use load::{Source, load, load_process};
+pub use log::{LogConfig, LogFormat};
+pub use server::ServerConfig;
+
+/// The whole configuration.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// Addresses, connections and their timeouts.
+    pub server: ServerConfig,
+    /// What one request may cost.
+    pub limits: LimitsConfig,
+    /// The worker pool.
+    pub jobs: JobsConfig,
+    /// The folder of structures by PDB id.
+    pub archive: ArchiveConfig,
+    /// Logs.
+    pub log: LogConfig,
+}
+
+impl Config {
+    /// The folder in which structures are looked up by PDB id.
+    #[must_use]
+    pub fn archive_dir(&self) -> PathBuf {
+        self.archive.dir.clone().unwrap_or_else(|| self.server.data_dir.join("archive"))
+    }
+}

@@ -1,1 +1,61 @@
-//! The worker pool. No HTTP type, no wgpu.
+//! The worker pool: a bounded queue in front of one backend, on threads of its own.
+//!
+//! Structure bytes and a [`crate::pipeline::Job`] go in; a mesh with its report comes out. Deadlines, cancellation
+//! and panics are dealt with here, so that whoever submits only waits. It knows no HTTP and no graphics API.
+
+mod budget;
+mod error;
+mod key;
+mod pool;
+mod queue;
+mod ticket;
+mod worker;
+
+pub use budget::{Budget, Exhausted, Lease};
+pub use error::{Failure, Refusal};
+pub use key::{ContentKey, Digest};
+pub use pool::{Pool, Settings};
+pub use ticket::Ticket;
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+
+use crate::pipeline::{Job, Product};
+use crate::structure::referee::Diagnostic;
+
+/// One job to run.
+#[derive(Debug)]
+pub struct Task {
+    /// The structure file as it came, compressed or not.
+    pub input: Bytes,
+    /// Its digest, if it is known already.
+    pub digest: Option<Digest>,
+    /// Ask the referee, and refuse a file in which it finds errors.
+    pub strict: bool,
+    /// What to make of it.
+    pub job: Job,
+    /// When the mesh must be there.
+    pub deadline: Instant,
+    /// Memory that the input is charged to, given back with it.
+    pub lease: Option<Lease>,
+}
+
+/// A finished job.
+#[derive(Debug)]
+pub struct Finished {
+    /// Mesh and report.
+    pub product: Product,
+    /// What the referee said, if it was asked.
+    pub diagnostics: Option<Vec<Diagnostic>>,
+    /// Digest of the input.
+    pub digest: Digest,
+    /// Time in the queue.
+    pub waited: Duration,
+    /// Memory that the mesh is charged to, given back when this is dropped.
+    pub lease: Lease,
+}
+
+/// What a job comes to.
+pub type Outcome = Result<Arc<Finished>, Failure>;

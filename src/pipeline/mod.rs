@@ -1,6 +1,8 @@
 //! One job from end to end: structure bytes to spheres to mesh to report. No HTTP, no paths, no queue.
 
 mod clock;
+pub mod nearest;
+pub mod params;
 mod report;
 
 use thiserror::Error;

@@ -1,0 +1,60 @@
+# molmesh. The two that matter: `make run` and `make test`. `make help` lists the rest.
+#
+# No variable here needs to be set. PROFILE=release runs the tests optimised; ARGS passes flags to `make run`.
+
+SHELL := bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+CARGO ?= cargo
+ARGS ?=
+
+.PHONY: help run test tools fmt fmt-check lint matrix deny deny-if-installed tests bench release clean
+
+help: ## This list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
+
+run: ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
+	$(CARGO) run --release --bin molmesh -- serve $(ARGS)
+
+test: tools fmt-check lint deny-if-installed matrix tests ## Everything that must hold; installs what it needs
+
+tools: ## Install what the tests compare with (a Python environment and Node packages)
+	@if [ -f tests/tools/setup.sh ]; then bash tests/tools/setup.sh; fi
+
+fmt: ## Format
+	$(CARGO) fmt --all
+
+fmt-check:
+	$(CARGO) fmt --all -- --check
+
+lint: ## Clippy on everything, warnings are errors
+	$(CARGO) clippy --locked --all-targets -- -D warnings
+
+# The rooms compile apart: a stray async type in the core, or a flag in the service, does not get through here.
+matrix: ## Clippy on every combination of features that is supported
+	$(CARGO) clippy --locked --lib --no-default-features -- -D warnings
+	$(CARGO) clippy --locked --lib --no-default-features --features gpu -- -D warnings
+	$(CARGO) clippy --locked --lib --no-default-features --features server -- -D warnings
+	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
+	$(CARGO) clippy --locked --lib --bins -- -D warnings
+
+deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (three minutes) when absent
+	@command -v cargo-deny >/dev/null || $(CARGO) install cargo-deny --locked
+	$(CARGO) deny check licenses bans sources
+
+deny-if-installed:
+	@if command -v cargo-deny >/dev/null; then $(MAKE) --no-print-directory deny; \
+	else echo "SKIPPED: cargo-deny is not installed; make deny installs and runs it"; fi
+
+tests: ## The tests alone
+	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
+
+bench: ## The benchmarks
+	$(CARGO) bench
+
+release: ## The optimised binary: target/release/molmesh
+	$(CARGO) build --release --locked --bin molmesh
+
+clean: ## Remove everything that was built
+	$(CARGO) clean
+	rm -rf dist

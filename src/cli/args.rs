@@ -1,0 +1,236 @@
+//! The flags. Values of parameters stay text here: [`molmesh::pipeline::params`] reads them, for the command line
+//! and HTTP alike, so that both refuse them with the same words.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
+
+use super::error::EXIT_CODES;
+
+const MESH_EXAMPLES: &str = "\
+Examples:
+  molmesh mesh 4pti.pdb -o 4pti.glb
+  molmesh mesh 1gbt.cif.gz -o - --format ply --resolution 0.3 > 1gbt.ply
+  curl -s http://127.0.0.1:8080/v1/samples/4pti.pdb | molmesh mesh - -o 4pti.stl --report json";
+
+/// Molecules in, proven surface meshes out.
+#[derive(Debug, Parser)]
+#[command(name = "molmesh", version, arg_required_else_help = true, disable_help_subcommand = true)]
+#[command(max_term_width = 100, after_help = EXIT_CODES)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    pub(crate) command: Command,
+}
+
+/// What to do.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Mesh the surface of one structure
+    Mesh(Box<MeshArgs>),
+    /// Serve meshes over HTTP
+    Serve(ServeArgs),
+    /// Say what this machine has, and what of it is used
+    Doctor,
+    /// Ask a running service whether it is ready; exit code 0 if so
+    Healthcheck(HealthcheckArgs),
+    /// Print the version
+    Version,
+}
+
+/// Which backend runs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum BackendName {
+    /// The GPU if there is one that we can use, else the CPU
+    Auto,
+    /// Every core, with the widest vectors that the processor has
+    Cpu,
+    /// Plain, sequential, brute force: what the others are compared with
+    Reference,
+    /// The GPU or nothing
+    Gpu,
+    /// The program of Dias, Bora and Gomes (2010), on the GPU
+    Paper,
+}
+
+/// How the report is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ReportStyle {
+    /// A summary on stderr
+    Text,
+    /// JSON on stdout (on stderr when the mesh goes to stdout)
+    Json,
+}
+
+/// How the service logs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum LogStyle {
+    /// For people
+    Pretty,
+    /// One JSON object a line
+    Json,
+}
+
+/// `molmesh mesh`.
+#[derive(Debug, ClapArgs)]
+#[command(after_help = format!("{MESH_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
+pub(crate) struct MeshArgs {
+    /// Structure file, PDB or mmCIF, plain or compressed with gzip or zstd; `-` is stdin
+    pub(crate) input: PathBuf,
+    /// Mesh file; `-` is stdout
+    #[arg(short, long)]
+    pub(crate) output: PathBuf,
+    /// glb, gltf, ply, stl or obj; by default what the output's extension says, glb on stdout
+    #[arg(long, value_name = "FORMAT")]
+    pub(crate) format: Option<String>,
+    /// What runs the meshing
+    #[arg(long, value_enum, default_value = "auto")]
+    pub(crate) backend: BackendName,
+    /// Threads of the CPU backend; every core by default
+    #[arg(long, value_name = "N")]
+    pub(crate) threads: Option<usize>,
+    /// How the report is written
+    #[arg(long, value_enum, default_value = "text")]
+    pub(crate) report: ReportStyle,
+    /// No summary and no progress bar
+    #[arg(short, long)]
+    pub(crate) quiet: bool,
+    #[command(flatten)]
+    pub(crate) surface: SurfaceArgs,
+    #[command(flatten)]
+    pub(crate) selection: SelectionArgs,
+    #[command(flatten)]
+    pub(crate) limits: LimitArgs,
+}
+
+/// Which surface.
+#[derive(Debug, ClapArgs)]
+#[command(next_help_heading = "Surface")]
+pub(crate) struct SurfaceArgs {
+    /// Density of an atom: gaussian, soft-object or inverse-square [default: gaussian]
+    #[arg(long, value_name = "KERNEL")]
+    pub(crate) kernel: Option<String>,
+    /// Values for what is not given: default, ses-like, vdw-like, molstar, blinn or quicksurf
+    #[arg(long, value_name = "PRESET")]
+    pub(crate) preset: Option<String>,
+    /// Grid spacing in Å [default: 0.5]
+    #[arg(long, value_name = "Å")]
+    pub(crate) resolution: Option<String>,
+    /// Level of the density that is the surface [default: 1, an isolated atom's radius]
+    #[arg(long, value_name = "LEVEL")]
+    pub(crate) isovalue: Option<String>,
+    /// How closely the gaussian follows the atoms; higher is less smooth [default: 1.25]
+    #[arg(long, value_name = "A")]
+    pub(crate) smoothness: Option<String>,
+    /// Radii are multiplied by this [default: 1]
+    #[arg(long, value_name = "FACTOR")]
+    pub(crate) radius_scale: Option<String>,
+    /// Then this is added, in Å [default: 0]
+    #[arg(long, value_name = "Å")]
+    pub(crate) radius_offset: Option<String>,
+    /// Where the gaussian is cut off, relative to its value at the radius [default: 0.01]
+    #[arg(long, value_name = "FRACTION")]
+    pub(crate) cutoff_tolerance: Option<String>,
+    /// Raw parameter a of the 2010 paper (gaussian: decay in Å⁻²; soft object: height)
+    #[arg(long, value_name = "A")]
+    pub(crate) paper_a: Option<String>,
+    /// Raw parameter b of the 2010 paper (gaussian: height; otherwise a radius in Å)
+    #[arg(long, value_name = "B")]
+    pub(crate) paper_b: Option<String>,
+    /// Raw parameter c of the 2010 paper (inverse square: strength in Å²)
+    #[arg(long, value_name = "C")]
+    pub(crate) paper_c: Option<String>,
+    /// Store the nearest atom of every vertex (`_ATOM` in glTF, `atom` in PLY)
+    #[arg(long)]
+    pub(crate) atom_ids: bool,
+}
+
+/// Which atoms.
+#[expect(clippy::struct_excessive_bools, reason = "flags are what a command line has")]
+#[derive(Debug, ClapArgs)]
+#[command(next_help_heading = "Atoms")]
+pub(crate) struct SelectionArgs {
+    /// Comma-separated: polymer, ligand, water, hydrogens, all [default: polymer]
+    #[arg(long, value_name = "WHAT")]
+    pub(crate) select: Option<String>,
+    /// Take ligands too
+    #[arg(long)]
+    pub(crate) ligands: bool,
+    /// Take waters too
+    #[arg(long)]
+    pub(crate) waters: bool,
+    /// Take hydrogens of whatever is taken
+    #[arg(long)]
+    pub(crate) hydrogens: bool,
+    /// Comma-separated chains, by author name [default: all]
+    #[arg(long, value_name = "A,B")]
+    pub(crate) chains: Option<String>,
+    /// Model number [default: the first]
+    #[arg(long, value_name = "N")]
+    pub(crate) model: Option<String>,
+    /// One alternative location instead of the best occupied of each residue
+    #[arg(long, value_name = "X")]
+    pub(crate) altloc: Option<String>,
+    /// Refuse a structure that a strict second reader finds fault with
+    #[arg(long)]
+    pub(crate) check: bool,
+}
+
+/// What is too much.
+#[expect(clippy::struct_field_names, reason = "the fields are named like their flags")]
+#[derive(Debug, ClapArgs)]
+#[command(next_help_heading = "Limits")]
+pub(crate) struct LimitArgs {
+    /// Atoms in the file, all models [default: 20000000]
+    #[arg(long, value_name = "N")]
+    pub(crate) max_atoms: Option<u64>,
+    /// Bytes of the input after decompression [default: 4 GiB]
+    #[arg(long, value_name = "BYTES")]
+    pub(crate) max_input_bytes: Option<u64>,
+    /// Grid samples in occupied bricks [default: 4294967296]
+    #[arg(long, value_name = "N")]
+    pub(crate) max_samples: Option<u64>,
+    /// Bytes of vertices and triangles [default: 8 GiB]
+    #[arg(long, value_name = "BYTES")]
+    pub(crate) max_mesh_bytes: Option<u64>,
+}
+
+/// `molmesh serve`.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct ServeArgs {
+    /// Address of the service; port 0 takes a free one [default: 127.0.0.1:8080]
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) listen: Option<SocketAddr>,
+    /// Address of the metrics; none by default
+    #[arg(long, value_name = "ADDR")]
+    pub(crate) metrics_listen: Option<SocketAddr>,
+    /// Where the service keeps its data
+    #[arg(long, value_name = "DIR")]
+    pub(crate) data_dir: Option<PathBuf>,
+    /// Folder of structure files, flat or in the `divided` layout of the wwPDB
+    #[arg(long, value_name = "DIR")]
+    pub(crate) archive: Option<PathBuf>,
+    /// Configuration file (TOML)
+    #[arg(long, value_name = "FILE")]
+    pub(crate) config: Option<PathBuf>,
+    /// Set one value of the configuration, such as `limits.max_atoms=100000`; may be repeated
+    #[arg(long, value_name = "SECTION.KEY=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// What runs the meshing
+    #[arg(long, value_enum, default_value = "auto")]
+    pub(crate) backend: BackendName,
+    /// How to log
+    #[arg(long, value_enum)]
+    pub(crate) log: Option<LogStyle>,
+}
+
+/// `molmesh healthcheck`.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct HealthcheckArgs {
+    /// What to ask
+    #[arg(long, default_value = "http://127.0.0.1:8080/readyz")]
+    pub(crate) url: String,
+    /// Seconds to wait for the answer
+    #[arg(long, value_name = "SECONDS", default_value_t = 3.0)]
+    pub(crate) timeout: f64,
+}

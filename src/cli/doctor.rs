@@ -1,0 +1,66 @@
+//! `molmesh doctor`: what this machine has, what of it is used, and why the rest is not.
+
+use molmesh::pipeline::JobLimits;
+use molmesh::structure::radii;
+
+use super::args::BackendName;
+use super::backend;
+use super::error::CliError;
+use super::page::Page;
+use super::style::Style;
+
+/// Runs the command.
+pub(super) fn run() -> Result<(), CliError> {
+    super::say(&text(Style::stdout())?)
+}
+
+fn text(style: Style) -> Result<String, CliError> {
+    let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
+    let mut line = |label: &str, value: &str| page.row(label, value);
+    line("system", &format!("{} {}", std::env::consts::OS, std::env::consts::ARCH));
+    let cores = std::thread::available_parallelism().map_or_else(|e| format!("unknown ({e})"), |n| n.to_string());
+    line("cores", &format!("{cores} for this process"));
+    line("vectors", &vector_extensions());
+    for candidate in backend::survey() {
+        let name = candidate.name;
+        match candidate.state {
+            Ok(device) => line(name, &format!("{} {device}", style.green("yes"))),
+            Err(why) => line(name, &format!("{} {why}", style.dim("no "))),
+        }
+    }
+    let picked = backend::pick(BackendName::Auto, None)?;
+    line("auto", &format!("{} ({})", picked.backend.name(), picked.reason));
+    let JobLimits { read, surface } = JobLimits::default();
+    line("limits", &format!("{} atoms, {} bytes inflated", read.max_atoms, read.max_inflated_bytes));
+    line("", &format!("{} samples, {} bytes of mesh", surface.max_samples, surface.max_mesh_bytes));
+    line("radii", radii::TABLE);
+    Ok(page.finish())
+}
+
+/// The extensions that the inner loops care about, by the name that compilers give them.
+fn vector_extensions() -> String {
+    let found: Vec<&str> = detected().into_iter().filter_map(|(name, on)| on.then_some(name)).collect();
+    if found.is_empty() { "none that is known here".to_owned() } else { found.join(" ") }
+}
+
+#[cfg(target_arch = "x86_64")]
+fn detected() -> [(&'static str, bool); 6] {
+    [
+        ("sse4.2", std::arch::is_x86_feature_detected!("sse4.2")),
+        ("avx", std::arch::is_x86_feature_detected!("avx")),
+        ("avx2", std::arch::is_x86_feature_detected!("avx2")),
+        ("fma", std::arch::is_x86_feature_detected!("fma")),
+        ("avx512f", std::arch::is_x86_feature_detected!("avx512f")),
+        ("avx512vl", std::arch::is_x86_feature_detected!("avx512vl")),
+    ]
+}
+
+#[cfg(target_arch = "aarch64")]
+fn detected() -> [(&'static str, bool); 2] {
+    [("neon", std::arch::is_aarch64_feature_detected!("neon")), ("sve", std::arch::is_aarch64_feature_detected!("sve"))]
+}
+
+#[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+fn detected() -> [(&'static str, bool); 0] {
+    []
+}

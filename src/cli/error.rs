@@ -1,0 +1,259 @@
+//! Why a command failed, its exit code, and the one line (with a hint where there is one) that says so.
+
+use std::io::{self, Write};
+
+use molmesh::formats::FormatError;
+use molmesh::pipeline::JobError;
+use molmesh::structure::StructureError;
+use molmesh::surface::SurfaceError;
+use thiserror::Error;
+
+use super::style::Style;
+
+/// Exit codes. They are documented in `--help` and in the README and do not change meaning.
+pub(crate) mod code {
+    /// Done.
+    pub(crate) const OK: i32 = 0;
+    /// Something that should not happen, or an unhealthy service.
+    pub(crate) const INTERNAL: i32 = 1;
+    /// Bad usage or a bad parameter.
+    pub(crate) const USAGE: i32 = 2;
+    /// The input cannot be read from disk or stdin.
+    pub(crate) const INPUT: i32 = 3;
+    /// The structure is refused: unreadable, no atoms, empty selection.
+    pub(crate) const STRUCTURE: i32 = 4;
+    /// A limit is exceeded.
+    pub(crate) const LIMIT: i32 = 5;
+    /// No such backend or device on this machine.
+    pub(crate) const BACKEND: i32 = 6;
+    /// The output cannot be written.
+    pub(crate) const OUTPUT: i32 = 7;
+    /// Interrupted (Ctrl-C).
+    pub(crate) const INTERRUPTED: i32 = 130;
+}
+
+/// The table of exit codes for `--help`; the README has the same words.
+pub(crate) const EXIT_CODES: &str = "\
+Exit codes:
+    0  ok
+    1  internal error, or an unhealthy service
+    2  bad usage or a bad parameter
+    3  the input cannot be read
+    4  the structure is refused: unreadable, no atoms, empty selection
+    5  a limit is exceeded: input, atoms, grid, mesh
+    6  no such backend or device on this machine
+    7  the output cannot be written
+  130  interrupted; no partial file is left";
+
+/// Why a command failed.
+#[derive(Debug, Error)]
+pub(crate) enum CliError {
+    /// The flags do not make sense together.
+    #[error("{message}")]
+    Usage {
+        /// What is wrong.
+        message: String,
+        /// What would be right.
+        hint: Option<String>,
+    },
+    /// The input cannot be read.
+    #[error("cannot read {name}: {}", reason(source))]
+    Input {
+        /// Path, or `stdin`.
+        name: String,
+        /// The system's words.
+        source: io::Error,
+    },
+    /// The input has more bytes than allowed.
+    #[error("{name} has more than {limit} bytes")]
+    InputTooLarge {
+        /// Path, or `stdin`.
+        name: String,
+        /// Bytes allowed.
+        limit: u64,
+    },
+    /// Reading, selecting or meshing failed.
+    #[error("{name}: {source}")]
+    Job {
+        /// The input.
+        name: String,
+        /// Why.
+        source: JobError,
+    },
+    /// The format cannot hold the mesh, or the mesh is broken.
+    #[error(transparent)]
+    Format(#[from] FormatError),
+    /// The backend that was asked for is not there.
+    #[error("no backend `{asked}` on this machine: {why}")]
+    NoBackend {
+        /// What was asked for.
+        asked: &'static str,
+        /// Why it is not there.
+        why: String,
+    },
+    /// The output cannot be written.
+    #[error("cannot write {name}: {}", reason(source))]
+    Output {
+        /// Path, or `stdout`.
+        name: String,
+        /// The system's words.
+        source: io::Error,
+    },
+    /// Ctrl-C.
+    #[error("interrupted; nothing was written")]
+    Interrupted,
+    /// The service could not start, or is not healthy.
+    #[error("{0}")]
+    Service(String),
+    /// A defect of ours.
+    #[error("internal error: {0}")]
+    Internal(String),
+}
+
+/// The system's words without its error number.
+fn reason(error: &io::Error) -> String {
+    let text = error.to_string();
+    let words = text.split(" (os error").next().unwrap_or(&text);
+    match words.split_once(' ') {
+        // "No such file" reads better as "no such file" behind a colon; "I/O error" keeps its capitals.
+        Some((first, rest)) if first.chars().skip(1).all(char::is_lowercase) => {
+            format!("{} {rest}", first.to_lowercase())
+        }
+        _ => words.to_owned(),
+    }
+}
+
+impl CliError {
+    /// A usage error without a hint.
+    pub(crate) fn usage(message: impl Into<String>) -> Self {
+        Self::Usage { message: message.into(), hint: None }
+    }
+
+    /// The exit code.
+    pub(crate) fn code(&self) -> i32 {
+        match self {
+            Self::Usage { .. } => code::USAGE,
+            Self::Input { .. } => code::INPUT,
+            Self::InputTooLarge { .. } => code::LIMIT,
+            Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
+            Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
+            Self::Format(error) => format_code(error),
+            Self::NoBackend { .. } => code::BACKEND,
+            Self::Output { .. } => code::OUTPUT,
+            Self::Interrupted => code::INTERRUPTED,
+            Self::Service(_) | Self::Internal(_) => code::INTERNAL,
+        }
+    }
+
+    /// What would help, if we know.
+    pub(crate) fn hint(&self) -> Option<String> {
+        match self {
+            Self::Usage { hint, .. } => hint.clone(),
+            Self::InputTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
+            Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
+            Self::Job { source: JobError::Structure(error), .. } => match error {
+                StructureError::TooManyAtoms { .. } => Some("raise it with --max-atoms".to_owned()),
+                StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
+                _ => None,
+            },
+            Self::NoBackend { .. } => Some("try --backend auto, and `molmesh doctor` for what there is".to_owned()),
+            Self::Output { source, .. } if source.kind() == io::ErrorKind::NotFound => {
+                Some("the directory must exist".to_owned())
+            }
+            _ => None,
+        }
+    }
+
+    /// Prints the error line and the hint line to stderr.
+    pub(crate) fn print(&self, style: Style) {
+        let hint = self.hint().map(|hint| format!("{} {hint}\n", style.dim("   hint:"))).unwrap_or_default();
+        let text = format!("{} {self}\n{hint}", style.red("molmesh:"));
+        // Nobody is left to tell when stderr is closed; the exit code still speaks.
+        drop(io::stderr().write_all(text.as_bytes()));
+    }
+}
+
+fn structure_code(error: &StructureError) -> i32 {
+    match error {
+        StructureError::InflatedTooLarge { .. } | StructureError::TooManyAtoms { .. } => code::LIMIT,
+        _ => code::STRUCTURE,
+    }
+}
+
+fn surface_code(error: &SurfaceError) -> i32 {
+    match error {
+        SurfaceError::NoSpheres | SurfaceError::BadSphere { .. } => code::STRUCTURE,
+        // An isovalue that the density never reaches is the caller's parameter.
+        SurfaceError::BadParameter { .. } | SurfaceError::NoSurface { .. } => code::USAGE,
+        SurfaceError::GridTooLarge { .. } | SurfaceError::MeshTooLarge { .. } => code::LIMIT,
+        SurfaceError::Cancelled => code::INTERRUPTED,
+    }
+}
+
+fn format_code(error: &FormatError) -> i32 {
+    match error {
+        FormatError::TooMany { .. }
+        | FormatError::GlbTooLarge { .. }
+        | FormatError::AtomIndexTooLarge { .. }
+        | FormatError::CoordinateTooLarge { .. } => code::LIMIT,
+        // A mesh that is broken is our defect, not the caller's.
+        FormatError::ColumnLength { .. }
+        | FormatError::IndexOutOfRange { .. }
+        | FormatError::NotFinite { .. }
+        | FormatError::NotUnit { .. }
+        | FormatError::Json { .. } => code::INTERNAL,
+    }
+}
+
+fn surface_hint(error: &SurfaceError) -> Option<String> {
+    match error {
+        SurfaceError::GridTooLarge { suggested_resolution, .. } => {
+            Some(format!("try --resolution {suggested_resolution}, or raise --max-samples"))
+        }
+        SurfaceError::MeshTooLarge { suggested_resolution, .. } => {
+            Some(format!("try --resolution {suggested_resolution}, or raise --max-mesh-bytes"))
+        }
+        SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_kind_of_failure_has_its_code() {
+        let job = |source: JobError| CliError::Job { name: "x".into(), source };
+        let missing = || io::Error::from(io::ErrorKind::NotFound);
+        let cases: [(CliError, i32); 12] = [
+            (CliError::Internal(String::new()), 1),
+            (CliError::usage("x"), 2),
+            (CliError::Input { name: "x".into(), source: missing() }, 3),
+            (job(StructureError::NoAtoms { found: "nothing".into() }.into()), 4),
+            (job(SurfaceError::NoSpheres.into()), 4),
+            (job(StructureError::TooManyAtoms { limit: 1 }.into()), 5),
+            (job(SurfaceError::MeshTooLarge { bytes: 2, limit: 1, suggested_resolution: 1.0 }.into()), 5),
+            (FormatError::GlbTooLarge { bytes: 2, limit: 1 }.into(), 5),
+            (CliError::NoBackend { asked: "gpu", why: String::new() }, 6),
+            (CliError::Output { name: "x".into(), source: missing() }, 7),
+            (job(SurfaceError::Cancelled.into()), 130),
+            (CliError::Interrupted, 130),
+        ];
+        for (error, expected) in cases {
+            assert_eq!(error.code(), expected, "{error}");
+        }
+    }
+
+    #[test]
+    fn the_systems_words_lose_their_number() {
+        assert_eq!(reason(&io::Error::from_raw_os_error(2)), "no such file or directory");
+    }
+
+    #[test]
+    fn a_grid_that_is_too_large_comes_with_a_resolution() {
+        let error = SurfaceError::GridTooLarge { samples: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
+        let hint = CliError::Job { name: "x".into(), source: error.into() }.hint();
+        assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-samples"));
+    }
+}

@@ -1,0 +1,112 @@
+//! `molmesh healthcheck`: one GET to a running service, for containers that have no curl.
+
+use std::io::{Read, Write};
+use std::net::{TcpStream, ToSocketAddrs};
+use std::time::Duration;
+
+use super::args::HealthcheckArgs;
+use super::error::CliError;
+
+/// Enough for a status line, the headers and a short body.
+const MAX_ANSWER: u64 = 64 << 10;
+
+/// Runs the command: prints the answer's status, fails unless it is 200.
+pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
+    let url = Url::parse(&args.url)?;
+    let timeout = Some(args.timeout)
+        .filter(|seconds| (0.001..=3600.0).contains(seconds))
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| CliError::usage("parameter `timeout`: expected seconds from 0.001 to 3600"))?;
+    let answer = get(&url, timeout).map_err(|e| CliError::Service(format!("{} does not answer: {e}", args.url)))?;
+    match status(&answer) {
+        Some(200) => super::say("200 ok\n"),
+        Some(code) => Err(CliError::Service(format!("{} answers {code}", args.url))),
+        None => Err(CliError::Service(format!("{} does not speak HTTP", args.url))),
+    }
+}
+
+/// The parts of an `http://` address.
+#[derive(Debug, PartialEq)]
+struct Url<'a> {
+    authority: &'a str,
+    path: &'a str,
+}
+
+impl<'a> Url<'a> {
+    fn parse(text: &'a str) -> Result<Self, CliError> {
+        let rest = text
+            .strip_prefix("http://")
+            .ok_or_else(|| CliError::usage(format!("parameter `url`: `{text}` is not allowed; expected http://…")))?;
+        let at = rest.find('/').unwrap_or(rest.len());
+        let (authority, path) = rest.split_at(at);
+        if authority.is_empty() || rest.contains(|c: char| c.is_ascii_control() || c == ' ') {
+            return Err(CliError::usage(format!(
+                "parameter `url`: `{text}` is not allowed; expected http://host:port/"
+            )));
+        }
+        Ok(Self { authority, path: if path.is_empty() { "/readyz" } else { path } })
+    }
+
+    /// Host and port, port 80 if none is given. Brackets around an IPv6 address stay, as the resolver wants them.
+    fn socket(&self) -> String {
+        let after_host = self.authority.rfind(']').map_or(0, |i| i + 1);
+        if self.authority[after_host..].contains(':') {
+            self.authority.to_owned()
+        } else {
+            format!("{}:80", self.authority)
+        }
+    }
+}
+
+fn get(url: &Url<'_>, timeout: Duration) -> std::io::Result<Vec<u8>> {
+    let mut last = std::io::Error::from(std::io::ErrorKind::AddrNotAvailable);
+    for address in url.socket().to_socket_addrs()? {
+        match TcpStream::connect_timeout(&address, timeout) {
+            Ok(mut stream) => {
+                stream.set_read_timeout(Some(timeout))?;
+                stream.set_write_timeout(Some(timeout))?;
+                let (path, host) = (url.path, url.authority);
+                write!(stream, "GET {path} HTTP/1.1\r\nHost: {host}\r\nAccept: */*\r\nConnection: close\r\n\r\n")?;
+                let mut answer = Vec::new();
+                stream.take(MAX_ANSWER).read_to_end(&mut answer)?;
+                return Ok(answer);
+            }
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
+}
+
+/// The status code of an HTTP/1 answer.
+fn status(answer: &[u8]) -> Option<u16> {
+    let line = answer.split(|&b| b == b'\r').next()?;
+    let mut words = std::str::from_utf8(line).ok()?.split(' ');
+    words.next().filter(|version| version.starts_with("HTTP/1."))?;
+    words.next()?.parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_are_taken_apart() {
+        let url = |text| Url::parse(text).map(|u| (u.socket(), u.path.to_owned()));
+        let is = |socket: &str, path: &str| (socket.to_owned(), path.to_owned());
+        assert_eq!(url("http://127.0.0.1:8080/livez").unwrap(), is("127.0.0.1:8080", "/livez"));
+        assert_eq!(url("http://example").unwrap(), is("example:80", "/readyz"));
+        assert_eq!(url("http://[::1]/x").unwrap(), is("[::1]:80", "/x"));
+        assert_eq!(url("http://[::1]:9").unwrap(), is("[::1]:9", "/readyz"));
+        for bad in ["https://x/", "x", "http://", "http:///x", "http://a b/", "http://a/\r\nX: y"] {
+            assert!(Url::parse(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn only_a_status_line_has_a_status() {
+        assert_eq!(status(b"HTTP/1.1 503 Service Unavailable\r\n\r\n"), Some(503));
+        for bad in [&b""[..], b"hello", b"HTTP/1.1", b"HTTP/1.1 ok\r\n", b"\xff\xfe\r\n"] {
+            assert_eq!(status(bad), None, "{bad:?}");
+        }
+    }
+}

@@ -1,0 +1,157 @@
+//! `molmesh mesh`: one structure to one mesh file.
+
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::path::Path;
+use std::str::FromStr;
+use std::time::Instant;
+
+use molmesh::formats::{Encoder, Format};
+use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, ProgressSink, Report};
+use molmesh::surface::{CancelToken, SurfaceError};
+use serde_json::{Value, json};
+
+use super::args::{MeshArgs, ReportStyle};
+use super::backend::{self, Picked};
+use super::error::CliError;
+use super::output::{Output, is_stdio};
+use super::progress::Progress;
+use super::style::Style;
+use super::summary::{self, Written};
+use super::{interrupt, request};
+
+/// Runs the command. The order is that of cost: flags, backend, output, input, mesh.
+pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
+    let (job, asked) = request::parse(args)?;
+    let format = asked.map_or_else(|| format(&args.output), Ok)?;
+    let limits = request::limits(&args.limits);
+    let picked = backend::pick(args.backend, args.threads)?;
+    let cancel = CancelToken::default();
+    interrupt::watch(&cancel).map_err(|e| CliError::Internal(format!("cannot watch for signals: {e}")))?;
+    let mut output = Output::open(&args.output, &cancel)?;
+    let input = read(&args.input, limits.read.max_inflated_bytes)?;
+
+    let progress = Progress::new(!args.quiet);
+    let product = mesh(args, &job, &limits, &picked, &input, &cancel, &progress)?;
+    drop(input);
+    let mut report = encode(&product, format, &mut output, &progress)?;
+    drop(progress);
+    if cancel.is_cancelled() {
+        return Err(CliError::Interrupted);
+    }
+    let (to_stdout, bytes) = (output.is_stdout(), output.bytes);
+    let start = Instant::now();
+    let writing = output.writing;
+    output.finish()?;
+    report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
+
+    let name = if to_stdout { "stdout".to_owned() } else { args.output.display().to_string() };
+    let written = Written { name: &name, format: format.extension(), bytes };
+    tell(args, &report, &written, to_stdout)?;
+    // The caller exits the process next: nobody gains from the mesh being freed first.
+    std::mem::forget(product);
+    Ok(())
+}
+
+/// The format that an output's name says: by its extension, GLB on stdout.
+fn format(output: &Path) -> Result<Format, CliError> {
+    let hint = || Some("name the format with --format".to_owned());
+    let name = output.display();
+    match output.extension() {
+        Some(extension) => Format::from_str(&extension.to_string_lossy())
+            .map_err(|e| CliError::Usage { message: format!("cannot tell the format of `{name}`: {e}"), hint: hint() }),
+        None if is_stdio(output) => Ok(Format::default()),
+        None => Err(CliError::Usage {
+            message: format!("cannot tell the format of `{name}`: it has no extension"),
+            hint: hint(),
+        }),
+    }
+}
+
+/// The whole input, at most `limit` bytes of it: compressed or not, what inflates from it is no smaller.
+fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
+    let stdin = is_stdio(path);
+    let name = || name_of(path);
+    let read = || -> io::Result<Vec<u8>> {
+        if stdin {
+            return take(io::stdin().lock(), 0, limit);
+        }
+        let file = File::open(path)?;
+        let size = file.metadata()?.len();
+        // One byte more than there is, so that the end is seen without growing the buffer.
+        take(file, if size > limit { 0 } else { size + 1 }, limit)
+    };
+    let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
+    if bytes.len() as u64 > limit {
+        return Err(CliError::InputTooLarge { name: name(), limit });
+    }
+    Ok(bytes)
+}
+
+fn take(source: impl Read, capacity: u64, limit: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(usize::try_from(capacity).unwrap_or(0));
+    source.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// What messages call the input.
+fn name_of(input: &Path) -> String {
+    if is_stdio(input) { "stdin".to_owned() } else { input.display().to_string() }
+}
+
+fn mesh(
+    args: &MeshArgs,
+    job: &Job,
+    limits: &JobLimits,
+    picked: &Picked,
+    input: &[u8],
+    cancel: &CancelToken,
+    progress: &Progress,
+) -> Result<Product, CliError> {
+    let choice = Choice { backend: picked.backend.as_ref(), reason: &picked.reason };
+    pipeline::run(input, job, limits, &choice, cancel, progress).map_err(|source| match source {
+        JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
+        source => CliError::Job { name: name_of(&args.input), source },
+    })
+}
+
+/// Encodes the mesh straight into the output. Returns the report with the time that took, without the writes.
+fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<Report, CliError> {
+    sink.progress("encode", 0.0);
+    let start = Instant::now();
+    let written = Encoder::new(format, &product.mesh, &product.meta())?.write(out);
+    let encoding = start.elapsed().saturating_sub(out.writing);
+    written.map_err(|source| out.failure(source))?;
+    let mut report = product.report.clone();
+    report.add_timing("encode", encoding.as_secs_f64() * 1e3);
+    Ok(report)
+}
+
+/// Writes the report where the mesh did not go.
+fn tell(args: &MeshArgs, report: &Report, written: &Written<'_>, mesh_on_stdout: bool) -> Result<(), CliError> {
+    match args.report {
+        ReportStyle::Text if args.quiet => Ok(()),
+        ReportStyle::Text => {
+            // A closed stderr is no reason to call a finished mesh a failure.
+            drop(io::stderr().write_all(summary::text(report, written, Style::stderr()).as_bytes()));
+            Ok(())
+        }
+        ReportStyle::Json => {
+            let text = json_report(report, written)?;
+            let told = if mesh_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
+            told.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
+        }
+    }
+}
+
+fn json_report(report: &Report, written: &Written<'_>) -> Result<String, CliError> {
+    let failed = |e: serde_json::Error| CliError::Internal(format!("the report is no JSON: {e}"));
+    let mut value = serde_json::to_value(report).map_err(failed)?;
+    if let Value::Object(map) = &mut value {
+        let output = json!({ "file": written.name, "format": written.format, "bytes": written.bytes });
+        map.insert("output".to_owned(), output);
+    }
+    let mut text = serde_json::to_string_pretty(&value).map_err(failed)?;
+    text.push('\n');
+    Ok(text)
+}

@@ -1,0 +1,84 @@
+//! The command line: flags in, one line of error or one screen of summary out, exit codes that scripts can trust.
+//!
+//! Nothing is started that a command does not need: `mesh` has no async runtime and no log.
+
+mod args;
+mod backend;
+mod banner;
+mod doctor;
+mod error;
+mod healthcheck;
+mod interrupt;
+mod mesh;
+mod output;
+mod page;
+mod panics;
+mod progress;
+mod request;
+mod serve;
+mod style;
+mod summary;
+
+use std::io::{self, Write};
+
+use clap::Parser;
+use clap::error::ErrorKind;
+
+use args::{Args, Command};
+use error::{CliError, code};
+use style::Style;
+
+/// Runs the command that the process's arguments name. Returns the exit code.
+pub(crate) fn main() -> i32 {
+    let args = match Args::try_parse() {
+        Ok(args) => args,
+        Err(error) => return usage(&error),
+    };
+    let result = match args.command {
+        Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
+        Command::Serve(args) => serve::run(&args),
+        Command::Doctor => doctor::run(),
+        Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::Version => version(),
+    };
+    match result {
+        Ok(()) => code::OK,
+        Err(error) => {
+            error.print(Style::stderr());
+            error.code()
+        }
+    }
+}
+
+/// Prints what clap has to say: help is an answer, anything else is a mistake of the caller.
+fn usage(error: &clap::Error) -> i32 {
+    let text = error.render().to_string();
+    let (written, code) = match error.kind() {
+        ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => (io::stdout().write_all(text.as_bytes()), code::OK),
+        ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => (io::stderr().write_all(text.as_bytes()), code::USAGE),
+        _ => {
+            let text = text.strip_prefix("error: ").unwrap_or(&text);
+            (write!(io::stderr(), "molmesh: {text}"), code::USAGE)
+        }
+    };
+    // Whoever closed the stream does not want to read it.
+    drop(written);
+    code
+}
+
+/// `molmesh version`.
+fn version() -> Result<(), CliError> {
+    let features: Vec<&str> = [("cli", true), ("server", true), ("gpu", cfg!(feature = "gpu"))]
+        .into_iter()
+        .filter_map(|(name, on)| on.then_some(name))
+        .collect();
+    say(&format!("molmesh {} (features: {})\n", env!("CARGO_PKG_VERSION"), features.join(", ")))
+}
+
+/// Writes `text` to stdout at once.
+fn say(text: &str) -> Result<(), CliError> {
+    let mut out = io::stdout().lock();
+    out.write_all(text.as_bytes())
+        .and_then(|()| out.flush())
+        .map_err(|source| CliError::Output { name: "stdout".to_owned(), source })
+}

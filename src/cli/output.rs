@@ -1,0 +1,168 @@
+//! Where the mesh goes: stdout, or a file that appears under its name only when it is complete.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use molmesh::surface::CancelToken;
+
+use super::error::CliError;
+use super::interrupt;
+
+/// An open output. Dropped without [`Output::finish`], it leaves nothing behind.
+pub(crate) struct Output {
+    to: To,
+    name: String,
+    cancel: CancelToken,
+    /// Bytes written so far.
+    pub(crate) bytes: u64,
+    /// Time spent in the system's writes: what is left of the whole is encoding.
+    pub(crate) writing: Duration,
+}
+
+enum To {
+    Stdout(io::StdoutLock<'static>),
+    /// What cannot be replaced by a rename: a pipe, a terminal, `/dev/null`.
+    Device(File),
+    /// A file beside `target`, renamed when it is complete.
+    Staged {
+        file: File,
+        target: PathBuf,
+    },
+}
+
+impl Output {
+    /// Opens `path`; `-` is stdout. Fails before any work is done where it would fail after it.
+    pub(crate) fn open(path: &Path, cancel: &CancelToken) -> Result<Self, CliError> {
+        let name = if is_stdio(path) { "stdout".to_owned() } else { path.display().to_string() };
+        let to = if is_stdio(path) { Ok(To::Stdout(io::stdout().lock())) } else { open_file(path) };
+        match to {
+            Ok(to) => Ok(Self { to, name, cancel: cancel.clone(), bytes: 0, writing: Duration::ZERO }),
+            Err(source) => Err(CliError::Output { name, source }),
+        }
+    }
+
+    /// Whether the mesh goes to stdout.
+    pub(crate) fn is_stdout(&self) -> bool {
+        matches!(self.to, To::Stdout(_))
+    }
+
+    /// Gives the file its name.
+    pub(crate) fn finish(mut self) -> Result<(), CliError> {
+        let done = self.flush().and_then(|()| match &self.to {
+            To::Staged { target, .. } => interrupt::commit(target),
+            To::Stdout(_) | To::Device(_) => Ok(()),
+        });
+        done.map_err(|source| self.failure(source))
+    }
+
+    /// What a failed write means: a signal, or a failed write.
+    pub(crate) fn failure(&self, source: io::Error) -> CliError {
+        if self.cancel.is_cancelled() {
+            CliError::Interrupted
+        } else {
+            CliError::Output { name: self.name.clone(), source }
+        }
+    }
+}
+
+impl Drop for Output {
+    fn drop(&mut self) {
+        if matches!(self.to, To::Staged { .. }) {
+            interrupt::discard();
+        }
+    }
+}
+
+impl Write for Output {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.cancel.is_cancelled() {
+            // Not `Interrupted`: callers repeat a write that ends with that.
+            return Err(io::Error::other("interrupted"));
+        }
+        let start = Instant::now();
+        let written = match &mut self.to {
+            To::Stdout(out) => out.write(bytes),
+            To::Device(file) | To::Staged { file, .. } => file.write(bytes),
+        };
+        self.writing += start.elapsed();
+        written.inspect(|&n| self.bytes += n as u64)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match &mut self.to {
+            To::Stdout(out) => out.flush(),
+            To::Device(file) | To::Staged { file, .. } => file.flush(),
+        }
+    }
+}
+
+/// Whether `path` means stdin or stdout.
+pub(crate) fn is_stdio(path: &Path) -> bool {
+    path.as_os_str() == "-"
+}
+
+fn open_file(path: &Path) -> io::Result<To> {
+    // A link is followed, so that the file that it points to is replaced, not the link.
+    let target = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+    let existing = fs::metadata(&target).ok();
+    match &existing {
+        Some(meta) if meta.is_dir() => return Err(io::ErrorKind::IsADirectory.into()),
+        Some(meta) if !meta.is_file() => return Ok(To::Device(OpenOptions::new().write(true).open(&target)?)),
+        Some(_) => {
+            // A file that may not be written is not to be replaced through its directory either.
+            OpenOptions::new().write(true).open(&target)?;
+        }
+        None => {}
+    }
+    let Some(file_name) = target.file_name() else { return Err(io::ErrorKind::InvalidInput.into()) };
+    let mut staged_name = std::ffi::OsString::from(".");
+    staged_name.push(file_name);
+    // The time makes it unique where every process has the same id, as in containers that share a volume.
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
+    staged_name.push(format!(".{}-{now:x}.part", std::process::id()));
+    let staged = target.with_file_name(staged_name);
+    // Before it exists, so that no interrupt comes between.
+    interrupt::stage(&staged);
+    let created = OpenOptions::new().write(true).create_new(true).open(&staged).and_then(|file| {
+        existing.map_or(Ok(()), |meta| file.set_permissions(meta.permissions()))?;
+        Ok(To::Staged { file, target })
+    });
+    created.inspect_err(|_| interrupt::discard())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // One test, as the staged file is one for the process.
+    #[test]
+    fn a_file_appears_when_it_is_finished_and_only_then() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.glb");
+        let entries = || fs::read_dir(dir.path()).unwrap().count();
+        let cancel = CancelToken::default();
+
+        let mut output = Output::open(&path, &cancel).unwrap();
+        output.write_all(b"half").unwrap();
+        assert!(!path.exists());
+        drop(output);
+        assert_eq!(entries(), 0, "an unfinished file leaves nothing");
+
+        let mut output = Output::open(&path, &cancel).unwrap();
+        output.write_all(b"whole").unwrap();
+        assert_eq!(output.bytes, 5);
+        output.finish().unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"whole");
+        assert_eq!(entries(), 1);
+
+        let mut output = Output::open(&path, &cancel).unwrap();
+        cancel.cancel();
+        let error = output.write_all(b"more").unwrap_err();
+        assert!(matches!(output.failure(error), CliError::Interrupted));
+        drop(output);
+        assert_eq!(fs::read(&path).unwrap(), b"whole", "the old file survives");
+        assert_eq!(entries(), 1);
+    }
+}

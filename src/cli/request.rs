@@ -1,0 +1,121 @@
+//! Flags to a job: the same names and values that a query has, read by the same reader.
+
+use molmesh::formats::Format;
+use molmesh::pipeline::params::{self, ParamError};
+use molmesh::pipeline::{Job, JobLimits};
+
+use super::args::{LimitArgs, MeshArgs};
+use super::error::CliError;
+
+/// What the flags ask for: the job, and the format if one was named.
+pub(super) fn parse(args: &MeshArgs) -> Result<(Job, Option<Format>), CliError> {
+    let request = params::parse(pairs(args)).map_err(|error| match error {
+        ParamError::Unknown { .. } | ParamError::Repeated { .. } => CliError::Internal(error.to_string()),
+        ParamError::BadValue { .. } => CliError::Usage { message: error.to_string(), hint: None },
+    })?;
+    Ok((request.job, request.format))
+}
+
+/// The limits, with what the flags change.
+pub(super) fn limits(args: &LimitArgs) -> JobLimits {
+    let mut limits = JobLimits::default();
+    let set = |limit: &mut u64, flag: Option<u64>| *limit = flag.unwrap_or(*limit);
+    set(&mut limits.read.max_atoms, args.max_atoms);
+    set(&mut limits.read.max_inflated_bytes, args.max_input_bytes);
+    set(&mut limits.surface.max_samples, args.max_samples);
+    set(&mut limits.surface.max_mesh_bytes, args.max_mesh_bytes);
+    limits
+}
+
+/// Names and values, as a query would have them.
+fn pairs(args: &MeshArgs) -> Vec<(&'static str, String)> {
+    let (surface, atoms) = (&args.surface, &args.selection);
+    let given = [
+        ("format", &args.format),
+        ("kernel", &surface.kernel),
+        ("preset", &surface.preset),
+        ("resolution", &surface.resolution),
+        ("isovalue", &surface.isovalue),
+        ("smoothness", &surface.smoothness),
+        ("radius_scale", &surface.radius_scale),
+        ("radius_offset", &surface.radius_offset),
+        ("cutoff_tolerance", &surface.cutoff_tolerance),
+        ("paper_a", &surface.paper_a),
+        ("paper_b", &surface.paper_b),
+        ("paper_c", &surface.paper_c),
+        ("chains", &atoms.chains),
+        ("model", &atoms.model),
+        ("altloc", &atoms.altloc),
+    ];
+    let mut pairs: Vec<_> =
+        given.into_iter().filter_map(|(name, value)| value.clone().map(|value| (name, value))).collect();
+    if surface.atom_ids {
+        pairs.push(("atom_ids", "true".to_owned()));
+    }
+    // The short flags add to what is selected; alone they add to the default.
+    let mut select = atoms.select.clone();
+    for (flag, class) in [(atoms.ligands, "ligand"), (atoms.waters, "water"), (atoms.hydrogens, "hydrogens")] {
+        if flag {
+            select = Some(format!("{},{class}", select.as_deref().unwrap_or("polymer")));
+        }
+    }
+    pairs.extend(select.map(|select| ("select", select)));
+    pairs
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::super::args::{Args, Command};
+    use super::*;
+
+    fn request(flags: &[&str]) -> Result<(Job, Option<Format>), CliError> {
+        let line = ["molmesh", "mesh", "in.pdb", "-o", "out.glb"].iter().chain(flags);
+        let Command::Mesh(args) = Args::try_parse_from(line).unwrap().command else { panic!("not mesh") };
+        parse(&args)
+    }
+
+    #[test]
+    fn short_flags_add_to_the_selection() {
+        let selection = |flags: &[&str]| request(flags).unwrap().0.selection;
+        let plain = selection(&[]);
+        assert!(plain.polymer && !plain.ligands && !plain.waters && !plain.hydrogens);
+        let more = selection(&["--ligands", "--hydrogens"]);
+        assert!(more.polymer && more.ligands && !more.waters && more.hydrogens);
+        let water = selection(&["--select", "ligand", "--waters"]);
+        assert!(!water.polymer && water.ligands && water.waters);
+    }
+
+    #[test]
+    fn every_parameter_of_a_mesh_has_a_flag() {
+        // `report` is how HTTP asks for what `--report json` always gives.
+        for parameter in params::TABLE.iter().filter(|p| p.name != "report") {
+            let flag = format!("--{}", parameter.name.replace('_', "-"));
+            let value = match parameter.name {
+                "atom_ids" => vec![flag.as_str()],
+                "kernel" => vec![&flag, "soft-object"],
+                "preset" => vec![&flag, "blinn"],
+                "select" => vec![&flag, "water"],
+                "format" => vec![&flag, "ply"],
+                "paper_a" => vec![&flag, "1", "--paper-b", "2"],
+                "paper_b" => vec![&flag, "2", "--paper-a", "1"],
+                "paper_c" => vec![&flag, "0.5", "--paper-b", "3", "--kernel", "inverse-square"],
+                "radius_offset" => vec![&flag, "-0.1"],
+                "cutoff_tolerance" => vec![&flag, "0.02"],
+                _ => vec![&flag, "2"],
+            };
+            let (job, format) = request(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
+            let (plain, none) = request(&[]).unwrap();
+            let changed = params::canonical(&job) != params::canonical(&plain) || format != none;
+            assert!(changed, "{flag} changes nothing");
+        }
+    }
+
+    #[test]
+    fn a_bad_value_is_bad_usage() {
+        for flags in [["--resolution", "0"], ["--resolution", "nan"], ["--kernel", "x"], ["--chains", ",,"]] {
+            assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
+        }
+    }
+}

@@ -1,0 +1,204 @@
+//! The report of a mesh on one screen, for people. Pure: a report in, text out.
+
+use molmesh::pipeline::Report;
+
+use super::page::Page;
+use super::style::Style;
+
+/// Cells of the longest bar.
+const BAR: f64 = 24.0;
+
+/// What was written where.
+pub(crate) struct Written<'a> {
+    /// Path, or `stdout`.
+    pub(crate) name: &'a str,
+    /// Format.
+    pub(crate) format: &'static str,
+    /// Bytes.
+    pub(crate) bytes: u64,
+}
+
+/// The summary.
+pub(crate) fn text(report: &Report, written: &Written<'_>, style: Style) -> String {
+    let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
+    let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
+    page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, model {})", report.source_format, report.model));
+    page.row("surface", &surface(report));
+    let [bricks, with_surface, samples, dense] =
+        [report.bricks, report.surface_bricks, report.samples, report.box_cells].map(grouped);
+    page.row("grid", &format!("{bricks} bricks ({with_surface} with surface), {samples} samples; box: {dense} cells"));
+    page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
+    page.row("proof", &proof(report, style));
+    page.row("parts", &parts(report));
+    page.row("area", &format!("{} Å²", decimal(report.area)));
+    page.row("volume", &format!("{} Å³", decimal(report.volume)));
+    page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
+    page.row("wrote", &format!("{} ({}, {} bytes)", written.name, written.format, grouped(written.bytes)));
+    timings(&mut page, report);
+    page.finish()
+}
+
+/// The structure's title, cut to one line.
+fn title(report: &Report) -> String {
+    let title = report.title.as_deref().unwrap_or_default();
+    let mut chars = title.chars();
+    let short: String = chars.by_ref().take(90).collect();
+    if chars.next().is_some() { format!("{short}…") } else { short }
+}
+
+fn surface(report: &Report) -> String {
+    let smoothness = report.smoothness.map(|a| format!(", smoothness {a}")).unwrap_or_default();
+    let preset = Some(report.preset).filter(|p| *p != "default").map(|p| format!(" (preset {p})")).unwrap_or_default();
+    format!("{}, {} Å, isovalue {}{smoothness}{preset}", report.kernel, report.resolution, report.isovalue)
+}
+
+fn proof(report: &Report, style: Style) -> String {
+    let says = |holds: bool, yes: &str, no: &str| if holds { style.green(yes) } else { style.red(no) };
+    format!(
+        "{}, {}, {}, Euler number {}",
+        says(report.closed, "closed", "NOT closed"),
+        says(report.oriented, "oriented", "NOT oriented"),
+        says(report.manifold, "manifold", "NOT manifold"),
+        report.euler
+    )
+}
+
+fn parts(report: &Report) -> String {
+    let of = |n: u64, one: &str, more: &str| format!("{} {}", grouped(n), if n == 1 { one } else { more });
+    let components = of(report.components, "component", "components");
+    match report.cavities {
+        0 => format!("{components}, no cavities"),
+        n => format!("{components}, of which {}", of(n, "cavity", "cavities")),
+    }
+}
+
+/// A bar per stage, the longest stage the longest bar.
+fn timings(page: &mut Page, report: &Report) {
+    let stages: Vec<(&str, f64)> =
+        report.timings_ms.iter().filter_map(|(name, ms)| Some((name.as_str(), ms.as_f64()?))).collect();
+    let total: f64 = stages.iter().map(|(_, ms)| ms).sum();
+    let longest = stages.iter().map(|(_, ms)| *ms).fold(f64::MIN_POSITIVE, f64::max);
+    page.row("time", &format!("{} ms", decimal(total)));
+    for (name, ms) in stages {
+        let (label, bar) = (page.style.dim(&format!("{name:<12}")), page.style.cyan(&bar(ms / longest)));
+        page.line(format!("    {label} {:>9} ms  {bar}", decimal(ms)));
+    }
+}
+
+/// A bar in eighths of a cell.
+fn bar(fraction: f64) -> String {
+    const EIGHTHS: [&str; 8] = ["", "▏", "▎", "▍", "▌", "▋", "▊", "▉"];
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0..=192")]
+    let eighths = (fraction.clamp(0.0, 1.0) * BAR * 8.0).round().max(1.0) as usize;
+    format!("{}{}", "█".repeat(eighths / 8), EIGHTHS[eighths % 8])
+}
+
+/// `1234567` as `1,234,567`.
+fn grouped(n: u64) -> String {
+    let digits = n.to_string();
+    let mut out = String::with_capacity(digits.len() + digits.len() / 3);
+    for (i, digit) in digits.chars().enumerate() {
+        if i > 0 && (digits.len() - i).is_multiple_of(3) {
+            out.push(',');
+        }
+        out.push(digit);
+    }
+    out
+}
+
+/// With as many decimals as are worth reading: one from 100 on, two below, three below 1.
+fn decimal(value: f64) -> String {
+    let digits = match value.abs() {
+        v if v >= 100.0 => 1,
+        v if v >= 1.0 => 2,
+        _ => 3,
+    };
+    let text = format!("{value:.digits$}");
+    let (sign, unsigned) = text.strip_prefix('-').map_or(("", text.as_str()), |rest| ("-", rest));
+    match unsigned.split_once('.') {
+        Some((whole, part)) => {
+            let whole = whole.parse().map_or_else(|_| whole.to_owned(), grouped);
+            format!("{sign}{whole}.{part}")
+        }
+        None => text,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_read_well() {
+        assert_eq!([0, 999, 1000, 1_234_567].map(grouped), ["0", "999", "1,000", "1,234,567"]);
+        assert_eq!([0.0123, 3.14159, -1234.56, 99.999].map(decimal), ["0.012", "3.14", "-1,234.6", "100.00"]);
+        assert_eq!(decimal(f64::NAN), "NaN");
+    }
+
+    #[test]
+    fn bars_grow_with_time_and_never_vanish() {
+        let cells = [0.0, 0.1, 0.5, 1.0].map(|f| bar(f).chars().count());
+        assert_eq!(cells, [1, 3, 12, 24]);
+        assert_eq!(bar(2.0), bar(1.0));
+    }
+
+    fn report() -> Report {
+        Report {
+            id: Some("4PTI".into()),
+            title: Some("TRYPSIN INHIBITOR".into()),
+            source_format: "pdb",
+            atoms: 454,
+            atoms_in_file: 514,
+            model: 1,
+            radii: "table",
+            kernel: "gaussian",
+            preset: "default",
+            resolution: 0.5,
+            isovalue: 1.0,
+            smoothness: Some(1.25),
+            bricks: 300,
+            surface_bricks: 250,
+            samples: 153_600,
+            box_cells: 1_000_000,
+            vertices: 20_000,
+            triangles: 39_996,
+            closed: true,
+            oriented: true,
+            manifold: false,
+            euler: 2,
+            components: 2,
+            cavities: 1,
+            component_list: Vec::new(),
+            area: 3200.04,
+            volume: 7100.0,
+            backend: "cpu",
+            device: "2 threads".into(),
+            backend_reason: "asked for".into(),
+            timings_ms: [("read".to_owned(), 0.25.into()), ("field".to_owned(), 2.5.into())].into_iter().collect(),
+        }
+    }
+
+    #[test]
+    fn it_says_everything_on_one_screen() {
+        let text = text(&report(), &Written { name: "a.glb", format: "glb", bytes: 720_000 }, Style::PLAIN);
+        for part in [
+            "4PTI TRYPSIN INHIBITOR",
+            "454 of 514",
+            "300 bricks",
+            "153,600 samples",
+            "20,000 vertices",
+            "39,996 triangles",
+            "closed, oriented, NOT manifold, Euler number 2",
+            "2 components, of which 1 cavity",
+            "3,200.0 Å²",
+            "7,100.0 Å³",
+            "cpu: 2 threads (asked for)",
+            "a.glb (glb, 720,000 bytes)",
+            "2.75 ms",
+            "field",
+        ] {
+            assert!(text.contains(part), "no `{part}` in\n{text}");
+        }
+        assert!(text.lines().count() <= 24, "{text}");
+    }
+}

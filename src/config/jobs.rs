@@ -1,0 +1,34 @@
+//! The worker pool: how much runs, how much waits, how long.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+/// The worker pool.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct JobsConfig {
+    /// Jobs that run at once. Default 2: the backend spreads one job over all cores, and a second one fills them
+    /// while the first reads its file or measures its mesh.
+    pub workers: usize,
+    /// Jobs that wait. Default 64: at a typical 0.1 s a job on two workers the last one waits three seconds,
+    /// which is as long as anybody waits for an answer; more would only make refusals late.
+    pub queue: usize,
+    /// Time from acceptance to the finished mesh, ms, waiting included. Default 60,000: proxies commonly cut an
+    /// exchange after a minute.
+    pub deadline_ms: u64,
+}
+
+impl Default for JobsConfig {
+    fn default() -> Self {
+        Self { workers: 2, queue: 64, deadline_ms: 60_000 }
+    }
+}
+
+impl JobsConfig {
+    /// Time from acceptance to the finished mesh.
+    #[must_use]
+    pub fn deadline(&self) -> Duration {
+        Duration::from_millis(self.deadline_ms)
+    }
+}

@@ -1,0 +1,58 @@
+//! What one request may cost, checked before anything is allocated for it.
+
+use serde::{Deserialize, Serialize};
+
+use crate::pipeline::JobLimits;
+use crate::structure::ReadLimits;
+use crate::surface::SurfaceLimits;
+
+/// Limits of a request, and of all of them together.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LimitsConfig {
+    /// Bytes of a request body as sent. Default 256 MiB: the largest entries of the archive are about 100 MB
+    /// compressed.
+    pub body_bytes: u64,
+    /// Bytes of a structure after decompression. Default 2 GiB: the largest entries inflate to about 1 GB; a
+    /// compression bomb stops here.
+    pub inflated_bytes: u64,
+    /// Atoms in all models of a structure. Default 10,000,000: four times the largest entry of the archive; at
+    /// 80 bytes each they take 800 MB.
+    pub atoms: u64,
+    /// Grid samples in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; as 32-bit numbers
+    /// they take 4 GiB.
+    pub grid_samples: u64,
+    /// Bytes of a mesh in memory (24 a vertex, 12 a triangle). Default 2 GiB: 85 million triangles.
+    pub mesh_bytes: u64,
+    /// Bytes of a mesh file. Default 3 GiB: below the 4 GiB that a GLB can say, and text formats take more than
+    /// the mesh in memory.
+    pub output_bytes: u64,
+    /// Bytes of uploads and finished meshes that all requests together hold in memory. Default 8 GiB. A new
+    /// upload or job is refused while it is used up; running jobs may overshoot it by `mesh_bytes` each.
+    pub memory_bytes: u64,
+}
+
+impl Default for LimitsConfig {
+    fn default() -> Self {
+        Self {
+            body_bytes: 256 << 20,
+            inflated_bytes: 2 << 30,
+            atoms: 10_000_000,
+            grid_samples: 1 << 30,
+            mesh_bytes: 2 << 30,
+            output_bytes: 3 << 30,
+            memory_bytes: 8 << 30,
+        }
+    }
+}
+
+impl LimitsConfig {
+    /// The limits of reading and meshing.
+    #[must_use]
+    pub fn job(&self) -> JobLimits {
+        JobLimits {
+            read: ReadLimits { max_inflated_bytes: self.inflated_bytes, max_atoms: self.atoms },
+            surface: SurfaceLimits { max_samples: self.grid_samples, max_mesh_bytes: self.mesh_bytes },
+        }
+    }
+}

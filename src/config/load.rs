@@ -1,0 +1,150 @@
+//! The layers: each sets single keys of a tree whose shape the defaults give.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+
+use super::{Config, ConfigError};
+use crate::pipeline::nearest::nearest;
+
+/// Prefix of environment variables; sections and keys follow, separated by two underscores.
+const PREFIX: &str = "MOLMESH__";
+
+/// Where a value came from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Source {
+    /// The TOML file.
+    File(PathBuf),
+    /// An environment variable.
+    Environment(String),
+    /// A flag of the command line.
+    Flag,
+}
+
+impl fmt::Display for Source {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::File(path) => write!(f, "{}", path.display()),
+            Self::Environment(name) => f.write_str(name),
+            Self::Flag => f.write_str("command line"),
+        }
+    }
+}
+
+/// Loads the configuration of this process: `file`, then the environment, then `flags`.
+///
+/// # Errors
+/// See [`load`].
+pub fn load_process(file: Option<&Path>, flags: &[(String, String)]) -> Result<Config, ConfigError> {
+    let env = std::env::vars_os().filter_map(|(k, v)| Some((k.into_string().ok()?, v.to_string_lossy().into_owned())));
+    load(file, env, flags)
+}
+
+/// Loads a configuration: defaults, then `file`, then the variables of `env` that begin with `MOLMESH__`, then
+/// `flags` as pairs of a path such as `server.listen` and a value.
+///
+/// Values from the environment and flags are text: `none` clears a key, sizes may be written as `64MiB`.
+///
+/// # Errors
+/// [`ConfigError`] names the first key that is unknown or whose value cannot be used.
+pub fn load(
+    file: Option<&Path>,
+    env: impl IntoIterator<Item = (String, String)>,
+    flags: &[(String, String)],
+) -> Result<Config, ConfigError> {
+    let mut tree = Tree::new();
+    if let Some(path) = file {
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| ConfigError::Read { path: path.to_owned(), error })?;
+        let table: Value = toml::from_str(&text)
+            .map_err(|e| ConfigError::Syntax { path: path.to_owned(), reason: e.to_string().trim().to_owned() })?;
+        let source = Source::File(path.to_owned());
+        for (section, entries) in table.as_object().into_iter().flatten() {
+            let Some(entries) = entries.as_object() else {
+                return Err(tree.unknown(section, source));
+            };
+            for (key, value) in entries {
+                tree.set(&format!("{section}.{key}"), value, &source)?;
+            }
+        }
+    }
+    let mut env: Vec<_> = env.into_iter().filter(|(name, _)| name.starts_with(PREFIX)).collect();
+    env.sort();
+    for (name, value) in env {
+        let key = name[PREFIX.len()..].to_ascii_lowercase().replace("__", ".");
+        tree.set(&key, &Value::String(value), &Source::Environment(name))?;
+    }
+    for (key, value) in flags {
+        tree.set(key, &Value::String(value.clone()), &Source::Flag)?;
+    }
+    Ok(tree.config)
+}
+
+/// The configuration so far, typed and as a tree.
+struct Tree {
+    defaults: Value,
+    values: Value,
+    config: Config,
+}
+
+impl Tree {
+    fn new() -> Self {
+        let config = Config::default();
+        let defaults = serde_json::to_value(&config).unwrap_or(Value::Null);
+        Self { values: defaults.clone(), defaults, config }
+    }
+
+    fn unknown(&self, key: &str, source_layer: Source) -> ConfigError {
+        let mut known = Vec::new();
+        for (section, keys) in self.defaults.as_object().into_iter().flatten() {
+            known.extend(keys.as_object().into_iter().flatten().map(|(key, _)| format!("{section}.{key}")));
+        }
+        // A key under the wrong section, or under none, is nearest to its namesake.
+        let last = key.rsplit('.').next().unwrap_or(key);
+        let namesake = known.iter().find(|k| k.rsplit('.').next() == Some(last)).cloned();
+        let nearest = namesake.or_else(|| nearest(key, known.iter().map(String::as_str)).map(str::to_owned));
+        ConfigError::UnknownKey { key: key.to_owned(), nearest, source_layer }
+    }
+
+    /// Sets one key and checks the whole, so that a bad value is blamed on the layer that gave it.
+    fn set(&mut self, key: &str, value: &Value, source: &Source) -> Result<(), ConfigError> {
+        let pointer = format!("/{}", key.replace('.', "/"));
+        let default = self.defaults.pointer(&pointer).filter(|d| !d.is_object());
+        let Some(default) = default else { return Err(self.unknown(key, source.clone())) };
+        let bad = |expected: String| ConfigError::BadValue {
+            key: key.to_owned(),
+            value: value.to_string(),
+            expected,
+            source_layer: source.clone(),
+        };
+        let typed = match (value, default) {
+            (Value::String(text), Value::Number(_)) => {
+                let size = key.ends_with("_bytes");
+                let expected = if size { "a whole number, or a size such as 64MiB" } else { "a whole number" };
+                Value::from(whole(text, size).ok_or_else(|| bad(expected.to_owned()))?)
+            }
+            (Value::String(text), _) if text == "none" => Value::Null,
+            _ => value.clone(),
+        };
+        // Nothing can be served with a limit or a timeout of zero; ports are part of addresses, not numbers.
+        if typed.as_f64().is_some_and(|v| v < 1.0) {
+            return Err(bad("1 or more".to_owned()));
+        }
+        if let Some(place) = self.values.pointer_mut(&pointer) {
+            *place = typed;
+        }
+        self.config = serde_json::from_value(self.values.clone()).map_err(|e| bad(e.to_string()))?;
+        Ok(())
+    }
+}
+
+/// A whole number, with underscores between digits, and for sizes with a binary suffix.
+fn whole(text: &str, size: bool) -> Option<u64> {
+    let text = text.trim();
+    let (digits, factor) = [("KiB", 1 << 10), ("MiB", 1 << 20), ("GiB", 1u64 << 30)]
+        .into_iter()
+        .find_map(|(suffix, factor)| Some((text.strip_suffix(suffix).filter(|_| size)?, factor)))
+        .unwrap_or((text, 1));
+    digits.trim().replace('_', "").parse::<u64>().ok()?.checked_mul(factor)
+}

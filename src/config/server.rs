@@ -1,0 +1,86 @@
+//! Addresses, connections and their timeouts.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+/// The listeners and what a connection may do.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ServerConfig {
+    /// Address of the service. Default 127.0.0.1:8080: nothing is exposed until somebody says so. Port 0 takes
+    /// any free port.
+    pub listen: SocketAddr,
+    /// Address of `/metrics`. Default `none`: there is no port that is free on every machine. It is apart from
+    /// the service, so that a proxy in front cannot expose it by accident.
+    pub metrics_listen: Option<SocketAddr>,
+    /// Folder of everything that the service keeps; the archive is looked for in it.
+    pub data_dir: PathBuf,
+    /// Connections at once. Default 1,024: the usual limit of open files leaves no room for more. One more is
+    /// answered with 503 and closed.
+    pub connections: usize,
+    /// Time for the head of a request, ms, from the connection or the answer before it: also how long an idle
+    /// HTTP/1.1 connection is kept. Default 15,000: clients on slow lines need seconds, a minute serves only those
+    /// who send one byte at a time.
+    pub header_timeout_ms: u64,
+    /// Time for the whole body of a request, ms. Default 60,000: 256 MiB at 36 Mbit/s.
+    pub body_timeout_ms: u64,
+    /// Time in which a client must take some bytes of an answer, ms. Default 30,000: a mesh is kept in memory
+    /// until it is sent.
+    pub write_timeout_ms: u64,
+    /// How long an idle HTTP/2 connection is kept, ms. Default 120,000: front-ends come back within that time.
+    pub idle_timeout_ms: u64,
+    /// Time for running requests to finish after a stop signal, ms. Default 20,000: orchestrators commonly kill
+    /// after 30 seconds.
+    pub drain_timeout_ms: u64,
+}
+
+impl Default for ServerConfig {
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)),
+            metrics_listen: None,
+            data_dir: PathBuf::from("molmesh-data"),
+            connections: 1024,
+            header_timeout_ms: 15_000,
+            body_timeout_ms: 60_000,
+            write_timeout_ms: 30_000,
+            idle_timeout_ms: 120_000,
+            drain_timeout_ms: 20_000,
+        }
+    }
+}
+
+impl ServerConfig {
+    /// Time for the head of a request.
+    #[must_use]
+    pub fn header_timeout(&self) -> Duration {
+        Duration::from_millis(self.header_timeout_ms)
+    }
+
+    /// Time for the whole body of a request.
+    #[must_use]
+    pub fn body_timeout(&self) -> Duration {
+        Duration::from_millis(self.body_timeout_ms)
+    }
+
+    /// Time in which a client must take some bytes of an answer.
+    #[must_use]
+    pub fn write_timeout(&self) -> Duration {
+        Duration::from_millis(self.write_timeout_ms)
+    }
+
+    /// How long an idle HTTP/2 connection is kept.
+    #[must_use]
+    pub fn idle_timeout(&self) -> Duration {
+        Duration::from_millis(self.idle_timeout_ms)
+    }
+
+    /// Time for running requests to finish after a stop signal.
+    #[must_use]
+    pub fn drain_timeout(&self) -> Duration {
+        Duration::from_millis(self.drain_timeout_ms)
+    }
+}

@@ -1,0 +1,109 @@
+//! Memory that all requests share, counted in bytes: uploads and meshes that nobody has taken yet.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use metrics::gauge;
+use thiserror::Error;
+
+use crate::telemetry::MEMORY_HELD;
+
+/// The budget is used up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+#[error("{held} of {limit} bytes of memory for uploads and meshes are in use")]
+pub struct Exhausted {
+    /// Bytes allowed.
+    pub limit: u64,
+    /// Bytes in use.
+    pub held: u64,
+}
+
+/// Bytes that may be held at once. Clones share one budget.
+#[derive(Debug, Clone)]
+pub struct Budget {
+    limit: u64,
+    held: Arc<AtomicU64>,
+}
+
+impl Budget {
+    /// A budget of `limit` bytes.
+    #[must_use]
+    pub fn new(limit: u64) -> Self {
+        Self { limit, held: Arc::default() }
+    }
+
+    /// Fails while more than the limit is held.
+    ///
+    /// # Errors
+    /// [`Exhausted`].
+    pub fn check(&self) -> Result<(), Exhausted> {
+        let held = self.held.load(Ordering::Relaxed);
+        if held > self.limit { Err(Exhausted { limit: self.limit, held }) } else { Ok(()) }
+    }
+
+    /// A lease of nothing, to grow.
+    #[must_use]
+    pub fn lease(&self) -> Lease {
+        Lease { budget: self.clone(), bytes: 0 }
+    }
+}
+
+/// Bytes held; dropping it gives them back.
+#[derive(Debug)]
+pub struct Lease {
+    budget: Budget,
+    bytes: u64,
+}
+
+impl Lease {
+    /// Holds `bytes` more, or fails and holds what it held before.
+    ///
+    /// # Errors
+    /// [`Exhausted`].
+    pub fn grow(&mut self, bytes: u64) -> Result<(), Exhausted> {
+        let Budget { limit, held } = &self.budget;
+        held.try_update(Ordering::Relaxed, Ordering::Relaxed, |now| now.checked_add(bytes).filter(|sum| sum <= limit))
+            .map_err(|held| Exhausted { limit: *limit, held })?;
+        self.bytes += bytes;
+        self.publish();
+        Ok(())
+    }
+
+    /// Holds `bytes` more, whatever the limit: for what exists already.
+    pub fn force(&mut self, bytes: u64) {
+        self.budget.held.fetch_add(bytes, Ordering::Relaxed);
+        self.bytes += bytes;
+        self.publish();
+    }
+
+    fn publish(&self) {
+        gauge!(MEMORY_HELD).set(self.budget.held.load(Ordering::Relaxed) as f64);
+    }
+}
+
+impl Drop for Lease {
+    fn drop(&mut self) {
+        self.budget.held.fetch_sub(self.bytes, Ordering::Relaxed);
+        self.publish();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Budget;
+
+    #[test]
+    fn leases_add_up_and_come_back() {
+        let budget = Budget::new(100);
+        let (mut a, mut b) = (budget.lease(), budget.lease());
+        a.grow(60).unwrap();
+        assert_eq!(b.grow(41).unwrap_err().held, 60);
+        b.grow(40).unwrap();
+        b.force(10);
+        assert_eq!(budget.check().unwrap_err().held, 110);
+        drop(b);
+        budget.check().unwrap();
+        drop(a);
+        budget.lease().grow(100).unwrap();
+    }
+}

@@ -1,0 +1,68 @@
+//! Why a job is not accepted, and why an accepted one ends without a mesh.
+
+use std::time::Duration;
+
+use thiserror::Error;
+
+use super::Exhausted;
+use crate::pipeline::JobError;
+use crate::structure::referee::{Diagnostic, Level};
+
+/// Why a job is not accepted.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum Refusal {
+    /// As many jobs wait as may.
+    #[error("{waiting} jobs are waiting, the limit is {limit}; the next place is free in about {} s", wait.as_secs_f64().ceil())]
+    QueueFull {
+        /// Jobs that wait.
+        waiting: usize,
+        /// Jobs that may wait.
+        limit: usize,
+        /// Estimated time until the queue has moved.
+        wait: Duration,
+    },
+    /// The pool is shutting down.
+    #[error("the service is shutting down")]
+    Draining,
+}
+
+/// Why an accepted job ended without a mesh.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum Failure {
+    /// The job itself failed.
+    #[error("{error}")]
+    Job {
+        /// Why.
+        error: JobError,
+        /// What the referee says of a file that cannot be read; empty otherwise.
+        diagnostics: Vec<Diagnostic>,
+    },
+    /// A strict check was asked for, and the referee found errors.
+    #[error("the strict check found {} errors", errors(diagnostics))]
+    Check {
+        /// Everything that it found.
+        diagnostics: Vec<Diagnostic>,
+    },
+    /// The deadline passed.
+    #[error("the deadline of {} s passed", limit.as_secs_f64())]
+    Deadline {
+        /// Time that was allowed.
+        limit: Duration,
+    },
+    /// Too much memory is held by meshes that clients have not taken yet.
+    #[error(transparent)]
+    Memory(#[from] Exhausted),
+    /// The pool stopped before the job was done.
+    #[error("the service shut down before the job was done")]
+    Stopped,
+    /// The job panicked; the message is for the log.
+    #[error("the job panicked: {message}")]
+    Panicked {
+        /// What the panic said.
+        message: String,
+    },
+}
+
+fn errors(diagnostics: &[Diagnostic]) -> usize {
+    diagnostics.iter().filter(|d| d.level == Level::Error).count()
+}

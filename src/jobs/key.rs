@@ -1,0 +1,79 @@
+//! Names of contents: the digest of an input, and the key of what is made of it.
+
+use std::fmt;
+
+use sha2::{Digest as _, Sha256};
+
+use crate::formats::Format;
+use crate::pipeline::{Job, params};
+
+/// SHA-256 of a structure file as it came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Digest([u8; 32]);
+
+impl Digest {
+    /// The digest of `bytes`. About a nanosecond a byte: not for the async runtime.
+    #[must_use]
+    pub fn of(bytes: &[u8]) -> Self {
+        Self(Sha256::digest(bytes).into())
+    }
+}
+
+impl fmt::Display for Digest {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+/// The name of a mesh file: equal keys, equal bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct ContentKey(Digest);
+
+impl ContentKey {
+    /// The key of what `backend` makes of an input. The version is part of it, as any release may move a bit.
+    #[must_use]
+    pub fn new(input: &Digest, job: &Job, format: Format, backend: &str) -> Self {
+        let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
+        let text = format!("molmesh {version}\n{backend}\n{}\n{canonical}\n{input}\n", format.extension());
+        Self(Digest::of(text.as_bytes()))
+    }
+}
+
+impl fmt::Display for ContentKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn digests_are_sha256() {
+        assert_eq!(
+            Digest::of(b"abc").to_string(),
+            "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+        );
+    }
+
+    #[test]
+    fn keys_tell_everything_apart() {
+        let plain = Job::default();
+        let fine = params::parse([("resolution", "0.4")]).unwrap().job;
+        let chain = params::parse([("chains", "A")]).unwrap().job;
+        let (a, b) = (Digest::of(b"a"), Digest::of(b"b"));
+        let mut keys = vec![
+            ContentKey::new(&a, &plain, Format::Glb, "cpu"),
+            ContentKey::new(&b, &plain, Format::Glb, "cpu"),
+            ContentKey::new(&a, &fine, Format::Glb, "cpu"),
+            ContentKey::new(&a, &chain, Format::Glb, "cpu"),
+            ContentKey::new(&a, &plain, Format::Ply, "cpu"),
+            ContentKey::new(&a, &plain, Format::Glb, "gpu"),
+        ];
+        assert_eq!(keys[0], ContentKey::new(&a, &Job::default(), Format::Glb, "cpu"));
+        keys.sort_by_key(ToString::to_string);
+        keys.dedup();
+        assert_eq!(keys.len(), 6);
+    }
+}

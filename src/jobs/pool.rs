@@ -1,0 +1,113 @@
+//! The pool: worker threads, the queue in front of them, the memory that they share.
+
+use std::io;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use metrics::counter;
+use tokio::sync::oneshot;
+
+use super::queue::Queue;
+use super::{Budget, Refusal, Task, Ticket, worker};
+use crate::pipeline::JobLimits;
+use crate::surface::Backend;
+use crate::telemetry::JOBS_SUBMITTED;
+
+/// Sizes of a pool.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// Jobs that run at once, at least 1.
+    pub workers: usize,
+    /// Jobs that wait.
+    pub queue: usize,
+    /// Limits of every job.
+    pub limits: JobLimits,
+    /// Memory for uploads and meshes.
+    pub budget: Budget,
+}
+
+/// What workers share.
+pub(super) struct Shared {
+    pub(super) queue: Arc<Queue>,
+    pub(super) backend: Arc<dyn Backend>,
+    pub(super) reason: String,
+    pub(super) limits: JobLimits,
+    pub(super) budget: Budget,
+}
+
+/// A running pool. Dropping it cancels what runs.
+pub struct Pool {
+    shared: Arc<Shared>,
+}
+
+impl Pool {
+    /// Starts the workers. `reason` says why this backend was taken, for reports.
+    ///
+    /// # Errors
+    /// That of the system, if a thread cannot be started.
+    pub fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
+        let Settings { workers, queue, limits, budget } = settings;
+        let workers = workers.max(1);
+        let queue = Arc::new(Queue::new(queue, workers));
+        let pool = Self { shared: Arc::new(Shared { queue, backend, reason, limits, budget }) };
+        for n in 0..workers {
+            let shared = Arc::clone(&pool.shared);
+            std::thread::Builder::new().name(format!("molmesh-job-{n}")).spawn(move || worker::work(&shared))?;
+        }
+        Ok(pool)
+    }
+
+    /// Accepts a job, or says at once why not.
+    ///
+    /// # Errors
+    /// Any [`Refusal`].
+    pub fn submit(&self, task: Task) -> Result<Ticket, Refusal> {
+        let (deadline, allowed) = (task.deadline, task.deadline.saturating_duration_since(Instant::now()));
+        let (reply, outcome) = oneshot::channel();
+        let (id, cancel) = self.shared.queue.push(task, reply)?;
+        counter!(JOBS_SUBMITTED, "mode" => "sync").increment(1);
+        Ok(Ticket { id, queue: Arc::clone(&self.shared.queue), cancel, outcome, deadline, allowed })
+    }
+
+    /// How long a job that is accepted now would wait.
+    #[must_use]
+    pub fn estimated_wait(&self) -> Duration {
+        self.shared.queue.estimated_wait()
+    }
+
+    /// The backend.
+    #[must_use]
+    pub fn backend(&self) -> &Arc<dyn Backend> {
+        &self.shared.backend
+    }
+
+    /// Why the backend was taken.
+    #[must_use]
+    pub fn reason(&self) -> &str {
+        &self.shared.reason
+    }
+
+    /// Memory for uploads and meshes.
+    #[must_use]
+    pub fn budget(&self) -> &Budget {
+        &self.shared.budget
+    }
+
+    /// Accepts no more jobs and waits for those that were accepted, until `deadline` at most; then cancels the
+    /// rest. True if all of them ended by themselves.
+    pub async fn drain(&self, deadline: Instant) -> bool {
+        self.shared.queue.close();
+        let in_time = tokio::time::timeout_at(deadline.into(), self.shared.queue.idle()).await.is_ok();
+        if !in_time {
+            self.shared.queue.cancel_all();
+        }
+        in_time
+    }
+}
+
+impl Drop for Pool {
+    fn drop(&mut self) {
+        self.shared.queue.close();
+        self.shared.queue.cancel_all();
+    }
+}

@@ -1,0 +1,195 @@
+//! Every exit code that the help promises, the line that comes with it, and that a failure leaves no file.
+#![cfg(all(feature = "cli", feature = "server"))]
+#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
+
+mod cli_support;
+
+use std::fs;
+use std::path::Path;
+
+use cli_support::{Folder, assert_code, mesh, molmesh, pdb, piped, rod, run, stderr, stdout};
+
+/// Runs a mesh that must fail with `code`, and must leave nothing but its input.
+#[track_caller]
+fn fails(input: impl AsRef<[u8]>, flags: &[&str], code: i32) -> String {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", input);
+    let done = mesh(&input, &folder.path("out.glb"), flags);
+    assert_code(&done, code);
+    assert_eq!(folder.entries(), ["in.pdb"], "{flags:?}");
+    assert_eq!(stdout(&done), "", "{flags:?}");
+    stderr(&done)
+}
+
+#[test]
+fn two_is_bad_usage() {
+    let cases: [(&[&str], &str); 14] = [
+        (&["--resolution", "0"], "resolution"),
+        (&["--resolution", "-1"], "resolution"),
+        (&["--resolution", "fine"], "`fine`"),
+        (&["--resolution", "NaN"], "resolution"),
+        (&["--resolution", "0.000001"], "resolution"),
+        (&["--kernel", "sphere"], "gaussian, soft-object, inverse-square"),
+        (&["--preset", "best"], "preset"),
+        (&["--isovalue", "1e300"], "isovalue"),
+        (&["--kernel", "soft-object", "--smoothness", "2"], "smoothness"),
+        (&["--paper-a", "1"], "paper_b"),
+        (&["--altloc", "AB"], "altloc"),
+        (&["--select", "everything"], "select"),
+        (&["--threads", "0"], "threads"),
+        (&["--isovalue", "900000"], "isovalue"),
+    ];
+    for (flags, part) in cases {
+        let said = fails(rod(), flags, 2);
+        assert!(said.contains(part), "{flags:?}: {said}");
+    }
+}
+
+#[test]
+fn two_is_also_what_clap_refuses() {
+    let cases: [&[&str]; 6] = [
+        &["mesh"],
+        &["mesh", "a.pdb"],
+        &["mesh", "a.pdb", "-o", "b.glb", "--no-such-flag"],
+        &["mesh", "a.pdb", "-o", "b.glb", "--backend", "abacus"],
+        &["mesh", "a.pdb", "-o", "b.glb", "--threads", "many"],
+        &["fold"],
+    ];
+    for args in cases {
+        let done = run(args);
+        assert_eq!(done.status.code(), Some(2), "{args:?}");
+        assert!(stderr(&done).starts_with("molmesh: "), "{args:?}: {}", stderr(&done));
+        assert_eq!(stdout(&done), "", "{args:?}");
+    }
+    let bare = molmesh().output().unwrap();
+    assert_eq!(bare.status.code(), Some(2));
+    assert!(stderr(&bare).contains("Usage: molmesh"));
+}
+
+#[test]
+fn two_is_an_output_without_a_known_format() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    for name in ["out", "out.pdf", "out.glb.gz"] {
+        let done = mesh(&input, &folder.path(name), &[]);
+        assert_code(&done, 2);
+        assert!(stderr(&done).contains("hint: name the format with --format"), "{}", stderr(&done));
+    }
+    assert_code(&mesh(&input, &folder.path("out.glb"), &["--format", "pdf"]), 2);
+    assert_eq!(folder.entries(), ["in.pdb"]);
+}
+
+#[test]
+fn three_is_an_input_that_cannot_be_read() {
+    let folder = Folder::new();
+    let done = mesh(&folder.path("nowhere.pdb"), &folder.path("out.glb"), &[]);
+    assert_code(&done, 3);
+    assert!(stderr(&done).contains("nowhere.pdb: no such file or directory"), "{}", stderr(&done));
+    fs::create_dir(folder.path("folder")).unwrap();
+    assert_code(&mesh(&folder.path("folder"), &folder.path("out.glb"), &[]), 3);
+    assert_eq!(folder.entries(), ["folder"]);
+}
+
+#[test]
+fn four_is_a_structure_that_is_refused() {
+    for bytes in [&b""[..], b"\n\n", b"hello", b"\x00\x01\x02\xff", b"END\n", b"HEADER    X\nREMARK   1\nEND\n"] {
+        fails(bytes, &[], 4);
+    }
+    fails(rod().replace("   0.250", "     nan"), &[], 4);
+    fails(pdb(&[[0.0; 3]]).replace("   0.000   0.000", " 9999999   0.000"), &[], 4);
+    let said = fails(rod(), &["--chains", "Z"], 4);
+    assert!(said.contains('Z') && said.contains('A'), "{said}");
+    let said = fails(rod(), &["--model", "7"], 4);
+    assert!(said.contains("model 7"), "{said}");
+    let said = fails(rod(), &["--select", "water"], 4);
+    assert!(said.contains("polymer"), "what the file holds is said: {said}");
+    assert_code(&piped(&["mesh", "-", "-o", "-"], b"nothing"), 4);
+}
+
+#[test]
+fn five_is_a_limit_and_says_the_numbers() {
+    let said = fails(rod(), &["--max-atoms", "9"], 5);
+    assert!(said.contains('9') && said.contains("hint: raise it with --max-atoms"), "{said}");
+    let said = fails(rod(), &["--max-samples", "100"], 5);
+    assert!(said.contains("limit is 100") && said.contains("hint: try --resolution "), "{said}");
+    let said = fails(rod(), &["--max-mesh-bytes", "1000"], 5);
+    assert!(said.contains("limit is 1000") && said.contains("hint: try --resolution "), "{said}");
+    let said = fails(rod(), &["--max-input-bytes", "100"], 5);
+    assert!(said.contains("100 bytes"), "{said}");
+    assert_code(&piped(&["mesh", "-", "-o", "-", "--max-input-bytes", "100"], rod().as_bytes()), 5);
+}
+
+#[test]
+fn the_suggested_resolution_fits() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let limit = ["--max-samples", "2000"];
+    let done = mesh(&input, &folder.path("out.glb"), &limit);
+    assert_code(&done, 5);
+    let said = stderr(&done);
+    let suggested = said.split("--resolution ").nth(1).unwrap().split(',').next().unwrap();
+    assert_code(&mesh(&input, &folder.path("out.glb"), &[limit[0], limit[1], "--resolution", suggested]), 0);
+}
+
+#[test]
+fn six_is_a_backend_that_is_not_here_and_why() {
+    for backend in ["gpu", "paper"] {
+        let said = fails(rod(), &["--backend", backend], 6);
+        assert!(said.contains(&format!("no backend `{backend}`")) && said.contains("GPU"), "{said}");
+    }
+}
+
+#[test]
+fn seven_is_an_output_that_cannot_be_written() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let done = mesh(&input, &folder.path("no/such/folder/out.glb"), &[]);
+    assert_code(&done, 7);
+    assert!(stderr(&done).contains("hint: the directory must exist"), "{}", stderr(&done));
+    fs::create_dir(folder.path("out.glb")).unwrap();
+    assert_code(&mesh(&input, &folder.path("out.glb"), &[]), 7);
+    assert_eq!(folder.entries(), ["in.pdb", "out.glb"]);
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn seven_is_also_a_full_disk() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let done = mesh(&input, Path::new("/dev/full"), &["--format", "glb"]);
+    assert_code(&done, 7);
+    assert!(stderr(&done).contains("no space left"), "{}", stderr(&done));
+}
+
+#[cfg(unix)]
+#[test]
+fn seven_is_also_a_reader_that_went_away() {
+    use std::process::Stdio;
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let mut child = molmesh();
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let child = child.arg("mesh").arg(input).args(["-o", "-", "--resolution", "0.1"]).stdout(writer);
+    assert_code(&child.stderr(Stdio::piped()).spawn().unwrap().wait_with_output().unwrap(), 7);
+}
+
+#[test]
+fn a_failure_leaves_the_old_file() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", "no structure");
+    let output = folder.file("out.glb", "old");
+    assert_code(&mesh(&input, &output, &[]), 4);
+    assert_eq!(fs::read(&output).unwrap(), b"old");
+    assert_eq!(folder.entries(), ["in.pdb", "out.glb"]);
+}
+
+#[test]
+fn one_is_a_service_that_does_not_answer() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("http://{}/readyz", listener.local_addr().unwrap());
+    drop(listener);
+    assert_code(&run(["healthcheck", "--url", &url, "--timeout", "1"]), 1);
+    assert_code(&run(["healthcheck", "--url", "ftp://x"]), 2);
+    assert_code(&run(["healthcheck", "--timeout", "-1"]), 2);
+}

@@ -1,0 +1,222 @@
+//! `molmesh mesh` where it succeeds: formats, stdin and stdout, reports, where files go.
+#![cfg(all(feature = "cli", feature = "server"))]
+#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
+
+mod cli_support;
+
+use std::fs;
+
+use cli_support::{Folder, assert_code, mesh, piped, rod, run, stderr, stdout};
+use serde_json::Value;
+
+/// How the files of a format begin.
+fn magic(format: &str) -> &'static [u8] {
+    match format {
+        "glb" => b"glTF",
+        "gltf" => b"{",
+        "ply" => b"ply\nformat binary_little_endian 1.0\n",
+        "stl" => b"molmesh",
+        "obj" => b"#",
+        other => panic!("no format {other}"),
+    }
+}
+
+#[test]
+fn the_extension_says_the_format() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    for format in ["glb", "gltf", "ply", "stl", "obj"] {
+        let output = folder.path(&format!("rod.{}", format.to_uppercase()));
+        assert_code(&mesh(&input, &output, &[]), 0);
+        let bytes = fs::read(&output).unwrap();
+        assert!(bytes.starts_with(magic(format)), "{format}: {:?}", &bytes[..20]);
+        assert!(bytes.len() > 1000, "{format}: {} bytes", bytes.len());
+    }
+}
+
+#[test]
+fn the_flag_overrides_the_extension() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let output = folder.path("rod.bin");
+    assert_code(&mesh(&input, &output, &["--format", "ply"]), 0);
+    assert!(fs::read(&output).unwrap().starts_with(magic("ply")));
+}
+
+#[test]
+fn stdin_to_stdout_gives_the_bytes_of_a_file() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let output = folder.path("rod.glb");
+    assert_code(&mesh(&input, &output, &["--quiet"]), 0);
+    let through = piped(&["mesh", "-", "-o", "-", "--quiet"], rod().as_bytes());
+    assert_code(&through, 0);
+    assert_eq!(through.stdout, fs::read(&output).unwrap());
+    assert_eq!(stderr(&through), "");
+
+    let ply = piped(&["mesh", "-", "-o", "-", "--format", "ply", "-q"], rod().as_bytes());
+    assert!(ply.stdout.starts_with(magic("ply")));
+}
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|e| panic!("{e} in {text}"))
+}
+
+#[test]
+fn the_json_report_has_its_fields() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let output = folder.path("rod.glb");
+    let done = mesh(&input, &output, &["--report", "json"]);
+    assert_code(&done, 0);
+    assert_eq!(stderr(&done), "", "the report went to stdout");
+    let report = json(&stdout(&done));
+    for field in ["vertices", "triangles", "bricks", "samples"] {
+        assert!(report[field].as_u64().unwrap() > 0, "{field}: {report}");
+    }
+    assert_eq!(report["atoms"], 10);
+    assert_eq!([&report["closed"], &report["manifold"], &report["oriented"]], [&Value::Bool(true); 3]);
+    assert_eq!((&report["euler"], &report["components"]), (&2.into(), &1.into()));
+    assert_eq!((&report["kernel"], &report["resolution"]), (&"gaussian".into(), &0.5.into()));
+    assert_eq!(report["backend"], "cpu");
+    assert!(report["backend_reason"].as_str().unwrap().contains("no GPU"), "{report}");
+    assert!(report["area"].as_f64().unwrap() > 100.0 && report["volume"].as_f64().unwrap() > 50.0, "{report}");
+    for stage in ["read", "field", "emit", "measure", "encode", "write"] {
+        assert!(report["timings_ms"][stage].as_f64().is_some_and(|ms| ms >= 0.0), "{stage}: {report}");
+    }
+    assert_eq!(report["output"]["format"], "glb");
+    assert_eq!(report["output"]["file"], output.to_str().unwrap());
+    assert_eq!(report["output"]["bytes"], fs::metadata(&output).unwrap().len());
+}
+
+#[test]
+fn the_report_leaves_stdout_to_the_mesh() {
+    let done = piped(&["mesh", "-", "-o", "-", "--report", "json"], rod().as_bytes());
+    assert_code(&done, 0);
+    assert!(done.stdout.starts_with(magic("glb")));
+    let report = json(&stderr(&done));
+    assert_eq!(report["output"]["file"], "stdout");
+    assert_eq!(report["output"]["bytes"], done.stdout.len());
+}
+
+#[test]
+fn the_summary_fits_a_screen_and_has_no_colour_here() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let done = mesh(&input, &folder.path("rod.glb"), &[]);
+    let text = stderr(&done);
+    assert_eq!(stdout(&done), "");
+    assert!(text.lines().count() <= 25, "{text}");
+    assert!(!text.contains('\x1b'), "{text}");
+    let expected =
+        ["10 of 10", "bricks", "vertices", "closed, oriented, manifold, Euler number 2", "1 component", "Å²", "Å³"];
+    for part in expected.iter().chain(&["cpu: ", "field", "encode", "rod.glb (glb, "]) {
+        assert!(text.contains(part), "no `{part}` in\n{text}");
+    }
+}
+
+#[test]
+fn the_same_input_gives_the_same_bytes_on_any_number_of_threads() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let bytes = ["1", "2", "7"].map(|threads| {
+        let output = folder.path(&format!("{threads}.glb"));
+        assert_code(&mesh(&input, &output, &["--threads", threads, "--resolution", "0.3"]), 0);
+        fs::read(output).unwrap()
+    });
+    assert_eq!(bytes[0], bytes[1]);
+    assert_eq!(bytes[0], bytes[2]);
+}
+
+#[test]
+fn the_reference_backend_agrees_on_the_topology() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let [cpu, reference] = ["cpu", "reference"].map(|backend| {
+        let done = mesh(&input, &folder.path("x.glb"), &["--backend", backend, "--report", "json"]);
+        assert_code(&done, 0);
+        json(&stdout(&done))
+    });
+    assert_eq!((&cpu["backend"], &reference["backend"]), (&"cpu".into(), &"reference".into()));
+    for field in ["vertices", "triangles", "euler", "components"] {
+        assert_eq!(cpu[field], reference[field], "{field}");
+    }
+    assert_eq!(cpu["backend_reason"], "asked for");
+}
+
+#[test]
+fn parameters_reach_the_mesh() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let report = |flags: &[&str]| {
+        let done = mesh(&input, &folder.path("x.glb"), &[flags, &["--report", "json"]].concat());
+        assert_code(&done, 0);
+        json(&stdout(&done))
+    };
+    assert_eq!(report(&["--kernel", "soft-object"])["kernel"], "soft-object");
+    assert_eq!(report(&["--preset", "vdw-like"])["isovalue"], 1.06);
+    let [fine, coarse] = ["0.25", "1"].map(|r| report(&["--resolution", r])["triangles"].as_u64().unwrap());
+    assert!(fine > 10 * coarse, "{fine} {coarse}");
+    let [plain, more] = ["0", "1.0"].map(|o| report(&["--radius-offset", o])["volume"].as_f64().unwrap());
+    assert!(more > 1.5 * plain, "{plain} {more}");
+    assert!(report(&["--radius-offset", "-0.2"])["volume"].as_f64().unwrap() < plain);
+    let raw = ["--kernel", "inverse-square", "--paper-c", "0.9", "--paper-b", "3", "--isovalue", "0.3"];
+    assert_eq!(report(&raw)["kernel"], "inverse-square");
+}
+
+#[test]
+fn atom_ids_come_with_the_mesh_on_request() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let output = folder.path("x.gltf");
+    assert_code(&mesh(&input, &output, &[]), 0);
+    assert!(!fs::read_to_string(&output).unwrap().contains("_ATOM"));
+    assert_code(&mesh(&input, &output, &["--atom-ids"]), 0);
+    assert!(fs::read_to_string(&output).unwrap().contains("_ATOM"));
+}
+
+#[test]
+fn an_existing_file_is_replaced_and_keeps_its_permissions() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let output = folder.file("rod.glb", "old");
+    #[cfg(unix)]
+    fs::set_permissions(&output, std::os::unix::fs::PermissionsExt::from_mode(0o640)).unwrap();
+    assert_code(&mesh(&input, &output, &[]), 0);
+    assert!(fs::read(&output).unwrap().starts_with(magic("glb")));
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        assert_eq!(fs::metadata(&output).unwrap().permissions().mode() & 0o777, 0o640);
+    }
+    assert_eq!(folder.entries(), ["rod.glb", "rod.pdb"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn a_link_is_followed_and_a_device_is_not_replaced() {
+    let folder = Folder::new();
+    let input = folder.file("rod.pdb", rod());
+    let target = folder.file("target.glb", "old");
+    let link = folder.path("link.glb");
+    std::os::unix::fs::symlink(&target, &link).unwrap();
+    assert_code(&mesh(&input, &link, &[]), 0);
+    assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
+    assert!(fs::read(&target).unwrap().starts_with(magic("glb")));
+
+    assert_code(&mesh(&input, std::path::Path::new("/dev/null"), &["--format", "glb"]), 0);
+    assert!(!fs::metadata("/dev/null").unwrap().is_file());
+}
+
+#[test]
+fn version_and_doctor_answer_on_stdout() {
+    let version = run(["version"]);
+    assert_code(&version, 0);
+    assert!(stdout(&version).starts_with(concat!("molmesh ", env!("CARGO_PKG_VERSION"))));
+    let doctor = run(["doctor"]);
+    assert_code(&doctor, 0);
+    let text = stdout(&doctor);
+    for part in ["cpu", "reference", "gpu", "paper", "auto", "limits", "cores", "vectors"] {
+        assert!(text.contains(part), "no `{part}` in\n{text}");
+    }
+}

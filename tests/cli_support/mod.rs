@@ -1,0 +1,109 @@
+//! Drives the built binary: made-up structures in, exit codes and files out.
+#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::missing_panics_doc,
+    unreachable_pub,
+    reason = "tests say what they expect by panicking"
+)]
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+/// A folder that is gone afterwards.
+pub struct Folder(tempfile::TempDir);
+
+impl Folder {
+    pub fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    pub fn file(&self, name: &str, bytes: impl AsRef<[u8]>) -> PathBuf {
+        let path = self.path(name);
+        std::fs::write(&path, bytes).unwrap();
+        path
+    }
+
+    /// Names of everything in it, hidden files too, sorted.
+    pub fn entries(&self) -> Vec<String> {
+        let name = |e: std::io::Result<std::fs::DirEntry>| e.unwrap().file_name().into_string().unwrap();
+        let mut names: Vec<_> = std::fs::read_dir(self.0.path()).unwrap().map(name).collect();
+        names.sort();
+        names
+    }
+}
+
+/// The binary, with an environment that does not change what it prints.
+pub fn molmesh() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_molmesh"));
+    for name in ["RUST_BACKTRACE", "RUST_LOG", "COLUMNS", "CLICOLOR_FORCE"] {
+        command.env_remove(name);
+    }
+    command.stdin(Stdio::null());
+    command
+}
+
+/// Runs `molmesh` with `args`.
+pub fn run<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Output {
+    molmesh().args(args).output().unwrap()
+}
+
+/// Runs `molmesh mesh input -o output` and more flags.
+pub fn mesh(input: &Path, output: &Path, more: &[&str]) -> Output {
+    molmesh().arg("mesh").arg(input).arg("-o").arg(output).args(more).output().unwrap()
+}
+
+/// Runs `molmesh` with `args`, `bytes` on stdin.
+pub fn piped(args: &[&str], bytes: &[u8]) -> Output {
+    let mut child =
+        molmesh().args(args).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    child.stdin.take().unwrap().write_all(bytes).unwrap();
+    child.wait_with_output().unwrap()
+}
+
+pub fn stderr(output: &Output) -> String {
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+pub fn stdout(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+/// Asserts an exit code, and that a failure is one line with at most a hint behind it.
+#[track_caller]
+pub fn assert_code(output: &Output, code: i32) {
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{said}");
+    if code != 0 {
+        assert!(said.starts_with("molmesh: "), "{said}");
+        assert!(said.lines().count() <= 2, "{said}");
+        assert!(!said.contains("panicked") && !said.contains("\x1b["), "{said}");
+    }
+}
+
+/// One carbon a residue, at these places, Å.
+pub fn pdb(places: &[[f64; 3]]) -> String {
+    let line = |(i, [x, y, z]): (usize, &[f64; 3])| {
+        let n = i % 9999 + 1;
+        format!("ATOM  {n:>5}  CA  ALA A{n:>4}    {x:>8.3}{y:>8.3}{z:>8.3}  1.00  0.00           C  \n")
+    };
+    places.iter().enumerate().map(line).chain(["END\n".to_owned()]).collect()
+}
+
+/// Ten overlapping atoms in a row.
+pub fn rod() -> String {
+    pdb(&std::array::from_fn::<_, 10, _>(|i| [f64::from(u32::try_from(i).unwrap()) * 1.5, 0.25, -0.75]))
+}
+
+/// A cube of `n`³ atoms, 2 Å apart: work that takes long at a fine resolution.
+pub fn block(n: u32) -> String {
+    let at = |i: u32| f64::from(i) * 2.0;
+    let places: Vec<[f64; 3]> =
+        (0..n).flat_map(|x| (0..n).flat_map(move |y| (0..n).map(move |z| [at(x), at(y), at(z)]))).collect();
+    pdb(&places)
+}
