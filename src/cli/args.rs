@@ -95,6 +95,9 @@ pub(crate) struct MeshArgs {
     /// No summary and no progress bar
     #[arg(short, long)]
     pub(crate) quiet: bool,
+    /// Check twice: report what a strict second reader says of the file, and prove the mesh edge by edge
+    #[arg(long)]
+    pub(crate) check: bool,
     #[command(flatten)]
     pub(crate) surface: SurfaceArgs,
     #[command(flatten)]
@@ -171,9 +174,6 @@ pub(crate) struct SelectionArgs {
     /// One alternative location instead of the best occupied of each residue
     #[arg(long, value_name = "X")]
     pub(crate) altloc: Option<String>,
-    /// Refuse a structure that a strict second reader finds fault with
-    #[arg(long)]
-    pub(crate) check: bool,
 }
 
 /// What is too much.

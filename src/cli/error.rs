@@ -79,6 +79,8 @@ pub(crate) enum CliError {
         name: String,
         /// Why.
         source: JobError,
+        /// What a strict reader says of the same file.
+        opinion: Option<String>,
     },
     /// The format cannot hold the mesh, or the mesh is broken.
     #[error(transparent)]
@@ -151,10 +153,10 @@ impl CliError {
             Self::Usage { hint, .. } => hint.clone(),
             Self::InputTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
             Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
-            Self::Job { source: JobError::Structure(error), .. } => match error {
+            Self::Job { source: JobError::Structure(error), opinion, .. } => match error {
                 StructureError::TooManyAtoms { .. } => Some("raise it with --max-atoms".to_owned()),
                 StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
-                _ => None,
+                _ => opinion.clone(),
             },
             Self::NoBackend { .. } => Some("try --backend auto, and `molmesh doctor` for what there is".to_owned()),
             Self::Output { source, .. } if source.kind() == io::ErrorKind::NotFound => {
@@ -224,7 +226,7 @@ mod tests {
 
     #[test]
     fn every_kind_of_failure_has_its_code() {
-        let job = |source: JobError| CliError::Job { name: "x".into(), source };
+        let job = |source: JobError| CliError::Job { name: "x".into(), source, opinion: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
         let cases: [(CliError, i32); 12] = [
             (CliError::Internal(String::new()), 1),
@@ -253,7 +255,7 @@ mod tests {
     #[test]
     fn a_grid_that_is_too_large_comes_with_a_resolution() {
         let error = SurfaceError::GridTooLarge { samples: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
-        let hint = CliError::Job { name: "x".into(), source: error.into() }.hint();
+        let hint = CliError::Job { name: "x".into(), source: error.into(), opinion: None }.hint();
         assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-samples"));
     }
 }

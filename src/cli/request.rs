@@ -3,6 +3,7 @@
 use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError};
 use molmesh::pipeline::{Job, JobLimits};
+use molmesh::surface::measure::Proof;
 
 use super::args::{LimitArgs, MeshArgs};
 use super::error::CliError;
@@ -13,7 +14,8 @@ pub(super) fn parse(args: &MeshArgs) -> Result<(Job, Option<Format>), CliError> 
         ParamError::Unknown { .. } | ParamError::Repeated { .. } => CliError::Internal(error.to_string()),
         ParamError::BadValue { .. } => CliError::Usage { message: error.to_string(), hint: None },
     })?;
-    Ok((request.job, request.format))
+    let proof = if args.check { Proof::Exact } else { request.job.proof };
+    Ok((Job { proof, ..request.job }, request.format))
 }
 
 /// The limits, with what the flags change.
