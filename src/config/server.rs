@@ -13,8 +13,8 @@ pub struct ServerConfig {
     /// Address of the service. Default 127.0.0.1:8080: nothing is exposed until somebody says so. Port 0 takes
     /// any free port.
     pub listen: SocketAddr,
-    /// Address of `/metrics`; `none` turns it off. Default 127.0.0.1:9090: apart from the service, so that a
-    /// proxy in front cannot expose it by accident.
+    /// Address of `/metrics`. Default `none`: there is no port that is free on every machine. It is apart from
+    /// the service, so that a proxy in front cannot expose it by accident.
     pub metrics_listen: Option<SocketAddr>,
     /// Folder of everything that the service keeps; the archive is looked for in it.
     pub data_dir: PathBuf,
@@ -41,7 +41,7 @@ impl Default for ServerConfig {
     fn default() -> Self {
         Self {
             listen: SocketAddr::from((Ipv4Addr::LOCALHOST, 8080)),
-            metrics_listen: Some(SocketAddr::from((Ipv4Addr::LOCALHOST, 9090))),
+            metrics_listen: None,
             data_dir: PathBuf::from("molmesh-data"),
             connections: 1024,
             header_timeout_ms: 15_000,

@@ -1,1 +1,31 @@
-//! The HTTP service: axum and tower only.
+//! The HTTP service: requests to jobs, jobs to answers. axum, hyper and tower live here and nowhere else.
+//!
+//! [`router`](self) is the table of contents, `middleware` the order of what every request goes through, `kinds` the
+//! only table of status codes. One file per resource. Nothing here computes a mesh or blocks the runtime: work goes
+//! to [`crate::jobs`], files are read on threads that may block.
+
+mod accept;
+mod capabilities;
+mod conditional;
+mod declared;
+mod delivery;
+mod health;
+mod io;
+mod kinds;
+mod meshes;
+mod metrics;
+mod middleware;
+mod negotiate;
+mod observe;
+mod page;
+mod pdb;
+mod problem;
+mod problems;
+mod request_id;
+mod router;
+mod server;
+mod state;
+mod stream;
+mod upload;
+
+pub use server::{ServeError, Server, shutdown_signal};

@@ -6,6 +6,7 @@ use thiserror::Error;
 
 use super::Exhausted;
 use crate::pipeline::JobError;
+use crate::structure::referee::{Diagnostic, Level};
 
 /// Why a job is not accepted.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -29,8 +30,19 @@ pub enum Refusal {
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum Failure {
     /// The job itself failed.
-    #[error(transparent)]
-    Job(#[from] JobError),
+    #[error("{error}")]
+    Job {
+        /// Why.
+        error: JobError,
+        /// What the referee says of a file that cannot be read; empty otherwise.
+        diagnostics: Vec<Diagnostic>,
+    },
+    /// A strict check was asked for, and the referee found errors.
+    #[error("the strict check found {} errors", errors(diagnostics))]
+    Check {
+        /// Everything that it found.
+        diagnostics: Vec<Diagnostic>,
+    },
     /// The deadline passed.
     #[error("the deadline of {} s passed", limit.as_secs_f64())]
     Deadline {
@@ -49,4 +61,8 @@ pub enum Failure {
         /// What the panic said.
         message: String,
     },
+}
+
+fn errors(diagnostics: &[Diagnostic]) -> usize {
+    diagnostics.iter().filter(|d| d.level == Level::Error).count()
 }

@@ -23,6 +23,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 
 use crate::pipeline::{Job, Product};
+use crate::structure::referee::Diagnostic;
 
 /// One job to run.
 #[derive(Debug)]
@@ -31,6 +32,8 @@ pub struct Task {
     pub input: Bytes,
     /// Its digest, if it is known already.
     pub digest: Option<Digest>,
+    /// Ask the referee, and refuse a file in which it finds errors.
+    pub strict: bool,
     /// What to make of it.
     pub job: Job,
     /// When the mesh must be there.
@@ -44,6 +47,8 @@ pub struct Task {
 pub struct Finished {
     /// Mesh and report.
     pub product: Product,
+    /// What the referee said, if it was asked.
+    pub diagnostics: Option<Vec<Diagnostic>>,
     /// Digest of the input.
     pub digest: Digest,
     /// Time in the queue.

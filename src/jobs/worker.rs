@@ -11,8 +11,13 @@ use super::pool::Shared;
 use super::queue::Entry;
 use super::{Digest, Failure, Finished, Outcome};
 use crate::pipeline::{self, Choice, JobError, Report};
+use crate::structure::StructureError;
+use crate::structure::referee::{self, Diagnostic, Level};
 use crate::surface::{Mesh, SurfaceError};
 use crate::telemetry::{JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, VOXELS};
+
+/// Largest input of which the referee explains a refusal: it takes about 20 ms for so much.
+const MAX_EXPLAINED: usize = 1 << 20;
 
 /// Runs jobs until the queue is closed and empty.
 pub(super) fn work(shared: &Shared) {
@@ -38,27 +43,48 @@ fn run(shared: &Shared, entry: Entry) -> bool {
             let digesting = Instant::now();
             let digest = task.digest.unwrap_or_else(|| Digest::of(&task.input));
             let digested = digesting.elapsed();
-            let product = pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, &())?;
-            Ok::<_, JobError>((digest, digested, product))
+            let diagnostics = if task.strict { Some(check(shared, &task.input)?) } else { None };
+            let product = pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, &())
+                .map_err(|error| explained(shared, &task.input, error))?;
+            Ok::<_, Failure>((digest, digested, diagnostics, product))
         };
-        let (digest, digested, mut product) =
+        let (digest, digested, diagnostics, mut product) =
             catch_unwind(AssertUnwindSafe(work)).map_err(|payload| panicked(&*payload))??;
         product.report.add_timing("queue", ms(waited));
         product.report.add_timing("digest", ms(digested));
         count(&product.report);
         let mut lease = shared.budget.lease();
         lease.force(bytes_of(&product.mesh));
-        Ok(Finished { product, digest, waited, lease })
+        Ok(Finished { product, diagnostics, digest, waited, lease })
     });
     // The input is freed before the answer goes out: the receiver then sees the memory that is really held.
     drop(task);
     answer(reply, outcome.map(Arc::new))
 }
 
+/// The strict check: the referee's findings, or a refusal if there are errors among them.
+fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
+    let diagnostics = referee::check(input, &shared.limits.read)
+        .map_err(|error| Failure::Job { error: error.into(), diagnostics: Vec::new() })?;
+    if diagnostics.iter().any(|d| d.level == Level::Error) {
+        return Err(Failure::Check { diagnostics });
+    }
+    Ok(diagnostics)
+}
+
+/// A failure, with the referee's opinion of a file that our reader refused and that is small enough to ask about.
+fn explained(shared: &Shared, input: &[u8], error: JobError) -> Failure {
+    let unreadable = matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
+    let ask = unreadable && input.len() <= MAX_EXPLAINED;
+    // A file of which the referee cannot say anything either gets our refusal alone.
+    let diagnostics = if ask { referee::check(input, &shared.limits.read).unwrap_or_default() } else { Vec::new() };
+    Failure::Job { error, diagnostics }
+}
+
 fn answer(reply: tokio::sync::oneshot::Sender<Outcome>, outcome: Outcome) -> bool {
     let label = match &outcome {
         Ok(_) => "successful",
-        Err(Failure::Job(JobError::Surface(SurfaceError::Cancelled))) => "dismissed",
+        Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => "dismissed",
         Err(Failure::Panicked { .. }) => "panicked",
         Err(_) => "failed",
     };
@@ -86,7 +112,7 @@ fn count(report: &Report) {
 
 /// Bytes that a mesh holds.
 fn bytes_of(mesh: &Mesh) -> u64 {
-    let optional = mesh.atom_ids.as_ref().map_or(0, Vec::len) + mesh.colors.as_ref().map_or(0, Vec::len);
+    let optional = mesh.atom_ids.as_ref().map_or(0, |c| c.len()) + mesh.colors.as_ref().map_or(0, |c| c.len());
     Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64) + 4 * optional as u64
 }
 

@@ -12,8 +12,9 @@ use super::Job;
 use super::nearest::nearest;
 use crate::formats::Format;
 use crate::structure::Selection;
+use crate::structure::select::KIND_NAMES;
 use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
-use crate::surface::{Kernel, PaperParams, Preset, SurfaceError, SurfaceOptions, SurfaceParams};
+use crate::surface::{Kernel, PaperParams, Preset, Proof, SurfaceError, SurfaceOptions, SurfaceParams};
 
 /// What values a parameter takes.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -84,7 +85,7 @@ const fn number(
 const KERNELS: &[&str] = &names(Kernel::ALL);
 const PRESETS: &[&str] = &preset_names(Preset::ALL);
 const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj"];
-const CLASSES: &[&str] = &["polymer", "ligand", "water", "hydrogens", "all"];
+const PROOFS: &[&str] = &[Proof::Checksum.name(), Proof::Exact.name()];
 
 const fn names(all: &[Kernel]) -> [&'static str; 3] {
     [all[0].name(), all[1].name(), all[2].name()]
@@ -168,7 +169,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "select",
-        domain: Domain::Set(CLASSES),
+        domain: Domain::Set(&KIND_NAMES),
         default: "polymer",
         doc: "Which atoms to take; hydrogens adds those of whatever else is taken.",
     },
@@ -177,6 +178,18 @@ pub const TABLE: &[Parameter] = &[
         domain: Domain::Text { expected: "one character" },
         default: "the best occupied of each residue",
         doc: "The alternative location to take.",
+    },
+    Parameter {
+        name: "proof",
+        domain: Domain::Choice(PROOFS),
+        default: "checksum",
+        doc: "How closedness is proven: by a checksum over edges, or exactly, edge by edge and vertex by vertex.",
+    },
+    Parameter {
+        name: "check",
+        domain: Domain::Choice(&["strict"]),
+        default: "absent",
+        doc: "Refuse a file in which a second, strict reader finds errors.",
     },
     Parameter {
         name: "format",
@@ -230,6 +243,8 @@ pub struct Request {
     pub format: Option<Format>,
     /// The report as JSON was asked for.
     pub report: bool,
+    /// A strict check of the file was asked for.
+    pub strict: bool,
 }
 
 /// Reads parameters.
@@ -253,7 +268,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         }
         set(parameter, value, &mut options, &mut selection, &mut request)?;
     }
-    request.job = Job { selection, params: SurfaceParams::new(&options)? };
+    request.job = Job { selection, params: SurfaceParams::new(&options)?, proof: request.job.proof };
     Ok(request)
 }
 
@@ -303,8 +318,14 @@ fn set(
         "atom_ids" => options.atom_ids = flag(text).ok_or_else(bad)?,
         "model" => selection.model = Some(text.trim().parse().ok().ok_or_else(bad)?),
         "chains" => selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect()),
-        "select" => classes(text, selection).ok_or_else(bad)?,
+        "select" => selection.set_kinds(text).map_err(|e| ParamError::BadValue {
+            name: "select",
+            value: format!("`{}`", e.value),
+            expected: e.expected,
+        })?,
         "altloc" => selection.altloc = Some(one_char(text).ok_or_else(bad)?),
+        "proof" => request.job.proof = proof(text).ok_or_else(bad)?,
+        "check" => request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
         "format" => request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
         "report" => request.report = (text == "json").then_some(true).ok_or_else(bad)?,
         _ => return Err(unknown(parameter.name)),
@@ -320,6 +341,10 @@ fn flag(text: &str) -> Option<bool> {
     }
 }
 
+fn proof(text: &str) -> Option<Proof> {
+    [Proof::Checksum, Proof::Exact].into_iter().find(|proof| proof.name() == text)
+}
+
 /// Words separated by commas, none of them empty.
 fn list(text: &str) -> Option<Vec<&str>> {
     let words: Vec<&str> = text.split(',').map(str::trim).collect();
@@ -331,26 +356,13 @@ fn one_char(text: &str) -> Option<char> {
     chars.next().filter(|c| chars.next().is_none() && !c.is_control())
 }
 
-/// Reads `select`. Hydrogens are no class of their own: alone they keep the default's polymer.
-fn classes(text: &str, selection: &mut Selection) -> Option<()> {
-    let words = list(text)?;
-    if !words.iter().all(|w| CLASSES.contains(w)) {
-        return None;
-    }
-    let has = |word| words.contains(&word) || words.contains(&"all");
-    selection.hydrogens = has("hydrogens");
-    selection.ligands = has("ligand");
-    selection.waters = has("water");
-    selection.polymer = has("polymer") || !(selection.ligands || selection.waters);
-    Some(())
-}
-
 /// Everything that decides what a mesh looks like, as one line of text: equal for equal jobs, different for
 /// different ones. Part of the key under which results are known.
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a field that is added without a place here does not compile.
-    let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = &job.selection;
+    let Job { selection, params, proof } = job;
+    let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = selection;
     let SurfaceParams {
         kernel,
         resolution,
@@ -362,12 +374,13 @@ pub fn canonical(job: &Job) -> String {
         preset,
         paper,
         atom_ids,
-    } = &job.params;
+    } = params;
     let mut text = format!(
         "kernel={kernel}&resolution={resolution}&isovalue={isovalue}&smoothness={smoothness}\
          &radius_scale={radius_scale}&radius_offset={radius_offset}&cutoff_tolerance={cutoff_tolerance}\
          &preset={preset}&atom_ids={atom_ids}&model={model:?}&chains={chains:?}&polymer={polymer}\
-         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}"
+         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}&proof={}",
+        proof.name()
     );
     let paper = match paper {
         None => Ok(()),

@@ -1,5 +1,9 @@
 //! Atoms of a structure file as a structure of arrays.
 
+use super::contents::Kind;
+use super::residue;
+use super::texts::{Interner, TextColumn};
+
 /// The file format that a structure was read from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SourceFormat {
@@ -20,8 +24,9 @@ impl SourceFormat {
     }
 }
 
-/// Atoms of every model of a file, in file order. All columns have the same length.
-#[derive(Debug, Clone)]
+/// Atoms of every model of a file, in file order. All columns have the same length, `label_chain` excepted.
+/// An atom takes 60 bytes.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
     /// Where it came from.
     pub format: SourceFormat,
@@ -35,8 +40,30 @@ pub struct Structure {
     pub y: Vec<f64>,
     /// Coordinates, Å.
     pub z: Vec<f64>,
-    /// Atomic numbers; 0 where the element is unknown.
+    /// Atomic numbers; 0 where the element is unknown, 1 for deuterium.
     pub element: Vec<u8>,
+    /// Atom names without padding: `CA`, `O5'`; the author's where the file has two.
+    pub name: TextColumn,
+    /// Residue names: `ALA`, `HOH`; the author's where the file has two.
+    pub residue: TextColumn,
+    /// Chains by author name; a PDB file's blank chain is the empty text.
+    pub chain: TextColumn,
+    /// Chains as mmCIF numbers them (`label_asym_id`); empty for PDB files and for mmCIF without that column.
+    pub label_chain: TextColumn,
+    /// Residue numbers as the author gives them; 0 where the file leaves them blank.
+    pub residue_number: Vec<i32>,
+    /// Insertion codes as Latin-1 characters; 0 where there is none.
+    pub insertion_code: Vec<u8>,
+    /// Alternative locations as Latin-1 characters; 0 where there is none.
+    pub altloc: Vec<u8>,
+    /// Occupancies; 1 where the file gives none.
+    pub occupancy: Vec<f32>,
+    /// Isotropic displacement (B-factor), Å²; 0 where the file gives none.
+    pub b_factor: Vec<f32>,
+    /// Model numbers.
+    pub model: Vec<i32>,
+    /// Whether the record was HETATM.
+    pub hetero: Vec<bool>,
 }
 
 impl Structure {
@@ -50,5 +77,190 @@ impl Structure {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.element.is_empty()
+    }
+
+    /// What each residue name is, by [`TextColumn::id`] in the `residue` column: whether it is water.
+    #[must_use]
+    pub fn water_residues(&self) -> Vec<bool> {
+        self.residue.texts().iter().map(|name| residue::is_water(name)).collect()
+    }
+
+    /// The kind of atom `i`; `water` comes from [`Self::water_residues`].
+    #[must_use]
+    pub fn kind(&self, i: usize, water: &[bool]) -> Kind {
+        if water[self.residue.id(i) as usize] {
+            Kind::Water
+        } else if self.hetero[i] {
+            Kind::Ligand
+        } else {
+            Kind::Polymer
+        }
+    }
+
+    /// Whether atom `i` is hydrogen or deuterium.
+    #[must_use]
+    pub fn is_hydrogen(&self, i: usize) -> bool {
+        self.element[i] == 1
+    }
+}
+
+/// One atom on its way into the columns; texts are ids of the [`Tables`].
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Atom {
+    pub(super) position: [f64; 3],
+    pub(super) element: u8,
+    pub(super) name: u32,
+    pub(super) residue: u32,
+    pub(super) chain: u32,
+    pub(super) label_chain: u32,
+    pub(super) residue_number: i32,
+    pub(super) insertion_code: u8,
+    pub(super) altloc: u8,
+    pub(super) occupancy: f32,
+    pub(super) b_factor: f32,
+    pub(super) model: i32,
+    pub(super) hetero: bool,
+}
+
+/// The texts that atoms refer to while they are read.
+#[derive(Debug, Default)]
+pub(super) struct Tables {
+    pub(super) name: Interner,
+    pub(super) residue: Interner,
+    pub(super) chain: Interner,
+    pub(super) label_chain: Interner,
+}
+
+macro_rules! columns {
+    ($($field:ident: $type:ty = $from:expr),+ $(,)?) => {
+        /// Columns while they are read.
+        #[derive(Debug, Default)]
+        pub(super) struct Columns { $(pub(super) $field: Vec<$type>),+ }
+
+        impl Columns {
+            /// Room for exactly `n` more atoms.
+            pub(super) fn reserve(&mut self, n: usize) {
+                $(self.$field.reserve_exact(n);)+
+            }
+
+            #[inline]
+            pub(super) fn push(&mut self, atom: &Atom) {
+                $(self.$field.push($from(atom));)+
+            }
+
+            /// `n` atoms of zeros, to be filled through [`Self::slices`].
+            pub(super) fn zeroed(n: usize) -> Self {
+                Self { $($field: vec![<$type>::default(); n]),+ }
+            }
+
+            /// All columns, to be split and filled by several threads.
+            pub(super) fn slices(&mut self) -> Slices<'_> {
+                Slices { next: 0, $($field: &mut self.$field),+ }
+            }
+
+            /// Gives back room that was reserved and not used, unless it is little.
+            fn shrink(&mut self) {
+                $(if self.$field.capacity() > self.$field.len() + self.$field.len() / 8 + 1024 {
+                    self.$field.shrink_to_fit();
+                })+
+            }
+        }
+
+        /// A range of rows of the columns, filled from its beginning.
+        #[derive(Debug)]
+        pub(super) struct Slices<'a> { next: usize, $(pub(super) $field: &'a mut [$type]),+ }
+
+        impl<'a> Slices<'a> {
+            /// The first `n` rows, and the others.
+            pub(super) fn split(self, n: usize) -> (Self, Self) {
+                $(let $field = self.$field.split_at_mut(n);)+
+                (Slices { next: 0, $($field: $field.0),+ }, Slices { next: 0, $($field: $field.1),+ })
+            }
+
+            /// Fills the next row; `false` if there is none left.
+            #[inline]
+            pub(super) fn put(&mut self, atom: &Atom) -> bool {
+                let i = self.next;
+                if i >= self.element.len() {
+                    return false;
+                }
+                $(self.$field[i] = $from(atom);)+
+                self.next += 1;
+                true
+            }
+        }
+    };
+}
+
+columns! {
+    x: f64 = |a: &Atom| a.position[0],
+    y: f64 = |a: &Atom| a.position[1],
+    z: f64 = |a: &Atom| a.position[2],
+    element: u8 = |a: &Atom| a.element,
+    name: u32 = |a: &Atom| a.name,
+    residue: u32 = |a: &Atom| a.residue,
+    chain: u32 = |a: &Atom| a.chain,
+    label_chain: u32 = |a: &Atom| a.label_chain,
+    residue_number: i32 = |a: &Atom| a.residue_number,
+    insertion_code: u8 = |a: &Atom| a.insertion_code,
+    altloc: u8 = |a: &Atom| a.altloc,
+    occupancy: f32 = |a: &Atom| a.occupancy,
+    b_factor: f32 = |a: &Atom| a.b_factor,
+    model: i32 = |a: &Atom| a.model,
+    hetero: bool = |a: &Atom| a.hetero,
+}
+
+impl Slices<'_> {
+    /// Whether every row was filled.
+    pub(super) fn is_full(&self) -> bool {
+        self.next == self.element.len()
+    }
+
+    /// Replaces ids of another reader's tables by ids of `tables`, which learn the texts they lack.
+    pub(super) fn adopt(&mut self, from: Tables, tables: &mut Tables) {
+        tables.name.adopt(from.name, self.name);
+        tables.residue.adopt(from.residue, self.residue);
+        tables.chain.adopt(from.chain, self.chain);
+        tables.label_chain.adopt(from.label_chain, self.label_chain);
+    }
+}
+
+impl Columns {
+    pub(super) fn len(&self) -> usize {
+        self.element.len()
+    }
+
+    /// The finished structure.
+    pub(super) fn finish(
+        mut self,
+        tables: Tables,
+        format: SourceFormat,
+        id: Option<String>,
+        title: Option<String>,
+    ) -> Structure {
+        if tables.label_chain.is_empty() {
+            self.label_chain = Vec::new();
+        }
+        self.shrink();
+        Structure {
+            format,
+            id,
+            title,
+            x: self.x,
+            y: self.y,
+            z: self.z,
+            element: self.element,
+            name: tables.name.column(self.name),
+            residue: tables.residue.column(self.residue),
+            chain: tables.chain.column(self.chain),
+            label_chain: tables.label_chain.column(self.label_chain),
+            residue_number: self.residue_number,
+            insertion_code: self.insertion_code,
+            altloc: self.altloc,
+            occupancy: self.occupancy,
+            b_factor: self.b_factor,
+            model: self.model,
+            hetero: self.hetero,
+        }
     }
 }

@@ -1,14 +1,35 @@
 //! Structure files to atoms to spheres: PDB and mmCIF bytes in, [`crate::surface::Spheres`] out.
 //!
 //! It knows nothing of grids, meshes, HTTP or paths (the archive folder excepted). Positions are Å.
+//!
+//! [`read()`] goes straight from bytes to columns; [`Selection`] says which atoms are meshed, [`Contents`] what there
+//! is to select; [`radii`] gives every element a radius; [`referee`] asks a second, strict reader for its opinion.
 
+mod altloc;
+pub mod archive;
 pub mod atoms;
+mod cif;
+pub mod contents;
+pub mod element;
 pub mod error;
+mod inflate;
+mod mmcif;
+mod number;
+mod pdb;
 pub mod radii;
 pub mod read;
+pub mod referee;
+mod residue;
+mod scan;
 pub mod select;
+mod sniff;
+mod text;
+mod texts;
 
-pub use atoms::Structure;
+pub use archive::{Archive, ArchiveError, EntryId};
+pub use atoms::{SourceFormat, Structure};
+pub use contents::{Contents, Kind};
 pub use error::StructureError;
 pub use read::{ReadLimits, read};
-pub use select::{Selected, Selection, select};
+pub use select::{BadKinds, Selected, Selection, select};
+pub use texts::TextColumn;

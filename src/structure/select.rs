@@ -1,8 +1,15 @@
 //! Which atoms of a structure are meshed.
 
+use std::collections::HashSet;
+
+use thiserror::Error;
+
+use super::altloc::Alternatives;
 use super::atoms::Structure;
+use super::contents::{Contents, Kind};
 use super::error::StructureError;
 use super::radii;
+use super::text::list;
 use crate::surface::{Spheres, SurfaceError};
 
 /// What to take. The default: first model, polymer (ATOM records), no hydrogens, best alternative location.
@@ -10,23 +17,79 @@ use crate::surface::{Spheres, SurfaceError};
 pub struct Selection {
     /// Model number as the file gives it; the file's first by default.
     pub model: Option<i32>,
-    /// Chains by author name; all by default.
+    /// Chains by author name; all by default. The empty name and `_` are a blank one.
     pub chains: Option<Vec<String>>,
-    /// ATOM records.
+    /// ATOM records that are not water.
     pub polymer: bool,
     /// HETATM records that are not water.
     pub ligands: bool,
-    /// Water.
+    /// Water, whatever its record.
     pub waters: bool,
     /// Hydrogen and deuterium of whatever else is taken.
     pub hydrogens: bool,
-    /// One alternative location instead of the best occupied one of each residue.
+    /// This alternative location of the residues that have it, instead of the best occupied one.
     pub altloc: Option<char>,
 }
 
 impl Default for Selection {
     fn default() -> Self {
         Self { model: None, chains: None, polymer: true, ligands: false, waters: false, hydrogens: false, altloc: None }
+    }
+}
+
+/// Names of kinds in the list form, in documentation order.
+pub const KIND_NAMES: [&str; 5] = ["polymer", "ligand", "water", "hydrogens", "all"];
+
+/// A list of kinds that says nothing sensible.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("`{value}` is no kind of atoms; expected {expected}")]
+pub struct BadKinds {
+    /// What was asked for.
+    pub value: String,
+    /// What was expected, in words.
+    pub expected: String,
+}
+
+impl Selection {
+    /// Takes the kinds of a list such as `polymer,ligand,hydrogens`, and no others.
+    ///
+    /// # Errors
+    /// [`BadKinds`] for a name that is not in [`KIND_NAMES`], an empty list, and `hydrogens` alone.
+    pub fn set_kinds(&mut self, names: &str) -> Result<(), BadKinds> {
+        let mut taken = [false; 4];
+        for name in names.split(',').map(str::trim) {
+            match KIND_NAMES.iter().position(|&known| known == name) {
+                Some(4) => taken = [true; 4],
+                Some(kind) => taken[kind] = true,
+                None => {
+                    let expected = format!("a list of {}", KIND_NAMES.join(", "));
+                    return Err(BadKinds { value: name.chars().take(40).collect(), expected });
+                }
+            }
+        }
+        let [polymer, ligands, waters, hydrogens] = taken;
+        if !(polymer || ligands || waters) {
+            let expected = "polymer, ligand or water beside it: hydrogens are those of other atoms taken".to_owned();
+            return Err(BadKinds { value: "hydrogens".to_owned(), expected });
+        }
+        *self = Self { polymer, ligands, waters, hydrogens, ..std::mem::take(self) };
+        Ok(())
+    }
+
+    /// The kinds as a list that [`Self::set_kinds`] reads.
+    #[must_use]
+    pub fn kinds(&self) -> String {
+        let flags = [self.polymer, self.ligands, self.waters, self.hydrogens];
+        let names: Vec<&str> = KIND_NAMES.iter().zip(flags).filter(|(_, taken)| *taken).map(|(name, _)| *name).collect();
+        names.join(",")
+    }
+
+    fn takes(&self, kind: Kind) -> bool {
+        match kind {
+            Kind::Polymer => self.polymer,
+            Kind::Ligand => self.ligands,
+            Kind::Water => self.waters,
+        }
     }
 }
 
@@ -42,10 +105,103 @@ pub struct Selected {
 /// Selects atoms.
 ///
 /// # Errors
-/// [`StructureError::EmptySelection`], [`StructureError::NotFound`].
+/// [`StructureError::EmptySelection`] says what the file holds and what takes it; [`StructureError::NotFound`] for a model,
+/// chain or alternative location that the file does not have.
 pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, StructureError> {
-    let _ = selection;
-    Ok(Selected { atoms: (0..u32::try_from(structure.len()).unwrap_or(u32::MAX)).collect(), model: 1 })
+    let model = model(structure, selection)?;
+    let chains = chains(structure, selection)?;
+    let wanted = alternative(structure, selection, model)?;
+    let alternatives = Alternatives::choose(structure, model, wanted);
+    let water = structure.water_residues();
+    let taken = |i: usize| {
+        structure.model[i] == model
+            && (selection.hydrogens || !structure.is_hydrogen(i))
+            && selection.takes(structure.kind(i, &water))
+            && chains.as_ref().is_none_or(|chains| chains[structure.chain.id(i) as usize])
+            && alternatives.keeps(structure, i)
+    };
+    // The reader refuses more atoms than 32 bits count.
+    let atoms: Vec<u32> = (0..structure.len()).filter(|&i| taken(i)).filter_map(|i| u32::try_from(i).ok()).collect();
+    if atoms.is_empty() {
+        return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
+    }
+    Ok(Selected { atoms, model })
+}
+
+fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureError> {
+    match selection.model {
+        None => Ok(structure.model.first().copied().unwrap_or(1)),
+        Some(asked) if structure.model.contains(&asked) => Ok(asked),
+        Some(asked) => Err(StructureError::NotFound {
+            what: "model",
+            asked: asked.to_string(),
+            available: Contents::of(structure, None).model_list(),
+        }),
+    }
+}
+
+/// For each text of the chain column, whether it was asked for.
+fn chains(structure: &Structure, selection: &Selection) -> Result<Option<Vec<bool>>, StructureError> {
+    let Some(asked) = &selection.chains else { return Ok(None) };
+    let texts = structure.chain.texts();
+    let known: HashSet<&str> = texts.iter().map(|t| &**t).collect();
+    let mut names: HashSet<&str> = HashSet::new();
+    for name in asked {
+        let name = if name == "_" && !known.contains("_") { "" } else { name.as_str() };
+        if !known.contains(name) {
+            return Err(StructureError::NotFound {
+                what: "chain",
+                asked: format!("`{}`", name.chars().take(40).collect::<String>()),
+                available: Contents::of(structure, None).chain_list(),
+            });
+        }
+        names.insert(name);
+    }
+    Ok(Some(texts.iter().map(|text| names.contains(&**text)).collect()))
+}
+
+fn alternative(structure: &Structure, selection: &Selection, model: i32) -> Result<Option<u8>, StructureError> {
+    let Some(asked) = selection.altloc else { return Ok(None) };
+    let mut present = [false; 256];
+    for (altloc, _) in structure.altloc.iter().zip(&structure.model).filter(|(_, m)| **m == model) {
+        present[usize::from(*altloc)] = true;
+    }
+    match u8::try_from(asked) {
+        Ok(letter) if letter != 0 && present[usize::from(letter)] => Ok(Some(letter)),
+        _ => {
+            let letters: Vec<String> = (1..=u8::MAX).filter(|&b| present[usize::from(b)]).map(|b| char::from(b).into()).collect();
+            let n = letters.len();
+            let available = if n == 0 { "none".to_owned() } else { list(letters, n) };
+            Err(StructureError::NotFound { what: "alternative location", asked: format!("`{asked}`"), available })
+        }
+    }
+}
+
+/// What the file holds and what takes it.
+fn holds(structure: &Structure, selection: &Selection, model: i32) -> String {
+    let contents = Contents::of(structure, Some(model));
+    let counts = contents.counts;
+    let mut kinds: Vec<&str> = Vec::new();
+    for (name, atoms) in [("polymer", counts.polymer), ("ligand", counts.ligand), ("water", counts.water)] {
+        if atoms > 0 {
+            kinds.push(name);
+        }
+    }
+    let heavy = !kinds.is_empty();
+    if !heavy && counts.hydrogens > 0 {
+        kinds = vec!["all"];
+    }
+    let asked = selection.kinds();
+    let chains = match &selection.chains {
+        Some(names) => format!(" of chains {}", list(names.iter().cloned(), names.len())),
+        None => String::new(),
+    };
+    format!(
+        "{asked}{chains} was asked for; model {model} has {counts} in {}; the file has {}; `select={}` takes them",
+        contents.chain_list(),
+        contents.model_list(),
+        kinds.join(",")
+    )
 }
 
 impl Selected {

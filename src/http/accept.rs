@@ -1,0 +1,226 @@
+//! The accept loop: connections to hyper, with the timeouts and the cap that `axum::serve` does not have, and a drain.
+
+use std::convert::Infallible;
+use std::error::Error;
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::Duration;
+
+use axum::Router;
+use axum::body::Body;
+use axum::http::Request;
+use hyper::body::Incoming;
+use hyper::service::service_fn;
+use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use hyper_util::server::conn::auto;
+use metrics::{counter, gauge};
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::task::JoinSet;
+use tokio::time::Instant;
+use tower::ServiceExt as _;
+
+use super::io::Guarded;
+use super::kinds::Kind;
+use super::problem::{MEDIA_TYPE, Problem};
+use crate::config::ServerConfig;
+use crate::telemetry::{CONNECTIONS, REJECTED};
+
+/// Most that is buffered of a request's head; a head that is longer is refused.
+const MAX_HEAD_BYTES: usize = 64 << 10;
+/// Requests at once on one HTTP/2 connection.
+const MAX_STREAMS: u32 = 64;
+/// Pause after the system could not accept, most likely for want of file descriptors.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// How often an HTTP/2 client is asked whether it is still there.
+const PING: Duration = Duration::from_secs(20);
+
+/// Serves `router` on `listener` until `stop` turns true; then lets requests finish until `drain` has passed.
+/// True if all of them did.
+pub(super) async fn serve(
+    listener: TcpListener,
+    router: Router,
+    config: Arc<ServerConfig>,
+    mut stop: watch::Receiver<bool>,
+) -> bool {
+    let places = Arc::new(Semaphore::new(config.connections));
+    let mut connections = JoinSet::new();
+    loop {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            Some(_ended) = connections.join_next() => continue,
+            _ = stop.wait_for(|stop| *stop) => break,
+        };
+        let stream = match accepted {
+            Ok((stream, _peer)) => stream,
+            Err(error) => {
+                tracing::warn!(%error, "cannot accept a connection");
+                tokio::time::sleep(ACCEPT_PAUSE).await;
+                continue;
+            }
+        };
+        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
+            refuse(stream);
+            continue;
+        };
+        // Answers are written in pieces that are large already; waiting for more only delays them.
+        if let Err(error) = stream.set_nodelay(true) {
+            tracing::debug!(%error, "the client left at once");
+            continue;
+        }
+        let stream = Guarded::new(stream, Place::new(place), config.write_timeout());
+        connections.spawn(connection(stream, router.clone(), Arc::clone(&config), stop.clone()));
+    }
+    drop(listener);
+    let all = async { while connections.join_next().await.is_some() {} };
+    let drained = tokio::time::timeout(config.drain_timeout(), all).await.is_ok();
+    connections.shutdown().await;
+    drained
+}
+
+/// A connection's place among those that there may be.
+struct Place(#[expect(dead_code, reason = "held for its drop")] OwnedSemaphorePermit);
+
+impl Place {
+    fn new(permit: OwnedSemaphorePermit) -> Self {
+        gauge!(CONNECTIONS).increment(1.0);
+        Self(permit)
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        gauge!(CONNECTIONS).decrement(1.0);
+    }
+}
+
+/// Tells one client too many so. Its request is not waited for: that would cost what there is no room for.
+fn refuse(stream: TcpStream) {
+    counter!(REJECTED, "reason" => Kind::TooManyConnections.row().slug).increment(1);
+    let body = Problem::new(Kind::TooManyConnections, "the server holds as many connections as it may").document("unknown");
+    let head = format!(
+        "HTTP/1.1 503 Service Unavailable\r\ncontent-type: {MEDIA_TYPE}\r\ncontent-length: {}\r\n\
+         retry-after: 1\r\nconnection: close\r\n\r\n",
+        body.len()
+    );
+    // A fresh socket has room for these few bytes; dropping the guard closes it gently.
+    let mut stream = Guarded::new(stream, (), Duration::from_secs(1));
+    tokio::spawn(async move {
+        if let Err(error) = stream.write_all(&[head.as_bytes(), &body].concat()).await {
+            tracing::debug!(%error, "a refused client left");
+        }
+    });
+}
+
+/// Whether a connection does anything.
+#[derive(Default)]
+struct Activity {
+    requests: AtomicUsize,
+    begun: AtomicBool,
+    /// Set by every request, cleared by every look.
+    busy: AtomicBool,
+}
+
+/// Counts a request while it lives.
+struct Working(Arc<Activity>);
+
+impl Working {
+    fn on(activity: &Arc<Activity>) -> Self {
+        activity.begun.store(true, Ordering::Relaxed);
+        activity.requests.fetch_add(1, Ordering::Relaxed);
+        Self(Arc::clone(activity))
+    }
+}
+
+impl Drop for Working {
+    fn drop(&mut self) {
+        self.0.busy.store(true, Ordering::Relaxed);
+        self.0.requests.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+/// Serves one connection.
+async fn connection(stream: Guarded<Place>, router: Router, config: Arc<ServerConfig>, mut stop: watch::Receiver<bool>) {
+    let activity = Arc::new(Activity::default());
+    let service = service_fn(|request: Request<Incoming>| {
+        let working = Working::on(&activity);
+        let answer = router.clone().oneshot(request.map(Body::new));
+        async move {
+            let answer = answer.await;
+            drop(working);
+            answer as Result<_, Infallible>
+        }
+    });
+    let builder = builder(&config);
+    let connection = builder.serve_connection(TokioIo::new(stream), service);
+    tokio::pin!(connection);
+    let mut stopping = false;
+    let mut look = Instant::now() + config.header_timeout();
+    loop {
+        tokio::select! {
+            ended = connection.as_mut() => {
+                if let Err(error) = ended {
+                    report(error.as_ref());
+                }
+                return;
+            }
+            _ = stop.wait_for(|stop| *stop), if !stopping => {
+                stopping = true;
+                connection.as_mut().graceful_shutdown();
+            }
+            () = tokio::time::sleep_until(look) => {
+                // hyper's own timer starts only once the protocol's version is known.
+                if !activity.begun.load(Ordering::Relaxed) {
+                    late();
+                    return;
+                }
+                let busy = activity.busy.swap(false, Ordering::Relaxed) || activity.requests.load(Ordering::Relaxed) > 0;
+                if !busy {
+                    connection.as_mut().graceful_shutdown();
+                }
+                look = Instant::now() + config.idle_timeout();
+            }
+        }
+    }
+}
+
+fn builder(config: &ServerConfig) -> auto::Builder<TokioExecutor> {
+    let mut builder = auto::Builder::new(TokioExecutor::new());
+    builder
+        .http1()
+        .timer(TokioTimer::new())
+        .header_read_timeout(config.header_timeout())
+        .max_buf_size(MAX_HEAD_BYTES);
+    builder
+        .http2()
+        .timer(TokioTimer::new())
+        .keep_alive_interval(PING)
+        .keep_alive_timeout(PING)
+        .max_concurrent_streams(MAX_STREAMS)
+        .max_header_list_size(MAX_HEAD_BYTES as u32);
+    builder
+}
+
+/// A connection that ended badly: its client's doing, nothing for an operator.
+fn report(error: &(dyn Error + Send + Sync + 'static)) {
+    let hyper = error.downcast_ref::<hyper::Error>();
+    if hyper.is_some_and(hyper::Error::is_timeout) {
+        late();
+        return;
+    }
+    let mut cause = Some(error as &(dyn Error + 'static));
+    while let Some(error) = cause {
+        if error.downcast_ref::<io::Error>().is_some_and(|e| e.kind() == io::ErrorKind::TimedOut) {
+            counter!(REJECTED, "reason" => "write-timeout").increment(1);
+        }
+        cause = error.source();
+    }
+    tracing::debug!(error, "a connection ended early");
+}
+
+fn late() {
+    counter!(REJECTED, "reason" => "header-timeout").increment(1);
+    tracing::debug!("a connection sent no request in time");
+}

@@ -1,0 +1,122 @@
+//! A finished job as an answer: the mesh with its summary in headers, or the report.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::http::header::{self, HeaderMap, HeaderName};
+use axum::http::HeaderValue;
+use axum::response::{IntoResponse, Response};
+
+use super::problem::{self, Problem};
+use super::state::App;
+use super::stream;
+use crate::formats::Format;
+use crate::jobs::{ContentKey, Finished};
+use crate::pipeline::Report;
+
+/// Headers that sum up the report.
+pub(super) const SUMMARY: [&str; 16] = [
+    "molmesh-atoms",
+    "molmesh-vertices",
+    "molmesh-triangles",
+    "molmesh-area",
+    "molmesh-volume",
+    "molmesh-closed",
+    "molmesh-manifold",
+    "molmesh-euler",
+    "molmesh-components",
+    "molmesh-kernel",
+    "molmesh-preset",
+    "molmesh-resolution",
+    "molmesh-isovalue",
+    "molmesh-radii",
+    "molmesh-backend",
+    "molmesh-backend-reason",
+];
+
+const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
+
+/// The mesh as `format`.
+pub(super) async fn mesh(
+    app: &App,
+    finished: Arc<Finished>,
+    format: Format,
+    key: &ContentKey,
+    received: Duration,
+) -> Result<Response, Problem> {
+    let report = &finished.product.report;
+    let mut headers = summary(report);
+    headers.insert(SERVER_TIMING, server_timing(report, received));
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
+    headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
+    headers.insert(header::ETAG, etag(key));
+    let (length, body) = stream::start(finished, format, app.config.limits.output_bytes).await?;
+    if let Some(length) = length {
+        headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
+    }
+    Ok((headers, body).into_response())
+}
+
+/// The report as JSON.
+pub(super) fn report(finished: &Finished, received: Duration) -> Result<Response, Problem> {
+    let report = &finished.product.report;
+    let mut headers = summary(report);
+    headers.insert(SERVER_TIMING, server_timing(report, received));
+    headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
+    // Times differ from run to run, so no two reports are the same.
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    let mut document = serde_json::to_value(report).map_err(Problem::internal)?;
+    if let (Some(diagnostics), Some(members)) = (&finished.diagnostics, document.as_object_mut()) {
+        members.insert("diagnostics".to_owned(), problem::findings(diagnostics));
+    }
+    let body = document.to_string();
+    Ok((headers, body).into_response())
+}
+
+/// The strong validator of a mesh file.
+pub(super) fn etag(key: &ContentKey) -> HeaderValue {
+    HeaderValue::from_str(&format!("\"{key}\"")).unwrap_or_else(|_| HeaderValue::from_static("\"\""))
+}
+
+/// A file name for browsers.
+pub(super) fn disposition(id: Option<&str>, format: Format) -> HeaderValue {
+    let safe = |c: &char| c.is_ascii_alphanumeric() || "-_.".contains(*c);
+    let stem: String = id.unwrap_or_default().chars().filter(safe).take(64).collect();
+    let stem = if stem.trim_matches('.').is_empty() { "surface" } else { &stem };
+    text(&format!("attachment; filename=\"{stem}.{}\"", format.extension()))
+}
+
+/// A header value; characters that headers cannot hold are written as `?`.
+fn text(value: &str) -> HeaderValue {
+    let plain: String = value.chars().map(|c| if (' '..='~').contains(&c) { c } else { '?' }).collect();
+    HeaderValue::from_str(&plain).unwrap_or_else(|_| HeaderValue::from_static("?"))
+}
+
+fn summary(report: &Report) -> HeaderMap {
+    let values = [
+        report.atoms.to_string(),
+        report.vertices.to_string(),
+        report.triangles.to_string(),
+        format!("{:.3}", report.area),
+        format!("{:.3}", report.volume),
+        report.closed.to_string(),
+        report.manifold.to_string(),
+        report.euler.to_string(),
+        report.components.to_string(),
+        report.kernel.to_owned(),
+        report.preset.to_owned(),
+        report.resolution.to_string(),
+        report.isovalue.to_string(),
+        report.radii.replace('Å', "A"),
+        report.backend.to_owned(),
+        report.backend_reason.clone(),
+    ];
+    SUMMARY.iter().zip(values).map(|(name, value)| (HeaderName::from_static(name), text(&value))).collect()
+}
+
+/// Time of every stage that is over when the head is sent; writing the file is not.
+fn server_timing(report: &Report, received: Duration) -> HeaderValue {
+    let stages = report.timings_ms.iter().map(|(name, ms)| format!("{name};dur={ms}"));
+    let receive = format!("receive;dur={:.3}", received.as_secs_f64() * 1e3);
+    text(&std::iter::once(receive).chain(stages).collect::<Vec<_>>().join(", "))
+}

@@ -1,0 +1,114 @@
+//! A connection's stream, guarded in two ways that hyper leaves to others: a client that takes no bytes is given up,
+//! and a connection that is closed while the client still sends is closed gently, so that the client gets to read why.
+
+use std::io;
+use std::pin::Pin;
+use std::task::{Context, Poll, ready};
+use std::time::Duration;
+
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, ReadBuf};
+use tokio::net::TcpStream;
+use tokio::time::{Instant, Sleep};
+
+/// How long a closed connection still takes what its client sends.
+const LINGER: Duration = Duration::from_secs(2);
+/// How much of it.
+const LINGER_BYTES: u64 = 64 << 20;
+
+/// A guarded stream.
+pub(super) struct Guarded<H: Send + 'static> {
+    stream: Option<TcpStream>,
+    /// Kept until the socket is really closed: the connection's place.
+    hold: Option<H>,
+    timeout: Duration,
+    stalled: Option<Pin<Box<Sleep>>>,
+    peer_ended: bool,
+}
+
+impl<H: Send + 'static> Guarded<H> {
+    /// Guards `stream`; `hold` is dropped when the socket is closed.
+    pub(super) fn new(stream: TcpStream, hold: H, timeout: Duration) -> Self {
+        Self { stream: Some(stream), hold: Some(hold), timeout, stalled: None, peer_ended: false }
+    }
+
+    fn stream(&mut self) -> io::Result<Pin<&mut TcpStream>> {
+        self.stream.as_mut().map(Pin::new).ok_or_else(|| io::ErrorKind::NotConnected.into())
+    }
+
+    /// A write that waits starts the clock, one that goes on stops it.
+    fn watch<T>(&mut self, cx: &mut Context<'_>, polled: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
+        if polled.is_ready() {
+            self.stalled = None;
+            return polled;
+        }
+        let timeout = self.timeout;
+        let sleep = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(Instant::now() + timeout)));
+        ready!(sleep.as_mut().poll(cx));
+        Poll::Ready(Err(io::Error::new(io::ErrorKind::TimedOut, "the client takes no bytes")))
+    }
+}
+
+impl<H: Send + Unpin + 'static> AsyncRead for Guarded<H> {
+    fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        let before = buf.filled().len();
+        let polled = self.stream()?.poll_read(cx, buf);
+        if matches!(polled, Poll::Ready(Ok(()))) && buf.filled().len() == before && buf.remaining() > 0 {
+            self.peer_ended = true;
+        }
+        polled
+    }
+}
+
+impl<H: Send + Unpin + 'static> AsyncWrite for Guarded<H> {
+    fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
+        let polled = self.stream()?.poll_write(cx, buf);
+        self.watch(cx, polled)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bufs: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        let polled = self.stream()?.poll_write_vectored(cx, bufs);
+        self.watch(cx, polled)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        true
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        let polled = self.stream()?.poll_flush(cx);
+        self.watch(cx, polled)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        self.stream()?.poll_shutdown(cx)
+    }
+}
+
+impl<H: Send + 'static> Drop for Guarded<H> {
+    fn drop(&mut self) {
+        let (Some(stream), hold) = (self.stream.take(), self.hold.take()) else { return };
+        let Ok(runtime) = tokio::runtime::Handle::try_current() else { return };
+        if !self.peer_ended {
+            runtime.spawn(linger(stream, hold));
+        }
+    }
+}
+
+/// Closing a socket with unread bytes makes the system tell the client of a reset, which throws away the answer that
+/// it has not read yet. So: say that nothing more comes, and swallow what does, for a while.
+async fn linger<H>(mut stream: TcpStream, hold: H) {
+    use tokio::io::AsyncWriteExt as _;
+    let swallow = async {
+        stream.shutdown().await?;
+        let (mut sink, mut reader) = (tokio::io::sink(), stream.take(LINGER_BYTES));
+        tokio::io::copy(&mut reader, &mut sink).await
+    };
+    if let Ok(Err(error)) = tokio::time::timeout(LINGER, swallow).await {
+        tracing::trace!(%error, "a client was gone before its connection was closed");
+    }
+    drop(hold);
+}

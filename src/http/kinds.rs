@@ -1,0 +1,155 @@
+//! The kinds of problems: stable names, statuses and what each means in words. The one table of status codes.
+
+use axum::http::StatusCode;
+
+/// What went wrong, as a stable name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    BadRequest,
+    BadParameter,
+    NotFound,
+    NotInArchive,
+    MethodNotAllowed,
+    NotAcceptable,
+    BodyTimeout,
+    BodyTooLarge,
+    InflatedTooLarge,
+    UnsupportedMediaType,
+    UnsupportedEncoding,
+    UnreadableStructure,
+    NoAtoms,
+    EmptySelection,
+    TooManyAtoms,
+    GridTooLarge,
+    MeshTooLarge,
+    NoSurface,
+    Internal,
+    NotReady,
+    QueueFull,
+    MemoryFull,
+    ShuttingDown,
+    TooManyConnections,
+    Deadline,
+}
+
+/// A kind's row.
+pub(super) struct Row {
+    pub(super) kind: Kind,
+    /// Last segment of its `type`: `/problems/{slug}`.
+    pub(super) slug: &'static str,
+    pub(super) status: StatusCode,
+    pub(super) title: &'static str,
+    /// What it means and what to do, for people.
+    pub(super) about: &'static str,
+    /// A limit was reached: counted as a rejection.
+    pub(super) limit: bool,
+}
+
+const fn row(
+    kind: Kind,
+    slug: &'static str,
+    status: StatusCode,
+    limit: bool,
+    title: &'static str,
+    about: &'static str,
+) -> Row {
+    Row { kind, slug, status, title, about, limit }
+}
+
+use StatusCode as S;
+
+/// Every kind.
+#[rustfmt::skip]
+pub(super) const KINDS: &[Row] = &[
+    row(Kind::BadRequest, "bad-request", S::BAD_REQUEST, false, "The request is malformed",
+        "The request could not be understood as HTTP or as multipart/form-data. `detail` says what was found."),
+    row(Kind::BadParameter, "bad-parameter", S::BAD_REQUEST, false, "A parameter cannot be used",
+        "A parameter is unknown, given twice, malformed, out of range, or does not go with another one. `parameter` names it, `value` is what was given, `expected` says what is allowed, `nearest` is the known name that is nearest to an unknown one. /v1/capabilities lists all of them."),
+    row(Kind::NotFound, "not-found", S::NOT_FOUND, false, "There is nothing here",
+        "No resource has this path. /v1/capabilities and / say what there is."),
+    row(Kind::NotInArchive, "not-in-archive", S::NOT_FOUND, false, "The archive has no such entry",
+        "The id is well formed, but this server's folder of structures holds no file for it. POST the file to /v1/meshes instead."),
+    row(Kind::MethodNotAllowed, "method-not-allowed", S::METHOD_NOT_ALLOWED, false, "The resource has no such method",
+        "The `Allow` header lists the methods that the resource has."),
+    row(Kind::NotAcceptable, "not-acceptable", S::NOT_ACCEPTABLE, false, "No such representation",
+        "None of the media types in `Accept` can be produced. `available` lists those that can; `?format=` names one directly."),
+    row(Kind::BodyTimeout, "body-timeout", S::REQUEST_TIMEOUT, true, "The body came too slowly",
+        "The request's body was not complete within `limit` milliseconds."),
+    row(Kind::BodyTooLarge, "body-too-large", S::PAYLOAD_TOO_LARGE, true, "The body is too large",
+        "The request's body has more than `limit` bytes. Compress it with gzip or zstd, or ask the operator to raise limits.body_bytes."),
+    row(Kind::InflatedTooLarge, "inflated-too-large", S::PAYLOAD_TOO_LARGE, true, "The structure inflates to too much",
+        "After decompression the structure has more than `limit` bytes."),
+    row(Kind::UnsupportedMediaType, "unsupported-media-type", S::UNSUPPORTED_MEDIA_TYPE, false, "The content is not what its type says",
+        "`Content-Type` is only a hint, as the bytes are looked at; but here the two contradict each other. `declared` is what the header said, `found` what the bytes are."),
+    row(Kind::UnsupportedEncoding, "unsupported-encoding", S::UNSUPPORTED_MEDIA_TYPE, false, "The content encoding cannot be used",
+        "`Content-Encoding` may be gzip, zstd or identity, and the bytes must be what it says."),
+    row(Kind::UnreadableStructure, "unreadable-structure", S::UNPROCESSABLE_ENTITY, false, "The structure cannot be read",
+        "The bytes are no PDB or mmCIF file, or a broken one. `line` and `column` give the place where there is one, `found` and `expected` what stood there and what should have; `diagnostics` is what a second, strict reader says of the file."),
+    row(Kind::NoAtoms, "no-atoms", S::UNPROCESSABLE_ENTITY, false, "The structure has no atoms",
+        "The file was read, but holds no atoms with coordinates."),
+    row(Kind::EmptySelection, "empty-selection", S::UNPROCESSABLE_ENTITY, false, "The selection holds no atoms",
+        "The file holds atoms, but none that was asked for. `detail` says what the file holds and how to select it."),
+    row(Kind::TooManyAtoms, "too-many-atoms", S::UNPROCESSABLE_ENTITY, true, "The structure has too many atoms",
+        "The file holds more than `limit` atoms."),
+    row(Kind::GridTooLarge, "grid-too-large", S::UNPROCESSABLE_ENTITY, true, "The grid would be too large",
+        "At this resolution the surface needs more than `limit` grid samples. `suggested_resolution` is a spacing in ångström that would fit."),
+    row(Kind::MeshTooLarge, "mesh-too-large", S::UNPROCESSABLE_ENTITY, true, "The mesh would be too large",
+        "The mesh, or its file, would have more than `limit` bytes. `suggested_resolution` is a spacing in ångström that would fit."),
+    row(Kind::NoSurface, "no-surface", S::UNPROCESSABLE_ENTITY, false, "There is no surface",
+        "The density reaches `isovalue` nowhere on the grid. Take a lower isovalue or a finer resolution."),
+    row(Kind::Internal, "internal", S::INTERNAL_SERVER_ERROR, false, "Our mistake",
+        "Something failed that should not have. The log has the details under the request id that `instance` gives."),
+    row(Kind::NotReady, "not-ready", S::SERVICE_UNAVAILABLE, false, "Not ready",
+        "The service has not yet computed its first mesh, could not, or is shutting down."),
+    row(Kind::QueueFull, "queue-full", S::SERVICE_UNAVAILABLE, true, "Too many jobs are waiting",
+        "All workers are busy and `limit` jobs wait already. `Retry-After` is the estimated time in seconds until there is room."),
+    row(Kind::MemoryFull, "memory-full", S::SERVICE_UNAVAILABLE, true, "Too much is held in memory",
+        "Uploads and meshes that clients have not taken yet use the memory that is set aside for them (`limit` bytes). Try again after `Retry-After` seconds."),
+    row(Kind::ShuttingDown, "shutting-down", S::SERVICE_UNAVAILABLE, false, "The service is shutting down",
+        "The job was not done before the service stopped. Try again: another instance, or this one after its restart, will do it."),
+    row(Kind::TooManyConnections, "too-many-connections", S::SERVICE_UNAVAILABLE, true, "Too many connections",
+        "The server holds as many connections as it may. Try again after `Retry-After` seconds."),
+    row(Kind::Deadline, "deadline", S::GATEWAY_TIMEOUT, true, "The deadline passed",
+        "The mesh was not done within `limit` milliseconds, the time in the queue included. A coarser resolution is faster: the work grows with the cube of its inverse."),
+];
+
+impl Kind {
+    /// The kind's row.
+    pub(super) fn row(self) -> &'static Row {
+        match KINDS.iter().find(|row| row.kind == self) {
+            Some(row) => row,
+            None => unreachable!("every kind has a row: a test says so"),
+        }
+    }
+
+    /// The kind of an answer that a library gave, by its status.
+    pub(super) fn of_status(status: StatusCode) -> Self {
+        match status {
+            S::NOT_FOUND => Self::NotFound,
+            S::METHOD_NOT_ALLOWED => Self::MethodNotAllowed,
+            S::NOT_ACCEPTABLE => Self::NotAcceptable,
+            S::REQUEST_TIMEOUT => Self::BodyTimeout,
+            S::PAYLOAD_TOO_LARGE => Self::BodyTooLarge,
+            S::UNSUPPORTED_MEDIA_TYPE => Self::UnsupportedMediaType,
+            S::SERVICE_UNAVAILABLE => Self::NotReady,
+            S::GATEWAY_TIMEOUT => Self::Deadline,
+            other if other.is_client_error() => Self::BadRequest,
+            _ => Self::Internal,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_kind_has_one_row_in_order() {
+        for (n, row) in KINDS.iter().enumerate() {
+            assert_eq!(row.kind as usize, n, "{}", row.slug);
+            assert_eq!(row.kind.row().slug, row.slug);
+            assert!(KINDS.iter().filter(|other| other.slug == row.slug).count() == 1, "{}", row.slug);
+        }
+        assert_eq!(KINDS.len(), Kind::Deadline as usize + 1);
+    }
+}

@@ -1,0 +1,266 @@
+//! Problems: RFC 9457 `application/problem+json` for everything that is not a success, ours and the libraries'.
+//!
+//! Handlers return a [`Problem`]; the errors of the other rooms become one here and nowhere else. The answer is
+//! written by [`render`], a middleware, because it alone knows the request's id.
+
+use axum::body::Body;
+use axum::extract::Request;
+use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER};
+use axum::http::{HeaderValue, Method, StatusCode};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use metrics::counter;
+use serde_json::{Map, Value, json};
+
+use super::kinds::Kind;
+use super::request_id::RequestId;
+use crate::formats::FormatError;
+use crate::jobs::{Exhausted, Failure, Refusal};
+use crate::pipeline::JobError;
+use crate::pipeline::params::ParamError;
+use crate::structure::StructureError;
+use crate::structure::referee::Diagnostic;
+use crate::surface::SurfaceError;
+use crate::telemetry::REJECTED;
+
+/// Media type of problems.
+pub(super) const MEDIA_TYPE: &str = "application/problem+json";
+
+/// Something to tell the client instead of what it asked for.
+#[derive(Debug, Clone)]
+pub(super) struct Problem {
+    kind: Kind,
+    detail: String,
+    members: Map<String, Value>,
+    retry_after_s: Option<u64>,
+}
+
+impl Problem {
+    /// A problem with its explanation for this occurrence.
+    pub(super) fn new(kind: Kind, detail: impl Into<String>) -> Self {
+        Self { kind, detail: detail.into(), members: Map::new(), retry_after_s: None }
+    }
+
+    /// A mistake of ours. The message goes to the log, not to the client.
+    pub(super) fn internal(message: impl std::fmt::Display) -> Self {
+        tracing::error!(%message, "internal error");
+        Self::new(Kind::Internal, "The request could not be answered.")
+    }
+
+    /// Adds a member.
+    pub(super) fn with(mut self, name: &str, value: impl Into<Value>) -> Self {
+        self.members.insert(name.to_owned(), value.into());
+        self
+    }
+
+    /// Says when to try again.
+    pub(super) fn retry_after(mut self, wait: std::time::Duration) -> Self {
+        self.retry_after_s = Some(wait.as_secs_f64().ceil().clamp(1.0, 600.0) as u64);
+        self
+    }
+
+    /// Adds what the referee found, if it found anything.
+    fn diagnosed(self, diagnostics: &[Diagnostic]) -> Self {
+        if diagnostics.is_empty() { self } else { self.with("diagnostics", findings(diagnostics)) }
+    }
+
+    /// The document.
+    pub(super) fn document(&self, instance: &str) -> Vec<u8> {
+        let row = self.kind.row();
+        let mut document = Map::new();
+        document.insert("type".to_owned(), format!("/problems/{}", row.slug).into());
+        document.insert("title".to_owned(), row.title.into());
+        document.insert("status".to_owned(), row.status.as_u16().into());
+        document.insert("detail".to_owned(), self.detail.as_str().into());
+        document.insert("instance".to_owned(), instance.into());
+        document.extend(self.members.iter().map(|(name, value)| (name.clone(), value.clone())));
+        let mut bytes = Value::Object(document).to_string().into_bytes();
+        bytes.push(b'\n');
+        bytes
+    }
+}
+
+impl IntoResponse for Problem {
+    /// The status and, for [`render`], the problem itself.
+    fn into_response(self) -> Response {
+        let mut response = self.kind.row().status.into_response();
+        if let Some(wait) = self.retry_after_s {
+            response.headers_mut().insert(RETRY_AFTER, HeaderValue::from(wait));
+        }
+        response.extensions_mut().insert(self);
+        response
+    }
+}
+
+/// Writes problems, and turns every other answer that is an error into one.
+pub(super) async fn render(request: Request, next: Next) -> Response {
+    let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
+    let (head, path) = (request.method() == Method::HEAD, request.uri().path().to_owned());
+    let mut response = next.run(request).await;
+    let status = response.status();
+    if !status.is_client_error() && !status.is_server_error() {
+        return response;
+    }
+    let problem = response.extensions_mut().remove::<Problem>();
+    let problem = problem.unwrap_or_else(|| of_library(status, &path));
+    let row = problem.kind.row();
+    if row.limit {
+        counter!(REJECTED, "reason" => row.slug).increment(1);
+    }
+    let document = problem.document(id.as_str());
+    let (mut parts, _body) = response.into_parts();
+    parts.status = row.status;
+    parts.headers.insert(CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE));
+    parts.headers.insert(CONTENT_LENGTH, HeaderValue::from(document.len()));
+    Response::from_parts(parts, if head { Body::empty() } else { Body::from(document) })
+}
+
+/// The problem behind an error answer that axum or a layer gave.
+fn of_library(status: StatusCode, path: &str) -> Problem {
+    let detail = match status {
+        StatusCode::NOT_FOUND => format!("There is nothing at {path}."),
+        StatusCode::METHOD_NOT_ALLOWED => format!("{path} has other methods; the Allow header lists them."),
+        _ => status.canonical_reason().unwrap_or("The request could not be answered").to_owned(),
+    };
+    Problem::new(Kind::of_status(status), detail)
+}
+
+/// The referee's findings as JSON.
+pub(super) fn findings(diagnostics: &[Diagnostic]) -> Value {
+    let finding = |d: &Diagnostic| json!({ "level": d.level.name(), "line": d.line, "message": d.message });
+    diagnostics.iter().map(finding).collect()
+}
+
+impl From<ParamError> for Problem {
+    fn from(error: ParamError) -> Self {
+        let problem = Self::new(Kind::BadParameter, error.to_string());
+        match error {
+            ParamError::Unknown { name, nearest } => problem.with("parameter", name).with("nearest", nearest),
+            ParamError::Repeated { name } => problem.with("parameter", name),
+            ParamError::BadValue { name, value, expected } => {
+                problem.with("parameter", name).with("value", value.trim_matches('`')).with("expected", expected)
+            }
+        }
+    }
+}
+
+impl From<Exhausted> for Problem {
+    fn from(error: Exhausted) -> Self {
+        Self::new(Kind::MemoryFull, error.to_string())
+            .with("limit", error.limit)
+            .with("actual", error.held)
+            .retry_after(std::time::Duration::from_secs(1))
+    }
+}
+
+impl From<Refusal> for Problem {
+    fn from(error: Refusal) -> Self {
+        match error {
+            Refusal::QueueFull { waiting, limit, wait } => Self::new(Kind::QueueFull, error.to_string())
+                .with("limit", limit)
+                .with("actual", waiting)
+                .with("estimated_wait_s", wait.as_secs_f64())
+                .retry_after(wait),
+            Refusal::Draining => {
+                Self::new(Kind::ShuttingDown, error.to_string()).retry_after(std::time::Duration::from_secs(1))
+            }
+        }
+    }
+}
+
+impl From<Failure> for Problem {
+    fn from(error: Failure) -> Self {
+        match error {
+            Failure::Job { error: JobError::Structure(error), diagnostics } => Self::from(error).diagnosed(&diagnostics),
+            Failure::Job { error: JobError::Surface(error), .. } => error.into(),
+            Failure::Check { ref diagnostics } => {
+                Self::new(Kind::UnreadableStructure, error.to_string()).with("parameter", "check").diagnosed(diagnostics)
+            }
+            Failure::Deadline { limit } => Self::new(Kind::Deadline, error.to_string())
+                .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX)),
+            Failure::Memory(error) => error.into(),
+            Failure::Stopped => {
+                Self::new(Kind::ShuttingDown, error.to_string()).retry_after(std::time::Duration::from_secs(1))
+            }
+            Failure::Panicked { .. } => Self::internal(error),
+        }
+    }
+}
+
+impl From<StructureError> for Problem {
+    fn from(error: StructureError) -> Self {
+        use StructureError as E;
+        let detail = error.to_string();
+        match error {
+            E::UnknownFormat { found } => Self::new(Kind::UnreadableStructure, detail).with("found", found),
+            E::Syntax { line, column, found, expected } => Self::new(Kind::UnreadableStructure, detail)
+                .with("line", line)
+                .with("column", column)
+                .with("found", found)
+                .with("expected", expected),
+            E::Decompress { encoding, .. } => Self::new(Kind::UnreadableStructure, detail).with("encoding", encoding),
+            E::InflatedTooLarge { limit } => Self::new(Kind::InflatedTooLarge, detail).with("limit", limit),
+            E::TooManyAtoms { limit } => Self::new(Kind::TooManyAtoms, detail).with("limit", limit),
+            E::NoAtoms { .. } => Self::new(Kind::NoAtoms, detail),
+            E::EmptySelection { .. } => Self::new(Kind::EmptySelection, detail),
+            E::NotFound { what, asked, available } => Self::new(Kind::EmptySelection, detail)
+                .with("parameter", if what == "chain" { "chains" } else { what })
+                .with("value", asked)
+                .with("expected", available),
+        }
+    }
+}
+
+impl From<SurfaceError> for Problem {
+    fn from(error: SurfaceError) -> Self {
+        use SurfaceError as E;
+        let detail = error.to_string();
+        match error {
+            E::NoSpheres => Self::new(Kind::NoAtoms, detail),
+            E::BadSphere { index, expected, .. } => {
+                Self::new(Kind::UnreadableStructure, detail).with("atom", index).with("expected", expected)
+            }
+            E::BadParameter { .. } => ParamError::from(error).into(),
+            E::GridTooLarge { samples, limit, resolution, suggested_resolution } => {
+                Self::new(Kind::GridTooLarge, detail)
+                    .with("limit", limit)
+                    .with("actual", samples)
+                    .with("resolution", resolution)
+                    .with("suggested_resolution", suggested_resolution)
+            }
+            E::MeshTooLarge { bytes, limit, suggested_resolution } => Self::new(Kind::MeshTooLarge, detail)
+                .with("limit", limit)
+                .with("actual", bytes)
+                .with("suggested_resolution", suggested_resolution),
+            E::NoSurface { isovalue } => {
+                Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
+            }
+            E::Cancelled => Self::from(Failure::Stopped),
+        }
+    }
+}
+
+/// A mesh file of `bytes` bytes where `limit` are allowed; files grow with the inverse square of the spacing.
+pub(super) fn file_too_large(bytes: u64, limit: u64, resolution: f64) -> Problem {
+    let fits = resolution * (bytes as f64 / limit as f64).sqrt();
+    let fits = (fits * 105.0).ceil() / 100.0;
+    Problem::new(
+        Kind::MeshTooLarge,
+        format!("the file would take {bytes} bytes, the limit is {limit}; {fits} Å would fit"),
+    )
+    .with("limit", limit)
+    .with("actual", bytes)
+    .with("suggested_resolution", fits)
+}
+
+/// A mesh that its format cannot hold, or that no format could.
+pub(super) fn of_format(error: &FormatError, resolution: f64) -> Problem {
+    match *error {
+        FormatError::GlbTooLarge { bytes, limit } => file_too_large(bytes, limit, resolution),
+        FormatError::TooMany { count, limit, .. } => file_too_large(count, limit, resolution),
+        FormatError::AtomIndexTooLarge { limit, .. } => {
+            Problem::new(Kind::MeshTooLarge, error.to_string()).with("limit", limit).with("parameter", "atom_ids")
+        }
+        _ => Problem::internal(error),
+    }
+}

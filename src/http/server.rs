@@ -1,0 +1,202 @@
+//! The server: binds its listeners, warms the backend up, serves until it is told to stop, drains.
+
+use std::future::Future;
+use std::io;
+use std::net::{SocketAddr, TcpListener};
+use std::sync::Arc;
+use std::time::Instant;
+
+use thiserror::Error;
+use tokio::sync::watch;
+
+use super::state::{App, Readiness, Ready, Shared};
+use super::{accept, capabilities, metrics, router};
+use crate::config::Config;
+use crate::jobs::{Budget, Pool, Settings};
+use crate::structure::Archive;
+use crate::surface::{Backend, Control, Spheres, SurfaceLimits, SurfaceParams};
+use crate::telemetry::{self, TelemetryError};
+
+/// How often the recorder tidies up its histograms.
+const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
+
+/// Why the server cannot start.
+#[derive(Debug, Error)]
+pub enum ServeError {
+    /// An address cannot be listened on.
+    #[error("cannot listen on {addr} ({key}): {error}")]
+    Listen {
+        /// The key of the configuration that says the address.
+        key: &'static str,
+        /// The address.
+        addr: SocketAddr,
+        /// The system's words.
+        error: io::Error,
+    },
+    /// A worker thread cannot be started.
+    #[error("cannot start the worker threads: {0}")]
+    Workers(io::Error),
+    /// Metrics cannot be set up.
+    #[error(transparent)]
+    Telemetry(#[from] TelemetryError),
+}
+
+/// A server whose listeners are bound and whose workers run.
+pub struct Server {
+    app: Shared,
+    listener: TcpListener,
+    metrics_listener: Option<TcpListener>,
+    addr: SocketAddr,
+    metrics_addr: Option<SocketAddr>,
+}
+
+fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
+    let bind = || {
+        let listener = TcpListener::bind(addr)?;
+        listener.set_nonblocking(true)?;
+        let bound = listener.local_addr()?;
+        Ok((listener, bound))
+    };
+    bind().map_err(|error| ServeError::Listen { key, addr, error })
+}
+
+impl Server {
+    /// Binds the listeners and starts the workers. `reason` says why `backend` was taken.
+    ///
+    /// # Errors
+    /// [`ServeError`].
+    pub fn bind(config: Config, backend: Arc<dyn Backend>, reason: String) -> Result<Self, ServeError> {
+        let (listener, addr) = listen("server.listen", config.server.listen)?;
+        let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
+        let (metrics_listener, metrics_addr) = metrics.unzip();
+        telemetry::recorder()?;
+        let settings = Settings {
+            workers: config.jobs.workers,
+            queue: config.jobs.queue,
+            limits: config.limits.job(),
+            budget: Budget::new(config.limits.memory_bytes),
+        };
+        let pool = Pool::start(settings, backend, reason).map_err(ServeError::Workers)?;
+        let archive = Archive::new(config.archive_dir()).with_max_bytes(config.limits.inflated_bytes);
+        let capabilities = capabilities::document(&config, &pool);
+        let app = Arc::new(App { config, pool, archive, readiness: Readiness::default(), capabilities });
+        Ok(Self { app, listener, metrics_listener, addr, metrics_addr })
+    }
+
+    /// Address of the service.
+    #[must_use]
+    pub fn addr(&self) -> SocketAddr {
+        self.addr
+    }
+
+    /// Address of `/metrics`, if it is served.
+    #[must_use]
+    pub fn metrics_addr(&self) -> Option<SocketAddr> {
+        self.metrics_addr
+    }
+
+    /// Serves until `shutdown` is done, then lets running requests finish, for the drain timeout at most. Must run
+    /// on a tokio runtime with timers and several threads. True if every request was finished.
+    ///
+    /// # Errors
+    /// [`ServeError`].
+    pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<bool, ServeError> {
+        let handle = telemetry::recorder()?;
+        let (stop, stopped) = watch::channel(false);
+        let config = Arc::new(self.app.config.server.clone());
+        let warming = tokio::task::spawn_blocking({
+            let app = Arc::clone(&self.app);
+            move || warm_up(&app)
+        });
+        let listener = tokio_listener("server.listen", self.addr, self.listener)?;
+        let service = router::router(Arc::clone(&self.app));
+        let serving = tokio::spawn(accept::serve(listener, service, Arc::clone(&config), stopped.clone()));
+        let metrics = match self.metrics_listener.zip(self.metrics_addr) {
+            Some((listener, addr)) => {
+                let listener = tokio_listener("server.metrics_listen", addr, listener)?;
+                Some(tokio::spawn(accept::serve(listener, metrics::router(handle.clone()), config, stopped)))
+            }
+            None => None,
+        };
+        let upkeep = tokio::spawn(async move {
+            loop {
+                tokio::time::sleep(UPKEEP).await;
+                handle.run_upkeep();
+            }
+        });
+        shutdown.await;
+        tracing::info!("stopping: running requests are finished, new ones are refused");
+        self.app.readiness.set(Ready::ShuttingDown);
+        let deadline = Instant::now() + self.app.config.server.drain_timeout();
+        stop.send_replace(true);
+        let (jobs, requests) = tokio::join!(self.app.pool.drain(deadline), serving);
+        upkeep.abort();
+        warming.abort();
+        if let Some(metrics) = metrics {
+            metrics.abort();
+        }
+        let drained = jobs && requests.unwrap_or(false);
+        tracing::info!(drained, "stopped");
+        Ok(drained)
+    }
+}
+
+fn tokio_listener(
+    key: &'static str,
+    addr: SocketAddr,
+    listener: TcpListener,
+) -> Result<tokio::net::TcpListener, ServeError> {
+    tokio::net::TcpListener::from_std(listener).map_err(|error| ServeError::Listen { key, addr, error })
+}
+
+/// Computes a first, tiny mesh: threads are started, code is paged in, and a backend that cannot work is found out.
+fn warm_up(app: &App) {
+    let start = Instant::now();
+    let backend = Arc::clone(app.pool.backend());
+    let first = || {
+        let spheres = Spheres::new(vec![0.0], vec![0.0], vec![0.0], vec![1.7])?;
+        backend.run(&spheres, &SurfaceParams::default(), &SurfaceLimits::default(), &Control::default())
+    };
+    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(first));
+    match result {
+        Ok(Ok(meshed)) => {
+            let ms = start.elapsed().as_secs_f64() * 1e3;
+            tracing::info!(ms, triangles = meshed.mesh.n_triangles(), backend = backend.name(), "ready");
+            app.readiness.set(Ready::Yes);
+        }
+        Ok(Err(error)) => {
+            tracing::error!(%error, backend = backend.name(), "the first mesh failed");
+            app.readiness.set(Ready::Broken);
+        }
+        Err(_payload) => {
+            tracing::error!(backend = backend.name(), "the first mesh panicked");
+            app.readiness.set(Ready::Broken);
+        }
+    }
+}
+
+/// Done on the first SIGTERM, or SIGINT (Ctrl-C).
+pub async fn shutdown_signal() {
+    let interrupt = async {
+        if let Err(error) = tokio::signal::ctrl_c().await {
+            tracing::warn!(%error, "cannot listen for Ctrl-C");
+            std::future::pending::<()>().await;
+        }
+    };
+    #[cfg(unix)]
+    let terminate = async {
+        match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
+            Ok(mut signal) => drop(signal.recv().await),
+            Err(error) => {
+                tracing::warn!(%error, "cannot listen for SIGTERM");
+                std::future::pending::<()>().await;
+            }
+        }
+    };
+    #[cfg(not(unix))]
+    let terminate = std::future::pending::<()>();
+    tokio::select! {
+        () = interrupt => {}
+        () = terminate => {}
+    }
+}

@@ -1,0 +1,55 @@
+//! What the handlers share.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use bytes::Bytes;
+
+use crate::config::Config;
+use crate::jobs::Pool;
+use crate::structure::Archive;
+
+/// State of the service, behind one pointer.
+pub(super) struct App {
+    pub(super) config: Config,
+    pub(super) pool: Pool,
+    pub(super) archive: Archive,
+    pub(super) readiness: Readiness,
+    /// The body of `/v1/capabilities`, which cannot change while the service runs.
+    pub(super) capabilities: Bytes,
+}
+
+/// What handlers extract.
+pub(super) type Shared = Arc<App>;
+
+/// Whether requests should come here.
+#[derive(Debug, Default)]
+pub(super) struct Readiness(AtomicU8);
+
+/// The answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub(super) enum Ready {
+    /// The first mesh is being computed.
+    Warming = 0,
+    Yes = 1,
+    /// The first mesh could not be computed.
+    Broken = 2,
+    ShuttingDown = 3,
+}
+
+impl Readiness {
+    pub(super) fn get(&self) -> Ready {
+        match self.0.load(Ordering::Relaxed) {
+            0 => Ready::Warming,
+            1 => Ready::Yes,
+            2 => Ready::Broken,
+            _ => Ready::ShuttingDown,
+        }
+    }
+
+    /// Takes the new value unless the service is shutting down, which is final.
+    pub(super) fn set(&self, ready: Ready) {
+        self.0.fetch_max(ready as u8, Ordering::Relaxed);
+    }
+}

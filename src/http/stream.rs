@@ -1,0 +1,150 @@
+//! A mesh on its way to the client: the writer runs on a blocking thread and hands small pieces to the body through a
+//! bounded channel, so the file never exists in memory as a whole and a slow client slows the writer down.
+
+use std::io::{self, Write};
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Instant;
+
+use axum::body::Body;
+use bytes::{BufMut as _, Bytes, BytesMut};
+use hyper::body::{Body as HttpBody, Frame, SizeHint};
+use metrics::histogram;
+use tokio::sync::{mpsc, oneshot};
+
+use super::problem::{self, Problem};
+use crate::formats::{Encoder, Format};
+use crate::jobs::Finished;
+use crate::telemetry::STAGE_DURATION;
+
+/// Bytes of a piece: few wake-ups for large meshes, small enough to be in a cache while it is sent.
+const PIECE: usize = 256 << 10;
+/// Pieces under way to one client.
+const PIECES: usize = 4;
+
+/// What the writer sends.
+enum Piece {
+    Data(Bytes),
+    /// Everything was written. A channel that closes without it is a writer that failed.
+    End,
+}
+
+/// Starts writing; the length comes with the body where it is known.
+pub(super) async fn start(finished: Arc<Finished>, format: Format, limit: u64) -> Result<(Option<u64>, Body), Problem> {
+    let (head, answer) = oneshot::channel();
+    let (pieces, receiver) = mpsc::channel(PIECES);
+    let span = tracing::Span::current();
+    tokio::task::spawn_blocking(move || span.in_scope(|| write(&finished, format, limit, head, pieces)));
+    // A writer that panics drops its end; the panic hook has logged it.
+    let length = answer.await.map_err(|_dropped| Problem::internal("the writer failed"))??;
+    Ok((length, Body::new(MeshBody { pieces: receiver, left: length, ended: false })))
+}
+
+/// Lays the file out, says how long it is, writes it.
+fn write(
+    finished: &Finished,
+    format: Format,
+    limit: u64,
+    head: oneshot::Sender<Result<Option<u64>, Problem>>,
+    pieces: mpsc::Sender<Piece>,
+) {
+    let start = Instant::now();
+    let product = &finished.product;
+    let resolution = product.report.resolution;
+    let encoder = match Encoder::new(format, &product.mesh, &product.meta()) {
+        Ok(encoder) if encoder.encoded_len_bound() > limit => Err(problem::file_too_large(encoder.encoded_len_bound(), limit, resolution)),
+        Ok(encoder) => Ok(encoder),
+        Err(error) => Err(problem::of_format(&error, resolution)),
+    };
+    let (length, encoder) = match encoder {
+        Ok(encoder) => (Ok(encoder.encoded_len()), Some(encoder)),
+        Err(problem) => (Err(problem), None),
+    };
+    // Without a receiver the client is gone; the first piece would find out as well.
+    let gone = head.send(length).is_err();
+    let Some(encoder) = encoder.filter(|_| !gone) else { return };
+    let mut writer = Pieces { pieces, buffer: BytesMut::new() };
+    match encoder.write(&mut writer).and_then(|()| writer.finish()) {
+        Ok(()) => histogram!(STAGE_DURATION, "stage" => "encode").record(start.elapsed().as_secs_f64()),
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => tracing::debug!("the client left"),
+        // The body ends without its end, which breaks the connection off: a truncated mesh must not look whole.
+        Err(error) => tracing::error!(%error, format = format.extension(), "writing a mesh failed"),
+    }
+}
+
+/// Collects what is written into pieces. Blocks while the client is slow.
+struct Pieces {
+    pieces: mpsc::Sender<Piece>,
+    buffer: BytesMut,
+}
+
+impl Pieces {
+    fn send(&self, piece: Piece) -> io::Result<()> {
+        self.pieces.blocking_send(piece).map_err(|_gone| io::ErrorKind::BrokenPipe.into())
+    }
+
+    fn finish(&mut self) -> io::Result<()> {
+        if !self.buffer.is_empty() {
+            let data = self.buffer.split().freeze();
+            self.send(Piece::Data(data))?;
+        }
+        self.send(Piece::End)
+    }
+}
+
+impl Write for Pieces {
+    fn write(&mut self, data: &[u8]) -> io::Result<usize> {
+        if self.buffer.capacity() == 0 {
+            self.buffer.reserve(PIECE);
+        }
+        let n = data.len().min(self.buffer.capacity() - self.buffer.len());
+        self.buffer.put_slice(&data[..n]);
+        if self.buffer.len() == self.buffer.capacity() {
+            let data = std::mem::take(&mut self.buffer).freeze();
+            self.send(Piece::Data(data))?;
+        }
+        Ok(n)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// The receiving end.
+struct MeshBody {
+    pieces: mpsc::Receiver<Piece>,
+    left: Option<u64>,
+    ended: bool,
+}
+
+impl HttpBody for MeshBody {
+    type Data = Bytes;
+    type Error = io::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, io::Error>>> {
+        if self.ended {
+            return Poll::Ready(None);
+        }
+        self.pieces.poll_recv(cx).map(|piece| match piece {
+            Some(Piece::Data(data)) => {
+                self.left = self.left.map(|left| left.saturating_sub(data.len() as u64));
+                Some(Ok(Frame::data(data)))
+            }
+            Some(Piece::End) => {
+                self.ended = true;
+                None
+            }
+            None => Some(Err(io::Error::other("the mesh could not be written to its end"))),
+        })
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.ended
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.left.map_or_else(SizeHint::default, SizeHint::with_exact)
+    }
+}

@@ -1,0 +1,64 @@
+//! One alternative location for each residue.
+//!
+//! A residue is a chain, a number and an insertion code: where two residue names share these (microheterogeneity), they
+//! are alternatives of one residue. One letter is taken for the whole residue, so that no bond joins two alternatives.
+
+use std::collections::HashMap;
+
+use super::atoms::Structure;
+
+type Residue = (u32, i32, u8);
+
+/// The letter of each residue that has alternatives.
+#[derive(Debug, Default)]
+pub(super) struct Alternatives {
+    chosen: HashMap<Residue, u8>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Letter {
+    letter: u8,
+    occupancy: f64,
+    atoms: u32,
+}
+
+impl Letter {
+    /// Mean occupancy in ten thousandths: files give two or three digits, and a tie must be one.
+    fn rank(&self) -> i64 {
+        (self.occupancy / f64::from(self.atoms) * 1e4).round() as i64
+    }
+}
+
+fn residue(structure: &Structure, i: usize) -> Residue {
+    (structure.chain.id(i), structure.residue_number[i], structure.insertion_code[i])
+}
+
+impl Alternatives {
+    /// Chooses among the atoms of `model`: `wanted` where a residue has it, otherwise the alternative with the highest
+    /// mean occupancy, otherwise the lowest letter.
+    pub(super) fn choose(structure: &Structure, model: i32, wanted: Option<u8>) -> Self {
+        let mut letters: HashMap<Residue, Vec<Letter>> = HashMap::new();
+        for i in (0..structure.len()).filter(|&i| structure.altloc[i] != 0 && structure.model[i] == model) {
+            let of_residue = letters.entry(residue(structure, i)).or_default();
+            let (letter, occupancy) = (structure.altloc[i], f64::from(structure.occupancy[i]));
+            match of_residue.iter_mut().find(|l| l.letter == letter) {
+                Some(known) => {
+                    known.occupancy += occupancy;
+                    known.atoms += 1;
+                }
+                None => of_residue.push(Letter { letter, occupancy, atoms: 1 }),
+            }
+        }
+        let best = |letters: Vec<Letter>| {
+            let has = letters.iter().find(|l| Some(l.letter) == wanted);
+            let best = letters.iter().max_by_key(|l| (l.rank(), std::cmp::Reverse(l.letter)));
+            has.or(best).map_or(0, |l| l.letter)
+        };
+        Self { chosen: letters.into_iter().map(|(residue, letters)| (residue, best(letters))).collect() }
+    }
+
+    /// Whether atom `i` is common to all alternatives or belongs to the chosen one.
+    pub(super) fn keeps(&self, structure: &Structure, i: usize) -> bool {
+        structure.altloc[i] == 0 || self.chosen.get(&residue(structure, i)) == Some(&structure.altloc[i])
+    }
+}

@@ -1,0 +1,234 @@
+//! The CIF 1.1 grammar as a stream of tokens: S. R. Hall, J. D. Westbrook et al., *Specification of the Crystallographic
+//! Information File*, International Tables for Crystallography G, chapter 2.2.
+//!
+//! Every byte up to a blank counts as white space, and `[`, `]` and `$` begin plain values like any other character:
+//! files that do so have one meaning only.
+
+use super::text::Fault;
+
+/// What a token is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// `data_NAME`.
+    Data,
+    /// `save_NAME` begins a frame, `save_` ends it.
+    Save,
+    /// `loop_`.
+    Loop,
+    /// `stop_` or `global_`: reserved words without a meaning here.
+    Reserved,
+    /// `_category.item`.
+    Tag,
+    /// A value, with its quotes.
+    Value,
+    /// The end of the text.
+    End,
+}
+
+/// A token and where it stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Token {
+    pub(super) kind: Kind,
+    pub(super) start: usize,
+    pub(super) end: usize,
+}
+
+/// Splits a text into tokens.
+#[derive(Debug, Clone)]
+pub(super) struct Tokenizer<'a> {
+    pub(super) text: &'a [u8],
+    pub(super) at: usize,
+}
+
+impl<'a> Tokenizer<'a> {
+    pub(super) fn new(text: &'a [u8]) -> Self {
+        Self { text, at: 0 }
+    }
+
+    /// The next token; [`Kind::End`] again and again at the end.
+    pub(super) fn next(&mut self) -> Result<Token, Box<Fault>> {
+        self.skip_blanks();
+        let text = self.text;
+        let start = self.at;
+        let Some(&first) = text.get(start) else {
+            return Ok(Token { kind: Kind::End, start, end: start });
+        };
+        match first {
+            b'\'' | b'"' => self.quoted(first),
+            b';' if at_line_start(text, start) => self.text_field(),
+            _ => {
+                let len = text[start..].iter().position(|&b| b <= b' ').unwrap_or(text.len() - start);
+                self.at = start + len;
+                Ok(Token { kind: bare_kind(&text[start..self.at]), start, end: self.at })
+            }
+        }
+    }
+
+    /// White space and comments.
+    fn skip_blanks(&mut self) {
+        while let Some(&b) = self.text.get(self.at) {
+            if b == b'#' {
+                let rest = &self.text[self.at..];
+                self.at += memchr::memchr2(b'\n', b'\r', rest).unwrap_or(rest.len());
+            } else if b <= b' ' {
+                self.at += 1;
+            } else {
+                break;
+            }
+        }
+    }
+
+    /// A quote ends a value only where white space follows it, and not beyond its line.
+    fn quoted(&mut self, quote: u8) -> Result<Token, Box<Fault>> {
+        let start = self.at;
+        let mut at = start + 1;
+        loop {
+            let rest = &self.text[at..];
+            let found = memchr::memchr3(quote, b'\n', b'\r', rest).map(|i| (at + i, rest[i]));
+            match found {
+                Some((i, b)) if b == quote => {
+                    at = i + 1;
+                    if self.text.get(at).is_none_or(|&next| next <= b' ') {
+                        self.at = at;
+                        return Ok(Token { kind: Kind::Value, start, end: at });
+                    }
+                }
+                line_end => {
+                    let end = line_end.map_or(self.text.len(), |(i, _)| i);
+                    let expected = format!("a closing {} on the same line", char::from(quote));
+                    return Err(Fault::token(self.text, start, end, expected));
+                }
+            }
+        }
+    }
+
+    /// A text field reaches from a semicolon at the start of a line to the next one.
+    fn text_field(&mut self) -> Result<Token, Box<Fault>> {
+        let start = self.at;
+        let ends = memchr::memchr_iter(b';', &self.text[start + 1..]).map(|i| start + 1 + i);
+        match ends.into_iter().find(|&i| at_line_start(self.text, i)) {
+            Some(i) => {
+                self.at = i + 1;
+                Ok(Token { kind: Kind::Value, start, end: self.at })
+            }
+            None => Err(Fault::words(start, "a text field without end", "a line that begins with ;")),
+        }
+    }
+}
+
+fn at_line_start(text: &[u8], at: usize) -> bool {
+    at == 0 || matches!(text[at - 1], b'\n' | b'\r')
+}
+
+/// What a token without quotes is.
+pub(super) fn bare_kind(token: &[u8]) -> Kind {
+    if token[0] == b'_' {
+        return Kind::Tag;
+    }
+    if token.get(4) != Some(&b'_') && token.get(6) != Some(&b'_') {
+        return Kind::Value;
+    }
+    let starts = |word: &[u8]| token.get(..word.len()).is_some_and(|t| t.eq_ignore_ascii_case(word));
+    if starts(b"data_") {
+        Kind::Data
+    } else if starts(b"save_") {
+        Kind::Save
+    } else if token.eq_ignore_ascii_case(b"loop_") {
+        Kind::Loop
+    } else if token.eq_ignore_ascii_case(b"stop_") || token.eq_ignore_ascii_case(b"global_") {
+        Kind::Reserved
+    } else {
+        Kind::Value
+    }
+}
+
+/// A value's own text, without quotes or the semicolons of a text field, and whether it had some.
+#[inline]
+pub(super) fn unquote(text: &[u8], start: usize, end: usize) -> (usize, usize, bool) {
+    match text[start] {
+        b'\'' | b'"' | b';' => unquote_slow(text, start, end),
+        _ => (start, end, false),
+    }
+}
+
+#[cold]
+fn unquote_slow(text: &[u8], start: usize, end: usize) -> (usize, usize, bool) {
+    let first = text[start];
+    if first != b';' {
+        return (start + 1, end - 1, true);
+    }
+    // A semicolon elsewhere than at a line's start is a character like any other.
+    if !at_line_start(text, start) || end < start + 3 {
+        return (start, end, false);
+    }
+    // The line end before the closing semicolon is not part of the text.
+    let body = end - 1;
+    let line_end = if text[body - 2..body] == *b"\r\n" { 2 } else { 1 };
+    (start + 1, (body - line_end).max(start + 1), true)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tokens(text: &str) -> Vec<(Kind, String)> {
+        let mut tokenizer = Tokenizer::new(text.as_bytes());
+        let mut out = Vec::new();
+        loop {
+            let token = tokenizer.next().unwrap();
+            if token.kind == Kind::End {
+                return out;
+            }
+            let (start, end, _) = unquote(text.as_bytes(), token.start, token.end);
+            out.push((token.kind, text[start..end].to_owned()));
+        }
+    }
+
+    fn values(text: &str) -> Vec<String> {
+        tokens(text).into_iter().filter(|t| t.0 == Kind::Value).map(|t| t.1).collect()
+    }
+
+    #[test]
+    fn words_tags_and_values() {
+        let kinds: Vec<Kind> = tokens("data_X\nLOOP_ _a.b save_f _c 1 save_ stop_ global_ datax loop_x").iter().map(|t| t.0).collect();
+        use Kind::*;
+        assert_eq!(kinds, [Data, Loop, Tag, Save, Tag, Value, Save, Reserved, Reserved, Value, Value]);
+    }
+
+    #[test]
+    fn quotes_and_text_fields() {
+        assert_eq!(values(r#"'a dog's life' "O5'" '' "a"b" ' # not a comment '"#), ["a dog's life", "O5'", "", "a\"b", " # not a comment "]);
+        assert_eq!(values("a#b # a comment ' \n c"), ["a#b", "c"]);
+        assert_eq!(values("\n;one\n two;\n;\n ;x y"), ["one\n two;", ";x", "y"]);
+        assert_eq!(values("\r\n;one\r\ntwo\r\n; z"), ["one\r\ntwo", "z"]);
+        assert_eq!(values("\n;\n; z"), ["", "z"]);
+    }
+
+    #[test]
+    fn what_does_not_end_is_an_error_at_its_start() {
+        for (text, at) in [("a 'b c\nd'", 2), ("\"abc", 0), ("x\n;abc\n d;", 2), ("'", 0), ("\n;", 1)] {
+            let mut tokenizer = Tokenizer::new(text.as_bytes());
+            let fault = loop {
+                match tokenizer.next() {
+                    Ok(token) => assert_ne!(token.kind, Kind::End, "{text:?}"),
+                    Err(fault) => break fault,
+                }
+            };
+            assert_eq!(fault.at, at, "{text:?}");
+        }
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn any_text_ends(text in "[a_;'\"# \n\r]{0,60}") {
+            let mut tokenizer = Tokenizer::new(text.as_bytes());
+            for _ in 0..=text.len() {
+                match tokenizer.next() {
+                    Ok(t) if t.kind != Kind::End => { unquote(text.as_bytes(), t.start, t.end); }
+                    _ => return Ok(()),
+                }
+            }
+            proptest::prop_assert!(false, "more tokens than bytes");
+        }
+    }
+}

@@ -1,0 +1,151 @@
+//! What a structure holds, for people who wonder what to select.
+
+use std::collections::HashMap;
+use std::fmt;
+
+use super::atoms::Structure;
+use super::text::list;
+
+/// What an atom belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Kind {
+    /// ATOM records that are not water: chains of amino acids and nucleotides.
+    Polymer,
+    /// HETATM records that are not water: ligands, ions, modified residues.
+    Ligand,
+    /// Water, whatever its record.
+    Water,
+}
+
+/// Atoms by kind; hydrogens and deuterium are counted by themselves.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// ATOM records that are neither water nor hydrogen.
+    pub polymer: u64,
+    /// HETATM records that are neither water nor hydrogen.
+    pub ligand: u64,
+    /// Water without its hydrogens.
+    pub water: u64,
+    /// Hydrogen and deuterium of all kinds.
+    pub hydrogens: u64,
+}
+
+impl Counts {
+    /// Atoms of all kinds.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.polymer + self.ligand + self.water + self.hydrogens
+    }
+
+    fn add(&mut self, kind: Kind, hydrogen: bool) {
+        let slot = match (hydrogen, kind) {
+            (true, _) => &mut self.hydrogens,
+            (_, Kind::Polymer) => &mut self.polymer,
+            (_, Kind::Ligand) => &mut self.ligand,
+            (_, Kind::Water) => &mut self.water,
+        };
+        *slot += 1;
+    }
+}
+
+impl fmt::Display for Counts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { polymer, ligand, water, hydrogens } = self;
+        write!(f, "{polymer} polymer, {ligand} ligand, {water} water and {hydrogens} hydrogen atoms")
+    }
+}
+
+/// One chain of a model.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ChainContents {
+    /// Author name; empty where the file leaves it blank.
+    pub name: String,
+    /// Its atoms.
+    pub counts: Counts,
+}
+
+/// What a structure holds.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Contents {
+    /// Atoms in all models.
+    pub atoms: u64,
+    /// Model numbers, in order of first appearance.
+    pub models: Vec<i32>,
+    /// The model that the counts below describe.
+    pub model: i32,
+    /// Atoms of that model, every alternative location.
+    pub counts: Counts,
+    /// Atoms of that model that have an alternative location.
+    pub alternatives: u64,
+    /// Atoms of that model whose element is unknown.
+    pub unknown_elements: u64,
+    /// Chains of that model, in order of first appearance.
+    pub chains: Vec<ChainContents>,
+}
+
+impl Contents {
+    /// Counts what `model` holds, the first of the file by default; a model that is not there holds nothing.
+    #[must_use]
+    pub fn of(structure: &Structure, model: Option<i32>) -> Self {
+        let models = models(structure);
+        let model = model.or(models.first().copied()).unwrap_or(1);
+        let mut contents = Self {
+            atoms: structure.len() as u64,
+            models,
+            model,
+            counts: Counts::default(),
+            alternatives: 0,
+            unknown_elements: 0,
+            chains: Vec::new(),
+        };
+        let water = structure.water_residues();
+        let mut chain_at: HashMap<u32, usize> = HashMap::new();
+        for i in (0..structure.len()).filter(|&i| structure.model[i] == model) {
+            let (kind, hydrogen) = (structure.kind(i, &water), structure.is_hydrogen(i));
+            contents.counts.add(kind, hydrogen);
+            contents.alternatives += u64::from(structure.altloc[i] != 0);
+            contents.unknown_elements += u64::from(structure.element[i] == 0);
+            let n_chains = contents.chains.len();
+            let at = *chain_at.entry(structure.chain.id(i)).or_insert(n_chains);
+            if at == n_chains {
+                let name = structure.chain.get(i).to_owned();
+                contents.chains.push(ChainContents { name, counts: Counts::default() });
+            }
+            contents.chains[at].counts.add(kind, hydrogen);
+        }
+        contents
+    }
+
+    /// Chains for a message.
+    #[must_use]
+    pub(super) fn chain_list(&self) -> String {
+        let names = self.chains.iter().map(|c| shown(&c.name));
+        format!("{} {}", plural(self.chains.len(), "chain"), list(names, self.chains.len()))
+    }
+
+    /// Models for a message.
+    #[must_use]
+    pub(super) fn model_list(&self) -> String {
+        format!("{} {}", plural(self.models.len(), "model"), list(self.models.iter().map(ToString::to_string), self.models.len()))
+    }
+}
+
+fn plural(n: usize, what: &str) -> String {
+    format!("{n} {what}{}", if n == 1 { "" } else { "s" })
+}
+
+fn shown(chain: &str) -> String {
+    if chain.is_empty() { "(blank)".to_owned() } else { chain.to_owned() }
+}
+
+/// Distinct model numbers, in order of first appearance.
+fn models(structure: &Structure) -> Vec<i32> {
+    let mut seen = std::collections::HashSet::new();
+    let mut models = Vec::new();
+    for run in structure.model.chunk_by(|a, b| a == b) {
+        if seen.insert(run[0]) {
+            models.push(run[0]);
+        }
+    }
+    models
+}

@@ -1,0 +1,199 @@
+//! Elements: symbols to atomic numbers, and a guess where a file leaves the element out.
+//!
+//! An atom name such as `CA` is a carbon or a calcium. PDB files right-align the symbol in the name's first two
+//! columns, so ` CA ` is a carbon and `CA  ` a calcium; what the residue is outweighs that, because files with
+//! carelessly placed names are common and calcium inside an alanine is not.
+
+use super::residue;
+
+/// Symbols by atomic number, from 1.
+pub const SYMBOLS: [&str; 118] = [
+    "H", "He", "Li", "Be", "B", "C", "N", "O", "F", "Ne", "Na", "Mg", "Al", "Si", "P", "S", "Cl", "Ar", "K", "Ca", "Sc", "Ti", "V",
+    "Cr", "Mn", "Fe", "Co", "Ni", "Cu", "Zn", "Ga", "Ge", "As", "Se", "Br", "Kr", "Rb", "Sr", "Y", "Zr", "Nb", "Mo", "Tc", "Ru",
+    "Rh", "Pd", "Ag", "Cd", "In", "Sn", "Sb", "Te", "I", "Xe", "Cs", "Ba", "La", "Ce", "Pr", "Nd", "Pm", "Sm", "Eu", "Gd", "Tb",
+    "Dy", "Ho", "Er", "Tm", "Yb", "Lu", "Hf", "Ta", "W", "Re", "Os", "Ir", "Pt", "Au", "Hg", "Tl", "Pb", "Bi", "Po", "At", "Rn",
+    "Fr", "Ra", "Ac", "Th", "Pa", "U", "Np", "Pu", "Am", "Cm", "Bk", "Cf", "Es", "Fm", "Md", "No", "Lr", "Rf", "Db", "Sg", "Bh",
+    "Hs", "Mt", "Ds", "Rg", "Cn", "Nh", "Fl", "Mc", "Lv", "Ts", "Og",
+];
+
+/// Atomic numbers by letters: first letter (A is 1) times 32 plus the second (none is 0).
+const BY_LETTERS: [u8; 1024] = {
+    let mut table = [0; 1024];
+    let mut z = 0;
+    while z < SYMBOLS.len() {
+        let s = SYMBOLS[z].as_bytes();
+        let second = if s.len() == 2 { s[1] & 31 } else { 0 };
+        table[(s[0] & 31) as usize * 32 + second as usize] = z as u8 + 1;
+        z += 1;
+    }
+    // Deuterium and tritium are hydrogen.
+    table[(b'D' & 31) as usize * 32] = 1;
+    table[(b'T' & 31) as usize * 32] = 1;
+    table
+};
+
+/// Atomic number of a symbol in any case, `D` being 1; 0 if it is none. A charge behind it (`FE3+`, `O1-`) is ignored.
+#[inline]
+#[must_use]
+pub fn atomic_number(symbol: &[u8]) -> u8 {
+    match *symbol {
+        [a] if a.is_ascii_alphabetic() => BY_LETTERS[usize::from(a & 31) * 32],
+        [a, b] if a.is_ascii_alphabetic() && b.is_ascii_alphabetic() => {
+            BY_LETTERS[usize::from(a & 31) * 32 + usize::from(b & 31)]
+        }
+        [ref bare @ .., b'0'..=b'9' | b'+' | b'-'] if !bare.is_empty() && symbol.len() <= 5 => atomic_number(bare),
+        _ => 0,
+    }
+}
+
+/// Two-letter elements that are believed from a name alone, as in `CL1`, `FE`, `BR12`: those whose letters are no carbon,
+/// nitrogen, oxygen, sulphur, phosphorus or hydrogen with a Greek remoteness letter behind it.
+const SURE: &[&[u8; 2]] = &[
+    b"CL", b"BR", b"FE", b"ZN", b"MG", b"MN", b"CU", b"NI", b"NA", b"LI", b"AL", b"SI", b"SE", b"AS", b"RU", b"RH", b"PT", b"AU",
+    b"AG", b"IR", b"MO", b"SR", b"RB", b"TI", b"ZR", b"GA", b"XE", b"KR", b"YB", b"GD", b"LA", b"TL",
+];
+
+/// An atom name as a file gives it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Name<'a> {
+    /// Without padding.
+    pub(super) text: &'a [u8],
+    /// The four columns of a PDB file, where their alignment can be trusted.
+    pub(super) columns: Option<[u8; 4]>,
+}
+
+/// The element that an atom's name and residue suggest; 0 if they suggest none.
+pub(super) fn guess(name: Name<'_>, residue: &str) -> u8 {
+    let upper = name.text.to_ascii_uppercase();
+    let letters_at = upper.iter().position(u8::is_ascii_alphabetic).unwrap_or(upper.len());
+    let rest = &upper[letters_at..];
+    let n_letters = rest.iter().take_while(|b| b.is_ascii_alphabetic()).count();
+    let letters = &rest[..n_letters];
+    let Some(&first) = letters.first() else { return 0 };
+    let single = atomic_number(&[first]);
+    if let Some(ion) = single_ion(letters, residue) {
+        return ion;
+    }
+    if residue::is_polymer(residue) || residue::is_water(residue) {
+        return if letters.starts_with(b"SE") && matches!(residue, "MSE" | "SEC") { 34 } else { single };
+    }
+    // `1HB`, `2HG1`: a digit first is a hydrogen's or a carbon's number, never a metal's.
+    let two = if letters_at == 0 { letters.get(..2) } else { None };
+    match (two, name.columns) {
+        // ` CL1`: a symbol of one letter, by its place.
+        (_, Some([b' ', ..])) => single,
+        // `HG11`, `CA12`, `NB1A`: all columns used, so the place says nothing; hydrogens and carbons are likelier.
+        (Some(two), Some([_, _, _, last])) if last != b' ' => sure(two, n_letters).unwrap_or(single),
+        (Some(two), Some(_)) => aligned_left(two, residue).unwrap_or(single),
+        (Some(two), None) => sure(two, n_letters).unwrap_or(single),
+        (None, _) => single,
+    }
+}
+
+/// A residue of one atom that bears its name: `CA` in `CA`, `CL` in `CL-`, `NA` in `Na+`, `SOD` in `SOD`.
+fn single_ion(letters: &[u8], residue: &str) -> Option<u8> {
+    let bare: Vec<u8> = residue.bytes().filter(u8::is_ascii_alphabetic).map(|b| b.to_ascii_uppercase()).collect();
+    if bare != letters {
+        return None;
+    }
+    residue::charmm_ion(residue).or_else(|| (letters.len() == 2).then(|| atomic_number(letters)).filter(|&z| z != 0))
+}
+
+fn sure(two: &[u8], n_letters: usize) -> Option<u8> {
+    (n_letters == 2 && SURE.iter().any(|s| s.as_slice() == two)).then(|| atomic_number(two))
+}
+
+/// A symbol of two letters in the first two columns, as the format wants it.
+fn aligned_left(two: &[u8], residue: &str) -> Option<u8> {
+    // Left-justified hydrogens (`HO1 `, `HE  `) are commoner than helium, holmium, hafnium and hassium, and deuterium than
+    // dysprosium: the residue has to name these.
+    let rare = matches!(two, b"HE" | b"HO" | b"HF" | b"HS" | b"DY" | b"DB" | b"DS");
+    let named = residue.as_bytes().get(..2).is_some_and(|r| r.eq_ignore_ascii_case(two));
+    (!rare || named).then(|| atomic_number(two)).filter(|&z| z != 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn symbol(z: u8) -> &'static str {
+        if z == 0 { "?" } else { SYMBOLS[usize::from(z) - 1] }
+    }
+
+    fn pdb(columns: &[u8; 4], residue: &str) -> &'static str {
+        symbol(guess(Name { text: columns.trim_ascii(), columns: Some(*columns) }, residue))
+    }
+
+    fn cif(name: &str, residue: &str) -> &'static str {
+        symbol(guess(Name { text: name.as_bytes(), columns: None }, residue))
+    }
+
+    #[test]
+    fn every_symbol_is_found() {
+        for (i, s) in SYMBOLS.iter().enumerate() {
+            for text in [(*s).to_owned(), s.to_uppercase(), s.to_lowercase(), format!("{s}2+")] {
+                assert_eq!(usize::from(atomic_number(text.as_bytes())), i + 1, "{text}");
+            }
+        }
+        assert_eq!(atomic_number(b"D"), 1);
+        for bad in [&b""[..], b"X", b"Xx", b"1", b"+", b"C@", b"ABC", b"C1+++++", b"\xe9"] {
+            assert_eq!(atomic_number(bad), 0, "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn calcium_is_told_from_carbon_by_place_and_residue() {
+        assert_eq!(pdb(b" CA ", "ALA"), "C");
+        assert_eq!(pdb(b"CA  ", "ALA"), "C");
+        assert_eq!(pdb(b"CA  ", "CA"), "Ca");
+        assert_eq!(pdb(b" CA ", "CA"), "Ca");
+        assert_eq!(pdb(b"CA  ", "XYZ"), "Ca");
+        assert_eq!(pdb(b" CA ", "XYZ"), "C");
+        assert_eq!(pdb(b"CAL ", "CAL"), "Ca");
+        assert_eq!(cif("CA", "CA"), "Ca");
+        assert_eq!(cif("CA", "GLY"), "C");
+        assert_eq!(cif("CA", "XYZ"), "C");
+    }
+
+    #[test]
+    fn hydrogens_are_told_from_mercury() {
+        assert_eq!(pdb(b"HG11", "VAL"), "H");
+        assert_eq!(pdb(b" HG ", "SER"), "H");
+        assert_eq!(pdb(b"HG  ", "SER"), "H");
+        assert_eq!(pdb(b"HG11", "XYZ"), "H");
+        assert_eq!(pdb(b"HG  ", "HG"), "Hg");
+        assert_eq!(pdb(b"HG  ", "MMC"), "Hg");
+        assert_eq!(pdb(b"HO1 ", "XYZ"), "H");
+        assert_eq!(pdb(b"HO  ", "HO3"), "Ho");
+        assert_eq!(pdb(b"1HB ", "ALA"), "H");
+        assert_eq!(pdb(b"2HG1", "XYZ"), "H");
+        assert_eq!(pdb(b" D1 ", "DOD"), "H");
+        assert_eq!(pdb(b"DG11", "VAL"), "H");
+    }
+
+    #[test]
+    fn ions_metals_and_halogens() {
+        assert_eq!(pdb(b"SOD ", "SOD"), "Na");
+        assert_eq!(pdb(b" CLA", "CLA"), "Cl");
+        assert_eq!(pdb(b"POT ", "POT"), "K");
+        assert_eq!(pdb(b"Na+ ", "Na+"), "Na");
+        assert_eq!(pdb(b"CL  ", "CL-"), "Cl");
+        assert_eq!(pdb(b"ZN  ", "ZN2"), "Zn");
+        assert_eq!(pdb(b"FE  ", "HEM"), "Fe");
+        assert_eq!(pdb(b" NA ", "HEM"), "N");
+        assert_eq!(pdb(b"CL12", "LIG"), "Cl");
+        assert_eq!(pdb(b"CAA1", "LIG"), "C");
+        assert_eq!(pdb(b"C10A", "LIG"), "C");
+        assert_eq!(pdb(b"SE  ", "MSE"), "Se");
+        assert_eq!(pdb(b" P  ", "DA"), "P");
+        assert_eq!(pdb(b" O5*", "C"), "O");
+        assert_eq!(pdb(b" OW ", "SOL"), "O");
+        assert_eq!(pdb(b"HW1 ", "SOL"), "H");
+        assert_eq!(pdb(b" MW ", "SOL"), "?");
+        assert_eq!(pdb(b" 1  ", "XYZ"), "?");
+        assert_eq!(cif("BR1", "LIG"), "Br");
+        assert_eq!(cif("O5'", "DA"), "O");
+        assert_eq!(cif("C1'", "LIG"), "C");
+        assert_eq!(cif("UNK", "LIG"), "U");
+    }
+}

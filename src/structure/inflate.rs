@@ -1,0 +1,163 @@
+//! gzip and zstd by magic bytes, every member and frame, bounded while inflating.
+//!
+//! Nothing is believed about sizes: the output grows by at most its own length (or a megabyte) at a time, never
+//! beyond one byte over the limit.
+
+use std::borrow::Cow;
+use std::io::{self, Read};
+
+use super::error::StructureError;
+
+const GZIP: &[u8] = b"\x1f\x8b";
+const ZSTD: &[u8] = b"\x28\xb5\x2f\xfd";
+/// A decoder's window is memory that the sender chooses: 32 MiB covers every level of the usual tools but the
+/// `--ultra --long` ones.
+const MAX_ZSTD_WINDOW: u64 = 32 << 20;
+
+/// Whether the bytes begin with a magic number that is inflated here, and its name.
+pub(super) fn encoding(bytes: &[u8]) -> Option<&'static str> {
+    if bytes.starts_with(GZIP) {
+        Some("gzip")
+    } else if bytes.starts_with(ZSTD) || skippable_frame(bytes) {
+        Some("zstd")
+    } else {
+        None
+    }
+}
+
+/// The plain bytes; borrowed where nothing is compressed.
+pub(super) fn inflate(bytes: &[u8], limit: u64) -> Result<Cow<'_, [u8]>, StructureError> {
+    let plain = match encoding(bytes) {
+        None if bytes.len() as u64 > limit => return Err(StructureError::InflatedTooLarge { limit }),
+        None => return Ok(Cow::Borrowed(bytes)),
+        Some("gzip") => gzip(bytes, limit)?,
+        Some(_) => zstd(bytes, limit)?,
+    };
+    Ok(Cow::Owned(plain))
+}
+
+fn gzip(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
+    let broken = |e: io::Error| StructureError::Decompress { encoding: "gzip", reason: e.to_string() };
+    let mut out = Vec::new();
+    while !rest.is_empty() {
+        if !rest.starts_with(GZIP) {
+            // Tapes and block devices pad with zeros, which gzip itself ignores.
+            if rest.iter().all(|&b| b == 0) {
+                break;
+            }
+            let reason = format!("{} bytes after the last member are no gzip data", rest.len());
+            return Err(StructureError::Decompress { encoding: "gzip", reason });
+        }
+        let mut decoder = flate2::bufread::GzDecoder::new(rest);
+        append(&mut decoder, &mut out, limit, broken)?;
+        rest = decoder.into_inner();
+    }
+    Ok(out)
+}
+
+fn zstd(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
+    let broken = |reason: String| StructureError::Decompress { encoding: "zstd", reason };
+    let mut out = Vec::new();
+    while !rest.is_empty() {
+        if skippable_frame(rest) {
+            let size = rest.get(4..8).and_then(|b| b.first_chunk()).map_or(0, |&b| u32::from_le_bytes(b) as usize);
+            rest = rest.get(8..).and_then(|r| r.get(size..)).ok_or_else(|| broken("truncated frame".to_owned()))?;
+            continue;
+        }
+        let mut decoder = ruzstd::decoding::StreamingDecoder::new_with_max_window_size(rest, MAX_ZSTD_WINDOW)
+            .map_err(|e| broken(e.to_string()))?;
+        append(&mut decoder, &mut out, limit, |e| broken(e.to_string()))?;
+        // The frame may end in a checksum of what was inflated.
+        let frame = &decoder.decoder;
+        if let (Some(said), Some(computed)) = (frame.get_checksum_from_data(), frame.get_calculated_checksum())
+            && said != computed
+        {
+            return Err(broken(format!("checksum {computed:08x}, the frame says {said:08x}")));
+        }
+        rest = decoder.into_inner();
+    }
+    Ok(out)
+}
+
+/// Reads all of `decoder`, in steps that double.
+fn append(
+    decoder: &mut dyn Read,
+    out: &mut Vec<u8>,
+    limit: u64,
+    broken: impl Fn(io::Error) -> StructureError,
+) -> Result<(), StructureError> {
+    let limit_len = usize::try_from(limit).unwrap_or(usize::MAX - 1);
+    loop {
+        let room = limit_len.saturating_sub(out.len()).saturating_add(1);
+        let step = out.len().max(1 << 20).min(room);
+        let start = out.len();
+        if out.try_reserve_exact(step).is_err() {
+            return Err(StructureError::InflatedTooLarge { limit });
+        }
+        decoder.take(step as u64).read_to_end(out).map_err(&broken)?;
+        if out.len() > limit_len {
+            return Err(StructureError::InflatedTooLarge { limit });
+        }
+        if out.len() - start < step {
+            return Ok(());
+        }
+    }
+}
+
+/// zstd lets tools put frames of their own between those with data.
+fn skippable_frame(bytes: &[u8]) -> bool {
+    matches!(bytes, [0x50..=0x5F, 0x2A, 0x4D, 0x18, ..])
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    fn gz(data: &[u8]) -> Vec<u8> {
+        let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        encoder.write_all(data).unwrap();
+        encoder.finish().unwrap()
+    }
+
+    fn zst(data: &[u8]) -> Vec<u8> {
+        ruzstd::encoding::compress_to_vec(data, ruzstd::encoding::CompressionLevel::Fastest)
+    }
+
+    #[test]
+    fn all_members_and_frames() {
+        for (packed, encoding) in [
+            ([gz(b"ab"), gz(b""), gz(b"cd")].concat(), "gzip"),
+            ([zst(b"ab"), b"\x53\x2a\x4d\x18\x03\0\0\0xyz".to_vec(), zst(b"cd")].concat(), "zstd"),
+        ] {
+            assert_eq!(super::encoding(&packed), Some(encoding));
+            assert_eq!(inflate(&packed, 4).unwrap(), &b"abcd"[..]);
+            assert_eq!(inflate(&packed, 3), Err(StructureError::InflatedTooLarge { limit: 3 }));
+        }
+        assert_eq!(inflate(&[gz(b"ab"), vec![0; 512]].concat(), 9).unwrap(), &b"ab"[..]);
+    }
+
+    #[test]
+    fn a_bomb_stops_at_the_limit() {
+        let zeros = vec![b' '; 64 << 20];
+        for bomb in [gz(&zeros), zst(&zeros)] {
+            assert_eq!(inflate(&bomb, 1 << 20), Err(StructureError::InflatedTooLarge { limit: 1 << 20 }));
+            assert_eq!(inflate(&bomb, 64 << 20).unwrap().len(), 64 << 20);
+        }
+    }
+
+    #[test]
+    fn broken_data_is_an_error() {
+        for (packed, encoding) in [(gz(&[7; 5000]), "gzip"), (zst(&[7; 5000]), "zstd")] {
+            for cut in 4..packed.len() {
+                let error = inflate(&packed[..cut], 1 << 20).unwrap_err();
+                assert!(matches!(error, StructureError::Decompress { encoding: e, .. } if e == encoding), "{cut}: {error}");
+            }
+        }
+        assert!(inflate(&[gz(b"ab"), b"junk".to_vec()].concat(), 100).is_err());
+        // A zstd frame header that asks for a window of 2 GiB.
+        let huge = [ZSTD, &[0x00, 0xA8, 0, 0, 0][..]].concat();
+        assert!(matches!(inflate(&huge, u64::MAX), Err(StructureError::Decompress { .. })));
+    }
+}

@@ -1,0 +1,264 @@
+//! PDBx/mmCIF: the `atom_site` category of the first data block that has one, and the entry's id and title.
+//!
+//! Dictionary: PDBx/mmCIF, category `atom_site`. Author names and numbers (`auth_*`) go before the dictionary's own
+//! (`label_*`), which stand in where the author's are missing.
+
+mod atom_site;
+mod rows;
+
+use self::atom_site::{Layout, PREFIX};
+use self::rows::Rows;
+use super::atoms::{SourceFormat, Structure};
+use super::cif::{self, Kind, Token, Tokenizer};
+use super::error::StructureError;
+use super::pdb::MAX_TITLE;
+use super::read::ReadLimits;
+use super::text::{self, Fault, decode, tidy};
+
+/// Why rows stop being read.
+#[derive(Debug)]
+enum Stop {
+    /// The text is wrong.
+    Fault(Box<Fault>),
+    /// The limit of atoms.
+    TooMany,
+}
+
+impl From<Box<Fault>> for Stop {
+    fn from(fault: Box<Fault>) -> Self {
+        Self::Fault(fault)
+    }
+}
+
+pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
+    let mut reader = Reader::new(text, limits);
+    match reader.run() {
+        Ok(()) => reader.finish(),
+        Err(Stop::Fault(fault)) => Err(fault.locate(text)),
+        Err(Stop::TooMany) => Err(StructureError::TooManyAtoms { limit: limits.max_atoms }),
+    }
+}
+
+struct Reader<'a> {
+    text: &'a [u8],
+    tokens: Tokenizer<'a>,
+    limits: &'a ReadLimits,
+    block: Option<String>,
+    entry: Option<String>,
+    title: Option<String>,
+    in_frame: bool,
+    rows: Option<Rows<'a>>,
+    /// `atom_site` given item by item, as files with one atom may: item names, and their values as offsets.
+    single: (Vec<(usize, usize)>, Vec<(usize, usize)>),
+    /// Categories that were passed, for the message when there are no atoms.
+    categories: Vec<String>,
+    n_blocks: usize,
+}
+
+impl<'a> Reader<'a> {
+    fn new(text: &'a [u8], limits: &'a ReadLimits) -> Self {
+        Self {
+            text,
+            tokens: Tokenizer::new(text),
+            limits,
+            block: None,
+            entry: None,
+            title: None,
+            in_frame: false,
+            rows: None,
+            single: Default::default(),
+            categories: Vec::new(),
+            n_blocks: 0,
+        }
+    }
+
+    fn run(&mut self) -> Result<(), Stop> {
+        let mut token = self.tokens.next()?;
+        loop {
+            match token.kind {
+                Kind::End | Kind::Data => {
+                    self.end_block()?;
+                    if self.rows.is_some() || token.kind == Kind::End {
+                        return Ok(());
+                    }
+                    self.begin_block(&token);
+                }
+                Kind::Save => self.in_frame = token.end - token.start > b"save_".len(),
+                Kind::Reserved => {}
+                Kind::Tag => self.item(&token)?,
+                Kind::Loop => {
+                    token = self.category()?;
+                    if self.rows.is_some() {
+                        self.rest_of_block(token);
+                        return Ok(());
+                    }
+                    continue;
+                }
+                Kind::Value => {
+                    let expected = "a data block, loop_, or a tag that begins with _";
+                    return Err(Fault::token(self.text, token.start, token.end, expected).into());
+                }
+            }
+            token = self.tokens.next()?;
+        }
+    }
+
+    fn begin_block(&mut self, token: &Token) {
+        let name = &self.text[token.start + b"data_".len()..token.end];
+        self.block = tidy(name, 80);
+        self.entry = None;
+        self.title = None;
+        self.in_frame = false;
+        self.n_blocks += 1;
+    }
+
+    /// A tag and its value.
+    fn item(&mut self, tag: &Token) -> Result<(), Stop> {
+        let value = self.tokens.next()?;
+        if value.kind != Kind::Value {
+            let expected = format!("a value of {}", decode(&self.text[tag.start..tag.end.min(tag.start + 80)]));
+            return Err(match value.kind {
+                Kind::End => Fault::words(value.start, "the end of the file", expected).into(),
+                _ => Fault::token(self.text, value.start, value.end, expected).into(),
+            });
+        }
+        self.note_category(tag);
+        let name = &self.text[tag.start..tag.end];
+        if !self.in_frame && starts_with(name, PREFIX) {
+            self.single.0.push((tag.start, tag.end));
+            self.single.1.push((value.start, value.end));
+        } else {
+            self.note_value(name, &value);
+        }
+        Ok(())
+    }
+
+    /// The id and the title of the entry.
+    fn note_value(&mut self, tag: &[u8], value: &Token) {
+        if self.in_frame || !(starts_with(tag, b"_entry.id") || starts_with(tag, b"_struct.title")) {
+            return;
+        }
+        let (start, end, quoted) = cif::unquote(self.text, value.start, value.end);
+        let raw = &self.text[start..end];
+        if !quoted && matches!(raw, b"?" | b".") {
+            return;
+        }
+        if tag.eq_ignore_ascii_case(b"_entry.id") && self.entry.is_none() {
+            self.entry = tidy(raw, 80);
+        } else if tag.eq_ignore_ascii_case(b"_struct.title") && self.title.is_none() {
+            self.title = tidy(raw, MAX_TITLE);
+        }
+    }
+
+    /// A loop: its tags, then its rows. Returns the token behind it.
+    fn category(&mut self) -> Result<Token, Stop> {
+        let mut tags: Vec<Token> = Vec::new();
+        let mut token = self.tokens.next()?;
+        while token.kind == Kind::Tag {
+            tags.push(token);
+            token = self.tokens.next()?;
+        }
+        let Some(first) = tags.first() else {
+            return Err(match token.kind {
+                Kind::End => Fault::words(token.start, "the end of the file", "a tag after loop_").into(),
+                _ => Fault::token(self.text, token.start, token.end, "a tag after loop_").into(),
+            });
+        };
+        self.note_category(first);
+        let is_atom_site = !self.in_frame && starts_with(&self.text[first.start..first.end], PREFIX);
+        if is_atom_site && self.rows.is_none() && token.kind == Kind::Value {
+            let ranges: Vec<_> = tags.iter().map(|t| (t.start, t.end)).collect();
+            if let Some(layout) = self.layout(&ranges)? {
+                let mut rows = Rows::new(self.text, layout, self.limits.max_rows());
+                self.tokens.at = rows.read(token.start)?;
+                self.rows = Some(rows);
+                return Ok(self.tokens.next()?);
+            }
+        }
+        let mut i = 0;
+        while token.kind == Kind::Value {
+            // Of a loop over entries or titles the first row is meant.
+            if let Some(tag) = tags.get(i) {
+                self.note_value(&self.text[tag.start..tag.end], &token);
+            }
+            i += 1;
+            token = self.tokens.next()?;
+        }
+        Ok(token)
+    }
+
+    /// The columns of `atom_site`; `None` if it has no coordinates.
+    fn layout(&mut self, tags: &[(usize, usize)]) -> Result<Option<Layout>, Stop> {
+        let layout = Layout::new(self.text, tags)?;
+        if let Err(missing) = layout.check() {
+            self.categories.push(format!("atom_site without {missing}"));
+            return Ok(None);
+        }
+        Ok(Some(layout))
+    }
+
+    /// `atom_site` item by item is one row.
+    fn end_block(&mut self) -> Result<(), Stop> {
+        let (tags, values) = std::mem::take(&mut self.single);
+        if self.rows.is_some() || tags.is_empty() {
+            return Ok(());
+        }
+        if let Some(layout) = self.layout(&tags)? {
+            let mut rows = Rows::new(self.text, layout, self.limits.max_rows());
+            rows.single(&values)?;
+            self.rows = Some(rows);
+        }
+        Ok(())
+    }
+
+    /// Looks for a title behind the atoms. These are complete: what is wrong from here on harms nobody.
+    fn rest_of_block(&mut self, mut token: Token) {
+        while self.title.is_none() && !matches!(token.kind, Kind::End | Kind::Data) {
+            let next = match token.kind {
+                Kind::Tag => self.item(&token).and_then(|()| Ok(self.tokens.next()?)),
+                Kind::Loop => self.category(),
+                Kind::Save => {
+                    self.in_frame = token.end - token.start > b"save_".len();
+                    self.tokens.next().map_err(Stop::from)
+                }
+                _ => self.tokens.next().map_err(Stop::from),
+            };
+            match next {
+                Ok(next) => token = next,
+                Err(_) => return,
+            }
+        }
+    }
+
+    fn note_category(&mut self, tag: &Token) {
+        const KEPT: usize = 10;
+        if self.categories.len() >= KEPT {
+            return;
+        }
+        let name = &self.text[tag.start + 1..tag.end.min(tag.start + 80)];
+        let category = decode(name.split(|&b| b == b'.').next().unwrap_or(name));
+        if !self.categories.iter().any(|c| *c == *category) {
+            self.categories.push(category.into_owned());
+        }
+    }
+
+    fn finish(self) -> Result<Structure, StructureError> {
+        let (columns, tables) = self.rows.map(Rows::into_parts).unwrap_or_default();
+        if columns.len() == 0 {
+            let block = self.block.map_or_else(|| "no named data block".to_owned(), |b| format!("data block {b}"));
+            let more = if self.n_blocks > 1 { format!(" (the last of {})", self.n_blocks) } else { String::new() };
+            let n = self.categories.len();
+            let found = if n == 0 {
+                format!("mmCIF with {block}{more} and nothing in it")
+            } else {
+                format!("mmCIF with {block}{more}, categories {}", text::list(self.categories, n))
+            };
+            return Err(StructureError::NoAtoms { found });
+        }
+        Ok(columns.finish(tables, SourceFormat::Mmcif, self.entry.or(self.block), self.title))
+    }
+}
+
+fn starts_with(tag: &[u8], prefix: &[u8]) -> bool {
+    tag.get(..prefix.len()).is_some_and(|t| t.eq_ignore_ascii_case(prefix))
+}

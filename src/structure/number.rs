@@ -1,0 +1,200 @@
+//! Numbers as structure files write them, eight digits at a time.
+//!
+//! The usual `-?ddd.ddd` of at most eight digits is an integer below 10⁸ divided by a power of ten: both are
+//! exact in an `f64`, so the quotient is the nearest `f64`, the same as the general parser's. Anything else goes to
+//! that parser.
+
+const ONES: u64 = 0x0101_0101_0101_0101;
+const ZEROS: u64 = 0x3030_3030_3030_3030;
+const HIGH: u64 = 0x8080_8080_8080_8080;
+const POWERS: [f64; 9] = [1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8];
+
+/// The low `n` bytes set, `n` from 0 to 8.
+const LOW: [u64; 9] = {
+    let mut masks = [0; 9];
+    let mut n = 1;
+    while n <= 8 {
+        masks[n] = u64::MAX >> (64 - 8 * n);
+        n += 1;
+    }
+    masks
+};
+
+/// A number in `text[start..end]`; `None` if it is none, or not finite. A standard uncertainty in parentheses
+/// (`1.234(5)`) is ignored.
+#[inline]
+pub(super) fn real(text: &[u8], start: usize, end: usize) -> Option<f64> {
+    match short_decimal(text, start, end) {
+        Some(value) => Some(value),
+        None => general(&text[start..end]),
+    }
+}
+
+#[inline]
+fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
+    // Eleven bytes hold a sign, eight digits, a point and one more.
+    let window = text.get(start..)?.first_chunk::<11>()?;
+    let negative = usize::from(window[0] == b'-');
+    let len = (end - start).wrapping_sub(negative);
+    let word = |at: usize| -> u64 {
+        let mut bytes = [0; 8];
+        bytes.copy_from_slice(&window[at..at + 8]);
+        u64::from_le_bytes(bytes)
+    };
+    let (head, tail) = if negative == 1 { (word(1), word(2)) } else { (word(0), word(1)) };
+    // The lowest zero byte of `head ^ "........"` is the first point.
+    let points = head ^ (ONES * 0x2E);
+    let point = (points.wrapping_sub(ONES) & !points & HIGH).trailing_zeros() as usize / 8;
+    let integer_digits = point.min(len);
+    let digits = len - usize::from(point < len);
+    // A point in the ninth place is out of sight.
+    if digits == 0 || digits > 8 || (point == 8 && len > 8) {
+        return None;
+    }
+    // Digits before the point from `head`, those after it from `tail`, which is one byte further.
+    let joined = (head & LOW[integer_digits]) | (tail & !LOW[integer_digits]);
+    let shift = 8 * (8 - digits) as u32;
+    // Right-aligned, with leading zeros.
+    let aligned = (joined << shift) | (ZEROS & LOW[8 - digits]);
+    let values = aligned ^ ZEROS;
+    if (values.wrapping_add(ONES * 0x76) | values) & HIGH != 0 {
+        return None;
+    }
+    let pairs = (values.wrapping_mul(10).wrapping_add(values >> 8)) & 0x00FF_00FF_00FF_00FF;
+    let fours = (pairs.wrapping_mul(100).wrapping_add(pairs >> 16)) & 0x0000_FFFF_0000_FFFF;
+    let eights = (fours.wrapping_mul(10_000).wrapping_add(fours >> 32)) & 0xFFFF_FFFF;
+    let magnitude = f64::from(u32::try_from(eights).ok()?) / POWERS[digits - integer_digits];
+    Some(if negative == 1 { -magnitude } else { magnitude })
+}
+
+#[cold]
+fn general(raw: &[u8]) -> Option<f64> {
+    let digits = match raw.iter().position(|&b| b == b'(') {
+        Some(open) if raw.last() == Some(&b')') && raw[open + 1..raw.len() - 1].iter().all(u8::is_ascii_digit) => {
+            &raw[..open]
+        }
+        Some(_) => return None,
+        None => raw,
+    };
+    // The general parser also knows words: nan, inf, infinity.
+    if digits.iter().any(|b| b.is_ascii_alphabetic() && !matches!(b, b'e' | b'E')) {
+        return None;
+    }
+    let value: f64 = fast_float2::parse(digits).ok()?;
+    value.is_finite().then_some(value)
+}
+
+/// A decimal integer that fits.
+#[inline]
+pub(super) fn integer(raw: &[u8]) -> Option<i32> {
+    let (negative, digits) = match raw {
+        [b'-', rest @ ..] => (true, rest),
+        [b'+', rest @ ..] => (false, rest),
+        _ => (false, raw),
+    };
+    if digits.is_empty() || digits.len() > 10 {
+        return None;
+    }
+    let mut value = 0_i64;
+    for &b in digits {
+        if !b.is_ascii_digit() {
+            return None;
+        }
+        value = value * 10 + i64::from(b - b'0');
+    }
+    i32::try_from(if negative { -value } else { value }).ok()
+}
+
+/// A residue number of four columns: decimal, or hybrid-36 (`A000` is 10000, `a000` follows `ZZZZ`).
+pub(super) fn hybrid36(raw: &[u8]) -> Option<i32> {
+    let [first, rest @ ..] = raw else { return None };
+    if !first.is_ascii_alphabetic() || raw.len() != 4 {
+        return integer(raw);
+    }
+    let lower = first.is_ascii_lowercase();
+    let mut value = 0_i32;
+    for (i, b) in std::iter::once(first).chain(rest).enumerate() {
+        let digit = match b {
+            b'0'..=b'9' if i > 0 => b - b'0',
+            b'A'..=b'Z' if !lower => b - b'A' + 10,
+            b'a'..=b'z' if lower => b - b'a' + 10,
+            _ => return None,
+        };
+        value = value * 36 + i32::from(digit);
+    }
+    let cube = 36 * 36 * 36;
+    Some(value - 10 * cube + 10_000 + if lower { 26 * cube } else { 0 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Option<f64> {
+        let padded = [text.as_bytes(), b" 7.7 5555555555"].concat();
+        let fast = real(&padded, 0, text.len());
+        // At the end of the text there is no room for the fast path.
+        assert_eq!(fast.map(f64::to_bits), real(text.as_bytes(), 0, text.len()).map(f64::to_bits), "{text}");
+        fast
+    }
+
+    #[test]
+    fn usual_numbers_are_the_nearest_ones() {
+        for text in [
+            "0.000", "-0.000", "1", "12345678", "-1234.567", "245.05200", "-99999.999", "1.", ".5", "-.5", "0.1", "999999.99",
+            "123456789.5", "1234567.89", "3.3", "1e5", "1.5E-3", "+1.25", "12345678.", "0.1234567",
+        ] {
+            assert_eq!(parse(text), text.parse().ok(), "{text}");
+        }
+        assert!(parse("-0.000").is_some_and(f64::is_sign_negative));
+        assert_eq!(parse("1.234(5)"), Some(1.234));
+        assert_eq!(parse("-12(3)"), Some(-12.0));
+    }
+
+    #[test]
+    fn what_is_no_number_is_none() {
+        for text in [
+            "", "-", ".", "-.", "1.2.3", "1-2", "--1", "1,5", "nan", "NaN", "inf", "-inf", "Infinity", "1e400", "********", "1.0(a)",
+            "1(2", "1.0x", "0x10", "1 2", "1.5:", "1./5", "/.55",
+        ] {
+            assert_eq!(parse(text), None, "{text}");
+        }
+    }
+
+    #[test]
+    fn integers_and_hybrid_36() {
+        assert_eq!(integer(b"-12"), Some(-12));
+        assert_eq!(integer(b"2147483647"), Some(i32::MAX));
+        assert_eq!(integer(b"2147483648"), None);
+        for bad in [&b""[..], b"-", b"1.0", b"a", b"99999999999", b"1 "] {
+            assert_eq!(integer(bad), None);
+        }
+        let cases: [(&[u8], _); 9] = [
+            (b"9999", Some(9999)),
+            (b"A000", Some(10_000)),
+            (b"A001", Some(10_001)),
+            (b"ZZZZ", Some(10_000 + 26 * 46_656 - 1)),
+            (b"a000", Some(10_000 + 26 * 46_656)),
+            (b"-999", Some(-999)),
+            (b"Aa00", None),
+            (b"****", None),
+            (b"A00", None),
+        ];
+        for (text, value) in cases {
+            assert_eq!(hybrid36(text), value);
+        }
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn every_fixed_point_number_is_the_nearest(value in -99_999_999_i64..=99_999_999, places in 0_usize..=8) {
+            let text = format!("{:.*}", places, value as f64 / 10_f64.powi(places as i32));
+            proptest::prop_assert_eq!(parse(&text), text.parse().ok());
+        }
+
+        #[test]
+        fn any_text_is_read_as_the_general_parser_reads_it(text in "[-+0-9.eE]{0,12}") {
+            proptest::prop_assert_eq!(parse(&text), text.parse().ok().filter(|v: &f64| v.is_finite()));
+        }
+    }
+}

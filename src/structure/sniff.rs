@@ -1,0 +1,165 @@
+//! What kind of file some plain (inflated) bytes are, by content alone.
+
+use super::atoms::SourceFormat;
+use super::error::StructureError;
+use super::text::quote;
+
+/// Records that begin lines of PDB files. `END` and `TER` are common words: they do not decide.
+const PDB_RECORDS: [&[u8]; 33] = [
+    b"ATOM", b"HETATM", b"HEADER", b"TITLE", b"REMARK", b"COMPND", b"SOURCE", b"CRYST1", b"MODEL", b"ENDMDL", b"OBSLTE", b"SPLIT",
+    b"CAVEAT", b"KEYWDS", b"EXPDTA", b"NUMMDL", b"MDLTYP", b"AUTHOR", b"REVDAT", b"SPRSDE", b"JRNL", b"DBREF", b"SEQRES", b"HELIX",
+    b"SHEET", b"SSBOND", b"LINK", b"ORIGX1", b"SCALE1", b"MTRIX1", b"ANISOU", b"CONECT", b"MASTER",
+];
+
+/// Only so much is looked at before a text is called unknown.
+const LOOKED_AT: usize = 256 << 10;
+
+/// The format of `text`, which begins after any byte order mark.
+pub(super) fn sniff(text: &[u8]) -> Result<SourceFormat, StructureError> {
+    let unknown = |found: String| Err(StructureError::UnknownFormat { found });
+    if let Some(found) = binary(text) {
+        return unknown(found);
+    }
+    if text.iter().all(u8::is_ascii_whitespace) {
+        return unknown(if text.is_empty() { "nothing (0 bytes)" } else { "only white space" }.to_owned());
+    }
+    let head = &text[..text.len().min(LOOKED_AT)];
+    if is_cif(head) {
+        return Ok(SourceFormat::Mmcif);
+    }
+    if head.split(|&b| b == b'\n' || b == b'\r').any(is_pdb_record) {
+        return Ok(SourceFormat::Pdb);
+    }
+    unknown(words(head))
+}
+
+/// mmCIF begins, after comments, with a data block; bare categories are taken for one without a name.
+fn is_cif(head: &[u8]) -> bool {
+    let mut rest = head;
+    loop {
+        let Some(start) = rest.iter().position(|&b| b > b' ') else { return false };
+        rest = &rest[start..];
+        if rest[0] != b'#' {
+            break;
+        }
+        let end = rest.iter().position(|&b| b == b'\n' || b == b'\r').unwrap_or(rest.len());
+        rest = &rest[end..];
+    }
+    let starts = |word: &[u8]| rest.get(..word.len()).is_some_and(|r| r.eq_ignore_ascii_case(word));
+    starts(b"data_") || starts(b"loop_") || starts(b"global_") || starts(b"_atom_site.") || starts(b"_entry.")
+}
+
+fn is_pdb_record(line: &[u8]) -> bool {
+    let word = &line[..line.len().min(6)];
+    let end = word.iter().position(|&b| b <= b' ').unwrap_or(word.len());
+    PDB_RECORDS.contains(&&word[..end]) || (word.starts_with(b"ATOM ") && word.len() == 6)
+}
+
+/// Names binary formats by their first bytes.
+fn binary(bytes: &[u8]) -> Option<String> {
+    // A MessagePack map at the top, with these keys near the beginning.
+    let head = &bytes[..bytes.len().min(4096)];
+    let has = |key: &[u8]| memchr::memmem::find(head, key).is_some();
+    if matches!(bytes.first(), Some(0x80..=0x8F | 0xDE | 0xDF)) {
+        if has(b"mmtfVersion") || has(b"mmtfProducer") {
+            return Some("MMTF (MessagePack)".to_owned());
+        }
+        if has(b"dataBlocks") || has(b"encoder") {
+            return Some("BinaryCIF (MessagePack)".to_owned());
+        }
+    }
+    let magic: [(&[u8], &str); 14] = [
+        (b"\x1f\x8b", "gzip inside a compressed file"),
+        (b"\x28\xb5\x2f\xfd", "zstd inside a compressed file"),
+        (b"PK\x03\x04", "a ZIP archive"),
+        (b"BZh", "bzip2 data"),
+        (b"\xfd7zXZ\0", "xz data"),
+        (b"7z\xbc\xaf", "a 7z archive"),
+        (b"\x1f\x9d", "compress (.Z) data"),
+        (b"%PDF", "a PDF document"),
+        (b"\x89PNG", "a PNG image"),
+        (b"\xff\xd8\xff", "a JPEG image"),
+        (b"glTF", "a GLB mesh"),
+        (b"\x7fELF", "a program"),
+        (b"\xff\xfe", "UTF-16 text"),
+        (b"\xfe\xff", "UTF-16 text"),
+    ];
+    if let Some((_, name)) = magic.iter().find(|(m, _)| bytes.starts_with(m)) {
+        return Some((*name).to_owned());
+    }
+    if bytes.get(257..262) == Some(b"ustar") {
+        return Some("a tar archive".to_owned());
+    }
+    let odd = head.iter().filter(|&&b| b < b' ' && !b.is_ascii_whitespace()).count();
+    (odd * 10 > head.len()).then(|| format!("binary data beginning with {}", hex(head)))
+}
+
+/// Names text formats by tell-tale words.
+fn words(head: &[u8]) -> String {
+    let trimmed = head.trim_ascii_start();
+    let has = |word: &[u8]| memchr::memmem::find(&head[..head.len().min(4096)], word).is_some();
+    let lower = trimmed[..trimmed.len().min(15)].to_ascii_lowercase();
+    if lower.starts_with(b"<!doctype html") || lower.starts_with(b"<html") {
+        return "an HTML page".to_owned();
+    }
+    if lower.starts_with(b"<?xml") || lower.starts_with(b"<") {
+        return if has(b"PDBx") { "PDBML (XML)" } else { "XML" }.to_owned();
+    }
+    if lower.starts_with(b"{") || lower.starts_with(b"[") {
+        return "JSON".to_owned();
+    }
+    if has(b"@<TRIPOS>") {
+        return "Tripos MOL2".to_owned();
+    }
+    if has(b" V2000") || has(b" V3000") {
+        return "an MDL molfile (SDF)".to_owned();
+    }
+    let line = trimmed.split(|&b| b == b'\n' || b == b'\r').next().unwrap_or_default();
+    format!("text beginning with {}", quote(line))
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().take(8).map(|b| format!("{b:02x}")).collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn formats_are_told_by_content() {
+        for pdb in ["\n\nHEADER x", "ATOM      1", "REMARK\r\n", "junk\nmore junk\rHETATM    1", "MODEL        1", "CRYST1   1"] {
+            assert_eq!(sniff(pdb.as_bytes()).unwrap(), SourceFormat::Pdb, "{pdb}");
+        }
+        for cif in ["data_1ABC\n", "# comment\n#\n\n  DATA_x", "loop_\n_atom_site.id", "_entry.id X"] {
+            assert_eq!(sniff(cif.as_bytes()).unwrap(), SourceFormat::Mmcif, "{cif}");
+        }
+    }
+
+    #[test]
+    fn everything_else_is_named() {
+        let cases: [(&[u8], &str); 17] = [
+            (b"", "nothing (0 bytes)"),
+            (b" \n\t", "only white space"),
+            (b"\x83\xa7encoder\xb6mol*/ciftools", "BinaryCIF"),
+            (b"\xde\x00\x20\xabmmtfVersion\xa51.0.0", "MMTF"),
+            (b"PK\x03\x04rest", "ZIP"),
+            (b"\xfd7zXZ\0", "xz"),
+            (b"\xff\xfed\0a\0t\0a\0", "UTF-16"),
+            (b"<!DOCTYPE html><html>", "HTML"),
+            (b"<?xml version=\"1.0\"?><PDBx:datablock", "PDBML"),
+            (b"{\"a\": 1}", "JSON"),
+            (b"@<TRIPOS>MOLECULE\n", "MOL2"),
+            (b"x\n  y\n\n  1  0  0 V2000\n", "SDF"),
+            (b"hello world\n", "`hello world`"),
+            (b"\0\x01\x02\x03", "binary data beginning with 00 01 02 03"),
+            (b"\x1f\x8bxx", "gzip inside"),
+            (b"END\n", "`END`"),
+            (b"ATOMIC bomb\n", "`ATOMIC bomb`"),
+        ];
+        for (bytes, found) in cases {
+            let message = sniff(bytes).unwrap_err().to_string();
+            assert!(message.contains(found), "{message} does not name {found}");
+        }
+    }
+}

@@ -1,0 +1,121 @@
+//! Bytes of a text file: places as line and column, excerpts for messages, decoding.
+
+use std::borrow::Cow;
+
+use super::error::StructureError;
+
+/// Something wrong at a byte of the text.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Fault {
+    /// Byte offset.
+    pub(super) at: usize,
+    /// What stands there.
+    pub(super) found: String,
+    /// What was expected.
+    pub(super) expected: String,
+}
+
+impl Fault {
+    /// `found` is an excerpt of `text[start..end]`.
+    #[cold]
+    pub(super) fn token(text: &[u8], start: usize, end: usize, expected: impl Into<String>) -> Box<Self> {
+        Box::new(Self { at: start, found: quote(&text[start..end]), expected: expected.into() })
+    }
+
+    /// `found` in words.
+    #[cold]
+    pub(super) fn words(at: usize, found: impl Into<String>, expected: impl Into<String>) -> Box<Self> {
+        Box::new(Self { at, found: found.into(), expected: expected.into() })
+    }
+
+    /// The error of reading, with line and column.
+    pub(super) fn locate(self, text: &[u8]) -> StructureError {
+        let (line, column) = line_and_column(text, self.at);
+        StructureError::Syntax { line, column, found: self.found, expected: self.expected }
+    }
+}
+
+/// Line and column of a byte, both from 1. Lines end with LF, CR LF or a lone CR; columns are bytes.
+pub(super) fn line_and_column(text: &[u8], at: usize) -> (u64, u64) {
+    let before = &text[..at.min(text.len())];
+    let lf = memchr::memchr_iter(b'\n', before).count();
+    let lone_cr = memchr::memchr_iter(b'\r', before).filter(|&i| text.get(i + 1) != Some(&b'\n')).count();
+    let start = memchr::memrchr2(b'\n', b'\r', before).map_or(0, |i| i + 1);
+    ((lf + lone_cr) as u64 + 1, (before.len() - start) as u64 + 1)
+}
+
+/// Bytes as text: UTF-8 where they are, Latin-1 otherwise; control characters become U+FFFD, so that a name
+/// is safe to print.
+pub(super) fn decode(raw: &[u8]) -> Cow<'_, str> {
+    let text = match std::str::from_utf8(raw) {
+        Ok(text) => Cow::Borrowed(text),
+        Err(_) => Cow::Owned(raw.iter().copied().map(char::from).collect()),
+    };
+    if text.chars().any(char::is_control) {
+        Cow::Owned(text.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect())
+    } else {
+        text
+    }
+}
+
+/// An excerpt for a message.
+pub(super) fn quote(raw: &[u8]) -> String {
+    const SHOWN: usize = 40;
+    if raw.is_empty() {
+        return "nothing".to_owned();
+    }
+    if raw.iter().all(|&b| b == b' ') {
+        return "blanks".to_owned();
+    }
+    let text = decode(&raw[..raw.len().min(SHOWN)]);
+    if raw.len() > SHOWN { format!("`{text}…` ({} bytes)", raw.len()) } else { format!("`{text}`") }
+}
+
+/// A title or id: white space collapsed, at most `max` characters; `None` if nothing is left.
+pub(super) fn tidy(raw: &[u8], max: usize) -> Option<String> {
+    // Enough bytes for `max` characters and generous padding: a title of 50 MB must not be copied.
+    let raw = &raw[..raw.len().min(8 * max)];
+    let spaced: Vec<u8> = raw.iter().map(|&b| if b <= b' ' { b' ' } else { b }).collect();
+    let text = decode(&spaced);
+    let joined = text.split(' ').filter(|word| !word.is_empty()).collect::<Vec<_>>().join(" ");
+    let short: String = joined.chars().take(max).collect();
+    (!short.is_empty()).then_some(short)
+}
+
+/// `raw` without blanks and control characters at both ends, as offsets into it.
+pub(super) fn trimmed(raw: &[u8]) -> (usize, usize) {
+    let Some(start) = raw.iter().position(|&b| b > b' ') else { return (0, 0) };
+    let end = raw.iter().rposition(|&b| b > b' ').map_or(start, |i| i + 1);
+    (start, end)
+}
+
+/// `items` with commas, at most twenty of `total`.
+pub(super) fn list<I: IntoIterator<Item = String>>(items: I, total: usize) -> String {
+    const SHOWN: usize = 20;
+    let shown: Vec<String> = items.into_iter().take(SHOWN).collect();
+    let more = total.saturating_sub(shown.len());
+    let joined = shown.join(", ");
+    if more > 0 { format!("{joined} and {more} more") } else { joined }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_end_in_three_ways() {
+        let text = b"ab\ncd\r\nef\rgh";
+        let places: Vec<_> = [0, 1, 3, 5, 7, 10, 11].iter().map(|&at| line_and_column(text, at)).collect();
+        assert_eq!(places, [(1, 1), (1, 2), (2, 1), (2, 3), (3, 1), (4, 1), (4, 2)]);
+    }
+
+    #[test]
+    fn latin_1_and_control_characters_are_safe_to_print() {
+        assert_eq!(decode(b"caf\xe9"), "café");
+        assert_eq!(decode("café".as_bytes()), "café");
+        assert_eq!(decode(b"a\x1b[2J"), "a\u{fffd}[2J");
+        assert_eq!(quote(b"    "), "blanks");
+        assert_eq!(tidy(b"  a \n b\t", 10), Some("a b".to_owned()));
+        assert_eq!(tidy(b" \n ", 10), None);
+    }
+}
