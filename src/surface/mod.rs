@@ -15,14 +15,18 @@ pub mod lattice;
 pub mod measure;
 pub mod mesh;
 pub mod params;
+pub mod reference;
+mod simd;
 pub mod spheres;
 pub mod topology;
 
 pub use backend::{Backend, GridStats, Meshed};
 pub use column::Column;
 pub use control::{CancelToken, Control, Observer, Stage};
+pub use cpu::CpuBackend;
 pub use error::SurfaceError;
 pub use measure::{Component, Measures, Proof};
 pub use mesh::Mesh;
 pub use params::{Kernel, PaperParams, Preset, SurfaceLimits, SurfaceOptions, SurfaceParams};
+pub use reference::ReferenceBackend;
 pub use spheres::Spheres;
