@@ -95,9 +95,12 @@ pub(crate) struct MeshArgs {
     /// No summary and no progress bar
     #[arg(short, long)]
     pub(crate) quiet: bool,
-    /// Check twice: report what a strict second reader says of the file, and prove the mesh edge by edge
+    /// Refuse a file in which a second, strict reader finds errors, and report what else it finds
     #[arg(long)]
     pub(crate) check: bool,
+    /// How the mesh is proven closed: checksum (fast) or exact (edge by edge) [default: checksum]
+    #[arg(long, value_name = "PROOF")]
+    pub(crate) proof: Option<String>,
     #[command(flatten)]
     pub(crate) surface: SurfaceArgs,
     #[command(flatten)]

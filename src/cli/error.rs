@@ -82,6 +82,16 @@ pub(crate) enum CliError {
         /// What a strict reader says of the same file.
         opinion: Option<String>,
     },
+    /// A strict check was asked for, and the referee found errors.
+    #[error("{name}: the strict check found {errors} errors")]
+    Strict {
+        /// The input.
+        name: String,
+        /// How many.
+        errors: usize,
+        /// The first of them.
+        first: String,
+    },
     /// The format cannot hold the mesh, or the mesh is broken.
     #[error(transparent)]
     Format(#[from] FormatError),
@@ -139,6 +149,7 @@ impl CliError {
             Self::InputTooLarge { .. } => code::LIMIT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
+            Self::Strict { .. } => code::STRUCTURE,
             Self::Format(error) => format_code(error),
             Self::NoBackend { .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
@@ -151,6 +162,7 @@ impl CliError {
     pub(crate) fn hint(&self) -> Option<String> {
         match self {
             Self::Usage { hint, .. } => hint.clone(),
+            Self::Strict { first, .. } => Some(format!("the first: {first}")),
             Self::InputTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
             Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
             Self::Job { source: JobError::Structure(error), opinion, .. } => match error {
@@ -228,12 +240,13 @@ mod tests {
     fn every_kind_of_failure_has_its_code() {
         let job = |source: JobError| CliError::Job { name: "x".into(), source, opinion: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
-        let cases: [(CliError, i32); 12] = [
+        let cases: [(CliError, i32); 13] = [
             (CliError::Internal(String::new()), 1),
             (CliError::usage("x"), 2),
             (CliError::Input { name: "x".into(), source: missing() }, 3),
             (job(StructureError::NoAtoms { found: "nothing".into() }.into()), 4),
             (job(SurfaceError::NoSpheres.into()), 4),
+            (CliError::Strict { name: "x".into(), errors: 1, first: String::new() }, 4),
             (job(StructureError::TooManyAtoms { limit: 1 }.into()), 5),
             (job(SurfaceError::MeshTooLarge { bytes: 2, limit: 1, suggested_resolution: 1.0 }.into()), 5),
             (FormatError::GlbTooLarge { bytes: 2, limit: 1 }.into(), 5),

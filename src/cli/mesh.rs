@@ -7,9 +7,10 @@ use std::str::FromStr;
 use std::time::Instant;
 
 use molmesh::formats::{Encoder, Format};
+use molmesh::pipeline::params::Request;
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, ProgressSink, Report};
 use molmesh::structure::StructureError;
-use molmesh::structure::referee::{self, Diagnostic};
+use molmesh::structure::referee::{self, Diagnostic, Level};
 use molmesh::surface::{CancelToken, SurfaceError};
 use serde_json::{Value, json};
 
@@ -24,7 +25,7 @@ use super::{interrupt, request};
 
 /// Runs the command. The order is that of cost: flags, backend, output, input, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
-    let (job, asked) = request::parse(args)?;
+    let Request { job, format: asked, strict, .. } = request::parse(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
     let limits = request::limits(&args.limits);
     let picked = backend::pick(args.backend, args.threads)?;
@@ -34,7 +35,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let input = read(&args.input, limits.read.max_inflated_bytes)?;
 
     let progress = Progress::new(!args.quiet);
-    let findings = if args.check { referee::check(&input, &limits.read).ok() } else { None };
+    let findings = if strict { Some(check(args, &input, &limits)?) } else { None };
     let product = mesh(args, &job, &limits, &picked, &input, &cancel, &progress)?;
     drop(input);
     let mut report = encode(&product, format, &mut output, &progress)?;
@@ -116,6 +117,21 @@ fn mesh(
         JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
         source => CliError::Job { name: name_of(&args.input), opinion: opinion(&source, input, limits), source },
     })
+}
+
+/// The strict check: the referee's findings, or a refusal if there are errors among them.
+fn check(args: &MeshArgs, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
+    let name = || name_of(&args.input);
+    let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
+        name: name(),
+        source: source.into(),
+        opinion: None,
+    })?;
+    let errors = findings.iter().filter(|f| f.level == Level::Error);
+    match errors.clone().next() {
+        Some(first) => Err(CliError::Strict { name: name(), errors: errors.count(), first: finding(first) }),
+        None => Ok(findings),
+    }
 }
 
 /// What the referee holds against a file that our reader could not read.
