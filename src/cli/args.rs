@@ -95,6 +95,12 @@ pub(crate) struct MeshArgs {
     /// No summary and no progress bar
     #[arg(short, long)]
     pub(crate) quiet: bool,
+    /// Refuse a file in which a second, strict reader finds errors, and report what else it finds
+    #[arg(long)]
+    pub(crate) check: bool,
+    /// How the mesh is proven closed: checksum (fast) or exact (edge by edge) [default: checksum]
+    #[arg(long, value_name = "PROOF")]
+    pub(crate) proof: Option<String>,
     #[command(flatten)]
     pub(crate) surface: SurfaceArgs,
     #[command(flatten)]
@@ -171,9 +177,6 @@ pub(crate) struct SelectionArgs {
     /// One alternative location instead of the best occupied of each residue
     #[arg(long, value_name = "X")]
     pub(crate) altloc: Option<String>,
-    /// Refuse a structure that a strict second reader finds fault with
-    #[arg(long)]
-    pub(crate) check: bool,
 }
 
 /// What is too much.
