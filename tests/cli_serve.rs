@@ -44,7 +44,8 @@ fn flags_reach_the_service() {
     assert!(service.banner.contains("reference: "), "{}", service.banner);
     let pdb = folder.file("rod.pdb", cli_support::rod());
     let url = format!("http://{}/v1/meshes", service.addr);
-    let answer = Command::new("curl").args(["-sS", "--data-binary"]).arg(format!("@{}", pdb.display())).arg(url).output();
+    let answer =
+        Command::new("curl").args(["-sS", "--data-binary"]).arg(format!("@{}", pdb.display())).arg(url).output();
     let problem: serde_json::Value = serde_json::from_slice(&answer.unwrap().stdout).unwrap();
     assert_eq!(problem["limit"], 5, "{problem}");
 }

@@ -223,12 +223,16 @@ mod tests {
 
     #[test]
     fn columns_of_different_lengths_are_refused() {
-        let whole = Mesh { positions: vec![[0.0; 3]; 2], normals: vec![[0.0, 0.0, 1.0]; 2], ..Mesh::default() };
+        let whole = Mesh {
+            positions: vec![[0.0; 3]; 2].into(),
+            normals: vec![[0.0, 0.0, 1.0]; 2].into(),
+            ..Mesh::default()
+        };
         assert!(check(&whole, Depth::All).is_ok());
         let broken = [
-            ("normals", Mesh { normals: vec![[0.0; 3]], ..whole.clone() }),
-            ("atom_ids", Mesh { atom_ids: Some(vec![1]), ..whole.clone() }),
-            ("colors", Mesh { colors: Some(vec![[0; 4]; 3]), ..whole.clone() }),
+            ("normals", Mesh { normals: vec![[0.0; 3]].into(), ..whole.clone() }),
+            ("atom_ids", Mesh { atom_ids: Some(vec![1].into()), ..whole.clone() }),
+            ("colors", Mesh { colors: Some(vec![[0; 4]; 3].into()), ..whole.clone() }),
         ];
         for (name, mesh) in broken {
             assert!(

@@ -222,7 +222,7 @@ mod tests {
 
     #[test]
     fn coordinates_without_room_are_refused() {
-        let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]], ..Mesh::default() };
+        let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]].into(), ..Mesh::default() };
         let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: None, translucent: false };
         let refusal = ObjPlan::new(&mesh, &summary, &Meta::default()).unwrap_err();
         assert_eq!(refusal, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });

@@ -99,7 +99,8 @@ impl Drop for Place {
 /// Tells one client too many so. Its request is not waited for: that would cost what there is no room for.
 fn refuse(stream: TcpStream) {
     counter!(REJECTED, "reason" => Kind::TooManyConnections.row().slug).increment(1);
-    let body = Problem::new(Kind::TooManyConnections, "the server holds as many connections as it may").document("unknown");
+    let body =
+        Problem::new(Kind::TooManyConnections, "the server holds as many connections as it may").document("unknown");
     let head = format!(
         "HTTP/1.1 503 Service Unavailable\r\ncontent-type: {MEDIA_TYPE}\r\ncontent-length: {}\r\n\
          retry-after: 1\r\nconnection: close\r\n\r\n",
@@ -142,7 +143,12 @@ impl Drop for Working {
 }
 
 /// Serves one connection.
-async fn connection(stream: Guarded<Place>, router: Router, config: Arc<ServerConfig>, mut stop: watch::Receiver<bool>) {
+async fn connection(
+    stream: Guarded<Place>,
+    router: Router,
+    config: Arc<ServerConfig>,
+    mut stop: watch::Receiver<bool>,
+) {
     let activity = Arc::new(Activity::default());
     let service = service_fn(|request: Request<Incoming>| {
         let working = Working::on(&activity);
@@ -188,11 +194,7 @@ async fn connection(stream: Guarded<Place>, router: Router, config: Arc<ServerCo
 
 fn builder(config: &ServerConfig) -> auto::Builder<TokioExecutor> {
     let mut builder = auto::Builder::new(TokioExecutor::new());
-    builder
-        .http1()
-        .timer(TokioTimer::new())
-        .header_read_timeout(config.header_timeout())
-        .max_buf_size(MAX_HEAD_BYTES);
+    builder.http1().timer(TokioTimer::new()).header_read_timeout(config.header_timeout()).max_buf_size(MAX_HEAD_BYTES);
     builder
         .http2()
         .timer(TokioTimer::new())

@@ -62,7 +62,12 @@ fn cors() -> CorsLayer {
         .allow_origin(Any)
         .allow_methods([Method::GET, Method::HEAD, Method::POST])
         .allow_headers(Any)
-        .expose_headers(exposed.into_iter().chain(delivery::SUMMARY.iter().map(|name| HeaderName::from_static(name))).collect::<Vec<_>>())
+        .expose_headers(
+            exposed
+                .into_iter()
+                .chain(delivery::SUMMARY.iter().map(|name| HeaderName::from_static(name)))
+                .collect::<Vec<_>>(),
+        )
         .max_age(Duration::from_secs(86_400))
 }
 

@@ -171,11 +171,13 @@ impl From<Refusal> for Problem {
 impl From<Failure> for Problem {
     fn from(error: Failure) -> Self {
         match error {
-            Failure::Job { error: JobError::Structure(error), diagnostics } => Self::from(error).diagnosed(&diagnostics),
-            Failure::Job { error: JobError::Surface(error), .. } => error.into(),
-            Failure::Check { ref diagnostics } => {
-                Self::new(Kind::UnreadableStructure, error.to_string()).with("parameter", "check").diagnosed(diagnostics)
+            Failure::Job { error: JobError::Structure(error), diagnostics } => {
+                Self::from(error).diagnosed(&diagnostics)
             }
+            Failure::Job { error: JobError::Surface(error), .. } => error.into(),
+            Failure::Check { ref diagnostics } => Self::new(Kind::UnreadableStructure, error.to_string())
+                .with("parameter", "check")
+                .diagnosed(diagnostics),
             Failure::Deadline { limit } => Self::new(Kind::Deadline, error.to_string())
                 .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX)),
             Failure::Memory(error) => error.into(),

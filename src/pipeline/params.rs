@@ -191,12 +191,7 @@ pub const TABLE: &[Parameter] = &[
         default: "absent",
         doc: "Refuse a file in which a second, strict reader finds errors.",
     },
-    Parameter {
-        name: "format",
-        domain: Domain::Choice(FORMATS),
-        default: "glb",
-        doc: "The mesh file format.",
-    },
+    Parameter { name: "format", domain: Domain::Choice(FORMATS), default: "glb", doc: "The mesh file format." },
     Parameter {
         name: "report",
         domain: Domain::Choice(&["json"]),
@@ -283,7 +278,9 @@ impl From<SurfaceError> for ParamError {
     fn from(error: SurfaceError) -> Self {
         match error {
             SurfaceError::BadParameter { name, value, expected } => Self::BadValue { name, value, expected },
-            other => Self::BadValue { name: "kernel", value: other.to_string(), expected: "valid parameters".to_owned() },
+            other => {
+                Self::BadValue { name: "kernel", value: other.to_string(), expected: "valid parameters".to_owned() }
+            }
         }
     }
 }

@@ -37,6 +37,19 @@ impl<T: Pod> Column<T> {
     }
 }
 
+impl<T: Pod> Column<T> {
+    /// The rows as a vector, to add or remove some. Copies a mapped column.
+    pub fn edit(&mut self) -> &mut Vec<T> {
+        if let Storage::Mapped { .. } = &self.0 {
+            self.0 = Storage::Owned(self.to_vec());
+        }
+        match &mut self.0 {
+            Storage::Owned(rows) => rows,
+            Storage::Mapped { .. } => unreachable!("owned by now"),
+        }
+    }
+}
+
 impl<T: Pod> Deref for Column<T> {
     type Target = [T];
 
@@ -121,6 +134,8 @@ mod tests {
                 assert_ne!(column, Column::zeroed(n));
             }
             assert_eq!(column, column.clone());
+            column.edit().push([4.0; 3]);
+            assert_eq!((column.len(), column[n]), (n + 1, [4.0; 3]));
         }
     }
 }
