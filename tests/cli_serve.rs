@@ -1,6 +1,5 @@
 //! `molmesh serve` as a process: its banner, its addresses, its end.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
 
 mod cli_support;
 
@@ -44,7 +43,8 @@ fn flags_reach_the_service() {
     assert!(service.banner.contains("reference: "), "{}", service.banner);
     let pdb = folder.file("rod.pdb", cli_support::rod());
     let url = format!("http://{}/v1/meshes", service.addr);
-    let answer = Command::new("curl").args(["-sS", "--data-binary"]).arg(format!("@{}", pdb.display())).arg(url).output();
+    let answer =
+        Command::new("curl").args(["-sS", "--data-binary"]).arg(format!("@{}", pdb.display())).arg(url).output();
     let problem: serde_json::Value = serde_json::from_slice(&answer.unwrap().stdout).unwrap();
     assert_eq!(problem["limit"], 5, "{problem}");
 }

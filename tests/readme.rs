@@ -37,10 +37,12 @@ fn is_what_it_says(name: &str, bytes: &[u8]) -> bool {
         "obj" => bytes.starts_with(b"#") && bytes.windows(3).any(|w| w == b"\nf "),
         "json" | "gltf" => serde_json::from_slice::<serde_json::Value>(bytes).is_ok_and(|v| v.is_object()),
         // 80 bytes of anything, a count, 50 bytes a triangle.
-        "stl" => bytes.len() > 84 && {
-            let n = u32::from_le_bytes([bytes[80], bytes[81], bytes[82], bytes[83]]) as usize;
-            n > 0 && bytes.len() == 84 + 50 * n
-        },
+        "stl" => {
+            bytes.len() > 84 && {
+                let n = u32::from_le_bytes([bytes[80], bytes[81], bytes[82], bytes[83]]) as usize;
+                n > 0 && bytes.len() == 84 + 50 * n
+            }
+        }
         _ => false,
     }
 }
@@ -72,7 +74,11 @@ fn every_curl_line_works() {
             let start = String::from_utf8_lossy(&bytes[..bytes.len().min(400)]).into_owned();
             assert!(is_what_it_says(name, &bytes), "{line}: {name} begins with {start}");
             // A problem is JSON as well, and belongs into the file of that name only.
-            assert_eq!(start.contains("\"status\":4") || start.contains("\"status\": 4"), name.contains("problem"), "{line}: {start}");
+            assert_eq!(
+                start.contains("\"status\":4") || start.contains("\"status\": 4"),
+                name.contains("problem"),
+                "{line}: {start}"
+            );
             std::fs::remove_file(path).unwrap();
         }
     }
@@ -85,6 +91,8 @@ fn control_lines_and_files_are_told_apart() {
     assert_eq!(lines.len(), 2);
     assert_eq!((outputs(&lines[0]), outputs(&lines[1])), (vec!["a.glb"], vec!["b.ply"]));
     let problem = b"{\"type\":\"about:blank\"}";
-    assert!(!is_what_it_says("a.glb", problem) && !is_what_it_says("a.stl", problem) && is_what_it_says("a.json", problem));
+    assert!(
+        !is_what_it_says("a.glb", problem) && !is_what_it_says("a.stl", problem) && is_what_it_says("a.json", problem)
+    );
     assert!(!is_what_it_says("a.txt", problem) && !is_what_it_says("a.stl", &[0; 84]));
 }
