@@ -347,3 +347,41 @@ proptest! {
         prop_assert_eq!((stl.len(), u32_at(&stl, 80), stl[..80].is_ascii()), (134, 1, true));
     }
 }
+
+#[test]
+fn trusted_meshes_give_the_same_bytes() {
+    for (name, mesh) in cases() {
+        for format in Format::ALL {
+            let mut bytes = Vec::new();
+            Encoder::trusting(format, &mesh, &meta()).unwrap().write(&mut bytes).unwrap();
+            assert!(bytes == encode(format, &mesh, &meta()), "{name} as {format}");
+        }
+    }
+}
+
+#[test]
+fn trust_in_a_broken_mesh_never_panics() {
+    for n in [4, 300] {
+        let mut far_index = torus(n, 300);
+        far_index.triangles[1][1] = u32::MAX;
+        let mut long_normal = torus(n, 300);
+        long_normal.normals[1] = [f32::NAN, f32::MAX, f32::INFINITY];
+        let mut not_finite = torus(n, 300);
+        not_finite.positions[1][2] = f32::NAN;
+        let mut short = torus(n, 300);
+        short.normals.pop();
+        for format in Format::ALL {
+            let refused = |mesh: &Mesh| {
+                let encoder = Encoder::trusting(format, mesh, &meta());
+                if let Ok(encoder) = &encoder {
+                    encoder.write(&mut io::sink()).unwrap();
+                }
+                encoder.is_err()
+            };
+            let narrow = matches!(format, Format::Glb | Format::Gltf) && n == 4;
+            assert_eq!(refused(&far_index), narrow || format == Format::Stl, "{format}");
+            assert_eq!(refused(&long_normal), format == Format::Obj, "{format}");
+            assert!(refused(&not_finite) && refused(&short), "{format}");
+        }
+    }
+}

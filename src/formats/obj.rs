@@ -59,7 +59,7 @@ impl ObjPlan {
         out.write_all(self.header.as_bytes())?;
         let mut lines = Lines::new(out, self.len_bound);
         for &position in &mesh.positions[..] {
-            lines.push(|line| line.vector(b"v", absolute(mesh, position)))?;
+            lines.push(|line| line.vector(b"v", absolute(mesh.centre, position)))?;
         }
         for &normal in &mesh.normals[..] {
             lines.push(|line| line.vector(b"vn", normal))?;
