@@ -1,6 +1,5 @@
 //! Every exit code that the help promises, the line that comes with it, and that a failure leaves no file.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
 
 mod cli_support;
 

@@ -1,6 +1,5 @@
 //! `molmesh serve` as a process: its banner, its addresses, its end.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
 
 mod cli_support;
 

@@ -12,7 +12,7 @@ const MESH_EXAMPLES: &str = "\
 Examples:
   molmesh mesh 4pti.pdb -o 4pti.glb
   molmesh mesh 1gbt.cif.gz -o - --format ply --resolution 0.3 > 1gbt.ply
-  curl -s http://127.0.0.1:8080/v1/samples/4pti.pdb | molmesh mesh - -o 4pti.stl --report json";
+  curl -s http://127.0.0.1:8080/sample.pdb | molmesh mesh - -o 4pti.stl --report json";
 
 /// Molecules in, proven surface meshes out.
 #[derive(Debug, Parser)]
@@ -152,7 +152,6 @@ pub(crate) struct SurfaceArgs {
 }
 
 /// Which atoms.
-#[expect(clippy::struct_excessive_bools, reason = "flags are what a command line has")]
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
 pub(crate) struct SelectionArgs {

@@ -2,6 +2,7 @@
 #![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
 #![allow(
     clippy::unwrap_used,
+    clippy::panic,
     clippy::missing_panics_doc,
     unreachable_pub,
     reason = "tests say what they expect by panicking"
