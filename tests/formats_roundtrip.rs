@@ -68,10 +68,10 @@ fn assert_gltf(name: &str, mesh: &Mesh, json: &Value, bin: &[u8]) {
     let nothing = mesh.triangles.is_empty();
     let expected = Contents {
         translation: mesh.centre,
-        positions: mesh.positions.clone(),
-        normals: mesh.normals.clone(),
-        triangles: mesh.triangles.clone(),
-        atoms: mesh.atom_ids.clone().filter(|_| !nothing),
+        positions: mesh.positions.to_vec(),
+        normals: mesh.normals.to_vec(),
+        triangles: mesh.triangles.to_vec(),
+        atoms: mesh.atom_ids.as_deref().map(<[_]>::to_vec).filter(|_| !nothing),
         colors: found.colors.clone(),
     };
     assert!(found == expected, "{name}");
@@ -138,10 +138,10 @@ fn ply_gives_every_column_back() {
         let expected = Contents {
             translation: [0.0; 3],
             positions: absolute(&mesh),
-            normals: mesh.normals.clone(),
-            triangles: mesh.triangles.clone(),
-            atoms: mesh.atom_ids.clone(),
-            colors: mesh.colors.clone(),
+            normals: mesh.normals.to_vec(),
+            triangles: mesh.triangles.to_vec(),
+            atoms: mesh.atom_ids.as_deref().map(<[_]>::to_vec),
+            colors: mesh.colors.as_deref().map(<[_]>::to_vec),
         };
         assert!(read_ply(&bytes) == expected, "{name}");
         let (header, _) = ply_header(&bytes);
@@ -280,10 +280,10 @@ fn broken_meshes_are_refused_before_the_first_byte() {
         mesh
     };
     let cases: [(&str, Mesh); 9] = [
-        ("20 positions but 19 normals", broken(|m| m.normals.truncate(19))),
-        ("20 positions but 0 normals", broken(|m| m.normals.clear())),
-        ("20 positions but 21 atom_ids", broken(|m| m.atom_ids.as_mut().unwrap().push(3))),
-        ("20 positions but 1 colors", broken(|m| m.colors = Some(vec![[0; 4]]))),
+        ("20 positions but 19 normals", broken(|m| m.normals.edit().truncate(19))),
+        ("20 positions but 0 normals", broken(|m| m.normals.edit().clear())),
+        ("20 positions but 21 atom_ids", broken(|m| m.atom_ids.as_mut().unwrap().edit().push(3))),
+        ("20 positions but 1 colors", broken(|m| m.colors = Some(vec![[0; 4]].into()))),
         ("triangle 7 names vertex 20, but the mesh has 20", broken(|m| m.triangles[7][1] = 20)),
         ("names vertex 4294967295", broken(|m| m.triangles[0][0] = u32::MAX)),
         ("position 3 holds NaN", broken(|m| m.positions[3][2] = f32::NAN)),
