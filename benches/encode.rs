@@ -20,11 +20,11 @@ fn torus(side: u32) -> Mesh {
         let ((su, cu), (sv, cv)) = (angle(i), angle(j));
         let normal = [cv * cu, cv * su, sv];
         let ring = [60.0 * cu, 60.0 * su, 0.0];
-        mesh.positions.push(std::array::from_fn(|k| (ring[k] + 30.0 * normal[k]) as f32));
-        mesh.normals.push(normal.map(|v| v as f32));
+        mesh.positions.edit().push(std::array::from_fn(|k| (ring[k] + 30.0 * normal[k]) as f32));
+        mesh.normals.edit().push(normal.map(|v| v as f32));
         let at = |i: u32, j: u32| (i % side) * side + j % side;
         let (a, b, c, d) = (at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1));
-        mesh.triangles.extend([[a, b, c], [a, c, d]]);
+        mesh.triangles.edit().extend([[a, b, c], [a, c, d]]);
     }
     mesh
 }
