@@ -74,7 +74,9 @@ pub fn init_logs(config: &LogConfig) -> Result<(), TelemetryError> {
         .map_err(|e| TelemetryError::Filter { filter: config.filter.clone(), reason: e.to_string() })?;
     let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
     let installed = match config.format {
-        LogFormat::Pretty => builder.with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr())).finish().try_init(),
+        LogFormat::Pretty => {
+            builder.with_ansi(std::io::IsTerminal::is_terminal(&std::io::stderr())).finish().try_init()
+        }
         LogFormat::Json => builder.json().flatten_event(true).finish().try_init(),
     };
     installed.map_err(|e| TelemetryError::Install { what: "the log", reason: e.to_string() })?;

@@ -55,8 +55,7 @@ pub fn load(
 ) -> Result<Config, ConfigError> {
     let mut tree = Tree::new();
     if let Some(path) = file {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| ConfigError::Read { path: path.to_owned(), error })?;
+        let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Read { path: path.to_owned(), error })?;
         let table: Value = toml::from_str(&text)
             .map_err(|e| ConfigError::Syntax { path: path.to_owned(), reason: e.to_string().trim().to_owned() })?;
         let source = Source::File(path.to_owned());

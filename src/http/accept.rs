@@ -29,7 +29,7 @@ use crate::config::ServerConfig;
 use crate::telemetry::{CONNECTIONS, REJECTED};
 
 /// Most that is buffered of a request's head; a head that is longer is refused.
-const MAX_HEAD_BYTES: usize = 64 << 10;
+const MAX_HEAD_BYTES: u32 = 64 << 10;
 /// Requests at once on one HTTP/2 connection.
 const MAX_STREAMS: u32 = 64;
 /// Pause after the system could not accept, most likely for want of file descriptors.
@@ -99,7 +99,8 @@ impl Drop for Place {
 /// Tells one client too many so. Its request is not waited for: that would cost what there is no room for.
 fn refuse(stream: TcpStream) {
     counter!(REJECTED, "reason" => Kind::TooManyConnections.row().slug).increment(1);
-    let body = Problem::new(Kind::TooManyConnections, "the server holds as many connections as it may").document("unknown");
+    let body =
+        Problem::new(Kind::TooManyConnections, "the server holds as many connections as it may").document("unknown");
     let head = format!(
         "HTTP/1.1 503 Service Unavailable\r\ncontent-type: {MEDIA_TYPE}\r\ncontent-length: {}\r\n\
          retry-after: 1\r\nconnection: close\r\n\r\n",
@@ -142,7 +143,12 @@ impl Drop for Working {
 }
 
 /// Serves one connection.
-async fn connection(stream: Guarded<Place>, router: Router, config: Arc<ServerConfig>, mut stop: watch::Receiver<bool>) {
+async fn connection(
+    stream: Guarded<Place>,
+    router: Router,
+    config: Arc<ServerConfig>,
+    mut stop: watch::Receiver<bool>,
+) {
     let activity = Arc::new(Activity::default());
     let service = service_fn(|request: Request<Incoming>| {
         let working = Working::on(&activity);
@@ -192,14 +198,14 @@ fn builder(config: &ServerConfig) -> auto::Builder<TokioExecutor> {
         .http1()
         .timer(TokioTimer::new())
         .header_read_timeout(config.header_timeout())
-        .max_buf_size(MAX_HEAD_BYTES);
+        .max_buf_size(MAX_HEAD_BYTES as usize);
     builder
         .http2()
         .timer(TokioTimer::new())
         .keep_alive_interval(PING)
         .keep_alive_timeout(PING)
         .max_concurrent_streams(MAX_STREAMS)
-        .max_header_list_size(MAX_HEAD_BYTES as u32);
+        .max_header_list_size(MAX_HEAD_BYTES);
     builder
 }
 

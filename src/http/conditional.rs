@@ -22,7 +22,14 @@ mod tests {
     #[test]
     fn tags_are_compared_weakly() {
         let etag = HeaderValue::from_static("\"abc\"");
-        for (sent, unchanged) in [("\"abc\"", true), ("W/\"abc\"", true), ("\"x\", \"abc\"", true), ("*", true), ("\"x\"", false), ("abc", false)] {
+        for (sent, unchanged) in [
+            ("\"abc\"", true),
+            ("W/\"abc\"", true),
+            ("\"x\", \"abc\"", true),
+            ("*", true),
+            ("\"x\"", false),
+            ("abc", false),
+        ] {
             let headers = HeaderMap::from_iter([(IF_NONE_MATCH, HeaderValue::from_static(sent))]);
             assert_eq!(is_unchanged(&headers, &etag), unchanged, "{sent}");
         }

@@ -83,7 +83,9 @@ mod tests {
 
     #[test]
     fn curl_and_browsers_are_neutral() {
-        for neutral in ["", "application/x-www-form-urlencoded", "text/plain; charset=utf-8", "application/octet-stream", "x"] {
+        for neutral in
+            ["", "application/x-www-form-urlencoded", "text/plain; charset=utf-8", "application/octet-stream", "x"]
+        {
             assert_eq!(Declared::new(neutral), Declared::Neutral, "{neutral}");
         }
         assert!(matches!(Declared::new("Image/PNG"), Declared::Foreign(e) if e == "image/png"));

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::http::header::{self, HeaderMap, HeaderName};
 use axum::http::HeaderValue;
+use axum::http::header::{self, HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
 use super::problem::{self, Problem};

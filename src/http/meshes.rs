@@ -3,10 +3,10 @@
 use std::time::Instant;
 
 use axum::body::Body;
-use axum::extract::{Query, State};
 use axum::extract::rejection::QueryRejection;
-use axum::http::header::{self, HeaderMap};
+use axum::extract::{Query, State};
 use axum::http::HeaderValue;
+use axum::http::header::{self, HeaderMap};
 use axum::response::Response;
 
 use super::kinds::Kind;
@@ -54,7 +54,14 @@ pub(super) async fn create(
     let received = start.elapsed();
     let job = request.job.clone();
     let deadline = Instant::now() + app.config.jobs.deadline();
-    let ticket = app.pool.submit(Task { input: bytes, digest: None, strict: request.strict, job, deadline, lease: Some(lease) })?;
+    let ticket = app.pool.submit(Task {
+        input: bytes,
+        digest: None,
+        strict: request.strict,
+        job,
+        deadline,
+        lease: Some(lease),
+    })?;
     let finished = ticket.wait().await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(finished.product.report.source_format)?;
     if request.report {

@@ -62,8 +62,13 @@ fn cors() -> CorsLayer {
         .allow_origin(Any)
         .allow_methods([Method::GET, Method::HEAD, Method::POST])
         .allow_headers(Any)
-        .expose_headers(exposed.into_iter().chain(delivery::SUMMARY.iter().map(|name| HeaderName::from_static(name))).collect::<Vec<_>>())
-        .max_age(Duration::from_secs(86_400))
+        .expose_headers(
+            exposed
+                .into_iter()
+                .chain(delivery::SUMMARY.iter().map(|name| HeaderName::from_static(name)))
+                .collect::<Vec<_>>(),
+        )
+        .max_age(Duration::from_hours(24))
 }
 
 async fn catch_panics(request: Request, next: Next) -> Response {

@@ -73,11 +73,13 @@ pub(super) async fn surface(
 
 /// The format that `surface.{ext}` names.
 fn format_of(file: &str) -> Result<Format, Problem> {
-    file.strip_prefix("surface.").and_then(|ext| Format::ALL.into_iter().find(|f| f.extension() == ext)).ok_or_else(|| {
-        let available: Vec<String> = Format::ALL.iter().map(|f| format!("surface.{}", f.extension())).collect();
-        let detail = format!("an entry has no `{file}`; it has {}", available.join(", "));
-        Problem::new(Kind::NotFound, detail).with("available", available)
-    })
+    file.strip_prefix("surface.").and_then(|ext| Format::ALL.into_iter().find(|f| f.extension() == ext)).ok_or_else(
+        || {
+            let available: Vec<String> = Format::ALL.iter().map(|f| format!("surface.{}", f.extension())).collect();
+            let detail = format!("an entry has no `{file}`; it has {}", available.join(", "));
+            Problem::new(Kind::NotFound, detail).with("available", available)
+        },
+    )
 }
 
 /// Reads an entry and its digest, on a thread that may block.
@@ -88,7 +90,8 @@ async fn fetch(app: Shared, id: EntryId) -> Result<(Bytes, Digest, Lease), Probl
         let digest = Digest::of(&bytes);
         Ok((Bytes::from(bytes), digest))
     });
-    let (bytes, digest) = reading.await.map_err(Problem::internal)?.map_err(|error: ArchiveError| of_archive(&error))?;
+    let (bytes, digest) =
+        reading.await.map_err(Problem::internal)?.map_err(|error: ArchiveError| of_archive(&error))?;
     lease.grow(bytes.len() as u64)?;
     Ok((bytes, digest, lease))
 }

@@ -5,7 +5,7 @@ use axum::extract::Path;
 use axum::response::{IntoResponse, Response};
 use serde_json::{Value, json};
 
-use super::kinds::{Kind, KINDS, Row};
+use super::kinds::{KINDS, Kind, Row};
 use super::problem::Problem;
 
 fn describe(row: &Row) -> Value {

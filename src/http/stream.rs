@@ -53,7 +53,9 @@ fn write(
     let product = &finished.product;
     let resolution = product.report.resolution;
     let encoder = match Encoder::new(format, &product.mesh, &product.meta()) {
-        Ok(encoder) if encoder.encoded_len_bound() > limit => Err(problem::file_too_large(encoder.encoded_len_bound(), limit, resolution)),
+        Ok(encoder) if encoder.encoded_len_bound() > limit => {
+            Err(problem::file_too_large(encoder.encoded_len_bound(), limit, resolution))
+        }
         Ok(encoder) => Ok(encoder),
         Err(error) => Err(problem::of_format(&error, resolution)),
     };

@@ -127,7 +127,9 @@ async fn form(app: &App, content_type: &str, body: Body, limit: u64) -> Result<U
             content.extend_from_slice(&chunk);
             if !is_file && content.len() > MAX_FIELD_BYTES {
                 let detail = format!("the form field `{name}` has more than {MAX_FIELD_BYTES} bytes");
-                return Err(Problem::new(Kind::BadParameter, detail).with("parameter", name).with("limit", MAX_FIELD_BYTES));
+                return Err(Problem::new(Kind::BadParameter, detail)
+                    .with("parameter", name)
+                    .with("limit", MAX_FIELD_BYTES));
             }
         }
         if is_file {

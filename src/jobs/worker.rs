@@ -74,7 +74,8 @@ fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
 
 /// A failure, with the referee's opinion of a file that our reader refused and that is small enough to ask about.
 fn explained(shared: &Shared, input: &[u8], error: JobError) -> Failure {
-    let unreadable = matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
+    let unreadable =
+        matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
     let ask = unreadable && input.len() <= MAX_EXPLAINED;
     // A file of which the referee cannot say anything either gets our refusal alone.
     let diagnostics = if ask { referee::check(input, &shared.limits.read).unwrap_or_default() } else { Vec::new() };

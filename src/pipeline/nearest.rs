@@ -38,7 +38,9 @@ mod tests {
 
     #[test]
     fn distances() {
-        for (a, b, edits) in [("", "", 0), ("abc", "", 3), ("kernel", "kernal", 1), ("ab", "ba", 1), ("kitten", "sitting", 3)] {
+        for (a, b, edits) in
+            [("", "", 0), ("abc", "", 3), ("kernel", "kernal", 1), ("ab", "ba", 1), ("kitten", "sitting", 3)]
+        {
             assert_eq!(distance(a, b), edits, "{a} {b}");
         }
     }

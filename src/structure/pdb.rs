@@ -265,7 +265,12 @@ impl<'a> Reader<'a> {
     fn guess(&mut self, card: &Card, residue: u32) -> u8 {
         let columns = [card[12], card[13], card[14], card[15]];
         let (from, to) = trimmed(&columns);
-        if from == 0 && to == 1 && columns[0].is_ascii_alphabetic() && atomic_number(&columns[..1]) != 0 && !self.left_justified {
+        if from == 0
+            && to == 1
+            && columns[0].is_ascii_alphabetic()
+            && atomic_number(&columns[..1]) != 0
+            && !self.left_justified
+        {
             self.left_justified = true;
             self.guesses.clear();
         }

@@ -299,8 +299,10 @@ impl<'a> Scanner<'a> {
                 return true;
             }
         }
-        row.offsets.as_chunks::<2>().0.iter().all(|edge| {
-            bare_kind(&self.text[row.base + edge[0] as usize..row.base + edge[1] as usize]) == Kind::Value
-        })
+        row.offsets
+            .as_chunks::<2>()
+            .0
+            .iter()
+            .all(|edge| bare_kind(&self.text[row.base + edge[0] as usize..row.base + edge[1] as usize]) == Kind::Value)
     }
 }
