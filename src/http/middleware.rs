@@ -68,7 +68,7 @@ fn cors() -> CorsLayer {
                 .chain(delivery::SUMMARY.iter().map(|name| HeaderName::from_static(name)))
                 .collect::<Vec<_>>(),
         )
-        .max_age(Duration::from_secs(86_400))
+        .max_age(Duration::from_hours(24))
 }
 
 async fn catch_panics(request: Request, next: Next) -> Response {

@@ -17,11 +17,11 @@ pub(super) fn format(headers: &HeaderMap) -> Result<Format, Problem> {
     })
 }
 
-/// A media range with its weight in thousandths and its place.
+/// A media range with its weight and its place.
 struct Range<'a> {
     kind: &'a str,
     subtype: &'a str,
-    weight: u16,
+    weight: f64,
     place: usize,
 }
 
@@ -46,10 +46,10 @@ fn choose(accept: &str) -> Option<Format> {
     let best = Format::ALL.into_iter().filter_map(|format| {
         let matching = ranges.iter().filter(|range| range.specificity(format.media_type()) > 0);
         let range = matching.max_by_key(|r| (r.specificity(format.media_type()), usize::MAX - r.place))?;
-        (range.weight > 0).then_some((range.weight, usize::MAX - range.place, format))
+        (range.weight > 0.0).then_some((range.weight, usize::MAX - range.place, format))
     });
     // `max_by_key` takes the last of equals; the formats' order wants the first.
-    best.rev().max_by_key(|(weight, place, _)| (*weight, *place)).map(|(_, _, format)| format)
+    best.rev().max_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).map(|(_, _, format)| format)
 }
 
 /// One member of the list; malformed ones are ignored.
@@ -59,7 +59,7 @@ fn range(place: usize, text: &str) -> Option<Range<'_>> {
     let weight = parts
         .find_map(|parameter| parameter.strip_prefix("q=").or_else(|| parameter.strip_prefix("Q=")))
         .map_or(Some(1.0), |q| q.parse::<f64>().ok().filter(|q| (0.0..=1.0).contains(q)))?;
-    Some(Range { kind, subtype, weight: (weight * 1000.0).round() as u16, place })
+    Some(Range { kind, subtype, weight, place })
 }
 
 #[cfg(test)]

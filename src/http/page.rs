@@ -39,5 +39,5 @@ pub(super) async fn icon() -> Response {
 }
 
 pub(super) async fn sample() -> Response {
-    asset("chemical/x-pdb", include_str!("../../web/sample.pdb"))
+    asset("chemical/x-pdb", include_str!("../../samples/4pti.pdb"))
 }

@@ -3,6 +3,8 @@
 //! Handlers return a [`Problem`]; the errors of the other rooms become one here and nowhere else. The answer is
 //! written by [`render`], a middleware, because it alone knows the request's id.
 
+use std::time::Duration;
+
 use axum::body::Body;
 use axum::extract::Request;
 use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER};
@@ -54,8 +56,8 @@ impl Problem {
     }
 
     /// Says when to try again.
-    pub(super) fn retry_after(mut self, wait: std::time::Duration) -> Self {
-        self.retry_after_s = Some(wait.as_secs_f64().ceil().clamp(1.0, 600.0) as u64);
+    pub(super) fn retry_after(mut self, wait: Duration) -> Self {
+        self.retry_after_s = Some((wait + Duration::from_millis(999)).as_secs().clamp(1, 600));
         self
     }
 
@@ -149,7 +151,7 @@ impl From<Exhausted> for Problem {
         Self::new(Kind::MemoryFull, error.to_string())
             .with("limit", error.limit)
             .with("actual", error.held)
-            .retry_after(std::time::Duration::from_secs(1))
+            .retry_after(Duration::from_secs(1))
     }
 }
 
@@ -161,9 +163,7 @@ impl From<Refusal> for Problem {
                 .with("actual", waiting)
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait),
-            Refusal::Draining => {
-                Self::new(Kind::ShuttingDown, error.to_string()).retry_after(std::time::Duration::from_secs(1))
-            }
+            Refusal::Draining => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
         }
     }
 }
@@ -181,9 +181,7 @@ impl From<Failure> for Problem {
             Failure::Deadline { limit } => Self::new(Kind::Deadline, error.to_string())
                 .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX)),
             Failure::Memory(error) => error.into(),
-            Failure::Stopped => {
-                Self::new(Kind::ShuttingDown, error.to_string()).retry_after(std::time::Duration::from_secs(1))
-            }
+            Failure::Stopped => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
             Failure::Panicked { .. } => Self::internal(error),
         }
     }
@@ -243,6 +241,7 @@ impl From<SurfaceError> for Problem {
 }
 
 /// A mesh file of `bytes` bytes where `limit` are allowed; files grow with the inverse square of the spacing.
+#[expect(clippy::cast_precision_loss, reason = "an estimate: 52 bits are plenty")]
 pub(super) fn file_too_large(bytes: u64, limit: u64, resolution: f64) -> Problem {
     let fits = resolution * (bytes as f64 / limit as f64).sqrt();
     let fits = (fits * 105.0).ceil() / 100.0;

@@ -76,6 +76,7 @@ impl Lease {
         self.publish();
     }
 
+    #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
     fn publish(&self) {
         gauge!(MEMORY_HELD).set(self.budget.held.load(Ordering::Relaxed) as f64);
     }

@@ -154,11 +154,13 @@ impl Queue {
         self.wait(&self.lock())
     }
 
+    #[expect(clippy::cast_precision_loss, reason = "counts of jobs are small")]
     fn wait(&self, state: &State) -> Duration {
         let ahead = (state.waiting.len() + state.running.len() + 1).saturating_sub(self.workers);
         Duration::from_secs_f64(ahead as f64 * state.mean_s / self.workers as f64)
     }
 
+    #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of jobs are small")]
     fn publish(&self, state: &State) {
         gauge!(QUEUE_DEPTH).set(state.waiting.len() as f64);
         gauge!(QUEUE_WAIT).set(self.wait(state).as_secs_f64());

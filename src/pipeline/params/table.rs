@@ -1,0 +1,189 @@
+//! The table of parameters: names, what values they take, what they do.
+
+use crate::structure::select::KIND_NAMES;
+use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
+use crate::surface::{Kernel, Preset, Proof};
+
+/// What values a parameter takes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Domain {
+    /// A number within bounds, both included, in a unit (empty: none).
+    Number {
+        /// Lowest value.
+        min: f64,
+        /// Highest value.
+        max: f64,
+        /// Unit, such as `Å`.
+        unit: &'static str,
+    },
+    /// A whole number of 32 bits.
+    Integer,
+    /// `true` or `false`.
+    Flag,
+    /// One of these words.
+    Choice(&'static [&'static str]),
+    /// Words of this set, separated by commas.
+    Set(&'static [&'static str]),
+    /// Free text.
+    Text {
+        /// What is expected, in words.
+        expected: &'static str,
+    },
+}
+
+impl Domain {
+    /// What is expected, in words.
+    #[must_use]
+    pub fn expected(&self) -> String {
+        match self {
+            Self::Number { min, max, unit: "" } => format!("a number from {min} to {max}"),
+            Self::Number { min, max, unit } => format!("a number from {min} to {max} {unit}"),
+            Self::Integer => "a whole number".to_owned(),
+            Self::Flag => "true or false".to_owned(),
+            Self::Choice(words) => format!("one of {}", words.join(", ")),
+            Self::Set(words) => format!("one or more of {}, separated by commas", words.join(", ")),
+            Self::Text { expected } => (*expected).to_owned(),
+        }
+    }
+}
+
+/// One parameter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Parameter {
+    /// Its name in queries and, with dashes for underscores, on the command line.
+    pub name: &'static str,
+    /// What values it takes.
+    pub domain: Domain,
+    /// The value that is used when it is absent, in words.
+    pub default: &'static str,
+    /// What it does, one sentence.
+    pub doc: &'static str,
+}
+
+const fn number(
+    name: &'static str,
+    [min, max]: [f64; 2],
+    unit: &'static str,
+    default: &'static str,
+    doc: &'static str,
+) -> Parameter {
+    Parameter { name, domain: Domain::Number { min, max, unit }, default, doc }
+}
+
+const KERNELS: &[&str] = &names(Kernel::ALL);
+const PRESETS: &[&str] = &preset_names(Preset::ALL);
+const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj"];
+const PROOFS: &[&str] = &[Proof::Checksum.name(), Proof::Exact.name()];
+
+const fn names(all: &[Kernel]) -> [&'static str; 3] {
+    [all[0].name(), all[1].name(), all[2].name()]
+}
+
+const fn preset_names(all: &[Preset]) -> [&'static str; 6] {
+    [all[0].name(), all[1].name(), all[2].name(), all[3].name(), all[4].name(), all[5].name()]
+}
+
+/// Every parameter, in documentation order. The bounds repeat those of [`SurfaceParams::new`]; a test says that
+/// the two agree.
+pub const TABLE: &[Parameter] = &[
+    Parameter {
+        name: "preset",
+        domain: Domain::Choice(PRESETS),
+        default: "default",
+        doc: "A named pair of smoothness and isovalue for the gaussian kernel.",
+    },
+    Parameter {
+        name: "kernel",
+        domain: Domain::Choice(KERNELS),
+        default: "gaussian",
+        doc: "The density that one atom contributes, as a function of distance.",
+    },
+    number("resolution", [MIN_RESOLUTION, MAX_RESOLUTION], "Å", "0.5", "Spacing of the grid."),
+    number(
+        "isovalue",
+        [1e-3, 1e6],
+        "",
+        "1, or the preset's",
+        "Level of the density that is the surface; at 1 an isolated atom's surface lies at its radius.",
+    ),
+    number(
+        "smoothness",
+        [0.1, 50.0],
+        "",
+        "1.25, or the preset's",
+        "How fast the gaussian kernel falls off: small is smooth, large hugs the atoms.",
+    ),
+    number("radius_scale", [0.1, 10.0], "", "1", "Van der Waals radii are multiplied by this first."),
+    number("radius_offset", [-5.0, 10.0], "Å", "0", "Then this is added to the radii."),
+    number(
+        "cutoff_tolerance",
+        [1e-6, 0.2],
+        "",
+        "0.01",
+        "Where the gaussian kernel is cut off, as a fraction of its value at the radius.",
+    ),
+    number(
+        "paper_a",
+        [1e-3, 1e6],
+        "",
+        "absent",
+        "Raw constant a of Dias, Bora and Gomes 2010 for every atom, radii unused (gaussian: decay in Å⁻², at most 100; soft-object: height, at least 0.01).",
+    ),
+    number(
+        "paper_b",
+        [1e-2, 1e6],
+        "",
+        "absent",
+        "Raw constant b of the same paper (gaussian: height; soft-object and inverse-square: radius of support in Å, 0.1 to 50).",
+    ),
+    number("paper_c", [1e-6, 1.0], "Å²", "absent", "Raw constant C of the same paper (inverse-square only)."),
+    Parameter {
+        name: "atom_ids",
+        domain: Domain::Flag,
+        default: "false",
+        doc: "Give every vertex the index of its nearest atom in the file.",
+    },
+    Parameter {
+        name: "model",
+        domain: Domain::Integer,
+        default: "the first of the file",
+        doc: "The model to take, by its number in the file.",
+    },
+    Parameter {
+        name: "chains",
+        domain: Domain::Text { expected: "chain names separated by commas" },
+        default: "all",
+        doc: "The chains to take, by the author's names.",
+    },
+    Parameter {
+        name: "select",
+        domain: Domain::Set(&KIND_NAMES),
+        default: "polymer",
+        doc: "Which atoms to take; hydrogens adds those of whatever else is taken.",
+    },
+    Parameter {
+        name: "altloc",
+        domain: Domain::Text { expected: "one character" },
+        default: "the best occupied of each residue",
+        doc: "The alternative location to take.",
+    },
+    Parameter {
+        name: "proof",
+        domain: Domain::Choice(PROOFS),
+        default: "checksum",
+        doc: "How closedness is proven: by a checksum over edges, or exactly, edge by edge and vertex by vertex.",
+    },
+    Parameter {
+        name: "check",
+        domain: Domain::Choice(&["strict"]),
+        default: "absent",
+        doc: "Refuse a file in which a second, strict reader finds errors.",
+    },
+    Parameter { name: "format", domain: Domain::Choice(FORMATS), default: "glb", doc: "The mesh file format." },
+    Parameter {
+        name: "report",
+        domain: Domain::Choice(&["json"]),
+        default: "absent",
+        doc: "Answer with the report in this form instead of the mesh.",
+    },
+];
