@@ -42,7 +42,9 @@ fn benches(c: &mut Criterion) {
         group.bench_function("read, all threads", |b| b.iter(|| read(black_box(&text), &limits).expect("atoms").len()));
         let structure = read(&text, &limits).expect("atoms");
         group.throughput(Throughput::Elements(structure.len() as u64));
-        group.bench_function("select", |b| b.iter(|| select(black_box(&structure), &Selection::default()).map(|s| s.atoms.len())));
+        group.bench_function("select", |b| {
+            b.iter(|| select(black_box(&structure), &Selection::default()).map(|s| s.atoms.len()))
+        });
         group.finish();
     }
 }

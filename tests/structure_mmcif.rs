@@ -83,7 +83,10 @@ fn quotes_end_before_blanks_only() {
     assert_eq!(name("datax_"), "datax_");
     assert_eq!(name("\n;two\nlines\n;"), "two\u{fffd}lines");
     let error = refusal(file(&ROW.replace("\"C1'\"", "'C1")));
-    assert!(error.starts_with("line 23, column 12: found `'C1 A LIG") && error.ends_with("expected a closing ' on the same line"));
+    assert!(
+        error.starts_with("line 23, column 12: found `'C1 A LIG")
+            && error.ends_with("expected a closing ' on the same line")
+    );
     let error = refusal(file(&ROW.replace("\"C1'\"", "\n;C1")));
     assert_eq!(error, "line 24, column 1: found a text field without end, expected a line that begins with ;");
 }
@@ -103,12 +106,17 @@ fn columns_and_categories_in_any_order() {
 #[test]
 fn author_items_come_first_and_dictionary_items_stand_in() {
     let text = |auth: &str| {
-        format!("data_x loop_ _atom_site.Cartn_x _atom_site.Cartn_y _atom_site.Cartn_z
+        format!(
+            "data_x loop_ _atom_site.Cartn_x _atom_site.Cartn_y _atom_site.Cartn_z
 _atom_site.label_atom_id _atom_site.auth_atom_id _atom_site.label_comp_id _atom_site.auth_comp_id
 _atom_site.label_asym_id _atom_site.auth_asym_id _atom_site.label_seq_id _atom_site.auth_seq_id
-1 2 3 N1 {auth} ALA {auth} A {auth} 7 {}", if auth == "X" { "8" } else { auth })
+1 2 3 N1 {auth} ALA {auth} A {auth} 7 {}",
+            if auth == "X" { "8" } else { auth }
+        )
     };
-    let names = |s: &Structure| (s.name.get(0).to_owned(), s.residue.get(0).to_owned(), s.chain.get(0).to_owned(), s.residue_number[0]);
+    let names = |s: &Structure| {
+        (s.name.get(0).to_owned(), s.residue.get(0).to_owned(), s.chain.get(0).to_owned(), s.residue_number[0])
+    };
     assert_eq!(names(&cif(text("X"))), ("X".into(), "X".into(), "X".into(), 8));
     for null in ["?", "."] {
         assert_eq!(names(&cif(text(null))), ("N1".into(), "ALA".into(), "A".into(), 7));
@@ -156,15 +164,27 @@ fn elements_are_read_or_guessed() {
 #[test]
 fn values_are_refused_by_place() {
     let bad = |from: &str, to: &str| refusal(file(&format!("{ROW}{}", ROW.replace(from, to))));
-    assert_eq!(bad("11.104", "nan"), "line 24, column 30: found `nan`, expected Cartn_x in Å, within ±100000");
-    assert_eq!(bad("11.104", "1e400"), "line 24, column 30: found `1e400`, expected Cartn_x in Å, within ±100000");
-    assert_eq!(bad("-6.134", "?"), "line 24, column 37: found `?`, expected Cartn_y in Å, within ±100000");
-    assert_eq!(bad("0.500 ", "-100000.5 "), "line 24, column 44: found `-100000.5`, expected Cartn_z in Å, within ±100000");
+    assert_eq!(bad("11.104", "nan"), "line 24, column 32: found `nan`, expected Cartn_x in Å, within ±100000");
+    assert_eq!(bad("11.104", "1e400"), "line 24, column 32: found `1e400`, expected Cartn_x in Å, within ±100000");
+    assert_eq!(bad("-6.134", "?"), "line 24, column 39: found `?`, expected Cartn_y in Å, within ±100000");
+    assert_eq!(
+        bad("0.500 ", "-100000.5 "),
+        "line 24, column 46: found `-100000.5`, expected Cartn_z in Å, within ±100000"
+    );
     assert_eq!(bad("HETATM", "ATOMS"), "line 24, column 1: found `ATOMS`, expected ATOM or HETATM");
-    assert_eq!(bad("0.50 ", "x "), "line 24, column 50: found `x`, expected an occupancy, ? or .");
-    assert_eq!(bad("-3 Bb", "1.5 Bb"), "line 24, column 61: found `1.5`, expected a residue number (a whole number), ? or .");
-    assert_eq!(bad(" A LIG", " AB LIG"), "line 24, column 18: found `AB`, expected an alternative location of one character, ? or .");
-    assert_eq!(bad("Bb 2", "Bb 99999999999"), "line 24, column 67: found `99999999999`, expected a model number (a whole number), ? or .");
+    assert_eq!(bad("0.50 ", "x "), "line 24, column 52: found `x`, expected an occupancy, ? or .");
+    assert_eq!(
+        bad("-3 Bb", "1.5 Bb"),
+        "line 24, column 63: found `1.5`, expected a residue number (a whole number), ? or ."
+    );
+    assert_eq!(
+        bad(" A LIG", " AB LIG"),
+        "line 24, column 18: found `AB`, expected an alternative location of one character, ? or ."
+    );
+    assert_eq!(
+        bad("Bb 2", "Bb 99999999999"),
+        "line 24, column 69: found `99999999999`, expected a model number (a whole number), ? or ."
+    );
     assert_eq!(
         refusal(file(&format!("{ROW}{}", ROW.replace(" Bb 2", "")))),
         "line 26, column 1: found the end of the file, expected value 16 of the 17 in a row of atom_site"
@@ -173,7 +193,10 @@ fn values_are_refused_by_place() {
         refusal(format!("{}loop_ _x.y 1", file(&ROW.replace(" Bb 2", "")))),
         "line 25, column 1: found `loop_`, expected value 16 of the 17 in a row of atom_site"
     );
-    assert_eq!(refusal("data_x\n1 2\n"), "line 2, column 1: found `1`, expected a data block, loop_, or a tag that begins with _");
+    assert_eq!(
+        refusal("data_x\n1 2\n"),
+        "line 2, column 1: found `1`, expected a data block, loop_, or a tag that begins with _"
+    );
     assert_eq!(refusal("data_x\n_a.b\n_a.c 1\n"), "line 3, column 1: found `_a.c`, expected a value of _a.b");
     assert_eq!(refusal("data_x\n_a.b"), "line 2, column 5: found the end of the file, expected a value of _a.b");
     assert_eq!(refusal("data_x\nloop_\n"), "line 3, column 1: found the end of the file, expected a tag after loop_");

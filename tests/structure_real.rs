@@ -59,7 +59,9 @@ fn files_without_atoms_are_refused_by_name() {
     }
     let limits = ReadLimits::default();
     match read(&bytes("2ins_header_only.pdb.gz"), &limits) {
-        Err(StructureError::NoAtoms { found }) => assert!(found.contains("HEADER") && found.contains("COMPND"), "{found}"),
+        Err(StructureError::NoAtoms { found }) => {
+            assert!(found.contains("HEADER") && found.contains("COMPND"), "{found}")
+        }
         other => panic!("{other:?}"),
     }
     match read(&bytes("1gbt.bcif.gz"), &limits) {
@@ -178,14 +180,18 @@ const DISAGREEMENTS: &[(&str, &str, usize, &str)] = &[
     ("md_1tw7_charmm.pdb.gz", "code", 17_178, "the same: no insertion code is a digit"),
     ("md_1tw7_charmm.pdb.gz", "residue", 47_175, "TIP3 is a name of four letters, gemmi cuts it to three"),
     ("md_1tw7_charmm.pdb.gz", "element", 8, "CLA in CLA is CHARMM's chloride, gemmi takes it for carbon"),
-    ("odd_a_structure.pdb.gz", "element", 1, "a misplaced CA of pyroglutamic acid is no calcium; only its columns say so"),
+    (
+        "odd_a_structure.pdb.gz",
+        "element",
+        1,
+        "a misplaced CA of pyroglutamic acid is no calcium; only its columns say so",
+    ),
     ("odd_occupancy.pdb.gz", "b", 1, "a B-factor that is left out is 0 here and 20 in gemmi"),
 ];
 
 /// The fields of an atom that are compared, by name, apart from its place.
-const FIELDS: [&str; 11] = [
-    "chain", "number", "code", "residue", "name", "altloc", "element", "occupancy", "b", "hetero", "selected",
-];
+const FIELDS: [&str; 11] =
+    ["chain", "number", "code", "residue", "name", "altloc", "element", "occupancy", "b", "hetero", "selected"];
 
 type Rows = Vec<([i64; 3], Vec<String>)>;
 
@@ -337,14 +343,20 @@ fn pdbtbx_agrees_where_it_is_right() {
                 let s = structure(&file);
                 let ours: usize = s.model.iter().filter(|&&m| m == s.model[0]).count();
                 let model = pdb.models().next().unwrap();
-                let mut theirs: Vec<_> = model.atoms().map(|a| (place(a.x(), a.y(), a.z()), a.element().map_or(0, |e| e.atomic_number()))).collect();
-                let mut mine: Vec<_> = (0..ours).map(|i| (place(s.x[i], s.y[i], s.z[i]), usize::from(s.element[i]))).collect();
+                let mut theirs: Vec<_> = model
+                    .atoms()
+                    .map(|a| (place(a.x(), a.y(), a.z()), a.element().map_or(0, |e| e.atomic_number())))
+                    .collect();
+                let mut mine: Vec<_> =
+                    (0..ours).map(|i| (place(s.x[i], s.y[i], s.z[i]), usize::from(s.element[i]))).collect();
                 theirs.sort_unstable();
                 mine.sort_unstable();
                 match (theirs.len() == mine.len(), theirs == mine) {
                     (_, true) => continue,
                     (false, _) => format!("{} atoms, ours {}", theirs.len(), mine.len()),
-                    (true, false) => format!("{} atoms differ", theirs.iter().zip(&mine).filter(|(a, b)| a != b).count()),
+                    (true, false) => {
+                        format!("{} atoms differ", theirs.iter().zip(&mine).filter(|(a, b)| a != b).count())
+                    }
                 }
             }
         };

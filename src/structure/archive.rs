@@ -170,7 +170,8 @@ fn open_inside(root: &Path, candidate: &Path) -> io::Result<Option<File>> {
         return Ok(None);
     }
     // Asked before it is opened: opening a pipe waits for its other end.
-    match std::fs::metadata(&real).and_then(|data| if data.is_file() { File::open(&real).map(Some) } else { Ok(None) }) {
+    match std::fs::metadata(&real).and_then(|data| if data.is_file() { File::open(&real).map(Some) } else { Ok(None) })
+    {
         Err(e) if is_absent(&e) => Ok(None),
         file => file,
     }

@@ -190,14 +190,18 @@ mod tests {
 
     #[test]
     fn words_tags_and_values() {
-        let kinds: Vec<Kind> = tokens("data_X\nLOOP_ _a.b save_f _c 1 save_ stop_ global_ datax loop_x").iter().map(|t| t.0).collect();
+        let kinds: Vec<Kind> =
+            tokens("data_X\nLOOP_ _a.b save_f _c 1 save_ stop_ global_ datax loop_x").iter().map(|t| t.0).collect();
         use Kind::*;
         assert_eq!(kinds, [Data, Loop, Tag, Save, Tag, Value, Save, Reserved, Reserved, Value, Value]);
     }
 
     #[test]
     fn quotes_and_text_fields() {
-        assert_eq!(values(r#"'a dog's life' "O5'" '' "a"b" ' # not a comment '"#), ["a dog's life", "O5'", "", "a\"b", " # not a comment "]);
+        assert_eq!(
+            values(r#"'a dog's life' "O5'" '' "a"b" ' # not a comment '"#),
+            ["a dog's life", "O5'", "", "a\"b", " # not a comment "]
+        );
         assert_eq!(values("a#b # a comment ' \n c"), ["a#b", "c"]);
         assert_eq!(values("\n;one\n two;\n;\n ;x y"), ["one\n two;", ";x", "y"]);
         assert_eq!(values("\r\n;one\r\ntwo\r\n; z"), ["one\r\ntwo", "z"]);

@@ -126,7 +126,11 @@ impl Contents {
     /// Models for a message.
     #[must_use]
     pub(super) fn model_list(&self) -> String {
-        format!("{} {}", plural(self.models.len(), "model"), list(self.models.iter().map(ToString::to_string), self.models.len()))
+        format!(
+            "{} {}",
+            plural(self.models.len(), "model"),
+            list(self.models.iter().map(ToString::to_string), self.models.len())
+        )
     }
 }
 

@@ -8,12 +8,13 @@ use super::residue;
 
 /// Symbols by atomic number, from 1.
 pub const SYMBOLS: [&str; 118] = [
-    "H", "He", "Li", "Be", "B", "C", "N", "O", "F", "Ne", "Na", "Mg", "Al", "Si", "P", "S", "Cl", "Ar", "K", "Ca", "Sc", "Ti", "V",
-    "Cr", "Mn", "Fe", "Co", "Ni", "Cu", "Zn", "Ga", "Ge", "As", "Se", "Br", "Kr", "Rb", "Sr", "Y", "Zr", "Nb", "Mo", "Tc", "Ru",
-    "Rh", "Pd", "Ag", "Cd", "In", "Sn", "Sb", "Te", "I", "Xe", "Cs", "Ba", "La", "Ce", "Pr", "Nd", "Pm", "Sm", "Eu", "Gd", "Tb",
-    "Dy", "Ho", "Er", "Tm", "Yb", "Lu", "Hf", "Ta", "W", "Re", "Os", "Ir", "Pt", "Au", "Hg", "Tl", "Pb", "Bi", "Po", "At", "Rn",
-    "Fr", "Ra", "Ac", "Th", "Pa", "U", "Np", "Pu", "Am", "Cm", "Bk", "Cf", "Es", "Fm", "Md", "No", "Lr", "Rf", "Db", "Sg", "Bh",
-    "Hs", "Mt", "Ds", "Rg", "Cn", "Nh", "Fl", "Mc", "Lv", "Ts", "Og",
+    "H", "He", "Li", "Be", "B", "C", "N", "O", "F", "Ne", "Na", "Mg", "Al", "Si", "P", "S", "Cl", "Ar", "K", "Ca",
+    "Sc", "Ti", "V", "Cr", "Mn", "Fe", "Co", "Ni", "Cu", "Zn", "Ga", "Ge", "As", "Se", "Br", "Kr", "Rb", "Sr", "Y",
+    "Zr", "Nb", "Mo", "Tc", "Ru", "Rh", "Pd", "Ag", "Cd", "In", "Sn", "Sb", "Te", "I", "Xe", "Cs", "Ba", "La", "Ce",
+    "Pr", "Nd", "Pm", "Sm", "Eu", "Gd", "Tb", "Dy", "Ho", "Er", "Tm", "Yb", "Lu", "Hf", "Ta", "W", "Re", "Os", "Ir",
+    "Pt", "Au", "Hg", "Tl", "Pb", "Bi", "Po", "At", "Rn", "Fr", "Ra", "Ac", "Th", "Pa", "U", "Np", "Pu", "Am", "Cm",
+    "Bk", "Cf", "Es", "Fm", "Md", "No", "Lr", "Rf", "Db", "Sg", "Bh", "Hs", "Mt", "Ds", "Rg", "Cn", "Nh", "Fl", "Mc",
+    "Lv", "Ts", "Og",
 ];
 
 /// Atomic numbers by letters: first letter (A is 1) times 32 plus the second (none is 0).
@@ -49,8 +50,8 @@ pub fn atomic_number(symbol: &[u8]) -> u8 {
 /// Two-letter elements that are believed from a name alone, as in `CL1`, `FE`, `BR12`: those whose letters are no carbon,
 /// nitrogen, oxygen, sulphur, phosphorus or hydrogen with a Greek remoteness letter behind it.
 const SURE: &[&[u8; 2]] = &[
-    b"CL", b"BR", b"FE", b"ZN", b"MG", b"MN", b"CU", b"NI", b"NA", b"LI", b"AL", b"SI", b"SE", b"AS", b"RU", b"RH", b"PT", b"AU",
-    b"AG", b"IR", b"MO", b"SR", b"RB", b"TI", b"ZR", b"GA", b"XE", b"KR", b"YB", b"GD", b"LA", b"TL",
+    b"CL", b"BR", b"FE", b"ZN", b"MG", b"MN", b"CU", b"NI", b"NA", b"LI", b"AL", b"SI", b"SE", b"AS", b"RU", b"RH",
+    b"PT", b"AU", b"AG", b"IR", b"MO", b"SR", b"RB", b"TI", b"ZR", b"GA", b"XE", b"KR", b"YB", b"GD", b"LA", b"TL",
 ];
 
 /// An atom name as a file gives it.

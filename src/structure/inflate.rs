@@ -152,7 +152,10 @@ mod tests {
         for (packed, encoding) in [(gz(&[7; 5000]), "gzip"), (zst(&[7; 5000]), "zstd")] {
             for cut in 4..packed.len() {
                 let error = inflate(&packed[..cut], 1 << 20).unwrap_err();
-                assert!(matches!(error, StructureError::Decompress { encoding: e, .. } if e == encoding), "{cut}: {error}");
+                assert!(
+                    matches!(error, StructureError::Decompress { encoding: e, .. } if e == encoding),
+                    "{cut}: {error}"
+                );
             }
         }
         assert!(inflate(&[gz(b"ab"), b"junk".to_vec()].concat(), 100).is_err());

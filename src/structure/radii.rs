@@ -117,9 +117,30 @@ mod tests {
     #[test]
     fn values_of_the_two_papers() {
         let cases = [
-            ("H", 1.10), ("C", 1.70), ("N", 1.55), ("O", 1.52), ("F", 1.47), ("Si", 2.10), ("P", 1.80), ("S", 1.80), ("Cl", 1.75),
-            ("Se", 1.90), ("Br", 1.83), ("I", 1.98), ("Na", 2.27), ("Mg", 1.73), ("K", 2.75), ("Ca", 2.31), ("Zn", 1.39),
-            ("Cu", 1.40), ("Ni", 1.63), ("Hg", 1.55), ("U", 1.86), ("Fe", FALLBACK), ("Mn", FALLBACK), ("Og", FALLBACK),
+            ("H", 1.10),
+            ("C", 1.70),
+            ("N", 1.55),
+            ("O", 1.52),
+            ("F", 1.47),
+            ("Si", 2.10),
+            ("P", 1.80),
+            ("S", 1.80),
+            ("Cl", 1.75),
+            ("Se", 1.90),
+            ("Br", 1.83),
+            ("I", 1.98),
+            ("Na", 2.27),
+            ("Mg", 1.73),
+            ("K", 2.75),
+            ("Ca", 2.31),
+            ("Zn", 1.39),
+            ("Cu", 1.40),
+            ("Ni", 1.63),
+            ("Hg", 1.55),
+            ("U", 1.86),
+            ("Fe", FALLBACK),
+            ("Mn", FALLBACK),
+            ("Og", FALLBACK),
         ];
         for (symbol, radius) in cases {
             assert_eq!(vdw_radius(atomic_number(symbol.as_bytes())).to_bits(), f32::to_bits(radius), "{symbol}");

@@ -3,33 +3,42 @@
 /// Amino acids, nucleotides and their common variants and modifications, whose atoms C*, N*, O*, H* are never metals.
 /// Names: the chemical component dictionary; AMBER, CHARMM and GROMOS for protonation states and old nucleic acids.
 const POLYMER: &[&str] = &[
-    "ALA", "ARG", "ASN", "ASP", "CYS", "GLN", "GLU", "GLY", "HIS", "ILE", "LEU", "LYS", "MET", "PHE", "PRO", "SER", "THR",
-    "TRP", "TYR", "VAL", "ASX", "GLX", "UNK", "XLE", "MSE", "SEC", "PYL", "HID", "HIE", "HIP", "HSD", "HSE", "HSP", "HISA",
-    "HISB", "HISD", "HISE", "HISH", "CYX", "CYM", "CYS2", "CYSH", "CSS", "ASH", "ASPH", "GLH", "GLUH", "LYN", "LYSH", "LSN",
-    "ARGN", "PCA", "SEP", "TPO", "PTR", "HYP", "CSO", "CSD", "CME", "CSX", "OCS", "KCX", "MLY", "M3L", "MLZ", "ALY", "CGU",
-    "DAL", "DAR", "DSG", "DAS", "DCY", "DGN", "DGL", "DHI", "DIL", "DLE", "DLY", "MED", "DPN", "DPR", "DSN", "DTH", "DTR",
-    "DTY", "DVA", "AIB", "NLE", "ORN", "ABA", "SAR", "ACE", "NME", "NMA", "NH2", "FOR", "A", "C", "G", "U", "T", "I", "N", "DA",
-    "DC", "DG", "DT", "DU", "DI", "DN", "RA", "RC", "RG", "RU", "A3", "A5", "C3", "C5", "G3", "G5", "U3", "U5", "DA3", "DA5",
-    "DC3", "DC5", "DG3", "DG5", "DT3", "DT5", "RA3", "RA5", "RC3", "RC5", "RG3", "RG5", "RU3", "RU5", "ADE", "CYT", "GUA",
-    "THY", "URA", "PSU", "5MU", "5MC", "1MA", "2MG", "7MG", "H2U", "OMC", "OMG", "OMU", "4SU", "M2G", "YYG", "+A", "+C", "+G",
-    "+U", "+T", "+I",
+    "ALA", "ARG", "ASN", "ASP", "CYS", "GLN", "GLU", "GLY", "HIS", "ILE", "LEU", "LYS", "MET", "PHE", "PRO", "SER",
+    "THR", "TRP", "TYR", "VAL", "ASX", "GLX", "UNK", "XLE", "MSE", "SEC", "PYL", "HID", "HIE", "HIP", "HSD", "HSE",
+    "HSP", "HISA", "HISB", "HISD", "HISE", "HISH", "CYX", "CYM", "CYS2", "CYSH", "CSS", "ASH", "ASPH", "GLH", "GLUH",
+    "LYN", "LYSH", "LSN", "ARGN", "PCA", "SEP", "TPO", "PTR", "HYP", "CSO", "CSD", "CME", "CSX", "OCS", "KCX", "MLY",
+    "M3L", "MLZ", "ALY", "CGU", "DAL", "DAR", "DSG", "DAS", "DCY", "DGN", "DGL", "DHI", "DIL", "DLE", "DLY", "MED",
+    "DPN", "DPR", "DSN", "DTH", "DTR", "DTY", "DVA", "AIB", "NLE", "ORN", "ABA", "SAR", "ACE", "NME", "NMA", "NH2",
+    "FOR", "A", "C", "G", "U", "T", "I", "N", "DA", "DC", "DG", "DT", "DU", "DI", "DN", "RA", "RC", "RG", "RU", "A3",
+    "A5", "C3", "C5", "G3", "G5", "U3", "U5", "DA3", "DA5", "DC3", "DC5", "DG3", "DG5", "DT3", "DT5", "RA3", "RA5",
+    "RC3", "RC5", "RG3", "RG5", "RU3", "RU5", "ADE", "CYT", "GUA", "THY", "URA", "PSU", "5MU", "5MC", "1MA", "2MG",
+    "7MG", "H2U", "OMC", "OMG", "OMU", "4SU", "M2G", "YYG", "+A", "+C", "+G", "+U", "+T", "+I",
 ];
 
 /// Water under the names of the component dictionary and of the simulation packages.
 const WATER: &[&str] = &[
-    "HOH", "WAT", "H2O", "DOD", "D2O", "TIP", "TIP3", "TIP4", "TIP5", "TIP2", "TIP3P", "TIP4P", "TIP5P", "TP3", "TP3M", "TP4", "TP5",
-    "T3P", "T4P", "T5P", "T3H", "SOL", "SPC", "SPCE", "OHH", "HHO", "WTR", "OPC", "OPC3",
+    "HOH", "WAT", "H2O", "DOD", "D2O", "TIP", "TIP3", "TIP4", "TIP5", "TIP2", "TIP3P", "TIP4P", "TIP5P", "TP3", "TP3M",
+    "TP4", "TP5", "T3P", "T4P", "T5P", "T3H", "SOL", "SPC", "SPCE", "OHH", "HHO", "WTR", "OPC", "OPC3",
 ];
 
 /// CHARMM's names of ions that do not begin with the element's symbol, or begin with that of another one.
-const IONS: &[(&str, u8)] =
-    &[("SOD", 11), ("POT", 19), ("CLA", 17), ("CAL", 20), ("CES", 55), ("LIT", 3), ("RUB", 37), ("CAD", 48), ("BAR", 56)];
+const IONS: &[(&str, u8)] = &[
+    ("SOD", 11),
+    ("POT", 19),
+    ("CLA", 17),
+    ("CAL", 20),
+    ("CES", 55),
+    ("LIT", 3),
+    ("RUB", 37),
+    ("CAD", 48),
+    ("BAR", 56),
+];
 
 /// Residue names of four letters whose first three are a name of their own; such a name next to a chain letter is no
 /// name of three letters next to a chain of two.
 const FOUR_LETTERS: &[&str] = &[
-    "TIP2", "TIP3", "TIP4", "TIP5", "SPCE", "HISA", "HISB", "HISD", "HISE", "HISH", "CYS2", "CYSH", "ASPH", "GLUH", "LYSH",
-    "ARGN", "ALAD",
+    "TIP2", "TIP3", "TIP4", "TIP5", "SPCE", "HISA", "HISB", "HISD", "HISE", "HISH", "CYS2", "CYSH", "ASPH", "GLUH",
+    "LYSH", "ARGN", "ALAD",
 ];
 
 pub(super) fn is_polymer(residue: &str) -> bool {
@@ -45,8 +54,12 @@ pub(super) fn charmm_ion(residue: &str) -> Option<u8> {
     IONS.iter().find(|(name, _)| *name == residue).map(|&(_, z)| z)
 }
 
-/// Whether four columns hold a residue name of three letters and the first of two letters of a chain.
-pub(super) fn splits_from_chain(four: &str) -> bool {
-    let Some((three, _)) = four.split_at_checked(3) else { return false };
+/// Whether columns 18-21 hold a residue name of three columns and the first letter of a chain of two, and not a name of
+/// four letters: names of less than three letters leave a blank, and known names are not longer than they are.
+pub(super) fn splits_from_chain(four: [u8; 4]) -> bool {
+    if four[..3].contains(&b' ') {
+        return true;
+    }
+    let (Ok(four), Ok(three)) = (std::str::from_utf8(&four), std::str::from_utf8(&four[..3])) else { return false };
     !FOUR_LETTERS.contains(&four) && (is_polymer(three) || is_water(three))
 }

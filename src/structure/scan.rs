@@ -36,7 +36,10 @@ impl Edges {
 }
 
 /// Writes the edges of `window` to `out`, which is a little longer, and returns how many there are: an even number.
-#[multiversion::multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+bmi1+bmi2+popcnt+lzcnt", "x86_64+avx2+bmi1+bmi2+popcnt+lzcnt"))]
+#[multiversion::multiversion(targets(
+    "x86_64+avx512f+avx512bw+avx512dq+avx512vl+bmi1+bmi2+popcnt+lzcnt",
+    "x86_64+avx2+bmi1+bmi2+popcnt+lzcnt"
+))]
 fn edges(window: &[u8], out: &mut [u32]) -> usize {
     let mut len = 0;
     let mut open = 0;

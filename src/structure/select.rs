@@ -80,7 +80,8 @@ impl Selection {
     #[must_use]
     pub fn kinds(&self) -> String {
         let flags = [self.polymer, self.ligands, self.waters, self.hydrogens];
-        let names: Vec<&str> = KIND_NAMES.iter().zip(flags).filter(|(_, taken)| *taken).map(|(name, _)| *name).collect();
+        let names: Vec<&str> =
+            KIND_NAMES.iter().zip(flags).filter(|(_, taken)| *taken).map(|(name, _)| *name).collect();
         names.join(",")
     }
 
@@ -169,7 +170,8 @@ fn alternative(structure: &Structure, selection: &Selection, model: i32) -> Resu
     match u8::try_from(asked) {
         Ok(letter) if letter != 0 && present[usize::from(letter)] => Ok(Some(letter)),
         _ => {
-            let letters: Vec<String> = (1..=u8::MAX).filter(|&b| present[usize::from(b)]).map(|b| char::from(b).into()).collect();
+            let letters: Vec<String> =
+                (1..=u8::MAX).filter(|&b| present[usize::from(b)]).map(|b| char::from(b).into()).collect();
             let n = letters.len();
             let available = if n == 0 { "none".to_owned() } else { list(letters, n) };
             Err(StructureError::NotFound { what: "alternative location", asked: format!("`{asked}`"), available })

@@ -6,9 +6,10 @@ use super::text::quote;
 
 /// Records that begin lines of PDB files. `END` and `TER` are common words: they do not decide.
 const PDB_RECORDS: [&[u8]; 33] = [
-    b"ATOM", b"HETATM", b"HEADER", b"TITLE", b"REMARK", b"COMPND", b"SOURCE", b"CRYST1", b"MODEL", b"ENDMDL", b"OBSLTE", b"SPLIT",
-    b"CAVEAT", b"KEYWDS", b"EXPDTA", b"NUMMDL", b"MDLTYP", b"AUTHOR", b"REVDAT", b"SPRSDE", b"JRNL", b"DBREF", b"SEQRES", b"HELIX",
-    b"SHEET", b"SSBOND", b"LINK", b"ORIGX1", b"SCALE1", b"MTRIX1", b"ANISOU", b"CONECT", b"MASTER",
+    b"ATOM", b"HETATM", b"HEADER", b"TITLE", b"REMARK", b"COMPND", b"SOURCE", b"CRYST1", b"MODEL", b"ENDMDL",
+    b"OBSLTE", b"SPLIT", b"CAVEAT", b"KEYWDS", b"EXPDTA", b"NUMMDL", b"MDLTYP", b"AUTHOR", b"REVDAT", b"SPRSDE",
+    b"JRNL", b"DBREF", b"SEQRES", b"HELIX", b"SHEET", b"SSBOND", b"LINK", b"ORIGX1", b"SCALE1", b"MTRIX1", b"ANISOU",
+    b"CONECT", b"MASTER",
 ];
 
 /// Only so much is looked at before a text is called unknown.
@@ -128,7 +129,14 @@ mod tests {
 
     #[test]
     fn formats_are_told_by_content() {
-        for pdb in ["\n\nHEADER x", "ATOM      1", "REMARK\r\n", "junk\nmore junk\rHETATM    1", "MODEL        1", "CRYST1   1"] {
+        for pdb in [
+            "\n\nHEADER x",
+            "ATOM      1",
+            "REMARK\r\n",
+            "junk\nmore junk\rHETATM    1",
+            "MODEL        1",
+            "CRYST1   1",
+        ] {
             assert_eq!(sniff(pdb.as_bytes()).unwrap(), SourceFormat::Pdb, "{pdb}");
         }
         for cif in ["data_1ABC\n", "# comment\n#\n\n  DATA_x", "loop_\n_atom_site.id", "_entry.id X"] {

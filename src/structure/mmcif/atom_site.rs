@@ -200,7 +200,12 @@ fn coordinate<const QUOTES: bool>(row: &Row<'_, QUOTES>, layout: &Layout, axis: 
 }
 
 #[inline]
-fn optional<const QUOTES: bool>(row: &Row<'_, QUOTES>, column: usize, default: f32, what: &str) -> Result<f32, Box<Fault>> {
+fn optional<const QUOTES: bool>(
+    row: &Row<'_, QUOTES>,
+    column: usize,
+    default: f32,
+    what: &str,
+) -> Result<f32, Box<Fault>> {
     let Some((start, end)) = row.value(column) else { return Ok(default) };
     match real(row.text, start, end) {
         Some(value) => Ok(value as f32),

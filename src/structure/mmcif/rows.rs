@@ -145,13 +145,17 @@ impl<'a> Rows<'a> {
             rest = others;
         }
         let failed = AtomicBool::new(false);
-        parts.par_iter_mut().for_each_init(|| Scanner::new(text), |scanner, (stretch, slices, site)| {
-            let done = scanner.rows(site, slices, stretch.from, stretch.to, &failed);
-            let whole = done.is_ok_and(|done| text[done..stretch.to].iter().all(|&b| b <= b' ')) && slices.is_full();
-            if !whole {
-                failed.store(true, Ordering::Relaxed);
-            }
-        });
+        parts.par_iter_mut().for_each_init(
+            || Scanner::new(text),
+            |scanner, (stretch, slices, site)| {
+                let done = scanner.rows(site, slices, stretch.from, stretch.to, &failed);
+                let whole =
+                    done.is_ok_and(|done| text[done..stretch.to].iter().all(|&b| b <= b' ')) && slices.is_full();
+                if !whole {
+                    failed.store(true, Ordering::Relaxed);
+                }
+            },
+        );
         if failed.into_inner() {
             return None;
         }
