@@ -69,7 +69,7 @@ fn serial_numbers_may_overflow() {
     {
         assert_eq!(pdb(CA.replace("ATOM      2", serial)).name.get(0), "CA", "{serial}");
     }
-    assert!(pdb(CA.replace("ATOM      2", "HETATM100000")[..55].to_owned() + "\n").hetero[0]);
+    assert!(pdb(CA.replace("ATOM      2 ", "HETATM100000")[..54].to_owned() + "\n").hetero[0]);
 }
 
 #[test]
@@ -105,6 +105,9 @@ fn four_letter_residues_and_two_letter_chains() {
         (" DCAB", "DC", "AB"),
         (" DC B", "DC", "B"),
         ("  C B", "C", "B"),
+        ("  CL5", "C", "L5"),
+        ("  CA ", "CA", ""),
+        ("NALAB", "NALA", "B"),
         ("CYSH ", "CYSH", ""),
         ("     ", "", ""),
     ];
@@ -143,7 +146,7 @@ fn blank_element_columns_are_guessed_from_name_and_residue() {
         assert_eq!(element(name, residue), z, "{name} in {residue}");
     }
     // A file whose names are all left-justified says nothing by alignment: N and C in the first column give it away.
-    let lines = ["N   ALA", "CA  ALA", "C   LIG", "CD  LIG", "CD   CD"]
+    let lines = ["N    ALA", "CA   ALA", "C    LIG", "CD   LIG", "CD    CD"]
         .map(|n| format!("ATOM      1 {n} A   1      11.104   6.134  -6.504\n"));
     assert_eq!(symbols(&pdb(lines.concat())), [7, 6, 6, 6, 48]);
 }
@@ -193,8 +196,8 @@ fn tabs_are_eight_columns() {
 
 #[test]
 fn latin_1_reads() {
-    let text = [b"REMARK   1 AUTHOR: M\xdcLLER\n", CA.replace("CA A", "C\u{1} A").as_bytes()].concat();
-    assert_eq!(pdb(&text).name.get(0), "C\u{fffd}");
+    let text = [b"REMARK   1 AUTHOR: M\xdcLLER\n", CA.replace("CA A", "C\u{1}BA").as_bytes()].concat();
+    assert_eq!(pdb(&text).name.get(0), "C\u{fffd}B");
     let mut line = CA.as_bytes().to_vec();
     line[14] = 0xe9;
     assert_eq!(pdb(&line).name.get(0), "Cé");
@@ -213,7 +216,7 @@ fn numbers_are_refused_by_place() {
     assert!(bad("  -6.134", "  -6.13x").starts_with("line 2, column 39: found `  -6.13x`, expected the y"));
     assert!(bad("   0.500", " 0 . 500").starts_with("line 2, column 47: found ` 0 . 500`, expected the z"));
     assert!(
-        bad("  0.50", "  x.50")
+        bad("  0.50 ", "  x.50 ")
             .starts_with("line 2, column 55: found `  x.50`, expected an occupancy in columns 55 to 60")
     );
     assert!(

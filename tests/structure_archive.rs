@@ -1,0 +1,153 @@
+//! A folder of entries, and what must not come out of it.
+
+use std::fs;
+use std::path::Path;
+
+use molmesh::structure::{Archive, ArchiveError, EntryId};
+
+fn id(text: &str) -> EntryId {
+    text.parse().unwrap()
+}
+
+fn put(root: &Path, file: &str) {
+    let path = root.join(file);
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    fs::write(path, file).unwrap();
+}
+
+#[test]
+fn ids_are_validated_and_lowered() {
+    for (text, canonical) in [
+        ("4pti", "4pti"),
+        ("4PTI", "4pti"),
+        ("1000", "1000"),
+        ("pdb_00001abc", "1abc"),
+        ("PDB_00001ABC", "1abc"),
+        ("pdb_12345678", "pdb_12345678"),
+        ("pdb_0000abcd", "pdb_0000abcd"),
+        ("pdb_10001abc", "pdb_10001abc"),
+    ] {
+        assert_eq!(id(text).as_str(), canonical);
+    }
+    let long = "1".repeat(1 << 20);
+    for bad in [
+        "",
+        "abc",
+        "abcd",
+        "1ab",
+        "1abcd",
+        "1ab/",
+        "1ab.",
+        "../a",
+        "1a\0b",
+        "1äb",
+        "pdb_1234567",
+        "pdb_123456789",
+        "pdb_1234567/",
+        "pdb-12345678",
+        "1abc ",
+        " 1abc",
+        "1abc\n",
+        "%31abc",
+        "١abc",
+        &long,
+    ] {
+        match bad.parse::<EntryId>() {
+            Err(e @ ArchiveError::BadId { .. }) => assert!(e.to_string().len() < 250),
+            other => panic!("{bad:?}: {other:?}"),
+        }
+    }
+}
+
+#[test]
+fn every_layout_is_found_mmcif_first() {
+    let files = [
+        "1abc.cif",
+        "ab/1abc.cif",
+        "divided/mmCIF/ab/1abc.cif",
+        "1abc.cif.gz",
+        "ab/1abc.cif.gz",
+        "divided/mmCIF/ab/1abc.cif.gz",
+        "1abc.pdb",
+        "1abc.pdb.gz",
+        "ab/pdb1abc.ent.gz",
+        "pdb1abc.ent",
+        "divided/pdb/ab/pdb1abc.ent.gz",
+        "divided/pdb/ab/pdb1abc.ent",
+        "ab/pdb_00001abc.cif.gz",
+    ];
+    for file in files {
+        let dir = tempfile::tempdir().unwrap();
+        put(dir.path(), file);
+        put(dir.path(), "divided/mmCIF/ab/2abc.cif.gz");
+        let archive = Archive::new(dir.path());
+        assert_eq!(archive.fetch(&id("1ABC")).unwrap(), file.as_bytes());
+        assert_eq!(archive.fetch(&id("pdb_00001abc")).unwrap(), file.as_bytes());
+    }
+    let dir = tempfile::tempdir().unwrap();
+    for file in ["1abc.pdb", "pdb1abc.ent.gz", "ab/1abc.cif.gz"] {
+        put(dir.path(), file);
+    }
+    assert_eq!(Archive::new(dir.path()).fetch(&id("1abc")).unwrap(), b"ab/1abc.cif.gz");
+    put(dir.path(), "divided/mmCIF/67/pdb_12345678.cif.gz");
+    assert_eq!(Archive::new(dir.path()).fetch(&id("pdb_12345678")).unwrap(), b"divided/mmCIF/67/pdb_12345678.cif.gz");
+}
+
+#[test]
+fn what_is_not_there_is_not_found_by_id() {
+    let dir = tempfile::tempdir().unwrap();
+    fs::create_dir(dir.path().join("1abc.cif")).unwrap();
+    fs::write(dir.path().join("ab"), "a file where a folder would be").unwrap();
+    let error = Archive::new(dir.path()).fetch(&id("1abc")).unwrap_err();
+    assert!(matches!(&error, ArchiveError::NotFound { id } if id.as_str() == "1abc"));
+    assert_eq!(error.to_string(), "entry 1abc is not in the archive");
+    let gone = Archive::new(dir.path().join("missing")).fetch(&id("1abc")).unwrap_err();
+    assert!(matches!(gone, ArchiveError::Io(_)));
+    assert_eq!(gone.to_string(), "the archive cannot be read");
+}
+
+#[test]
+fn files_are_limited_in_size() {
+    let dir = tempfile::tempdir().unwrap();
+    put(dir.path(), "1abc.cif");
+    let archive = Archive::new(dir.path());
+    assert_eq!(archive.clone().with_max_bytes(8).fetch(&id("1abc")).unwrap(), b"1abc.cif");
+    let error = archive.with_max_bytes(7).fetch(&id("1abc")).unwrap_err();
+    assert_eq!(error.to_string(), "entry 1abc has 8 bytes, the limit is 7");
+}
+
+#[cfg(unix)]
+#[test]
+fn links_may_not_lead_out() {
+    use std::os::unix::fs::symlink;
+    let outside = tempfile::tempdir().unwrap();
+    put(outside.path(), "secret");
+    let dir = tempfile::tempdir().unwrap();
+    put(dir.path(), "data/5abc");
+    symlink(outside.path().join("secret"), dir.path().join("1abc.cif")).unwrap();
+    symlink(outside.path(), dir.path().join("bc")).unwrap();
+    put(outside.path(), "2bcd.cif");
+    symlink("missing", dir.path().join("3abc.cif")).unwrap();
+    symlink("data/5abc", dir.path().join("5abc.cif")).unwrap();
+    let archive = Archive::new(dir.path());
+    for entry in ["1abc", "2bcd", "3abc"] {
+        assert!(matches!(archive.fetch(&id(entry)), Err(ArchiveError::NotFound { .. })), "{entry}");
+    }
+    assert_eq!(archive.fetch(&id("5abc")).unwrap(), b"data/5abc", "a link inside the folder");
+    // The folder itself may be a link.
+    let link = outside.path().join("link");
+    symlink(dir.path(), &link).unwrap();
+    assert_eq!(Archive::new(link).fetch(&id("5abc")).unwrap(), b"data/5abc");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_pipe_is_no_file() {
+    let dir = tempfile::tempdir().unwrap();
+    let made = std::process::Command::new("mkfifo").arg(dir.path().join("1abc.cif")).status();
+    if !made.is_ok_and(|s| s.success()) {
+        eprintln!("SKIPPED: mkfifo does not work here");
+        return;
+    }
+    assert!(matches!(Archive::new(dir.path()).fetch(&id("1abc")), Err(ArchiveError::NotFound { .. })));
+}
