@@ -20,6 +20,9 @@ use crate::telemetry::{self, TelemetryError};
 /// How often the recorder tidies up its histograms.
 const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
 
+/// Time for a job to notice that it was cancelled.
+const CANCELLING: std::time::Duration = std::time::Duration::from_secs(1);
+
 /// Why the server cannot start.
 #[derive(Debug, Error)]
 pub enum ServeError {
@@ -129,13 +132,15 @@ impl Server {
         self.app.readiness.set(Ready::ShuttingDown);
         let deadline = Instant::now() + self.app.config.server.drain_timeout();
         stop.send_replace(true);
-        let (jobs, requests) = tokio::join!(self.app.pool.drain(deadline), serving);
+        // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
+        let requests = serving.await.unwrap_or(false);
+        let jobs = self.app.pool.drain(deadline.max(Instant::now() + CANCELLING)).await;
         upkeep.abort();
         warming.abort();
         if let Some(metrics) = metrics {
             metrics.abort();
         }
-        let drained = jobs && requests.unwrap_or(false);
+        let drained = jobs && requests;
         tracing::info!(drained, "stopped");
         Ok(drained)
     }
