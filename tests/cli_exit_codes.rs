@@ -1,6 +1,5 @@
 //! Every exit code that the help promises, the line that comes with it, and that a failure leaves no file.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
 
 mod cli_support;
 
@@ -123,8 +122,8 @@ fn five_is_a_limit_and_says_the_numbers() {
 fn the_suggested_resolution_fits() {
     let folder = Folder::new();
     let input = folder.file("in.pdb", rod());
-    let limit = ["--max-samples", "2000"];
-    let done = mesh(&input, &folder.path("out.glb"), &limit);
+    let limit = ["--max-samples", "50000"];
+    let done = mesh(&input, &folder.path("out.glb"), &[limit[0], limit[1], "--resolution", "0.1"]);
     assert_code(&done, 5);
     let said = stderr(&done);
     let suggested = said.split("--resolution ").nth(1).unwrap().split(',').next().unwrap();
@@ -191,5 +190,5 @@ fn one_is_a_service_that_does_not_answer() {
     drop(listener);
     assert_code(&run(["healthcheck", "--url", &url, "--timeout", "1"]), 1);
     assert_code(&run(["healthcheck", "--url", "ftp://x"]), 2);
-    assert_code(&run(["healthcheck", "--timeout", "-1"]), 2);
+    assert_code(&run(["healthcheck", "--timeout=-1"]), 2);
 }

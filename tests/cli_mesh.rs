@@ -1,6 +1,6 @@
 //! `molmesh mesh` where it succeeds: formats, stdin and stdout, reports, where files go.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
+#![expect(clippy::panic, reason = "tests say what they expect by panicking")]
 
 mod cli_support;
 

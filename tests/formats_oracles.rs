@@ -190,8 +190,8 @@ type Fault = (&'static str, fn(&mut Mesh), fn(&tools::TrimeshReport) -> bool);
 
 const FAULTS: [Fault; 9] = [
     ("flipped triangle", |m| m.triangles[7].swap(0, 1), |r| !r.winding_consistent && !r.is_volume),
-    ("missing triangle", |m| m.triangles.truncate(m.triangles.len() - 1), |r| !r.watertight && r.bad_edges == 3),
-    ("triangle twice", |m| m.triangles.push(m.triangles[7]), |r| r.duplicate_faces == 1 && r.bad_edges == 3),
+    ("missing triangle", |m| drop(m.triangles.edit().pop()), |r| !r.watertight && r.bad_edges == 3),
+    ("triangle twice", |m| m.triangles.edit().extend_from_within(7..8), |r| r.duplicate_faces == 1 && r.bad_edges == 3),
     ("pinched triangle", |m| m.triangles[7][1] = m.triangles[7][0], |r| r.degenerate_faces == 1 && !r.watertight),
     ("inside out", |m| m.triangles.iter_mut().for_each(|t| t.swap(0, 1)), |r| r.volume < 0.0 && !r.is_volume),
     ("loose vertex", |m| *m = with_loose_vertex(m), |r| r.unused_vertices == 1 && r.euler == 2),
@@ -201,10 +201,9 @@ const FAULTS: [Fault; 9] = [
 ];
 
 fn with_loose_vertex(mesh: &Mesh) -> Mesh {
-    let lone = Mesh { triangles: Vec::new(), ..triangle() };
-    let mut mesh = union(mesh, &lone);
-    mesh.positions.truncate(mesh.positions.len() - 2);
-    mesh.normals.truncate(mesh.normals.len() - 2);
+    let mut mesh = mesh.clone();
+    mesh.positions.edit().push([0.5; 3]);
+    mesh.normals.edit().push([0.0, 0.0, 1.0]);
     mesh
 }
 

@@ -68,10 +68,10 @@ fn assert_gltf(name: &str, mesh: &Mesh, json: &Value, bin: &[u8]) {
     let nothing = mesh.triangles.is_empty();
     let expected = Contents {
         translation: mesh.centre,
-        positions: mesh.positions.clone(),
-        normals: mesh.normals.clone(),
-        triangles: mesh.triangles.clone(),
-        atoms: mesh.atom_ids.clone().filter(|_| !nothing),
+        positions: mesh.positions.to_vec(),
+        normals: mesh.normals.to_vec(),
+        triangles: mesh.triangles.to_vec(),
+        atoms: mesh.atom_ids.as_deref().map(<[_]>::to_vec).filter(|_| !nothing),
         colors: found.colors.clone(),
     };
     assert!(found == expected, "{name}");
@@ -138,10 +138,10 @@ fn ply_gives_every_column_back() {
         let expected = Contents {
             translation: [0.0; 3],
             positions: absolute(&mesh),
-            normals: mesh.normals.clone(),
-            triangles: mesh.triangles.clone(),
-            atoms: mesh.atom_ids.clone(),
-            colors: mesh.colors.clone(),
+            normals: mesh.normals.to_vec(),
+            triangles: mesh.triangles.to_vec(),
+            atoms: mesh.atom_ids.as_deref().map(<[_]>::to_vec),
+            colors: mesh.colors.as_deref().map(<[_]>::to_vec),
         };
         assert!(read_ply(&bytes) == expected, "{name}");
         let (header, _) = ply_header(&bytes);
@@ -280,10 +280,10 @@ fn broken_meshes_are_refused_before_the_first_byte() {
         mesh
     };
     let cases: [(&str, Mesh); 9] = [
-        ("20 positions but 19 normals", broken(|m| m.normals.truncate(19))),
-        ("20 positions but 0 normals", broken(|m| m.normals.clear())),
-        ("20 positions but 21 atom_ids", broken(|m| m.atom_ids.as_mut().unwrap().push(3))),
-        ("20 positions but 1 colors", broken(|m| m.colors = Some(vec![[0; 4]]))),
+        ("20 positions but 19 normals", broken(|m| m.normals.edit().truncate(19))),
+        ("20 positions but 0 normals", broken(|m| m.normals.edit().clear())),
+        ("20 positions but 21 atom_ids", broken(|m| m.atom_ids.as_mut().unwrap().edit().push(3))),
+        ("20 positions but 1 colors", broken(|m| m.colors = Some(vec![[0; 4]].into()))),
         ("triangle 7 names vertex 20, but the mesh has 20", broken(|m| m.triangles[7][1] = 20)),
         ("names vertex 4294967295", broken(|m| m.triangles[0][0] = u32::MAX)),
         ("position 3 holds NaN", broken(|m| m.positions[3][2] = f32::NAN)),
@@ -345,5 +345,43 @@ proptest! {
         prop_assert_eq!(&read_obj(&encode(Format::Obj, &mesh, &meta)).positions, &mesh.positions);
         let stl = encode(Format::Stl, &mesh, &meta);
         prop_assert_eq!((stl.len(), u32_at(&stl, 80), stl[..80].is_ascii()), (134, 1, true));
+    }
+}
+
+#[test]
+fn trusted_meshes_give_the_same_bytes() {
+    for (name, mesh) in cases() {
+        for format in Format::ALL {
+            let mut bytes = Vec::new();
+            Encoder::trusting(format, &mesh, &meta()).unwrap().write(&mut bytes).unwrap();
+            assert!(bytes == encode(format, &mesh, &meta()), "{name} as {format}");
+        }
+    }
+}
+
+#[test]
+fn trust_in_a_broken_mesh_never_panics() {
+    for n in [4, 300] {
+        let mut far_index = torus(n, 300);
+        far_index.triangles[1][1] = u32::MAX;
+        let mut long_normal = torus(n, 300);
+        long_normal.normals[1] = [f32::NAN, f32::MAX, f32::INFINITY];
+        let mut not_finite = torus(n, 300);
+        not_finite.positions[1][2] = f32::NAN;
+        let mut short = torus(n, 300);
+        short.normals.pop();
+        for format in Format::ALL {
+            let refused = |mesh: &Mesh| {
+                let encoder = Encoder::trusting(format, mesh, &meta());
+                if let Ok(encoder) = &encoder {
+                    encoder.write(&mut io::sink()).unwrap();
+                }
+                encoder.is_err()
+            };
+            let narrow = matches!(format, Format::Glb | Format::Gltf) && n == 4;
+            assert_eq!(refused(&far_index), narrow || format == Format::Stl, "{format}");
+            assert_eq!(refused(&long_normal), format == Format::Obj, "{format}");
+            assert!(refused(&not_finite) && refused(&short), "{format}");
+        }
     }
 }

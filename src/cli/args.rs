@@ -12,7 +12,7 @@ const MESH_EXAMPLES: &str = "\
 Examples:
   molmesh mesh 4pti.pdb -o 4pti.glb
   molmesh mesh 1gbt.cif.gz -o - --format ply --resolution 0.3 > 1gbt.ply
-  curl -s http://127.0.0.1:8080/v1/samples/4pti.pdb | molmesh mesh - -o 4pti.stl --report json";
+  curl -s http://127.0.0.1:8080/sample.pdb | molmesh mesh - -o 4pti.stl --report json";
 
 /// Molecules in, proven surface meshes out.
 #[derive(Debug, Parser)]
@@ -95,6 +95,12 @@ pub(crate) struct MeshArgs {
     /// No summary and no progress bar
     #[arg(short, long)]
     pub(crate) quiet: bool,
+    /// Refuse a file in which a second, strict reader finds errors, and report what else it finds
+    #[arg(long)]
+    pub(crate) check: bool,
+    /// How the mesh is proven closed: checksum (fast) or exact (edge by edge) [default: checksum]
+    #[arg(long, value_name = "PROOF")]
+    pub(crate) proof: Option<String>,
     #[command(flatten)]
     pub(crate) surface: SurfaceArgs,
     #[command(flatten)]
@@ -146,7 +152,6 @@ pub(crate) struct SurfaceArgs {
 }
 
 /// Which atoms.
-#[expect(clippy::struct_excessive_bools, reason = "flags are what a command line has")]
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
 pub(crate) struct SelectionArgs {
@@ -171,9 +176,6 @@ pub(crate) struct SelectionArgs {
     /// One alternative location instead of the best occupied of each residue
     #[arg(long, value_name = "X")]
     pub(crate) altloc: Option<String>,
-    /// Refuse a structure that a strict second reader finds fault with
-    #[arg(long)]
-    pub(crate) check: bool,
 }
 
 /// What is too much.

@@ -40,6 +40,11 @@ pub(crate) fn pick(asked: BackendName, threads: Option<usize>) -> Result<Picked,
     })
 }
 
+/// A backend's name and what it runs on.
+pub(crate) fn describe(backend: &dyn Backend) -> String {
+    format!("{}: {}", backend.name(), backend.describe())
+}
+
 /// Every backend and its state.
 pub(crate) fn survey() -> Vec<Candidate> {
     vec![

@@ -1,1 +1,75 @@
-//! The banner.
+//! What a service says when it starts: where it is, how to try it, what it runs on and why not on something else.
+
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
+
+use super::backend::Candidate;
+use super::page::Page;
+use super::style::Style;
+
+/// What the banner knows of the machine.
+pub(crate) struct Facts {
+    /// The backend that runs, and what it runs on.
+    pub(crate) device: String,
+    /// Why it was taken.
+    pub(crate) reason: String,
+    /// Every backend and its state.
+    pub(crate) others: Vec<Candidate>,
+}
+
+/// The banner of a service that listens on `addr`.
+pub(crate) fn text(addr: SocketAddr, metrics: Option<SocketAddr>, facts: &Facts, style: Style) -> String {
+    let base = format!("http://{}", reachable(addr));
+    let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
+    page.row("viewer", &style.cyan(&format!("{base}/")));
+    page.row("API", &style.cyan(&format!("{base}/v1/capabilities")));
+    if let Some(metrics) = metrics {
+        page.row("metrics", &style.cyan(&format!("http://{}/metrics", reachable(metrics))));
+    }
+    page.row("device", &format!("{} ({})", facts.device, facts.reason));
+    for Candidate { name, state } in &facts.others {
+        if let Err(why) = state {
+            page.row("", &style.dim(&format!("not {name}: {why}")));
+        }
+    }
+    page.row("try", &format!("curl -sS {base}/sample.pdb | curl -sS --data-binary @- {base}/v1/meshes -o 4pti.glb"));
+    page.finish()
+}
+
+/// An address that works as pasted: the unspecified one is for listening, not for asking.
+fn reachable(addr: SocketAddr) -> SocketAddr {
+    let ip = match addr.ip() {
+        IpAddr::V4(ip) if ip.is_unspecified() => IpAddr::V4(Ipv4Addr::LOCALHOST),
+        IpAddr::V6(ip) if ip.is_unspecified() => IpAddr::V6(Ipv6Addr::LOCALHOST),
+        ip => ip,
+    };
+    SocketAddr::new(ip, addr.port())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn it_says_where_and_why() {
+        let facts = Facts {
+            device: "cpu: 2 threads".into(),
+            reason: "auto".into(),
+            others: vec![
+                Candidate { name: "cpu", state: Ok("2 threads".into()) },
+                Candidate { name: "gpu", state: Err("none found".into()) },
+            ],
+        };
+        let text = text("0.0.0.0:81".parse().unwrap(), Some("[::]:82".parse().unwrap()), &facts, Style::PLAIN);
+        for part in [
+            "http://127.0.0.1:81/\n",
+            "http://127.0.0.1:81/v1/capabilities",
+            "http://[::1]:82/metrics",
+            "cpu: 2 threads (auto)",
+            "not gpu: none found",
+            "| curl -sS --data-binary @- http://127.0.0.1:81/v1/meshes",
+        ] {
+            assert!(text.contains(part), "no `{part}` in\n{text}");
+        }
+        assert!(!text.contains("not cpu") && text.lines().count() <= 8, "{text}");
+    }
+}

@@ -79,6 +79,18 @@ pub(crate) enum CliError {
         name: String,
         /// Why.
         source: JobError,
+        /// What a strict reader says of the same file.
+        opinion: Option<String>,
+    },
+    /// A strict check was asked for, and the referee found errors.
+    #[error("{name}: the strict check found {errors} errors")]
+    Strict {
+        /// The input.
+        name: String,
+        /// How many.
+        errors: usize,
+        /// The first of them.
+        first: String,
     },
     /// The format cannot hold the mesh, or the mesh is broken.
     #[error(transparent)]
@@ -137,6 +149,7 @@ impl CliError {
             Self::InputTooLarge { .. } => code::LIMIT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
+            Self::Strict { .. } => code::STRUCTURE,
             Self::Format(error) => format_code(error),
             Self::NoBackend { .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
@@ -149,12 +162,13 @@ impl CliError {
     pub(crate) fn hint(&self) -> Option<String> {
         match self {
             Self::Usage { hint, .. } => hint.clone(),
+            Self::Strict { first, .. } => Some(format!("the first: {first}")),
             Self::InputTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
             Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
-            Self::Job { source: JobError::Structure(error), .. } => match error {
+            Self::Job { source: JobError::Structure(error), opinion, .. } => match error {
                 StructureError::TooManyAtoms { .. } => Some("raise it with --max-atoms".to_owned()),
                 StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
-                _ => None,
+                _ => opinion.clone(),
             },
             Self::NoBackend { .. } => Some("try --backend auto, and `molmesh doctor` for what there is".to_owned()),
             Self::Output { source, .. } if source.kind() == io::ErrorKind::NotFound => {
@@ -224,14 +238,15 @@ mod tests {
 
     #[test]
     fn every_kind_of_failure_has_its_code() {
-        let job = |source: JobError| CliError::Job { name: "x".into(), source };
+        let job = |source: JobError| CliError::Job { name: "x".into(), source, opinion: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
-        let cases: [(CliError, i32); 12] = [
+        let cases: [(CliError, i32); 13] = [
             (CliError::Internal(String::new()), 1),
             (CliError::usage("x"), 2),
             (CliError::Input { name: "x".into(), source: missing() }, 3),
             (job(StructureError::NoAtoms { found: "nothing".into() }.into()), 4),
             (job(SurfaceError::NoSpheres.into()), 4),
+            (CliError::Strict { name: "x".into(), errors: 1, first: String::new() }, 4),
             (job(StructureError::TooManyAtoms { limit: 1 }.into()), 5),
             (job(SurfaceError::MeshTooLarge { bytes: 2, limit: 1, suggested_resolution: 1.0 }.into()), 5),
             (FormatError::GlbTooLarge { bytes: 2, limit: 1 }.into(), 5),
@@ -253,7 +268,7 @@ mod tests {
     #[test]
     fn a_grid_that_is_too_large_comes_with_a_resolution() {
         let error = SurfaceError::GridTooLarge { samples: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
-        let hint = CliError::Job { name: "x".into(), source: error.into() }.hint();
+        let hint = CliError::Job { name: "x".into(), source: error.into(), opinion: None }.hint();
         assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-samples"));
     }
 }

@@ -7,7 +7,10 @@ use std::str::FromStr;
 use std::time::Instant;
 
 use molmesh::formats::{Encoder, Format};
+use molmesh::pipeline::params::Request;
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, ProgressSink, Report};
+use molmesh::structure::StructureError;
+use molmesh::structure::referee::{self, Diagnostic, Level};
 use molmesh::surface::{CancelToken, SurfaceError};
 use serde_json::{Value, json};
 
@@ -22,7 +25,7 @@ use super::{interrupt, request};
 
 /// Runs the command. The order is that of cost: flags, backend, output, input, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
-    let (job, asked) = request::parse(args)?;
+    let Request { job, format: asked, strict, .. } = request::parse(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
     let limits = request::limits(&args.limits);
     let picked = backend::pick(args.backend, args.threads)?;
@@ -32,6 +35,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let input = read(&args.input, limits.read.max_inflated_bytes)?;
 
     let progress = Progress::new(!args.quiet);
+    let findings = if strict { Some(check(args, &input, &limits)?) } else { None };
     let product = mesh(args, &job, &limits, &picked, &input, &cancel, &progress)?;
     drop(input);
     let mut report = encode(&product, format, &mut output, &progress)?;
@@ -47,7 +51,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
 
     let name = if to_stdout { "stdout".to_owned() } else { args.output.display().to_string() };
     let written = Written { name: &name, format: format.extension(), bytes };
-    tell(args, &report, &written, to_stdout)?;
+    tell(args, &report, findings.as_deref(), &written, to_stdout)?;
     // The caller exits the process next: nobody gains from the mesh being freed first.
     std::mem::forget(product);
     Ok(())
@@ -111,8 +115,37 @@ fn mesh(
     let choice = Choice { backend: picked.backend.as_ref(), reason: &picked.reason };
     pipeline::run(input, job, limits, &choice, cancel, progress).map_err(|source| match source {
         JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
-        source => CliError::Job { name: name_of(&args.input), source },
+        source => CliError::Job { name: name_of(&args.input), opinion: opinion(&source, input, limits), source },
     })
+}
+
+/// The strict check: the referee's findings, or a refusal if there are errors among them.
+fn check(args: &MeshArgs, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
+    let name = || name_of(&args.input);
+    let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
+        name: name(),
+        source: source.into(),
+        opinion: None,
+    })?;
+    let errors = findings.iter().filter(|f| f.level == Level::Error);
+    match errors.clone().next() {
+        Some(first) => Err(CliError::Strict { name: name(), errors: errors.count(), first: finding(first) }),
+        None => Ok(findings),
+    }
+}
+
+/// What the referee holds against a file that our reader could not read.
+fn opinion(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
+    let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
+    let findings = referee::check(input, &limits.read).ok()?;
+    let worst = findings.iter().max_by_key(|f| f.level)?;
+    Some(format!("a strict reader says: {}", finding(worst)))
+}
+
+/// A finding on one line.
+fn finding(finding: &Diagnostic) -> String {
+    let place = finding.line.map(|n| format!("line {n}: ")).unwrap_or_default();
+    format!("{place}{}", finding.message.split_whitespace().collect::<Vec<_>>().join(" "))
 }
 
 /// Encodes the mesh straight into the output. Returns the report with the time that took, without the writes.
@@ -128,28 +161,41 @@ fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn Progre
 }
 
 /// Writes the report where the mesh did not go.
-fn tell(args: &MeshArgs, report: &Report, written: &Written<'_>, mesh_on_stdout: bool) -> Result<(), CliError> {
+fn tell(
+    args: &MeshArgs,
+    report: &Report,
+    findings: Option<&[Diagnostic]>,
+    written: &Written<'_>,
+    mesh_on_stdout: bool,
+) -> Result<(), CliError> {
     match args.report {
         ReportStyle::Text if args.quiet => Ok(()),
         ReportStyle::Text => {
+            let lines: Option<Vec<String>> =
+                findings.map(|all| all.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect());
+            let text = summary::text(report, written, lines.as_deref(), Style::stderr());
             // A closed stderr is no reason to call a finished mesh a failure.
-            drop(io::stderr().write_all(summary::text(report, written, Style::stderr()).as_bytes()));
+            drop(io::stderr().write_all(text.as_bytes()));
             Ok(())
         }
         ReportStyle::Json => {
-            let text = json_report(report, written)?;
+            let text = json_report(report, findings, written)?;
             let told = if mesh_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
             told.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
         }
     }
 }
 
-fn json_report(report: &Report, written: &Written<'_>) -> Result<String, CliError> {
+fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Written<'_>) -> Result<String, CliError> {
     let failed = |e: serde_json::Error| CliError::Internal(format!("the report is no JSON: {e}"));
     let mut value = serde_json::to_value(report).map_err(failed)?;
     if let Value::Object(map) = &mut value {
         let output = json!({ "file": written.name, "format": written.format, "bytes": written.bytes });
         map.insert("output".to_owned(), output);
+        let finding = |f: &Diagnostic| json!({ "level": f.level.name(), "message": f.message, "line": f.line });
+        if let Some(findings) = findings {
+            map.insert("findings".to_owned(), findings.iter().map(finding).collect());
+        }
     }
     let mut text = serde_json::to_string_pretty(&value).map_err(failed)?;
     text.push('\n');

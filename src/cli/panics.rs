@@ -1,10 +1,11 @@
 //! A defect of ours ends a command with one line and exit code 1, not with a backtrace.
 //!
-//! The hook stays silent, because the referee's panics on hostile files are caught and answered elsewhere;
 //! `RUST_BACKTRACE` brings the usual report back for whoever hunts the defect.
 
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::{Mutex, PoisonError};
+
+use molmesh::structure::referee;
 
 use super::error::CliError;
 
@@ -20,6 +21,7 @@ pub(crate) fn contained(command: impl FnOnce() -> Result<(), CliError>) -> Resul
             *LAST.lock().unwrap_or_else(PoisonError::into_inner) = Some(format!("{what}{place}"));
         }));
     }
+    referee::quiet_panics();
     panic::catch_unwind(AssertUnwindSafe(command)).unwrap_or_else(|_| {
         let last = LAST.lock().unwrap_or_else(PoisonError::into_inner).take();
         Err(CliError::Internal(last.unwrap_or_else(|| "panic".to_owned())))

@@ -1,19 +1,17 @@
 //! Flags to a job: the same names and values that a query has, read by the same reader.
 
-use molmesh::formats::Format;
-use molmesh::pipeline::params::{self, ParamError};
-use molmesh::pipeline::{Job, JobLimits};
+use molmesh::pipeline::JobLimits;
+use molmesh::pipeline::params::{self, ParamError, Request};
 
 use super::args::{LimitArgs, MeshArgs};
 use super::error::CliError;
 
-/// What the flags ask for: the job, and the format if one was named.
-pub(super) fn parse(args: &MeshArgs) -> Result<(Job, Option<Format>), CliError> {
-    let request = params::parse(pairs(args)).map_err(|error| match error {
+/// What the flags ask for.
+pub(super) fn parse(args: &MeshArgs) -> Result<Request, CliError> {
+    params::parse(pairs(args)).map_err(|error| match error {
         ParamError::Unknown { .. } | ParamError::Repeated { .. } => CliError::Internal(error.to_string()),
         ParamError::BadValue { .. } => CliError::Usage { message: error.to_string(), hint: None },
-    })?;
-    Ok((request.job, request.format))
+    })
 }
 
 /// The limits, with what the flags change.
@@ -46,11 +44,15 @@ fn pairs(args: &MeshArgs) -> Vec<(&'static str, String)> {
         ("chains", &atoms.chains),
         ("model", &atoms.model),
         ("altloc", &atoms.altloc),
+        ("proof", &args.proof),
     ];
     let mut pairs: Vec<_> =
         given.into_iter().filter_map(|(name, value)| value.clone().map(|value| (name, value))).collect();
     if surface.atom_ids {
         pairs.push(("atom_ids", "true".to_owned()));
+    }
+    if args.check {
+        pairs.push(("check", "strict".to_owned()));
     }
     // The short flags add to what is selected; alone they add to the default.
     let mut select = atoms.select.clone();
@@ -70,7 +72,7 @@ mod tests {
     use super::super::args::{Args, Command};
     use super::*;
 
-    fn request(flags: &[&str]) -> Result<(Job, Option<Format>), CliError> {
+    fn request(flags: &[&str]) -> Result<Request, CliError> {
         let line = ["molmesh", "mesh", "in.pdb", "-o", "out.glb"].iter().chain(flags);
         let Command::Mesh(args) = Args::try_parse_from(line).unwrap().command else { panic!("not mesh") };
         parse(&args)
@@ -78,7 +80,7 @@ mod tests {
 
     #[test]
     fn short_flags_add_to_the_selection() {
-        let selection = |flags: &[&str]| request(flags).unwrap().0.selection;
+        let selection = |flags: &[&str]| request(flags).unwrap().job.selection;
         let plain = selection(&[]);
         assert!(plain.polymer && !plain.ligands && !plain.waters && !plain.hydrogens);
         let more = selection(&["--ligands", "--hydrogens"]);
@@ -93,7 +95,8 @@ mod tests {
         for parameter in params::TABLE.iter().filter(|p| p.name != "report") {
             let flag = format!("--{}", parameter.name.replace('_', "-"));
             let value = match parameter.name {
-                "atom_ids" => vec![flag.as_str()],
+                "atom_ids" | "check" => vec![flag.as_str()],
+                "proof" => vec![&flag, "exact"],
                 "kernel" => vec![&flag, "soft-object"],
                 "preset" => vec![&flag, "blinn"],
                 "select" => vec![&flag, "water"],
@@ -105,9 +108,9 @@ mod tests {
                 "cutoff_tolerance" => vec![&flag, "0.02"],
                 _ => vec![&flag, "2"],
             };
-            let (job, format) = request(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
-            let (plain, none) = request(&[]).unwrap();
-            let changed = params::canonical(&job) != params::canonical(&plain) || format != none;
+            let key = |r: &Request| (params::canonical(&r.job), r.format, r.strict);
+            let changed = request(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
+            let changed = key(&changed) != key(&request(&[]).unwrap());
             assert!(changed, "{flag} changes nothing");
         }
     }

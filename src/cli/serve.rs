@@ -1,6 +1,73 @@
-//! `molmesh serve`.
-use super::args::ServeArgs;
+//! `molmesh serve`: flags to a configuration, a runtime, a banner, and the service until it is told to stop.
+
+use std::io::{self, Write};
+use std::sync::Arc;
+use std::time::Duration;
+
+use molmesh::config::{self, Config};
+use molmesh::http::{Server, shutdown_signal};
+use molmesh::structure::referee;
+use molmesh::surface::Backend;
+use molmesh::telemetry;
+
+use super::args::{LogStyle, ServeArgs};
+use super::backend::{self, Picked};
+use super::banner::{self, Facts};
 use super::error::CliError;
-pub(super) fn run(_: &ServeArgs) -> Result<(), CliError> {
-    Ok(())
+use super::style::Style;
+
+/// Threads of the runtime: they read and write sockets; meshing has its own.
+const RUNTIME_THREADS: usize = 2;
+
+/// Runs the command: returns when the service was stopped and has finished what it was doing.
+pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
+    let config = config(args)?;
+    telemetry::init_logs(&config.log).map_err(|e| CliError::usage(e.to_string()))?;
+    referee::quiet_panics();
+    let Picked { backend, reason } = backend::pick(args.backend, None)?;
+    let backend: Arc<dyn Backend> = Arc::from(backend);
+    let facts =
+        Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others: backend::survey() };
+    let server = Server::bind(config, backend, reason).map_err(|e| CliError::Service(e.to_string()))?;
+    let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
+    // The service runs whether or not somebody reads its banner.
+    drop(io::stderr().write_all(text.as_bytes()));
+
+    let failed = |e: io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(RUNTIME_THREADS)
+        .thread_name("http")
+        .enable_all()
+        .build()
+        .map_err(failed)?;
+    let drained = runtime.block_on(server.run(shutdown_signal())).map_err(|e| CliError::Service(e.to_string()));
+    // What still reads a file or computes after the drain timeout is not waited for.
+    runtime.shutdown_timeout(Duration::from_millis(100));
+    if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
+}
+
+/// Defaults, then the file, then the environment, then `--set`, then the flags that have names of their own.
+fn config(args: &ServeArgs) -> Result<Config, CliError> {
+    let mut flags = Vec::new();
+    for set in &args.set {
+        let (key, value) = set.split_once('=').ok_or_else(|| CliError::Usage {
+            message: format!("parameter `set`: `{set}` is not allowed; expected section.key=value"),
+            hint: None,
+        })?;
+        flags.push((key.to_owned(), value.to_owned()));
+    }
+    let path = |p: &std::path::PathBuf| p.to_string_lossy().into_owned();
+    let log = args.log.map(|style| match style {
+        LogStyle::Pretty => "pretty".to_owned(),
+        LogStyle::Json => "json".to_owned(),
+    });
+    let named = [
+        ("server.listen", args.listen.map(|a| a.to_string())),
+        ("server.metrics_listen", args.metrics_listen.map(|a| a.to_string())),
+        ("server.data_dir", args.data_dir.as_ref().map(path)),
+        ("archive.dir", args.archive.as_ref().map(path)),
+        ("log.format", log),
+    ];
+    flags.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
+    config::load_process(args.config.as_deref(), &flags).map_err(|e| CliError::usage(e.to_string()))
 }

@@ -18,8 +18,8 @@ pub(crate) struct Written<'a> {
     pub(crate) bytes: u64,
 }
 
-/// The summary.
-pub(crate) fn text(report: &Report, written: &Written<'_>, style: Style) -> String {
+/// The summary; `findings` are what a strict second reader says of the file, if it was asked.
+pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[String]>, style: Style) -> String {
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
     page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, model {})", report.source_format, report.model));
@@ -34,6 +34,9 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, style: Style) -> Stri
     page.row("volume", &format!("{} Å³", decimal(report.volume)));
     page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
     page.row("wrote", &format!("{} ({}, {} bytes)", written.name, written.format, grouped(written.bytes)));
+    if let Some(findings) = findings {
+        second_opinion(&mut page, findings);
+    }
     timings(&mut page, report);
     page.finish()
 }
@@ -69,6 +72,15 @@ fn parts(report: &Report) -> String {
     match report.cavities {
         0 => format!("{components}, no cavities"),
         n => format!("{components}, of which {}", of(n, "cavity", "cavities")),
+    }
+}
+
+/// The first findings: a damaged file has one a line, and this is one screen.
+fn second_opinion(page: &mut Page, findings: &[String]) {
+    let of = if findings.len() == 1 { "finding" } else { "findings" };
+    page.row("check", &format!("{} {of} of a strict reader", findings.len()));
+    for finding in findings.iter().take(5) {
+        page.line(format!("    {}", finding.chars().take(110).collect::<String>()));
     }
 }
 
@@ -165,6 +177,7 @@ mod tests {
             closed: true,
             oriented: true,
             manifold: false,
+            proof: "checksum",
             euler: 2,
             components: 2,
             cavities: 1,
@@ -180,7 +193,7 @@ mod tests {
 
     #[test]
     fn it_says_everything_on_one_screen() {
-        let text = text(&report(), &Written { name: "a.glb", format: "glb", bytes: 720_000 }, Style::PLAIN);
+        let text = text(&report(), &Written { name: "a.glb", format: "glb", bytes: 720_000 }, None, Style::PLAIN);
         for part in [
             "4PTI TRYPSIN INHIBITOR",
             "454 of 514",

@@ -4,8 +4,6 @@
 use std::io::{self, Write};
 use std::ops::Range;
 
-use crate::surface::Mesh;
-
 /// Bytes converted before they are written in one call: fits the second-level cache, and is large enough for
 /// the cost of a call not to matter.
 pub(super) const BLOCK_BYTES: usize = 512 << 10;
@@ -61,12 +59,14 @@ pub(super) fn convert_words<const N: usize, T: Copy>(
 }
 
 /// A vertex in the structure file's coordinates, Å: added in double precision, then rounded once.
+#[inline]
 #[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what the file formats ask for")]
-pub(super) fn absolute(mesh: &Mesh, position: [f32; 3]) -> [f32; 3] {
-    std::array::from_fn(|k| (mesh.centre[k] + f64::from(position[k])) as f32)
+pub(super) fn absolute(centre: [f64; 3], position: [f32; 3]) -> [f32; 3] {
+    std::array::from_fn(|k| (centre[k] + f64::from(position[k])) as f32)
 }
 
-/// Puts three floats at the start of `bytes`.
+/// Puts three floats into `bytes`.
+#[inline]
 pub(super) fn put_floats(bytes: &mut [u8; 12], row: [f32; 3]) {
     let (words, _) = bytes.as_chunks_mut::<4>();
     for (word, value) in words.iter_mut().zip(row) {

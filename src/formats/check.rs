@@ -6,6 +6,7 @@
 use rayon::prelude::*;
 
 use super::error::FormatError;
+use super::format::Format;
 use crate::surface::Mesh;
 
 /// Rows looked at by one task: below that a mesh is checked on the calling thread.
@@ -13,6 +14,31 @@ const CHUNK_ROWS: usize = 1 << 16;
 
 /// No component of a unit vector is larger, rounding included.
 const MAX_NORMAL: f32 = 1.001;
+
+/// How much of a mesh is looked at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Depth {
+    /// Everything.
+    All,
+    /// Only what the writer of the format relies on. A writer that copies a column does not rely on its values.
+    Needed(Format),
+}
+
+impl Depth {
+    /// OBJ has lines of bounded length, so numbers must be.
+    fn normals(self) -> bool {
+        matches!(self, Self::All | Self::Needed(Format::Obj))
+    }
+
+    /// STL looks vertices up, and glTF narrows indices where they fit into 16 bits.
+    fn indices(self, n_vertices: usize) -> bool {
+        match self {
+            Self::All | Self::Needed(Format::Stl) => true,
+            Self::Needed(Format::Glb | Format::Gltf) => u16::try_from(n_vertices).is_ok(),
+            Self::Needed(Format::Ply | Format::Obj) => false,
+        }
+    }
+}
 
 /// What the formats need to know of a mesh that they can hold.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,7 +52,7 @@ pub(super) struct Summary {
 }
 
 /// Checks that columns have one length, numbers are finite and indices in range.
-pub(super) fn check(mesh: &Mesh) -> Result<Summary, FormatError> {
+pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
     let positions = &mesh.positions[..];
     let n = positions.len();
     let lengths = [
@@ -43,11 +69,15 @@ pub(super) fn check(mesh: &Mesh) -> Result<Summary, FormatError> {
         return Err(FormatError::NotFinite { column: "centre", row: axis as u64, value });
     }
     let bounds = extent("position", positions)?.unwrap_or_default();
-    let longest = extent("normal", &mesh.normals[..])?.unwrap_or_default();
-    if let Some(&value) = longest.as_flattened().iter().find(|v| v.abs() > MAX_NORMAL) {
-        return Err(FormatError::NotUnit { value });
+    if depth.normals() {
+        let longest = extent("normal", &mesh.normals[..])?.unwrap_or_default();
+        if let Some(&value) = longest.as_flattened().iter().find(|v| v.abs() > MAX_NORMAL) {
+            return Err(FormatError::NotUnit { value });
+        }
     }
-    in_range(&mesh.triangles[..], n)?;
+    if depth.indices(n) {
+        in_range(&mesh.triangles[..], n)?;
+    }
     Ok(Summary {
         bounds,
         max_atom: mesh.atom_ids.as_ref().map(|ids| maximum(&ids[..]).unwrap_or(0)),
@@ -193,20 +223,27 @@ mod tests {
 
     #[test]
     fn columns_of_different_lengths_are_refused() {
-        let whole = Mesh { positions: vec![[0.0; 3]; 2], normals: vec![[0.0, 0.0, 1.0]; 2], ..Mesh::default() };
-        assert!(check(&whole).is_ok());
+        let whole = Mesh {
+            positions: vec![[0.0; 3]; 2].into(),
+            normals: vec![[0.0, 0.0, 1.0]; 2].into(),
+            ..Mesh::default()
+        };
+        assert!(check(&whole, Depth::All).is_ok());
         let broken = [
-            ("normals", Mesh { normals: vec![[0.0; 3]], ..whole.clone() }),
-            ("atom_ids", Mesh { atom_ids: Some(vec![1]), ..whole.clone() }),
-            ("colors", Mesh { colors: Some(vec![[0; 4]; 3]), ..whole.clone() }),
+            ("normals", Mesh { normals: vec![[0.0; 3]].into(), ..whole.clone() }),
+            ("atom_ids", Mesh { atom_ids: Some(vec![1].into()), ..whole.clone() }),
+            ("colors", Mesh { colors: Some(vec![[0; 4]; 3].into()), ..whole.clone() }),
         ];
         for (name, mesh) in broken {
             assert!(
-                matches!(check(&mesh), Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name),
+                matches!(check(&mesh, Depth::All), Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name),
                 "{name}"
             );
         }
         let adrift = Mesh { centre: [0.0, f64::NAN, 0.0], ..whole };
-        assert!(matches!(check(&adrift), Err(FormatError::NotFinite { column: "centre", row: 1, .. })));
+        assert!(matches!(
+            check(&adrift, Depth::Needed(Format::Ply)),
+            Err(FormatError::NotFinite { column: "centre", row: 1, .. })
+        ));
     }
 }

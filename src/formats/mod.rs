@@ -20,6 +20,7 @@ mod text;
 
 use std::io::{self, Write};
 
+use check::Depth;
 pub use error::FormatError;
 pub use format::{Format, UnknownFormat};
 
@@ -84,7 +85,22 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn new(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        let summary = check::check(mesh)?;
+        Self::lay_out(format, mesh, meta, Depth::All)
+    }
+
+    /// The same for a mesh that a backend returned, whose invariants hold: does not look at normals and indices
+    /// that the format holds as they are. Writing a large GLB then costs hardly more than copying the mesh.
+    ///
+    /// A mesh that breaks its invariants may be written as a file that breaks them too; nothing panics.
+    ///
+    /// # Errors
+    /// Any [`FormatError`].
+    pub fn trusting(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
+        Self::lay_out(format, mesh, meta, Depth::Needed(format))
+    }
+
+    fn lay_out(format: Format, mesh: &'a Mesh, meta: &Meta, depth: Depth) -> Result<Self, FormatError> {
+        let summary = check::check(mesh, depth)?;
         let plan = match format {
             Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, &summary, meta)?),
             Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, &summary, meta)?),

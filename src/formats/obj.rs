@@ -59,7 +59,7 @@ impl ObjPlan {
         out.write_all(self.header.as_bytes())?;
         let mut lines = Lines::new(out, self.len_bound);
         for &position in &mesh.positions[..] {
-            lines.push(|line| line.vector(b"v", absolute(mesh, position)))?;
+            lines.push(|line| line.vector(b"v", absolute(mesh.centre, position)))?;
         }
         for &normal in &mesh.normals[..] {
             lines.push(|line| line.vector(b"vn", normal))?;
@@ -222,7 +222,7 @@ mod tests {
 
     #[test]
     fn coordinates_without_room_are_refused() {
-        let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]], ..Mesh::default() };
+        let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]].into(), ..Mesh::default() };
         let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: None, translucent: false };
         let refusal = ObjPlan::new(&mesh, &summary, &Meta::default()).unwrap_err();
         assert_eq!(refusal, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });

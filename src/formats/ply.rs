@@ -56,12 +56,12 @@ impl PlyPlan {
 
 /// Writes vertex records of position, normal and whatever `rest` adds.
 fn vertices<const N: usize>(mesh: &Mesh, out: &mut dyn Write, rest: impl Fn(usize, &mut [u8; N])) -> io::Result<()> {
-    let (positions, normals) = (&mesh.positions[..], &mesh.normals[..]);
+    let (centre, positions, normals) = (mesh.centre, &mesh.positions[..], &mesh.normals[..]);
     write_records::<N>(out, positions.len(), |range, records| {
         let rows = positions[range.clone()].iter().zip(&normals[range.clone()]);
         for ((record, (&position, &normal)), i) in records.iter_mut().zip(rows).zip(range) {
             let (floats, _) = record.as_chunks_mut::<12>();
-            put_floats(&mut floats[0], absolute(mesh, position));
+            put_floats(&mut floats[0], absolute(centre, position));
             put_floats(&mut floats[1], normal);
             rest(i, record);
         }

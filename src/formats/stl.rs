@@ -44,14 +44,14 @@ impl StlPlan {
 
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(&self.head)?;
-        let (positions, triangles) = (&mesh.positions[..], &mesh.triangles[..]);
+        let (centre, positions, triangles) = (mesh.centre, &mesh.positions[..], &mesh.triangles[..]);
         write_records::<TRIANGLE_BYTES>(out, triangles.len(), |range, records| {
             for (record, triangle) in records.iter_mut().zip(&triangles[range]) {
                 let corners = triangle.map(|v| positions[v as usize]);
                 let (floats, attribute) = record.as_chunks_mut::<12>();
                 put_floats(&mut floats[0], face_normal(corners));
                 for (bytes, corner) in floats[1..].iter_mut().zip(corners) {
-                    put_floats(bytes, absolute(mesh, corner));
+                    put_floats(bytes, absolute(centre, corner));
                 }
                 attribute.fill(0);
             }
@@ -60,6 +60,7 @@ impl StlPlan {
 }
 
 /// Unit normal of a triangle by the right-hand rule; zero where the triangle has no area, as STL readers expect.
+#[inline]
 #[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what STL asks for")]
 fn face_normal(corners: [[f32; 3]; 3]) -> [f32; 3] {
     // Double precision: the cross product of two edges of 1e-10 Å would underflow in single precision.

@@ -7,6 +7,7 @@
 const ONES: u64 = 0x0101_0101_0101_0101;
 const ZEROS: u64 = 0x3030_3030_3030_3030;
 const HIGH: u64 = 0x8080_8080_8080_8080;
+const TWO_52: f64 = 4_503_599_627_370_496.0;
 const POWERS: [f64; 9] = [1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8];
 
 /// The low `n` bytes set, `n` from 0 to 8.
@@ -63,8 +64,10 @@ fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
     let pairs = (values.wrapping_mul(10).wrapping_add(values >> 8)) & 0x00FF_00FF_00FF_00FF;
     let fours = (pairs.wrapping_mul(100).wrapping_add(pairs >> 16)) & 0x0000_FFFF_0000_FFFF;
     let eights = (fours.wrapping_mul(10_000).wrapping_add(fours >> 32)) & 0xFFFF_FFFF;
-    let magnitude = f64::from(u32::try_from(eights).ok()?) / POWERS[digits - integer_digits];
-    Some(if negative == 1 { -magnitude } else { magnitude })
+    // An integer below 2⁵² as the low bits of 2⁵² plus itself: no conversion instruction has to wait for the number before.
+    let whole = f64::from_bits(TWO_52.to_bits() | eights) - TWO_52;
+    let magnitude = whole / POWERS[digits - integer_digits];
+    Some(f64::from_bits(magnitude.to_bits() | (negative as u64) << 63))
 }
 
 #[cold]

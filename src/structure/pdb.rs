@@ -243,8 +243,7 @@ impl<'a> Reader<'a> {
         }
         let four = [card[17], card[18], card[19], card[20]];
         if self.four_letters.0 != four {
-            let splits = std::str::from_utf8(&four).is_ok_and(|f| residue::splits_from_chain(f.trim_start()));
-            self.four_letters = (four, splits);
+            self.four_letters = (four, residue::splits_from_chain(four));
         }
         if self.four_letters.1 && card[21] > b' ' { (20, 20) } else { (21, 21) }
     }

@@ -54,8 +54,12 @@ pub(super) fn charmm_ion(residue: &str) -> Option<u8> {
     IONS.iter().find(|(name, _)| *name == residue).map(|&(_, z)| z)
 }
 
-/// Whether four columns hold a residue name of three letters and the first of two letters of a chain.
-pub(super) fn splits_from_chain(four: &str) -> bool {
-    let Some((three, _)) = four.split_at_checked(3) else { return false };
+/// Whether columns 18-21 hold a residue name of three columns and the first letter of a chain of two, and not a name of
+/// four letters: names of less than three letters leave a blank, and known names are not longer than they are.
+pub(super) fn splits_from_chain(four: [u8; 4]) -> bool {
+    if four[..3].contains(&b' ') {
+        return true;
+    }
+    let (Ok(four), Ok(three)) = (std::str::from_utf8(&four), std::str::from_utf8(&four[..3])) else { return false };
     !FOUR_LETTERS.contains(&four) && (is_polymer(three) || is_water(three))
 }

@@ -1,7 +1,7 @@
 //! Finds the boundaries of white-space separated tokens, 64 bytes at a time.
 //!
-//! Eight bytes are compared at once in a machine word, their verdicts gathered into a bit mask, and the places where
-//! the mask changes are the starts and ends of tokens. Quotes, comments and text fields are the caller's business:
+//! Bytes are compared many at once, their verdicts gathered into a bit mask, and the places where the mask changes are
+//! the starts and ends of tokens. Quotes, comments and text fields are the caller's business:
 //! [`Edges`] only knows white space (any byte up to a blank).
 
 /// Starts and ends of tokens, alternating, as offsets from the beginning of the window that was scanned.
@@ -11,79 +11,82 @@ pub(super) struct Edges {
     len: usize,
 }
 
-/// Edges that 64 bytes can hold.
-const PER_BLOCK: usize = 64;
+/// Bytes that are looked at together, and edges that they can hold.
+const BLOCK: usize = 64;
 
 impl Edges {
-    /// Scans `window`, which begins outside of any token. A token that the window cuts off is left out, unless
-    /// `last` says that the text ends with the window.
-    ///
-    /// # Panics
-    /// Never: windows are far below 4 GiB, as the caller chooses them.
+    /// Scans `window`, which begins outside of any token and is below 4 GiB. A token that the window may have cut off
+    /// is left out, unless `last` says that the text ends with the window.
     pub(super) fn scan(&mut self, window: &[u8], last: bool) {
-        self.len = 0;
-        let room = window.len() + 2 * PER_BLOCK;
+        let room = window.len() + 2 * BLOCK;
         if self.offsets.len() < room {
             self.offsets.resize(room, 0);
         }
-        let mut open = 0_u64;
-        let (blocks, rest) = window.as_chunks::<PER_BLOCK>();
-        for (i, block) in blocks.iter().enumerate() {
-            open = self.block(block, i * PER_BLOCK, open);
-        }
-        if !rest.is_empty() {
-            let mut block = [b' '; PER_BLOCK];
-            block[..rest.len()].copy_from_slice(rest);
-            open = self.block(&block, blocks.len() * PER_BLOCK, open);
-        }
-        if open == 1 {
-            self.push_last(window.len());
-        }
-        // A token that touches the end of the window may go on behind it.
-        let touches = self.len.is_multiple_of(2) && self.len > 0 && self.offsets[self.len - 1] as usize == window.len();
-        if touches && !last {
+        self.len = edges(window, &mut self.offsets);
+        let cut = self.len > 0 && self.offsets[self.len - 1] as usize == window.len();
+        if cut && !last {
             self.len -= 2;
         }
-    }
-
-    fn push_last(&mut self, end: usize) {
-        self.offsets[self.len] = end as u32;
-        self.len += 1;
     }
 
     /// The edges that were found: `[start, end, start, end, …]`.
     pub(super) fn offsets(&self) -> &[u32] {
         &self.offsets[..self.len]
     }
+}
 
-    /// Scans one block; `open` is 1 where a token goes on from the block before.
-    #[inline]
-    fn block(&mut self, block: &[u8; PER_BLOCK], base: usize, open: u64) -> u64 {
-        let solid = solid_mask(block);
-        let mut edges = solid ^ ((solid << 1) | open);
-        let count = edges.count_ones() as usize;
-        let base = base as u32;
-        let mut at = self.len;
-        self.len += count;
-        // Eight at a time without asking whether there are eight: what is too much is written over later.
-        loop {
-            if let Some(out) = self.offsets.get_mut(at..).and_then(|o| o.first_chunk_mut::<8>()) {
-                for slot in out {
-                    *slot = base + edges.trailing_zeros();
-                    edges &= edges.wrapping_sub(1);
-                }
-            }
-            at += 8;
-            if at >= self.len {
-                return solid >> 63;
+/// Writes the edges of `window` to `out`, which is a little longer, and returns how many there are: an even number.
+#[multiversion::multiversion(targets(
+    "x86_64+avx512f+avx512bw+avx512dq+avx512vl+bmi1+bmi2+popcnt+lzcnt",
+    "x86_64+avx2+bmi1+bmi2+popcnt+lzcnt"
+))]
+fn edges(window: &[u8], out: &mut [u32]) -> usize {
+    let mut len = 0;
+    let mut open = 0;
+    let (blocks, rest) = window.as_chunks::<BLOCK>();
+    let mut base = 0;
+    for block in blocks {
+        (len, open) = block_edges(block, base, open, out, len);
+        base += BLOCK as u32;
+    }
+    if !rest.is_empty() {
+        let mut block = [b' '; BLOCK];
+        block[..rest.len()].copy_from_slice(rest);
+        (len, open) = block_edges(&block, base, open, out, len);
+    }
+    if open == 1 {
+        out[len] = window.len() as u32;
+        len += 1;
+    }
+    len
+}
+
+/// Adds the edges of one block to the `len` that `out` has; `open` is 1 where a token goes on from the block before.
+#[expect(clippy::inline_always, reason = "so that it is compiled for each of the caller's instruction sets")]
+#[inline(always)]
+fn block_edges(block: &[u8; BLOCK], base: u32, open: u64, out: &mut [u32], len: usize) -> (usize, u64) {
+    let solid = solid_mask(block);
+    let mut edges = solid ^ ((solid << 1) | open);
+    let total = len + edges.count_ones() as usize;
+    let mut at = len;
+    // Sixteen at a time without asking whether there are sixteen: what is too much is written over later. Blocks of
+    // atoms have 17 to 32 edges, so the number of turns can be foreseen.
+    while at < total {
+        if let Some(out) = out.get_mut(at..).and_then(|o| o.first_chunk_mut::<16>()) {
+            for slot in out {
+                *slot = (u64::from(base) + u64::from(edges.trailing_zeros())) as u32;
+                edges &= edges.wrapping_sub(1);
             }
         }
+        at += 16;
     }
+    (total, solid >> 63)
 }
 
 /// Bit `i` is set where byte `i` is above a blank.
-#[inline]
-fn solid_mask(block: &[u8; PER_BLOCK]) -> u64 {
+#[expect(clippy::inline_always, reason = "so that it is compiled for each of the caller's instruction sets")]
+#[inline(always)]
+fn solid_mask(block: &[u8; BLOCK]) -> u64 {
     const LOW_BITS: u64 = 0x7F7F_7F7F_7F7F_7F7F;
     const ABOVE_BLANK: u64 = 0x5F5F_5F5F_5F5F_5F5F;
     let mut mask = 0;
@@ -119,6 +122,18 @@ mod tests {
             }
         }
         out
+    }
+
+    #[test]
+    fn every_byte_is_classified() {
+        for byte in 0..=u8::MAX {
+            for at in 0..BLOCK {
+                let mut block = [b' '; BLOCK];
+                block[at] = byte;
+                let expected = u64::from(byte > b' ') << at;
+                assert_eq!(solid_mask(&block), expected, "{byte} at {at}");
+            }
+        }
     }
 
     proptest::proptest! {

@@ -37,6 +37,19 @@ impl<T: Pod> Column<T> {
     }
 }
 
+impl<T: Pod> Column<T> {
+    /// The rows as a vector, to add or remove some. Copies a mapped column.
+    pub fn edit(&mut self) -> &mut Vec<T> {
+        if let Storage::Mapped { .. } = &self.0 {
+            self.0 = Storage::Owned(self.to_vec());
+        }
+        match &mut self.0 {
+            Storage::Owned(rows) => rows,
+            Storage::Mapped { .. } => unreachable!("owned by now"),
+        }
+    }
+}
+
 impl<T: Pod> Deref for Column<T> {
     type Target = [T];
 
@@ -90,6 +103,12 @@ impl<T: Pod + PartialEq> PartialEq for Column<T> {
     }
 }
 
+impl<T: Pod + PartialEq> PartialEq<Column<T>> for Vec<T> {
+    fn eq(&self, other: &Column<T>) -> bool {
+        **self == **other
+    }
+}
+
 impl<T: Pod + fmt::Debug> fmt::Debug for Column<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Column({} rows)", self.len())
@@ -121,6 +140,8 @@ mod tests {
                 assert_ne!(column, Column::zeroed(n));
             }
             assert_eq!(column, column.clone());
+            column.edit().push([4.0; 3]);
+            assert_eq!((column.len(), column[n]), (n + 1, [4.0; 3]));
         }
     }
 }

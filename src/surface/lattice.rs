@@ -70,13 +70,7 @@ impl Lattice {
         let profile = Profile::new(params);
         let smallest = spheres.radii().iter().copied().fold(f32::MAX, f32::min);
         let effective = |r: f32| f64::from(r) * params.radius_scale + params.radius_offset;
-        if effective(smallest) < 0.05 {
-            return Err(SurfaceError::BadParameter {
-                name: "radius_offset",
-                value: params.radius_offset.to_string(),
-                expected: format!("an offset that leaves every radius at 0.05 Å or more; the smallest is {smallest} Å"),
-            });
-        }
+        params.check_radius(smallest)?;
         let mut atoms: Vec<LatticeAtom> = (0..spheres.len())
             .into_par_iter()
             .with_min_len(4096)

@@ -3,14 +3,14 @@
 //! Sums run over fixed blocks of triangles, merged in order: the same mesh gives the same digits whatever the
 //! thread count.
 
-use std::sync::atomic::{AtomicU32, Ordering};
-
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use super::control::Control;
 use super::error::SurfaceError;
+use super::labels::Labels;
 use super::mesh::Mesh;
+use super::simd::dispatched;
 use super::topology;
 
 /// Triangles per block of the sums.
@@ -91,7 +91,7 @@ impl Measures {
         let labels = Labels::of(mesh);
         control.check()?;
         let blocks: Vec<BlockSums> =
-            mesh.triangles.par_chunks(BLOCK).map(|block| sum_block(mesh, block, &labels)).collect();
+            mesh.triangles.par_chunks(BLOCK).map(|block| sum_block(&mesh.positions, block, &labels)).collect();
         control.check()?;
         let mut by_root: FxHashMap<u32, Component> = FxHashMap::default();
         let (mut checksum, mut degenerate) = (0_u64, false);
@@ -142,117 +142,90 @@ fn edge_share(from: u32, to: u32) -> u64 {
     if from < to { key } else { key.wrapping_neg() }
 }
 
-fn sum_block(mesh: &Mesh, block: &[[u32; 3]], labels: &Labels) -> BlockSums {
+/// Triangles whose geometry is computed together: enough that what was gathered lane by lane has left the store
+/// buffer when it is read back as vectors.
+const LANES: usize = 128;
+
+/// Area and volume of up to [`LANES`] triangles, each. Missing ones are zero.
+type Lanes = [[f32; LANES]; 2];
+
+dispatched! {
+/// Sums of one block. Everything that can fill vectors is done for [`LANES`] triangles at a time.
+fn sum_block(positions: &[[f32; 3]], block: &[[u32; 3]], labels: &Labels) -> BlockSums {
     let mut sums = BlockSums::default();
     let mut run = (u32::MAX, Component::default());
-    for &[i, j, k] in block {
-        let root = labels.root_of(i);
-        if root != run.0 {
-            if run.1.triangles > 0 {
-                sums.components.push(run);
-            }
-            run = (root, Component::default());
-        }
-        let [a, b, c] = [i, j, k].map(|v| mesh.positions[v as usize]);
-        // Differences are nearly exact in single precision; products and sums are not.
-        let u: [f64; 3] = std::array::from_fn(|x| f64::from(b[x] - a[x]));
-        let v: [f64; 3] = std::array::from_fn(|x| f64::from(c[x] - a[x]));
-        let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
-        run.1.triangles += 1;
-        run.1.area += 0.5 * (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
-        run.1.volume += (f64::from(a[0]) * n[0] + f64::from(a[1]) * n[1] + f64::from(a[2]) * n[2]) / 6.0;
-        let shares = edge_share(i, j).wrapping_add(edge_share(j, k)).wrapping_add(edge_share(k, i));
+    for batch in block.chunks(LANES) {
+        let (shares, degenerate) = edge_shares(batch);
         sums.checksum = sums.checksum.wrapping_add(shares);
-        sums.degenerate |= i == j || j == k || k == i;
+        sums.degenerate |= degenerate;
+        let [area, volume] = geometry(positions, batch);
+        let root = labels.component(batch[0][0]);
+        if root == run.0 && batch.iter().all(|t| labels.component(t[0]) == root) {
+            run.1.triangles += batch.len() as u64;
+            run.1.area += area.iter().map(|&a| f64::from(a)).sum::<f64>();
+            run.1.volume += volume.iter().map(|&v| f64::from(v)).sum::<f64>();
+            continue;
+        }
+        for (t, (&area, &volume)) in batch.iter().zip(area.iter().zip(&volume)) {
+            let root = labels.component(t[0]);
+            if root != run.0 {
+                if run.1.triangles > 0 {
+                    sums.components.push(run);
+                }
+                run = (root, Component::default());
+            }
+            run.1.triangles += 1;
+            run.1.area += f64::from(area);
+            run.1.volume += f64::from(volume);
+        }
     }
     if run.1.triangles > 0 {
         sums.components.push(run);
     }
     sums
 }
+}
 
-/// Connected components of the vertices: a union–find whose sets are named by their lowest vertex.
-struct Labels(Vec<AtomicU32>);
-
-impl Labels {
-    fn of(mesh: &Mesh) -> Self {
-        let n = u32::try_from(mesh.n_vertices()).unwrap_or(u32::MAX);
-        let labels = Self((0..n).into_par_iter().with_min_len(BLOCK).map(AtomicU32::new).collect());
-        mesh.triangles.par_chunks(BLOCK).for_each(|block| {
-            for &[a, b, c] in block {
-                labels.join(a, b);
-                labels.join(b, c);
-            }
-        });
-        // Flatten, so that a look-up is one step. Every set is complete now, so the order does not matter.
-        (0..n).into_par_iter().with_min_len(BLOCK).for_each(|v| {
-            let root = labels.find(v);
-            labels.0[v as usize].store(root, Ordering::Relaxed);
-        });
-        labels
+/// The checksum of a batch, and whether a triangle of it has a corner twice.
+#[inline(always)]
+fn edge_shares(batch: &[[u32; 3]]) -> (u64, bool) {
+    let mut corners = [[0_u32; LANES]; 3];
+    for (lane, t) in batch.iter().enumerate() {
+        (corners[0][lane], corners[1][lane], corners[2][lane]) = (t[0], t[1], t[2]);
     }
-
-    fn parent(&self, v: u32) -> u32 {
-        self.0[v as usize].load(Ordering::Relaxed)
+    let [a, b, c] = corners;
+    let (mut sum, mut degenerate) = ([0_u64; LANES], false);
+    for i in 0..LANES {
+        let shares = edge_share(a[i], b[i]).wrapping_add(edge_share(b[i], c[i])).wrapping_add(edge_share(c[i], a[i]));
+        sum[i] = if i < batch.len() { shares } else { 0 };
     }
+    for i in 0..LANES {
+        degenerate |= i < batch.len() && ((a[i] == b[i]) | (b[i] == c[i]) | (c[i] == a[i]));
+    }
+    (sum.iter().fold(0, |all, s| all.wrapping_add(*s)), degenerate)
+}
 
-    /// The set's lowest vertex; halves the path on the way.
-    fn find(&self, mut v: u32) -> u32 {
-        loop {
-            let parent = self.parent(v);
-            let above = self.parent(parent);
-            if parent == above {
-                return parent;
-            }
-            // Losing this race is harmless: another thread wrote an ancestor too.
-            self.0[v as usize].store(above, Ordering::Relaxed);
-            v = above;
+/// Areas and signed volumes against the mesh's centre. Single precision inside a triangle: differences of close
+/// positions are nearly exact, and the sums over triangles are double.
+#[inline(always)]
+fn geometry(positions: &[[f32; 3]], batch: &[[u32; 3]]) -> Lanes {
+    let mut p = [[0.0_f32; LANES]; 9];
+    for (lane, t) in batch.iter().enumerate() {
+        let [a, b, c] = [positions[t[0] as usize], positions[t[1] as usize], positions[t[2] as usize]];
+        for k in 0..3 {
+            (p[k][lane], p[3 + k][lane], p[6 + k][lane]) = (a[k], b[k], c[k]);
         }
     }
-
-    /// Joins two sets. Parents only ever get lower, so threads cannot make a cycle.
-    #[inline(always)]
-    fn join(&self, a: u32, b: u32) {
-        if self.parent(a) == self.parent(b) {
-            return;
-        }
-        let (mut a, mut b) = (self.find(a), self.find(b));
-        while a != b {
-            let (low, high) = if a < b { (a, b) } else { (b, a) };
-            let root = &self.0[high as usize];
-            match root.compare_exchange_weak(high, low, Ordering::Relaxed, Ordering::Relaxed) {
-                Ok(_) => return,
-                Err(_) => (a, b) = (self.find(low), self.find(high)),
-            }
-        }
+    let [ax, ay, az, bx, by, bz, cx, cy, cz] = p;
+    let (mut area, mut volume) = ([0.0; LANES], [0.0; LANES]);
+    for i in 0..LANES {
+        let (ux, uy, uz) = (bx[i] - ax[i], by[i] - ay[i], bz[i] - az[i]);
+        let (vx, vy, vz) = (cx[i] - ax[i], cy[i] - ay[i], cz[i] - az[i]);
+        let (nx, ny, nz) = (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx);
+        area[i] = 0.5 * (nx * nx + ny * ny + nz * nz).sqrt();
+        volume[i] = (ax[i] * nx + ay[i] * ny + az[i] * nz) * (1.0 / 6.0);
     }
-
-    /// After flattening: the name of the vertex's set.
-    fn root_of(&self, v: u32) -> u32 {
-        self.parent(v)
-    }
-
-    /// Adds the vertices of each component; returns how many belong to any triangle.
-    fn count_vertices(&self, components: &mut FxHashMap<u32, Component>) -> u64 {
-        let mut used = 0;
-        let mut run = (u32::MAX, 0_u64);
-        let mut close = |run: (u32, u64)| {
-            if let Some(component) = components.get_mut(&run.0) {
-                component.vertices += run.1;
-                used += run.1;
-            }
-        };
-        for parent in &self.0 {
-            let root = parent.load(Ordering::Relaxed);
-            if root != run.0 {
-                close(run);
-                run = (root, 0);
-            }
-            run.1 += 1;
-        }
-        close(run);
-        used
-    }
+    [area, volume]
 }
 
 #[cfg(test)]

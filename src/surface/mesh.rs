@@ -23,6 +23,9 @@ pub struct Mesh {
     pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
     pub colors: Option<Column<[u8; 4]>>,
+    /// Where the mesh falls into parts that hang together, as (first vertex, first triangle), ascending from (0, 0):
+    /// most triangles of a part use vertices of the part. A hint for parallel work; empty is always right.
+    pub parts: Vec<(usize, usize)>,
 }
 
 impl Mesh {

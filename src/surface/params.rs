@@ -9,6 +9,8 @@ use super::error::SurfaceError;
 pub const MIN_RESOLUTION: f64 = 0.01;
 /// Coarsest grid spacing that is accepted, Å.
 pub const MAX_RESOLUTION: f64 = 20.0;
+/// Least radius after scale and offset, Å.
+pub const MIN_RADIUS: f64 = 0.05;
 /// Radius of support of the soft-object and inverse-square kernels, in radii.
 pub const SUPPORT_RADII: f64 = 2.0;
 
@@ -255,6 +257,21 @@ impl SurfaceParams {
             paper,
             atom_ids: options.atom_ids,
         })
+    }
+}
+
+impl SurfaceParams {
+    /// Whether scale and offset leave the smallest radius usable.
+    ///
+    /// # Errors
+    /// [`SurfaceError::BadParameter`] names `radius_offset`.
+    pub(super) fn check_radius(&self, smallest: f32) -> Result<(), SurfaceError> {
+        if f64::from(smallest) * self.radius_scale + self.radius_offset < MIN_RADIUS {
+            let expected =
+                format!("an offset that leaves every radius at {MIN_RADIUS} Å or more; the smallest is {smallest} Å");
+            return Err(bad("radius_offset", self.radius_offset, expected));
+        }
+        Ok(())
     }
 }
 

@@ -2,6 +2,7 @@
 #![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
 #![allow(
     clippy::unwrap_used,
+    clippy::panic,
     clippy::missing_panics_doc,
     unreachable_pub,
     reason = "tests say what they expect by panicking"
@@ -106,4 +107,70 @@ pub fn block(n: u32) -> String {
     let places: Vec<[f64; 3]> =
         (0..n).flat_map(|x| (0..n).flat_map(move |y| (0..n).map(move |z| [at(x), at(y), at(z)]))).collect();
     pdb(&places)
+}
+
+/// A running `molmesh serve`. Killed when dropped, unless it was stopped.
+pub struct Service {
+    child: std::process::Child,
+    /// Its address, such as `127.0.0.1:41234`.
+    pub addr: String,
+    /// Its banner.
+    pub banner: String,
+    log: Option<std::thread::JoinHandle<String>>,
+}
+
+impl Service {
+    /// Starts a service on free ports and waits until it is ready.
+    pub fn start(folder: &Folder, more: &[&str]) -> Self {
+        use std::io::{BufRead, BufReader};
+        let mut child = molmesh()
+            .args(["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir"])
+            .arg(folder.path("data"))
+            .args(more)
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+        let mut banner = String::new();
+        loop {
+            let line = lines.next().unwrap_or_else(|| panic!("it ended after\n{banner}")).unwrap();
+            banner.push_str(&line);
+            banner.push('\n');
+            if line.trim_start().starts_with("try ") {
+                break;
+            }
+        }
+        // The log has to be read on, or the service waits for somebody to do it.
+        let log = std::thread::spawn(move || lines.map_while(Result::ok).collect::<Vec<_>>().join("\n"));
+        let viewer = banner.lines().find(|l| l.contains("viewer")).unwrap();
+        let addr = viewer.split("http://").nth(1).unwrap().trim_end_matches('/').to_owned();
+        let service = Self { child, addr, banner, log: Some(log) };
+        let start = std::time::Instant::now();
+        while !service.ready() {
+            assert!(start.elapsed().as_secs() < 30, "it is not ready after 30 s");
+            std::thread::sleep(std::time::Duration::from_millis(20));
+        }
+        service
+    }
+
+    /// Whether `molmesh healthcheck` says that it is ready.
+    pub fn ready(&self) -> bool {
+        run(["healthcheck", "--url", &format!("http://{}/readyz", self.addr)]).status.success()
+    }
+
+    /// Sends it a signal; returns its exit code and its log.
+    pub fn stop(mut self, signal: &str) -> (Option<i32>, String) {
+        let id = self.child.id().to_string();
+        assert!(Command::new("kill").args([&format!("-{signal}"), &id]).status().unwrap().success());
+        let code = self.child.wait().unwrap().code();
+        (code, self.log.take().unwrap().join().unwrap())
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        // After a stop there is nothing to kill, and that is no error.
+        drop(self.child.kill());
+        drop(self.child.wait());
+    }
 }

@@ -119,7 +119,7 @@ pub fn trimesh(paths: &[impl AsRef<Path>]) -> Option<Vec<TrimeshReport>> {
 
 /// Looks at `.glb` and `.gltf` files with the Khronos validator, one report per path, in their order.
 pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
-    if !installed_here().join("node/node_modules/gltf-validator").is_dir() {
+    if !installed_here().join("node/.stamp").is_file() {
         return missing("gltf-validator");
     }
     Some(ask(Path::new("node"), "validate_gltf.mjs", paths))
@@ -130,7 +130,7 @@ pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
 pub fn python<T: DeserializeOwned>(script: &str, paths: &[impl AsRef<Path>]) -> Option<Vec<T>> {
     match python_interpreter() {
         Some(python) => Some(ask(&python, script, paths)),
-        None => missing(script),
+        None => missing(&format!("the Python for {script}")),
     }
 }
 

@@ -67,11 +67,11 @@ pub fn torus(around: u32, across: u32) -> Mesh {
         let (u, v) = (2.0 * PI * f64::from(i) / f64::from(around), 2.0 * PI * f64::from(j) / f64::from(across));
         let normal = [v.cos() * u.cos(), v.cos() * u.sin(), v.sin()];
         let centre = [5.0 * u.cos(), 5.0 * u.sin(), 0.0];
-        mesh.positions.push(std::array::from_fn(|k| (centre[k] + 2.0 * normal[k]) as f32));
-        mesh.normals.push(normal.map(|v| v as f32));
+        mesh.positions.edit().push(std::array::from_fn(|k| (centre[k] + 2.0 * normal[k]) as f32));
+        mesh.normals.edit().push(normal.map(|v| v as f32));
         let at = |i: u32, j: u32| (i % around) * across + j % across;
         let (a, b, c, d) = (at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1));
-        mesh.triangles.extend([[a, b, c], [a, c, d]]);
+        mesh.triangles.edit().extend([[a, b, c], [a, c, d]]);
     }
     mesh
 }
@@ -80,9 +80,9 @@ pub fn torus(around: u32, across: u32) -> Mesh {
 pub fn union(a: &Mesh, b: &Mesh) -> Mesh {
     let shift = u32::try_from(a.n_vertices()).unwrap();
     let mut mesh = a.clone();
-    mesh.positions.extend_from_slice(&b.positions);
-    mesh.normals.extend_from_slice(&b.normals);
-    mesh.triangles.extend(b.triangles.iter().map(|t| t.map(|v| v + shift)));
+    mesh.positions.edit().extend_from_slice(&b.positions);
+    mesh.normals.edit().extend_from_slice(&b.normals);
+    mesh.triangles.edit().extend(b.triangles.iter().map(|t| t.map(|v| v + shift)));
     mesh
 }
 
@@ -99,9 +99,9 @@ pub fn sphere_with_cavity() -> Mesh {
 /// One triangle: three vertices, a boundary.
 pub fn triangle() -> Mesh {
     Mesh {
-        positions: vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]],
-        normals: vec![[0.0, 0.0, 1.0]; 3],
-        triangles: vec![[0, 1, 2]],
+        positions: vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]].into(),
+        normals: vec![[0.0, 0.0, 1.0]; 3].into(),
+        triangles: vec![[0, 1, 2]].into(),
         ..Mesh::default()
     }
 }

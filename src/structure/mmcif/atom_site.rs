@@ -82,9 +82,9 @@ impl Layout {
     }
 }
 
-/// A row: where its values stand in the text.
+/// A row: where its values stand in the text. Most rows have no quotes, and are spared looking for them.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Row<'a> {
+pub(super) struct Row<'a, const QUOTES: bool> {
     pub(super) text: &'a [u8],
     /// Offsets count from here.
     pub(super) base: usize,
@@ -92,7 +92,7 @@ pub(super) struct Row<'a> {
     pub(super) offsets: &'a [u32],
 }
 
-impl Row<'_> {
+impl<const QUOTES: bool> Row<'_, QUOTES> {
     /// Start and end of a value as it stands.
     #[inline]
     pub(super) fn raw(&self, column: usize) -> (usize, usize) {
@@ -106,7 +106,7 @@ impl Row<'_> {
             return None;
         }
         let (start, end) = self.raw(column);
-        let (start, end, quoted) = unquote(self.text, start, end);
+        let (start, end, quoted) = if QUOTES { unquote(self.text, start, end) } else { (start, end, false) };
         let null = !quoted && end - start == 1 && matches!(self.text[start], b'?' | b'.');
         (!null).then_some((start, end))
     }
@@ -138,7 +138,7 @@ impl AtomSite {
     }
 
     #[inline]
-    pub(super) fn atom(&mut self, row: &Row<'_>) -> Result<Atom, Box<Fault>> {
+    pub(super) fn atom<const QUOTES: bool>(&mut self, row: &Row<'_, QUOTES>) -> Result<Atom, Box<Fault>> {
         let layout = self.layout;
         let text = row.text;
         let position = [coordinate(row, &layout, 0)?, coordinate(row, &layout, 1)?, coordinate(row, &layout, 2)?];
@@ -172,7 +172,7 @@ impl AtomSite {
     }
 
     #[inline]
-    fn element(&mut self, row: &Row<'_>, name: u32, residue: u32) -> u8 {
+    fn element<const QUOTES: bool>(&mut self, row: &Row<'_, QUOTES>, name: u32, residue: u32) -> u8 {
         let symbol = row.value(self.layout.element).map_or(0, |(start, end)| atomic_number(&row.text[start..end]));
         if symbol != 0 { symbol } else { self.guess(name, residue) }
     }
@@ -188,7 +188,7 @@ impl AtomSite {
 }
 
 #[inline]
-fn coordinate(row: &Row<'_>, layout: &Layout, axis: usize) -> Result<f64, Box<Fault>> {
+fn coordinate<const QUOTES: bool>(row: &Row<'_, QUOTES>, layout: &Layout, axis: usize) -> Result<f64, Box<Fault>> {
     let column = layout.position[axis];
     if let Some((start, end)) = row.value(column)
         && let Some(value) = real(row.text, start, end)
@@ -200,7 +200,12 @@ fn coordinate(row: &Row<'_>, layout: &Layout, axis: usize) -> Result<f64, Box<Fa
 }
 
 #[inline]
-fn optional(row: &Row<'_>, column: usize, default: f32, what: &str) -> Result<f32, Box<Fault>> {
+fn optional<const QUOTES: bool>(
+    row: &Row<'_, QUOTES>,
+    column: usize,
+    default: f32,
+    what: &str,
+) -> Result<f32, Box<Fault>> {
     let Some((start, end)) = row.value(column) else { return Ok(default) };
     match real(row.text, start, end) {
         Some(value) => Ok(value as f32),
@@ -209,8 +214,8 @@ fn optional(row: &Row<'_>, column: usize, default: f32, what: &str) -> Result<f3
 }
 
 #[inline]
-fn whole(
-    row: &Row<'_>,
+fn whole<const QUOTES: bool>(
+    row: &Row<'_, QUOTES>,
     value: Option<(usize, usize)>,
     column: usize,
     default: i32,
@@ -221,7 +226,7 @@ fn whole(
 }
 
 #[inline]
-fn character(row: &Row<'_>, column: usize, what: &str) -> Result<u8, Box<Fault>> {
+fn character<const QUOTES: bool>(row: &Row<'_, QUOTES>, column: usize, what: &str) -> Result<u8, Box<Fault>> {
     match row.value(column) {
         None => Ok(0),
         Some((start, end)) if end - start == 1 => Ok(row.text[start]),
@@ -232,7 +237,7 @@ fn character(row: &Row<'_>, column: usize, what: &str) -> Result<u8, Box<Fault>>
 }
 
 #[inline]
-fn hetero(row: &Row<'_>, column: usize) -> Result<bool, Box<Fault>> {
+fn hetero<const QUOTES: bool>(row: &Row<'_, QUOTES>, column: usize) -> Result<bool, Box<Fault>> {
     let Some((start, end)) = row.value(column) else { return Ok(false) };
     match &row.text[start..end] {
         b"ATOM" => Ok(false),

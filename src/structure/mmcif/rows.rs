@@ -69,14 +69,14 @@ impl<'a> Rows<'a> {
 
     /// Reads rows from the first value on; returns where the loop ends.
     pub(super) fn read(&mut self, first: usize) -> Result<usize, Stop> {
-        let end = plain_stretch(self.text, first);
-        let mut at = first;
-        if end - first >= PARALLEL_BYTES && rayon::current_num_threads() > 1 && self.read_parallel(first, end) {
-            at = end;
-        } else {
-            let lines = memchr::memchr_iter(b'\n', &self.text[first..end]).count();
-            self.columns.reserve((lines + 1).min(self.max_rows));
-        }
+        let large = self.text.len() - first >= PARALLEL_BYTES && rayon::current_num_threads() > 1;
+        let mut at = match if large { self.read_parallel(first) } else { None } {
+            Some(end) => end,
+            None => {
+                self.columns.reserve(estimate(&self.text[first..]).min(self.max_rows));
+                first
+            }
+        };
         let mut scanner = Scanner::new(self.text);
         loop {
             let mut sink = Limited { columns: &mut self.columns, max_rows: self.max_rows };
@@ -121,40 +121,43 @@ impl<'a> Rows<'a> {
             };
             offsets.extend([near(start)?, near(end)?]);
         }
-        let atom = self.site.atom(&Row { text: self.text, base, offsets: &offsets })?;
+        let atom = self.site.atom(&Row::<true> { text: self.text, base, offsets: &offsets })?;
         let mut sink = Limited { columns: &mut self.columns, max_rows: self.max_rows };
         if sink.put(&atom) { Ok(()) } else { Err(Stop::TooMany) }
     }
 
-    /// Reads `first..end` by several threads; `false`, with nothing changed, if that stretch is not one plain row to
-    /// a line.
-    fn read_parallel(&mut self, first: usize, end: usize) -> bool {
-        let chunks = chunks(self.text, first, end);
+    /// Reads rows from `first` on by several threads, and returns where they stop; `None`, with nothing changed, if what
+    /// they read is not one plain row to a line.
+    fn read_parallel(&mut self, first: usize) -> Option<usize> {
         let text = self.text;
-        let lines: Vec<usize> =
-            chunks.par_iter().map(|&(from, to)| memchr::memchr_iter(b'\n', &text[from..to]).count()).collect();
-        let n_rows: usize = lines.iter().sum();
+        let stretches = stretches(text, first);
+        let n_rows: usize = stretches.iter().map(|s| s.lines).sum();
+        let end = stretches.last()?.to;
         if n_rows > self.max_rows {
-            return false;
+            return None;
         }
         let mut columns = Columns::zeroed(n_rows);
         let mut rest = columns.slices();
-        let mut parts = Vec::with_capacity(chunks.len());
-        for (&chunk, &n) in chunks.iter().zip(&lines) {
-            let (slices, others) = rest.split(n);
-            parts.push((chunk, slices, AtomSite::new(self.site.layout)));
+        let mut parts = Vec::with_capacity(stretches.len());
+        for stretch in stretches {
+            let (slices, others) = rest.split(stretch.lines);
+            parts.push((stretch, slices, AtomSite::new(self.site.layout)));
             rest = others;
         }
         let failed = AtomicBool::new(false);
-        parts.par_iter_mut().for_each(|((from, to), slices, site)| {
-            let end = Scanner::new(text).rows(site, slices, *from, *to, &failed);
-            let whole = end.is_ok_and(|end| text[end..*to].iter().all(|&b| b <= b' ')) && slices.is_full();
-            if !whole {
-                failed.store(true, Ordering::Relaxed);
-            }
-        });
+        parts.par_iter_mut().for_each_init(
+            || Scanner::new(text),
+            |scanner, (stretch, slices, site)| {
+                let done = scanner.rows(site, slices, stretch.from, stretch.to, &failed);
+                let whole =
+                    done.is_ok_and(|done| text[done..stretch.to].iter().all(|&b| b <= b' ')) && slices.is_full();
+                if !whole {
+                    failed.store(true, Ordering::Relaxed);
+                }
+            },
+        );
         if failed.into_inner() {
-            return false;
+            return None;
         }
         let mut tables = Tables::default();
         for (_, mut slices, site) in parts {
@@ -162,40 +165,68 @@ impl<'a> Rows<'a> {
         }
         self.columns = columns;
         self.site.tables = tables;
-        true
+        Some(end)
     }
 }
 
-/// The end of the stretch from `first` on in which no row holds an underscore, and hence no tag and no reserved word:
-/// the line start before the next one, without the comments and blank lines before that.
-fn plain_stretch(text: &[u8], first: usize) -> usize {
-    let rest = &text[first..];
-    let mut end = memchr::memchr(b'_', rest).unwrap_or(rest.len());
-    loop {
-        // Up to the start of the line.
-        end = memchr::memrchr(b'\n', &rest[..end]).map_or(0, |i| i + 1);
-        if end == 0 {
-            return first;
-        }
-        let line = memchr::memrchr(b'\n', &rest[..end - 1]).map_or(0, |i| i + 1);
-        if !matches!(rest[line..end].trim_ascii_start().first(), None | Some(b'#')) {
-            return first + end;
-        }
-        end -= 1;
+/// About as many rows as lines: what three samples suggest, and a little more. Too many cost nothing, as memory that is
+/// not touched is not there; too few make the columns grow.
+fn estimate(rest: &[u8]) -> usize {
+    const SAMPLE: usize = 64 << 10;
+    if rest.len() <= 4 * SAMPLE {
+        return memchr::memchr_iter(b'\n', rest).count() + 1;
     }
+    let starts = [0, rest.len() / 2, rest.len() - SAMPLE];
+    let lines: usize = starts.iter().map(|&s| memchr::memchr_iter(b'\n', &rest[s..s + SAMPLE]).count()).sum();
+    (lines + 1) * (rest.len() / (3 * SAMPLE) + 1) / 16 * 17
 }
 
-/// Stretches of whole lines.
-fn chunks(text: &[u8], first: usize, end: usize) -> Vec<(usize, usize)> {
-    let mut chunks = Vec::new();
-    let mut from = first;
-    while from < end {
-        let goal = (from + CHUNK_BYTES).min(end);
-        let to = memchr::memchr(b'\n', &text[goal - 1..end]).map_or(end, |i| goal + i);
-        chunks.push((from, to));
-        from = to;
+/// Whole lines that one thread reads.
+#[derive(Debug, Clone, Copy)]
+struct Stretch {
+    from: usize,
+    to: usize,
+    lines: usize,
+}
+
+/// Stretches from `first` on in which no row holds an underscore, and hence no tag and no reserved word, without the
+/// comments and blank lines before that.
+fn stretches(text: &[u8], first: usize) -> Vec<Stretch> {
+    let starts: Vec<usize> = (first..text.len()).step_by(CHUNK_BYTES).collect();
+    let line_start = |at: usize| match memchr::memchr(b'\n', &text[at..]) {
+        Some(i) if at > first => at + i + 1,
+        _ => at,
+    };
+    let mut found: Vec<(Stretch, bool)> = starts
+        .par_iter()
+        .map(|&start| {
+            let from = line_start(start);
+            let to = if start + CHUNK_BYTES < text.len() { line_start(start + CHUNK_BYTES) } else { text.len() };
+            let chunk = &text[from..to.max(from)];
+            let underscore = memchr::memchr(b'_', chunk);
+            let to = from + underscore.map_or(chunk.len(), |i| whole_rows(&chunk[..i]));
+            let lines = memchr::memchr_iter(b'\n', &text[from..to]).count();
+            (Stretch { from, to, lines }, underscore.is_some())
+        })
+        .collect();
+    if let Some(last) = found.iter().position(|(_, underscore)| *underscore) {
+        found.truncate(last + 1);
     }
-    chunks
+    // The text's last line may lack its end.
+    found.into_iter().map(|(stretch, _)| stretch).filter(|s| s.lines > 0).collect()
+}
+
+/// Length of `chunk`, which a tag follows, up to the end of the last line that is neither blank nor a comment.
+fn whole_rows(chunk: &[u8]) -> usize {
+    let mut end = memchr::memrchr(b'\n', chunk).map_or(0, |i| i + 1);
+    while end > 0 {
+        let line = memchr::memrchr(b'\n', &chunk[..end - 1]).map_or(0, |i| i + 1);
+        if !matches!(chunk[line..end].trim_ascii_start().first(), None | Some(b'#')) {
+            break;
+        }
+        end = line;
+    }
+    end
 }
 
 /// Reads plain rows.
@@ -203,8 +234,6 @@ struct Scanner<'a> {
     text: &'a [u8],
     edges: Edges,
     window: usize,
-    /// The next underscore from the row at hand on.
-    underscore: usize,
 }
 
 /// What the first byte of a token says: 1 for quotes, 2 for what the tokenizer has to look at.
@@ -219,7 +248,7 @@ const SPECIAL: [u8; 256] = {
 
 impl<'a> Scanner<'a> {
     fn new(text: &'a [u8]) -> Self {
-        Self { text, edges: Edges::default(), window: MAX_WINDOW, underscore: 0 }
+        Self { text, edges: Edges::default(), window: MAX_WINDOW }
     }
 
     /// Reads rows from `at` to `end` into `sink`; returns the end of the last row before one that is not plain, not
@@ -236,16 +265,23 @@ impl<'a> Scanner<'a> {
         let mut edges = std::mem::take(&mut self.edges);
         let result = loop {
             let to = at.saturating_add(self.window).min(end);
-            edges.scan(&self.text[at..to], to == self.text.len());
+            let window = &self.text[at..to];
+            // Tags and reserved words have an underscore; almost no row has one.
+            let words = memchr::memchr(b'_', window).is_some();
+            edges.scan(window, to == self.text.len());
             let mut done = at;
             let mut plain = true;
             for offsets in edges.offsets().chunks_exact(per_row) {
-                let row = Row { text: self.text, base: at, offsets };
-                if !self.is_plain(&row) {
-                    plain = false;
-                    break;
-                }
-                let atom = site.atom(&row)?;
+                let atom = match special(window, offsets) {
+                    0 if !words => site.atom(&Row::<false> { text: self.text, base: at, offsets })?,
+                    special if special < 2 && values_only(window, offsets) => {
+                        site.atom(&Row::<true> { text: self.text, base: at, offsets })?
+                    }
+                    _ => {
+                        plain = false;
+                        break;
+                    }
+                };
                 if !sink.put(&atom) {
                     return Err(Stop::TooMany);
                 }
@@ -264,45 +300,23 @@ impl<'a> Scanner<'a> {
         self.edges = edges;
         Ok(result)
     }
+}
 
-    /// Whether each token of the row is one value by itself.
-    #[inline]
-    fn is_plain(&mut self, row: &Row<'_>) -> bool {
-        let base = row.base;
-        let (starts, _) = row.offsets.as_chunks::<2>();
-        let special = starts.iter().fold(0, |sum, edge| sum | SPECIAL[usize::from(self.text[base + edge[0] as usize])]);
-        if special != 0 && !self.quotes_match(row) {
-            return false;
+/// What the first bytes of a row's tokens say, as in [`SPECIAL`].
+#[inline]
+fn special(window: &[u8], offsets: &[u32]) -> u8 {
+    let (tokens, _) = offsets.as_chunks::<2>();
+    tokens.iter().fold(0, |sum, token| sum | SPECIAL[usize::from(window[token[0] as usize])])
+}
+
+/// Whether every token of the row is one value by itself: quotes close where the token ends, and nothing is a tag or a
+/// reserved word.
+fn values_only(window: &[u8], offsets: &[u32]) -> bool {
+    offsets.as_chunks::<2>().0.iter().all(|token| {
+        let token = &window[token[0] as usize..token[1] as usize];
+        match token[0] {
+            quote @ (b'\'' | b'"') => token.len() > 1 && token[token.len() - 1] == quote,
+            _ => bare_kind(token) == Kind::Value,
         }
-        let end = base + row.offsets[row.offsets.len() - 1] as usize;
-        self.underscore >= end || self.no_words(row, end)
-    }
-
-    fn quotes_match(&self, row: &Row<'_>) -> bool {
-        row.offsets.as_chunks::<2>().0.iter().all(|edge| {
-            let token = &self.text[row.base + edge[0] as usize..row.base + edge[1] as usize];
-            match token[0] {
-                quote @ (b'\'' | b'"') => token.len() > 1 && token[token.len() - 1] == quote,
-                b'#' | b';' => false,
-                _ => true,
-            }
-        })
-    }
-
-    /// Whether a row without special characters, but with underscores, has no tag and no reserved word.
-    fn no_words(&mut self, row: &Row<'_>, end: usize) -> bool {
-        let from = row.base + row.offsets[0] as usize;
-        if self.underscore < from {
-            let rest = &self.text[from..];
-            self.underscore = from + memchr::memchr(b'_', rest).unwrap_or(rest.len());
-            if self.underscore >= end {
-                return true;
-            }
-        }
-        row.offsets
-            .as_chunks::<2>()
-            .0
-            .iter()
-            .all(|edge| bare_kind(&self.text[row.base + edge[0] as usize..row.base + edge[1] as usize]) == Kind::Value)
-    }
+    })
 }

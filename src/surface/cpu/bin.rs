@@ -4,12 +4,12 @@
 //! its upper faces (index 8), of which it needs the face samples only: they belong to the next tile, which
 //! computes the same bits.
 
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32};
-use crate::surface::params::SurfaceLimits;
+use crate::surface::params::{MAX_RESOLUTION, SurfaceLimits};
 
 /// Bricks along a tile's edge with the layer beyond.
 pub(super) const SIDE: usize = 9;
@@ -134,12 +134,30 @@ pub(super) fn too_many_atoms(n: usize) -> SurfaceError {
 /// The refusal of a grid of (at least) `samples` samples.
 pub(super) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
     let excess = samples as f64 / limits.max_samples.max(1) as f64;
+    let mut fitting = lattice.spacing * excess.max(1.0).cbrt();
+    // Ever coarser until an upper bound of the samples fits; a box of one cell needs 27 blocks at most.
+    while samples_at_most(lattice, fitting) > limits.max_samples as f64 && fitting < MAX_RESOLUTION {
+        fitting *= 1.08;
+    }
     SurfaceError::GridTooLarge {
         samples,
         limit: limits.max_samples,
         resolution: lattice.spacing,
-        suggested_resolution: super::roomier(lattice.spacing * excess.max(1.0).cbrt()),
+        suggested_resolution: (fitting.min(MAX_RESOLUTION) * 100.0).ceil() / 100.0,
     }
+}
+
+/// An upper bound of the samples at another `spacing` (Å): blocks as long as the reach and a brick together that
+/// hold an atom, with their neighbours, contain every brick in reach.
+fn samples_at_most(lattice: &Lattice, spacing: f64) -> f64 {
+    let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
+    let side = reach + spacing * f64::from(BRICK);
+    let scale = lattice.spacing / side;
+    let homes: FxHashSet<[i32; 3]> =
+        lattice.atoms.iter().map(|atom| std::array::from_fn(|k| to_i32((atom.position(k) * scale).floor()))).collect();
+    let near = |c: &[i32; 3]| boxed(c.map(|c| [c - 1, c + 1])).collect::<Vec<_>>();
+    let blocks: FxHashSet<[i32; 3]> = homes.iter().flat_map(near).collect();
+    blocks.len() as f64 * (side / spacing).powi(3)
 }
 
 /// A tile's bricks and their candidate atoms. Kept and refilled from tile to tile.

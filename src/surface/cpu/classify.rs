@@ -3,9 +3,9 @@
 //! A brick's samples are eight 64-bit words, one per z layer, bit `8·y + x`. Every test on them is a shift.
 
 use super::field::Samples;
-use super::simd::dispatched;
 use crate::surface::cases::CASES;
 use crate::surface::lattice::BRICK_SAMPLES;
+use crate::surface::simd::dispatched;
 
 /// Inside bits of a brick: word z, bit `8·y + x`.
 pub(super) type Inside = [u64; 8];

@@ -7,8 +7,8 @@ use std::sync::LazyLock;
 
 use super::bin::SIDE;
 use super::classify::SurfaceBrick;
-use super::simd::dispatched;
 use crate::surface::cases::{CASES, MAX_TRIANGLES, cell_edge};
+use crate::surface::simd::dispatched;
 
 /// Samples along a brick's edge with the neighbours' first layer.
 const EDGE: usize = 9;

@@ -5,10 +5,10 @@
 //! whichever tile computes it and however generous the candidate list is: neighbours never disagree on a sign.
 
 use super::bin::NORMAL_ONLY;
-use super::simd::{dispatched, exp2, fma};
 use crate::surface::kernel::{MIN_DISTANCE2, Profile};
 use crate::surface::lattice::{BRICK_SAMPLES, LatticeAtom, to_f32};
 use crate::surface::params::Kernel;
+use crate::surface::simd::{dispatched, exp2, fma};
 
 /// Densities of a brick, x fastest: index `(z·8 + y)·8 + x`.
 pub(super) type Samples = [f32; BRICK_SAMPLES];

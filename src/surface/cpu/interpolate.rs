@@ -2,10 +2,10 @@
 
 use super::bin::{NORMAL_ONLY, slot_origin};
 use super::classify::SurfaceBrick;
-use super::simd::{dispatched, exp2, fma};
 use crate::surface::kernel::{MIN_DISTANCE2, Profile};
 use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
 use crate::surface::params::Kernel;
+use crate::surface::simd::{dispatched, exp2, fma};
 
 /// Vertices are shaded in batches of this many: one AVX-512 vector, two AVX ones.
 const LANES: usize = 16;

@@ -13,7 +13,6 @@ mod emit;
 mod field;
 mod interpolate;
 mod scan;
-mod simd;
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
@@ -31,6 +30,7 @@ use super::error::SurfaceError;
 use super::lattice::{BRICK_SAMPLES, Lattice, to_f32};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
+use super::simd;
 use super::spheres::Spheres;
 
 /// The native CPU backend.
@@ -116,7 +116,16 @@ struct Tally {
     bricks: AtomicU64,
     samples: AtomicU64,
     candidates: AtomicU64,
+    mesh_bytes: AtomicU64,
     tiles_done: AtomicUsize,
+}
+
+impl Tally {
+    /// What all `n` tiles will have, going by what the finished ones have.
+    fn all_tiles(&self, so_far: u64, n: usize) -> u64 {
+        let done = self.tiles_done.load(Ordering::Relaxed) + 1;
+        so_far / done as u64 * n as u64
+    }
 }
 
 /// A spacing a little above `spacing`, rounded up to hundredths of an Å: a suggestion that fits.
@@ -189,9 +198,7 @@ fn sample_tile(
     let occupied = count_occupied(bricks, tally);
     let samples = tally.samples.fetch_add(occupied * 512, Ordering::Relaxed) + occupied * 512;
     if samples > limits.max_samples {
-        // Only a part of the tiles is counted yet: scale up to all of them.
-        let share = (tally.tiles_done.load(Ordering::Relaxed) + 1) as u64;
-        return Err(bin::too_large(lattice, samples / share * tiles.len() as u64, limits));
+        return Err(bin::too_large(lattice, tally.all_tiles(samples, tiles.len()), limits));
     }
     control.span(Stage::Field, || {
         slots.fill(NO_BRICK);
@@ -219,6 +226,11 @@ fn sample_tile(
         inside.extend(fields.iter().map(|field| classify::inside_bits(field, iso)));
         classify_tile(bricks, fields, inside, slots, iso)
     });
+    let bytes = Mesh::bytes_for(u64::from(found.vertices), u64::from(found.triangles));
+    let so_far = tally.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
+    if so_far > limits.max_mesh_bytes {
+        return Err(scan::too_large(tally.all_tiles(so_far, tiles.len()), lattice.spacing, limits.max_mesh_bytes));
+    }
     Ok(Tile { coord, found, bricks: local, first_vertex: 0, first_triangle: 0 })
 }
 
@@ -278,6 +290,7 @@ fn build(
         triangles: Column::zeroed(totals.triangles),
         atom_ids: atom_ids.then(|| Column::zeroed(totals.vertices)),
         colors: None,
+        parts: done.iter().map(|tile| (tile.first_vertex as usize, tile.first_triangle as usize)).collect(),
     };
     let mut work = Vec::with_capacity(done.len());
     let (mut positions, mut normals) = (&mut mesh.positions[..], &mut mesh.normals[..]);

@@ -30,11 +30,13 @@ pub(super) fn scan(tiles: &mut [Tile], spacing: f64, limits: &SurfaceLimits) -> 
     let most = limits.max_mesh_bytes.min(Mesh::bytes_for(u64::from(u32::MAX), 0));
     match (usize::try_from(vertices), usize::try_from(triangles)) {
         (Ok(vertices), Ok(triangles)) if bytes <= most => Ok(Totals { vertices, triangles }),
-        _ => {
-            // Areas stay while cells shrink: bytes grow with the inverse square of the spacing.
-            let excess = bytes as f64 / most.max(1) as f64;
-            let suggested_resolution = super::roomier(spacing * excess.sqrt());
-            Err(SurfaceError::MeshTooLarge { bytes, limit: most, suggested_resolution })
-        }
+        _ => Err(too_large(bytes, spacing, most)),
     }
+}
+
+/// The refusal of a mesh of `bytes` bytes. Areas stay while cells shrink: bytes grow with the inverse square of the
+/// spacing.
+pub(super) fn too_large(bytes: u64, spacing: f64, limit: u64) -> SurfaceError {
+    let excess = (bytes as f64 / limit.max(1) as f64).max(1.0);
+    SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution: super::roomier(spacing * excess.sqrt()) }
 }

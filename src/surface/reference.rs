@@ -1,0 +1,233 @@
+//! The sequential reference: marching cubes over a dense box, every atom at every sample, in double precision.
+//!
+//! This is the program that the parallel backends are compared with, as in Dias, Bora and Gomes (HPDC 2010): time
+//! grows with atoms times samples. It shares the formulas and the case table with the others and nothing else.
+
+use super::backend::{Backend, GridStats, Meshed};
+use super::cases::{CASES, cell_edge};
+use super::control::{Control, Stage};
+use super::error::SurfaceError;
+use super::kernel::{MIN_DISTANCE2, Profile};
+use super::lattice::{to_f32, to_i32, to_u64};
+use super::mesh::Mesh;
+use super::params::{SurfaceLimits, SurfaceParams};
+use super::spheres::Spheres;
+
+/// The sequential reference backend.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ReferenceBackend;
+
+/// Edge parameters keep this distance from both ends, as in every backend.
+const EDGE_MARGIN: f64 = 1.0 / 1024.0;
+/// No vertex on this edge.
+const NONE: u32 = u32::MAX;
+
+/// The density as a sum over all spheres, in double precision.
+#[derive(Debug, Clone)]
+pub struct Density {
+    profile: Profile,
+    /// Centre and length scale ρ, Å.
+    spheres: Vec<([f64; 3], f64)>,
+}
+
+impl Density {
+    /// The density of `spheres` under `params`.
+    #[must_use]
+    pub fn new(spheres: &Spheres, params: &SurfaceParams) -> Self {
+        let profile = Profile::new(params);
+        let length = |i| profile.length(f64::from(spheres.radius(i)) * params.radius_scale + params.radius_offset);
+        Self { profile, spheres: (0..spheres.len()).map(|i| (spheres.centre(i), length(i))).collect() }
+    }
+
+    /// F at `x` (Å).
+    #[must_use]
+    pub fn value(&self, x: [f64; 3]) -> f64 {
+        let term = |(c, length): &([f64; 3], f64)| {
+            let d2: f64 = (0..3).map(|k| (x[k] - c[k]).powi(2)).sum();
+            let length2 = length * length;
+            self.profile.value(d2 / length2, MIN_DISTANCE2 / length2)
+        };
+        self.spheres.iter().map(term).sum()
+    }
+
+    /// ∇F at `x`, per Å.
+    #[must_use]
+    pub fn gradient(&self, x: [f64; 3]) -> [f64; 3] {
+        let mut sum = [0.0; 3];
+        for (c, length) in &self.spheres {
+            let d: [f64; 3] = std::array::from_fn(|k| x[k] - c[k]);
+            let length2 = length * length;
+            let u = d.iter().map(|d| d * d).sum::<f64>() / length2;
+            let slope = 2.0 / length2 * self.profile.slope(u, MIN_DISTANCE2 / length2);
+            (0..3).for_each(|k| sum[k] += slope * d[k]);
+        }
+        sum
+    }
+
+    /// Index of the sphere whose centre is nearest to `x`.
+    fn nearest(&self, x: [f64; 3]) -> u32 {
+        let distance2 = |c: &[f64; 3]| (0..3).map(|k| (x[k] - c[k]).powi(2)).sum::<f64>();
+        let best = (0_u32..).zip(&self.spheres).min_by(|(_, a), (_, b)| distance2(&a.0).total_cmp(&distance2(&b.0)));
+        best.map_or(0, |(i, _)| i)
+    }
+
+    /// The furthest that any sphere's density reaches, Å.
+    fn reach(&self) -> f64 {
+        self.spheres.iter().map(|(_, length)| self.profile.reach(*length)).fold(0.0, f64::max)
+    }
+}
+
+/// A dense box of samples.
+struct Grid {
+    origin: [i32; 3],
+    n: [usize; 3],
+}
+
+impl Grid {
+    fn new(spheres: &Spheres, density: &Density, h: f64, limits: &SurfaceLimits) -> Result<Self, SurfaceError> {
+        let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
+        let reach = density.reach();
+        let first: [f64; 3] = std::array::from_fn(|k| ((lo[k] - reach) / h).floor() - 1.0);
+        let last: [f64; 3] = std::array::from_fn(|k| ((hi[k] + reach) / h).ceil() + 1.0);
+        let n: [f64; 3] = std::array::from_fn(|k| last[k] - first[k] + 1.0);
+        let samples = to_u64(n.iter().product());
+        if samples > limits.max_samples {
+            let excess = samples as f64 / limits.max_samples.max(1) as f64;
+            let suggested_resolution = (h * excess.cbrt() * 105.0).ceil() / 100.0;
+            let limit = limits.max_samples;
+            return Err(SurfaceError::GridTooLarge { samples, limit, resolution: h, suggested_resolution });
+        }
+        Ok(Self { origin: first.map(to_i32), n: n.map(|n| usize::try_from(to_u64(n)).unwrap_or(usize::MAX)) })
+    }
+
+    fn len(&self) -> usize {
+        self.n.iter().product()
+    }
+
+    fn at(&self, [x, y, z]: [usize; 3]) -> usize {
+        (z * self.n[1] + y) * self.n[0] + x
+    }
+
+    fn cells(&self) -> impl Iterator<Item = [usize; 3]> {
+        let [nx, ny, nz] = self.n;
+        (0..nz - 1).flat_map(move |z| (0..ny - 1).flat_map(move |y| (0..nx - 1).map(move |x| [x, y, z])))
+    }
+
+    fn sample(&self, at: [usize; 3]) -> [i32; 3] {
+        std::array::from_fn(|k| self.origin[k] + at[k] as i32)
+    }
+}
+
+impl Backend for ReferenceBackend {
+    fn name(&self) -> &'static str {
+        "reference"
+    }
+
+    fn describe(&self) -> String {
+        "sequential reference, 1 thread, double precision".to_owned()
+    }
+
+    fn run(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<Meshed, SurfaceError> {
+        let smallest = spheres.radii().iter().copied().fold(f32::MAX, f32::min);
+        params.check_radius(smallest)?;
+        let density = Density::new(spheres, params);
+        let grid = Grid::new(spheres, &density, params.resolution, limits)?;
+        let h = params.resolution;
+        let mut field = vec![0.0_f64; grid.len()];
+        let layer = grid.n[0] * grid.n[1];
+        for (z, layer) in field.chunks_mut(layer).enumerate() {
+            control.check()?;
+            control.span(Stage::Field, || {
+                for (i, value) in layer.iter_mut().enumerate() {
+                    let at = [i % grid.n[0], i / grid.n[0], z];
+                    *value = density.value(grid.sample(at).map(|s| f64::from(s) * h));
+                }
+            });
+            control.observer.progress(Stage::Field, z + 1, grid.n[2]);
+        }
+        let cases: Vec<u8> = control.span(Stage::Classify, || {
+            let inside = |at| field[grid.at(at)] >= params.isovalue;
+            let corner = |[x, y, z]: [usize; 3], c: usize| [x + (c & 1), y + (c >> 1 & 1), z + (c >> 2 & 1)];
+            grid.cells().map(|cell| (0..8).fold(0, |case, c| case | u8::from(inside(corner(cell, c))) << c)).collect()
+        });
+        control.check()?;
+        let (mut mesh, ids) = control.span(Stage::Interpolate, || vertices(&grid, &field, &density, params, spheres));
+        control.check()?;
+        control.span(Stage::Emit, || mesh.triangles = triangles(&grid, &cases, &ids).into());
+        if mesh.n_triangles() == 0 {
+            return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
+        }
+        let bytes = Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64);
+        if bytes > limits.max_mesh_bytes {
+            let excess = bytes as f64 / limits.max_mesh_bytes.max(1) as f64;
+            let suggested_resolution = (h * excess.sqrt() * 105.0).ceil() / 100.0;
+            return Err(SurfaceError::MeshTooLarge { bytes, limit: limits.max_mesh_bytes, suggested_resolution });
+        }
+        let n = grid.len() as u64;
+        let stats =
+            GridStats { bricks: 0, surface_bricks: 0, samples: n, box_cells: cases.len() as u64, candidates: 0 };
+        Ok(Meshed { mesh, grid: stats })
+    }
+}
+
+/// A vertex on every crossing edge, and its id by sample and axis.
+fn vertices(
+    grid: &Grid,
+    field: &[f64],
+    density: &Density,
+    params: &SurfaceParams,
+    spheres: &Spheres,
+) -> (Mesh, Vec<[u32; 3]>) {
+    let (h, iso) = (params.resolution, params.isovalue);
+    let centre =
+        spheres.bounds().map_or([0.0; 3], |[lo, hi]| std::array::from_fn(|k| (0.5 * (lo[k] + hi[k]) / h).round() * h));
+    let (mut positions, mut normals, mut nearest) = (Vec::new(), Vec::new(), Vec::new());
+    let mut ids = vec![[NONE; 3]; grid.len()];
+    for cell in grid.cells() {
+        let (i, value) = (grid.at(cell), field[grid.at(cell)]);
+        for axis in 0..3 {
+            let mut next = cell;
+            next[axis] += 1;
+            let other = field[grid.at(next)];
+            if (value >= iso) == (other >= iso) {
+                continue;
+            }
+            let t = ((value - iso) / (value - other)).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
+            let mut x = grid.sample(cell).map(f64::from);
+            x[axis] += t;
+            let x = x.map(|c| c * h);
+            ids[i][axis] = u32::try_from(positions.len()).unwrap_or(NONE);
+            positions.push(std::array::from_fn(|k| to_f32(x[k] - centre[k])));
+            let g = density.gradient(x);
+            let length = g.iter().map(|c| c * c).sum::<f64>().sqrt();
+            normals.push(if length > 1e-9 { g.map(|c| to_f32(-c / length)) } else { [0.0; 3] });
+            if params.atom_ids {
+                nearest.push(density.nearest(x));
+            }
+        }
+    }
+    let atom_ids = params.atom_ids.then(|| nearest.into());
+    let mesh = Mesh { centre, positions: positions.into(), normals: normals.into(), atom_ids, ..Mesh::default() };
+    (mesh, ids)
+}
+
+/// The triangles of every cell.
+fn triangles(grid: &Grid, cases: &[u8], ids: &[[u32; 3]]) -> Vec<[u32; 3]> {
+    let mut triangles = Vec::new();
+    for (cell, &case) in grid.cells().zip(cases) {
+        triangles.extend(CASES.of(case).iter().map(|t| {
+            t.map(|e| {
+                let edge = cell_edge(e);
+                let owner = std::array::from_fn(|k| cell[k] + usize::from(edge.offset[k]));
+                ids[grid.at(owner)][usize::from(edge.axis)]
+            })
+        }));
+    }
+    triangles
+}

@@ -1,0 +1,65 @@
+//! `molmesh serve` as a process: its banner, its addresses, its end.
+#![cfg(all(unix, feature = "cli", feature = "server"))]
+
+mod cli_support;
+
+use std::process::Command;
+
+use cli_support::{Folder, Service, assert_code, run, stderr};
+
+#[test]
+fn the_banner_is_small_and_its_line_works_as_pasted() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &[]);
+    assert!(service.banner.lines().count() <= 10 && !service.banner.contains('\x1b'), "{}", service.banner);
+    for part in ["viewer", "/v1/capabilities", "metrics", "device", "cpu: ", "not gpu: "] {
+        assert!(service.banner.contains(part), "no `{part}` in\n{}", service.banner);
+    }
+    let line = service.banner.lines().last().unwrap().trim().strip_prefix("try").unwrap().trim();
+    let elsewhere = Folder::new();
+    let pasted = Command::new("sh").args(["-c", line]).current_dir(elsewhere.path("")).output().unwrap();
+    assert!(pasted.status.success(), "{line}: {}", String::from_utf8_lossy(&pasted.stderr));
+    let mesh = std::fs::read(elsewhere.path("4pti.glb")).unwrap();
+    assert!(mesh.starts_with(b"glTF") && mesh.len() > 100_000, "{line}: {}", String::from_utf8_lossy(&mesh));
+}
+
+#[test]
+fn it_stops_when_told_and_says_nothing_bad() {
+    for signal in ["TERM", "INT"] {
+        let folder = Folder::new();
+        let (code, log) = Service::start(&folder, &["--log", "json"]).stop(signal);
+        assert_eq!(code, Some(0), "{log}");
+        for line in log.lines() {
+            let value: serde_json::Value = serde_json::from_str(line).unwrap_or_else(|e| panic!("{e}: {line}"));
+            assert!(!["WARN", "ERROR"].contains(&value["level"].as_str().unwrap()), "{line}");
+        }
+    }
+}
+
+#[test]
+fn flags_reach_the_service() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--set", "limits.atoms=5", "--backend", "reference"]);
+    assert!(service.banner.contains("reference: "), "{}", service.banner);
+    let pdb = folder.file("rod.pdb", cli_support::rod());
+    let url = format!("http://{}/v1/meshes", service.addr);
+    let answer =
+        Command::new("curl").args(["-sS", "--data-binary"]).arg(format!("@{}", pdb.display())).arg(url).output();
+    let problem: serde_json::Value = serde_json::from_slice(&answer.unwrap().stdout).unwrap();
+    assert_eq!(problem["limit"], 5, "{problem}");
+}
+
+#[test]
+fn what_cannot_start_says_why() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &[]);
+    let taken = run(["serve", "--listen", &service.addr, "--set", "server.metrics_listen=none"]);
+    assert_code(&taken, 1);
+    assert!(stderr(&taken).contains(&service.addr), "{}", stderr(&taken));
+    for set in ["limits.atomz=5", "atoms", "limits.atoms=many", "limits.atoms=0"] {
+        let refused = run(["serve", "--listen", "127.0.0.1:0", "--set", set]);
+        assert_code(&refused, 2);
+    }
+    assert_code(&run(["serve", "--listen", "127.0.0.1:0", "--backend", "gpu"]), 6);
+    assert_code(&run(["serve", "--config", "/no/such/file.toml"]), 2);
+}

@@ -1,0 +1,480 @@
+//! The meshing core against truths from outside it: analytic spheres, a brute-force field in double precision,
+//! the sequential reference, and its own promises (closed, deterministic, indifferent to order).
+
+#![expect(clippy::unwrap_used, reason = "a test may panic")]
+
+use molmesh::surface::reference::Density;
+use molmesh::surface::{
+    Backend, CancelToken, Control, CpuBackend, Kernel, Measures, Meshed, Proof, ReferenceBackend, Spheres,
+    SurfaceError, SurfaceLimits, SurfaceOptions, SurfaceParams,
+};
+
+const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
+
+fn spheres(rows: &[[f64; 4]]) -> Spheres {
+    let column = |k: usize| rows.iter().map(|row| row[k]).collect();
+    Spheres::new(column(0), column(1), column(2), rows.iter().map(|row| row[3] as f32).collect()).unwrap()
+}
+
+fn params(kernel: Kernel, resolution: f64) -> SurfaceParams {
+    let options = SurfaceOptions { kernel: Some(kernel), resolution: Some(resolution), ..SurfaceOptions::default() };
+    SurfaceParams::new(&options).unwrap()
+}
+
+fn run_on(backend: &dyn Backend, spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+    backend.run(spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap()
+}
+
+fn run(spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+    run_on(&CpuBackend::new(Some(2)).unwrap(), spheres, params)
+}
+
+fn exact(meshed: &Meshed) -> Measures {
+    Measures::of(&meshed.mesh, Proof::Exact, &Control::default()).unwrap()
+}
+
+fn assert_sound(meshed: &Meshed, what: &str) -> Measures {
+    let m = exact(meshed);
+    assert!(m.closed && m.oriented && m.manifold, "{what}: {m:?}");
+    let quick = Measures::of(&meshed.mesh, Proof::Checksum, &Control::default()).unwrap();
+    assert_eq!((quick.closed, quick.manifold, quick.euler), (true, true, m.euler), "{what}");
+    for (p, n) in meshed.mesh.positions.iter().zip(&meshed.mesh.normals) {
+        assert!(p.iter().all(|c| c.is_finite()), "{what}");
+        let length = n.iter().map(|c| f64::from(*c).powi(2)).sum::<f64>().sqrt();
+        assert!((length - 1.0).abs() < 1e-5, "{what}: normal {n:?}");
+    }
+    m
+}
+
+/// A small deterministic generator: tests must fail the same way twice.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    fn cloud(&mut self, n: usize, side: f64) -> Vec<[f64; 4]> {
+        (0..n).map(|_| [self.next() * side, self.next() * side, self.next() * side, 1.2 + 0.7 * self.next()]).collect()
+    }
+}
+
+/// Slope of log(error) over log(spacing) between the coarsest and the finest spacing.
+fn order(errors: &[(f64, f64)]) -> f64 {
+    let (first, last) = (errors[0], errors[errors.len() - 1]);
+    (first.1 / last.1).ln() / (first.0 / last.0).ln()
+}
+
+#[test]
+fn a_lone_sphere_has_its_analytic_area_and_volume() {
+    let r = 1.7_f64;
+    let at = spheres(&[[0.123, -4.321, 7.007, r]]);
+    for kernel in KERNELS {
+        let (mut areas, mut volumes) = (Vec::new(), Vec::new());
+        for h in [0.4, 0.2, 0.1, 0.05] {
+            let meshed = run(&at, &params(kernel, h));
+            let m = assert_sound(&meshed, "sphere");
+            assert_eq!((m.euler, m.components.len()), (2, 1));
+            areas.push((h, (m.area - 4.0 * std::f64::consts::PI * r * r).abs()));
+            volumes.push((h, (m.volume - 4.0 / 3.0 * std::f64::consts::PI * r.powi(3)).abs()));
+            let bound = 0.6 * h * h;
+            for (p, n) in meshed.mesh.positions.iter().zip(&meshed.mesh.normals) {
+                let c = [0.123, -4.321, 7.007];
+                let d: [f64; 3] = std::array::from_fn(|k| f64::from(p[k]) + meshed.mesh.centre[k] - c[k]);
+                let length = d.iter().map(|c| c * c).sum::<f64>().sqrt();
+                assert!((length - r).abs() < bound, "{kernel} {h}: {length}");
+                let cosine: f64 = (0..3).map(|k| d[k] / length * f64::from(n[k])).sum();
+                assert!(cosine > 1.0 - 1e-5, "{kernel} {h}: {cosine}");
+            }
+        }
+        assert!(order(&areas) >= 1.9, "{kernel}: area of order {} {areas:?}", order(&areas));
+        assert!(order(&volumes) >= 1.9, "{kernel}: volume of order {} {volumes:?}", order(&volumes));
+    }
+}
+
+/// Area and volume of the body of revolution that two overlapping atoms make, by integrating the profile that a
+/// root finder gets from the double-precision density.
+fn two_atom_truth(density: &Density, iso: f64, half_length: f64) -> (f64, f64) {
+    let n = 4000;
+    let radius = |x: f64| {
+        let (mut lo, mut hi) = (0.0, 6.0);
+        if density.value([x, 0.0, 0.0]) < iso {
+            return 0.0;
+        }
+        for _ in 0..60 {
+            let mid = 0.5 * (lo + hi);
+            if density.value([x, mid, 0.0]) >= iso { lo = mid } else { hi = mid }
+        }
+        lo
+    };
+    // x = L·sin(θ) makes the profile's square-root ends smooth in θ.
+    let (mut lo, mut hi) = (0.0, 2.0 * half_length);
+    for _ in 0..60 {
+        let mid = 0.5 * (lo + hi);
+        if density.value([mid, 0.0, 0.0]) >= iso { lo = mid } else { hi = mid }
+    }
+    let end = lo;
+    let (mut area, mut volume) = (0.0, 0.0);
+    let step = std::f64::consts::PI / f64::from(n);
+    let points: Vec<(f64, f64)> = (0..=n)
+        .map(|i| {
+            let x = end * (-std::f64::consts::FRAC_PI_2 + step * f64::from(i)).sin();
+            (x, if i == 0 || i == n { 0.0 } else { radius(x) })
+        })
+        .collect();
+    for pair in points.windows(2) {
+        let ((x0, r0), (x1, r1)) = (pair[0], pair[1]);
+        // Frustums: second order in the step, far below the mesh's error.
+        area += std::f64::consts::PI * (r0 + r1) * ((x1 - x0).powi(2) + (r1 - r0).powi(2)).sqrt();
+        volume += std::f64::consts::PI / 3.0 * (x1 - x0) * (r0 * r0 + r0 * r1 + r1 * r1);
+    }
+    (area, volume)
+}
+
+#[test]
+fn two_overlapping_atoms_converge_to_the_integrated_truth() {
+    let at = spheres(&[[-0.8, 0.0, 0.0, 1.7], [0.8, 0.0, 0.0, 1.7]]);
+    for kernel in KERNELS {
+        let density = Density::new(&at, &params(kernel, 0.5));
+        let (area, volume) = two_atom_truth(&density, 1.0, 2.5);
+        let (mut areas, mut volumes) = (Vec::new(), Vec::new());
+        for h in [0.4, 0.2, 0.1, 0.05] {
+            let m = assert_sound(&run(&at, &params(kernel, h)), "two atoms");
+            areas.push((h, (m.area - area).abs()));
+            volumes.push((h, (m.volume - volume).abs()));
+        }
+        assert!(order(&areas) >= 1.9, "{kernel}: area of order {} {areas:?}", order(&areas));
+        assert!(order(&volumes) >= 1.9, "{kernel}: volume of order {} {volumes:?}", order(&volumes));
+    }
+}
+
+/// Every vertex lies where the straight line between its edge's two exact densities crosses the isovalue, and its
+/// normal is the exact gradient's.
+#[test]
+fn vertices_and_normals_agree_with_the_brute_force_field() {
+    let rows = Random(7).cloud(300, 18.0);
+    let at = spheres(&rows);
+    for kernel in KERNELS {
+        for h in [0.5, 0.37, 1.0] {
+            let params = params(kernel, h);
+            let density = Density::new(&at, &params);
+            let meshed = run(&at, &params);
+            assert_sound(&meshed, kernel.name());
+            let mut worst = (0.0_f64, 0.0_f64);
+            for (p, n) in meshed.mesh.positions.iter().zip(&meshed.mesh.normals).step_by(17) {
+                let x: [f64; 3] = std::array::from_fn(|k| f64::from(p[k]) + meshed.mesh.centre[k]);
+                let lattice = x.map(|c| c / h);
+                let axis = (0..3).max_by(|&a, &b| fraction(lattice[a]).total_cmp(&fraction(lattice[b]))).unwrap();
+                let mut low = lattice.map(f64::round);
+                low[axis] = lattice[axis].floor();
+                let mut high = low;
+                high[axis] += 1.0;
+                let [f0, f1] = [low, high].map(|s| density.value(s.map(|c| c * h)));
+                assert!((f0 >= 1.0) != (f1 >= 1.0) || (f0 - 1.0).abs() < 1e-5 || (f1 - 1.0).abs() < 1e-5);
+                let t = ((f0 - 1.0) / (f0 - f1)).clamp(1.0 / 1024.0, 1.0 - 1.0 / 1024.0);
+                worst.0 = worst.0.max((low[axis] + t - lattice[axis]).abs() * h);
+                let g = density.gradient(x);
+                let length = g.iter().map(|c| c * c).sum::<f64>().sqrt();
+                if length > 1e-2 {
+                    let cosine: f64 = (0..3).map(|k| -g[k] / length * f64::from(n[k])).sum();
+                    worst.1 = worst.1.max(1.0 - cosine);
+                }
+            }
+            assert!(worst.0 < 2e-4, "{kernel} {h}: vertices off by {} Å", worst.0);
+            assert!(worst.1 < 1e-5, "{kernel} {h}: normals off by 1 − cos = {}", worst.1);
+        }
+    }
+}
+
+fn fraction(v: f64) -> f64 {
+    (v - v.round()).abs()
+}
+
+#[test]
+fn the_gradient_is_the_fields_derivative() {
+    let rows = Random(11).cloud(60, 9.0);
+    let at = spheres(&rows);
+    let mut random = Random(5);
+    for kernel in KERNELS {
+        let density = Density::new(&at, &params(kernel, 0.5));
+        for _ in 0..200 {
+            let x: [f64; 3] = std::array::from_fn(|_| random.next() * 9.0);
+            let g = density.gradient(x);
+            let e = 1e-5;
+            for k in 0..3 {
+                let (mut a, mut b) = (x, x);
+                a[k] -= e;
+                b[k] += e;
+                let numeric = (density.value(b) - density.value(a)) / (2.0 * e);
+                let bound = 1e-4 * g.iter().map(|c| c.abs()).fold(1.0, f64::max);
+                assert!((numeric - g[k]).abs() < bound, "{kernel} at {x:?}: {numeric} {}", g[k]);
+            }
+        }
+    }
+}
+
+#[test]
+fn the_native_backend_agrees_with_the_sequential_reference() {
+    let rows = Random(3).cloud(40, 8.0);
+    let at = spheres(&rows);
+    for kernel in KERNELS {
+        let params = SurfaceParams { atom_ids: true, ..params(kernel, 0.6) };
+        let native = run(&at, &params);
+        let reference = run_on(&ReferenceBackend, &at, &params);
+        let (a, b) = (assert_sound(&native, "native"), assert_sound(&reference, "reference"));
+        assert_eq!(native.mesh.n_vertices(), reference.mesh.n_vertices(), "{kernel}");
+        assert_eq!(native.mesh.n_triangles(), reference.mesh.n_triangles(), "{kernel}");
+        assert_eq!((a.euler, a.components.len()), (b.euler, b.components.len()), "{kernel}");
+        assert!(
+            (a.area / b.area - 1.0).abs() < 1e-5 && (a.volume / b.volume - 1.0).abs() < 1e-5,
+            "{kernel} {a:?} {b:?}"
+        );
+        assert_eq!(native.mesh.centre, reference.mesh.centre);
+        // The two number vertices differently: compare them in the order of their grid edges.
+        let sorted = |m: &Meshed| {
+            let ids = m.mesh.atom_ids.as_ref().unwrap();
+            let mut rows: Vec<_> =
+                m.mesh.positions.iter().zip(ids).map(|(p, id)| (p.map(|c| (c * 500.0).round() as i64), *id)).collect();
+            rows.sort_unstable();
+            rows
+        };
+        let (x, y) = (sorted(&native), sorted(&reference));
+        let same = x.iter().filter(|row| y.binary_search(row).is_ok()).count();
+        assert!(same * 100 >= x.len() * 97, "{kernel}: {same} of {} rows equal", x.len());
+    }
+    // Negative control: another isovalue must not pass for the same mesh.
+    let other = SurfaceParams { isovalue: 1.01, ..params(Kernel::Gaussian, 0.6) };
+    let (a, b) = (exact(&run(&at, &params(Kernel::Gaussian, 0.6))), exact(&run(&at, &other)));
+    assert!((a.volume / b.volume - 1.0).abs() > 1e-4, "{} {}", a.volume, b.volume);
+}
+
+#[test]
+fn the_same_bytes_with_any_number_of_threads_and_any_order_of_atoms() {
+    let mut rows = Random(21).cloud(1500, 45.0);
+    let at = spheres(&rows);
+    for kernel in KERNELS {
+        let params = params(kernel, 0.5);
+        let [one, two, seven] = [1, 2, 7].map(|n| run_on(&CpuBackend::new(Some(n)).unwrap(), &at, &params));
+        assert_eq!(one.mesh, two.mesh);
+        assert_eq!(one.mesh, seven.mesh);
+        assert_eq!(one.grid, seven.grid);
+        rows.reverse();
+        rows.rotate_left(311);
+        let permuted = run(&spheres(&rows), &params);
+        assert_eq!(one.mesh.triangles, permuted.mesh.triangles, "{kernel}");
+        assert_eq!(one.mesh.positions, permuted.mesh.positions, "{kernel}");
+        let changed = run(&spheres(&rows[1..]), &params);
+        assert_ne!(one.mesh.positions, changed.mesh.positions, "negative control");
+    }
+}
+
+#[test]
+fn shifting_by_whole_steps_shifts_the_mesh() {
+    let rows = Random(77).cloud(200, 15.0);
+    let moved: Vec<[f64; 4]> = rows.iter().map(|r| [r[0] + 512.5, r[1] - 100.0, r[2] + 33.0, r[3]]).collect();
+    let (a, b) =
+        (run(&spheres(&rows), &params(Kernel::Gaussian, 0.5)), run(&spheres(&moved), &params(Kernel::Gaussian, 0.5)));
+    let (m, n) = (assert_sound(&a, "here"), assert_sound(&b, "there"));
+    assert_eq!(
+        (m.euler, a.mesh.n_vertices(), a.mesh.n_triangles()),
+        (n.euler, b.mesh.n_vertices(), b.mesh.n_triangles())
+    );
+    assert!((m.area - n.area).abs() < 1e-3 && (m.volume - n.volume).abs() < 1e-3);
+    let shift: [f64; 3] = std::array::from_fn(|k| b.mesh.centre[k] - a.mesh.centre[k]);
+    assert_eq!(shift, [512.5, -100.0, 33.0]);
+}
+
+#[test]
+fn a_union_never_shrinks() {
+    let rows = Random(99).cloud(120, 12.0);
+    for kernel in KERNELS {
+        let part = exact(&run(&spheres(&rows[..60]), &params(kernel, 0.5)));
+        let whole = exact(&run(&spheres(&rows), &params(kernel, 0.5)));
+        assert!(whole.volume > part.volume, "{kernel}: {} {}", whole.volume, part.volume);
+    }
+}
+
+#[test]
+fn atoms_everywhere_around_tile_and_brick_borders() {
+    // One atom at a time, swept across a tile's corner in steps that hit samples, faces and halves exactly.
+    for step in 0..24 {
+        let x = 31.0 + f64::from(step) * 0.125;
+        for at in [[x, 0.0, 0.0], [x, x, 0.25], [x, x, x], [-x, x, -x]] {
+            let m =
+                assert_sound(&run(&spheres(&[[at[0], at[1], at[2], 1.7]]), &params(Kernel::Gaussian, 0.5)), "swept");
+            assert_eq!((m.euler, m.components.len()), (2, 1), "{at:?}");
+            // Chords cut a few per cent off a sphere of 3.4 spacings.
+            assert!((m.volume - 20.58).abs() < 0.8, "{at:?} {}", m.volume);
+        }
+    }
+}
+
+#[test]
+fn ties_are_inside_and_stay_manifold() {
+    // The soft object's density is 1 exactly at half its support: put that on grid points.
+    let at = spheres(&[[0.0, 0.0, 0.0, 1.5], [6.0, 0.0, 0.0, 1.5], [3.0, 0.0, 0.0, 1.5]]);
+    for h in [0.5, 0.25, 0.75, 1.5] {
+        assert_sound(&run(&at, &params(Kernel::SoftObject, h)), "ties");
+    }
+    // A block of equal atoms on a lattice gives saddles where the gradient vanishes.
+    let rows: Vec<[f64; 4]> = (0..125)
+        .map(|i| [i % 5, i / 5 % 5, i / 25].map(|c| f64::from(c) * 3.0))
+        .map(|c| [c[0], c[1], c[2], 1.5])
+        .collect();
+    for kernel in KERNELS {
+        for h in [0.25, 0.5, 0.75] {
+            assert_sound(&run(&spheres(&rows), &params(kernel, h)), "lattice of atoms");
+        }
+    }
+}
+
+#[test]
+fn a_hollow_shell_has_a_cavity() {
+    // Atoms on a sphere of radius 9 Å: an outer surface and an inner one of negative volume.
+    let golden = std::f64::consts::PI * (3.0 - 5.0_f64.sqrt());
+    let n = 300;
+    let rows: Vec<[f64; 4]> = (0..n)
+        .map(|i| {
+            let z = 1.0 - 2.0 * (f64::from(i) + 0.5) / f64::from(n);
+            let (r, a) = ((1.0 - z * z).sqrt(), golden * f64::from(i));
+            [9.0 * r * a.cos(), 9.0 * r * a.sin(), 9.0 * z, 1.7]
+        })
+        .collect();
+    let m = assert_sound(&run(&spheres(&rows), &params(Kernel::Gaussian, 0.5)), "shell");
+    let volumes: Vec<f64> = m.components.iter().map(|c| c.volume).collect();
+    assert_eq!(m.components.len(), 2, "{volumes:?}");
+    assert!(volumes[0] > 4000.0 && volumes[1] < -1000.0, "{volumes:?}");
+}
+
+#[test]
+fn the_nearest_atom_of_each_vertex_is_the_nearest() {
+    let rows = Random(13).cloud(400, 20.0);
+    let at = spheres(&rows);
+    let params = SurfaceParams { atom_ids: true, ..params(Kernel::Gaussian, 0.5) };
+    let mesh = run(&at, &params).mesh;
+    let ids = mesh.atom_ids.as_ref().unwrap();
+    assert_eq!(ids.len(), mesh.n_vertices());
+    let mut right = 0;
+    for (p, &id) in mesh.positions.iter().zip(ids.iter()) {
+        let d2 = |row: &[f64; 4]| (0..3).map(|k| (f64::from(p[k]) + mesh.centre[k] - row[k]).powi(2)).sum::<f64>();
+        let best = rows.iter().map(d2).fold(f64::MAX, f64::min);
+        right += usize::from(d2(&rows[id as usize]) <= best + 1e-4);
+    }
+    assert_eq!(right, ids.len());
+}
+
+#[test]
+fn limits_are_checked_and_their_suggestions_fit() {
+    let at = spheres(&Random(1).cloud(500, 40.0));
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    for limits in [
+        SurfaceLimits { max_samples: 100_000, ..SurfaceLimits::default() },
+        SurfaceLimits { max_mesh_bytes: 300_000, ..SurfaceLimits::default() },
+    ] {
+        for h in [0.5, 0.2, 0.05, 0.02] {
+            let started = std::time::Instant::now();
+            let error = backend.run(&at, &params(Kernel::Gaussian, h), &limits, &Control::default()).unwrap_err();
+            let (SurfaceError::GridTooLarge { suggested_resolution: mut h, .. }
+            | SurfaceError::MeshTooLarge { suggested_resolution: mut h, .. }) = error
+            else {
+                panic!("{error}")
+            };
+            assert!(started.elapsed().as_secs_f64() < 5.0, "refused late");
+            // An extrapolation from a part of the tiles may need another step.
+            for attempt in 0.. {
+                match backend.run(&at, &params(Kernel::Gaussian, h), &limits, &Control::default()) {
+                    Ok(_) => break,
+                    Err(
+                        SurfaceError::GridTooLarge { suggested_resolution, .. }
+                        | SurfaceError::MeshTooLarge { suggested_resolution, .. },
+                    ) => {
+                        assert!(
+                            attempt < 2 && suggested_resolution > h,
+                            "no progress from {h} to {suggested_resolution}"
+                        );
+                        h = suggested_resolution;
+                    }
+                    Err(other) => panic!("{other}"),
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn nothing_to_see_is_said() {
+    let backend = CpuBackend::new(Some(1)).unwrap();
+    let limits = SurfaceLimits::default();
+    let empty = Spheres::new(vec![], vec![], vec![], vec![]).unwrap();
+    let run =
+        |at: &Spheres, p: &SurfaceParams| backend.run(at, p, &limits, &Control::default()).map(|_| ()).unwrap_err();
+    assert_eq!(run(&empty, &params(Kernel::Gaussian, 0.5)), SurfaceError::NoSpheres);
+    let one = spheres(&[[0.3, 0.3, 0.3, 1.7]]);
+    let high = SurfaceParams { isovalue: 50.0, ..params(Kernel::Gaussian, 0.5) };
+    assert_eq!(run(&one, &high), SurfaceError::NoSurface { isovalue: 50.0 });
+    let shrunk = SurfaceParams { radius_offset: -1.7, ..params(Kernel::Gaussian, 0.5) };
+    assert!(matches!(run(&one, &shrunk), SurfaceError::BadParameter { name: "radius_offset", .. }));
+    for bad in [
+        [f64::NAN, 0.0, 0.0, 1.0],
+        [0.0, 1e30, 0.0, 1.0],
+        [0.0, 0.0, 2e5, 1.0],
+        [0.0, 0.0, 0.0, 0.0],
+        [0.0, 0.0, 0.0, -1.0],
+    ] {
+        let column = |k: usize| vec![bad[k]];
+        let refused = Spheres::new(column(0), column(1), column(2), vec![bad[3] as f32]);
+        assert!(matches!(refused, Err(SurfaceError::BadSphere { index: 0, .. })), "{bad:?}");
+    }
+}
+
+#[test]
+fn a_cancelled_run_stops() {
+    let at = spheres(&Random(1).cloud(3000, 60.0));
+    let cancel = CancelToken::default();
+    cancel.cancel();
+    let control = Control { cancel, ..Control::default() };
+    for backend in [&CpuBackend::new(Some(2)).unwrap() as &dyn Backend, &ReferenceBackend] {
+        let started = std::time::Instant::now();
+        let stopped = backend.run(&at, &params(Kernel::Gaussian, 0.3), &SurfaceLimits::default(), &control);
+        assert_eq!(stopped.map(|_| ()).unwrap_err(), SurfaceError::Cancelled);
+        assert!(started.elapsed().as_secs_f64() < 5.0);
+    }
+}
+
+#[test]
+fn far_apart_atoms_cost_what_they_occupy() {
+    let rows: Vec<[f64; 4]> = (0..8)
+        .map(|i| [i & 1, i >> 1 & 1, i >> 2].map(|c| f64::from(c) * 180_000.0 - 90_000.0))
+        .map(|c| [c[0], c[1], c[2], 1.7])
+        .collect();
+    let meshed = run(&spheres(&rows), &params(Kernel::Gaussian, 0.5));
+    let m = assert_sound(&meshed, "far apart");
+    assert_eq!(m.components.len(), 8);
+    assert!(meshed.grid.box_cells > 1 << 52 && meshed.grid.samples < 1 << 18, "{:?}", meshed.grid);
+}
+
+#[test]
+fn the_papers_raw_parameters_mesh() {
+    let rows = Random(31).cloud(100, 12.0);
+    let raw = |kernel, a, b, c, iso| SurfaceOptions {
+        kernel: Some(kernel),
+        paper_a: a,
+        paper_b: b,
+        paper_c: c,
+        isovalue: Some(iso),
+        ..SurfaceOptions::default()
+    };
+    for options in [
+        raw(Kernel::Gaussian, Some(0.5), Some(4.0), None, 1.0),
+        raw(Kernel::SoftObject, Some(2.0), Some(3.4), None, 1.0),
+        raw(Kernel::InverseSquare, None, Some(4.0), Some(1.0), 0.5),
+    ] {
+        let params = SurfaceParams::new(&options).unwrap();
+        let m = assert_sound(&run(&spheres(&rows), &params), "raw");
+        assert!(m.volume > 0.0);
+        // Radii are out of play: other radii, same mesh.
+        let other: Vec<[f64; 4]> = rows.iter().map(|r| [r[0], r[1], r[2], 1.0]).collect();
+        assert_eq!(run(&spheres(&rows), &params).mesh.positions, run(&spheres(&other), &params).mesh.positions);
+    }
+}
