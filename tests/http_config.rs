@@ -1,5 +1,6 @@
 //! The configuration's layers, and what they refuse; the table of parameters against the core's own ranges.
 #![cfg(feature = "server")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
 use std::path::Path;
 

@@ -1,5 +1,6 @@
 //! What happens when things go wrong or end: panics, failures, clients that leave, the warm-up, the drain.
 #![cfg(feature = "server")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
 mod http_support;
 
@@ -162,7 +163,7 @@ fn a_drain_finishes_what_runs_and_what_waits() {
 
 #[test]
 fn a_drain_has_a_deadline() {
-    let backend = Fake::new(Mode::Slow(Duration::from_secs(60)));
+    let backend = Fake::new(Mode::Slow(Duration::from_mins(1)));
     let mut server = start(Arc::clone(&backend) as _, |c| c.server.drain_timeout_ms = 300);
     let stream = begin(&server, SAMPLE);
     wait_for("the job to run", || backend.started.load(Ordering::SeqCst) == 1);
@@ -180,7 +181,7 @@ fn a_backend_that_cannot_be_cancelled_does_not_hold_up_the_answer() {
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.deadline_ms = 200);
     let start = Instant::now();
     server.post("/v1/meshes", &[], SAMPLE).problem(504, "deadline");
-    assert!(start.elapsed() < Duration::from_millis(1000), "{:?}", start.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(1), "{:?}", start.elapsed());
 }
 
 #[test]

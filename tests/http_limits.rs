@@ -1,5 +1,6 @@
 //! Every limit of the configuration, reached over a socket: the answer, the number, the metric, and a server that lives.
 #![cfg(feature = "server")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
 mod http_support;
 

@@ -19,8 +19,12 @@ fn symbols(s: &Structure) -> Vec<u8> {
 
 #[test]
 fn every_column_is_read() {
-    let s = pdb(["HEADER    HYDROLASE                               02-MAR-00   1ABC              \n",
-        "TITLE     A TITLE  OF\nTITLE    2 TWO LINES \n", CA].concat());
+    let s = pdb([
+        "HEADER    HYDROLASE                               02-MAR-00   1ABC              \n",
+        "TITLE     A TITLE  OF\nTITLE    2 TWO LINES \n",
+        CA,
+    ]
+    .concat());
     assert_eq!((s.id.as_deref(), s.title.as_deref()), (Some("1ABC"), Some("A TITLE OF TWO LINES")));
     assert_eq!((s.x[0], s.y[0], s.z[0]), (11.104, -6.134, 0.5));
     assert_eq!((s.name.get(0), s.residue.get(0), s.chain.get(0)), ("CA", "ALA", "B"));
@@ -52,12 +56,17 @@ fn short_lines_read_down_to_the_coordinates() {
     }
     let error = refusal(format!("REMARK\n{}\n", &CA[..53]));
     assert_eq!(error, "line 2, column 54: found a line of 53 columns, expected coordinates in columns 31 to 54");
-    assert_eq!(refusal("REMARK   1\r\nATOM"), "line 2, column 5: found a line of 4 columns, expected coordinates in columns 31 to 54");
+    assert_eq!(
+        refusal("REMARK   1\r\nATOM"),
+        "line 2, column 5: found a line of 4 columns, expected coordinates in columns 31 to 54"
+    );
 }
 
 #[test]
 fn serial_numbers_may_overflow() {
-    for serial in ["ATOM  99999", "ATOM  A0000", "ATOM  *****", "ATOM 100000", "ATOM      0", "ATOM       ", "ATOM  186a0"] {
+    for serial in
+        ["ATOM  99999", "ATOM  A0000", "ATOM  *****", "ATOM 100000", "ATOM      0", "ATOM       ", "ATOM  186a0"]
+    {
         assert_eq!(pdb(CA.replace("ATOM      2", serial)).name.get(0), "CA", "{serial}");
     }
     assert!(pdb(CA.replace("ATOM      2", "HETATM100000")[..55].to_owned() + "\n").hetero[0]);
@@ -111,17 +120,31 @@ fn blank_element_columns_are_guessed_from_name_and_residue() {
         pdb(line).element[0]
     };
     let cases = [
-        (" CA ", "ALA", 6), ("CA  ", " CA", 20), ("CA  ", "ALA", 6), ("HG  ", " HG", 80), ("HG11", "VAL", 1), (" HG ", "CYS", 1),
-        ("FE  ", "HEM", 26), (" NA ", "HEM", 7), ("NA  ", " NA", 11), ("1HB ", "ALA", 1), (" D  ", "ALA", 1), ("SE  ", "MSE", 34),
-        ("CL1 ", "LIG", 17), ("ZN  ", " ZN", 30), (" O5*", "  C", 8), (" OW ", "SOL", 8), ("SOD ", "SOD", 11), (" P  ", " DA", 15),
+        (" CA ", "ALA", 6),
+        ("CA  ", " CA", 20),
+        ("CA  ", "ALA", 6),
+        ("HG  ", " HG", 80),
+        ("HG11", "VAL", 1),
+        (" HG ", "CYS", 1),
+        ("FE  ", "HEM", 26),
+        (" NA ", "HEM", 7),
+        ("NA  ", " NA", 11),
+        ("1HB ", "ALA", 1),
+        (" D  ", "ALA", 1),
+        ("SE  ", "MSE", 34),
+        ("CL1 ", "LIG", 17),
+        ("ZN  ", " ZN", 30),
+        (" O5*", "  C", 8),
+        (" OW ", "SOL", 8),
+        ("SOD ", "SOD", 11),
+        (" P  ", " DA", 15),
     ];
     for (name, residue, z) in cases {
         assert_eq!(element(name, residue), z, "{name} in {residue}");
     }
     // A file whose names are all left-justified says nothing by alignment: N and C in the first column give it away.
-    let lines = ["N   ALA", "CA  ALA", "C   LIG", "CD  LIG", "CD   CD"].map(|n| {
-        format!("ATOM      1 {n} A   1      11.104   6.134  -6.504\n")
-    });
+    let lines = ["N   ALA", "CA  ALA", "C   LIG", "CD  LIG", "CD   CD"]
+        .map(|n| format!("ATOM      1 {n} A   1      11.104   6.134  -6.504\n"));
     assert_eq!(symbols(&pdb(lines.concat())), [7, 6, 6, 6, 48]);
 }
 
@@ -189,8 +212,14 @@ fn numbers_are_refused_by_place() {
     assert_eq!(bad("  11.104", "        "), format!("line 2, column 31: found blanks, {x}"));
     assert!(bad("  -6.134", "  -6.13x").starts_with("line 2, column 39: found `  -6.13x`, expected the y"));
     assert!(bad("   0.500", " 0 . 500").starts_with("line 2, column 47: found ` 0 . 500`, expected the z"));
-    assert!(bad("  0.50", "  x.50").starts_with("line 2, column 55: found `  x.50`, expected an occupancy in columns 55 to 60"));
-    assert!(bad(" 20.25", "   NaN").starts_with("line 2, column 61: found `   NaN`, expected a B-factor in columns 61 to 66"));
+    assert!(
+        bad("  0.50", "  x.50")
+            .starts_with("line 2, column 55: found `  x.50`, expected an occupancy in columns 55 to 60")
+    );
+    assert!(
+        bad(" 20.25", "   NaN")
+            .starts_with("line 2, column 61: found `   NaN`, expected a B-factor in columns 61 to 66")
+    );
     assert_eq!(pdb(CA.replace("  11.104", "1.104   ")).x[0], 1.104);
     assert_eq!(pdb(CA.replace("  11.104", "  -1e2  ")).x[0], -100.0);
     assert_eq!(pdb(CA.replace("  11.104", "100000.0")).x[0], 100_000.0);

@@ -223,11 +223,8 @@ mod tests {
 
     #[test]
     fn columns_of_different_lengths_are_refused() {
-        let whole = Mesh {
-            positions: vec![[0.0; 3]; 2].into(),
-            normals: vec![[0.0, 0.0, 1.0]; 2].into(),
-            ..Mesh::default()
-        };
+        let whole =
+            Mesh { positions: vec![[0.0; 3]; 2].into(), normals: vec![[0.0, 0.0, 1.0]; 2].into(), ..Mesh::default() };
         assert!(check(&whole, Depth::All).is_ok());
         let broken = [
             ("normals", Mesh { normals: vec![[0.0; 3]].into(), ..whole.clone() }),

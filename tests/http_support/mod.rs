@@ -1,6 +1,8 @@
 //! A server in this process, backends that misbehave on command, and a client that speaks HTTP/1.1 by hand, so that it
 //! can misbehave as well.
 #![allow(dead_code, reason = "every test binary uses its own part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::format_push_string, reason = "requests read best as they are sent")]
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -200,7 +202,7 @@ pub(crate) fn start_cold(backend: Arc<dyn Backend>, change: impl FnOnce(&mut Con
     let mut config = Config::default();
     config.server.listen = "127.0.0.1:0".parse().unwrap();
     config.server.metrics_listen = Some("127.0.0.1:0".parse().unwrap());
-    config.server.data_dir = dir.path().to_owned();
+    dir.path().clone_into(&mut config.server.data_dir);
     change(&mut config);
     let server = Server::bind(config, backend, "a test says so".to_owned()).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
