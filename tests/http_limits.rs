@@ -267,3 +267,45 @@ fn a_hundred_clients_at_once_are_all_answered() {
     assert!(statuses.iter().all(|status| [200, 503].contains(status)), "{statuses:?}");
     assert!(statuses.iter().filter(|status| **status == 200).count() >= 60, "{statuses:?}");
 }
+
+#[test]
+fn slow_takers_cannot_use_up_the_threads() {
+    let server = fake(|c| c.jobs.deliveries = 1);
+    let body = carbons(60_000);
+    let mut stream = connect(server.addr);
+    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    let mut some = [0; 1000];
+    stream.read_exact(&mut some).unwrap();
+    let refused = server.post("/v1/meshes", &[], SAMPLE);
+    assert_eq!(refused.problem(503, "too-many-deliveries")["limit"], 1);
+    assert!(refused.header("retry-after").is_some());
+    drop(stream);
+    wait_for("the place is free", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
+}
+
+#[test]
+fn an_idle_http2_connection_is_closed() {
+    use hyper_util::rt::{TokioExecutor, TokioIo};
+    let server = fake(|c| {
+        c.server.header_timeout_ms = 300;
+        c.server.idle_timeout_ms = 300;
+    });
+    let addr = server.addr;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let time = runtime.block_on(async move {
+        let stream = tokio::net::TcpStream::connect(addr).await.unwrap();
+        let (mut client, connection) =
+            hyper::client::conn::http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await.unwrap();
+        let request = hyper::Request::get(format!("http://{addr}/livez"))
+            .body(http_body_util::Empty::<bytes::Bytes>::new())
+            .unwrap();
+        let start = Instant::now();
+        let driven = tokio::spawn(connection);
+        assert_eq!(client.send_request(request).await.unwrap().status().as_u16(), 200);
+        tokio::time::timeout(Duration::from_secs(4), driven).await.expect("closed").unwrap().unwrap();
+        start.elapsed()
+    });
+    assert!(time > Duration::from_millis(250), "{time:?}");
+}

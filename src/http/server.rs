@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use thiserror::Error;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 
 use super::state::{App, Readiness, Ready, Shared};
 use super::{accept, capabilities, metrics, router};
@@ -82,7 +82,9 @@ impl Server {
         let pool = Pool::start(settings, backend, reason).map_err(ServeError::Workers)?;
         let archive = Archive::new(config.archive_dir()).with_max_bytes(config.limits.inflated_bytes);
         let capabilities = capabilities::document(&config, &pool);
-        let app = Arc::new(App { config, pool, archive, readiness: Readiness::default(), capabilities });
+        let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
+        let readiness = Readiness::default();
+        let app = Arc::new(App { config, pool, archive, deliveries, readiness, capabilities });
         Ok(Self { app, listener, metrics_listener, addr, metrics_addr })
     }
 
