@@ -320,7 +320,7 @@ fn only_gltf_refuses_atom_indices_that_floats_cannot_hold() {
 
 #[test]
 fn vertices_without_triangles_make_an_empty_but_valid_gltf() {
-    let mesh = Mesh { triangles: Vec::new(), ..torus(4, 5) };
+    let mesh = Mesh { triangles: Vec::new().into(), ..torus(4, 5) };
     let glb = split_glb(&encode(Format::Glb, &mesh, &meta()));
     assert_eq!(gltf_contents(&glb.json, &glb.bin).positions.len(), 0);
     assert_eq!(read_ply(&encode(Format::Ply, &mesh, &meta())).positions.len(), 20);
@@ -369,7 +369,7 @@ fn trust_in_a_broken_mesh_never_panics() {
         let mut not_finite = torus(n, 300);
         not_finite.positions[1][2] = f32::NAN;
         let mut short = torus(n, 300);
-        short.normals.pop();
+        short.normals.edit().pop();
         for format in Format::ALL {
             let refused = |mesh: &Mesh| {
                 let encoder = Encoder::trusting(format, mesh, &meta());

@@ -269,7 +269,7 @@ proptest::proptest! {
         let letter = |text: &str| text.trim().bytes().next().unwrap_or(0);
         proptest::prop_assert_eq!((s.name.get(0), s.residue.get(0), s.chain.get(0)), (&*name, &*residue, &*chain));
         proptest::prop_assert_eq!((s.residue_number[0], s.insertion_code[0], s.altloc[0]), (number, letter(&code), letter(&altloc)));
-        proptest::prop_assert_eq!([s.x[0], s.y[0], s.z[0]], [x, y, zz].map(|v| format!("{v:.3}").parse().unwrap()));
+        proptest::prop_assert_eq!([s.x[0], s.y[0], s.z[0]], [x, y, zz].map(|v| format!("{v:.3}").parse::<f64>().unwrap()));
         proptest::prop_assert_eq!(s.occupancy[0], f32::from(occupancy) / 100.0);
         proptest::prop_assert!((f64::from(s.b_factor[0]) - f64::from(b) / 100.0).abs() < 1e-4);
         proptest::prop_assert_eq!((s.hetero[0], usize::from(s.element[0])), (hetero, z));

@@ -8,15 +8,45 @@
 //! a face's diagonal corners are inside, each is cut off by itself: a rule that looks at nothing but the face's
 //! four signs, so the two cells that share a face always agree. The outlines close into loops; each loop is
 //! triangulated without a diagonal that lies in a face, so no edge of the mesh gets a third triangle. The tests
-//! prove both for every case and for every pair of cases that can share a face.
-
-use std::sync::LazyLock;
+//! prove both for every case and for every pair of cases that can share a face, and that the table below is what this
+//! rule gives.
 
 /// Most triangles that a case has.
 pub const MAX_TRIANGLES: usize = 5;
 
 /// The table of all cases.
-pub static CASES: LazyLock<Cases> = LazyLock::new(Cases::generate);
+pub static CASES: Cases = Cases::parse(ROWS);
+
+/// The triangles of cases 0 to 255: each digit is a cell edge (hexadecimal), three make a triangle, `.` is none.
+#[rustfmt::skip]
+const ROWS: &str = "
+. 048 095 485895 1a4 0181a8 0951a4 1a5a85895 15b 04815b 0919b1 14b49b489 45a5ba 0585a85ba 0949b4ba4 89a9ba 286
+042462 095286 296946954 1a4286 0a201aa62 0951a4286 1a5a25a62295 15b286 04246215b 0919b1286 14b46b62b29b
+28645a5ba 0525b2ba2a62 0949b4ba4286 2969b6ba6 279 048279 025275 278758548 1a4279 0181a8279 0252751a4
+1a5a85825275 15b279 04815b279 0710277b1 14b42b48227b 27945a5ba 0585a85ba279 0242b427bba4 2787a87ba 678798
+049469679 085875867 465675 1a4678798 0191691a6679 0858758671a4 1a5a75a67 15b678798 04946967915b 0818616717b1
+14b46b67b 45a5ba678798 0690b605bba6679 0b406b08667bba4 67a7ba 36a 04836a 09536a 36a485895 134364 018138368
+095134364 135385368895 15b36a 04815b36a 0919b136a 14b49b48936a 36b64b45b 0585385b3368 0949b4b34364 36b69b689
+2838a3 0424a2a32 0952838a3 2939535434a3 134324284 012132 095134324284 135325295 15b2838a3 0424a2a3215b
+0919b12838a3 14b42b4a2a3229b 2838434535b3 0525b2b32 0949b4b34324284 2939b3 27936a 04827936a 02527536a
+27875854836a 134364279 018138368279 025275134364 135385368825275 15b27936a 04815b27936a 0710277b136a
+14b42b48227b36a 27936b64b45b 0585385b3368279 0242b427bb34364 2787b8b38368 37a78a798 0494394a3379 0858a5a35375
+37a75a54a 134394379984 019139379 085835843413375 135375 15b37a78a798 0494394a337915b 0818718a7a377b1
+14b47b4a7a37 34b39437998445b 0390535b3379 08437b 37b 3b7 0483b7 0953b7 3b7485895 1a43b7 0181a83b7 0951a43b7
+1a5a858953b7 153573 048153573 091971731 143483893973 3a7a57a45 0585787383a8 0949349733a4 3a7a87897 2863b7
+0424623b7 0952863b7 2969469543b7 1a42863b7 0a201aa623b7 0951a42863b7 1a5a25a622953b7 153573286 042462153573
+091971731286 143493469629973 2863a7a57a45 0525a257a73aa62 0949349733a4286 2969a697a73a 2393b9 0482393b9
+0252353b5 2383583b5548 1a42393b9 0181a82393b9 0252353b51a4 1a5a858252353b5 153593923 048153593923 021231
+143483823 2393493a4459 0585385939233a8 0242343a4 2383a8 3b6b96986 0494696393b9 0858358633b5 3b6b46b54
+1a43b6b96986 0191691a66393b9 0858358633b51a4 1a5a656353b5 153593983863 049469639319159 081861631 143463
+3963493a4459986 0593a6 0340838633a4 3a6 6a7ab7 0486a7ab7 0956a7ab7 4858956a7ab7 1b4b64b76 0181781b7768
+0951b4b64b76 1851781b7768895 15a57a76a 04815a57a76a 0919717616a1 17a18714889776a 456576 058578768 094964976
+687897 2878a7ab7 0424a2ab2b72 0952878a7ab7 2a725a29554aab7 1b4b24b72284 0b201bb72 0951b4b24b72284 1251b2b72295
+15a57a72a28a 0424a2a52a15572 0919717817288a1 14a297 287857845 052572 094974724284 297 2696b96ab 0482696b96ab
+0252a526aab5 2582a526aab5548 1b4b94924264 0181681b6b96926 0252b526b64b41b 1b5268 15a52a59226a 04815a52a59226a
+0610266a1 12a14248226a 269649459 058568596926 024264 268 8a9ab9 0494b94ab 0858a5ab5 4a5ab5 1b4b94984 0191b9
+0858b584b41b 1b5 15a58a598 0494a9a19159 0818a1 14a 458598 059 084 .
+";
 
 /// One edge of a cell: the corner that owns it, as an offset from the cell's corner 0, and its axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -49,105 +79,31 @@ pub const fn cell_edge(e: u8) -> CellEdge {
     CellEdge { offset, axis }
 }
 
-/// Edge between two adjacent corners.
-fn edge_between(a: u8, b: u8) -> u8 {
-    let (low, axis) = (a & b, (a ^ b).trailing_zeros());
-    let bit = |axis: u8| low >> axis & 1;
-    match axis {
-        0 => bit(1) | bit(2) << 1,
-        1 => 4 + (bit(0) | bit(2) << 1),
-        _ => 8 + (bit(0) | bit(1) << 1),
-    }
-}
-
-/// The four corners of each face, counter-clockwise seen from outside the cell.
-const FACES: [[u8; 4]; 6] = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
-
-/// For a case and a face: the outline's segments on it as (from edge, to edge).
-fn face_segments(case: u8, face: &[u8; 4]) -> Vec<(u8, u8)> {
-    let inside = |i: usize| case >> face[i % 4] & 1 == 1;
-    let edge = |i: usize| edge_between(face[i % 4], face[(i + 1) % 4]);
-    (0..4)
-        .filter(|&i| !inside(i) && inside(i + 1))
-        .filter_map(|enter| {
-            let leave = (enter + 1..enter + 4).find(|&i| inside(i) && !inside(i + 1))?;
-            Some((edge(enter), edge(leave)))
-        })
-        .collect()
-}
-
-/// Bit mask of the two faces that an edge belongs to.
-fn faces_of(edge: u8) -> u8 {
-    (0..6)
-        .filter(|&f| (0..4).any(|i| edge_between(FACES[f][i], FACES[f][(i + 1) % 4]) == edge))
-        .fold(0, |m, f| m | 1 << f)
-}
-
-/// The loops of a case's outline, each a cycle of cell edges.
-fn loops(case: u8) -> Vec<Vec<u8>> {
-    let mut next = [None; 12];
-    for (from, to) in FACES.iter().flat_map(|face| face_segments(case, face)) {
-        next[usize::from(from)] = Some(to);
-    }
-    let mut found = Vec::new();
-    for start in 0..12_u8 {
-        let mut cycle = Vec::new();
-        let mut at = start;
-        while let Some(to) = next[usize::from(at)].take() {
-            cycle.push(at);
-            at = to;
-        }
-        if !cycle.is_empty() {
-            found.push(cycle);
-        }
-    }
-    found
-}
-
-/// Twice the midpoint of an edge, for lengths of diagonals.
-fn midpoint2(edge: u8) -> [i32; 3] {
-    let CellEdge { offset, axis } = cell_edge(edge);
-    std::array::from_fn(|k| if k == usize::from(axis) { 1 } else { 2 * i32::from(offset[k]) })
-}
-
-/// Every triangulation of a polygon with its cost: (diagonals within a face, sum of squared diagonals).
-fn best_triangulation(polygon: &[u8]) -> ((usize, i32), Vec<[u8; 3]>) {
-    if polygon.len() < 3 {
-        return ((0, 0), Vec::new());
-    }
-    let (first, last) = (polygon[0], polygon[polygon.len() - 1]);
-    let diagonal = |a: u8, b: u8| {
-        let length2: i32 = midpoint2(a).iter().zip(midpoint2(b)).map(|(p, q)| (p - q).pow(2)).sum();
-        (usize::from(faces_of(a) & faces_of(b) != 0), length2)
-    };
-    // The edge (last, first) belongs to exactly one triangle: try every apex.
-    (1..polygon.len() - 1)
-        .map(|apex| {
-            let (left_cost, left) = best_triangulation(&polygon[..=apex]);
-            let (right_cost, right) = best_triangulation(&polygon[apex..]);
-            let mut cost = (left_cost.0 + right_cost.0, left_cost.1 + right_cost.1);
-            let sides = [(apex > 1, first, polygon[apex]), (apex + 2 < polygon.len(), polygon[apex], last)];
-            for (_, a, b) in sides.into_iter().filter(|side| side.0) {
-                let (in_face, length2) = diagonal(a, b);
-                cost = (cost.0 + in_face, cost.1 + length2);
-            }
-            let triangles = [vec![[first, polygon[apex], last]], left, right].concat();
-            (cost, triangles)
-        })
-        .min_by_key(|(cost, _)| *cost)
-        .unwrap_or_default()
-}
-
 impl Cases {
-    fn generate() -> Self {
+    /// Reads the table, at compile time.
+    const fn parse(rows: &str) -> Self {
+        let text = rows.as_bytes();
         let mut table = Self { count: [0; 256], triangles: [[[0; 3]; MAX_TRIANGLES]; 256] };
-        for case in 0..=255_u8 {
-            let triangles: Vec<_> = loops(case).iter().flat_map(|l| best_triangulation(l).1).collect();
-            let row = usize::from(case);
-            for (slot, triangle) in table.triangles[row].iter_mut().zip(&triangles) {
-                *slot = *triangle;
-                table.count[row] += 1;
+        let (mut at, mut case, mut corner) = (0, 0, 0);
+        while at < text.len() {
+            let digit = match text[at] {
+                c @ b'0'..=b'9' => Some(c - b'0'),
+                c @ b'a'..=b'b' => Some(c - b'a' + 10),
+                _ => None,
+            };
+            if let Some(edge) = digit {
+                table.triangles[case][corner / 3][corner % 3] = edge;
+                corner += 1;
+                if corner % 3 == 0 {
+                    table.count[case] += 1;
+                }
+            } else if text[at] == b' ' || text[at] == b'\n' {
+                // A row ends where white space follows something.
+                if at > 0 && text[at - 1] != b' ' && text[at - 1] != b'\n' {
+                    (case, corner) = (case + 1, 0);
+                }
             }
+            at += 1;
         }
         table
     }
@@ -163,6 +119,104 @@ impl Cases {
 mod tests {
     use super::*;
     use std::collections::BTreeMap;
+
+    /// Edge between two adjacent corners.
+    fn edge_between(a: u8, b: u8) -> u8 {
+        let (low, axis) = (a & b, (a ^ b).trailing_zeros());
+        let bit = |axis: u8| low >> axis & 1;
+        match axis {
+            0 => bit(1) | bit(2) << 1,
+            1 => 4 + (bit(0) | bit(2) << 1),
+            _ => 8 + (bit(0) | bit(1) << 1),
+        }
+    }
+
+    /// The four corners of each face, counter-clockwise seen from outside the cell.
+    const FACES: [[u8; 4]; 6] = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+
+    /// For a case and a face: the outline's segments on it as (from edge, to edge).
+    fn face_segments(case: u8, face: &[u8; 4]) -> Vec<(u8, u8)> {
+        let inside = |i: usize| case >> face[i % 4] & 1 == 1;
+        let edge = |i: usize| edge_between(face[i % 4], face[(i + 1) % 4]);
+        (0..4)
+            .filter(|&i| !inside(i) && inside(i + 1))
+            .filter_map(|enter| {
+                let leave = (enter + 1..enter + 4).find(|&i| inside(i) && !inside(i + 1))?;
+                Some((edge(enter), edge(leave)))
+            })
+            .collect()
+    }
+
+    /// Bit mask of the two faces that an edge belongs to.
+    fn faces_of(edge: u8) -> u8 {
+        (0..6)
+            .filter(|&f| (0..4).any(|i| edge_between(FACES[f][i], FACES[f][(i + 1) % 4]) == edge))
+            .fold(0, |m, f| m | 1 << f)
+    }
+
+    /// The loops of a case's outline, each a cycle of cell edges.
+    fn loops(case: u8) -> Vec<Vec<u8>> {
+        let mut next = [None; 12];
+        for (from, to) in FACES.iter().flat_map(|face| face_segments(case, face)) {
+            next[usize::from(from)] = Some(to);
+        }
+        let mut found = Vec::new();
+        for start in 0..12_u8 {
+            let mut cycle = Vec::new();
+            let mut at = start;
+            while let Some(to) = next[usize::from(at)].take() {
+                cycle.push(at);
+                at = to;
+            }
+            if !cycle.is_empty() {
+                found.push(cycle);
+            }
+        }
+        found
+    }
+
+    /// Twice the midpoint of an edge, for lengths of diagonals.
+    fn midpoint2(edge: u8) -> [i32; 3] {
+        let CellEdge { offset, axis } = cell_edge(edge);
+        std::array::from_fn(|k| if k == usize::from(axis) { 1 } else { 2 * i32::from(offset[k]) })
+    }
+
+    /// Every triangulation of a polygon with its cost: (diagonals within a face, sum of squared diagonals).
+    fn best_triangulation(polygon: &[u8]) -> ((usize, i32), Vec<[u8; 3]>) {
+        if polygon.len() < 3 {
+            return ((0, 0), Vec::new());
+        }
+        let (first, last) = (polygon[0], polygon[polygon.len() - 1]);
+        let diagonal = |a: u8, b: u8| {
+            let length2: i32 = midpoint2(a).iter().zip(midpoint2(b)).map(|(p, q)| (p - q).pow(2)).sum();
+            (usize::from(faces_of(a) & faces_of(b) != 0), length2)
+        };
+        // The edge (last, first) belongs to exactly one triangle: try every apex.
+        (1..polygon.len() - 1)
+            .map(|apex| {
+                let (left_cost, left) = best_triangulation(&polygon[..=apex]);
+                let (right_cost, right) = best_triangulation(&polygon[apex..]);
+                let mut cost = (left_cost.0 + right_cost.0, left_cost.1 + right_cost.1);
+                let sides = [(apex > 1, first, polygon[apex]), (apex + 2 < polygon.len(), polygon[apex], last)];
+                for (_, a, b) in sides.into_iter().filter(|side| side.0) {
+                    let (in_face, length2) = diagonal(a, b);
+                    cost = (cost.0 + in_face, cost.1 + length2);
+                }
+                let triangles = [vec![[first, polygon[apex], last]], left, right].concat();
+                (cost, triangles)
+            })
+            .min_by_key(|(cost, _)| *cost)
+            .unwrap_or_default()
+    }
+
+    #[test]
+    fn the_table_is_what_the_topology_gives() {
+        for case in 0..=255_u8 {
+            let triangles: Vec<_> = loops(case).iter().flat_map(|l| best_triangulation(l).1).collect();
+            assert_eq!(CASES.of(case), triangles, "case {case}");
+        }
+        assert_eq!(CASES.count.iter().max(), Some(&5));
+    }
 
     /// Directed edges of a case's triangles with their multiplicities.
     fn half_edges(triangles: &[[u8; 3]]) -> BTreeMap<(u8, u8), i32> {

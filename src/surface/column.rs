@@ -9,8 +9,11 @@ use std::ops::{Deref, DerefMut};
 use bytemuck::Pod;
 use memmap2::MmapMut;
 
-/// From this many bytes on, a column is mapped and asks for huge pages: two of them.
-const MAP_FROM: usize = 4 << 20;
+/// From this many bytes on, a column is mapped.
+const MAP_FROM: usize = 64 << 10;
+/// From this many bytes on, a mapped column asks for huge pages: two of them. Below, its pages are made present in one
+/// call: a page fault each costs several times as much.
+const HUGE_FROM: usize = 4 << 20;
 
 /// Rows of a mesh: behaves like a slice.
 pub struct Column<T: Pod>(Storage<T>);
@@ -30,7 +33,9 @@ impl<T: Pod> Column<T> {
         {
             // Advice only: where the kernel has no huge pages, small ones do.
             #[cfg(target_os = "linux")]
-            let _advised = map.advise(memmap2::Advice::HugePage).is_ok();
+            let _advised = map
+                .advise(if bytes >= HUGE_FROM { memmap2::Advice::HugePage } else { memmap2::Advice::PopulateWrite })
+                .is_ok();
             return Self(Storage::Mapped { map, bytes });
         }
         Self(Storage::Owned(vec![T::zeroed(); n]))
@@ -130,7 +135,7 @@ mod tests {
 
     #[test]
     fn small_and_mapped_columns_behave_alike() {
-        for n in [0, 1, 1000, MAP_FROM / 12 - 1, MAP_FROM / 12 + 1, MAP_FROM] {
+        for n in [0, 1, 1000, MAP_FROM / 12 - 1, MAP_FROM / 12 + 1, MAP_FROM, HUGE_FROM / 12 + 1] {
             let mut column: Column<[f32; 3]> = Column::zeroed(n);
             assert_eq!(column.len(), n);
             assert!(column.iter().all(|row| *row == [0.0; 3]));

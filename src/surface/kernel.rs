@@ -4,7 +4,7 @@
 //! the atom's length scale: its radius for the Gaussian, the radius of its support for the two others. All
 //! kernels vanish, with their slope, at `u = support()`; an isolated atom's density at its radius is 1.
 //!
-//! Sources: J. Blinn, ACM TOG 1(3), 1982 (Gaussian); G. Wyvill, C. McPheeters, B. Wyvill, The Visual Computer 2,
+//! Sources: J. Blinn, ACM TOG 1(3), 1982 (Gaussian); G. Wyvill, C. `McPheeters`, B. Wyvill, The Visual Computer 2,
 //! 1986 (soft object); S. Dias, K. Bora, A. Gomes, HPDC 2010 (all three as blending functions of molecules).
 
 use super::params::{Kernel, PaperParams, SUPPORT_RADII, SurfaceParams};

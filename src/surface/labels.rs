@@ -7,6 +7,7 @@
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
+use super::lattice::to_u32;
 use super::measure::Component;
 use super::mesh::Mesh;
 
@@ -44,7 +45,7 @@ impl Labels {
         let mut equal = Vec::new();
         let mut offsets = Vec::with_capacity(joined.len());
         for part in &joined {
-            let offset = equal.len() as u32;
+            let offset = to_u32(equal.len());
             offsets.push(offset);
             equal.extend(part.equal.iter().map(|label| label + offset));
         }
@@ -129,14 +130,14 @@ impl Part<'_> {
         for &[a, b, c] in self.triangles {
             let own = |v: u32| labels.get(v.wrapping_sub(first) as usize).copied();
             let (i, j, k) = (own(a), own(b), own(c));
-            if i.is_none() | j.is_none() | k.is_none() {
+            if [i, j, k].contains(&None) {
                 joined.leaving.extend([[a, b], [b, c]]);
             }
             // A foreign corner counts as one without a label here.
             let (i, j, k) = (i.unwrap_or(NONE), j.unwrap_or(NONE), k.unwrap_or(NONE));
             let mut low = i.min(j).min(k);
             if low == NONE {
-                low = joined.equal.len() as u32;
+                low = to_u32(joined.equal.len());
                 joined.equal.push(low);
             }
             for v in [a, b, c] {
@@ -144,9 +145,9 @@ impl Part<'_> {
                     *label = low;
                 }
             }
-            let differs = |label: u32| (label != low) & (label != NONE);
-            if differs(i) | differs(j) | differs(k) {
-                for label in [i, j, k].into_iter().filter(|&label| differs(label)) {
+            let differs = |label: u32| label != low && label != NONE;
+            for label in [i, j, k] {
+                if differs(label) {
                     join(&mut joined.equal, label, low);
                 }
             }

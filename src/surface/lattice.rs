@@ -176,6 +176,13 @@ pub(super) fn to_i32(v: f64) -> i32 {
     v as i32
 }
 
+/// An index as u32. Indices within tiles, of atoms and of vertices are bounded where they arise; were a bound ever
+/// wrong, the saturated value fails the next look-up instead of aliasing another index.
+pub(super) fn to_u32(n: usize) -> u32 {
+    debug_assert!(u32::try_from(n).is_ok(), "{n} is no 32-bit index");
+    u32::try_from(n).unwrap_or(u32::MAX)
+}
+
 /// `v` as u64, saturating at both ends.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
 pub(super) fn to_u64(v: f64) -> u64 {

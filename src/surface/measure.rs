@@ -111,17 +111,17 @@ impl Measures {
         let components: Vec<Component> = roots.into_iter().map(|(_, component)| component).collect();
         let balanced = checksum == 0 && !degenerate;
         let exact = (proof == Proof::Exact).then(|| topology::check(&mesh.triangles));
-        let faces = mesh.n_triangles() as i64;
+        let faces = mesh.n_triangles() as u64;
         // Where every edge has two triangles there are 3F/2 of them; otherwise only counting tells.
         let edges = match &exact {
-            Some(topology) => topology.edges as i64,
+            Some(topology) => topology.edges,
             None if balanced => faces * 3 / 2,
-            None => topology::check(&mesh.triangles).edges as i64,
+            None => topology::check(&mesh.triangles).edges,
         };
         Ok(Self {
             area: components.iter().map(|c| c.area).sum(),
             volume: components.iter().map(|c| c.volume).sum(),
-            euler: used as i64 - edges + faces,
+            euler: (used + faces).cast_signed() - edges.cast_signed(),
             closed: exact.as_ref().map_or(balanced, |t| t.closed),
             oriented: exact.as_ref().map_or(balanced, |t| t.oriented),
             manifold: exact.as_ref().map_or(balanced, |t| t.manifold),
@@ -200,7 +200,8 @@ fn edge_shares(batch: &[[u32; 3]]) -> (u64, bool) {
         sum[i] = if i < batch.len() { shares } else { 0 };
     }
     for i in 0..LANES {
-        degenerate |= i < batch.len() && ((a[i] == b[i]) | (b[i] == c[i]) | (c[i] == a[i]));
+        let twice = a[i] == b[i] || b[i] == c[i] || c[i] == a[i];
+        degenerate |= i < batch.len() && twice;
     }
     (sum.iter().fold(0, |all, s| all.wrapping_add(*s)), degenerate)
 }

@@ -53,8 +53,12 @@ impl Mesh {
     /// Gives every vertex whose normal is zero the area-weighted mean normal of its triangles: at a saddle of the
     /// density the gradient vanishes and has no direction.
     pub(super) fn fill_flat_normals(&mut self) {
-        let flat: FxHashMap<u32, usize> =
-            (0_u32..).zip(&self.normals).filter(|(_, n)| **n == [0.0; 3]).zip(0..).map(|((v, _), i)| (v, i)).collect();
+        let flat: FxHashMap<u32, usize> = (0_u32..)
+            .zip(&self.normals)
+            .filter(|(_, n)| n.iter().all(|c| c.abs() < 0.5))
+            .zip(0..)
+            .map(|((v, _), i)| (v, i))
+            .collect();
         let mut sums = vec![[0.0_f64; 3]; flat.len()];
         for t in &self.triangles {
             for v in t {

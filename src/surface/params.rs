@@ -20,7 +20,7 @@ pub enum Kernel {
     /// Blinn 1982: exp(−a(d²/r² − 1)), with a C¹ cut-off.
     #[default]
     Gaussian,
-    /// Wyvill, McPheeters, Wyvill 1986: a sextic with compact support.
+    /// Wyvill, `McPheeters`, Wyvill 1986: a sextic with compact support.
     SoftObject,
     /// C/d², windowed.
     InverseSquare,
@@ -40,7 +40,7 @@ pub enum Preset {
     Molstar,
     /// Smoothness 2.5.
     Blinn,
-    /// Smoothness 0.5 at isovalue 0.824: the density that VMD's QuickSurf draws by default.
+    /// Smoothness 0.5 at isovalue 0.824: the density that VMD's `QuickSurf` draws by default.
     Quicksurf,
 }
 

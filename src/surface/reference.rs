@@ -114,7 +114,7 @@ impl Grid {
     }
 
     fn sample(&self, at: [usize; 3]) -> [i32; 3] {
-        std::array::from_fn(|k| self.origin[k] + at[k] as i32)
+        std::array::from_fn(|k| self.origin[k] + i32::try_from(at[k]).unwrap_or(i32::MAX))
     }
 }
 

@@ -22,6 +22,12 @@ fn key(from: u32, to: u32) -> u64 {
     u64::from(from) << 32 | u64::from(to)
 }
 
+/// The two vertices of a key.
+fn ends(key: u64) -> [u32; 2] {
+    let half = |v: u64| u32::try_from(v & u64::from(u32::MAX)).unwrap_or_default();
+    [half(key >> 32), half(key)]
+}
+
 /// Checks `triangles`. Takes memory of 28 bytes for each of their edges.
 #[must_use]
 pub fn check(triangles: &[[u32; 3]]) -> Topology {
@@ -39,7 +45,10 @@ pub fn check(triangles: &[[u32; 3]]) -> Topology {
 
 /// Distinct undirected edges.
 fn count_edges(forward: &[Corner]) -> u64 {
-    let undirected = |edge: u64| key(((edge >> 32) as u32).min(edge as u32), ((edge >> 32) as u32).max(edge as u32));
+    let undirected = |edge: u64| {
+        let [from, to] = ends(edge);
+        key(from.min(to), from.max(to))
+    };
     let mut edges: Vec<u64> = forward.par_iter().map(|(edge, _)| undirected(*edge)).collect();
     edges.par_sort_unstable();
     edges.dedup();
@@ -49,14 +58,15 @@ fn count_edges(forward: &[Corner]) -> u64 {
 /// Whether the triangles around one vertex form one cycle. `fan`: its outgoing edges, each with the third corner.
 fn one_fan(fan: &[Corner]) -> bool {
     let Some(&(start, _)) = fan.first() else { return true };
-    let (vertex, mut at) = ((start >> 32) as u32, start as u32);
+    let [vertex, first] = ends(start);
+    let mut at = first;
     for step in 1..=fan.len() {
         // The triangle (vertex, at, next) is followed by the one that leaves along (vertex, next).
         match fan.binary_search_by_key(&key(vertex, at), |(edge, _)| *edge) {
             Ok(i) => at = fan[i].1,
             Err(_) => return false,
         }
-        if at == start as u32 {
+        if at == first {
             return step == fan.len();
         }
     }

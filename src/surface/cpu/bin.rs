@@ -8,7 +8,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32};
+use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32};
 use crate::surface::params::{MAX_RESOLUTION, SurfaceLimits};
 
 /// Bricks along a tile's edge with the layer beyond.
@@ -169,7 +169,7 @@ pub(super) struct Bricks {
     pub(super) candidates: Vec<u32>,
     /// Per slot the number of candidates that reach a sample.
     pub(super) reaching: Vec<u32>,
-    hits: Vec<(u16, u32)>,
+    hits: Vec<(u32, u32)>,
 }
 
 impl Default for Bricks {
@@ -236,7 +236,7 @@ impl Bricks {
                         let slot = row + bx;
                         self.starts[slot + 1] += 1;
                         self.reaching[slot] += u32::from(reaches);
-                        self.hits.push((slot as u16, if reaches { ix } else { ix | NORMAL_ONLY }));
+                        self.hits.push((to_u32(slot), if reaches { ix } else { ix | NORMAL_ONLY }));
                     }
                 }
             }
@@ -248,7 +248,7 @@ impl Bricks {
         self.candidates.resize(self.hits.len(), 0);
         let mut cursor: [u32; SLOTS] = std::array::from_fn(|slot| self.starts[slot]);
         for &(slot, candidate) in &self.hits {
-            let at = &mut cursor[usize::from(slot)];
+            let at = &mut cursor[slot as usize];
             self.candidates[*at as usize] = candidate;
             *at += 1;
         }
@@ -268,5 +268,5 @@ pub(super) fn slot_brick(slot: usize) -> [usize; 3] {
 /// First sample of a slot's brick.
 pub(super) fn slot_origin(tile: [i32; 3], slot: usize) -> [i32; 3] {
     let brick = slot_brick(slot);
-    std::array::from_fn(|k| tile[k] * TILE + brick[k] as i32 * BRICK)
+    std::array::from_fn(|k| tile[k] * TILE + i32::try_from(brick[k]).unwrap_or_default() * BRICK)
 }

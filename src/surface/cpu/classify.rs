@@ -4,7 +4,7 @@
 
 use super::field::Samples;
 use crate::surface::cases::CASES;
-use crate::surface::lattice::BRICK_SAMPLES;
+use crate::surface::lattice::{BRICK_SAMPLES, to_u32};
 use crate::surface::simd::dispatched;
 
 /// Inside bits of a brick: word z, bit `8·y + x`.
@@ -94,9 +94,12 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
 }
 
 impl Found {
-    /// Classifies one brick and appends what it holds.
-    pub(super) fn add(&mut self, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) {
+    /// Classifies one brick and appends what it holds. Returns where, if it holds any surface.
+    pub(super) fn add(&mut self, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) -> Option<u16> {
+        let n = self.bricks.len();
         classify(self, slot, around, iso, candidates);
+        // A tile has 512 bricks.
+        (self.bricks.len() > n).then(|| u16::try_from(n).ok()).flatten()
     }
 }
 
@@ -108,33 +111,30 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
         return;
     }
     let mut brick = SurfaceBrick {
-        slot: slot as u16,
+        slot: u16::try_from(slot).unwrap_or(u16::MAX),
         crossing: [0; 24],
         before: [0; 24],
         active,
         vertex: found.vertices,
         triangle: found.triangles,
-        case: found.cases.len() as u32,
-        candidates: [found.candidates.len() as u32, (found.candidates.len() + candidates.len()) as u32],
+        case: to_u32(found.cases.len()),
+        candidates: [to_u32(found.candidates.len()), to_u32(found.candidates.len() + candidates.len())],
     };
     found.candidates.extend_from_slice(candidates);
     let mut n = 0_u16;
-    for z in 0..8 {
-        for axis in 0..3 {
-            let word = corners[z][0] ^ corners[z][1 << axis];
-            let w = 3 * z + axis;
-            (brick.crossing[w], brick.before[w]) = (word, n);
-            n += word.count_ones() as u16;
-        }
+    for (w, (crossing, before)) in brick.crossing.iter_mut().zip(&mut brick.before).enumerate() {
+        let layer = &corners[w / 3];
+        (*crossing, *before) = (layer[0] ^ layer[1 << (w % 3)], n);
+        n += ones(*crossing);
     }
     edge_parameters(&brick.crossing, n, &around.samples, iso, &mut found.t);
     let count = &CASES.count;
-    for z in 0..8 {
-        let mut cells = active[z];
+    for (layer, &cells) in corners.iter().zip(&active) {
+        let mut cells = cells;
         while cells != 0 {
             let bit = cells.trailing_zeros();
             cells &= cells - 1;
-            let case = (0..8).fold(0, |case, c| case | (corners[z][c] >> bit & 1) << c) as u8;
+            let case = (0..8).fold(0, |case, c| case | u8::from(layer[c] >> bit & 1 == 1) << c);
             found.cases.push(case);
             found.triangles += u32::from(count[usize::from(case)]);
         }
@@ -142,6 +142,13 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
     found.vertices += u32::from(n);
     found.bricks.push(brick);
 }
+}
+
+/// Set bits of a word.
+#[inline(always)]
+fn ones(word: u64) -> u16 {
+    // At most 64.
+    u16::try_from(word.count_ones()).unwrap_or_default()
 }
 
 /// Where along each crossing edge the density is `iso`, by linear interpolation.

@@ -86,9 +86,7 @@ fn see(atom: &LatticeAtom, origin: [i32; 3], support: f32, need: Need) -> Seen {
     let base: [f32; 3] = std::array::from_fn(|k| (origin[k] - atom.cell[k]) as f32);
     let range = |k: usize, n: usize| {
         let c = atom.frac[k] - base[k];
-        let lo = (c - reach).ceil().max(0.0) as usize;
-        let hi = ((c + reach).floor() + 1.0).max(0.0) as usize;
-        [lo.min(n), hi.min(n)]
+        [to_row((c - reach).ceil(), n), to_row((c + reach).floor() + 1.0, n)]
     };
     let [y0, y1] = range(1, 8);
     let mut u = [0.0; AXES];
@@ -103,6 +101,13 @@ fn see(atom: &LatticeAtom, origin: [i32; 3], support: f32, need: Need) -> Seen {
     }
     let y = [(y0 / 2).min(need.y_pairs), y1.div_ceil(2).min(need.y_pairs)];
     Seen { z: range(2, need.z_layers), y, u }
+}
+
+/// A row number within 0 to `n`.
+#[inline(always)]
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to the range before")]
+fn to_row(v: f32, n: usize) -> usize {
+    v.clamp(0.0, n as f32) as usize
 }
 
 /// Values along x and y combined into the brick's 8 × 8 plane, as 4 pairs of rows.

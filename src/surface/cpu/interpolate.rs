@@ -65,8 +65,8 @@ impl Batch {
                 edges &= edges - 1;
                 let mut p = [(bit & 7) as f32, (bit >> 3) as f32, z as f32];
                 p[axis] += t.next().copied().unwrap_or_default();
-                for k in 0..3 {
-                    self.p[k].push(p[k]);
+                for (column, p) in self.p.iter_mut().zip(p) {
+                    column.push(p);
                 }
             }
         }
@@ -78,6 +78,16 @@ impl Batch {
         let padded = self.p[0].len();
         self.n.iter_mut().for_each(|n| n.resize(padded, 0.0));
     }
+}
+
+/// What a brick's vertices are made from.
+pub(super) struct Source<'a> {
+    /// The brick's tile.
+    pub(super) tile: [i32; 3],
+    /// The brick's candidate atoms.
+    pub(super) candidates: &'a [u32],
+    /// Parameter of each vertex along its edge.
+    pub(super) t: &'a [f32],
 }
 
 /// Where a brick's vertices go.
@@ -94,15 +104,13 @@ pub(super) struct Target<'a> {
 pub(super) fn interpolate(
     lattice: &Lattice,
     slope: &SlopeConstants,
-    tile: [i32; 3],
     brick: &SurfaceBrick,
-    candidates: &[u32],
-    t: &[f32],
+    source: &Source<'_>,
     batch: &mut Batch,
     target: Target<'_>,
 ) -> usize {
-    let origin = slot_origin(tile, usize::from(brick.slot));
-    batch.place(brick, t);
+    let (origin, candidates) = (slot_origin(source.tile, usize::from(brick.slot)), source.candidates);
+    batch.place(brick, source.t);
     gradients(slope, &lattice.atoms, candidates, origin, &batch.p, &mut batch.n);
     if let Some(ids) = target.atom_ids {
         nearest_atoms(&lattice.atoms, candidates, origin, &batch.p, ids);

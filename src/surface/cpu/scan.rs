@@ -19,19 +19,16 @@ pub(super) struct Totals {
 /// # Errors
 /// [`SurfaceError::MeshTooLarge`] where the mesh would exceed the limit, or 32-bit indices.
 pub(super) fn scan(tiles: &mut [Tile], spacing: f64, limits: &SurfaceLimits) -> Result<Totals, SurfaceError> {
-    let (mut vertices, mut triangles) = (0_u64, 0_u64);
+    let (mut vertices, mut triangles) = (0, 0);
     for tile in &mut *tiles {
         (tile.first_vertex, tile.first_triangle) = (vertices, triangles);
-        vertices += u64::from(tile.found.vertices);
-        triangles += u64::from(tile.found.triangles);
+        vertices += tile.found.vertices as usize;
+        triangles += tile.found.triangles as usize;
     }
-    let bytes = Mesh::bytes_for(vertices, triangles);
+    let bytes = Mesh::bytes_for(vertices as u64, triangles as u64);
     // The highest value of an index is the primitive restart of graphics interfaces.
     let most = limits.max_mesh_bytes.min(Mesh::bytes_for(u64::from(u32::MAX), 0));
-    match (usize::try_from(vertices), usize::try_from(triangles)) {
-        (Ok(vertices), Ok(triangles)) if bytes <= most => Ok(Totals { vertices, triangles }),
-        _ => Err(too_large(bytes, spacing, most)),
-    }
+    if bytes <= most { Ok(Totals { vertices, triangles }) } else { Err(too_large(bytes, spacing, most)) }
 }
 
 /// The refusal of a mesh of `bytes` bytes. Areas stay while cells shrink: bytes grow with the inverse square of the
