@@ -1,5 +1,6 @@
 //! The service over a socket: every resource, every answer that a client can provoke without reaching a limit.
 #![cfg(feature = "server")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
 mod http_support;
 

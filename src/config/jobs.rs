@@ -14,6 +14,9 @@ pub struct JobsConfig {
     /// Jobs that wait. Default 64: at a typical 0.1 s a job on two workers the last one waits three seconds,
     /// which is as long as anybody waits for an answer; more would only make refusals late.
     pub queue: usize,
+    /// Requests for meshes in the house at once, from the submission of the job to the last byte of the answer.
+    /// Default 256: each holds a thread while its mesh is written, and leaves threads for reading files.
+    pub deliveries: usize,
     /// Time from acceptance to the finished mesh, ms, waiting included. Default 60,000: proxies commonly cut an
     /// exchange after a minute.
     pub deadline_ms: u64,
@@ -21,7 +24,7 @@ pub struct JobsConfig {
 
 impl Default for JobsConfig {
     fn default() -> Self {
-        Self { workers: 2, queue: 64, deadline_ms: 60_000 }
+        Self { workers: 2, queue: 64, deliveries: 256, deadline_ms: 60_000 }
     }
 }
 

@@ -34,6 +34,11 @@ const MAX_HEAD_BYTES: u32 = 64 << 10;
 const MAX_STREAMS: u32 = 64;
 /// Pause after the system could not accept, most likely for want of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// Clients at once that are being told that there are too many.
+const MAX_REFUSALS: usize = 64;
+/// What an HTTP/2 client may send before it is read, per request and per connection: enough for full speed over
+/// long distances.
+const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
 /// How often an HTTP/2 client is asked whether it is still there.
 const PING: Duration = Duration::from_secs(20);
 
@@ -46,6 +51,7 @@ pub(super) async fn serve(
     mut stop: watch::Receiver<bool>,
 ) -> bool {
     let places = Arc::new(Semaphore::new(config.connections));
+    let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
     let mut connections = JoinSet::new();
     loop {
         let accepted = tokio::select! {
@@ -62,7 +68,11 @@ pub(super) async fn serve(
             }
         };
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-            refuse(stream);
+            counter!(REJECTED, "reason" => Kind::TooManyConnections.row().slug).increment(1);
+            // Beyond these few, closing without a word is all that there is room for.
+            if let Ok(hold) = Arc::clone(&refusals).try_acquire_owned() {
+                refuse(stream, hold);
+            }
             continue;
         };
         // Answers are written in pieces that are large already; waiting for more only delays them.
@@ -97,8 +107,7 @@ impl Drop for Place {
 }
 
 /// Tells one client too many so. Its request is not waited for: that would cost what there is no room for.
-fn refuse(stream: TcpStream) {
-    counter!(REJECTED, "reason" => Kind::TooManyConnections.row().slug).increment(1);
+fn refuse(stream: TcpStream, hold: OwnedSemaphorePermit) {
     let body =
         Problem::new(Kind::TooManyConnections, "the server holds as many connections as it may").document("unknown");
     let head = format!(
@@ -107,7 +116,7 @@ fn refuse(stream: TcpStream) {
         body.len()
     );
     // A fresh socket has room for these few bytes; dropping the guard closes it gently.
-    let mut stream = Guarded::new(stream, (), Duration::from_secs(1));
+    let mut stream = Guarded::new(stream, hold, Duration::from_secs(1));
     tokio::spawn(async move {
         if let Err(error) = stream.write_all(&[head.as_bytes(), &body].concat()).await {
             tracing::debug!(%error, "a refused client left");
@@ -204,6 +213,8 @@ fn builder(config: &ServerConfig) -> auto::Builder<TokioExecutor> {
         .timer(TokioTimer::new())
         .keep_alive_interval(PING)
         .keep_alive_timeout(PING)
+        .initial_stream_window_size(WINDOWS[0])
+        .initial_connection_window_size(WINDOWS[1])
         .max_concurrent_streams(MAX_STREAMS)
         .max_header_list_size(MAX_HEAD_BYTES);
     builder

@@ -92,6 +92,7 @@ fn limits(config: &Config) -> Value {
         "memory_bytes": limits.memory_bytes,
         "workers": jobs.workers,
         "queue": jobs.queue,
+        "deliveries": jobs.deliveries,
         "deadline_ms": jobs.deadline_ms,
         "body_timeout_ms": server.body_timeout_ms,
         "header_timeout_ms": server.header_timeout_ms,

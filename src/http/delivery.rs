@@ -7,6 +7,8 @@ use axum::http::HeaderValue;
 use axum::http::header::{self, HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
+use tokio::sync::OwnedSemaphorePermit;
+
 use super::problem::{self, Problem};
 use super::state::App;
 use super::stream;
@@ -36,13 +38,14 @@ pub(super) const SUMMARY: [&str; 16] = [
 
 const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
 
-/// The mesh as `format`.
+/// The mesh as `format`; `place` is given back when its last byte is written.
 pub(super) async fn mesh(
     app: &App,
     finished: Arc<Finished>,
     format: Format,
     key: &ContentKey,
     received: Duration,
+    place: OwnedSemaphorePermit,
 ) -> Result<Response, Problem> {
     let report = &finished.product.report;
     let mut headers = summary(report);
@@ -50,7 +53,7 @@ pub(super) async fn mesh(
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
     headers.insert(header::ETAG, etag(key));
-    let (length, body) = stream::start(finished, format, app.config.limits.output_bytes).await?;
+    let (length, body) = stream::start(finished, format, app.config.limits.output_bytes, place).await?;
     if let Some(length) = length {
         headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     }

@@ -1,5 +1,7 @@
 //! `/livez`, `/readyz`, `/version`: for orchestrators.
 
+use std::time::Duration;
+
 use axum::Json;
 use axum::extract::State;
 use axum::http::header::CACHE_CONTROL;
@@ -25,7 +27,7 @@ pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem
         Ready::Broken => "the first mesh could not be computed; the log says why",
         Ready::ShuttingDown => "the service is shutting down",
     };
-    Err(Problem::new(Kind::NotReady, why))
+    Err(Problem::new(Kind::NotReady, why).retry_after(Duration::from_secs(1)))
 }
 
 /// What is running.

@@ -52,6 +52,7 @@ pub(super) async fn create(
         (None, None, false) => negotiate::format(&headers)?,
     };
     let received = start.elapsed();
+    let place = app.delivery()?;
     let job = request.job.clone();
     let deadline = Instant::now() + app.config.jobs.deadline();
     let ticket = app.pool.submit(Task {
@@ -68,7 +69,7 @@ pub(super) async fn create(
         return delivery::report(&finished, received);
     }
     let key = ContentKey::new(&finished.digest, &request.job, format, app.pool.backend().name());
-    let mut response = delivery::mesh(&app, finished, format, &key, received).await?;
+    let mut response = delivery::mesh(&app, finished, format, &key, received, place).await?;
     response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
     Ok(response)
 }

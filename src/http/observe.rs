@@ -24,12 +24,13 @@ pub(super) async fn request(request: Request, next: Next) -> Response {
     let route = request.extensions().get::<MatchedPath>().cloned();
     let method = request.method().clone();
     let span = tracing::info_span!("request", id = id.as_str(), %method, path = request.uri().path());
-    let response = next.run(request).instrument(span.clone()).await;
-    let status = response.status().as_u16();
+    let mut log = Log { start, method, route, status: None, span: span.clone(), bytes: 0, complete: false };
+    let response = next.run(request).instrument(span).await;
+    log.status = Some(response.status().as_u16());
     response.map(|body| {
         // Nobody polls a body that is empty, or the answer to HEAD.
-        let complete = body.is_end_stream() || method == Method::HEAD;
-        Body::new(Observed { body, log: Log { start, method, route, status, span, bytes: 0, complete } })
+        log.complete = body.is_end_stream() || log.method == Method::HEAD;
+        Body::new(Observed { body, log })
     })
 }
 
@@ -38,7 +39,8 @@ struct Log {
     start: Instant,
     method: Method,
     route: Option<MatchedPath>,
-    status: u16,
+    /// None if the client left before there was an answer.
+    status: Option<u16>,
     span: tracing::Span,
     bytes: usize,
     complete: bool,
@@ -49,10 +51,14 @@ impl Drop for Log {
         let time = self.start.elapsed();
         let route = self.route.as_ref().map_or("unmatched", MatchedPath::as_str).to_owned();
         let Self { status, bytes, complete, .. } = *self;
-        histogram!(HTTP_DURATION, "method" => known(&self.method), "route" => route, "status" => status.to_string())
+        let label = status.map_or_else(|| "none".to_owned(), |status| status.to_string());
+        histogram!(HTTP_DURATION, "method" => known(&self.method), "route" => route, "status" => label)
             .record(time.as_secs_f64());
         let ms = (time.as_secs_f64() * 1e6).round() / 1e3;
-        self.span.in_scope(|| tracing::info!(status, ms, bytes, complete, "answered"));
+        self.span.in_scope(|| match status {
+            Some(status) => tracing::info!(status, ms, bytes, complete, "answered"),
+            None => tracing::info!(ms, "the client left before it was answered"),
+        });
     }
 }
 

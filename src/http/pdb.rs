@@ -58,6 +58,7 @@ pub(super) async fn surface(
             return Ok((caching, [(header::CONTENT_TYPE, media_type)]).into_response());
         }
     }
+    let place = app.delivery()?;
     let job = request.job.clone();
     let deadline = Instant::now() + app.config.jobs.deadline();
     let (digest, strict, lease) = (Some(digest), request.strict, Some(lease));
@@ -66,7 +67,7 @@ pub(super) async fn surface(
     if request.report {
         return delivery::report(&finished, received);
     }
-    let mut response = delivery::mesh(&app, finished, format, &key, received).await?;
+    let mut response = delivery::mesh(&app, finished, format, &key, received, place).await?;
     response.headers_mut().insert(header::CACHE_CONTROL, CACHE);
     Ok(response)
 }

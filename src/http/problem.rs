@@ -205,7 +205,7 @@ impl From<StructureError> for Problem {
             E::EmptySelection { .. } => Self::new(Kind::EmptySelection, detail),
             E::NotFound { what, asked, available } => Self::new(Kind::EmptySelection, detail)
                 .with("parameter", if what == "chain" { "chains" } else { what })
-                .with("value", asked)
+                .with("value", asked.trim_matches('`'))
                 .with("expected", available),
         }
     }

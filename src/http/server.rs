@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use thiserror::Error;
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 
 use super::state::{App, Readiness, Ready, Shared};
 use super::{accept, capabilities, metrics, router};
@@ -19,6 +19,9 @@ use crate::telemetry::{self, TelemetryError};
 
 /// How often the recorder tidies up its histograms.
 const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
+
+/// Time for a job to notice that it was cancelled.
+const CANCELLING: std::time::Duration = std::time::Duration::from_secs(1);
 
 /// Why the server cannot start.
 #[derive(Debug, Error)]
@@ -79,7 +82,9 @@ impl Server {
         let pool = Pool::start(settings, backend, reason).map_err(ServeError::Workers)?;
         let archive = Archive::new(config.archive_dir()).with_max_bytes(config.limits.inflated_bytes);
         let capabilities = capabilities::document(&config, &pool);
-        let app = Arc::new(App { config, pool, archive, readiness: Readiness::default(), capabilities });
+        let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
+        let readiness = Readiness::default();
+        let app = Arc::new(App { config, pool, archive, deliveries, readiness, capabilities });
         Ok(Self { app, listener, metrics_listener, addr, metrics_addr })
     }
 
@@ -129,13 +134,15 @@ impl Server {
         self.app.readiness.set(Ready::ShuttingDown);
         let deadline = Instant::now() + self.app.config.server.drain_timeout();
         stop.send_replace(true);
-        let (jobs, requests) = tokio::join!(self.app.pool.drain(deadline), serving);
+        // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
+        let requests = serving.await.unwrap_or(false);
+        let jobs = self.app.pool.drain(deadline.max(Instant::now() + CANCELLING)).await;
         upkeep.abort();
         warming.abort();
         if let Some(metrics) = metrics {
             metrics.abort();
         }
-        let drained = jobs && requests.unwrap_or(false);
+        let drained = jobs && requests;
         tracing::info!(drained, "stopped");
         Ok(drained)
     }

@@ -4,7 +4,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use bytes::Bytes;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::kinds::Kind;
+use super::problem::Problem;
 use crate::config::Config;
 use crate::jobs::Pool;
 use crate::structure::Archive;
@@ -14,9 +17,23 @@ pub(super) struct App {
     pub(super) config: Config,
     pub(super) pool: Pool,
     pub(super) archive: Archive,
+    /// Places for requests for meshes: see `jobs.deliveries`.
+    pub(super) deliveries: Arc<Semaphore>,
     pub(super) readiness: Readiness,
     /// The body of `/v1/capabilities`, which cannot change while the service runs.
     pub(super) capabilities: Bytes,
+}
+
+impl App {
+    /// A place for one request for a mesh.
+    pub(super) fn delivery(&self) -> Result<OwnedSemaphorePermit, Problem> {
+        Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
+            let limit = self.config.jobs.deliveries;
+            Problem::new(Kind::TooManyDeliveries, format!("{limit} meshes are being made or sent, which is the limit"))
+                .with("limit", limit)
+                .retry_after(self.pool.estimated_wait())
+        })
+    }
 }
 
 /// What handlers extract.

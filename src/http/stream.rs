@@ -11,7 +11,7 @@ use axum::body::Body;
 use bytes::{BufMut as _, Bytes, BytesMut};
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
 use metrics::histogram;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 
 use super::problem::{self, Problem};
 use crate::formats::{Encoder, Format};
@@ -31,11 +31,19 @@ enum Piece {
 }
 
 /// Starts writing; the length comes with the body where it is known.
-pub(super) async fn start(finished: Arc<Finished>, format: Format, limit: u64) -> Result<(Option<u64>, Body), Problem> {
+pub(super) async fn start(
+    finished: Arc<Finished>,
+    format: Format,
+    limit: u64,
+    place: OwnedSemaphorePermit,
+) -> Result<(Option<u64>, Body), Problem> {
     let (head, answer) = oneshot::channel();
     let (pieces, receiver) = mpsc::channel(PIECES);
     let span = tracing::Span::current();
-    tokio::task::spawn_blocking(move || span.in_scope(|| write(&finished, format, limit, head, pieces)));
+    tokio::task::spawn_blocking(move || {
+        span.in_scope(|| write(&finished, format, limit, head, pieces));
+        drop(place);
+    });
     // A writer that panics drops its end; the panic hook has logged it.
     let length = answer.await.map_err(|_dropped| Problem::internal("the writer failed"))??;
     Ok((length, Body::new(MeshBody { pieces: receiver, left: length, ended: false })))
@@ -91,7 +99,8 @@ impl Pieces {
             let data = self.buffer.split().freeze();
             self.send(Piece::Data(data))?;
         }
-        self.send(Piece::End)
+        // Whoever knows the length hangs up after the last byte and does not wait for the end.
+        self.send(Piece::End).or(Ok(()))
     }
 }
 
@@ -143,7 +152,7 @@ impl HttpBody for MeshBody {
     }
 
     fn is_end_stream(&self) -> bool {
-        self.ended
+        self.ended || self.left == Some(0)
     }
 
     fn size_hint(&self) -> SizeHint {

@@ -65,7 +65,7 @@ impl Lease {
         held.try_update(Ordering::Relaxed, Ordering::Relaxed, |now| now.checked_add(bytes).filter(|sum| sum <= limit))
             .map_err(|held| Exhausted { limit: *limit, held })?;
         self.bytes += bytes;
-        self.publish();
+        publish(bytes, 1.0);
         Ok(())
     }
 
@@ -73,20 +73,21 @@ impl Lease {
     pub fn force(&mut self, bytes: u64) {
         self.budget.held.fetch_add(bytes, Ordering::Relaxed);
         self.bytes += bytes;
-        self.publish();
-    }
-
-    #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
-    fn publish(&self) {
-        gauge!(MEMORY_HELD).set(self.budget.held.load(Ordering::Relaxed) as f64);
+        publish(bytes, 1.0);
     }
 }
 
 impl Drop for Lease {
     fn drop(&mut self) {
         self.budget.held.fetch_sub(self.bytes, Ordering::Relaxed);
-        self.publish();
+        publish(self.bytes, -1.0);
     }
+}
+
+/// Tells the gauge of a difference, so that several budgets in one process add up.
+#[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
+fn publish(bytes: u64, sign: f64) {
+    gauge!(MEMORY_HELD).increment(sign * bytes as f64);
 }
 
 #[cfg(test)]

@@ -31,6 +31,8 @@ struct State {
     closed: bool,
     next_id: u64,
     mean_s: f64,
+    /// Waiting jobs that the gauge knows of.
+    told: usize,
 }
 
 /// The queue.
@@ -50,6 +52,7 @@ impl Queue {
             closed: false,
             next_id: 0,
             mean_s: FIRST_GUESS.as_secs_f64(),
+            told: 0,
         };
         Self { state: Mutex::new(state), filled: Condvar::new(), idle: Notify::new(), limit, workers }
     }
@@ -73,7 +76,7 @@ impl Queue {
         let (id, cancel) = (state.next_id, CancelToken::default());
         state.next_id += 1;
         state.waiting.push_back(Entry { id, task, cancel: cancel.clone(), reply, accepted: Instant::now() });
-        self.publish(&state);
+        self.publish(&mut state);
         drop(state);
         self.filled.notify_one();
         Ok((id, cancel))
@@ -85,7 +88,7 @@ impl Queue {
         loop {
             if let Some(entry) = state.waiting.pop_front() {
                 state.running.push((entry.id, entry.cancel.clone()));
-                self.publish(&state);
+                self.publish(&mut state);
                 return Some(entry);
             }
             if state.closed {
@@ -102,7 +105,7 @@ impl Queue {
         if let Some(time) = time {
             state.mean_s += NEWEST * (time.as_secs_f64() - state.mean_s);
         }
-        self.publish(&state);
+        self.publish(&mut state);
         if state.running.is_empty() && state.waiting.is_empty() {
             self.idle.notify_waiters();
         }
@@ -112,7 +115,7 @@ impl Queue {
     pub(super) fn forget(&self, id: u64) {
         let mut state = self.lock();
         let left = state.waiting.iter().position(|entry| entry.id == id).and_then(|at| state.waiting.remove(at));
-        self.publish(&state);
+        self.publish(&mut state);
         drop(state);
         // The input, which may be large, is freed outside the lock.
         drop(left);
@@ -129,7 +132,7 @@ impl Queue {
         let mut state = self.lock();
         state.running.iter().for_each(|(_, cancel)| cancel.cancel());
         let left = std::mem::take(&mut state.waiting);
-        self.publish(&state);
+        self.publish(&mut state);
         drop(state);
         drop(left);
     }
@@ -161,8 +164,10 @@ impl Queue {
     }
 
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of jobs are small")]
-    fn publish(&self, state: &State) {
-        gauge!(QUEUE_DEPTH).set(state.waiting.len() as f64);
+    fn publish(&self, state: &mut State) {
+        // By difference, so that several pools in one process add up.
+        gauge!(QUEUE_DEPTH).increment(state.waiting.len() as f64 - state.told as f64);
+        state.told = state.waiting.len();
         gauge!(QUEUE_WAIT).set(self.wait(state).as_secs_f64());
     }
 }

@@ -11,13 +11,13 @@ use super::pool::Shared;
 use super::queue::Entry;
 use super::{Digest, Failure, Finished, Outcome};
 use crate::pipeline::{self, Choice, JobError, Report};
-use crate::structure::StructureError;
 use crate::structure::referee::{self, Diagnostic, Level};
+use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Mesh, SurfaceError};
 use crate::telemetry::{JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, VOXELS};
 
-/// Largest input of which the referee explains a refusal: it takes about 20 ms for so much.
-const MAX_EXPLAINED: usize = 1 << 20;
+/// Largest text of which the referee explains a refusal, bytes: it takes some 10 ms for so much, and 40 in the worst case.
+const MAX_EXPLAINED: u64 = 512 << 10;
 
 /// Runs jobs until the queue is closed and empty.
 pub(super) fn work(shared: &Shared) {
@@ -76,9 +76,9 @@ fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
 fn explained(shared: &Shared, input: &[u8], error: JobError) -> Failure {
     let unreadable =
         matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
-    let ask = unreadable && input.len() <= MAX_EXPLAINED;
+    let limits = ReadLimits { max_inflated_bytes: MAX_EXPLAINED, ..shared.limits.read };
     // A file of which the referee cannot say anything either gets our refusal alone.
-    let diagnostics = if ask { referee::check(input, &shared.limits.read).unwrap_or_default() } else { Vec::new() };
+    let diagnostics = if unreadable { referee::check(input, &limits).unwrap_or_default() } else { Vec::new() };
     Failure::Job { error, diagnostics }
 }
 

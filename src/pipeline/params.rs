@@ -160,10 +160,10 @@ fn proof(text: &str) -> Option<Proof> {
     [Proof::Checksum, Proof::Exact].into_iter().find(|proof| proof.name() == text)
 }
 
-/// Words separated by commas, none of them empty.
+/// Words separated by commas, none of them empty or with control characters.
 fn list(text: &str) -> Option<Vec<&str>> {
     let words: Vec<&str> = text.split(',').map(str::trim).collect();
-    words.iter().all(|w| !w.is_empty()).then_some(words)
+    words.iter().all(|w| !w.is_empty() && !w.chars().any(char::is_control)).then_some(words)
 }
 
 fn one_char(text: &str) -> Option<char> {

@@ -1,6 +1,8 @@
 //! A server in this process, backends that misbehave on command, and a client that speaks HTTP/1.1 by hand, so that it
 //! can misbehave as well.
 #![allow(dead_code, reason = "every test binary uses its own part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::format_push_string, reason = "requests read best as they are sent")]
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -33,7 +35,7 @@ pub(crate) enum Mode {
     GridTooLarge,
     /// Fails for want of a surface.
     NoSurface,
-    /// A mesh with an index out of range, which no writer takes.
+    /// A mesh with a normal too few, which no writer takes.
     Broken,
 }
 
@@ -110,8 +112,7 @@ impl Backend for Fake {
         }
         let mut mesh = octahedra(spheres);
         if mode == Mode::Broken {
-            let n = u32::try_from(mesh.n_vertices()).unwrap();
-            mesh.triangles[0][0] = n;
+            mesh.normals = mesh.normals[1..].to_vec().into();
         }
         if !warm_up {
             self.finished.fetch_add(1, Ordering::SeqCst);
@@ -201,7 +202,7 @@ pub(crate) fn start_cold(backend: Arc<dyn Backend>, change: impl FnOnce(&mut Con
     let mut config = Config::default();
     config.server.listen = "127.0.0.1:0".parse().unwrap();
     config.server.metrics_listen = Some("127.0.0.1:0".parse().unwrap());
-    config.server.data_dir = dir.path().to_owned();
+    dir.path().clone_into(&mut config.server.data_dir);
     change(&mut config);
     let server = Server::bind(config, backend, "a test says so".to_owned()).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
@@ -239,7 +240,7 @@ impl Running {
     /// Says to stop, without waiting.
     pub(crate) fn stop(&mut self) {
         if let Some(stop) = self.stop.take() {
-            drop(stop.send(()));
+            stop.send(()).unwrap_or(());
         }
     }
 

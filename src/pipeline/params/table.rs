@@ -108,7 +108,7 @@ pub const TABLE: &[Parameter] = &[
     ),
     number(
         "smoothness",
-        [0.1, 50.0],
+        [0.1, 40.0],
         "",
         "1.25, or the preset's",
         "How fast the gaussian kernel falls off: small is smooth, large hugs the atoms.",

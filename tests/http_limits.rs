@@ -1,0 +1,311 @@
+//! Every limit of the configuration, reached over a socket: the answer, the number, the metric, and a server that lives.
+#![cfg(feature = "server")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+mod http_support;
+
+use std::io::{Read, Write};
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Barrier};
+use std::time::{Duration, Instant};
+
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, connect, read_reply, send, start, wait_for};
+use molmesh::config::Config;
+use molmesh::surface::cpu::CpuBackend;
+
+fn fake(change: impl FnOnce(&mut Config)) -> Running {
+    start(Fake::new(Mode::Octahedra), change)
+}
+
+fn rejected(server: &Running, reason: &str) -> f64 {
+    server.metric("molmesh_requests_rejected_total", &[&format!("reason=\"{reason}\"")])
+}
+
+/// Posts with a chunked body, so that no length is announced.
+fn post_chunked(server: &Running, body: &[u8]) -> Reply {
+    let mut stream = connect(server.addr);
+    stream
+        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\r\n")
+        .unwrap();
+    for chunk in body.chunks(16 << 10) {
+        let framed = [format!("{:x}\r\n", chunk.len()).as_bytes(), chunk, b"\r\n"].concat();
+        if stream.write_all(&framed).is_err() {
+            break;
+        }
+    }
+    stream.write_all(b"0\r\n\r\n").unwrap_or(());
+    read_reply(&mut stream, false)
+}
+
+#[test]
+fn bodies_are_limited_whether_announced_or_not() {
+    let server = fake(|c| c.limits.body_bytes = 100_000);
+    let large = vec![b'x'; 5_000_000];
+    let before = rejected(&server, "body-too-large");
+    for reply in [server.post("/v1/meshes", &[], &large), post_chunked(&server, &large)] {
+        assert_eq!(reply.problem(413, "body-too-large")["limit"], 100_000);
+    }
+    let mut form = b"--XX\r\ncontent-disposition: form-data; name=\"file\"\r\n\r\n".to_vec();
+    form.extend_from_slice(&large);
+    form.extend_from_slice(b"\r\n--XX--\r\n");
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    assert_eq!(server.post("/v1/meshes", &[kind], &form).problem(413, "body-too-large")["limit"], 100_000);
+    let mut stream = connect(server.addr);
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-type: multipart/form-data; \
+                boundary=XX\r\ntransfer-encoding: chunked\r\n\r\n";
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(format!("{:x}\r\n", form.len()).as_bytes()).unwrap();
+    stream.write_all(&form).unwrap_or(());
+    read_reply(&mut stream, false).problem(413, "body-too-large");
+    assert!(rejected(&server, "body-too-large") >= before + 4.0);
+    // A length that is a lie about to be told is refused before a byte of it has come.
+    let start = Instant::now();
+    let mut stream = connect(server.addr);
+    stream
+        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 99999999999\r\n\r\n")
+        .unwrap();
+    assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["actual"], 99_999_999_999u64);
+    assert!(start.elapsed() < Duration::from_secs(3));
+    assert_eq!(post_chunked(&server, SAMPLE).status, 200);
+}
+
+#[test]
+fn compression_bombs_stop_at_the_inflated_limit() {
+    let server = fake(|c| c.limits.inflated_bytes = 1_000_000);
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
+    encoder.write_all(&vec![b' '; 50_000_000]).unwrap();
+    let bomb = encoder.finish().unwrap();
+    let before = rejected(&server, "inflated-too-large");
+    let start = Instant::now();
+    assert_eq!(server.post("/v1/meshes", &[], &bomb).problem(413, "inflated-too-large")["limit"], 1_000_000);
+    assert!(start.elapsed() < Duration::from_secs(1), "{:?}", start.elapsed());
+    assert!(rejected(&server, "inflated-too-large") > before);
+    let archive = server.dir.path().join("archive");
+    std::fs::create_dir_all(&archive).unwrap();
+    std::fs::write(archive.join("1abc.cif"), vec![b' '; 1_000_001]).unwrap();
+    assert_eq!(server.get("/v1/pdb/1abc/surface.glb").problem(413, "inflated-too-large")["limit"], 1_000_000);
+}
+
+#[test]
+fn atoms_are_limited() {
+    let server = fake(|c| c.limits.atoms = 100);
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).problem(422, "too-many-atoms")["limit"], 100);
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(100)).status, 200);
+    assert!(rejected(&server, "too-many-atoms") >= 1.0);
+}
+
+#[test]
+fn grids_and_meshes_are_limited_and_what_would_fit_fits() {
+    for (slug, change) in [
+        ("grid-too-large", Box::new(|c: &mut Config| c.limits.grid_samples = 60_000) as Box<dyn FnOnce(&mut Config)>),
+        ("mesh-too-large", Box::new(|c: &mut Config| c.limits.mesh_bytes = 300_000)),
+        ("mesh-too-large", Box::new(|c: &mut Config| c.limits.output_bytes = 300_000)),
+    ] {
+        let server = start(Arc::new(CpuBackend::new(None).unwrap()), change);
+        let problem = server.post("/v1/meshes?resolution=0.4", &[], SAMPLE).problem(422, slug);
+        assert!(problem["actual"].as_u64() > problem["limit"].as_u64(), "{problem}");
+        let suggested = problem["suggested_resolution"].as_f64().unwrap();
+        let reply = server.post(&format!("/v1/meshes?resolution={suggested}"), &[], SAMPLE);
+        assert_eq!(reply.status, 200, "{slug} {suggested}: {}", String::from_utf8_lossy(&reply.body));
+        assert!(rejected(&server, slug) >= 1.0);
+    }
+}
+
+#[test]
+fn a_full_queue_refuses_at_once_and_says_when_to_come_back() {
+    let backend = Fake::new(Mode::Slow(Duration::from_millis(600)));
+    let server = start(Arc::clone(&backend) as _, |c| {
+        c.jobs.workers = 1;
+        c.jobs.queue = 2;
+    });
+    std::thread::scope(|scope| {
+        let accepted: Vec<_> = (0..3).map(|_| scope.spawn(|| server.post("/v1/meshes", &[], SAMPLE).status)).collect();
+        wait_for("two jobs to wait", || server.metric("molmesh_queue_depth", &[]) >= 2.0);
+        wait_for("one job to run", || backend.started.load(Ordering::SeqCst) == 1);
+        let start = Instant::now();
+        let refused = server.post("/v1/meshes", &[], SAMPLE);
+        assert!(start.elapsed() < Duration::from_millis(200), "{:?}", start.elapsed());
+        let problem = refused.problem(503, "queue-full");
+        assert_eq!((&problem["limit"], &problem["actual"]), (&2.into(), &2.into()));
+        assert!(problem["estimated_wait_s"].as_f64().unwrap() > 0.0);
+        let after: u64 = refused.header("retry-after").unwrap().parse().unwrap();
+        assert!((1..=5).contains(&after), "{after}");
+        // Load does not make the service unready.
+        assert_eq!(server.get("/readyz").status, 200);
+        for job in accepted {
+            assert_eq!(job.join().unwrap(), 200);
+        }
+    });
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    assert!(rejected(&server, "queue-full") >= 1.0);
+}
+
+#[test]
+fn the_deadline_counts_waiting_and_stops_the_job() {
+    let backend = Fake::new(Mode::Slow(Duration::from_secs(30)));
+    let server = start(Arc::clone(&backend) as _, |c| {
+        c.jobs.workers = 1;
+        c.jobs.deadline_ms = 300;
+    });
+    std::thread::scope(|scope| {
+        let replies: Vec<_> = (0..2).map(|_| scope.spawn(|| server.post("/v1/meshes", &[], SAMPLE))).collect();
+        for reply in replies {
+            let problem = reply.join().unwrap().problem(504, "deadline");
+            let limit = problem["limit"].as_u64().unwrap();
+            assert!((200..=300).contains(&limit), "{limit}");
+        }
+    });
+    wait_for("the job is cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
+    assert_eq!(backend.started.load(Ordering::SeqCst), 1, "the second one never started");
+    backend.set(Mode::Octahedra);
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+}
+
+#[test]
+fn a_body_that_trickles_is_given_up() {
+    let server = fake(|c| c.server.body_timeout_ms = 300);
+    let mut stream = connect(server.addr);
+    let start = Instant::now();
+    stream
+        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 1000\r\n\r\nATOM")
+        .unwrap();
+    assert_eq!(read_reply(&mut stream, false).problem(408, "body-timeout")["limit"], 300);
+    assert!(start.elapsed() < Duration::from_secs(4), "{:?}", start.elapsed());
+    assert!(rejected(&server, "body-timeout") >= 1.0);
+}
+
+#[test]
+fn slow_heads_and_silent_connections_are_closed() {
+    let server = fake(|c| c.server.header_timeout_ms = 300);
+    let before = rejected(&server, "header-timeout");
+    for sent in [&b""[..], b"P", b"PRI * HTTP/2.0\r\n", b"GET /livez HTTP/1.1\r\nhost: t\r\nx-slow: "] {
+        let mut stream = connect(server.addr);
+        stream.write_all(sent).unwrap();
+        let start = Instant::now();
+        let mut rest = Vec::new();
+        stream.read_to_end(&mut rest).unwrap_or(0);
+        let time = start.elapsed();
+        assert!(time > Duration::from_millis(200) && time < Duration::from_secs(3), "{sent:?}: {time:?}");
+    }
+    // A connection that has been used and then says nothing is closed as well.
+    let mut stream = connect(server.addr);
+    stream.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+    let start = Instant::now();
+    let reply = read_reply(&mut stream, false);
+    assert!(reply.status == 200 && start.elapsed() < Duration::from_secs(3), "{:?}", start.elapsed());
+    wait_for("they are counted", || rejected(&server, "header-timeout") >= before + 4.0);
+    assert_eq!(server.get("/livez").status, 200);
+}
+
+#[test]
+fn one_connection_too_many_is_told_so() {
+    let server = fake(|c| c.server.connections = 4);
+    wait_for("earlier connections to be gone", || server.metric("molmesh_connections", &[]) >= 0.0);
+    let mut held = Vec::new();
+    let refused = loop {
+        let mut stream = connect(server.addr);
+        stream.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+        let mut start = [0; 12];
+        stream.read_exact(&mut start).unwrap();
+        if &start[9..] == b"503" {
+            let mut rest = start.to_vec();
+            stream.read_to_end(&mut rest).unwrap();
+            break String::from_utf8(rest).unwrap();
+        }
+        held.push(stream);
+        assert!(held.len() <= 4, "five connections at once");
+    };
+    assert!(refused.contains("retry-after: 1") && refused.contains("/problems/too-many-connections"), "{refused}");
+    assert!(rejected(&server, "too-many-connections") >= 1.0);
+    drop(held);
+    wait_for("there is room again", || send(server.addr, "GET", "/livez", &[], b"").status == 200);
+}
+
+#[test]
+fn a_client_that_takes_nothing_is_given_up_and_its_mesh_freed() {
+    let server = fake(|c| c.server.write_timeout_ms = 400);
+    // Large enough for no socket buffer.
+    let body = carbons(60_000);
+    let before = rejected(&server, "write-timeout");
+    let mut stream = connect(server.addr);
+    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    wait_for("the client is given up", || rejected(&server, "write-timeout") > before);
+    wait_for("the mesh is freed", || server.metric("molmesh_memory_held_bytes", &[]) < 1e6);
+    let mut rest = Vec::new();
+    stream.read_to_end(&mut rest).unwrap_or(0);
+    assert!(rest.len() < 84 + 50 * 60_000 * 8, "the answer was cut off");
+}
+
+#[test]
+fn memory_is_shared_and_limited() {
+    let server = fake(|c| c.limits.memory_bytes = 200_000);
+    let problem = server.post("/v1/meshes", &[], &carbons(3_000)).problem(503, "memory-full");
+    assert_eq!(problem["limit"], 200_000);
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    assert!(rejected(&server, "memory-full") >= 1.0);
+}
+
+#[test]
+fn a_hundred_clients_at_once_are_all_answered() {
+    let server = fake(|_| {});
+    let barrier = Barrier::new(100);
+    let statuses: Vec<u16> = std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..100)
+            .map(|_| {
+                scope.spawn(|| {
+                    barrier.wait();
+                    let reply = server.post("/v1/meshes", &[], SAMPLE);
+                    assert!(reply.complete);
+                    reply.status
+                })
+            })
+            .collect();
+        clients.into_iter().map(|client| client.join().unwrap()).collect()
+    });
+    assert!(statuses.iter().all(|status| [200, 503].contains(status)), "{statuses:?}");
+    assert!(statuses.iter().filter(|status| **status == 200).count() >= 60, "{statuses:?}");
+}
+
+#[test]
+fn slow_takers_cannot_use_up_the_threads() {
+    let server = fake(|c| c.jobs.deliveries = 1);
+    let body = carbons(60_000);
+    let mut stream = connect(server.addr);
+    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    let mut some = [0; 1000];
+    stream.read_exact(&mut some).unwrap();
+    let refused = server.post("/v1/meshes", &[], SAMPLE);
+    assert_eq!(refused.problem(503, "too-many-deliveries")["limit"], 1);
+    assert!(refused.header("retry-after").is_some());
+    drop(stream);
+    wait_for("the place is free", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
+}
+
+#[test]
+fn an_idle_http2_connection_is_closed() {
+    use hyper_util::rt::{TokioExecutor, TokioIo};
+    let server = fake(|c| {
+        c.server.header_timeout_ms = 300;
+        c.server.idle_timeout_ms = 300;
+    });
+    let addr = server.addr;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let time = runtime.block_on(async move {
+        let stream = tokio::net::TcpStream::connect(addr).await.unwrap();
+        let (mut client, connection) =
+            hyper::client::conn::http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await.unwrap();
+        let request = hyper::Request::get(format!("http://{addr}/livez"))
+            .body(http_body_util::Empty::<bytes::Bytes>::new())
+            .unwrap();
+        let start = Instant::now();
+        let driven = tokio::spawn(connection);
+        assert_eq!(client.send_request(request).await.unwrap().status().as_u16(), 200);
+        tokio::time::timeout(Duration::from_secs(4), driven).await.expect("closed").unwrap().unwrap();
+        start.elapsed()
+    });
+    assert!(time > Duration::from_millis(250), "{time:?}");
+}
