@@ -55,9 +55,12 @@ impl Drop for Log {
         histogram!(HTTP_DURATION, "method" => known(&self.method), "route" => route, "status" => label)
             .record(time.as_secs_f64());
         let ms = (time.as_secs_f64() * 1e6).round() / 1e3;
-        self.span.in_scope(|| match status {
-            Some(status) => tracing::info!(status, ms, bytes, complete, "answered"),
-            None => tracing::info!(ms, "the client left before it was answered"),
+        self.span.in_scope(|| {
+            if let Some(status) = status {
+                tracing::info!(status, ms, bytes, complete, "answered");
+            } else {
+                tracing::info!(ms, "the client left before it was answered");
+            }
         });
     }
 }

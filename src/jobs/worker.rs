@@ -32,7 +32,7 @@ pub(super) fn work(shared: &Shared) {
 /// Runs one job and answers. False if it says nothing about how long jobs take.
 fn run(shared: &Shared, entry: Entry) -> bool {
     let Entry { task, cancel, reply, accepted, .. } = entry;
-    if cancel.is_cancelled() || reply.is_closed() {
+    if cancel.is_cancelled() || reply.is_closed() || task.deadline <= Instant::now() {
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
         return false;
     }
