@@ -48,7 +48,9 @@ fn main() {
     let sample = structure::read(&bytes, &ReadLimits::default()).unwrap();
     let sample = structure::select(&sample, &Selection::default()).unwrap().spheres(&sample).unwrap();
     println!("{}; the bundled sample tiled, Gaussian, 0.5 Å; medians", backend.describe());
-    println!("| atoms | bricks | pairs/atom | triangles | bin | field | classify | interpolate | emit | measure | total ms | µs/atom | field ns/pair |");
+    println!(
+        "| atoms | bricks | pairs/atom | triangles | bin | field | classify | interpolate | emit | measure | total ms | µs/atom | field ns/pair |"
+    );
     println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|");
     let sizes = [1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000];
     for n in sizes.into_iter().filter(|&n| n <= most) {

@@ -403,6 +403,19 @@ fn limits_are_checked_and_their_suggestions_fit() {
 }
 
 #[test]
+fn a_hopeless_grid_is_refused_before_it_is_begun() {
+    // 10⁴ times the samples that fit: the field of what fits alone would take seconds here.
+    let at = spheres(&Random(1).cloud(3000, 40.0));
+    let limits = SurfaceLimits { max_samples: 1 << 28, ..SurfaceLimits::default() };
+    let started = std::time::Instant::now();
+    let error =
+        CpuBackend::new(Some(2)).unwrap().run(&at, &params(Kernel::Gaussian, 0.01), &limits, &Control::default());
+    let SurfaceError::GridTooLarge { samples, limit, suggested_resolution, .. } = error.unwrap_err() else { panic!() };
+    assert!(samples > limit && (0.05..1.0).contains(&suggested_resolution), "{samples} {suggested_resolution}");
+    assert!(started.elapsed().as_secs_f64() < 1.0, "{:?}", started.elapsed());
+}
+
+#[test]
 fn nothing_to_see_is_said() {
     let backend = CpuBackend::new(Some(1)).unwrap();
     let limits = SurfaceLimits::default();

@@ -8,7 +8,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32};
+use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32, to_u64};
 use crate::surface::params::{MAX_RESOLUTION, SurfaceLimits};
 
 /// Bricks along a tile's edge with the layer beyond.
@@ -145,6 +145,37 @@ pub(super) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits)
         resolution: lattice.spacing,
         suggested_resolution: (fitting.min(MAX_RESOLUTION) * 100.0).ceil() / 100.0,
     }
+}
+
+/// Refuses a grid that is certain to exceed the limit before any of it is computed.
+///
+/// # Errors
+/// [`SurfaceError::GridTooLarge`].
+pub(super) fn refuse_early(lattice: &Lattice, tiles: &Tiles, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
+    let tile_samples = f64::from(TILE).powi(3);
+    if tiles.len() as f64 * tile_samples <= limits.max_samples as f64 {
+        return Ok(());
+    }
+    let least = to_u64(samples_at_least(lattice));
+    if least > limits.max_samples { Err(too_large(lattice, least, limits)) } else { Ok(()) }
+}
+
+/// A lower bound of the samples: the volume of the blocks that lie wholly within some atom's reach.
+fn samples_at_least(lattice: &Lattice) -> f64 {
+    let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(f64::MAX, f64::min);
+    // Half the least reach: a sphere then holds a few blocks wherever it lies.
+    let side = 0.5 * reach;
+    let mut blocks: FxHashSet<[i32; 3]> = FxHashSet::default();
+    for atom in &lattice.atoms {
+        let (centre, reach2) = ([0, 1, 2].map(|k| atom.position(k) / side), (lattice.reach(atom) / side).powi(2));
+        let home = centre.map(|c| to_i32(c.floor()));
+        blocks.extend(boxed(home.map(|c| [c - 2, c + 2])).filter(|block| {
+            let furthest =
+                |k: usize| (f64::from(block[k]) - centre[k]).abs().max((f64::from(block[k] + 1) - centre[k]).abs());
+            (0..3).map(|k| furthest(k).powi(2)).sum::<f64>() <= reach2
+        }));
+    }
+    blocks.len() as f64 * side.powi(3)
 }
 
 /// An upper bound of the samples at another `spacing` (Å): blocks as long as the reach and a brick together that

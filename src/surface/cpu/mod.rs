@@ -110,6 +110,7 @@ fn run(
         }
         let lattice = Lattice::new(spheres, params)?;
         let tiles = Tiles::new(&lattice, limits, control)?;
+        bin::refuse_early(&lattice, &tiles, limits)?;
         Ok((lattice, tiles))
     });
     let (lattice, tiles) = binned?;
