@@ -13,6 +13,7 @@ pub(super) struct Edges {
 
 /// Bytes that are looked at together, and edges that they can hold.
 const BLOCK: usize = 64;
+const STEP: u32 = 64;
 
 impl Edges {
     /// Scans `window`, which begins outside of any token and is below 4 GiB. A token that the window may have cut off
@@ -47,7 +48,7 @@ fn edges(window: &[u8], out: &mut [u32]) -> usize {
     let mut base = 0;
     for block in blocks {
         (len, open) = block_edges(block, base, open, out, len);
-        base += BLOCK as u32;
+        base += STEP;
     }
     if !rest.is_empty() {
         let mut block = [b' '; BLOCK];
@@ -55,7 +56,7 @@ fn edges(window: &[u8], out: &mut [u32]) -> usize {
         (len, open) = block_edges(&block, base, open, out, len);
     }
     if open == 1 {
-        out[len] = window.len() as u32;
+        out[len] = u32::try_from(window.len()).unwrap_or(u32::MAX);
         len += 1;
     }
     len
@@ -74,7 +75,7 @@ fn block_edges(block: &[u8; BLOCK], base: u32, open: u64, out: &mut [u32], len: 
     while at < total {
         if let Some(out) = out.get_mut(at..).and_then(|o| o.first_chunk_mut::<16>()) {
             for slot in out {
-                *slot = (u64::from(base) + u64::from(edges.trailing_zeros())) as u32;
+                *slot = base + edges.trailing_zeros();
                 edges &= edges.wrapping_sub(1);
             }
         }
@@ -84,8 +85,7 @@ fn block_edges(block: &[u8; BLOCK], base: u32, open: u64, out: &mut [u32], len: 
 }
 
 /// Bit `i` is set where byte `i` is above a blank.
-#[expect(clippy::inline_always, reason = "so that it is compiled for each of the caller's instruction sets")]
-#[inline(always)]
+#[inline]
 fn solid_mask(block: &[u8; BLOCK]) -> u64 {
     const LOW_BITS: u64 = 0x7F7F_7F7F_7F7F_7F7F;
     const ABOVE_BLANK: u64 = 0x5F5F_5F5F_5F5F_5F5F;
@@ -103,6 +103,7 @@ fn solid_mask(block: &[u8; BLOCK]) -> u64 {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
 

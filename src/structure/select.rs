@@ -14,6 +14,7 @@ use crate::surface::{Spheres, SurfaceError};
 
 /// What to take. The default: first model, polymer (ATOM records), no hydrogens, best alternative location.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a flag of its own, given by name")]
 pub struct Selection {
     /// Model number as the file gives it; the file's first by default.
     pub model: Option<i32>,

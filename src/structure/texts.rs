@@ -4,6 +4,7 @@
 //! comparison; what it does not know goes to a hash map with a random seed, so that no choice of names is slow.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 
 use super::text;
 
@@ -11,7 +12,7 @@ use super::text;
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TextColumn {
     ids: Vec<u32>,
-    texts: Vec<Box<str>>,
+    texts: Vec<Arc<str>>,
 }
 
 impl TextColumn {
@@ -35,7 +36,7 @@ impl TextColumn {
 
     /// The distinct texts, by number.
     #[must_use]
-    pub fn texts(&self) -> &[Box<str>] {
+    pub fn texts(&self) -> &[Arc<str>] {
         &self.texts
     }
 
@@ -54,11 +55,16 @@ impl TextColumn {
 
 const CACHE_BITS: u32 = 8;
 
+/// The length of a text that a cache entry holds, 1 to 8.
+fn short(len: usize) -> u32 {
+    u32::try_from(len).unwrap_or(0)
+}
+
 /// Gives numbers to texts.
 #[derive(Debug)]
 pub(super) struct Interner {
-    texts: Vec<Box<str>>,
-    by_text: HashMap<Box<str>, u32>,
+    texts: Vec<Arc<str>>,
+    by_text: HashMap<Arc<str>, u32>,
     /// Up to eight bytes of a text, their count, and the text's number; direct mapped, vacant where the count is 0.
     cache: Box<[(u64, u32, u32); 1 << CACHE_BITS]>,
 }
@@ -92,11 +98,11 @@ impl Interner {
         let key = u64::from_le_bytes(word) << (64 - 8 * len);
         let slot = (key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> (64 - CACHE_BITS)) as usize;
         let (cached, cached_len, id) = self.cache[slot];
-        if cached == key && cached_len == len as u32 {
+        if cached == key && cached_len == short(len) {
             return id;
         }
         let id = self.intern_slow(&text[start..end]);
-        self.cache[slot] = (key, len as u32, id);
+        self.cache[slot] = (key, short(len), id);
         id
     }
 
@@ -115,25 +121,29 @@ impl Interner {
 
     #[cold]
     fn intern_slow(&mut self, raw: &[u8]) -> u32 {
-        self.intern_text(text::decode(raw).into_owned().into_boxed_str())
+        let text = text::decode(raw);
+        match self.by_text.get(&*text) {
+            Some(&id) => id,
+            None => self.add(Arc::from(text)),
+        }
     }
 
-    fn intern_text(&mut self, text: Box<str>) -> u32 {
-        if let Some(&id) = self.by_text.get(&text) {
-            return id;
-        }
+    fn add(&mut self, text: Arc<str>) -> u32 {
         // More than 2³² distinct texts need more than 2³² rows, which the reader's limit refuses.
         let id = u32::try_from(self.texts.len()).unwrap_or(u32::MAX);
-        self.texts.push(text.clone());
+        self.texts.push(Arc::clone(&text));
         self.by_text.insert(text, id);
         id
     }
 
     /// Learns the texts of `other` and rewrites `ids` accordingly.
     pub(super) fn adopt(&mut self, other: Self, ids: &mut [u32]) {
-        let map: Vec<u32> = other.texts.into_iter().map(|text| self.intern_text(text)).collect();
+        let number = |text: Arc<str>| self.by_text.get(&text).copied().unwrap_or_else(|| self.add(text));
+        let map: Vec<u32> = other.texts.into_iter().map(number).collect();
         if map.iter().enumerate().any(|(i, &id)| i != id as usize) {
-            ids.iter_mut().for_each(|id| *id = map[*id as usize]);
+            for id in ids {
+                *id = map[*id as usize];
+            }
         }
     }
 
@@ -143,6 +153,7 @@ impl Interner {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
 

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use super::super::atoms::{Atom, Tables};
 use super::super::cif::unquote;
 use super::super::element::{self, Name, atomic_number};
-use super::super::number::{integer, real};
+use super::super::number::{integer, real, single};
 use super::super::read::MAX_COORDINATE;
 use super::super::text::Fault;
 
@@ -117,6 +117,7 @@ impl<const QUOTES: bool> Row<'_, QUOTES> {
     }
 
     #[cold]
+    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
     fn fault(&self, column: usize, expected: String) -> Box<Fault> {
         let (start, end) = self.raw(column);
         Fault::token(self.text, start, end, expected)
@@ -208,7 +209,7 @@ fn optional<const QUOTES: bool>(
 ) -> Result<f32, Box<Fault>> {
     let Some((start, end)) = row.value(column) else { return Ok(default) };
     match real(row.text, start, end) {
-        Some(value) => Ok(value as f32),
+        Some(value) => Ok(single(value)),
         None => Err(row.fault(column, format!("{what}, ? or ."))),
     }
 }
