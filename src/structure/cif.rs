@@ -4,6 +4,7 @@
 //! Every byte up to a blank counts as white space, and `[`, `]` and `$` begin plain values like any other character:
 //! files that do so have one meaning only.
 
+use super::scan::run_length;
 use super::text::Fault;
 
 /// What a token is.
@@ -57,8 +58,7 @@ impl<'a> Tokenizer<'a> {
             b'\'' | b'"' => self.quoted(first),
             b';' if at_line_start(text, start) => self.text_field(),
             _ => {
-                let len = text[start..].iter().position(|&b| b <= b' ').unwrap_or(text.len() - start);
-                self.at = start + len;
+                self.at = start + token_length(&text[start..]);
                 Ok(Token { kind: bare_kind(&text[start..self.at]), start, end: self.at })
             }
         }
@@ -104,6 +104,12 @@ impl<'a> Tokenizer<'a> {
             None => Err(Fault::words(start, "a text field without end", "a line that begins with ;")),
         }
     }
+}
+
+/// Most tokens are shorter than what it takes to look at many bytes at once.
+fn token_length(text: &[u8]) -> usize {
+    let short = text.iter().take(32).position(|&b| b <= b' ');
+    short.unwrap_or_else(|| run_length(text, true))
 }
 
 /// The first semicolon from `at` on that begins a line.

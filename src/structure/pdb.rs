@@ -14,6 +14,7 @@ use super::error::StructureError;
 use super::number::{hybrid36, real, single};
 use super::read::{MAX_COORDINATE, ReadLimits};
 use super::residue;
+use super::scan::run_length;
 use super::text::{self, Fault, tidy, trimmed};
 
 /// Longest title that is kept, characters.
@@ -57,12 +58,25 @@ impl Iterator for Lines<'_> {
     #[inline]
     fn next(&mut self) -> Option<(usize, usize)> {
         let rest = self.text.get(self.at..).unwrap_or_default();
-        let start = self.at + rest.iter().position(|&b| b != b'\n' && b != b'\r')?;
-        let rest = &self.text[start..];
+        let one_end = match rest {
+            [b'\n', ..] => 1,
+            [b'\r', b'\n', ..] => 2,
+            _ => 0,
+        };
+        // Usually the next line begins right there.
+        let next = if rest.get(one_end).is_some_and(|&b| b > b' ') { one_end } else { empty_lines(rest) };
+        let start = self.at + next;
+        let rest = self.text.get(start..).filter(|rest| !rest.is_empty())?;
         let len = if self.carriage_returns { memchr::memchr2(b'\n', b'\r', rest) } else { memchr::memchr(b'\n', rest) };
         self.at = start + len.unwrap_or(rest.len());
         Some((start, self.at))
     }
+}
+
+/// Length of the line ends and blank lines that `text` begins with.
+fn empty_lines(text: &[u8]) -> usize {
+    let blanks = &text[..run_length(text, false)];
+    memchr::memrchr2(b'\n', b'\r', blanks).map_or(0, |i| i + 1)
 }
 
 /// Which model an atom belongs to. A number that comes back, and atoms after the end of a model, begin a new one.

@@ -36,6 +36,19 @@ impl Edges {
     }
 }
 
+/// How many bytes `text` begins with that are `solid` (above a blank), or that are not.
+pub(super) fn run_length(text: &[u8], solid: bool) -> usize {
+    let (blocks, rest) = text.as_chunks::<BLOCK>();
+    for (i, block) in blocks.iter().enumerate() {
+        let mask = solid_mask(block);
+        let run = if solid { mask.trailing_ones() } else { mask.trailing_zeros() };
+        if run < STEP {
+            return i * BLOCK + run as usize;
+        }
+    }
+    blocks.len() * BLOCK + rest.iter().position(|&b| (b > b' ') != solid).unwrap_or(rest.len())
+}
+
 /// Writes the edges of `window` to `out`, which is a little longer, and returns how many there are: an even number.
 #[multiversion::multiversion(targets(
     "x86_64+avx512f+avx512bw+avx512dq+avx512vl+bmi1+bmi2+popcnt+lzcnt",
@@ -133,6 +146,21 @@ mod tests {
                 block[at] = byte;
                 let expected = u64::from(byte > b' ') << at;
                 assert_eq!(solid_mask(&block), expected, "{byte} at {at}");
+            }
+        }
+    }
+
+    #[test]
+    fn runs_end_where_they_end() {
+        for n in 0..200 {
+            for tail in ["", " x", "x y"] {
+                let solid = format!("{}{}", "é".repeat(n), tail.trim_start_matches('x'));
+                assert_eq!(run_length(solid.as_bytes(), true), 2 * n, "{tail}");
+                assert_eq!(
+                    run_length(format!("{}{}", "\t".repeat(n), tail.trim_start()).as_bytes(), false),
+                    n,
+                    "{tail}"
+                );
             }
         }
     }

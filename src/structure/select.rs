@@ -145,8 +145,7 @@ fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureE
 /// For each text of the chain column, whether it was asked for.
 fn chains(structure: &Structure, selection: &Selection) -> Result<Option<Vec<bool>>, StructureError> {
     let Some(asked) = &selection.chains else { return Ok(None) };
-    let texts = structure.chain.texts();
-    let known: HashSet<&str> = texts.iter().map(|t| &**t).collect();
+    let known: HashSet<&str> = structure.chain.texts().collect();
     let mut names: HashSet<&str> = HashSet::new();
     for name in asked {
         let name = if name == "_" && !known.contains("_") { "" } else { name.as_str() };
@@ -159,7 +158,7 @@ fn chains(structure: &Structure, selection: &Selection) -> Result<Option<Vec<boo
         }
         names.insert(name);
     }
-    Ok(Some(texts.iter().map(|text| names.contains(&**text)).collect()))
+    Ok(Some(structure.chain.texts().map(|text| names.contains(text)).collect()))
 }
 
 fn alternative(structure: &Structure, selection: &Selection, model: i32) -> Result<Option<u8>, StructureError> {

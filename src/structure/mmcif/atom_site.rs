@@ -12,6 +12,9 @@ use super::super::text::Fault;
 /// Tags of the category begin with this.
 pub(super) const PREFIX: &[u8] = b"_atom_site.";
 
+/// Longest name of an atom, a residue or a chain, bytes: the dictionary's have five.
+const MAX_NAME: usize = 255;
+
 /// No such column.
 const NONE: usize = usize::MAX;
 
@@ -143,16 +146,16 @@ impl AtomSite {
         let layout = self.layout;
         let text = row.text;
         let position = [coordinate(row, &layout, 0)?, coordinate(row, &layout, 1)?, coordinate(row, &layout, 2)?];
-        let (from, to) = row.first_of(layout.name).unwrap_or((0, 0));
+        let (from, to) = text_of(row, row.first_of(layout.name), layout.name[0])?;
         let name = self.tables.name.intern(text, from, to);
-        let (from, to) = row.first_of(layout.residue).unwrap_or((0, 0));
+        let (from, to) = text_of(row, row.first_of(layout.residue), layout.residue[0])?;
         let residue = self.tables.residue.intern(text, from, to);
-        let (from, to) = row.first_of(layout.chain).unwrap_or((0, 0));
+        let (from, to) = text_of(row, row.first_of(layout.chain), layout.chain[0])?;
         let chain = self.tables.chain.intern(text, from, to);
         let label_chain = if layout.label_chain == NONE {
             0
         } else {
-            let (from, to) = row.value(layout.label_chain).unwrap_or((0, 0));
+            let (from, to) = text_of(row, row.value(layout.label_chain), layout.label_chain)?;
             self.tables.label_chain.intern(text, from, to)
         };
         Ok(Atom {
@@ -198,6 +201,20 @@ fn coordinate<const QUOTES: bool>(row: &Row<'_, QUOTES>, layout: &Layout, axis: 
         return Ok(value);
     }
     Err(row.fault(column, format!("{} in Å, within ±{MAX_COORDINATE}", POSITION[axis])))
+}
+
+/// A name, empty where there is none.
+#[inline]
+fn text_of<const QUOTES: bool>(
+    row: &Row<'_, QUOTES>,
+    value: Option<(usize, usize)>,
+    column: usize,
+) -> Result<(usize, usize), Box<Fault>> {
+    match value {
+        None => Ok((0, 0)),
+        Some((start, end)) if end - start <= MAX_NAME => Ok((start, end)),
+        Some(_) => Err(row.fault(column, format!("a name of at most {MAX_NAME} bytes"))),
+    }
 }
 
 #[inline]

@@ -159,7 +159,7 @@ impl<'a> Rows<'a> {
         }
         let mut tables = Tables::default();
         for (_, mut slices, site) in parts {
-            slices.adopt(site.tables, &mut tables);
+            slices.adopt(&site.tables, &mut tables);
         }
         self.columns = columns;
         self.site.tables = tables;
