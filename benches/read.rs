@@ -43,7 +43,7 @@ fn benches(c: &mut Criterion) {
         let structure = read(&text, &limits).expect("atoms");
         group.throughput(Throughput::Elements(structure.len() as u64));
         group.bench_function("select", |b| {
-            b.iter(|| select(black_box(&structure), &Selection::default()).map(|s| s.atoms.len()))
+            b.iter(|| select(black_box(&structure), &Selection::default()).map(|s| s.atoms.len()));
         });
         group.finish();
     }

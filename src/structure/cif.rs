@@ -4,6 +4,7 @@
 //! Every byte up to a blank counts as white space, and `[`, `]` and `$` begin plain values like any other character:
 //! files that do so have one meaning only.
 
+use super::scan::run_length;
 use super::text::Fault;
 
 /// What a token is.
@@ -57,8 +58,7 @@ impl<'a> Tokenizer<'a> {
             b'\'' | b'"' => self.quoted(first),
             b';' if at_line_start(text, start) => self.text_field(),
             _ => {
-                let len = text[start..].iter().position(|&b| b <= b' ').unwrap_or(text.len() - start);
-                self.at = start + len;
+                self.at = start + token_length(&text[start..]);
                 Ok(Token { kind: bare_kind(&text[start..self.at]), start, end: self.at })
             }
         }
@@ -66,53 +66,61 @@ impl<'a> Tokenizer<'a> {
 
     /// White space and comments.
     fn skip_blanks(&mut self) {
-        while let Some(&b) = self.text.get(self.at) {
-            if b == b'#' {
-                let rest = &self.text[self.at..];
-                self.at += memchr::memchr2(b'\n', b'\r', rest).unwrap_or(rest.len());
-            } else if b <= b' ' {
-                self.at += 1;
-            } else {
-                break;
-            }
-        }
+        let mut comment = false;
+        let blanks = self.text[self.at..].iter().position(|&b| {
+            // Neither is searched for with vectors: both are short, unless somebody wants to be slow.
+            comment = if comment { b != b'\n' && b != b'\r' } else { b == b'#' };
+            !comment && b > b' '
+        });
+        self.at = blanks.map_or(self.text.len(), |n| self.at + n);
     }
 
     /// A quote ends a value only where white space follows it, and not beyond its line.
     fn quoted(&mut self, quote: u8) -> Result<Token, Box<Fault>> {
         let start = self.at;
-        let mut at = start + 1;
-        loop {
-            let rest = &self.text[at..];
-            let found = memchr::memchr3(quote, b'\n', b'\r', rest).map(|i| (at + i, rest[i]));
-            match found {
-                Some((i, b)) if b == quote => {
-                    at = i + 1;
-                    if self.text.get(at).is_none_or(|&next| next <= b' ') {
-                        self.at = at;
-                        return Ok(Token { kind: Kind::Value, start, end: at });
-                    }
-                }
-                line_end => {
-                    let end = line_end.map_or(self.text.len(), |(i, _)| i);
-                    let expected = format!("a closing {} on the same line", char::from(quote));
-                    return Err(Fault::token(self.text, start, end, expected));
-                }
-            }
+        let mut before = 0;
+        let blank = self.text[start + 1..].iter().position(|&b| {
+            let ends = matches!(b, b'\n' | b'\r') || (before == quote && b <= b' ');
+            before = b;
+            ends
+        });
+        let end = blank.map_or(self.text.len(), |n| start + 1 + n);
+        // The opening quote is no closing one, even if nothing stands between it and a blank.
+        if end > start + 1 && self.text[end - 1] == quote {
+            self.at = end;
+            return Ok(Token { kind: Kind::Value, start, end });
         }
+        Err(Fault::token(self.text, start, end, format!("a closing {} on the same line", char::from(quote))))
     }
 
     /// A text field reaches from a semicolon at the start of a line to the next one.
     fn text_field(&mut self) -> Result<Token, Box<Fault>> {
         let start = self.at;
-        let ends = memchr::memchr_iter(b';', &self.text[start + 1..]).map(|i| start + 1 + i);
-        match ends.into_iter().find(|&i| at_line_start(self.text, i)) {
+        match line_beginning_with_semicolon(self.text, start + 1) {
             Some(i) => {
                 self.at = i + 1;
                 Ok(Token { kind: Kind::Value, start, end: self.at })
             }
             None => Err(Fault::words(start, "a text field without end", "a line that begins with ;")),
         }
+    }
+}
+
+/// Most tokens are shorter than what it takes to look at many bytes at once.
+fn token_length(text: &[u8]) -> usize {
+    let short = text.iter().take(32).position(|&b| b <= b' ');
+    short.unwrap_or_else(|| run_length(text, true))
+}
+
+/// The first semicolon from `at` on that begins a line.
+fn line_beginning_with_semicolon(text: &[u8], mut at: usize) -> Option<usize> {
+    loop {
+        at += memchr::memchr(b';', &text[at..])?;
+        if at_line_start(text, at) {
+            return Some(at);
+        }
+        // No other one on this line can be the first.
+        at += memchr::memchr2(b'\n', b'\r', &text[at..])?;
     }
 }
 
@@ -168,6 +176,7 @@ fn unquote_slow(text: &[u8], start: usize, end: usize) -> (usize, usize, bool) {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
 

@@ -20,11 +20,11 @@ pub const SYMBOLS: [&str; 118] = [
 /// Atomic numbers by letters: first letter (A is 1) times 32 plus the second (none is 0).
 const BY_LETTERS: [u8; 1024] = {
     let mut table = [0; 1024];
-    let mut z = 0;
-    while z < SYMBOLS.len() {
-        let s = SYMBOLS[z].as_bytes();
+    let mut z = 0_u8;
+    while (z as usize) < SYMBOLS.len() {
+        let s = SYMBOLS[z as usize].as_bytes();
         let second = if s.len() == 2 { s[1] & 31 } else { 0 };
-        table[(s[0] & 31) as usize * 32 + second as usize] = z as u8 + 1;
+        table[(s[0] & 31) as usize * 32 + second as usize] = z + 1;
         z += 1;
     }
     // Deuterium and tritium are hydrogen.
@@ -78,16 +78,15 @@ pub(super) fn guess(name: Name<'_>, residue: &str) -> u8 {
     if residue::is_polymer(residue) || residue::is_water(residue) {
         return if letters.starts_with(b"SE") && matches!(residue, "MSE" | "SEC") { 34 } else { single };
     }
-    // `1HB`, `2HG1`: a digit first is a hydrogen's or a carbon's number, never a metal's.
+    // A digit first is a hydrogen's or a carbon's number, never a metal's.
     let two = if letters_at == 0 { letters.get(..2) } else { None };
     match (two, name.columns) {
-        // ` CL1`: a symbol of one letter, by its place.
-        (_, Some([b' ', ..])) => single,
+        // ` CL1`: a symbol of one letter, by its place. `1HB `: a number first.
+        (_, Some([b' ', ..])) | (None, _) => single,
         // `HG11`, `CA12`, `NB1A`: all columns used, so the place says nothing; hydrogens and carbons are likelier.
         (Some(two), Some([_, _, _, last])) if last != b' ' => sure(two, n_letters).unwrap_or(single),
         (Some(two), Some(_)) => aligned_left(two, residue).unwrap_or(single),
         (Some(two), None) => sure(two, n_letters).unwrap_or(single),
-        (None, _) => single,
     }
 }
 
@@ -114,6 +113,7 @@ fn aligned_left(two: &[u8], residue: &str) -> Option<u8> {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
 

@@ -110,6 +110,7 @@ fn skippable_frame(bytes: &[u8]) -> bool {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use std::io::Write;
 

@@ -31,6 +31,12 @@ pub(super) fn real(text: &[u8], start: usize, end: usize) -> Option<f64> {
     }
 }
 
+/// An occupancy or a B-factor: a few digits, which an `f32` holds but for the last bits.
+#[expect(clippy::cast_possible_truncation, reason = "rounding is meant; what is too large becomes infinite")]
+pub(super) fn single(value: f64) -> f32 {
+    value as f32
+}
+
 #[inline]
 fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
     // Eleven bytes hold a sign, eight digits, a point and one more.
@@ -54,7 +60,7 @@ fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
     }
     // Digits before the point from `head`, those after it from `tail`, which is one byte further.
     let joined = (head & LOW[integer_digits]) | (tail & !LOW[integer_digits]);
-    let shift = 8 * (8 - digits) as u32;
+    let shift = 8 * (8 - digits);
     // Right-aligned, with leading zeros.
     let aligned = (joined << shift) | (ZEROS & LOW[8 - digits]);
     let values = aligned ^ ZEROS;
@@ -72,6 +78,10 @@ fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
 
 #[cold]
 fn general(raw: &[u8]) -> Option<f64> {
+    // Nobody writes a coordinate with so many digits, but somebody may send one with millions.
+    if raw.len() > 64 {
+        return None;
+    }
     let digits = match raw.iter().position(|&b| b == b'(') {
         Some(open) if raw.last() == Some(&b')') && raw[open + 1..raw.len() - 1].iter().all(u8::is_ascii_digit) => {
             &raw[..open]
@@ -130,6 +140,7 @@ pub(super) fn hybrid36(raw: &[u8]) -> Option<i32> {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
 

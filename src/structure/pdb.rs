@@ -11,10 +11,11 @@ use std::collections::{HashMap, HashSet};
 use super::atoms::{Atom, Columns, SourceFormat, Structure, Tables};
 use super::element::{self, Name, atomic_number};
 use super::error::StructureError;
-use super::number::{hybrid36, real};
+use super::number::{hybrid36, real, single};
 use super::read::{MAX_COORDINATE, ReadLimits};
 use super::residue;
-use super::text::{self, Fault, quote, tidy, trimmed};
+use super::scan::run_length;
+use super::text::{self, Fault, tidy, trimmed};
 
 /// Longest title that is kept, characters.
 pub(super) const MAX_TITLE: usize = 1000;
@@ -38,7 +39,7 @@ pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, Struct
     Ok(reader.columns.finish(reader.tables, SourceFormat::Pdb, reader.id, title))
 }
 
-/// Lines as offsets, without their ends.
+/// Lines that are not empty, as offsets, without their ends.
 struct Lines<'a> {
     text: &'a [u8],
     at: usize,
@@ -56,14 +57,26 @@ impl Iterator for Lines<'_> {
 
     #[inline]
     fn next(&mut self) -> Option<(usize, usize)> {
-        let start = self.at;
-        let rest = self.text.get(start..).filter(|r| !r.is_empty())?;
+        let rest = self.text.get(self.at..).unwrap_or_default();
+        let one_end = match rest {
+            [b'\n', ..] => 1,
+            [b'\r', b'\n', ..] => 2,
+            _ => 0,
+        };
+        // Usually the next line begins right there.
+        let next = if rest.get(one_end).is_some_and(|&b| b > b' ') { one_end } else { empty_lines(rest) };
+        let start = self.at + next;
+        let rest = self.text.get(start..).filter(|rest| !rest.is_empty())?;
         let len = if self.carriage_returns { memchr::memchr2(b'\n', b'\r', rest) } else { memchr::memchr(b'\n', rest) };
-        let len = len.unwrap_or(rest.len());
-        let crlf = usize::from(rest.get(len..len + 2) == Some(b"\r\n"));
-        self.at = start + len + 1 + crlf;
-        Some((start, start + len))
+        self.at = start + len.unwrap_or(rest.len());
+        Some((start, self.at))
     }
+}
+
+/// Length of the line ends and blank lines that `text` begins with.
+fn empty_lines(text: &[u8]) -> usize {
+    let blanks = &text[..run_length(text, false)];
+    memchr::memrchr2(b'\n', b'\r', blanks).map_or(0, |i| i + 1)
 }
 
 /// Which model an atom belongs to. A number that comes back, and atoms after the end of a model, begin a new one.
@@ -125,7 +138,7 @@ impl<'a> Reader<'a> {
     fn line(&mut self, (start, end): (usize, usize)) -> Result<(), Box<Fault>> {
         let line = &self.text[start..end];
         match line {
-            [b'A', b'T', b'O', b'M', rest @ ..] if matches!(rest, [] | [b' ' | b'\t' | b'0'..=b'9', ..]) => {
+            [b'A', b'T', b'O', b'M'] | [b'A', b'T', b'O', b'M', b' ' | b'\t' | b'0'..=b'9', ..] => {
                 self.atom(start, end, false)
             }
             [b'H', b'E', b'T', b'A', b'T', b'M', ..] => self.atom(start, end, true),
@@ -303,8 +316,7 @@ fn coordinate(card: &Card, from: usize, axis: &str) -> Result<f64, Box<Fault>> {
 #[inline]
 fn optional(card: &Card, from: usize, to: usize, default: f32, what: &str) -> Result<f32, Box<Fault>> {
     match number(card, from, to) {
-        // The value is one of six columns: an `f32` holds it, but for the last bits.
-        Some(value) => Ok(value as f32),
+        Some(value) => Ok(single(value)),
         None if trimmed(&card[from..to]).1 == 0 => Ok(default),
         None => Err(Fault::token(card, from, to, format!("{what} in columns {} to {to}, or blanks", from + 1))),
     }
@@ -351,23 +363,19 @@ fn expand_tabs(line: &[u8]) -> (Vec<u8>, Vec<usize>) {
 
 /// What a file without atoms holds.
 fn describe(text: &[u8]) -> String {
+    /// So many lines are looked at for records to name.
+    const LINES: usize = 10_000;
     let mut records: Vec<String> = Vec::new();
-    let mut n_lines = 0_u64;
-    for (start, end) in Lines::new(text) {
-        n_lines += 1;
+    for (start, end) in Lines::new(text).take(LINES) {
         let line = &text[start..end];
         let word = text::decode(line[..line.len().min(6)].trim_ascii()).into_owned();
         if records.len() < 10 && !word.is_empty() && !records.contains(&word) {
             records.push(word);
         }
     }
-    if records.is_empty() {
-        return format!("a PDB file of {n_lines} empty lines");
-    }
-    let first = records[0].clone();
+    let (n_lines, _) = text::line_and_column(text, text.len().saturating_sub(1));
     format!(
-        "a PDB file of {n_lines} lines from {} on without an ATOM or HETATM record; it has {}",
-        quote(first.as_bytes()),
+        "a PDB file of {n_lines} lines without ATOM and HETATM; it has {}",
         text::list(records.iter().cloned(), records.len())
     )
 }

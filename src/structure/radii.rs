@@ -99,6 +99,7 @@ pub fn vdw_radius(atomic_number: u8) -> f32 {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::super::element::atomic_number;
     use super::*;

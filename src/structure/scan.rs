@@ -13,6 +13,7 @@ pub(super) struct Edges {
 
 /// Bytes that are looked at together, and edges that they can hold.
 const BLOCK: usize = 64;
+const STEP: u32 = 64;
 
 impl Edges {
     /// Scans `window`, which begins outside of any token and is below 4 GiB. A token that the window may have cut off
@@ -35,6 +36,19 @@ impl Edges {
     }
 }
 
+/// How many bytes `text` begins with that are `solid` (above a blank), or that are not.
+pub(super) fn run_length(text: &[u8], solid: bool) -> usize {
+    let (blocks, rest) = text.as_chunks::<BLOCK>();
+    for (i, block) in blocks.iter().enumerate() {
+        let mask = solid_mask(block);
+        let run = if solid { mask.trailing_ones() } else { mask.trailing_zeros() };
+        if run < STEP {
+            return i * BLOCK + run as usize;
+        }
+    }
+    blocks.len() * BLOCK + rest.iter().position(|&b| (b > b' ') != solid).unwrap_or(rest.len())
+}
+
 /// Writes the edges of `window` to `out`, which is a little longer, and returns how many there are: an even number.
 #[multiversion::multiversion(targets(
     "x86_64+avx512f+avx512bw+avx512dq+avx512vl+bmi1+bmi2+popcnt+lzcnt",
@@ -47,7 +61,7 @@ fn edges(window: &[u8], out: &mut [u32]) -> usize {
     let mut base = 0;
     for block in blocks {
         (len, open) = block_edges(block, base, open, out, len);
-        base += BLOCK as u32;
+        base += STEP;
     }
     if !rest.is_empty() {
         let mut block = [b' '; BLOCK];
@@ -55,7 +69,7 @@ fn edges(window: &[u8], out: &mut [u32]) -> usize {
         (len, open) = block_edges(&block, base, open, out, len);
     }
     if open == 1 {
-        out[len] = window.len() as u32;
+        out[len] = u32::try_from(window.len()).unwrap_or(u32::MAX);
         len += 1;
     }
     len
@@ -74,7 +88,7 @@ fn block_edges(block: &[u8; BLOCK], base: u32, open: u64, out: &mut [u32], len: 
     while at < total {
         if let Some(out) = out.get_mut(at..).and_then(|o| o.first_chunk_mut::<16>()) {
             for slot in out {
-                *slot = (u64::from(base) + u64::from(edges.trailing_zeros())) as u32;
+                *slot = base + edges.trailing_zeros();
                 edges &= edges.wrapping_sub(1);
             }
         }
@@ -84,8 +98,7 @@ fn block_edges(block: &[u8; BLOCK], base: u32, open: u64, out: &mut [u32], len: 
 }
 
 /// Bit `i` is set where byte `i` is above a blank.
-#[expect(clippy::inline_always, reason = "so that it is compiled for each of the caller's instruction sets")]
-#[inline(always)]
+#[inline]
 fn solid_mask(block: &[u8; BLOCK]) -> u64 {
     const LOW_BITS: u64 = 0x7F7F_7F7F_7F7F_7F7F;
     const ABOVE_BLANK: u64 = 0x5F5F_5F5F_5F5F_5F5F;
@@ -103,6 +116,7 @@ fn solid_mask(block: &[u8; BLOCK]) -> u64 {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
 
@@ -132,6 +146,21 @@ mod tests {
                 block[at] = byte;
                 let expected = u64::from(byte > b' ') << at;
                 assert_eq!(solid_mask(&block), expected, "{byte} at {at}");
+            }
+        }
+    }
+
+    #[test]
+    fn runs_end_where_they_end() {
+        for n in 0..200 {
+            for tail in ["", " x", "x y"] {
+                let solid = format!("{}{}", "é".repeat(n), tail.trim_start_matches('x'));
+                assert_eq!(run_length(solid.as_bytes(), true), 2 * n, "{tail}");
+                assert_eq!(
+                    run_length(format!("{}{}", "\t".repeat(n), tail.trim_start()).as_bytes(), false),
+                    n,
+                    "{tail}"
+                );
             }
         }
     }

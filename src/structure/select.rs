@@ -14,6 +14,7 @@ use crate::surface::{Spheres, SurfaceError};
 
 /// What to take. The default: first model, polymer (ATOM records), no hydrogens, best alternative location.
 #[derive(Debug, Clone, PartialEq, Eq)]
+#[expect(clippy::struct_excessive_bools, reason = "each is a flag of its own, given by name")]
 pub struct Selection {
     /// Model number as the file gives it; the file's first by default.
     pub model: Option<i32>,
@@ -144,8 +145,7 @@ fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureE
 /// For each text of the chain column, whether it was asked for.
 fn chains(structure: &Structure, selection: &Selection) -> Result<Option<Vec<bool>>, StructureError> {
     let Some(asked) = &selection.chains else { return Ok(None) };
-    let texts = structure.chain.texts();
-    let known: HashSet<&str> = texts.iter().map(|t| &**t).collect();
+    let known: HashSet<&str> = structure.chain.texts().collect();
     let mut names: HashSet<&str> = HashSet::new();
     for name in asked {
         let name = if name == "_" && !known.contains("_") { "" } else { name.as_str() };
@@ -158,7 +158,7 @@ fn chains(structure: &Structure, selection: &Selection) -> Result<Option<Vec<boo
         }
         names.insert(name);
     }
-    Ok(Some(texts.iter().map(|text| names.contains(&**text)).collect()))
+    Ok(Some(structure.chain.texts().map(|text| names.contains(text)).collect()))
 }
 
 fn alternative(structure: &Structure, selection: &Selection, model: i32) -> Result<Option<u8>, StructureError> {

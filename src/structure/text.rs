@@ -18,12 +18,14 @@ pub(super) struct Fault {
 impl Fault {
     /// `found` is an excerpt of `text[start..end]`.
     #[cold]
+    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
     pub(super) fn token(text: &[u8], start: usize, end: usize, expected: impl Into<String>) -> Box<Self> {
         Box::new(Self { at: start, found: quote(&text[start..end]), expected: expected.into() })
     }
 
     /// `found` in words.
     #[cold]
+    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
     pub(super) fn words(at: usize, found: impl Into<String>, expected: impl Into<String>) -> Box<Self> {
         Box::new(Self { at, found: found.into(), expected: expected.into() })
     }
@@ -39,7 +41,14 @@ impl Fault {
 pub(super) fn line_and_column(text: &[u8], at: usize) -> (u64, u64) {
     let before = &text[..at.min(text.len())];
     let lf = memchr::memchr_iter(b'\n', before).count();
-    let lone_cr = memchr::memchr_iter(b'\r', before).filter(|&i| text.get(i + 1) != Some(&b'\n')).count();
+    let cr = memchr::memchr_iter(b'\r', before).count();
+    // The line feed of the last pair may stand at `at` itself.
+    let pairs = if lf == 0 || cr == 0 {
+        usize::from(before.last() == Some(&b'\r') && text.get(at) == Some(&b'\n'))
+    } else {
+        before.iter().zip(&text[1..]).filter(|&(&a, &b)| a == b'\r' && b == b'\n').count()
+    };
+    let lone_cr = cr - pairs;
     let start = memchr::memrchr2(b'\n', b'\r', before).map_or(0, |i| i + 1);
     ((lf + lone_cr) as u64 + 1, (before.len() - start) as u64 + 1)
 }
@@ -47,7 +56,9 @@ pub(super) fn line_and_column(text: &[u8], at: usize) -> (u64, u64) {
 /// Bytes as text: UTF-8 where they are, Latin-1 otherwise; control characters become U+FFFD, so that a name
 /// is safe to print.
 pub(super) fn decode(raw: &[u8]) -> Cow<'_, str> {
+    // Almost every text is plain.
     let text = match std::str::from_utf8(raw) {
+        Ok(text) if raw.iter().all(|b| (b' '..=b'~').contains(b)) => return Cow::Borrowed(text),
         Ok(text) => Cow::Borrowed(text),
         Err(_) => Cow::Owned(raw.iter().copied().map(char::from).collect()),
     };
@@ -99,6 +110,7 @@ pub(super) fn list<I: IntoIterator<Item = String>>(items: I, total: usize) -> St
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
 

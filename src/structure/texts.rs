@@ -1,24 +1,46 @@
 //! Columns of short texts (names of atoms, residues and chains) stored once each and referred to by number.
 //!
 //! Real files repeat a few hundred names millions of times. A small cache answers almost every look-up with one
-//! comparison; what it does not know goes to a hash map with a random seed, so that no choice of names is slow.
+//! comparison; what it does not know goes to a hash table with a random seed, so that no choice of names is slow.
 
-use std::collections::HashMap;
+use std::hash::{BuildHasher, RandomState};
 
 use super::text;
+
+/// Distinct texts, one behind the other, by number.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+struct Texts {
+    joined: String,
+    ends: Vec<usize>,
+}
+
+impl Texts {
+    fn len(&self) -> usize {
+        self.ends.len()
+    }
+
+    fn get(&self, id: usize) -> &str {
+        let start = if id == 0 { 0 } else { self.ends[id - 1] };
+        &self.joined[start..self.ends[id]]
+    }
+
+    fn iter(&self) -> impl ExactSizeIterator<Item = &str> {
+        (0..self.len()).map(|id| self.get(id))
+    }
+}
 
 /// Texts of a column: `get(i)` is the text of row `i`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TextColumn {
     ids: Vec<u32>,
-    texts: Vec<Box<str>>,
+    texts: Texts,
 }
 
 impl TextColumn {
     /// The text of row `i`.
     #[must_use]
     pub fn get(&self, i: usize) -> &str {
-        &self.texts[self.ids[i] as usize]
+        self.texts.get(self.ids[i] as usize)
     }
 
     /// The number of the text of row `i`: equal numbers are equal texts, counted in order of first appearance.
@@ -35,8 +57,8 @@ impl TextColumn {
 
     /// The distinct texts, by number.
     #[must_use]
-    pub fn texts(&self) -> &[Box<str>] {
-        &self.texts
+    pub fn texts(&self) -> impl ExactSizeIterator<Item = &str> {
+        self.texts.iter()
     }
 
     /// Number of rows.
@@ -54,28 +76,36 @@ impl TextColumn {
 
 const CACHE_BITS: u32 = 8;
 
+/// The length of a text that a cache entry holds, 1 to 8.
+fn short(len: usize) -> u32 {
+    u32::try_from(len).unwrap_or(0)
+}
+
 /// Gives numbers to texts.
 #[derive(Debug)]
 pub(super) struct Interner {
-    texts: Vec<Box<str>>,
-    by_text: HashMap<Box<str>, u32>,
+    texts: Texts,
+    seed: RandomState,
+    /// Hash and number plus one of each text, open addressing; a power of two, at most half full.
+    table: Vec<(u32, u32)>,
     /// Up to eight bytes of a text, their count, and the text's number; direct mapped, vacant where the count is 0.
     cache: Box<[(u64, u32, u32); 1 << CACHE_BITS]>,
 }
 
 impl Default for Interner {
     fn default() -> Self {
-        Self { texts: Vec::new(), by_text: HashMap::new(), cache: Box::new([(0, 0, 0); 1 << CACHE_BITS]) }
+        let cache = Box::new([(0, 0, 0); 1 << CACHE_BITS]);
+        Self { texts: Texts::default(), seed: RandomState::new(), table: vec![(0, 0); 64], cache }
     }
 }
 
 impl Interner {
     pub(super) fn is_empty(&self) -> bool {
-        self.texts.is_empty()
+        self.texts.len() == 0
     }
 
     pub(super) fn text(&self, id: u32) -> &str {
-        &self.texts[id as usize]
+        self.texts.get(id as usize)
     }
 
     /// The number of `text[start..end]`.
@@ -92,11 +122,11 @@ impl Interner {
         let key = u64::from_le_bytes(word) << (64 - 8 * len);
         let slot = (key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> (64 - CACHE_BITS)) as usize;
         let (cached, cached_len, id) = self.cache[slot];
-        if cached == key && cached_len == len as u32 {
+        if cached == key && cached_len == short(len) {
             return id;
         }
         let id = self.intern_slow(&text[start..end]);
-        self.cache[slot] = (key, len as u32, id);
+        self.cache[slot] = (key, short(len), id);
         id
     }
 
@@ -115,25 +145,59 @@ impl Interner {
 
     #[cold]
     fn intern_slow(&mut self, raw: &[u8]) -> u32 {
-        self.intern_text(text::decode(raw).into_owned().into_boxed_str())
+        self.number(&text::decode(raw))
     }
 
-    fn intern_text(&mut self, text: Box<str>) -> u32 {
-        if let Some(&id) = self.by_text.get(&text) {
-            return id;
+    /// The number of `text`, which is added if it is new.
+    fn number(&mut self, text: &str) -> u32 {
+        let hash = self.hash(text);
+        let mut slot = self.slot(hash);
+        loop {
+            match self.table[slot] {
+                (_, 0) => break,
+                (known, id_plus_one) if known == hash && self.text(id_plus_one - 1) == text => return id_plus_one - 1,
+                _ => slot = (slot + 1) % self.table.len(),
+            }
         }
-        // More than 2³² distinct texts need more than 2³² rows, which the reader's limit refuses.
-        let id = u32::try_from(self.texts.len()).unwrap_or(u32::MAX);
-        self.texts.push(text.clone());
-        self.by_text.insert(text, id);
+        // As many distinct texts as 32 bits count need as many rows, which the reader's limit refuses.
+        let id = u32::try_from(self.texts.len()).unwrap_or(u32::MAX - 1);
+        self.texts.joined.push_str(text);
+        self.texts.ends.push(self.texts.joined.len());
+        self.table[slot] = (hash, id + 1);
+        if 2 * self.texts.len() > self.table.len() {
+            self.grow();
+        }
         id
     }
 
+    fn grow(&mut self) {
+        let old = std::mem::take(&mut self.table);
+        self.table = vec![(0, 0); 4 * old.len()];
+        for entry in old.into_iter().filter(|entry| entry.1 != 0) {
+            let mut slot = self.slot(entry.0);
+            while self.table[slot].1 != 0 {
+                slot = (slot + 1) % self.table.len();
+            }
+            self.table[slot] = entry;
+        }
+    }
+
+    fn hash(&self, text: &str) -> u32 {
+        // The upper half of the hash; the table never needs more bits.
+        u32::try_from(self.seed.hash_one(text) >> 32).unwrap_or(0)
+    }
+
+    fn slot(&self, hash: u32) -> usize {
+        hash as usize % self.table.len()
+    }
+
     /// Learns the texts of `other` and rewrites `ids` accordingly.
-    pub(super) fn adopt(&mut self, other: Self, ids: &mut [u32]) {
-        let map: Vec<u32> = other.texts.into_iter().map(|text| self.intern_text(text)).collect();
+    pub(super) fn adopt(&mut self, other: &Self, ids: &mut [u32]) {
+        let map: Vec<u32> = other.texts.iter().map(|text| self.number(text)).collect();
         if map.iter().enumerate().any(|(i, &id)| i != id as usize) {
-            ids.iter_mut().for_each(|id| *id = map[*id as usize]);
+            for id in ids {
+                *id = map[*id as usize];
+            }
         }
     }
 
@@ -143,6 +207,7 @@ impl Interner {
 }
 
 #[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
 mod tests {
     use super::*;
 
@@ -163,13 +228,25 @@ mod tests {
     }
 
     #[test]
+    fn many_texts_keep_their_numbers() {
+        let mut interner = Interner::default();
+        let text = |i: u32| format!("{i}{}", "x".repeat(i as usize % 12));
+        for turn in 0..2 {
+            for i in 0..20_000 {
+                assert_eq!(id(&mut interner, &text(i)), i, "turn {turn}");
+            }
+        }
+        assert_eq!(interner.text(19_999), text(19_999));
+    }
+
+    #[test]
     fn two_tables_become_one() {
         let (mut a, mut b) = (Interner::default(), Interner::default());
         for t in ["X", "Y"] {
             id(&mut a, t);
         }
         let mut ids: Vec<u32> = ["Y", "Z", "X"].iter().map(|t| id(&mut b, t)).collect();
-        a.adopt(b, &mut ids);
+        a.adopt(&b, &mut ids);
         let column = a.column(ids);
         assert_eq!((0..3).map(|i| column.get(i)).collect::<Vec<_>>(), ["Y", "Z", "X"]);
         assert_eq!(column.texts().len(), 3);

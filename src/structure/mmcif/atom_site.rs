@@ -5,12 +5,15 @@ use std::collections::HashMap;
 use super::super::atoms::{Atom, Tables};
 use super::super::cif::unquote;
 use super::super::element::{self, Name, atomic_number};
-use super::super::number::{integer, real};
+use super::super::number::{integer, real, single};
 use super::super::read::MAX_COORDINATE;
 use super::super::text::Fault;
 
 /// Tags of the category begin with this.
 pub(super) const PREFIX: &[u8] = b"_atom_site.";
+
+/// Longest name of an atom, a residue or a chain, bytes: the dictionary's have five.
+const MAX_NAME: usize = 255;
 
 /// No such column.
 const NONE: usize = usize::MAX;
@@ -117,6 +120,7 @@ impl<const QUOTES: bool> Row<'_, QUOTES> {
     }
 
     #[cold]
+    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
     fn fault(&self, column: usize, expected: String) -> Box<Fault> {
         let (start, end) = self.raw(column);
         Fault::token(self.text, start, end, expected)
@@ -142,16 +146,16 @@ impl AtomSite {
         let layout = self.layout;
         let text = row.text;
         let position = [coordinate(row, &layout, 0)?, coordinate(row, &layout, 1)?, coordinate(row, &layout, 2)?];
-        let (from, to) = row.first_of(layout.name).unwrap_or((0, 0));
+        let (from, to) = text_of(row, row.first_of(layout.name), layout.name[0])?;
         let name = self.tables.name.intern(text, from, to);
-        let (from, to) = row.first_of(layout.residue).unwrap_or((0, 0));
+        let (from, to) = text_of(row, row.first_of(layout.residue), layout.residue[0])?;
         let residue = self.tables.residue.intern(text, from, to);
-        let (from, to) = row.first_of(layout.chain).unwrap_or((0, 0));
+        let (from, to) = text_of(row, row.first_of(layout.chain), layout.chain[0])?;
         let chain = self.tables.chain.intern(text, from, to);
         let label_chain = if layout.label_chain == NONE {
             0
         } else {
-            let (from, to) = row.value(layout.label_chain).unwrap_or((0, 0));
+            let (from, to) = text_of(row, row.value(layout.label_chain), layout.label_chain)?;
             self.tables.label_chain.intern(text, from, to)
         };
         Ok(Atom {
@@ -199,6 +203,20 @@ fn coordinate<const QUOTES: bool>(row: &Row<'_, QUOTES>, layout: &Layout, axis: 
     Err(row.fault(column, format!("{} in Å, within ±{MAX_COORDINATE}", POSITION[axis])))
 }
 
+/// A name, empty where there is none.
+#[inline]
+fn text_of<const QUOTES: bool>(
+    row: &Row<'_, QUOTES>,
+    value: Option<(usize, usize)>,
+    column: usize,
+) -> Result<(usize, usize), Box<Fault>> {
+    match value {
+        None => Ok((0, 0)),
+        Some((start, end)) if end - start <= MAX_NAME => Ok((start, end)),
+        Some(_) => Err(row.fault(column, format!("a name of at most {MAX_NAME} bytes"))),
+    }
+}
+
 #[inline]
 fn optional<const QUOTES: bool>(
     row: &Row<'_, QUOTES>,
@@ -208,7 +226,7 @@ fn optional<const QUOTES: bool>(
 ) -> Result<f32, Box<Fault>> {
     let Some((start, end)) = row.value(column) else { return Ok(default) };
     match real(row.text, start, end) {
-        Some(value) => Ok(value as f32),
+        Some(value) => Ok(single(value)),
         None => Err(row.fault(column, format!("{what}, ? or ."))),
     }
 }

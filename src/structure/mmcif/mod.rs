@@ -39,6 +39,13 @@ pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, Struct
     }
 }
 
+/// Tags and values, as offsets.
+#[derive(Debug, Default)]
+struct SingleRow {
+    tags: Vec<(usize, usize)>,
+    values: Vec<(usize, usize)>,
+}
+
 struct Reader<'a> {
     text: &'a [u8],
     tokens: Tokenizer<'a>,
@@ -49,7 +56,7 @@ struct Reader<'a> {
     in_frame: bool,
     rows: Option<Rows<'a>>,
     /// `atom_site` given item by item, as files with one atom may: item names, and their values as offsets.
-    single: (Vec<(usize, usize)>, Vec<(usize, usize)>),
+    single: SingleRow,
     /// Categories that were passed, for the message when there are no atoms.
     categories: Vec<String>,
     n_blocks: usize,
@@ -66,7 +73,7 @@ impl<'a> Reader<'a> {
             title: None,
             in_frame: false,
             rows: None,
-            single: Default::default(),
+            single: SingleRow::default(),
             categories: Vec::new(),
             n_blocks: 0,
         }
@@ -125,8 +132,8 @@ impl<'a> Reader<'a> {
         self.note_category(tag);
         let name = &self.text[tag.start..tag.end];
         if !self.in_frame && starts_with(name, PREFIX) {
-            self.single.0.push((tag.start, tag.end));
-            self.single.1.push((value.start, value.end));
+            self.single.tags.push((tag.start, tag.end));
+            self.single.values.push((value.start, value.end));
         } else {
             self.note_value(name, &value);
         }
@@ -199,7 +206,7 @@ impl<'a> Reader<'a> {
 
     /// `atom_site` item by item is one row.
     fn end_block(&mut self) -> Result<(), Stop> {
-        let (tags, values) = std::mem::take(&mut self.single);
+        let SingleRow { tags, values } = std::mem::take(&mut self.single);
         if self.rows.is_some() || tags.is_empty() {
             return Ok(());
         }

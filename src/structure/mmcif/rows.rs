@@ -17,7 +17,7 @@ use super::Stop;
 use super::atom_site::{AtomSite, Layout, Row};
 
 /// Bytes scanned at a time: short after a special row, as what was scanned beyond it is scanned again.
-const MIN_WINDOW: usize = 1 << 10;
+const MIN_WINDOW: usize = 1 << 8;
 const MAX_WINDOW: usize = 16 << 10;
 /// A stretch worth sharing among threads, and the share of one.
 const PARALLEL_BYTES: usize = 2 << 20;
@@ -27,7 +27,7 @@ pub(super) struct Rows<'a> {
     text: &'a [u8],
     site: AtomSite,
     columns: Columns,
-    max_rows: usize,
+    limit: usize,
 }
 
 /// Where atoms go; `false` if there is no room.
@@ -60,7 +60,7 @@ impl Sink for Slices<'_> {
 
 impl<'a> Rows<'a> {
     pub(super) fn new(text: &'a [u8], layout: Layout, max_rows: usize) -> Self {
-        Self { text, site: AtomSite::new(layout), columns: Columns::default(), max_rows }
+        Self { text, site: AtomSite::new(layout), columns: Columns::default(), limit: max_rows }
     }
 
     pub(super) fn into_parts(self) -> (Columns, Tables) {
@@ -70,16 +70,14 @@ impl<'a> Rows<'a> {
     /// Reads rows from the first value on; returns where the loop ends.
     pub(super) fn read(&mut self, first: usize) -> Result<usize, Stop> {
         let large = self.text.len() - first >= PARALLEL_BYTES && rayon::current_num_threads() > 1;
-        let mut at = match if large { self.read_parallel(first) } else { None } {
-            Some(end) => end,
-            None => {
-                self.columns.reserve(estimate(&self.text[first..]).min(self.max_rows));
-                first
-            }
-        };
+        let parallel = if large { self.read_parallel(first) } else { None };
+        let mut at = parallel.unwrap_or_else(|| {
+            self.columns.reserve(estimate(&self.text[first..]).min(self.limit));
+            first
+        });
         let mut scanner = Scanner::new(self.text);
         loop {
-            let mut sink = Limited { columns: &mut self.columns, max_rows: self.max_rows };
+            let mut sink = Limited { columns: &mut self.columns, max_rows: self.limit };
             at = scanner.rows(&mut self.site, &mut sink, at, self.text.len(), &AtomicBool::new(false))?;
             match self.special_row(at)? {
                 Some(next) => at = next,
@@ -116,13 +114,13 @@ impl<'a> Rows<'a> {
         let Some(&(base, _)) = values.first() else { return Ok(()) };
         let mut offsets = Vec::with_capacity(2 * values.len());
         for &(start, end) in values {
-            let near = |at: usize| {
-                u32::try_from(at - base).map_err(|_| Fault::words(at, "a value", "a row of less than 4 GiB"))
+            let (Ok(from), Ok(to)) = (u32::try_from(start - base), u32::try_from(end - base)) else {
+                return Err(Fault::words(start, "a value", "a row of less than 4 GiB").into());
             };
-            offsets.extend([near(start)?, near(end)?]);
+            offsets.extend([from, to]);
         }
         let atom = self.site.atom(&Row::<true> { text: self.text, base, offsets: &offsets })?;
-        let mut sink = Limited { columns: &mut self.columns, max_rows: self.max_rows };
+        let mut sink = Limited { columns: &mut self.columns, max_rows: self.limit };
         if sink.put(&atom) { Ok(()) } else { Err(Stop::TooMany) }
     }
 
@@ -130,10 +128,10 @@ impl<'a> Rows<'a> {
     /// they read is not one plain row to a line.
     fn read_parallel(&mut self, first: usize) -> Option<usize> {
         let text = self.text;
-        let stretches = stretches(text, first);
+        let stretches = stretches(text, first)?;
         let n_rows: usize = stretches.iter().map(|s| s.lines).sum();
         let end = stretches.last()?.to;
-        if n_rows > self.max_rows {
+        if n_rows > self.limit {
             return None;
         }
         let mut columns = Columns::zeroed(n_rows);
@@ -161,7 +159,7 @@ impl<'a> Rows<'a> {
         }
         let mut tables = Tables::default();
         for (_, mut slices, site) in parts {
-            slices.adopt(site.tables, &mut tables);
+            slices.adopt(&site.tables, &mut tables);
         }
         self.columns = columns;
         self.site.tables = tables;
@@ -191,32 +189,39 @@ struct Stretch {
 
 /// Stretches from `first` on in which no row holds an underscore, and hence no tag and no reserved word, without the
 /// comments and blank lines before that.
-fn stretches(text: &[u8], first: usize) -> Vec<Stretch> {
-    let starts: Vec<usize> = (first..text.len()).step_by(CHUNK_BYTES).collect();
-    let line_start = |at: usize| match memchr::memchr(b'\n', &text[at..]) {
-        Some(i) if at > first => at + i + 1,
-        _ => at,
+///
+/// `None` where lines are as long as chunks.
+fn stretches(text: &[u8], first: usize) -> Option<Vec<Stretch>> {
+    let line_start = |at: usize| {
+        if at == first || at >= text.len() {
+            return Some(at.min(text.len()));
+        }
+        let near = &text[at..text.len().min(at + CHUNK_BYTES)];
+        memchr::memchr(b'\n', near).map(|i| at + i + 1)
     };
-    let mut found: Vec<(Stretch, bool)> = starts
+    let starts: Vec<usize> = (first..text.len()).step_by(CHUNK_BYTES).collect();
+    let found: Option<Vec<(Stretch, bool)>> = starts
         .par_iter()
         .map(|&start| {
-            let from = line_start(start);
-            let to = if start + CHUNK_BYTES < text.len() { line_start(start + CHUNK_BYTES) } else { text.len() };
-            let chunk = &text[from..to.max(from)];
+            let from = line_start(start)?;
+            let to = line_start(start + CHUNK_BYTES)?;
+            let chunk = &text[from..to];
             let underscore = memchr::memchr(b'_', chunk);
-            let to = from + underscore.map_or(chunk.len(), |i| whole_rows(&chunk[..i]));
+            // The text may end in comments, or within its last line, which then is read in order.
+            let until = underscore.or((to == text.len()).then_some(chunk.len()));
+            let to = from + until.map_or(chunk.len(), |i| whole_rows(&chunk[..i]));
             let lines = memchr::memchr_iter(b'\n', &text[from..to]).count();
-            (Stretch { from, to, lines }, underscore.is_some())
+            Some((Stretch { from, to, lines }, underscore.is_some()))
         })
         .collect();
+    let mut found = found?;
     if let Some(last) = found.iter().position(|(_, underscore)| *underscore) {
         found.truncate(last + 1);
     }
-    // The text's last line may lack its end.
-    found.into_iter().map(|(stretch, _)| stretch).filter(|s| s.lines > 0).collect()
+    Some(found.into_iter().map(|(stretch, _)| stretch).filter(|s| s.lines > 0).collect())
 }
 
-/// Length of `chunk`, which a tag follows, up to the end of the last line that is neither blank nor a comment.
+/// Length of `chunk`, which a tag or nothing follows, up to the end of the last line that is neither blank nor a comment.
 fn whole_rows(chunk: &[u8]) -> usize {
     let mut end = memchr::memrchr(b'\n', chunk).map_or(0, |i| i + 1);
     while end > 0 {
@@ -274,7 +279,7 @@ impl<'a> Scanner<'a> {
             for offsets in edges.offsets().chunks_exact(per_row) {
                 let atom = match special(window, offsets) {
                     0 if !words => site.atom(&Row::<false> { text: self.text, base: at, offsets })?,
-                    special if special < 2 && values_only(window, offsets) => {
+                    special if special < 2 && values_only(window, offsets, words) => {
                         site.atom(&Row::<true> { text: self.text, base: at, offsets })?
                     }
                     _ => {
@@ -310,13 +315,50 @@ fn special(window: &[u8], offsets: &[u32]) -> u8 {
 }
 
 /// Whether every token of the row is one value by itself: quotes close where the token ends, and nothing is a tag or a
-/// reserved word.
-fn values_only(window: &[u8], offsets: &[u32]) -> bool {
+/// reserved word, which is looked for only if the window has `words`, that is, underscores.
+fn values_only(window: &[u8], offsets: &[u32], words: bool) -> bool {
     offsets.as_chunks::<2>().0.iter().all(|token| {
         let token = &window[token[0] as usize..token[1] as usize];
         match token[0] {
             quote @ (b'\'' | b'"') => token.len() > 1 && token[token.len() - 1] == quote,
-            _ => bare_kind(token) == Kind::Value,
+            _ => !words || bare_kind(token) == Kind::Value,
         }
     })
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "tests fail by panicking")]
+mod tests {
+    use super::*;
+
+    const TAGS: &str = "_atom_site.Cartn_x _atom_site.Cartn_y _atom_site.Cartn_z _atom_site.auth_asym_id\n";
+
+    fn layout(text: &str) -> Layout {
+        let tags = text.lines().next().unwrap().split(' ').scan(0, |at, tag| {
+            let start = *at;
+            *at += tag.len() + 1;
+            Some((start, start + tag.len()))
+        });
+        Layout::new(text.as_bytes(), &tags.collect::<Vec<_>>()).unwrap()
+    }
+
+    /// How many rows several threads read of a text with these rows and this end, and where they stop.
+    fn parallel(rows: &str, end: &str) -> Option<(usize, usize)> {
+        let text = format!("{TAGS}{rows}{end}");
+        let mut table = Rows::new(text.as_bytes(), layout(&text), usize::MAX);
+        let stop = table.read_parallel(TAGS.len())?;
+        Some((table.columns.len(), stop - TAGS.len()))
+    }
+
+    #[test]
+    fn plain_rows_are_read_by_several_threads_whatever_follows() {
+        const N: usize = 200_000;
+        let rows = "1.0 2.0 3.0 A\n".repeat(N);
+        for end in ["", "#\n", "#\nloop_\n_x.y\n1\n", "\n# comment\n\n_x.y 1\n", "4 5 6 B", "4 5 6 'B", "data_y\n"] {
+            assert_eq!(parallel(&rows, end), Some((N, rows.len())), "{end}");
+        }
+        for special in ["4 5 6 'a b'\n", "# comment\n", "\n", "4 5\n6 B\n", ";text\n;\n5 6 7\n", "oops 5 6 B\n"] {
+            assert_eq!(parallel(&format!("{rows}{special}{rows}"), ""), None, "{special}");
+        }
+    }
 }
