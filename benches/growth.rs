@@ -17,7 +17,7 @@ fn tiled(sample: &Spheres, n: usize) -> Spheres {
     let [lo, hi] = sample.bounds().unwrap();
     let side: [f64; 3] = std::array::from_fn(|k| hi[k] - lo[k] + 3.0);
     let copies = n.div_ceil(sample.len());
-    let edge = (1..).find(|e: &usize| e.pow(3) >= copies).unwrap();
+    let edge = (1..=copies).find(|e| e.pow(3) >= copies).unwrap();
     let (mut columns, mut radii) = ([const { Vec::new() }; 3], Vec::new());
     for i in 0..n {
         let (copy, atom) = (i / sample.len(), i % sample.len());

@@ -4,6 +4,13 @@
 //! The samples of the product always run. Where a folder of structures lies beside the repository, they run too: those
 //! of up to [`EVERYDAY`] atoms on every run, all of them with `MOLMESH_ALL_STRUCTURES=1`.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "a test says what it expects by panicking"
+)]
+
 mod tools;
 
 use std::path::{Path, PathBuf};

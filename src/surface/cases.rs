@@ -135,7 +135,7 @@ mod tests {
     const FACES: [[u8; 4]; 6] = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
 
     /// For a case and a face: the outline's segments on it as (from edge, to edge).
-    fn face_segments(case: u8, face: &[u8; 4]) -> Vec<(u8, u8)> {
+    fn face_segments(case: u8, face: [u8; 4]) -> Vec<(u8, u8)> {
         let inside = |i: usize| case >> face[i % 4] & 1 == 1;
         let edge = |i: usize| edge_between(face[i % 4], face[(i + 1) % 4]);
         (0..4)
@@ -157,7 +157,7 @@ mod tests {
     /// The loops of a case's outline, each a cycle of cell edges.
     fn loops(case: u8) -> Vec<Vec<u8>> {
         let mut next = [None; 12];
-        for (from, to) in FACES.iter().flat_map(|face| face_segments(case, face)) {
+        for (from, to) in FACES.iter().flat_map(|face| face_segments(case, *face)) {
             next[usize::from(from)] = Some(to);
         }
         let mut found = Vec::new();
@@ -255,7 +255,7 @@ mod tests {
                 "nothing cut off: {case}"
             );
             assert!(half_edges(triangles).values().all(|&n| n == 1), "case {case}");
-            let mut segments: Vec<_> = FACES.iter().flat_map(|f| face_segments(case, f)).collect();
+            let mut segments: Vec<_> = FACES.iter().flat_map(|f| face_segments(case, *f)).collect();
             segments.sort_unstable();
             assert_eq!(outline(triangles), segments, "case {case}");
             // Exactly the edges whose ends differ carry vertices.
@@ -324,8 +324,7 @@ mod tests {
                         }
                     }
                     pairs += 1;
-                    let in_face =
-                        |edges: (u8, u8), face: u8| faces_of(edges.0) & faces_of(edges.1) >> 0 & 1 << face != 0;
+                    let in_face = |edges: (u8, u8), face: u8| faces_of(edges.0) & faces_of(edges.1) & 1 << face != 0;
                     let shift = |e: u8| {
                         let CellEdge { offset, axis: a } = cell_edge(e);
                         let mut corner = offset[0] | offset[1] << 1 | offset[2] << 2;
@@ -361,7 +360,7 @@ mod tests {
     fn a_wrong_table_is_caught() {
         let mut triangles = CASES.of(0b0110_1001).to_vec();
         triangles[0].swap(0, 1);
-        let segments: Vec<_> = FACES.iter().flat_map(|f| face_segments(0b0110_1001, f)).collect();
+        let segments: Vec<_> = FACES.iter().flat_map(|f| face_segments(0b0110_1001, *f)).collect();
         assert_ne!(outline(&triangles), segments);
     }
 }

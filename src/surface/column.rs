@@ -138,15 +138,15 @@ mod tests {
         for n in [0, 1, 1000, MAP_FROM / 12 - 1, MAP_FROM / 12 + 1, MAP_FROM, HUGE_FROM / 12 + 1] {
             let mut column: Column<[f32; 3]> = Column::zeroed(n);
             assert_eq!(column.len(), n);
-            assert!(column.iter().all(|row| *row == [0.0; 3]));
+            assert_eq!(column, Column::from(vec![[0.0; 3]; n]));
             if let Some(last) = column.last_mut() {
                 *last = [1.0, 2.0, 3.0];
-                assert_eq!(column.clone()[n - 1], [1.0, 2.0, 3.0]);
+                assert_eq!(column.clone().last(), Some(&[1.0, 2.0, 3.0]));
                 assert_ne!(column, Column::zeroed(n));
             }
             assert_eq!(column, column.clone());
             column.edit().push([4.0; 3]);
-            assert_eq!((column.len(), column[n]), (n + 1, [4.0; 3]));
+            assert_eq!((column.len(), column.last()), (n + 1, Some(&[4.0; 3])));
         }
     }
 }
