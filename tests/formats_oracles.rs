@@ -190,7 +190,11 @@ type Fault = (&'static str, fn(&mut Mesh), fn(&tools::TrimeshReport) -> bool);
 
 const FAULTS: [Fault; 9] = [
     ("flipped triangle", |m| m.triangles[7].swap(0, 1), |r| !r.winding_consistent && !r.is_volume),
-    ("missing triangle", |m| drop(m.triangles.edit().pop()), |r| !r.watertight && r.bad_edges == 3),
+    (
+        "missing triangle",
+        |m| m.triangles = m.triangles[1..].iter().copied().collect(),
+        |r| !r.watertight && r.bad_edges == 3,
+    ),
     ("triangle twice", |m| m.triangles.edit().extend_from_within(7..8), |r| r.duplicate_faces == 1 && r.bad_edges == 3),
     ("pinched triangle", |m| m.triangles[7][1] = m.triangles[7][0], |r| r.degenerate_faces == 1 && !r.watertight),
     ("inside out", |m| m.triangles.iter_mut().for_each(|t| t.swap(0, 1)), |r| r.volume < 0.0 && !r.is_volume),

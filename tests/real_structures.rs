@@ -89,7 +89,7 @@ fn mesh(spheres: &Spheres, kernel: Kernel, resolution: f64, threads: usize) -> M
 fn permuted(spheres: &Spheres) -> Spheres {
     let n = spheres.len();
     // A stride that shares no factor with n visits every atom.
-    let stride = (n / 2 + 1..).find(|s| gcd(*s, n) == 1).unwrap();
+    let stride = (n / 2 + 1..2 * n + 2).find(|s| gcd(*s, n) == 1).unwrap();
     let order: Vec<usize> = (0..n).map(|i| (i * stride + n / 3) % n).collect();
     let column = |k: usize| order.iter().map(|&i| spheres.centre(i)[k]).collect();
     Spheres::new(column(0), column(1), column(2), order.iter().map(|&i| spheres.radius(i)).collect()).unwrap()

@@ -1,7 +1,13 @@
 //! The meshing core against truths from outside it: analytic spheres, a brute-force field in double precision,
 //! the sequential reference, and its own promises (closed, deterministic, indifferent to order).
 
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::cast_possible_truncation,
+    clippy::float_cmp,
+    reason = "a test may panic, and means exact equality where it asks for it"
+)]
 
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
