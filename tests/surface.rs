@@ -3,7 +3,6 @@
 
 #![expect(
     clippy::unwrap_used,
-    clippy::panic,
     clippy::cast_possible_truncation,
     clippy::float_cmp,
     reason = "a test may panic, and means exact equality where it asks for it"
