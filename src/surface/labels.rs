@@ -5,46 +5,47 @@
 //! that meet are made equal in a small table. Edges that leave a part are joined afterwards.
 
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
 
+use super::column::Column;
 use super::lattice::to_u32;
 use super::measure::Component;
 use super::mesh::Mesh;
-
-/// No label yet. Vertices that no triangle uses keep it.
-const NONE: u32 = u32::MAX;
+use super::sums::NONE;
 
 /// The component of every vertex.
 pub(super) struct Labels {
-    /// A label per vertex.
-    of_vertex: Vec<u32>,
+    /// A label per vertex; vertices that no triangle uses have none.
+    of_vertex: Column<u32>,
     /// The component that a label stands for: the lowest label in it.
     equal: Vec<u32>,
 }
 
 /// The vertices and triangles of one part of a mesh.
-struct Part<'a> {
-    first: u32,
-    labels: &'a mut [u32],
-    triangles: &'a [[u32; 3]],
+pub(super) struct Part<'a> {
+    /// The part's first vertex.
+    pub(super) first: u32,
+    /// Labels of its vertices.
+    pub(super) labels: &'a mut [u32],
+    /// Its triangles.
+    pub(super) triangles: &'a [[u32; 3]],
 }
 
-/// What a part hands on: its table of equal labels, and the edges that leave it.
+/// What a part hands on.
 #[derive(Default)]
-struct Joined {
-    equal: Vec<u32>,
+pub(super) struct Joined {
+    /// Per label of the part, from 0, a label that it equals: itself or a lower one.
+    pub(super) equal: Vec<u32>,
+    /// The edges that leave the part.
     leaving: Vec<[u32; 2]>,
 }
 
 impl Labels {
-    /// Labels the components of `mesh`.
-    pub(super) fn of(mesh: &Mesh) -> Self {
-        let mut of_vertex = vec![NONE; mesh.n_vertices()];
-        let joined: Vec<Joined> = split(mesh, &mut of_vertex).into_par_iter().map(Part::label).collect();
+    /// Joins the parts of `mesh`, whose vertices have been labelled part by part.
+    pub(super) fn join(mesh: &Mesh, mut of_vertex: Column<u32>, joined: &[Joined]) -> Self {
         // Labels are counted per part: number them through.
         let mut equal = Vec::new();
         let mut offsets = Vec::with_capacity(joined.len());
-        for part in &joined {
+        for part in joined {
             let offset = to_u32(equal.len());
             offsets.push(offset);
             equal.extend(part.equal.iter().map(|label| label + offset));
@@ -68,26 +69,25 @@ impl Labels {
         Self { of_vertex, equal }
     }
 
-    /// The component of a vertex that some triangle uses.
-    #[inline(always)]
-    pub(super) fn component(&self, v: u32) -> u32 {
-        self.equal[self.of_vertex[v as usize] as usize]
+    /// The label of a vertex that some triangle uses. Several labels may stand for one component.
+    pub(super) fn label(&self, v: u32) -> u32 {
+        self.of_vertex[v as usize]
     }
 
-    /// Adds the vertices of each component; returns how many belong to any triangle.
-    pub(super) fn count_vertices(&self, components: &mut FxHashMap<u32, Component>) -> u64 {
-        let mut counts = vec![0_u64; self.equal.len()];
+    /// The component that a label stands for.
+    pub(super) fn component_of(&self, label: u32) -> u32 {
+        self.equal[label as usize]
+    }
+
+    /// One entry per label, with the vertices of the component that it stands for counted at the component's own.
+    pub(super) fn count_vertices(&self) -> Vec<Component> {
+        let mut components = vec![Component::default(); self.equal.len()];
         for run in self.of_vertex.chunk_by(|a, b| a == b) {
             if let Some(&component) = self.equal.get(run[0] as usize) {
-                counts[component as usize] += run.len() as u64;
+                components[component as usize].vertices += run.len() as u64;
             }
         }
-        for (label, &n) in (0_u32..).zip(&counts).filter(|(_, n)| **n > 0) {
-            if let Some(component) = components.get_mut(&label) {
-                component.vertices += n;
-            }
-        }
-        counts.iter().sum()
+        components
     }
 }
 
@@ -107,7 +107,7 @@ fn join(equal: &mut [u32], a: u32, b: u32) {
 }
 
 /// Cuts the labels and the triangles into the mesh's parts; one part where it names none.
-fn split<'a>(mesh: &'a Mesh, labels: &'a mut [u32]) -> Vec<Part<'a>> {
+pub(super) fn split<'a>(mesh: &'a Mesh, labels: &'a mut [u32]) -> Vec<Part<'a>> {
     let whole = [(0, 0)];
     let starts = if mesh.parts.is_empty() { &whole[..] } else { &mesh.parts[..] };
     let mut rest = labels;
@@ -124,9 +124,10 @@ fn split<'a>(mesh: &'a Mesh, labels: &'a mut [u32]) -> Vec<Part<'a>> {
 
 impl Part<'_> {
     /// Labels the part's own vertices, with labels from 0.
-    fn label(self) -> Joined {
+    pub(super) fn label(&mut self) -> Joined {
         let mut joined = Joined::default();
-        let (first, labels) = (self.first, self.labels);
+        let (first, labels) = (self.first, &mut *self.labels);
+        labels.fill(NONE);
         for &[a, b, c] in self.triangles {
             let own = |v: u32| labels.get(v.wrapping_sub(first) as usize).copied();
             let (i, j, k) = (own(a), own(b), own(c));
@@ -145,9 +146,10 @@ impl Part<'_> {
                     *label = low;
                 }
             }
-            let differs = |label: u32| label != low && label != NONE;
-            for label in [i, j, k] {
-                if differs(label) {
+            // Selections, not branches: whether a corner has a label yet is a coin toss.
+            let known = |label: u32| if label == NONE { low } else { label };
+            if known(i).max(known(j)).max(known(k)) != low {
+                for label in [i, j, k].map(known) {
                     join(&mut joined.equal, label, low);
                 }
             }

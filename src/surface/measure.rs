@@ -1,20 +1,16 @@
 //! What people compute surfaces for, and the proof that the mesh is one: area, volume, components, closedness.
 //!
-//! Sums run over fixed blocks of triangles, merged in order: the same mesh gives the same digits whatever the
-//! thread count.
+//! Sums run over the parts of the mesh, merged in order: the same mesh gives the same digits whatever the thread count.
 
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
 
+use super::column::Column;
 use super::control::Control;
 use super::error::SurfaceError;
-use super::labels::Labels;
+use super::labels::{self, Joined, Labels};
 use super::mesh::Mesh;
-use super::simd::dispatched;
+use super::sums::{self, Sums};
 use super::topology;
-
-/// Triangles per block of the sums.
-const BLOCK: usize = 1 << 15;
 
 /// How closedness and manifoldness are established.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -73,14 +69,6 @@ pub struct Measures {
     pub components: Vec<Component>,
 }
 
-/// Sums over a block of triangles.
-#[derive(Default)]
-struct BlockSums {
-    components: Vec<(u32, Component)>,
-    checksum: u64,
-    degenerate: bool,
-}
-
 impl Measures {
     /// Measures `mesh`.
     ///
@@ -88,27 +76,8 @@ impl Measures {
     /// [`SurfaceError::Cancelled`].
     pub fn of(mesh: &Mesh, proof: Proof, control: &Control<'_>) -> Result<Self, SurfaceError> {
         control.check()?;
-        let labels = Labels::of(mesh);
+        let Totals { components, used, checksum, degenerate } = Totals::of(mesh);
         control.check()?;
-        let blocks: Vec<BlockSums> =
-            mesh.triangles.par_chunks(BLOCK).map(|block| sum_block(&mesh.positions, block, &labels)).collect();
-        control.check()?;
-        let mut by_root: FxHashMap<u32, Component> = FxHashMap::default();
-        let (mut checksum, mut degenerate) = (0_u64, false);
-        for block in &blocks {
-            checksum = checksum.wrapping_add(block.checksum);
-            degenerate |= block.degenerate;
-            for (root, part) in &block.components {
-                let sum = by_root.entry(*root).or_default();
-                sum.triangles += part.triangles;
-                sum.area += part.area;
-                sum.volume += part.volume;
-            }
-        }
-        let used = labels.count_vertices(&mut by_root);
-        let mut roots: Vec<(u32, Component)> = by_root.into_iter().collect();
-        roots.sort_unstable_by(|(i, a), (j, b)| b.area.total_cmp(&a.area).then(i.cmp(j)));
-        let components: Vec<Component> = roots.into_iter().map(|(_, component)| component).collect();
         let balanced = checksum == 0 && !degenerate;
         let exact = (proof == Proof::Exact).then(|| topology::check(&mesh.triangles));
         let faces = mesh.n_triangles() as u64;
@@ -131,102 +100,51 @@ impl Measures {
     }
 }
 
-/// A directed edge's share of the checksum: the two directions of an edge have opposite shares.
-#[inline(always)]
-fn edge_share(from: u32, to: u32) -> u64 {
-    let (low, high) = if from < to { (from, to) } else { (to, from) };
-    // Two rounds of multiply and shift, as in splitmix64: neighbouring keys must not cancel by arithmetic.
-    let mut key = (u64::from(low) << 32 | u64::from(high)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    key = (key ^ key >> 32).wrapping_mul(0xd6e8_feb8_6659_fd93);
-    key ^= key >> 32;
-    if from < to { key } else { key.wrapping_neg() }
+/// What one pass over the parts of a mesh gives.
+struct Totals {
+    /// Largest area first.
+    components: Vec<Component>,
+    /// Vertices that some triangle uses.
+    used: u64,
+    checksum: u64,
+    degenerate: bool,
 }
 
-/// Triangles whose geometry is computed together: enough that what was gathered lane by lane has left the store
-/// buffer when it is read back as vectors.
-const LANES: usize = 128;
-
-/// Area and volume of up to [`LANES`] triangles, each. Missing ones are zero.
-type Lanes = [[f32; LANES]; 2];
-
-dispatched! {
-/// Sums of one block. Everything that can fill vectors is done for [`LANES`] triangles at a time.
-fn sum_block(positions: &[[f32; 3]], block: &[[u32; 3]], labels: &Labels) -> BlockSums {
-    let mut sums = BlockSums::default();
-    let mut run = (u32::MAX, Component::default());
-    for batch in block.chunks(LANES) {
-        let (shares, degenerate) = edge_shares(batch);
-        sums.checksum = sums.checksum.wrapping_add(shares);
-        sums.degenerate |= degenerate;
-        let [area, volume] = geometry(positions, batch);
-        let root = labels.component(batch[0][0]);
-        if root == run.0 && batch.iter().all(|t| labels.component(t[0]) == root) {
-            run.1.triangles += batch.len() as u64;
-            run.1.area += area.iter().map(|&a| f64::from(a)).sum::<f64>();
-            run.1.volume += volume.iter().map(|&v| f64::from(v)).sum::<f64>();
-            continue;
+impl Totals {
+    /// Labels and sums each part while it is in cache, then joins the parts.
+    fn of(mesh: &Mesh) -> Self {
+        let mut of_vertex = Column::zeroed(mesh.n_vertices());
+        let (joined, sums): (Vec<Joined>, Vec<Sums>) = labels::split(mesh, &mut of_vertex)
+            .into_par_iter()
+            .map(|mut part| {
+                let joined = part.label();
+                let n = joined.equal.len();
+                let sums = sums::sum(&mesh.positions, part.triangles, part.first, part.labels, n);
+                (joined, sums)
+            })
+            .unzip();
+        let labels = Labels::join(mesh, of_vertex, &joined);
+        let mut components = labels.count_vertices();
+        let used = components.iter().map(|c| c.vertices).sum();
+        let mut add = |label: u32, part: &Component| {
+            let component = &mut components[labels.component_of(label) as usize];
+            component.triangles += part.triangles;
+            component.area += part.area;
+            component.volume += part.volume;
+        };
+        let (mut checksum, mut degenerate) = (0_u64, false);
+        for (sums, label) in sums.iter().flat_map(|s| s.by_label.iter()).zip(0..) {
+            add(label, sums);
         }
-        for (t, (&area, &volume)) in batch.iter().zip(area.iter().zip(&volume)) {
-            let root = labels.component(t[0]);
-            if root != run.0 {
-                if run.1.triangles > 0 {
-                    sums.components.push(run);
-                }
-                run = (root, Component::default());
-            }
-            run.1.triangles += 1;
-            run.1.area += f64::from(area);
-            run.1.volume += f64::from(volume);
+        for part in &sums {
+            checksum = checksum.wrapping_add(part.checksum);
+            degenerate |= part.degenerate;
+            part.unlabelled.iter().for_each(|(v, triangle)| add(labels.label(*v), triangle));
         }
+        components.retain(|c| c.triangles > 0);
+        components.sort_by(|a, b| b.area.total_cmp(&a.area));
+        Self { components, used, checksum, degenerate }
     }
-    if run.1.triangles > 0 {
-        sums.components.push(run);
-    }
-    sums
-}
-}
-
-/// The checksum of a batch, and whether a triangle of it has a corner twice.
-#[inline(always)]
-fn edge_shares(batch: &[[u32; 3]]) -> (u64, bool) {
-    let mut corners = [[0_u32; LANES]; 3];
-    for (lane, t) in batch.iter().enumerate() {
-        (corners[0][lane], corners[1][lane], corners[2][lane]) = (t[0], t[1], t[2]);
-    }
-    let [a, b, c] = corners;
-    let (mut sum, mut degenerate) = ([0_u64; LANES], false);
-    for i in 0..LANES {
-        let shares = edge_share(a[i], b[i]).wrapping_add(edge_share(b[i], c[i])).wrapping_add(edge_share(c[i], a[i]));
-        sum[i] = if i < batch.len() { shares } else { 0 };
-    }
-    for i in 0..LANES {
-        let twice = a[i] == b[i] || b[i] == c[i] || c[i] == a[i];
-        degenerate |= i < batch.len() && twice;
-    }
-    (sum.iter().fold(0, |all, s| all.wrapping_add(*s)), degenerate)
-}
-
-/// Areas and signed volumes against the mesh's centre. Single precision inside a triangle: differences of close
-/// positions are nearly exact, and the sums over triangles are double.
-#[inline(always)]
-fn geometry(positions: &[[f32; 3]], batch: &[[u32; 3]]) -> Lanes {
-    let mut p = [[0.0_f32; LANES]; 9];
-    for (lane, t) in batch.iter().enumerate() {
-        let [a, b, c] = [positions[t[0] as usize], positions[t[1] as usize], positions[t[2] as usize]];
-        for k in 0..3 {
-            (p[k][lane], p[3 + k][lane], p[6 + k][lane]) = (a[k], b[k], c[k]);
-        }
-    }
-    let [ax, ay, az, bx, by, bz, cx, cy, cz] = p;
-    let (mut area, mut volume) = ([0.0; LANES], [0.0; LANES]);
-    for i in 0..LANES {
-        let (ux, uy, uz) = (bx[i] - ax[i], by[i] - ay[i], bz[i] - az[i]);
-        let (vx, vy, vz) = (cx[i] - ax[i], cy[i] - ay[i], cz[i] - az[i]);
-        let (nx, ny, nz) = (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx);
-        area[i] = 0.5 * (nx * nx + ny * ny + nz * nz).sqrt();
-        volume[i] = (ax[i] * nx + ay[i] * ny + az[i] * nz) * (1.0 / 6.0);
-    }
-    [area, volume]
 }
 
 #[cfg(test)]

@@ -19,6 +19,7 @@ pub mod params;
 pub mod reference;
 mod simd;
 pub mod spheres;
+mod sums;
 pub mod topology;
 
 pub use backend::{Backend, GridStats, Meshed};

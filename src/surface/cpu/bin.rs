@@ -61,8 +61,11 @@ impl Tiles {
         // atoms and tiles than this: both bound what is allocated below.
         let max_tiles = limits.max_samples / 512 + 1;
         let max_pairs = limits.max_samples.saturating_mul(4).max(1 << 16);
-        let mut last = [i32::MAX; 3];
-        for (i, atom) in lattice.atoms.iter().enumerate() {
+        // Tiles in the order in which they were first met, and every pair of an atom and such a tile.
+        let mut hits: Vec<(u32, u32)> = Vec::with_capacity(2 * lattice.atoms.len());
+        // The last tile of each parity: a run of neighbouring atoms asks for the same eight again and again.
+        let mut recent = [([i32::MAX; 3], 0_u32); 8];
+        for (i, atom) in (0_u32..).zip(&lattice.atoms) {
             let range = tile_range(atom, lattice.reach(atom));
             let n: u64 = range.iter().map(|[lo, hi]| u64::from(lo.abs_diff(*hi)) + 1).product();
             pairs += n;
@@ -71,46 +74,41 @@ impl Tiles {
                 return Err(too_large(lattice, samples, limits));
             }
             for tile in boxed(range) {
-                if tile != last {
-                    index.entry(tile).or_default();
-                    last = tile;
+                let parity = tile.iter().fold(0, |p, c| p << 1 | usize::from(c & 1 == 1));
+                let (cached, id) = &mut recent[parity];
+                if *cached != tile {
+                    let next = to_u32(index.len());
+                    (*cached, *id) = (tile, *index.entry(tile).or_insert(next));
                 }
+                hits.push((*id, i));
             }
             if i % 65_536 == 0 {
                 control.check()?;
             }
         }
-        let mut coords: Vec<[i32; 3]> = index.keys().copied().collect();
-        coords.sort_unstable_by_key(|&t| tile_order(t));
-        for (rank, tile) in (0..).zip(&coords) {
-            index.insert(*tile, rank);
+        let mut met: Vec<([i32; 3], u32)> = index.iter().map(|(tile, id)| (*tile, *id)).collect();
+        met.sort_unstable_by_key(|(tile, _)| tile_order(*tile));
+        let mut rank = vec![0_usize; met.len()];
+        for (order, (tile, id)) in met.iter().enumerate() {
+            rank[*id as usize] = order;
+            index.insert(*tile, to_u32(order));
         }
-        let mut counts = vec![0_u32; coords.len()];
-        let each = |visit: &mut dyn FnMut(u32, usize)| {
-            let (mut last, mut last_ix) = ([i32::MAX; 3], 0);
-            for (i, atom) in (0_u32..).zip(&lattice.atoms) {
-                for tile in boxed(tile_range(atom, lattice.reach(atom))) {
-                    if tile != last {
-                        (last, last_ix) = (tile, index[&tile] as usize);
-                    }
-                    visit(i, last_ix);
-                }
-            }
-        };
-        each(&mut |_, tile| counts[tile] += 1);
-        let mut starts = Vec::with_capacity(coords.len() + 1);
-        let mut total = 0;
-        for &n in &counts {
-            starts.push(total);
-            total += n as usize;
+        // Counting sort: by tile, and by atom within a tile, as that is the order of the hits.
+        let mut starts = vec![0; met.len() + 1];
+        for (id, _) in &hits {
+            starts[rank[*id as usize] + 1] += 1;
         }
-        starts.push(total);
+        for t in 0..met.len() {
+            starts[t + 1] += starts[t];
+        }
         let mut cursor = starts.clone();
-        let mut atoms = vec![0_u32; total];
-        each(&mut |atom, tile| {
-            atoms[cursor[tile]] = atom;
-            cursor[tile] += 1;
-        });
+        let mut atoms = vec![0_u32; hits.len()];
+        for (id, atom) in &hits {
+            let at = &mut cursor[rank[*id as usize]];
+            atoms[*at] = *atom;
+            *at += 1;
+        }
+        let coords = met.into_iter().map(|(tile, _)| tile).collect();
         Ok(Self { coords, index, starts, atoms })
     }
 

@@ -1,0 +1,133 @@
+//! Sums over triangles: area, volume, and the checksum of directed edges.
+//!
+//! Everything that can fill vectors is done for a batch of triangles at a time.
+
+use super::measure::Component;
+use super::simd::dispatched;
+
+/// No label: see [`sum`].
+pub(super) const NONE: u32 = u32::MAX;
+
+/// Sums over the triangles of one part of a mesh.
+#[derive(Default)]
+pub(super) struct Sums {
+    /// By label.
+    pub(super) by_label: Vec<Component>,
+    /// Triangles without a label, each with a vertex of theirs.
+    pub(super) unlabelled: Vec<(u32, Component)>,
+    /// Sum of the shares of all directed edges: zero for a closed, consistently wound mesh.
+    pub(super) checksum: u64,
+    /// A triangle has a corner twice.
+    pub(super) degenerate: bool,
+}
+
+impl Component {
+    fn add(&mut self, triangles: u64, area: f64, volume: f64) {
+        self.triangles += triangles;
+        self.area += area;
+        self.volume += volume;
+    }
+}
+
+/// A directed edge's share of the checksum: the two directions of an edge have opposite shares.
+#[inline(always)]
+fn edge_share(from: u32, to: u32) -> u64 {
+    let (low, high) = if from < to { (from, to) } else { (to, from) };
+    // Two rounds of multiply and shift, as in splitmix64: neighbouring keys must not cancel by arithmetic.
+    let mut key = (u64::from(low) << 32 | u64::from(high)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    key = (key ^ key >> 32).wrapping_mul(0xd6e8_feb8_6659_fd93);
+    key ^= key >> 32;
+    if from < to { key } else { key.wrapping_neg() }
+}
+
+/// Triangles whose geometry is computed together: enough that what was gathered lane by lane has left the store
+/// buffer when it is read back as vectors.
+const LANES: usize = 128;
+
+/// Area and volume of up to [`LANES`] triangles, each. Missing ones are zero.
+type Lanes = [[f32; LANES]; 2];
+
+dispatched! {
+/// Sums `triangles` by the label of their vertices. `labels` are those of the vertices from `first` on; the label of a
+/// triangle is that of its first corner among them, if any is.
+pub(super) fn sum(positions: &[[f32; 3]], triangles: &[[u32; 3]], first: u32, labels: &[u32], n_labels: usize) -> Sums {
+    let mut sums = Sums { by_label: vec![Component::default(); n_labels], ..Sums::default() };
+    for batch in triangles.chunks(LANES) {
+        let (shares, degenerate) = edge_shares(batch);
+        sums.checksum = sums.checksum.wrapping_add(shares);
+        sums.degenerate |= degenerate;
+        let [area, volume] = geometry(positions, batch);
+        let label = |t: &[u32; 3]| {
+            t.iter().find_map(|v| labels.get(v.wrapping_sub(first) as usize)).copied().unwrap_or(NONE)
+        };
+        let common = label(&batch[0]);
+        if common != NONE && batch.iter().all(|t| label(t) == common) {
+            sums.by_label[common as usize].add(batch.len() as u64, sum_lanes(&area), sum_lanes(&volume));
+            continue;
+        }
+        for (t, (&area, &volume)) in batch.iter().zip(area.iter().zip(&volume)) {
+            let (area, volume) = (f64::from(area), f64::from(volume));
+            match sums.by_label.get_mut(label(t) as usize) {
+                Some(component) => component.add(1, area, volume),
+                None => sums.unlabelled.push((t[0], Component { triangles: 1, vertices: 0, area, volume })),
+            }
+        }
+    }
+    sums
+}
+}
+
+/// Sum in double precision, in eight strands: one would wait for every addition.
+#[inline(always)]
+fn sum_lanes(lanes: &[f32; LANES]) -> f64 {
+    let mut strands = [0.0_f64; 8];
+    for row in lanes.as_chunks::<8>().0 {
+        for (strand, value) in strands.iter_mut().zip(row) {
+            *strand += f64::from(*value);
+        }
+    }
+    strands.iter().sum()
+}
+
+/// The checksum of a batch, and whether a triangle of it has a corner twice.
+#[inline(always)]
+fn edge_shares(batch: &[[u32; 3]]) -> (u64, bool) {
+    let mut corners = [[0_u32; LANES]; 3];
+    for (lane, t) in batch.iter().enumerate() {
+        (corners[0][lane], corners[1][lane], corners[2][lane]) = (t[0], t[1], t[2]);
+    }
+    let [a, b, c] = corners;
+    let (mut sum, mut degenerate) = ([0_u64; LANES], false);
+    for i in 0..LANES {
+        let shares = edge_share(a[i], b[i]).wrapping_add(edge_share(b[i], c[i])).wrapping_add(edge_share(c[i], a[i]));
+        sum[i] = if i < batch.len() { shares } else { 0 };
+    }
+    for i in 0..LANES {
+        let twice = a[i] == b[i] || b[i] == c[i] || c[i] == a[i];
+        degenerate |= i < batch.len() && twice;
+    }
+    (sum.iter().fold(0, |all, s| all.wrapping_add(*s)), degenerate)
+}
+
+/// Areas and signed volumes against the mesh's centre. Single precision inside a triangle: differences of close
+/// positions are nearly exact, and the sums over triangles are double.
+#[inline(always)]
+fn geometry(positions: &[[f32; 3]], batch: &[[u32; 3]]) -> Lanes {
+    let mut p = [[0.0_f32; LANES]; 9];
+    for (lane, t) in batch.iter().enumerate() {
+        let [a, b, c] = [positions[t[0] as usize], positions[t[1] as usize], positions[t[2] as usize]];
+        for k in 0..3 {
+            (p[k][lane], p[3 + k][lane], p[6 + k][lane]) = (a[k], b[k], c[k]);
+        }
+    }
+    let [ax, ay, az, bx, by, bz, cx, cy, cz] = p;
+    let (mut area, mut volume) = ([0.0; LANES], [0.0; LANES]);
+    for i in 0..LANES {
+        let (ux, uy, uz) = (bx[i] - ax[i], by[i] - ay[i], bz[i] - az[i]);
+        let (vx, vy, vz) = (cx[i] - ax[i], cy[i] - ay[i], cz[i] - az[i]);
+        let (nx, ny, nz) = (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx);
+        area[i] = 0.5 * (nx * nx + ny * ny + nz * nz).sqrt();
+        volume[i] = (ax[i] * nx + ay[i] * ny + az[i] * nz) * (1.0 / 6.0);
+    }
+    [area, volume]
+}
