@@ -50,6 +50,8 @@ pub(super) struct Found {
     pub(super) triangles: u32,
     /// Candidates of the bricks with surface.
     pub(super) candidates: Vec<u32>,
+    /// F(owner) − F(other end) of the edges of the brick at hand.
+    drop: Vec<f32>,
 }
 
 /// A brick's samples with those of the seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
@@ -127,7 +129,7 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
         (*crossing, *before) = (layer[0] ^ layer[1 << (w % 3)], n);
         n += ones(*crossing);
     }
-    edge_parameters(&brick.crossing, n, &around.samples, iso, &mut found.t);
+    edge_parameters(&brick.crossing, n, &around.samples, iso, &mut found.t, &mut found.drop);
     let count = &CASES.count;
     for (layer, &cells) in corners.iter().zip(&active) {
         let mut cells = cells;
@@ -153,13 +155,22 @@ fn ones(word: u64) -> u16 {
 
 /// Where along each crossing edge the density is `iso`, by linear interpolation.
 #[inline(always)]
-fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, t: &mut Vec<f32>) {
+fn edge_parameters(
+    crossing: &[u64; 24],
+    n: u16,
+    samples: &[&Samples; 8],
+    iso: f32,
+    t: &mut Vec<f32>,
+    drop: &mut Vec<f32>,
+) {
     const STEP: [usize; 3] = [1, 8, 64];
     let first = t.len();
     // Densities at both ends first, one division per vector afterwards: `t` holds F(owner) − iso meanwhile.
-    let mut drop = [0.0_f32; 3 * BRICK_SAMPLES];
-    let mut k = 0;
-    t.reserve(usize::from(n));
+    t.resize(first + usize::from(n), 0.0);
+    if drop.len() < usize::from(n) {
+        drop.resize(3 * BRICK_SAMPLES, 0.0);
+    }
+    let mut ends = t[first..].iter_mut().zip(drop.iter_mut());
     for (w, &word) in crossing.iter().enumerate() {
         let (z, axis) = (w / 3, w % 3);
         let mut edges = word;
@@ -170,12 +181,12 @@ fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f
             let coordinate = [bit & 7, bit >> 3, z][axis];
             let (far, next) = if coordinate == 7 { (1 << axis, at - 7 * STEP[axis]) } else { (0, at + STEP[axis]) };
             let (f0, f1) = (samples[0][at & 511], samples[far][next & 511]);
-            t.push(f0 - iso);
-            drop[k] = f0 - f1;
-            k += 1;
+            if let Some((above, drop)) = ends.next() {
+                (*above, *drop) = (f0 - iso, f0 - f1);
+            }
         }
     }
-    for (t, drop) in t[first..].iter_mut().zip(&drop) {
+    for (t, drop) in t[first..].iter_mut().zip(drop.iter()) {
         *t = (*t / drop).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
     }
 }

@@ -55,28 +55,30 @@ impl Default for Batch {
 impl Batch {
     /// Lays out a brick's vertices in order; rounds the count up to whole vectors by repeating the last one.
     fn place(&mut self, brick: &SurfaceBrick, t: &[f32]) {
-        self.p.iter_mut().for_each(Vec::clear);
-        let mut t = t.iter();
+        let padded = t.len().next_multiple_of(LANES);
+        for column in self.p.iter_mut().chain(&mut self.n) {
+            column.resize(padded, 0.0);
+        }
+        let [px, py, pz] = &mut self.p;
+        let mut rows = px.iter_mut().zip(py).zip(pz).zip(t);
         for (w, &word) in brick.crossing.iter().enumerate() {
             let (z, axis) = (w / 3, w % 3);
+            let along = [axis == 0, axis == 1, axis == 2].map(|is| if is { 1.0 } else { 0.0 });
             let mut edges = word;
             while edges != 0 {
                 let bit = edges.trailing_zeros();
                 edges &= edges - 1;
-                let mut p = [(bit & 7) as f32, (bit >> 3) as f32, z as f32];
-                p[axis] += t.next().copied().unwrap_or_default();
-                for (column, p) in self.p.iter_mut().zip(p) {
-                    column.push(p);
+                if let Some((((x, y), row_z), t)) = rows.next() {
+                    *x = (bit & 7) as f32 + along[0] * t;
+                    *y = (bit >> 3) as f32 + along[1] * t;
+                    *row_z = z as f32 + along[2] * t;
                 }
             }
         }
-        for p in &mut self.p {
-            let padded = p.len().next_multiple_of(LANES);
-            let last = p.last().copied().unwrap_or_default();
-            p.resize(padded, last);
+        for column in &mut self.p {
+            let last = column[t.len() - 1];
+            column[t.len()..].fill(last);
         }
-        let padded = self.p[0].len();
-        self.n.iter_mut().for_each(|n| n.resize(padded, 0.0));
     }
 }
 
