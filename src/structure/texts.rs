@@ -61,11 +61,13 @@ pub(super) struct Interner {
     by_text: HashMap<Box<str>, u32>,
     /// Up to eight bytes of a text, their count, and the text's number; direct mapped, vacant where the count is 0.
     cache: Box<[(u64, u32, u32); 1 << CACHE_BITS]>,
+    /// The number of the empty text: columns that are missing or blank are as common as any name.
+    empty: Option<u32>,
 }
 
 impl Default for Interner {
     fn default() -> Self {
-        Self { texts: Vec::new(), by_text: HashMap::new(), cache: Box::new([(0, 0, 0); 1 << CACHE_BITS]) }
+        Self { texts: Vec::new(), by_text: HashMap::new(), cache: Box::new([(0, 0, 0); 1 << CACHE_BITS]), empty: None }
     }
 }
 
@@ -82,6 +84,9 @@ impl Interner {
     #[inline]
     pub(super) fn intern(&mut self, text: &[u8], start: usize, end: usize) -> u32 {
         let len = end - start;
+        if let (0, Some(id)) = (len, self.empty) {
+            return id;
+        }
         let Some(&word) = text.get(start..).and_then(|t| t.first_chunk::<8>()) else {
             return self.intern_slow(&text[start..end]);
         };
@@ -115,15 +120,27 @@ impl Interner {
 
     #[cold]
     fn intern_slow(&mut self, raw: &[u8]) -> u32 {
-        self.intern_text(text::decode(raw).into_owned().into_boxed_str())
+        let text = text::decode(raw);
+        if let Some(&id) = self.by_text.get(&*text) {
+            return id;
+        }
+        self.add(text.into_owned().into_boxed_str())
     }
 
     fn intern_text(&mut self, text: Box<str>) -> u32 {
         if let Some(&id) = self.by_text.get(&text) {
             return id;
         }
+        self.add(text)
+    }
+
+    /// The number of a text that is new.
+    fn add(&mut self, text: Box<str>) -> u32 {
         // More than 2³² distinct texts need more than 2³² rows, which the reader's limit refuses.
         let id = u32::try_from(self.texts.len()).unwrap_or(u32::MAX);
+        if text.is_empty() {
+            self.empty = Some(id);
+        }
         self.texts.push(text.clone());
         self.by_text.insert(text, id);
         id
