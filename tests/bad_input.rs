@@ -11,7 +11,7 @@ mod http_support;
 
 use std::io::Write;
 use std::process::{Output, Stdio};
-use std::sync::Arc;
+use std::sync::{Arc, Once};
 use std::time::{Duration, Instant};
 
 use http_support::{Reply, Running, SAMPLE, send, start};
@@ -24,9 +24,11 @@ const IN_TIME: Duration = Duration::from_millis(if cfg!(debug_assertions) { 1000
 /// How many of the slowest rows are printed.
 const SHOWN: usize = 8;
 
+static QUIET: Once = Once::new();
+
 fn server() -> Running {
     // As `molmesh serve` does: the referee panics at some rows, which is caught and says nothing.
-    molmesh::structure::referee::quiet_panics();
+    QUIET.call_once(molmesh::structure::referee::quiet_panics);
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |c| {
         c.limits.body_bytes = BODY_BYTES;
         c.limits.inflated_bytes = INFLATED_BYTES;
