@@ -218,7 +218,7 @@ fn compressed() -> Vec<Row> {
 /// PDB files.
 fn pdb() -> Vec<Row> {
     let cut = SAMPLE.windows(6).position(|w| w == b"\nATOM ").unwrap() + 10 * 81 + 1 + 40;
-    let line = 1 + SAMPLE[..cut].iter().filter(|&&b| b == b'\n').count();
+    let line = SAMPLE[..cut].split(|&b| b == b'\n').count();
     let cryst = "CRYST1   28.070   28.070   53.350  90.00  90.00  90.00 Q 99 99 9   8\n";
     vec![
         broken("truncated in an ATOM line", &SAMPLE[..cut], [line, 41], "coordinates in columns 31 to 54"),
@@ -260,7 +260,7 @@ fn pdb() -> Vec<Row> {
 
 /// Three atoms of a file from before 1996: no elements, but the entry and the line in columns 73 to 80.
 fn old_file() -> String {
-    (1..=3).map(|i| format!("{:<72}4PTI{i:>4}\n", x(&format!("{i:>6}.0")).get(..66).unwrap())).collect()
+    [1, 2, 3].map(|i| format!("{:<72}4PTI{i:>4}\n", &x(&format!("{i:>6}.0"))[..66])).concat()
 }
 
 /// mmCIF files.
@@ -309,7 +309,7 @@ fn parameters() -> Vec<Row> {
         ..beyond("a grid far too fine", SAMPLE, 422, "grid-too-large", 1 << 30)
     };
     far_too_fine.named.extend([
-        ("actual", Is::Above(1073741824.0)),
+        ("actual", Is::Above(1_073_741_824.0)),
         ("resolution", Is::Equal(json!(0.01))),
         ("suggested_resolution", Is::Above(0.01)),
     ]);
