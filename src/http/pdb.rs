@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
 use axum::http::header::{self, HeaderMap};
 use axum::http::{HeaderValue, Method, StatusCode};
@@ -26,11 +27,12 @@ const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stal
 pub(super) async fn surface(
     State(app): State<Shared>,
     method: Method,
-    Path((id, file)): Path<(String, String)>,
+    path: Result<Path<(String, String)>, PathRejection>,
     query: Pairs,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let start = Instant::now();
+    let Path((id, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let format = format_of(&file)?;
     let pairs = pairs(query)?;
     let request = params::parse(pairs)?;

@@ -201,8 +201,8 @@ impl From<StructureError> for Problem {
             E::Decompress { encoding, .. } => Self::new(Kind::UnreadableStructure, detail).with("encoding", encoding),
             E::InflatedTooLarge { limit } => Self::new(Kind::InflatedTooLarge, detail).with("limit", limit),
             E::TooManyAtoms { limit } => Self::new(Kind::TooManyAtoms, detail).with("limit", limit),
-            E::NoAtoms { .. } => Self::new(Kind::NoAtoms, detail),
-            E::EmptySelection { .. } => Self::new(Kind::EmptySelection, detail),
+            E::NoAtoms { found } => Self::new(Kind::NoAtoms, detail).with("found", found),
+            E::EmptySelection { holds } => Self::new(Kind::EmptySelection, detail).with("found", holds),
             E::NotFound { what, asked, available } => Self::new(Kind::EmptySelection, detail)
                 .with("parameter", if what == "chain" { "chains" } else { what })
                 .with("value", asked.trim_matches('`'))

@@ -2,6 +2,7 @@
 
 use axum::Json;
 use axum::extract::Path;
+use axum::extract::rejection::PathRejection;
 use axum::response::{IntoResponse, Response};
 use serde_json::{Value, json};
 
@@ -23,7 +24,8 @@ pub(super) async fn list() -> Response {
 }
 
 /// One kind.
-pub(super) async fn one(Path(slug): Path<String>) -> Result<Response, Problem> {
+pub(super) async fn one(path: Result<Path<String>, PathRejection>) -> Result<Response, Problem> {
+    let Path(slug) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let row = KINDS.iter().find(|row| row.slug == slug);
     row.map(|row| Json(describe(row)).into_response())
         .ok_or_else(|| Problem::new(Kind::NotFound, "no problem has this name; /problems lists all"))

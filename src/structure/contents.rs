@@ -1,6 +1,5 @@
 //! What a structure holds, for people who wonder what to select.
 
-use std::collections::HashMap;
 use std::fmt;
 
 use super::atoms::Structure;
@@ -99,19 +98,21 @@ impl Contents {
             chains: Vec::new(),
         };
         let water = structure.water_residues();
-        let mut chain_at: HashMap<u32, usize> = HashMap::new();
+        // Where each of the chain column's texts stands among the chains of this model.
+        let mut chain_at = vec![usize::MAX; structure.chain.texts().len()];
         for i in (0..structure.len()).filter(|&i| structure.model[i] == model) {
             let (kind, hydrogen) = (structure.kind(i, &water), structure.is_hydrogen(i));
             contents.counts.add(kind, hydrogen);
             contents.alternatives += u64::from(structure.altloc[i] != 0);
             contents.unknown_elements += u64::from(structure.element[i] == 0);
             let n_chains = contents.chains.len();
-            let at = *chain_at.entry(structure.chain.id(i)).or_insert(n_chains);
-            if at == n_chains {
+            let at = &mut chain_at[structure.chain.id(i) as usize];
+            if *at == usize::MAX {
+                *at = n_chains;
                 let name = structure.chain.get(i).to_owned();
                 contents.chains.push(ChainContents { name, counts: Counts::default() });
             }
-            contents.chains[at].counts.add(kind, hydrogen);
+            contents.chains[*at].counts.add(kind, hydrogen);
         }
         contents
     }
