@@ -23,17 +23,26 @@ pub(crate) struct Candidate {
     pub(crate) state: Result<String, String>,
 }
 
+/// What a backend is picked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Use {
+    /// One mesh, by the calling thread.
+    Once,
+    /// Many, by the threads of a service.
+    Service,
+}
+
 /// Picks a backend.
 ///
 /// # Errors
 /// [`CliError::NoBackend`] says why the one that was asked for is not there.
-pub(crate) fn pick(asked: BackendName, threads: Option<usize>) -> Result<Picked, CliError> {
+pub(crate) fn pick(asked: BackendName, threads: Option<usize>, use_: Use) -> Result<Picked, CliError> {
     if threads == Some(0) {
         return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
     }
     Ok(match asked {
-        BackendName::Auto => Picked { backend: cpu(threads)?, reason: format!("auto: no GPU, as {}", no_gpu()) },
-        BackendName::Cpu => Picked { backend: cpu(threads)?, reason: "asked for".to_owned() },
+        BackendName::Auto => Picked { backend: cpu(threads, use_)?, reason: format!("auto: no GPU, as {}", no_gpu()) },
+        BackendName::Cpu => Picked { backend: cpu(threads, use_)?, reason: "asked for".to_owned() },
         BackendName::Reference => Picked { backend: Box::new(ReferenceBackend), reason: "asked for".to_owned() },
         BackendName::Gpu => return Err(CliError::NoBackend { asked: "gpu", why: no_gpu().to_owned() }),
         BackendName::Paper => return Err(CliError::NoBackend { asked: "paper", why: no_paper() }),
@@ -55,8 +64,12 @@ pub(crate) fn survey() -> Vec<Candidate> {
     ]
 }
 
-fn cpu(threads: Option<usize>) -> Result<Box<dyn Backend>, CliError> {
-    let backend = CpuBackend::new(threads).map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
+fn cpu(threads: Option<usize>, use_: Use) -> Result<Box<dyn Backend>, CliError> {
+    let backend = match use_ {
+        Use::Once => CpuBackend::on_this_thread(threads),
+        Use::Service => CpuBackend::new(threads),
+    };
+    let backend = backend.map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
     Ok(Box::new(backend))
 }
 

@@ -28,7 +28,7 @@ fn text(style: Style) -> Result<String, CliError> {
             Err(why) => line(name, &format!("{} {why}", style.dim("no "))),
         }
     }
-    let picked = backend::pick(BackendName::Auto, None)?;
+    let picked = backend::pick(BackendName::Auto, None, backend::Use::Service)?;
     line("auto", &format!("{} ({})", picked.backend.name(), picked.reason));
     let JobLimits { read, surface } = JobLimits::default();
     line("limits", &format!("{} atoms, {} bytes inflated", read.max_atoms, read.max_inflated_bytes));

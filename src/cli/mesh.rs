@@ -28,7 +28,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let Request { job, format: asked, strict, .. } = request::parse(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
     let limits = request::limits(&args.limits);
-    let picked = backend::pick(args.backend, args.threads)?;
+    let picked = backend::pick(args.backend, args.threads, backend::Use::Once)?;
     let cancel = CancelToken::default();
     interrupt::watch(&cancel).map_err(|e| CliError::Internal(format!("cannot watch for signals: {e}")))?;
     let mut output = Output::open(&args.output, &cancel)?;

@@ -24,7 +24,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let config = config(args)?;
     telemetry::init_logs(&config.log).map_err(|e| CliError::usage(e.to_string()))?;
     referee::quiet_panics();
-    let Picked { backend, reason } = backend::pick(args.backend, None)?;
+    let Picked { backend, reason } = backend::pick(args.backend, None, backend::Use::Service)?;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let facts =
         Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others: backend::survey() };

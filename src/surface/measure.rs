@@ -116,6 +116,7 @@ impl Totals {
         let mut of_vertex = Column::zeroed(mesh.n_vertices());
         let (joined, sums): (Vec<Joined>, Vec<Sums>) = labels::split(mesh, &mut of_vertex)
             .into_par_iter()
+            .with_max_len(1)
             .map(|mut part| {
                 let joined = part.label();
                 let n = joined.equal.len();

@@ -56,6 +56,7 @@ pub(super) fn build(
     let finished = AtomicUsize::new(0);
     let flat: usize = work
         .into_par_iter()
+        .with_max_len(1)
         .map(|mut part| {
             control.check()?;
             let flat = SHADING.with_borrow_mut(|(batch, table)| {

@@ -96,6 +96,27 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
 }
 
 impl Found {
+    /// Forgets everything but the memory.
+    pub(super) fn clear(&mut self) {
+        self.bricks.clear();
+        self.t.clear();
+        self.cases.clear();
+        self.candidates.clear();
+        (self.vertices, self.triangles) = (0, 0);
+    }
+
+    /// A copy in memory of just the right size.
+    pub(super) fn take(&self) -> Self {
+        Self {
+            bricks: self.bricks.clone(),
+            t: self.t.clone(),
+            cases: self.cases.clone(),
+            candidates: self.candidates.clone(),
+            drop: Vec::new(),
+            ..*self
+        }
+    }
+
     /// Classifies one brick and appends what it holds. Returns where, if it holds any surface.
     pub(super) fn add(&mut self, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) -> Option<u16> {
         let n = self.bricks.len();

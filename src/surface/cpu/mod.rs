@@ -48,6 +48,17 @@ impl CpuBackend {
         Ok(Self { pool: pool.map_err(|e| e.to_string())? })
     }
 
+    /// A backend for a process that meshes once and ends: the calling thread works too, instead of waiting for a pool
+    /// whose threads compete with it for the processors between the stages.
+    ///
+    /// # Errors
+    /// The pool's, in words, where it exists already or its threads cannot be started.
+    pub fn on_this_thread(threads: Option<usize>) -> Result<Self, String> {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(0)).use_current_thread();
+        pool.build_global().map_err(|e| e.to_string())?;
+        Ok(Self { pool: None })
+    }
+
     /// Threads that a run uses.
     #[must_use]
     pub fn threads(&self) -> usize {
@@ -124,7 +135,8 @@ fn run(
         tally: Tally::default(),
         control,
     };
-    let mut done: Vec<Tile> = (0..tiles.len()).into_par_iter().map(|t| pass.sample(t)).collect::<Result<_, _>>()?;
+    let mut done: Vec<Tile> =
+        (0..tiles.len()).into_par_iter().with_max_len(1).map(|t| pass.sample(t)).collect::<Result<_, _>>()?;
     control.check()?;
     let totals = control.span(Stage::Scan, || scan::scan(&mut done, lattice.spacing, limits))?;
     if totals.triangles == 0 {

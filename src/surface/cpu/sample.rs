@@ -20,11 +20,19 @@ struct Scratch {
     inside: Vec<Inside>,
     /// Index into `fields` per slot, or `NO_BRICK`.
     slots: Vec<u16>,
+    /// What `classify` appends to; a tile takes a copy of the right size with it.
+    found: Found,
 }
 
 impl Default for Scratch {
     fn default() -> Self {
-        Self { bricks: Bricks::default(), fields: Vec::new(), inside: Vec::new(), slots: vec![NO_BRICK; SLOTS] }
+        Self {
+            bricks: Bricks::default(),
+            fields: Vec::new(),
+            inside: Vec::new(),
+            slots: vec![NO_BRICK; SLOTS],
+            found: Found::default(),
+        }
     }
 }
 
@@ -119,10 +127,10 @@ impl Scratch {
     fn classify(&mut self, iso: f32) -> (Found, Vec<u16>) {
         const NOWHERE: Inside = [0; 8];
         const NOTHING: Samples = [0.0; BRICK_SAMPLES];
-        let Self { bricks, fields, inside, slots } = self;
+        let Self { bricks, fields, inside, slots, found } = self;
         inside.clear();
         inside.extend(fields.iter().map(|field| classify::inside_bits(field, iso)));
-        let mut found = Found::default();
+        found.clear();
         let mut local = vec![NO_BRICK; BRICK_SAMPLES];
         for (at, entry) in local.iter_mut().enumerate() {
             let slot = (at / 64 * SIDE + at / 8 % 8) * SIDE + at % 8;
@@ -138,7 +146,7 @@ impl Scratch {
                 *entry = record;
             }
         }
-        (found, local)
+        (found.take(), local)
     }
 }
 
