@@ -1,5 +1,5 @@
 //! Time against atoms, and the field stage's time for each pair of a sample and an atom: one table, medians of several
-//! runs. `cargo bench --bench growth`; `-- --most 300000` stops earlier, `-- --threads 1` sets the threads.
+//! runs. `cargo bench --bench growth`; `-- --most 300000` stops earlier, `RAYON_NUM_THREADS=1` sets the threads.
 
 #![expect(clippy::print_stdout, clippy::unwrap_used, reason = "a benchmark prints its table and may panic")]
 
@@ -43,7 +43,7 @@ fn main() {
         arguments.nth(1).map(|v| v.parse::<usize>().unwrap())
     };
     let most = flag("--most").unwrap_or(1_000_000);
-    let backend = CpuBackend::new(flag("--threads")).unwrap();
+    let backend = CpuBackend::new(None).unwrap();
     let bytes = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb")).unwrap();
     let sample = structure::read(&bytes, &ReadLimits::default()).unwrap();
     let sample = structure::select(&sample, &Selection::default()).unwrap().spheres(&sample).unwrap();
