@@ -226,7 +226,7 @@ fn pdb() -> Vec<Row> {
         broken("bare HETATM", "REMARK\nHETATM\n", [2, 7], "coordinates in columns 31 to 54"),
         atomless("bare MODEL and ENDMDL", "MODEL\nENDMDL\n", "it has MODEL, ENDMDL"),
         atomless("bare HEADER", "HEADER", "it has HEADER"),
-        atomless("zero atoms", "HEADER    X\nREMARK   1\nCRYST1\nEND\n", "without an ATOM or HETATM record"),
+        atomless("zero atoms", "HEADER    X\nREMARK   1\nCRYST1\nEND\n", "without ATOM and HETATM"),
         broken("a bare word among atoms", format!("{ATOM}ATOM\n{ATOM}"), [2, 5], "coordinates"),
         broken("MODEL of 1e400", format!("MODEL     1e400\n{ATOM}"), [1, 11], "a model number"),
         broken("NaN", x("     NaN"), [1, 31], X),
