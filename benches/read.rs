@@ -1,7 +1,7 @@
 //! Reading speed in bytes of inflated text per second, one thread and all: `cargo bench --bench read`.
 //!
-//! Runs over the files of `../shared/data/structures` (or of the folder in `MOLMESH_STRUCTURES`) that are large enough to
-//! time, and over the small ones of `samples/`.
+//! Runs over the small files of `samples/`, and over those of the folder in `MOLMESH_STRUCTURES`, if it is set, that are
+//! large enough to time.
 
 use std::hint::black_box;
 use std::io::Read;
@@ -21,10 +21,10 @@ fn plain(path: &Path) -> Vec<u8> {
 }
 
 fn files() -> Vec<PathBuf> {
-    let folder = std::env::var("MOLMESH_STRUCTURES").unwrap_or_else(|_| "../shared/data/structures".to_owned());
-    let shared = ["1ubq.pdb.gz", "1aon.pdb.gz", "3v2u.pdb.gz", "7cth.cif.gz", "6zu5.cif.gz", "7cgo.cif.gz"];
+    let folder = std::env::var_os("MOLMESH_STRUCTURES").map(PathBuf::from);
+    let large = ["1ubq.pdb.gz", "1aon.pdb.gz", "3v2u.pdb.gz", "7cth.cif.gz", "6zu5.cif.gz", "7cgo.cif.gz"];
     let samples = ["samples/4pti.pdb", "samples/1crn.cif"].map(PathBuf::from);
-    let files = shared.iter().map(|name| Path::new(&folder).join(name)).chain(samples);
+    let files = folder.iter().flat_map(|folder| large.map(|name| folder.join(name))).chain(samples);
     files.filter(|path| path.exists()).collect()
 }
 
