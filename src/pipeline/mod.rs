@@ -84,19 +84,6 @@ pub fn run(
     cancel: &CancelToken,
     sink: &dyn ProgressSink,
 ) -> Result<Product, JobError> {
-    // On the pool from the start: every parallel step that a thread outside asks for wakes the pool anew, which costs
-    // a small molecule as much as meshing it.
-    rayon::scope(|_| run_here(bytes, job, limits, choice, cancel, sink))
-}
-
-fn run_here(
-    bytes: &[u8],
-    job: &Job,
-    limits: &JobLimits,
-    choice: &Choice<'_>,
-    cancel: &CancelToken,
-    sink: &dyn ProgressSink,
-) -> Result<Product, JobError> {
     let clock = StageClock::new(sink);
     let structure = clock.time("read", || structure::read(bytes, &limits.read))?;
     let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {

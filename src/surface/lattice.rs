@@ -20,6 +20,10 @@ pub const BRICK_SAMPLES: usize = 512;
 /// Samples along a tile's edge: 8 bricks.
 pub const TILE: i32 = 64;
 
+/// Edge parameters are kept this far from both ends, in every backend: no triangle degenerates and no two vertices of
+/// different edges coincide.
+pub(super) const EDGE_MARGIN: f32 = 1.0 / 1024.0;
+
 /// A sphere on the lattice. 32 bytes, the layout that the shaders share.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
@@ -161,6 +165,11 @@ pub fn tile_of(cell: [i32; 3]) -> [i32; 3] {
 #[must_use]
 pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
     [tile[2], tile[1], tile[0]]
+}
+
+/// A spacing a little above `spacing`, rounded up to hundredths of an Å: a suggestion that fits.
+pub(super) fn roomier(spacing: f64) -> f64 {
+    (spacing * 105.0).ceil() / 100.0
 }
 
 /// `v` as f32; the loss of digits is meant.

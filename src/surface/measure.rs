@@ -20,7 +20,7 @@ pub enum Proof {
     /// than twice then follows from the case table, which the tests prove: meant for meshes that a backend made.
     #[default]
     Checksum,
-    /// Every edge and the fan of triangles around every vertex, for any mesh. Costs about as much as meshing.
+    /// Every edge and the fan of triangles around every vertex, for any mesh. Takes about four times as long as meshing.
     Exact,
 }
 

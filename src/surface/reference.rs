@@ -8,7 +8,7 @@ use super::cases::{CASES, cell_edge};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
-use super::lattice::{to_f32, to_i32, to_u64};
+use super::lattice::{EDGE_MARGIN, roomier, to_f32, to_i32, to_u64};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
@@ -17,8 +17,6 @@ use super::spheres::Spheres;
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ReferenceBackend;
 
-/// Edge parameters keep this distance from both ends, as in every backend.
-const EDGE_MARGIN: f64 = 1.0 / 1024.0;
 /// No vertex on this edge.
 const NONE: u32 = u32::MAX;
 
@@ -93,7 +91,7 @@ impl Grid {
         let samples = to_u64(n.iter().product());
         if samples > limits.max_samples {
             let excess = samples as f64 / limits.max_samples.max(1) as f64;
-            let suggested_resolution = (h * excess.cbrt() * 105.0).ceil() / 100.0;
+            let suggested_resolution = roomier(h * excess.cbrt());
             let limit = limits.max_samples;
             return Err(SurfaceError::GridTooLarge { samples, limit, resolution: h, suggested_resolution });
         }
@@ -166,7 +164,7 @@ impl Backend for ReferenceBackend {
         let bytes = Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64);
         if bytes > limits.max_mesh_bytes {
             let excess = bytes as f64 / limits.max_mesh_bytes.max(1) as f64;
-            let suggested_resolution = (h * excess.sqrt() * 105.0).ceil() / 100.0;
+            let suggested_resolution = roomier(h * excess.sqrt());
             return Err(SurfaceError::MeshTooLarge { bytes, limit: limits.max_mesh_bytes, suggested_resolution });
         }
         let n = grid.len() as u64;
@@ -184,7 +182,7 @@ fn vertices(
     params: &SurfaceParams,
     spheres: &Spheres,
 ) -> (Mesh, Vec<[u32; 3]>) {
-    let (h, iso) = (params.resolution, params.isovalue);
+    let (h, iso, margin) = (params.resolution, params.isovalue, f64::from(EDGE_MARGIN));
     let centre =
         spheres.bounds().map_or([0.0; 3], |[lo, hi]| std::array::from_fn(|k| (0.5 * (lo[k] + hi[k]) / h).round() * h));
     let (mut positions, mut normals, mut nearest) = (Vec::new(), Vec::new(), Vec::new());
@@ -198,7 +196,7 @@ fn vertices(
             if (value >= iso) == (other >= iso) {
                 continue;
             }
-            let t = ((value - iso) / (value - other)).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
+            let t = ((value - iso) / (value - other)).clamp(margin, 1.0 - margin);
             let mut x = grid.sample(cell).map(f64::from);
             x[axis] += t;
             let x = x.map(|c| c * h);

@@ -28,7 +28,7 @@ fn ends(key: u64) -> [u32; 2] {
     [half(key >> 32), half(key)]
 }
 
-/// Checks `triangles`. Takes memory of 28 bytes for each of their edges.
+/// Checks `triangles`. Takes memory of 32 bytes for each of their edges.
 #[must_use]
 pub fn check(triangles: &[[u32; 3]]) -> Topology {
     let corners = |&[a, b, c]: &[u32; 3]| [(key(a, b), c), (key(b, c), a), (key(c, a), b)];

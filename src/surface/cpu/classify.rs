@@ -4,15 +4,11 @@
 
 use super::field::Samples;
 use crate::surface::cases::CASES;
-use crate::surface::lattice::{BRICK_SAMPLES, to_u32};
+use crate::surface::lattice::{BRICK_SAMPLES, EDGE_MARGIN, to_u32};
 use crate::surface::simd::dispatched;
 
 /// Inside bits of a brick: word z, bit `8·y + x`.
 pub(super) type Inside = [u64; 8];
-
-/// Edge parameters are kept this far from both ends, so that no triangle degenerates and no two vertices of
-/// different edges coincide.
-pub(super) const EDGE_MARGIN: f32 = 1.0 / 1024.0;
 
 /// A brick that the surface passes through, as the later stages need it.
 #[derive(Debug, Clone)]

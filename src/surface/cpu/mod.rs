@@ -104,11 +104,6 @@ struct Tile {
 
 const NO_BRICK: u16 = u16::MAX;
 
-/// A spacing a little above `spacing`, rounded up to hundredths of an Å: a suggestion that fits.
-fn roomier(spacing: f64) -> f64 {
-    (spacing * 1.05 * 100.0).ceil() / 100.0
-}
-
 fn run(
     spheres: &Spheres,
     params: &SurfaceParams,

@@ -2,6 +2,7 @@
 
 use super::Tile;
 use crate::surface::error::SurfaceError;
+use crate::surface::lattice::roomier;
 use crate::surface::mesh::Mesh;
 use crate::surface::params::SurfaceLimits;
 
@@ -35,5 +36,5 @@ pub(super) fn scan(tiles: &mut [Tile], spacing: f64, limits: &SurfaceLimits) -> 
 /// spacing.
 pub(super) fn too_large(bytes: u64, spacing: f64, limit: u64) -> SurfaceError {
     let excess = (bytes as f64 / limit.max(1) as f64).max(1.0);
-    SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution: super::roomier(spacing * excess.sqrt()) }
+    SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution: roomier(spacing * excess.sqrt()) }
 }
