@@ -2,6 +2,7 @@
 
 use super::control::Control;
 use super::error::SurfaceError;
+use super::measure::Measures;
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
@@ -28,6 +29,9 @@ pub struct Meshed {
     pub mesh: Mesh,
     /// Its grid.
     pub grid: GridStats,
+    /// Its measures with [`Proof::Checksum`](super::measure::Proof::Checksum), if the backend took them on the way and
+    /// the mesh is closed. What [`Measures::of`] finds in the finished mesh is the same up to rounding.
+    pub measures: Option<Measures>,
 }
 
 /// Turns spheres into a mesh. The same input gives the same bytes, whatever the thread count.

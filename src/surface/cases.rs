@@ -113,6 +113,19 @@ impl Cases {
     pub fn of(&self, case: u8) -> &[[u8; 3]] {
         &self.triangles[usize::from(case)][..usize::from(self.count[usize::from(case)])]
     }
+
+    /// Into how many loops the outline of a case closes. Each is a disc of its own.
+    #[must_use]
+    pub fn n_loops(&self, case: u8) -> u8 {
+        // A loop's triangles follow each other, and each but the first has a corner with an earlier one in common.
+        let (mut seen, mut n) = (0_u16, 0);
+        for triangle in self.of(case) {
+            let corners = triangle.iter().fold(0_u16, |mask, e| mask | 1 << e);
+            n += u8::from(seen & corners == 0);
+            seen |= corners;
+        }
+        n
+    }
 }
 
 #[cfg(test)]
@@ -255,6 +268,7 @@ mod tests {
                 "nothing cut off: {case}"
             );
             assert!(half_edges(triangles).values().all(|&n| n == 1), "case {case}");
+            assert_eq!(usize::from(CASES.n_loops(case)), loops(case).len(), "case {case}");
             let mut segments: Vec<_> = FACES.iter().flat_map(|f| face_segments(case, *f)).collect();
             segments.sort_unstable();
             assert_eq!(outline(triangles), segments, "case {case}");

@@ -100,6 +100,24 @@ impl Measures {
     }
 }
 
+impl Measures {
+    /// Measures from components whose checksum of directed edges is zero; every vertex is used.
+    pub(super) fn balanced(mut components: Vec<Component>, vertices: u64, faces: u64) -> Self {
+        components.retain(|c| c.triangles > 0);
+        components.sort_by(|a, b| b.area.total_cmp(&a.area));
+        Self {
+            area: components.iter().map(|c| c.area).sum(),
+            volume: components.iter().map(|c| c.volume).sum(),
+            euler: (vertices + faces).cast_signed() - (faces * 3 / 2).cast_signed(),
+            closed: true,
+            oriented: true,
+            manifold: true,
+            proof: Proof::Checksum,
+            components,
+        }
+    }
+}
+
 /// What one pass over the parts of a mesh gives.
 struct Totals {
     /// Largest area first.

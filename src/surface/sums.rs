@@ -79,7 +79,7 @@ pub(super) fn sum(positions: &[[f32; 3]], triangles: &[[u32; 3]], first: u32, la
 
 /// Sum in double precision, in eight strands: one would wait for every addition.
 #[inline(always)]
-fn sum_lanes(lanes: &[f32; LANES]) -> f64 {
+pub(super) fn sum_lanes(lanes: &[f32; LANES]) -> f64 {
     let mut strands = [0.0_f64; 8];
     for row in lanes.as_chunks::<8>().0 {
         for (strand, value) in strands.iter_mut().zip(row) {
@@ -89,24 +89,28 @@ fn sum_lanes(lanes: &[f32; LANES]) -> f64 {
     strands.iter().sum()
 }
 
-/// The checksum of a batch, and whether a triangle of it has a corner twice.
+/// Triangles whose checksum is computed together.
+const SHARES: usize = 16;
+
+/// The checksum of triangles, and whether one of them has a corner twice.
 #[inline(always)]
-fn edge_shares(batch: &[[u32; 3]]) -> (u64, bool) {
-    let mut corners = [[0_u32; LANES]; 3];
-    for (lane, t) in batch.iter().enumerate() {
-        (corners[0][lane], corners[1][lane], corners[2][lane]) = (t[0], t[1], t[2]);
+pub(super) fn edge_shares(triangles: &[[u32; 3]]) -> (u64, bool) {
+    let (mut sum, mut twice) = ([0_u64; SHARES], [false; SHARES]);
+    let (whole, rest) = triangles.as_chunks::<SHARES>();
+    for batch in whole {
+        let [a, b, c]: [[u32; SHARES]; 3] = std::array::from_fn(|k| std::array::from_fn(|i| batch[i][k]));
+        for i in 0..SHARES {
+            let shares =
+                edge_share(a[i], b[i]).wrapping_add(edge_share(b[i], c[i])).wrapping_add(edge_share(c[i], a[i]));
+            sum[i] = sum[i].wrapping_add(shares);
+            twice[i] |= a[i] == b[i] || b[i] == c[i] || c[i] == a[i];
+        }
     }
-    let [a, b, c] = corners;
-    let (mut sum, mut degenerate) = ([0_u64; LANES], false);
-    for i in 0..LANES {
-        let shares = edge_share(a[i], b[i]).wrapping_add(edge_share(b[i], c[i])).wrapping_add(edge_share(c[i], a[i]));
-        sum[i] = if i < batch.len() { shares } else { 0 };
+    for &[a, b, c] in rest {
+        sum[0] = sum[0].wrapping_add(edge_share(a, b)).wrapping_add(edge_share(b, c)).wrapping_add(edge_share(c, a));
+        twice[0] |= a == b || b == c || c == a;
     }
-    for i in 0..LANES {
-        let twice = a[i] == b[i] || b[i] == c[i] || c[i] == a[i];
-        degenerate |= i < batch.len() && twice;
-    }
-    (sum.iter().fold(0, |all, s| all.wrapping_add(*s)), degenerate)
+    (sum.iter().fold(0, |all, s| all.wrapping_add(*s)), twice.contains(&true))
 }
 
 /// Areas and signed volumes against the mesh's centre. Single precision inside a triangle: differences of close

@@ -117,7 +117,7 @@ impl Backend for Fake {
         if !warm_up {
             self.finished.fetch_add(1, Ordering::SeqCst);
         }
-        Ok(Meshed { mesh, grid: GridStats { samples: 7, ..GridStats::default() } })
+        Ok(Meshed { mesh, grid: GridStats { samples: 7, ..GridStats::default() }, measures: None })
     }
 }
 

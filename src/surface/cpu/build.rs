@@ -5,19 +5,31 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
-use super::bin::Tiles;
-use super::emit::{self, IdTable, Numbered};
+use super::bin::{Tiles, slot_origin};
+use super::emit::{self, BrickTable, Numbered};
 use super::interpolate::{self, Batch, SlopeConstants, Source, Target};
+use super::join;
+use super::sheets::Sheets;
+use super::tally::{Place, Tally};
 use super::{Tile, scan};
 use crate::surface::column::Column;
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::Lattice;
+use crate::surface::measure::Measures;
 use crate::surface::mesh::Mesh;
 
 thread_local! {
     // As the first pass's scratch: kept per thread, not per piece of work.
-    static SHADING: RefCell<(Batch, IdTable)> = RefCell::default();
+    static SHADING: RefCell<Shading> = RefCell::default();
+}
+
+/// What one thread keeps from tile to tile.
+#[derive(Default)]
+struct Shading {
+    batch: Batch,
+    table: BrickTable,
+    sheets: Sheets,
 }
 
 /// `interpolate` and `emit`: every tile writes its own part of the mesh.
@@ -28,7 +40,7 @@ pub(super) fn build(
     totals: scan::Totals,
     atom_ids: bool,
     control: &Control<'_>,
-) -> Result<Mesh, SurfaceError> {
+) -> Result<(Mesh, Option<Measures>), SurfaceError> {
     let mut mesh = Mesh {
         centre: lattice.centre(),
         positions: Column::zeroed(totals.vertices),
@@ -54,25 +66,27 @@ pub(super) fn build(
     }
     let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
     let finished = AtomicUsize::new(0);
-    let flat: usize = work
+    let parts = work
         .into_par_iter()
         .with_max_len(1)
         .map(|mut part| {
             control.check()?;
-            let flat = SHADING.with_borrow_mut(|(batch, table)| {
+            let done_part = SHADING.with_borrow_mut(|Shading { batch, table, sheets }| {
                 let flat = control.span(Stage::Interpolate, || part.interpolate(lattice, &slope, batch));
-                control.span(Stage::Emit, || part.emit(tiles, done, table));
-                flat
+                let tally = control.span(Stage::Emit, || part.emit(lattice, tiles, done, table, sheets));
+                (flat, tally)
             });
             let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
             control.observer.progress(Stage::Emit, n, done.len());
-            Ok(flat)
+            Ok(done_part)
         })
-        .sum::<Result<usize, SurfaceError>>()?;
-    if flat > 0 {
+        .collect::<Result<Vec<(usize, Tally)>, SurfaceError>>()?;
+    let (flat, tallies): (Vec<usize>, Vec<Tally>) = parts.into_iter().unzip();
+    if flat.iter().any(|&n| n > 0) {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
     }
-    Ok(mesh)
+    let measures = control.span(Stage::Measure, || join::measures(tiles, done, &tallies, totals));
+    Ok((mesh, measures))
 }
 
 /// Splits the first `n` rows off.
@@ -115,23 +129,59 @@ impl TilePart<'_> {
         flat
     }
 
-    /// Triangles of the tile's bricks.
-    fn emit(&mut self, tiles: &Tiles, done: &[Tile], table: &mut IdTable) {
-        // The tile itself and its neighbours towards +x, +y, +z.
-        let near: [Option<&Tile>; 8] = std::array::from_fn(|n| {
-            let coord = std::array::from_fn(|k| self.tile.coord[k] + i32::from(n >> k & 1 == 1));
-            tiles.index.get(&coord).map(|&t| &done[t as usize])
-        });
+    /// Triangles of the tile's bricks, and what they add up to.
+    fn emit(
+        &mut self,
+        lattice: &Lattice,
+        tiles: &Tiles,
+        done: &[Tile],
+        table: &mut BrickTable,
+        sheets: &mut Sheets,
+    ) -> Tally {
+        let near = Near::new(tiles, done, self.tile.coord);
         let found = &self.tile.found;
+        let mut tally = Tally::default();
         for (i, brick) in found.bricks.iter().enumerate() {
-            let around: [Numbered<'_>; 8] = std::array::from_fn(|n| {
-                let (slot, beyond) = emit::neighbour_slot(usize::from(brick.slot), n);
-                near[beyond[0] | beyond[1] << 1 | beyond[2] << 2].and_then(|tile| tile.numbered(slot))
-            });
+            let around: [Option<Numbered<'_>>; 8] =
+                std::array::from_fn(|n| near.of(usize::from(brick.slot), n).map(|(_, _, numbered)| numbered));
             let end =
                 found.bricks.get(i + 1).map_or((found.triangles, found.cases.len()), |n| (n.triangle, n.case as usize));
             let cases = &found.cases[brick.case as usize..end.1];
-            emit::emit(table, &around, cases, &mut self.triangles[brick.triangle as usize..end.0 as usize]);
+            let out = &mut self.triangles[brick.triangle as usize..end.0 as usize];
+            let own_sheets = match brick.n_sheets.map_or(0, |n| usize::from(n.get())) {
+                0 | 1 => &[][..],
+                n => &found.sheets[brick.sheets as usize..][..n],
+            };
+            emit::emit(table, sheets, &around, cases, own_sheets, out);
+            let origin = slot_origin(self.tile.coord, usize::from(brick.slot));
+            let offset = std::array::from_fn(|k| f64::from(origin[k] - lattice.centre[k]));
+            tally.add(table, sheets, &around, &Place { offset, spacing: lattice.spacing }, out);
         }
+        tally
+    }
+}
+
+/// A tile and its neighbours towards +x, +y, +z.
+pub(super) struct Near<'a> {
+    tiles: [Option<(usize, &'a Tile)>; 8],
+}
+
+impl<'a> Near<'a> {
+    pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3]) -> Self {
+        Self {
+            tiles: std::array::from_fn(|n| {
+                let coord = std::array::from_fn(|k| coord[k] + i32::from(n >> k & 1 == 1));
+                tiles.index.get(&coord).map(|&t| (t as usize, &done[t as usize]))
+            }),
+        }
+    }
+
+    /// The neighbour `n` (bits: 0 x, 1 y, 2 z; 0 is the brick itself) of the brick in `slot`, if it has surface: its
+    /// tile, its place among the tile's bricks, and the brick.
+    pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, Numbered<'a>)> {
+        let (slot, beyond) = emit::neighbour_slot(slot, n);
+        let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
+        let (ix, numbered) = tile.numbered(slot)?;
+        Some((t, ix, numbered))
     }
 }

@@ -2,6 +2,9 @@
 //!
 //! A brick's samples are eight 64-bit words, one per z layer, bit `8·y + x`. Every test on them is a shift.
 
+use std::num::NonZeroU16;
+use std::sync::LazyLock;
+
 use super::field::Samples;
 use crate::surface::cases::CASES;
 use crate::surface::lattice::{BRICK_SAMPLES, EDGE_MARGIN, to_u32};
@@ -29,6 +32,11 @@ pub(super) struct SurfaceBrick {
     pub(super) case: u32,
     /// Candidates in the tile's list of kept candidates.
     pub(super) candidates: [u32; 2],
+    /// Sheets of surface that hang together within the brick; `None` where a cell holds two of them, which takes a
+    /// closer look.
+    pub(super) n_sheets: Option<NonZeroU16>,
+    /// The cells of each sheet in the tile's list, if there are several sheets.
+    pub(super) sheets: u32,
 }
 
 /// What `classify` finds in the bricks of one tile, appended brick by brick.
@@ -46,6 +54,8 @@ pub(super) struct Found {
     pub(super) triangles: u32,
     /// Candidates of the bricks with surface.
     pub(super) candidates: Vec<u32>,
+    /// Cells of the sheets of bricks with several: word z, bit `8·y + x`.
+    pub(super) sheets: Vec<[u64; 8]>,
     /// F(owner) − F(other end) of the edges of the brick at hand.
     drop: Vec<f32>,
 }
@@ -98,6 +108,7 @@ impl Found {
         self.t.clear();
         self.cases.clear();
         self.candidates.clear();
+        self.sheets.clear();
         (self.vertices, self.triangles) = (0, 0);
     }
 
@@ -108,6 +119,7 @@ impl Found {
             t: self.t.clone(),
             cases: self.cases.clone(),
             candidates: self.candidates.clone(),
+            sheets: self.sheets.clone(),
             drop: Vec::new(),
             ..*self
         }
@@ -138,6 +150,8 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
         triangle: found.triangles,
         case: to_u32(found.cases.len()),
         candidates: [to_u32(found.candidates.len()), to_u32(found.candidates.len() + candidates.len())],
+        n_sheets: None,
+        sheets: to_u32(found.sheets.len()),
     };
     found.candidates.extend_from_slice(candidates);
     let mut n = 0_u16;
@@ -147,7 +161,8 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
         n += ones(*crossing);
     }
     edge_parameters(&brick.crossing, n, &around.samples, iso, &mut found.t, &mut found.drop);
-    let count = &CASES.count;
+    let cases = &*CELLS;
+    let mut torn = false;
     for (layer, &cells) in corners.iter().zip(&active) {
         let mut cells = cells;
         while cells != 0 {
@@ -155,12 +170,91 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
             cells &= cells - 1;
             let case = (0..8).fold(0, |case, c| case | u8::from(layer[c] >> bit & 1 == 1) << c);
             found.cases.push(case);
-            found.triangles += u32::from(count[usize::from(case)]);
+            let CellCase { triangles, loops } = cases[usize::from(case)];
+            found.triangles += u32::from(triangles);
+            torn |= loops > 1;
         }
     }
     found.vertices += u32::from(n);
+    if !torn {
+        brick.n_sheets = sheets(&active, &links(&corners), &mut found.sheets);
+    }
     found.bricks.push(brick);
 }
+}
+
+/// What a cell's case adds to its brick.
+#[derive(Clone, Copy)]
+struct CellCase {
+    triangles: u8,
+    loops: u8,
+}
+
+static CELLS: LazyLock<Vec<CellCase>> = LazyLock::new(|| {
+    (0..=255_u8)
+        .map(|case| CellCase { triangles: CASES.count[usize::from(case)], loops: CASES.n_loops(case) })
+        .collect()
+});
+
+/// Cells whose surface goes on in the cell before them along x, y and z, if that is in the brick.
+#[inline(always)]
+fn links(corners: &[[u64; 8]; 8]) -> [[u64; 8]; 3] {
+    const FIRST: [u64; 2] = [0x0101_0101_0101_0101, 0xff];
+    let crossed = |layer: &[u64; 8], c: [usize; 4]| {
+        (layer[c[0]] | layer[c[1]] | layer[c[2]] | layer[c[3]]) & !(layer[c[0]] & layer[c[1]] & layer[c[2]] & layer[c[3]])
+    };
+    let z = |z: usize| if z == 0 { 0 } else { crossed(&corners[z], [0, 1, 2, 3]) };
+    [
+        std::array::from_fn(|z| crossed(&corners[z], [0, 2, 4, 6]) & !FIRST[0]),
+        std::array::from_fn(|z| crossed(&corners[z], [0, 1, 4, 5]) & !FIRST[1]),
+        std::array::from_fn(z),
+    ]
+}
+
+/// Counts the sheets of a brick in whose cells there is one each: cells hang together where the face between them is
+/// crossed. Appends the cells of each if there are several.
+#[inline(always)]
+fn sheets(active: &[u64; 8], links: &[[u64; 8]; 3], found: &mut Vec<[u64; 8]>) -> Option<NonZeroU16> {
+    let mut left = *active;
+    let mut n = 0;
+    let first = found.len();
+    while let Some(z) = left.iter().position(|&word| word != 0) {
+        let mut sheet = [0; 8];
+        sheet[z] = left[z] & left[z].wrapping_neg();
+        flood(&mut sheet, links);
+        for (left, taken) in left.iter_mut().zip(&sheet) {
+            *left &= !taken;
+        }
+        n += 1;
+        if n > 1 || left != [0; 8] {
+            found.push(sheet);
+        }
+    }
+    debug_assert!(n == 1 || found.len() == first + usize::from(n), "one mask a sheet, none for a lone one");
+    NonZeroU16::new(n)
+}
+
+/// Adds to `sheet` every cell that links lead to.
+#[inline(always)]
+fn flood(sheet: &mut [u64; 8], links: &[[u64; 8]; 3]) {
+    let [lx, ly, lz] = links;
+    loop {
+        let before = *sheet;
+        for z in 0..8 {
+            let s = sheet[z];
+            sheet[z] = s | (s << 1 & lx[z]) | (s & lx[z]) >> 1 | (s << 8 & ly[z]) | (s & ly[z]) >> 8;
+        }
+        let s = *sheet;
+        for z in 0..7 {
+            sheet[z] |= s[z + 1] & lz[z + 1];
+        }
+        for z in 1..8 {
+            sheet[z] |= s[z - 1] & lz[z];
+        }
+        if *sheet == before {
+            return;
+        }
+    }
 }
 
 /// Set bits of a word.

@@ -13,8 +13,12 @@ mod classify;
 mod emit;
 mod field;
 mod interpolate;
+mod join;
 mod sample;
 mod scan;
+mod sheets;
+mod tally;
+mod threads;
 
 use rayon::prelude::*;
 
@@ -54,8 +58,9 @@ impl CpuBackend {
     /// # Errors
     /// The pool's, in words, where it exists already or its threads cannot be started.
     pub fn on_this_thread(threads: Option<usize>) -> Result<Self, String> {
+        let home = threads::current();
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(0)).use_current_thread();
-        pool.build_global().map_err(|e| e.to_string())?;
+        pool.start_handler(move |index| threads::spread(home, index)).build_global().map_err(|e| e.to_string())?;
         Ok(Self { pool: None })
     }
 
@@ -137,7 +142,7 @@ fn run(
     if totals.triangles == 0 {
         return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
     }
-    let mesh = build::build(&lattice, &tiles, &done, totals, params.atom_ids, control)?;
+    let (mesh, measures) = build::build(&lattice, &tiles, &done, totals, params.atom_ids, control)?;
     let tally = pass.tally;
     let surface_bricks = done.iter().map(|tile| tile.found.bricks.len() as u64).sum();
     let grid = GridStats {
@@ -147,15 +152,18 @@ fn run(
         box_cells: lattice.box_cells,
         candidates: tally.candidates.into_inner(),
     };
-    Ok(Meshed { mesh, grid })
+    Ok(Meshed { mesh, grid, measures })
 }
 
 impl Tile {
-    /// The surface brick in `slot` with its first vertex's global id.
-    fn numbered(&self, slot: usize) -> Numbered<'_> {
+    /// The surface brick in `slot`: its place among the tile's, and itself with its first vertex's global id.
+    fn numbered(&self, slot: usize) -> Option<(usize, Numbered<'_>)> {
         let [x, y, z] = slot_brick(slot);
-        let brick = self.found.bricks.get(usize::from(self.bricks[(z * 8 + y) * 8 + x]))?;
+        let ix = usize::from(self.bricks[(z * 8 + y) * 8 + x]);
+        let brick = self.found.bricks.get(ix)?;
+        let end = self.found.bricks.get(ix + 1).map_or(self.found.vertices, |next| next.vertex);
+        let t = &self.found.t[brick.vertex as usize..end as usize];
         // `scan` made sure that ids fit 32 bits.
-        Some((brick, to_u32(self.first_vertex) + brick.vertex))
+        Some((ix, Numbered { brick, first: to_u32(self.first_vertex) + brick.vertex, t }))
     }
 }

@@ -1,0 +1,212 @@
+//! Area, volume and the checksum of directed edges, brick by brick, while the triangles are in the fastest cache.
+//!
+//! What [`Measures::of`](crate::surface::Measures::of) finds in a finished mesh, at a third of the cost.
+
+use glam::Vec3A;
+
+use super::emit::{BrickTable, Numbered, shared_vertices, shared_words};
+use super::sheets::Sheets;
+use crate::surface::lattice::to_u32;
+use crate::surface::measure::Component;
+use crate::surface::simd::dispatched;
+use crate::surface::sums::{edge_shares, sum_lanes};
+
+/// Triangles whose areas are computed together.
+const LANES: usize = 128;
+
+/// The sheets of a brick as the tile numbers them.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct BrickSheets {
+    /// The brick's first sheet.
+    pub(super) first: u32,
+    /// How many it has.
+    n: u16,
+    /// Where the sheets of its vertices begin in `of_vertices`, if it has several.
+    detail: u32,
+}
+
+/// A vertex of a neighbour on a sheet of a brick that has several.
+#[derive(Debug, Clone, Copy)]
+struct Far {
+    brick: u32,
+    /// Which neighbour (bits: 0 x, 1 y, 2 z), and the vertex's rank in it.
+    neighbour: u8,
+    rank: u32,
+    sheet: u32,
+}
+
+/// What one tile adds up.
+#[derive(Debug, Default)]
+pub(super) struct Tally {
+    /// Sum of the shares of all directed edges.
+    pub(super) checksum: u64,
+    /// A triangle has a corner twice.
+    pub(super) degenerate: bool,
+    /// Per sheet of the tile.
+    pub(super) sheets: Vec<Component>,
+    /// Per brick of the tile.
+    pub(super) bricks: Vec<BrickSheets>,
+    of_vertices: Vec<u16>,
+    far: Vec<Far>,
+}
+
+/// Where a brick lies and how large a cell is.
+pub(super) struct Place {
+    /// The brick's first sample relative to the mesh's centre, in spacings.
+    pub(super) offset: [f64; 3],
+    /// Å.
+    pub(super) spacing: f64,
+}
+
+/// Twice the area vectors summed, and the corners' products with them.
+#[derive(Default, Clone, Copy)]
+struct Sum {
+    triangles: u64,
+    area: f64,
+    vector: [f64; 3],
+    product: f64,
+}
+
+impl Sum {
+    fn component(&self, vertices: u64, place: &Place) -> Component {
+        let h2 = place.spacing * place.spacing;
+        // Moving the origin by an offset adds its product with the area vector.
+        let moved: f64 = (0..3).map(|k| place.offset[k] * self.vector[k]).sum();
+        let volume = (self.product + moved) / 6.0 * h2 * place.spacing;
+        Component { triangles: self.triangles, vertices, area: 0.5 * self.area * h2, volume }
+    }
+}
+
+impl Tally {
+    /// Adds the brick that `emit` has just written.
+    pub(super) fn add(
+        &mut self,
+        table: &BrickTable,
+        sheets: &mut Sheets,
+        around: &[Option<Numbered<'_>>; 8],
+        place: &Place,
+        written: &[[u32; 3]],
+    ) {
+        let (shares, degenerate) = check(written);
+        self.checksum = self.checksum.wrapping_add(shares);
+        self.degenerate |= degenerate;
+        let n_own = around[0].map_or(0, |own| own.t.len());
+        let n = sheets.resolve();
+        let (first, detail) = (to_u32(self.sheets.len()), to_u32(self.of_vertices.len()));
+        self.bricks.push(BrickSheets { first, n, detail });
+        let corners = table.corners();
+        if n == 1 {
+            self.sheets.push(sum(table, corners).component(n_own as u64, place));
+            return;
+        }
+        let on = |edge: u16| sheets.of(table.sheet(edge));
+        let mut sums = vec![(Sum::default(), 0_u64); usize::from(n)];
+        for run in corners.chunk_by(|a, b| on(a[0]) == on(b[0])) {
+            let (of, part) = (&mut sums[usize::from(on(run[0][0]))].0, sum(table, run));
+            of.triangles += part.triangles;
+            of.area += part.area;
+            of.product += part.product;
+            (0..3).for_each(|k| of.vector[k] += part.vector[k]);
+        }
+        let brick = to_u32(self.bricks.len() - 1);
+        for (neighbour, near) in (0_u8..).zip(around) {
+            let Some(near) = near else { continue };
+            shared_vertices(near, usize::from(neighbour), |rank, edge| {
+                let sheet = on(u16::try_from(edge).unwrap_or_default());
+                if neighbour == 0 {
+                    sums[usize::from(sheet)].1 += 1;
+                    self.of_vertices.push(sheet);
+                } else {
+                    self.far.push(Far { brick, neighbour, rank, sheet: first + u32::from(sheet) });
+                }
+            });
+        }
+        self.sheets.extend(sums.iter().map(|(sum, vertices)| sum.component(*vertices, place)));
+    }
+
+    /// The pairs of sheets that neighbouring bricks share. `near(brick, neighbour)` gives a brick's neighbour, the tally
+    /// of its tile, and its tile with its place in that; `pair` gets the sheet of this tile, and the other's tile and
+    /// sheet.
+    pub(super) fn pairs<'a>(
+        &self,
+        near: impl Fn(usize, usize) -> Option<(Numbered<'a>, &'a Self, (usize, usize))>,
+        mut pair: impl FnMut(u32, (usize, u32)),
+    ) {
+        let mut far = self.far.iter().peekable();
+        for (ix, brick) in self.bricks.iter().enumerate() {
+            if brick.n != 1 {
+                let mut last = None;
+                while let Some(at) = far.next_if(|f| f.brick as usize == ix) {
+                    let Some((_, tally, (tile, other))) = near(ix, usize::from(at.neighbour)) else { continue };
+                    let met = (at.sheet, (tile, tally.sheet_of(other, at.rank)));
+                    if last != Some(met) {
+                        pair(met.0, met.1);
+                        last = Some(met);
+                    }
+                }
+                continue;
+            }
+            for neighbour in 1..8 {
+                let Some((of, tally, (tile, other))) = near(ix, neighbour) else { continue };
+                if tally.bricks[other].n == 1 {
+                    let mut shared = false;
+                    shared_words(neighbour, |z, axis, mask| shared |= of.brick.crossing[3 * z + axis] & mask != 0);
+                    if shared {
+                        pair(brick.first, (tile, tally.bricks[other].first));
+                    }
+                    continue;
+                }
+                let mut last = None;
+                shared_vertices(&of, neighbour, |rank, _| {
+                    let sheet = tally.sheet_of(other, rank);
+                    if last.replace(sheet) != Some(sheet) {
+                        pair(brick.first, (tile, sheet));
+                    }
+                });
+            }
+        }
+    }
+
+    /// The sheet of a brick's vertex.
+    fn sheet_of(&self, brick: usize, rank: u32) -> u32 {
+        let brick = &self.bricks[brick];
+        if brick.n == 1 {
+            return brick.first;
+        }
+        brick.first + u32::from(self.of_vertices[(brick.detail + rank) as usize])
+    }
+}
+
+dispatched! {
+/// The checksum of triangles, and whether one of them has a corner twice.
+fn check(triangles: &[[u32; 3]]) -> (u64, bool) {
+    edge_shares(triangles)
+}
+}
+
+dispatched! {
+/// Sums over triangles given by the grid edges of their corners. Single precision within a brick, where differences of positions are nearly
+/// exact; double between bricks.
+fn sum(table: &BrickTable, corners: &[[u16; 3]]) -> Sum {
+    let mut all = Sum { triangles: corners.len() as u64, ..Sum::default() };
+    let mut normals = [Vec3A::ZERO; LANES];
+    for batch in corners.chunks(LANES) {
+        let (mut vector, mut product) = (Vec3A::ZERO, Vec3A::ZERO);
+        for (normal, edges) in normals.iter_mut().zip(batch) {
+            let [a, b, c] = edges.map(|edge| table.position(edge));
+            let n = (b - a).cross(c - a);
+            *normal = n;
+            vector += n;
+            product += a * n;
+        }
+        let mut area = [0.0_f32; LANES];
+        for (area, n) in area.iter_mut().zip(&normals[..batch.len()]) {
+            *area = n.length();
+        }
+        all.area += sum_lanes(&area);
+        (0..3).for_each(|k| all.vector[k] += f64::from(vector[k]));
+        all.product += f64::from(product.element_sum());
+    }
+    all
+}
+}
