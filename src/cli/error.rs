@@ -201,6 +201,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         SurfaceError::BadParameter { .. } | SurfaceError::NoSurface { .. } => code::USAGE,
         SurfaceError::GridTooLarge { .. } | SurfaceError::MeshTooLarge { .. } => code::LIMIT,
         SurfaceError::Cancelled => code::INTERRUPTED,
+        SurfaceError::Sink => code::INTERNAL,
     }
 }
 

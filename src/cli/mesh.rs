@@ -7,6 +7,8 @@ use std::str::FromStr;
 use std::time::Instant;
 
 use molmesh::formats::{Encoder, Format};
+#[cfg(unix)]
+use molmesh::formats::{GlbSink, PlaceError};
 use molmesh::pipeline::params::Request;
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, ProgressSink, Report};
 use molmesh::structure::StructureError;
@@ -36,9 +38,15 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
 
     let progress = Progress::new(!args.quiet);
     let findings = if strict { Some(check(args, &input, &limits)?) } else { None };
-    let product = mesh(args, &job, &limits, &picked, &input, &cancel, &progress)?;
-    drop(input);
-    let mut report = encode(&product, format, &mut output, &progress)?;
+    let work = Work { args, job: &job, limits: &limits, picked: &picked, input: &input, cancel: &cancel };
+    let mut poured = None;
+    if format == Format::Glb && pipeline::can_pour(&job) {
+        poured = work.pour(&mut output, &progress)?;
+    }
+    let mut report = match poured {
+        Some(report) => report,
+        None => work.whole(format, &mut output, &progress)?,
+    };
     drop(progress);
     if cancel.is_cancelled() {
         return Err(CliError::Interrupted);
@@ -51,10 +59,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
 
     let name = if to_stdout { "stdout".to_owned() } else { args.output.display().to_string() };
     let written = Written { name: &name, format: format.extension(), bytes };
-    tell(args, &report, findings.as_deref(), &written, to_stdout)?;
-    // The caller exits the process next: nobody gains from the mesh being freed first.
-    std::mem::forget(product);
-    Ok(())
+    tell(args, &report, findings.as_deref(), &written, to_stdout)
 }
 
 /// The format that an output's name says: by its extension, GLB on stdout.
@@ -103,20 +108,85 @@ fn name_of(input: &Path) -> String {
     if is_stdio(input) { "stdin".to_owned() } else { input.display().to_string() }
 }
 
-fn mesh(
-    args: &MeshArgs,
-    job: &Job,
-    limits: &JobLimits,
-    picked: &Picked,
-    input: &[u8],
-    cancel: &CancelToken,
-    progress: &Progress,
-) -> Result<Product, CliError> {
-    let choice = Choice { backend: picked.backend.as_ref(), reason: &picked.reason };
-    pipeline::run(input, job, limits, &choice, cancel, progress).map_err(|source| match source {
-        JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
-        source => CliError::Job { name: name_of(&args.input), opinion: opinion(&source, input, limits), source },
-    })
+/// What there is to do.
+struct Work<'a> {
+    args: &'a MeshArgs,
+    job: &'a Job,
+    limits: &'a JobLimits,
+    picked: &'a Picked,
+    input: &'a [u8],
+    cancel: &'a CancelToken,
+}
+
+impl Work<'_> {
+    fn choice(&self) -> Choice<'_> {
+        Choice { backend: self.picked.backend.as_ref(), reason: &self.picked.reason }
+    }
+
+    fn failure(&self, source: JobError) -> CliError {
+        match source {
+            JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
+            source => {
+                let (name, opinion) = (name_of(&self.args.input), opinion(&source, self.input, self.limits));
+                CliError::Job { name, opinion, source }
+            }
+        }
+    }
+
+    /// Meshes, then writes the mesh in order. Returns the report.
+    fn whole(&self, format: Format, output: &mut Output, progress: &Progress) -> Result<Report, CliError> {
+        let product = pipeline::run(self.input, self.job, self.limits, &self.choice(), self.cancel, progress)
+            .map_err(|source| self.failure(source))?;
+        let report = encode(&product, format, output, progress)?;
+        // The process ends soon: nobody gains from the mesh being freed first.
+        std::mem::forget(product);
+        Ok(report)
+    }
+
+    /// Writes a GLB while it is meshed. `None` if this output takes bytes in order only.
+    #[cfg(unix)]
+    fn pour(&self, output: &mut Output, progress: &Progress) -> Result<Option<Report>, CliError> {
+        let Some(placer) = output.placer() else { return Ok(None) };
+        let sink = GlbSink::new(&placer);
+        let poured = pipeline::pour(self.input, self.job, self.limits, &self.choice(), self.cancel, progress, &sink);
+        let poured = match poured {
+            Ok(poured) => poured,
+            Err(JobError::Surface(SurfaceError::Sink)) => return Err(place_failure(output, sink.failure())),
+            Err(source) => return Err(self.failure(source)),
+        };
+        progress.progress("encode", 0.0);
+        let start = Instant::now();
+        let finished = sink.finish(&poured.meta(), poured.centre, poured.bounds);
+        match finished {
+            Ok(len) => output.set_len(len),
+            // The header's place is fixed before the report is known: a report of unusual length needs another go.
+            Err(PlaceError::HeadTooLong { .. }) => {
+                output.clear()?;
+                return Ok(None);
+            }
+            Err(error) => return Err(place_failure(output, Some(error))),
+        }
+        let mut report = poured.report;
+        report.add_timing("encode", start.elapsed().as_secs_f64() * 1e3);
+        Ok(Some(report))
+    }
+
+    /// There is no portable way to write one file from several threads.
+    #[cfg(not(unix))]
+    fn pour(&self, _output: &mut Output, _progress: &Progress) -> Result<Option<Report>, CliError> {
+        Ok(None)
+    }
+}
+
+/// What it means that a mesh could not be placed.
+#[cfg(unix)]
+fn place_failure(output: &Output, error: Option<PlaceError>) -> CliError {
+    match error {
+        Some(PlaceError::Format(error)) => error.into(),
+        Some(PlaceError::Io(source)) => output.failure(source),
+        Some(error @ PlaceError::HeadTooLong { .. }) => CliError::Internal(error.to_string()),
+        None => CliError::Internal("the output failed without a reason".to_owned()),
+    }
 }
 
 /// The strict check: the referee's findings, or a refusal if there are errors among them.

@@ -5,6 +5,8 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+#[cfg(unix)]
+use molmesh::formats::PlaceBytes;
 use molmesh::surface::CancelToken;
 
 use super::error::CliError;
@@ -43,6 +45,29 @@ impl Output {
         }
     }
 
+    /// A way to write at any place of the file, if it is one.
+    #[cfg(unix)]
+    pub(crate) fn placer(&self) -> Option<Placer<'_>> {
+        match &self.to {
+            To::Staged { file, .. } => Some(Placer { file, cancel: &self.cancel }),
+            To::Stdout(_) | To::Device(_) => None,
+        }
+    }
+
+    /// The length of a file that was written through [`Self::placer`].
+    pub(crate) fn set_len(&mut self, bytes: u64) {
+        self.bytes = bytes;
+    }
+
+    /// Empties a file that was written through [`Self::placer`].
+    pub(crate) fn clear(&mut self) -> Result<(), CliError> {
+        let cleared = match &self.to {
+            To::Staged { file, .. } => file.set_len(0),
+            To::Stdout(_) | To::Device(_) => Ok(()),
+        };
+        cleared.map_err(|source| self.failure(source))
+    }
+
     /// Whether the mesh goes to stdout.
     pub(crate) fn is_stdout(&self) -> bool {
         matches!(self.to, To::Stdout(_))
@@ -72,6 +97,23 @@ impl Drop for Output {
         if matches!(self.to, To::Staged { .. }) {
             interrupt::discard();
         }
+    }
+}
+
+/// Writes at any place of a staged file.
+#[cfg(unix)]
+pub(crate) struct Placer<'a> {
+    file: &'a File,
+    cancel: &'a CancelToken,
+}
+
+#[cfg(unix)]
+impl PlaceBytes for Placer<'_> {
+    fn place(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
+        if self.cancel.is_cancelled() {
+            return Err(io::Error::other("interrupted"));
+        }
+        std::os::unix::fs::FileExt::write_all_at(self.file, bytes, offset)
     }
 }
 

@@ -23,6 +23,7 @@ use std::io::{self, Write};
 use check::Depth;
 pub use error::FormatError;
 pub use format::{Format, UnknownFormat};
+pub use gltf::{GlbSink, PlaceBytes, PlaceError};
 
 use crate::surface::Mesh;
 

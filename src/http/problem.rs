@@ -236,6 +236,8 @@ impl From<SurfaceError> for Problem {
                 Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
             }
             E::Cancelled => Self::from(Failure::Stopped),
+            // No sink takes part in an answer.
+            E::Sink => Self::internal(detail),
         }
     }
 }

@@ -11,10 +11,12 @@ pub use clock::{ProgressSink, StageClock};
 pub use report::Report;
 
 use crate::formats::Meta;
-use crate::structure::{self, ReadLimits, Selection, StructureError};
+use crate::structure::{self, ReadLimits, Selected, Selection, Structure, StructureError};
 use crate::surface::{
-    Backend, CancelToken, Control, Measures, Mesh, Proof, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, CancelToken, Control, Measures, Mesh, MeshSink, Meshed, Proof, Spheres, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams,
 };
+use report::Counts;
 
 /// Everything that decides what a mesh looks like.
 #[derive(Debug, Clone, Default)]
@@ -72,6 +74,25 @@ pub enum JobError {
     Surface(#[from] SurfaceError),
 }
 
+/// A job whose mesh went into a sink.
+#[derive(Debug, Clone)]
+pub struct Poured {
+    /// What was measured.
+    pub report: Report,
+    /// What to add to a position to get the structure file's own coordinates, Å.
+    pub centre: [f64; 3],
+    /// Lowest and highest relative position per axis, Å.
+    pub bounds: [[f32; 3]; 2],
+}
+
+impl Poured {
+    /// What a mesh file says about this job.
+    #[must_use]
+    pub fn meta(&self) -> Meta {
+        Meta { name: self.report.id.clone(), extras: self.report.extras() }
+    }
+}
+
 /// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh.
 ///
 /// # Errors
@@ -82,15 +103,10 @@ pub fn run(
     limits: &JobLimits,
     choice: &Choice<'_>,
     cancel: &CancelToken,
-    sink: &dyn ProgressSink,
+    progress: &dyn ProgressSink,
 ) -> Result<Product, JobError> {
-    let clock = StageClock::new(sink);
-    let structure = clock.time("read", || structure::read(bytes, &limits.read))?;
-    let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {
-        let selected = structure::select(&structure, &job.selection)?;
-        let spheres = selected.spheres(&structure)?;
-        Ok((selected, spheres))
-    })?;
+    let clock = StageClock::new(progress);
+    let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), observer: &clock };
     let mut meshed = clock.pass(|| choice.backend.run(&spheres, &job.params, &limits.surface, &control))?;
     if let Some(ids) = &mut meshed.mesh.atom_ids {
@@ -101,6 +117,53 @@ pub fn run(
         Some(taken) => taken,
         None => clock.time(Stage::Measure.name(), || Measures::of(&meshed.mesh, job.proof, &control))?,
     };
-    let report = Report::new(&structure, &selected, job, choice, &meshed, &measures, clock.finish());
-    Ok(Product { mesh: meshed.mesh, report })
+    let Meshed { mesh, grid, .. } = meshed;
+    let counts = Counts { grid, n_vertices: mesh.n_vertices(), n_triangles: mesh.n_triangles() };
+    let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
+    Ok(Product { mesh, report })
+}
+
+/// Whether [`pour`] can run a job: atoms by vertex and the exact proof need the whole mesh.
+#[must_use]
+pub fn can_pour(job: &Job) -> bool {
+    !job.params.atom_ids && job.proof == Proof::Checksum
+}
+
+/// Runs a job that [`can_pour`], handing the mesh on to `sink` part by part: the same mesh and report as [`run`] gives, but
+/// the mesh is never held as a whole.
+///
+/// # Errors
+/// Any [`JobError`]; [`SurfaceError::Sink`] if `sink` failed.
+pub fn pour(
+    bytes: &[u8],
+    job: &Job,
+    limits: &JobLimits,
+    choice: &Choice<'_>,
+    cancel: &CancelToken,
+    progress: &dyn ProgressSink,
+    sink: &dyn MeshSink,
+) -> Result<Poured, JobError> {
+    let clock = StageClock::new(progress);
+    let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
+    let control = Control { cancel: cancel.clone(), observer: &clock };
+    let poured = clock.pass(|| choice.backend.pour(&spheres, &job.params, &limits.surface, &control, sink))?;
+    let counts = Counts { grid: poured.grid, n_vertices: poured.n_vertices, n_triangles: poured.n_triangles };
+    let report = Report::new(&structure, &selected, job, choice, &counts, &poured.measures, clock.finish());
+    Ok(Poured { report, centre: poured.centre, bounds: poured.bounds })
+}
+
+/// Bytes to spheres.
+fn read(
+    bytes: &[u8],
+    job: &Job,
+    limits: &JobLimits,
+    clock: &StageClock<'_>,
+) -> Result<(Structure, Selected, Spheres), JobError> {
+    let structure = clock.time("read", || structure::read(bytes, &limits.read))?;
+    let (selected, spheres) = clock.time("select", || -> Result<_, JobError> {
+        let selected = structure::select(&structure, &job.selection)?;
+        let spheres = selected.spheres(&structure)?;
+        Ok((selected, spheres))
+    })?;
+    Ok((structure, selected, spheres))
 }

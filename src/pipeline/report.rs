@@ -5,7 +5,7 @@ use serde_json::{Map, Value};
 
 use super::{Choice, Job};
 use crate::structure::{Selected, Structure, radii};
-use crate::surface::{Measures, Meshed};
+use crate::surface::{GridStats, Measures};
 
 /// One connected component.
 #[derive(Debug, Clone, Serialize)]
@@ -90,13 +90,20 @@ pub struct Report {
     pub timings_ms: Map<String, Value>,
 }
 
+/// What a report counts.
+pub(super) struct Counts {
+    pub(super) grid: GridStats,
+    pub(super) n_vertices: usize,
+    pub(super) n_triangles: usize,
+}
+
 impl Report {
     pub(super) fn new(
         structure: &Structure,
         selected: &Selected,
         job: &Job,
         choice: &Choice<'_>,
-        meshed: &Meshed,
+        counts: &Counts,
         measures: &Measures,
         timings: Vec<(&'static str, f64)>,
     ) -> Self {
@@ -116,12 +123,12 @@ impl Report {
             resolution: params.resolution,
             isovalue: params.isovalue,
             smoothness: gaussian.then_some(params.smoothness),
-            bricks: meshed.grid.bricks,
-            surface_bricks: meshed.grid.surface_bricks,
-            samples: meshed.grid.samples,
-            box_cells: meshed.grid.box_cells,
-            vertices: meshed.mesh.n_vertices() as u64,
-            triangles: meshed.mesh.n_triangles() as u64,
+            bricks: counts.grid.bricks,
+            surface_bricks: counts.grid.surface_bricks,
+            samples: counts.grid.samples,
+            box_cells: counts.grid.box_cells,
+            vertices: counts.n_vertices as u64,
+            triangles: counts.n_triangles as u64,
             closed: measures.closed,
             oriented: measures.oriented,
             manifold: measures.manifold,
@@ -149,9 +156,10 @@ impl Report {
         }
     }
 
-    /// Adds a stage that ran after the job, such as `encode`.
+    /// Adds time to a stage that ran after the job, or went on after it, such as `encode` and `write`.
     pub fn add_timing(&mut self, stage: &str, ms: f64) {
-        self.timings_ms.insert(stage.to_owned(), Value::from((ms * 1e3).round() / 1e3));
+        let before = self.timings_ms.get(stage).and_then(Value::as_f64).unwrap_or_default();
+        self.timings_ms.insert(stage.to_owned(), Value::from(((before + ms) * 1e3).round() / 1e3));
     }
 
     /// The report as a mesh file's extras: without what differs from run to run, so that the same input gives

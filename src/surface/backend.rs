@@ -1,10 +1,11 @@
 //! What a backend is: something that turns spheres into a mesh.
 
-use super::control::Control;
+use super::control::{Control, Stage};
 use super::error::SurfaceError;
-use super::measure::Measures;
+use super::measure::{Measures, Proof};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
+use super::sink::{MeshPart, MeshSink, Poured, SinkFailed};
 use super::spheres::Spheres;
 
 /// What the grid of a run looked like.
@@ -53,4 +54,35 @@ pub trait Backend: Send + Sync {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Meshed, SurfaceError>;
+
+    /// Meshes `spheres` into `sink`: the same rows as [`Self::run`] returns, measured with
+    /// [`Proof::Checksum`]. A backend that need not hold the whole mesh for that does not.
+    ///
+    /// # Errors
+    /// As [`Self::run`], and [`SurfaceError::Sink`].
+    fn pour(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+        sink: &dyn MeshSink,
+    ) -> Result<Poured, SurfaceError> {
+        let Meshed { mesh, grid, measures } = self.run(spheres, params, limits, control)?;
+        let measures = match measures {
+            Some(measures) => measures,
+            None => control.span(Stage::Measure, || Measures::of(&mesh, Proof::Checksum, control))?,
+        };
+        pour_whole(&mesh, sink)?;
+        let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
+        Ok(Poured { centre: mesh.centre, n_vertices, n_triangles, bounds: mesh.bounds(), grid, measures })
+    }
+}
+
+/// Hands a finished mesh on as one part.
+fn pour_whole(mesh: &Mesh, sink: &dyn MeshSink) -> Result<(), SurfaceError> {
+    let failed = |SinkFailed| SurfaceError::Sink;
+    sink.begin(mesh.n_vertices(), mesh.n_triangles()).map_err(failed)?;
+    let (positions, normals, triangles) = (&mesh.positions[..], &mesh.normals[..], &mesh.triangles[..]);
+    sink.part(&MeshPart { first_vertex: 0, positions, normals, first_triangle: 0, triangles }).map_err(failed)
 }

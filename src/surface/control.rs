@@ -20,14 +20,24 @@ pub enum Stage {
     Interpolate,
     /// Triangle indices.
     Emit,
+    /// Handing finished parts of the mesh on.
+    Write,
     /// Area, volume, components, closedness.
     Measure,
 }
 
 impl Stage {
     /// Every stage, in the order in which they run.
-    pub const ALL: [Self; 7] =
-        [Self::Bin, Self::Field, Self::Classify, Self::Scan, Self::Interpolate, Self::Emit, Self::Measure];
+    pub const ALL: [Self; 8] = [
+        Self::Bin,
+        Self::Field,
+        Self::Classify,
+        Self::Scan,
+        Self::Interpolate,
+        Self::Emit,
+        Self::Write,
+        Self::Measure,
+    ];
 
     /// The stage's name, as shaders, reports and `Server-Timing` spell it.
     #[must_use]
@@ -39,6 +49,7 @@ impl Stage {
             Self::Scan => "scan",
             Self::Interpolate => "interpolate",
             Self::Emit => "emit",
+            Self::Write => "write",
             Self::Measure => "measure",
         }
     }

@@ -60,6 +60,9 @@ pub enum SurfaceError {
         /// The isovalue asked for.
         isovalue: f64,
     },
+    /// Whoever takes the mesh part by part failed, and knows why.
+    #[error("the mesh could not be handed on")]
+    Sink,
     /// The run was cancelled by its caller.
     #[error("cancelled")]
     Cancelled,

@@ -23,8 +23,12 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
             AtomType::F32 => convert_words(out, &ids[..], exact_f32_bytes)?,
         }
     }
-    let indices = mesh.triangles[..].as_flattened();
-    match layout.indices.0 {
+    write_indices(out, layout.indices.0, mesh.triangles[..].as_flattened())
+}
+
+/// Writes indices as the layout has them.
+pub(super) fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32]) -> io::Result<()> {
+    match index_type {
         IndexType::U8 => convert_words(out, indices, |i| [i.to_le_bytes()[0]]),
         IndexType::U16 => convert_words(out, indices, |i| {
             let [low, high, ..] = i.to_le_bytes();

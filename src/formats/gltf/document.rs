@@ -14,7 +14,6 @@ use serde_json::{Map, Value};
 use super::layout::{AtomType, IndexType, Layout, Span};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, GENERATOR, Meta};
-use crate::surface::Mesh;
 
 /// A calm blue, linear light. Like every constant here it is a short binary fraction, so JSON shows it short.
 const BASE_COLOR: [f32; 4] = [0.156_25, 0.390_625, 0.718_75, 1.0];
@@ -26,7 +25,7 @@ const ROUGHNESS: f32 = 0.625;
 /// The document as a JSON object. With a layout it has one buffer, without a URI: the caller adds what its
 /// wrapping needs.
 pub(super) fn document(
-    mesh: &Mesh,
+    centre: [f64; 3],
     summary: &Summary,
     layout: Option<&Layout>,
     meta: &Meta,
@@ -53,8 +52,8 @@ pub(super) fn document(
     let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };
     let mut value = serde_json::to_value(&root).map_err(json)?;
     // The crate's translation is single precision, which would move a structure far from the origin by up to 1e-5 Å.
-    value["nodes"][0]["translation"] = Value::from(mesh.centre.to_vec());
-    value["asset"]["extras"] = Value::Object(extras(mesh, meta));
+    value["nodes"][0]["translation"] = Value::from(centre.to_vec());
+    value["asset"]["extras"] = Value::Object(extras(centre, meta));
     match value {
         Value::Object(map) => Ok(map),
         _ => Err(FormatError::Json { reason: "the document is no object".to_owned() }),
@@ -62,11 +61,11 @@ pub(super) fn document(
 }
 
 /// What the file says of itself: units first, then parameters and report.
-fn extras(mesh: &Mesh, meta: &Meta) -> Map<String, Value> {
+fn extras(centre: [f64; 3], meta: &Meta) -> Map<String, Value> {
     let mut extras = Map::new();
     extras.insert("units".to_owned(), Value::from("angstrom"));
     extras.insert("unit_scale".to_owned(), Value::from(1.0));
-    extras.insert("centre".to_owned(), Value::from(mesh.centre.to_vec()));
+    extras.insert("centre".to_owned(), Value::from(centre.to_vec()));
     for (key, value) in &meta.extras {
         if !extras.contains_key(key) {
             extras.insert(key.clone(), value.clone());

@@ -17,6 +17,12 @@ const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
 const HEADER_BYTES: u64 = 12;
 const CHUNK_HEADER_BYTES: u64 = 8;
 
+/// From so many bytes on a buffer begins at a multiple of [`HEAD_BYTES`]: it can be written, mapped or asked for by
+/// range before the JSON is known.
+pub(super) const LARGE_BUFFER_BYTES: u64 = 1 << 20;
+/// What a report of a hundred components takes, with room to spare.
+pub(super) const HEAD_BYTES: u64 = 16 << 10;
+
 /// A GLB that is laid out.
 #[derive(Debug)]
 pub(in crate::formats) struct GlbPlan {
@@ -28,32 +34,55 @@ pub(in crate::formats) struct GlbPlan {
 
 impl GlbPlan {
     pub(in crate::formats) fn new(mesh: &Mesh, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
-        let layout = Layout::of(mesh, summary)?;
-        let document = document(mesh, summary, layout.as_ref(), meta)?;
+        Self::placed(Layout::of(mesh, summary)?, mesh.centre, summary, meta)
+    }
+
+    /// The same for a mesh of which only this is known.
+    pub(super) fn placed(
+        layout: Option<Layout>,
+        centre: [f64; 3],
+        summary: &Summary,
+        meta: &Meta,
+    ) -> Result<Self, FormatError> {
+        let document = document(centre, summary, layout.as_ref(), meta)?;
         let json = serde_json::to_vec(&document).map_err(|e| FormatError::Json { reason: e.to_string() })?;
         Self::wrap(json, layout)
     }
 
     fn wrap(mut json: Vec<u8>, layout: Option<Layout>) -> Result<Self, FormatError> {
         json.resize(json.len().next_multiple_of(4), b' ');
+        if layout.is_some_and(|layout| layout.len >= LARGE_BUFFER_BYTES) {
+            let around = HEADER_BYTES + 2 * CHUNK_HEADER_BYTES;
+            let head = (json.len() as u64 + around).next_multiple_of(HEAD_BYTES);
+            json.resize(usize::try_from(head - around).unwrap_or(json.len()), b' ');
+        }
         let json_len = json.len() as u64;
         let bin_len = layout.map(|layout| layout.len.next_multiple_of(4));
         let bytes = HEADER_BYTES + CHUNK_HEADER_BYTES + json_len + bin_len.map_or(0, |len| CHUNK_HEADER_BYTES + len);
-        let fits = |n: u64| {
-            u32::try_from(n).map_err(|_overflow| FormatError::GlbTooLarge { bytes, limit: u64::from(u32::MAX) })
-        };
-        let len = fits(bytes)?;
+        let len = Self::check_len(bytes)?;
+        // No chunk is longer than the file.
+        let fits = |n: u64| u32::try_from(n).unwrap_or(u32::MAX);
         let mut head = Vec::with_capacity(json.len() + 28);
-        for word in [MAGIC, VERSION, len, fits(json_len)?, JSON] {
+        for word in [MAGIC, VERSION, len, fits(json_len), JSON] {
             head.extend_from_slice(&word.to_le_bytes());
         }
         head.append(&mut json);
         if let Some(bin_len) = bin_len {
-            for word in [fits(bin_len)?, BIN] {
+            for word in [fits(bin_len), BIN] {
                 head.extend_from_slice(&word.to_le_bytes());
             }
         }
         Ok(Self { head, layout, len })
+    }
+
+    /// The length of a file as the header says it.
+    pub(super) fn check_len(bytes: u64) -> Result<u32, FormatError> {
+        u32::try_from(bytes).map_err(|_overflow| FormatError::GlbTooLarge { bytes, limit: u64::from(u32::MAX) })
+    }
+
+    /// Everything before the buffer.
+    pub(super) fn head(&self) -> &[u8] {
+        &self.head
     }
 
     pub(in crate::formats) fn len(&self) -> u64 {
@@ -77,20 +106,31 @@ mod tests {
     fn a_glb_of_four_gibibytes_is_refused_with_numbers() {
         // 24 bytes per vertex and 12 per triangle, two triangles per vertex: 48 bytes a vertex.
         let fits = Layout::plain(89_000_000, 178_000_000).unwrap();
-        assert_eq!(GlbPlan::wrap(vec![b' '; 1000], Some(fits)).unwrap().len(), 48 * 89_000_000 + 1028);
+        assert_eq!(GlbPlan::wrap(vec![b' '; 1000], fits).unwrap().len(), 48 * 89_000_000 + HEAD_BYTES);
         let large = Layout::plain(90_000_000, 180_000_000).unwrap();
-        let refusal = GlbPlan::wrap(vec![b' '; 1000], Some(large)).unwrap_err();
-        assert_eq!(refusal, FormatError::GlbTooLarge { bytes: 4_320_001_028, limit: 4_294_967_295 });
-        assert!(refusal.to_string().contains("4320001028"));
+        let refusal = GlbPlan::wrap(vec![b' '; 1000], large).unwrap_err();
+        assert_eq!(refusal, FormatError::GlbTooLarge { bytes: 4_320_016_384, limit: 4_294_967_295 });
+        assert!(refusal.to_string().contains("4320016384"));
         assert_eq!(io::Error::from(refusal).kind(), io::ErrorKind::InvalidInput);
     }
 
     #[test]
     fn the_limit_is_met_to_the_byte() {
         // A GLB's length is a multiple of 4: the largest is 4,294,967,292 bytes.
-        let layout = Layout::plain(89_000_000, 178_000_000).unwrap();
-        let json = usize::try_from(4_294_967_292 - 28 - layout.len).unwrap();
-        assert_eq!(GlbPlan::wrap(vec![b' '; json - 3], Some(layout)).unwrap().len(), 4_294_967_292);
-        assert!(GlbPlan::wrap(vec![b' '; json + 1], Some(layout)).is_err());
+        assert_eq!(GlbPlan::check_len(4_294_967_295).unwrap(), u32::MAX);
+        assert!(GlbPlan::check_len(4_294_967_296).is_err());
+    }
+
+    #[test]
+    fn a_large_buffer_begins_at_a_fixed_place() {
+        let head = |json: usize, vertices: u64| {
+            let layout = Layout::plain(vertices, 1).unwrap();
+            GlbPlan::wrap(vec![b' '; json], layout).unwrap().head().len() as u64
+        };
+        // 24 bytes a vertex and 3 indices of four bytes.
+        let large = LARGE_BUFFER_BYTES.div_ceil(24);
+        assert_eq!((head(10, large), head(16_000, large), head(16_356, large)), (HEAD_BYTES, HEAD_BYTES, HEAD_BYTES));
+        assert_eq!(head(16_357, large), 2 * HEAD_BYTES);
+        assert_eq!(head(10, large - 1), 40);
     }
 }

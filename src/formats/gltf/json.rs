@@ -25,7 +25,7 @@ pub(in crate::formats) struct GltfPlan {
 impl GltfPlan {
     pub(in crate::formats) fn new(mesh: &Mesh, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
         let layout = Layout::of(mesh, summary)?;
-        let mut document = document(mesh, summary, layout.as_ref(), meta)?;
+        let mut document = document(mesh.centre, summary, layout.as_ref(), meta)?;
         // The buffer's entry comes last and is written by hand, so that its text can be left open.
         document.shift_remove("buffers");
         let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };

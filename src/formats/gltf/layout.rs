@@ -27,7 +27,7 @@ impl IndexType {
         }
     }
 
-    const fn bytes(self) -> u64 {
+    pub(super) const fn bytes(self) -> u64 {
         match self {
             Self::U8 => 1,
             Self::U16 => 2,
@@ -114,10 +114,9 @@ impl Layout {
         Ok(Self { n_vertices, n_triangles, positions, normals, colors, atoms, indices, len: end })
     }
 
-    /// A layout by counts alone, for meshes that tests cannot hold in memory.
-    #[cfg(test)]
-    pub(super) fn plain(n_vertices: u64, n_triangles: u64) -> Result<Self, FormatError> {
-        Self::new(n_vertices, n_triangles, false, None)
+    /// The layout of a mesh without colours and atoms; `None` if there is nothing to draw.
+    pub(super) fn plain(n_vertices: u64, n_triangles: u64) -> Result<Option<Self>, FormatError> {
+        if n_triangles == 0 { Ok(None) } else { Self::new(n_vertices, n_triangles, false, None).map(Some) }
     }
 }
 

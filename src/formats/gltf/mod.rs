@@ -10,6 +10,8 @@ mod document;
 mod glb;
 mod json;
 mod layout;
+mod placed;
 
 pub(super) use glb::GlbPlan;
 pub(super) use json::GltfPlan;
+pub use placed::{GlbSink, PlaceBytes, PlaceError};

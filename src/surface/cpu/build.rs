@@ -1,6 +1,7 @@
 //! The second pass: every tile writes its own part of the mesh, vertices by `interpolate`, triangles by `emit`.
 
 use std::cell::RefCell;
+use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
@@ -11,7 +12,7 @@ use super::interpolate::{self, Batch, SlopeConstants, Source, Target};
 use super::join;
 use super::sheets::Sheets;
 use super::tally::{Place, Tally};
-use super::{Tile, scan};
+use super::{Scanned, Tile};
 use crate::surface::column::Column;
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
@@ -26,21 +27,28 @@ thread_local! {
 
 /// What one thread keeps from tile to tile.
 #[derive(Default)]
-struct Shading {
+pub(super) struct Shading {
     batch: Batch,
     table: BrickTable,
     sheets: Sheets,
 }
 
+/// What a tile's part of the mesh adds up to.
+#[derive(Default)]
+pub(super) struct Written {
+    /// Vertices that have no gradient to take a normal from.
+    pub(super) flat: usize,
+    /// Its sums.
+    pub(super) tally: Tally,
+}
+
 /// `interpolate` and `emit`: every tile writes its own part of the mesh.
 pub(super) fn build(
-    lattice: &Lattice,
-    tiles: &Tiles,
-    done: &[Tile],
-    totals: scan::Totals,
+    scanned: &Scanned,
     atom_ids: bool,
     control: &Control<'_>,
 ) -> Result<(Mesh, Option<Measures>), SurfaceError> {
+    let Scanned { lattice, done, totals, .. } = scanned;
     let mut mesh = Mesh {
         centre: lattice.centre(),
         positions: Column::zeroed(totals.vertices),
@@ -57,6 +65,7 @@ pub(super) fn build(
         let (n, m) = (tile.found.vertices as usize, tile.found.triangles as usize);
         let part = TilePart {
             tile,
+            bricks: 0..tile.found.bricks.len(),
             positions: take(&mut positions, n),
             normals: take(&mut normals, n),
             triangles: take(&mut triangles, m),
@@ -66,26 +75,22 @@ pub(super) fn build(
     }
     let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
     let finished = AtomicUsize::new(0);
-    let parts = work
+    let written = work
         .into_par_iter()
         .with_max_len(1)
         .map(|mut part| {
             control.check()?;
-            let done_part = SHADING.with_borrow_mut(|Shading { batch, table, sheets }| {
-                let flat = control.span(Stage::Interpolate, || part.interpolate(lattice, &slope, batch));
-                let tally = control.span(Stage::Emit, || part.emit(lattice, tiles, done, table, sheets));
-                (flat, tally)
-            });
+            let mut written = Written::default();
+            SHADING.with_borrow_mut(|shading| part.write(scanned, &slope, shading, control, &mut written));
             let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
             control.observer.progress(Stage::Emit, n, done.len());
-            Ok(done_part)
+            Ok(written)
         })
-        .collect::<Result<Vec<(usize, Tally)>, SurfaceError>>()?;
-    let (flat, tallies): (Vec<usize>, Vec<Tally>) = parts.into_iter().unzip();
-    if flat.iter().any(|&n| n > 0) {
+        .collect::<Result<Vec<Written>, SurfaceError>>()?;
+    if written.iter().any(|part| part.flat > 0) {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
     }
-    let measures = control.span(Stage::Measure, || join::measures(tiles, done, &tallies, totals));
+    let measures = control.span(Stage::Measure, || join::measures(scanned, &written));
     Ok((mesh, measures))
 }
 
@@ -97,57 +102,67 @@ fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
     head
 }
 
-/// A tile with its part of the mesh.
-struct TilePart<'a> {
-    tile: &'a Tile,
-    positions: &'a mut [[f32; 3]],
-    normals: &'a mut [[f32; 3]],
-    triangles: &'a mut [[u32; 3]],
-    atom_ids: Option<&'a mut [u32]>,
+/// Bricks of a tile with their part of the mesh.
+pub(super) struct TilePart<'a> {
+    pub(super) tile: &'a Tile,
+    /// Which of its surface bricks.
+    pub(super) bricks: Range<usize>,
+    pub(super) positions: &'a mut [[f32; 3]],
+    pub(super) normals: &'a mut [[f32; 3]],
+    pub(super) triangles: &'a mut [[u32; 3]],
+    pub(super) atom_ids: Option<&'a mut [u32]>,
 }
 
 impl TilePart<'_> {
-    /// Vertices of the tile's bricks. Returns how many have no gradient.
+    /// Writes the vertices and triangles of the part's bricks, and adds what they add up to.
+    pub(super) fn write(
+        &mut self,
+        scanned: &Scanned,
+        slope: &SlopeConstants,
+        shading: &mut Shading,
+        control: &Control<'_>,
+        written: &mut Written,
+    ) {
+        let Shading { batch, table, sheets } = shading;
+        written.flat += control.span(Stage::Interpolate, || self.interpolate(&scanned.lattice, slope, batch));
+        control.span(Stage::Emit, || self.emit(scanned, table, sheets, &mut written.tally));
+    }
+
+    /// Vertices of the bricks. Returns how many have no gradient.
     fn interpolate(&mut self, lattice: &Lattice, slope: &SlopeConstants, batch: &mut Batch) -> usize {
         let found = &self.tile.found;
+        let base = found.before(self.bricks.start).vertices;
         let mut flat = 0;
-        for (i, brick) in found.bricks.iter().enumerate() {
-            let end = found.bricks.get(i + 1).map_or(found.vertices, |next| next.vertex);
-            let rows = brick.vertex as usize..end as usize;
-            if rows.is_empty() {
+        for i in self.bricks.clone() {
+            let (brick, all) = (&found.bricks[i], found.before(i).vertices..found.before(i + 1).vertices);
+            if all.is_empty() {
                 continue;
             }
             let candidates = &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize];
+            let rows = all.start - base..all.end - base;
             let target = Target {
                 positions: &mut self.positions[rows.clone()],
                 normals: &mut self.normals[rows.clone()],
                 atom_ids: self.atom_ids.as_deref_mut().map(|ids| &mut ids[rows.clone()]),
             };
-            let source = Source { tile: self.tile.coord, candidates, t: &found.t[rows] };
+            let source = Source { tile: self.tile.coord, candidates, t: &found.t[all] };
             flat += interpolate::interpolate(lattice, slope, brick, &source, batch, target);
         }
         flat
     }
 
-    /// Triangles of the tile's bricks, and what they add up to.
-    fn emit(
-        &mut self,
-        lattice: &Lattice,
-        tiles: &Tiles,
-        done: &[Tile],
-        table: &mut BrickTable,
-        sheets: &mut Sheets,
-    ) -> Tally {
+    /// Triangles of the bricks, and what they add up to.
+    fn emit(&mut self, scanned: &Scanned, table: &mut BrickTable, sheets: &mut Sheets, tally: &mut Tally) {
+        let Scanned { lattice, tiles, done, .. } = scanned;
         let near = Near::new(tiles, done, self.tile.coord);
         let found = &self.tile.found;
-        let mut tally = Tally::default();
-        for (i, brick) in found.bricks.iter().enumerate() {
+        let base = found.before(self.bricks.start).triangles;
+        for i in self.bricks.clone() {
+            let (brick, before, end) = (&found.bricks[i], found.before(i), found.before(i + 1));
             let around: [Option<Numbered<'_>>; 8] =
                 std::array::from_fn(|n| near.of(usize::from(brick.slot), n).map(|(_, _, numbered)| numbered));
-            let end =
-                found.bricks.get(i + 1).map_or((found.triangles, found.cases.len()), |n| (n.triangle, n.case as usize));
-            let cases = &found.cases[brick.case as usize..end.1];
-            let out = &mut self.triangles[brick.triangle as usize..end.0 as usize];
+            let cases = &found.cases[before.cases..end.cases];
+            let out = &mut self.triangles[before.triangles - base..end.triangles - base];
             let own_sheets = match brick.n_sheets.map_or(0, |n| usize::from(n.get())) {
                 0 | 1 => &[][..],
                 n => &found.sheets[brick.sheets as usize..][..n],
@@ -157,7 +172,6 @@ impl TilePart<'_> {
             let offset = std::array::from_fn(|k| f64::from(origin[k] - lattice.centre[k]));
             tally.add(table, sheets, &around, &Place { offset, spacing: lattice.spacing }, out);
         }
-        tally
     }
 }
 

@@ -60,6 +60,14 @@ pub(super) struct Found {
     drop: Vec<f32>,
 }
 
+/// How much of a tile comes before a brick.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Before {
+    pub(super) vertices: usize,
+    pub(super) triangles: usize,
+    pub(super) cases: usize,
+}
+
 /// A brick's samples with those of the seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
 #[derive(Clone, Copy)]
 pub(super) struct Around<'a> {
@@ -123,6 +131,20 @@ impl Found {
             drop: Vec::new(),
             ..*self
         }
+    }
+
+    /// Vertices, triangles and cases of the tile before brick `i`; all of them where `i` is their number.
+    pub(super) fn before(&self, i: usize) -> Before {
+        let all = Before {
+            vertices: self.vertices as usize,
+            triangles: self.triangles as usize,
+            cases: self.cases.len(),
+        };
+        self.bricks.get(i).map_or(all, |brick| Before {
+            vertices: brick.vertex as usize,
+            triangles: brick.triangle as usize,
+            cases: brick.case as usize,
+        })
     }
 
     /// Classifies one brick and appends what it holds. Returns where, if it holds any surface.

@@ -2,16 +2,16 @@
 
 use rayon::prelude::*;
 
-use super::bin::Tiles;
-use super::build::Near;
-use super::scan::Totals;
+use super::Scanned;
+use super::build::{Near, Written};
 use super::tally::Tally;
-use super::Tile;
 use crate::surface::lattice::to_u32;
 use crate::surface::measure::{Component, Measures};
 
 /// The measures of the mesh that the tiles wrote; `None` if it is not closed, which the tallies cannot explain.
-pub(super) fn measures(tiles: &Tiles, done: &[Tile], tallies: &[Tally], totals: Totals) -> Option<Measures> {
+pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measures> {
+    let Scanned { tiles, done, totals, .. } = scanned;
+    let tallies: Vec<&Tally> = written.iter().map(|part| &part.tally).collect();
     let checksum = tallies.iter().fold(0_u64, |sum, tally| sum.wrapping_add(tally.checksum));
     if checksum != 0 || tallies.iter().any(|tally| tally.degenerate) {
         return None;
@@ -33,7 +33,7 @@ pub(super) fn measures(tiles: &Tiles, done: &[Tile], tallies: &[Tally], totals: 
             let mut pairs = Vec::new();
             let neighbour = |brick: usize, n: usize| {
                 let (other, ix, numbered) = near.of(usize::from(done[t].found.bricks[brick].slot), n)?;
-                Some((numbered, &tallies[other], (other, ix)))
+                Some((numbered, tallies[other], (other, ix)))
             };
             tallies[t].pairs(neighbour, |own, (other, sheet)| {
                 pairs.push([to_u32(first[t]) + own, to_u32(first[other]) + sheet]);

@@ -14,6 +14,7 @@ mod emit;
 mod field;
 mod interpolate;
 mod join;
+mod pour;
 mod sample;
 mod scan;
 mod sheets;
@@ -26,13 +27,15 @@ use self::bin::{Tiles, slot_brick};
 use self::classify::Found;
 use self::emit::Numbered;
 use self::field::Constants;
-use self::sample::{Pass, Tally};
+use self::sample::Pass;
+use self::scan::Totals;
 use super::backend::{Backend, GridStats, Meshed};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::lattice::{Lattice, to_f32, to_u32};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::simd;
+use super::sink::{MeshSink, Poured};
 use super::spheres::Spheres;
 
 /// The native CPU backend.
@@ -94,6 +97,20 @@ impl Backend for CpuBackend {
             None => run(spheres, params, limits, control),
         }
     }
+
+    fn pour(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+        sink: &dyn MeshSink,
+    ) -> Result<Poured, SurfaceError> {
+        match &self.pool {
+            Some(pool) => pool.install(|| pour(spheres, params, limits, control, sink)),
+            None => pour(spheres, params, limits, control, sink),
+        }
+    }
 }
 
 /// A tile between the stages.
@@ -109,12 +126,21 @@ struct Tile {
 
 const NO_BRICK: u16 = u16::MAX;
 
-fn run(
+/// The stages up to `scan`: everything that must be known before the first row can be written.
+struct Scanned {
+    lattice: Lattice,
+    tiles: Tiles,
+    done: Vec<Tile>,
+    totals: Totals,
+    grid: GridStats,
+}
+
+fn scan(
     spheres: &Spheres,
     params: &SurfaceParams,
     limits: &SurfaceLimits,
     control: &Control<'_>,
-) -> Result<Meshed, SurfaceError> {
+) -> Result<Scanned, SurfaceError> {
     let binned = control.span(Stage::Bin, || {
         if spheres.len() > bin::MAX_ATOMS {
             return Err(bin::too_many_atoms(spheres.len()));
@@ -132,7 +158,7 @@ fn run(
         constants: Constants::new(&lattice.profile, lattice.spacing),
         iso: to_f32(params.isovalue),
         limits,
-        tally: Tally::default(),
+        tally: sample::Tally::default(),
         control,
     };
     let mut done: Vec<Tile> =
@@ -142,7 +168,6 @@ fn run(
     if totals.triangles == 0 {
         return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
     }
-    let (mesh, measures) = build::build(&lattice, &tiles, &done, totals, params.atom_ids, control)?;
     let tally = pass.tally;
     let surface_bricks = done.iter().map(|tile| tile.found.bricks.len() as u64).sum();
     let grid = GridStats {
@@ -152,7 +177,29 @@ fn run(
         box_cells: lattice.box_cells,
         candidates: tally.candidates.into_inner(),
     };
-    Ok(Meshed { mesh, grid, measures })
+    Ok(Scanned { lattice, tiles, done, totals, grid })
+}
+
+fn run(
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<Meshed, SurfaceError> {
+    let scanned = scan(spheres, params, limits, control)?;
+    let (mesh, measures) = build::build(&scanned, params.atom_ids, control)?;
+    Ok(Meshed { mesh, grid: scanned.grid, measures })
+}
+
+fn pour(
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+    sink: &dyn MeshSink,
+) -> Result<Poured, SurfaceError> {
+    let scanned = scan(spheres, params, limits, control)?;
+    pour::pour(&scanned, control, sink)
 }
 
 impl Tile {

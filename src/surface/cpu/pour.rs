@@ -1,0 +1,130 @@
+//! The second pass into a sink: every tile's part of the mesh lives only until the sink has taken it.
+
+use std::cell::RefCell;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use rayon::prelude::*;
+
+use super::build::{Shading, TilePart, Written};
+use super::interpolate::SlopeConstants;
+use super::{Scanned, Tile, build, join};
+use crate::surface::control::{Control, Stage};
+use crate::surface::error::SurfaceError;
+use crate::surface::measure::{Measures, Proof};
+use crate::surface::sink::{MeshPart, MeshSink, Poured, SinkFailed};
+
+/// What one thread keeps from tile to tile.
+#[derive(Default)]
+struct Scratch {
+    shading: Shading,
+    positions: Vec<[f32; 3]>,
+    normals: Vec<[f32; 3]>,
+    triangles: Vec<[u32; 3]>,
+}
+
+thread_local! {
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// Vertices that are handed on together: with their triangles they fit the second-level cache many times, and the
+/// cost of a system call does not matter.
+const PIECE: usize = 4096;
+
+type Bounds = [[f32; 3]; 2];
+
+/// What no bounds are: less than any.
+const NOWHERE: Bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
+
+/// `interpolate` and `emit` into `sink`.
+pub(super) fn pour(scanned: &Scanned, control: &Control<'_>, sink: &dyn MeshSink) -> Result<Poured, SurfaceError> {
+    let Scanned { lattice, done, totals, .. } = scanned;
+    let failed = |SinkFailed| SurfaceError::Sink;
+    sink.begin(totals.vertices, totals.triangles).map_err(failed)?;
+    let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
+    let finished = AtomicUsize::new(0);
+    let parts = done
+        .par_iter()
+        .with_max_len(1)
+        .map(|tile| {
+            control.check()?;
+            let part = SCRATCH.with_borrow_mut(|scratch| scratch.pour(tile, scanned, &slope, control, sink))?;
+            let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
+            control.observer.progress(Stage::Emit, n, done.len());
+            Ok(part)
+        })
+        .collect::<Result<Vec<(Written, Bounds)>, SurfaceError>>()?;
+    let (written, bounds): (Vec<Written>, Vec<Bounds>) = parts.into_iter().unzip();
+    let measures = control.span(Stage::Measure, || join::measures(scanned, &written));
+    let measures = match measures {
+        Some(measures) if written.iter().all(|part| part.flat == 0) => measures,
+        // A normal without a gradient needs the triangles around it, and a mesh that is not closed a closer look: the
+        // whole mesh, then, and the same rows once more.
+        found => {
+            let (mesh, _) = build::build(scanned, false, control)?;
+            let (positions, normals, triangles) = (&mesh.positions[..], &mesh.normals[..], &mesh.triangles[..]);
+            let whole = MeshPart { first_vertex: 0, positions, normals, first_triangle: 0, triangles };
+            sink.part(&whole).map_err(failed)?;
+            found.map_or_else(|| Measures::of(&mesh, Proof::Checksum, control), Ok)?
+        }
+    };
+    Ok(Poured {
+        centre: lattice.centre(),
+        n_vertices: totals.vertices,
+        n_triangles: totals.triangles,
+        bounds: bounds.into_iter().fold(NOWHERE, join_bounds),
+        grid: scanned.grid,
+        measures,
+    })
+}
+
+impl Scratch {
+    /// One tile, a few bricks at a time.
+    fn pour(
+        &mut self,
+        tile: &Tile,
+        scanned: &Scanned,
+        slope: &SlopeConstants,
+        control: &Control<'_>,
+        sink: &dyn MeshSink,
+    ) -> Result<(Written, Bounds), SurfaceError> {
+        let (found, mut written, mut bounds) = (&tile.found, Written::default(), NOWHERE);
+        let mut first = 0;
+        while first < found.bricks.len() {
+            let start = found.before(first);
+            // A brick has at most 1536 vertices.
+            let last = (first + 1..found.bricks.len()).find(|&i| found.before(i).vertices - start.vertices >= PIECE);
+            let bricks = first..last.unwrap_or(found.bricks.len());
+            let end = found.before(bricks.end);
+            first = bricks.end;
+            let (n, m) = (end.vertices - start.vertices, end.triangles - start.triangles);
+            let Self { shading, positions, normals, triangles } = self;
+            positions.resize(positions.len().max(n), [0.0; 3]);
+            normals.resize(normals.len().max(n), [0.0; 3]);
+            triangles.resize(triangles.len().max(m), [0; 3]);
+            let (positions, normals, triangles) = (&mut positions[..n], &mut normals[..n], &mut triangles[..m]);
+            let mut part = TilePart { tile, bricks, positions, normals, triangles, atom_ids: None };
+            part.write(scanned, slope, shading, control, &mut written);
+            let TilePart { positions, normals, triangles, .. } = part;
+            bounds = positions.iter().fold(bounds, |bounds, p| join_bounds(bounds, [*p, *p]));
+            let part = MeshPart {
+                first_vertex: tile.first_vertex + start.vertices,
+                positions,
+                normals,
+                first_triangle: tile.first_triangle + start.triangles,
+                triangles,
+            };
+            control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
+        }
+        Ok((written, bounds))
+    }
+}
+
+/// The bounds of both.
+#[inline(always)]
+fn join_bounds([low, high]: Bounds, [other_low, other_high]: Bounds) -> Bounds {
+    // Comparisons that compile to minimum and maximum of vectors.
+    [
+        std::array::from_fn(|k| if other_low[k] < low[k] { other_low[k] } else { low[k] }),
+        std::array::from_fn(|k| if other_high[k] > high[k] { other_high[k] } else { high[k] }),
+    ]
+}
