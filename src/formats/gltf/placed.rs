@@ -4,7 +4,7 @@
 //! begins at a fixed place; a small one waits in memory until the header is known.
 
 use std::io::{self, Write};
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use thiserror::Error;
 
@@ -42,12 +42,19 @@ pub enum PlaceError {
     },
 }
 
+/// Blocks that may wait for the file: some 100 KiB each.
+const MOST_WAITING: usize = 48;
+
 /// A GLB that is being written into `out`.
 pub struct GlbSink<'a> {
     out: &'a dyn PlaceBytes,
     layout: OnceLock<Option<Layout>>,
     /// The buffer, if it is small.
     small: Mutex<Vec<u8>>,
+    /// Held by whoever writes into the file. Systems let one thread at a time write to a file and put the others to
+    /// sleep; threads that find it taken leave their bytes in `waiting` and compute on.
+    lane: Mutex<()>,
+    waiting: Mutex<Vec<(u64, Vec<u8>)>>,
     failure: Mutex<Option<PlaceError>>,
 }
 
@@ -55,13 +62,13 @@ impl<'a> GlbSink<'a> {
     /// A GLB that will be written into `out`, which is empty.
     #[must_use]
     pub fn new(out: &'a dyn PlaceBytes) -> Self {
-        Self { out, layout: OnceLock::new(), small: Mutex::default(), failure: Mutex::default() }
+        Self { out, layout: OnceLock::new(), small: Mutex::default(), lane: Mutex::default(), waiting: Mutex::default(), failure: Mutex::default() }
     }
 
     /// Why a part was refused.
     #[must_use]
     pub fn failure(&self) -> Option<PlaceError> {
-        self.failure.lock().unwrap_or_else(PoisonError::into_inner).take()
+        lock(&self.failure).take()
     }
 
     /// Writes the header; the file is then complete. `centre` is the mesh's, `bounds` are those of its positions.
@@ -76,7 +83,8 @@ impl<'a> GlbSink<'a> {
         let layout = self.layout.get().copied().flatten();
         let plan = GlbPlan::placed(layout, centre, &summary, meta)?;
         let head = plan.head().len() as u64;
-        let small = self.small.lock().unwrap_or_else(PoisonError::into_inner);
+        let small = lock(&self.small);
+        self.drain()?;
         if layout.is_some() && small.is_empty() && head != HEAD_BYTES {
             return Err(PlaceError::HeadTooLong { bytes: head });
         }
@@ -96,7 +104,7 @@ impl<'a> GlbSink<'a> {
         if let Some(layout) = layout {
             GlbPlan::check_len(HEAD_BYTES + layout.len.next_multiple_of(4))?;
             if layout.len < LARGE_BUFFER_BYTES {
-                let mut small = self.small.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut small = lock(&self.small);
                 small.resize(usize::try_from(layout.len).unwrap_or(0), 0);
             }
         }
@@ -110,19 +118,33 @@ impl<'a> GlbSink<'a> {
         let row = 12 * part.first_vertex as u64;
         let (index_type, indices) = layout.indices;
         let first = 3 * part.first_triangle as u64 * index_type.bytes();
-        write_floats(&mut self.at(layout.positions.offset + row), part.positions)?;
-        write_floats(&mut self.at(layout.normals.offset + row), part.normals)?;
-        write_indices(&mut self.at(indices.offset + first), index_type, part.triangles.as_flattened())?;
-        Ok(())
+        let lane = match self.lane.try_lock() {
+            Ok(lane) => Some(lane),
+            // Too much is waiting: now it is right to sleep.
+            Err(_) if lock(&self.waiting).len() > MOST_WAITING => {
+                Some(lock(&self.lane))
+            }
+            Err(_) => None,
+        };
+        let at = |offset: u64| At { sink: self, offset, now: lane.is_some() };
+        write_floats(&mut at(layout.positions.offset + row), part.positions)?;
+        write_floats(&mut at(layout.normals.offset + row), part.normals)?;
+        write_indices(&mut at(indices.offset + first), index_type, part.triangles.as_flattened())?;
+        if lane.is_some() { self.drain() } else { Ok(()) }
     }
 
-    fn at(&self, offset: u64) -> At<'_> {
-        At { sink: self, offset }
+    /// Writes what is waiting. The caller holds the lane, or is the last.
+    fn drain(&self) -> Result<(), PlaceError> {
+        loop {
+            let Some((offset, bytes)) = lock(&self.waiting).pop() else { return Ok(()) };
+            self.out.place(offset, &bytes)?;
+        }
     }
+
 
     fn note<T>(&self, done: Result<T, PlaceError>) -> Result<T, SinkFailed> {
         done.map_err(|error| {
-            self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+            lock(&self.failure).get_or_insert(error);
             SinkFailed
         })
     }
@@ -143,14 +165,21 @@ struct At<'a> {
     sink: &'a GlbSink<'a>,
     /// In the buffer, not in the file.
     offset: u64,
+    /// Whether the lane is ours.
+    now: bool,
 }
 
 impl Write for At<'_> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let mut small = self.sink.small.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut small = lock(&self.sink.small);
         if small.is_empty() {
             drop(small);
-            self.sink.out.place(HEAD_BYTES + self.offset, bytes)?;
+            let place = HEAD_BYTES + self.offset;
+            if self.now {
+                self.sink.out.place(place, bytes)?;
+            } else {
+                lock(&self.sink.waiting).push((place, bytes.to_vec()));
+            }
         } else {
             let start = usize::try_from(self.offset).unwrap_or(usize::MAX);
             let place = small.get_mut(start..).and_then(|rest| rest.get_mut(..bytes.len()));
@@ -163,4 +192,9 @@ impl Write for At<'_> {
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
     }
+}
+
+/// A panic elsewhere leaves bytes unwritten, which ends the run there; the lock is still good.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

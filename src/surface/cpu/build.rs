@@ -3,8 +3,7 @@
 use std::cell::RefCell;
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
-
-use rayon::prelude::*;
+use std::sync::{Mutex, PoisonError};
 
 use super::bin::{Tiles, slot_origin};
 use super::emit::{self, BrickTable, Numbered};
@@ -12,7 +11,7 @@ use super::interpolate::{self, Batch, SlopeConstants, Source, Target};
 use super::join;
 use super::sheets::Sheets;
 use super::tally::{Place, Tally};
-use super::{Scanned, Tile};
+use super::{Scanned, Tile, threads};
 use crate::surface::column::Column;
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
@@ -33,7 +32,7 @@ pub(super) struct Shading {
     sheets: Sheets,
 }
 
-/// What a tile's part of the mesh adds up to.
+/// What a piece of the mesh adds up to.
 #[derive(Default)]
 pub(super) struct Written {
     /// Vertices that have no gradient to take a normal from.
@@ -42,13 +41,13 @@ pub(super) struct Written {
     pub(super) tally: Tally,
 }
 
-/// `interpolate` and `emit`: every tile writes its own part of the mesh.
+/// `interpolate` and `emit`: every piece is written to its final place.
 pub(super) fn build(
     scanned: &Scanned,
     atom_ids: bool,
     control: &Control<'_>,
 ) -> Result<(Mesh, Option<Measures>), SurfaceError> {
-    let Scanned { lattice, done, totals, .. } = scanned;
+    let Scanned { lattice, done, totals, pieces, .. } = scanned;
     let mut mesh = Mesh {
         centre: lattice.centre(),
         positions: Column::zeroed(totals.vertices),
@@ -58,35 +57,34 @@ pub(super) fn build(
         colors: None,
         parts: done.iter().map(|tile| (tile.first_vertex, tile.first_triangle)).collect(),
     };
-    let mut work = Vec::with_capacity(done.len());
+    let mut work = Vec::with_capacity(pieces.len());
     let (mut positions, mut normals) = (&mut mesh.positions[..], &mut mesh.normals[..]);
     let (mut triangles, mut ids) = (&mut mesh.triangles[..], mesh.atom_ids.as_deref_mut());
-    for tile in done {
-        let (n, m) = (tile.found.vertices as usize, tile.found.triangles as usize);
-        let part = TilePart {
+    for piece in pieces {
+        let (tile, [start, end]) = (&done[piece.tile], done[piece.tile].span(piece));
+        let (n, m) = (end.vertices - start.vertices, end.triangles - start.triangles);
+        work.push(Mutex::new(TilePart {
             tile,
-            bricks: 0..tile.found.bricks.len(),
+            bricks: piece.bricks.clone(),
             positions: take(&mut positions, n),
             normals: take(&mut normals, n),
             triangles: take(&mut triangles, m),
             atom_ids: ids.as_mut().map(|ids| take(ids, n)),
-        };
-        work.push(part);
+        }));
     }
     let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
     let finished = AtomicUsize::new(0);
-    let written = work
-        .into_par_iter()
-        .with_max_len(1)
-        .map(|mut part| {
-            control.check()?;
-            let mut written = Written::default();
-            SHADING.with_borrow_mut(|shading| part.write(scanned, &slope, shading, control, &mut written));
-            let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
-            control.observer.progress(Stage::Emit, n, done.len());
-            Ok(written)
-        })
-        .collect::<Result<Vec<Written>, SurfaceError>>()?;
+    let written = threads::each(work.len(), |i| {
+        control.check()?;
+        let mut written = Written::default();
+        // Nobody else locks it: the lock only hands the slices over.
+        let mut part = work[i].lock().unwrap_or_else(PoisonError::into_inner);
+        SHADING.with_borrow_mut(|shading| part.write(scanned, &slope, shading, control, &mut written));
+        let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
+        control.observer.progress(Stage::Emit, n, pieces.len());
+        Ok(written)
+    })?;
+    drop(work);
     if written.iter().any(|part| part.flat > 0) {
         control.span(Stage::Interpolate, || mesh.fill_flat_normals());
     }

@@ -1,22 +1,25 @@
 //! The sheets of all bricks joined into components.
 
-use rayon::prelude::*;
+use std::convert::Infallible;
 
-use super::Scanned;
 use super::build::{Near, Written};
 use super::tally::Tally;
+use super::{PIECE_BRICKS, Piece, Scanned, threads};
 use crate::surface::lattice::to_u32;
 use crate::surface::measure::{Component, Measures};
 
-/// The measures of the mesh that the tiles wrote; `None` if it is not closed, which the tallies cannot explain.
+/// Fewer pieces are not worth waking a thread for.
+const FEW: usize = 64;
+
+/// The measures of the mesh that the pieces make up; `None` if it is not closed, which the tallies cannot explain.
 pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measures> {
-    let Scanned { tiles, done, totals, .. } = scanned;
+    let Scanned { tiles, done, totals, pieces, .. } = scanned;
     let tallies: Vec<&Tally> = written.iter().map(|part| &part.tally).collect();
     let checksum = tallies.iter().fold(0_u64, |sum, tally| sum.wrapping_add(tally.checksum));
     if checksum != 0 || tallies.iter().any(|tally| tally.degenerate) {
         return None;
     }
-    // Sheets are counted per tile: number them through.
+    // Sheets are counted per piece: number them through.
     let mut n = 0;
     let first: Vec<usize> = tallies
         .iter()
@@ -26,21 +29,27 @@ pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measure
             first
         })
         .collect();
-    let pairs: Vec<Vec<[u32; 2]>> = (0..done.len())
-        .into_par_iter()
-        .map(|t| {
-            let near = Near::new(tiles, done, done[t].coord);
-            let mut pairs = Vec::new();
-            let neighbour = |brick: usize, n: usize| {
-                let (other, ix, numbered) = near.of(usize::from(done[t].found.bricks[brick].slot), n)?;
-                Some((numbered, tallies[other], (other, ix)))
-            };
-            tallies[t].pairs(neighbour, |own, (other, sheet)| {
-                pairs.push([to_u32(first[t]) + own, to_u32(first[other]) + sheet]);
-            });
-            pairs
-        })
-        .collect();
+    let pairs_of = |p: usize| {
+        let Piece { tile, bricks } = &pieces[p];
+        let near = Near::new(tiles, done, done[*tile].coord);
+        let mut pairs = Vec::new();
+        let neighbour = |brick: usize, n: usize| {
+            let slot = done[*tile].found.bricks[bricks.start + brick].slot;
+            let (other, ix, numbered) = near.of(usize::from(slot), n)?;
+            let piece = done[other].first_piece + ix / PIECE_BRICKS;
+            Some((numbered, tallies[piece], (piece, ix % PIECE_BRICKS)))
+        };
+        tallies[p].pairs(neighbour, |own, (other, sheet)| {
+            pairs.push([to_u32(first[p]) + own, to_u32(first[other]) + sheet]);
+        });
+        Ok(pairs)
+    };
+    let pairs = if pieces.len() < FEW {
+        (0..pieces.len()).map(pairs_of).collect::<Result<Vec<_>, Infallible>>()
+    } else {
+        threads::each(pieces.len(), pairs_of)
+    };
+    let Ok(pairs) = pairs;
     let mut equal: Vec<u32> = (0..to_u32(n)).collect();
     for [a, b] in pairs.into_iter().flatten() {
         unite(&mut equal, a, b);

@@ -21,10 +21,13 @@ mod sheets;
 mod tally;
 mod threads;
 
-use rayon::prelude::*;
+use std::cmp::Reverse;
+use std::num::NonZero;
+use std::ops::Range;
+use std::sync::Arc;
 
 use self::bin::{Tiles, slot_brick};
-use self::classify::Found;
+use self::classify::{Before, Found};
 use self::emit::Numbered;
 use self::field::Constants;
 use self::sample::Pass;
@@ -61,9 +64,22 @@ impl CpuBackend {
     /// # Errors
     /// The pool's, in words, where it exists already or its threads cannot be started.
     pub fn on_this_thread(threads: Option<usize>) -> Result<Self, String> {
-        let home = threads::current();
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.unwrap_or(0)).use_current_thread();
-        pool.start_handler(move |index| threads::spread(home, index)).build_global().map_err(|e| e.to_string())?;
+        // Counted before this thread is held in one place, which would count as one processor.
+        let n = threads.or_else(|| std::thread::available_parallelism().ok().map(NonZero::get)).unwrap_or(1);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(n).use_current_thread();
+        let homes = threads::Homes::hold().map(Arc::new);
+        let built = match homes.clone() {
+            Some(homes) => pool.start_handler(move |index| homes.spread(index)).build_global(),
+            None => pool.build_global(),
+        };
+        if let Some(homes) = homes {
+            homes.free();
+        }
+        built.map_err(|e| e.to_string())?;
+        // The other threads get their memory while this one reads the file, and are awake when there is work.
+        for _ in 1..rayon::current_num_threads() {
+            rayon::spawn(warm);
+        }
         Ok(Self { pool: None })
     }
 
@@ -113,6 +129,13 @@ impl Backend for CpuBackend {
     }
 }
 
+/// Makes what a thread keeps from tile to tile, and the tables that all share.
+fn warm() {
+    sample::warm();
+    pour::warm();
+    emit::warm();
+}
+
 /// A tile between the stages.
 #[derive(Debug)]
 struct Tile {
@@ -122,6 +145,7 @@ struct Tile {
     bricks: Vec<u16>,
     first_vertex: usize,
     first_triangle: usize,
+    first_piece: usize,
 }
 
 const NO_BRICK: u16 = u16::MAX;
@@ -133,6 +157,29 @@ struct Scanned {
     done: Vec<Tile>,
     totals: Totals,
     grid: GridStats,
+    pieces: Vec<Piece>,
+}
+
+/// Surface bricks of a tile whose part of the mesh is written by one thread in one go.
+#[derive(Debug, Clone)]
+struct Piece {
+    tile: usize,
+    bricks: Range<usize>,
+}
+
+/// Surface bricks of a piece: some 3,000 vertices with their triangles, a small part of the second-level cache.
+const PIECE_BRICKS: usize = 32;
+
+/// Cuts the tiles into pieces, in order.
+fn pieces(done: &mut [Tile]) -> Vec<Piece> {
+    let mut pieces = Vec::new();
+    for (t, tile) in done.iter_mut().enumerate() {
+        tile.first_piece = pieces.len();
+        let n = tile.found.bricks.len();
+        let starts = (0..n).step_by(PIECE_BRICKS);
+        pieces.extend(starts.map(|first| Piece { tile: t, bricks: first..n.min(first + PIECE_BRICKS) }));
+    }
+    pieces
 }
 
 fn scan(
@@ -161,8 +208,13 @@ fn scan(
         tally: sample::Tally::default(),
         control,
     };
-    let mut done: Vec<Tile> =
-        (0..tiles.len()).into_par_iter().with_max_len(1).map(|t| pass.sample(t)).collect::<Result<_, _>>()?;
+    // The largest first, so that none is left over at the end for one thread alone.
+    let mut order: Vec<usize> = (0..tiles.len()).collect();
+    order.sort_by_key(|&t| Reverse(tiles.atoms(t).len()));
+    let sampled = threads::each(tiles.len(), |i| pass.sample(order[i]))?;
+    let mut done: Vec<(usize, Tile)> = order.into_iter().zip(sampled).collect();
+    done.sort_unstable_by_key(|(t, _)| *t);
+    let mut done: Vec<Tile> = done.into_iter().map(|(_, tile)| tile).collect();
     control.check()?;
     let totals = control.span(Stage::Scan, || scan::scan(&mut done, lattice.spacing, limits))?;
     if totals.triangles == 0 {
@@ -177,7 +229,8 @@ fn scan(
         box_cells: lattice.box_cells,
         candidates: tally.candidates.into_inner(),
     };
-    Ok(Scanned { lattice, tiles, done, totals, grid })
+    let pieces = pieces(&mut done);
+    Ok(Scanned { lattice, tiles, done, totals, grid, pieces })
 }
 
 fn run(
@@ -203,6 +256,11 @@ fn pour(
 }
 
 impl Tile {
+    /// What comes before the first brick of a piece of this tile, and before the first one after it.
+    fn span(&self, piece: &Piece) -> [Before; 2] {
+        [self.found.before(piece.bricks.start), self.found.before(piece.bricks.end)]
+    }
+
     /// The surface brick in `slot`: its place among the tile's, and itself with its first vertex's global id.
     fn numbered(&self, slot: usize) -> Option<(usize, Numbered<'_>)> {
         let [x, y, z] = slot_brick(slot);

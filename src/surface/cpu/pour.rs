@@ -3,11 +3,9 @@
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use rayon::prelude::*;
-
 use super::build::{Shading, TilePart, Written};
 use super::interpolate::SlopeConstants;
-use super::{Scanned, Tile, build, join};
+use super::{Piece, Scanned, build, join, threads};
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::measure::{Measures, Proof};
@@ -26,9 +24,14 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-/// Vertices that are handed on together: with their triangles they fit the second-level cache many times, and the
-/// cost of a system call does not matter.
-const PIECE: usize = 4096;
+/// Makes the calling thread's scratch.
+pub(super) fn warm() {
+    SCRATCH.with_borrow_mut(|scratch| {
+        scratch.positions.resize(4096, [0.0; 3]);
+        scratch.normals.resize(4096, [0.0; 3]);
+        scratch.triangles.resize(8192, [0; 3]);
+    });
+}
 
 type Bounds = [[f32; 3]; 2];
 
@@ -37,22 +40,18 @@ const NOWHERE: Bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
 
 /// `interpolate` and `emit` into `sink`.
 pub(super) fn pour(scanned: &Scanned, control: &Control<'_>, sink: &dyn MeshSink) -> Result<Poured, SurfaceError> {
-    let Scanned { lattice, done, totals, .. } = scanned;
+    let Scanned { lattice, totals, pieces, .. } = scanned;
     let failed = |SinkFailed| SurfaceError::Sink;
     sink.begin(totals.vertices, totals.triangles).map_err(failed)?;
     let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
     let finished = AtomicUsize::new(0);
-    let parts = done
-        .par_iter()
-        .with_max_len(1)
-        .map(|tile| {
-            control.check()?;
-            let part = SCRATCH.with_borrow_mut(|scratch| scratch.pour(tile, scanned, &slope, control, sink))?;
-            let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
-            control.observer.progress(Stage::Emit, n, done.len());
-            Ok(part)
-        })
-        .collect::<Result<Vec<(Written, Bounds)>, SurfaceError>>()?;
+    let parts = threads::each(pieces.len(), |i| {
+        control.check()?;
+        let part = SCRATCH.with_borrow_mut(|scratch| scratch.pour(&pieces[i], scanned, &slope, control, sink))?;
+        let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
+        control.observer.progress(Stage::Emit, n, pieces.len());
+        Ok(part)
+    })?;
     let (written, bounds): (Vec<Written>, Vec<Bounds>) = parts.into_iter().unzip();
     let measures = control.span(Stage::Measure, || join::measures(scanned, &written));
     let measures = match measures {
@@ -78,43 +77,36 @@ pub(super) fn pour(scanned: &Scanned, control: &Control<'_>, sink: &dyn MeshSink
 }
 
 impl Scratch {
-    /// One tile, a few bricks at a time.
+    /// One piece.
     fn pour(
         &mut self,
-        tile: &Tile,
+        piece: &Piece,
         scanned: &Scanned,
         slope: &SlopeConstants,
         control: &Control<'_>,
         sink: &dyn MeshSink,
     ) -> Result<(Written, Bounds), SurfaceError> {
-        let (found, mut written, mut bounds) = (&tile.found, Written::default(), NOWHERE);
-        let mut first = 0;
-        while first < found.bricks.len() {
-            let start = found.before(first);
-            // A brick has at most 1536 vertices.
-            let last = (first + 1..found.bricks.len()).find(|&i| found.before(i).vertices - start.vertices >= PIECE);
-            let bricks = first..last.unwrap_or(found.bricks.len());
-            let end = found.before(bricks.end);
-            first = bricks.end;
-            let (n, m) = (end.vertices - start.vertices, end.triangles - start.triangles);
-            let Self { shading, positions, normals, triangles } = self;
-            positions.resize(positions.len().max(n), [0.0; 3]);
-            normals.resize(normals.len().max(n), [0.0; 3]);
-            triangles.resize(triangles.len().max(m), [0; 3]);
-            let (positions, normals, triangles) = (&mut positions[..n], &mut normals[..n], &mut triangles[..m]);
-            let mut part = TilePart { tile, bricks, positions, normals, triangles, atom_ids: None };
-            part.write(scanned, slope, shading, control, &mut written);
-            let TilePart { positions, normals, triangles, .. } = part;
-            bounds = positions.iter().fold(bounds, |bounds, p| join_bounds(bounds, [*p, *p]));
-            let part = MeshPart {
-                first_vertex: tile.first_vertex + start.vertices,
-                positions,
-                normals,
-                first_triangle: tile.first_triangle + start.triangles,
-                triangles,
-            };
-            control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
-        }
+        let tile = &scanned.done[piece.tile];
+        let [start, end] = tile.span(piece);
+        let (n, m) = (end.vertices - start.vertices, end.triangles - start.triangles);
+        let Self { shading, positions, normals, triangles } = self;
+        positions.resize(positions.len().max(n), [0.0; 3]);
+        normals.resize(normals.len().max(n), [0.0; 3]);
+        triangles.resize(triangles.len().max(m), [0; 3]);
+        let (positions, normals, triangles) = (&mut positions[..n], &mut normals[..n], &mut triangles[..m]);
+        let mut written = Written::default();
+        let mut part = TilePart { tile, bricks: piece.bricks.clone(), positions, normals, triangles, atom_ids: None };
+        part.write(scanned, slope, shading, control, &mut written);
+        let TilePart { positions, normals, triangles, .. } = part;
+        let bounds = positions.iter().fold(NOWHERE, |bounds, p| join_bounds(bounds, [*p, *p]));
+        let part = MeshPart {
+            first_vertex: tile.first_vertex + start.vertices,
+            positions,
+            normals,
+            first_triangle: tile.first_triangle + start.triangles,
+            triangles,
+        };
+        control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
         Ok((written, bounds))
     }
 }

@@ -41,6 +41,14 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
+/// Fields of a tile of a small structure: more would cost a small structure more than it saves a large one.
+const WARM_FIELDS: usize = 192;
+
+/// Makes the calling thread's scratch.
+pub(super) fn warm() {
+    SCRATCH.with_borrow_mut(|scratch| scratch.fields.resize(WARM_FIELDS, [0.0; BRICK_SAMPLES]));
+}
+
 /// Counters that the tiles add to.
 #[derive(Default)]
 pub(super) struct Tally {
@@ -100,7 +108,7 @@ impl Pass<'_> {
             let all = tally.all_tiles(so_far, self.tiles.len());
             return Err(scan::too_large(all, self.lattice.spacing, self.limits.max_mesh_bytes));
         }
-        Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0 })
+        Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_piece: 0 })
     }
 }
 

@@ -14,7 +14,7 @@ use crate::surface::sums::{edge_shares, sum_lanes};
 /// Triangles whose areas are computed together.
 const LANES: usize = 128;
 
-/// The sheets of a brick as the tile numbers them.
+/// The sheets of a brick as its piece numbers them.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BrickSheets {
     /// The brick's first sheet.
@@ -35,16 +35,16 @@ struct Far {
     sheet: u32,
 }
 
-/// What one tile adds up.
+/// What one piece adds up.
 #[derive(Debug, Default)]
 pub(super) struct Tally {
     /// Sum of the shares of all directed edges.
     pub(super) checksum: u64,
     /// A triangle has a corner twice.
     pub(super) degenerate: bool,
-    /// Per sheet of the tile.
+    /// Per sheet of the piece.
     pub(super) sheets: Vec<Component>,
-    /// Per brick of the tile.
+    /// Per brick of the piece.
     pub(super) bricks: Vec<BrickSheets>,
     of_vertices: Vec<u16>,
     far: Vec<Far>,
@@ -125,8 +125,8 @@ impl Tally {
     }
 
     /// The pairs of sheets that neighbouring bricks share. `near(brick, neighbour)` gives a brick's neighbour, the tally
-    /// of its tile, and its tile with its place in that; `pair` gets the sheet of this tile, and the other's tile and
-    /// sheet.
+    /// of its piece, and its piece with its place in that; `pair` gets the sheet of this piece, and the other's piece
+    /// and sheet.
     pub(super) fn pairs<'a>(
         &self,
         near: impl Fn(usize, usize) -> Option<(Numbered<'a>, &'a Self, (usize, usize))>,
@@ -137,8 +137,8 @@ impl Tally {
             if brick.n != 1 {
                 let mut last = None;
                 while let Some(at) = far.next_if(|f| f.brick as usize == ix) {
-                    let Some((_, tally, (tile, other))) = near(ix, usize::from(at.neighbour)) else { continue };
-                    let met = (at.sheet, (tile, tally.sheet_of(other, at.rank)));
+                    let Some((_, tally, (piece, other))) = near(ix, usize::from(at.neighbour)) else { continue };
+                    let met = (at.sheet, (piece, tally.sheet_of(other, at.rank)));
                     if last != Some(met) {
                         pair(met.0, met.1);
                         last = Some(met);
@@ -147,12 +147,12 @@ impl Tally {
                 continue;
             }
             for neighbour in 1..8 {
-                let Some((of, tally, (tile, other))) = near(ix, neighbour) else { continue };
+                let Some((of, tally, (piece, other))) = near(ix, neighbour) else { continue };
                 if tally.bricks[other].n == 1 {
                     let mut shared = false;
                     shared_words(neighbour, |z, axis, mask| shared |= of.brick.crossing[3 * z + axis] & mask != 0);
                     if shared {
-                        pair(brick.first, (tile, tally.bricks[other].first));
+                        pair(brick.first, (piece, tally.bricks[other].first));
                     }
                     continue;
                 }
@@ -160,7 +160,7 @@ impl Tally {
                 shared_vertices(&of, neighbour, |rank, _| {
                     let sheet = tally.sheet_of(other, rank);
                     if last.replace(sheet) != Some(sheet) {
-                        pair(brick.first, (tile, sheet));
+                        pair(brick.first, (piece, sheet));
                     }
                 });
             }
