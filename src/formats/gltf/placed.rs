@@ -55,6 +55,8 @@ pub struct GlbSink<'a> {
     /// sleep; threads that find it taken leave their bytes in `waiting` and compute on.
     lane: Mutex<()>,
     waiting: Mutex<Vec<(u64, Vec<u8>)>>,
+    /// Blocks that were written: fresh memory costs more than the copy.
+    spare: Mutex<Vec<Vec<u8>>>,
     failure: Mutex<Option<PlaceError>>,
 }
 
@@ -62,7 +64,7 @@ impl<'a> GlbSink<'a> {
     /// A GLB that will be written into `out`, which is empty.
     #[must_use]
     pub fn new(out: &'a dyn PlaceBytes) -> Self {
-        Self { out, layout: OnceLock::new(), small: Mutex::default(), lane: Mutex::default(), waiting: Mutex::default(), failure: Mutex::default() }
+        Self { out, layout: OnceLock::new(), small: Mutex::default(), lane: Mutex::default(), waiting: Mutex::default(), spare: Mutex::default(), failure: Mutex::default() }
     }
 
     /// Why a part was refused.
@@ -138,6 +140,7 @@ impl<'a> GlbSink<'a> {
         loop {
             let Some((offset, bytes)) = lock(&self.waiting).pop() else { return Ok(()) };
             self.out.place(offset, &bytes)?;
+            lock(&self.spare).push(bytes);
         }
     }
 
@@ -178,7 +181,10 @@ impl Write for At<'_> {
             if self.now {
                 self.sink.out.place(place, bytes)?;
             } else {
-                lock(&self.sink.waiting).push((place, bytes.to_vec()));
+                let mut block = lock(&self.sink.spare).pop().unwrap_or_default();
+                block.clear();
+                block.extend_from_slice(bytes);
+                lock(&self.sink.waiting).push((place, block));
             }
         } else {
             let start = usize::try_from(self.offset).unwrap_or(usize::MAX);

@@ -134,7 +134,7 @@ const Y0: u64 = 0xff;
 /// Calls `each(layer, axis, mask)` for the words of the neighbour `n` (bits: 0 x, 1 y, 2 z) that hold edges on what it
 /// shares with a brick; edges that leave the shared face belong to other cells.
 #[inline(always)]
-pub(super) fn shared_words(n: usize, mut each: impl FnMut(usize, usize, u64)) {
+fn shared_words(n: usize, mut each: impl FnMut(usize, usize, u64)) {
     let beyond = [n & 1, n >> 1 & 1, n >> 2 & 1];
     let mask = if beyond[0] == 1 { X0 } else { u64::MAX } & if beyond[1] == 1 { Y0 } else { u64::MAX };
     for layer in 0..if beyond[2] == 1 { 1 } else { 8 } {
@@ -142,6 +142,13 @@ pub(super) fn shared_words(n: usize, mut each: impl FnMut(usize, usize, u64)) {
             each(layer, axis, mask);
         }
     }
+}
+
+/// Whether the neighbour `n` holds a vertex that a brick's cells use.
+pub(super) fn shares_vertices(near: &SurfaceBrick, n: usize) -> bool {
+    let mut words = 0;
+    shared_words(n, |z, axis, mask| words |= near.crossing[3 * z + axis] & mask);
+    words != 0
 }
 
 /// The grid edge of a vertex: of the edge at `bit` of word `(z, axis)` of a brick that lies `far` (0 or 8 per axis) away.

@@ -4,7 +4,7 @@
 
 use glam::Vec3A;
 
-use super::emit::{BrickTable, Numbered, shared_vertices, shared_words};
+use super::emit::{BrickTable, Numbered, shared_vertices, shares_vertices};
 use super::sheets::Sheets;
 use crate::surface::lattice::to_u32;
 use crate::surface::measure::Component;
@@ -149,9 +149,7 @@ impl Tally {
             for neighbour in 1..8 {
                 let Some((of, tally, (piece, other))) = near(ix, neighbour) else { continue };
                 if tally.bricks[other].n == 1 {
-                    let mut shared = false;
-                    shared_words(neighbour, |z, axis, mask| shared |= of.brick.crossing[3 * z + axis] & mask != 0);
-                    if shared {
+                    if shares_vertices(of.brick, neighbour) {
                         pair(brick.first, (piece, tally.bricks[other].first));
                     }
                     continue;
