@@ -3,10 +3,22 @@
 //! `prepare` turns spheres into what a device needs, on the caller's thread; an [`Executor`](executor::Executor) runs
 //! prepared jobs on one device; the pool above owns one thread per device and decides which job runs where.
 
+mod assemble;
+pub mod engine;
 pub mod error;
 pub mod executor;
+mod flight;
+mod health;
+mod landing;
+mod pipelines;
 pub mod prepare;
+mod progress;
+mod record;
+mod run;
+mod shaders;
+mod workspace;
 
+pub use engine::{Budget, Engine};
 pub use error::GpuError;
 pub use executor::{Executor, Finished, GpuJob};
 pub use prepare::Prepared;
