@@ -4,8 +4,6 @@
 //! exactly the capabilities that the device code asks for (none beyond WebGPU's), and reflected: bindings by name, and
 //! the layout of every struct that lies in a buffer. All broken shaders are reported at once.
 
-#![expect(clippy::print_stdout, reason = "cargo reads what a build script prints")]
-
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-changed=shaders");
@@ -41,7 +39,7 @@ mod shaders {
                     let bindings = bindings(&module);
                     writeln!(
                         generated,
-                        "Shader {{ stage: {stage:?}, source: include_str!({path:?}), bindings: &[{bindings}] }},"
+                        "Shader {{ stage: {stage:?}, source: include_str!(\"{stage}.wgsl\"), bindings: &[{bindings}] }},"
                     )
                     .expect("a string takes it");
                     layouts.extend(structs(&module));
@@ -52,7 +50,7 @@ mod shaders {
         assert!(broken.is_empty(), "{} of {} shaders are broken:\n{}", broken.len(), STAGES.len(), broken.join("\n"));
         generated.push_str("];\n\n/// Name, size, and (field, offset, size) of every struct that lies in a buffer.\n");
         generated.push_str("#[cfg(test)]\npub(super) static LAYOUTS: &[Layout] = &[\n");
-        layouts.iter().for_each(|layout| generated.push_str(layout));
+        generated.extend(layouts);
         generated.push_str("];\n");
         fs::write(out.join("shaders.rs"), generated).expect("OUT_DIR can be written");
     }

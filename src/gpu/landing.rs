@@ -37,7 +37,9 @@ impl Landings {
         let mut idle = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let fits = |b: &Buffer| (wanted..=2 * wanted).contains(&b.size());
         let best = (0..idle.buffers.len()).filter(|&i| fits(&idle.buffers[i])).min_by_key(|&i| idle.buffers[i].size());
-        let buffer = best.map(|i| idle.buffers.swap_remove(i)).unwrap_or_else(|| {
+        let buffer = if let Some(i) = best {
+            idle.buffers.swap_remove(i)
+        } else {
             idle.held += wanted;
             device.create_buffer(&wgpu::BufferDescriptor {
                 label: Some("molmesh.landing"),
@@ -45,7 +47,7 @@ impl Landings {
                 usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
                 mapped_at_creation: false,
             })
-        });
+        };
         Landing { buffer: Some(buffer), view: None, pool: self.clone() }
     }
 
