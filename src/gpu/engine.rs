@@ -62,7 +62,7 @@ impl Budget {
 #[derive(Debug)]
 pub struct Engine {
     pub(super) device: Device,
-    queue: Queue,
+    pub(super) queue: Queue,
     pub(super) budget: Budget,
     /// Bytes of the largest binding.
     binding: u64,

@@ -12,6 +12,8 @@ mod health;
 mod landing;
 mod pipelines;
 pub mod prepare;
+#[doc(hidden)]
+pub mod probe;
 mod progress;
 mod record;
 mod run;

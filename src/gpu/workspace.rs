@@ -94,6 +94,11 @@ impl Needs {
         Self(needs)
     }
 
+    /// Bytes of one buffer.
+    pub(super) fn of(&self, name: &str) -> u64 {
+        self.0[place(name)]
+    }
+
     /// The largest of all buffers.
     pub(super) fn largest(&self) -> u64 {
         self.0.iter().copied().max().unwrap_or_default()

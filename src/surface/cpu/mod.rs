@@ -13,6 +13,8 @@ mod classify;
 mod emit;
 mod field;
 mod interpolate;
+#[doc(hidden)]
+pub mod probe;
 mod sample;
 mod scan;
 
