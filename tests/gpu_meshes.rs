@@ -1,11 +1,12 @@
 //! Whole meshes of the engine against the CPU backend's, on the software device.
 #![cfg(feature = "gpu")]
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
+#![expect(clippy::unwrap_used, clippy::float_cmp, reason = "a test may panic, and means equality where it asks for it")]
 
 mod gpu_support;
 
 use gpu_support::{KERNELS, Random, engine, engine_with, job, measures, mesh_of, params, run, sample, spheres};
-use molmesh::gpu::{Executor, GpuError};
+use molmesh::gpu::{Budget, Executor, GpuError};
+use molmesh::surface::chunks::ChunkLimits;
 use molmesh::surface::{
     Backend, Control, CpuBackend, Mesh, Meshed, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
 };
@@ -168,6 +169,9 @@ fn bytes(mesh: &Mesh) -> (Vec<u8>, Vec<u8>, Vec<u8>) {
     (raw(&mesh.positions), raw(&mesh.normals), bytemuck::cast_slice(&mesh.triangles).to_vec())
 }
 
+/// Makes a budget smaller.
+type Change = fn(&mut Budget);
+
 #[test]
 fn chunks_pieces_and_landings_change_no_byte() {
     let mut random = Random(11);
@@ -177,9 +181,14 @@ fn chunks_pieces_and_landings_change_no_byte() {
     let params = params(KERNELS[0], 0.5);
     let whole = mesh_of(&mut engine(), &crowd, &params);
     assert_equal(&whole, &crowd, &params, "whole");
+    // Small enough to be cut below, large enough that it will be.
+    let plan = job(&crowd, &params).prepared;
+    let chunks = plan.plan.chunks(ChunkLimits { bricks: 900, candidates: 1 << 30 }).unwrap();
+    assert!(chunks.len() > 4 && chunks.iter().all(|c| c.n_slots() <= 900), "{} chunks", chunks.len());
+    assert!(whole.mesh.n_triangles() * 12 > 5 << 20, "{} triangles", whole.mesh.n_triangles());
     let again = mesh_of(&mut engine(), &crowd, &params);
     assert_eq!(bytes(&whole.mesh), bytes(&again.mesh), "two runs");
-    let cut: [(&str, fn(&mut molmesh::gpu::Budget)); 4] = [
+    let cut: [(&str, Change); 4] = [
         ("chunks", |b| b.chunk_bricks = 900),
         ("pieces", |b| (b.small_bytes, b.piece_bytes) = (0, 2 << 20)),
         ("landings", |b| (b.small_bytes, b.landing_bytes) = (0, 3 << 20)),
@@ -195,6 +204,20 @@ fn chunks_pieces_and_landings_change_no_byte() {
         let other = mesh_of(&mut engine, &spheres(&backwards), &params);
         assert_eq!(bytes(&other.mesh), bytes(&whole.mesh), "{what}, other order");
     }
+}
+
+#[test]
+fn more_workgroups_than_one_dimension_has() {
+    // Lone atoms on a grid of their own: each has a few dozen bricks and little to compute.
+    let rows: Vec<[f64; 4]> = (0..8000)
+        .map(|i| [i % 20, i / 20 % 20, i / 400].map(|k| 41.3 * f64::from(k) - 300.0))
+        .map(|[x, y, z]| [x, y, z, 1.4])
+        .collect();
+    let (spheres, params) = (spheres(&rows), params(KERNELS[1], 0.5));
+    let job = job(&spheres, &params);
+    assert!(job.prepared.plan.bricks.len() > 70_000, "{} bricks", job.prepared.plan.bricks.len());
+    let meshed = run(&mut engine(), &job).unwrap().meshed;
+    assert_equal(&meshed, &spheres, &params, "many");
 }
 
 #[test]

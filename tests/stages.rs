@@ -70,9 +70,17 @@ impl Setup {
 
     /// Runs `stage` on `inputs` with every output poisoned, and reads the outputs.
     fn run(&self, stage: Stage, inputs: &[(&str, Vec<u8>)], outputs: &[&str]) -> Vec<Vec<u8>> {
-        inputs.iter().for_each(|(name, bytes)| self.bench.write(name, bytes));
+        for (name, bytes) in inputs {
+            self.bench.write(name, bytes);
+        }
         self.bench.run(stage).unwrap();
         outputs.iter().map(|name| self.bench.read(name, self.bench.needed(&self.job, name)).unwrap()).collect()
+    }
+
+    fn poison(&self, buffers: &[&str]) {
+        for name in buffers {
+            self.bench.poison(name);
+        }
     }
 
     /// The CPU's candidate lists as the device keeps them: entries, and (start, reaching, all, brick) per brick.
@@ -189,7 +197,7 @@ fn by_brick(entries: &[u32], heads: &[[u32; 4]]) -> Vec<(u32, Vec<u32>)> {
 fn bin_finds_the_same_candidates_in_the_same_order() {
     for (name, setup) in setups() {
         let zero = [("tally", raw(&[Tally::default()]))];
-        ["lists", "heads"].iter().for_each(|b| setup.bench.poison(b));
+        setup.poison(&["lists", "heads"]);
         let out = setup.run(Stage::Bin, &zero, &["lists", "heads", "tally"]);
         let (entries, heads): (Vec<u32>, Vec<[u32; 4]>) = (cast(&out[0]), cast(&out[1]));
         let (expected, expected_heads) = setup.lists();
@@ -229,7 +237,7 @@ fn bin_says_when_its_lists_do_not_fit_and_writes_nothing_beyond() {
 fn field_is_within_its_bound_and_marks_what_it_finds_inside() {
     for (name, setup) in setups() {
         let (entries, heads) = setup.lists();
-        ["field", "inside"].iter().for_each(|b| setup.bench.poison(b));
+        setup.poison(&["field", "inside"]);
         let out = setup.run(Stage::Field, &[("lists", raw(&entries)), ("heads", raw(&heads))], &["field", "inside"]);
         let (got, expected) = (cast::<f32>(&out[0]), setup.samples());
         assert_eq!(apart(&got, &expected, FIELD_BOUND, 0.1), None, "{name}");
@@ -250,7 +258,7 @@ fn field_is_within_its_bound_and_marks_what_it_finds_inside() {
 #[test]
 fn classify_finds_the_same_edges_and_counts() {
     for (name, setup) in setups() {
-        ["records", "counts"].iter().for_each(|b| setup.bench.poison(b));
+        setup.poison(&["records", "counts"]);
         let inputs = [("inside", raw(&setup.inside())), ("groups", raw(&vec![[0_u32; 4]; setup.groups().len()]))];
         let out = setup.run(Stage::Classify, &inputs, &["records", "counts", "groups"]);
         let (records, counts): (Vec<Record>, Vec<u32>) = (cast(&out[0]), cast(&out[1]));
@@ -292,7 +300,7 @@ fn scan_numbers_bricks_in_order() {
 fn interpolate_is_within_its_bounds() {
     for (name, setup) in setups() {
         let (entries, heads) = setup.lists();
-        ["positions", "normals"].iter().for_each(|b| setup.bench.poison(b));
+        setup.poison(&["positions", "normals"]);
         let inputs = [
             ("lists", raw(&entries)),
             ("heads", raw(&heads)),

@@ -125,7 +125,7 @@ mod tests {
     fn classes_are_never_too_small_and_waste_a_third_at_most() {
         for bytes in (0..200_000).step_by(77).chain([1 << 30, (1 << 30) + 1, 5 << 30]) {
             let class = size_class(bytes);
-            assert!(class >= bytes && class % 1024 == 0, "{bytes}: {class}");
+            assert!(class >= bytes && class.is_multiple_of(1024), "{bytes}: {class}");
             assert!(bytes < 8192 || class * 3 <= bytes * 4, "{bytes}: {class}");
             assert_eq!(size_class(class), class);
         }

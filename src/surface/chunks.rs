@@ -143,3 +143,84 @@ impl Plan {
         (words[half] >> bit & 1 == 1).then_some(there.base + rank)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::{BTreeSet, HashMap};
+
+    use super::*;
+    use crate::surface::control::Control;
+    use crate::surface::lattice::Lattice;
+    use crate::surface::params::{SurfaceLimits, SurfaceParams};
+    use crate::surface::spheres::Spheres;
+
+    fn plan() -> Plan {
+        let at = |i: u32, k: f64| 55.0 * (f64::from(i) * k).sin();
+        let column = |k: f64| (0..900).map(|i| at(i, k)).collect::<Vec<_>>();
+        let spheres = Spheres::new(column(0.37), column(1.13), column(2.71), vec![1.6; 900]).unwrap();
+        let lattice = Lattice::new(&spheres, &SurfaceParams::default()).unwrap();
+        Plan::new(&lattice, &SurfaceLimits::default(), &Control::default()).unwrap()
+    }
+
+    /// What is wrong with `chunks`.
+    fn wrong(plan: &Plan, chunks: &[Chunk], limits: ChunkLimits) -> Option<String> {
+        let place = |b: usize| {
+            let local = [0, 3, 6].map(|shift| i32::try_from(plan.bricks[b] >> shift & 7).unwrap());
+            let tile = plan.tiles[(plan.bricks[b] >> 9) as usize].coord;
+            std::array::from_fn::<i32, 3, _>(|k| 8 * tile[k] + local[k])
+        };
+        let index: HashMap<[i32; 3], u32> = (0..plan.bricks.len()).map(|b| (place(b), to_u32(b))).collect();
+        let mut next = 0;
+        for chunk in chunks {
+            if chunk.first_brick != next || chunk.n_own == 0 || chunk.n_slots() > limits.bricks {
+                return Some(format!("chunk at {} of {}", chunk.first_brick, chunk.n_slots()));
+            }
+            next += chunk.n_own;
+            let mut needed = BTreeSet::new();
+            for own in chunk.first_brick..next {
+                let at = place(own as usize);
+                for n in 1..8 {
+                    let there = std::array::from_fn(|k| at[k] + (n >> k & 1));
+                    needed.extend(index.get(&there).copied().filter(|&b| b >= next));
+                }
+            }
+            if !needed.iter().eq(&chunk.halo) {
+                return Some(format!("{} borrowed, {} needed", chunk.halo.len(), needed.len()));
+            }
+            let table = chunk.halo_table();
+            for (slot, brick) in (chunk.n_own..).zip(&chunk.halo) {
+                if table[chunk.halo.len() + (brick - next) as usize] != slot {
+                    return Some(format!("brick {brick} is not in slot {slot}"));
+                }
+            }
+            if table.len() as u64 != chunk.halo_table_len() {
+                return Some("the table's length".to_owned());
+            }
+        }
+        (next as usize != plan.bricks.len()).then(|| format!("{next} bricks"))
+    }
+
+    #[test]
+    fn chunks_cover_all_bricks_and_borrow_what_they_need() {
+        let plan = plan();
+        let limits = |bricks| ChunkLimits { bricks, candidates: 1 << 30 };
+        for bricks in [700, 1500, 4000, 1 << 20] {
+            let chunks = plan.chunks(limits(bricks)).unwrap();
+            assert_eq!(wrong(&plan, &chunks, limits(bricks)), None, "{bricks}");
+            assert_eq!(chunks.len() == 1, bricks == 1 << 20);
+        }
+        // Few entries for lists make small chunks too.
+        let few = ChunkLimits { bricks: 1 << 20, candidates: plan.candidates.iter().sum::<u64>() / 2 };
+        assert!(plan.chunks(few).unwrap().len() > 2);
+        assert!(plan.chunks(limits(100)).is_none());
+        // Controls.
+        let good = plan.chunks(limits(1500)).unwrap();
+        let mut bad = good.clone();
+        bad[0].halo.pop();
+        assert!(wrong(&plan, &bad, limits(1500)).is_some());
+        bad = good.clone();
+        bad.remove(1);
+        assert!(wrong(&plan, &bad, limits(1500)).is_some());
+        assert!(wrong(&plan, &good, limits(800)).is_some());
+    }
+}

@@ -156,7 +156,7 @@ mod tests {
 
     #[test]
     fn a_foreign_column_is_read_in_place_and_copied_when_written() {
-        let owner: Foreign = Arc::new(vec![7_u32, 8, 9, 10].iter().flat_map(|v| v.to_ne_bytes()).collect::<Vec<u8>>());
+        let owner: Foreign = Arc::new([7_u32, 8, 9, 10].iter().flat_map(|v| v.to_ne_bytes()).collect::<Vec<u8>>());
         let start = (*owner).as_ref().as_ptr().align_offset(4);
         assert_eq!(start, 0, "an allocation of 16 bytes is aligned to 4");
         let mut column: Column<u32> = Column::foreign(owner.clone(), 4..12).unwrap();

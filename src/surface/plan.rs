@@ -395,3 +395,114 @@ fn local_of(atom: &LatticeAtom) -> u32 {
     let [x, y, z] = atom.cell.map(|c| c.rem_euclid(TILE).unsigned_abs() / BRICK.unsigned_abs());
     z << 6 | y << 3 | x
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashMap;
+
+    use super::*;
+    use crate::surface::params::SurfaceOptions;
+    use crate::surface::spheres::Spheres;
+
+    fn lattice(n: u32, side: f64, resolution: f64) -> Lattice {
+        let mut state = 3_u64;
+        let mut next = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1_u64 << 53) as f64
+        };
+        let mut column = || (0..n).map(|_| side * (next() - 0.5)).collect::<Vec<_>>();
+        let (x, y, z) = (column(), column(), column());
+        let radii = (0..n).map(|i| 1.2 + 0.1 * (i % 7) as f32).collect();
+        let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
+        Lattice::new(&Spheres::new(x, y, z, radii).unwrap(), &SurfaceParams::new(&options).unwrap()).unwrap()
+    }
+
+    fn plan(lattice: &Lattice) -> Plan {
+        Plan::new(lattice, &SurfaceLimits::default(), &Control::default()).unwrap()
+    }
+
+    /// Place of each brick, in bricks.
+    fn coords(plan: &Plan) -> Vec<[i32; 3]> {
+        let place = |&b: &u32| {
+            let local = [0, 3, 6].map(|shift| i32::try_from(b >> shift & 7).unwrap());
+            let tile = plan.tiles[(b >> 9) as usize].coord;
+            std::array::from_fn(|k| 8 * tile[k] + local[k])
+        };
+        plan.bricks.iter().map(place).collect()
+    }
+
+    #[test]
+    fn bricks_are_in_order_and_hold_their_atoms() {
+        // From bricks much larger than atoms, of which some reach nothing of their own, to much smaller ones.
+        for resolution in [20.0, 3.0, 0.5, 0.15] {
+            let lattice = lattice(200, 60.0, resolution);
+            let plan = plan(&lattice);
+            assert!(plan.bricks.windows(2).all(|pair| pair[0] < pair[1]));
+            assert!(plan.tiles.windows(2).all(|pair| tile_order(pair[0].coord) < tile_order(pair[1].coord)));
+            let coords = coords(&plan);
+            let mut seen = 0;
+            for (i, place) in coords.iter().enumerate() {
+                let [from, to] = [plan.first_atoms[i], plan.first_atoms[i + 1]];
+                assert_eq!(from, seen);
+                seen = to;
+                for atom in &lattice.atoms[from as usize..to as usize] {
+                    assert_eq!(atom.cell.map(|c| c.div_euclid(BRICK)), *place);
+                }
+            }
+            assert_eq!(seen, 200);
+        }
+    }
+
+    #[test]
+    fn a_brick_exists_where_an_atom_is_near_and_nowhere_else() {
+        let lattice = lattice(60, 25.0, 0.6);
+        let plan = plan(&lattice);
+        let exists: HashMap<[i32; 3], usize> = coords(&plan).into_iter().zip(0..).collect();
+        let (mut there, mut pairs) = (0, 0);
+        for z in -8..8 {
+            for y in -8..8 {
+                for x in -8..8 {
+                    // In double precision, with the slack that atoms have and a little less.
+                    let near = |beyond: f64, slack: f64| {
+                        let gap = |c: f64, b: i32| {
+                            let lo = f64::from(b * BRICK);
+                            (lo - c).max(c - lo - beyond).max(0.0)
+                        };
+                        let reaches = |atom: &&LatticeAtom| {
+                            let d = [gap(atom.position(0), x), gap(atom.position(1), y), gap(atom.position(2), z)];
+                            d.iter().map(|d| d * d).sum::<f64>().sqrt() <= lattice.reach(atom) + slack
+                        };
+                        lattice.atoms.iter().filter(reaches).count()
+                    };
+                    let found = exists.contains_key(&[x, y, z]);
+                    assert!(near(8.0, 0.0) == 0 || found, "{x} {y} {z} is missing");
+                    assert!(near(8.0, 2e-3) > 0 || !found, "{x} {y} {z} is too many");
+                    there += usize::from(found);
+                    pairs += near(7.0, 1e-3);
+                }
+            }
+        }
+        assert_eq!((there, there > 100), (plan.bricks.len(), true));
+        assert!(pairs.abs_diff(usize::try_from(plan.pairs).unwrap()) <= 2, "{pairs} {}", plan.pairs);
+    }
+
+    #[test]
+    fn a_grid_beyond_the_limit_is_refused_with_one_that_fits() {
+        let lattice = lattice(300, 80.0, 0.5);
+        let samples = plan(&lattice).occupied * 512;
+        let with = |max_samples| {
+            Plan::new(&lattice, &SurfaceLimits { max_samples, ..SurfaceLimits::default() }, &Control::default())
+        };
+        assert!(with(samples).is_ok());
+        match with(samples - 1) {
+            Err(SurfaceError::GridTooLarge { samples: n, limit, suggested_resolution, .. }) => {
+                assert_eq!((n, limit), (samples, samples - 1));
+                assert!(suggested_resolution >= 0.5);
+            }
+            other => panic!("{:?}", other.map(|p| p.occupied)),
+        }
+        let control = Control::default();
+        control.cancel.cancel();
+        assert_eq!(Plan::new(&lattice, &SurfaceLimits::default(), &control).err(), Some(SurfaceError::Cancelled));
+    }
+}
