@@ -256,6 +256,10 @@ impl Engine {
             landing.request(*bytes).map_err(GpuError::Failed)?;
         }
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });
+        if waited.is_err() {
+            // A loss is told by a callback, which a device that cannot wait any more has not run yet.
+            _ = self.device.poll(wgpu::PollType::Poll);
+        }
         self.healthy()?;
         waited.map_err(|e| GpuError::Failed(e.to_string()))?;
         landings.into_iter().map(|(landing, bytes)| landing.look(bytes).map_err(GpuError::Failed)).collect()
