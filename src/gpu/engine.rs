@@ -46,7 +46,7 @@ impl Budget {
     /// What the limits of a device allow; of its memory, which they do not tell, 64 GiB at most.
     #[must_use]
     pub fn of(limits: &wgpu::Limits) -> Self {
-        let binding = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
+        let binding = largest_binding(limits);
         Self {
             memory: 64 << 30,
             chunk_bricks: binding / (4 * layout::SAMPLES),
@@ -119,7 +119,7 @@ impl Engine {
         queue.write_buffer(&cases, 0, bytemuck::cast_slice(&table));
         let clock = Clock::new(&device, &queue);
         let engine = Self {
-            binding: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
+            binding: largest_binding(&limits),
             workspaces: Vec::new(),
             landings: Landings::default(),
             device,
@@ -314,6 +314,11 @@ impl Executor for Engine {
     fn held_bytes(&self) -> u64 {
         self.workspaces.iter().map(Workspace::bytes).sum::<u64>() + self.landings.held() + self.cases.size()
     }
+}
+
+/// Bytes of the largest binding: limits are at times a byte less than a power of two, and buffers are whole words.
+fn largest_binding(limits: &wgpu::Limits) -> u64 {
+    limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !(ROW - 1)
 }
 
 /// Scales ticks to ns.
