@@ -6,6 +6,7 @@
 
 pub mod backend;
 pub mod cases;
+pub mod chunks;
 pub mod column;
 pub mod control;
 pub mod cpu;
@@ -13,9 +14,12 @@ pub mod error;
 pub mod kernel;
 mod labels;
 pub mod lattice;
+pub mod layout;
+mod marks;
 pub mod measure;
 pub mod mesh;
 pub mod params;
+pub mod plan;
 pub mod reference;
 mod simd;
 pub mod sink;

@@ -15,6 +15,8 @@ mod field;
 mod interpolate;
 mod join;
 mod pour;
+#[doc(hidden)]
+pub mod probe;
 mod sample;
 mod scan;
 mod sheets;
@@ -26,10 +28,15 @@ use std::num::NonZero;
 use std::ops::Range;
 use std::sync::Arc;
 
+// What the plan of a device's work shares with this backend: formulas, refusals and their numbers.
+pub(super) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
+pub(super) use self::field::Constants;
+pub(super) use self::interpolate::SlopeConstants;
+pub(super) use self::scan::too_large as mesh_too_large;
+
 use self::bin::{Tiles, slot_brick};
 use self::classify::{Before, Found};
 use self::emit::Numbered;
-use self::field::Constants;
 use self::sample::Pass;
 use self::scan::Totals;
 use super::backend::{Backend, GridStats, Meshed};
@@ -188,16 +195,27 @@ fn scan(
     limits: &SurfaceLimits,
     control: &Control<'_>,
 ) -> Result<Scanned, SurfaceError> {
-    let binned = control.span(Stage::Bin, || {
+    let lattice = control.span(Stage::Bin, || {
         if spheres.len() > bin::MAX_ATOMS {
             return Err(bin::too_many_atoms(spheres.len()));
         }
-        let lattice = Lattice::new(spheres, params)?;
+        Lattice::new(spheres, params)
+    });
+    scan_lattice(lattice?, params, limits, control)
+}
+
+fn scan_lattice(
+    lattice: Lattice,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    control: &Control<'_>,
+) -> Result<Scanned, SurfaceError> {
+    let tiles = control.span(Stage::Bin, || {
         let tiles = Tiles::new(&lattice, limits, control)?;
         bin::refuse_early(&lattice, &tiles, limits)?;
-        Ok((lattice, tiles))
+        Ok(tiles)
     });
-    let (lattice, tiles) = binned?;
+    let tiles = tiles?;
     control.check()?;
     let pass = Pass {
         lattice: &lattice,

@@ -1,0 +1,38 @@
+//! What runs prepared jobs on one device. The pool knows devices through this alone, so that it can be tested with
+//! executors that fail on purpose.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use super::error::GpuError;
+use super::prepare::Prepared;
+use crate::surface::{CancelToken, Meshed, Stage};
+
+/// A job as a device's thread sees it.
+#[derive(Debug, Clone)]
+pub struct GpuJob {
+    /// The work, sized and laid out on the caller's thread.
+    pub prepared: Arc<Prepared>,
+    /// Checked between dispatches and between tiles.
+    pub cancel: CancelToken,
+    /// Checked likewise.
+    pub deadline: Option<Instant>,
+}
+
+/// A finished job.
+#[derive(Debug, Clone)]
+pub struct Finished {
+    /// The mesh and its grid.
+    pub meshed: Meshed,
+    /// Device time per stage in ns, in order; empty where the device has no timestamps.
+    pub stages: Vec<(Stage, u64)>,
+}
+
+/// Runs jobs on one device.
+pub trait Executor: Send {
+    /// Runs `jobs`, as few submissions as it can, and answers each: one result per job, in order.
+    fn run(&mut self, jobs: &[GpuJob]) -> Vec<Result<Finished, GpuError>>;
+
+    /// Bytes of device memory that it holds now: in use and pooled.
+    fn held_bytes(&self) -> u64;
+}
