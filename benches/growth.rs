@@ -61,7 +61,7 @@ fn main() {
         let (mut triangles, mut grid) = (0, None);
         for _ in 0..runs {
             let clock = StageClock::new(&());
-            let control = Control { cancel: CancelToken::default(), observer: &clock };
+            let control = Control { observer: &clock, ..Control::default() };
             let started = Instant::now();
             let run = || backend.run(&spheres, &SurfaceParams::default(), &SurfaceLimits::default(), &control).unwrap();
             let meshed = clock.pass(run);

@@ -5,6 +5,8 @@ pub mod nearest;
 pub mod params;
 mod report;
 
+use std::time::Instant;
+
 use thiserror::Error;
 
 pub use clock::{ProgressSink, StageClock};
@@ -34,6 +36,8 @@ pub struct JobLimits {
     pub read: ReadLimits,
     /// Limits of meshing.
     pub surface: SurfaceLimits,
+    /// When the mesh must be there; none: whenever.
+    pub deadline: Option<Instant>,
 }
 
 /// A backend and the reason why it was taken, for reports and logs.
@@ -91,7 +95,7 @@ pub fn run(
         let spheres = selected.spheres(&structure)?;
         Ok((selected, spheres))
     })?;
-    let control = Control { cancel: cancel.clone(), observer: &clock };
+    let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
     let mut meshed = clock.pass(|| choice.backend.run(&spheres, &job.params, &limits.surface, &control))?;
     if let Some(ids) = &mut meshed.mesh.atom_ids {
         // The core speaks of spheres; people ask for atoms of the file.

@@ -1,6 +1,7 @@
 //! What a backend is: something that turns spheres into a mesh.
 
 use super::control::Control;
+use super::devices::DeviceStatus;
 use super::error::SurfaceError;
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
@@ -28,6 +29,27 @@ pub struct Meshed {
     pub mesh: Mesh,
     /// Its grid.
     pub grid: GridStats,
+    /// Who made it, where that is known only afterwards: one of several devices, or a stand-in for them.
+    pub served: Option<Served>,
+}
+
+impl Meshed {
+    /// The run of a backend that is one thing and always serves by itself.
+    #[must_use]
+    pub const fn new(mesh: Mesh, grid: GridStats) -> Self {
+        Self { mesh, grid, served: None }
+    }
+}
+
+/// Who made a mesh.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Served {
+    /// The name of the backend that did, as [`Backend::name`] gives it.
+    pub backend: &'static str,
+    /// What it ran on, for people.
+    pub device: String,
+    /// Why this one stood in for the backend that was asked; none where none had to.
+    pub instead: Option<String>,
 }
 
 /// Turns spheres into a mesh. The same input gives the same bytes, whatever the thread count.
@@ -49,4 +71,27 @@ pub trait Backend: Send + Sync {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Meshed, SurfaceError>;
+
+    /// Makes a first, tiny mesh on everything that it runs on: threads are started, code is paged in, and what cannot
+    /// work is found out.
+    ///
+    /// # Errors
+    /// Those of [`Backend::run`].
+    fn warm(&self) -> Result<(), SurfaceError> {
+        let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
+        self.run(&one_atom()?, &params, &limits, &Control::default()).map(|_mesh| ())
+    }
+
+    /// How the devices behind it are doing; empty where there are none but the processor.
+    fn devices(&self) -> Vec<DeviceStatus> {
+        Vec::new()
+    }
+}
+
+/// The smallest structure that has a surface: one carbon.
+///
+/// # Errors
+/// None that could be met: the sphere is a good one.
+pub fn one_atom() -> Result<Spheres, SurfaceError> {
+    Spheres::new(vec![0.0], vec![0.0], vec![0.0], vec![1.7])
 }

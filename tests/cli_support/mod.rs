@@ -42,7 +42,7 @@ impl Folder {
 /// The binary, with an environment that does not change what it prints.
 pub fn molmesh() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_molmesh"));
-    for name in ["RUST_BACKTRACE", "RUST_LOG", "COLUMNS", "CLICOLOR_FORCE"] {
+    for name in ["RUST_BACKTRACE", "RUST_LOG", "MOLMESH__DEVICES__USE", "COLUMNS", "CLICOLOR_FORCE"] {
         command.env_remove(name);
     }
     command.stdin(Stdio::null());

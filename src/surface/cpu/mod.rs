@@ -147,7 +147,7 @@ fn run(
         box_cells: lattice.box_cells,
         candidates: tally.candidates.into_inner(),
     };
-    Ok(Meshed { mesh, grid })
+    Ok(Meshed::new(mesh, grid))
 }
 
 impl Tile {
