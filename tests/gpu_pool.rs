@@ -139,26 +139,26 @@ fn a_job_is_cancelled_while_it_waits_and_while_it_runs() {
 fn a_deadline_ends_a_job_while_it_waits_and_while_it_runs() {
     let rig = Rig::new(&[Hold, Serve]);
     let pool = pool(std::slice::from_ref(&rig), SETTINGS);
-    let soon = |atoms| {
+    let within = |atoms, ms| {
         let mut job = job(atoms);
-        job.deadline = Some(Instant::now() + Duration::from_millis(60));
+        job.deadline = Some(Instant::now() + Duration::from_millis(ms));
         job
     };
     let started = Instant::now();
-    let first = start(&pool, &soon(1));
+    let first = start(&pool, &within(1, 200));
     wait_for("the first job to run", || rig.calls() == [1]);
-    let ran = [first, start(&pool, &soon(2))];
+    let ran = [first, start(&pool, &within(2, 30))];
     for job in ran {
         assert_eq!(job.join().unwrap().unwrap_err(), GpuError::Deadline);
     }
-    assert!(started.elapsed() >= Duration::from_millis(60));
+    assert!(started.elapsed() >= Duration::from_millis(200));
     wait_for_load(&pool, 0, 0);
     // One whose time is up before it comes does not run at all.
     let mut late = job(3);
     late.deadline = Some(started);
     assert_eq!(pool.run(&late).map(|_| ()).unwrap_err(), GpuError::Deadline);
-    assert!(!rig.atoms().contains(&vec![3]));
     pool.run(&job(4)).unwrap();
+    assert_eq!(rig.atoms(), [[1], [4]]);
 }
 
 #[test]

@@ -45,6 +45,8 @@ pub fn molmesh() -> Command {
     for name in ["RUST_BACKTRACE", "RUST_LOG", "MOLMESH__DEVICES__USE", "COLUMNS", "CLICOLOR_FORCE"] {
         command.env_remove(name);
     }
+    // A layer of Mesa's complains on stderr where there is no desktop.
+    command.env("NODEVICE_SELECT", "1");
     command.stdin(Stdio::null());
     command
 }

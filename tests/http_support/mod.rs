@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use molmesh::config::Config;
 use molmesh::http::{Chosen, Server};
 use molmesh::surface::{
-    Backend, Control, GridStats, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, Control, FoundDevice, GridStats, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 /// The sample that ships with the product.
