@@ -8,9 +8,7 @@ use std::time::Instant;
 
 use molmesh::pipeline::StageClock;
 use molmesh::structure::{self, ReadLimits, Selection};
-use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Measures, Proof, Spheres, SurfaceLimits, SurfaceParams,
-};
+use molmesh::surface::{Backend, Control, CpuBackend, Measures, Proof, Spheres, SurfaceLimits, SurfaceParams};
 
 /// The sample, repeated on a lattice of boxes until there are `n` atoms: density and sparsity stay.
 fn tiled(sample: &Spheres, n: usize) -> Spheres {

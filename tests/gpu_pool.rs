@@ -74,7 +74,9 @@ fn jobs_go_to_the_least_loaded_device() {
     wait_for_load(&pool, 1, 4);
     ran.push(start(&pool, &job(1)));
     wait_for_load(&pool, 0, 2);
-    rigs.iter().for_each(|rig| rig.let_go());
+    for rig in &rigs {
+        rig.let_go();
+    }
     let devices = served(ran);
     assert_eq!(devices, ["fake 0", "fake 1", "fake 1", "fake 1", "fake 1", "fake 0"]);
 }

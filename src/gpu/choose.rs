@@ -106,7 +106,6 @@ pub(super) fn missing(found: &[FoundDevice], choice: &DeviceChoice) -> Vec<Strin
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
 mod tests {
     use super::*;
 

@@ -4,7 +4,7 @@ use std::panic::catch_unwind;
 
 use wgpu::{Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags};
 
-use super::{choose, probe};
+use super::{choose, hardware};
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, FoundDevice};
 
 /// How thoroughly to look.
@@ -60,10 +60,10 @@ impl Discovery {
 /// Looks for devices and judges each by `choice`. Never fails: what goes wrong is a reason.
 #[must_use]
 pub fn discover(choice: &DeviceChoice, look: Look) -> Discovery {
-    let hardware = probe::hardware();
+    let signs = hardware::signs();
     // Software and numbered devices are what only drivers know of.
     let named = matches!(choice, DeviceChoice::These(_));
-    match (look, &hardware) {
+    match (look, &signs) {
         (Look::Quick, _) if *choice == DeviceChoice::Cpu => {
             return Discovery::nothing("the CPU was asked for".to_owned());
         }
@@ -81,7 +81,7 @@ pub fn discover(choice: &DeviceChoice, look: Look) -> Discovery {
     let looked = format!(
         "no driver offers an adapter (asked: {}; hardware: {})",
         if cfg!(target_vendor = "apple") { "Metal" } else { "every Vulkan driver that a Vulkan loader finds" },
-        hardware.unwrap_or_else(|why| why),
+        signs.unwrap_or_else(|why| why),
     );
     let devices = choose::judge(adapters.iter().map(facts).collect(), choice);
     Discovery { devices, adapters, looked }

@@ -12,9 +12,9 @@ mod device;
 pub mod discover;
 pub mod error;
 pub mod executor;
+mod hardware;
 pub mod pool;
 pub mod prepare;
-mod probe;
 mod queue;
 mod worker;
 

@@ -18,7 +18,7 @@ pub(super) struct Entry {
     pub(super) job: GpuJob,
     /// It has failed before, and must not take others with it.
     alone: bool,
-    pub(super) reply: SyncSender<Answer>,
+    reply: SyncSender<Answer>,
 }
 
 impl Entry {
@@ -372,10 +372,13 @@ fn why_down(lanes: &[Lane]) -> String {
 }
 
 fn answer(entry: Entry, answer: Answer) {
+    let Entry { reply, .. } = entry;
     // Whoever has left does not want to know.
-    drop(entry.reply.send(answer));
+    drop(reply.send(answer));
 }
 
 fn dismiss(left: VecDeque<Entry>, why: &str) {
-    left.into_iter().for_each(|entry| answer(entry, Err(GpuError::NoDevice(why.to_owned()))));
+    for entry in left {
+        answer(entry, Err(GpuError::NoDevice(why.to_owned())));
+    }
 }

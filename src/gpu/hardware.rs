@@ -20,7 +20,7 @@ const NODES: [(&str, &str); 8] = [
 ///
 /// # Errors
 /// The reason in words where there can be none.
-pub(super) fn hardware() -> Result<String, String> {
+pub(super) fn signs() -> Result<String, String> {
     if cfg!(target_os = "linux") { nodes_under(Path::new("/")) } else { Ok("drivers are asked".to_owned()) }
 }
 
@@ -47,7 +47,6 @@ fn begins(name: &str, start: &str) -> bool {
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
 mod tests {
     use super::*;
 
