@@ -3,14 +3,14 @@
 #![cfg(feature = "gpu")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
-mod gpu_support;
+mod gpu_fakes;
 
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use gpu_support::Step::{Hold, Lose, OutOfMemory, Serve};
-use gpu_support::{Rig, SETTINGS, devices, spheres};
+use gpu_fakes::Step::{Hold, Lose, OutOfMemory, Serve};
+use gpu_fakes::{Rig, SETTINGS, devices, spheres};
 use molmesh::gpu::{DevicePool, GpuBackend, GpuError, Look, discover};
 use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, Meshed, Observer, Stage, SurfaceError,
@@ -84,7 +84,7 @@ fn deadline_and_cancellation_reach_the_device() {
     let cancel = CancelToken::default();
     let cancelled = std::thread::scope(|scope| {
         let running = scope.spawn(|| run(&backend, &Control { cancel: cancel.clone(), ..Control::default() }));
-        gpu_support::wait_for("the job to run", || rig.calls().len() == 2);
+        gpu_fakes::wait_for("the job to run", || rig.calls().len() == 2);
         cancel.cancel();
         running.join().unwrap()
     });

@@ -3,14 +3,14 @@
 #![cfg(feature = "gpu")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
-mod gpu_support;
+mod gpu_fakes;
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use gpu_support::Step::{Fail, Forget, Hold, Lose, OutOfMemory, Panic, Serve};
-use gpu_support::{Ran, Rig, SETTINGS, devices, job, pool, start, wait_for, wait_for_load};
+use gpu_fakes::Step::{Fail, Forget, Hold, Lose, OutOfMemory, Panic, Serve};
+use gpu_fakes::{Ran, Rig, SETTINGS, devices, job, pool, start, wait_for, wait_for_load};
 use molmesh::gpu::{DevicePool, GpuError, MOST_REBUILDS, PoolSettings};
 use molmesh::surface::SurfaceError;
 

@@ -10,7 +10,7 @@ fn needs(facts: &DeviceFacts) -> [(&'static str, u64, u64); 5] {
         ("largest buffer", facts.buffer_bytes, 256 << 20),
         ("workgroup memory", facts.workgroup_bytes, 16 << 10),
         ("workgroup size", facts.workgroup_size, 256),
-        ("storage buffers a stage", facts.storage_buffers, 8),
+        ("storage buffers a stage", facts.storage_buffers, 14),
     ]
 }
 
@@ -120,7 +120,7 @@ mod tests {
             buffer_bytes: 1 << 30,
             workgroup_bytes: 32 << 10,
             workgroup_size: 1024,
-            storage_buffers: 8,
+            storage_buffers: 14,
             timestamps: true,
             subgroups: None,
         }
