@@ -2,6 +2,7 @@
 
 use wgpu::{Adapter, Device, DeviceDescriptor, ExperimentalFeatures, Features, MemoryHints, Queue, Trace};
 
+use super::engine::Engine;
 use super::error::GpuError;
 use super::executor::Executor;
 
@@ -13,8 +14,8 @@ const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 /// # Errors
 /// [`GpuError::Failed`] where the driver refuses, and those of the stages.
 pub(super) fn build(adapter: &Adapter) -> Result<Box<dyn Executor>, GpuError> {
-    let (_device, _queue) = open(adapter)?;
-    Err(GpuError::Failed("this version has no GPU stages".to_owned()))
+    let (device, queue) = open(adapter)?;
+    Ok(Box::new(Engine::new(device, queue)?))
 }
 
 /// Opens `adapter` with all that its limits allow.

@@ -1,25 +1,39 @@
 //! The GPU room: the only module that may name a graphics API.
 //!
 //! `discover` asks the drivers what there is and `choose` judges it; `device` opens what is taken and builds the
-//! stages there. `prepare` turns spheres into what a device needs, on the caller's thread; an
+//! [`Engine`](engine::Engine) there. `prepare` turns spheres into what a device needs, on the caller's thread; an
 //! [`Executor`](executor::Executor) runs prepared jobs on one device; the [`DevicePool`](pool::DevicePool) owns one
 //! thread per device and decides which job runs where; [`GpuBackend`](backend::GpuBackend) is what the rest of the
 //! crate sees.
 
+mod assemble;
 pub mod backend;
 mod choose;
 mod device;
 pub mod discover;
+pub mod engine;
 pub mod error;
 pub mod executor;
+mod flight;
 mod hardware;
+mod health;
+mod landing;
+mod pipelines;
 pub mod pool;
 pub mod prepare;
+#[doc(hidden)]
+pub mod probe;
+mod progress;
 mod queue;
+mod record;
+mod run;
+mod shaders;
 mod worker;
+mod workspace;
 
 pub use backend::GpuBackend;
 pub use discover::{Discovery, Look, discover};
+pub use engine::{Budget, Engine};
 pub use error::GpuError;
 pub use executor::{Executor, Finished, GpuJob};
 pub use pool::{DevicePool, PoolDevice, PoolSettings};

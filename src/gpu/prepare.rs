@@ -1,6 +1,7 @@
 //! A job before it meets a device: the lattice and everything that follows from it without a device.
 
 use crate::surface::lattice::Lattice;
+use crate::surface::plan::Plan;
 use crate::surface::{Control, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// A job, ready for any device.
@@ -8,6 +9,8 @@ use crate::surface::{Control, Spheres, SurfaceError, SurfaceLimits, SurfaceParam
 pub struct Prepared {
     /// Atoms in canonical order.
     pub lattice: Lattice,
+    /// Its bricks.
+    pub plan: Plan,
     /// What was asked for.
     pub params: SurfaceParams,
     /// What may be used.
@@ -26,7 +29,10 @@ impl Prepared {
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
         control.check()?;
-        Ok(Self { lattice: Lattice::new(spheres, params)?, params: params.clone(), limits: *limits })
+        let lattice = Lattice::new(spheres, params)?;
+        control.check()?;
+        let plan = Plan::new(&lattice, limits, control)?;
+        Ok(Self { lattice, plan, params: params.clone(), limits: *limits })
     }
 
     /// Whether it is small enough to share a submission with others: what it costs is latency, not work.

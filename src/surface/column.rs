@@ -4,7 +4,8 @@
 //! pages of 4 KiB took half as long as meshing them.
 
 use std::fmt;
-use std::ops::{Deref, DerefMut};
+use std::ops::{Deref, DerefMut, Range};
+use std::sync::Arc;
 
 use bytemuck::Pod;
 use memmap2::MmapMut;
@@ -15,12 +16,16 @@ const MAP_FROM: usize = 64 << 10;
 /// call instead of by a page fault each.
 const HUGE_FROM: usize = 4 << 20;
 
+/// Memory that somebody else owns and gives back when nobody looks at it any more.
+pub type Foreign = Arc<dyn AsRef<[u8]> + Send + Sync>;
+
 /// Rows of a mesh: behaves like a slice.
 pub struct Column<T: Pod>(Storage<T>);
 
 enum Storage<T> {
     Owned(Vec<T>),
     Mapped { map: MmapMut, bytes: usize },
+    Foreign { owner: Foreign, bytes: Range<usize> },
 }
 
 impl<T: Pod> Column<T> {
@@ -43,14 +48,23 @@ impl<T: Pod> Column<T> {
 }
 
 impl<T: Pod> Column<T> {
-    /// The rows as a vector, to add or remove some. Copies a mapped column.
+    /// The rows in `bytes` of memory that somebody else owns, without a copy; kept until the column is dropped or
+    /// written to. `None` where the range does not lie in that memory, on a row's alignment, as whole rows.
+    #[must_use]
+    pub fn foreign(owner: Foreign, bytes: Range<usize>) -> Option<Self> {
+        let rows = (*owner).as_ref().get(bytes.clone())?;
+        bytemuck::try_cast_slice::<u8, T>(rows).ok()?;
+        Some(Self(Storage::Foreign { owner, bytes }))
+    }
+
+    /// The rows as a vector, to add or remove some. Copies a column that is none yet.
     pub fn edit(&mut self) -> &mut Vec<T> {
-        if let Storage::Mapped { .. } = &self.0 {
+        if !matches!(self.0, Storage::Owned(_)) {
             self.0 = Storage::Owned(self.to_vec());
         }
         match &mut self.0 {
             Storage::Owned(rows) => rows,
-            Storage::Mapped { .. } => unreachable!("owned by now"),
+            Storage::Mapped { .. } | Storage::Foreign { .. } => unreachable!("owned by now"),
         }
     }
 }
@@ -63,15 +77,22 @@ impl<T: Pod> Deref for Column<T> {
             Storage::Owned(rows) => rows,
             // A mapping begins on a page boundary, so any plain row type is aligned.
             Storage::Mapped { map, bytes } => bytemuck::cast_slice(&map[..*bytes]),
+            // Checked when the column was made.
+            Storage::Foreign { owner, bytes } => bytemuck::cast_slice(&(**owner).as_ref()[bytes.clone()]),
         }
     }
 }
 
 impl<T: Pod> DerefMut for Column<T> {
     fn deref_mut(&mut self) -> &mut [T] {
+        if matches!(self.0, Storage::Foreign { .. }) {
+            // What belongs to somebody else is only read: the first write makes a copy.
+            *self = self.clone();
+        }
         match &mut self.0 {
             Storage::Owned(rows) => rows,
             Storage::Mapped { map, bytes } => bytemuck::cast_slice_mut(&mut map[..*bytes]),
+            Storage::Foreign { .. } => unreachable!("copied by now"),
         }
     }
 }
@@ -132,6 +153,24 @@ impl<'a, T: Pod> IntoIterator for &'a Column<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_foreign_column_is_read_in_place_and_copied_when_written() {
+        let owner: Foreign = Arc::new([7_u32, 8, 9, 10].iter().flat_map(|v| v.to_ne_bytes()).collect::<Vec<u8>>());
+        let start = (*owner).as_ref().as_ptr().align_offset(4);
+        assert_eq!(start, 0, "an allocation of 16 bytes is aligned to 4");
+        let mut column: Column<u32> = Column::foreign(owner.clone(), 4..12).unwrap();
+        assert_eq!(column.to_vec(), [8, 9]);
+        assert_eq!(Arc::strong_count(&owner), 2);
+        column[0] = 1;
+        assert_eq!((column.to_vec(), Arc::strong_count(&owner)), (vec![1, 9], 1));
+        let mut other: Column<u32> = Column::foreign(owner.clone(), 0..16).unwrap();
+        other.edit().push(3);
+        assert_eq!(other.to_vec(), [7, 8, 9, 10, 3]);
+        for bad in [1..5, 0..6, 8..20] {
+            assert!(Column::<u32>::foreign(owner.clone(), bad).is_none());
+        }
+    }
 
     #[test]
     fn small_and_mapped_columns_behave_alike() {

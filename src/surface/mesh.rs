@@ -52,7 +52,7 @@ impl Mesh {
 
     /// Gives every vertex whose normal is zero the area-weighted mean normal of its triangles: at a saddle of the
     /// density the gradient vanishes and has no direction.
-    pub(super) fn fill_flat_normals(&mut self) {
+    pub(crate) fn fill_flat_normals(&mut self) {
         let flat: FxHashMap<u32, usize> = (0_u32..)
             .zip(&self.normals)
             .filter(|(_, n)| n.iter().all(|c| c.abs() < 0.5))

@@ -6,6 +6,7 @@
 
 pub mod backend;
 pub mod cases;
+pub mod chunks;
 pub mod column;
 pub mod control;
 pub mod cpu;
@@ -14,9 +15,11 @@ pub mod error;
 pub mod kernel;
 mod labels;
 pub mod lattice;
+pub mod layout;
 pub mod measure;
 pub mod mesh;
 pub mod params;
+pub mod plan;
 pub mod reference;
 mod simd;
 pub mod spheres;

@@ -19,7 +19,7 @@ pub(super) const SLOTS: usize = SIDE * SIDE * SIDE;
 /// matters to normals, not to the field.
 pub(super) const NORMAL_ONLY: u32 = 1 << 31;
 /// Atoms are indexed with 31 bits.
-pub(super) const MAX_ATOMS: usize = (1 << 31) - 1;
+pub(in crate::surface) const MAX_ATOMS: usize = (1 << 31) - 1;
 
 /// The tiles that some atom reaches, in canonical order, with their atoms.
 #[derive(Debug)]
@@ -35,7 +35,7 @@ pub(super) struct Tiles {
 }
 
 /// First and last tile per axis whose samples, with the layer beyond, the atom reaches.
-fn tile_range(atom: &LatticeAtom, reach: f64) -> [[i32; 2]; 3] {
+pub(in crate::surface) fn tile_range(atom: &LatticeAtom, reach: f64) -> [[i32; 2]; 3] {
     let side = f64::from(TILE);
     std::array::from_fn(|k| {
         let c = atom.position(k);
@@ -124,13 +124,13 @@ impl Tiles {
 }
 
 /// The refusal of more atoms than 31-bit indices can number.
-pub(super) fn too_many_atoms(n: usize) -> SurfaceError {
+pub(in crate::surface) fn too_many_atoms(n: usize) -> SurfaceError {
     let expected = format!("at most {MAX_ATOMS} spheres");
     SurfaceError::BadParameter { name: "spheres", value: n.to_string(), expected }
 }
 
 /// The refusal of a grid of (at least) `samples` samples.
-pub(super) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
+pub(in crate::surface) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
     let excess = samples as f64 / limits.max_samples.max(1) as f64;
     let mut fitting = lattice.spacing * excess.max(1.0).cbrt();
     // Ever coarser until an upper bound of the samples fits; a box of one cell needs 27 blocks at most.
@@ -159,7 +159,7 @@ pub(super) fn refuse_early(lattice: &Lattice, tiles: &Tiles, limits: &SurfaceLim
 }
 
 /// A lower bound of the samples: the volume of the blocks that lie wholly within some atom's reach.
-fn samples_at_least(lattice: &Lattice) -> f64 {
+pub(in crate::surface) fn samples_at_least(lattice: &Lattice) -> f64 {
     let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(f64::MAX, f64::min);
     // Half the least reach: a sphere then holds a few blocks wherever it lies.
     let side = 0.5 * reach;

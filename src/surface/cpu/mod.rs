@@ -13,15 +13,22 @@ mod classify;
 mod emit;
 mod field;
 mod interpolate;
+#[doc(hidden)]
+pub mod probe;
 mod sample;
 mod scan;
+
+// What the plan of a device's work shares with this backend: formulas, refusals and their numbers.
+pub(super) use self::bin::{MAX_ATOMS, samples_at_least, tile_range, too_large as grid_too_large, too_many_atoms};
+pub(super) use self::field::Constants;
+pub(super) use self::interpolate::SlopeConstants;
+pub(super) use self::scan::too_large as mesh_too_large;
 
 use rayon::prelude::*;
 
 use self::bin::{Tiles, slot_brick};
 use self::classify::Found;
 use self::emit::Numbered;
-use self::field::Constants;
 use self::sample::{Pass, Tally};
 use super::backend::{Backend, GridStats, Meshed};
 use super::control::{Control, Stage};

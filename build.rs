@@ -1,0 +1,131 @@
+//! Assembles the shaders, checks them all, and writes down what the host must match.
+//!
+//! Every `shaders/<stage>.wgsl` gets the fragments that it names in `#include` lines, is parsed and validated with
+//! exactly the capabilities that the device code asks for (none beyond WebGPU's), and reflected: bindings by name, and
+//! the layout of every struct that lies in a buffer. All broken shaders are reported at once.
+
+fn main() {
+    println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rerun-if-changed=shaders");
+    #[cfg(feature = "gpu")]
+    shaders::build();
+}
+
+#[cfg(feature = "gpu")]
+mod shaders {
+    use std::collections::BTreeSet;
+    use std::fmt::Write as _;
+    use std::path::{Path, PathBuf};
+    use std::{env, fs};
+
+    use naga::valid::{Capabilities, ValidationFlags, Validator};
+    use naga::{AddressSpace, Module, StorageAccess, TypeInner};
+
+    /// In the order in which they run.
+    const STAGES: [&str; 6] = ["bin", "field", "classify", "scan", "interpolate", "emit"];
+
+    pub(super) fn build() {
+        let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
+        let (mut generated, mut broken) = (String::new(), Vec::new());
+        let mut layouts = BTreeSet::new();
+        generated.push_str("pub(super) static SHADERS: [Shader; 6] = [\n");
+        for stage in STAGES {
+            match assemble(Path::new("shaders"), &format!("{stage}.wgsl"), &mut BTreeSet::new())
+                .and_then(|source| checked(&source).map(|module| (source, module)))
+            {
+                Ok((source, module)) => {
+                    let path = out.join(format!("{stage}.wgsl"));
+                    fs::write(&path, &source).expect("OUT_DIR can be written");
+                    let bindings = bindings(&module);
+                    writeln!(
+                        generated,
+                        "Shader {{ stage: {stage:?}, source: include_str!(\"{stage}.wgsl\"), bindings: &[{bindings}] }},"
+                    )
+                    .expect("a string takes it");
+                    layouts.extend(structs(&module));
+                }
+                Err(why) => broken.push(format!("shaders/{stage}.wgsl: {why}")),
+            }
+        }
+        assert!(broken.is_empty(), "{} of {} shaders are broken:\n{}", broken.len(), STAGES.len(), broken.join("\n"));
+        generated.push_str("];\n\n/// Name, size, and (field, offset, size) of every struct that lies in a buffer.\n");
+        generated.push_str("#[cfg(test)]\npub(super) static LAYOUTS: &[Layout] = &[\n");
+        generated.extend(layouts);
+        generated.push_str("];\n");
+        fs::write(out.join("shaders.rs"), generated).expect("OUT_DIR can be written");
+    }
+
+    /// The text of `name` with every `#include` line replaced by the fragment that it names, each once.
+    fn assemble(folder: &Path, name: &str, seen: &mut BTreeSet<String>) -> Result<String, String> {
+        let text = fs::read_to_string(folder.join(name)).map_err(|e| format!("{name}: {e}"))?;
+        let mut assembled = String::with_capacity(text.len());
+        for line in text.lines() {
+            match line.strip_prefix("#include ") {
+                Some(fragment) if seen.insert(fragment.to_owned()) => {
+                    assembled.push_str(&assemble(folder, fragment, seen)?);
+                }
+                Some(_) => {}
+                None => {
+                    assembled.push_str(line);
+                    assembled.push('\n');
+                }
+            }
+        }
+        Ok(assembled)
+    }
+
+    fn checked(source: &str) -> Result<Module, String> {
+        let module = naga::front::wgsl::parse_str(source).map_err(|e| e.emit_to_string(source))?;
+        Validator::new(ValidationFlags::all(), Capabilities::empty())
+            .validate(&module)
+            .map_err(|e| e.emit_to_string(source))?;
+        match &module.entry_points[..] {
+            [entry] if entry.name == "main" => Ok(module),
+            others => Err(format!("{} entry points; one named main is wanted", others.len())),
+        }
+    }
+
+    fn bindings(module: &Module) -> String {
+        let mut rows: Vec<(u32, String)> = module
+            .global_variables
+            .iter()
+            .filter_map(|(_, global)| {
+                let at = global.binding.as_ref()?;
+                let access = match global.space {
+                    AddressSpace::Uniform => "Uniform",
+                    AddressSpace::Storage { access } if access.contains(StorageAccess::STORE) => "Write",
+                    _ => "Read",
+                };
+                let name = global.name.as_deref().unwrap_or_default();
+                Some((
+                    at.binding,
+                    format!("Binding {{ name: {name:?}, number: {}, access: Access::{access} }}", at.binding),
+                ))
+            })
+            .collect();
+        rows.sort();
+        rows.into_iter().map(|(_, row)| row).collect::<Vec<_>>().join(", ")
+    }
+
+    /// The structs of the buffers' types.
+    fn structs(module: &Module) -> Vec<String> {
+        let mut found = Vec::new();
+        for (_, global) in module.global_variables.iter().filter(|(_, global)| global.binding.is_some()) {
+            let mut ty = &module.types[global.ty];
+            if let TypeInner::Array { base, .. } = ty.inner {
+                ty = &module.types[base];
+            }
+            let TypeInner::Struct { members, span } = &ty.inner else { continue };
+            let name = ty.name.as_deref().unwrap_or_default();
+            let fields: Vec<String> = members
+                .iter()
+                .map(|member| {
+                    let size = module.types[member.ty].inner.size(module.to_ctx());
+                    format!("({:?}, {}, {size})", member.name.as_deref().unwrap_or_default(), member.offset)
+                })
+                .collect();
+            found.push(format!("Layout {{ name: {name:?}, size: {span}, fields: &[{}] }},\n", fields.join(", ")));
+        }
+        found
+    }
+}

@@ -1,0 +1,261 @@
+// Stage `bin`: the candidate atoms of every brick, in canonical order. One workgroup a brick.
+//
+// Atoms are sorted by tile and brick, so the atoms of a run of bricks along x within a tile are one range. A lane
+// looks up a range; then the lanes share out the atoms of 64 ranges evenly and keep those in reach, in order.
+#include shared/params.wgsl
+#include shared/atom.wgsl
+#include shared/bits.wgsl
+#include shared/tiles.wgsl
+#include shared/chunk.wgsl
+
+struct Tally {
+    // Entries of the lists; counts on beyond the capacity.
+    list_end: atomic<u32>,
+    vertices: u32,
+    triangles: u32,
+    // Vertices without a gradient.
+    flat: u32,
+}
+
+@group(0) @binding(0) var<uniform> params: Params;
+@group(0) @binding(1) var<storage, read> atoms: array<Atom>;
+@group(0) @binding(2) var<storage, read> reaches: array<f32>;
+@group(0) @binding(3) var<storage, read> tiles: array<Tile>;
+@group(0) @binding(4) var<storage, read> bricks: array<u32>;
+@group(0) @binding(5) var<storage, read> first_atoms: array<u32>;
+@group(0) @binding(6) var<storage, read> halo: array<u32>;
+@group(0) @binding(7) var<storage, read_write> lists: array<u32>;
+@group(0) @binding(8) var<storage, read_write> heads: array<vec4<u32>>;
+@group(0) @binding(9) var<storage, read_write> tally: Tally;
+
+const LANES: u32 = 64u;
+// Lists up to this long are staged; longer ones, of fine grids, are gathered twice.
+const STAGED: u32 = 512u;
+
+// Where the ranges begin, and how many atoms they and those before them hold.
+var<workgroup> range_start: array<u32, 64>;
+var<workgroup> range_end: array<u32, 64>;
+// Lanes with an atom that reaches a sample (0, 1) or only the gap behind the samples (2, 3), for three steps.
+var<workgroup> hits: array<atomic<u32>, 12>;
+var<workgroup> staged: array<u32, 512>;
+var<workgroup> list_start: u32;
+
+// `v` as it was rounded: the compiler cannot see through the zero, so it cannot fuse the product into a sum. The
+// comparison below must come out as on the host.
+fn rounded(v: f32) -> f32 {
+    return bitcast<f32>(bitcast<u32>(v) | params.zero);
+}
+
+fn square(v: vec3<f32>) -> vec3<f32> {
+    let s = v * v;
+    return vec3<f32>(rounded(s.x), rounded(s.y), rounded(s.z));
+}
+
+// A tile by its coordinates: next to tile `from` at a glance, further away by search.
+fn tile_at(tile_from: u32, coord: vec3<i32>) -> u32 {
+    let step = coord - tiles[tile_from].coord;
+    if (all(abs(step) <= vec3<i32>(1))) {
+        return tiles[tile_from].around[u32(13 + 9 * step.z + 3 * step.y + step.x)];
+    }
+    var lo = 0u;
+    var hi = params.n_tiles;
+    while (lo < hi) {
+        let mid = (lo + hi) / 2u;
+        let c = tiles[mid].coord;
+        let less = c.z < coord.z || (c.z == coord.z && (c.y < coord.y || (c.y == coord.y && c.x < coord.x)));
+        if (less) { lo = mid + 1u; } else { hi = mid; }
+    }
+    if (lo < params.n_tiles && all(tiles[lo].coord == coord)) {
+        return lo;
+    }
+    return NONE;
+}
+
+// Part of [lo, hi] that lies in tile coordinate t, as first and count.
+fn part(lo: i32, hi: i32, t: i32) -> vec2<i32> {
+    let first = max(lo, 8 * t);
+    return vec2<i32>(first, min(hi, 8 * t + 7) - first + 1);
+}
+
+// Gap along one axis, in spacings, between a brick and an atom of another brick `step` bricks away.
+fn brick_gap(step: i32) -> f32 {
+    return max(max(f32(8 * step) - 8.5, f32(-8 * step) - 7.5), 0.0);
+}
+
+// Range number `index` of those that can hold candidates of `brick`: first atom and number of atoms. Ranges come in
+// the order of the atoms: by tile, and by row within a tile.
+fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
+    let lo = brick - vec3<i32>(i32(params.back));
+    let hi = brick + vec3<i32>(i32(params.ahead));
+    let first = lo >> vec3<u32>(3u);
+    let n_x = (hi.x >> 3u) - first.x + 1;
+    let n_y = hi.y - lo.y + 1;
+    var left = i32(index);
+    var t = first;
+    var z = part(lo.z, hi.z, t.z);
+    while (left >= z.y * n_y * n_x) {
+        left -= z.y * n_y * n_x;
+        t.z += 1;
+        z = part(lo.z, hi.z, t.z);
+    }
+    var y = part(lo.y, hi.y, t.y);
+    while (left >= z.y * y.y * n_x) {
+        left -= z.y * y.y * n_x;
+        t.y += 1;
+        y = part(lo.y, hi.y, t.y);
+    }
+    t.x += left / (z.y * y.y);
+    left = left % (z.y * y.y);
+    let row = vec2<i32>(y.x + left % y.y, z.x + left / y.y);
+    // How far along x the longest reach gets in this row.
+    let gap = vec2<f32>(brick_gap(row.x - brick.y), brick_gap(row.y - brick.z));
+    let rest = params.reach * params.reach - dot(gap, gap);
+    if (rest < 0.0) {
+        return vec2<u32>(0u);
+    }
+    let far = sqrt(rest) + 0.01;
+    let x_lo = max(max(lo.x, 8 * t.x), brick.x - i32(floor((far + 7.5) / 8.0)));
+    let x_hi = min(min(hi.x, 8 * t.x + 7), brick.x + i32(floor((far + 8.5) / 8.0)));
+    if (x_lo > x_hi) {
+        return vec2<u32>(0u);
+    }
+    let at = tile_at(tile, t);
+    if (at == NONE) {
+        return vec2<u32>(0u);
+    }
+    let base = u32(row.y & 7) << 6u | u32(row.x & 7) << 3u;
+    let start = first_atoms[bricks_before(at, base | u32(x_lo & 7))];
+    let last = base | u32(x_hi & 7);
+    let end = first_atoms[bricks_before(at, last) + select(0u, 1u, brick_exists(at, last))];
+    return vec2<u32>(start, end - start);
+}
+
+// Whether the atom reaches a sample of the brick (1), or only the gap up to its neighbours' first samples (2).
+fn reach_of(atom: u32, tile_origin: vec3<i32>, lo: vec3<f32>) -> u32 {
+    let local = vec3<f32>(atoms[atom].cell - tile_origin) + atoms[atom].frac;
+    let reach = reaches[atom];
+    let gap = max(max(lo - local, local - (lo + vec3<f32>(7.0))), vec3<f32>(0.0));
+    let closed_gap = max(max(lo - local, local - (lo + vec3<f32>(8.0))), vec3<f32>(0.0));
+    let reach2 = rounded(reach * reach);
+    let closed = square(closed_gap);
+    if (any(closed_gap > vec3<f32>(reach)) || (closed.y + closed.z) + closed.x > reach2) {
+        return 0u;
+    }
+    let samples = square(gap);
+    return select(2u, 1u, (samples.y + samples.z) + samples.x <= reach2);
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) workgroup: vec3<u32>,
+    @builtin(num_workgroups) workgroups: vec3<u32>,
+    @builtin(local_invocation_index) lane: u32,
+) {
+    let slot = workgroup_number(workgroup, workgroups);
+    if (slot >= params.n_own + params.n_halo) {
+        return;
+    }
+    let id = brick_in(slot);
+    let tile = bricks[id] >> 9u;
+    let within = local_brick(bricks[id] & 511u);
+    let brick = tiles[tile].coord * 8 + within;
+    let tile_origin = tiles[tile].coord * 64;
+    let lo = vec3<f32>(within * 8);
+    let span = vec3<i32>(i32(params.back + params.ahead) + 1);
+    let n_x = ((brick.x + i32(params.ahead)) >> 3u) - ((brick.x - i32(params.back)) >> 3u) + 1;
+    let n_ranges = u32(span.z * span.y * n_x);
+    if (lane < 12u) {
+        atomicStore(&hits[lane], 0u);
+    }
+    // Atoms that reach a sample, and those that reach the gap only.
+    var n = vec2<u32>(0u);
+    var start = 0u;
+    for (var pass_number = 0u; pass_number < 2u; pass_number++) {
+        var kept = vec2<u32>(0u);
+        var phase = 0u;
+        for (var first = 0u; first < n_ranges; first += LANES) {
+            var range = vec2<u32>(0u);
+            if (first + lane < n_ranges) {
+                range = range_at(tile, brick, first + lane);
+            }
+            workgroupBarrier();
+            range_start[lane] = range.x;
+            range_end[lane] = range.y;
+            for (var step = 1u; step < LANES; step = step << 1u) {
+                workgroupBarrier();
+                let before = select(0u, range_end[(lane - step) & 63u], lane >= step);
+                workgroupBarrier();
+                range_end[lane] += before;
+            }
+            let total = workgroupUniformLoad(&range_end[63]);
+            for (var at = 0u; at < total; at += LANES) {
+                let index = at + lane;
+                var reaches_it = 0u;
+                var atom = 0u;
+                if (index < total) {
+                    // The first range that ends behind the index.
+                    var r = 0u;
+                    for (var step = 32u; step > 0u; step = step >> 1u) {
+                        if (range_end[r + step - 1u] <= index) {
+                            r += step;
+                        }
+                    }
+                    let before = select(0u, range_end[(r - 1u) & 63u], r > 0u);
+                    atom = range_start[r] + (index - before);
+                    reaches_it = reach_of(atom, tile_origin, lo);
+                }
+                let hit = 4u * phase;
+                phase = select(phase + 1u, 0u, phase == 2u);
+                if (lane < 4u) {
+                    // Used in the next step; last read two steps ago.
+                    atomicStore(&hits[4u * phase + lane], 0u);
+                }
+                let half = lane >> 5u;
+                if (reaches_it != 0u) {
+                    atomicOr(&hits[hit + 2u * (reaches_it - 1u) + half], 1u << (lane & 31u));
+                }
+                workgroupBarrier();
+                let near = vec2<u32>(atomicLoad(&hits[hit]), atomicLoad(&hits[hit + 1u]));
+                let gap = vec2<u32>(atomicLoad(&hits[hit + 2u]), atomicLoad(&hits[hit + 3u]));
+                let mine = select(gap, near, reaches_it == 1u);
+                let earlier = below(lane & 31u);
+                let low = countOneBits(select(mine.x & earlier, mine.x, half == 1u));
+                let ahead = low + countOneBits(select(0u, mine.y & earlier, half == 1u));
+                if (reaches_it != 0u) {
+                    let place = ahead + select(kept.y, kept.x, reaches_it == 1u);
+                    if (pass_number == 1u) {
+                        lists[start + place + select(n.x, 0u, reaches_it == 1u)] = atom;
+                    } else if (place < STAGED) {
+                        staged[select(STAGED - 1u - place, place, reaches_it == 1u)] = atom;
+                    }
+                }
+                kept += vec2<u32>(
+                    countOneBits(near.x) + countOneBits(near.y),
+                    countOneBits(gap.x) + countOneBits(gap.y),
+                );
+            }
+        }
+        if (pass_number == 1u) {
+            break;
+        }
+        n = kept;
+        let entries = n.x + n.y;
+        if (lane == 0u) {
+            list_start = atomicAdd(&tally.list_end, entries);
+        }
+        start = workgroupUniformLoad(&list_start);
+        // What does not fit is not written; the host sees the counter.
+        if (start + entries > params.list_capacity) {
+            n = vec2<u32>(0u);
+        }
+        if (lane == 0u) {
+            heads[slot] = vec4<u32>(start, n.x, n.x + n.y, id);
+        }
+        if (n.x + n.y <= STAGED) {
+            for (var i = lane; i < n.x + n.y; i += LANES) {
+                lists[start + i] = staged[select(STAGED - 1u - (i - n.x), i, i < n.x)];
+            }
+            break;
+        }
+    }
+}

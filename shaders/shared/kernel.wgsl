@@ -1,0 +1,60 @@
+// The three densities along u = d²/ρ². Needs `params`.
+override KERNEL: u32 = 0u;
+
+const GAUSSIAN: u32 = 0u;
+const SOFT_OBJECT: u32 = 1u;
+const INVERSE_SQUARE: u32 = 2u;
+
+// What of the density belongs to one axis, for four distances: the exponential and the cut-off's linear term for the
+// Gaussian, u for the others.
+struct Axis {
+    e: vec4<f32>,
+    w: vec4<f32>,
+}
+
+fn z_axis(u: vec4<f32>) -> Axis {
+    if (KERNEL == GAUSSIAN) {
+        return Axis(exp2(params.share - params.rate * u), params.tail_share + params.tail_rate * u);
+    }
+    return Axis(vec4<f32>(0.0), u);
+}
+
+// Density of four samples of a column, from u of the column and what belongs to z. Beyond the support exactly 0, so
+// that it does not matter who else is among the candidates.
+struct Column {
+    e: f32,
+    w: f32,
+}
+
+fn column(u: f32) -> Column {
+    if (KERNEL == GAUSSIAN) {
+        return Column(exp2(2.0 * params.share - params.rate * u), 2.0 * params.tail_share + params.tail_rate * u);
+    }
+    return Column(0.0, u);
+}
+
+fn density(c: Column, z: Axis, u_min: f32) -> vec4<f32> {
+    if (KERNEL == GAUSSIAN) {
+        let tail = c.w + z.w;
+        return select(vec4<f32>(0.0), fma(vec4<f32>(c.e), z.e, tail), tail < vec4<f32>(params.tail_end));
+    }
+    let u = c.w + z.w;
+    let t = max(1.0 - u, vec4<f32>(0.0));
+    let t2 = t * t * params.amplitude;
+    if (KERNEL == SOFT_OBJECT) {
+        return t2 * fma(u, vec4<f32>(-4.0 / 9.0), vec4<f32>(1.0));
+    }
+    return t2 / max(u, vec4<f32>(u_min));
+}
+
+// -dF/du up to a factor that all atoms share.
+fn slope(u: f32, u_min: f32) -> f32 {
+    if (KERNEL == GAUSSIAN) {
+        return exp2(params.slope_offset - params.rate * u) - params.slope_tail;
+    }
+    if (KERNEL == SOFT_OBJECT) {
+        return (1.0 - u) * fma(u, -6.0, 11.0);
+    }
+    let v = max(u, u_min);
+    return (1.0 - v * v) / (v * v);
+}

@@ -1,0 +1,226 @@
+//! A plan's bricks cut into chunks that fit a device. A chunk is a run of tiles, and the bricks behind it whose samples
+//! its cells need: those are computed again where they belong.
+
+use super::lattice::to_u32;
+use super::layout::{NONE, Params};
+use super::plan::Plan;
+
+/// What a device can hold of one chunk at once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ChunkLimits {
+    /// Bricks with their samples.
+    pub bricks: u64,
+    /// Entries of candidate lists.
+    pub candidates: u64,
+}
+
+/// A run of bricks that is computed at once.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Chunk {
+    /// Its first brick.
+    pub first_brick: u32,
+    /// Its bricks.
+    pub n_own: u32,
+    /// Borrowed bricks: later ones that hold samples of its cells, ascending.
+    pub halo: Vec<u32>,
+    /// Entries that its candidate lists take at most.
+    pub candidates: u64,
+}
+
+impl Chunk {
+    /// Bricks with samples, own and borrowed.
+    #[must_use]
+    pub fn n_slots(&self) -> u64 {
+        u64::from(self.n_own) + self.halo.len() as u64
+    }
+
+    /// The borrowed bricks, then for each brick behind the chunk its slot or [`NONE`], up to the last borrowed one.
+    #[must_use]
+    pub fn halo_table(&self) -> Vec<u32> {
+        let end = self.first_brick + self.n_own;
+        let mut table = self.halo.clone();
+        table.resize(self.halo.len() + self.n_halo_slots() as usize, NONE);
+        for (slot, &brick) in (self.n_own..).zip(&self.halo) {
+            table[self.halo.len() + (brick - end) as usize] = slot;
+        }
+        table
+    }
+
+    /// Entries of [`Self::halo_table`].
+    #[must_use]
+    pub fn halo_table_len(&self) -> u64 {
+        self.halo.len() as u64 + u64::from(self.n_halo_slots())
+    }
+
+    fn n_halo_slots(&self) -> u32 {
+        self.halo.last().map_or(0, |last| last - (self.first_brick + self.n_own) + 1)
+    }
+
+    /// `params` for this chunk.
+    #[must_use]
+    pub fn params(&self, params: &Params) -> Params {
+        Params {
+            first_brick: self.first_brick,
+            n_own: self.n_own,
+            n_halo: to_u32(self.halo.len()),
+            n_halo_slots: self.n_halo_slots(),
+            list_capacity: u32::try_from(self.candidates).unwrap_or(u32::MAX),
+            ..*params
+        }
+    }
+}
+
+impl Plan {
+    /// Cuts the bricks into chunks. `None` where a single tile is more than the limits allow.
+    #[must_use]
+    pub fn chunks(&self, limits: ChunkLimits) -> Option<Vec<Chunk>> {
+        let mut chunks = Vec::new();
+        let mut from = 0;
+        while from < self.tiles.len() {
+            // As many tiles as fit by themselves, then fewer until the borrowed bricks fit too.
+            let mut to = from;
+            let (mut bricks, mut candidates) = (0, 0);
+            while to < self.tiles.len() {
+                bricks += u64::from(self.tile_end(to) - self.tiles[to].base);
+                candidates += self.candidates[to];
+                if bricks > limits.bricks || candidates > limits.candidates {
+                    break;
+                }
+                to += 1;
+            }
+            let chunk = loop {
+                if to == from {
+                    return None;
+                }
+                let chunk = self.chunk(from, to);
+                if chunk.n_slots() <= limits.bricks && chunk.candidates <= limits.candidates {
+                    break chunk;
+                }
+                to -= (to - from).div_ceil(8);
+            };
+            chunks.push(chunk);
+            from = to;
+        }
+        Some(chunks)
+    }
+
+    /// The brick behind the last one of tile `t`.
+    fn tile_end(&self, t: usize) -> u32 {
+        self.tiles.get(t + 1).map_or(to_u32(self.bricks.len()), |next| next.base)
+    }
+
+    fn chunk(&self, from: usize, to: usize) -> Chunk {
+        let (first, end) = (self.tiles[from].base, self.tile_end(to - 1));
+        let mut halo = Vec::new();
+        if (end as usize) < self.bricks.len() {
+            for brick in &self.bricks[first as usize..end as usize] {
+                if [7, 7 << 3, 7 << 6].iter().any(|face| brick & face == *face) {
+                    halo.extend((1..8).filter_map(|n| self.neighbour(*brick, n)).filter(|&b| b >= end));
+                }
+            }
+            halo.sort_unstable();
+            halo.dedup();
+        }
+        let mut lenders: Vec<u32> = halo.iter().map(|&b| self.bricks[b as usize] >> 9).collect();
+        lenders.dedup();
+        let candidates = self.candidates[from..to].iter().sum::<u64>()
+            + lenders.iter().map(|&t| self.candidates[t as usize]).sum::<u64>();
+        Chunk { first_brick: first, n_own: end - first, halo, candidates }
+    }
+
+    /// The neighbour towards +x (bit 0 of `n`), +y (1), +z (2) of a brick given as in [`Plan::bricks`].
+    fn neighbour(&self, brick: u32, n: u32) -> Option<u32> {
+        let (tile, local) = (&self.tiles[(brick >> 9) as usize], brick & 511);
+        let moved = [0, 3, 6].map(|shift| (local >> shift & 7) + (n >> (shift / 3) & 1));
+        let around = 13 + 9 * (moved[2] >> 3) + 3 * (moved[1] >> 3) + (moved[0] >> 3);
+        let there = self.tiles.get(tile.around[around as usize] as usize)?;
+        let [x, y, z] = moved.map(|m| m & 7);
+        let (half, bit) = (usize::from(y >= 4), (y & 3) << 3 | x);
+        let words = there.bricks[z as usize];
+        let below = (1_u32 << bit) - 1;
+        let low = if half == 1 { words[0].count_ones() } else { 0 };
+        let rank = there.before[z as usize] + low + (words[half] & below).count_ones();
+        (words[half] >> bit & 1 == 1).then_some(there.base + rank)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::{BTreeSet, HashMap};
+
+    use super::*;
+    use crate::surface::control::Control;
+    use crate::surface::lattice::Lattice;
+    use crate::surface::params::{SurfaceLimits, SurfaceParams};
+    use crate::surface::spheres::Spheres;
+
+    fn plan() -> Plan {
+        let at = |i: u32, k: f64| 55.0 * (f64::from(i) * k).sin();
+        let column = |k: f64| (0..900).map(|i| at(i, k)).collect::<Vec<_>>();
+        let spheres = Spheres::new(column(0.37), column(1.13), column(2.71), vec![1.6; 900]).unwrap();
+        let lattice = Lattice::new(&spheres, &SurfaceParams::default()).unwrap();
+        Plan::new(&lattice, &SurfaceLimits::default(), &Control::default()).unwrap()
+    }
+
+    /// What is wrong with `chunks`.
+    fn wrong(plan: &Plan, chunks: &[Chunk], limits: ChunkLimits) -> Option<String> {
+        let place = |b: usize| {
+            let local = [0, 3, 6].map(|shift| i32::try_from(plan.bricks[b] >> shift & 7).unwrap());
+            let tile = plan.tiles[(plan.bricks[b] >> 9) as usize].coord;
+            std::array::from_fn::<i32, 3, _>(|k| 8 * tile[k] + local[k])
+        };
+        let index: HashMap<[i32; 3], u32> = (0..plan.bricks.len()).map(|b| (place(b), to_u32(b))).collect();
+        let mut next = 0;
+        for chunk in chunks {
+            if chunk.first_brick != next || chunk.n_own == 0 || chunk.n_slots() > limits.bricks {
+                return Some(format!("chunk at {} of {}", chunk.first_brick, chunk.n_slots()));
+            }
+            next += chunk.n_own;
+            let mut needed = BTreeSet::new();
+            for own in chunk.first_brick..next {
+                let at = place(own as usize);
+                for n in 1..8 {
+                    let there = std::array::from_fn(|k| at[k] + (n >> k & 1));
+                    needed.extend(index.get(&there).copied().filter(|&b| b >= next));
+                }
+            }
+            if !needed.iter().eq(&chunk.halo) {
+                return Some(format!("{} borrowed, {} needed", chunk.halo.len(), needed.len()));
+            }
+            let table = chunk.halo_table();
+            for (slot, brick) in (chunk.n_own..).zip(&chunk.halo) {
+                if table[chunk.halo.len() + (brick - next) as usize] != slot {
+                    return Some(format!("brick {brick} is not in slot {slot}"));
+                }
+            }
+            if table.len() as u64 != chunk.halo_table_len() {
+                return Some("the table's length".to_owned());
+            }
+        }
+        (next as usize != plan.bricks.len()).then(|| format!("{next} bricks"))
+    }
+
+    #[test]
+    fn chunks_cover_all_bricks_and_borrow_what_they_need() {
+        let plan = plan();
+        let limits = |bricks| ChunkLimits { bricks, candidates: 1 << 30 };
+        for bricks in [700, 1500, 4000, 1 << 20] {
+            let chunks = plan.chunks(limits(bricks)).unwrap();
+            assert_eq!(wrong(&plan, &chunks, limits(bricks)), None, "{bricks}");
+            assert_eq!(chunks.len() == 1, bricks == 1 << 20);
+        }
+        // Few entries for lists make small chunks too.
+        let few = ChunkLimits { bricks: 1 << 20, candidates: plan.candidates.iter().sum::<u64>() / 2 };
+        assert!(plan.chunks(few).unwrap().len() > 2);
+        assert!(plan.chunks(limits(100)).is_none());
+        // Controls.
+        let good = plan.chunks(limits(1500)).unwrap();
+        let mut bad = good.clone();
+        bad[0].halo.pop();
+        assert!(wrong(&plan, &bad, limits(1500)).is_some());
+        bad = good.clone();
+        bad.remove(1);
+        assert!(wrong(&plan, &bad, limits(1500)).is_some());
+        assert!(wrong(&plan, &good, limits(800)).is_some());
+    }
+}

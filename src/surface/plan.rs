@@ -1,0 +1,508 @@
+//! What a device is to do, worked out without one: which bricks exist, where their atoms are, how the work is cut into
+//! chunks that fit. Pure, and equal to what the CPU's stage `bin` finds.
+//!
+//! Bricks are numbered by tile (z, y, x), then by `z·64 + y·8 + x` within the tile: the order of the atoms, so the atoms
+//! of a run of bricks are one range. A brick exists where an atom reaches one of its samples, or the gap up to its
+//! neighbours' first samples: cells live there too.
+
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use super::control::Control;
+use super::cpu::{self, Constants, SlopeConstants};
+use super::error::SurfaceError;
+use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_u32, to_u64};
+use super::layout::{NONE, Params, Tile};
+use super::mesh::Mesh;
+use super::params::{SurfaceLimits, SurfaceParams};
+
+/// Atoms that one piece of parallel work marks the bricks of.
+const RUN: usize = 1024;
+/// More tiles than this in all runs together, and the grid is looked at before it is built.
+const MANY_TILES: u64 = 1 << 20;
+
+/// The bricks of a job.
+#[derive(Debug, Clone, Default)]
+pub struct Plan {
+    /// Tiles with bricks, in order.
+    pub tiles: Vec<Tile>,
+    /// Per brick its tile, shifted by 9, and its place within the tile.
+    pub bricks: Vec<u32>,
+    /// Per brick its first atom; one more entry than bricks.
+    pub first_atoms: Vec<u32>,
+    /// Per atom how far it reaches, in spacings, with a little slack for rounding.
+    pub reaches: Vec<f32>,
+    /// Per tile the entries of its bricks' candidate lists.
+    pub candidates: Vec<u64>,
+    /// Bricks with a sample in reach of an atom.
+    pub occupied: u64,
+    /// Pairs of such a brick and an atom that reaches one of its samples.
+    pub pairs: u64,
+    /// The longest reach.
+    pub reach: f32,
+}
+
+/// Bricks of a tile as bits: word z, bit `8·y + x`.
+type Bits = [u64; 8];
+
+/// What atoms mark in one tile.
+#[derive(Debug, Clone, Copy)]
+struct Marked {
+    tile: [i32; 3],
+    /// Bricks that exist.
+    closed: Bits,
+    /// Those with a sample in reach.
+    reached: Bits,
+    candidates: u64,
+    pairs: u64,
+}
+
+/// Squared gaps along one axis between an atom and the bricks of a tile, from `first` to before `end`.
+struct Gaps {
+    first: usize,
+    end: usize,
+    samples: [f32; 8],
+    closed: [f32; 8],
+}
+
+impl Gaps {
+    /// `local`: the atom's coordinate from the tile's first sample.
+    fn new(local: f32, reach: f32) -> Self {
+        let mut gaps = Self { first: 8, end: 0, samples: [0.0; 8], closed: [0.0; 8] };
+        for b in 0..8 {
+            let lo = (b * 8) as f32;
+            let gap = |hi: f32| (lo - local).max(local - hi).max(0.0);
+            let (samples, closed) = (gap(lo + 7.0), gap(lo + 8.0));
+            (gaps.samples[b], gaps.closed[b]) = (samples * samples, closed * closed);
+            if closed <= reach {
+                (gaps.first, gaps.end) = (gaps.first.min(b), b + 1);
+            }
+        }
+        gaps
+    }
+}
+
+impl Marked {
+    fn none(tile: [i32; 3]) -> Self {
+        Self { tile, closed: [0; 8], reached: [0; 8], candidates: 0, pairs: 0 }
+    }
+
+    /// Marks the bricks of the tile that `atom` reaches: the arithmetic of the CPU's stage `bin`, step by step.
+    fn mark(&mut self, atom: &LatticeAtom, reach: f32) {
+        let origin = self.tile.map(|t| t * TILE);
+        let local = |k: usize| (atom.cell[k] - origin[k]) as f32 + atom.frac[k];
+        let [x, y, z] = std::array::from_fn(|k| Gaps::new(local(k), reach));
+        let reach2 = reach * reach;
+        for bz in z.first..z.end {
+            for by in y.first..y.end {
+                let (closed, samples) = (y.closed[by] + z.closed[bz], y.samples[by] + z.samples[bz]);
+                let (mut near, mut hit) = (0_u64, 0_u64);
+                for bx in x.first..x.end {
+                    near |= u64::from(closed + x.closed[bx] <= reach2) << bx;
+                    hit |= u64::from(samples + x.samples[bx] <= reach2) << bx;
+                }
+                hit &= near;
+                self.closed[bz] |= near << (8 * by);
+                self.reached[bz] |= hit << (8 * by);
+                self.candidates += u64::from(near.count_ones());
+                self.pairs += u64::from(hit.count_ones());
+            }
+        }
+    }
+}
+
+/// How far an atom reaches, in spacings, a little more than its support: rounding must not lose a pair, and a pair too
+/// many adds zero.
+fn reach_of(lattice: &Lattice, atom: &LatticeAtom) -> f32 {
+    to_f32(lattice.reach(atom) * (1.0 + 1e-5)) + 1e-3
+}
+
+/// Marks the bricks of `atoms`, which live in one tile.
+fn mark_run(lattice: &Lattice, atoms: &[LatticeAtom], reaches: &[f32]) -> Vec<Marked> {
+    let mut marked: Vec<Marked> = Vec::new();
+    let mut at: FxHashMap<[i32; 3], usize> = FxHashMap::default();
+    // Neighbouring atoms reach the same few tiles: the last of each parity, as there are at most eight at most times.
+    let mut recent = [([i32::MAX; 3], 0); 8];
+    for (atom, &reach) in atoms.iter().zip(reaches) {
+        let [x, y, z] = cpu::tile_range(atom, lattice.reach(atom));
+        for tz in z[0]..=z[1] {
+            for ty in y[0]..=y[1] {
+                for tx in x[0]..=x[1] {
+                    let tile = [tx, ty, tz];
+                    let parity = tile.iter().fold(0, |p, c| p << 1 | usize::from(c & 1 == 1));
+                    let (cached, i) = &mut recent[parity];
+                    if *cached != tile {
+                        (*cached, *i) = (tile, *at.entry(tile).or_insert(marked.len()));
+                        if *i == marked.len() {
+                            marked.push(Marked::none(tile));
+                        }
+                    }
+                    marked[*i].mark(atom, reach);
+                }
+            }
+        }
+        // Where spheres are tiny, an atom may reach nothing of the brick that it lives in; its atoms are found there.
+        let home = tile_of(atom.cell);
+        let i = *at.entry(home).or_insert(marked.len());
+        if i == marked.len() {
+            marked.push(Marked::none(home));
+        }
+        let local = local_of(atom);
+        marked[i].closed[local as usize >> 6] |= 1 << (local & 63);
+    }
+    marked
+}
+
+/// The atoms of each tile, cut into runs.
+fn runs(atoms: &[LatticeAtom]) -> Vec<(usize, usize)> {
+    let mut runs = Vec::new();
+    let mut start = 0;
+    while start < atoms.len() {
+        let tile = tile_of(atoms[start].cell);
+        let end = (start + RUN).min(atoms.len());
+        let end = start + atoms[start..end].partition_point(|atom| tile_of(atom.cell) == tile);
+        runs.push((start, end));
+        start = end;
+    }
+    runs
+}
+
+impl Plan {
+    /// Finds the bricks of `lattice`.
+    ///
+    /// # Errors
+    /// [`SurfaceError::GridTooLarge`] before memory is allocated beyond what the limit allows,
+    /// [`SurfaceError::BadParameter`] for more atoms than 31 bits number, and [`SurfaceError::Cancelled`].
+    pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
+        let atoms = &lattice.atoms;
+        if atoms.len() > cpu::MAX_ATOMS {
+            return Err(cpu::too_many_atoms(atoms.len()));
+        }
+        let runs = runs(atoms);
+        refuse_early(lattice, &runs, limits)?;
+        control.check()?;
+        let reaches: Vec<f32> = atoms.par_iter().with_min_len(4096).map(|atom| reach_of(lattice, atom)).collect();
+        let marks: Vec<Vec<Marked>> = runs
+            .par_iter()
+            .map(|&(start, end)| {
+                control.check()?;
+                Ok(mark_run(lattice, &atoms[start..end], &reaches[start..end]))
+            })
+            .collect::<Result<_, SurfaceError>>()?;
+        let marked = merge(marks);
+        control.check()?;
+        let occupied = marked.iter().map(|m| ones(&m.reached)).sum::<u64>();
+        if occupied.saturating_mul(512) > limits.max_samples {
+            return Err(cpu::grid_too_large(lattice, occupied * 512, limits));
+        }
+        let mut plan = Self {
+            reach: reaches.iter().copied().fold(0.0, f32::max),
+            reaches,
+            candidates: marked.iter().map(|m| m.candidates).collect(),
+            occupied,
+            pairs: marked.iter().map(|m| m.pairs).sum(),
+            ..Self::default()
+        };
+        plan.number(&marked).ok_or_else(|| cpu::grid_too_large(lattice, u64::from(u32::MAX) * 512, limits))?;
+        plan.place(atoms);
+        Ok(plan)
+    }
+
+    /// Numbers tiles and bricks. `None` where 32 bits do not.
+    fn number(&mut self, marked: &[Marked]) -> Option<()> {
+        let index: FxHashMap<[i32; 3], u32> = marked.iter().map(|m| m.tile).zip(0..).collect();
+        if marked.len() >= 1 << 23 {
+            return None;
+        }
+        let mut base = 0_u32;
+        let mut bases = Vec::with_capacity(marked.len());
+        for m in marked {
+            bases.push(base);
+            base = base.checked_add(u32::try_from(ones(&m.closed)).ok()?)?;
+        }
+        self.tiles = marked
+            .par_iter()
+            .zip(&bases)
+            .map(|(m, &base)| {
+                let mut tile = Tile { coord: m.tile, base, bricks: [[0; 2]; 8], before: [0; 8], around: [NONE; 28] };
+                let mut before = 0;
+                for (z, word) in m.closed.iter().enumerate() {
+                    tile.bricks[z] = halves(*word);
+                    tile.before[z] = before;
+                    before += word.count_ones();
+                }
+                for (n, entry) in (0_i32..27).zip(&mut tile.around) {
+                    let step = [n % 3 - 1, n / 3 % 3 - 1, n / 9 - 1];
+                    let there = std::array::from_fn(|k| m.tile[k] + step[k]);
+                    *entry = index.get(&there).copied().unwrap_or(NONE);
+                }
+                tile
+            })
+            .collect();
+        self.bricks = (0_u32..)
+            .zip(marked)
+            .flat_map(|(tile, m)| set_bits(&m.closed).map(move |local| tile << 9 | local))
+            .collect();
+        Some(())
+    }
+
+    /// Finds every brick's first atom.
+    fn place(&mut self, atoms: &[LatticeAtom]) {
+        let Self { tiles, bricks, first_atoms, .. } = self;
+        first_atoms.resize(bricks.len() + 1, to_u32(atoms.len()));
+        let mut rest = &mut first_atoms[..];
+        let mut parts = Vec::with_capacity(tiles.len());
+        for (t, tile) in tiles.iter().enumerate() {
+            let end = tiles.get(t + 1).map_or(bricks.len(), |next| next.base as usize);
+            let (part, tail) = rest.split_at_mut(end - tile.base as usize);
+            parts.push((tile, part));
+            rest = tail;
+        }
+        parts.into_par_iter().for_each(|(tile, part)| {
+            let order = tile_order(tile.coord);
+            let mut at = atoms.partition_point(|atom| tile_order(tile_of(atom.cell)) < order);
+            let own = &bricks[tile.base as usize..][..part.len()];
+            for (brick, first) in own.iter().zip(part) {
+                // Every atom's own brick exists, so none is passed over.
+                *first = to_u32(at);
+                while atoms
+                    .get(at)
+                    .is_some_and(|atom| tile_of(atom.cell) == tile.coord && local_of(atom) == brick & 511)
+                {
+                    at += 1;
+                }
+            }
+        });
+    }
+
+    /// What every dispatch of the job has in common.
+    #[must_use]
+    pub fn params(&self, lattice: &Lattice, params: &SurfaceParams) -> Params {
+        let field = Constants::new(&lattice.profile, lattice.spacing);
+        let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
+        // Atoms lie at most half a spacing outside their brick's samples.
+        let bricks = |reach: f32| u32::try_from(to_u64(f64::from(reach) / f64::from(BRICK))).unwrap_or(u32::MAX);
+        Params {
+            centre: lattice.centre,
+            spacing: to_f32(lattice.spacing),
+            isovalue: to_f32(params.isovalue),
+            support: field.support,
+            share: field.share,
+            rate: field.rate,
+            tail_share: field.tail_share,
+            tail_rate: field.tail_rate,
+            tail_end: field.tail_end,
+            amplitude: field.amplitude,
+            u_min: field.u_min,
+            slope_offset: slope.offset,
+            slope_tail: slope.tail,
+            reach: self.reach,
+            back: bricks(self.reach + 7.51),
+            ahead: bricks(self.reach + 8.51),
+            n_tiles: to_u32(self.tiles.len()),
+            n_bricks: to_u32(self.bricks.len()),
+            ..bytemuck::Zeroable::zeroed()
+        }
+    }
+}
+
+/// Refuses a mesh of so many vertices and triangles that the limits do not allow, and one of none.
+///
+/// # Errors
+/// [`SurfaceError::MeshTooLarge`], also where 32 bits do not number the vertices; [`SurfaceError::NoSurface`].
+pub fn check_totals(
+    lattice: &Lattice,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    n_vertices: u64,
+    n_triangles: u64,
+) -> Result<(), SurfaceError> {
+    if n_triangles == 0 {
+        return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
+    }
+    let bytes = Mesh::bytes_for(n_vertices, n_triangles);
+    let most = limits.max_mesh_bytes.min(Mesh::bytes_for(u64::from(u32::MAX), 0));
+    if bytes <= most { Ok(()) } else { Err(cpu::mesh_too_large(bytes, lattice.spacing, most)) }
+}
+
+/// Refuses a grid that is certain to exceed the limit before any of it is computed.
+fn refuse_early(lattice: &Lattice, runs: &[(usize, usize)], limits: &SurfaceLimits) -> Result<(), SurfaceError> {
+    let tiles_of = |atom: &LatticeAtom| -> u64 {
+        let range = cpu::tile_range(atom, lattice.reach(atom));
+        range.iter().map(|[lo, hi]| u64::from(lo.abs_diff(*hi)) + 1).product()
+    };
+    // Tiles that the runs will hold: no more than their atoms reach, hence few unless spheres are huge in spacings.
+    let most: u64 = runs
+        .par_iter()
+        .map(|&(start, end)| lattice.atoms[start..end].iter().map(tiles_of).fold(0, u64::saturating_add))
+        .reduce(|| 0, u64::saturating_add);
+    let each: u64 = lattice.atoms.par_iter().with_min_len(4096).map(tiles_of).max().unwrap_or(0);
+    if each <= 8 && most <= limits.max_samples.max(MANY_TILES) {
+        return Ok(());
+    }
+    if each.saturating_mul(runs.len() as u64) <= MANY_TILES {
+        return Ok(());
+    }
+    let least = to_u64(cpu::samples_at_least(lattice));
+    if least > limits.max_samples { Err(cpu::grid_too_large(lattice, least, limits)) } else { Ok(()) }
+}
+
+/// Everything that was marked, one entry a tile, in the order of tiles.
+fn merge(marks: Vec<Vec<Marked>>) -> Vec<Marked> {
+    let mut all: Vec<Marked> = marks.into_iter().flatten().collect();
+    all.par_sort_unstable_by_key(|m| tile_order(m.tile));
+    let mut merged: Vec<Marked> = Vec::new();
+    for mark in all {
+        match merged.last_mut().filter(|last| last.tile == mark.tile) {
+            Some(last) => {
+                last.closed.iter_mut().zip(mark.closed).for_each(|(word, more)| *word |= more);
+                last.reached.iter_mut().zip(mark.reached).for_each(|(word, more)| *word |= more);
+                last.candidates += mark.candidates;
+                last.pairs += mark.pairs;
+            }
+            // A tile is in an atom's range by a corner that no brick is near to.
+            None if mark.closed == [0; 8] => {}
+            None => merged.push(mark),
+        }
+    }
+    merged
+}
+
+fn ones(bits: &Bits) -> u64 {
+    bits.iter().map(|word| u64::from(word.count_ones())).sum()
+}
+
+/// Positions of the set bits, ascending.
+fn set_bits(bits: &Bits) -> impl Iterator<Item = u32> + '_ {
+    (0_u32..).zip(bits).flat_map(|(z, &word)| {
+        let mut rest = word;
+        std::iter::from_fn(move || {
+            let bit = (rest != 0).then(|| rest.trailing_zeros());
+            rest &= rest.wrapping_sub(1);
+            bit.map(|bit| z << 6 | bit)
+        })
+    })
+}
+
+/// The lower and the upper 32 bits.
+fn halves(word: u64) -> [u32; 2] {
+    let part = |v: u64| u32::try_from(v & u64::from(u32::MAX)).unwrap_or_default();
+    [part(word), part(word >> 32)]
+}
+
+/// An atom's brick within its tile.
+fn local_of(atom: &LatticeAtom) -> u32 {
+    let [x, y, z] = atom.cell.map(|c| c.rem_euclid(TILE).unsigned_abs() / BRICK.unsigned_abs());
+    z << 6 | y << 3 | x
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashMap;
+
+    use super::*;
+    use crate::surface::params::SurfaceOptions;
+    use crate::surface::spheres::Spheres;
+
+    fn lattice(n: u32, side: f64, resolution: f64) -> Lattice {
+        let mut state = 3_u64;
+        let mut next = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1_u64 << 53) as f64
+        };
+        let mut column = || (0..n).map(|_| side * (next() - 0.5)).collect::<Vec<_>>();
+        let (x, y, z) = (column(), column(), column());
+        let radii = (0..n).map(|i| 1.2 + 0.1 * (i % 7) as f32).collect();
+        let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
+        Lattice::new(&Spheres::new(x, y, z, radii).unwrap(), &SurfaceParams::new(&options).unwrap()).unwrap()
+    }
+
+    fn plan(lattice: &Lattice) -> Plan {
+        Plan::new(lattice, &SurfaceLimits::default(), &Control::default()).unwrap()
+    }
+
+    /// Place of each brick, in bricks.
+    fn coords(plan: &Plan) -> Vec<[i32; 3]> {
+        let place = |&b: &u32| {
+            let local = [0, 3, 6].map(|shift| i32::try_from(b >> shift & 7).unwrap());
+            let tile = plan.tiles[(b >> 9) as usize].coord;
+            std::array::from_fn(|k| 8 * tile[k] + local[k])
+        };
+        plan.bricks.iter().map(place).collect()
+    }
+
+    #[test]
+    fn bricks_are_in_order_and_hold_their_atoms() {
+        // From bricks much larger than atoms, of which some reach nothing of their own, to much smaller ones.
+        for resolution in [20.0, 3.0, 0.5, 0.15] {
+            let lattice = lattice(200, 60.0, resolution);
+            let plan = plan(&lattice);
+            assert!(plan.bricks.windows(2).all(|pair| pair[0] < pair[1]));
+            assert!(plan.tiles.windows(2).all(|pair| tile_order(pair[0].coord) < tile_order(pair[1].coord)));
+            let coords = coords(&plan);
+            let mut seen = 0;
+            for (i, place) in coords.iter().enumerate() {
+                let [from, to] = [plan.first_atoms[i], plan.first_atoms[i + 1]];
+                assert_eq!(from, seen);
+                seen = to;
+                for atom in &lattice.atoms[from as usize..to as usize] {
+                    assert_eq!(atom.cell.map(|c| c.div_euclid(BRICK)), *place);
+                }
+            }
+            assert_eq!(seen, 200);
+        }
+    }
+
+    #[test]
+    fn a_brick_exists_where_an_atom_is_near_and_nowhere_else() {
+        let lattice = lattice(60, 25.0, 0.6);
+        let plan = plan(&lattice);
+        let exists: HashMap<[i32; 3], usize> = coords(&plan).into_iter().zip(0..).collect();
+        let (mut there, mut pairs) = (0, 0);
+        for z in -8..8 {
+            for y in -8..8 {
+                for x in -8..8 {
+                    // In double precision, with the slack that atoms have and a little less.
+                    let near = |beyond: f64, slack: f64| {
+                        let gap = |c: f64, b: i32| {
+                            let lo = f64::from(b * BRICK);
+                            (lo - c).max(c - lo - beyond).max(0.0)
+                        };
+                        let reaches = |atom: &&LatticeAtom| {
+                            let d = [gap(atom.position(0), x), gap(atom.position(1), y), gap(atom.position(2), z)];
+                            d.iter().map(|d| d * d).sum::<f64>().sqrt() <= lattice.reach(atom) + slack
+                        };
+                        lattice.atoms.iter().filter(reaches).count()
+                    };
+                    let found = exists.contains_key(&[x, y, z]);
+                    assert!(near(8.0, 0.0) == 0 || found, "{x} {y} {z} is missing");
+                    assert!(near(8.0, 2e-3) > 0 || !found, "{x} {y} {z} is too many");
+                    there += usize::from(found);
+                    pairs += near(7.0, 1e-3);
+                }
+            }
+        }
+        assert_eq!((there, there > 100), (plan.bricks.len(), true));
+        assert!(pairs.abs_diff(usize::try_from(plan.pairs).unwrap()) <= 2, "{pairs} {}", plan.pairs);
+    }
+
+    #[test]
+    fn a_grid_beyond_the_limit_is_refused_with_one_that_fits() {
+        let lattice = lattice(300, 80.0, 0.5);
+        let samples = plan(&lattice).occupied * 512;
+        let with = |max_samples| {
+            Plan::new(&lattice, &SurfaceLimits { max_samples, ..SurfaceLimits::default() }, &Control::default())
+        };
+        assert!(with(samples).is_ok());
+        match with(samples - 1) {
+            Err(SurfaceError::GridTooLarge { samples: n, limit, suggested_resolution, .. }) => {
+                assert_eq!((n, limit), (samples, samples - 1));
+                assert!(suggested_resolution >= 0.5);
+            }
+            other => panic!("{:?}", other.map(|p| p.occupied)),
+        }
+        let control = Control::default();
+        control.cancel.cancel();
+        assert_eq!(Plan::new(&lattice, &SurfaceLimits::default(), &control).err(), Some(SurfaceError::Cancelled));
+    }
+}

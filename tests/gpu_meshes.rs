@@ -1,0 +1,295 @@
+//! Whole meshes of the engine against the CPU backend's, on the software device.
+#![cfg(feature = "gpu")]
+#![expect(clippy::unwrap_used, clippy::float_cmp, reason = "a test may panic, and means equality where it asks for it")]
+
+mod gpu_support;
+
+use gpu_support::{KERNELS, Random, engine, engine_with, job, measures, mesh_of, params, run, sample, spheres};
+use molmesh::gpu::{Budget, Executor, GpuError};
+use molmesh::surface::chunks::ChunkLimits;
+use molmesh::surface::{
+    Backend, Control, CpuBackend, Mesh, Meshed, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+};
+
+fn cpu(spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+    CpuBackend::new(Some(2)).unwrap().run(spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap()
+}
+
+/// What is wrong with `mesh`, going by `expected`; bounds in Å.
+fn difference(mesh: &Mesh, expected: &Mesh) -> Option<String> {
+    if mesh.centre != expected.centre {
+        return Some("centre".to_owned());
+    }
+    if mesh.triangles != expected.triangles {
+        let first = mesh.triangles.iter().zip(&expected.triangles).position(|(a, b)| a != b);
+        return Some(format!("{} triangles of {}, first at {first:?}", mesh.n_triangles(), expected.n_triangles()));
+    }
+    let furthest = |a: &[[f32; 3]], b: &[[f32; 3]]| {
+        let apart = |(a, b): (&[f32; 3], &[f32; 3])| (0..3).map(|k| (a[k] - b[k]).abs()).fold(0.0, f32::max);
+        a.iter().zip(b).map(apart).fold(0.0, f32::max)
+    };
+    let (n, apart) = (mesh.n_vertices(), furthest(&mesh.positions, &expected.positions));
+    let turned = furthest(&mesh.normals, &expected.normals);
+    (n != expected.n_vertices() || mesh.normals.len() != n || apart > 1e-4 || turned > 2e-2)
+        .then(|| format!("{n} vertices of {}, {apart} Å apart, normals {turned}", expected.n_vertices()))
+}
+
+fn assert_equal(gpu: &Meshed, spheres: &Spheres, params: &SurfaceParams, what: &str) {
+    let cpu = cpu(spheres, params);
+    assert_eq!(difference(&gpu.mesh, &cpu.mesh), None, "{what}");
+    assert_eq!(gpu.grid, cpu.grid, "{what}");
+    let (a, b) = (measures(gpu), measures(&cpu));
+    assert!(a.closed && a.oriented && a.manifold, "{what}: {a:?}");
+    assert_eq!((a.euler, a.components.len()), (b.euler, b.components.len()), "{what}");
+    assert!((a.area / b.area - 1.0).abs() < 1e-5 && (a.volume / b.volume - 1.0).abs() < 1e-5, "{what}");
+    for n in &gpu.mesh.normals {
+        let length = n.iter().map(|c| f64::from(*c).powi(2)).sum::<f64>().sqrt();
+        assert!((length - 1.0).abs() < 1e-5, "{what}: normal {n:?}");
+    }
+}
+
+#[test]
+fn structures_are_as_on_the_cpu_with_every_kernel() {
+    for name in ["4pti.pdb", "1crn.cif"] {
+        let spheres = sample(name);
+        for kernel in KERNELS {
+            let params = params(kernel, 0.5);
+            let meshed = mesh_of(&mut engine(), &spheres, &params);
+            assert_equal(&meshed, &spheres, &params, &format!("{name} {kernel}"));
+        }
+    }
+}
+
+#[test]
+fn the_comparison_finds_fault() {
+    let spheres = sample("1crn.cif");
+    let good = cpu(&spheres, &params(KERNELS[0], 1.0)).mesh;
+    assert_eq!(difference(&good, &good), None);
+    let changed = |change: &dyn Fn(&mut Mesh)| {
+        let mut mesh = good.clone();
+        change(&mut mesh);
+        difference(&mesh, &good)
+    };
+    assert!(changed(&|m| m.triangles[7].swap(0, 1)).is_some());
+    assert!(changed(&|m| _ = m.triangles.edit().pop()).is_some());
+    assert!(changed(&|m| m.positions[3][1] += 2e-4).is_some());
+    assert!(changed(&|m| m.normals[5] = m.normals[5].map(|c| -c)).is_some());
+    assert!(changed(&|m| _ = m.positions.edit().pop()).is_some());
+    assert!(changed(&|m| m.centre[0] += 0.5).is_some());
+}
+
+/// Small cases that a grid's seams and limits make hard.
+fn hard_cases() -> Vec<(&'static str, Vec<[f64; 4]>, f64)> {
+    let mut random = Random(7);
+    let ring = |n: u32| {
+        (0..n).map(move |i| {
+            let angle = f64::from(i) * std::f64::consts::TAU / f64::from(n);
+            [10.0 * angle.cos(), 10.0 * angle.sin(), 0.37 * f64::from(i), 1.7]
+        })
+    };
+    vec![
+        ("one atom", vec![[0.1, -0.2, 0.3, 1.7]], 0.5),
+        ("one atom on a tile's corner", vec![[0.0, 0.0, 0.0, 1.7]], 0.5),
+        ("one atom before a tile's corner", vec![[31.9, -32.1, 63.99, 1.5]], 0.5),
+        ("two atoms far apart", vec![[-400.0, 300.0, 20.0, 1.2], [5000.0, -2000.0, 900.0, 1.9]], 0.5),
+        ("negative coordinates", ring(24).map(|[x, y, z, r]| [x - 90.0, y - 90.0, z - 130.0, r]).collect(), 0.4),
+        ("across tiles", ring(40).map(|[x, y, z, r]| [x + 32.0, y + 32.0, z + 26.0, r]).collect(), 0.5),
+        ("coarse", random.cloud(300, 60.0), 3.0),
+        ("coarser than the atoms", random.cloud(60, 60.0), 1.3),
+        ("fine", vec![[0.0, 0.0, 0.0, 1.5], [1.6, 0.3, -0.2, 1.7], [-0.9, 1.3, 0.4, 1.2]], 0.1),
+        ("a crowd", random.cloud(2000, 24.0), 0.6),
+        ("coinciding atoms", vec![[1.0, 2.0, 3.0, 1.5]; 5], 0.5),
+        ("very different radii", vec![[0.0, 0.0, 0.0, 14.0], [16.0, 1.0, 0.0, 0.3], [-9.0, 12.0, 3.0, 1.1]], 0.6),
+    ]
+}
+
+#[test]
+fn hard_cases_are_as_on_the_cpu() {
+    for (name, rows, resolution) in hard_cases() {
+        let spheres = spheres(&rows);
+        for kernel in KERNELS {
+            let params = params(kernel, resolution);
+            let meshed = match run(&mut engine(), &job(&spheres, &params)) {
+                Ok(finished) => finished.meshed,
+                Err(e) => {
+                    // Where the CPU finds no surface either.
+                    let cpu = CpuBackend::new(Some(2)).unwrap();
+                    let same = cpu.run(&spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap_err();
+                    assert_eq!(e, GpuError::Surface(same), "{name} {kernel}");
+                    continue;
+                }
+            };
+            assert_equal(&meshed, &spheres, &params, &format!("{name} {kernel}"));
+        }
+    }
+}
+
+#[test]
+fn parameters_of_the_paper_and_presets_are_as_on_the_cpu() {
+    use molmesh::surface::{Kernel, Preset};
+    let spheres = sample("1crn.cif");
+    let all = [
+        SurfaceOptions { preset: Some(Preset::SesLike), ..SurfaceOptions::default() },
+        SurfaceOptions { preset: Some(Preset::VdwLike), atom_ids: true, ..SurfaceOptions::default() },
+        SurfaceOptions { preset: Some(Preset::Quicksurf), radius_scale: Some(1.2), ..SurfaceOptions::default() },
+        SurfaceOptions { smoothness: Some(40.0), cutoff_tolerance: Some(1e-6), ..SurfaceOptions::default() },
+        SurfaceOptions { paper_a: Some(0.5), paper_b: Some(4.0), isovalue: Some(0.7), ..SurfaceOptions::default() },
+        SurfaceOptions {
+            kernel: Some(Kernel::SoftObject),
+            paper_a: Some(1.5),
+            paper_b: Some(3.0),
+            isovalue: Some(0.6),
+            ..SurfaceOptions::default()
+        },
+        SurfaceOptions {
+            kernel: Some(Kernel::InverseSquare),
+            paper_c: Some(0.8),
+            paper_b: Some(5.0),
+            isovalue: Some(0.9),
+            atom_ids: true,
+            ..SurfaceOptions::default()
+        },
+    ];
+    for options in all {
+        let params = SurfaceParams::new(&options).unwrap();
+        let meshed = mesh_of(&mut engine(), &spheres, &params);
+        assert_equal(&meshed, &spheres, &params, &format!("{options:?}"));
+        let expected = cpu(&spheres, &params).mesh.atom_ids;
+        assert_eq!(meshed.mesh.atom_ids.is_some(), expected.is_some());
+        if let (Some(ids), Some(expected)) = (meshed.mesh.atom_ids, expected) {
+            // Two atoms at the same distance to the last bit may change places.
+            let other = ids.iter().zip(&expected).filter(|(a, b)| a != b).count();
+            assert!(other * 1000 <= ids.len(), "{options:?}: {other} of {} nearest atoms differ", ids.len());
+        }
+    }
+}
+
+fn bytes(mesh: &Mesh) -> (Vec<u8>, Vec<u8>, Vec<u8>) {
+    let raw = |rows: &[[f32; 3]]| bytemuck::cast_slice(rows).to_vec();
+    (raw(&mesh.positions), raw(&mesh.normals), bytemuck::cast_slice(&mesh.triangles).to_vec())
+}
+
+/// Makes a budget smaller.
+type Change = fn(&mut Budget);
+
+#[test]
+fn chunks_pieces_and_landings_change_no_byte() {
+    let mut random = Random(11);
+    let cloud: Vec<[f64; 4]> =
+        random.cloud(1500, 70.0).iter().map(|[x, y, z, r]| [x - 20.0, y + 3.0, z - 40.0, *r]).collect();
+    let crowd = spheres(&cloud);
+    let params = params(KERNELS[0], 0.5);
+    let whole = mesh_of(&mut engine(), &crowd, &params);
+    assert_equal(&whole, &crowd, &params, "whole");
+    // Small enough to be cut below, large enough that it will be.
+    let plan = job(&crowd, &params).prepared;
+    let chunks = plan.plan.chunks(ChunkLimits { bricks: 900, candidates: 1 << 30 }).unwrap();
+    assert!(chunks.len() > 4 && chunks.iter().all(|c| c.n_slots() <= 900), "{} chunks", chunks.len());
+    assert!(whole.mesh.n_triangles() * 12 > 5 << 20, "{} triangles", whole.mesh.n_triangles());
+    let again = mesh_of(&mut engine(), &crowd, &params);
+    assert_eq!(bytes(&whole.mesh), bytes(&again.mesh), "two runs");
+    let cut: [(&str, Change); 4] = [
+        ("chunks", |b| b.chunk_bricks = 900),
+        ("pieces", |b| (b.small_bytes, b.piece_bytes) = (0, 2 << 20)),
+        ("landings", |b| (b.small_bytes, b.landing_bytes) = (0, 3 << 20)),
+        ("all three", |b| (b.chunk_bricks, b.piece_bytes, b.landing_bytes) = (1200, 2 << 20, 3 << 20)),
+    ];
+    for (what, change) in cut {
+        let mut engine = engine_with(change);
+        let meshed = mesh_of(&mut engine, &crowd, &params);
+        assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{what}");
+        assert_eq!(meshed.grid, whole.grid, "{what}");
+        // In another order, and with buffers that still hold the last job.
+        let backwards: Vec<[f64; 4]> = cloud.iter().rev().copied().collect();
+        let other = mesh_of(&mut engine, &spheres(&backwards), &params);
+        assert_eq!(bytes(&other.mesh), bytes(&whole.mesh), "{what}, other order");
+    }
+}
+
+#[test]
+fn more_workgroups_than_one_dimension_has() {
+    // Lone atoms on a grid of their own: each has a few dozen bricks and little to compute.
+    let rows: Vec<[f64; 4]> = (0..8000)
+        .map(|i| [i % 20, i / 20 % 20, i / 400].map(|k| 41.3 * f64::from(k) - 300.0))
+        .map(|[x, y, z]| [x, y, z, 1.4])
+        .collect();
+    let (spheres, params) = (spheres(&rows), params(KERNELS[1], 0.5));
+    let job = job(&spheres, &params);
+    assert!(job.prepared.plan.bricks.len() > 70_000, "{} bricks", job.prepared.plan.bricks.len());
+    let meshed = run(&mut engine(), &job).unwrap().meshed;
+    assert_equal(&meshed, &spheres, &params, "many");
+}
+
+#[test]
+fn an_estimate_that_is_too_low_costs_a_second_round_and_nothing_else() {
+    let spheres = sample("1crn.cif");
+    let params = params(KERNELS[0], 0.5);
+    let whole = mesh_of(&mut engine(), &spheres, &params);
+    for rows in [[1, 256], [128, 1], [20, 20]] {
+        let mut engine = engine_with(|b| b.rows_per_brick = rows);
+        let meshed = mesh_of(&mut engine, &spheres, &params);
+        assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{rows:?}");
+    }
+}
+
+#[test]
+fn several_jobs_share_a_submission_and_none_sees_another() {
+    let mut random = Random(5);
+    let clouds: Vec<Spheres> = (1..=9).map(|n| spheres(&random.cloud(n * n * 7, 6.0 * n as f64))).collect();
+    let mut jobs: Vec<_> =
+        clouds.iter().zip(KERNELS.iter().cycle()).map(|(cloud, &kernel)| job(cloud, &params(kernel, 0.5))).collect();
+    // One that has no surface, one that nobody wants any more, one whose time is over.
+    let high = SurfaceOptions { isovalue: Some(1e6), ..SurfaceOptions::default() };
+    jobs.push(job(&clouds[2], &SurfaceParams::new(&high).unwrap()));
+    jobs.push(job(&clouds[3], &params(KERNELS[0], 0.5)));
+    jobs[10].cancel.cancel();
+    jobs.push(job(&clouds[3], &params(KERNELS[0], 0.5)));
+    jobs[11].deadline = Some(std::time::Instant::now());
+    let mut answers = engine().run(&jobs);
+    assert_eq!(answers.len(), 12);
+    assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Deadline);
+    assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(molmesh::surface::SurfaceError::Cancelled));
+    let none = molmesh::surface::SurfaceError::NoSurface { isovalue: 1e6 };
+    assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(none));
+    for ((answer, job), cloud) in answers.into_iter().zip(&jobs).zip(&clouds) {
+        let together = answer.unwrap();
+        assert_equal(&together.meshed, cloud, &job.prepared.params, "together");
+        let alone = run(&mut engine(), job).unwrap();
+        assert_eq!(bytes(&together.meshed.mesh), bytes(&alone.meshed.mesh));
+    }
+}
+
+#[test]
+fn meshes_outlive_the_engine_and_give_their_memory_back() {
+    let params = params(KERNELS[0], 1.0);
+    let spheres = sample("1crn.cif");
+    let mut engine = engine_with(|_| ());
+    let first = mesh_of(&mut engine, &spheres, &params);
+    let kept = bytes(&first.mesh);
+    let while_kept = {
+        let _second = mesh_of(&mut engine, &spheres, &params);
+        engine.held_bytes()
+    };
+    // A third finds the second's landing again.
+    let third = mesh_of(&mut engine, &spheres, &params);
+    assert_eq!(engine.held_bytes(), while_kept);
+    drop(third);
+    drop(engine);
+    assert_eq!(bytes(&first.mesh), kept);
+}
+
+#[test]
+fn what_a_device_cannot_hold_is_refused_with_numbers() {
+    let spheres = sample("1crn.cif");
+    let params = params(KERNELS[0], 0.3);
+    let mut engine = engine_with(|b| b.memory = 1 << 20);
+    let error = run(&mut engine, &job(&spheres, &params)).unwrap_err();
+    let GpuError::OutOfMemory { needed, available, suggested_resolution } = error else { panic!("{error}") };
+    assert!(
+        needed > available && available == 1 << 20 && suggested_resolution > 0.3,
+        "{needed} {suggested_resolution}"
+    );
+    let mut engine = engine_with(|b| b.chunk_bricks = 10);
+    let error = run(&mut engine, &job(&spheres, &params)).unwrap_err();
+    assert!(matches!(error, GpuError::OutOfMemory { .. }), "{error}");
+}

@@ -1,0 +1,102 @@
+//! A device for the tests: the software one, which every machine can have. A test without it fails.
+
+#![allow(dead_code, reason = "every test binary uses a part")]
+
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
+
+use molmesh::gpu::{Budget, Engine, Executor, Finished, GpuError, GpuJob, Prepared};
+use molmesh::surface::{
+    CancelToken, Control, Kernel, Measures, Meshed, Proof, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+};
+
+pub(crate) const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
+
+/// A Vulkan device with the adapter's own limits.
+pub(crate) fn device() -> (wgpu::Device, wgpu::Queue) {
+    let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
+    descriptor.backends = wgpu::Backends::VULKAN;
+    let instance = wgpu::Instance::new(descriptor);
+    let adapter = pollster::block_on(instance.request_adapter(&wgpu::RequestAdapterOptions::default()))
+        .expect("a Vulkan adapter: install Mesa's lavapipe");
+    let features = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
+    pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+        label: Some("molmesh.test"),
+        required_features: features,
+        required_limits: adapter.limits(),
+        ..Default::default()
+    }))
+    .expect("a device")
+}
+
+/// One engine for all tests of a binary: compiling it takes longer than most of them.
+pub(crate) fn engine() -> MutexGuard<'static, Engine> {
+    static ENGINE: OnceLock<Mutex<Engine>> = OnceLock::new();
+    let make = || {
+        let (device, queue) = device();
+        Mutex::new(Engine::new(device, queue).expect("the stages compile"))
+    };
+    ENGINE.get_or_init(make).lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+}
+
+/// An engine within what `change` makes of the device's budget.
+pub(crate) fn engine_with(change: impl FnOnce(&mut Budget)) -> Engine {
+    let (device, queue) = device();
+    let mut budget = Budget::of(&device.limits());
+    change(&mut budget);
+    Engine::with_budget(device, queue, budget).expect("the stages compile")
+}
+
+pub(crate) fn job(spheres: &Spheres, params: &SurfaceParams) -> GpuJob {
+    let prepared = Prepared::new(spheres, params, &SurfaceLimits::default(), &Control::default()).expect("prepared");
+    GpuJob { prepared: Arc::new(prepared), cancel: CancelToken::default(), deadline: None }
+}
+
+pub(crate) fn run(engine: &mut Engine, job: &GpuJob) -> Result<Finished, GpuError> {
+    engine.run(std::slice::from_ref(job)).pop().expect("one answer")
+}
+
+pub(crate) fn mesh_of(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+    run(engine, &job(spheres, params)).expect("a mesh").meshed
+}
+
+pub(crate) fn spheres(rows: &[[f64; 4]]) -> Spheres {
+    let column = |k: usize| rows.iter().map(|row| row[k]).collect();
+    #[expect(clippy::cast_possible_truncation, reason = "radii of tests")]
+    let radii = rows.iter().map(|row| row[3] as f32).collect();
+    Spheres::new(column(0), column(1), column(2), radii).expect("usable spheres")
+}
+
+pub(crate) fn params(kernel: Kernel, resolution: f64) -> SurfaceParams {
+    let options = SurfaceOptions { kernel: Some(kernel), resolution: Some(resolution), ..SurfaceOptions::default() };
+    SurfaceParams::new(&options).expect("valid")
+}
+
+pub(crate) fn measures(meshed: &Meshed) -> Measures {
+    Measures::of(&meshed.mesh, Proof::Exact, &Control::default()).expect("not cancelled")
+}
+
+/// The spheres of a structure in `samples/`.
+pub(crate) fn sample(name: &str) -> Spheres {
+    use molmesh::structure;
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("samples").join(name);
+    let bytes = std::fs::read(path).expect("a sample");
+    let structure = structure::read(&bytes, &structure::ReadLimits::default()).expect("readable");
+    structure::select(&structure, &structure::Selection::default())
+        .expect("atoms")
+        .spheres(&structure)
+        .expect("spheres")
+}
+
+/// A small deterministic generator: tests must fail the same way twice.
+pub(crate) struct Random(pub(crate) u64);
+
+impl Random {
+    pub(crate) fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    pub(crate) fn cloud(&mut self, n: usize, side: f64) -> Vec<[f64; 4]> {
+        (0..n).map(|_| [self.next() * side, self.next() * side, self.next() * side, 1.2 + 0.7 * self.next()]).collect()
+    }
+}

@@ -1,0 +1,352 @@
+//! Stage by stage: a device's stage, fed with what the CPU's stages before it made, against the CPU's. `bin`, `classify`,
+//! `scan` and `emit` to the bit, `field` and `interpolate` within bounds. Outputs hold poison before a stage runs.
+#![cfg(feature = "gpu")]
+#![expect(clippy::unwrap_used, reason = "a test may panic")]
+
+mod gpu_support;
+
+use std::collections::HashMap;
+
+use bytemuck::{Pod, pod_collect_to_vec};
+use gpu_support::{KERNELS, engine_with, job, params, sample, spheres};
+use molmesh::gpu::GpuJob;
+use molmesh::gpu::probe::Bench;
+use molmesh::surface::cpu::probe::{Probe, ProbedBrick, ProbedSurface, probe};
+use molmesh::surface::layout::{GROUP, Record, Tally};
+use molmesh::surface::{Kernel, Spheres, Stage, SurfaceLimits};
+
+/// Densities differ by at most this part of them, or of a tenth where they are smaller.
+const FIELD_BOUND: f32 = 1e-5;
+/// Vertices lie at most this far apart, Å.
+const POSITION_BOUND: f32 = 1e-4;
+/// Normals differ by at most this, per component.
+const NORMAL_BOUND: f32 = 1e-3;
+
+/// A job, what the CPU makes of it, and its buffers on the device.
+struct Setup {
+    job: GpuJob,
+    probe: Probe,
+    bench: Bench,
+    /// The CPU's bricks in the order of the plan; a plan's brick without atoms is none of the CPU's.
+    bricks: Vec<Option<ProbedBrick>>,
+    surface: Vec<Option<ProbedSurface>>,
+}
+
+fn halves(word: u64) -> [u32; 2] {
+    [word & 0xffff_ffff, word >> 32].map(|half| u32::try_from(half).unwrap())
+}
+
+fn u32_of(n: usize) -> u32 {
+    u32::try_from(n).unwrap()
+}
+
+impl Setup {
+    fn new(spheres: &Spheres, kernel: Kernel, resolution: f64) -> Self {
+        let params = params(kernel, resolution);
+        let job = job(spheres, &params);
+        let probe = probe(&job.prepared.lattice, &params, &SurfaceLimits::default()).unwrap();
+        let rows = [probe.mesh.n_vertices(), probe.mesh.n_triangles()].map(u32_of);
+        let bench = Bench::new(engine_with(|_| ()), &job, rows[0], rows[1]).unwrap();
+        let plan = &job.prepared.plan;
+        let coord = |&brick: &u32| {
+            let tile = plan.tiles[(brick >> 9) as usize].coord;
+            [0, 3, 6]
+                .map(|shift| i32::try_from(brick >> shift & 7).unwrap())
+                .iter()
+                .zip(tile)
+                .map(|(b, t)| 8 * t + b)
+                .collect::<Vec<_>>()
+        };
+        let coords: Vec<Vec<i32>> = plan.bricks.iter().map(coord).collect();
+        let mut bricks: HashMap<Vec<i32>, ProbedBrick> =
+            probe.bricks.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
+        let mut surface: HashMap<Vec<i32>, ProbedSurface> =
+            probe.surface.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
+        let bricks_in_order = coords.iter().map(|c| bricks.remove(c)).collect();
+        let surface_in_order = coords.iter().map(|c| surface.remove(c)).collect();
+        assert!(bricks.is_empty() && surface.is_empty(), "the plan has every brick of the CPU's");
+        Self { job, probe, bench, bricks: bricks_in_order, surface: surface_in_order }
+    }
+
+    /// Runs `stage` on `inputs` with every output poisoned, and reads the outputs.
+    fn run(&self, stage: Stage, inputs: &[(&str, Vec<u8>)], outputs: &[&str]) -> Vec<Vec<u8>> {
+        for (name, bytes) in inputs {
+            self.bench.write(name, bytes);
+        }
+        self.bench.run(stage).unwrap();
+        outputs.iter().map(|name| self.bench.read(name, self.bench.needed(&self.job, name)).unwrap()).collect()
+    }
+
+    fn poison(&self, buffers: &[&str]) {
+        for name in buffers {
+            self.bench.poison(name);
+        }
+    }
+
+    /// The CPU's candidate lists as the device keeps them: entries, and (start, reaching, all, brick) per brick.
+    fn lists(&self) -> (Vec<u32>, Vec<[u32; 4]>) {
+        let (mut entries, mut heads) = (Vec::new(), Vec::new());
+        for (id, brick) in self.bricks.iter().enumerate() {
+            let start = u32_of(entries.len());
+            let (reaching, gap): (&[u32], &[u32]) = brick.as_ref().map_or((&[], &[]), |b| (&b.reaching, &b.gap_only));
+            entries.extend(reaching.iter().chain(gap));
+            heads.push([start, u32_of(reaching.len()), u32_of(reaching.len() + gap.len()), u32_of(id)]);
+        }
+        (entries, heads)
+    }
+
+    fn samples(&self) -> Vec<f32> {
+        self.bricks.iter().flat_map(|b| b.as_ref().map_or([0.0; 512], |b| b.samples)).collect()
+    }
+
+    fn inside(&self) -> Vec<u32> {
+        self.bricks.iter().flat_map(|b| b.as_ref().map_or([0; 8], |b| b.inside)).flat_map(halves).collect()
+    }
+
+    fn records(&self) -> Vec<Record> {
+        let record = |b: &Option<ProbedSurface>| {
+            let mut record = Record { crossing: [0; 48], layers: [0; 8] };
+            let Some(b) = b else { return record };
+            let words: Vec<u32> = b.crossing.iter().flat_map(|w| halves(*w)).collect();
+            record.crossing.copy_from_slice(&words);
+            for (z, layer) in record.layers.iter_mut().enumerate() {
+                let [x, y] = [3 * z, 3 * z + 1].map(|w| b.crossing[w].count_ones());
+                *layer = u32::from(b.before[3 * z]) | x << 16 | y << 24;
+            }
+            record
+        };
+        self.surface.iter().map(record).collect()
+    }
+
+    fn counts(&self) -> Vec<u32> {
+        self.surface.iter().map(|b| b.as_ref().map_or(0, |b| b.count[0] | b.count[1] << 16)).collect()
+    }
+
+    fn groups(&self) -> Vec<[u32; 4]> {
+        let sum = |group: &[Option<ProbedSurface>]| {
+            let there = group.iter().flatten();
+            there.fold([0; 4], |s, b| [s[0] + b.count[0], s[1] + b.count[1], s[2] + 1, 0])
+        };
+        self.surface.chunks(GROUP as usize).map(sum).collect()
+    }
+
+    /// Where each brick's vertices and triangles begin.
+    fn offsets(&self) -> Vec<[u32; 2]> {
+        let mut at = [0; 2];
+        let mut next = |b: &Option<ProbedSurface>| {
+            let first = at;
+            if let Some(b) = b {
+                assert_eq!(b.first, at, "the CPU numbers bricks in the order of the plan");
+                at = [at[0] + b.count[0], at[1] + b.count[1]];
+            }
+            first
+        };
+        self.surface.iter().map(&mut next).collect()
+    }
+}
+
+fn raw<T: bytemuck::NoUninit>(values: &[T]) -> Vec<u8> {
+    bytemuck::cast_slice(values).to_vec()
+}
+
+fn cast<T: Pod>(bytes: &[u8]) -> Vec<T> {
+    pod_collect_to_vec(bytes)
+}
+
+/// The first place where two columns differ.
+fn unequal<T: PartialEq + std::fmt::Debug>(got: &[T], expected: &[T]) -> Option<String> {
+    if got.len() != expected.len() {
+        return Some(format!("{} rows of {}", got.len(), expected.len()));
+    }
+    let at = got.iter().zip(expected).position(|(a, b)| a != b)?;
+    Some(format!("row {at}: {:?}, expected {:?}", got[at], expected[at]))
+}
+
+/// The first place where two columns differ by more than `bound` of the expected value, or of `least`.
+fn apart(got: &[f32], expected: &[f32], bound: f32, least: f32) -> Option<String> {
+    if got.len() != expected.len() {
+        return Some(format!("{} values of {}", got.len(), expected.len()));
+    }
+    let close = |(a, b): (&f32, &f32)| (a - b).abs() <= bound * b.abs().max(least);
+    let at = got.iter().zip(expected).position(|pair| !close(pair))?;
+    Some(format!("value {at}: {}, expected {}", got[at], expected[at]))
+}
+
+/// Setups that every stage is tested with: a structure with each kernel, and seams of bricks and tiles.
+fn setups() -> Vec<(String, Setup)> {
+    let mut all: Vec<(String, Setup)> = KERNELS
+        .iter()
+        .map(|&kernel| (format!("4pti {kernel}"), Setup::new(&sample("4pti.pdb"), kernel, 0.7)))
+        .collect();
+    let seams: Vec<[f64; 4]> = (0..60)
+        .map(|i| f64::from(i) * 1.1)
+        .map(|s| [s - 40.0, 0.4 * s - 31.9, 31.7 - 0.7 * s, 1.3 + 0.01 * s])
+        .collect();
+    all.push(("seams".to_owned(), Setup::new(&spheres(&seams), Kernel::Gaussian, 0.5)));
+    all.push(("one atom".to_owned(), Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5)));
+    all
+}
+
+/// Lists by brick: where they lie in the pool is the device's own business.
+fn by_brick(entries: &[u32], heads: &[[u32; 4]]) -> Vec<(u32, Vec<u32>)> {
+    let list = |h: &[u32; 4]| (h[1], entries[h[0] as usize..(h[0] + h[2]) as usize].to_vec());
+    heads.iter().map(list).collect()
+}
+
+#[test]
+fn bin_finds_the_same_candidates_in_the_same_order() {
+    for (name, setup) in setups() {
+        let zero = [("tally", raw(&[Tally::default()]))];
+        setup.poison(&["lists", "heads"]);
+        let out = setup.run(Stage::Bin, &zero, &["lists", "heads", "tally"]);
+        let (entries, heads): (Vec<u32>, Vec<[u32; 4]>) = (cast(&out[0]), cast(&out[1]));
+        let (expected, expected_heads) = setup.lists();
+        let (got, want) = (by_brick(&entries, &heads), by_brick(&expected, &expected_heads));
+        assert_eq!(unequal(&got, &want), None, "{name}");
+        assert!(heads.iter().zip(0..).all(|(h, id)| h[3] == id), "{name}");
+        assert_eq!(cast::<Tally>(&out[2])[0].list_end as usize, expected.len(), "{name}");
+        let plan = &setup.job.prepared.plan;
+        assert_eq!(plan.candidates.iter().sum::<u64>(), expected.len() as u64, "{name}");
+        // Control: an atom too few, and two in another order.
+        let mut wrong = got.clone();
+        let longest = (0..wrong.len()).max_by_key(|&i| wrong[i].1.len()).unwrap();
+        wrong[longest].1.pop();
+        assert!(unequal(&wrong, &want).is_some());
+        if got[longest].1.len() > 1 {
+            wrong[longest].1.clone_from(&got[longest].1);
+            wrong[longest].1.swap(0, 1);
+            assert!(unequal(&wrong, &want).is_some());
+        }
+    }
+}
+
+#[test]
+fn bin_says_when_its_lists_do_not_fit_and_writes_nothing_beyond() {
+    let mut setup = Setup::new(&sample("1crn.cif"), Kernel::Gaussian, 0.7);
+    let all = setup.lists().0.len();
+    setup.bench.params.list_capacity = u32_of(all / 2);
+    setup.bench.poison("lists");
+    let zero = [("tally", raw(&[Tally::default()]))];
+    let out = setup.run(Stage::Bin, &zero, &["tally", "lists", "heads"]);
+    assert_eq!(cast::<Tally>(&out[0])[0].list_end as usize, all);
+    assert!(cast::<u32>(&out[1])[all / 2..].iter().all(|&entry| entry == 0xa5a5_a5a5));
+    assert!(cast::<[u32; 4]>(&out[2]).iter().all(|h| h[2] == 0 || (h[0] + h[2]) as usize <= all / 2));
+}
+
+#[test]
+fn field_is_within_its_bound_and_marks_what_it_finds_inside() {
+    for (name, setup) in setups() {
+        let (entries, heads) = setup.lists();
+        setup.poison(&["field", "inside"]);
+        let out = setup.run(Stage::Field, &[("lists", raw(&entries)), ("heads", raw(&heads))], &["field", "inside"]);
+        let (got, expected) = (cast::<f32>(&out[0]), setup.samples());
+        assert_eq!(apart(&got, &expected, FIELD_BOUND, 0.1), None, "{name}");
+        let iso = setup.bench.params.isovalue;
+        let bits = |half: &[f32]| (0..).zip(half).fold(0, |word, (i, f)| word | u32::from(*f >= iso) << i);
+        let inside: Vec<u32> = got.chunks(32).map(bits).collect();
+        assert_eq!(unequal(&cast::<u32>(&out[1]), &inside), None, "{name}");
+        // Out of reach means exactly nothing.
+        assert!(got.iter().zip(&expected).all(|(a, b)| (*b == 0.0) == (*a == 0.0) || *a < 1e-5), "{name}");
+        // Control: twice the bound.
+        let mut wrong = got.clone();
+        let highest = (0..wrong.len()).max_by(|&a, &b| wrong[a].total_cmp(&wrong[b])).unwrap();
+        wrong[highest] *= 1.0 + 2.5 * FIELD_BOUND;
+        assert!(apart(&wrong, &expected, FIELD_BOUND, 0.1).is_some());
+    }
+}
+
+#[test]
+fn classify_finds_the_same_edges_and_counts() {
+    for (name, setup) in setups() {
+        setup.poison(&["records", "counts"]);
+        let inputs = [("inside", raw(&setup.inside())), ("groups", raw(&vec![[0_u32; 4]; setup.groups().len()]))];
+        let out = setup.run(Stage::Classify, &inputs, &["records", "counts", "groups"]);
+        let (records, counts): (Vec<Record>, Vec<u32>) = (cast(&out[0]), cast(&out[1]));
+        assert_eq!(unequal(&records, &setup.records()), None, "{name}");
+        assert_eq!(unequal(&counts, &setup.counts()), None, "{name}");
+        assert_eq!(unequal(&cast::<[u32; 4]>(&out[2]), &setup.groups()), None, "{name}");
+        // Control: one edge more.
+        let mut wrong = setup.inside();
+        let some = wrong.iter().position(|w| *w != 0 && *w != u32::MAX).unwrap();
+        wrong[some] ^= 1 << wrong[some].trailing_zeros();
+        let out = setup.run(Stage::Classify, &[("inside", raw(&wrong))], &["records", "counts"]);
+        assert!(unequal(&cast::<Record>(&out[0]), &setup.records()).is_some());
+    }
+}
+
+#[test]
+fn scan_numbers_bricks_in_order() {
+    for (name, mut setup) in setups() {
+        setup.bench.poison("offsets");
+        let inputs = |s: &Setup| {
+            [("counts", raw(&s.counts())), ("groups", raw(&s.groups())), ("tally", raw(&[Tally::default()]))]
+        };
+        let out = setup.run(Stage::Scan, &inputs(&setup), &["offsets", "tally"]);
+        let want = setup.offsets();
+        assert_eq!(unequal(&cast::<[u32; 2]>(&out[0]), &want), None, "{name}");
+        let tally = cast::<Tally>(&out[1])[0];
+        let mesh = &setup.probe.mesh;
+        assert_eq!((tally.vertices as usize, tally.triangles as usize), (mesh.n_vertices(), mesh.n_triangles()));
+        // What chunks before have made is added; and that is the control too.
+        (setup.bench.params.first_vertex, setup.bench.params.first_triangle) = (1000, 7);
+        let out = setup.run(Stage::Scan, &inputs(&setup), &["offsets"]);
+        let moved: Vec<[u32; 2]> = want.iter().map(|[v, t]| [v + 1000, t + 7]).collect();
+        assert_eq!(unequal(&cast::<[u32; 2]>(&out[0]), &moved), None, "{name}");
+        assert!(unequal(&cast::<[u32; 2]>(&out[0]), &want).is_some());
+    }
+}
+
+#[test]
+fn interpolate_is_within_its_bounds() {
+    for (name, setup) in setups() {
+        let (entries, heads) = setup.lists();
+        setup.poison(&["positions", "normals"]);
+        let inputs = [
+            ("lists", raw(&entries)),
+            ("heads", raw(&heads)),
+            ("field", raw(&setup.samples())),
+            ("records", raw(&setup.records())),
+            ("counts", raw(&setup.counts())),
+            ("offsets", raw(&setup.offsets())),
+            ("tally", raw(&[Tally::default()])),
+        ];
+        let out = setup.run(Stage::Interpolate, &inputs, &["positions", "normals", "tally"]);
+        let mesh = &setup.probe.mesh;
+        let (positions, normals): (Vec<f32>, Vec<f32>) = (cast(&out[0]), cast(&out[1]));
+        let flat = |rows: &[[f32; 3]]| rows.as_flattened().to_vec();
+        let (want, want_normals) = (flat(&mesh.positions), flat(&mesh.normals));
+        // Bounds on lengths: relative to 1 at least.
+        let error = |got: &[f32], want: &[f32], bound: f32| {
+            got.iter().zip(want).position(|(a, b)| (a - b).abs() > bound || !a.is_finite())
+        };
+        assert_eq!((positions.len(), error(&positions, &want, POSITION_BOUND)), (want.len(), None), "{name}");
+        assert_eq!(error(&normals, &want_normals, NORMAL_BOUND), None, "{name}");
+        assert_eq!(cast::<Tally>(&out[2])[0].flat, 0, "{name}");
+        // Controls.
+        let mut wrong = positions.clone();
+        wrong[positions.len() / 2] += 2.0 * POSITION_BOUND;
+        assert!(error(&wrong, &want, POSITION_BOUND).is_some());
+        wrong.clone_from(&normals);
+        wrong[normals.len() / 3] += 2.0 * NORMAL_BOUND;
+        assert!(error(&wrong, &want_normals, NORMAL_BOUND).is_some());
+    }
+}
+
+#[test]
+fn emit_makes_the_same_triangles() {
+    for (name, setup) in setups() {
+        setup.bench.poison("triangles");
+        let inputs = [
+            ("inside", raw(&setup.inside())),
+            ("records", raw(&setup.records())),
+            ("counts", raw(&setup.counts())),
+            ("offsets", raw(&setup.offsets())),
+        ];
+        let out = setup.run(Stage::Emit, &inputs, &["triangles"]);
+        let got: Vec<[u32; 3]> = cast(&out[0]);
+        assert_eq!(unequal(&got, &setup.probe.mesh.triangles), None, "{name}");
+        let mut wrong = got.clone();
+        wrong[got.len() - 1].rotate_left(1);
+        assert!(unequal(&wrong, &setup.probe.mesh.triangles).is_some());
+    }
+}
