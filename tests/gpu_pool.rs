@@ -10,7 +10,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use gpu_fakes::Step::{Fail, Forget, Hold, Lose, OutOfMemory, Panic, Serve};
-use gpu_fakes::{Ran, Rig, SETTINGS, devices, job, pool, start, wait_for, wait_for_load};
+use gpu_fakes::{LOST, Ran, Rig, SETTINGS, devices, job, pool, start, wait_for, wait_for_load};
 use molmesh::gpu::{DevicePool, GpuError, MOST_REBUILDS, PoolSettings};
 use molmesh::surface::SurfaceError;
 
@@ -223,7 +223,7 @@ fn without_a_device_that_is_up_the_reason_is_what_the_job_met_with() {
     let pool = pool(std::slice::from_ref(&rig), SETTINGS);
     // Two attempts each, until the device is given up at the fourth loss.
     for _ in 0..2 {
-        assert_eq!(pool.run(&job(1)).map(|_| ()).unwrap_err(), GpuError::Lost("as told".to_owned()));
+        assert_eq!(pool.run(&job(1)).map(|_| ()).unwrap_err(), GpuError::Lost(LOST.to_owned()));
     }
     let error = pool.run(&job(1)).map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("no device is up") && error.contains("0 fake 0: given up after 3"), "{error}");

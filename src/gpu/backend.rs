@@ -8,6 +8,7 @@ use super::error::GpuError;
 use super::executor::GpuJob;
 use super::pool::{DevicePool, PoolDevice, PoolSettings};
 use super::prepare::Prepared;
+use super::queue::one_line;
 use crate::surface::{
     Backend, Control, DeviceFacts, DeviceStatus, Meshed, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, backend::one_atom,
@@ -116,13 +117,13 @@ impl Backend for GpuBackend {
             (GpuError::OutOfMemory { needed, available, suggested_resolution }, _) => {
                 Err(SurfaceError::DeviceMemory { needed, available, suggested_resolution })
             }
-            (error, None) => Err(SurfaceError::Device { why: error.to_string() }),
+            (error, None) => Err(SurfaceError::Device { why: one_line(&error.to_string()) }),
             (error, Some(fallback)) => {
                 let meshed = fallback.run(spheres, params, limits, control)?;
                 let served = Served {
                     backend: fallback.name(),
                     device: fallback.describe(),
-                    instead: Some(format!("the GPU failed: {error}")),
+                    instead: Some(one_line(&format!("the GPU failed: {error}"))),
                 };
                 Ok(Meshed { served: Some(served), ..meshed })
             }

@@ -31,8 +31,6 @@ fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
         memory_hints: MemoryHints::Performance,
         trace: Trace::Off,
     };
-    pollster::block_on(adapter.request_device(&descriptor)).map_err(|error| {
-        let words = error.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
-        GpuError::Failed(format!("the device cannot be opened: {words}"))
-    })
+    pollster::block_on(adapter.request_device(&descriptor))
+        .map_err(|error| GpuError::Failed(format!("the device cannot be opened: {error}")))
 }

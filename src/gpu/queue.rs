@@ -242,7 +242,7 @@ impl Queues {
             lane.running = 0;
             lane.held_bytes = held_bytes;
             if let Some(why) = &down {
-                left = lane.fell(why.clone());
+                left = lane.fell(why);
             }
         }
         self.moved.notify_all();
@@ -276,7 +276,7 @@ impl Queues {
 
     /// Device `n` takes no jobs any more; those that wait are answered.
     pub(super) fn down(&self, n: usize, why: &str) {
-        let left = self.lock().lanes[n].fell(why.to_owned());
+        let left = self.lock().lanes[n].fell(why);
         self.moved.notify_all();
         self.filled[n].notify_all();
         dismiss(left, why);
@@ -343,9 +343,9 @@ impl Queues {
 
 impl Lane {
     /// Marks it down, unless it is, and hands out what waits.
-    fn fell(&mut self, why: String) -> VecDeque<Entry> {
+    fn fell(&mut self, why: &str) -> VecDeque<Entry> {
         if !matches!(self.health, Health::Down(_)) {
-            self.health = Health::Down(why);
+            self.health = Health::Down(one_line(why));
         }
         self.held_bytes = 0;
         let left = std::mem::take(&mut self.waiting);
@@ -369,6 +369,11 @@ fn why_down(lanes: &[Lane]) -> String {
         Health::Starting | Health::Up => None,
     };
     lanes.iter().filter_map(why).collect::<Vec<_>>().join("; ")
+}
+
+/// Drivers and validation speak in paragraphs; reasons stand on one line of a banner, an error or a header.
+pub(super) fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 fn answer(entry: Entry, answer: Answer) {

@@ -12,6 +12,9 @@ use molmesh::surface::{
     CancelToken, Control, GridStats, Mesh, Meshed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
+/// What a lost device says, in the manner of drivers.
+pub const LOST: &str = "as\n\n  told";
+
 /// What an executor does with one call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Step {
@@ -111,7 +114,7 @@ impl Executor for Fake {
                 meshed: Meshed::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),
                 stages: vec![(Stage::Field, 2_000), (Stage::Emit, 1_000)],
             }),
-            Step::Lose => Err(GpuError::Lost("as told".to_owned())),
+            Step::Lose => Err(GpuError::Lost(LOST.to_owned())),
             Step::Fail => Err(GpuError::Failed("as told".to_owned())),
             Step::Panic => panic!("as told"),
             Step::OutOfMemory => Err(GpuError::OutOfMemory { needed: 9, available: 5, suggested_resolution: 1.5 }),
