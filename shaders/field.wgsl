@@ -88,8 +88,13 @@ fn main(
             if (u + min(a.nearest.x, a.nearest.y) < params.support) {
                 let c = column(u);
                 let u_min = params.u_min * a.inv_length2;
-                low += density(c, Axis(z_e[2u * i], z_w[2u * i]), u_min);
-                high += density(c, Axis(z_e[2u * i + 1u], z_w[2u * i + 1u]), u_min);
+                // Most candidates reach one half of the brick only; beyond their reach they would add zeros.
+                if (u + a.nearest.x < params.support) {
+                    low += density(c, Axis(z_e[2u * i], z_w[2u * i]), u_min);
+                }
+                if (u + a.nearest.y < params.support) {
+                    high += density(c, Axis(z_e[2u * i + 1u], z_w[2u * i + 1u]), u_min);
+                }
             }
         }
     }

@@ -293,3 +293,39 @@ fn what_a_device_cannot_hold_is_refused_with_numbers() {
     let error = run(&mut engine, &job(&spheres, &params)).unwrap_err();
     assert!(matches!(error, GpuError::OutOfMemory { .. }), "{error}");
 }
+
+#[test]
+fn stages_tell_their_times_where_the_device_has_a_clock() {
+    let (spheres, params) = (sample("1crn.cif"), params(KERNELS[0], 0.7));
+    for small_bytes in [0, 16 << 20] {
+        let mut engine = engine_with(|b| b.small_bytes = small_bytes);
+        let finished = run(&mut engine, &job(&spheres, &params)).unwrap();
+        if engine.has_clock() {
+            let stages: Vec<_> = finished.stages.iter().map(|(stage, _)| *stage).collect();
+            assert_eq!(stages, molmesh::surface::Stage::ALL[..6]);
+            assert!(finished.stages.iter().all(|(_, ns)| *ns < 60_000_000_000), "{:?}", finished.stages);
+            assert!(finished.stages.iter().map(|(_, ns)| ns).sum::<u64>() > 1000, "{:?}", finished.stages);
+        } else {
+            assert!(finished.stages.is_empty());
+        }
+    }
+}
+
+#[test]
+fn a_lost_device_is_an_error_and_no_panic() {
+    let (spheres, params) = (sample("1crn.cif"), params(KERNELS[0], 0.7));
+    for small in [0, 16 << 20] {
+        let (device, queue) = gpu_support::device();
+        let mut budget = Budget::of(&device.limits());
+        budget.small_bytes = small;
+        let mut engine = molmesh::gpu::Engine::with_budget(device.clone(), queue, budget).unwrap();
+        let before = mesh_of(&mut engine, &spheres, &params);
+        device.destroy();
+        for _ in 0..2 {
+            let error = run(&mut engine, &job(&spheres, &params)).unwrap_err();
+            assert!(matches!(error, GpuError::Lost(_)), "{error}");
+        }
+        // What was read before stays readable.
+        assert_eq!(measures(&before).euler, measures(&cpu(&spheres, &params)).euler);
+    }
+}

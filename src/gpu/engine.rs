@@ -134,6 +134,12 @@ impl Engine {
         Ok(engine)
     }
 
+    /// Whether it tells the stages' times.
+    #[must_use]
+    pub const fn has_clock(&self) -> bool {
+        self.clock.is_some()
+    }
+
     /// What was complained about since the last look, but for memory.
     fn healthy(&self) -> Result<(), GpuError> {
         match self.health.complaint() {

@@ -6,7 +6,6 @@
 
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
 
 use super::error::SurfaceError;
 use super::kernel::Profile;
@@ -72,7 +71,8 @@ impl Lattice {
         let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
         let spacing = params.resolution;
         let profile = Profile::new(params);
-        let smallest = spheres.radii().iter().copied().fold(f32::MAX, f32::min);
+        let radii = || spheres.radii().par_iter().with_min_len(1 << 16).copied();
+        let smallest = radii().reduce(|| f32::MAX, f32::min);
         let effective = |r: f32| f64::from(r) * params.radius_scale + params.radius_offset;
         params.check_radius(smallest)?;
         let mut atoms: Vec<LatticeAtom> = (0..spheres.len())
@@ -91,7 +91,7 @@ impl Lattice {
             })
             .collect();
         sort_canonically(&mut atoms);
-        let reach = spheres.radii().iter().copied().fold(0.0, f32::max);
+        let reach = radii().reduce(|| 0.0, f32::max);
         let margin = 2.0 * profile.reach(profile.length(effective(reach)));
         let box_cells = (0..3).map(|k| ((hi[k] - lo[k] + margin) / spacing).ceil()).product::<f64>();
         Ok(Self {
@@ -120,39 +120,44 @@ impl Lattice {
 
 /// Sorts by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order last.
 fn sort_canonically(atoms: &mut Vec<LatticeAtom>) {
-    let mut tiles: FxHashMap<[i32; 3], u64> = FxHashMap::default();
-    for atom in atoms.iter() {
-        tiles.entry(tile_of(atom.cell)).or_default();
-    }
-    let mut order: Vec<[i32; 3]> = tiles.keys().copied().collect();
-    order.sort_unstable_by_key(|&t| tile_order(t));
-    for (rank, tile) in (0..).zip(&order) {
-        tiles.insert(*tile, rank);
-    }
-    let mut keyed: Vec<(u64, u32)> = (0..)
-        .zip(atoms.iter())
-        .map(|(i, atom)| {
-            let local = atom.cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
-            let brick = local.map(|c| c / BRICK.unsigned_abs());
-            let cell = local.map(|c| c % BRICK.unsigned_abs());
-            let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
-            (tiles[&tile_of(atom.cell)] << 18 | pack(brick) << 9 | pack(cell), i)
-        })
-        .collect();
-    keyed.par_sort_unstable();
+    let rank = tile_ranks(atoms);
+    let key = |atom: &LatticeAtom| {
+        let local = atom.cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
+        let brick = local.map(|c| c / BRICK.unsigned_abs());
+        let cell = local.map(|c| c % BRICK.unsigned_abs());
+        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
+        rank(tile_of(atom.cell)) << 18 | pack(brick) << 9 | pack(cell)
+    };
+    let mut keyed: Vec<(u64, u32)> =
+        atoms.par_iter().enumerate().with_min_len(4096).map(|(i, atom)| (key(atom), to_u32(i))).collect();
     let tie = |a: &LatticeAtom, b: &LatticeAtom| {
         let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
         axis(2).then(axis(1)).then(axis(0)).then(a.inv_length2.total_cmp(&b.inv_length2)).then(a.source.cmp(&b.source))
     };
-    let mut sorted: Vec<LatticeAtom> = keyed.iter().map(|&(_, i)| atoms[i as usize]).collect();
-    let mut start = 0;
-    for run in keyed.chunk_by(|a, b| a.0 == b.0) {
-        if run.len() > 1 {
-            sorted[start..start + run.len()].sort_unstable_by(tie);
-        }
-        start += run.len();
+    let order =
+        |a: &(u64, u32), b: &(u64, u32)| a.0.cmp(&b.0).then_with(|| tie(&atoms[a.1 as usize], &atoms[b.1 as usize]));
+    keyed.par_sort_unstable_by(order);
+    *atoms = keyed.par_iter().with_min_len(4096).map(|&(_, i)| atoms[i as usize]).collect();
+}
+
+/// Numbers that order the tiles of `atoms`, below 2⁴⁶: places in the box around them, or ranks where the box is too large.
+fn tile_ranks(atoms: &[LatticeAtom]) -> Box<dyn Fn([i32; 3]) -> u64 + Sync> {
+    let tiles = || atoms.par_iter().with_min_len(4096).map(|atom| tile_of(atom.cell));
+    let fold = |f: fn(i32, i32) -> i32| move |a: [i32; 3], b: [i32; 3]| std::array::from_fn(|k| f(a[k], b[k]));
+    let lo: [i32; 3] = tiles().reduce(|| [i32::MAX; 3], fold(i32::min));
+    let hi = tiles().reduce(|| [i32::MIN; 3], fold(i32::max));
+    let side: [u64; 3] = std::array::from_fn(|k| u64::from(lo[k].abs_diff(hi[k])) + 1);
+    // Each side is below 2²⁰, as coordinates are bounded.
+    if side.iter().product::<u64>() < 1 << 46 {
+        return Box::new(move |tile| {
+            let [x, y, z]: [u64; 3] = std::array::from_fn(|k| u64::from(tile[k].abs_diff(lo[k])));
+            (z * side[1] + y) * side[0] + x
+        });
     }
-    *atoms = sorted;
+    let mut order: Vec<[i32; 3]> = atoms.iter().map(|atom| tile_of(atom.cell)).collect();
+    order.par_sort_unstable_by_key(|&tile| tile_order(tile));
+    order.dedup();
+    Box::new(move |tile| order.partition_point(|&t| tile_order(t) < tile_order(tile)) as u64)
 }
 
 /// The tile that a sample belongs to.

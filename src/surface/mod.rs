@@ -16,6 +16,7 @@ pub mod kernel;
 mod labels;
 pub mod lattice;
 pub mod layout;
+mod marks;
 pub mod measure;
 pub mod mesh;
 pub mod params;

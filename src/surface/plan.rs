@@ -13,13 +13,12 @@ use super::cpu::{self, Constants, SlopeConstants};
 use super::error::SurfaceError;
 use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_u32, to_u64};
 use super::layout::{NONE, Params, Tile};
+use super::marks::{Bits, Marked, local_of, mark_run, merge, runs};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 
-/// Atoms that one piece of parallel work marks the bricks of.
-const RUN: usize = 1024;
 /// More tiles than this in all runs together, and the grid is looked at before it is built.
-const MANY_TILES: u64 = 1 << 20;
+const MANY_TILES: f64 = 1e6;
 
 /// The bricks of a job.
 #[derive(Debug, Clone, Default)]
@@ -42,129 +41,10 @@ pub struct Plan {
     pub reach: f32,
 }
 
-/// Bricks of a tile as bits: word z, bit `8·y + x`.
-type Bits = [u64; 8];
-
-/// What atoms mark in one tile.
-#[derive(Debug, Clone, Copy)]
-struct Marked {
-    tile: [i32; 3],
-    /// Bricks that exist.
-    closed: Bits,
-    /// Those with a sample in reach.
-    reached: Bits,
-    candidates: u64,
-    pairs: u64,
-}
-
-/// Squared gaps along one axis between an atom and the bricks of a tile, from `first` to before `end`.
-struct Gaps {
-    first: usize,
-    end: usize,
-    samples: [f32; 8],
-    closed: [f32; 8],
-}
-
-impl Gaps {
-    /// `local`: the atom's coordinate from the tile's first sample.
-    fn new(local: f32, reach: f32) -> Self {
-        let mut gaps = Self { first: 8, end: 0, samples: [0.0; 8], closed: [0.0; 8] };
-        for b in 0..8 {
-            let lo = (b * 8) as f32;
-            let gap = |hi: f32| (lo - local).max(local - hi).max(0.0);
-            let (samples, closed) = (gap(lo + 7.0), gap(lo + 8.0));
-            (gaps.samples[b], gaps.closed[b]) = (samples * samples, closed * closed);
-            if closed <= reach {
-                (gaps.first, gaps.end) = (gaps.first.min(b), b + 1);
-            }
-        }
-        gaps
-    }
-}
-
-impl Marked {
-    fn none(tile: [i32; 3]) -> Self {
-        Self { tile, closed: [0; 8], reached: [0; 8], candidates: 0, pairs: 0 }
-    }
-
-    /// Marks the bricks of the tile that `atom` reaches: the arithmetic of the CPU's stage `bin`, step by step.
-    fn mark(&mut self, atom: &LatticeAtom, reach: f32) {
-        let origin = self.tile.map(|t| t * TILE);
-        let local = |k: usize| (atom.cell[k] - origin[k]) as f32 + atom.frac[k];
-        let [x, y, z] = std::array::from_fn(|k| Gaps::new(local(k), reach));
-        let reach2 = reach * reach;
-        for bz in z.first..z.end {
-            for by in y.first..y.end {
-                let (closed, samples) = (y.closed[by] + z.closed[bz], y.samples[by] + z.samples[bz]);
-                let (mut near, mut hit) = (0_u64, 0_u64);
-                for bx in x.first..x.end {
-                    near |= u64::from(closed + x.closed[bx] <= reach2) << bx;
-                    hit |= u64::from(samples + x.samples[bx] <= reach2) << bx;
-                }
-                hit &= near;
-                self.closed[bz] |= near << (8 * by);
-                self.reached[bz] |= hit << (8 * by);
-                self.candidates += u64::from(near.count_ones());
-                self.pairs += u64::from(hit.count_ones());
-            }
-        }
-    }
-}
-
 /// How far an atom reaches, in spacings, a little more than its support: rounding must not lose a pair, and a pair too
 /// many adds zero.
 fn reach_of(lattice: &Lattice, atom: &LatticeAtom) -> f32 {
     to_f32(lattice.reach(atom) * (1.0 + 1e-5)) + 1e-3
-}
-
-/// Marks the bricks of `atoms`, which live in one tile.
-fn mark_run(lattice: &Lattice, atoms: &[LatticeAtom], reaches: &[f32]) -> Vec<Marked> {
-    let mut marked: Vec<Marked> = Vec::new();
-    let mut at: FxHashMap<[i32; 3], usize> = FxHashMap::default();
-    // Neighbouring atoms reach the same few tiles: the last of each parity, as there are at most eight at most times.
-    let mut recent = [([i32::MAX; 3], 0); 8];
-    for (atom, &reach) in atoms.iter().zip(reaches) {
-        let [x, y, z] = cpu::tile_range(atom, lattice.reach(atom));
-        for tz in z[0]..=z[1] {
-            for ty in y[0]..=y[1] {
-                for tx in x[0]..=x[1] {
-                    let tile = [tx, ty, tz];
-                    let parity = tile.iter().fold(0, |p, c| p << 1 | usize::from(c & 1 == 1));
-                    let (cached, i) = &mut recent[parity];
-                    if *cached != tile {
-                        (*cached, *i) = (tile, *at.entry(tile).or_insert(marked.len()));
-                        if *i == marked.len() {
-                            marked.push(Marked::none(tile));
-                        }
-                    }
-                    marked[*i].mark(atom, reach);
-                }
-            }
-        }
-        // Where spheres are tiny, an atom may reach nothing of the brick that it lives in; its atoms are found there.
-        let home = tile_of(atom.cell);
-        let i = *at.entry(home).or_insert(marked.len());
-        if i == marked.len() {
-            marked.push(Marked::none(home));
-        }
-        let local = local_of(atom);
-        marked[i].closed[local as usize >> 6] |= 1 << (local & 63);
-    }
-    marked
-}
-
-/// The atoms of each tile, cut into runs.
-fn runs(atoms: &[LatticeAtom]) -> Vec<(usize, usize)> {
-    let mut runs = Vec::new();
-    let mut start = 0;
-    while start < atoms.len() {
-        let tile = tile_of(atoms[start].cell);
-        let end = (start + RUN).min(atoms.len());
-        let end = start + atoms[start..end].partition_point(|atom| tile_of(atom.cell) == tile);
-        runs.push((start, end));
-        start = end;
-    }
-    runs
 }
 
 impl Plan {
@@ -179,24 +59,25 @@ impl Plan {
             return Err(cpu::too_many_atoms(atoms.len()));
         }
         let runs = runs(atoms);
-        refuse_early(lattice, &runs, limits)?;
-        control.check()?;
         let reaches: Vec<f32> = atoms.par_iter().with_min_len(4096).map(|atom| reach_of(lattice, atom)).collect();
+        let longest = reaches.par_iter().with_min_len(1 << 16).copied().reduce(|| 0.0, f32::max);
+        refuse_early(lattice, runs.len(), longest, limits)?;
+        control.check()?;
         let marks: Vec<Vec<Marked>> = runs
             .par_iter()
             .map(|&(start, end)| {
                 control.check()?;
-                Ok(mark_run(lattice, &atoms[start..end], &reaches[start..end]))
+                Ok(mark_run(&atoms[start..end], &reaches[start..end], longest))
             })
             .collect::<Result<_, SurfaceError>>()?;
-        let marked = merge(marks);
+        let marked = merge(&marks);
         control.check()?;
         let occupied = marked.iter().map(|m| ones(&m.reached)).sum::<u64>();
         if occupied.saturating_mul(512) > limits.max_samples {
             return Err(cpu::grid_too_large(lattice, occupied * 512, limits));
         }
         let mut plan = Self {
-            reach: reaches.iter().copied().fold(0.0, f32::max),
+            reach: longest,
             reaches,
             candidates: marked.iter().map(|m| m.candidates).collect(),
             occupied,
@@ -326,46 +207,14 @@ pub fn check_totals(
 }
 
 /// Refuses a grid that is certain to exceed the limit before any of it is computed.
-fn refuse_early(lattice: &Lattice, runs: &[(usize, usize)], limits: &SurfaceLimits) -> Result<(), SurfaceError> {
-    let tiles_of = |atom: &LatticeAtom| -> u64 {
-        let range = cpu::tile_range(atom, lattice.reach(atom));
-        range.iter().map(|[lo, hi]| u64::from(lo.abs_diff(*hi)) + 1).product()
-    };
-    // Tiles that the runs will hold: no more than their atoms reach, hence few unless spheres are huge in spacings.
-    let most: u64 = runs
-        .par_iter()
-        .map(|&(start, end)| lattice.atoms[start..end].iter().map(tiles_of).fold(0, u64::saturating_add))
-        .reduce(|| 0, u64::saturating_add);
-    let each: u64 = lattice.atoms.par_iter().with_min_len(4096).map(tiles_of).max().unwrap_or(0);
-    if each <= 8 && most <= limits.max_samples.max(MANY_TILES) {
-        return Ok(());
-    }
-    if each.saturating_mul(runs.len() as u64) <= MANY_TILES {
+fn refuse_early(lattice: &Lattice, n_runs: usize, longest: f32, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
+    // Tiles that the runs will hold: few, unless spheres are huge in spacings.
+    let along = 2.0 * (f64::from(longest) + 2.0) / f64::from(TILE) + 3.0;
+    if along.powi(3) * n_runs as f64 <= MANY_TILES || along < 6.0 {
         return Ok(());
     }
     let least = to_u64(cpu::samples_at_least(lattice));
     if least > limits.max_samples { Err(cpu::grid_too_large(lattice, least, limits)) } else { Ok(()) }
-}
-
-/// Everything that was marked, one entry a tile, in the order of tiles.
-fn merge(marks: Vec<Vec<Marked>>) -> Vec<Marked> {
-    let mut all: Vec<Marked> = marks.into_iter().flatten().collect();
-    all.par_sort_unstable_by_key(|m| tile_order(m.tile));
-    let mut merged: Vec<Marked> = Vec::new();
-    for mark in all {
-        match merged.last_mut().filter(|last| last.tile == mark.tile) {
-            Some(last) => {
-                last.closed.iter_mut().zip(mark.closed).for_each(|(word, more)| *word |= more);
-                last.reached.iter_mut().zip(mark.reached).for_each(|(word, more)| *word |= more);
-                last.candidates += mark.candidates;
-                last.pairs += mark.pairs;
-            }
-            // A tile is in an atom's range by a corner that no brick is near to.
-            None if mark.closed == [0; 8] => {}
-            None => merged.push(mark),
-        }
-    }
-    merged
 }
 
 fn ones(bits: &Bits) -> u64 {
@@ -388,12 +237,6 @@ fn set_bits(bits: &Bits) -> impl Iterator<Item = u32> + '_ {
 fn halves(word: u64) -> [u32; 2] {
     let part = |v: u64| u32::try_from(v & u64::from(u32::MAX)).unwrap_or_default();
     [part(word), part(word >> 32)]
-}
-
-/// An atom's brick within its tile.
-fn local_of(atom: &LatticeAtom) -> u32 {
-    let [x, y, z] = atom.cell.map(|c| c.rem_euclid(TILE).unsigned_abs() / BRICK.unsigned_abs());
-    z << 6 | y << 3 | x
 }
 
 #[cfg(test)]
@@ -434,7 +277,7 @@ mod tests {
     #[test]
     fn bricks_are_in_order_and_hold_their_atoms() {
         // From bricks much larger than atoms, of which some reach nothing of their own, to much smaller ones.
-        for resolution in [20.0, 3.0, 0.5, 0.15] {
+        for resolution in [20.0, 3.0, 0.5, 0.15, 0.066, 0.0655, 0.05] {
             let lattice = lattice(200, 60.0, resolution);
             let plan = plan(&lattice);
             assert!(plan.bricks.windows(2).all(|pair| pair[0] < pair[1]));

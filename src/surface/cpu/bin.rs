@@ -35,7 +35,7 @@ pub(super) struct Tiles {
 }
 
 /// First and last tile per axis whose samples, with the layer beyond, the atom reaches.
-pub(in crate::surface) fn tile_range(atom: &LatticeAtom, reach: f64) -> [[i32; 2]; 3] {
+fn tile_range(atom: &LatticeAtom, reach: f64) -> [[i32; 2]; 3] {
     let side = f64::from(TILE);
     std::array::from_fn(|k| {
         let c = atom.position(k);

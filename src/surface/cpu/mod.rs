@@ -19,7 +19,7 @@ mod sample;
 mod scan;
 
 // What the plan of a device's work shares with this backend: formulas, refusals and their numbers.
-pub(super) use self::bin::{MAX_ATOMS, samples_at_least, tile_range, too_large as grid_too_large, too_many_atoms};
+pub(super) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
 pub(super) use self::field::Constants;
 pub(super) use self::interpolate::SlopeConstants;
 pub(super) use self::scan::too_large as mesh_too_large;
