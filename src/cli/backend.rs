@@ -84,8 +84,12 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
 fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     let Gpu { backend, devices, mut state } = gpu(asked, use_);
     if let (Some(backend), Ok(reason)) = (backend, &state) {
-        let auto = if asked.backend == BackendName::Auto { "auto: " } else { "" };
-        return Ok(Picked { backend, reason: format!("{auto}{reason}"), devices, no_gpu: None });
+        let reason = match (asked.backend, asked.devices) {
+            (_, DeviceChoice::These(_)) => format!("--devices {}", asked.devices),
+            (BackendName::Auto, _) => format!("auto: {reason}"),
+            _ => "asked for".to_owned(),
+        };
+        return Ok(Picked { backend, reason, devices, no_gpu: None });
     }
     let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
     // Whoever asks for a device by name does not want to learn from a report that it was not used.
@@ -181,9 +185,8 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
                     (found.taken, found.reason) = (false, why);
                 }
             }
-            let up: Vec<String> = devices.iter().filter(|d| d.taken).map(|d| d.reason.clone()).collect();
-            let reason = match &up[..] {
-                [one] if one == "asked for" => one.clone(),
+            let up: Vec<&str> = devices.iter().filter(|d| d.taken).map(|d| d.reason.as_str()).collect();
+            let reason = match up[..] {
                 [one] => format!("a GPU ({one})"),
                 _ => format!("{} GPUs", up.len()),
             };
