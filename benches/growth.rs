@@ -8,9 +8,7 @@ use std::time::Instant;
 
 use molmesh::pipeline::StageClock;
 use molmesh::structure::{self, ReadLimits, Selection};
-use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Measures, Proof, Spheres, SurfaceLimits, SurfaceParams,
-};
+use molmesh::surface::{Backend, Control, CpuBackend, Measures, Proof, Spheres, SurfaceLimits, SurfaceParams};
 
 /// The sample, repeated on a lattice of boxes until there are `n` atoms: density and sparsity stay.
 fn tiled(sample: &Spheres, n: usize) -> Spheres {
@@ -61,7 +59,7 @@ fn main() {
         let (mut triangles, mut grid) = (0, None);
         for _ in 0..runs {
             let clock = StageClock::new(&());
-            let control = Control { cancel: CancelToken::default(), observer: &clock };
+            let control = Control { observer: &clock, ..Control::default() };
             let started = Instant::now();
             let run = || backend.run(&spheres, &SurfaceParams::default(), &SurfaceLimits::default(), &control).unwrap();
             let meshed = clock.pass(run);

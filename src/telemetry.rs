@@ -21,6 +21,20 @@ pub const CONNECTIONS: &str = "molmesh_connections";
 pub const JOBS_SUBMITTED: &str = "molmesh_jobs_submitted_total";
 /// Jobs ended, by outcome: `successful`, `failed`, `dismissed`, `panicked`.
 pub const JOBS_FINISHED: &str = "molmesh_jobs_finished_total";
+/// Jobs that another backend served in place of the chosen one.
+pub const JOBS_FALLBACK: &str = "molmesh_jobs_fallback_total";
+/// 1 while the device takes jobs, else 0, by device number.
+pub const DEVICE_UP: &str = "molmesh_device_up";
+/// Jobs that a device ended, by device and outcome: `finished`, or `failed` for the device's sake.
+pub const DEVICE_JOBS: &str = "molmesh_device_jobs_total";
+/// Times that a device was built anew after a failure.
+pub const DEVICE_REBUILDS: &str = "molmesh_device_rebuilds_total";
+/// Submissions that several jobs shared, by device.
+pub const DEVICE_SHARED: &str = "molmesh_device_shared_submissions_total";
+/// Bytes of a device's memory that are held, in use and pooled.
+pub const DEVICE_HELD: &str = "molmesh_device_memory_held_bytes";
+/// Jobs that wait for a device or run on it.
+pub const DEVICE_WAITING: &str = "molmesh_device_jobs";
 /// Time per stage.
 pub const STAGE_DURATION: &str = "molmesh_job_stage_duration_seconds";
 /// Jobs that wait.
@@ -114,6 +128,13 @@ fn describe() {
     describe_gauge!(CONNECTIONS, "Open connections");
     describe_counter!(JOBS_SUBMITTED, "Jobs accepted");
     describe_counter!(JOBS_FINISHED, "Jobs ended, by outcome");
+    describe_counter!(JOBS_FALLBACK, "Jobs that another backend served in place of the chosen one");
+    describe_gauge!(DEVICE_UP, "1 while the device takes jobs");
+    describe_counter!(DEVICE_JOBS, "Jobs that a device ended, by outcome");
+    describe_counter!(DEVICE_REBUILDS, "Times that a device was built anew after a failure");
+    describe_counter!(DEVICE_SHARED, "Submissions that several jobs shared");
+    describe_gauge!(DEVICE_HELD, Unit::Bytes, "Bytes of a device's memory that are held");
+    describe_gauge!(DEVICE_WAITING, "Jobs that wait for a device or run on it");
     describe_histogram!(STAGE_DURATION, Unit::Seconds, "Time per stage of a job");
     describe_gauge!(QUEUE_DEPTH, "Jobs that wait");
     describe_gauge!(QUEUE_WAIT, Unit::Seconds, "How long a job that is accepted now would wait");
@@ -127,7 +148,7 @@ fn describe() {
     for gauge_name in [CONNECTIONS, QUEUE_DEPTH, QUEUE_WAIT, MEMORY_HELD] {
         gauge!(gauge_name).set(0.0);
     }
-    for counter_name in [VOXELS, TRIANGLES] {
+    for counter_name in [VOXELS, TRIANGLES, JOBS_FALLBACK] {
         counter!(counter_name).increment(0);
     }
     for place in ["job", "http"] {

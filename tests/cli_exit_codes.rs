@@ -133,7 +133,7 @@ fn the_suggested_resolution_fits() {
 #[test]
 fn six_is_a_backend_that_is_not_here_and_why() {
     for backend in ["gpu", "paper"] {
-        let said = fails(rod(), &["--backend", backend], 6);
+        let said = fails(rod(), &["--backend", backend, "--devices", "77"], 6);
         assert!(said.contains(&format!("no backend `{backend}`")) && said.contains("GPU"), "{said}");
     }
 }

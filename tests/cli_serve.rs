@@ -10,7 +10,7 @@ use cli_support::{Folder, Service, assert_code, run, stderr};
 #[test]
 fn the_banner_is_small_and_its_line_works_as_pasted() {
     let folder = Folder::new();
-    let service = Service::start(&folder, &[]);
+    let service = Service::start(&folder, &["--devices", "cpu"]);
     assert!(service.banner.lines().count() <= 10 && !service.banner.contains('\x1b'), "{}", service.banner);
     for part in ["viewer", "/v1/capabilities", "metrics", "device", "cpu: ", "not gpu: "] {
         assert!(service.banner.contains(part), "no `{part}` in\n{}", service.banner);
@@ -60,6 +60,6 @@ fn what_cannot_start_says_why() {
         let refused = run(["serve", "--listen", "127.0.0.1:0", "--set", set]);
         assert_code(&refused, 2);
     }
-    assert_code(&run(["serve", "--listen", "127.0.0.1:0", "--backend", "gpu"]), 6);
+    assert_code(&run(["serve", "--listen", "127.0.0.1:0", "--backend", "gpu", "--devices", "77"]), 6);
     assert_code(&run(["serve", "--config", "/no/such/file.toml"]), 2);
 }

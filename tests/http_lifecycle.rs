@@ -209,6 +209,7 @@ fn an_address_in_use_is_named_with_its_key() {
     let server = running(&backend);
     let mut config = molmesh::config::Config::default();
     config.server.listen = server.addr;
-    let error = molmesh::http::Server::bind(config, backend, String::new()).err().unwrap().to_string();
+    let chosen = molmesh::http::Chosen { backend, reason: String::new(), devices: Vec::new() };
+    let error = molmesh::http::Server::bind(config, chosen).err().unwrap().to_string();
     assert!(error.contains("server.listen") && error.contains(&server.addr.to_string()), "{error}");
 }

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 
 use clap::{Args as ClapArgs, Parser, Subcommand, ValueEnum};
 
+use molmesh::surface::DeviceChoice;
+
 use super::error::EXIT_CODES;
 
 const MESH_EXAMPLES: &str = "\
@@ -31,7 +33,7 @@ pub(crate) enum Command {
     /// Serve meshes over HTTP
     Serve(ServeArgs),
     /// Say what this machine has, and what of it is used
-    Doctor,
+    Doctor(DoctorArgs),
     /// Ask a running service whether it is ready; exit code 0 if so
     Healthcheck(HealthcheckArgs),
     /// Print the version
@@ -86,6 +88,8 @@ pub(crate) struct MeshArgs {
     /// What runs the meshing
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: BackendName,
+    #[command(flatten)]
+    pub(crate) devices: DeviceArgs,
     /// Threads of the CPU backend; every core by default
     #[arg(long, value_name = "N")]
     pub(crate) threads: Option<usize>,
@@ -107,6 +111,22 @@ pub(crate) struct MeshArgs {
     pub(crate) selection: SelectionArgs,
     #[command(flatten)]
     pub(crate) limits: LimitArgs,
+}
+
+/// Which devices.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct DeviceArgs {
+    /// Which devices may be used: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software; `molmesh
+    /// doctor` numbers them
+    #[arg(long, value_name = "WHICH", default_value = "auto", env = "MOLMESH__DEVICES__USE", hide_env_values = true)]
+    pub(crate) devices: DeviceChoice,
+}
+
+/// `molmesh doctor`.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct DoctorArgs {
+    #[command(flatten)]
+    pub(crate) devices: DeviceArgs,
 }
 
 /// Which surface.
@@ -221,6 +241,9 @@ pub(crate) struct ServeArgs {
     /// What runs the meshing
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: BackendName,
+    /// Which devices may be used: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software
+    #[arg(long, value_name = "WHICH")]
+    pub(crate) devices: Option<String>,
     /// How to log
     #[arg(long, value_enum)]
     pub(crate) log: Option<LogStyle>,

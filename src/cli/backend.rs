@@ -1,11 +1,23 @@
 //! The only place that picks a backend, and gives the reason in words.
 
-use molmesh::surface::Backend;
+use molmesh::config::DevicesConfig;
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::reference::ReferenceBackend;
+use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
 
 use super::args::BackendName;
 use super::error::CliError;
+
+/// What was asked for.
+#[derive(Debug)]
+pub(crate) struct Asked<'a> {
+    /// The backend.
+    pub(crate) backend: BackendName,
+    /// Which devices it may use.
+    pub(crate) devices: &'a DeviceChoice,
+    /// Threads of the CPU backend.
+    pub(crate) threads: Option<usize>,
+}
 
 /// A backend and why it was taken.
 pub(crate) struct Picked {
@@ -13,40 +25,82 @@ pub(crate) struct Picked {
     pub(crate) backend: Box<dyn Backend>,
     /// Why, in words.
     pub(crate) reason: String,
+    /// Every device that was found on the way, taken or not.
+    pub(crate) devices: Vec<FoundDevice>,
+    /// Why no GPU runs, if none does.
+    pub(crate) no_gpu: Option<String>,
 }
 
-/// A backend that could be asked for, as `doctor` and the banner show it.
+/// A backend that could be asked for, or a device of one, as `doctor` and the banner show it.
 pub(crate) struct Candidate {
-    /// What `--backend` calls it.
-    pub(crate) name: &'static str,
+    /// What `--backend` calls it; a device has its number behind that.
+    pub(crate) name: String,
     /// What it would run on, or why it is not there.
     pub(crate) state: Result<String, String>,
 }
 
+impl Candidate {
+    /// Whether this is a device of a backend.
+    pub(crate) fn is_device(&self) -> bool {
+        self.name.contains(' ')
+    }
+}
+
 /// What a backend is picked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Use {
     /// One mesh, by the calling thread.
     Once,
     /// Many, by the threads of a service.
-    Service,
+    Service(DevicesConfig),
 }
 
 /// Picks a backend.
 ///
 /// # Errors
 /// [`CliError::NoBackend`] says why the one that was asked for is not there.
-pub(crate) fn pick(asked: BackendName, threads: Option<usize>, use_: Use) -> Result<Picked, CliError> {
-    if threads == Some(0) {
+pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
+    if asked.threads == Some(0) {
         return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
     }
-    Ok(match asked {
-        BackendName::Auto => Picked { backend: cpu(threads, use_)?, reason: format!("auto: no GPU, as {}", no_gpu()) },
-        BackendName::Cpu => Picked { backend: cpu(threads, use_)?, reason: "asked for".to_owned() },
-        BackendName::Reference => Picked { backend: Box::new(ReferenceBackend), reason: "asked for".to_owned() },
-        BackendName::Gpu => return Err(CliError::NoBackend { asked: "gpu", why: no_gpu().to_owned() }),
-        BackendName::Paper => return Err(CliError::NoBackend { asked: "paper", why: no_paper() }),
-    })
+    if asked.backend == BackendName::Gpu && *asked.devices == DeviceChoice::Cpu {
+        return Err(CliError::usage("parameter `devices`: cpu is not allowed with --backend gpu; expected a GPU"));
+    }
+    let unasked = |backend: Box<dyn Backend>| Picked {
+        backend,
+        reason: "asked for".to_owned(),
+        devices: Vec::new(),
+        no_gpu: Some("not looked for, as another backend was asked for".to_owned()),
+    };
+    match asked.backend {
+        BackendName::Cpu => Ok(unasked(cpu(asked.threads, use_)?)),
+        BackendName::Reference => Ok(unasked(Box::new(ReferenceBackend))),
+        BackendName::Paper => Err(CliError::NoBackend { asked: "paper", why: NO_PAPER.to_owned() }),
+        BackendName::Auto | BackendName::Gpu => gpu_or_cpu(asked, use_),
+    }
+}
+
+/// A GPU, or the CPU where any backend will do.
+fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
+    let Gpu { backend, devices, mut state } = gpu(asked, use_);
+    if let (Some(backend), Ok(reason)) = (backend, &state) {
+        let reason = match (asked.backend, asked.devices) {
+            (_, DeviceChoice::These(_)) => format!("--devices {}", asked.devices),
+            (BackendName::Auto, _) => format!("auto: {reason}"),
+            _ => "asked for".to_owned(),
+        };
+        return Ok(Picked { backend, reason, devices, no_gpu: None });
+    }
+    let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
+    // Whoever asks for a device by name does not want to learn from a report that it was not used.
+    if asked.backend == BackendName::Gpu || matches!(asked.devices, DeviceChoice::These(_)) {
+        return Err(CliError::NoBackend { asked: "gpu", why: format!("no GPU can be used: {why}") });
+    }
+    let reason = match asked.devices {
+        DeviceChoice::Cpu => "--devices cpu".to_owned(),
+        _ => format!("auto: no GPU, as {why}"),
+    };
+    Ok(Picked { backend: cpu(asked.threads, use_)?, reason, devices, no_gpu: Some(why) })
 }
 
 /// A backend's name and what it runs on.
@@ -54,33 +108,99 @@ pub(crate) fn describe(backend: &dyn Backend) -> String {
     format!("{}: {}", backend.name(), backend.describe())
 }
 
-/// Every backend and its state.
-pub(crate) fn survey() -> Vec<Candidate> {
-    vec![
-        Candidate { name: "cpu", state: CpuBackend::new(None).map(|cpu| cpu.describe()) },
-        Candidate { name: "reference", state: Ok(ReferenceBackend.describe()) },
-        Candidate { name: "gpu", state: Err(no_gpu().to_owned()) },
-        Candidate { name: "paper", state: Err(no_paper()) },
-    ]
+/// Every backend and its state, and the devices that are not taken.
+pub(crate) fn survey(picked: &Picked) -> Vec<Candidate> {
+    let candidate = |name: &str, state| Candidate { name: name.to_owned(), state };
+    let gpu = picked.no_gpu.clone().map_or_else(|| Ok(picked.backend.describe()), Err);
+    let mut survey = vec![
+        candidate("cpu", CpuBackend::new(None).map(|cpu| cpu.describe())),
+        candidate("reference", Ok(ReferenceBackend.describe())),
+    ];
+    // The devices' own reasons follow, one a line.
+    let gpu = gpu.map_err(|why| if picked.devices.is_empty() { why } else { "no device is taken".to_owned() });
+    survey.push(candidate("gpu", gpu));
+    let left = picked.devices.iter().filter(|device| !device.taken);
+    survey
+        .extend(left.map(|d| candidate(&format!("gpu {}", d.number), Err(format!("{}: {}", d.facts.name, d.reason)))));
+    survey.push(candidate("paper", Err(NO_PAPER.to_owned())));
+    survey
 }
 
-fn cpu(threads: Option<usize>, use_: Use) -> Result<Box<dyn Backend>, CliError> {
+fn cpu(threads: Option<usize>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
     let backend = match use_ {
         Use::Once => CpuBackend::on_this_thread(threads),
-        Use::Service => CpuBackend::new(threads),
+        Use::Service(_) => CpuBackend::new(threads),
     };
     let backend = backend.map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
     Ok(Box::new(backend))
 }
 
-/// Why no GPU can be used.
-fn no_gpu() -> &'static str {
-    #[cfg(feature = "gpu")]
-    return molmesh::gpu::unavailable();
-    #[cfg(not(feature = "gpu"))]
-    return "this build has no GPU support";
+const NO_PAPER: &str = "the 2010 program runs on a GPU, and its stages are not in this version";
+
+/// What came of looking for GPUs.
+struct Gpu {
+    backend: Option<Box<dyn Backend>>,
+    devices: Vec<FoundDevice>,
+    /// Why it is taken, or why there is none.
+    state: Result<String, String>,
 }
 
-fn no_paper() -> String {
-    format!("the 2010 program runs on a GPU, and {}", no_gpu())
+#[cfg(not(feature = "gpu"))]
+fn gpu(_asked: &Asked<'_>, _use: &Use) -> Gpu {
+    Gpu { backend: None, devices: Vec::new(), state: Err("this build has no GPU support".to_owned()) }
+}
+
+#[cfg(feature = "gpu")]
+fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
+    use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, discover};
+
+    // One mesh is not worth asking drivers that have nothing to drive; who asks for a GPU wants to know of all.
+    let look = if *use_ == Use::Once && asked.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
+    let discovery = discover(asked.devices, look);
+    let none = |devices, why| Gpu { backend: None, devices, state: Err(why) };
+    let missing = discovery.missing(asked.devices);
+    if !missing.is_empty() {
+        let there = discovery.why_none().map(|why| format!(" ({why})")).unwrap_or_default();
+        return none(discovery.devices, format!("{}{there}", missing.join(", ")));
+    }
+    if let Some(why) = discovery.why_none() {
+        return none(discovery.devices, why);
+    }
+    let settings = match use_ {
+        Use::Once => PoolSettings::default(),
+        Use::Service(config) => PoolSettings { queue: config.jobs, batch: config.batch, ..PoolSettings::default() },
+    };
+    // Whoever asked for the GPU gets it or nothing.
+    let fallback = match asked.backend {
+        BackendName::Auto => CpuBackend::new(asked.threads).ok().map(|cpu| Box::new(cpu) as Box<dyn Backend>),
+        _ => None,
+    };
+    let started = GpuBackend::start(&discovery, &settings, fallback);
+    let mut devices = discovery.devices;
+    match started {
+        Ok(backend) => {
+            for status in backend.devices() {
+                let found = devices.iter_mut().find(|found| found.number == status.number);
+                if let (Some(found), Some(why)) = (found, status.down) {
+                    (found.taken, found.reason) = (false, why);
+                }
+            }
+            let up: Vec<&str> = devices.iter().filter(|d| d.taken).map(|d| d.reason.as_str()).collect();
+            let reason = match up[..] {
+                [one] => format!("a GPU ({one})"),
+                _ => format!("{} GPUs", up.len()),
+            };
+            Gpu { backend: Some(Box::new(backend)), devices, state: Ok(reason) }
+        }
+        Err(error) => {
+            let why = match error {
+                GpuError::NoDevice(why) => why,
+                error => error.to_string(),
+            };
+            for device in devices.iter_mut().filter(|device| device.taken) {
+                (device.taken, device.reason) = (false, format!("the stages could not be built: {why}"));
+            }
+            none(devices, why)
+        }
+    }
 }

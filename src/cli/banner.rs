@@ -55,8 +55,8 @@ mod tests {
             device: "cpu: 2 threads".into(),
             reason: "auto".into(),
             others: vec![
-                Candidate { name: "cpu", state: Ok("2 threads".into()) },
-                Candidate { name: "gpu", state: Err("none found".into()) },
+                Candidate { name: "cpu".into(), state: Ok("2 threads".into()) },
+                Candidate { name: "gpu".into(), state: Err("none found".into()) },
             ],
         };
         let text = text("0.0.0.0:81".parse().unwrap(), Some("[::]:82".parse().unwrap()), &facts, Style::PLAIN);

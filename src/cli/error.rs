@@ -199,7 +199,11 @@ fn surface_code(error: &SurfaceError) -> i32 {
         SurfaceError::NoSpheres | SurfaceError::BadSphere { .. } => code::STRUCTURE,
         // An isovalue that the density never reaches is the caller's parameter.
         SurfaceError::BadParameter { .. } | SurfaceError::NoSurface { .. } => code::USAGE,
-        SurfaceError::GridTooLarge { .. } | SurfaceError::MeshTooLarge { .. } => code::LIMIT,
+        SurfaceError::GridTooLarge { .. }
+        | SurfaceError::MeshTooLarge { .. }
+        | SurfaceError::DeviceMemory { .. }
+        | SurfaceError::Deadline => code::LIMIT,
+        SurfaceError::Device { .. } => code::BACKEND,
         SurfaceError::Cancelled => code::INTERRUPTED,
         SurfaceError::Sink => code::INTERNAL,
     }
@@ -228,6 +232,10 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::MeshTooLarge { suggested_resolution, .. } => {
             Some(format!("try --resolution {suggested_resolution}, or raise --max-mesh-bytes"))
         }
+        SurfaceError::DeviceMemory { suggested_resolution, .. } => {
+            Some(format!("try --resolution {suggested_resolution}, or --backend cpu"))
+        }
+        SurfaceError::Device { .. } => Some("try --backend cpu, and `molmesh doctor` for what there is".to_owned()),
         SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
         _ => None,
     }
@@ -241,7 +249,7 @@ mod tests {
     fn every_kind_of_failure_has_its_code() {
         let job = |source: JobError| CliError::Job { name: "x".into(), source, opinion: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
-        let cases: [(CliError, i32); 13] = [
+        let cases: [(CliError, i32); 16] = [
             (CliError::Internal(String::new()), 1),
             (CliError::usage("x"), 2),
             (CliError::Input { name: "x".into(), source: missing() }, 3),
@@ -250,6 +258,9 @@ mod tests {
             (CliError::Strict { name: "x".into(), errors: 1, first: String::new() }, 4),
             (job(StructureError::TooManyAtoms { limit: 1 }.into()), 5),
             (job(SurfaceError::MeshTooLarge { bytes: 2, limit: 1, suggested_resolution: 1.0 }.into()), 5),
+            (job(SurfaceError::DeviceMemory { needed: 2, available: 1, suggested_resolution: 1.0 }.into()), 5),
+            (job(SurfaceError::Deadline.into()), 5),
+            (job(SurfaceError::Device { why: String::new() }.into()), 6),
             (FormatError::GlbTooLarge { bytes: 2, limit: 1 }.into(), 5),
             (CliError::NoBackend { asked: "gpu", why: String::new() }, 6),
             (CliError::Output { name: "x".into(), source: missing() }, 7),

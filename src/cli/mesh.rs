@@ -17,7 +17,7 @@ use molmesh::surface::{CancelToken, SurfaceError};
 use serde_json::{Value, json};
 
 use super::args::{MeshArgs, ReportStyle};
-use super::backend::{self, Picked};
+use super::backend::{self, Asked, Picked};
 use super::error::CliError;
 use super::output::{Output, is_stdio};
 use super::progress::Progress;
@@ -30,7 +30,8 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let Request { job, format: asked, strict, .. } = request::parse(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
     let limits = request::limits(&args.limits);
-    let picked = backend::pick(args.backend, args.threads, backend::Use::Once)?;
+    let asked = Asked { backend: args.backend, devices: &args.devices.devices, threads: args.threads };
+    let picked = backend::pick(&asked, &backend::Use::Once)?;
     let cancel = CancelToken::default();
     interrupt::watch(&cancel).map_err(|e| CliError::Internal(format!("cannot watch for signals: {e}")))?;
     let mut output = Output::open(&args.output, &cancel)?;

@@ -37,7 +37,7 @@ pub(crate) fn main() -> i32 {
     let result = match args.command {
         Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
         Command::Serve(args) => serve::run(&args),
-        Command::Doctor => doctor::run(),
+        Command::Doctor(args) => doctor::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
         Command::Version => version(),
     };

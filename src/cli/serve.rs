@@ -5,13 +5,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use molmesh::config::{self, Config};
-use molmesh::http::{Server, shutdown_signal};
+use molmesh::http::{Chosen, Server, shutdown_signal};
 use molmesh::structure::referee;
 use molmesh::surface::Backend;
 use molmesh::telemetry;
 
 use super::args::{LogStyle, ServeArgs};
-use super::backend::{self, Picked};
+use super::backend::{self, Asked, Picked};
 use super::banner::{self, Facts};
 use super::error::CliError;
 use super::style::Style;
@@ -24,11 +24,14 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let config = config(args)?;
     telemetry::init_logs(&config.log).map_err(|e| CliError::usage(e.to_string()))?;
     referee::quiet_panics();
-    let Picked { backend, reason } = backend::pick(args.backend, None, backend::Use::Service)?;
+    let asked = Asked { backend: args.backend, devices: &config.devices.choice, threads: None };
+    let picked = backend::pick(&asked, &backend::Use::Service(config.devices.clone()))?;
+    let others = backend::survey(&picked);
+    let Picked { backend, reason, devices, .. } = picked;
     let backend: Arc<dyn Backend> = Arc::from(backend);
-    let facts =
-        Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others: backend::survey() };
-    let server = Server::bind(config, backend, reason).map_err(|e| CliError::Service(e.to_string()))?;
+    let facts = Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others };
+    let server =
+        Server::bind(config, Chosen { backend, reason, devices }).map_err(|e| CliError::Service(e.to_string()))?;
     let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
     // The service runs whether or not somebody reads its banner.
     drop(io::stderr().write_all(text.as_bytes()));
@@ -65,6 +68,7 @@ fn config(args: &ServeArgs) -> Result<Config, CliError> {
         ("server.listen", args.listen.map(|a| a.to_string())),
         ("server.metrics_listen", args.metrics_listen.map(|a| a.to_string())),
         ("server.data_dir", args.data_dir.as_ref().map(path)),
+        ("devices.use", args.devices.clone()),
         ("archive.dir", args.archive.as_ref().map(path)),
         ("log.format", log),
     ];

@@ -187,6 +187,7 @@ mod tests {
             backend: "cpu",
             device: "2 threads".into(),
             backend_reason: "asked for".into(),
+            fallback: None,
             timings_ms: [("read".to_owned(), 0.25.into()), ("field".to_owned(), 2.5.into())].into_iter().collect(),
         }
     }

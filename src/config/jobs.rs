@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 #[serde(deny_unknown_fields, default)]
 pub struct JobsConfig {
     /// Jobs that run at once. Default 2: the backend spreads one job over all cores, and a second one fills them
-    /// while the first reads its file or measures its mesh.
+    /// while the first reads its file or measures its mesh. GPUs take more: see `devices.jobs`.
     pub workers: usize,
     /// Jobs that wait. Default 64: at a typical 0.1 s a job on two workers the last one waits three seconds,
     /// which is as long as anybody waits for an answer; more would only make refusals late.

@@ -53,6 +53,7 @@ impl LimitsConfig {
         JobLimits {
             read: ReadLimits { max_inflated_bytes: self.inflated_bytes, max_atoms: self.atoms },
             surface: SurfaceLimits { max_samples: self.grid_samples, max_mesh_bytes: self.mesh_bytes },
+            deadline: None,
         }
     }
 }

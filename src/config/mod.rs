@@ -4,6 +4,7 @@
 //! unit (`_ms`, `_bytes`). A key that does not exist is refused, whichever layer it comes from.
 
 mod archive;
+mod devices;
 mod error;
 mod jobs;
 mod limits;
@@ -16,6 +17,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 pub use archive::ArchiveConfig;
+pub use devices::DevicesConfig;
 pub use error::ConfigError;
 pub use jobs::JobsConfig;
 pub use limits::LimitsConfig;
@@ -33,6 +35,8 @@ pub struct Config {
     pub limits: LimitsConfig,
     /// The worker pool.
     pub jobs: JobsConfig,
+    /// GPUs.
+    pub devices: DevicesConfig,
     /// The folder of structures by PDB id.
     pub archive: ArchiveConfig,
     /// Logs.

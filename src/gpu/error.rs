@@ -11,7 +11,9 @@ pub enum GpuError {
     #[error(transparent)]
     Surface(#[from] SurfaceError),
     /// The device has too little memory, even in tiles.
-    #[error("the device has too little memory: {needed} bytes are needed, {available} are there; {suggested_resolution} Å would fit")]
+    #[error(
+        "the device has too little memory: {needed} bytes are needed, {available} are there; {suggested_resolution} Å would fit"
+    )]
     OutOfMemory {
         /// Bytes that the job's smallest tile and its output need.
         needed: u64,

@@ -134,6 +134,6 @@ impl<'a> Progress<'a> {
         };
         let timed = self.times.iter().any(|&ns| ns > 0);
         let stages = if timed { STAGES.into_iter().zip(self.times).collect() } else { Vec::new() };
-        Ok(Finished { meshed: Meshed { mesh, grid, measures: None }, stages })
+        Ok(Finished { meshed: Meshed::new(mesh, grid), stages })
     }
 }

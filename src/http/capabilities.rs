@@ -12,16 +12,18 @@ use crate::formats::Format;
 use crate::jobs::Pool;
 use crate::pipeline::params::{Domain, Parameter, TABLE};
 use crate::structure::{element, radii};
-use crate::surface::{Kernel, Preset, SurfaceOptions, SurfaceParams};
+use crate::surface::{DeviceStatus, FoundDevice, Kernel, Preset, SurfaceOptions, SurfaceParams};
 
 /// The document.
 pub(super) async fn show(State(app): State<Shared>) -> Response {
     let headers = [(CONTENT_TYPE, "application/json"), (CACHE_CONTROL, "no-cache")];
-    (headers, app.capabilities.clone()).into_response()
+    let body =
+        if app.found.is_empty() { app.capabilities.clone() } else { document(&app.config, &app.pool, &app.found) };
+    (headers, body).into_response()
 }
 
-/// Writes the document, once.
-pub(super) fn document(config: &Config, pool: &Pool) -> Bytes {
+/// Writes the document.
+pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> Bytes {
     let formats: Vec<Value> =
         Format::ALL.iter().map(|f| json!({ "name": f.extension(), "media_type": f.media_type() })).collect();
     let document = json!({
@@ -38,16 +40,42 @@ pub(super) fn document(config: &Config, pool: &Pool) -> Bytes {
         "kernels": Kernel::ALL.iter().map(|k| k.name()).collect::<Vec<_>>(),
         "presets": presets(),
         "parameters": TABLE.iter().map(parameter).collect::<Vec<_>>(),
-        "limits": limits(config),
+        "limits": limits(config, pool),
         "backends": [{
             "name": pool.backend().name(),
             "device": pool.backend().describe(),
             "reason": pool.reason(),
         }],
+        "devices": devices(found, &pool.backend().devices()),
         "radii": { "table": radii::TABLE, "unit": "Å", "fallback": radii::FALLBACK, "values": radii_by_symbol() },
         "problems": "/problems",
     });
     Bytes::from(document.to_string())
+}
+
+/// Every device that was found; `up` says whether it takes jobs now, `reason` why or why not.
+fn devices(found: &[FoundDevice], running: &[DeviceStatus]) -> Vec<Value> {
+    let device = |found: &FoundDevice| {
+        let status = running.iter().find(|status| status.number == found.number);
+        let down = status.and_then(|status| status.down.as_ref());
+        let facts = &found.facts;
+        json!({
+            "number": found.number,
+            "name": facts.name,
+            "kind": facts.kind.name(),
+            "api": facts.api,
+            "driver": facts.driver,
+            "binding_bytes": facts.binding_bytes,
+            "buffer_bytes": facts.buffer_bytes,
+            "workgroup_bytes": facts.workgroup_bytes,
+            "timestamps": facts.timestamps,
+            "subgroups": facts.subgroups,
+            "taken": found.taken,
+            "up": status.is_some() && down.is_none(),
+            "reason": down.unwrap_or(&found.reason),
+        })
+    };
+    found.iter().map(device).collect()
 }
 
 /// Smoothness and isovalue of every preset, from the code that applies them.
@@ -80,7 +108,7 @@ fn parameter(parameter: &Parameter) -> Value {
     entry
 }
 
-fn limits(config: &Config) -> Value {
+fn limits(config: &Config, pool: &Pool) -> Value {
     let (limits, server, jobs) = (&config.limits, &config.server, &config.jobs);
     json!({
         "body_bytes": limits.body_bytes,
@@ -90,7 +118,7 @@ fn limits(config: &Config) -> Value {
         "mesh_bytes": limits.mesh_bytes,
         "output_bytes": limits.output_bytes,
         "memory_bytes": limits.memory_bytes,
-        "workers": jobs.workers,
+        "workers": pool.workers(),
         "queue": jobs.queue,
         "deliveries": jobs.deliveries,
         "deadline_ms": jobs.deadline_ms,

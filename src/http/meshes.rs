@@ -68,7 +68,7 @@ pub(super) async fn create(
     if request.report {
         return delivery::report(&finished, received);
     }
-    let key = ContentKey::new(&finished.digest, &request.job, format, app.pool.backend().name());
+    let key = ContentKey::new(&finished.digest, &request.job, format, finished.product.report.backend);
     let mut response = delivery::mesh(&app, finished, format, &key, received, place).await?;
     response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
     Ok(response)

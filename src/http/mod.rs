@@ -28,4 +28,4 @@ mod state;
 mod stream;
 mod upload;
 
-pub use server::{ServeError, Server, shutdown_signal};
+pub use server::{Chosen, ServeError, Server, shutdown_signal};

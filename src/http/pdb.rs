@@ -63,12 +63,14 @@ pub(super) async fn surface(
     let place = app.delivery()?;
     let job = request.job.clone();
     let deadline = Instant::now() + app.config.jobs.deadline();
-    let (digest, strict, lease) = (Some(digest), request.strict, Some(lease));
-    let ticket = app.pool.submit(Task { input: bytes, digest, strict, job, deadline, lease })?;
+    let (strict, lease) = (request.strict, Some(lease));
+    let ticket = app.pool.submit(Task { input: bytes, digest: Some(digest), strict, job, deadline, lease })?;
     let finished = ticket.wait().await?;
     if request.report {
         return delivery::report(&finished, received);
     }
+    // Another backend may have stood in for the chosen one, and its bytes are others.
+    let key = ContentKey::new(&digest, &request.job, format, finished.product.report.backend);
     let mut response = delivery::mesh(&app, finished, format, &key, received, place).await?;
     response.headers_mut().insert(header::CACHE_CONTROL, CACHE);
     Ok(response)

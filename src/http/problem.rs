@@ -235,6 +235,15 @@ impl From<SurfaceError> for Problem {
             E::NoSurface { isovalue } => {
                 Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
             }
+            E::DeviceMemory { needed, available, suggested_resolution } => Self::new(Kind::DeviceMemory, detail)
+                .with("limit", available)
+                .with("actual", needed)
+                .with("suggested_resolution", suggested_resolution),
+            // What drivers say is for the log, where the job's worker put it.
+            E::Device { .. } => {
+                Self::new(Kind::DeviceFailed, "no device could run the job").retry_after(Duration::from_secs(1))
+            }
+            E::Deadline => Self::new(Kind::Deadline, detail),
             E::Cancelled => Self::from(Failure::Stopped),
             // No sink takes part in an answer.
             E::Sink => Self::internal(detail),

@@ -14,7 +14,7 @@ use super::{accept, capabilities, metrics, router};
 use crate::config::Config;
 use crate::jobs::{Budget, Pool, Settings};
 use crate::structure::Archive;
-use crate::surface::{Backend, Control, Spheres, SurfaceLimits, SurfaceParams};
+use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, TelemetryError};
 
 /// How often the recorder tidies up its histograms.
@@ -44,6 +44,16 @@ pub enum ServeError {
     Telemetry(#[from] TelemetryError),
 }
 
+/// What the service computes with, and why.
+pub struct Chosen {
+    /// The backend.
+    pub backend: Arc<dyn Backend>,
+    /// Why it was taken.
+    pub reason: String,
+    /// Every device that was found, taken or not.
+    pub devices: Vec<FoundDevice>,
+}
+
 /// A server whose listeners are bound and whose workers run.
 pub struct Server {
     app: Shared,
@@ -64,27 +74,28 @@ fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAdd
 }
 
 impl Server {
-    /// Binds the listeners and starts the workers. `reason` says why `backend` was taken.
+    /// Binds the listeners and starts the workers.
     ///
     /// # Errors
     /// [`ServeError`].
-    pub fn bind(config: Config, backend: Arc<dyn Backend>, reason: String) -> Result<Self, ServeError> {
+    pub fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
+        let Chosen { backend, reason, devices: found } = chosen;
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
         let (metrics_listener, metrics_addr) = metrics.unzip();
         telemetry::recorder()?;
         let settings = Settings {
-            workers: config.jobs.workers,
+            workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
         };
         let pool = Pool::start(settings, backend, reason).map_err(ServeError::Workers)?;
         let archive = Archive::new(config.archive_dir()).with_max_bytes(config.limits.inflated_bytes);
-        let capabilities = capabilities::document(&config, &pool);
+        let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();
-        let app = Arc::new(App { config, pool, archive, deliveries, readiness, capabilities });
+        let app = Arc::new(App { config, pool, archive, deliveries, readiness, found, capabilities });
         Ok(Self { app, listener, metrics_listener, addr, metrics_addr })
     }
 
@@ -123,9 +134,11 @@ impl Server {
             }
             None => None,
         };
+        let watched = Arc::clone(&self.app);
         let upkeep = tokio::spawn(async move {
             loop {
                 tokio::time::sleep(UPKEEP).await;
+                watched.pool.publish_devices();
                 handle.run_upkeep();
             }
         });
@@ -156,19 +169,17 @@ fn tokio_listener(
     tokio::net::TcpListener::from_std(listener).map_err(|error| ServeError::Listen { key, addr, error })
 }
 
-/// Computes a first, tiny mesh: threads are started, code is paged in, and a backend that cannot work is found out.
+/// Computes a first, tiny mesh on every device, or on the processor where there is none.
 fn warm_up(app: &App) {
     let start = Instant::now();
     let backend = Arc::clone(app.pool.backend());
-    let first = || {
-        let spheres = Spheres::new(vec![0.0], vec![0.0], vec![0.0], vec![1.7])?;
-        backend.run(&spheres, &SurfaceParams::default(), &SurfaceLimits::default(), &Control::default())
-    };
-    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(first));
+    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| backend.warm()));
+    app.pool.publish_devices();
     match result {
-        Ok(Ok(meshed)) => {
+        Ok(Ok(())) => {
             let ms = start.elapsed().as_secs_f64() * 1e3;
-            tracing::info!(ms, triangles = meshed.mesh.n_triangles(), backend = backend.name(), "ready");
+            let (device, reason) = (backend.describe(), app.pool.reason());
+            tracing::info!(ms, backend = backend.name(), device, reason, "ready");
             app.readiness.set(Ready::Yes);
         }
         Ok(Err(error)) => {

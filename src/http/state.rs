@@ -11,6 +11,7 @@ use super::problem::Problem;
 use crate::config::Config;
 use crate::jobs::Pool;
 use crate::structure::Archive;
+use crate::surface::FoundDevice;
 
 /// State of the service, behind one pointer.
 pub(super) struct App {
@@ -20,7 +21,9 @@ pub(super) struct App {
     /// Places for requests for meshes: see `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
     pub(super) readiness: Readiness,
-    /// The body of `/v1/capabilities`, which cannot change while the service runs.
+    /// The devices that were found when the service started.
+    pub(super) found: Vec<FoundDevice>,
+    /// The body of `/v1/capabilities`, which changes only where devices can fail: with devices it is written anew.
     pub(super) capabilities: Bytes,
 }
 

@@ -4,6 +4,7 @@
 //! and panics are dealt with here, so that whoever submits only waits. It knows no HTTP and no graphics API.
 
 mod budget;
+mod devices;
 mod error;
 mod key;
 mod pool;

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use metrics::counter;
 use tokio::sync::oneshot;
 
+use super::devices::Watch;
 use super::queue::Queue;
 use super::{Budget, Refusal, Task, Ticket, worker};
 use crate::pipeline::JobLimits;
@@ -33,6 +34,15 @@ pub(super) struct Shared {
     pub(super) reason: String,
     pub(super) limits: JobLimits,
     pub(super) budget: Budget,
+    pub(super) workers: usize,
+    watch: Watch,
+}
+
+impl Shared {
+    /// Tells metrics and log how the devices are doing.
+    pub(super) fn publish_devices(&self) {
+        self.watch.publish(&self.backend.devices());
+    }
 }
 
 /// A running pool. Dropping it cancels what runs.
@@ -49,7 +59,9 @@ impl Pool {
         let Settings { workers, queue, limits, budget } = settings;
         let workers = workers.max(1);
         let queue = Arc::new(Queue::new(queue, workers));
-        let pool = Self { shared: Arc::new(Shared { queue, backend, reason, limits, budget }) };
+        let pool = Self {
+            shared: Arc::new(Shared { queue, backend, reason, limits, budget, workers, watch: Watch::default() }),
+        };
         for n in 0..workers {
             let shared = Arc::clone(&pool.shared);
             std::thread::Builder::new().name(format!("molmesh-job-{n}")).spawn(move || worker::work(&shared))?;
@@ -85,6 +97,17 @@ impl Pool {
     #[must_use]
     pub fn reason(&self) -> &str {
         &self.shared.reason
+    }
+
+    /// Jobs that run at once.
+    #[must_use]
+    pub fn workers(&self) -> usize {
+        self.shared.workers
+    }
+
+    /// Tells metrics and log how the backend's devices are doing, as every finished job does.
+    pub fn publish_devices(&self) {
+        self.shared.publish_devices();
     }
 
     /// Memory for uploads and meshes.

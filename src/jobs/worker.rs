@@ -10,11 +10,11 @@ use metrics::{counter, histogram};
 use super::pool::Shared;
 use super::queue::Entry;
 use super::{Digest, Failure, Finished, Outcome};
-use crate::pipeline::{self, Choice, JobError, Report};
+use crate::pipeline::{self, Choice, JobError, JobLimits, Report};
 use crate::structure::referee::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Mesh, SurfaceError};
-use crate::telemetry::{JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, VOXELS};
+use crate::telemetry::{JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, VOXELS};
 
 /// Largest text of which the referee explains a refusal, bytes: it takes some 10 ms for so much, and 40 in the worst case.
 const MAX_EXPLAINED: u64 = 512 << 10;
@@ -25,6 +25,7 @@ pub(super) fn work(shared: &Shared) {
         let id = entry.id;
         let start = Instant::now();
         let ran = run(shared, entry);
+        shared.publish_devices();
         shared.queue.done(id, ran.then(|| start.elapsed()));
     }
 }
@@ -44,7 +45,8 @@ fn run(shared: &Shared, entry: Entry) -> bool {
             let digest = task.digest.unwrap_or_else(|| Digest::of(&task.input));
             let digested = digesting.elapsed();
             let diagnostics = if task.strict { Some(check(shared, &task.input)?) } else { None };
-            let product = pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, &())
+            let limits = JobLimits { deadline: Some(task.deadline), ..shared.limits };
+            let product = pipeline::run(&task.input, &task.job, &limits, &choice, &cancel, &())
                 .map_err(|error| explained(shared, &task.input, error))?;
             Ok::<_, Failure>((digest, digested, diagnostics, product))
         };
@@ -53,6 +55,10 @@ fn run(shared: &Shared, entry: Entry) -> bool {
         product.report.add_timing("queue", ms(waited));
         product.report.add_timing("digest", ms(digested));
         count(&product.report);
+        if let Some(why) = &product.report.fallback {
+            counter!(JOBS_FALLBACK).increment(1);
+            tracing::warn!(backend = product.report.backend, why, "another backend served a job");
+        }
         let mut lease = shared.budget.lease();
         lease.force(bytes_of(&product.mesh));
         Ok(Finished { product, diagnostics, digest, waited, lease })
@@ -82,6 +88,13 @@ fn explained(shared: &Shared, input: &[u8], error: JobError) -> Failure {
     Failure::Job { error, diagnostics }
 }
 
+/// What drivers say of a failed device is for the log alone.
+fn log_device(failure: &Failure) {
+    if let Failure::Job { error: JobError::Surface(SurfaceError::Device { why }), .. } = failure {
+        tracing::error!(why, "no device could run a job");
+    }
+}
+
 fn answer(reply: tokio::sync::oneshot::Sender<Outcome>, outcome: Outcome) -> bool {
     let label = match &outcome {
         Ok(_) => "successful",
@@ -89,6 +102,9 @@ fn answer(reply: tokio::sync::oneshot::Sender<Outcome>, outcome: Outcome) -> boo
         Err(Failure::Panicked { .. }) => "panicked",
         Err(_) => "failed",
     };
+    if let Err(failure) = &outcome {
+        log_device(failure);
+    }
     let ran = outcome.is_ok();
     counter!(JOBS_FINISHED, "outcome" => label).increment(1);
     if reply.send(outcome).is_err() {

@@ -17,10 +17,13 @@ pub trait ProgressSink: Sync {
 impl ProgressSink for () {}
 
 /// Measures stages. Stages that run interleaved on several threads (the backend's) share the wall time of
-/// their pass in proportion to the threads' time in each, so the stages add up to the wall time.
+/// their pass in proportion to the threads' time in each, so the stages add up to the wall time. Where a device told
+/// the times of its stages they stand as told, and what is left of the pass is its `roundtrip`: waiting for the
+/// device, transfers, everything that is no stage.
 pub struct StageClock<'a> {
     sink: &'a dyn ProgressSink,
     busy_ns: [AtomicU64; Stage::ALL.len()],
+    device_ns: [AtomicU64; Stage::ALL.len()],
     wall_ms: Mutex<Vec<(&'static str, f64)>>,
 }
 
@@ -28,7 +31,7 @@ impl<'a> StageClock<'a> {
     /// A clock that reports to `sink`.
     #[must_use]
     pub fn new(sink: &'a dyn ProgressSink) -> Self {
-        Self { sink, busy_ns: Default::default(), wall_ms: Mutex::default() }
+        Self { sink, busy_ns: Default::default(), device_ns: Default::default(), wall_ms: Mutex::default() }
     }
 
     /// Times `work` under `name`.
@@ -40,13 +43,24 @@ impl<'a> StageClock<'a> {
         value
     }
 
-    /// Times a backend's pass, whose spans were reported through [`Observer::span`].
+    /// Times a backend's pass, whose stages were reported through [`Observer::span`] and [`Observer::elapsed`].
     pub fn pass<T>(&self, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let value = work();
         let wall = start.elapsed().as_secs_f64() * 1e3;
         let busy = self.busy_ns.each_ref().map(|ns| ns.swap(0, Ordering::Relaxed) as f64);
         let total: f64 = busy.iter().sum();
+        let device = self.device_ns.each_ref().map(|ns| ns.swap(0, Ordering::Relaxed) as f64);
+        if device.iter().any(|ns| *ns > 0.0) {
+            for ((stage, host), device) in Stage::ALL.into_iter().zip(busy).zip(device) {
+                if host + device > 0.0 {
+                    self.push(stage.name(), (host + device) / 1e6);
+                }
+            }
+            let stages = (total + device.iter().sum::<f64>()) / 1e6;
+            self.push("roundtrip", (wall - stages).max(0.0));
+            return value;
+        }
         for (stage, share) in Stage::ALL.into_iter().zip(busy) {
             if share > 0.0 {
                 self.push(stage.name(), wall * share / total);
@@ -74,7 +88,39 @@ impl Observer for StageClock<'_> {
         self.busy_ns[stage as usize].fetch_add(ns, Ordering::Relaxed);
     }
 
+    fn elapsed(&self, stage: Stage, ns: u64) {
+        self.device_ns[stage as usize].fetch_add(ns, Ordering::Relaxed);
+    }
+
     fn progress(&self, stage: Stage, done: usize, total: usize) {
         self.sink.progress(stage.name(), done as f64 / total.max(1) as f64);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_devices_stages_stand_as_told_and_the_rest_is_the_roundtrip() {
+        let clock = StageClock::new(&());
+        clock.pass(|| {
+            clock.span(Stage::Bin, &mut || {});
+            clock.elapsed(Stage::Field, 2_000_000);
+            clock.elapsed(Stage::Field, 1_000_000);
+            std::thread::sleep(std::time::Duration::from_millis(8));
+        });
+        let times = clock.finish();
+        let of = |name: &str| times.iter().find(|(n, _)| *n == name).map(|(_, ms)| *ms).unwrap();
+        assert!((of("field") - 3.0).abs() < 1e-9, "{times:?}");
+        assert!(of("roundtrip") >= 4.9 && of("bin") < 1.0, "{times:?}");
+    }
+
+    #[test]
+    fn without_a_device_the_stages_share_the_wall_time() {
+        let clock = StageClock::new(&());
+        clock.pass(|| clock.span(Stage::Field, &mut || std::thread::sleep(std::time::Duration::from_millis(2))));
+        let times = clock.finish();
+        assert_eq!(times.iter().map(|(name, _)| *name).collect::<Vec<_>>(), ["field"]);
     }
 }

@@ -5,6 +5,8 @@ pub mod nearest;
 pub mod params;
 mod report;
 
+use std::time::Instant;
+
 use thiserror::Error;
 
 pub use clock::{ProgressSink, StageClock};
@@ -36,6 +38,8 @@ pub struct JobLimits {
     pub read: ReadLimits,
     /// Limits of meshing.
     pub surface: SurfaceLimits,
+    /// When the mesh must be there; none: whenever.
+    pub deadline: Option<Instant>,
 }
 
 /// A backend and the reason why it was taken, for reports and logs.
@@ -107,7 +111,7 @@ pub fn run(
 ) -> Result<Product, JobError> {
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
-    let control = Control { cancel: cancel.clone(), observer: &clock };
+    let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
     let mut meshed = clock.pass(|| choice.backend.run(&spheres, &job.params, &limits.surface, &control))?;
     if let Some(ids) = &mut meshed.mesh.atom_ids {
         // The core speaks of spheres; people ask for atoms of the file.
@@ -117,8 +121,8 @@ pub fn run(
         Some(taken) => taken,
         None => clock.time(Stage::Measure.name(), || Measures::of(&meshed.mesh, job.proof, &control))?,
     };
-    let Meshed { mesh, grid, .. } = meshed;
-    let counts = Counts { grid, n_vertices: mesh.n_vertices(), n_triangles: mesh.n_triangles() };
+    let Meshed { mesh, grid, served, .. } = meshed;
+    let counts = Counts { grid, n_vertices: mesh.n_vertices(), n_triangles: mesh.n_triangles(), served };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     Ok(Product { mesh, report })
 }
@@ -145,9 +149,14 @@ pub fn pour(
 ) -> Result<Poured, JobError> {
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
-    let control = Control { cancel: cancel.clone(), observer: &clock };
+    let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
     let poured = clock.pass(|| choice.backend.pour(&spheres, &job.params, &limits.surface, &control, sink))?;
-    let counts = Counts { grid: poured.grid, n_vertices: poured.n_vertices, n_triangles: poured.n_triangles };
+    let counts = Counts {
+        grid: poured.grid,
+        n_vertices: poured.n_vertices,
+        n_triangles: poured.n_triangles,
+        served: poured.served,
+    };
     let report = Report::new(&structure, &selected, job, choice, &counts, &poured.measures, clock.finish());
     Ok(Poured { report, centre: poured.centre, bounds: poured.bounds })
 }

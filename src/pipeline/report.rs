@@ -5,7 +5,7 @@ use serde_json::{Map, Value};
 
 use super::{Choice, Job};
 use crate::structure::{Selected, Structure, radii};
-use crate::surface::{GridStats, Measures};
+use crate::surface::{GridStats, Measures, Served};
 
 /// One connected component.
 #[derive(Debug, Clone, Serialize)]
@@ -86,15 +86,19 @@ pub struct Report {
     pub device: String,
     /// Why it was taken.
     pub backend_reason: String,
+    /// Why `backend` stood in for the one that was chosen; absent where none had to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fallback: Option<String>,
     /// Wall time per stage, ms.
     pub timings_ms: Map<String, Value>,
 }
 
-/// What a report counts.
+/// What a report counts, and who made it.
 pub(super) struct Counts {
     pub(super) grid: GridStats,
     pub(super) n_vertices: usize,
     pub(super) n_triangles: usize,
+    pub(super) served: Option<Served>,
 }
 
 impl Report {
@@ -109,6 +113,11 @@ impl Report {
     ) -> Self {
         let params = &job.params;
         let gaussian = params.kernel == crate::surface::Kernel::Gaussian && params.paper.is_none();
+        let served = counts.served.clone().unwrap_or_else(|| Served {
+            backend: choice.backend.name(),
+            device: choice.backend.describe(),
+            instead: None,
+        });
         let list = measures.components.iter().take(100);
         Self {
             id: structure.id.clone(),
@@ -146,9 +155,13 @@ impl Report {
                 .collect(),
             area: measures.area,
             volume: measures.volume,
-            backend: choice.backend.name(),
-            device: choice.backend.describe(),
-            backend_reason: choice.reason.to_owned(),
+            backend: served.backend,
+            device: served.device,
+            backend_reason: match &served.instead {
+                Some(why) => format!("{}; but {why}", choice.reason),
+                None => choice.reason.to_owned(),
+            },
+            fallback: served.instead,
             timings_ms: timings
                 .into_iter()
                 .map(|(name, ms)| (name.to_owned(), Value::from((ms * 1e3).round() / 1e3)))
@@ -167,7 +180,7 @@ impl Report {
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
-        for run_dependent in ["timings_ms", "device", "backend_reason"] {
+        for run_dependent in ["timings_ms", "device", "backend_reason", "fallback"] {
             map.remove(run_dependent);
         }
         map

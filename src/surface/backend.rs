@@ -1,6 +1,7 @@
 //! What a backend is: something that turns spheres into a mesh.
 
 use super::control::{Control, Stage};
+use super::devices::DeviceStatus;
 use super::error::SurfaceError;
 use super::measure::{Measures, Proof};
 use super::mesh::Mesh;
@@ -33,6 +34,27 @@ pub struct Meshed {
     /// Its measures with [`Proof::Checksum`](super::measure::Proof::Checksum), if the backend took them on the way and
     /// the mesh is closed. What [`Measures::of`] finds in the finished mesh is the same up to rounding.
     pub measures: Option<Measures>,
+    /// Who made it, where that is known only afterwards: one of several devices, or a stand-in for them.
+    pub served: Option<Served>,
+}
+
+impl Meshed {
+    /// The run of a backend that is one thing, always serves by itself, and did not measure.
+    #[must_use]
+    pub const fn new(mesh: Mesh, grid: GridStats) -> Self {
+        Self { mesh, grid, measures: None, served: None }
+    }
+}
+
+/// Who made a mesh.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Served {
+    /// The name of the backend that did, as [`Backend::name`] gives it.
+    pub backend: &'static str,
+    /// What it ran on, for people.
+    pub device: String,
+    /// Why this one stood in for the backend that was asked; none where none had to.
+    pub instead: Option<String>,
 }
 
 /// Turns spheres into a mesh. The same input gives the same bytes, whatever the thread count.
@@ -68,14 +90,29 @@ pub trait Backend: Send + Sync {
         control: &Control<'_>,
         sink: &dyn MeshSink,
     ) -> Result<Poured, SurfaceError> {
-        let Meshed { mesh, grid, measures } = self.run(spheres, params, limits, control)?;
+        let Meshed { mesh, grid, measures, served } = self.run(spheres, params, limits, control)?;
         let measures = match measures {
             Some(measures) => measures,
             None => control.span(Stage::Measure, || Measures::of(&mesh, Proof::Checksum, control))?,
         };
         pour_whole(&mesh, sink)?;
         let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
-        Ok(Poured { centre: mesh.centre, n_vertices, n_triangles, bounds: mesh.bounds(), grid, measures })
+        Ok(Poured { centre: mesh.centre, n_vertices, n_triangles, bounds: mesh.bounds(), grid, measures, served })
+    }
+
+    /// Makes a first, tiny mesh on everything that it runs on: threads are started, code is paged in, and what cannot
+    /// work is found out.
+    ///
+    /// # Errors
+    /// Those of [`Backend::run`].
+    fn warm(&self) -> Result<(), SurfaceError> {
+        let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
+        self.run(&one_atom()?, &params, &limits, &Control::default()).map(|_mesh| ())
+    }
+
+    /// How the devices behind it are doing; empty where there are none but the processor.
+    fn devices(&self) -> Vec<DeviceStatus> {
+        Vec::new()
     }
 }
 
@@ -85,4 +122,12 @@ fn pour_whole(mesh: &Mesh, sink: &dyn MeshSink) -> Result<(), SurfaceError> {
     sink.begin(mesh.n_vertices(), mesh.n_triangles()).map_err(failed)?;
     let (positions, normals, triangles) = (&mesh.positions[..], &mesh.normals[..], &mesh.triangles[..]);
     sink.part(&MeshPart { first_vertex: 0, positions, normals, first_triangle: 0, triangles }).map_err(failed)
+}
+
+/// The smallest structure that has a surface: one carbon.
+///
+/// # Errors
+/// None that could be met: the sphere is a good one.
+pub fn one_atom() -> Result<Spheres, SurfaceError> {
+    Spheres::new(vec![0.0], vec![0.0], vec![0.0], vec![1.7])
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
 use super::error::SurfaceError;
 
@@ -63,6 +64,11 @@ pub trait Observer: Sync {
         work();
     }
 
+    /// (A part of) `stage` took `ns` nanoseconds by a device's own clock.
+    fn elapsed(&self, stage: Stage, ns: u64) {
+        let _ = (stage, ns);
+    }
+
     /// `done` of `total` parts of `stage` are finished.
     fn progress(&self, stage: Stage, done: usize, total: usize) {
         let _ = (stage, done, total);
@@ -97,13 +103,16 @@ impl CancelToken {
 pub struct Control<'a> {
     /// Checked between stages and every few bricks.
     pub cancel: CancelToken,
+    /// When nobody wants the mesh any more. The core reads no clock and only hands it on: backends that queue jobs
+    /// behind one another look at it.
+    pub deadline: Option<Instant>,
     /// Told of stages and progress.
     pub observer: &'a dyn Observer,
 }
 
 impl Default for Control<'_> {
     fn default() -> Self {
-        Self { cancel: CancelToken::default(), observer: &Silent }
+        Self { cancel: CancelToken::default(), deadline: None, observer: &Silent }
     }
 }
 

@@ -63,6 +63,25 @@ pub enum SurfaceError {
     /// Whoever takes the mesh part by part failed, and knows why.
     #[error("the mesh could not be handed on")]
     Sink,
+    /// The device has too little memory for the mesh, even piece by piece.
+    #[error("the device would need {needed} bytes of memory, it has {available}; {suggested_resolution} Å would fit")]
+    DeviceMemory {
+        /// Bytes needed.
+        needed: u64,
+        /// Bytes that the device can give.
+        available: u64,
+        /// A spacing that would fit, in Å.
+        suggested_resolution: f64,
+    },
+    /// Every device that could have run the job failed, and nothing stands in for them.
+    #[error("no device could run the job: {why}")]
+    Device {
+        /// What happened, in words.
+        why: String,
+    },
+    /// The deadline passed.
+    #[error("the deadline passed")]
+    Deadline,
     /// The run was cancelled by its caller.
     #[error("cancelled")]
     Cancelled,

@@ -170,7 +170,7 @@ impl Backend for ReferenceBackend {
         let n = grid.len() as u64;
         let stats =
             GridStats { bricks: 0, surface_bricks: 0, samples: n, box_cells: cases.len() as u64, candidates: 0 };
-        Ok(Meshed { mesh, grid: stats, measures: None })
+        Ok(Meshed::new(mesh, stats))
     }
 }
 

@@ -1,6 +1,6 @@
 //! A mesh that leaves the backend part by part, and is never held as a whole.
 
-use super::backend::GridStats;
+use super::backend::{GridStats, Served};
 use super::measure::Measures;
 
 /// A part of a mesh: rows of its columns, each in its final place.
@@ -53,4 +53,6 @@ pub struct Poured {
     pub grid: GridStats,
     /// Its measures.
     pub measures: Measures,
+    /// Who made it, as in [`Meshed`](super::backend::Meshed).
+    pub served: Option<Served>,
 }

@@ -12,9 +12,9 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use molmesh::config::Config;
-use molmesh::http::Server;
+use molmesh::http::{Chosen, Server};
 use molmesh::surface::{
-    Backend, Control, GridStats, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, Control, FoundDevice, GridStats, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 /// The sample that ships with the product.
@@ -117,7 +117,7 @@ impl Backend for Fake {
         if !warm_up {
             self.finished.fetch_add(1, Ordering::SeqCst);
         }
-        Ok(Meshed { mesh, grid: GridStats { samples: 7, ..GridStats::default() }, measures: None })
+        Ok(Meshed::new(mesh, GridStats { samples: 7, ..GridStats::default() }))
     }
 }
 
@@ -197,6 +197,15 @@ pub(crate) fn start(backend: Arc<dyn Backend>, change: impl FnOnce(&mut Config))
 
 /// Starts a server.
 pub(crate) fn start_cold(backend: Arc<dyn Backend>, change: impl FnOnce(&mut Config)) -> Running {
+    start_on(backend, Vec::new(), change)
+}
+
+/// Starts a server that says that it has found these devices.
+pub(crate) fn start_on(
+    backend: Arc<dyn Backend>,
+    found: Vec<FoundDevice>,
+    change: impl FnOnce(&mut Config),
+) -> Running {
     LazyLock::force(&LOG);
     let dir = tempfile::tempdir().unwrap();
     let mut config = Config::default();
@@ -204,7 +213,7 @@ pub(crate) fn start_cold(backend: Arc<dyn Backend>, change: impl FnOnce(&mut Con
     config.server.metrics_listen = Some("127.0.0.1:0".parse().unwrap());
     dir.path().clone_into(&mut config.server.data_dir);
     change(&mut config);
-    let server = Server::bind(config, backend, "a test says so".to_owned()).unwrap();
+    let server = Server::bind(config, Chosen { backend, reason: "a test says so".to_owned(), devices: found }).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
     let (stop, stopped) = tokio::sync::oneshot::channel();
     let thread = std::thread::spawn(move || {

@@ -259,7 +259,7 @@ fn run(
 ) -> Result<Meshed, SurfaceError> {
     let scanned = scan(spheres, params, limits, control)?;
     let (mesh, measures) = build::build(&scanned, params.atom_ids, control)?;
-    Ok(Meshed { mesh, grid: scanned.grid, measures })
+    Ok(Meshed { measures, ..Meshed::new(mesh, scanned.grid) })
 }
 
 fn pour(

@@ -73,6 +73,7 @@ pub(super) fn pour(scanned: &Scanned, control: &Control<'_>, sink: &dyn MeshSink
         bounds: bounds.into_iter().fold(NOWHERE, join_bounds),
         grid: scanned.grid,
         measures,
+        served: None,
     })
 }
 

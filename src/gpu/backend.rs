@@ -1,0 +1,151 @@
+//! The backend: devices that share the work, and the one that stands in for them when they fail.
+
+use std::sync::Arc;
+
+use super::device;
+use super::discover::Discovery;
+use super::error::GpuError;
+use super::executor::GpuJob;
+use super::pool::{DevicePool, PoolDevice, PoolSettings};
+use super::prepare::Prepared;
+use super::queue::one_line;
+use crate::surface::{
+    Backend, Control, DeviceFacts, DeviceStatus, Meshed, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams, backend::one_atom,
+};
+
+/// Meshes on devices.
+pub struct GpuBackend {
+    pool: DevicePool,
+    /// Serves what no device could, and says so in [`Meshed::served`].
+    fallback: Option<Box<dyn Backend>>,
+}
+
+impl GpuBackend {
+    /// Builds the stages on every device that `discovery` takes.
+    ///
+    /// # Errors
+    /// [`GpuError::NoDevice`] with every device's reason if none is taken or none could be built.
+    pub fn start(
+        discovery: &Discovery,
+        settings: &PoolSettings,
+        fallback: Option<Box<dyn Backend>>,
+    ) -> Result<Self, GpuError> {
+        if let Some(why) = discovery.why_none() {
+            return Err(GpuError::NoDevice(why));
+        }
+        let taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(device, _)| device.taken);
+        let devices = taken.map(|(device, adapter)| {
+            let adapter = adapter.clone();
+            let build = Box::new(move || device::build(&adapter));
+            PoolDevice { number: device.number, name: describe(&device.facts), build }
+        });
+        Ok(Self::over(DevicePool::start(devices.collect(), settings)?, fallback))
+    }
+
+    /// The backend over a pool that runs already.
+    #[must_use]
+    pub fn over(pool: DevicePool, fallback: Option<Box<dyn Backend>>) -> Self {
+        Self { pool, fallback }
+    }
+
+    fn job(
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<GpuJob, SurfaceError> {
+        let prepared = control.span(Stage::Bin, || Prepared::new(spheres, params, limits, control))?;
+        Ok(GpuJob { prepared: Arc::new(prepared), cancel: control.cancel.clone(), deadline: control.deadline })
+    }
+
+    /// Makes one atom's surface on device `n`, which is given up if it cannot.
+    fn warm_device(&self, n: usize) -> Result<(), SurfaceError> {
+        let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
+        let job = Self::job(&one_atom()?, &params, &limits, &Control::default())?;
+        if let Err(error) = self.pool.run_only_on(n, &job) {
+            self.pool.give_up(n, &format!("its first mesh failed: {error}"));
+        }
+        Ok(())
+    }
+}
+
+/// A device for people.
+fn describe(facts: &DeviceFacts) -> String {
+    let DeviceFacts { name, kind, api, driver, .. } = facts;
+    let driver = if driver.is_empty() { String::new() } else { format!(", {driver}") };
+    format!("{name} ({}, {api}{driver})", kind.name())
+}
+
+impl Backend for GpuBackend {
+    fn name(&self) -> &'static str {
+        "gpu"
+    }
+
+    fn describe(&self) -> String {
+        let status = self.pool.status();
+        let up: Vec<&str> = status.iter().filter(|d| d.down.is_none()).map(|d| d.name.as_str()).collect();
+        match up[..] {
+            [] => "no device is up".to_owned(),
+            [one] => one.to_owned(),
+            [..] => format!("{} devices: {}", up.len(), up.join(", ")),
+        }
+    }
+
+    fn run(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<Meshed, SurfaceError> {
+        control.check()?;
+        let job = Self::job(spheres, params, limits, control)?;
+        let error = match self.pool.run(&job) {
+            Ok((finished, device)) => {
+                finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));
+                let served = Served { backend: self.name(), device: device.to_owned(), instead: None };
+                return Ok(Meshed { served: Some(served), ..finished.meshed });
+            }
+            Err(error) => error,
+        };
+        // The atoms on their way to a device are not needed for what follows.
+        drop(job);
+        match (error, &self.fallback) {
+            (GpuError::Surface(error), _) => Err(error),
+            (GpuError::Deadline, _) => Err(SurfaceError::Deadline),
+            (GpuError::OutOfMemory { needed, available, suggested_resolution }, _) => {
+                Err(SurfaceError::DeviceMemory { needed, available, suggested_resolution })
+            }
+            (error, None) => Err(SurfaceError::Device { why: one_line(&error.to_string()) }),
+            (error, Some(fallback)) => {
+                let meshed = fallback.run(spheres, params, limits, control)?;
+                let served = Served {
+                    backend: fallback.name(),
+                    device: fallback.describe(),
+                    instead: Some(one_line(&format!("the GPU failed: {error}"))),
+                };
+                Ok(Meshed { served: Some(served), ..meshed })
+            }
+        }
+    }
+
+    fn warm(&self) -> Result<(), SurfaceError> {
+        let n_devices = self.pool.status().len();
+        std::thread::scope(|scope| {
+            let warming: Vec<_> = (0..n_devices).map(|n| scope.spawn(move || self.warm_device(n))).collect();
+            warming.into_iter().try_for_each(|thread| thread.join().unwrap_or(Err(SurfaceError::Cancelled)))
+        })?;
+        if self.pool.status().iter().any(|device| device.down.is_none()) {
+            return Ok(());
+        }
+        match &self.fallback {
+            Some(fallback) => fallback.warm(),
+            None => Err(SurfaceError::Device { why: self.describe() }),
+        }
+    }
+
+    fn devices(&self) -> Vec<DeviceStatus> {
+        self.pool.status()
+    }
+}

@@ -1,0 +1,42 @@
+//! Tells metrics and log how the backend's devices are doing.
+
+use std::sync::{Mutex, PoisonError};
+
+use metrics::{counter, gauge};
+
+use crate::surface::DeviceStatus;
+use crate::telemetry::{DEVICE_HELD, DEVICE_JOBS, DEVICE_REBUILDS, DEVICE_SHARED, DEVICE_UP, DEVICE_WAITING};
+
+/// What the log knows of each device: its rebuilds, and whether it was up.
+#[derive(Debug, Default)]
+pub(super) struct Watch(Mutex<Vec<(u64, bool)>>);
+
+impl Watch {
+    /// Publishes `devices`, and logs what has changed since the last time.
+    #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
+    pub(super) fn publish(&self, devices: &[DeviceStatus]) {
+        let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        known.resize(devices.len(), (0, true));
+        for (device, known) in devices.iter().zip(known.iter_mut()) {
+            let number = device.number.to_string();
+            let up = device.down.is_none();
+            gauge!(DEVICE_UP, "device" => number.clone()).set(f64::from(u8::from(up)));
+            gauge!(DEVICE_HELD, "device" => number.clone()).set(device.held_bytes as f64);
+            gauge!(DEVICE_WAITING, "device" => number.clone()).set(device.waiting as f64);
+            counter!(DEVICE_REBUILDS, "device" => number.clone()).absolute(device.rebuilds);
+            counter!(DEVICE_SHARED, "device" => number.clone()).absolute(device.shared);
+            for (outcome, count) in [("finished", device.finished), ("failed", device.failed)] {
+                counter!(DEVICE_JOBS, "device" => number.clone(), "outcome" => outcome).absolute(count);
+            }
+            let DeviceStatus { number, name, rebuilds, .. } = device;
+            if *rebuilds > known.0 {
+                tracing::warn!(device = number, name, rebuilds, "a device failed and was built anew");
+            }
+            match &device.down {
+                Some(why) if known.1 => tracing::error!(device = number, name, why, "a device takes no jobs any more"),
+                _ => {}
+            }
+            *known = (*rebuilds, up);
+        }
+    }
+}

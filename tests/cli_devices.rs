@@ -1,0 +1,93 @@
+//! `--devices` and what is said of devices, through the binary.
+#![cfg(all(feature = "cli", feature = "server"))]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+mod cli_support;
+
+use cli_support::{Folder, Service, assert_code, mesh, molmesh, rod, run, stderr, stdout};
+
+fn report(flags: &[&str]) -> serde_json::Value {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let done = mesh(&input, &folder.path("out.glb"), &[flags, &["--report", "json"]].concat());
+    assert_code(&done, 0);
+    serde_json::from_str(&stdout(&done)).unwrap()
+}
+
+#[test]
+fn devices_that_cannot_be_meant_are_bad_usage() {
+    for devices in ["", "gpu", "-1", "0,", "cpu,0", "0 1"] {
+        let flag = format!("--devices={devices}");
+        for command in [&["mesh", "a.pdb", "-o", "b.glb", &flag][..], &["doctor", &flag]] {
+            let done = run(command);
+            assert_eq!(done.status.code(), Some(2), "{command:?}: {}", stderr(&done));
+            assert!(stderr(&done).contains("auto, all, cpu"), "{}", stderr(&done));
+        }
+        let done = run(["serve", "--listen", "127.0.0.1:0", &flag]);
+        assert_code(&done, 2);
+        assert!(stderr(&done).contains("devices.use") && stderr(&done).contains("auto, all, cpu"), "{}", stderr(&done));
+    }
+    let done = run(["mesh", "a.pdb", "-o", "b.glb", "--backend", "gpu", "--devices", "cpu"]);
+    assert_code(&done, 2);
+}
+
+#[test]
+fn the_environment_is_read_and_flags_win() {
+    let bad = molmesh().env("MOLMESH__DEVICES__USE", "abacus").args(["doctor"]).output().unwrap();
+    assert_eq!(bad.status.code(), Some(2), "{}", stderr(&bad));
+    let flagged =
+        molmesh().env("MOLMESH__DEVICES__USE", "abacus").args(["doctor", "--devices", "cpu"]).output().unwrap();
+    assert_code(&flagged, 0);
+}
+
+#[test]
+fn the_cpu_is_taken_when_asked_for_and_the_reason_says_which_way() {
+    for (flags, reason) in [(&["--devices", "cpu"][..], "--devices cpu"), (&["--backend", "cpu"], "asked for")] {
+        let report = report(flags);
+        assert_eq!((&report["backend"], &report["backend_reason"]), (&"cpu".into(), &reason.into()), "{flags:?}");
+    }
+}
+
+#[test]
+#[cfg(feature = "gpu")]
+fn a_device_that_is_asked_for_and_not_there_is_not_replaced_in_silence() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    for flags in [&["--devices", "77"][..], &["--backend", "gpu", "--devices", "77"]] {
+        let done = mesh(&input, &folder.path("out.glb"), flags);
+        assert_code(&done, 6);
+        assert!(stderr(&done).contains("there is no device 77"), "{}", stderr(&done));
+    }
+    assert_code(&run(["serve", "--listen", "127.0.0.1:0", "--devices", "77"]), 6);
+    assert_eq!(folder.entries(), ["in.pdb"]);
+}
+
+#[test]
+fn doctor_lists_every_device_with_its_reason() {
+    let done = run(["doctor"]);
+    assert_code(&done, 0);
+    let text = stdout(&done);
+    for row in ["cpu", "reference", "gpu", "auto"] {
+        assert!(text.lines().any(|line| line.trim_start().starts_with(row)), "no `{row}` in\n{text}");
+    }
+    if cfg!(feature = "gpu") && std::env::var_os("CI").is_some() {
+        assert!(text.contains("device 0"), "CI has software Vulkan:\n{text}");
+    }
+    for line in text.lines().filter(|line| line.trim_start().starts_with("device ")) {
+        let (_, said) = line.split_once("device ").unwrap();
+        assert!(said.contains("yes ") || said.contains("no "), "{line}");
+        assert!(said.contains(": "), "no reason: {line}");
+    }
+    let cpu = run(["doctor", "--devices", "cpu"]);
+    for line in stdout(&cpu).lines().filter(|line| line.trim_start().starts_with("device ")) {
+        assert!(line.contains("the CPU was asked for"), "{line}");
+    }
+}
+
+#[test]
+fn a_service_says_which_devices_it_found() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--devices", "cpu"]);
+    assert!(service.banner.contains("cpu: ") && service.banner.contains("(--devices cpu)"), "{}", service.banner);
+    assert!(service.banner.contains("not gpu: "), "{}", service.banner);
+}

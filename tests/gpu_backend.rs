@@ -1,0 +1,200 @@
+//! The GPU backend as the rest of the crate sees it: who served, what stands in, what errors become. Devices are fakes
+//! here; what drivers offer is looked for in earnest at the end.
+#![cfg(feature = "gpu")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+mod gpu_fakes;
+
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Instant;
+
+use gpu_fakes::Step::{Hold, Lose, OutOfMemory, Serve};
+use gpu_fakes::{Rig, SETTINGS, devices, spheres};
+use molmesh::gpu::{DevicePool, GpuBackend, GpuError, Look, discover};
+use molmesh::surface::{
+    Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, Meshed, Observer, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams,
+};
+
+fn over(rigs: &[Arc<Rig>], fallback: bool) -> GpuBackend {
+    let fallback = fallback.then(|| Box::new(CpuBackend::new(None).unwrap()) as Box<dyn Backend>);
+    GpuBackend::over(DevicePool::start(devices(rigs), &SETTINGS).unwrap(), fallback)
+}
+
+fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<Meshed, SurfaceError> {
+    backend.run(&spheres(2), &SurfaceParams::default(), &SurfaceLimits::default(), control)
+}
+
+#[test]
+fn the_device_that_served_is_named() {
+    let backend = over(&[Rig::new(&[]), Rig::new(&[])], true);
+    let names: Vec<String> =
+        (0..2).map(|_| run(&backend, &Control::default()).unwrap().served.unwrap().device).collect();
+    assert_eq!(names, ["fake 0", "fake 1"]);
+    assert_eq!((backend.name(), backend.describe().as_str()), ("gpu", "2 devices: fake 0, fake 1"));
+}
+
+#[test]
+fn the_cpu_stands_in_and_says_so() {
+    let rig = Rig::new(&[Lose]);
+    let backend = over(std::slice::from_ref(&rig), true);
+    let cpu = run(&CpuBackend::new(None).unwrap(), &Control::default()).unwrap();
+    // First for a device that fails, then, from the third job on, for one that is given up.
+    for n in 0..4 {
+        let meshed = run(&backend, &Control::default()).unwrap();
+        assert_eq!(meshed.mesh, cpu.mesh);
+        let served = meshed.served.unwrap();
+        let why = served.instead.unwrap();
+        assert_eq!(served.backend, "cpu");
+        assert!(
+            served.device.contains("native CPU") && why.contains("the GPU failed") && why.contains("as told"),
+            "{why}"
+        );
+        assert_eq!(why.contains("no device is up"), n >= 2, "{n}: {why}");
+    }
+    assert_eq!(backend.describe(), "no device is up");
+    // A device that works is not stood in for.
+    let well = run(&over(&[Rig::new(&[])], true), &Control::default()).unwrap().served.unwrap();
+    assert_eq!((well.backend, well.instead), ("gpu", None));
+}
+
+#[test]
+fn with_nothing_that_stands_in_the_failure_is_an_error() {
+    let error = run(&over(&[Rig::new(&[Lose])], false), &Control::default()).unwrap_err();
+    let SurfaceError::Device { why } = error else { panic!("{error}") };
+    assert!(why.contains("as told"), "{why}");
+}
+
+#[test]
+fn too_little_memory_is_refused_with_numbers_and_not_stood_in_for() {
+    let error = run(&over(&[Rig::new(&[OutOfMemory])], true), &Control::default()).unwrap_err();
+    assert_eq!(error, SurfaceError::DeviceMemory { needed: 9, available: 5, suggested_resolution: 1.5 });
+}
+
+#[test]
+fn deadline_and_cancellation_reach_the_device() {
+    let rig = Rig::new(&[Hold]);
+    let backend = over(std::slice::from_ref(&rig), true);
+    let deadline = Some(Instant::now() + std::time::Duration::from_millis(30));
+    assert_eq!(
+        run(&backend, &Control { deadline, ..Control::default() }).map(|_| ()).unwrap_err(),
+        SurfaceError::Deadline
+    );
+    let cancel = CancelToken::default();
+    let cancelled = std::thread::scope(|scope| {
+        let running = scope.spawn(|| run(&backend, &Control { cancel: cancel.clone(), ..Control::default() }));
+        gpu_fakes::wait_for("the job to run", || rig.calls().len() == 2);
+        cancel.cancel();
+        running.join().unwrap()
+    });
+    assert_eq!(cancelled.map(|_| ()).unwrap_err(), SurfaceError::Cancelled);
+    // A job that is cancelled from the start does not get there.
+    let before = rig.calls().len();
+    assert!(run(&backend, &Control { cancel, ..Control::default() }).is_err());
+    assert_eq!(rig.calls().len(), before);
+}
+
+#[test]
+fn the_observer_is_told_of_the_stages() {
+    #[derive(Default)]
+    struct Watch {
+        told: Mutex<Vec<(Stage, u64)>>,
+        binned: AtomicBool,
+    }
+    impl Observer for Watch {
+        fn span(&self, stage: Stage, work: &mut dyn FnMut()) {
+            work();
+            self.binned.fetch_or(stage == Stage::Bin, Ordering::Relaxed);
+        }
+        fn elapsed(&self, stage: Stage, ns: u64) {
+            self.told.lock().unwrap().push((stage, ns));
+        }
+    }
+    let watch = Watch::default();
+    run(&over(&[Rig::new(&[])], true), &Control { observer: &watch, ..Control::default() }).unwrap();
+    assert_eq!(*watch.told.lock().unwrap(), [(Stage::Field, 2_000), (Stage::Emit, 1_000)]);
+    assert!(watch.binned.into_inner());
+}
+
+#[test]
+fn warming_up_reaches_every_device_and_gives_up_those_that_fail() {
+    let rigs = [Rig::new(&[Serve]), Rig::new(&[Lose]), Rig::new(&[Serve])];
+    let backend = over(&rigs, true);
+    backend.warm().unwrap();
+    assert_eq!(rigs.each_ref().map(|rig| rig.calls().len()), [1, 2, 1]);
+    let down: Vec<bool> = backend.devices().iter().map(|device| device.down.is_some()).collect();
+    assert_eq!(down, [false, true, false]);
+    assert!(backend.devices()[1].down.as_deref().unwrap().contains("first mesh failed"));
+    // With no device left the one that stands in has to work, and without one there is nothing to be ready with.
+    over(&[Rig::new(&[Lose])], true).warm().unwrap();
+    assert!(matches!(over(&[Rig::new(&[Lose])], false).warm(), Err(SurfaceError::Device { .. })));
+}
+
+#[test]
+fn many_callers_share_one_device() {
+    let rig = Rig::new(&[]);
+    let backend = over(std::slice::from_ref(&rig), false);
+    let (done, samples) = (AtomicUsize::new(0), AtomicU64::new(0));
+    std::thread::scope(|scope| {
+        for _ in 0..16 {
+            scope.spawn(|| {
+                for _ in 0..20 {
+                    let meshed = run(&backend, &Control::default()).unwrap();
+                    samples.fetch_add(meshed.grid.samples, Ordering::Relaxed);
+                    done.fetch_add(1, Ordering::Relaxed);
+                }
+            });
+        }
+    });
+    assert_eq!((done.into_inner(), samples.into_inner()), (320, 320 * 7));
+    assert_eq!(rig.calls().iter().sum::<usize>(), 320);
+    assert_eq!(backend.devices()[0].finished, 320);
+}
+
+/// Software Vulkan, which CI has: `mesa-vulkan-drivers`. Elsewhere a machine may lack it, and says so.
+fn software() -> Option<usize> {
+    let found = discover(&DeviceChoice::All, Look::Thorough);
+    let software = found.devices.iter().find(|device| device.facts.kind == DeviceKind::Software);
+    if software.is_none() {
+        assert!(std::env::var_os("CI").is_none(), "no software Vulkan: install mesa-vulkan-drivers. {found:?}");
+        #[expect(clippy::print_stderr, reason = "a test that does not run says so")]
+        {
+            eprintln!("SKIPPED: no software Vulkan on this machine; install mesa-vulkan-drivers");
+        }
+    }
+    software.map(|device| device.number)
+}
+
+#[test]
+fn software_is_found_and_taken_only_when_asked_for() {
+    let Some(number) = software() else { return };
+    for (choice, taken) in [("auto", false), ("all", false), ("software", true), (&number.to_string(), true)] {
+        let found = discover(&choice.parse().unwrap(), Look::Thorough);
+        let device = &found.devices[number];
+        assert_eq!((device.number, device.taken), (number, taken), "{choice}: {}", device.reason);
+        assert!(!device.reason.is_empty() && !device.facts.name.is_empty() && !device.facts.driver.is_empty());
+        assert!(device.facts.binding_bytes >= 128 << 20 && device.facts.workgroup_size >= 256, "{device:?}");
+        assert_eq!(found.why_none().is_none(), found.taken().next().is_some(), "{choice}");
+    }
+}
+
+#[test]
+fn devices_keep_their_numbers() {
+    let names = || {
+        let found = discover(&DeviceChoice::All, Look::Thorough);
+        found.devices.into_iter().map(|d| (d.number, d.facts)).collect::<Vec<_>>()
+    };
+    assert_eq!(names(), names());
+}
+
+#[test]
+fn what_is_not_there_is_missing_and_nothing_can_be_started_on_it() {
+    let choice: DeviceChoice = "77".parse().unwrap();
+    let found = discover(&choice, Look::Quick);
+    assert_eq!(found.missing(&choice), ["there is no device 77"]);
+    let Err(GpuError::NoDevice(why)) = GpuBackend::start(&found, &SETTINGS, None) else { panic!("it started") };
+    assert!(!why.is_empty());
+    let quick = discover(&DeviceChoice::Cpu, Look::Quick);
+    assert_eq!((quick.devices.len(), quick.why_none().as_deref()), (0, Some("the CPU was asked for")));
+}

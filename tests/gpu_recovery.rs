@@ -1,0 +1,96 @@
+//! The pool over a real engine on software Vulkan: found, started, shared, lost and rebuilt.
+#![cfg(feature = "gpu")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+mod gpu_support;
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use molmesh::gpu::{DevicePool, Engine, Executor, GpuBackend, GpuError, Look, PoolDevice, PoolSettings, discover};
+use molmesh::surface::{Backend, Control, CpuBackend, Meshed, SurfaceError, SurfaceLimits, SurfaceParams};
+
+fn run(backend: &dyn Backend) -> Result<Meshed, SurfaceError> {
+    let params = SurfaceParams::default();
+    backend.run(&gpu_support::sample("4pti.pdb"), &params, &SurfaceLimits::default(), &Control::default())
+}
+
+#[test]
+fn a_device_that_was_found_meshes_as_the_cpu_does() {
+    let choice = "software".parse().unwrap();
+    let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
+    backend.warm().unwrap();
+    let (cpu, gpu) = (run(&CpuBackend::new(None).unwrap()).unwrap(), run(&backend).unwrap());
+    assert_eq!(gpu.mesh.n_triangles(), cpu.mesh.n_triangles());
+    let served = gpu.served.unwrap();
+    assert_eq!((served.backend, served.instead), ("gpu", None));
+    assert_eq!(served.device, backend.describe());
+    let status = backend.devices().remove(0);
+    assert_eq!((status.finished, status.failed, status.down), (2, 0, None));
+    assert!(status.held_bytes > 0);
+}
+
+#[test]
+fn callers_share_submissions_and_get_what_they_would_get_alone() {
+    let choice = "software".parse().unwrap();
+    let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
+    let alone = run(&backend).unwrap().mesh;
+    std::thread::scope(|scope| {
+        for _ in 0..12 {
+            scope.spawn(|| assert!(run(&backend).unwrap().mesh == alone, "another mesh"));
+        }
+    });
+    let status = backend.devices().remove(0);
+    assert_eq!(status.finished, 13);
+    assert!(status.shared > 0, "{status:?}");
+}
+
+/// Starts a backend whose device is destroyed, as a driver might, before the first `n_losses` jobs.
+fn losing(n_losses: usize, fallback: Option<Box<dyn Backend>>) -> GpuBackend {
+    /// An engine whose device is destroyed when it is given work.
+    struct Doomed(Engine, Mutex<Option<wgpu::Device>>);
+    impl Executor for Doomed {
+        fn run(&mut self, jobs: &[molmesh::gpu::GpuJob]) -> Vec<Result<molmesh::gpu::Finished, GpuError>> {
+            if let Some(device) = self.1.lock().unwrap().take() {
+                device.destroy();
+            }
+            self.0.run(jobs)
+        }
+        fn held_bytes(&self) -> u64 {
+            self.0.held_bytes()
+        }
+    }
+    let builds = AtomicUsize::new(0);
+    let build = move || {
+        let doomed = builds.fetch_add(1, Ordering::SeqCst) < n_losses;
+        let (device, queue) = gpu_support::device();
+        let engine = Engine::new(device.clone(), queue)?;
+        Ok(Box::new(Doomed(engine, Mutex::new(doomed.then_some(device)))) as Box<dyn Executor>)
+    };
+    let device = PoolDevice { number: 0, name: "doomed".to_owned(), build: Box::new(build) };
+    GpuBackend::over(DevicePool::start(vec![device], &PoolSettings::default()).unwrap(), fallback)
+}
+
+#[test]
+fn a_lost_device_is_rebuilt_and_gives_the_same_mesh() {
+    let undisturbed = losing(0, None);
+    let expected = run(&undisturbed).unwrap().mesh;
+    assert_eq!(undisturbed.devices()[0].rebuilds, 0);
+    let backend = losing(1, None);
+    assert!(run(&backend).unwrap().mesh == expected, "another mesh");
+    let status = backend.devices().remove(0);
+    assert_eq!((status.finished, status.failed, status.rebuilds, status.down), (1, 1, 1, None));
+}
+
+#[test]
+fn the_cpu_serves_what_a_device_that_is_lost_for_good_does_not() {
+    let cpu = run(&CpuBackend::new(None).unwrap()).unwrap().mesh;
+    let backend = losing(usize::MAX, Some(Box::new(CpuBackend::new(None).unwrap())));
+    for _ in 0..3 {
+        let meshed = run(&backend).unwrap();
+        assert!(meshed.mesh == cpu, "not the CPU's mesh");
+        assert!(meshed.served.unwrap().instead.unwrap().contains("the GPU failed"));
+    }
+    let why = backend.devices().remove(0).down.unwrap();
+    assert!(why.contains("given up after 3 rebuilds") && !why.contains('\n'), "{why}");
+}
