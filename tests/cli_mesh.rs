@@ -5,6 +5,7 @@
 mod cli_support;
 
 use std::fs;
+use std::path::Path;
 
 use cli_support::{Folder, assert_code, mesh, piped, rod, run, stderr, stdout};
 use serde_json::Value;
@@ -56,6 +57,41 @@ fn stdin_to_stdout_gives_the_bytes_of_a_file() {
 
     let ply = piped(&["mesh", "-", "-o", "-", "--format", "ply", "-q"], rod().as_bytes());
     assert!(ply.stdout.starts_with(magic("ply")));
+}
+
+/// A GLB that goes into a file is written out of order while it is meshed; one that goes through a pipe is not.
+#[test]
+fn a_file_has_the_bytes_that_a_pipe_gets() {
+    let folder = Folder::new();
+    let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
+    // A small buffer, a large one, 16-bit indices and 32-bit ones; then the longest report that there is.
+    let long = folder.file("long.cif", long_report());
+    for (input, resolution) in
+        [(Path::new(sample), "0.6"), (Path::new(sample), "0.45"), (Path::new(sample), "0.3"), (&long, "0.4")]
+    {
+        let output = folder.path("out.glb");
+        assert_code(&mesh(input, &output, &["--quiet", "--resolution", resolution]), 0);
+        let piped = run(["mesh", input.to_str().unwrap(), "-o", "-", "--quiet", "--resolution", resolution]);
+        assert_code(&piped, 0);
+        let file = fs::read(&output).unwrap();
+        assert!(piped.stdout == file, "{resolution}: {} and {} bytes", piped.stdout.len(), file.len());
+        let json_bytes = u32::from_le_bytes(file[12..16].try_into().unwrap()) as usize;
+        let large = file.len() > 1 << 20;
+        assert_eq!(json_bytes + 28 == 16_384, large, "{resolution}: {json_bytes} bytes of JSON");
+        let text = file[20..20 + json_bytes].trim_ascii_end().len();
+        assert!(input != long || (14_000..16_000).contains(&text), "{text}");
+    }
+}
+
+/// More components than a report lists, and the longest title.
+fn long_report() -> String {
+    let names = ["group_PDB", "id", "type_symbol", "label_atom_id", "label_comp_id", "label_asym_id", "label_seq_id"];
+    let columns = names.into_iter().chain(["Cartn_x", "Cartn_y", "Cartn_z", "occupancy"]);
+    let columns: Vec<String> = columns.map(|name| format!("_atom_site.{name}\n")).collect();
+    let atom = |i: i32| format!("ATOM {i} C C1 ALA A 1 {} {} {} 1\n", i % 5 * 13, i / 5 % 5 * 13, i / 25 * 13);
+    let (columns, atoms) = (columns.concat(), (0..125).map(atom).collect::<Vec<_>>().concat());
+    let title = "\u{1f600}".repeat(1500);
+    format!("data_{}\n_struct.title '{title}'\nloop_\n{columns}{atoms}", "L".repeat(200))
 }
 
 fn json(text: &str) -> Value {

@@ -7,9 +7,10 @@
 mod tools;
 
 use std::io::{self, ErrorKind, Write};
+use std::sync::Mutex;
 
-use molmesh::formats::{self, Encoder, Format, FormatError, Meta};
-use molmesh::surface::Mesh;
+use molmesh::formats::{self, Encoder, Format, FormatError, GlbSink, Meta, PlaceBytes, PlaceError};
+use molmesh::surface::{Mesh, MeshPart, MeshSink};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 use tools::readers::{
@@ -202,6 +203,83 @@ fn lengths_are_known_before_a_byte_is_written() {
             }
         }
     }
+}
+
+/// A file in memory that takes bytes anywhere.
+#[derive(Default)]
+struct Anywhere(Mutex<Vec<u8>>);
+
+impl PlaceBytes for Anywhere {
+    fn place(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
+        let (mut file, start) = (self.0.lock().unwrap(), usize::try_from(offset).unwrap());
+        let len = file.len().max(start + bytes.len());
+        file.resize(len, 0xee);
+        file[start..start + bytes.len()].copy_from_slice(bytes);
+        Ok(())
+    }
+}
+
+/// A mesh's parts from the last to the first.
+fn pour(sink: &GlbSink<'_>, mesh: &Mesh, n_parts: usize) {
+    let (n, m) = (mesh.n_vertices(), mesh.n_triangles());
+    sink.begin(n, m).unwrap();
+    for part in (0..n_parts).rev() {
+        let cut = |len: usize| part * len / n_parts..(part + 1) * len / n_parts;
+        let (v, t) = (cut(n), cut(m));
+        let (first_vertex, first_triangle) = (v.start, t.start);
+        let (positions, normals) = (&mesh.positions[v.clone()], &mesh.normals[v]);
+        let triangles = &mesh.triangles[t];
+        sink.part(&MeshPart { first_vertex, positions, normals, first_triangle, triangles }).unwrap();
+    }
+}
+
+#[test]
+fn a_glb_written_out_of_order_has_the_same_bytes() {
+    let plain = cases().into_iter().filter(|(_, mesh)| mesh.colors.is_none() && mesh.atom_ids.is_none());
+    let mut large = 0;
+    for (name, mesh) in plain {
+        let in_order = encode(Format::Glb, &mesh, &meta());
+        large += usize::from(in_order.len() > 1 << 20);
+        for n_parts in [1, 3] {
+            let file = Anywhere::default();
+            let sink = GlbSink::new(&file);
+            pour(&sink, &mesh, n_parts);
+            let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).unwrap();
+            let placed = file.0.lock().unwrap().clone();
+            assert_eq!(len, in_order.len() as u64, "{name}");
+            assert!(placed == in_order, "{name} in {n_parts}");
+        }
+    }
+    assert!(large > 0, "a large buffer was among them");
+}
+
+#[test]
+fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
+    let mesh = torus(255, 257);
+    let file = Anywhere::default();
+    let sink = GlbSink::new(&file);
+    pour(&sink, &mesh, 2);
+    let mut long = meta();
+    long.extras.insert("title".to_owned(), json!("x".repeat(20_000)));
+    let refused = sink.finish(&long, mesh.centre, mesh.bounds()).unwrap_err();
+    assert!(matches!(refused, PlaceError::HeadTooLong { bytes: 32_768 }), "{refused}");
+
+    struct Full;
+    impl PlaceBytes for Full {
+        fn place(&self, _: u64, _: &[u8]) -> io::Result<()> {
+            Err(ErrorKind::StorageFull.into())
+        }
+    }
+    let sink = GlbSink::new(&Full);
+    sink.begin(mesh.n_vertices(), mesh.n_triangles()).unwrap();
+    let (positions, normals, triangles) = (&mesh.positions[..], &mesh.normals[..], &mesh.triangles[..]);
+    let part = MeshPart { first_vertex: 0, positions, normals, first_triangle: 0, triangles };
+    assert!(sink.part(&part).is_err());
+    assert!(matches!(sink.failure(), Some(PlaceError::Io(e)) if e.kind() == ErrorKind::StorageFull));
+
+    let sink = GlbSink::new(&Full);
+    assert!(sink.begin(90_000_000, 180_000_000).is_err());
+    assert!(matches!(sink.failure(), Some(PlaceError::Format(FormatError::GlbTooLarge { .. }))));
 }
 
 #[test]

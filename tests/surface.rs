@@ -10,9 +10,11 @@
 
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Kernel, Measures, Meshed, Proof, ReferenceBackend, Spheres,
-    SurfaceError, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    Backend, CancelToken, Control, CpuBackend, Kernel, Measures, Mesh, MeshPart, MeshSink, Meshed, Observer, Proof,
+    ReferenceBackend, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceOptions, SurfaceParams,
 };
+use std::collections::BTreeSet;
+use std::sync::Mutex;
 
 const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
 
@@ -43,12 +45,56 @@ fn assert_sound(meshed: &Meshed, what: &str) -> Measures {
     assert!(m.closed && m.oriented && m.manifold, "{what}: {m:?}");
     let quick = Measures::of(&meshed.mesh, Proof::Checksum, &Control::default()).unwrap();
     assert_eq!((quick.closed, quick.manifold, quick.euler), (true, true, m.euler), "{what}");
+    if let Some(taken) = &meshed.measures {
+        assert!(agree(taken, &quick, &meshed.mesh), "{what}: {taken:?} {quick:?}");
+    }
     for (p, n) in meshed.mesh.positions.iter().zip(&meshed.mesh.normals) {
         assert!(p.iter().all(|c| c.is_finite()), "{what}");
         let length = n.iter().map(|c| f64::from(*c).powi(2)).sum::<f64>().sqrt();
         assert!((length - 1.0).abs() < 1e-5, "{what}: normal {n:?}");
     }
     m
+}
+
+/// Whether two measures are of one mesh, up to rounding. Components of equal size may be listed in any order. Positions
+/// are single precision: far from the mesh's centre they are rounded to a visible part of an ångström, which measures
+/// taken on the way do not see.
+fn agree(a: &Measures, b: &Measures, mesh: &Mesh) -> bool {
+    let furthest = mesh.bounds().as_flattened().iter().fold(0.0_f64, |far, c| far.max(f64::from(c.abs())));
+    let tolerance = 2e-5 + furthest * 1.2e-7;
+    let close = |x: f64, y: f64| (x - y).abs() <= tolerance * x.abs().max(y.abs()).max(1.0);
+    let counts = |m: &Measures| {
+        let mut counts: Vec<_> = m.components.iter().map(|c| (c.triangles, c.vertices)).collect();
+        counts.sort_unstable();
+        counts
+    };
+    let volumes = |m: &Measures| {
+        let mut volumes: Vec<f64> = m.components.iter().map(|c| c.volume).collect();
+        volumes.sort_by(f64::total_cmp);
+        volumes
+    };
+    (a.euler, a.closed, a.oriented, a.manifold) == (b.euler, b.closed, b.oriented, b.manifold)
+        && close(a.area, b.area)
+        && close(a.volume, b.volume)
+        && counts(a) == counts(b)
+        && volumes(a).iter().zip(&volumes(b)).all(|(x, y)| close(*x, *y))
+}
+
+#[test]
+fn measures_taken_on_the_way_are_those_of_the_mesh() {
+    // Cavities, several sheets in a brick, cells with two sheets, components across tiles.
+    let crowd = spheres(&Random(11).cloud(4000, 70.0));
+    for (h, kernel) in [(0.5, Kernel::Gaussian), (1.3, Kernel::SoftObject), (2.5, Kernel::InverseSquare)] {
+        let meshed = run(&crowd, &params(kernel, h));
+        let m = assert_sound(&meshed, &format!("{h} {kernel}"));
+        assert!(m.components.len() > 1 && meshed.measures.is_some(), "{h} {kernel}: {}", m.components.len());
+    }
+    // One atom more or less is seen.
+    let fewer = spheres(&Random(11).cloud(3999, 70.0));
+    let [all, fewer] = [&crowd, &fewer].map(|at| run(at, &params(Kernel::Gaussian, 1.0)));
+    let measured = exact(&all);
+    assert!(!agree(&measured, &fewer.measures.unwrap(), &all.mesh));
+    assert!(agree(&measured, all.measures.as_ref().unwrap(), &all.mesh));
 }
 
 /// A small deterministic generator: tests must fail the same way twice.
@@ -412,12 +458,99 @@ fn a_hopeless_grid_is_refused_before_it_is_begun() {
     // 10⁴ times the samples that fit: the field of what fits alone would take seconds here.
     let at = spheres(&Random(1).cloud(3000, 40.0));
     let limits = SurfaceLimits { max_samples: 1 << 28, ..SurfaceLimits::default() };
-    let started = std::time::Instant::now();
-    let error =
-        CpuBackend::new(Some(2)).unwrap().run(&at, &params(Kernel::Gaussian, 0.01), &limits, &Control::default());
+    let seen = Stages::default();
+    let control = Control { observer: &seen, ..Control::default() };
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let error = backend.run(&at, &params(Kernel::Gaussian, 0.01), &limits, &control);
     let SurfaceError::GridTooLarge { samples, limit, suggested_resolution, .. } = error.unwrap_err() else { panic!() };
     assert!(samples > limit && (0.05..1.0).contains(&suggested_resolution), "{samples} {suggested_resolution}");
-    assert!(started.elapsed().as_secs_f64() < 1.0, "{:?}", started.elapsed());
+    assert_eq!(seen.all(), [Stage::Bin], "nothing was evaluated");
+    // The same watch sees the later stages of a grid that fits.
+    backend.run(&at, &params(Kernel::Gaussian, 1.0), &limits, &control).unwrap();
+    assert!(seen.all().contains(&Stage::Field));
+}
+
+/// The stages that a run went through.
+#[derive(Default)]
+struct Stages(Mutex<BTreeSet<Stage>>);
+
+impl Stages {
+    fn all(&self) -> Vec<Stage> {
+        self.0.lock().unwrap().iter().copied().collect()
+    }
+}
+
+impl Observer for Stages {
+    fn span(&self, stage: Stage, work: &mut dyn FnMut()) {
+        self.0.lock().unwrap().insert(stage);
+        work();
+    }
+}
+
+/// A mesh put together from parts that come in any order.
+#[derive(Default)]
+struct Collected(Mutex<Mesh>);
+
+impl MeshSink for Collected {
+    fn begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), SinkFailed> {
+        let mesh = &mut *self.0.lock().unwrap();
+        mesh.positions = vec![[f32::NAN; 3]; n_vertices].into();
+        mesh.normals = vec![[f32::NAN; 3]; n_vertices].into();
+        mesh.triangles = vec![[u32::MAX; 3]; n_triangles].into();
+        Ok(())
+    }
+
+    fn part(&self, part: &MeshPart<'_>) -> Result<(), SinkFailed> {
+        let mesh = &mut *self.0.lock().unwrap();
+        let (v, t) = (part.first_vertex, part.first_triangle);
+        mesh.positions[v..v + part.positions.len()].copy_from_slice(part.positions);
+        mesh.normals[v..v + part.normals.len()].copy_from_slice(part.normals);
+        mesh.triangles[t..t + part.triangles.len()].copy_from_slice(part.triangles);
+        Ok(())
+    }
+}
+
+#[test]
+fn what_is_poured_is_what_is_returned() {
+    // Tiles side by side; and two atoms whose saddle lies on a sample, where the gradient vanishes and a normal has to
+    // be taken from the triangles.
+    let flat = spheres(&[[0.0, 0.0, 0.0, 1.7], [4.0, 0.0, 0.0, 1.7]]);
+    for (at, h) in [(spheres(&Random(5).cloud(900, 60.0)), 0.5), (flat, 0.5)] {
+        let p = params(Kernel::Gaussian, h);
+        let whole = run(&at, &p);
+        for threads in [1, 3] {
+            let sink = Collected::default();
+            let backend = CpuBackend::new(Some(threads)).unwrap();
+            let poured = backend.pour(&at, &p, &SurfaceLimits::default(), &Control::default(), &sink).unwrap();
+            let mesh = sink.0.into_inner().unwrap();
+            assert!(mesh.positions == whole.mesh.positions && mesh.normals == whole.mesh.normals);
+            assert!(mesh.triangles == whole.mesh.triangles);
+            assert_eq!((poured.n_vertices, poured.n_triangles), (mesh.n_vertices(), mesh.n_triangles()));
+            assert_eq!((poured.bounds, poured.centre, poured.grid), (mesh.bounds(), whole.mesh.centre, whole.grid));
+            assert_eq!(Some(&poured.measures), whole.measures.as_ref());
+        }
+    }
+}
+
+#[test]
+fn a_sink_that_fails_ends_the_run() {
+    struct Full(usize);
+    impl MeshSink for Full {
+        fn begin(&self, n_vertices: usize, _: usize) -> Result<(), SinkFailed> {
+            if n_vertices > self.0 { Err(SinkFailed) } else { Ok(()) }
+        }
+
+        fn part(&self, part: &MeshPart<'_>) -> Result<(), SinkFailed> {
+            if part.first_vertex > 0 { Err(SinkFailed) } else { Ok(()) }
+        }
+    }
+    let at = spheres(&Random(6).cloud(900, 60.0));
+    let p = params(Kernel::Gaussian, 0.5);
+    let (backend, limits) = (CpuBackend::new(Some(2)).unwrap(), SurfaceLimits::default());
+    for room in [0, usize::MAX] {
+        let error = backend.pour(&at, &p, &limits, &Control::default(), &Full(room)).unwrap_err();
+        assert_eq!(error, SurfaceError::Sink);
+    }
 }
 
 #[test]

@@ -158,15 +158,8 @@ impl Work<'_> {
         progress.progress("encode", 0.0);
         let start = Instant::now();
         let finished = sink.finish(&poured.meta(), poured.centre, poured.bounds);
-        match finished {
-            Ok(len) => output.set_len(len),
-            // The header's place is fixed before the report is known: a report of unusual length needs another go.
-            Err(PlaceError::HeadTooLong { .. }) => {
-                output.clear()?;
-                return Ok(None);
-            }
-            Err(error) => return Err(place_failure(output, Some(error))),
-        }
+        let len = finished.map_err(|error| place_failure(output, Some(error)))?;
+        output.set_len(len);
         let mut report = poured.report;
         report.add_timing("encode", start.elapsed().as_secs_f64() * 1e3);
         Ok(Some(report))

@@ -59,15 +59,6 @@ impl Output {
         self.bytes = bytes;
     }
 
-    /// Empties a file that was written through [`Self::placer`].
-    pub(crate) fn clear(&mut self) -> Result<(), CliError> {
-        let cleared = match &self.to {
-            To::Staged { file, .. } => file.set_len(0),
-            To::Stdout(_) | To::Device(_) => Ok(()),
-        };
-        cleared.map_err(|source| self.failure(source))
-    }
-
     /// Whether the mesh goes to stdout.
     pub(crate) fn is_stdout(&self) -> bool {
         matches!(self.to, To::Stdout(_))

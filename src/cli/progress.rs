@@ -20,17 +20,18 @@ const FRAME: Duration = Duration::from_millis(80);
 const UNIT: f64 = 1000.0;
 
 /// Stages with their usual share of the time, in the order in which they run.
-const STAGES: [(&str, f64); 10] = [
+const STAGES: [(&str, f64); 11] = [
     ("read", 0.10),
     ("select", 0.02),
     ("bin", 0.03),
-    ("field", 0.45),
+    ("field", 0.40),
     ("classify", 0.05),
     ("scan", 0.02),
     ("interpolate", 0.10),
-    ("emit", 0.05),
+    ("emit", 0.10),
+    ("write", 0.05),
     ("measure", 0.08),
-    ("encode", 0.10),
+    ("encode", 0.05),
 ];
 
 /// How far each stage is.
@@ -66,7 +67,7 @@ impl State {
 }
 
 /// Stages of which several run at a time, on different bricks.
-const INTERLEAVED: [&str; 4] = ["field", "classify", "interpolate", "emit"];
+const INTERLEAVED: [&str; 5] = ["field", "classify", "interpolate", "emit", "write"];
 
 /// The bar. It is gone when this is dropped.
 pub(crate) struct Progress {

@@ -32,7 +32,7 @@ pub struct Meshed {
     /// Its grid.
     pub grid: GridStats,
     /// Its measures with [`Proof::Checksum`](super::measure::Proof::Checksum), if the backend took them on the way and
-    /// the mesh is closed. What [`Measures::of`] finds in the finished mesh is the same up to rounding.
+    /// the mesh is closed. What [`Measures::of`] finds in the finished mesh is the same up to the rounding of positions.
     pub measures: Option<Measures>,
     /// Who made it, where that is known only afterwards: one of several devices, or a stand-in for them.
     pub served: Option<Served>,

@@ -29,16 +29,8 @@ pub enum Stage {
 
 impl Stage {
     /// Every stage, in the order in which they run.
-    pub const ALL: [Self; 8] = [
-        Self::Bin,
-        Self::Field,
-        Self::Classify,
-        Self::Scan,
-        Self::Interpolate,
-        Self::Emit,
-        Self::Write,
-        Self::Measure,
-    ];
+    pub const ALL: [Self; 8] =
+        [Self::Bin, Self::Field, Self::Classify, Self::Scan, Self::Interpolate, Self::Emit, Self::Write, Self::Measure];
 
     /// The stage's name, as shaders, reports and `Server-Timing` spell it.
     #[must_use]

@@ -34,7 +34,7 @@ pub enum PlaceError {
     /// Whatever takes the bytes failed.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// The header is longer than what is kept free for it: write the mesh in order instead.
+    /// The header is longer than what is kept free for it.
     #[error("the header takes {bytes} bytes, {HEAD_BYTES} are kept free for it")]
     HeadTooLong {
         /// Its length.
@@ -64,7 +64,15 @@ impl<'a> GlbSink<'a> {
     /// A GLB that will be written into `out`, which is empty.
     #[must_use]
     pub fn new(out: &'a dyn PlaceBytes) -> Self {
-        Self { out, layout: OnceLock::new(), small: Mutex::default(), lane: Mutex::default(), waiting: Mutex::default(), spare: Mutex::default(), failure: Mutex::default() }
+        Self {
+            out,
+            layout: OnceLock::new(),
+            small: Mutex::default(),
+            lane: Mutex::default(),
+            waiting: Mutex::default(),
+            spare: Mutex::default(),
+            failure: Mutex::default(),
+        }
     }
 
     /// Why a part was refused.
@@ -123,9 +131,7 @@ impl<'a> GlbSink<'a> {
         let lane = match self.lane.try_lock() {
             Ok(lane) => Some(lane),
             // Too much is waiting: now it is right to sleep.
-            Err(_) if lock(&self.waiting).len() > MOST_WAITING => {
-                Some(lock(&self.lane))
-            }
+            Err(_) if lock(&self.waiting).len() > MOST_WAITING => Some(lock(&self.lane)),
             Err(_) => None,
         };
         let at = |offset: u64| At { sink: self, offset, now: lane.is_some() };
@@ -143,7 +149,6 @@ impl<'a> GlbSink<'a> {
             lock(&self.spare).push(bytes);
         }
     }
-
 
     fn note<T>(&self, done: Result<T, PlaceError>) -> Result<T, SinkFailed> {
         done.map_err(|error| {

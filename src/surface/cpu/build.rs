@@ -10,7 +10,7 @@ use super::emit::{self, BrickTable, Numbered};
 use super::interpolate::{self, Batch, SlopeConstants, Source, Target};
 use super::join;
 use super::sheets::Sheets;
-use super::tally::{Place, Tally};
+use super::tally::Tally;
 use super::{Scanned, Tile, threads};
 use crate::surface::column::Column;
 use crate::surface::control::{Control, Stage};
@@ -151,7 +151,7 @@ impl TilePart<'_> {
 
     /// Triangles of the bricks, and what they add up to.
     fn emit(&mut self, scanned: &Scanned, table: &mut BrickTable, sheets: &mut Sheets, tally: &mut Tally) {
-        let Scanned { lattice, tiles, done, .. } = scanned;
+        let Scanned { tiles, done, .. } = scanned;
         let near = Near::new(tiles, done, self.tile.coord);
         let found = &self.tile.found;
         let base = found.before(self.bricks.start).triangles;
@@ -167,8 +167,7 @@ impl TilePart<'_> {
             };
             emit::emit(table, sheets, &around, cases, own_sheets, out);
             let origin = slot_origin(self.tile.coord, usize::from(brick.slot));
-            let offset = std::array::from_fn(|k| f64::from(origin[k] - lattice.centre[k]));
-            tally.add(table, sheets, &around, &Place { offset, spacing: lattice.spacing }, out);
+            tally.add(table, sheets, &around, origin, out);
         }
     }
 }

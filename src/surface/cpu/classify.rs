@@ -135,11 +135,8 @@ impl Found {
 
     /// Vertices, triangles and cases of the tile before brick `i`; all of them where `i` is their number.
     pub(super) fn before(&self, i: usize) -> Before {
-        let all = Before {
-            vertices: self.vertices as usize,
-            triangles: self.triangles as usize,
-            cases: self.cases.len(),
-        };
+        let all =
+            Before { vertices: self.vertices as usize, triangles: self.triangles as usize, cases: self.cases.len() };
         self.bricks.get(i).map_or(all, |brick| Before {
             vertices: brick.vertex as usize,
             triangles: brick.triangle as usize,
@@ -223,7 +220,8 @@ static CELLS: LazyLock<Vec<CellCase>> = LazyLock::new(|| {
 fn links(corners: &[[u64; 8]; 8]) -> [[u64; 8]; 3] {
     const FIRST: [u64; 2] = [0x0101_0101_0101_0101, 0xff];
     let crossed = |layer: &[u64; 8], c: [usize; 4]| {
-        (layer[c[0]] | layer[c[1]] | layer[c[2]] | layer[c[3]]) & !(layer[c[0]] & layer[c[1]] & layer[c[2]] & layer[c[3]])
+        (layer[c[0]] | layer[c[1]] | layer[c[2]] | layer[c[3]])
+            & !(layer[c[0]] & layer[c[1]] & layer[c[2]] & layer[c[3]])
     };
     let z = |z: usize| if z == 0 { 0 } else { crossed(&corners[z], [0, 1, 2, 3]) };
     [

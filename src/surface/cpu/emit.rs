@@ -37,15 +37,17 @@ pub(super) struct BrickTable {
     triangles: usize,
 }
 
+/// A table on the heap, without passing through the stack.
+fn boxed<T: Copy>(value: T) -> Box<[T; EDGES]> {
+    match vec![value; EDGES].into_boxed_slice().try_into() {
+        Ok(table) => table,
+        Err(_) => unreachable!("it has just this length"),
+    }
+}
+
 impl Default for BrickTable {
     fn default() -> Self {
-        Self {
-            ids: Box::new([0; EDGES]),
-            at: Box::new([Vec3A::ZERO; EDGES]),
-            sheet: Box::new([0; EDGES]),
-            corners: Box::new([0; CORNERS]),
-            triangles: 0,
-        }
+        Self { ids: boxed(0), at: boxed(Vec3A::ZERO), sheet: boxed(0), corners: Box::new([0; CORNERS]), triangles: 0 }
     }
 }
 

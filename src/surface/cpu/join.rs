@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 
 use super::build::{Near, Written};
-use super::tally::Tally;
+use super::tally::{Sheet, Tally};
 use super::{PIECE_BRICKS, Piece, Scanned, threads};
 use crate::surface::lattice::to_u32;
 use crate::surface::measure::{Component, Measures};
@@ -13,7 +13,7 @@ const FEW: usize = 64;
 
 /// The measures of the mesh that the pieces make up; `None` if it is not closed, which the tallies cannot explain.
 pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measures> {
-    let Scanned { tiles, done, totals, pieces, .. } = scanned;
+    let Scanned { lattice, tiles, done, totals, pieces, .. } = scanned;
     let tallies: Vec<&Tally> = written.iter().map(|part| &part.tally).collect();
     let checksum = tallies.iter().fold(0_u64, |sum, tally| sum.wrapping_add(tally.checksum));
     if checksum != 0 || tallies.iter().any(|tally| tally.degenerate) {
@@ -55,14 +55,12 @@ pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measure
         unite(&mut equal, a, b);
     }
     let mut components = vec![Component::default(); n];
-    for (label, sheet) in tallies.iter().flat_map(|tally| &tally.sheets).enumerate() {
+    let sheets: Vec<&Sheet> = tallies.iter().flat_map(|tally| &tally.sheets).collect();
+    for (label, sheet) in sheets.iter().enumerate() {
         // Ascending: the lower label that this one equals is final already.
-        equal[label] = equal[equal[label] as usize];
-        let component = &mut components[equal[label] as usize];
-        component.triangles += sheet.triangles;
-        component.vertices += sheet.vertices;
-        component.area += sheet.area;
-        component.volume += sheet.volume;
+        let of = equal[equal[label] as usize];
+        equal[label] = of;
+        sheet.add_to(&mut components[of as usize], sheets[of as usize], lattice.spacing);
     }
     Some(Measures::balanced(components, totals.vertices as u64, totals.triangles as u64))
 }

@@ -43,37 +43,39 @@ pub(super) struct Tally {
     /// A triangle has a corner twice.
     pub(super) degenerate: bool,
     /// Per sheet of the piece.
-    pub(super) sheets: Vec<Component>,
+    pub(super) sheets: Vec<Sheet>,
     /// Per brick of the piece.
     pub(super) bricks: Vec<BrickSheets>,
     of_vertices: Vec<u16>,
     far: Vec<Far>,
 }
 
-/// Where a brick lies and how large a cell is.
-pub(super) struct Place {
-    /// The brick's first sample relative to the mesh's centre, in spacings.
-    pub(super) offset: [f64; 3],
-    /// Å.
-    pub(super) spacing: f64,
-}
-
-/// Twice the area vectors summed, and the corners' products with them.
-#[derive(Default, Clone, Copy)]
-struct Sum {
+/// Sums over the triangles of a sheet, in spacings, with the brick's first sample as the origin.
+#[derive(Debug, Default, Clone, Copy)]
+pub(super) struct Sheet {
+    /// The brick's first sample, in spacings.
+    origin: [i32; 3],
     triangles: u64,
+    vertices: u64,
+    /// Twice the area.
     area: f64,
+    /// Twice the area vectors summed.
     vector: [f64; 3],
+    /// The first corners' products with them: six times the volume, for a closed surface.
     product: f64,
 }
 
-impl Sum {
-    fn component(&self, vertices: u64, place: &Place) -> Component {
-        let h2 = place.spacing * place.spacing;
-        // Moving the origin by an offset adds its product with the area vector.
-        let moved: f64 = (0..3).map(|k| place.offset[k] * self.vector[k]).sum();
-        let volume = (self.product + moved) / 6.0 * h2 * place.spacing;
-        Component { triangles: self.triangles, vertices, area: 0.5 * self.area * h2, volume }
+impl Sheet {
+    /// Adds the sheet to its component, of which `first` is one too. Volumes are taken against that one's origin: against
+    /// one that is far away, small errors of the area vectors would weigh as much as a molecule.
+    pub(super) fn add_to(&self, component: &mut Component, first: &Self, spacing: f64) {
+        let h2 = spacing * spacing;
+        // Moving the origin adds the offset's product with the area vector.
+        let moved: f64 = (0..3).map(|k| f64::from(self.origin[k] - first.origin[k]) * self.vector[k]).sum();
+        component.triangles += self.triangles;
+        component.vertices += self.vertices;
+        component.area += 0.5 * self.area * h2;
+        component.volume += (self.product + moved) / 6.0 * h2 * spacing;
     }
 }
 
@@ -84,7 +86,7 @@ impl Tally {
         table: &BrickTable,
         sheets: &mut Sheets,
         around: &[Option<Numbered<'_>>; 8],
-        place: &Place,
+        origin: [i32; 3],
         written: &[[u32; 3]],
     ) {
         let (shares, degenerate) = check(written);
@@ -96,13 +98,13 @@ impl Tally {
         self.bricks.push(BrickSheets { first, n, detail });
         let corners = table.corners();
         if n == 1 {
-            self.sheets.push(sum(table, corners).component(n_own as u64, place));
+            self.sheets.push(Sheet { origin, vertices: n_own as u64, ..sum(table, corners) });
             return;
         }
         let on = |edge: u16| sheets.of(table.sheet(edge));
-        let mut sums = vec![(Sum::default(), 0_u64); usize::from(n)];
+        let mut sums = vec![Sheet { origin, ..Sheet::default() }; usize::from(n)];
         for run in corners.chunk_by(|a, b| on(a[0]) == on(b[0])) {
-            let (of, part) = (&mut sums[usize::from(on(run[0][0]))].0, sum(table, run));
+            let (of, part) = (&mut sums[usize::from(on(run[0][0]))], sum(table, run));
             of.triangles += part.triangles;
             of.area += part.area;
             of.product += part.product;
@@ -114,14 +116,14 @@ impl Tally {
             shared_vertices(near, usize::from(neighbour), |rank, edge| {
                 let sheet = on(u16::try_from(edge).unwrap_or_default());
                 if neighbour == 0 {
-                    sums[usize::from(sheet)].1 += 1;
+                    sums[usize::from(sheet)].vertices += 1;
                     self.of_vertices.push(sheet);
                 } else {
                     self.far.push(Far { brick, neighbour, rank, sheet: first + u32::from(sheet) });
                 }
             });
         }
-        self.sheets.extend(sums.iter().map(|(sum, vertices)| sum.component(*vertices, place)));
+        self.sheets.append(&mut sums);
     }
 
     /// The pairs of sheets that neighbouring bricks share. `near(brick, neighbour)` gives a brick's neighbour, the tally
@@ -185,8 +187,8 @@ fn check(triangles: &[[u32; 3]]) -> (u64, bool) {
 dispatched! {
 /// Sums over triangles given by the grid edges of their corners. Single precision within a brick, where differences of positions are nearly
 /// exact; double between bricks.
-fn sum(table: &BrickTable, corners: &[[u16; 3]]) -> Sum {
-    let mut all = Sum { triangles: corners.len() as u64, ..Sum::default() };
+fn sum(table: &BrickTable, corners: &[[u16; 3]]) -> Sheet {
+    let mut all = Sheet { triangles: corners.len() as u64, ..Sheet::default() };
     let mut normals = [Vec3A::ZERO; LANES];
     for batch in corners.chunks(LANES) {
         let (mut vector, mut product) = (Vec3A::ZERO, Vec3A::ZERO);
