@@ -253,6 +253,15 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
     assert!(large > 0, "a large buffer was among them");
 }
 
+/// A file on a disk without room.
+struct Full;
+
+impl PlaceBytes for Full {
+    fn place(&self, _: u64, _: &[u8]) -> io::Result<()> {
+        Err(ErrorKind::StorageFull.into())
+    }
+}
+
 #[test]
 fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
     let mesh = torus(255, 257);
@@ -264,12 +273,6 @@ fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
     let refused = sink.finish(&long, mesh.centre, mesh.bounds()).unwrap_err();
     assert!(matches!(refused, PlaceError::HeadTooLong { bytes: 32_768 }), "{refused}");
 
-    struct Full;
-    impl PlaceBytes for Full {
-        fn place(&self, _: u64, _: &[u8]) -> io::Result<()> {
-            Err(ErrorKind::StorageFull.into())
-        }
-    }
     let sink = GlbSink::new(&Full);
     sink.begin(mesh.n_vertices(), mesh.n_triangles()).unwrap();
     let (positions, normals, triangles) = (&mesh.positions[..], &mesh.normals[..], &mesh.triangles[..]);
