@@ -4,16 +4,11 @@
 use std::path::Path;
 
 /// Device nodes of GPUs: a folder and how names in it begin. Every Linux driver that can compute makes one of them.
-const NODES: [(&str, &str); 8] = [
-    ("dev/dri", "renderD"),
+const NODES: [(&str, &[&str]); 3] = [
+    ("dev/dri", &["renderD"]),
     // Followed by a number: nvidiactl and nvidia-uvm are there on machines without a card.
-    ("dev", "nvidia#"),
-    ("dev", "dxg"),
-    ("dev", "kgsl-3d0"),
-    ("dev", "mali0"),
-    ("dev", "nvhost-gpu"),
-    ("dev/nvgpu", ""),
-    ("dev", "pvr"),
+    ("dev", &["nvidia#", "dxg", "kgsl-3d0", "mali0", "nvhost-gpu", "pvr"]),
+    ("dev/nvgpu", &[""]),
 ];
 
 /// Whether there may be a GPU, and what was looked at. On systems other than Linux nothing is known beforehand.
@@ -26,10 +21,11 @@ pub(super) fn signs() -> Result<String, String> {
 
 fn nodes_under(root: &Path) -> Result<String, String> {
     let mut found = Vec::new();
-    for (folder, start) in NODES {
+    for (folder, starts) in NODES {
         let Ok(entries) = root.join(folder).read_dir() else { continue };
         let names = entries.flatten().filter_map(|entry| entry.file_name().into_string().ok());
-        found.extend(names.filter(|name| begins(name, start)).map(|name| format!("/{folder}/{name}")));
+        let nodes = names.filter(|name| starts.iter().any(|start| begins(name, start)));
+        found.extend(nodes.map(|name| format!("/{folder}/{name}")));
     }
     found.sort();
     if found.is_empty() {
