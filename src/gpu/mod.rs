@@ -4,12 +4,14 @@
 //! prepared jobs on one device; the pool above owns one thread per device and decides which job runs where.
 
 mod assemble;
+pub mod bench;
 pub mod engine;
 pub mod error;
 pub mod executor;
 mod flight;
 mod health;
 mod landing;
+pub mod meter;
 mod pipelines;
 pub mod prepare;
 #[doc(hidden)]
@@ -19,6 +21,7 @@ mod record;
 mod run;
 mod shaders;
 mod workspace;
+pub mod yardstick;
 
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
