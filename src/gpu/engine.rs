@@ -143,8 +143,13 @@ impl Engine {
         self.clock.is_some()
     }
 
+    /// Bytes of the largest binding.
+    pub(super) const fn binding_bytes(&self) -> u64 {
+        self.binding
+    }
+
     /// What was complained about since the last look, but for memory.
-    fn healthy(&self) -> Result<(), GpuError> {
+    pub(super) fn healthy(&self) -> Result<(), GpuError> {
         match self.health.complaint() {
             None => Ok(()),
             Some(Complaint::OutOfMemory) => Err(GpuError::Failed("out of memory".to_owned())),

@@ -12,6 +12,8 @@ mod flight;
 mod health;
 mod landing;
 pub mod meter;
+pub mod paper;
+mod paper_pipelines;
 mod pipelines;
 pub mod prepare;
 #[doc(hidden)]
@@ -25,6 +27,7 @@ pub mod yardstick;
 
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
+pub use paper::Paper;
 pub use executor::{Executor, Finished, GpuJob};
 pub use prepare::Prepared;
 

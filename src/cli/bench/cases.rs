@@ -33,16 +33,22 @@ enum Spacing {
 pub(super) struct Case {
     /// What `--only` looks at.
     pub(super) name: &'static str,
+    /// Whether the 2010 program runs too: its box must be one that it could have had.
+    pub(super) with_paper: bool,
     source: Source,
     spacing: Spacing,
 }
 
 /// Every case; the made-up one has `atoms` atoms.
 pub(super) fn all(atoms: usize) -> Vec<Case> {
-    let file =
-        |name, stem, kinds, copies, spacing| Case { name, source: Source::File { stem, kinds, copies }, spacing };
+    let file = |name, stem, kinds, copies, spacing| Case {
+        name,
+        with_paper: stem == "2hhb",
+        source: Source::File { stem, kinds, copies },
+        spacing,
+    };
     vec![
-        Case { name: "ball-0.5", source: Source::MadeUp(atoms), spacing: Spacing::Is(0.5) },
+        Case { name: "ball-0.5", with_paper: true, source: Source::MadeUp(atoms), spacing: Spacing::Is(0.5) },
         file("2hhb-7.27M", "2hhb", "polymer", [1, 1], Spacing::Cells(PAPER_CUBES)),
         file("1aon-0.5", "1aon", "polymer,ligand", [1, 1], Spacing::Is(0.5)),
         file("7cgo-0.5", "7cgo", "polymer", [1, 1], Spacing::Is(0.5)),

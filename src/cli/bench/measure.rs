@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use molmesh::gpu::yardstick::Rates;
-use molmesh::gpu::{Engine, Executor, GpuJob, Prepared};
+use molmesh::gpu::{Engine, Executor, GpuJob, Paper, Prepared};
 use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, Measures, Mesh, Meshed, Proof, Spheres, Stage, SurfaceLimits,
     SurfaceParams,
@@ -14,6 +14,8 @@ use serde::Serialize;
 
 use super::floor::Work;
 
+/// A benchmark's machine is its own.
+const LIMITS: SurfaceLimits = SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30 };
 /// Runs before the measured ones.
 const WARM_UP: usize = 3;
 
@@ -83,6 +85,56 @@ pub(super) struct Row {
     /// Least transfer time of the mesh.
     pub(super) transfer_floor_ms: Option<f64>,
     pub(super) check: Option<Check>,
+    /// The 2010 program on the same device, or why it did not run; not for every case.
+    pub(super) paper: Option<Result<PaperRow, String>>,
+}
+
+/// What was measured of the 2010 program. Times are in ms.
+#[derive(Debug, Clone, Serialize)]
+pub(super) struct PaperRow {
+    pub(super) triangles: usize,
+    pub(super) stages: Vec<(&'static str, Spread)>,
+    pub(super) stages_ms: Spread,
+    pub(super) ready_ms: Spread,
+    /// Times that our stages are faster, by the sums of the stages' times.
+    pub(super) faster: f64,
+}
+
+/// Measures the 2010 program, against our `stages_ms`.
+///
+/// # Errors
+/// In words, as the device or the core put it.
+pub(super) fn paper(
+    paper: &mut Paper,
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    runs: usize,
+    ours: Spread,
+) -> Result<PaperRow, String> {
+    let [mut ready, mut summed] = [const { Vec::new() }; 2];
+    let mut stages = paper.times().map(|(name, _)| (name, Vec::new()));
+    let mut triangles = 0;
+    for run in 0..WARM_UP + runs {
+        let start = Instant::now();
+        let prepared = Prepared::new(spheres, params, &LIMITS, &Control::default()).map_err(|e| e.to_string())?;
+        let job = GpuJob { prepared: Arc::new(prepared), cancel: CancelToken::default(), deadline: None };
+        let finished = paper.run(&[job]).pop().ok_or("no answer")?.map_err(|e| e.to_string())?;
+        if run >= WARM_UP {
+            ready.push(start.elapsed().as_secs_f64() * 1e3);
+            let times = paper.times().map(|(_, ns)| ns as f64 * 1e-6);
+            summed.push(times.iter().sum());
+            stages.iter_mut().zip(times).for_each(|((_, all), ms)| all.push(ms));
+        }
+        triangles = finished.meshed.mesh.n_triangles();
+    }
+    let stages_ms = Spread::of(summed);
+    Ok(PaperRow {
+        triangles,
+        stages: stages.into_iter().map(|(name, all)| (name, Spread::of(all))).collect(),
+        stages_ms,
+        ready_ms: Spread::of(ready),
+        faster: stages_ms.median / ours.median,
+    })
 }
 
 /// What differs from the CPU's mesh.
@@ -109,7 +161,7 @@ pub(super) fn measure(
     rates: Option<&Rates>,
     check: bool,
 ) -> Result<Row, String> {
-    let limits = SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30 };
+    let limits = LIMITS;
     let [mut prepare, mut ready, mut read, mut device, mut summed] = [const { Vec::new() }; 5];
     let mut stages: Vec<(Stage, Vec<f64>)> = Vec::new();
     let mut last = None;
@@ -170,6 +222,7 @@ pub(super) fn measure(
         read_ms: Spread::of(read),
         transfer_floor_ms: rates.map(|rates| bytes as f64 / rates.to_host * 1e3),
         check: check.then(|| compare(meshed, spheres, params, &limits)).transpose()?,
+        paper: None,
     })
 }
 

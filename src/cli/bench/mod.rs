@@ -9,6 +9,7 @@ mod table;
 use std::path::PathBuf;
 
 use clap::{Args as ClapArgs, Subcommand};
+use molmesh::gpu::Paper;
 use molmesh::gpu::bench::{self, Opened};
 use molmesh::gpu::yardstick::{self, Effort, Rates};
 use serde_json::json;
@@ -101,7 +102,13 @@ fn cases(args: &GpuArgs, opened: Opened) -> Result<serde_json::Value, CliError> 
 fn one(args: &GpuArgs, case: &Case, rates: Option<&Rates>) -> Result<Row, String> {
     let (spheres, params) = case.load(args.data.as_deref())?;
     let mut opened = bench::open(args.device).map_err(|e| e.to_string())?;
-    measure::measure(&mut opened.engine, &spheres, &params, args.runs, rates, args.check)
+    let mut row = measure::measure(&mut opened.engine, &spheres, &params, args.runs, rates, args.check)?;
+    if case.with_paper {
+        let paper = Paper::new(opened.engine).map_err(|e| e.to_string());
+        row.paper =
+            Some(paper.and_then(|mut paper| measure::paper(&mut paper, &spheres, &params, args.runs, row.stages_ms)));
+    }
+    Ok(row)
 }
 
 fn open(number: usize) -> Result<Opened, CliError> {

@@ -73,6 +73,18 @@ pub(super) fn row(name: &str, row: &Result<Row, String>) -> String {
     line("prepare (host)", row.prepare_ms, None, None);
     line("request to ready", row.ready_ms, row.transfer_floor_ms, None);
     line("request to read", row.read_ms, None, None);
+    match &row.paper {
+        Some(Ok(paper)) => {
+            for (stage, ms) in &paper.stages {
+                line(&format!("2010: {stage}"), *ms, None, None);
+            }
+            line("2010: summed", paper.stages_ms, None, None);
+            line("2010: ready", paper.ready_ms, None, None);
+            _ = writeln!(text, "  2010: {} triangles, {:.1} times slower on the device", paper.triangles, paper.faster);
+        }
+        Some(Err(why)) => _ = writeln!(text, "  2010: not measured: {why}"),
+        None => {}
+    }
     if let Some(check) = &row.check {
         _ = writeln!(
             text,
