@@ -1,6 +1,6 @@
 //! The 2010 program against the CPU backend, on the software device: the same surface as a soup of triangles.
 #![cfg(feature = "gpu")]
-#![expect(clippy::unwrap_used, reason = "a test says what it expects by panicking")]
+#![expect(clippy::unwrap_used, clippy::float_cmp, reason = "a test may panic, and means equality where it asks for it")]
 
 mod gpu_support;
 

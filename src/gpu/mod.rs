@@ -27,8 +27,8 @@ pub mod yardstick;
 
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
-pub use paper::Paper;
 pub use executor::{Executor, Finished, GpuJob};
+pub use paper::Paper;
 pub use prepare::Prepared;
 
 /// Why no GPU can be used, for the banner, reports and logs.

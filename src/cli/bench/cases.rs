@@ -120,7 +120,7 @@ fn read(path: &Path, kinds: &str) -> Result<Spheres, String> {
     let bytes = fs::read(path).map_err(|e| words(&e))?;
     let structure = structure::read(&bytes, &ReadLimits::default()).map_err(|e| words(&e))?;
     let mut selection = Selection::default();
-    selection.set_kinds(kinds).map_err(|_| format!("`{kinds}` selects nothing"))?;
+    selection.set_kinds(kinds).map_err(|e| e.to_string())?;
     let selected = structure::select(&structure, &selection).map_err(|e| words(&e))?;
     selected.spheres(&structure).map_err(|e| words(&e))
 }
@@ -149,7 +149,7 @@ pub(super) fn ball(n: usize, seed: u64) -> Spheres {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
     };
-    let half = (1_i32..).find(|h| 4.0 * f64::from(*h).powi(3) > n as f64).unwrap_or(1) + 1;
+    let half = (1_i32..2000).find(|h| 4.0 * f64::from(*h).powi(3) > n as f64).unwrap_or(1) + 1;
     let mut places: Vec<[i32; 3]> =
         (-half..=half).flat_map(|z| (-half..=half).flat_map(move |y| (-half..=half).map(move |x| [x, y, z]))).collect();
     places.sort_by_key(|p| (p.iter().map(|c| c * c).sum::<i32>(), *p));
