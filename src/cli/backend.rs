@@ -63,8 +63,11 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     if asked.threads == Some(0) {
         return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
     }
-    if asked.backend == BackendName::Gpu && *asked.devices == DeviceChoice::Cpu {
-        return Err(CliError::usage("parameter `devices`: cpu is not allowed with --backend gpu; expected a GPU"));
+    let of_gpu = |name| matches!(name, BackendName::Gpu | BackendName::Paper);
+    if of_gpu(asked.backend) && *asked.devices == DeviceChoice::Cpu {
+        return Err(CliError::usage(
+            "parameter `devices`: cpu is not allowed with --backend gpu and paper; expected a GPU",
+        ));
     }
     let unasked = |backend: Box<dyn Backend>| Picked {
         backend,
@@ -75,8 +78,7 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     match asked.backend {
         BackendName::Cpu => Ok(unasked(cpu(asked.threads, use_)?)),
         BackendName::Reference => Ok(unasked(Box::new(ReferenceBackend))),
-        BackendName::Paper => Err(CliError::NoBackend { asked: "paper", why: NO_PAPER.to_owned() }),
-        BackendName::Auto | BackendName::Gpu => gpu_or_cpu(asked, use_),
+        BackendName::Auto | BackendName::Gpu | BackendName::Paper => gpu_or_cpu(asked, use_),
     }
 }
 
@@ -93,8 +95,9 @@ fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     }
     let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
     // Whoever asks for a device by name does not want to learn from a report that it was not used.
-    if asked.backend == BackendName::Gpu || matches!(asked.devices, DeviceChoice::These(_)) {
-        return Err(CliError::NoBackend { asked: "gpu", why: format!("no GPU can be used: {why}") });
+    if asked.backend != BackendName::Auto || matches!(asked.devices, DeviceChoice::These(_)) {
+        let asked = if asked.backend == BackendName::Paper { "paper" } else { "gpu" };
+        return Err(CliError::NoBackend { asked, why: format!("no GPU can be used: {why}") });
     }
     let reason = match asked.devices {
         DeviceChoice::Cpu => "--devices cpu".to_owned(),
@@ -122,7 +125,11 @@ pub(crate) fn survey(picked: &Picked) -> Vec<Candidate> {
     let left = picked.devices.iter().filter(|device| !device.taken);
     survey
         .extend(left.map(|d| candidate(&format!("gpu {}", d.number), Err(format!("{}: {}", d.facts.name, d.reason)))));
-    survey.push(candidate("paper", Err(NO_PAPER.to_owned())));
+    let paper = match &picked.no_gpu {
+        None => Ok("the program of 2010, on the same devices, to compare with".to_owned()),
+        Some(_) => Err("the program of 2010 runs on a GPU".to_owned()),
+    };
+    survey.push(candidate("paper", paper));
     survey
 }
 
@@ -134,8 +141,6 @@ fn cpu(threads: Option<usize>, use_: &Use) -> Result<Box<dyn Backend>, CliError>
     let backend = backend.map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
     Ok(Box::new(backend))
 }
-
-const NO_PAPER: &str = "the 2010 program runs on a GPU, and its stages are not in this version";
 
 /// What came of looking for GPUs.
 struct Gpu {
@@ -152,7 +157,7 @@ fn gpu(_asked: &Asked<'_>, _use: &Use) -> Gpu {
 
 #[cfg(feature = "gpu")]
 fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
-    use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, discover};
+    use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, Program, discover};
 
     // One mesh is not worth asking drivers that have nothing to drive; who asks for a GPU wants to know of all.
     let look = if *use_ == Use::Once && asked.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
@@ -175,7 +180,8 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
         BackendName::Auto => CpuBackend::new(asked.threads).ok().map(|cpu| Box::new(cpu) as Box<dyn Backend>),
         _ => None,
     };
-    let started = GpuBackend::start(&discovery, &settings, fallback);
+    let program = if asked.backend == BackendName::Paper { Program::Paper } else { Program::Stages };
+    let started = GpuBackend::start(&discovery, program, &settings, fallback);
     let mut devices = discovery.devices;
     match started {
         Ok(backend) => {

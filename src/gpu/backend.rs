@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::device;
+use super::device::{self, Program};
 use super::discover::Discovery;
 use super::error::GpuError;
 use super::executor::GpuJob;
@@ -17,17 +17,19 @@ use crate::surface::{
 /// Meshes on devices.
 pub struct GpuBackend {
     pool: DevicePool,
+    name: &'static str,
     /// Serves what no device could, and says so in [`Meshed::served`].
     fallback: Option<Box<dyn Backend>>,
 }
 
 impl GpuBackend {
-    /// Builds the stages on every device that `discovery` takes.
+    /// Builds `program` on every device that `discovery` takes.
     ///
     /// # Errors
     /// [`GpuError::NoDevice`] with every device's reason if none is taken or none could be built.
     pub fn start(
         discovery: &Discovery,
+        program: Program,
         settings: &PoolSettings,
         fallback: Option<Box<dyn Backend>>,
     ) -> Result<Self, GpuError> {
@@ -37,16 +39,17 @@ impl GpuBackend {
         let taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(device, _)| device.taken);
         let devices = taken.map(|(device, adapter)| {
             let adapter = adapter.clone();
-            let build = Box::new(move || device::build(&adapter));
+            let build = Box::new(move || device::build(&adapter, program));
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
-        Ok(Self::over(DevicePool::start(devices.collect(), settings)?, fallback))
+        let pool = DevicePool::start(devices.collect(), settings)?;
+        Ok(Self { name: program.name(), ..Self::over(pool, fallback) })
     }
 
     /// The backend over a pool that runs already.
     #[must_use]
     pub fn over(pool: DevicePool, fallback: Option<Box<dyn Backend>>) -> Self {
-        Self { pool, fallback }
+        Self { pool, name: Program::Stages.name(), fallback }
     }
 
     fn job(
@@ -79,7 +82,7 @@ fn describe(facts: &DeviceFacts) -> String {
 
 impl Backend for GpuBackend {
     fn name(&self) -> &'static str {
-        "gpu"
+        self.name
     }
 
     fn describe(&self) -> String {

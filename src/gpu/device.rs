@@ -5,17 +5,41 @@ use wgpu::{Adapter, Device, DeviceDescriptor, ExperimentalFeatures, Features, Me
 use super::engine::Engine;
 use super::error::GpuError;
 use super::executor::Executor;
+use super::paper::Paper;
 
 /// Features that are used where a device has them.
 const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 
-/// Opens `adapter` and builds the stages on it: the one place where a device meets them.
+/// Which program runs on a device.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Program {
+    /// Ours.
+    Stages,
+    /// The one of 2010, to compare with.
+    Paper,
+}
+
+impl Program {
+    /// The name of the backend that runs it.
+    pub(super) const fn name(self) -> &'static str {
+        match self {
+            Self::Stages => "gpu",
+            Self::Paper => "paper",
+        }
+    }
+}
+
+/// Opens `adapter` and builds a program on it: the one place where a device meets its stages.
 ///
 /// # Errors
 /// [`GpuError::Failed`] where the driver refuses, and those of the stages.
-pub(super) fn build(adapter: &Adapter) -> Result<Box<dyn Executor>, GpuError> {
+pub(super) fn build(adapter: &Adapter, program: Program) -> Result<Box<dyn Executor>, GpuError> {
     let (device, queue) = open(adapter)?;
-    Ok(Box::new(Engine::new(device, queue)?))
+    let engine = Engine::new(device, queue)?;
+    Ok(match program {
+        Program::Stages => Box::new(engine),
+        Program::Paper => Box::new(Paper::new(engine)?),
+    })
 }
 
 /// Opens `adapter` with all that its limits allow.

@@ -37,6 +37,7 @@ mod workspace;
 pub mod yardstick;
 
 pub use backend::GpuBackend;
+pub use device::Program;
 pub use discover::{Discovery, Look, discover};
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
