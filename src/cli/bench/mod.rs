@@ -4,6 +4,7 @@ mod cases;
 mod floor;
 mod jobs;
 mod measure;
+mod pool;
 mod table;
 
 use std::path::PathBuf;
@@ -12,6 +13,7 @@ use clap::{Args as ClapArgs, Subcommand};
 use molmesh::gpu::Paper;
 use molmesh::gpu::bench::{self, Opened};
 use molmesh::gpu::yardstick::{self, Effort, Rates};
+use molmesh::surface::DeviceChoice;
 use serde_json::json;
 
 use super::error::CliError;
@@ -49,6 +51,12 @@ pub(crate) struct GpuArgs {
     /// Time so many jobs of 600 atoms instead, alone and together
     #[arg(long, value_name = "N")]
     pub(crate) jobs: Option<usize>,
+    /// Time so many jobs of 600 atoms, and some large ones, through the pool on 1, 2, … devices instead
+    #[arg(long, value_name = "N", conflicts_with_all = ["jobs", "device"])]
+    pub(crate) pool: Option<usize>,
+    /// Devices of `--pool`: all, software, or numbers
+    #[arg(long, value_name = "WHICH", default_value = "all", requires = "pool")]
+    pub(crate) devices: DeviceChoice,
     /// Write everything to this file too, as JSON
     #[arg(long, value_name = "FILE")]
     pub(crate) json: Option<PathBuf>,
@@ -57,8 +65,13 @@ pub(crate) struct GpuArgs {
 /// Runs the command.
 pub(super) fn run(bench: &Bench) -> Result<(), CliError> {
     let Bench::Gpu(args) = bench;
-    if args.runs == 0 || args.atoms == 0 || args.jobs == Some(0) {
+    if args.runs == 0 || args.atoms == 0 || args.jobs == Some(0) || args.pool == Some(0) {
         return Err(CliError::usage("nothing is measured with 0 runs, atoms or jobs"));
+    }
+    if let Some(n) = args.pool {
+        let rates = pool::run(&args.devices, n)?;
+        super::say(&pool::table(&rates))?;
+        return save(args, &json!({ "pool": rates }));
     }
     let opened = open(args.device)?;
     super::say(&format!("device {}: {}, {}\n", args.device, opened.name, opened.driver))?;
@@ -70,6 +83,11 @@ pub(super) fn run(bench: &Bench) -> Result<(), CliError> {
         }
         None => cases(args, opened)?,
     };
+    save(args, &result)
+}
+
+/// Writes the result where it was asked for.
+fn save(args: &GpuArgs, result: &serde_json::Value) -> Result<(), CliError> {
     let Some(path) = &args.json else { return Ok(()) };
     let text = format!("{result:#}\n");
     std::fs::write(path, text).map_err(|source| CliError::Output { name: path.display().to_string(), source })
