@@ -18,7 +18,7 @@ run: ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
 
 test: tools fmt-check lint deny-if-installed matrix tests ## Everything that must hold; installs what it needs
 
-tools: ## Install what the tests compare with (a Python environment and Node packages)
+tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan)
 	@if [ -f tests/tools/setup.sh ]; then bash tests/tools/setup.sh; fi
 
 fmt: ## Format

@@ -1,6 +1,7 @@
 #!/bin/sh
 # Installs the outside oracles of the tests (trimesh, gemmi, gltf-validator) into target/test-tools, which git
-# ignores. Does nothing when they are there and up to date; says nothing unless it installs or fails.
+# ignores, and Mesa's software Vulkan (lavapipe) into the system where there is none: the shaders are tested on it. Does
+# nothing when all is there and up to date; says nothing unless it installs or fails.
 set -eu
 
 here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
@@ -16,6 +17,30 @@ fail() {
 for command in "$python" node npm; do
     command -v "$command" >/dev/null 2>&1 || fail "\`$command\` is not installed; the tests need Python 3.11 or later and Node 20 or later"
 done
+
+# Drivers announce themselves by a manifest; the loader finds lavapipe by its own.
+software_vulkan() {
+    for folder in /usr/share/vulkan/icd.d /usr/local/share/vulkan/icd.d /etc/vulkan/icd.d; do
+        for manifest in "$folder"/lvp_icd*.json; do
+            if [ -e "$manifest" ]; then return 0; fi
+        done
+    done
+    # Elsewhere (macOS, a driver named by hand) the tests say what they miss.
+    [ "$(uname -s)" != Linux ] || [ -n "${VK_DRIVER_FILES:-}${VK_ICD_FILENAMES:-}" ]
+}
+
+if ! software_vulkan; then
+    command -v apt-get >/dev/null 2>&1 ||
+        fail "the tests of the shaders need Mesa's software Vulkan (lavapipe): install it (Fedora: mesa-vulkan-drivers, Arch: vulkan-swrast)"
+    echo "installing mesa-vulkan-drivers, for the tests of the shaders" >&2
+    as_root=
+    if [ "$(id -u)" -ne 0 ]; then as_root="sudo -n"; fi
+    log=$(mktemp)
+    { $as_root apt-get update -qq &&
+        $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends mesa-vulkan-drivers; } >"$log" 2>&1 ||
+        { tail -5 "$log" >&2; rm -f "$log"; fail "apt-get could not install mesa-vulkan-drivers; install it as root"; }
+    rm -f "$log"
+fi
 
 # A stamp says what an installation was made from; it is written last, so a broken one is made again.
 digest() {
