@@ -30,14 +30,15 @@ struct Tally {
 
 const LANES: u32 = 64u;
 // Lists up to this long are staged; longer ones, of fine grids, are gathered twice.
-const STAGED: u32 = 512u;
+const STAGED: u32 = 256u;
 
 // Where the ranges begin, and how many atoms they and those before them hold.
 var<workgroup> range_start: array<u32, 64>;
 var<workgroup> range_end: array<u32, 64>;
+var<workgroup> range_sum: array<u32, 64>;
 // Lanes with an atom that reaches a sample (0, 1) or only the gap behind the samples (2, 3), for three steps.
 var<workgroup> hits: array<atomic<u32>, 12>;
-var<workgroup> staged: array<u32, 512>;
+var<workgroup> staged: array<u32, 256>;
 var<workgroup> list_start: u32;
 
 // `v` as it was rounded: the compiler cannot see through the zero, so it cannot fuse the product into a sum. The
@@ -170,9 +171,10 @@ fn main(
     // Atoms that reach a sample, and those that reach the gap only.
     var n = vec2<u32>(0u);
     var start = 0u;
+    // Which of the hits is used; the second pass goes on where the first one ended.
+    var phase = 0u;
     for (var pass_number = 0u; pass_number < 2u; pass_number++) {
         var kept = vec2<u32>(0u);
-        var phase = 0u;
         for (var first = 0u; first < n_ranges; first += LANES) {
             var range = vec2<u32>(0u);
             if (first + lane < n_ranges) {
@@ -181,12 +183,26 @@ fn main(
             workgroupBarrier();
             range_start[lane] = range.x;
             range_end[lane] = range.y;
-            for (var step = 1u; step < LANES; step = step << 1u) {
-                workgroupBarrier();
-                let before = select(0u, range_end[(lane - step) & 63u], lane >= step);
-                workgroupBarrier();
-                range_end[lane] += before;
-            }
+            // A scan from one array into the other and back: six steps end where they began.
+            var end = range.y;
+            workgroupBarrier();
+            end += select(0u, range_end[(lane - 1u) & 63u], lane >= 1u);
+            range_sum[lane] = end;
+            workgroupBarrier();
+            end += select(0u, range_sum[(lane - 2u) & 63u], lane >= 2u);
+            range_end[lane] = end;
+            workgroupBarrier();
+            end += select(0u, range_end[(lane - 4u) & 63u], lane >= 4u);
+            range_sum[lane] = end;
+            workgroupBarrier();
+            end += select(0u, range_sum[(lane - 8u) & 63u], lane >= 8u);
+            range_end[lane] = end;
+            workgroupBarrier();
+            end += select(0u, range_end[(lane - 16u) & 63u], lane >= 16u);
+            range_sum[lane] = end;
+            workgroupBarrier();
+            end += select(0u, range_sum[(lane - 32u) & 63u], lane >= 32u);
+            range_end[lane] = end;
             let total = workgroupUniformLoad(&range_end[63]);
             for (var at = 0u; at < total; at += LANES) {
                 let index = at + lane;
@@ -194,12 +210,12 @@ fn main(
                 var atom = 0u;
                 if (index < total) {
                     // The first range that ends behind the index.
-                    var r = 0u;
-                    for (var step = 32u; step > 0u; step = step >> 1u) {
-                        if (range_end[r + step - 1u] <= index) {
-                            r += step;
-                        }
-                    }
+                    var r = select(0u, 32u, range_end[31] <= index);
+                    r += select(0u, 16u, range_end[r + 15u] <= index);
+                    r += select(0u, 8u, range_end[r + 7u] <= index);
+                    r += select(0u, 4u, range_end[r + 3u] <= index);
+                    r += select(0u, 2u, range_end[r + 1u] <= index);
+                    r += select(0u, 1u, range_end[r] <= index);
                     let before = select(0u, range_end[(r - 1u) & 63u], r > 0u);
                     atom = range_start[r] + (index - before);
                     reaches_it = reach_of(atom, tile_origin, lo);

@@ -45,6 +45,9 @@ fn main(
             brick = neighbour(bricks[id] >> 9u, bricks[id] & 511u, part);
         }
         near[8u * owner + part] = brick;
+        if (exists) {
+            records[id].near[part] = brick;
+        }
     }
     workgroupBarrier();
     let z = part >> 1u;

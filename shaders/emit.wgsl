@@ -1,76 +1,90 @@
-// Stage `emit`: triangle indices. One workgroup a brick; a lane writes single indices, so that what is written together
-// lies together.
+// Stage `emit`: triangle indices. One workgroup a brick; a lane lists the triangles of a row of eight cells, then the
+// lanes write single indices, so that what is written together lies together.
 //
 // A cell's edge belongs to one of the samples around it, in the brick or in one of its seven neighbours towards +x, +y,
-// +z; the vertex's number is the rank of the edge among its brick's crossing edges.
+// +z; the vertex's number is the rank of the edge among its brick's crossing edges. Bricks and neighbours are put down
+// as one block of 9 × 9 × 9 samples, so that no index asks whose edge it is.
 #include shared/params.wgsl
 #include shared/bits.wgsl
-#include shared/tiles.wgsl
-#include shared/corners.wgsl
 #include shared/record.wgsl
 
 @group(0) @binding(0) var<uniform> params: Params;
-@group(0) @binding(1) var<storage, read> tiles: array<Tile>;
-@group(0) @binding(2) var<storage, read> bricks: array<u32>;
-@group(0) @binding(3) var<storage, read> inside: array<u32>;
-// Triangles of each case; then five triangles each, every corner four bits.
-@group(0) @binding(4) var<storage, read> cases: array<u32>;
-@group(0) @binding(5) var<storage, read> records: array<Record>;
-@group(0) @binding(6) var<storage, read> counts: array<u32>;
-@group(0) @binding(7) var<storage, read> offsets: array<vec2<u32>>;
-@group(0) @binding(8) var<storage, read_write> triangles: array<u32>;
+@group(0) @binding(1) var<storage, read> inside: array<u32>;
+@group(0) @binding(2) var<storage, read> cases: array<vec2<u32>>;
+@group(0) @binding(3) var<storage, read> records: array<Record>;
+@group(0) @binding(4) var<storage, read> counts: array<u32>;
+@group(0) @binding(5) var<storage, read> offsets: array<vec2<u32>>;
+@group(0) @binding(6) var<storage, read_write> triangles: array<u32>;
 
 const LANES: u32 = 64u;
+const NONE: u32 = 0xffffffffu;
 // Triangles listed at once.
-const WINDOW: u32 = 512u;
+const WINDOW: u32 = 256u;
+// In the case table, by pairs of words: eight cases' numbers of triangles a word and then the edges of a cell; the
+// corners of the cases' triangles, four bits each.
+const PACKED_COUNTS: u32 = 128u;
+const CORNERS: u32 = 152u;
 
-var<workgroup> near: array<u32, 8>;
-var<workgroup> first_vertex: array<u32, 8>;
-// Crossing words of the brick and its neighbours in the same layer of bricks, 48 each; then the x and y words of the
-// lowest layer of those above, 6 each.
-var<workgroup> crossing: array<u32, 216>;
-var<workgroup> layers: array<u32, 36>;
-// Corners of the cells of each half layer.
-var<workgroup> low: array<vec4<u32>, 16>;
-var<workgroup> high: array<vec4<u32>, 16>;
-// Numbers of triangles of the cells of each layer as bits of weight 1, 2, 4: two halves each.
-var<workgroup> weights: array<atomic<u32>, 48>;
-var<workgroup> layer_start: array<u32, 9>;
-// Triangles as cell, case and number within the case.
-var<workgroup> listed: array<u32, 512>;
+// Inside bits of the rows of samples along x, nine of nine each: row 9·z + y.
+var<workgroup> rows: array<u32, 81>;
+// Crossing edges of the block, as words of 4 rows, each with the number of its first vertex: by axis, z, every fourth
+// y; first those of samples with x < 8.
+var<workgroup> edges: array<vec2<u32>, 162>;
+// Numbers of triangles of eight cases each; from 32 on the edges of a cell, as steps from its sample to their own.
+var<workgroup> packed_counts: array<u32, 48>;
+// Triangles: their cell, and from bit 12 on their corners. Before that, sums of rows.
+var<workgroup> listed: array<u32, 256>;
 
-fn ones(word: u32, lane: u32, half: u32) -> u32 {
-    return countOneBits(word & select(select(0u, below(lane & 31u), lane >> 5u == half), 0xffffffffu, lane >> 5u > half));
-}
-
-// Triangles of the cells before `lane` in layer z.
-fn triangles_before(z: u32, lane: u32) -> u32 {
-    var n = 0u;
-    for (var half = 0u; half < 2u; half++) {
-        let at = 6u * z + half;
-        n += ones(atomicLoad(&weights[at]), lane, half);
-        n += 2u * ones(atomicLoad(&weights[at + 2u]), lane, half);
-        n += 4u * ones(atomicLoad(&weights[at + 4u]), lane, half);
+// Inside bits of row (y, z) of the block of brick `id`.
+fn row_at(id: u32, y: u32, z: u32) -> u32 {
+    let n = (y >> 3u) << 1u | (z >> 3u) << 2u;
+    let brick = records[id].near[n];
+    let next = records[id].near[n + 1u];
+    let at = 2u * (z & 7u) + (y >> 2u & 1u);
+    let shift = 8u * (y & 3u);
+    var row = 0u;
+    // A brick that does not exist is out of every atom's reach: nothing of it is inside.
+    if (brick != NONE) {
+        row = inside[brick * 16u + at] >> shift & 255u;
     }
-    return n;
+    if (next != NONE) {
+        row |= (inside[next * 16u + at] >> shift & 1u) << 8u;
+    }
+    return row;
 }
 
-// Vertex on edge `e` of a cell.
-fn vertex_of(cell: u32, e: u32) -> u32 {
-    let axis = e >> 2u;
-    let lo = e & 1u;
-    let hi = e >> 1u & 1u;
-    let x = (cell & 7u) + select(lo, 0u, axis == 0u);
-    let y = (cell >> 3u & 7u) + select(select(hi, 0u, axis == 1u), lo, axis == 0u);
-    let z = (cell >> 6u) + select(hi, 0u, axis == 2u);
-    let n = x >> 3u | (y >> 3u) << 1u | (z >> 3u) << 2u;
-    let layer = z & 7u;
-    let half = y >> 2u & 1u;
-    let bit = (y & 3u) << 3u | (x & 7u);
-    let word = select(192u + 6u * (n & 3u), 48u * n, n < 4u) + 2u * (3u * layer + axis);
-    let start = before_word(layers[select(28u + n, 8u * n + layer, n < 4u)], axis);
-    let whole = select(0u, countOneBits(crossing[word]), half == 1u);
-    return first_vertex[n] + start + whole + countOneBits(crossing[word + half] & below(bit));
+// Four bits to four bytes.
+fn spread(bits: u32) -> u32 {
+    return ((bits & 15u) * 0x00204081u) & 0x01010101u;
+}
+
+// Triangles of the case in byte `i` of `quad`.
+fn triangles_of(quad: u32, i: u32) -> u32 {
+    let case_ = quad >> (8u * i);
+    return packed_counts[case_ >> 3u & 31u] >> (4u * (case_ & 7u)) & 7u;
+}
+
+// Lists a cell's `n` triangles from `at` on; what is not in the window is another's.
+fn list_cell(at: u32, cell: u32, quad: u32, i: u32, n: u32) {
+    if (n == 0u) {
+        return;
+    }
+    let row = cases[CORNERS + (quad >> (8u * i) & 255u)];
+    if (at < WINDOW) { listed[at] = cell | row.x << 12u; }
+    if (n > 1u && at + 1u < WINDOW) { listed[at + 1u] = cell | (row.x & 0xfff000u); }
+    if (n > 2u && at + 2u < WINDOW) { listed[at + 2u] = cell | row.x >> 24u << 12u | row.y << 20u; }
+    if (n > 3u && at + 3u < WINDOW) { listed[at + 3u] = cell | row.y >> 4u << 12u; }
+    if (n > 4u && at + 4u < WINDOW) { listed[at + 4u] = cell | row.y >> 16u << 12u; }
+}
+
+// Number of the vertex at corner `k` of a listed triangle.
+fn vertex_at(triangle: u32, k: u32) -> u32 {
+    let code = listed[triangle];
+    // The sum of a cell and a step is a sample, x from bit 0, y from bit 4 on: every fourth y counts as a word.
+    let edge = (code & 0xfffu) + packed_counts[32u + (code >> (12u + 4u * k) & 15u)];
+    let word = edges[(edge >> 6u) + 81u * (edge >> 3u & 1u)];
+    let bit = (edge >> 1u & 24u) | (edge & 7u);
+    return word.y + countOneBits(word.x & below(bit));
 }
 
 @compute @workgroup_size(64)
@@ -86,85 +100,123 @@ fn main(
     let id = params.piece_brick + number;
     let n = counts[id] >> 16u;
     let first = offsets[id].y - params.piece_triangle;
+    if (lane >= 40u) {
+        let pair = lane - 40u;
+        let words = cases[PACKED_COUNTS + pair];
+        packed_counts[2u * pair] = words.x;
+        packed_counts[2u * pair + 1u] = words.y;
+    }
+    let y = lane & 7u;
+    let z = lane >> 3u;
+    rows[9u * z + y] = row_at(id, y, z);
+    if (lane >= 47u) {
+        // Nine rows behind along y, eight along z.
+        let i = lane - 47u;
+        let at = select(vec2<u32>(i - 9u, 8u), vec2<u32>(8u, i), i < 9u);
+        rows[9u * at.y + at.x] = row_at(id, at.x, at.y);
+    }
+    if (lane < 36u) {
+        // A layer of the brick or of a neighbour in its own layer of bricks; the lowest one of a neighbour above.
+        let which = select(lane - 28u, lane >> 3u, lane < 32u);
+        let layer = select(0u, lane & 7u, lane < 32u);
+        let brick = records[id].near[which];
+        if (brick != NONE) {
+            var before = offsets[brick].x + (records[brick].layers[layer] & 0xffffu);
+            let at = 81u * (which & 1u) + 3u * (layer + (which >> 2u) * 8u) + (which & 2u);
+            let x_low = records[brick].crossing[6u * layer];
+            let x_high = records[brick].crossing[6u * layer + 1u];
+            let y_low = records[brick].crossing[6u * layer + 2u];
+            let y_high = records[brick].crossing[6u * layer + 3u];
+            let z_low = records[brick].crossing[6u * layer + 4u];
+            let z_high = records[brick].crossing[6u * layer + 5u];
+            // Of a brick behind along y the lowest rows are needed only, and there is no room for more.
+            let whole = (which & 2u) == 0u;
+            edges[at] = vec2<u32>(x_low, before);
+            before += countOneBits(x_low);
+            if (whole) { edges[at + 1u] = vec2<u32>(x_high, before); }
+            before += countOneBits(x_high);
+            edges[at + 27u] = vec2<u32>(y_low, before);
+            before += countOneBits(y_low);
+            if (whole) { edges[at + 28u] = vec2<u32>(y_high, before); }
+            before += countOneBits(y_high);
+            edges[at + 54u] = vec2<u32>(z_low, before);
+            before += countOneBits(z_low);
+            if (whole) { edges[at + 55u] = vec2<u32>(z_high, before); }
+        }
+    }
+    workgroupBarrier();
     if (n == 0u || first + n > params.triangle_capacity) {
         return;
     }
-    if (lane < 8u) {
-        let brick = neighbour(bricks[id] >> 9u, bricks[id] & 511u, lane);
-        near[lane] = brick;
-        first_vertex[lane] = offsets[min(brick, params.n_bricks - 1u)].x;
-    } else if (lane >= 16u) {
-        atomicStore(&weights[lane - 16u], 0u);
-    }
-    workgroupBarrier();
-    for (var i = lane; i < 252u; i += LANES) {
-        if (i < 216u) {
-            let above = i - 192u;
-            let brick = near[select(4u + above / 6u, i / 48u, i < 192u)];
-            if (brick != NONE) {
-                crossing[i] = records[brick].crossing[select(above % 6u, i % 48u, i < 192u)];
-            }
-        } else {
-            let at = i - 216u;
-            let brick = near[select(at - 28u, at >> 3u, at < 32u)];
-            if (brick != NONE) {
-                layers[at] = records[brick].layers[select(0u, at & 7u, at < 32u)];
-            }
+    // The corners of eight cells: four rows, their bits interleaved to a byte a cell.
+    let r0 = rows[9u * z + y];
+    let r1 = rows[9u * z + y + 1u];
+    let r2 = rows[9u * z + y + 9u];
+    let r3 = rows[9u * z + y + 10u];
+    let near_x = spread(r0) | spread(r1) << 2u | spread(r2) << 4u | spread(r3) << 6u;
+    let far_x = spread(r0 >> 4u) | spread(r1 >> 4u) << 2u | spread(r2 >> 4u) << 4u | spread(r3 >> 4u) << 6u;
+    let last_x = r0 >> 8u | r1 >> 8u << 2u | r2 >> 8u << 4u | r3 >> 8u << 6u;
+    let low = near_x | (near_x >> 8u | far_x << 24u) << 1u;
+    let high = far_x | (far_x >> 8u | last_x << 24u) << 1u;
+    let n0 = triangles_of(low, 0u);
+    let n1 = triangles_of(low, 1u);
+    let n2 = triangles_of(low, 2u);
+    let n3 = triangles_of(low, 3u);
+    let n4 = triangles_of(high, 0u);
+    let n5 = triangles_of(high, 1u);
+    let n6 = triangles_of(high, 2u);
+    let n7 = triangles_of(high, 3u);
+    let own = n0 + n1 + n2 + n3 + n4 + n5 + n6 + n7;
+    // Rows come in the order of cells.
+    var sum = own;
+    var side = 0u;
+    listed[lane] = sum;
+    for (var step = 1u; step < LANES; step = step << 1u) {
+        workgroupBarrier();
+        if (lane >= step) {
+            sum += listed[side + lane - step];
         }
+        side = 64u - side;
+        listed[side + lane] = sum;
     }
-    if (lane < 16u) {
-        let here = vec4<u32>(near[0], near[1], near[2], near[3]);
-        let above = vec4<u32>(near[4], near[5], near[6], near[7]);
-        let c = corners_of(here, above, lane >> 1u, lane & 1u);
-        low[lane] = c.low;
-        high[lane] = c.high;
-    }
+    let start = sum - own;
     workgroupBarrier();
-    // A lane's cells are the column above its bit.
-    let half = lane >> 5u;
-    let bit = lane & 31u;
-    for (var z = 0u; z < 8u; z++) {
-        let count = cases[case_at(Corners(low[2u * z + half], high[2u * z + half]), bit)];
-        for (var weight = 0u; weight < 3u; weight++) {
-            if ((count >> weight & 1u) == 1u) {
-                atomicOr(&weights[6u * z + 2u * weight + half], 1u << bit);
-            }
-        }
-    }
-    workgroupBarrier();
-    if (lane < 9u) {
-        var start = 0u;
-        for (var z = 0u; z < lane; z++) {
-            for (var i = 0u; i < 6u; i++) {
-                start += countOneBits(atomicLoad(&weights[6u * z + i])) << (i >> 1u);
-            }
-        }
-        layer_start[lane] = start;
-    }
-    workgroupBarrier();
+    let cell = (y & 3u) << 4u | (3u * z + (y >> 2u)) << 6u;
+    let t0 = lane / 3u;
+    let k0 = lane - 3u * t0;
+    let t1 = (lane + 64u) / 3u;
+    let k1 = lane + 64u - 3u * t1;
+    let t2 = (lane + 128u) / 3u;
+    let k2 = lane + 128u - 3u * t2;
     for (var window = 0u; window < n; window += WINDOW) {
-        let end = min(n, window + WINDOW);
-        for (var z = 0u; z < 8u; z++) {
-            if (layer_start[z + 1u] <= window || layer_start[z] >= end) {
-                continue;
-            }
-            let case_ = case_at(Corners(low[2u * z + half], high[2u * z + half]), bit);
-            let count = cases[case_];
-            if (count == 0u) {
-                continue;
-            }
-            let at = layer_start[z] + triangles_before(z, lane);
-            for (var k = 0u; k < count; k++) {
-                if (at + k >= window && at + k < end) {
-                    listed[at + k - window] = z << 6u | lane | case_ << 9u | k << 17u;
-                }
-            }
+        if (own != 0u) {
+            var at = start - window;
+            list_cell(at, cell, low, 0u, n0);
+            at += n0;
+            list_cell(at, cell + 1u, low, 1u, n1);
+            at += n1;
+            list_cell(at, cell + 2u, low, 2u, n2);
+            at += n2;
+            list_cell(at, cell + 3u, low, 3u, n3);
+            at += n3;
+            list_cell(at, cell + 4u, high, 0u, n4);
+            at += n4;
+            list_cell(at, cell + 5u, high, 1u, n5);
+            at += n5;
+            list_cell(at, cell + 6u, high, 2u, n6);
+            at += n6;
+            list_cell(at, cell + 7u, high, 3u, n7);
         }
         workgroupBarrier();
-        for (var i = lane; i < 3u * (end - window); i += LANES) {
-            let triangle = listed[i / 3u];
-            let row = cases[256u + 5u * (triangle >> 9u & 255u) + (triangle >> 17u)];
-            triangles[3u * (first + window) + i] = vertex_of(triangle & 511u, row >> (4u * (i % 3u)) & 15u);
+        let words = 3u * min(WINDOW, n - window);
+        let base = 3u * (first + window);
+        // Three times 64 indices are 64 triangles: a lane writes the same corners of every 64th.
+        var i = lane;
+        for (var at = 0u; i < words; at += LANES) {
+            triangles[base + i] = vertex_at(at + t0, k0);
+            if (i + 64u < words) { triangles[base + i + 64u] = vertex_at(at + t1, k1); }
+            if (i + 128u < words) { triangles[base + i + 128u] = vertex_at(at + t2, k2); }
+            i += 192u;
         }
         workgroupBarrier();
     }

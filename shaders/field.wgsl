@@ -19,8 +19,8 @@
 @group(0) @binding(6) var<storage, read_write> field: array<f32>;
 @group(0) @binding(7) var<storage, read_write> inside: array<u32>;
 
-// Candidates staged at once: two lanes stage one.
-const PIECE: u32 = 32u;
+// Candidates staged at once: two lanes stage one. More would take workgroup memory that more workgroups put to better use.
+const PIECE: u32 = 24u;
 
 struct Staged {
     // Whole cells from the atom's to the brick's first sample, and the atom's fraction: x, y.
@@ -31,10 +31,17 @@ struct Staged {
     nearest: vec2<f32>,
 }
 
-var<workgroup> staged: array<Staged, 32>;
-var<workgroup> z_e: array<vec4<f32>, 64>;
-var<workgroup> z_w: array<vec4<f32>, 64>;
-var<workgroup> columns: array<u32, 64>;
+var<workgroup> staged: array<Staged, 24>;
+var<workgroup> z_e: array<vec4<f32>, 48>;
+var<workgroup> z_w: array<vec4<f32>, 48>;
+// Inside bits of four columns each.
+var<workgroup> columns: array<vec4<u32>, 16>;
+
+// Those of layer z.
+fn four_bits(at: u32, z: u32) -> u32 {
+    let bits = columns[at] >> vec4<u32>(z) & vec4<u32>(1u);
+    return bits.x | bits.y << 1u | bits.z << 2u | bits.w << 3u;
+}
 
 @compute @workgroup_size(64)
 fn main(
@@ -112,15 +119,14 @@ fn main(
     let low_bits = select(vec4<u32>(0u), weights, low >= iso);
     let high_bits = select(vec4<u32>(0u), weights, high >= iso);
     let bits = low_bits.x + low_bits.y + low_bits.z + low_bits.w;
-    columns[lane] = bits | (high_bits.x + high_bits.y + high_bits.z + high_bits.w) << 4u;
+    columns[lane >> 2u][lane & 3u] = bits | (high_bits.x + high_bits.y + high_bits.z + high_bits.w) << 4u;
     workgroupBarrier();
     if (lane < 16u) {
         let z = lane >> 1u;
-        let start = (lane & 1u) * 32u;
-        var word = 0u;
-        for (var i = 0u; i < 32u; i++) {
-            word |= (columns[start + i] >> z & 1u) << i;
-        }
+        let start = 8u * (lane & 1u);
+        let word = four_bits(start, z) | four_bits(start + 1u, z) << 4u | four_bits(start + 2u, z) << 8u
+            | four_bits(start + 3u, z) << 12u | four_bits(start + 4u, z) << 16u | four_bits(start + 5u, z) << 20u
+            | four_bits(start + 6u, z) << 24u | four_bits(start + 7u, z) << 28u;
         inside[id * 16u + lane] = word;
     }
 }

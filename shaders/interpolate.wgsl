@@ -34,7 +34,7 @@ struct Tally {
 @group(0) @binding(13) var<storage, read_write> sources: array<u32>;
 @group(0) @binding(14) var<storage, read_write> tally: Tally;
 
-const LANES: u32 = 64u;
+const LANES: u32 = 128u;
 // Candidates staged at once.
 const PIECE: u32 = 128u;
 // As `EDGE_MARGIN` of every backend.
@@ -46,8 +46,13 @@ var<workgroup> layers: array<u32, 8>;
 var<workgroup> slots: array<u32, 4>;
 // Centre from the brick's first sample, and 1/ρ².
 var<workgroup> staged: array<vec4<f32>, 128>;
-var<workgroup> staged_source: array<u32, 128>;
-var<workgroup> written: array<f32, 192>;
+
+// What a candidate adds to the gradient at p, counted from the brick's first sample.
+fn pull(p: vec3<f32>, atom: vec4<f32>) -> vec3<f32> {
+    let d = p - atom.xyz;
+    let u = dot(d, d) * atom.w;
+    return select(0.0, slope(u, params.u_min * atom.w) * atom.w, u < params.support) * d;
+}
 
 // A crossing edge: its owner's bit, layer and axis.
 struct Edge {
@@ -57,12 +62,9 @@ struct Edge {
 }
 
 fn edge_of(vertex: u32) -> Edge {
-    var z = 0u;
-    for (var step = 4u; step > 0u; step = step >> 1u) {
-        if ((layers[z + step] & 0xffffu) <= vertex) {
-            z += step;
-        }
-    }
+    var z = select(0u, 4u, (layers[4] & 0xffffu) <= vertex);
+    z += select(0u, 2u, (layers[z + 2u] & 0xffffu) <= vertex);
+    z += select(0u, 1u, (layers[z + 1u] & 0xffffu) <= vertex);
     let layer = layers[z];
     var axis = 0u;
     axis += select(0u, 1u, before_word(layer, 1u) <= vertex);
@@ -91,7 +93,20 @@ fn density_beyond(edge: Edge) -> f32 {
     return field[slot * 512u + sample.z * 64u + sample.y * 8u + sample.x];
 }
 
-@compute @workgroup_size(64)
+// Stages the candidates from `start` on: a multiple of four, and what is too much is far away.
+fn stage_piece(lane: u32, head: vec4<u32>, start: u32, origin: vec3<i32>) {
+    let n = min(PIECE, head.z - start);
+    for (var i = lane; i < ((n + 3u) & ~3u); i += LANES) {
+        var near = vec4<f32>(1e9, 1e9, 1e9, 1.0);
+        if (i < n) {
+            let atom = atoms[lists[head.x + start + i]];
+            near = vec4<f32>(vec3<f32>(atom.cell - origin) + atom.frac, atom.inv_length2);
+        }
+        staged[i] = near;
+    }
+}
+
+@compute @workgroup_size(128)
 fn main(
     @builtin(workgroup_id) workgroup: vec3<u32>,
     @builtin(num_workgroups) workgroups: vec3<u32>,
@@ -104,10 +119,6 @@ fn main(
     let id = params.piece_brick + number;
     let n = counts[id] & 0xffffu;
     let first = offsets[id].x - params.piece_vertex;
-    // Where the estimate was too small nothing is written; the host sees the totals.
-    if (n == 0u || first + n > params.vertex_capacity) {
-        return;
-    }
     let tile = bricks[id] >> 9u;
     let local = bricks[id] & 511u;
     let origin = tiles[tile].coord * 64 + local_brick(local) * 8;
@@ -117,78 +128,78 @@ fn main(
     } else if (lane < 56u) {
         layers[lane - 48u] = records[id].layers[lane - 48u];
     } else if (lane < 59u) {
-        slots[lane - 55u] = slot_of(neighbour(tile, local, 1u << (lane - 56u)));
+        slots[lane - 55u] = slot_of(records[id].near[1u << (lane - 56u)]);
     } else if (lane == 59u) {
         slots[0] = id - params.first_brick;
     }
+    stage_piece(lane, head, 0u, origin);
     workgroupBarrier();
+    // Where the estimate was too small nothing is written; the host sees the totals.
+    if (n == 0u || first + n > params.vertex_capacity) {
+        return;
+    }
     for (var base = 0u; base < n; base += LANES) {
         let vertex = base + lane;
-        let edge = edge_of(min(vertex, n - 1u));
-        let inner = field[slots[0] * 512u + edge.z * 64u + edge.bit];
-        let drop = inner - density_beyond(edge);
-        let t = clamp((inner - params.isovalue) / drop, EDGE_MARGIN, 1.0 - EDGE_MARGIN);
-        let along = select(vec3<f32>(0.0), vec3<f32>(t), vec3<u32>(0u, 1u, 2u) == vec3<u32>(edge.axis));
-        let p = vec3<f32>(vec3<u32>(edge.bit & 7u, edge.bit >> 3u, edge.z)) + along;
+        let mine = vertex < n;
+        var p = vec3<f32>(0.0);
         var gradient = vec3<f32>(0.0);
         var nearest = 3.402823e38;
         var source = 0u;
-        for (var start = 0u; start < head.z; start += PIECE) {
+        for (var start = 0u; start == 0u || start < head.z; start += PIECE) {
             let in_piece = min(PIECE, head.z - start);
-            if (base == 0u || head.z > PIECE) {
+            if (head.z > PIECE && start + base > 0u) {
                 workgroupBarrier();
-                for (var i = lane; i < in_piece; i += LANES) {
-                    let atom = atoms[lists[head.x + start + i]];
-                    staged[i] = vec4<f32>(vec3<f32>(atom.cell - origin) + atom.frac, atom.inv_length2);
-                    if (NEAREST) {
-                        staged_source[i] = atom.source;
+                stage_piece(lane, head, start, origin);
+                workgroupBarrier();
+            }
+            // No barrier from here on: lanes without a vertex rest.
+            if (mine && start == 0u) {
+                let edge = edge_of(vertex);
+                let inner = field[slots[0] * 512u + edge.z * 64u + edge.bit];
+                let drop = inner - density_beyond(edge);
+                let t = clamp((inner - params.isovalue) / drop, EDGE_MARGIN, 1.0 - EDGE_MARGIN);
+                let along = select(vec3<f32>(0.0), vec3<f32>(t), vec3<u32>(0u, 1u, 2u) == vec3<u32>(edge.axis));
+                p = vec3<f32>(vec3<u32>(edge.bit & 7u, edge.bit >> 3u, edge.z)) + along;
+            }
+            if (mine) {
+                for (var i = 0u; i < in_piece; i += 4u) {
+                    gradient += pull(p, staged[i]);
+                    gradient += pull(p, staged[i + 1u]);
+                    gradient += pull(p, staged[i + 2u]);
+                    gradient += pull(p, staged[i + 3u]);
+                }
+                if (NEAREST) {
+                    for (var i = 0u; i < in_piece; i++) {
+                        let d = p - staged[i].xyz;
+                        let d2 = dot(d, d);
+                        if (d2 < nearest) {
+                            nearest = d2;
+                            source = start + i;
+                        }
                     }
                 }
-                workgroupBarrier();
-            }
-            for (var i = 0u; i < in_piece; i++) {
-                let a = staged[i];
-                let d = p - a.xyz;
-                let d2 = dot(d, d);
-                let u = d2 * a.w;
-                if (u < params.support) {
-                    gradient += slope(u, params.u_min * a.w) * a.w * d;
-                }
-                if (NEAREST && d2 < nearest) {
-                    nearest = d2;
-                    source = staged_source[i];
-                }
             }
         }
-        // Below this, single precision has no direction left.
-        let length2 = dot(gradient, gradient);
-        let usable = length2 > 1e-14;
-        let normal = gradient * select(0.0, inverseSqrt(length2), usable);
-        let mine = vertex < n;
-        if (mine && !usable) {
-            atomicAdd(&tally.flat, 1u);
-        }
-        if (NEAREST && mine) {
-            sources[first + vertex] = source;
-        }
-        // Whole steps are exact; the fraction is added before the one multiplication.
-        let position = (vec3<f32>(origin - params.centre) + p) * params.spacing;
-        let words = 3u * min(LANES, n - base);
-        workgroupBarrier();
-        written[3u * lane] = position.x;
-        written[3u * lane + 1u] = position.y;
-        written[3u * lane + 2u] = position.z;
-        workgroupBarrier();
-        for (var i = lane; i < words; i += LANES) {
-            positions[3u * (first + base) + i] = written[i];
-        }
-        workgroupBarrier();
-        written[3u * lane] = normal.x;
-        written[3u * lane + 1u] = normal.y;
-        written[3u * lane + 2u] = normal.z;
-        workgroupBarrier();
-        for (var i = lane; i < words; i += LANES) {
-            normals[3u * (first + base) + i] = written[i];
+        if (mine) {
+            // Below this, single precision has no direction left.
+            let length2 = dot(gradient, gradient);
+            let usable = length2 > 1e-14;
+            let normal = gradient * select(0.0, inverseSqrt(length2), usable);
+            if (!usable) {
+                atomicAdd(&tally.flat, 1u);
+            }
+            if (NEAREST) {
+                sources[first + vertex] = atoms[lists[head.x + source]].source;
+            }
+            // Whole steps are exact; the fraction is added before the one multiplication.
+            let position = (vec3<f32>(origin - params.centre) + p) * params.spacing;
+            let at = 3u * (first + vertex);
+            positions[at] = position.x;
+            positions[at + 1u] = position.y;
+            positions[at + 2u] = position.z;
+            normals[at] = normal.x;
+            normals[at + 1u] = normal.y;
+            normals[at + 2u] = normal.z;
         }
     }
 }

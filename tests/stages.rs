@@ -8,11 +8,12 @@ mod gpu_support;
 use std::collections::HashMap;
 
 use bytemuck::{Pod, pod_collect_to_vec};
-use gpu_support::{KERNELS, engine_with, job, params, sample, spheres};
+use gpu_support::{KERNELS, Random, engine_with, job, params, sample, spheres};
 use molmesh::gpu::GpuJob;
 use molmesh::gpu::probe::Bench;
 use molmesh::surface::cpu::probe::{Probe, ProbedBrick, ProbedSurface, probe};
-use molmesh::surface::layout::{GROUP, Record, Tally};
+use molmesh::surface::layout::{GROUP, NONE, Record, Tally};
+use molmesh::surface::plan::Plan;
 use molmesh::surface::{Kernel, Spheres, Stage, SurfaceLimits};
 
 /// Densities differ by at most this part of them, or of a tenth where they are smaller.
@@ -40,6 +41,16 @@ fn u32_of(n: usize) -> u32 {
     u32::try_from(n).unwrap()
 }
 
+/// Where each brick of a plan is, in bricks.
+fn coords(plan: &Plan) -> Vec<Vec<i32>> {
+    let coord = |&brick: &u32| {
+        let tile = plan.tiles[(brick >> 9) as usize].coord;
+        let local = [0, 3, 6].map(|shift| i32::try_from(brick >> shift & 7).unwrap());
+        local.iter().zip(tile).map(|(b, t)| 8 * t + b).collect()
+    };
+    plan.bricks.iter().map(coord).collect()
+}
+
 impl Setup {
     fn new(spheres: &Spheres, kernel: Kernel, resolution: f64) -> Self {
         let params = params(kernel, resolution);
@@ -48,16 +59,7 @@ impl Setup {
         let rows = [probe.mesh.n_vertices(), probe.mesh.n_triangles()].map(u32_of);
         let bench = Bench::new(engine_with(|_| ()), &job, rows[0], rows[1]).unwrap();
         let plan = &job.prepared.plan;
-        let coord = |&brick: &u32| {
-            let tile = plan.tiles[(brick >> 9) as usize].coord;
-            [0, 3, 6]
-                .map(|shift| i32::try_from(brick >> shift & 7).unwrap())
-                .iter()
-                .zip(tile)
-                .map(|(b, t)| 8 * t + b)
-                .collect::<Vec<_>>()
-        };
-        let coords: Vec<Vec<i32>> = plan.bricks.iter().map(coord).collect();
+        let coords = coords(plan);
         let mut bricks: HashMap<Vec<i32>, ProbedBrick> =
             probe.bricks.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
         let mut surface: HashMap<Vec<i32>, ProbedSurface> =
@@ -103,9 +105,20 @@ impl Setup {
         self.bricks.iter().flat_map(|b| b.as_ref().map_or([0; 8], |b| b.inside)).flat_map(halves).collect()
     }
 
+    /// Every brick's neighbours.
+    fn near(&self) -> Vec<[u32; 8]> {
+        let coords: Vec<Vec<i32>> = coords(&self.job.prepared.plan);
+        let ids: HashMap<&[i32], u32> = coords.iter().map(Vec::as_slice).zip(0..).collect();
+        let neighbour = |at: &[i32], n: usize| {
+            let there: Vec<i32> = at.iter().enumerate().map(|(k, c)| c + i32::from(n >> k & 1 == 1)).collect();
+            ids.get(&there[..]).copied().unwrap_or(NONE)
+        };
+        coords.iter().map(|at| std::array::from_fn(|n| neighbour(at, n))).collect()
+    }
+
     fn records(&self) -> Vec<Record> {
-        let record = |b: &Option<ProbedSurface>| {
-            let mut record = Record { crossing: [0; 48], layers: [0; 8] };
+        let record = |(b, near): (&Option<ProbedSurface>, [u32; 8])| {
+            let mut record = Record { crossing: [0; 48], layers: [0; 8], near };
             let Some(b) = b else { return record };
             let words: Vec<u32> = b.crossing.iter().flat_map(|w| halves(*w)).collect();
             record.crossing.copy_from_slice(&words);
@@ -115,7 +128,7 @@ impl Setup {
             }
             record
         };
-        self.surface.iter().map(record).collect()
+        self.surface.iter().zip(self.near()).map(record).collect()
     }
 
     fn counts(&self) -> Vec<u32> {
@@ -183,6 +196,10 @@ fn setups() -> Vec<(String, Setup)> {
         .map(|s| [s - 40.0, 0.4 * s - 31.9, 31.7 - 0.7 * s, 1.3 + 0.01 * s])
         .collect();
     all.push(("seams".to_owned(), Setup::new(&spheres(&seams), Kernel::Gaussian, 0.5)));
+    // More candidates than a list's first pass has room for; within one tile, as the CPU gives atoms to tiles without slack.
+    let crowd: Vec<[f64; 4]> =
+        Random(5).cloud(700, 6.0).iter().map(|[x, y, z, r]| [x + 8.0, y + 8.0, z + 8.0, *r]).collect();
+    all.push(("crowd".to_owned(), Setup::new(&spheres(&crowd), Kernel::Gaussian, 0.5)));
     all.push(("one atom".to_owned(), Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5)));
     all
 }

@@ -5,18 +5,18 @@ fn below(bit: u32) -> u32 {
     return (1u << bit) - 1u;
 }
 
-// Position of the set bit that has `rank` set bits below it.
+// Position of the set bit that has `rank` set bits below it. Written out, as the device's compiler does not unroll.
 fn select_bit(word: u32, rank: u32) -> u32 {
     var rest = word;
     var left = rank;
     var at = 0u;
-    for (var step = 16u; step > 0u; step = step >> 1u) {
-        let n = countOneBits(rest & below(step));
-        if (left >= n) {
-            left -= n;
-            at += step;
-            rest = rest >> step;
-        }
-    }
-    return at;
+    var n = countOneBits(rest & 0xffffu);
+    if (left >= n) { left -= n; at = 16u; rest = rest >> 16u; }
+    n = countOneBits(rest & 0xffu);
+    if (left >= n) { left -= n; at += 8u; rest = rest >> 8u; }
+    n = countOneBits(rest & 0xfu);
+    if (left >= n) { left -= n; at += 4u; rest = rest >> 4u; }
+    n = countOneBits(rest & 0x3u);
+    if (left >= n) { left -= n; at += 2u; rest = rest >> 2u; }
+    return at + select(0u, 1u, left >= (rest & 1u));
 }

@@ -4,6 +4,8 @@ struct Record {
     crossing: array<u32, 48>,
     // Per layer the vertices before it (16 bits), and those of its x and y edges (8 bits each).
     layers: array<u32, 8>,
+    // The brick and its neighbours, or NONE: bit 0 is a step along x, 1 y, 2 z.
+    near: array<u32, 8>,
 }
 
 // Vertices of a brick before the word of `axis` in a layer.

@@ -122,7 +122,7 @@ mod tests {
                 zero,
                 pad
             ),
-            host!("Record", Record, crossing, layers),
+            host!("Record", Record, crossing, layers, near),
             host!("Tally", Tally, list_end, vertices, triangles, flat),
             host!("Tile", Tile, coord, base, bricks, before, around),
         ]

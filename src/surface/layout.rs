@@ -3,6 +3,8 @@
 
 use bytemuck::{Pod, Zeroable};
 
+use super::cases::{CASES, CellEdge, cell_edge};
+
 /// Marks a tile or brick that does not exist.
 pub const NONE: u32 = u32::MAX;
 
@@ -103,6 +105,8 @@ pub struct Record {
     pub crossing: [u32; 48],
     /// Per layer the vertices before it (16 bits), those of its x edges (8) and of its y edges (8).
     pub layers: [u32; 8],
+    /// The brick and its neighbours towards +x (bit 0), +y (1), +z (2), or [`NONE`].
+    pub near: [u32; 8],
 }
 
 /// Counters that the host reads back.
@@ -123,33 +127,58 @@ pub struct Tally {
 pub const SAMPLES: u64 = 512;
 /// Bricks of a group, whose counts `classify` adds up for `scan`.
 pub const GROUP: u32 = 1024;
-/// Words of the case table: the number of triangles of each case, then five triangles of each, four bits a corner.
-pub const CASE_WORDS: usize = 256 + 5 * 256;
+/// Words of the case table: the number of triangles of each case; the same, eight cases a word; the twelve edges of a
+/// cell, and four words of nothing; then two words a case, four bits a corner of its triangles.
+pub const CASE_WORDS: usize = 256 + 32 + 16 + 2 * 256;
 
 /// The case table as the shaders read it.
 #[must_use]
 pub fn case_table() -> Vec<u32> {
-    use super::cases::CASES;
-    let counts = CASES.count.iter().map(|&n| u32::from(n));
-    let corners = |t: &[u8; 3]| t.iter().rev().fold(0, |word, &edge| word << 4 | u32::from(edge));
-    counts.chain(CASES.triangles.iter().flatten().map(corners)).collect()
+    let counts = || CASES.count.iter().map(|&n| u32::from(n));
+    let eight: Vec<u32> = counts().collect();
+    let packed = eight.chunks(8).map(|counts| counts.iter().rev().fold(0, |word, n| word << 4 | n));
+    let edges = (0..16).map(|e| if e < 12 { edge_code(e) } else { 0 });
+    let rows = CASES.triangles.iter().flat_map(|row| {
+        let corners = row.as_flattened().iter().rev().fold(0_u64, |row, &edge| row << 4 | u64::from(edge));
+        halves(corners)
+    });
+    counts().chain(packed).chain(edges).chain(rows).collect()
+}
+
+/// An edge of a cell as a step from the cell's sample to its own: 1 along x, 16 along y. Behind four rows begins another
+/// word of edges, worth 64; a layer has 3 of them, with the first row of the brick behind, and an axis 9 layers.
+fn edge_code(edge: u8) -> u32 {
+    let CellEdge { offset, axis } = cell_edge(edge);
+    let [x, y, z] = offset.map(u32::from);
+    x + 16 * y + 64 * (3 * z + 27 * u32::from(axis))
+}
+
+/// The lower and the upper 32 bits.
+pub(super) fn halves(word: u64) -> [u32; 2] {
+    let part = |v: u64| u32::try_from(v & u64::from(u32::MAX)).unwrap_or_default();
+    [part(word), part(word >> 32)]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::surface::cases::CASES;
 
     #[test]
     fn the_case_table_unpacks_to_the_cases() {
         let table = case_table();
         assert_eq!(table.len(), CASE_WORDS);
+        for (e, &code) in (0..12).zip(&table[288..]) {
+            let CellEdge { offset, axis } = cell_edge(e);
+            let steps = [code & 15, code >> 4 & 3, (code >> 6) % 27 / 3].map(|step| u8::try_from(step).unwrap());
+            assert_eq!((steps, code / (64 * 27)), (offset, u32::from(axis)), "edge {e}");
+        }
         for case in 0..=255_u8 {
             let at = usize::from(case);
             let n = table[at] as usize;
-            let unpack = |word: u32| [0, 4, 8].map(|shift| u8::try_from(word >> shift & 15).unwrap());
-            let rows: Vec<[u8; 3]> = table[256 + 5 * at..][..n].iter().map(|&word| unpack(word)).collect();
-            assert_eq!(rows, CASES.of(case), "case {case}");
+            assert_eq!(table[256 + at / 8] as usize >> (4 * (at % 8)) & 15, n);
+            let row = u64::from(table[304 + 2 * at]) | u64::from(table[305 + 2 * at]) << 32;
+            let corners: Vec<u8> = (0..3 * n).map(|i| u8::try_from(row >> (4 * i) & 15).unwrap()).collect();
+            assert_eq!(corners, CASES.of(case).as_flattened(), "case {case}");
         }
     }
 }

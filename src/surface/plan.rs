@@ -12,7 +12,7 @@ use super::control::Control;
 use super::cpu::{self, Constants, SlopeConstants};
 use super::error::SurfaceError;
 use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_u32, to_u64};
-use super::layout::{NONE, Params, Tile};
+use super::layout::{NONE, Params, Tile, halves};
 use super::marks::{Bits, Marked, local_of, mark_run, merge, runs};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
@@ -231,12 +231,6 @@ fn set_bits(bits: &Bits) -> impl Iterator<Item = u32> + '_ {
             bit.map(|bit| z << 6 | bit)
         })
     })
-}
-
-/// The lower and the upper 32 bits.
-fn halves(word: u64) -> [u32; 2] {
-    let part = |v: u64| u32::try_from(v & u64::from(u32::MAX)).unwrap_or_default();
-    [part(word), part(word >> 32)]
 }
 
 #[cfg(test)]
