@@ -162,7 +162,10 @@ mod tests {
             assert!(f64::from(step.reach()) >= extent);
         }
         for nonsense in [f64::NAN, f64::INFINITY] {
-            assert!(!Step::covering(nonsense).holds(&[[0.0; 3], [1.0; 3]]), "{nonsense} is not covered, and is refused");
+            assert!(
+                !Step::covering(nonsense).holds(&[[0.0; 3], [1.0; 3]]),
+                "{nonsense} is not covered, and is refused"
+            );
         }
     }
 
@@ -197,7 +200,8 @@ mod tests {
         let longest = |scale: f64| {
             let mut worst = 0.0_f64;
             for q in (0..=127).flat_map(|a| (a..=127).flat_map(move |b| (b..=127).map(move |c| [a, b, c]))) {
-                let length = |shift: f64| q.map(|v| (f64::from(v) + shift).max(0.0)).map(|v| v * v).iter().sum::<f64>().sqrt();
+                let length =
+                    |shift: f64| q.map(|v| (f64::from(v) + shift).max(0.0)).map(|v| v * v).iter().sum::<f64>().sqrt();
                 if (length(-0.5)..=length(0.5)).contains(&scale) {
                     worst = worst.max((length(0.0) / 127.0 - 1.0).abs());
                 }

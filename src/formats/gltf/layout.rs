@@ -1,7 +1,7 @@
 //! What lies where in the buffer of a glTF. Pure arithmetic on counts, so that files of any size can be planned.
 
-use crate::formats::{FormatError, Packing};
 use crate::formats::check::Summary;
+use crate::formats::{FormatError, Packing};
 use crate::surface::Mesh;
 
 /// Largest integer below which every integer is a 32-bit float.
@@ -148,7 +148,10 @@ mod tests {
                 assert!(n_vertices - 1 < (1 << (8 * index_type.bytes())) - 1, "{n_vertices}");
             }
         }
-        assert!(matches!(Layout::plain([1 << 32, 1], Packing::Full), Err(FormatError::TooMany { count: 0x1_0000_0000, .. })));
+        assert!(matches!(
+            Layout::plain([1 << 32, 1], Packing::Full),
+            Err(FormatError::TooMany { count: 0x1_0000_0000, .. })
+        ));
     }
 
     #[test]
