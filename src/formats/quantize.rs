@@ -69,9 +69,8 @@ impl Packing {
 const POSITION_MAX: f32 = 32_767.0;
 /// Largest integer of a normal.
 const NORMAL_MAX: f32 = 127.0;
-/// What a unit normal is multiplied by. With 127 the neighbourhood of one direction, (66.5, 75.5, 77.5), would be rounded to
-/// (67, 76, 78), which is 0.68 % too long and by a hair beyond what glTF's validator takes for a unit vector.
-const NORMAL_SCALE: f32 = 126.99;
+/// The largest square of a normal's length, in units of 1/127, that glTF's validator takes for 1: 0.674 % too long.
+const NORMAL_MAX_SQUARE: i32 = 16_347;
 /// Exponent of the smallest step, 1.5e-5 Å: 32,767 of them are half an ångström, less than any atom's radius.
 const MIN_EXPONENT: i32 = -16;
 
@@ -120,12 +119,31 @@ impl Step {
     }
 }
 
-/// A unit normal as multiples of 1/127: 126.99 times each component, the nearest, ties to even.
+/// A unit normal as multiples of 1/127: 127 times each component, the nearest, ties to even.
+///
+/// Near one direction, (66.5, 75.5, 77.5) and its mirror images, all three components are rounded up by half of a unit, and
+/// the vector comes out by a hair longer than what passes for a unit vector. There the largest component is rounded down.
 #[inline]
 #[must_use]
 pub fn normal(normal: [f32; 3]) -> [i8; 3] {
+    let mut rounded = normal.map(|v| nearest(v * NORMAL_MAX, NORMAL_MAX));
+    if square(rounded) > NORMAL_MAX_SQUARE {
+        shorten(&mut rounded);
+    }
     // The low byte is the number: it lies within ±127.
-    normal.map(|v| i8::from_le_bytes([nearest(v * NORMAL_SCALE, NORMAL_MAX).to_le_bytes()[0]]))
+    rounded.map(|v| i8::from_le_bytes([v.to_le_bytes()[0]]))
+}
+
+#[inline]
+fn square(normal: [i16; 3]) -> i32 {
+    normal.iter().map(|&v| i32::from(v) * i32::from(v)).sum()
+}
+
+/// Moves the largest component, the first of equals, one towards zero.
+#[cold]
+fn shorten(normal: &mut [i16; 3]) {
+    let largest = (1..3).fold(0, |k, other| if normal[other].abs() > normal[k].abs() { other } else { k });
+    normal[largest] -= normal[largest].signum();
 }
 
 /// The integer nearest to `v`, ties to even, within ±`max`, which is below 2¹⁵; what is no number becomes `max`.
@@ -190,28 +208,33 @@ mod tests {
             assert_eq!(f32::from(nearest(v, POSITION_MAX)), v.round_ties_even(), "{v}");
         }
         assert_eq!((nearest(0.5, 127.0), nearest(1.5, 127.0), nearest(-2.5, 127.0)), (0, 2, -2));
-        assert_eq!(normal([f32::NAN, f32::INFINITY, f32::NEG_INFINITY]), [127, 127, -127]);
+        assert_eq!(normal([f32::NAN, 0.0, f32::NEG_INFINITY]), [126, 0, -127], "what is no normal at all");
     }
 
     /// Looks at every integer vector that some unit vector is rounded to.
     #[test]
     fn every_quantised_normal_is_a_unit_vector_to_the_validator() {
         const TOLERANCE: f64 = 0.006_74;
-        let longest = |scale: f64| {
-            let mut worst = 0.0_f64;
-            for q in (0..=127).flat_map(|a| (a..=127).flat_map(move |b| (b..=127).map(move |c| [a, b, c]))) {
-                let length =
-                    |shift: f64| q.map(|v| (f64::from(v) + shift).max(0.0)).map(|v| v * v).iter().sum::<f64>().sqrt();
-                if (length(-0.5)..=length(0.5)).contains(&scale) {
-                    worst = worst.max((length(0.0) / 127.0 - 1.0).abs());
-                }
+        let off = |q: [i16; 3]| (f64::from(square(q)).sqrt() / 127.0 - 1.0).abs();
+        let (mut worst, mut shortened) = (0.0_f64, Vec::new());
+        for q in (0..=127).flat_map(|a| (a..=127).flat_map(move |b| (b..=127).map(move |c| [a, b, c]))) {
+            let length = |shift: f64| q.map(|v| (f64::from(v) + shift).max(0.0).powi(2)).iter().sum::<f64>().sqrt();
+            // Normals are of length 1 to a few parts in 1e7.
+            if length(-0.5) > 127.0 * 1.000_001 || length(0.5) < 127.0 * 0.999_999 {
+                continue;
             }
-            worst
-        };
-        let scale = f64::from(NORMAL_SCALE);
-        // Normals are of length 1 to a few parts in 1e7.
-        assert!(longest(scale * 1.000_001) < TOLERANCE && longest(scale * 0.999_999) < TOLERANCE);
-        assert!(longest(127.0) > TOLERANCE, "the reason for the other scale");
+            let mut kept = q;
+            if square(q) > NORMAL_MAX_SQUARE {
+                assert!(off(q) > TOLERANCE);
+                shorten(&mut kept);
+                shortened.push((q, kept));
+            }
+            worst = worst.max(off(kept));
+        }
+        assert!(worst < TOLERANCE, "{worst}");
+        assert_eq!(shortened, [([67, 76, 78], [67, 76, 77])]);
+        let length = (66.5_f32 * 66.5 + 75.5 * 75.5 + 77.5 * 77.5).sqrt();
+        assert_eq!(normal([-66.5, 77.5, 75.5].map(|v| v / length)), [-67, 77, 76]);
         assert_eq!((normal([1.0, 0.0, 0.0]), normal([0.0, -1.0, 0.0])), ([127, 0, 0], [0, -127, 0]));
     }
 }
