@@ -22,7 +22,7 @@ fn fails(input: impl AsRef<[u8]>, flags: &[&str], code: i32) -> String {
 
 #[test]
 fn two_is_bad_usage() {
-    let cases: [(&[&str], &str); 14] = [
+    let cases: [(&[&str], &str); 16] = [
         (&["--resolution", "0"], "resolution"),
         (&["--resolution", "-1"], "resolution"),
         (&["--resolution", "fine"], "`fine`"),
@@ -36,6 +36,8 @@ fn two_is_bad_usage() {
         (&["--altloc", "AB"], "altloc"),
         (&["--select", "everything"], "select"),
         (&["--threads", "0"], "threads"),
+        (&["--compress", "zip"], "none, quantize"),
+        (&["--compress", "quantize", "--format", "stl"], "glb, gltf"),
         (&["--isovalue", "900000"], "isovalue"),
     ];
     for (flags, part) in cases {
@@ -75,6 +77,9 @@ fn two_is_an_output_without_a_known_format() {
         assert!(stderr(&done).contains("hint: name the format with --format"), "{}", stderr(&done));
     }
     assert_code(&mesh(&input, &folder.path("out.glb"), &["--format", "pdf"]), 2);
+    let packed = mesh(&input, &folder.path("out.ply"), &["--compress", "quantize"]);
+    assert_code(&packed, 2);
+    assert!(stderr(&packed).contains("`quantize` with ply"), "{}", stderr(&packed));
     assert_eq!(folder.entries(), ["in.pdb"]);
 }
 

@@ -83,6 +83,34 @@ fn a_file_has_the_bytes_that_a_pipe_gets() {
     }
 }
 
+/// The step is known before the mesh is, so a file written out of order has the bytes of one written in order.
+#[test]
+fn a_quantised_file_has_the_bytes_that_a_pipe_gets() {
+    let folder = Folder::new();
+    let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
+    let long = folder.file("long.cif", long_report());
+    for (input, resolution) in [(Path::new(sample), "0.6"), (Path::new(sample), "0.3"), (&long, "0.3")] {
+        let output = folder.path("out.glb");
+        let flags = ["--quiet", "--resolution", resolution, "--compress", "quantize"];
+        assert_code(&mesh(input, &output, &flags), 0);
+        let piped = run(["mesh", input.to_str().unwrap(), "-o", "-"].iter().chain(&flags));
+        assert_code(&piped, 0);
+        let file = fs::read(&output).unwrap();
+        assert!(piped.stdout == file, "{resolution}: {} and {} bytes", piped.stdout.len(), file.len());
+        let full = folder.path("full.glb");
+        assert_code(&mesh(input, &full, &flags[..3]), 0);
+        let saved = fs::metadata(full).unwrap().len() - file.len() as u64;
+        let json_bytes = u32::from_le_bytes(file[12..16].try_into().unwrap()) as usize;
+        let document = json(std::str::from_utf8(&file[20..20 + json_bytes]).unwrap());
+        let vertices = document["asset"]["extras"]["vertices"].as_u64().unwrap();
+        // The heads differ by a few words, or not at all.
+        assert!(saved.abs_diff(12 * vertices) < 1000, "{saved} bytes saved on {vertices} vertices");
+        assert_eq!(json_bytes + 28 == 16_384, file.len() > 1 << 20, "{resolution}: {json_bytes} bytes of JSON");
+    }
+    let told = mesh(Path::new(sample), &folder.path("out.gltf"), &["--compress", "quantize"]);
+    assert!(stderr(&told).contains("quantised in steps of 0.0009765625 Å"), "{}", stderr(&told));
+}
+
 /// More components than a report lists, and the longest title.
 fn long_report() -> String {
     let names = ["group_PDB", "id", "type_symbol", "label_atom_id", "label_comp_id", "label_asym_id", "label_seq_id"];

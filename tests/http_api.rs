@@ -243,6 +243,8 @@ fn bad_parameters_are_named_with_what_was_expected() {
         ("report=xml", "report", None),
         ("check=lax", "check", None),
         ("proof=trust", "proof", None),
+        ("compress=draco", "compress", None),
+        ("compress=quantize&format=ply", "compress", None),
     ] {
         let problem = SERVER.post(&format!("/v1/meshes?{query}"), &[], SAMPLE).problem(400, "bad-parameter");
         assert_eq!(problem["parameter"], parameter, "{query}");
@@ -254,6 +256,59 @@ fn bad_parameters_are_named_with_what_was_expected() {
         let known = !query.starts_with("xyzzy") && nearest.is_none();
         assert_eq!(problem["expected"].is_string(), known && !repeated, "{query}: {problem}");
     }
+}
+
+#[test]
+fn quantised_meshes_are_glb_or_gltf() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let archive = server.dir.path().join("archive/pt");
+    std::fs::create_dir_all(&archive).unwrap();
+    std::fs::write(archive.join("pdb4pti.ent.gz"), gzip(SAMPLE)).unwrap();
+    let document = |body: &[u8]| -> serde_json::Value {
+        let json = if body.starts_with(b"glTF") {
+            &body[20..20 + u32::from_le_bytes(body[12..16].try_into().unwrap()) as usize]
+        } else {
+            body
+        };
+        serde_json::from_slice(json).unwrap()
+    };
+    let plain = server.post("/v1/meshes", &[], SAMPLE);
+    let small = server.post("/v1/meshes?compress=quantize", &[], SAMPLE);
+    assert_eq!((plain.status, small.status), (200, 200), "{}", String::from_utf8_lossy(&small.body));
+    let vertices: usize = plain.header("molmesh-vertices").unwrap().parse().unwrap();
+    assert_eq!(small.header("molmesh-vertices"), plain.header("molmesh-vertices"));
+    // Their heads differ by a few words, or not at all.
+    let saved = plain.body.len() - small.body.len();
+    assert!(saved.abs_diff(12 * vertices) < 1000, "{saved} bytes saved on {vertices} vertices");
+    assert_ne!(small.header("etag"), plain.header("etag"));
+    let none = server.post("/v1/meshes?compress=none", &[], SAMPLE);
+    assert!(none.body == plain.body && none.header("etag") == plain.header("etag"));
+    let step = document(&small.body)["asset"]["extras"]["quantization"]["step"].clone();
+    assert!(step.as_f64().is_some_and(|step| step > 0.0 && step < 0.01), "{step}");
+    let text = server.post("/v1/meshes?compress=quantize&format=gltf", &[], SAMPLE);
+    assert_eq!(document(&text.body)["extensionsRequired"][0], "KHR_mesh_quantization");
+    assert_eq!(document(&plain.body).get("extensionsRequired"), None);
+    let report = server.post("/v1/meshes?compress=quantize&report=json", &[], SAMPLE).json();
+    assert_eq!(report["quantization"]["step"], step);
+    let entry = server.get("/v1/pdb/4pti/surface.glb?compress=quantize");
+    assert!(entry.body == small.body);
+
+    // The format may come from elsewhere than the query.
+    let accept = server.post("/v1/meshes?compress=quantize", &[("accept", "model/stl")], SAMPLE);
+    for refused in [accept, server.get("/v1/pdb/4pti/surface.obj?compress=quantize")] {
+        let problem = refused.problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], "compress");
+        assert!(problem["expected"].as_str().unwrap().contains("glb, gltf"), "{problem}");
+    }
+    let form =
+        b"--XX\r\ncontent-disposition: form-data; name=\"compress\"\r\n\r\nquantize\r\n--XX\r\ncontent-disposition: \
+        form-data; name=\"file\"\r\n\r\nx\r\n--XX--\r\n";
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    let refused = server.post("/v1/meshes", &[kind, ("accept", "application/ply")], form);
+    assert_eq!(refused.problem(400, "bad-parameter")["parameter"], "compress");
+    let can = server.get("/v1/capabilities").json();
+    let compress = can["parameters"].as_array().unwrap().iter().find(|p| p["name"] == "compress").unwrap();
+    assert_eq!(compress["values"], serde_json::json!(["none", "quantize"]));
 }
 
 #[test]

@@ -141,6 +141,7 @@ fn canonical_texts_tell_jobs_apart_and_nothing_else() {
         &[("select", "polymer")],
         &[("format", "stl")],
         &[("report", "json")],
+        &[("compress", "none")],
         &[("isovalue", "1e0")],
     ] {
         assert_eq!(text(same), plain, "{same:?}");
@@ -157,6 +158,7 @@ fn canonical_texts_tell_jobs_apart_and_nothing_else() {
         &[("altloc", "B")],
         &[("atom_ids", "true")],
         &[("proof", "exact")],
+        &[("compress", "quantize")],
         &[("paper_a", "1"), ("paper_b", "2")],
         &[("paper_a", "2"), ("paper_b", "1")],
         &[("kernel", "inverse-square")],

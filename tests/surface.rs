@@ -11,7 +11,7 @@
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, Kernel, Measures, Mesh, MeshPart, MeshSink, Meshed, Observer, Proof,
-    ReferenceBackend, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    ReferenceBackend, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceOptions, SurfaceParams, lattice,
 };
 use std::collections::BTreeSet;
 use std::sync::Mutex;
@@ -528,6 +528,35 @@ fn what_is_poured_is_what_is_returned() {
             assert_eq!((poured.n_vertices, poured.n_triangles), (mesh.n_vertices(), mesh.n_triangles()));
             assert_eq!((poured.bounds, poured.centre, poured.grid), (mesh.bounds(), whole.mesh.centre, whole.grid));
             assert_eq!(Some(&poured.measures), whole.measures.as_ref());
+        }
+    }
+}
+
+#[test]
+fn every_vertex_lies_within_the_extent_that_is_known_before() {
+    let far = spheres(&[[900.0, -70.0, 3.3, 1.7], [930.2, -64.0, 3.4, 2.9]]);
+    for at in [spheres(&[[0.3, 0.2, 0.1, 1.7]]), spheres(&Random(8).cloud(60, 25.0)), far] {
+        for kernel in Kernel::ALL {
+            for h in [0.31, 1.0] {
+                let mut options =
+                    SurfaceOptions { kernel: Some(*kernel), resolution: Some(h), ..SurfaceOptions::default() };
+                // At a low level the surface comes closest to where densities end.
+                for isovalue in [None, Some(0.001)] {
+                    options.isovalue = isovalue;
+                    let params = SurfaceParams::new(&options).unwrap();
+                    let extent = lattice::extent(&at, &params);
+                    for backend in [&CpuBackend::new(Some(2)).unwrap() as &dyn Backend, &ReferenceBackend] {
+                        let bounds = run_on(backend, &at, &params).mesh.bounds();
+                        let furthest = bounds.as_flattened().iter().fold(0.0_f64, |far, c| far.max(f64::from(c.abs())));
+                        assert!(furthest <= extent, "{kernel} {h} {isovalue:?}: {furthest} beyond {extent}");
+                        // It is no wild guess: at the lowest level hardly more than its margin is left.
+                        assert!(
+                            isovalue.is_none() || extent - furthest < 4.0 * h + 1.0,
+                            "{kernel} {h}: {furthest} of {extent}"
+                        );
+                    }
+                }
+            }
         }
     }
 }

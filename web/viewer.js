@@ -22,9 +22,12 @@ void main() {
   color = vec4(vec3(0.16, 0.62, 0.5) * (0.3 + 0.7 * light) + 0.15 * rim, 1.0);
 }`;
 
-const TYPES = { 5121: Uint8Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
+const TYPES = { 5120: Int8Array, 5121: Uint8Array, 5122: Int16Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
 
-/** Positions, normals and indices of the first primitive of a GLB, without copying the buffer. */
+/**
+ * Positions, normals and indices of the first primitive of a GLB, without copying the buffer. Positions, `min` and `max` are in the
+ * mesh's own units, whatever the node makes of them; rows may be padded.
+ */
 export function readGlb(buffer) {
   const head = new DataView(buffer);
   if (head.getUint32(0, true) !== 0x46546c67) throw new Error("no GLB");
@@ -35,13 +38,14 @@ export function readGlb(buffer) {
   const array = (index) => {
     const accessor = json.accessors[index];
     const view = json.bufferViews[accessor.bufferView];
-    const width = accessor.type === "VEC3" ? 3 : 1;
     const Type = TYPES[accessor.componentType];
-    if (view.byteStride && view.byteStride !== width * Type.BYTES_PER_ELEMENT) throw new Error("interleaved attributes");
-    return new Type(buffer, binary + (view.byteOffset ?? 0) + (accessor.byteOffset ?? 0), accessor.count * width);
+    const stride = view.byteStride ?? (accessor.type === "VEC3" ? 3 : 1) * Type.BYTES_PER_ELEMENT;
+    if (stride * accessor.count !== view.byteLength) throw new Error("interleaved attributes");
+    const data = new Type(buffer, binary + (view.byteOffset ?? 0), view.byteLength / Type.BYTES_PER_ELEMENT);
+    return { data, type: accessor.componentType, normalized: accessor.normalized ?? false, stride };
   };
   const { min, max } = json.accessors[attributes.POSITION];
-  return { positions: array(attributes.POSITION), normals: array(attributes.NORMAL), indices: array(indices), min, max };
+  return { positions: array(attributes.POSITION), normals: array(attributes.NORMAL), indices: array(indices).data, min, max };
 }
 
 /** Draws a mesh into a canvas. */
@@ -84,11 +88,12 @@ export class Viewer {
       gl.bufferData(target, data, gl.STATIC_DRAW);
       return buffer;
     };
-    this.buffers = [["position", positions], ["normal", normals]].map(([name, data]) => {
+    this.buffers = [["position", positions], ["normal", normals]].map(([name, { data, type, normalized, stride }]) => {
       const buffer = upload(gl.ARRAY_BUFFER, data);
       const location = gl.getAttribLocation(program, name);
       gl.enableVertexAttribArray(location);
-      gl.vertexAttribPointer(location, 3, gl.FLOAT, false, 0, 0);
+      // glTF's numbers for types are WebGL's.
+      gl.vertexAttribPointer(location, 3, type, normalized, stride, 0);
       return buffer;
     });
     this.buffers.push(upload(gl.ELEMENT_ARRAY_BUFFER, indices));

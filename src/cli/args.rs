@@ -89,6 +89,10 @@ pub(crate) struct MeshArgs {
     /// glb, gltf, ply, stl or obj; by default what the output's extension says, glb on stdout
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
+    /// How glb and gltf store vertices: none, or quantize (12 bytes instead of 24: 16-bit positions, 8-bit normals)
+    /// [default: none]
+    #[arg(long, value_name = "HOW")]
+    pub(crate) compress: Option<String>,
     /// What runs the meshing
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: BackendName,

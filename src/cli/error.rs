@@ -220,6 +220,8 @@ fn format_code(error: &FormatError) -> i32 {
         | FormatError::IndexOutOfRange { .. }
         | FormatError::NotFinite { .. }
         | FormatError::NotUnit { .. }
+        | FormatError::BeyondStep { .. }
+        | FormatError::NotQuantized { .. }
         | FormatError::Json { .. } => code::INTERNAL,
     }
 }

@@ -29,6 +29,7 @@ use super::{interrupt, request};
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let Request { job, format: asked, strict, .. } = request::parse(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
+    request::suits(&job, format)?;
     let limits = request::limits(&args.limits);
     let asked = Asked { backend: args.backend, devices: &args.devices.devices, threads: args.threads };
     let picked = backend::pick(&asked, &backend::Use::Once)?;
@@ -216,7 +217,7 @@ fn finding(finding: &Diagnostic) -> String {
 fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<Report, CliError> {
     sink.progress("encode", 0.0);
     let start = Instant::now();
-    let written = Encoder::trusting(format, &product.mesh, &product.meta())?.write(out);
+    let written = Encoder::packed(format, product.packing, &product.mesh, &product.meta())?.write(out);
     let encoding = start.elapsed().saturating_sub(out.writing);
     written.map_err(|source| out.failure(source))?;
     let mut report = product.report.clone();

@@ -1,17 +1,27 @@
 //! Flags to a job: the same names and values that a query has, read by the same reader.
 
-use molmesh::pipeline::JobLimits;
+use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError, Request};
+use molmesh::pipeline::{Job, JobLimits};
 
 use super::args::{LimitArgs, MeshArgs};
 use super::error::CliError;
 
 /// What the flags ask for.
 pub(super) fn parse(args: &MeshArgs) -> Result<Request, CliError> {
-    params::parse(pairs(args)).map_err(|error| match error {
+    params::parse(pairs(args)).map_err(|error| refusal(&error))
+}
+
+/// Refuses what does not go with the format that the output's name says.
+pub(super) fn suits(job: &Job, format: Format) -> Result<(), CliError> {
+    params::suits(job, format).map_err(|error| refusal(&error))
+}
+
+fn refusal(error: &ParamError) -> CliError {
+    match error {
         ParamError::Unknown { .. } | ParamError::Repeated { .. } => CliError::Internal(error.to_string()),
         ParamError::BadValue { .. } => CliError::Usage { message: error.to_string(), hint: None },
-    })
+    }
 }
 
 /// The limits, with what the flags change.
@@ -30,6 +40,7 @@ fn pairs(args: &MeshArgs) -> Vec<(&'static str, String)> {
     let (surface, atoms) = (&args.surface, &args.selection);
     let given = [
         ("format", &args.format),
+        ("compress", &args.compress),
         ("kernel", &surface.kernel),
         ("preset", &surface.preset),
         ("resolution", &surface.resolution),
@@ -97,6 +108,7 @@ mod tests {
             let value = match parameter.name {
                 "atom_ids" | "check" => vec![flag.as_str()],
                 "proof" => vec![&flag, "exact"],
+                "compress" => vec![&flag, "quantize"],
                 "kernel" => vec![&flag, "soft-object"],
                 "preset" => vec![&flag, "blinn"],
                 "select" => vec![&flag, "water"],

@@ -28,6 +28,9 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
         [report.bricks, report.surface_bricks, report.samples, report.box_cells].map(grouped);
     page.row("grid", &format!("{bricks} bricks ({with_surface} with surface), {samples} samples; box: {dense} cells"));
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
+    if let Some(quantization) = report.quantization {
+        page.row("vertices", &format!("quantised in steps of {} Å", quantization.step));
+    }
     page.row("proof", &proof(report, style));
     page.row("parts", &parts(report));
     page.row("area", &format!("{} Å²", decimal(report.area)));
@@ -138,6 +141,8 @@ fn decimal(value: f64) -> String {
 
 #[cfg(test)]
 mod tests {
+    use molmesh::pipeline::Quantization;
+
     use super::*;
 
     #[test]
@@ -184,6 +189,7 @@ mod tests {
             component_list: Vec::new(),
             area: 3200.04,
             volume: 7100.0,
+            quantization: Some(Quantization { step: 0.000_976_562_5 }),
             backend: "cpu",
             device: "2 threads".into(),
             backend_reason: "asked for".into(),
@@ -201,6 +207,7 @@ mod tests {
             "300 bricks",
             "153,600 samples",
             "20,000 vertices",
+            "steps of 0.0009765625 Å",
             "39,996 triangles",
             "closed, oriented, NOT manifold, Euler number 2",
             "2 components, of which 1 cavity",

@@ -79,6 +79,20 @@ pub enum FormatError {
         /// The limit, Å.
         limit: f64,
     },
+    /// A position that no 16-bit multiple of the step is near.
+    #[error("a vertex lies beyond {reach} Å from the mesh's centre, the largest coordinate with a step of {step} Å")]
+    BeyondStep {
+        /// The largest coordinate that can be stored, Å.
+        reach: f32,
+        /// The step, Å.
+        step: f32,
+    },
+    /// Only glTF and GLB hold quantised vertices.
+    #[error("{format} cannot hold quantised vertices, glb and gltf can")]
+    NotQuantized {
+        /// The format's name.
+        format: &'static str,
+    },
     /// The JSON part of a glTF could not be made.
     #[error("the glTF document cannot be written as JSON: {reason}")]
     Json {

@@ -42,6 +42,12 @@ impl Format {
         }
     }
 
+    /// Whether it can hold quantised vertices.
+    #[must_use]
+    pub const fn holds_quantized(self) -> bool {
+        matches!(self, Self::Glb | Self::Gltf)
+    }
+
     /// Media type. Registered with IANA, except that of PLY, which has none: `application/ply` is what people send.
     #[must_use]
     pub const fn media_type(self) -> &'static str {

@@ -15,6 +15,7 @@ mod format;
 mod gltf;
 mod obj;
 mod ply;
+pub mod quantize;
 mod stl;
 mod text;
 
@@ -24,6 +25,7 @@ use check::Depth;
 pub use error::FormatError;
 pub use format::{Format, UnknownFormat};
 pub use gltf::{GlbSink, PlaceBytes, PlaceError};
+pub use quantize::{Compress, Packing, Step};
 
 use crate::surface::Mesh;
 
@@ -86,7 +88,7 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn new(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::lay_out(format, mesh, meta, Depth::All)
+        Self::lay_out(format, Packing::Full, mesh, meta, Depth::All)
     }
 
     /// The same for a mesh that a backend returned, whose invariants hold: does not look at normals and indices
@@ -97,14 +99,32 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn trusting(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::lay_out(format, mesh, meta, Depth::Needed(format))
+        Self::packed(format, Packing::Full, mesh, meta)
     }
 
-    fn lay_out(format: Format, mesh: &'a Mesh, meta: &Meta, depth: Depth) -> Result<Self, FormatError> {
+    /// As [`Self::trusting`], with the vertices packed.
+    ///
+    /// # Errors
+    /// Any [`FormatError`]; [`FormatError::NotQuantized`] if `format` has no such packing,
+    /// [`FormatError::BeyondStep`] if the step is too small for the mesh.
+    pub fn packed(format: Format, packing: Packing, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
+        Self::lay_out(format, packing, mesh, meta, Depth::Needed(format))
+    }
+
+    fn lay_out(
+        format: Format,
+        packing: Packing,
+        mesh: &'a Mesh,
+        meta: &Meta,
+        depth: Depth,
+    ) -> Result<Self, FormatError> {
+        if packing != Packing::Full && !format.holds_quantized() {
+            return Err(FormatError::NotQuantized { format: format.extension() });
+        }
         let summary = check::check(mesh, depth)?;
         let plan = match format {
-            Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, &summary, meta)?),
-            Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, &summary, meta)?),
+            Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, packing, &summary, meta)?),
+            Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, packing, &summary, meta)?),
             Format::Ply => Plan::Ply(ply::PlyPlan::new(mesh, meta)),
             Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, meta)?),
             Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, &summary, meta)?),

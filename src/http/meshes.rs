@@ -41,6 +41,7 @@ pub(super) async fn create(
         (None, false) if !upload::is_multipart(&headers) => Some(negotiate::format(&headers)?),
         _ => None,
     };
+    accepted.map_or(Ok(()), |format| params::suits(&request.job, format))?;
     let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
     if !fields.is_empty() {
         pairs.extend(fields);
@@ -51,6 +52,9 @@ pub(super) async fn create(
         (None, None, true) => crate::formats::Format::default(),
         (None, None, false) => negotiate::format(&headers)?,
     };
+    if !request.report {
+        params::suits(&request.job, format)?;
+    }
     let received = start.elapsed();
     let place = app.delivery()?;
     let job = request.job.clone();

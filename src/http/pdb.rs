@@ -44,6 +44,7 @@ pub(super) async fn surface(
             .with("value", value)
             .with("expected", format!("no value here, or the address surface.{value}")));
     }
+    params::suits(&request.job, format)?;
     let id = id.parse().map_err(|error| of_archive(&error))?;
     let (bytes, digest, lease) = fetch(Arc::clone(&app), id).await?;
     let received = start.elapsed();

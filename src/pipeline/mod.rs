@@ -10,17 +10,17 @@ use std::time::Instant;
 use thiserror::Error;
 
 pub use clock::{ProgressSink, StageClock};
-pub use report::Report;
+pub use report::{Quantization, Report};
 
-use crate::formats::Meta;
+use crate::formats::{Compress, GlbSink, Meta, Packing, Step};
 use crate::structure::{self, ReadLimits, Selected, Selection, Structure, StructureError};
 use crate::surface::{
-    Backend, CancelToken, Control, Measures, Mesh, MeshSink, Meshed, Proof, Spheres, Stage, SurfaceError,
-    SurfaceLimits, SurfaceParams,
+    Backend, CancelToken, Control, Measures, Mesh, Meshed, Proof, Spheres, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams, lattice,
 };
 use report::Counts;
 
-/// Everything that decides what a mesh looks like.
+/// Everything that decides what a mesh looks like, and how its vertices are stored.
 #[derive(Debug, Clone, Default)]
 pub struct Job {
     /// Which atoms.
@@ -29,6 +29,8 @@ pub struct Job {
     pub params: SurfaceParams,
     /// How the mesh is proven closed and manifold.
     pub proof: Proof,
+    /// How vertices are stored, in formats that have a choice.
+    pub compress: Compress,
 }
 
 /// Limits of one job.
@@ -55,6 +57,8 @@ pub struct Choice<'a> {
 pub struct Product {
     /// The mesh.
     pub mesh: Mesh,
+    /// How a file stores its vertices.
+    pub packing: Packing,
     /// What was measured.
     pub report: Report,
 }
@@ -122,9 +126,10 @@ pub fn run(
         None => clock.time(Stage::Measure.name(), || Measures::of(&meshed.mesh, job.proof, &control))?,
     };
     let Meshed { mesh, grid, served, .. } = meshed;
-    let counts = Counts { grid, n_vertices: mesh.n_vertices(), n_triangles: mesh.n_triangles(), served };
+    let packing = packing(job, &spheres);
+    let counts = Counts { grid, n_vertices: mesh.n_vertices(), n_triangles: mesh.n_triangles(), served, packing };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
-    Ok(Product { mesh, report })
+    Ok(Product { mesh, packing, report })
 }
 
 /// Whether [`pour`] can run a job: atoms by vertex and the exact proof need the whole mesh.
@@ -133,8 +138,8 @@ pub fn can_pour(job: &Job) -> bool {
     !job.params.atom_ids && job.proof == Proof::Checksum
 }
 
-/// Runs a job that [`can_pour`], handing the mesh on to `sink` part by part: the same mesh and report as [`run`] gives, but
-/// the mesh is never held as a whole.
+/// Runs a job that [`can_pour`], handing the mesh on to `sink` part by part, packed as the job asks: the same mesh and report
+/// as [`run`] gives, but the mesh is never held as a whole.
 ///
 /// # Errors
 /// Any [`JobError`]; [`SurfaceError::Sink`] if `sink` failed.
@@ -145,20 +150,32 @@ pub fn pour(
     choice: &Choice<'_>,
     cancel: &CancelToken,
     progress: &dyn ProgressSink,
-    sink: &dyn MeshSink,
+    sink: &GlbSink<'_>,
 ) -> Result<Poured, JobError> {
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
+    let packing = packing(job, &spheres);
+    sink.pack(packing);
     let poured = clock.pass(|| choice.backend.pour(&spheres, &job.params, &limits.surface, &control, sink))?;
     let counts = Counts {
         grid: poured.grid,
         n_vertices: poured.n_vertices,
         n_triangles: poured.n_triangles,
         served: poured.served,
+        packing,
     };
     let report = Report::new(&structure, &selected, job, choice, &counts, &poured.measures, clock.finish());
     Ok(Poured { report, centre: poured.centre, bounds: poured.bounds })
+}
+
+/// How the vertices of `spheres` are stored. Depends on nothing that the backend computes, so a file can be written, or a
+/// device can fill it, before the mesh is known.
+fn packing(job: &Job, spheres: &Spheres) -> Packing {
+    match job.compress {
+        Compress::None => Packing::Full,
+        Compress::Quantize => Packing::Quantized(Step::covering(lattice::extent(spheres, &job.params))),
+    }
 }
 
 /// Bytes to spheres.

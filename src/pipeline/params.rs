@@ -14,7 +14,7 @@ pub use table::{Domain, Parameter, TABLE};
 
 use super::Job;
 use super::nearest::nearest;
-use crate::formats::Format;
+use crate::formats::{Compress, Format};
 use crate::structure::Selection;
 use crate::surface::{Kernel, PaperParams, Preset, Proof, SurfaceError, SurfaceOptions, SurfaceParams};
 
@@ -81,8 +81,25 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         }
         set(parameter, value, &mut options, &mut selection, &mut request)?;
     }
-    request.job = Job { selection, params: SurfaceParams::new(&options)?, proof: request.job.proof };
+    request.job = Job { selection, params: SurfaceParams::new(&options)?, ..request.job };
+    request.format.map_or(Ok(()), |format| suits(&request.job, format))?;
     Ok(request)
+}
+
+/// Whether a job's mesh can be had in `format`: for a format that was named elsewhere than in the pairs.
+///
+/// # Errors
+/// [`ParamError::BadValue`] for `compress` where the format has nothing of the kind.
+pub fn suits(job: &Job, format: Format) -> Result<(), ParamError> {
+    if job.compress == Compress::None || format.holds_quantized() {
+        return Ok(());
+    }
+    let takes: Vec<_> = Format::ALL.into_iter().filter(|f| f.holds_quantized()).map(Format::extension).collect();
+    Err(ParamError::BadValue {
+        name: "compress",
+        value: format!("`{}` with {format}", job.compress.name()),
+        expected: format!("{}, or one of the formats {}", Compress::None.name(), takes.join(", ")),
+    })
 }
 
 /// The refusal of an unknown name.
@@ -142,6 +159,7 @@ fn set(
         "proof" => request.job.proof = proof(text).ok_or_else(bad)?,
         "check" => request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
         "format" => request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
+        "compress" => request.job.compress = compress(text).ok_or_else(bad)?,
         "report" => request.report = (text == "json").then_some(true).ok_or_else(bad)?,
         _ => return Err(unknown(parameter.name)),
     }
@@ -160,6 +178,10 @@ fn proof(text: &str) -> Option<Proof> {
     [Proof::Checksum, Proof::Exact].into_iter().find(|proof| proof.name() == text)
 }
 
+fn compress(text: &str) -> Option<Compress> {
+    Compress::ALL.into_iter().find(|compress| compress.name() == text)
+}
+
 /// Words separated by commas, none of them empty or with control characters.
 fn list(text: &str) -> Option<Vec<&str>> {
     let words: Vec<&str> = text.split(',').map(str::trim).collect();
@@ -176,7 +198,7 @@ fn one_char(text: &str) -> Option<char> {
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a field that is added without a place here does not compile.
-    let Job { selection, params, proof } = job;
+    let Job { selection, params, proof, compress } = job;
     let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = selection;
     let SurfaceParams {
         kernel,
@@ -194,8 +216,9 @@ pub fn canonical(job: &Job) -> String {
         "kernel={kernel}&resolution={resolution}&isovalue={isovalue}&smoothness={smoothness}\
          &radius_scale={radius_scale}&radius_offset={radius_offset}&cutoff_tolerance={cutoff_tolerance}\
          &preset={preset}&atom_ids={atom_ids}&model={model:?}&chains={chains:?}&polymer={polymer}\
-         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}&proof={}",
-        proof.name()
+         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}&proof={}&compress={}",
+        proof.name(),
+        compress.name()
     );
     let paper = match paper {
         None => Ok(()),

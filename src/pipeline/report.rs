@@ -4,6 +4,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::{Choice, Job};
+use crate::formats::Packing;
 use crate::structure::{Selected, Structure, radii};
 use crate::surface::{GridStats, Measures, Served};
 
@@ -18,6 +19,13 @@ pub struct ComponentReport {
     pub area: f64,
     /// Å³, negative for a cavity.
     pub volume: f64,
+}
+
+/// How coarse the file's vertices are.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Quantization {
+    /// Distance between neighbouring coordinates, Å; a vertex is moved by half of it at most along each axis.
+    pub step: f32,
 }
 
 /// A job's report. Field names are the JSON names.
@@ -80,6 +88,9 @@ pub struct Report {
     pub area: f64,
     /// Å³.
     pub volume: f64,
+    /// How coarse the file's vertices are; absent where they are not quantised.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub quantization: Option<Quantization>,
     /// The backend that ran.
     pub backend: &'static str,
     /// What it ran on.
@@ -99,6 +110,7 @@ pub(super) struct Counts {
     pub(super) n_vertices: usize,
     pub(super) n_triangles: usize,
     pub(super) served: Option<Served>,
+    pub(super) packing: Packing,
 }
 
 impl Report {
@@ -155,6 +167,7 @@ impl Report {
                 .collect(),
             area: measures.area,
             volume: measures.volume,
+            quantization: counts.packing.step().map(|step| Quantization { step: step.length() }),
             backend: served.backend,
             device: served.device,
             backend_reason: match &served.instead {

@@ -118,6 +118,20 @@ impl Lattice {
     }
 }
 
+/// How far from the mesh's centre a vertex can lie along any axis, Å, by spheres and parameters alone: known before any
+/// density is. 0 without spheres.
+#[must_use]
+pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
+    let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
+    let profile = Profile::new(params);
+    let largest = f64::from(spheres.radii().iter().copied().fold(0.0, f32::max));
+    let reach = profile.reach(profile.length(largest * params.radius_scale + params.radius_offset));
+    let half = (0..3).map(|k| 0.5 * (hi[k] - lo[k])).fold(0.0, f64::max);
+    // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within reach.
+    // Half a spacing more is far above every rounding.
+    half + reach + 2.0 * params.resolution
+}
+
 /// Sorts by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order last.
 fn sort_canonically(atoms: &mut Vec<LatticeAtom>) {
     let rank = tile_ranks(atoms);

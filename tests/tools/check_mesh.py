@@ -23,14 +23,28 @@ def load(path):
         part = scene.geometry[name].copy(include_cache=True)
         written = part._cache.cache.get("vertex_normals")
         if written is not None:
-            # Row vectors times the inverse are column vectors times the inverse transpose.
-            normals.append(np.array(written) @ np.linalg.inv(transform[:3, :3]))
+            # Row vectors times the inverse are column vectors times the inverse transpose; a scale does not make them longer.
+            linear = transform[:3, :3] / np.cbrt(np.linalg.det(transform[:3, :3]))
+            normals.append(np.array(written, dtype=np.float64) / normal_unit(path) @ np.linalg.inv(linear))
         part.apply_transform(transform)
         parts.append(part)
     if not parts:
         return trimesh.Trimesh(process=False), None, []
     mesh = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)
     return mesh, np.concatenate(normals) if len(normals) == len(parts) else None, parts
+
+
+def normal_unit(path):
+    """What stands for 1 in the normals of a glTF: trimesh hands integers on as they are."""
+    if not path.endswith((".glb", ".gltf")):
+        return 1.0
+    with open(path, "rb") as file:
+        data = file.read()
+    document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")] if path.endswith(".glb") else data)
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    accessor = document["accessors"][attributes["NORMAL"]]
+    # 5120 is a signed byte.
+    return 127.0 if accessor["componentType"] == 5120 and accessor.get("normalized") else 1.0
 
 
 def weld(mesh):

@@ -76,8 +76,18 @@ pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
     let rows = |accessor: &Value, component: u64, shape: &str, bytes: usize| {
         rows(json, bin, accessor, component, shape, bytes)
     };
-    contents.positions = rows(&attributes["POSITION"], 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
-    contents.normals = rows(&attributes["NORMAL"], 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
+    if let Some(scale) = quantized_scale(json) {
+        let position =
+            |r: &&[u8]| std::array::from_fn(|k| f32::from(i16::from_le_bytes([r[2 * k], r[2 * k + 1]])) * scale);
+        let normal = |r: &&[u8]| std::array::from_fn(|k| (f32::from(r[k].cast_signed()) / 127.0).max(-1.0));
+        assert_eq!(accessor_of(json, &attributes["NORMAL"])["normalized"], true);
+        assert!(accessor_of(json, &attributes["POSITION"])["normalized"].as_bool().is_none_or(|n| !n));
+        contents.positions = rows(&attributes["POSITION"], 5122, "VEC3", 6).iter().map(position).collect();
+        contents.normals = rows(&attributes["NORMAL"], 5120, "VEC3", 3).iter().map(normal).collect();
+    } else {
+        contents.positions = rows(&attributes["POSITION"], 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
+        contents.normals = rows(&attributes["NORMAL"], 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
+    }
     if let Some(accessor) = attributes.get("COLOR_0") {
         assert_eq!(accessor_of(json, accessor)["normalized"], true);
         contents.colors = Some(rows(accessor, 5121, "VEC4", 4).iter().map(|r| (*r).try_into().unwrap()).collect());
@@ -101,6 +111,17 @@ pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
     };
     contents.triangles = indices.as_chunks::<3>().0.to_vec();
     contents
+}
+
+/// What the integers of a quantised mesh are multiplied by: the node's scale, one for the three axes.
+fn quantized_scale(json: &Value) -> Option<f32> {
+    let node = &json["nodes"][0];
+    let [used, required] = ["extensionsUsed", "extensionsRequired"].map(|key| json.get(key));
+    assert_eq!((used, used.is_some()), (required, node.get("scale").is_some()));
+    assert_eq!(used?, &serde_json::json!(["KHR_mesh_quantization"]));
+    let scale: Vec<f64> = node["scale"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
+    assert_eq!(scale, [scale[0]; 3]);
+    Some(scale[0] as f32)
 }
 
 pub fn accessor_of<'a>(json: &'a Value, index: &Value) -> &'a Value {

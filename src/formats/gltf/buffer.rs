@@ -4,12 +4,13 @@ use std::io::{self, Write};
 
 use super::layout::{AtomType, IndexType, Layout};
 use crate::formats::block::{convert_words, write_floats, write_integers};
+use crate::formats::{Packing, quantize};
 use crate::surface::Mesh;
 
 /// Writes the buffer of `mesh`: `layout.len` bytes.
 pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
-    write_floats(out, &mesh.positions[..])?;
-    write_floats(out, &mesh.normals[..])?;
+    write_positions(out, layout.packing, &mesh.positions[..])?;
+    write_normals(out, layout.packing, &mesh.normals[..])?;
     if let Some(colors) = &mesh.colors {
         let linear = linear_of_srgb();
         convert_words(out, &colors[..], |[r, g, b, a]| {
@@ -24,6 +25,28 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
         }
     }
     write_indices(out, layout.indices.0, mesh.triangles[..].as_flattened())
+}
+
+/// Writes positions relative to the mesh's centre, Å, as the layout has them.
+pub(super) fn write_positions(out: &mut dyn Write, packing: Packing, rows: &[[f32; 3]]) -> io::Result<()> {
+    match packing {
+        Packing::Full => write_floats(out, rows),
+        Packing::Quantized(step) => convert_words(out, rows, |row| {
+            let [x, y, z] = step.position(row).map(i16::to_le_bytes);
+            [x[0], x[1], y[0], y[1], z[0], z[1], 0, 0]
+        }),
+    }
+}
+
+/// Writes unit normals as the layout has them.
+pub(super) fn write_normals(out: &mut dyn Write, packing: Packing, rows: &[[f32; 3]]) -> io::Result<()> {
+    match packing {
+        Packing::Full => write_floats(out, rows),
+        Packing::Quantized(_) => convert_words(out, rows, |row| {
+            let [x, y, z] = quantize::normal(row).map(|v| v.to_le_bytes()[0]);
+            [x, y, z, 0]
+        }),
+    }
 }
 
 /// Writes indices as the layout has them.

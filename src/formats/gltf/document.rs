@@ -9,11 +9,11 @@ use gltf_json::mesh::{Mode, Primitive, Semantic};
 use gltf_json::validation::Checked::Valid;
 use gltf_json::validation::USize64;
 use gltf_json::{Accessor, Asset, Buffer, Index, Material, Mesh as GltfMesh, Node, Root, Scene};
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 
 use super::layout::{AtomType, IndexType, Layout, Span};
 use crate::formats::check::Summary;
-use crate::formats::{FormatError, GENERATOR, Meta};
+use crate::formats::{FormatError, GENERATOR, Meta, Packing, Step};
 
 /// A calm blue, linear light. Like every constant here it is a short binary fraction, so JSON shows it short.
 const BASE_COLOR: [f32; 4] = [0.156_25, 0.390_625, 0.718_75, 1.0];
@@ -21,6 +21,9 @@ const BASE_COLOR: [f32; 4] = [0.156_25, 0.390_625, 0.718_75, 1.0];
 const WHITE: [f32; 4] = [1.0; 4];
 /// Between chalk and plastic: highlights show the shape and do not hide it.
 const ROUGHNESS: f32 = 0.625;
+
+/// What allows vertices that are no floats. A program that does not know it cannot show the file, hence required.
+const QUANTIZED: &str = "KHR_mesh_quantization";
 
 /// The document as a JSON object. With a layout it has one buffer, without a URI: the caller adds what its
 /// wrapping needs.
@@ -36,6 +39,14 @@ pub(super) fn document(
         scene: Some(Index::new(0)),
         ..Root::default()
     };
+    let step = layout.and_then(|layout| layout.packing.step());
+    if let Some(step) = step {
+        if !step.holds(&summary.bounds) {
+            return Err(FormatError::BeyondStep { reach: step.reach(), step: step.length() });
+        }
+        root.extensions_used.push(QUANTIZED.to_owned());
+        root.extensions_required.push(QUANTIZED.to_owned());
+    }
     let drawn = layout.map(|layout| {
         let primitive = primitive(&mut root, layout, summary);
         root.push(GltfMesh {
@@ -46,14 +57,15 @@ pub(super) fn document(
             extras: None,
         })
     });
-    let node = root.push(Node { mesh: drawn, name, translation: Some([0.0; 3]), ..Node::default() });
+    let scale = step.map(|step| [step.length(); 3]);
+    let node = root.push(Node { mesh: drawn, name, translation: Some([0.0; 3]), scale, ..Node::default() });
     root.push(Scene { nodes: vec![node], name: None, extensions: None, extras: None });
 
     let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };
     let mut value = serde_json::to_value(&root).map_err(json)?;
     // The crate's translation is single precision, which would move a structure far from the origin by up to 1e-5 Å.
     value["nodes"][0]["translation"] = Value::from(centre.to_vec());
-    value["asset"]["extras"] = Value::Object(extras(centre, meta));
+    value["asset"]["extras"] = Value::Object(extras(centre, step, meta));
     match value {
         Value::Object(map) => Ok(map),
         _ => Err(FormatError::Json { reason: "the document is no object".to_owned() }),
@@ -61,11 +73,14 @@ pub(super) fn document(
 }
 
 /// What the file says of itself: units first, then parameters and report.
-fn extras(centre: [f64; 3], meta: &Meta) -> Map<String, Value> {
+fn extras(centre: [f64; 3], step: Option<Step>, meta: &Meta) -> Map<String, Value> {
     let mut extras = Map::new();
     extras.insert("units".to_owned(), Value::from("angstrom"));
     extras.insert("unit_scale".to_owned(), Value::from(1.0));
     extras.insert("centre".to_owned(), Value::from(centre.to_vec()));
+    if let Some(step) = step {
+        extras.insert("quantization".to_owned(), json!({ "step": step.length() }));
+    }
     for (key, value) in &meta.extras {
         if !extras.contains_key(key) {
             extras.insert(key.clone(), value.clone());
@@ -80,20 +95,31 @@ fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
         root.push(Buffer { byte_length: USize64(layout.len), name: None, uri: None, extensions: None, extras: None });
     let n = layout.n_vertices;
     let mut attribute = |semantic: Semantic, span: Span, component: ComponentType, shape: Type| {
-        let stride = matches!(component, ComponentType::U16).then_some(Stride(4));
+        let stride = match component {
+            ComponentType::I16 => Some(Stride(8)),
+            ComponentType::I8 | ComponentType::U16 => Some(Stride(4)),
+            _ => None,
+        };
         let view = view(root, buffer, span, stride, Target::ArrayBuffer);
         let mut accessor = accessor(view, n, component, shape);
-        accessor.normalized = matches!(component, ComponentType::U8);
+        accessor.normalized = matches!(component, ComponentType::U8 | ComponentType::I8);
         if semantic == Semantic::Positions {
-            // As double-precision numbers these are exactly the values in the buffer.
-            let [low, high] = summary.bounds.map(|row| Value::from(row.map(f64::from).to_vec()));
+            // Exactly values in the buffer: rounding keeps the order, and floats are double-precision numbers too.
+            let [low, high] = summary.bounds.map(|row| match layout.packing {
+                Packing::Full => Value::from(row.map(f64::from).to_vec()),
+                Packing::Quantized(step) => Value::from(step.position(row).to_vec()),
+            });
             (accessor.min, accessor.max) = (Some(low), Some(high));
         }
         (Valid(semantic), root.push(accessor))
     };
+    let [position, normal] = match layout.packing {
+        Packing::Full => [ComponentType::F32, ComponentType::F32],
+        Packing::Quantized(_) => [ComponentType::I16, ComponentType::I8],
+    };
     let mut attributes = BTreeMap::from([
-        attribute(Semantic::Positions, layout.positions, ComponentType::F32, Type::Vec3),
-        attribute(Semantic::Normals, layout.normals, ComponentType::F32, Type::Vec3),
+        attribute(Semantic::Positions, layout.positions, position, Type::Vec3),
+        attribute(Semantic::Normals, layout.normals, normal, Type::Vec3),
     ]);
     attributes.extend(layout.colors.map(|span| attribute(Semantic::Colors(0), span, ComponentType::U8, Type::Vec4)));
     attributes.extend(layout.atoms.map(|(atom_type, span)| {

@@ -6,7 +6,7 @@ use super::buffer::write_buffer;
 use super::document::document;
 use super::layout::Layout;
 use crate::formats::check::Summary;
-use crate::formats::{FormatError, Meta};
+use crate::formats::{FormatError, Meta, Packing};
 use crate::surface::Mesh;
 
 const MAGIC: u32 = u32::from_le_bytes(*b"glTF");
@@ -34,8 +34,13 @@ pub(in crate::formats) struct GlbPlan {
 }
 
 impl GlbPlan {
-    pub(in crate::formats) fn new(mesh: &Mesh, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
-        Self::placed(Layout::of(mesh, summary)?, mesh.centre, summary, meta)
+    pub(in crate::formats) fn new(
+        mesh: &Mesh,
+        packing: Packing,
+        summary: &Summary,
+        meta: &Meta,
+    ) -> Result<Self, FormatError> {
+        Self::placed(Layout::of(mesh, packing, summary)?, mesh.centre, summary, meta)
     }
 
     /// The same for a mesh of which only this is known.
@@ -106,9 +111,9 @@ mod tests {
     #[test]
     fn a_glb_of_four_gibibytes_is_refused_with_numbers() {
         // 24 bytes per vertex and 12 per triangle, two triangles per vertex: 48 bytes a vertex.
-        let fits = Layout::plain(89_000_000, 178_000_000).unwrap();
+        let fits = Layout::plain([89_000_000, 178_000_000], Packing::Full).unwrap();
         assert_eq!(GlbPlan::wrap(vec![b' '; 1000], fits).unwrap().len(), 48 * 89_000_000 + HEAD_BYTES);
-        let large = Layout::plain(90_000_000, 180_000_000).unwrap();
+        let large = Layout::plain([90_000_000, 180_000_000], Packing::Full).unwrap();
         let refusal = GlbPlan::wrap(vec![b' '; 1000], large).unwrap_err();
         assert_eq!(refusal, FormatError::GlbTooLarge { bytes: 4_320_016_384, limit: 4_294_967_295 });
         assert!(refusal.to_string().contains("4320016384"));
@@ -125,7 +130,7 @@ mod tests {
     #[test]
     fn a_large_buffer_begins_at_a_fixed_place() {
         let head = |json: usize, vertices: u64| {
-            let layout = Layout::plain(vertices, 1).unwrap();
+            let layout = Layout::plain([vertices, 1], Packing::Full).unwrap();
             GlbPlan::wrap(vec![b' '; json], layout).unwrap().head().len() as u64
         };
         // 24 bytes a vertex and 3 indices of four bytes.

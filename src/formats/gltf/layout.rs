@@ -1,7 +1,7 @@
 //! What lies where in the buffer of a glTF. Pure arithmetic on counts, so that files of any size can be planned.
 
-use crate::formats::FormatError;
 use crate::formats::check::Summary;
+use crate::formats::{FormatError, Packing};
 use crate::surface::Mesh;
 
 /// Largest integer below which every integer is a 32-bit float.
@@ -73,6 +73,7 @@ pub(super) struct Span {
 pub(super) struct Layout {
     pub(super) n_vertices: u64,
     pub(super) n_triangles: u64,
+    pub(super) packing: Packing,
     pub(super) positions: Span,
     pub(super) normals: Span,
     pub(super) colors: Option<Span>,
@@ -84,16 +85,21 @@ pub(super) struct Layout {
 
 impl Layout {
     /// The layout of `mesh`; `None` if there is nothing to draw, as glTF knows no empty accessors.
-    pub(super) fn of(mesh: &Mesh, summary: &Summary) -> Result<Option<Self>, FormatError> {
+    pub(super) fn of(mesh: &Mesh, packing: Packing, summary: &Summary) -> Result<Option<Self>, FormatError> {
         let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
         if n_triangles == 0 {
             return Ok(None);
         }
         let atoms = summary.max_atom.map(AtomType::for_largest).transpose()?;
-        Self::new(n_vertices, n_triangles, mesh.colors.is_some(), atoms).map(Some)
+        Self::new([n_vertices, n_triangles], packing, mesh.colors.is_some(), atoms).map(Some)
     }
 
-    fn new(n_vertices: u64, n_triangles: u64, colors: bool, atoms: Option<AtomType>) -> Result<Self, FormatError> {
+    fn new(
+        [n_vertices, n_triangles]: [u64; 2],
+        packing: Packing,
+        colors: bool,
+        atoms: Option<AtomType>,
+    ) -> Result<Self, FormatError> {
         let index_type = IndexType::for_vertices(n_vertices).ok_or(FormatError::TooMany {
             format: "glTF",
             what: "vertices",
@@ -106,23 +112,24 @@ impl Layout {
             end += len;
             Span { offset, len }
         };
-        let positions = span(12 * n_vertices);
-        let normals = span(12 * n_vertices);
+        let positions = span(packing.position_bytes() * n_vertices);
+        let normals = span(packing.normal_bytes() * n_vertices);
         let colors = colors.then(|| span(4 * n_vertices));
         let atoms = atoms.map(|atom_type| (atom_type, span(4 * n_vertices)));
         let indices = (index_type, span(3 * n_triangles * index_type.bytes()));
-        Ok(Self { n_vertices, n_triangles, positions, normals, colors, atoms, indices, len: end })
+        Ok(Self { n_vertices, n_triangles, packing, positions, normals, colors, atoms, indices, len: end })
     }
 
     /// The layout of a mesh without colours and atoms; `None` if there is nothing to draw.
-    pub(super) fn plain(n_vertices: u64, n_triangles: u64) -> Result<Option<Self>, FormatError> {
-        if n_triangles == 0 { Ok(None) } else { Self::new(n_vertices, n_triangles, false, None).map(Some) }
+    pub(super) fn plain(counts: [u64; 2], packing: Packing) -> Result<Option<Self>, FormatError> {
+        if counts[1] == 0 { Ok(None) } else { Self::new(counts, packing, false, None).map(Some) }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::formats::Step;
 
     #[test]
     fn the_restart_value_is_never_an_index() {
@@ -141,7 +148,10 @@ mod tests {
                 assert!(n_vertices - 1 < (1 << (8 * index_type.bytes())) - 1, "{n_vertices}");
             }
         }
-        assert!(matches!(Layout::plain(1 << 32, 1), Err(FormatError::TooMany { count: 0x1_0000_0000, .. })));
+        assert!(matches!(
+            Layout::plain([1 << 32, 1], Packing::Full),
+            Err(FormatError::TooMany { count: 0x1_0000_0000, .. })
+        ));
     }
 
     #[test]
@@ -158,14 +168,17 @@ mod tests {
 
     #[test]
     fn spans_are_aligned_and_follow_each_other() {
-        let layout = Layout::new(5, 3, true, Some(AtomType::U16)).unwrap();
-        let spans =
-            [layout.positions, layout.normals, layout.colors.unwrap(), layout.atoms.unwrap().1, layout.indices.1];
-        let mut end = 0;
-        for span in spans {
-            assert_eq!((span.offset, span.offset % 4), (end, 0));
-            end += span.len;
+        let quantized = Packing::Quantized(Step::covering(1.0));
+        for (packing, vertices) in [(Packing::Full, 60 + 60), (quantized, 40 + 20)] {
+            let layout = Layout::new([5, 3], packing, true, Some(AtomType::U16)).unwrap();
+            let spans =
+                [layout.positions, layout.normals, layout.colors.unwrap(), layout.atoms.unwrap().1, layout.indices.1];
+            let mut end = 0;
+            for span in spans {
+                assert_eq!((span.offset, span.offset % 4), (end, 0));
+                end += span.len;
+            }
+            assert_eq!((end, layout.len), (vertices + 20 + 20 + 9, vertices + 49));
         }
-        assert_eq!((end, layout.len), (60 + 60 + 20 + 20 + 9, 169));
     }
 }

@@ -8,12 +8,11 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use thiserror::Error;
 
-use super::buffer::write_indices;
+use super::buffer::{write_indices, write_normals, write_positions};
 use super::glb::{GlbPlan, HEAD_BYTES, LARGE_BUFFER_BYTES};
 use super::layout::Layout;
-use crate::formats::block::write_floats;
 use crate::formats::check::Summary;
-use crate::formats::{FormatError, Meta};
+use crate::formats::{FormatError, Meta, Packing};
 use crate::surface::{MeshPart, MeshSink, SinkFailed};
 
 /// Something that takes bytes at any place, from several threads at once: a file.
@@ -48,6 +47,7 @@ const MOST_WAITING: usize = 48;
 /// A GLB that is being written into `out`.
 pub struct GlbSink<'a> {
     out: &'a dyn PlaceBytes,
+    packing: OnceLock<Packing>,
     layout: OnceLock<Option<Layout>>,
     /// The buffer, if it is small.
     small: Mutex<Vec<u8>>,
@@ -66,6 +66,7 @@ impl<'a> GlbSink<'a> {
     pub fn new(out: &'a dyn PlaceBytes) -> Self {
         Self {
             out,
+            packing: OnceLock::new(),
             layout: OnceLock::new(),
             small: Mutex::default(),
             lane: Mutex::default(),
@@ -73,6 +74,11 @@ impl<'a> GlbSink<'a> {
             spare: Mutex::default(),
             failure: Mutex::default(),
         }
+    }
+
+    /// Packs the vertices. To be called before the mesh begins, as their places depend on it; a second call changes nothing.
+    pub fn pack(&self, packing: Packing) {
+        let _first = self.packing.set(packing).is_ok();
     }
 
     /// Why a part was refused.
@@ -110,7 +116,8 @@ impl<'a> GlbSink<'a> {
     }
 
     fn try_begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), PlaceError> {
-        let layout = Layout::plain(n_vertices as u64, n_triangles as u64)?;
+        let packing = *self.packing.get_or_init(Packing::default);
+        let layout = Layout::plain([n_vertices as u64, n_triangles as u64], packing)?;
         if let Some(layout) = layout {
             GlbPlan::check_len(HEAD_BYTES + layout.len.next_multiple_of(4))?;
             if layout.len < LARGE_BUFFER_BYTES {
@@ -125,7 +132,8 @@ impl<'a> GlbSink<'a> {
 
     fn try_part(&self, part: &MeshPart<'_>) -> Result<(), PlaceError> {
         let Some(layout) = self.layout.get().copied().flatten() else { return Ok(()) };
-        let row = 12 * part.first_vertex as u64;
+        let (packing, row) = (layout.packing, part.first_vertex as u64);
+        let (position, normal) = (packing.position_bytes() * row, packing.normal_bytes() * row);
         let (index_type, indices) = layout.indices;
         let first = 3 * part.first_triangle as u64 * index_type.bytes();
         let lane = match self.lane.try_lock() {
@@ -135,8 +143,8 @@ impl<'a> GlbSink<'a> {
             Err(_) => None,
         };
         let at = |offset: u64| At { sink: self, offset, now: lane.is_some() };
-        write_floats(&mut at(layout.positions.offset + row), part.positions)?;
-        write_floats(&mut at(layout.normals.offset + row), part.normals)?;
+        write_positions(&mut at(layout.positions.offset + position), packing, part.positions)?;
+        write_normals(&mut at(layout.normals.offset + normal), packing, part.normals)?;
         write_indices(&mut at(indices.offset + first), index_type, part.triangles.as_flattened())?;
         if lane.is_some() { self.drain() } else { Ok(()) }
     }

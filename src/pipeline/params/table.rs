@@ -1,5 +1,6 @@
 //! The table of parameters: names, what values they take, what they do.
 
+use crate::formats::Compress;
 use crate::structure::select::KIND_NAMES;
 use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Kernel, Preset, Proof};
@@ -73,6 +74,7 @@ const fn number(
 const KERNELS: &[&str] = &names(Kernel::ALL);
 const PRESETS: &[&str] = &preset_names(Preset::ALL);
 const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj"];
+const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const PROOFS: &[&str] = &[Proof::Checksum.name(), Proof::Exact.name()];
 
 const fn names(all: &[Kernel]) -> [&'static str; 3] {
@@ -180,6 +182,12 @@ pub const TABLE: &[Parameter] = &[
         doc: "Refuse a file in which a second, strict reader finds errors.",
     },
     Parameter { name: "format", domain: Domain::Choice(FORMATS), default: "glb", doc: "The mesh file format." },
+    Parameter {
+        name: "compress",
+        domain: Domain::Choice(COMPRESS),
+        default: "none",
+        doc: "How glb and gltf store vertices: quantize takes 12 bytes instead of 24 (16-bit positions, 8-bit normals; KHR_mesh_quantization).",
+    },
     Parameter {
         name: "report",
         domain: Domain::Choice(&["json"]),
