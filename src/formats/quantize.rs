@@ -160,6 +160,7 @@ fn nearest(v: f32, max: f32) -> i16 {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "rounded numbers and powers of two are exact")]
 mod tests {
     use super::*;
 
