@@ -21,37 +21,50 @@ mod shaders {
     use naga::valid::{Capabilities, ValidationFlags, Validator};
     use naga::{AddressSpace, Module, StorageAccess, TypeInner};
 
-    /// In the order in which they run.
-    const STAGES: [&str; 6] = ["bin", "field", "classify", "scan", "interpolate", "emit"];
+    /// What is generated of a folder of shaders: the table's name, its layouts' name, the folder, and the shaders in the
+    /// order in which they run.
+    const TABLES: [(&str, &str, &str, &[&str]); 3] = [
+        ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit"]),
+        ("PAPER", "PAPER_LAYOUTS", "paper/", &["field", "classify", "scan", "add", "map", "vertices", "normals"]),
+        ("YARDSTICKS", "YARDSTICK_LAYOUTS", "bench/", &["copy", "fma"]),
+    ];
 
     pub(super) fn build() {
         let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
-        let (mut generated, mut broken) = (String::new(), Vec::new());
-        let mut layouts = BTreeSet::new();
-        generated.push_str("pub(super) static SHADERS: [Shader; 6] = [\n");
-        for stage in STAGES {
-            match assemble(Path::new("shaders"), &format!("{stage}.wgsl"), &mut BTreeSet::new())
-                .and_then(|source| checked(&source).map(|module| (source, module)))
-            {
-                Ok((source, module)) => {
-                    let path = out.join(format!("{stage}.wgsl"));
-                    fs::write(&path, &source).expect("OUT_DIR can be written");
-                    let bindings = bindings(&module);
-                    writeln!(
-                        generated,
-                        "Shader {{ stage: {stage:?}, source: include_str!(\"{stage}.wgsl\"), bindings: &[{bindings}] }},"
-                    )
-                    .expect("a string takes it");
-                    layouts.extend(structs(&module));
+        let (mut generated, mut broken, mut n) = (String::new(), Vec::new(), 0);
+        for (table, layouts_table, folder, names) in TABLES {
+            n += names.len();
+            let mut layouts = BTreeSet::new();
+            writeln!(generated, "pub(super) static {table}: [Shader; {}] = [", names.len()).expect("a string takes it");
+            for name in names {
+                match assemble(Path::new("shaders"), &format!("{folder}{name}.wgsl"), &mut BTreeSet::new())
+                    .and_then(|source| checked(&source).map(|module| (source, module)))
+                {
+                    Ok((source, module)) => {
+                        let file = format!("{}{name}.wgsl", folder.replace('/', "_"));
+                        fs::write(out.join(&file), &source).expect("OUT_DIR can be written");
+                        let bindings = bindings(&module);
+                        writeln!(
+                            generated,
+                            "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}] }},"
+                        )
+                        .expect("a string takes it");
+                        layouts.extend(structs(&module));
+                    }
+                    Err(why) => broken.push(format!("shaders/{folder}{name}.wgsl: {why}")),
                 }
-                Err(why) => broken.push(format!("shaders/{stage}.wgsl: {why}")),
+            }
+            generated.push_str("];\n\n");
+            if !layouts.is_empty() {
+                generated
+                    .push_str("/// Name, size, and (field, offset, size) of every struct that lies in a buffer.\n");
+                writeln!(generated, "#[cfg(test)]\npub(super) static {layouts_table}: &[Layout] = &[")
+                    .expect("a string takes it");
+                generated.extend(layouts);
+                generated.push_str("];\n\n");
             }
         }
-        assert!(broken.is_empty(), "{} of {} shaders are broken:\n{}", broken.len(), STAGES.len(), broken.join("\n"));
-        generated.push_str("];\n\n/// Name, size, and (field, offset, size) of every struct that lies in a buffer.\n");
-        generated.push_str("#[cfg(test)]\npub(super) static LAYOUTS: &[Layout] = &[\n");
-        generated.extend(layouts);
-        generated.push_str("];\n");
+        assert!(broken.is_empty(), "{} of {n} shaders are broken:\n{}", broken.len(), broken.join("\n"));
         fs::write(out.join("shaders.rs"), generated).expect("OUT_DIR can be written");
     }
 

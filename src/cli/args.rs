@@ -36,6 +36,10 @@ pub(crate) enum Command {
     Doctor(DoctorArgs),
     /// Ask a running service whether it is ready; exit code 0 if so
     Healthcheck(HealthcheckArgs),
+    /// Time what this machine has
+    #[cfg(feature = "gpu")]
+    #[command(subcommand)]
+    Bench(super::bench::Bench),
     /// Print the version
     Version,
 }

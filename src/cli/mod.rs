@@ -5,6 +5,8 @@
 mod args;
 mod backend;
 mod banner;
+#[cfg(feature = "gpu")]
+mod bench;
 mod doctor;
 mod error;
 mod healthcheck;
@@ -39,6 +41,8 @@ pub(crate) fn main() -> i32 {
         Command::Serve(args) => serve::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
+        #[cfg(feature = "gpu")]
+        Command::Bench(bench) => bench::run(&bench),
         Command::Version => version(),
     };
     match result {

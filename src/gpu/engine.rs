@@ -14,6 +14,7 @@ use super::executor::{Executor, Finished, GpuJob};
 use super::flight::values;
 use super::health::{Complaint, Health};
 use super::landing::{Landing, Landings};
+use super::meter::Meter;
 use super::pipelines::{N_STAGES, Pipelines, Variant};
 use super::record::{Clock, Recording};
 use super::workspace::{Needs, OutputRows, ROW, Workspace};
@@ -73,6 +74,7 @@ pub struct Engine {
     pub(super) workspaces: Vec<Workspace>,
     pub(super) landings: Landings,
     health: Arc<Health>,
+    pub(super) meter: Meter,
 }
 
 /// A job on its way: its buffers are filled.
@@ -129,6 +131,7 @@ impl Engine {
             clock,
             cases,
             health,
+            meter: Meter::default(),
         };
         engine.healthy()?;
         Ok(engine)
@@ -140,8 +143,13 @@ impl Engine {
         self.clock.is_some()
     }
 
+    /// Bytes of the largest binding.
+    pub(super) const fn binding_bytes(&self) -> u64 {
+        self.binding
+    }
+
     /// What was complained about since the last look, but for memory.
-    fn healthy(&self) -> Result<(), GpuError> {
+    pub(super) fn healthy(&self) -> Result<(), GpuError> {
         match self.health.complaint() {
             None => Ok(()),
             Some(Complaint::OutOfMemory) => Err(GpuError::Failed("out of memory".to_owned())),
@@ -251,6 +259,7 @@ impl Engine {
         recording: Recording<'_>,
         landings: Vec<(Landing, u64)>,
     ) -> Result<Vec<Arc<Landing>>, GpuError> {
+        let timed = recording.timed();
         let index = self.queue.submit([recording.encoder.finish()]);
         for (landing, bytes) in &landings {
             landing.request(*bytes).map_err(GpuError::Failed)?;
@@ -262,7 +271,16 @@ impl Engine {
         }
         self.healthy()?;
         waited.map_err(|e| GpuError::Failed(e.to_string()))?;
-        landings.into_iter().map(|(landing, bytes)| landing.look(bytes).map_err(GpuError::Failed)).collect()
+        let landed: Vec<_> = landings
+            .into_iter()
+            .map(|(landing, bytes)| landing.look(bytes).map_err(GpuError::Failed))
+            .collect::<Result<_, _>>()?;
+        self.meter.count_submission();
+        if let (Some(clock), Some(landing), Some(stages)) = (&self.clock, landed.first(), timed) {
+            let ticks: &[u64] = values((**landing).as_ref(), 0, 2 * N_STAGES as u64).map_err(GpuError::Failed)?;
+            self.meter.add_span(&ticks[2 * stages.start..2 * stages.end], f64::from(clock.period));
+        }
+        Ok(landed)
     }
 
     pub(super) fn recording(&self) -> Recording<'_> {

@@ -8,6 +8,7 @@
 
 mod assemble;
 pub mod backend;
+pub mod bench;
 mod choose;
 mod device;
 pub mod discover;
@@ -18,6 +19,9 @@ mod flight;
 mod hardware;
 mod health;
 mod landing;
+pub mod meter;
+pub mod paper;
+mod paper_pipelines;
 mod pipelines;
 pub mod pool;
 pub mod prepare;
@@ -30,12 +34,14 @@ mod run;
 mod shaders;
 mod worker;
 mod workspace;
+pub mod yardstick;
 
 pub use backend::GpuBackend;
 pub use discover::{Discovery, Look, discover};
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
 pub use executor::{Executor, Finished, GpuJob};
+pub use paper::Paper;
 pub use pool::{DevicePool, PoolDevice, PoolSettings};
 pub use prepare::Prepared;
 pub use worker::{Build, MOST_REBUILDS};

@@ -64,6 +64,13 @@ impl<'a> Recording<'a> {
         Self { encoder, pipelines, clock, timed: Vec::new() }
     }
 
+    /// The stages with times so far: from the first to behind the last; all between have some.
+    pub(super) fn timed(&self) -> Option<std::ops::Range<usize>> {
+        let of = |stage: &Stage| number(*stage);
+        self.clock?;
+        Some(self.timed.iter().map(of).min()?..self.timed.iter().map(of).max()? + 1)
+    }
+
     /// One stage for several jobs, or for several pieces of one with `after` recorded behind each. Dispatches without
     /// anything between them overlap on the device as far as their buffers allow.
     pub(super) fn stage(&mut self, stage: Stage, dispatches: &[Dispatch<'_>]) {

@@ -156,6 +156,18 @@ mod tests {
     }
 
     #[test]
+    fn the_papers_structs_are_laid_out_alike_on_both_sides() {
+        use crate::gpu::paper::Box;
+        let mut all = host();
+        all.retain(|(name, ..)| PAPER_LAYOUTS.iter().any(|layout| layout.name == *name));
+        all.push(host!("Box", Box, origin, n_atoms, n, n_samples, scale, n_active, n_triangles, pad));
+        assert_eq!(all.len(), PAPER_LAYOUTS.len(), "Atom, Params and Box");
+        assert_eq!(differences(PAPER_LAYOUTS, &all), Vec::<String>::new());
+        all[2].1 += 4;
+        assert!(!differences(PAPER_LAYOUTS, &all).is_empty());
+    }
+
+    #[test]
     fn a_moved_field_a_wrong_size_and_an_unknown_struct_are_found() {
         let mut host = host();
         host[0].2[1].1 += 4;

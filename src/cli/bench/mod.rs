@@ -1,0 +1,116 @@
+//! `molmesh bench`: how fast this machine's devices are, against what they could do.
+
+mod cases;
+mod floor;
+mod jobs;
+mod measure;
+mod table;
+
+use std::path::PathBuf;
+
+use clap::{Args as ClapArgs, Subcommand};
+use molmesh::gpu::Paper;
+use molmesh::gpu::bench::{self, Opened};
+use molmesh::gpu::yardstick::{self, Effort, Rates};
+use serde_json::json;
+
+use super::error::CliError;
+use cases::Case;
+use measure::Row;
+
+/// What to measure.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Bench {
+    /// Time the stages on a GPU, beside the floor that the device's own rates give
+    Gpu(GpuArgs),
+}
+
+/// `molmesh bench gpu`.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct GpuArgs {
+    /// Number of the device; hardware comes first
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    pub(crate) device: usize,
+    /// Measured runs of each case, after three to warm up
+    #[arg(long, value_name = "N", default_value_t = 20)]
+    pub(crate) runs: usize,
+    /// Folder with 2hhb, 1aon and 7cgo, as PDB or mmCIF, plain or compressed
+    #[arg(long, value_name = "DIR")]
+    pub(crate) data: Option<PathBuf>,
+    /// Only the cases whose name contains this
+    #[arg(long, value_name = "NAME")]
+    pub(crate) only: Option<String>,
+    /// Atoms of the made-up case, which needs no file
+    #[arg(long, value_name = "N", default_value_t = 60_000)]
+    pub(crate) atoms: usize,
+    /// Compare each mesh with the CPU's
+    #[arg(long)]
+    pub(crate) check: bool,
+    /// Time so many jobs of 600 atoms instead, alone and together
+    #[arg(long, value_name = "N")]
+    pub(crate) jobs: Option<usize>,
+    /// Write everything to this file too, as JSON
+    #[arg(long, value_name = "FILE")]
+    pub(crate) json: Option<PathBuf>,
+}
+
+/// Runs the command.
+pub(super) fn run(bench: &Bench) -> Result<(), CliError> {
+    let Bench::Gpu(args) = bench;
+    if args.runs == 0 || args.atoms == 0 || args.jobs == Some(0) {
+        return Err(CliError::usage("nothing is measured with 0 runs, atoms or jobs"));
+    }
+    let opened = open(args.device)?;
+    super::say(&format!("device {}: {}, {}\n", args.device, opened.name, opened.driver))?;
+    let result = match args.jobs {
+        Some(n) => {
+            let rates = jobs::run(opened, n)?;
+            super::say(&jobs::table(&rates))?;
+            json!({ "jobs": rates })
+        }
+        None => cases(args, opened)?,
+    };
+    let Some(path) = &args.json else { return Ok(()) };
+    let text = format!("{result:#}\n");
+    std::fs::write(path, text).map_err(|source| CliError::Output { name: path.display().to_string(), source })
+}
+
+/// Measures every case. Each has an engine of its own, so that none finds what another left.
+fn cases(args: &GpuArgs, opened: Opened) -> Result<serde_json::Value, CliError> {
+    let effort = if opened.software { Effort::SOFTWARE } else { Effort::HARDWARE };
+    let rates = yardstick::rates(&opened.engine, effort).map_err(|e| CliError::Service(e.to_string()))?;
+    super::say(&table::rates(rates.as_ref()))?;
+    let (name, driver) = (opened.name.clone(), opened.driver.clone());
+    drop(opened);
+    let mut rows = Vec::new();
+    for case in
+        cases::all(args.atoms).into_iter().filter(|c| args.only.as_ref().is_none_or(|o| c.name.contains(o.as_str())))
+    {
+        let row = one(args, &case, rates.as_ref());
+        super::say(&table::row(case.name, &row))?;
+        rows.push(match row {
+            Ok(row) => json!({ "case": case.name, "measured": row }),
+            Err(why) => json!({ "case": case.name, "not_measured": why }),
+        });
+    }
+    Ok(
+        json!({ "device": name, "driver": driver, "rates": rates.map(table::rates_json), "runs": args.runs, "cases": rows }),
+    )
+}
+
+/// One case, or why it was not measured.
+fn one(args: &GpuArgs, case: &Case, rates: Option<&Rates>) -> Result<Row, String> {
+    let (spheres, params) = case.load(args.data.as_deref())?;
+    let mut opened = bench::open(args.device).map_err(|e| e.to_string())?;
+    let mut row = measure::measure(&mut opened.engine, &spheres, &params, args.runs, rates, args.check)?;
+    if case.with_paper {
+        let paper = Paper::new(opened.engine).map_err(|e| e.to_string());
+        row.paper =
+            Some(paper.and_then(|mut paper| measure::paper(&mut paper, &spheres, &params, args.runs, row.stages_ms)));
+    }
+    Ok(row)
+}
+
+fn open(number: usize) -> Result<Opened, CliError> {
+    bench::open(number).map_err(|e| CliError::NoBackend { asked: "gpu", why: e.to_string() })
+}
