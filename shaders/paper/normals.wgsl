@@ -34,9 +34,9 @@ fn main(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(num_workgroups) wo
     let cell = place_of(i, box.n);
     let flag = flags[i];
     for (var t = 0u; t < cases[flag]; t++) {
-        let corners = cases[256u + 5u * flag + t];
         for (var v = 0u; v < 3u; v++) {
-            let e = corners >> (4u * v) & 15u;
+            let corner = 3u * t + v;
+            let e = cases[304u + 2u * flag + (corner >> 3u)] >> (4u * (corner & 7u)) & 15u;
             let start = edge_start(cell, e);
             let axis = edge_axis(e);
             let at = 3u * (3u * (counts[i].y + t) + v);
