@@ -64,11 +64,15 @@ fn stdin_to_stdout_gives_the_bytes_of_a_file() {
 fn a_file_has_the_bytes_that_a_pipe_gets() {
     let folder = Folder::new();
     let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
-    // A small buffer, a large one, 16-bit indices and 32-bit ones; then the longest report that there is.
+    // Vertices without a gradient, a small buffer, a large one, 16-bit indices and 32-bit ones; then the longest report that there is.
     let long = folder.file("long.cif", long_report());
-    for (input, resolution) in
-        [(Path::new(sample), "0.6"), (Path::new(sample), "0.45"), (Path::new(sample), "0.3"), (&long, "0.4")]
-    {
+    for (input, resolution) in [
+        (Path::new(sample), "8"),
+        (Path::new(sample), "0.6"),
+        (Path::new(sample), "0.45"),
+        (Path::new(sample), "0.3"),
+        (&long, "0.4"),
+    ] {
         let output = folder.path("out.glb");
         assert_code(&mesh(input, &output, &["--quiet", "--resolution", resolution]), 0);
         let piped = run(["mesh", input.to_str().unwrap(), "-o", "-", "--quiet", "--resolution", resolution]);

@@ -5,37 +5,17 @@
 
 mod tools;
 
-use std::fs;
-use std::path::PathBuf;
-
 use molmesh::formats::{self, Format, Meta};
 use molmesh::surface::Mesh;
-use tempfile::TempDir;
+use tools::files::Files;
 use tools::readers::{accessor_offset, ply_header, split_glb};
 use tools::shapes::{
     FAR, area_and_volume, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres, union,
 };
 
-/// Files in a folder that goes away.
-struct Files {
-    folder: TempDir,
-    paths: Vec<PathBuf>,
-}
-
-impl Files {
-    fn new() -> Self {
-        Self { folder: TempDir::new().unwrap(), paths: Vec::new() }
-    }
-
-    fn add_bytes(&mut self, name: &str, bytes: &[u8]) {
-        let path = self.folder.path().join(name);
-        fs::write(&path, bytes).unwrap();
-        self.paths.push(path);
-    }
-
-    fn add(&mut self, name: &str, format: Format, mesh: &Mesh) {
-        self.add_bytes(&format!("{name}.{format}"), &encode(format, mesh));
-    }
+/// Writes a mesh in a format.
+fn add(files: &mut Files, name: &str, format: Format, mesh: &Mesh) {
+    files.add(&format!("{name}.{format}"), &encode(format, mesh));
 }
 
 fn encode(format: Format, mesh: &Mesh) -> Vec<u8> {
@@ -72,10 +52,10 @@ fn the_gltf_validator_has_nothing_to_say() {
     meshes.extend([("triangle", triangle()), ("large", icosphere(7, 20.0, [0.0; 3], false))]);
     for format in [Format::Glb, Format::Gltf] {
         for (name, mesh) in &meshes {
-            files.add(name, format, mesh);
+            add(&mut files, name, format, mesh);
             expected.push((mesh.n_vertices() as u64, mesh.n_triangles() as u64));
         }
-        files.add("empty", format, &Mesh { centre: FAR, ..Mesh::default() });
+        add(&mut files, "empty", format, &Mesh { centre: FAR, ..Mesh::default() });
         expected.push((0, 0));
     }
     let Some(reports) = tools::gltf_validate(&files.paths) else { return };
@@ -101,7 +81,7 @@ fn the_gltf_validator_sees_what_is_broken() {
     let mut broken = |name: &str, codes: &'static [&'static str], change: &dyn Fn(&mut Vec<u8>)| {
         let mut bytes = good.clone();
         change(&mut bytes);
-        files.add_bytes(name, &bytes);
+        files.add(name, &bytes);
         expected.push(codes);
     };
     broken("nan.glb", &["ACCESSOR_INVALID_FLOAT"], &|b| b[position..position + 4].fill(0xff));
@@ -121,7 +101,7 @@ fn the_gltf_validator_sees_what_is_broken() {
         assert!(codes.iter().any(|code| report.codes.contains_key(*code)), "{codes:?}: {report:#?}");
     }
     let mut nonsense = Files::new();
-    nonsense.add_bytes("nonsense.glb", b"HEADER    HYDROLASE");
+    nonsense.add("nonsense.glb", b"HEADER    HYDROLASE");
     let report = &tools::gltf_validate(&nonsense.paths).unwrap()[0];
     assert!(report.error.is_some() || report.errors > 0, "{report:#?}");
 }
@@ -132,7 +112,7 @@ fn trimesh_sees_the_same_surface_in_every_format() {
     let mut expected = Vec::new();
     for (name, mesh, bodies, euler) in closed() {
         for format in Format::ALL {
-            files.add(name, format, &mesh);
+            add(&mut files, name, format, &mesh);
             expected.push((format, mesh.clone(), bodies, euler));
         }
     }
@@ -169,10 +149,10 @@ fn trimesh_sees_the_same_surface_in_every_format() {
 fn trimesh_takes_empty_and_tiny_files() {
     let mut files = Files::new();
     for format in Format::ALL {
-        files.add("triangle", format, &triangle());
+        add(&mut files, "triangle", format, &triangle());
     }
     for format in [Format::Glb, Format::Gltf, Format::Stl] {
-        files.add("empty", format, &Mesh::default());
+        add(&mut files, "empty", format, &Mesh::default());
     }
     let Some(reports) = tools::trimesh(&files.paths) else { return };
     for (report, path) in reports.iter().zip(&files.paths) {
@@ -218,7 +198,7 @@ fn trimesh_sees_what_is_broken() {
         let mut mesh = icosphere(2, 4.0, [0.0; 3], false);
         break_it(&mut mesh);
         for format in [Format::Glb, Format::Ply] {
-            files.add(name, format, &mesh);
+            add(&mut files, name, format, &mesh);
         }
     }
     let Some(reports) = tools::trimesh(&files.paths) else { return };
@@ -241,15 +221,15 @@ fn trimesh_sees_corrupted_bytes() {
     let mut ply = encode(Format::Ply, &mesh);
     let (_, data) = ply_header(&ply);
     ply[data + 24..data + 28].fill(0xff);
-    files.add_bytes("nan.ply", &ply);
+    files.add("nan.ply", &ply);
     let mut stl = encode(Format::Stl, &mesh);
     stl[84 + 11] ^= 0x80; // the sign of the first normal's z
     stl[84 + 50 + 12 + 3] ^= 0x01; // the exponent of a corner's x
-    files.add_bytes("bits.stl", &stl);
-    files.add_bytes("short.stl", &stl[..stl.len() - 25]);
+    files.add("bits.stl", &stl);
+    files.add("short.stl", &stl[..stl.len() - 25]);
     let glb = encode(Format::Glb, &mesh);
-    files.add_bytes("short.glb", &glb[..glb.len() / 2]);
-    files.add_bytes("nonsense.obj", b"f 1//1 2//2 3//3\n");
+    files.add("short.glb", &glb[..glb.len() / 2]);
+    files.add("nonsense.obj", b"f 1//1 2//2 3//3\n");
     let Some(reports) = tools::trimesh(&files.paths) else { return };
     let [nan, bits, short_stl, short_glb, nonsense] = &reports[..] else { panic!("{reports:#?}") };
     assert_eq!((&nan.error, nan.nan_count), (&None, 1), "{nan:#?}");

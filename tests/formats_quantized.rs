@@ -5,15 +5,10 @@
 
 mod tools;
 
-use std::fs;
-use std::io;
-use std::path::PathBuf;
-use std::sync::Mutex;
-
-use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Meta, Packing, PlaceBytes, PlaceError, Step};
-use molmesh::surface::{Mesh, MeshPart, MeshSink};
+use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Meta, Packing, PlaceError, Step};
+use molmesh::surface::Mesh;
 use serde_json::{Value, json};
-use tempfile::TempDir;
+use tools::files::{Anywhere, Files, pour};
 use tools::readers::{Contents, Glb, accessor_of, accessor_offset, gltf_contents, split_glb, split_gltf};
 use tools::shapes::{FAR, area_and_volume, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres};
 
@@ -159,37 +154,14 @@ fn what_a_step_does_not_reach_and_other_formats_are_refused() {
         assert!(Encoder::packed(format, Packing::Full, &mesh, &meta()).is_ok());
     }
     let file = Anywhere::default();
-    assert!(matches!(pour(&file, small, &mesh, 2), Err(PlaceError::Format(FormatError::BeyondStep { .. }))));
+    assert!(matches!(placed(&file, small, &mesh, 2), Err(PlaceError::Format(FormatError::BeyondStep { .. }))));
 }
 
-/// A file in memory that takes bytes anywhere.
-#[derive(Default)]
-struct Anywhere(Mutex<Vec<u8>>);
-
-impl PlaceBytes for Anywhere {
-    fn place(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
-        let (mut file, start) = (self.0.lock().unwrap(), usize::try_from(offset).unwrap());
-        let len = file.len().max(start + bytes.len());
-        file.resize(len, 0xee);
-        file[start..start + bytes.len()].copy_from_slice(bytes);
-        Ok(())
-    }
-}
-
-/// A mesh's parts from the last to the first.
-fn pour(file: &Anywhere, packing: Packing, mesh: &Mesh, n_parts: usize) -> Result<u64, PlaceError> {
+/// Writes a mesh out of order.
+fn placed(file: &Anywhere, packing: Packing, mesh: &Mesh, n_parts: usize) -> Result<u64, PlaceError> {
     let sink = GlbSink::new(file);
     sink.pack(packing);
-    let (n, m) = (mesh.n_vertices(), mesh.n_triangles());
-    sink.begin(n, m).unwrap();
-    for part in (0..n_parts).rev() {
-        let cut = |len: usize| part * len / n_parts..(part + 1) * len / n_parts;
-        let (v, t) = (cut(n), cut(m));
-        let (first_vertex, first_triangle) = (v.start, t.start);
-        let (positions, normals) = (&mesh.positions[v.clone()], &mesh.normals[v]);
-        let triangles = &mesh.triangles[t];
-        sink.part(&MeshPart { first_vertex, positions, normals, first_triangle, triangles }).unwrap();
-    }
+    pour(&sink, mesh, n_parts);
     sink.finish(&meta(), mesh.centre, mesh.bounds())
 }
 
@@ -204,33 +176,15 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
         large += usize::from(in_order.len() > 1 << 20);
         for n_parts in [1, 3] {
             let file = Anywhere::default();
-            let len = pour(&file, Packing::Quantized(step(&mesh)), &mesh, n_parts).unwrap();
+            let len = placed(&file, Packing::Quantized(step(&mesh)), &mesh, n_parts).unwrap();
             assert_eq!(len, in_order.len() as u64, "{name}");
-            assert!(*file.0.lock().unwrap() == in_order, "{name} in {n_parts}");
+            assert!(file.bytes() == in_order, "{name} in {n_parts}");
         }
         let file = Anywhere::default();
-        pour(&file, Packing::Full, &mesh, 3).unwrap();
-        assert!(*file.0.lock().unwrap() != in_order, "{name}: the sink packs only when told to");
+        placed(&file, Packing::Full, &mesh, 3).unwrap();
+        assert!(file.bytes() != in_order, "{name}: the sink packs only when told to");
     }
     assert!(large > 0, "a large buffer was among them");
-}
-
-/// Files in a folder that goes away.
-struct Files {
-    folder: TempDir,
-    paths: Vec<PathBuf>,
-}
-
-impl Files {
-    fn new() -> Self {
-        Self { folder: TempDir::new().unwrap(), paths: Vec::new() }
-    }
-
-    fn add(&mut self, name: &str, bytes: &[u8]) {
-        let path = self.folder.path().join(name);
-        fs::write(&path, bytes).unwrap();
-        self.paths.push(path);
-    }
 }
 
 #[test]

@@ -7,12 +7,12 @@
 mod tools;
 
 use std::io::{self, ErrorKind, Write};
-use std::sync::Mutex;
 
 use molmesh::formats::{self, Encoder, Format, FormatError, GlbSink, Meta, PlaceBytes, PlaceError};
 use molmesh::surface::{Mesh, MeshPart, MeshSink};
 use proptest::prelude::*;
 use serde_json::{Value, json};
+use tools::files::{Anywhere, pour};
 use tools::readers::{
     Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_stl, split_glb, split_gltf, u32_at,
 };
@@ -205,34 +205,6 @@ fn lengths_are_known_before_a_byte_is_written() {
     }
 }
 
-/// A file in memory that takes bytes anywhere.
-#[derive(Default)]
-struct Anywhere(Mutex<Vec<u8>>);
-
-impl PlaceBytes for Anywhere {
-    fn place(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
-        let (mut file, start) = (self.0.lock().unwrap(), usize::try_from(offset).unwrap());
-        let len = file.len().max(start + bytes.len());
-        file.resize(len, 0xee);
-        file[start..start + bytes.len()].copy_from_slice(bytes);
-        Ok(())
-    }
-}
-
-/// A mesh's parts from the last to the first.
-fn pour(sink: &GlbSink<'_>, mesh: &Mesh, n_parts: usize) {
-    let (n, m) = (mesh.n_vertices(), mesh.n_triangles());
-    sink.begin(n, m).unwrap();
-    for part in (0..n_parts).rev() {
-        let cut = |len: usize| part * len / n_parts..(part + 1) * len / n_parts;
-        let (v, t) = (cut(n), cut(m));
-        let (first_vertex, first_triangle) = (v.start, t.start);
-        let (positions, normals) = (&mesh.positions[v.clone()], &mesh.normals[v]);
-        let triangles = &mesh.triangles[t];
-        sink.part(&MeshPart { first_vertex, positions, normals, first_triangle, triangles }).unwrap();
-    }
-}
-
 #[test]
 fn a_glb_written_out_of_order_has_the_same_bytes() {
     let plain = cases().into_iter().filter(|(_, mesh)| mesh.colors.is_none() && mesh.atom_ids.is_none());
@@ -245,7 +217,7 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
             let sink = GlbSink::new(&file);
             pour(&sink, &mesh, n_parts);
             let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).unwrap();
-            let placed = file.0.lock().unwrap().clone();
+            let placed = file.bytes();
             assert_eq!(len, in_order.len() as u64, "{name}");
             assert!(placed == in_order, "{name} in {n_parts}");
         }

@@ -487,13 +487,13 @@ impl Observer for Stages {
     }
 }
 
-/// A mesh put together from parts that come in any order.
+/// A mesh put together from parts that come in any order, and how many vertices came.
 #[derive(Default)]
-struct Collected(Mutex<Mesh>);
+struct Collected(Mutex<(Mesh, usize)>);
 
 impl MeshSink for Collected {
     fn begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), SinkFailed> {
-        let mesh = &mut *self.0.lock().unwrap();
+        let (mesh, _) = &mut *self.0.lock().unwrap();
         mesh.positions = vec![[f32::NAN; 3]; n_vertices].into();
         mesh.normals = vec![[f32::NAN; 3]; n_vertices].into();
         mesh.triangles = vec![[u32::MAX; 3]; n_triangles].into();
@@ -501,7 +501,8 @@ impl MeshSink for Collected {
     }
 
     fn part(&self, part: &MeshPart<'_>) -> Result<(), SinkFailed> {
-        let mesh = &mut *self.0.lock().unwrap();
+        let (mesh, came) = &mut *self.0.lock().unwrap();
+        *came += part.positions.len();
         let (v, t) = (part.first_vertex, part.first_triangle);
         mesh.positions[v..v + part.positions.len()].copy_from_slice(part.positions);
         mesh.normals[v..v + part.normals.len()].copy_from_slice(part.normals);
@@ -512,17 +513,18 @@ impl MeshSink for Collected {
 
 #[test]
 fn what_is_poured_is_what_is_returned() {
-    // Tiles side by side; and two atoms whose saddle lies on a sample, where the gradient vanishes and a normal has to
-    // be taken from the triangles.
-    let flat = spheres(&[[0.0, 0.0, 0.0, 1.7], [4.0, 0.0, 0.0, 1.7]]);
-    for (at, h) in [(spheres(&Random(5).cloud(900, 60.0)), 0.5), (flat, 0.5)] {
+    // Tiles side by side; and a spacing so wide that vertices lie where no atom reaches. There is no gradient there, and
+    // normals are taken from the triangles: every row comes a second time.
+    let lone = spheres(&[[0.0, 0.0, 0.0, 1.7]]);
+    for (at, h, times) in [(spheres(&Random(5).cloud(900, 60.0)), 0.5, 1), (lone, 8.0, 2)] {
         let p = params(Kernel::Gaussian, h);
         let whole = run(&at, &p);
         for threads in [1, 3] {
             let sink = Collected::default();
             let backend = CpuBackend::new(Some(threads)).unwrap();
             let poured = backend.pour(&at, &p, &SurfaceLimits::default(), &Control::default(), &sink).unwrap();
-            let mesh = sink.0.into_inner().unwrap();
+            let (mesh, came) = sink.0.into_inner().unwrap();
+            assert_eq!(came, times * mesh.n_vertices(), "{h} Å");
             assert!(mesh.positions == whole.mesh.positions && mesh.normals == whole.mesh.normals);
             assert!(mesh.triangles == whole.mesh.triangles);
             assert_eq!((poured.n_vertices, poured.n_triangles), (mesh.n_vertices(), mesh.n_triangles()));

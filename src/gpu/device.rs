@@ -29,13 +29,21 @@ impl Program {
     }
 }
 
-/// Opens `adapter` and builds a program on it: the one place where a device meets its stages.
+/// Opens `adapter` and builds the stages on it: the one place where a device meets them.
 ///
 /// # Errors
 /// [`GpuError::Failed`] where the driver refuses, and those of the stages.
-pub(super) fn build(adapter: &Adapter, program: Program) -> Result<Box<dyn Executor>, GpuError> {
+pub(super) fn engine(adapter: &Adapter) -> Result<Engine, GpuError> {
     let (device, queue) = open(adapter)?;
-    let engine = Engine::new(device, queue)?;
+    Engine::new(device, queue)
+}
+
+/// Likewise, with a program on top.
+///
+/// # Errors
+/// As [`engine`], and those of the program.
+pub(super) fn build(adapter: &Adapter, program: Program) -> Result<Box<dyn Executor>, GpuError> {
+    let engine = engine(adapter)?;
     Ok(match program {
         Program::Stages => Box::new(engine),
         Program::Paper => Box::new(Paper::new(engine)?),

@@ -6,6 +6,7 @@
 #![allow(dead_code, unreachable_pub, reason = "every test crate compiles this file and uses its own part")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test says what it expects by panicking")]
 
+pub mod files;
 pub mod readers;
 pub mod shapes;
 

@@ -142,6 +142,10 @@ impl<'a> GlbSink<'a> {
             Err(_) if lock(&self.waiting).len() > MOST_WAITING => Some(lock(&self.lane)),
             Err(_) => None,
         };
+        if lane.is_some() {
+            // Rows that wait are older than these, which may be the same rows once more.
+            self.drain()?;
+        }
         let at = |offset: u64| At { sink: self, offset, now: lane.is_some() };
         write_positions(&mut at(layout.positions.offset + position), packing, part.positions)?;
         write_normals(&mut at(layout.normals.offset + normal), packing, part.normals)?;

@@ -1,6 +1,6 @@
 //! Area, volume and the checksum of directed edges, brick by brick, while the triangles are in the fastest cache.
 //!
-//! What [`Measures::of`](crate::surface::Measures::of) finds in a finished mesh, at a third of the cost.
+//! What [`Measures::of`](crate::surface::Measures::of) finds in a finished mesh.
 
 use glam::Vec3A;
 
