@@ -7,7 +7,8 @@ use tokio::sync::oneshot;
 
 use super::queue::Queue;
 use super::{Failure, Outcome};
-use crate::surface::CancelToken;
+use crate::pipeline::JobError;
+use crate::surface::{CancelToken, SurfaceError};
 
 /// An accepted job.
 #[must_use = "dropping the ticket cancels the job"]
@@ -27,9 +28,14 @@ impl Ticket {
     /// Any [`Failure`].
     pub async fn wait(mut self) -> Outcome {
         match tokio::time::timeout_at(self.deadline.into(), &mut self.outcome).await {
-            Ok(Ok(outcome)) => outcome,
             // Dropping `self` on return takes the job out of the queue or stops it.
             Err(_elapsed) => Err(Failure::Deadline { limit: self.allowed }),
+            // A worker or a device may look at the clock a moment before this timer does.
+            Ok(Ok(Err(Failure::Job { error: JobError::Surface(SurfaceError::Deadline), .. }))) => {
+                Err(Failure::Deadline { limit: self.allowed })
+            }
+            Ok(Err(_dropped)) if Instant::now() >= self.deadline => Err(Failure::Deadline { limit: self.allowed }),
+            Ok(Ok(outcome)) => outcome,
             Ok(Err(_dropped)) => Err(Failure::Stopped),
         }
     }
