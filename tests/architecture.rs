@@ -75,6 +75,16 @@ const ROOMS: &[Room] = &[
     },
     Room { name: "telemetry", rooms: &[("config", Any)], crates: &["axum", "tower", "hyper", "wgpu", "clap"] },
     Room {
+        name: "store",
+        rooms: &[("config", Any), ("telemetry", Any)],
+        crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
+    },
+    Room {
+        name: "archive",
+        rooms: &[("structure", Any), ("config", Any), ("telemetry", Any), ("store", Any)],
+        crates: &["axum", "tower", "tower_http", "wgpu", "clap"],
+    },
+    Room {
         name: "jobs",
         rooms: &[
             ("surface", Any),
@@ -83,6 +93,7 @@ const ROOMS: &[Room] = &[
             ("pipeline", Any),
             ("config", Any),
             ("telemetry", Any),
+            ("store", Any),
         ],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap"],
     },
@@ -95,6 +106,8 @@ const ROOMS: &[Room] = &[
             ("pipeline", Any),
             ("config", Any),
             ("telemetry", Any),
+            ("store", Any),
+            ("archive", Any),
             ("jobs", Any),
         ],
         crates: &["wgpu", "clap", "rayon"],

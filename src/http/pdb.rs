@@ -16,8 +16,9 @@ use super::problem::Problem;
 use super::state::Shared;
 use super::{conditional, delivery};
 use crate::formats::Format;
-use crate::jobs::{ContentKey, Digest, Lease, Task};
+use crate::jobs::{ContentKey, Lease, Task};
 use crate::pipeline::params;
+use crate::store::Digest;
 use crate::structure::{ArchiveError, EntryId};
 
 /// Entries change a few times in their life, and then in details: a day is soon enough to notice.

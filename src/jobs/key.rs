@@ -1,29 +1,10 @@
-//! Names of contents: the digest of an input, and the key of what is made of it.
+//! The name of what is made of an input: equal names, equal bytes.
 
 use std::fmt;
 
-use sha2::{Digest as _, Sha256};
-
 use crate::formats::Format;
 use crate::pipeline::{Job, params};
-
-/// SHA-256 of a structure file as it came.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Digest([u8; 32]);
-
-impl Digest {
-    /// The digest of `bytes`. About a nanosecond a byte: not for the async runtime.
-    #[must_use]
-    pub fn of(bytes: &[u8]) -> Self {
-        Self(Sha256::digest(bytes).into())
-    }
-}
-
-impl fmt::Display for Digest {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
-    }
-}
+use crate::store::Digest;
 
 /// The name of a mesh file: equal keys, equal bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -48,11 +29,6 @@ impl fmt::Display for ContentKey {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn digests_are_sha256() {
-        assert_eq!(Digest::of(b"abc").to_string(), "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
-    }
 
     #[test]
     fn keys_tell_everything_apart() {

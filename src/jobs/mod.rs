@@ -14,7 +14,7 @@ mod worker;
 
 pub use budget::{Budget, Exhausted, Lease};
 pub use error::{Failure, Refusal};
-pub use key::{ContentKey, Digest};
+pub use key::ContentKey;
 pub use pool::{Pool, Settings};
 pub use ticket::Ticket;
 
@@ -24,6 +24,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 
 use crate::pipeline::{Job, Product};
+use crate::store::Digest;
 use crate::structure::referee::Diagnostic;
 
 /// One job to run.

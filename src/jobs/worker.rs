@@ -9,8 +9,9 @@ use metrics::{counter, histogram};
 
 use super::pool::Shared;
 use super::queue::Entry;
-use super::{Digest, Failure, Finished, Outcome};
+use super::{Failure, Finished, Outcome};
 use crate::pipeline::{self, Choice, JobError, JobLimits, Report};
+use crate::store::Digest;
 use crate::structure::referee::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Mesh, SurfaceError};

@@ -1,0 +1,5 @@
+//! What the service keeps, by the names of contents.
+
+mod digest;
+
+pub use digest::{BadDigest, Digest};
