@@ -17,10 +17,16 @@ use crate::config::{LogConfig, LogFormat};
 pub const HTTP_DURATION: &str = "http_server_request_duration_seconds";
 /// Open connections.
 pub const CONNECTIONS: &str = "molmesh_connections";
-/// Jobs accepted, by mode.
+/// Jobs accepted, by mode (`sync`, `async`) and whether they took part in work that was in the house (`dedup`).
 pub const JOBS_SUBMITTED: &str = "molmesh_jobs_submitted_total";
 /// Jobs ended, by outcome: `successful`, `failed`, `dismissed`, `panicked`.
 pub const JOBS_FINISHED: &str = "molmesh_jobs_finished_total";
+/// Promised jobs that have not ended.
+pub const JOBS_OPEN: &str = "molmesh_jobs_open";
+/// Promised jobs of earlier processes that were taken up again.
+pub const JOBS_RECOVERED: &str = "molmesh_jobs_recovered_total";
+/// Results of synchronous requests that were not kept, by reason: `busy`, `failed`.
+pub const RESULTS_NOT_KEPT: &str = "molmesh_results_not_kept_total";
 /// Jobs that another backend served in place of the chosen one.
 pub const JOBS_FALLBACK: &str = "molmesh_jobs_fallback_total";
 /// 1 while the device takes jobs, else 0, by device number.
@@ -39,6 +45,8 @@ pub const DEVICE_WAITING: &str = "molmesh_device_jobs";
 pub const STAGE_DURATION: &str = "molmesh_job_stage_duration_seconds";
 /// Jobs that wait.
 pub const QUEUE_DEPTH: &str = "molmesh_queue_depth";
+/// How long the oldest job has waited.
+pub const QUEUE_AGE: &str = "molmesh_queue_oldest_age_seconds";
 /// How long a job that is accepted now would wait.
 pub const QUEUE_WAIT: &str = "molmesh_queue_estimated_wait_seconds";
 /// Requests refused by a limit, by the limit's problem type.
@@ -49,6 +57,16 @@ pub const MEMORY_HELD: &str = "molmesh_memory_held_bytes";
 pub const VOXELS: &str = "molmesh_voxels_processed_total";
 /// Triangles of finished meshes.
 pub const TRIANGLES: &str = "molmesh_triangles_emitted_total";
+/// Bytes kept in the store, by folder.
+pub const STORE_BYTES: &str = "molmesh_store_bytes";
+/// Objects kept in the store, by folder.
+pub const STORE_OBJECTS: &str = "molmesh_store_objects";
+/// Objects that the store removed by itself, by reason: `ttl` or `cap`.
+pub const STORE_REMOVED: &str = "molmesh_store_removed_total";
+/// Operations of the store that failed, by operation.
+pub const STORE_ERRORS: &str = "molmesh_store_errors_total";
+/// Results asked for, by tier (`memory`, then `store`) and result (`hit`, `miss`).
+pub const CACHE_REQUESTS: &str = "molmesh_cache_requests_total";
 /// Panics that were caught, by place.
 pub const PANICS: &str = "molmesh_panics_total";
 /// 1, labelled with the version.
@@ -128,6 +146,9 @@ fn describe() {
     describe_gauge!(CONNECTIONS, "Open connections");
     describe_counter!(JOBS_SUBMITTED, "Jobs accepted");
     describe_counter!(JOBS_FINISHED, "Jobs ended, by outcome");
+    describe_counter!(RESULTS_NOT_KEPT, "Results of synchronous requests that were not kept");
+    describe_gauge!(JOBS_OPEN, "Promised jobs that have not ended");
+    describe_counter!(JOBS_RECOVERED, "Promised jobs of earlier processes that were taken up again");
     describe_counter!(JOBS_FALLBACK, "Jobs that another backend served in place of the chosen one");
     describe_gauge!(DEVICE_UP, "1 while the device takes jobs");
     describe_counter!(DEVICE_JOBS, "Jobs that a device ended, by outcome");
@@ -137,18 +158,24 @@ fn describe() {
     describe_gauge!(DEVICE_WAITING, "Jobs that wait for a device or run on it");
     describe_histogram!(STAGE_DURATION, Unit::Seconds, "Time per stage of a job");
     describe_gauge!(QUEUE_DEPTH, "Jobs that wait");
+    describe_gauge!(QUEUE_AGE, Unit::Seconds, "How long the oldest job has waited");
     describe_gauge!(QUEUE_WAIT, Unit::Seconds, "How long a job that is accepted now would wait");
     describe_counter!(REJECTED, "Requests refused by a limit");
     describe_gauge!(MEMORY_HELD, Unit::Bytes, "Bytes of uploads and meshes held in memory");
     describe_counter!(VOXELS, "Samples at which the density was evaluated");
     describe_counter!(TRIANGLES, "Triangles of finished meshes");
+    describe_gauge!(STORE_BYTES, Unit::Bytes, "Bytes kept in the store");
+    describe_gauge!(STORE_OBJECTS, "Objects kept in the store");
+    describe_counter!(STORE_REMOVED, "Objects that the store removed by itself, by reason");
+    describe_counter!(STORE_ERRORS, "Operations of the store that failed");
+    describe_counter!(CACHE_REQUESTS, "Results asked for, by tier and result");
     describe_counter!(PANICS, "Panics that were caught");
     describe_gauge!(BUILD_INFO, "1, labelled with the version");
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
-    for gauge_name in [CONNECTIONS, QUEUE_DEPTH, QUEUE_WAIT, MEMORY_HELD] {
+    for gauge_name in [CONNECTIONS, JOBS_OPEN, QUEUE_DEPTH, QUEUE_AGE, QUEUE_WAIT, MEMORY_HELD] {
         gauge!(gauge_name).set(0.0);
     }
-    for counter_name in [VOXELS, TRIANGLES, JOBS_FALLBACK] {
+    for counter_name in [VOXELS, TRIANGLES, JOBS_FALLBACK, JOBS_RECOVERED] {
         counter!(counter_name).increment(0);
     }
     for place in ["job", "http"] {

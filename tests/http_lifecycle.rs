@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, log_lines, start, start_cold, wait_for};
+use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, log_lines, sample, start, start_cold, wait_for};
 
 fn running(backend: &Arc<Fake>) -> Running {
     start(Arc::clone(backend) as _, |_| {})
@@ -88,7 +88,7 @@ fn a_waiting_job_whose_client_leaves_never_runs() {
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.workers = 1);
     let first = begin(&server, SAMPLE);
     wait_for("the first job to run", || backend.started.load(Ordering::SeqCst) == 1);
-    let second = begin(&server, SAMPLE);
+    let second = begin(&server, &sample(2));
     std::thread::sleep(Duration::from_millis(100));
     drop(second);
     wait_for("the first job to end", || backend.finished.load(Ordering::SeqCst) == 1);
@@ -136,9 +136,9 @@ fn a_drain_finishes_what_runs_and_what_waits() {
     let mut server = start(Arc::clone(&backend) as _, |c| c.jobs.workers = 1);
     let statuses = std::thread::scope(|scope| {
         let clients: Vec<_> = (0..2)
-            .map(|_| {
+            .map(|n| {
                 let addr = server.addr;
-                scope.spawn(move || http_support::send(addr, "POST", "/v1/meshes", &[], SAMPLE))
+                scope.spawn(move || http_support::send(addr, "POST", "/v1/meshes", &[], &sample(n)))
             })
             .collect();
         wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 1);
@@ -210,6 +210,7 @@ fn an_address_in_use_is_named_with_its_key() {
     let mut config = molmesh::config::Config::default();
     config.server.listen = server.addr;
     let chosen = molmesh::http::Chosen { backend, reason: String::new(), devices: Vec::new() };
-    let error = molmesh::http::Server::bind(config, chosen).err().unwrap().to_string();
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let error = runtime.block_on(molmesh::http::Server::bind(config, chosen)).err().unwrap().to_string();
     assert!(error.contains("server.listen") && error.contains(&server.addr.to_string()), "{error}");
 }

@@ -9,7 +9,7 @@ use std::sync::atomic::Ordering;
 use std::sync::{Arc, Barrier};
 use std::time::{Duration, Instant};
 
-use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, connect, read_reply, send, start, wait_for};
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, connect, read_reply, sample, send, start, wait_for};
 use molmesh::config::Config;
 use molmesh::surface::cpu::CpuBackend;
 
@@ -118,12 +118,13 @@ fn a_full_queue_refuses_at_once_and_says_when_to_come_back() {
         c.jobs.workers = 1;
         c.jobs.queue = 2;
     });
+    let server = &server;
     std::thread::scope(|scope| {
-        let accepted: Vec<_> = (0..3).map(|_| scope.spawn(|| server.post("/v1/meshes", &[], SAMPLE).status)).collect();
+        let accepted: Vec<_> = (0..3).map(|n| scope.spawn(move || server.post("/v1/meshes", &[], &sample(n)).status)).collect();
         wait_for("two jobs to wait", || server.metric("molmesh_queue_depth", &[]) >= 2.0);
         wait_for("one job to run", || backend.started.load(Ordering::SeqCst) == 1);
         let start = Instant::now();
-        let refused = server.post("/v1/meshes", &[], SAMPLE);
+        let refused = server.post("/v1/meshes", &[], &sample(9));
         assert!(start.elapsed() < Duration::from_millis(200), "{:?}", start.elapsed());
         let problem = refused.problem(503, "queue-full");
         assert_eq!((&problem["limit"], &problem["actual"]), (&2.into(), &2.into()));
@@ -147,8 +148,9 @@ fn the_deadline_counts_waiting_and_stops_the_job() {
         c.jobs.workers = 1;
         c.jobs.deadline_ms = 300;
     });
+    let server = &server;
     std::thread::scope(|scope| {
-        let replies: Vec<_> = (0..2).map(|_| scope.spawn(|| server.post("/v1/meshes", &[], SAMPLE))).collect();
+        let replies: Vec<_> = (0..2).map(|n| scope.spawn(move || server.post("/v1/meshes", &[], &sample(n)))).collect();
         for reply in replies {
             let problem = reply.join().unwrap().problem(504, "deadline");
             let limit = problem["limit"].as_u64().unwrap();
@@ -256,10 +258,11 @@ fn a_hundred_clients_at_once_are_all_answered() {
     let barrier = Barrier::new(100);
     let statuses: Vec<u16> = std::thread::scope(|scope| {
         let clients: Vec<_> = (0..100)
-            .map(|_| {
-                scope.spawn(|| {
+            .map(|n| {
+                let (server, barrier) = (&server, &barrier);
+                scope.spawn(move || {
                     barrier.wait();
-                    let reply = server.post("/v1/meshes", &[], SAMPLE);
+                    let reply = server.post("/v1/meshes", &[], &sample(n));
                     assert!(reply.complete);
                     reply.status
                 })

@@ -30,12 +30,6 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let Picked { backend, reason, devices, .. } = picked;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let facts = Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others };
-    let server =
-        Server::bind(config, Chosen { backend, reason, devices }).map_err(|e| CliError::Service(e.to_string()))?;
-    let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
-    // The service runs whether or not somebody reads its banner.
-    drop(io::stderr().write_all(text.as_bytes()));
-
     let failed = |e: io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(RUNTIME_THREADS)
@@ -43,6 +37,13 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         .enable_all()
         .build()
         .map_err(failed)?;
+    let server = runtime
+        .block_on(Server::bind(config, Chosen { backend, reason, devices }))
+        .map_err(|e| CliError::Service(e.to_string()))?;
+    let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
+    // The service runs whether or not somebody reads its banner.
+    drop(io::stderr().write_all(text.as_bytes()));
+
     let drained = runtime.block_on(server.run(shutdown_signal())).map_err(|e| CliError::Service(e.to_string()));
     // What still reads a file or computes after the drain timeout is not waited for.
     runtime.shutdown_timeout(Duration::from_millis(100));

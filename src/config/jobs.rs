@@ -20,15 +20,38 @@ pub struct JobsConfig {
     /// Time from acceptance to the finished mesh, ms, waiting included. Default 60,000: proxies commonly cut an
     /// exchange after a minute.
     pub deadline_ms: u64,
+    /// Time that a request waits for its mesh, ms, before the answer is the promise of a job instead. Default 10,000: people
+    /// who wait longer want to see how far it is.
+    pub sync_wait_ms: u64,
+    /// Time from acceptance to the result of a promised job, ms, waiting included. Default 3,600,000: nobody holds a
+    /// connection for it.
+    pub batch_deadline_ms: u64,
+    /// Times that a promised job is begun at most. Default 3: a job that ended the process so often will end it again.
+    pub attempts: u32,
+    /// Results of synchronous requests that are kept at once, beside their answers. Default 4: more would compete with
+    /// the meshing; what is not kept is made again when somebody asks.
+    pub keepers: usize,
 }
 
 impl Default for JobsConfig {
     fn default() -> Self {
-        Self { workers: 2, queue: 64, deliveries: 256, deadline_ms: 60_000 }
+        Self { workers: 2, queue: 64, deliveries: 256, deadline_ms: 60_000, sync_wait_ms: 10_000, batch_deadline_ms: 3_600_000, attempts: 3, keepers: 4 }
     }
 }
 
 impl JobsConfig {
+    /// Time that a request waits for its mesh.
+    #[must_use]
+    pub fn sync_wait(&self) -> Duration {
+        Duration::from_millis(self.sync_wait_ms)
+    }
+
+    /// Time from acceptance to the result of a promised job.
+    #[must_use]
+    pub fn batch_deadline(&self) -> Duration {
+        Duration::from_millis(self.batch_deadline_ms)
+    }
+
     /// Time from acceptance to the finished mesh.
     #[must_use]
     pub fn deadline(&self) -> Duration {

@@ -25,6 +25,7 @@ use tower::ServiceExt as _;
 use super::io::Guarded;
 use super::kinds::Kind;
 use super::problem::{MEDIA_TYPE, Problem};
+use super::wish::Peer;
 use crate::config::ServerConfig;
 use crate::telemetry::{CONNECTIONS, REJECTED};
 
@@ -59,8 +60,8 @@ pub(super) async fn serve(
             Some(_ended) = connections.join_next() => continue,
             _ = stop.wait_for(|stop| *stop) => break,
         };
-        let stream = match accepted {
-            Ok((stream, _peer)) => stream,
+        let (stream, peer) = match accepted {
+            Ok(accepted) => accepted,
             Err(error) => {
                 tracing::warn!(%error, "cannot accept a connection");
                 tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -81,7 +82,7 @@ pub(super) async fn serve(
             continue;
         }
         let stream = Guarded::new(stream, Place::new(place), config.write_timeout());
-        connections.spawn(connection(stream, router.clone(), Arc::clone(&config), stop.clone()));
+        connections.spawn(connection(stream, Peer(peer.ip()), router.clone(), Arc::clone(&config), stop.clone()));
     }
     drop(listener);
     let all = async { while connections.join_next().await.is_some() {} };
@@ -154,6 +155,7 @@ impl Drop for Working {
 /// Serves one connection.
 async fn connection(
     stream: Guarded<Place>,
+    peer: Peer,
     router: Router,
     config: Arc<ServerConfig>,
     mut stop: watch::Receiver<bool>,
@@ -161,7 +163,9 @@ async fn connection(
     let activity = Arc::new(Activity::default());
     let service = service_fn(|request: Request<Incoming>| {
         let working = Working::on(&activity);
-        let answer = router.clone().oneshot(request.map(Body::new));
+        let mut request = request.map(Body::new);
+        request.extensions_mut().insert(peer);
+        let answer = router.clone().oneshot(request);
         async move {
             let answer = answer.await;
             drop(working);

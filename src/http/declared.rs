@@ -38,6 +38,11 @@ impl Declared {
         }
     }
 
+    /// Whether it names a structure format, which the bytes must then have.
+    pub(super) const fn is_structure(&self) -> bool {
+        matches!(self, Self::Structure(..))
+    }
+
     /// Checks what the first bytes can tell.
     pub(super) fn check_bytes(&self, bytes: &[u8]) -> Result<(), Problem> {
         match self {

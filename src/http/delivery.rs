@@ -7,6 +7,7 @@ use axum::http::HeaderValue;
 use axum::http::header::{self, HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
+use serde_json::Value;
 use tokio::sync::OwnedSemaphorePermit;
 
 use super::problem::{self, Problem};
@@ -36,7 +37,7 @@ pub(super) const SUMMARY: [&str; 16] = [
     "molmesh-backend-reason",
 ];
 
-const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
+pub(super) const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
 
 /// The mesh as `format`; `place` is given back when its last byte is written.
 pub(super) async fn mesh(
@@ -48,7 +49,7 @@ pub(super) async fn mesh(
     place: OwnedSemaphorePermit,
 ) -> Result<Response, Problem> {
     let report = &finished.product.report;
-    let mut headers = summary(report);
+    let mut headers = summary(&serde_json::to_value(report).map_err(Problem::internal)?);
     headers.insert(SERVER_TIMING, server_timing(report, received));
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
@@ -63,12 +64,12 @@ pub(super) async fn mesh(
 /// The report as JSON.
 pub(super) fn report(finished: &Finished, received: Duration) -> Result<Response, Problem> {
     let report = &finished.product.report;
-    let mut headers = summary(report);
+    let mut document = serde_json::to_value(report).map_err(Problem::internal)?;
+    let mut headers = summary(&document);
     headers.insert(SERVER_TIMING, server_timing(report, received));
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
     // Times differ from run to run, so no two reports are the same.
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
-    let mut document = serde_json::to_value(report).map_err(Problem::internal)?;
     if let (Some(diagnostics), Some(members)) = (&finished.diagnostics, document.as_object_mut()) {
         members.insert("diagnostics".to_owned(), problem::findings(diagnostics));
     }
@@ -90,31 +91,26 @@ pub(super) fn disposition(id: Option<&str>, format: Format) -> HeaderValue {
 }
 
 /// A header value; characters that headers cannot hold are written as `?`.
-fn text(value: &str) -> HeaderValue {
+pub(super) fn text(value: &str) -> HeaderValue {
     let plain: String = value.chars().map(|c| if (' '..='~').contains(&c) { c } else { '?' }).collect();
     HeaderValue::from_str(&plain).unwrap_or_else(|_| HeaderValue::from_static("?"))
 }
 
-fn summary(report: &Report) -> HeaderMap {
-    let values = [
-        report.atoms.to_string(),
-        report.vertices.to_string(),
-        report.triangles.to_string(),
-        format!("{:.3}", report.area),
-        format!("{:.3}", report.volume),
-        report.closed.to_string(),
-        report.manifold.to_string(),
-        report.euler.to_string(),
-        report.components.to_string(),
-        report.kernel.to_owned(),
-        report.preset.to_owned(),
-        report.resolution.to_string(),
-        report.isovalue.to_string(),
-        report.radii.replace('Å', "A"),
-        report.backend.to_owned(),
-        report.backend_reason.clone(),
-    ];
-    SUMMARY.iter().zip(values).map(|(name, value)| (HeaderName::from_static(name), text(&value))).collect()
+/// The headers that sum up a report, from its JSON: fresh or kept, the same.
+pub(super) fn summary(report: &Value) -> HeaderMap {
+    let header = |name: &'static str| {
+        let member = name.trim_start_matches("molmesh-").replace('-', "_");
+        let value = match &report[member.as_str()] {
+            Value::String(text) => text.replace('Å', "A"),
+            // Areas and volumes to a thousandth.
+            Value::Number(number) if member == "area" || member == "volume" => {
+                format!("{:.3}", number.as_f64().unwrap_or_default())
+            }
+            other => other.to_string(),
+        };
+        (HeaderName::from_static(name), text(&value))
+    };
+    SUMMARY.into_iter().map(header).collect()
 }
 
 /// Time of every stage that is over when the head is sent; writing the file is not.

@@ -1,21 +1,28 @@
-//! `POST /v1/meshes`: the mesh of an upload.
+//! `POST /v1/meshes`: the mesh of an upload, or of what a JSON document names.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use axum::body::Body;
 use axum::extract::rejection::QueryRejection;
 use axum::extract::{Query, State};
-use axum::http::HeaderValue;
 use axum::http::header::{self, HeaderMap};
+use axum::http::{Extensions, HeaderValue, Method};
 use axum::response::Response;
+use serde_json::Value;
 
+use super::ask::{self, Ask, Input};
+use super::declared::Declared;
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::state::Shared;
 use super::upload::{self, Upload};
-use super::{delivery, negotiate};
-use crate::jobs::{ContentKey, Task};
-use crate::pipeline::params;
+use super::wish::Wish;
+use super::{negotiate, pdb, structures};
+use crate::formats::Format;
+use crate::pipeline::params::{self, Request};
+use crate::store::Digest;
+use crate::structure::EntryId;
 
 /// A query as pairs, in order.
 pub(super) type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
@@ -26,54 +33,178 @@ pub(super) fn pairs(query: Pairs) -> Result<Vec<(String, String)>, Problem> {
     Ok(pairs)
 }
 
+/// What a body asks for.
+pub(super) struct Taken {
+    pub(super) request: Request,
+    pub(super) pairs: Vec<(String, String)>,
+    pub(super) format: Format,
+    pub(super) digest: Digest,
+    pub(super) declared: Declared,
+    /// The bytes, or what names them.
+    source: Source,
+}
+
+impl Taken {
+    /// The bytes.
+    pub(super) async fn input(self, app: &Shared) -> Result<Input, Problem> {
+        self.source.input(app).await
+    }
+}
+
 /// Meshes the body.
 pub(super) async fn create(
     State(app): State<Shared>,
     query: Pairs,
     headers: HeaderMap,
+    extensions: Extensions,
     body: Body,
 ) -> Result<Response, Problem> {
     let start = Instant::now();
+    let wish = Wish::of(&headers, &extensions)?;
+    let taken = take(&app, query, &headers, body).await?;
+    let Taken { request, pairs, format, digest, declared, source } = taken;
+    let ask = Ask { digest, request, pairs, format, wish, cache: None, received: start.elapsed(), declared };
+    // What a type says about the bytes is found out by reading them.
+    let known = if ask.declared.is_structure() {
+        None
+    } else {
+        ask.known(&app, &Method::POST, &HeaderMap::new()).await?
+    };
+    let mut response = match known {
+        Some(response) => response,
+        None => {
+            let input = source.input(&app).await?;
+            ask.make(&app, input).await?
+        }
+    };
+    response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
+    Ok(response)
+}
+
+/// Receives what a body asks for.
+pub(super) async fn take(
+    app: &Shared,
+    query: Pairs,
+    headers: &HeaderMap,
+    body: Body,
+) -> Result<Taken, Problem> {
     let mut pairs = pairs(query)?;
     // A request that will be refused is refused before its body is received.
     let mut request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
-    let accepted = match (request.format, request.report) {
-        (None, false) if !upload::is_multipart(&headers) => Some(negotiate::format(&headers)?),
-        _ => None,
+    let late = upload::is_multipart(headers) || upload::is_json(headers);
+    let early = if late { None } else { Some(format(&request, headers)?) };
+    early.map_or(Ok(()), |format| params::suits(&request.job, format))?;
+    let Upload { bytes, lease, fields, declared } = upload::receive(app, headers, body).await?;
+    let (source, fields) = if upload::is_json(headers) {
+        document(&bytes)?
+    } else {
+        (Source::Sent(Input { bytes, lease: Arc::new(lease) }), fields)
     };
-    accepted.map_or(Ok(()), |format| params::suits(&request.job, format))?;
-    let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
-    if !fields.is_empty() {
+    if late {
         pairs.extend(fields);
-        request = params::parse(pairs)?;
+        request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
     }
-    let format = match (request.format, accepted, request.report) {
-        (Some(format), ..) | (None, Some(format), _) => format,
-        (None, None, true) => crate::formats::Format::default(),
-        (None, None, false) => negotiate::format(&headers)?,
-    };
+    let format = early.map_or_else(|| format(&request, headers), Ok)?;
     if !request.report {
         params::suits(&request.job, format)?;
     }
-    let received = start.elapsed();
-    let place = app.delivery()?;
-    let job = request.job.clone();
-    let deadline = Instant::now() + app.config.jobs.deadline();
-    let ticket = app.pool.submit(Task {
-        input: bytes,
-        digest: None,
-        strict: request.strict,
-        job,
-        deadline,
-        lease: Some(lease),
-    })?;
-    let finished = ticket.wait().await.map_err(|failure| declared.explain(failure))?;
-    declared.check_format(finished.product.report.source_format)?;
-    if request.report {
-        return delivery::report(&finished, received);
+    let digest = match &source {
+        Source::Sent(input) => ask::digest(&input.bytes).await?,
+        Source::Entry(id) => pdb::digest(app, id).await?,
+        Source::Structure(digest) => *digest,
+    };
+    // The type of a document that names a structure says nothing about the structure.
+    let declared = if matches!(source, Source::Sent(_)) { declared } else { Declared::Neutral };
+    Ok(Taken { request, pairs, format, digest, declared, source })
+}
+
+/// The format that is asked for; a report has the default one, of which nothing is written.
+pub(super) fn format(request: &Request, headers: &HeaderMap) -> Result<Format, Problem> {
+    match (request.format, request.report) {
+        (Some(format), _) => Ok(format),
+        (None, true) => Ok(Format::default()),
+        (None, false) => negotiate::format(headers),
     }
-    let key = ContentKey::new(&finished.digest, &request.job, format, finished.product.report.backend);
-    let mut response = delivery::mesh(&app, finished, format, &key, received, place).await?;
-    response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
-    Ok(response)
+}
+
+/// Where the bytes come from.
+enum Source {
+    /// They were sent.
+    Sent(Input),
+    /// An entry of the archive is named.
+    Entry(EntryId),
+    /// A structure that was uploaded is named.
+    Structure(Digest),
+}
+
+impl Source {
+    async fn input(self, app: &Shared) -> Result<Input, Problem> {
+        match self {
+            Self::Sent(input) => Ok(input),
+            Self::Entry(id) => pdb::input(app, &id).await,
+            Self::Structure(digest) => structures::input(app, &digest).await,
+        }
+    }
+}
+
+/// Reads `{"pdb_id": …}` or `{"structure": …}` with parameters beside it.
+fn document(bytes: &[u8]) -> Result<(Source, Vec<(String, String)>), Problem> {
+    let bad = |detail: String| Problem::new(Kind::BadRequest, detail).with("expected", "{\"pdb_id\": \"4pti\", …}");
+    let value: Value = serde_json::from_slice(bytes)
+        .map_err(|e| bad(format!("the JSON cannot be read: {e}")).with("line", e.line()).with("column", e.column()))?;
+    let Value::Object(members) = value else { return Err(bad("the JSON is no object".to_owned())) };
+    let (mut source, mut fields) = (None, Vec::new());
+    for (name, value) in members {
+        let text = plain(&value).ok_or_else(|| {
+            Problem::new(Kind::BadParameter, format!("member `{name}` is neither text, number, true or false, nor a list of them"))
+                .with("parameter", name.as_str())
+        })?;
+        let found = match name.as_str() {
+            "pdb_id" => Source::Entry(text.parse().map_err(|error| pdb::of_archive(&error))?),
+            "structure" => Source::Structure(structures::digest_of(&text)?),
+            _ => {
+                fields.push((name, text));
+                continue;
+            }
+        };
+        if source.replace(found).is_some() {
+            return Err(bad("the JSON names more than one structure".to_owned()));
+        }
+    }
+    let source = source.ok_or_else(|| bad("the JSON names no structure: it has no `pdb_id` and no `structure`".to_owned()))?;
+    Ok((source, fields))
+}
+
+/// A value as it would stand in a query.
+fn plain(value: &Value) -> Option<String> {
+    match value {
+        Value::String(text) => Some(text.clone()),
+        Value::Number(number) => Some(number.to_string()),
+        Value::Bool(flag) => Some(flag.to_string()),
+        Value::Array(items) if !items.is_empty() => {
+            let items: Option<Vec<String>> = items.iter().filter(|i| !i.is_array()).map(plain).collect();
+            items.filter(|found| found.len() > 0).map(|items| items.join(","))
+        }
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn json_members_become_parameters() {
+        let (source, fields) =
+            document(br#"{"pdb_id": "4PTI", "resolution": 0.5, "chains": ["A", "B"], "atom_ids": true}"#).ok().unwrap();
+        assert!(matches!(source, Source::Entry(id) if id.as_str() == "4pti"));
+        let expected = [("resolution", "0.5"), ("chains", "A,B"), ("atom_ids", "true")];
+        assert_eq!(fields, expected.map(|(n, v)| (n.to_owned(), v.to_owned())));
+        for bad in [
+            "[]", "{", "{}", "{\"resolution\": 1}", "{\"pdb_id\": {}}", "{\"pdb_id\": \"../x\"}", "{\"pdb_id\": null}",
+            "{\"structure\": \"xyz\"}", "{\"pdb_id\": \"4pti\", \"chains\": []}",
+        ] {
+            assert!(document(bad.as_bytes()).is_err(), "{bad}");
+        }
+    }
 }

@@ -53,6 +53,10 @@ async fn security_headers(request: Request, next: Next) -> Response {
 fn cors() -> CorsLayer {
     let exposed = [
         header::ETAG,
+        header::LOCATION,
+        header::CONTENT_LOCATION,
+        header::CONTENT_RANGE,
+        header::ACCEPT_RANGES,
         header::CONTENT_DISPOSITION,
         header::RETRY_AFTER,
         HeaderName::from_static("server-timing"),
@@ -60,7 +64,7 @@ fn cors() -> CorsLayer {
     ];
     CorsLayer::new()
         .allow_origin(Any)
-        .allow_methods([Method::GET, Method::HEAD, Method::POST])
+        .allow_methods([Method::GET, Method::HEAD, Method::POST, Method::DELETE])
         .allow_headers(Any)
         .expose_headers(
             exposed

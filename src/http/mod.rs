@@ -5,12 +5,16 @@
 //! to [`crate::jobs`], files are read on threads that may block.
 
 mod accept;
+mod ask;
 mod capabilities;
 mod conditional;
 mod declared;
 mod delivery;
+mod estimate;
+mod events;
 mod health;
 mod io;
+mod jobs;
 mod kinds;
 mod meshes;
 mod metrics;
@@ -21,11 +25,15 @@ mod page;
 mod pdb;
 mod problem;
 mod problems;
+mod range;
 mod request_id;
+mod results;
 mod router;
 mod server;
 mod state;
 mod stream;
+mod structures;
 mod upload;
+mod wish;
 
 pub use server::{Chosen, ServeError, Server, shutdown_signal};

@@ -6,17 +6,19 @@ use std::time::Instant;
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
 use axum::http::header::{self, HeaderMap};
-use axum::http::{HeaderValue, Method, StatusCode};
+use axum::http::{Extensions, HeaderValue, Method};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 
+use super::ask::{Ask, Input};
+use super::declared::Declared;
+use super::delivery;
 use super::kinds::Kind;
 use super::meshes::{Pairs, pairs};
 use super::problem::Problem;
 use super::state::Shared;
-use super::{conditional, delivery};
+use super::wish::Wish;
 use crate::formats::Format;
-use crate::jobs::{ContentKey, Lease, Task};
 use crate::pipeline::params;
 use crate::store::Digest;
 use crate::structure::{ArchiveError, EntryId};
@@ -31,12 +33,28 @@ pub(super) async fn surface(
     path: Result<Path<(String, String)>, PathRejection>,
     query: Pairs,
     headers: HeaderMap,
+    extensions: Extensions,
 ) -> Result<Response, Problem> {
     let start = Instant::now();
     let Path((id, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let format = format_of(&file)?;
+    let (request, pairs, format) = named(&file, query)?;
+    let id: EntryId = id.parse().map_err(|error| of_archive(&error))?;
+    let digest = digest(&app, &id).await?;
+    let wish = Wish::of(&headers, &extensions)?;
+    let mut ask = Ask { digest, request, pairs, format, wish, cache: Some(CACHE), received: start.elapsed(), declared: Declared::Neutral };
+    if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
+        return Ok(response);
+    }
+    let input = input(&app, &id).await?;
+    ask.received = start.elapsed();
+    ask.make(&app, input).await
+}
+
+/// The request behind an address that ends in `surface.{ext}`.
+pub(super) fn named(file: &str, query: Pairs) -> Result<(params::Request, Vec<(String, String)>, Format), Problem> {
+    let format = format_of(file)?;
     let pairs = pairs(query)?;
-    let request = params::parse(pairs)?;
+    let request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
     if let Some(other) = request.format {
         let value = other.extension();
         let detail = format!("parameter `format`: the address already says {}", format.extension());
@@ -46,36 +64,32 @@ pub(super) async fn surface(
             .with("expected", format!("no value here, or the address surface.{value}")));
     }
     params::suits(&request.job, format)?;
-    let id = id.parse().map_err(|error| of_archive(&error))?;
-    let (bytes, digest, lease) = fetch(Arc::clone(&app), id).await?;
-    let received = start.elapsed();
-    let key = ContentKey::new(&digest, &request.job, format, app.pool.backend().name());
-    let etag = delivery::etag(&key);
-    if !request.report {
-        let caching = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, CACHE)];
-        if conditional::is_unchanged(&headers, &etag) {
-            return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
+    Ok((request, pairs, format))
+}
+
+impl Ask {
+    /// The answer that needs no mesh to be made: a known result, or that a `HEAD` gets.
+    pub(super) async fn answer_without_work(
+        &self,
+        app: &Shared,
+        method: &Method,
+        headers: &HeaderMap,
+    ) -> Result<Option<Response>, Problem> {
+        if let Some(response) = self.known(app, method, headers).await? {
+            return Ok(Some(response));
         }
-        if method == Method::HEAD {
-            // What a mesh would say about itself is known only after meshing, which HEAD is not worth.
-            let media_type = HeaderValue::from_static(format.media_type());
-            return Ok((caching, [(header::CONTENT_TYPE, media_type)]).into_response());
+        if method != Method::HEAD || self.request.report {
+            return Ok(None);
         }
+        // What a mesh would say about itself is known only after meshing, which HEAD is not worth.
+        let media_type = HeaderValue::from_static(self.format.media_type());
+        let mut response = [(header::CONTENT_TYPE, media_type)].into_response();
+        response.headers_mut().insert(header::ETAG, delivery::etag(&self.key(app)));
+        if let Some(cache) = &self.cache {
+            response.headers_mut().insert(header::CACHE_CONTROL, cache.clone());
+        }
+        Ok(Some(response))
     }
-    let place = app.delivery()?;
-    let job = request.job.clone();
-    let deadline = Instant::now() + app.config.jobs.deadline();
-    let (strict, lease) = (request.strict, Some(lease));
-    let ticket = app.pool.submit(Task { input: bytes, digest: Some(digest), strict, job, deadline, lease })?;
-    let finished = ticket.wait().await?;
-    if request.report {
-        return delivery::report(&finished, received);
-    }
-    // Another backend may have stood in for the chosen one, and its bytes are others.
-    let key = ContentKey::new(&digest, &request.job, format, finished.product.report.backend);
-    let mut response = delivery::mesh(&app, finished, format, &key, received, place).await?;
-    response.headers_mut().insert(header::CACHE_CONTROL, CACHE);
-    Ok(response)
 }
 
 /// The format that `surface.{ext}` names.
@@ -83,28 +97,38 @@ fn format_of(file: &str) -> Result<Format, Problem> {
     file.strip_prefix("surface.").and_then(|ext| Format::ALL.into_iter().find(|f| f.extension() == ext)).ok_or_else(
         || {
             let available: Vec<String> = Format::ALL.iter().map(|f| format!("surface.{}", f.extension())).collect();
-            let detail = format!("an entry has no `{file}`; it has {}", available.join(", "));
+            let detail = format!("a structure has no `{file}`; it has {}", available.join(", "));
             Problem::new(Kind::NotFound, detail).with("available", available)
         },
     )
 }
 
-/// Reads an entry and its digest, on a thread that may block.
-async fn fetch(app: Shared, id: EntryId) -> Result<(Bytes, Digest, Lease), Problem> {
+/// The digest of an entry's file.
+pub(super) async fn digest(app: &Shared, id: &EntryId) -> Result<Digest, Problem> {
+    Ok(fetch(app, id).await?.1)
+}
+
+/// An entry's file.
+pub(super) async fn input(app: &Shared, id: &EntryId) -> Result<Input, Problem> {
+    let bytes = fetch(app, id).await?.0;
     let mut lease = app.pool.budget().lease();
+    lease.grow(bytes.len() as u64)?;
+    Ok(Input { bytes, lease: Arc::new(lease) })
+}
+
+/// Reads an entry and its digest, on a thread that may block.
+async fn fetch(app: &Shared, id: &EntryId) -> Result<(Bytes, Digest), Problem> {
+    let (app, id) = (Arc::clone(app), id.clone());
     let reading = tokio::task::spawn_blocking(move || {
         let bytes = app.archive.fetch(&id)?;
         let digest = Digest::of(&bytes);
         Ok((Bytes::from(bytes), digest))
     });
-    let (bytes, digest) =
-        reading.await.map_err(Problem::internal)?.map_err(|error: ArchiveError| of_archive(&error))?;
-    lease.grow(bytes.len() as u64)?;
-    Ok((bytes, digest, lease))
+    reading.await.map_err(Problem::internal)?.map_err(|error: ArchiveError| of_archive(&error))
 }
 
 /// The archive's errors; its folder, and the paths in it, are nobody's business.
-fn of_archive(error: &ArchiveError) -> Problem {
+pub(super) fn of_archive(error: &ArchiveError) -> Problem {
     let detail = error.to_string();
     match error {
         ArchiveError::BadId { id } => Problem::new(Kind::BadParameter, detail)

@@ -7,19 +7,20 @@ use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::Request;
-use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, RETRY_AFTER};
+use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, HeaderName, RETRY_AFTER};
 use axum::http::{HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use metrics::counter;
 use serde_json::{Map, Value, json};
 
-use super::kinds::Kind;
+use super::kinds::{KINDS, Kind};
 use super::request_id::RequestId;
 use crate::formats::FormatError;
-use crate::jobs::{Exhausted, Failure, Refusal};
+use crate::jobs::{EndError, Exhausted, Failure, PromiseError, Refusal, SaveError};
 use crate::pipeline::JobError;
 use crate::pipeline::params::ParamError;
+use crate::store::StoreError;
 use crate::structure::StructureError;
 use crate::structure::referee::Diagnostic;
 use crate::surface::SurfaceError;
@@ -35,12 +36,13 @@ pub(super) struct Problem {
     detail: String,
     members: Map<String, Value>,
     retry_after_s: Option<u64>,
+    header: Option<(HeaderName, HeaderValue)>,
 }
 
 impl Problem {
     /// A problem with its explanation for this occurrence.
     pub(super) fn new(kind: Kind, detail: impl Into<String>) -> Self {
-        Self { kind, detail: detail.into(), members: Map::new(), retry_after_s: None }
+        Self { kind, detail: detail.into(), members: Map::new(), retry_after_s: None, header: None }
     }
 
     /// A mistake of ours. The message goes to the log, not to the client.
@@ -59,6 +61,31 @@ impl Problem {
     pub(super) fn retry_after(mut self, wait: Duration) -> Self {
         self.retry_after_s = Some((wait + Duration::from_millis(999)).as_secs().clamp(1, 600));
         self
+    }
+
+    /// Adds a header.
+    pub(super) fn header(mut self, name: HeaderName, value: &str) -> Self {
+        self.header = HeaderValue::from_str(value).ok().map(|value| (name, value));
+        self
+    }
+
+    /// The document for a job's record, which [`Self::recorded`] reads.
+    pub(super) fn record(&self) -> Value {
+        serde_json::from_slice(&self.document("")).unwrap_or_default()
+    }
+
+    /// The problem of a job's record.
+    pub(super) fn recorded(document: Option<&Value>) -> Self {
+        let lost = || Self::internal("a job's problem is not on record");
+        let Some(members) = document.and_then(Value::as_object) else { return lost() };
+        let text = |name: &str| members.get(name).and_then(Value::as_str);
+        let slug = text("type").and_then(|t| t.rsplit('/').next());
+        let Some(row) = KINDS.iter().find(|row| Some(row.slug) == slug) else { return lost() };
+        let mut problem = Self::new(row.kind, text("detail").unwrap_or_default());
+        let own = ["type", "title", "status", "detail", "instance"];
+        let others = members.iter().filter(|(name, _)| !own.contains(&name.as_str()));
+        problem.members.extend(others.map(|(name, value)| (name.clone(), value.clone())));
+        problem
     }
 
     /// Adds what the referee found, if it found anything.
@@ -88,6 +115,9 @@ impl IntoResponse for Problem {
         let mut response = self.kind.row().status.into_response();
         if let Some(wait) = self.retry_after_s {
             response.headers_mut().insert(RETRY_AFTER, HeaderValue::from(wait));
+        }
+        if let Some((name, value)) = self.header.clone() {
+            response.headers_mut().insert(name, value);
         }
         response.extensions_mut().insert(self);
         response
@@ -163,6 +193,10 @@ impl From<Refusal> for Problem {
                 .with("actual", waiting)
                 .with("estimated_wait_s", wait.as_secs_f64())
                 .retry_after(wait),
+            Refusal::TooLate { wait, allowed } => Self::new(Kind::QueueFull, error.to_string())
+                .with("limit", u64::try_from(allowed.as_millis()).unwrap_or(u64::MAX))
+                .with("estimated_wait_s", wait.as_secs_f64())
+                .retry_after(wait.saturating_sub(allowed)),
             Refusal::Draining => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
         }
     }
@@ -183,6 +217,56 @@ impl From<Failure> for Problem {
             Failure::Memory(error) => error.into(),
             Failure::Stopped => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
             Failure::Panicked { .. } => Self::internal(error),
+        }
+    }
+}
+
+impl From<EndError> for Problem {
+    fn from(error: EndError) -> Self {
+        match error {
+            EndError::Job(failure) => failure.into(),
+            EndError::Save { error: SaveError::Format(error), resolution } => of_format(&error, resolution),
+            EndError::Save { error: SaveError::TooLarge { bytes, limit }, resolution } => {
+                file_too_large(bytes, limit, resolution)
+            }
+            EndError::Save { error: SaveError::Store(error), .. } => error.into(),
+            EndError::Save { error: SaveError::Other(error), .. } => Self::internal(error),
+            EndError::Poison { attempts } => Self::new(Kind::JobAbandoned, error.to_string()).with("actual", attempts),
+            EndError::Lost { .. } => Self::new(Kind::JobAbandoned, error.to_string()),
+        }
+    }
+}
+
+impl From<PromiseError> for Problem {
+    fn from(error: PromiseError) -> Self {
+        match error {
+            PromiseError::Refused(refusal) => refusal.into(),
+            PromiseError::Store(error) => error.into(),
+            PromiseError::OtherRequest => {
+                Self::new(Kind::OtherRequest, error.to_string()).with("parameter", "Idempotency-Key")
+            }
+            PromiseError::Random(_) => Self::internal(error),
+        }
+    }
+}
+
+impl From<StoreError> for Problem {
+    /// Places and the system's words are for the log.
+    fn from(error: StoreError) -> Self {
+        let wait = Duration::from_secs(5);
+        match error {
+            StoreError::TooLarge { bytes, max_bytes } => Self::new(Kind::StoreFull, error.to_string())
+                .with("actual", bytes)
+                .with("limit", max_bytes)
+                .retry_after(wait),
+            StoreError::Full { held, max_bytes, .. } => Self::new(Kind::StoreFull, error.to_string())
+                .with("actual", held)
+                .with("limit", max_bytes)
+                .retry_after(wait),
+            other => {
+                tracing::error!(error = %other, "the store failed");
+                Self::new(Kind::StoreFailed, "what the service keeps cannot be reached").retry_after(wait)
+            }
         }
     }
 }

@@ -6,18 +6,31 @@ use axum::Router;
 use axum::routing::{get, post};
 
 use super::state::Shared;
-use super::{capabilities, health, meshes, middleware, page, pdb, problems};
+use super::{
+    capabilities, estimate, events, health, jobs, meshes, middleware, page, pdb, problems, results, structures,
+};
 
 /// Time beyond the limits that are met in order, before the backstop: reading the archive, writing the head.
 const MARGIN: Duration = Duration::from_secs(10);
 
 /// The service.
 pub(super) fn router(app: Shared) -> Router {
-    let timeout = app.config.server.body_timeout() + app.config.jobs.deadline() + MARGIN;
+    let longest = app.config.jobs.deadline().max(Duration::from_secs(jobs::MAX_WAIT_S));
+    let timeout = app.config.server.body_timeout() + longest + MARGIN;
     let router = Router::new()
         // Meshes.
         .route("/v1/meshes", post(meshes::create))
         .route("/v1/pdb/{id}/{file}", get(pdb::surface))
+        .route("/v1/structures", post(structures::create))
+        .route("/v1/structures/{digest}", get(structures::show))
+        .route("/v1/structures/{digest}/{file}", get(structures::surface))
+        .route("/v1/estimate", post(estimate::create))
+        // Jobs and what they have made.
+        .route("/v1/jobs/{id}", get(jobs::show).delete(jobs::dismiss))
+        .route("/v1/jobs/{id}/events", get(events::show))
+        .route("/v1/jobs/{id}/result", get(jobs::result))
+        .route("/v1/results/{file}", get(results::show))
+        .route("/v1/results/{key}/report.json", get(results::report))
         // About the service.
         .route("/v1/capabilities", get(capabilities::show))
         .route("/problems", get(problems::list))

@@ -3,22 +3,32 @@
 use std::future::Future;
 use std::io;
 use std::net::{SocketAddr, TcpListener};
-use std::sync::Arc;
-use std::time::Instant;
+use std::sync::{Arc, Mutex};
+use std::time::{Instant, SystemTime};
 
+use quick_cache::sync::Cache;
 use thiserror::Error;
 use tokio::sync::{Semaphore, watch};
 
+use super::problem::Problem;
 use super::state::{App, Readiness, Ready, Shared};
 use super::{accept, capabilities, metrics, router};
 use crate::config::Config;
-use crate::jobs::{Budget, Pool, Settings};
+use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
+use crate::store::{Store, StoreError};
 use crate::structure::Archive;
 use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, TelemetryError};
 
 /// How often the recorder tidies up its histograms.
 const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
+
+/// How often the store is tidied.
+const SWEEP: std::time::Duration = std::time::Duration::from_mins(1);
+/// Between two attempts to list the jobs of earlier processes.
+const RECOVER_PAUSE: std::time::Duration = std::time::Duration::from_secs(5);
+/// Results whose headers are kept at hand: a kilobyte each.
+const HEADS: usize = 4096;
 
 /// Time for a job to notice that it was cancelled.
 const CANCELLING: std::time::Duration = std::time::Duration::from_secs(1);
@@ -39,6 +49,9 @@ pub enum ServeError {
     /// A worker thread cannot be started.
     #[error("cannot start the worker threads: {0}")]
     Workers(io::Error),
+    /// What the service keeps cannot be kept.
+    #[error(transparent)]
+    Store(#[from] StoreError),
     /// Metrics cannot be set up.
     #[error(transparent)]
     Telemetry(#[from] TelemetryError),
@@ -61,6 +74,7 @@ pub struct Server {
     metrics_listener: Option<TcpListener>,
     addr: SocketAddr,
     metrics_addr: Option<SocketAddr>,
+    stop: watch::Sender<bool>,
 }
 
 fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
@@ -74,11 +88,11 @@ fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAdd
 }
 
 impl Server {
-    /// Binds the listeners and starts the workers.
+    /// Binds the listeners, opens the store and starts the workers. Must be called on the runtime that [`Self::run`] is.
     ///
     /// # Errors
     /// [`ServeError`].
-    pub fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
+    pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, devices: found } = chosen;
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
@@ -90,13 +104,37 @@ impl Server {
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
         };
-        let pool = Pool::start(settings, backend, reason).map_err(ServeError::Workers)?;
+        let store = Store::open(&config.store, &config.server.data_dir).await?;
+        let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
+        let promises = LedgerSettings {
+            allowed: config.jobs.batch_deadline(),
+            attempts: config.jobs.attempts,
+            output_bytes: config.limits.output_bytes,
+        };
+        let describe = |error: &EndError| Problem::from(error.clone()).record();
+        let ledger = Ledger::new(store.clone(), Arc::clone(&pool), promises, describe);
         let archive = Archive::new(config.archive_dir()).with_max_bytes(config.limits.inflated_bytes);
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();
-        let app = Arc::new(App { config, pool, archive, deliveries, readiness, found, capabilities });
-        Ok(Self { app, listener, metrics_listener, addr, metrics_addr })
+        let keepers = Arc::new(Semaphore::new(config.jobs.keepers));
+        let (stop, stopping) = watch::channel(false);
+        let app = Arc::new(App {
+            config,
+            pool,
+            archive,
+            store,
+            ledger,
+            heads: Cache::new(HEADS),
+            keepers,
+            keeping: Mutex::default(),
+            stopping,
+            deliveries,
+            readiness,
+            found,
+            capabilities,
+        });
+        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop })
     }
 
     /// Address of the service.
@@ -118,11 +156,24 @@ impl Server {
     /// [`ServeError`].
     pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<bool, ServeError> {
         let handle = telemetry::recorder()?;
-        let (stop, stopped) = watch::channel(false);
+        let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
         let warming = tokio::task::spawn_blocking({
             let app = Arc::clone(&self.app);
             move || warm_up(&app)
+        });
+        let recovering = tokio::spawn({
+            let ledger = self.app.ledger.clone();
+            async move { recover(&ledger).await }
+        });
+        let sweeping = tokio::spawn({
+            let store = self.app.store.clone();
+            async move {
+                loop {
+                    tokio::time::sleep(SWEEP).await;
+                    store.sweep(SystemTime::now()).await;
+                }
+            }
         });
         let listener = tokio_listener("server.listen", self.addr, self.listener)?;
         let service = router::router(Arc::clone(&self.app));
@@ -150,8 +201,9 @@ impl Server {
         // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
         let requests = serving.await.unwrap_or(false);
         let jobs = self.app.pool.drain(deadline.max(Instant::now() + CANCELLING)).await;
-        upkeep.abort();
-        warming.abort();
+        for task in [upkeep, warming, recovering, sweeping] {
+            task.abort();
+        }
         if let Some(metrics) = metrics {
             metrics.abort();
         }
@@ -167,6 +219,21 @@ fn tokio_listener(
     listener: TcpListener,
 ) -> Result<tokio::net::TcpListener, ServeError> {
     tokio::net::TcpListener::from_std(listener).map_err(|error| ServeError::Listen { key, addr, error })
+}
+
+/// Takes up what earlier processes left undone; tries again while the store does not answer.
+async fn recover(ledger: &Ledger) {
+    loop {
+        match ledger.recover().await {
+            Ok(0) => return,
+            Ok(jobs) => {
+                tracing::info!(jobs, "jobs of an earlier process were taken up again");
+                return;
+            }
+            Err(error) => tracing::error!(%error, "jobs of earlier processes cannot be listed"),
+        }
+        tokio::time::sleep(RECOVER_PAUSE).await;
+    }
 }
 
 /// Computes a first, tiny mesh on every device, or on the processor where there is none.

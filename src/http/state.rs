@@ -1,23 +1,37 @@
 //! What the handlers share.
 
-use std::sync::Arc;
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use bytes::Bytes;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use quick_cache::sync::Cache;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use super::kinds::Kind;
 use super::problem::Problem;
+use super::results::Head;
 use crate::config::Config;
-use crate::jobs::Pool;
+use crate::jobs::{ContentKey, Ledger, Pool};
+use crate::store::Store;
 use crate::structure::Archive;
 use crate::surface::FoundDevice;
 
 /// State of the service, behind one pointer.
 pub(super) struct App {
     pub(super) config: Config,
-    pub(super) pool: Pool,
+    pub(super) pool: Arc<Pool>,
     pub(super) archive: Archive,
+    pub(super) store: Store,
+    pub(super) ledger: Ledger,
+    /// Headers of results that were asked for lately.
+    pub(super) heads: Cache<ContentKey, Arc<Head>>,
+    /// Places for results that are kept beside their answers: see `jobs.keepers`.
+    pub(super) keepers: Arc<Semaphore>,
+    /// Results that are being kept at this moment; their receivers hang up when it is over.
+    pub(super) keeping: Mutex<HashMap<ContentKey, watch::Receiver<()>>>,
+    /// Turns true when the service ends: long answers end with it.
+    pub(super) stopping: watch::Receiver<bool>,
     /// Places for requests for meshes: see `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
     pub(super) readiness: Readiness,

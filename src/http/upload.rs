@@ -32,6 +32,12 @@ pub(super) fn is_multipart(headers: &HeaderMap) -> bool {
     text(headers, &CONTENT_TYPE).is_some_and(|t| t.trim_start().to_ascii_lowercase().starts_with("multipart/form-data"))
 }
 
+/// Whether the body says that it is a JSON document.
+pub(super) fn is_json(headers: &HeaderMap) -> bool {
+    let essence = text(headers, &CONTENT_TYPE).and_then(|t| t.split(';').next()).unwrap_or_default();
+    essence.trim().eq_ignore_ascii_case("application/json")
+}
+
 /// Receives the body.
 pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Result<Upload, Problem> {
     let limit = app.config.limits.body_bytes;

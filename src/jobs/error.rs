@@ -21,6 +21,14 @@ pub enum Refusal {
         /// Estimated time until the queue has moved.
         wait: Duration,
     },
+    /// The job would wait for longer than it has.
+    #[error("the jobs ahead take about {} s, longer than the {} s that this one has", wait.as_secs_f64().ceil(), allowed.as_secs_f64())]
+    TooLate {
+        /// Estimated time in the queue.
+        wait: Duration,
+        /// Time from acceptance to the mesh.
+        allowed: Duration,
+    },
     /// The pool is shutting down.
     #[error("the service is shutting down")]
     Draining,

@@ -1,10 +1,11 @@
 //! The name of what is made of an input: equal names, equal bytes.
 
 use std::fmt;
+use std::str::FromStr;
 
 use crate::formats::Format;
 use crate::pipeline::{Job, params};
-use crate::store::Digest;
+use crate::store::{BadDigest, Digest, Name, StoreError};
 
 /// The name of a mesh file: equal keys, equal bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -17,6 +18,24 @@ impl ContentKey {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
         let text = format!("molmesh {version}\n{backend}\n{}\n{canonical}\n{input}\n", format.extension());
         Self(Digest::of(text.as_bytes()))
+    }
+}
+
+impl ContentKey {
+    /// The name under which the store keeps it, or its report.
+    ///
+    /// # Errors
+    /// [`StoreError::Name`] for an extension that no file has.
+    pub fn name(&self, extension: &str) -> Result<Name, StoreError> {
+        Ok(Name::result(&self.0, extension)?)
+    }
+}
+
+impl FromStr for ContentKey {
+    type Err = BadDigest;
+
+    fn from_str(text: &str) -> Result<Self, BadDigest> {
+        text.parse().map(Self)
     }
 }
 

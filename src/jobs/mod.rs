@@ -4,22 +4,34 @@
 //! and panics are dealt with here, so that whoever submits only waits. It knows no HTTP and no graphics API.
 
 mod budget;
+mod cost;
 mod devices;
 mod error;
+mod flight;
 mod key;
+mod ledger;
 mod pool;
+mod promise;
 mod queue;
+mod rank;
+mod record;
+mod results;
 mod ticket;
 mod worker;
 
 pub use budget::{Budget, Exhausted, Lease};
 pub use error::{Failure, Refusal};
+pub use flight::{Claim, Progress};
 pub use key::ContentKey;
+pub use ledger::{Describe, EndError, Ledger, LedgerSettings, Order, PromiseError, View};
 pub use pool::{Pool, Settings};
+pub use rank::{Client, Rank, USUAL_URGENCY};
+pub use record::{BadJobId, JobId, Record, Status, now_ms, rfc3339};
+pub use results::{REPORT, SaveError, save};
 pub use ticket::Ticket;
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 
@@ -32,16 +44,16 @@ use crate::structure::referee::Diagnostic;
 pub struct Task {
     /// The structure file as it came, compressed or not.
     pub input: Bytes,
-    /// Its digest, if it is known already.
-    pub digest: Option<Digest>,
+    /// Its digest.
+    pub digest: Digest,
     /// Ask the referee, and refuse a file in which it finds errors.
     pub strict: bool,
     /// What to make of it.
     pub job: Job,
-    /// When the mesh must be there.
-    pub deadline: Instant,
+    /// Whose job it is, and how it stands to others.
+    pub rank: Rank,
     /// Memory that the input is charged to, given back with it.
-    pub lease: Option<Lease>,
+    pub lease: Option<Arc<Lease>>,
 }
 
 /// A finished job.

@@ -5,12 +5,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use metrics::counter;
-use tokio::sync::oneshot;
 
 use super::devices::Watch;
 use super::queue::Queue;
-use super::{Budget, Refusal, Task, Ticket, worker};
-use crate::pipeline::JobLimits;
+use super::{Budget, Claim, Refusal, Task, Ticket, cost, worker};
+use crate::pipeline::{Job, JobLimits};
 use crate::surface::Backend;
 use crate::telemetry::JOBS_SUBMITTED;
 
@@ -69,16 +68,24 @@ impl Pool {
         Ok(pool)
     }
 
-    /// Accepts a job, or says at once why not.
+    /// Accepts a job that has `allowed` time until its mesh must be there, waiting included, or says at once why not. `claim`
+    /// is called before the work begins.
     ///
     /// # Errors
     /// Any [`Refusal`].
-    pub fn submit(&self, task: Task) -> Result<Ticket, Refusal> {
-        let (deadline, allowed) = (task.deadline, task.deadline.saturating_duration_since(Instant::now()));
-        let (reply, outcome) = oneshot::channel();
-        let (id, cancel) = self.shared.queue.push(task, reply)?;
-        counter!(JOBS_SUBMITTED, "mode" => "sync").increment(1);
-        Ok(Ticket { id, queue: Arc::clone(&self.shared.queue), cancel, outcome, deadline, allowed })
+    pub fn submit(&self, task: Task, allowed: Duration, claim: Option<Claim>) -> Result<Ticket, Refusal> {
+        let mode = if task.rank.batch { "async" } else { "sync" };
+        let deadline = Instant::now() + allowed;
+        let place = self.shared.queue.push(task, allowed, claim)?;
+        let dedup = if place.shared { "yes" } else { "no" };
+        counter!(JOBS_SUBMITTED, "mode" => mode, "dedup" => dedup).increment(1);
+        Ok(Ticket { queue: Arc::clone(&self.shared.queue), place, deadline, allowed })
+    }
+
+    /// Expected time of a job on this machine, s, once it runs.
+    #[must_use]
+    pub fn expected(&self, input: &[u8], job: &Job) -> f64 {
+        self.shared.queue.expected(cost::units(input, job))
     }
 
     /// How long a job that is accepted now would wait.

@@ -1,38 +1,48 @@
-//! What waits and what runs, behind one lock. Entries that nobody waits for any more leave at once.
+//! What waits and what runs, behind one lock. Work that nobody waits for any more leaves at once.
 
-use std::collections::VecDeque;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use metrics::gauge;
 use tokio::sync::{Notify, oneshot};
 
+use super::cost::{self, Rate};
+use super::flight::{Claim, Entry, Flight, Progress, Waiter, WorkKey};
+use super::rank::{self, Shares};
 use super::{Outcome, Refusal, Task};
 use crate::surface::CancelToken;
-use crate::telemetry::{QUEUE_DEPTH, QUEUE_WAIT};
-
-/// A job that waits or runs.
-pub(super) struct Entry {
-    pub(super) id: u64,
-    pub(super) task: Task,
-    pub(super) cancel: CancelToken,
-    pub(super) reply: oneshot::Sender<Outcome>,
-    pub(super) accepted: Instant,
-}
-
-/// Assumed time of a job before one has run.
-const FIRST_GUESS: Duration = Duration::from_millis(250);
-/// Weight of the newest job in the moving average of their times.
-const NEWEST: f64 = 0.2;
+use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT};
 
 struct State {
-    waiting: VecDeque<Entry>,
-    running: Vec<(u64, CancelToken)>,
+    flights: Vec<Flight>,
+    shares: Shares,
+    rate: Rate,
     closed: bool,
     next_id: u64,
-    mean_s: f64,
+    /// When those that were refused were told to come back.
+    returns: Vec<Instant>,
     /// Waiting jobs that the gauge knows of.
     told: usize,
+}
+
+impl State {
+    fn waiting(&self) -> impl Iterator<Item = &Flight> {
+        self.flights.iter().filter(|flight| flight.begun.is_none())
+    }
+
+    fn find(&mut self, id: u64) -> Option<usize> {
+        self.flights.iter().position(|flight| flight.id == id)
+    }
+}
+
+/// A right to an outcome, as the queue gives it.
+pub(super) struct Place {
+    pub(super) flight: u64,
+    pub(super) waiter: u64,
+    pub(super) outcome: oneshot::Receiver<Outcome>,
+    pub(super) progress: Arc<Progress>,
+    /// The same work was in the house already.
+    pub(super) shared: bool,
 }
 
 /// The queue.
@@ -47,11 +57,12 @@ pub(super) struct Queue {
 impl Queue {
     pub(super) fn new(limit: usize, workers: usize) -> Self {
         let state = State {
-            waiting: VecDeque::with_capacity(limit),
-            running: Vec::with_capacity(workers),
+            flights: Vec::with_capacity(limit.min(1024) + workers),
+            shares: Shares::default(),
+            rate: Rate::default(),
             closed: false,
             next_id: 0,
-            mean_s: FIRST_GUESS.as_secs_f64(),
+            returns: Vec::new(),
             told: 0,
         };
         Self { state: Mutex::new(state), filled: Condvar::new(), idle: Notify::new(), limit, workers }
@@ -62,32 +73,80 @@ impl Queue {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Puts a job at the end of the queue; its id and cancel token come back.
-    pub(super) fn push(&self, task: Task, reply: oneshot::Sender<Outcome>) -> Result<(u64, CancelToken), Refusal> {
+    /// Takes a job in: into the work that is the same, or at its place in the queue. `allowed` is the time that it has.
+    pub(super) fn push(&self, task: Task, allowed: Duration, claim: Option<Claim>) -> Result<Place, Refusal> {
+        let work = WorkKey::new(&task.digest, &task.job, task.strict);
+        let (reply, outcome) = oneshot::channel();
         let mut state = self.lock();
         if state.closed {
             return Err(Refusal::Draining);
         }
+        let waiter = state.next_id;
+        state.next_id += 1;
+        let same = |f: &&mut Flight| f.work == work && !f.cancel.is_cancelled();
+        if let Some(flight) = state.flights.iter_mut().find(same) {
+            flight.waiters.push(Waiter { id: waiter, reply });
+            flight.rank.batch &= task.rank.batch;
+            let place = Place {
+                flight: flight.id,
+                waiter,
+                outcome,
+                progress: Arc::clone(&flight.progress),
+                shared: true,
+            };
+            // Work that runs cannot be held back any more: what has to be on record is recorded now.
+            let late = claim.and_then(|claim| match flight.begun {
+                Some(_) => Some(claim),
+                None => {
+                    flight.claims.push(claim);
+                    None
+                }
+            });
+            drop(state);
+            if let Some(claim) = late {
+                claim();
+            }
+            return Ok(place);
+        }
+        let now = Instant::now();
+        let cost = state.rate.seconds(cost::units(&task.input, &task.job));
         // A free worker's job counts as running, not as waiting, even before the worker has woken up.
-        if state.waiting.len() + state.running.len() >= self.limit + self.workers {
-            let (waiting, wait) = (state.waiting.len(), self.wait(&state));
+        if state.flights.len() >= self.limit + self.workers {
+            let waiting = state.waiting().count();
+            let wait = self.room_in(&mut state, now);
             return Err(Refusal::QueueFull { waiting, limit: self.limit, wait });
         }
-        let (id, cancel) = (state.next_id, CancelToken::default());
-        state.next_id += 1;
-        state.waiting.push_back(Entry { id, task, cancel: cancel.clone(), reply, accepted: Instant::now() });
+        let wait = self.wait(&state, now);
+        if wait > allowed {
+            return Err(Refusal::TooLate { wait, allowed });
+        }
+        let tag = state.shares.tag(&task.rank, cost);
+        let progress = Arc::new(Progress::default());
+        state.flights.push(Flight {
+            id: waiter,
+            work,
+            rank: task.rank,
+            cost,
+            tag,
+            accepted: now,
+            begun: None,
+            cancel: CancelToken::default(),
+            progress: Arc::clone(&progress),
+            waiters: vec![Waiter { id: waiter, reply }],
+            claims: claim.into_iter().collect(),
+            task: Some(task),
+        });
         self.publish(&mut state);
         drop(state);
         self.filled.notify_one();
-        Ok((id, cancel))
+        Ok(Place { flight: waiter, waiter, outcome, progress, shared: false })
     }
 
     /// The next job; blocks until there is one. `None` once the queue is closed and empty.
     pub(super) fn pop(&self) -> Option<Entry> {
         let mut state = self.lock();
         loop {
-            if let Some(entry) = state.waiting.pop_front() {
-                state.running.push((entry.id, entry.cancel.clone()));
+            if let Some(entry) = Self::take(&mut state) {
                 self.publish(&mut state);
                 return Some(entry);
             }
@@ -98,23 +157,67 @@ impl Queue {
         }
     }
 
-    /// A worker is done with job `id`, which took `time` if it ran to an end.
-    pub(super) fn done(&self, id: u64, time: Option<Duration>) {
+    /// The job whose turn it is: the client's with the lowest tag, and of this client's the most urgent one.
+    fn take(state: &mut State) -> Option<Entry> {
+        let now = Instant::now();
+        let turn = |f: &Flight| rank::turn(&f.rank, f.tag, f.id, f.accepted, now);
+        let next = state.waiting().reduce(|a, b| if rank::before(&turn(b), &turn(a)) { b } else { a })?;
+        let (client, batch) = (next.rank.client, next.rank.batch);
+        let own = state.waiting().filter(|f| f.rank.client == client && f.rank.batch == batch);
+        let id = own.min_by_key(|f| (f.rank.urgency, f.id))?.id;
+        let tag = next.tag;
+        state.shares.begin(tag);
+        let at = state.find(id)?;
+        let flight = &mut state.flights[at];
+        flight.begun = Some(now);
+        flight.progress.begin();
+        Some(Entry {
+            id,
+            task: flight.task.take()?,
+            cancel: flight.cancel.clone(),
+            progress: Arc::clone(&flight.progress),
+            claims: std::mem::take(&mut flight.claims),
+            accepted: flight.accepted,
+        })
+    }
+
+    /// A worker is done with job `id`: everybody who waits gets the outcome. `time` is what it took, if it ran to an end.
+    pub(super) fn done(&self, id: u64, outcome: Option<&Outcome>, time: Option<Duration>) {
         let mut state = self.lock();
-        state.running.retain(|(running, _)| *running != id);
+        let Some(at) = state.find(id) else { return };
+        let flight = state.flights.swap_remove(at);
         if let Some(time) = time {
-            state.mean_s += NEWEST * (time.as_secs_f64() - state.mean_s);
+            state.rate.learn(flight.cost, time.as_secs_f64());
+        }
+        if state.flights.is_empty() {
+            state.shares.settle();
+            self.idle.notify_waiters();
         }
         self.publish(&mut state);
-        if state.running.is_empty() && state.waiting.is_empty() {
-            self.idle.notify_waiters();
+        drop(state);
+        if let Some(outcome) = outcome {
+            for waiter in flight.waiters {
+                // Who has left meanwhile does not mind.
+                drop(waiter.reply.send(outcome.clone()));
+            }
         }
     }
 
-    /// Nobody waits for job `id` any more.
-    pub(super) fn forget(&self, id: u64) {
+    /// A waiter has left. The work that nobody waits for any more leaves the queue, or is stopped.
+    pub(super) fn forget(&self, flight: u64, waiter: u64) {
         let mut state = self.lock();
-        let left = state.waiting.iter().position(|entry| entry.id == id).and_then(|at| state.waiting.remove(at));
+        let Some(at) = state.find(flight) else { return };
+        let found = &mut state.flights[at];
+        found.waiters.retain(|w| w.id != waiter);
+        if !found.waiters.is_empty() {
+            return;
+        }
+        found.cancel.cancel();
+        let left = found.begun.is_none().then(|| state.flights.swap_remove(at));
+        if state.flights.is_empty() {
+            state.shares.settle();
+            self.idle.notify_waiters();
+        }
         self.publish(&mut state);
         drop(state);
         // The input, which may be large, is freed outside the lock.
@@ -130,8 +233,10 @@ impl Queue {
     /// Cancels what runs and drops what waits.
     pub(super) fn cancel_all(&self) {
         let mut state = self.lock();
-        state.running.iter().for_each(|(_, cancel)| cancel.cancel());
-        let left = std::mem::take(&mut state.waiting);
+        let (left, running): (Vec<_>, Vec<_>) =
+            std::mem::take(&mut state.flights).into_iter().partition(|flight| flight.begun.is_none());
+        running.iter().for_each(|flight| flight.cancel.cancel());
+        state.flights = running;
         self.publish(&mut state);
         drop(state);
         drop(left);
@@ -141,11 +246,7 @@ impl Queue {
     pub(super) async fn idle(&self) {
         loop {
             let notified = self.idle.notified();
-            let busy = {
-                let state = self.lock();
-                !(state.running.is_empty() && state.waiting.is_empty())
-            };
-            if !busy {
+            if self.lock().flights.is_empty() {
                 return;
             }
             notified.await;
@@ -154,20 +255,55 @@ impl Queue {
 
     /// How long a job that is accepted now would wait.
     pub(super) fn estimated_wait(&self) -> Duration {
-        self.wait(&self.lock())
+        self.wait(&self.lock(), Instant::now())
     }
 
-    #[expect(clippy::cast_precision_loss, reason = "counts of jobs are small")]
-    fn wait(&self, state: &State) -> Duration {
-        let ahead = (state.waiting.len() + state.running.len() + 1).saturating_sub(self.workers);
-        Duration::from_secs_f64(ahead as f64 * state.mean_s / self.workers as f64)
+    /// Expected seconds of a job.
+    pub(super) fn expected(&self, units: f64) -> f64 {
+        self.lock().rate.seconds(units)
+    }
+
+    /// Work ahead of a new job, shared out to the workers.
+    fn wait(&self, state: &State, now: Instant) -> Duration {
+        if state.flights.len() < self.workers {
+            return Duration::ZERO;
+        }
+        let left = |flight: &Flight| {
+            let spent = flight.begun.map_or(0.0, |begun| now.saturating_duration_since(begun).as_secs_f64());
+            // A job that takes longer than expected is not known to be over soon.
+            (flight.cost - spent).max(0.1 * flight.cost)
+        };
+        let ahead: f64 = state.flights.iter().map(left).sum();
+        Duration::try_from_secs_f64(ahead / self.workers as f64).unwrap_or(Duration::MAX)
+    }
+
+    /// When a place will be free for one who is refused now. Those who were refused before come back first: each of them
+    /// takes a place.
+    fn room_in(&self, state: &mut State, now: Instant) -> Duration {
+        state.returns.retain(|back| *back > now);
+        let all: f64 = state.flights.iter().map(|flight| flight.cost).sum();
+        let mean = state.rate.mean(all / state.flights.len().max(1) as f64) / self.workers as f64;
+        let wait = Duration::from_secs_f64((mean * (state.returns.len() + 1) as f64).min(600.0));
+        // Seconds are what can be said.
+        let said = Duration::from_secs(wait.as_secs_f64().ceil().max(1.0) as u64);
+        if state.returns.len() < MOST_RETURNS {
+            state.returns.push(now + said);
+        }
+        wait
     }
 
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of jobs are small")]
     fn publish(&self, state: &mut State) {
+        let now = Instant::now();
+        let waiting = state.waiting().count();
+        let oldest = state.waiting().map(|f| now.saturating_duration_since(f.accepted)).max().unwrap_or_default();
         // By difference, so that several pools in one process add up.
-        gauge!(QUEUE_DEPTH).increment(state.waiting.len() as f64 - state.told as f64);
-        state.told = state.waiting.len();
-        gauge!(QUEUE_WAIT).set(self.wait(state).as_secs_f64());
+        gauge!(QUEUE_DEPTH).increment(waiting as f64 - state.told as f64);
+        state.told = waiting;
+        gauge!(QUEUE_AGE).set(oldest.as_secs_f64());
+        gauge!(QUEUE_WAIT).set(self.wait(state, now).as_secs_f64());
     }
 }
+
+/// Refused ones that are kept in mind.
+const MOST_RETURNS: usize = 100_000;

@@ -8,10 +8,9 @@ use std::time::{Duration, Instant};
 use metrics::{counter, histogram};
 
 use super::pool::Shared;
-use super::queue::Entry;
+use super::flight::Entry;
 use super::{Failure, Finished, Outcome};
-use crate::pipeline::{self, Choice, JobError, JobLimits, Report};
-use crate::store::Digest;
+use crate::pipeline::{self, Choice, JobError, Report};
 use crate::structure::referee::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Mesh, SurfaceError};
@@ -25,36 +24,34 @@ pub(super) fn work(shared: &Shared) {
     while let Some(entry) = shared.queue.pop() {
         let id = entry.id;
         let start = Instant::now();
-        let ran = run(shared, entry);
+        let outcome = run(shared, entry);
         shared.publish_devices();
-        shared.queue.done(id, ran.then(|| start.elapsed()));
+        // Only a mesh says how long jobs take.
+        let time = matches!(outcome, Some(Ok(_))).then(|| start.elapsed());
+        shared.queue.done(id, outcome.as_ref(), time);
     }
 }
 
-/// Runs one job and answers. False if it says nothing about how long jobs take.
-fn run(shared: &Shared, entry: Entry) -> bool {
-    let Entry { task, cancel, reply, accepted, .. } = entry;
-    if cancel.is_cancelled() || reply.is_closed() || task.deadline <= Instant::now() {
+/// Runs one job. None if nobody wants it any more.
+fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
+    let Entry { task, cancel, progress, claims, accepted, .. } = entry;
+    if cancel.is_cancelled() {
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
-        return false;
+        return None;
     }
     let waited = accepted.elapsed();
     let outcome = shared.budget.check().map_err(Failure::from).and_then(|()| {
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
         let work = || {
-            let digesting = Instant::now();
-            let digest = task.digest.unwrap_or_else(|| Digest::of(&task.input));
-            let digested = digesting.elapsed();
+            claims.into_iter().for_each(|claim| claim());
             let diagnostics = if task.strict { Some(check(shared, &task.input)?) } else { None };
-            let limits = JobLimits { deadline: Some(task.deadline), ..shared.limits };
-            let product = pipeline::run(&task.input, &task.job, &limits, &choice, &cancel, &())
+            let product = pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref())
                 .map_err(|error| explained(shared, &task.input, error))?;
-            Ok::<_, Failure>((digest, digested, diagnostics, product))
+            Ok::<_, Failure>((diagnostics, product))
         };
-        let (digest, digested, diagnostics, mut product) =
+        let (diagnostics, mut product) =
             catch_unwind(AssertUnwindSafe(work)).map_err(|payload| panicked(&*payload))??;
         product.report.add_timing("queue", ms(waited));
-        product.report.add_timing("digest", ms(digested));
         count(&product.report);
         if let Some(why) = &product.report.fallback {
             counter!(JOBS_FALLBACK).increment(1);
@@ -62,11 +59,13 @@ fn run(shared: &Shared, entry: Entry) -> bool {
         }
         let mut lease = shared.budget.lease();
         lease.force(bytes_of(&product.mesh));
-        Ok(Finished { product, diagnostics, digest, waited, lease })
+        Ok(Finished { product, diagnostics, digest: task.digest, waited, lease })
     });
     // The input is freed before the answer goes out: the receiver then sees the memory that is really held.
     drop(task);
-    answer(reply, outcome.map(Arc::new))
+    let outcome = outcome.map(Arc::new);
+    tell(&outcome);
+    Some(outcome)
 }
 
 /// The strict check: the referee's findings, or a refusal if there are errors among them.
@@ -96,22 +95,18 @@ fn log_device(failure: &Failure) {
     }
 }
 
-fn answer(reply: tokio::sync::oneshot::Sender<Outcome>, outcome: Outcome) -> bool {
-    let label = match &outcome {
+/// Counts an outcome, and logs what is for the log.
+fn tell(outcome: &Outcome) {
+    let label = match outcome {
         Ok(_) => "successful",
         Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => "dismissed",
         Err(Failure::Panicked { .. }) => "panicked",
         Err(_) => "failed",
     };
-    if let Err(failure) = &outcome {
+    if let Err(failure) = outcome {
         log_device(failure);
     }
-    let ran = outcome.is_ok();
     counter!(JOBS_FINISHED, "outcome" => label).increment(1);
-    if reply.send(outcome).is_err() {
-        tracing::debug!(outcome = label, "nobody waits for the outcome");
-    }
-    ran
 }
 
 fn panicked(payload: &(dyn Any + Send)) -> Failure {

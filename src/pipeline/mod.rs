@@ -1,8 +1,10 @@
 //! One job from end to end: structure bytes to spheres to mesh to report. No HTTP, no paths, no queue.
 
 mod clock;
+mod estimate;
 pub mod nearest;
 pub mod params;
+mod progress;
 mod report;
 
 use std::time::Instant;
@@ -10,6 +12,8 @@ use std::time::Instant;
 use thiserror::Error;
 
 pub use clock::{ProgressSink, StageClock};
+pub use estimate::{Estimate, MeshEstimate, estimate};
+pub use progress::Tracker;
 pub use report::{Quantization, Report};
 
 use crate::formats::{Compress, GlbSink, Meta, Packing, Step};

@@ -213,11 +213,12 @@ pub(crate) fn start_on(
     config.server.metrics_listen = Some("127.0.0.1:0".parse().unwrap());
     dir.path().clone_into(&mut config.server.data_dir);
     change(&mut config);
-    let server = Server::bind(config, Chosen { backend, reason: "a test says so".to_owned(), devices: found }).unwrap();
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+    let chosen = Chosen { backend, reason: "a test says so".to_owned(), devices: found };
+    let server = runtime.block_on(Server::bind(config, chosen)).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
     let (stop, stopped) = tokio::sync::oneshot::channel();
     let thread = std::thread::spawn(move || {
-        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
         let drained = runtime.block_on(server.run(async { drop(stopped.await) })).unwrap();
         runtime.shutdown_timeout(Duration::from_secs(1));
         drained
@@ -380,6 +381,11 @@ pub(crate) fn wait_for(what: &str, mut is: impl FnMut() -> bool) {
         assert!(Instant::now() < end, "waited too long for: {what}");
         std::thread::sleep(Duration::from_millis(5));
     }
+}
+
+/// The sample with a remark: the same mesh, but not the same work as with another one.
+pub(crate) fn sample(n: usize) -> Vec<u8> {
+    [SAMPLE, format!("REMARK 900 SAMPLE {n}\n").as_bytes()].concat()
 }
 
 /// A PDB file of `n` carbon atoms, 10 Å apart.

@@ -1,0 +1,161 @@
+//! How a mesh is asked for and answered: from the store, from a job that is waited for, or with the promise of one.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::http::header::{self, HeaderMap};
+use axum::http::{HeaderValue, Method, StatusCode};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+
+use super::declared::Declared;
+use super::kinds::Kind;
+use super::problem::Problem;
+use super::state::Shared;
+use super::wish::{PREFERENCE_APPLIED, Wish};
+use super::{conditional, delivery, jobs, results};
+use crate::formats::Format;
+use crate::jobs::{ContentKey, Lease, Order, Task, Ticket};
+use crate::pipeline::params::Request;
+use crate::store::Digest;
+
+/// A mesh, or its report, that somebody asks for.
+pub(super) struct Ask {
+    pub(super) digest: Digest,
+    pub(super) request: Request,
+    /// The parameters as they were given.
+    pub(super) pairs: Vec<(String, String)>,
+    pub(super) format: Format,
+    pub(super) wish: Wish,
+    /// How long the answer stays good; none: it belongs to this request alone.
+    pub(super) cache: Option<HeaderValue>,
+    /// Time until the input was there.
+    pub(super) received: Duration,
+    /// What the input's type says that it is.
+    pub(super) declared: Declared,
+}
+
+/// The bytes to be meshed, and the memory that they are charged to.
+pub(super) struct Input {
+    pub(super) bytes: Bytes,
+    pub(super) lease: Arc<Lease>,
+}
+
+impl Ask {
+    /// The key of the answer, if the chosen backend makes it.
+    pub(super) fn key(&self, app: &Shared) -> ContentKey {
+        ContentKey::new(&self.digest, &self.request.job, self.format, app.pool.backend().name())
+    }
+
+    /// The answer that is known already.
+    pub(super) async fn known(
+        &self,
+        app: &Shared,
+        method: &Method,
+        headers: &HeaderMap,
+    ) -> Result<Option<Response>, Problem> {
+        // A check and a report's times are those of a run.
+        if self.request.strict || self.request.report {
+            return Ok(None);
+        }
+        let key = self.key(app);
+        let etag = delivery::etag(&key);
+        if let Some(cache) = &self.cache
+            && conditional::is_unchanged(headers, &etag)
+        {
+            let caching = [(header::ETAG, etag), (header::CACHE_CONTROL, cache.clone())];
+            return Ok(Some((StatusCode::NOT_MODIFIED, caching).into_response()));
+        }
+        let Some(mut response) = results::stored(app, &key, self.format, method, headers).await? else {
+            return Ok(None);
+        };
+        if let Some(cache) = &self.cache {
+            response.headers_mut().insert(header::CACHE_CONTROL, cache.clone());
+        } else {
+            response.headers_mut().remove(header::CACHE_CONTROL);
+        }
+        Ok(Some(response))
+    }
+
+    /// Makes the mesh, or promises to.
+    pub(super) async fn make(self, app: &Shared, input: Input) -> Result<Response, Problem> {
+        if self.wish.later {
+            return self.promise(app, input, None).await;
+        }
+        let place = app.delivery()?;
+        let task = self.task(&input);
+        let mut ticket = app.pool.submit(task, app.config.jobs.deadline(), None)?;
+        let patience = app.config.jobs.sync_wait();
+        let patience = self.wish.wait.map_or(patience, |wait| wait.min(patience));
+        let Ok(outcome) = tokio::time::timeout(patience, ticket.wait()).await else {
+            drop(place);
+            return self.promise(app, input, Some(ticket)).await;
+        };
+        drop((ticket, input));
+        let finished = outcome.map_err(|failure| self.declared.explain(failure))?;
+        self.declared.check_format(finished.product.report.source_format)?;
+        if self.request.report {
+            return delivery::report(&finished, self.received);
+        }
+        // Another backend may have stood in for the chosen one, and its bytes are others.
+        let key = ContentKey::new(&self.digest, &self.request.job, self.format, finished.product.report.backend);
+        let kept = results::keep_later(app, &finished, self.format, &key);
+        let mut response =
+            delivery::mesh(app, Arc::clone(&finished), self.format, &key, self.received, place).await?;
+        let headers = response.headers_mut();
+        if kept {
+            headers.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, self.format.extension())));
+        }
+        if let Some(cache) = self.cache {
+            headers.insert(header::CACHE_CONTROL, cache);
+        }
+        Ok(response)
+    }
+
+    fn task(&self, input: &Input) -> Task {
+        Task {
+            input: input.bytes.clone(),
+            digest: self.digest,
+            strict: self.request.strict,
+            job: self.request.job.clone(),
+            rank: self.wish.rank,
+            lease: Some(Arc::clone(&input.lease)),
+        }
+    }
+
+    /// A job that survives this process, and the answer that says so.
+    async fn promise(self, app: &Shared, input: Input, ticket: Option<Ticket>) -> Result<Response, Problem> {
+        if self.request.report {
+            let detail = "a report takes part in the result of a job; ask for the mesh, then for its report.json";
+            return Err(Problem::new(Kind::BadParameter, detail).with("parameter", "report"));
+        }
+        let (task, asked) = (self.task(&input), self.wish.later);
+        let order = Order {
+            task,
+            parameters: self.pairs,
+            format: self.format,
+            idempotency: self.wish.idempotency.clone(),
+        };
+        let ticket = ticket.map(|ticket| ticket.with_time(app.config.jobs.batch_deadline()));
+        let ledger = app.ledger.clone();
+        // Whoever leaves now has asked nevertheless: the job is promised as a whole or not at all.
+        let promised = tokio::spawn(async move { ledger.promise(order, ticket).await });
+        let view = promised.await.map_err(Problem::internal)??;
+        let wait = app.pool.estimated_wait() + Duration::from_secs_f64(app.pool.expected(&input.bytes, &self.request.job));
+        let mut response = jobs::accepted(&view, wait);
+        if let Some(applied) = self.wish.applied(asked) {
+            response.headers_mut().insert(PREFERENCE_APPLIED, applied);
+        }
+        Ok(response)
+    }
+}
+
+/// The digest of an input. Large ones are not for the runtime's threads: they take a nanosecond a byte.
+pub(super) async fn digest(bytes: &Bytes) -> Result<Digest, Problem> {
+    const SMALL: usize = 128 << 10;
+    if bytes.len() <= SMALL {
+        return Ok(Digest::of(bytes));
+    }
+    let bytes = bytes.clone();
+    tokio::task::spawn_blocking(move || Digest::of(&bytes)).await.map_err(Problem::internal)
+}

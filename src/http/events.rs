@@ -1,0 +1,74 @@
+//! `GET /v1/jobs/{id}/events`: a job as it goes on, as server-sent events. Each event is the whole state, so that whoever
+//! comes back with `Last-Event-ID` misses nothing that still matters.
+
+use std::convert::Infallible;
+use std::time::Duration;
+
+use axum::extract::rejection::PathRejection;
+use axum::extract::{Path, State};
+use axum::http::{HeaderMap, StatusCode};
+use axum::http::header::HeaderName;
+use axum::response::sse::{Event, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::stream;
+use tokio::sync::watch;
+
+use super::jobs;
+use super::problem::Problem;
+use super::state::Shared;
+use crate::jobs::View;
+
+/// A sign of life between events: proxies commonly give up after half a minute of silence.
+const HEARTBEAT: Duration = Duration::from_secs(15);
+/// The last event that a client has seen.
+const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
+
+/// What a listener has seen, and where it looks.
+struct Listener {
+    watched: watch::Receiver<View>,
+    stopping: watch::Receiver<bool>,
+    seen: u64,
+    over: bool,
+}
+
+/// The events of a job.
+pub(super) async fn show(
+    State(app): State<Shared>,
+    path: Result<Path<String>, PathRejection>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let id = jobs::id(path)?;
+    let watched = app.ledger.watch(&id).await?.ok_or_else(|| jobs::none(id.as_str()))?;
+    let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()?.trim().parse::<u64>().ok());
+    // After a restart of the service counting begins anew: an id that lies ahead is one of another life.
+    let seen = last.filter(|last| *last <= watched.borrow().version).unwrap_or(0);
+    if last == Some(watched.borrow().version) && watched.borrow().record.status.is_final() {
+        // Browsers reconnect for ever, unless they are told that there is nothing more to come.
+        return Ok(StatusCode::NO_CONTENT.into_response());
+    }
+    let listener = Listener { watched, stopping: app.stopping.clone(), seen, over: false };
+    let events = stream::unfold(listener, |mut listener| async move {
+        let event = listener.next().await?;
+        Some((Ok::<_, Infallible>(event), listener))
+    });
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(HEARTBEAT)).into_response())
+}
+
+impl Listener {
+    async fn next(&mut self) -> Option<Event> {
+        if self.over {
+            return None;
+        }
+        let seen = self.seen;
+        tokio::select! {
+            news = self.watched.wait_for(|view| view.version > seen || view.record.status.is_final()) => {
+                let view = news.ok()?.clone();
+                (self.seen, self.over) = (view.version, view.record.status.is_final());
+                let event = Event::default().id(view.version.to_string()).event(view.record.status.name());
+                Some(event.data(jobs::document(&view).to_string()))
+            }
+            // The stream ends with the service; clients reconnect by themselves.
+            _ = self.stopping.wait_for(|stop| *stop) => None,
+        }
+    }
+}

@@ -1,0 +1,167 @@
+//! `/v1/jobs/{id}`: how a promised job stands, with a long poll; its result; its end. Names and statuses are those of OGC
+//! API Processes.
+
+use std::time::Duration;
+
+use axum::Json;
+use axum::extract::rejection::{PathRejection, QueryRejection};
+use axum::extract::{Path, Query, State};
+use axum::http::header::{self, HeaderValue};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+use serde_json::{Map, Value, json};
+
+use super::kinds::Kind;
+use super::problem::Problem;
+use super::state::Shared;
+use super::delivery;
+use crate::jobs::{ContentKey, JobId, Status, View, rfc3339};
+
+/// Longest poll, s: proxies commonly cut an exchange after a minute.
+pub(super) const MAX_WAIT_S: u64 = 55;
+
+/// The long poll.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Poll {
+    /// Seconds to wait for the job's end.
+    wait: Option<u64>,
+}
+
+/// The job of a path.
+pub(super) fn id(path: Result<Path<String>, PathRejection>) -> Result<JobId, Problem> {
+    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    text.parse().map_err(|_| none(&text))
+}
+
+/// There is no such job.
+pub(super) fn none(id: &str) -> Problem {
+    let shown: String = id.chars().take(40).collect();
+    Problem::new(Kind::NoSuchJob, format!("there is no job `{shown}`: jobs are kept for some time after their end"))
+}
+
+/// How a job stands; with `wait`, once it has ended or the time is over.
+pub(super) async fn show(
+    State(app): State<Shared>,
+    path: Result<Path<String>, PathRejection>,
+    query: Result<Query<Poll>, QueryRejection>,
+) -> Result<Response, Problem> {
+    let id = id(path)?;
+    let Query(poll) = query.map_err(|e| Problem::new(Kind::BadParameter, e.body_text()).with("parameter", "wait"))?;
+    let wait = poll.wait.unwrap_or(0);
+    if wait > MAX_WAIT_S {
+        return Err(Problem::new(Kind::BadParameter, format!("parameter `wait`: {wait} is more than {MAX_WAIT_S} s"))
+            .with("parameter", "wait")
+            .with("value", wait)
+            .with("limit", MAX_WAIT_S)
+            .with("expected", format!("a whole number of seconds up to {MAX_WAIT_S}")));
+    }
+    let mut watched = app.ledger.watch(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let mut stopping = app.stopping.clone();
+    let ended = async {
+        tokio::select! {
+            _ = watched.wait_for(|view| view.record.status.is_final()) => {}
+            // The service ends: the client asks again, here after the restart or elsewhere.
+            _ = stopping.wait_for(|stop| *stop) => {}
+        }
+    };
+    drop(tokio::time::timeout(Duration::from_secs(wait), ended).await);
+    let view = watched.borrow().clone();
+    Ok(answer(StatusCode::OK, &view, None))
+}
+
+/// Cancels a job.
+pub(super) async fn dismiss(
+    State(app): State<Shared>,
+    path: Result<Path<String>, PathRejection>,
+) -> Result<Response, Problem> {
+    let id = id(path)?;
+    let view = app.ledger.dismiss(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    if view.record.status != Status::Dismissed {
+        let detail = format!("the job is {} and cannot be cancelled any more", view.record.status.name());
+        return Err(Problem::new(Kind::JobEnded, detail).with("status_name", view.record.status.name()));
+    }
+    Ok(answer(StatusCode::OK, &view, None))
+}
+
+/// The way to a job's result.
+pub(super) async fn result(
+    State(app): State<Shared>,
+    path: Result<Path<String>, PathRejection>,
+) -> Result<Response, Problem> {
+    let id = id(path)?;
+    let view = app.ledger.view(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let record = &view.record;
+    match (record.status, &record.result) {
+        (Status::Successful, Some(key)) => {
+            let gone = || Problem::new(Kind::ResultGone, "the result was kept for some time and is gone; ask for the mesh again");
+            let key: ContentKey = key.parse().map_err(|_| gone())?;
+            if app.store.head(&key.name(&record.format)?).await?.is_none() {
+                return Err(gone());
+            }
+            let location = delivery::text(&format!("/v1/results/{key}.{}", record.format));
+            Ok((StatusCode::SEE_OTHER, [(header::LOCATION, location)]).into_response())
+        }
+        (Status::Failed, _) => Err(Problem::recorded(record.problem.as_ref())),
+        (Status::Dismissed, _) => Err(Problem::new(Kind::JobDismissed, "the job was cancelled and has no result")),
+        _ => Err(Problem::new(Kind::NoResultYet, "the job has not ended; ask with ?wait= or watch its events")
+            .retry_after(Duration::from_secs(1))),
+    }
+}
+
+/// The answer that promises a job.
+pub(super) fn accepted(view: &View, wait: Duration) -> Response {
+    answer(StatusCode::ACCEPTED, view, Some(wait))
+}
+
+fn answer(status: StatusCode, view: &View, wait: Option<Duration>) -> Response {
+    let mut response = (status, Json(document(view))).into_response();
+    let headers = response.headers_mut();
+    headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
+    if status == StatusCode::ACCEPTED {
+        headers.insert(header::LOCATION, delivery::text(&format!("/v1/jobs/{}", view.record.id)));
+    }
+    if !view.record.status.is_final() {
+        let seconds = wait.map_or(1, |wait| wait.as_secs_f64().ceil().clamp(1.0, 600.0) as u64);
+        headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+    }
+    response
+}
+
+/// A job as JSON.
+pub(super) fn document(view: &View) -> Value {
+    let record = &view.record;
+    let own = format!("/v1/jobs/{}", record.id);
+    let link = |rel: &str, href: &str, kind: &str| json!({ "rel": rel, "href": href, "type": kind });
+    let mut links = vec![link("self", &own, "application/json")];
+    if !record.status.is_final() {
+        links.push(link("monitor", &format!("{own}/events"), "text/event-stream"));
+    }
+    if let Some(key) = &record.result {
+        let results = "http://www.opengis.net/def/rel/ogc/1.0/results";
+        links.push(link(results, &format!("{own}/result"), "application/octet-stream"));
+        links.push(link("describedby", &format!("/v1/results/{key}/report.json"), "application/json"));
+    }
+    let parameters: Map<String, Value> =
+        record.parameters.iter().map(|(name, value)| (name.clone(), value.as_str().into())).collect();
+    let time = |ms: Option<u64>| ms.map(rfc3339);
+    json!({
+        "jobID": record.id.as_str(),
+        "processID": "surface",
+        "type": "process",
+        "status": record.status.name(),
+        "progress": (view.fraction * 100.0).floor(),
+        "fraction": view.fraction,
+        "stage": view.stage,
+        "attempts": record.attempts,
+        "created": rfc3339(record.created_ms),
+        "started": time(record.started_ms),
+        "finished": time(record.finished_ms),
+        "structure": record.input,
+        "format": record.format,
+        "parameters": parameters,
+        "problem": record.problem,
+        "links": links,
+    })
+}

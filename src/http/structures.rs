@@ -1,0 +1,162 @@
+//! `/v1/structures`: upload once, mesh many times. A structure's name is the SHA-256 of its bytes as they came.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use axum::body::Body;
+use axum::extract::rejection::PathRejection;
+use axum::extract::{Path, State};
+use axum::http::header::{self, HeaderMap};
+use axum::http::{Extensions, HeaderValue, Method, StatusCode};
+use axum::response::{IntoResponse, Response};
+use axum::Json;
+use bytes::Bytes;
+use serde_json::{Value, json};
+
+use super::ask::{self, Ask, Input};
+use super::declared::Declared;
+use super::kinds::Kind;
+use super::meshes::Pairs;
+use super::problem::Problem;
+use super::state::Shared;
+use super::upload::{self, Upload};
+use super::wish::Wish;
+use super::{conditional, delivery, pdb};
+use crate::jobs::Failure;
+use crate::store::{Digest, Name};
+use crate::structure::contents::Counts;
+use crate::structure::{self, Contents, Structure};
+
+/// The name says what the bytes are, and the mesh follows from them and the parameters.
+const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stale-while-revalidate=604800");
+/// Chains that a summary lists at most.
+const MAX_CHAINS: usize = 1000;
+
+/// The digest that a client names.
+pub(super) fn digest_of(text: &str) -> Result<Digest, Problem> {
+    text.parse().map_err(|_| none(text))
+}
+
+fn none(digest: &str) -> Problem {
+    let shown: String = digest.chars().take(80).collect();
+    Problem::new(
+        Kind::NoSuchStructure,
+        format!("there is no structure `{shown}`: structures are kept for some time after their last use; upload it again"),
+    )
+}
+
+/// Takes a structure in.
+pub(super) async fn create(
+    State(app): State<Shared>,
+    headers: HeaderMap,
+    body: Body,
+) -> Result<Response, Problem> {
+    let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
+    if let Some((name, _)) = fields.first() {
+        return Err(Problem::new(Kind::BadParameter, format!("a structure has no parameter `{name}`; meshes have"))
+            .with("parameter", name.as_str()));
+    }
+    let _place = app.delivery()?;
+    let digest = ask::digest(&bytes).await?;
+    // Read before it is kept: what cannot be read is nobody's structure.
+    let summary = summarise(&app, digest, bytes.clone()).await.map_err(|failure| declared.explain(failure))?;
+    declared.check_format(summary["format"].as_str().unwrap_or_default())?;
+    let created = app.store.put_new(&Name::input(&digest), bytes).await?;
+    drop(lease);
+    let status = if created { StatusCode::CREATED } else { StatusCode::OK };
+    let location = delivery::text(&format!("/v1/structures/{digest}"));
+    Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
+}
+
+/// A structure's summary.
+pub(super) async fn show(
+    State(app): State<Shared>,
+    path: Result<Path<String>, PathRejection>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let digest = digest_of(&text)?;
+    let etag = HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)?;
+    let caching = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, CACHE)];
+    let _place = app.delivery()?;
+    let bytes = input(&app, &digest).await?.bytes;
+    if conditional::is_unchanged(&headers, &etag) {
+        return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
+    }
+    let summary = summarise(&app, digest, bytes).await?;
+    Ok((caching, Json(summary)).into_response())
+}
+
+/// Meshes a structure.
+pub(super) async fn surface(
+    State(app): State<Shared>,
+    method: Method,
+    path: Result<Path<(String, String)>, PathRejection>,
+    query: Pairs,
+    headers: HeaderMap,
+    extensions: Extensions,
+) -> Result<Response, Problem> {
+    let start = Instant::now();
+    let Path((text, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let (request, pairs, format) = pdb::named(&file, query)?;
+    let digest = digest_of(&text)?;
+    let wish = Wish::of(&headers, &extensions)?;
+    let mut ask = Ask { digest, request, pairs, format, wish, cache: Some(CACHE), received: start.elapsed(), declared: Declared::Neutral };
+    if app.store.head(&Name::input(&digest)).await?.is_none() {
+        return Err(none(&text));
+    }
+    if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
+        return Ok(response);
+    }
+    let input = input(&app, &digest).await?;
+    ask.received = start.elapsed();
+    ask.make(&app, input).await
+}
+
+/// The bytes of a structure.
+pub(super) async fn input(app: &Shared, digest: &Digest) -> Result<Input, Problem> {
+    let bytes = app.store.get(&Name::input(digest)).await?.ok_or_else(|| none(&digest.to_string()))?.bytes;
+    let mut lease = app.pool.budget().lease();
+    lease.grow(bytes.len() as u64)?;
+    Ok(Input { bytes, lease: Arc::new(lease) })
+}
+
+/// Reads a structure and says what it holds, on a thread that may block.
+async fn summarise(app: &Shared, digest: Digest, bytes: Bytes) -> Result<Value, Failure> {
+    let limits = app.config.limits.job().read;
+    let reading = tokio::task::spawn_blocking(move || {
+        let structure = structure::read(&bytes, &limits)?;
+        Ok(summary(&digest, bytes.len(), &structure))
+    });
+    let read = reading.await.map_err(|error| Failure::Panicked { message: error.to_string() })?;
+    read.map_err(|error: structure::StructureError| Failure::Job { error: error.into(), diagnostics: Vec::new() })
+}
+
+fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> Value {
+    let contents = Contents::of(structure, None);
+    let counts = |c: &Counts| {
+        json!({ "polymer": c.polymer, "ligand": c.ligand, "water": c.water, "hydrogens": c.hydrogens })
+    };
+    let chains: Vec<Value> = contents
+        .chains
+        .iter()
+        .take(MAX_CHAINS)
+        .map(|chain| json!({ "name": chain.name, "atoms": chain.counts.total(), "of": counts(&chain.counts) }))
+        .collect();
+    json!({
+        "digest": digest.to_string(),
+        "bytes": bytes,
+        "format": structure.format.name(),
+        "id": structure.id,
+        "title": structure.title,
+        "atoms": contents.atoms,
+        "models": contents.models,
+        "model": contents.model,
+        "atoms_in_model": counts(&contents.counts),
+        "alternatives": contents.alternatives,
+        "unknown_elements": contents.unknown_elements,
+        "chain_count": contents.chains.len(),
+        "chains": chains,
+        "surface": format!("/v1/structures/{digest}/surface.glb"),
+    })
+}

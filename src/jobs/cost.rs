@@ -1,0 +1,87 @@
+//! What a job will cost, before it is read: a model with one constant per machine, learned from the jobs that have run.
+
+use crate::pipeline::Job;
+
+/// Bytes of text per atom, about: a line of a PDB file has 81, one of an mmCIF file 90 to 110.
+const BYTES_PER_ATOM: f64 = 90.0;
+/// How much smaller compressed structure files are, about.
+const COMPRESSION: f64 = 4.0;
+/// Work of the smallest job, in atoms.
+const LEAST: f64 = 2_000.0;
+/// Assumed time of a unit of work before any job has run, s: an atom at 0.5 Å on two cores.
+const FIRST_GUESS: f64 = 4e-6;
+/// Weight of the newest job in the moving averages.
+const NEWEST: f64 = 0.2;
+
+/// Units of work that a job is taken for: atoms at 0.5 Å.
+pub(super) fn units(input: &[u8], job: &Job) -> f64 {
+    let compressed = input.starts_with(&[0x1f, 0x8b]) || input.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]);
+    let bytes = input.len() as f64 * if compressed { COMPRESSION } else { 1.0 };
+    // Samples go with the inverse cube of the spacing, the surface with its square, reading with neither.
+    let fineness = 0.5 / job.params.resolution;
+    (bytes / BYTES_PER_ATOM + LEAST) * (0.3 + 0.7 * fineness.powf(2.5))
+}
+
+/// Seconds per unit, and seconds per job, as lately measured.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rate {
+    per_unit: f64,
+    per_job: Option<f64>,
+}
+
+impl Default for Rate {
+    fn default() -> Self {
+        Self { per_unit: FIRST_GUESS, per_job: None }
+    }
+}
+
+impl Rate {
+    /// Expected seconds of so many units.
+    pub(super) fn seconds(&self, units: f64) -> f64 {
+        self.per_unit * units
+    }
+
+    /// Mean seconds of the jobs of late; `expected` before there were any.
+    pub(super) fn mean(&self, expected: f64) -> f64 {
+        self.per_job.unwrap_or(expected)
+    }
+
+    /// A job that was expected to take `expected` seconds took `seconds`.
+    pub(super) fn learn(&mut self, expected: f64, seconds: f64) {
+        // By the logarithm: a job a hundred times as long as expected says no more than one a hundredth as long.
+        let miss = (seconds.max(1e-6) / expected.max(1e-6)).ln();
+        self.per_unit *= (NEWEST * miss.clamp(-4.0, 4.0)).exp();
+        self.per_job = Some(self.per_job.map_or(seconds, |mean| mean + NEWEST * (seconds - mean)));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::params;
+
+    #[test]
+    fn finer_larger_and_compressed_inputs_cost_more() {
+        let at = |resolution: &str| params::parse([("resolution", resolution)]).unwrap().job;
+        let text = vec![b'A'; 90_000];
+        let gzip = [&[0x1f, 0x8b][..], &text].concat();
+        let coarse = units(&text, &at("1"));
+        assert!(units(&text, &at("0.5")) > 2.0 * coarse);
+        assert!(units(&gzip, &at("1")) > 2.0 * coarse);
+        assert!((units(&text, &at("0.5")) - 3000.0).abs() < 1.0);
+    }
+
+    #[test]
+    fn the_rate_follows_the_machine() {
+        let mut rate = Rate::default();
+        for _ in 0..50 {
+            let expected = rate.seconds(1e5);
+            rate.learn(expected, 2.0);
+        }
+        assert!((rate.seconds(1e5) - 2.0).abs() < 0.01, "{rate:?}");
+        assert!((rate.mean(0.0) - 2.0).abs() < 1e-9);
+        // One stray job does not turn everything over.
+        rate.learn(2.0, 2e4);
+        assert!(rate.seconds(1e5) < 5.0, "{rate:?}");
+    }
+}

@@ -1,0 +1,351 @@
+//! Jobs that were promised: on record before anybody is told of them, and taken up again after a restart.
+//!
+//! The store is the truth. Accepting means: input kept, record kept, only then an answer. Meshing twice is harmless, as
+//! results are named by their contents; so a crash anywhere costs time and never a job.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::time::Duration;
+
+use bytes::Bytes;
+use metrics::{counter, gauge};
+use serde_json::Value;
+use thiserror::Error;
+use tokio::sync::watch;
+
+use super::promise::{Promise, Runner};
+use super::record::{JobId, Record, Status, now_ms};
+use super::results::SaveError;
+use super::{Claim, Failure, Pool, Refusal, Task, Ticket};
+use crate::formats::Format;
+use crate::store::{Digest, Folder, Name, Pin, Store, StoreError};
+use crate::telemetry::{JOBS_OPEN, JOBS_RECOVERED};
+
+/// Ended jobs that are kept in mind; older ones are read from the store.
+const MOST_ENDED: usize = 10_000;
+
+/// Why a job cannot be promised.
+#[derive(Debug, Error)]
+pub enum PromiseError {
+    /// The queue has no room.
+    #[error(transparent)]
+    Refused(#[from] Refusal),
+    /// The record cannot be kept.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The idempotency key belongs to another request.
+    #[error("the idempotency key was used for another request")]
+    OtherRequest,
+    /// No random numbers.
+    #[error("no random numbers: {0}")]
+    Random(std::io::Error),
+}
+
+/// Why a promised job ended without a result.
+#[derive(Debug, Clone, Error)]
+pub enum EndError {
+    /// There is no mesh.
+    #[error(transparent)]
+    Job(#[from] Failure),
+    /// There is one, but no file of it.
+    #[error("{error}")]
+    Save {
+        /// Why.
+        error: SaveError,
+        /// The grid spacing, Å.
+        resolution: f64,
+    },
+    /// It was begun so many times without an end that it is taken for what ended the process.
+    #[error("the job was begun {attempts} times and never ended")]
+    Poison {
+        /// Times that it was begun.
+        attempts: u32,
+    },
+    /// Its input or its parameters cannot be read any more.
+    #[error("the job cannot be taken up again: {why}")]
+    Lost {
+        /// Why.
+        why: String,
+    },
+}
+
+/// Sizes of a ledger.
+#[derive(Debug, Clone, Copy)]
+pub struct LedgerSettings {
+    /// Time that a promised job has, waiting included.
+    pub allowed: Duration,
+    /// Times that a job is begun at most.
+    pub attempts: u32,
+    /// Bytes of a result at most.
+    pub output_bytes: u64,
+}
+
+/// What a job is made of.
+#[derive(Debug)]
+pub struct Order {
+    /// The task.
+    pub task: Task,
+    /// Its parameters as they were given.
+    pub parameters: Vec<(String, String)>,
+    /// The mesh format.
+    pub format: Format,
+    /// The key under which the client may send it again.
+    pub idempotency: Option<String>,
+}
+
+/// What everybody may know of a job.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// Its record.
+    pub record: Record,
+    /// The stage that runs.
+    pub stage: Option<&'static str>,
+    /// How much is done, from 0 to 1.
+    pub fraction: f64,
+    /// Rises with every change.
+    pub version: u64,
+}
+
+/// Writes an ending for clients.
+pub type Describe = fn(&EndError) -> Value;
+
+/// The jobs that were promised.
+#[derive(Clone)]
+pub struct Ledger(pub(super) Arc<Inner>);
+
+pub(super) struct Inner {
+    pub(super) store: Store,
+    pub(super) pool: Arc<Pool>,
+    pub(super) settings: LedgerSettings,
+    pub(super) describe: Describe,
+    promises: Mutex<HashMap<JobId, Arc<Promise>>>,
+}
+
+impl Inner {
+    fn lock(&self) -> MutexGuard<'_, HashMap<JobId, Arc<Promise>>> {
+        self.promises.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Keeps what an unfinished job needs from being tidied away.
+    fn pin(&self, id: &JobId, input: &Digest) -> Result<[Pin; 2], StoreError> {
+        Ok([self.store.pin(&Name::input(input)), self.store.pin(&Name::job(id.as_str())?)])
+    }
+
+    /// Writes a record down.
+    pub(super) async fn keep(&self, record: &Record) -> Result<(), StoreError> {
+        let bytes = serde_json::to_vec(record).unwrap_or_default();
+        self.store.put(&Name::job(record.id.as_str())?, Bytes::from(bytes)).await
+    }
+
+    fn insert(&self, promise: Arc<Promise>) {
+        let mut promises = self.lock();
+        promises.insert(promise.id(), promise);
+        if promises.len() > MOST_ENDED + MOST_ENDED / 10 {
+            let mut ended: Vec<_> = promises.values().filter_map(|p| p.ended()).collect();
+            ended.sort_unstable();
+            for (_, id) in ended.iter().take(promises.len().saturating_sub(MOST_ENDED)) {
+                promises.remove(id);
+            }
+        }
+    }
+}
+
+impl Ledger {
+    /// A ledger over `store`, whose jobs run on `pool`.
+    #[must_use]
+    pub fn new(store: Store, pool: Arc<Pool>, settings: LedgerSettings, describe: Describe) -> Self {
+        Self(Arc::new(Inner { store, pool, settings, describe, promises: Mutex::default() }))
+    }
+
+    /// Promises a job: when this returns, it survives the process. `ticket` is that of a job that waits or runs already.
+    ///
+    /// # Errors
+    /// [`PromiseError`]; then nothing was promised.
+    pub async fn promise(&self, order: Order, ticket: Option<Ticket>) -> Result<View, PromiseError> {
+        let inner = &self.0;
+        let client = order.task.rank.client.number();
+        let id = match &order.idempotency {
+            Some(key) => JobId::of_key(client, key),
+            None => JobId::random().map_err(PromiseError::Random)?,
+        };
+        let record = Record {
+            id: id.clone(),
+            input: order.task.digest.to_string(),
+            parameters: order.parameters,
+            format: order.format.extension().to_owned(),
+            client,
+            urgency: order.task.rank.urgency,
+            status: Status::Accepted,
+            attempts: u32::from(ticket.is_some()),
+            created_ms: now_ms(),
+            started_ms: None,
+            finished_ms: None,
+            result: None,
+            problem: None,
+        };
+        if order.idempotency.is_some()
+            && let Some(view) = self.view(&id).await?
+        {
+            let known = &view.record;
+            let same = (&known.input, &known.parameters, &known.format);
+            if same != (&record.input, &record.parameters, &record.format) {
+                return Err(PromiseError::OtherRequest);
+            }
+            return Ok(view);
+        }
+        // A place in the queue first: what is on record without one would be a promise that cannot be kept soon.
+        let promise = Arc::new(Promise::new(record));
+        let (input, digest) = (order.task.input.clone(), order.task.digest);
+        let pin = inner.pin(&id, &digest)?;
+        let (recorded, kept) = mpsc::channel();
+        let ticket = match ticket {
+            Some(ticket) => ticket,
+            None => {
+                let claim = self.claim(&promise, Some(kept));
+                inner.pool.submit(order.task, inner.settings.allowed, Some(claim))?
+            }
+        };
+        inner.store.put_new(&Name::input(&digest), input).await?;
+        let record = serde_json::to_vec(&promise.record()).unwrap_or_default();
+        let name = Name::job(id.as_str()).map_err(StoreError::from)?;
+        if !inner.store.put_new(&name, Bytes::from(record)).await?
+            && let Some(view) = self.view(&id).await?
+        {
+            // The same request came twice at once: the other one has promised it.
+            return Ok(view);
+        }
+        // A worker that waits for it goes on; there is none where the work runs already.
+        _ = recorded.send(());
+        inner.insert(Arc::clone(&promise));
+        let view = promise.view();
+        self.spawn(Runner { promise, ticket: Some(ticket), pin, digest });
+        Ok(view)
+    }
+
+    /// What is said of a job, and whatever follows; none if there is no such job.
+    ///
+    /// # Errors
+    /// That of the store.
+    pub async fn watch(&self, id: &JobId) -> Result<Option<watch::Receiver<View>>, StoreError> {
+        if let Some(promise) = self.0.lock().get(id) {
+            return Ok(Some(promise.subscribe()));
+        }
+        let Some(stored) = self.0.store.get(&Name::job(id.as_str())?).await? else { return Ok(None) };
+        // A record that cannot be read is none: nothing of ours writes one.
+        let Ok(record) = serde_json::from_slice::<Record>(&stored.bytes) else { return Ok(None) };
+        Ok(Some(Promise::new(record).subscribe()))
+    }
+
+    /// What is said of a job now.
+    ///
+    /// # Errors
+    /// That of the store.
+    pub async fn view(&self, id: &JobId) -> Result<Option<View>, StoreError> {
+        Ok(self.watch(id).await?.map(|seen| seen.borrow().clone()))
+    }
+
+    /// Cancels a job, if it has not ended. What is said of it then; none if there is no such job.
+    ///
+    /// # Errors
+    /// That of the store; the job is cancelled nevertheless.
+    pub async fn dismiss(&self, id: &JobId) -> Result<Option<View>, StoreError> {
+        let promise = self.0.lock().get(id).cloned();
+        let Some(promise) = promise else { return self.view(id).await };
+        if promise.end(Status::Dismissed, |_| {}) {
+            promise.dismiss();
+            self.0.keep(&promise.record()).await?;
+        }
+        Ok(Some(promise.view()))
+    }
+
+    /// Takes up what earlier processes left undone. The number of jobs.
+    ///
+    /// # Errors
+    /// That of the store, where the records cannot be listed.
+    pub async fn recover(&self) -> Result<usize, StoreError> {
+        let mut open = Vec::new();
+        for (name, _) in self.0.store.list(Folder::Jobs).await? {
+            let Some(stored) = self.0.store.get(&name).await? else { continue };
+            match serde_json::from_slice::<Record>(&stored.bytes) {
+                Ok(record) if !record.status.is_final() => open.push(record),
+                Ok(_) => {}
+                Err(error) => tracing::warn!(name = %name, %error, "a job's record cannot be read"),
+            }
+        }
+        // In the order in which they were promised.
+        open.sort_by_key(|record| (record.created_ms, record.id.clone()));
+        let count = open.len();
+        for record in open {
+            if self.0.lock().contains_key(&record.id) {
+                continue;
+            }
+            let promise = Arc::new(Promise::new(record));
+            self.0.insert(Arc::clone(&promise));
+            counter!(JOBS_RECOVERED).increment(1);
+            let Ok(digest) = promise.record().input.parse::<Digest>() else {
+                self.finish(&promise, Err(EndError::Lost { why: "its input has no name".to_owned() })).await;
+                continue;
+            };
+            let Ok(pin) = self.0.pin(&promise.id(), &digest) else { continue };
+            self.spawn(Runner { promise, ticket: None, pin, digest });
+        }
+        Ok(count)
+    }
+
+    fn spawn(&self, runner: Runner<[Pin; 2]>) {
+        gauge!(JOBS_OPEN).increment(1.0);
+        let ledger = self.clone();
+        tokio::spawn(async move {
+            runner.run(&ledger).await;
+            gauge!(JOBS_OPEN).decrement(1.0);
+        });
+    }
+
+    /// What the worker does before it begins: the attempt is on record by then, so that a job that ends the process is
+    /// found out. It waits until the job itself is.
+    pub(super) fn claim(&self, promise: &Arc<Promise>, kept: Option<mpsc::Receiver<()>>) -> Claim {
+        let (ledger, promise) = (self.clone(), Arc::clone(promise));
+        let runtime = tokio::runtime::Handle::current();
+        Box::new(move || {
+            // The sender is gone without a word if the job could not be recorded; it is cancelled then.
+            if kept.is_some_and(|kept| kept.recv().is_err()) {
+                return;
+            }
+            promise.begin();
+            if let Err(error) = runtime.block_on(ledger.0.keep(&promise.record())) {
+                tracing::error!(job = %promise.id(), %error, "a job's attempt cannot be recorded");
+            }
+        })
+    }
+
+    /// Writes an ending down. The ending of a job that was dismissed meanwhile is none.
+    pub(super) async fn finish(&self, promise: &Promise, ending: Result<String, EndError>) {
+        let changed = match ending {
+            Ok(key) => promise.end(Status::Successful, |record| record.result = Some(key)),
+            Err(error) => {
+                tracing::info!(job = %promise.id(), %error, "a job failed");
+                let problem = (self.0.describe)(&error);
+                promise.end(Status::Failed, |record| record.problem = Some(problem))
+            }
+        };
+        if !changed {
+            return;
+        }
+        // Without the record a restart would do the job again: a waste, but nothing is lost.
+        if let Err(error) = self.0.keep(&promise.record()).await {
+            tracing::error!(job = %promise.id(), %error, "a job's ending cannot be recorded");
+        }
+    }
+
+    /// A task as it is on record.
+    ///
+    /// # Errors
+    /// Why it cannot be had, in words.
+    pub(super) async fn task(&self, record: &Record, digest: Digest) -> Result<(Task, Format), String> {
+        let stored = self.0.store.get(&Name::input(&digest)).await.map_err(|e| e.to_string())?;
+        let input = stored.ok_or("its input is gone")?.bytes;
+        let mut lease = self.0.pool.budget().lease();
+        lease.force(input.len() as u64);
+        super::promise::task(record, digest, input, lease)
+    }
+}

@@ -1,0 +1,238 @@
+//! One promised job from its acceptance to its end, and whoever watches it.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use bytes::Bytes;
+use tokio::sync::{Notify, watch};
+
+use super::flight::Progress;
+use super::ledger::{EndError, Ledger, View};
+use super::rank::{Client, Rank};
+use super::record::{JobId, Record, Status, now_ms};
+use super::results;
+use super::{ContentKey, Failure, Finished, Lease, Refusal, Task, Ticket};
+use crate::formats::Format;
+use crate::pipeline::params;
+use crate::store::Digest;
+
+/// How often a running job's progress is looked at.
+const TICK: Duration = Duration::from_millis(100);
+/// Between two attempts to get a place in the queue, or memory.
+const PAUSE: Duration = Duration::from_millis(500);
+
+/// A promised job.
+pub(super) struct Promise {
+    view: watch::Sender<View>,
+    progress: Mutex<Option<Arc<Progress>>>,
+    dismissed: Notify,
+}
+
+impl Promise {
+    pub(super) fn new(record: Record) -> Self {
+        let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
+        let (view, _) = watch::channel(View { record, stage: None, fraction, version: 1 });
+        Self { view, progress: Mutex::default(), dismissed: Notify::new() }
+    }
+
+    pub(super) fn id(&self) -> JobId {
+        self.view.borrow().record.id.clone()
+    }
+
+    pub(super) fn record(&self) -> Record {
+        self.view.borrow().record.clone()
+    }
+
+    pub(super) fn view(&self) -> View {
+        self.view.borrow().clone()
+    }
+
+    pub(super) fn subscribe(&self) -> watch::Receiver<View> {
+        self.view.subscribe()
+    }
+
+    /// When it ended, and its id; none if it has not.
+    pub(super) fn ended(&self) -> Option<(u64, JobId)> {
+        let view = self.view.borrow();
+        view.record.finished_ms.map(|ms| (ms, view.record.id.clone()))
+    }
+
+    /// The work begins.
+    pub(super) fn begin(&self) {
+        self.view.send_modify(|view| {
+            view.record.attempts += 1;
+            view.record.status = Status::Running;
+            view.record.started_ms = Some(now_ms());
+            view.version += 1;
+        });
+    }
+
+    /// The job ends, unless it has. True if it did.
+    pub(super) fn end(&self, status: Status, and: impl FnOnce(&mut Record)) -> bool {
+        self.view.send_if_modified(|view| {
+            if view.record.status.is_final() {
+                return false;
+            }
+            view.record.status = status;
+            view.record.finished_ms = Some(now_ms());
+            and(&mut view.record);
+            (view.stage, view.version) = (None, view.version + 1);
+            if status == Status::Successful {
+                view.fraction = 1.0;
+            }
+            true
+        })
+    }
+
+    /// Tells the runner that nobody wants the result any more.
+    pub(super) fn dismiss(&self) {
+        self.dismissed.notify_one();
+    }
+
+    fn follow(&self, progress: &Arc<Progress>) {
+        *self.progress.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::clone(progress));
+    }
+
+    /// Publishes how far the work is, if it is further.
+    fn look(&self) {
+        let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        let Some((stage, fraction)) = progress.and_then(|progress| progress.now()) else { return };
+        self.tell(stage, fraction);
+    }
+
+    fn tell(&self, stage: &'static str, fraction: f64) {
+        self.view.send_if_modified(|view| {
+            let waits = view.record.status == Status::Accepted;
+            let further = view.stage != Some(stage) || fraction > view.fraction + 0.004;
+            if view.record.status.is_final() || !(waits || further) {
+                return false;
+            }
+            if waits {
+                view.record.status = Status::Running;
+                view.record.started_ms = Some(now_ms());
+            }
+            view.stage = Some(stage);
+            view.fraction = view.fraction.max(fraction);
+            view.version += 1;
+            true
+        });
+    }
+}
+
+/// Sees a promised job through. `P` keeps its input in the store.
+pub(super) struct Runner<P> {
+    pub(super) promise: Arc<Promise>,
+    /// The right to the outcome of work that waits or runs; none for a job from the records.
+    pub(super) ticket: Option<Ticket>,
+    pub(super) pin: P,
+    pub(super) digest: Digest,
+}
+
+/// What became of one attempt.
+enum Attempt {
+    Ended(Result<String, EndError>),
+    /// It can be tried again at once or later: nothing about the job stands against it.
+    Again,
+    /// The service stops; the record stays as it is, for the next start.
+    Left,
+}
+
+impl<P> Runner<P> {
+    pub(super) async fn run(self, ledger: &Ledger) {
+        let Self { promise, mut ticket, pin, digest } = self;
+        loop {
+            let attempt = attempt(ledger, &promise, &mut ticket, digest);
+            let attempt = tokio::select! {
+                attempt = attempt => attempt,
+                // Dropping the ticket stops the work.
+                () = promise.dismissed.notified() => break,
+            };
+            match attempt {
+                Attempt::Ended(ending) => {
+                    ledger.finish(&promise, ending).await;
+                    break;
+                }
+                Attempt::Again => tokio::time::sleep(PAUSE).await,
+                Attempt::Left => break,
+            }
+        }
+        drop(pin);
+    }
+}
+
+async fn attempt(ledger: &Ledger, promise: &Arc<Promise>, ticket: &mut Option<Ticket>, digest: Digest) -> Attempt {
+    let record = promise.record();
+    let mut ticket = match ticket.take() {
+        Some(ticket) => ticket,
+        None => match submit(ledger, promise, &record, digest).await {
+            Ok(ticket) => ticket,
+            Err(attempt) => return attempt,
+        },
+    };
+    promise.follow(ticket.progress());
+    let outcome = loop {
+        tokio::select! {
+            outcome = ticket.wait() => break outcome,
+            () = tokio::time::sleep(TICK) => promise.look(),
+        }
+    };
+    match outcome {
+        Ok(finished) => {
+            promise.tell("encode", 0.95);
+            Attempt::Ended(save(ledger, &record, finished).await)
+        }
+        Err(Failure::Stopped) => Attempt::Left,
+        Err(Failure::Memory(_)) => Attempt::Again,
+        Err(failure) => Attempt::Ended(Err(failure.into())),
+    }
+}
+
+/// Puts a job from the records into the queue.
+async fn submit(
+    ledger: &Ledger,
+    promise: &Arc<Promise>,
+    record: &Record,
+    digest: Digest,
+) -> Result<Ticket, Attempt> {
+    let settings = &ledger.0.settings;
+    if record.attempts >= settings.attempts {
+        return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
+    }
+    let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
+    let (task, _) = ledger.task(record, digest).await.map_err(lost)?;
+    let claim = ledger.claim(promise, None);
+    ledger.0.pool.submit(task, settings.allowed, Some(claim)).map_err(|refusal| match refusal {
+        Refusal::Draining => Attempt::Left,
+        // It was accepted once: it waits until there is room.
+        Refusal::QueueFull { .. } | Refusal::TooLate { .. } => Attempt::Again,
+    })
+}
+
+/// Keeps the result. Its key comes back.
+async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Result<String, EndError> {
+    let lost = |why| EndError::Lost { why };
+    let (job, format) = read(record).map_err(lost)?;
+    let report = &finished.product.report;
+    let (resolution, digest) = (report.resolution, finished.digest);
+    let key = ContentKey::new(&digest, &job, format, report.backend);
+    let inner = &ledger.0;
+    results::save(&inner.store, finished, format, &key, inner.settings.output_bytes)
+        .await
+        .map_err(|error| EndError::Save { error, resolution })?;
+    Ok(key.to_string())
+}
+
+/// The job and the format of a record.
+fn read(record: &Record) -> Result<(crate::pipeline::Job, Format), String> {
+    let request = params::parse(record.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
+    let format = record.format.parse().map_err(|_| format!("its format `{}` is unknown", record.format))?;
+    Ok((request.job, format))
+}
+
+/// The task of a record, with its input.
+pub(super) fn task(record: &Record, digest: Digest, input: Bytes, lease: Lease) -> Result<(Task, Format), String> {
+    let (job, format) = read(record)?;
+    let rank = Rank { client: Client::numbered(record.client), batch: true, urgency: record.urgency };
+    let strict = record.parameters.iter().any(|(name, _)| name == "check");
+    Ok((Task { input, digest, strict, job, rank, lease: Some(Arc::new(lease)) }, format))
+}

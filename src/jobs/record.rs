@@ -1,0 +1,206 @@
+//! The record of a job that was promised: what survives the process.
+
+use std::fmt;
+use std::str::FromStr;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use thiserror::Error;
+
+use crate::store::Digest;
+
+/// Not a job's id: 32 hexadecimal digits in lower case are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+#[error("a job's id has 32 hexadecimal digits in lower case")]
+pub struct BadJobId;
+
+/// The id of a job. Whoever knows it may see and cancel the job, so it cannot be guessed.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct JobId(String);
+
+impl JobId {
+    /// A new id, of 128 random bits.
+    ///
+    /// # Errors
+    /// That of the system, if it has no random numbers.
+    pub fn random() -> std::io::Result<Self> {
+        let mut bytes = [0; 16];
+        getrandom::fill(&mut bytes).map_err(std::io::Error::from)?;
+        Ok(Self(bytes.iter().map(|byte| format!("{byte:02x}")).collect()))
+    }
+
+    /// The id that belongs to an idempotency key: the same for the same key of the same client.
+    #[must_use]
+    pub fn of_key(client: u64, key: &str) -> Self {
+        let digest = Digest::of(format!("idempotency\n{client:x}\n{key}").as_bytes()).to_string();
+        Self(digest[..32].to_owned())
+    }
+
+    /// The id.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for JobId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl FromStr for JobId {
+    type Err = BadJobId;
+
+    fn from_str(text: &str) -> Result<Self, BadJobId> {
+        let hex = |c: u8| c.is_ascii_digit() || (b'a'..=b'f').contains(&c);
+        if text.len() == 32 && text.bytes().all(hex) { Ok(Self(text.to_owned())) } else { Err(BadJobId) }
+    }
+}
+
+impl TryFrom<String> for JobId {
+    type Error = BadJobId;
+
+    fn try_from(text: String) -> Result<Self, BadJobId> {
+        text.parse()
+    }
+}
+
+impl From<JobId> for String {
+    fn from(id: JobId) -> Self {
+        id.0
+    }
+}
+
+/// How a job stands, in the words of OGC API Processes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Status {
+    /// It waits.
+    Accepted,
+    /// It runs.
+    Running,
+    /// Its result is there.
+    Successful,
+    /// It ended without a result.
+    Failed,
+    /// It was cancelled.
+    Dismissed,
+}
+
+impl Status {
+    /// The status's name.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Accepted => "accepted",
+            Self::Running => "running",
+            Self::Successful => "successful",
+            Self::Failed => "failed",
+            Self::Dismissed => "dismissed",
+        }
+    }
+
+    /// Whether nothing will change any more.
+    #[must_use]
+    pub const fn is_final(self) -> bool {
+        matches!(self, Self::Successful | Self::Failed | Self::Dismissed)
+    }
+}
+
+/// What is on record about a job.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// Its id.
+    pub id: JobId,
+    /// SHA-256 of its input.
+    pub input: String,
+    /// Its parameters as they were given, name by name.
+    pub parameters: Vec<(String, String)>,
+    /// The mesh format, as a file name's extension.
+    pub format: String,
+    /// The client, for fairness after a restart.
+    pub client: u64,
+    /// Its urgency among the client's jobs.
+    pub urgency: u8,
+    /// How it stands. A record of a running job is one of a job that was running when it was last written.
+    pub status: Status,
+    /// Times that it was begun.
+    pub attempts: u32,
+    /// When it was accepted, ms since 1970.
+    pub created_ms: u64,
+    /// When it was begun last.
+    pub started_ms: Option<u64>,
+    /// When it ended.
+    pub finished_ms: Option<u64>,
+    /// The key of its result.
+    pub result: Option<String>,
+    /// Why there is none: a problem document.
+    pub problem: Option<Value>,
+}
+
+/// Milliseconds since 1970.
+#[must_use]
+pub fn now_ms() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+}
+
+/// A time as RFC 3339 writes it.
+#[must_use]
+pub fn rfc3339(ms: u64) -> String {
+    humantime::format_rfc3339_millis(UNIX_EPOCH + Duration::from_millis(ms.min(MAX_MS))).to_string()
+}
+
+/// The end of the year 9999, up to which RFC 3339 counts.
+const MAX_MS: u64 = 253_402_300_799_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ids_are_random_or_follow_their_key() {
+        let (a, b) = (JobId::random().unwrap(), JobId::random().unwrap());
+        assert_ne!(a, b);
+        assert_eq!(a.as_str().parse(), Ok(a.clone()));
+        assert_eq!(JobId::of_key(1, "x"), JobId::of_key(1, "x"));
+        assert_ne!(JobId::of_key(1, "x"), JobId::of_key(2, "x"));
+        assert_ne!(JobId::of_key(1, "x"), JobId::of_key(1, "y"));
+        for bad in ["", "..", &"A".repeat(32), &"a".repeat(31), &"a".repeat(33), "../../../../etc/passwd0123456789"] {
+            assert_eq!(bad.parse::<JobId>(), Err(BadJobId), "{bad}");
+        }
+    }
+
+    #[test]
+    fn records_come_back_as_they_were() {
+        let record = Record {
+            id: JobId::of_key(0, "k"),
+            input: Digest::of(b"x").to_string(),
+            parameters: vec![("resolution".to_owned(), "0.5".to_owned())],
+            format: "glb".to_owned(),
+            client: u64::MAX,
+            urgency: 3,
+            status: Status::Accepted,
+            attempts: 1,
+            created_ms: 1,
+            started_ms: None,
+            finished_ms: None,
+            result: None,
+            problem: None,
+        };
+        let text = serde_json::to_vec(&record).unwrap();
+        assert_eq!(serde_json::from_slice::<Record>(&text).unwrap(), record);
+        let hostile = String::from_utf8(text).unwrap().replace(record.id.as_str(), "../../x");
+        assert!(serde_json::from_str::<Record>(&hostile).is_err());
+    }
+
+    #[test]
+    fn times_are_written_as_the_web_does() {
+        assert_eq!(rfc3339(1_700_000_000_123), "2023-11-14T22:13:20.123Z");
+        assert!(rfc3339(u64::MAX).starts_with("9999-12-31"));
+        assert!(now_ms() > 1_700_000_000_000);
+    }
+}

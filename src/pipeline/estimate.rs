@@ -1,0 +1,147 @@
+//! What a job would come to, without its mesh: the grid to the sample, the mesh by its area.
+//!
+//! A surface of area A that lies in a grid of spacing h in no direction of its own crosses 1.5 A/h² grid edges: the mean
+//! of |nx| + |ny| + |nz| over the sphere of normals. Each crossing is a vertex, and a closed mesh has about two triangles a
+//! vertex. The area is that of a coarser mesh.
+
+use super::{Choice, Job, JobError, JobLimits, StageClock};
+use crate::surface::lattice::Lattice;
+use crate::surface::plan::Plan;
+use crate::surface::{CancelToken, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+
+/// Spacing of the coarser mesh, as a multiple of the job's, and at least so much, Å.
+const COARSER: f64 = 2.0;
+const COARSE: f64 = 1.0;
+
+/// What a job would come to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Estimate {
+    /// Atoms that would be meshed.
+    pub atoms: u64,
+    /// Atoms in the file, all models.
+    pub atoms_in_file: u64,
+    /// Cells that a dense grid would have had.
+    pub box_cells: u64,
+    /// The grid and the mesh, or why there would be none.
+    pub mesh: Result<MeshEstimate, SurfaceError>,
+}
+
+/// A grid, counted, and the mesh on it, estimated.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeshEstimate {
+    /// Bricks that some atom reaches.
+    pub bricks: u64,
+    /// Samples that would be evaluated.
+    pub samples: u64,
+    /// Area, Å².
+    pub area: f64,
+    /// Vertices.
+    pub vertices: u64,
+    /// Triangles.
+    pub triangles: u64,
+    /// Bytes of the mesh in memory, and of the binary part of a GLB.
+    pub bytes: u64,
+}
+
+/// Estimates a job.
+///
+/// # Errors
+/// Any [`JobError`] of reading and selecting; cancellation.
+pub fn estimate(
+    bytes: &[u8],
+    job: &Job,
+    limits: &JobLimits,
+    choice: &Choice<'_>,
+    cancel: &CancelToken,
+) -> Result<Estimate, JobError> {
+    let clock = StageClock::new(&());
+    let (structure, selected, spheres) = super::read(bytes, job, limits, &clock)?;
+    let control = Control { cancel: cancel.clone(), deadline: limits.deadline, ..Control::default() };
+    let lattice = Lattice::new(&spheres, &job.params)?;
+    let box_cells = lattice.box_cells;
+    let mesh = match of_mesh(&lattice, &spheres, &job.params, &limits.surface, choice, &control) {
+        Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)) => return Err(error.into()),
+        mesh => mesh,
+    };
+    let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.len() as u64);
+    Ok(Estimate { atoms, atoms_in_file, box_cells, mesh })
+}
+
+fn of_mesh(
+    lattice: &Lattice,
+    spheres: &Spheres,
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    choice: &Choice<'_>,
+    control: &Control<'_>,
+) -> Result<MeshEstimate, SurfaceError> {
+    let plan = Plan::new(lattice, limits, control)?;
+    let h = params.resolution;
+    let coarse = SurfaceParams { resolution: (COARSER * h).max(COARSE).max(h), atom_ids: false, ..params.clone() };
+    let mesh = match choice.backend.run(spheres, &coarse, limits, control) {
+        // Single small spheres fall through a coarse grid: then the grid itself is taken.
+        Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, params, limits, control)?.mesh,
+        meshed => meshed?.mesh,
+    };
+    let area = area(&mesh);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
+    let vertices = (1.5 * area / (h * h)).round() as u64;
+    let triangles = 2 * vertices;
+    let bytes = Mesh::bytes_for(vertices, triangles);
+    let estimate =
+        MeshEstimate { bricks: plan.occupied, samples: plan.occupied * 512, area, vertices, triangles, bytes };
+    if bytes > limits.max_mesh_bytes {
+        let fits = h * (bytes as f64 / limits.max_mesh_bytes as f64).sqrt();
+        let suggested_resolution = (fits * 105.0).ceil() / 100.0;
+        return Err(SurfaceError::MeshTooLarge { bytes, limit: limits.max_mesh_bytes, suggested_resolution });
+    }
+    Ok(estimate)
+}
+
+/// A mesh's area, Å².
+fn area(mesh: &Mesh) -> f64 {
+    let corner = |i: u32| glam::Vec3::from(mesh.positions[i as usize]);
+    let doubled = |t: &[u32; 3]| {
+        let [a, b, c] = t.map(corner);
+        f64::from((b - a).cross(c - a).length())
+    };
+    0.5 * mesh.triangles.iter().map(doubled).sum::<f64>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pipeline::{params, run};
+    use crate::surface::CpuBackend;
+
+    const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
+
+    #[test]
+    fn the_grid_is_exact_and_the_mesh_is_near() {
+        let backend = CpuBackend::new(None).unwrap();
+        let choice = Choice { backend: &backend, reason: "" };
+        for resolution in ["0.3", "0.5", "1", "2"] {
+            let job = params::parse([("resolution", resolution)]).unwrap().job;
+            let (limits, cancel) = (JobLimits::default(), CancelToken::default());
+            let estimate = estimate(SAMPLE, &job, &limits, &choice, &cancel).unwrap();
+            let report = run(SAMPLE, &job, &limits, &choice, &cancel, &()).unwrap().report;
+            let mesh = estimate.mesh.unwrap();
+            assert_eq!((mesh.samples, estimate.atoms), (report.samples, report.atoms));
+            let ratio = mesh.triangles as f64 / report.triangles as f64;
+            assert!((0.8..1.25).contains(&ratio), "{resolution}: {ratio}");
+        }
+    }
+
+    #[test]
+    fn what_would_be_refused_is_said_with_what_would_fit() {
+        let backend = CpuBackend::new(None).unwrap();
+        let choice = Choice { backend: &backend, reason: "" };
+        let small = SurfaceLimits { max_mesh_bytes: 100_000, ..SurfaceLimits::default() };
+        let limits = JobLimits { surface: small, ..JobLimits::default() };
+        let refused = estimate(SAMPLE, &Job::default(), &limits, &choice, &CancelToken::default()).unwrap();
+        let Err(SurfaceError::MeshTooLarge { suggested_resolution, .. }) = refused.mesh else { panic!("{refused:?}") };
+        let text = suggested_resolution.to_string();
+        let job = params::parse([("resolution", text.as_str())]).unwrap().job;
+        assert!(estimate(SAMPLE, &job, &limits, &choice, &CancelToken::default()).unwrap().mesh.is_ok());
+    }
+}

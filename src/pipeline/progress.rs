@@ -1,0 +1,97 @@
+//! How far a job is: fractions of stages in, one fraction of the whole out. It never goes back.
+
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use super::ProgressSink;
+
+/// Parts of a stage's fraction.
+const UNIT: f64 = 1000.0;
+
+/// Stages with their usual share of the time, in the order in which they run.
+const STAGES: [(&str, f64); 11] = [
+    ("read", 0.10),
+    ("select", 0.02),
+    ("bin", 0.03),
+    ("field", 0.40),
+    ("classify", 0.05),
+    ("scan", 0.02),
+    ("interpolate", 0.10),
+    ("emit", 0.10),
+    ("write", 0.05),
+    ("measure", 0.08),
+    ("encode", 0.05),
+];
+
+/// Stages of which several run at a time, on different bricks.
+const INTERLEAVED: [&str; 5] = ["field", "classify", "interpolate", "emit", "write"];
+
+/// How far each stage is. Told from several threads, read from another.
+#[derive(Debug, Default)]
+pub struct Tracker {
+    fractions: [AtomicU32; STAGES.len()],
+    /// Index of the stage that spoke last.
+    current: AtomicU32,
+}
+
+impl Tracker {
+    /// The stage that runs, and how much of the whole is done, from 0 to 1.
+    #[must_use]
+    pub fn now(&self) -> (&'static str, f64) {
+        let current = self.current.load(Ordering::Relaxed) as usize;
+        let part = |ix: usize| match ix {
+            // Stages of one pass run interleaved, so that an earlier one may not be done; the others are.
+            _ if ix < current && !INTERLEAVED.contains(&STAGES[ix].0) => 1.0,
+            _ => f64::from(self.fractions[ix].load(Ordering::Relaxed)) / UNIT,
+        };
+        let overall = (0..STAGES.len()).map(|ix| STAGES[ix].1 * part(ix)).sum();
+        (STAGES[current].0, overall)
+    }
+}
+
+impl ProgressSink for Tracker {
+    fn progress(&self, stage: &'static str, fraction: f64) {
+        let Some(ix) = STAGES.iter().position(|(name, _)| *name == stage) else { return };
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0..=1000")]
+        let parts = (fraction.clamp(0.0, 1.0) * UNIT) as u32;
+        // A stage that begins ends those before it, whether they reported it or not.
+        if self.fractions[ix].load(Ordering::Relaxed) == 0 {
+            self.current.fetch_max(u32::try_from(ix).unwrap_or(0), Ordering::Relaxed);
+        }
+        self.fractions[ix].fetch_max(parts, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shares_add_up_to_the_whole() {
+        let sum: f64 = STAGES.iter().map(|(_, share)| share).sum();
+        assert!((sum - 1.0).abs() < 1e-9, "{sum}");
+    }
+
+    #[test]
+    fn it_never_goes_back_and_ends_at_one() {
+        let tracker = Tracker::default();
+        let mut last = 0.0;
+        for (name, _) in STAGES {
+            for step in [0.0, 0.3, 1.0] {
+                tracker.progress(name, step);
+                let (_, now) = tracker.now();
+                assert!(now >= last - 1e-12, "{name} {step}: {now} after {last}");
+                last = now;
+            }
+        }
+        assert!((last - 1.0).abs() < 1e-9, "{last}");
+        tracker.progress("no such stage", 1.0);
+        assert_eq!(tracker.now().0, "encode");
+    }
+
+    #[test]
+    fn every_stage_of_the_core_is_known() {
+        for stage in crate::surface::Stage::ALL {
+            assert!(STAGES.iter().any(|(name, _)| *name == stage.name()), "{}", stage.name());
+        }
+    }
+}
