@@ -178,6 +178,14 @@ fn describe() {
     for counter_name in [VOXELS, TRIANGLES, JOBS_FALLBACK, JOBS_RECOVERED] {
         counter!(counter_name).increment(0);
     }
+    for reason in ["ttl", "cap"] {
+        counter!(STORE_REMOVED, "reason" => reason).increment(0);
+    }
+    for tier in ["memory", "store"] {
+        for result in ["hit", "miss"] {
+            counter!(CACHE_REQUESTS, "tier" => tier, "result" => result).increment(0);
+        }
+    }
     for place in ["job", "http"] {
         counter!(PANICS, "place" => place).increment(0);
     }

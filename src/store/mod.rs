@@ -17,6 +17,8 @@ mod s3;
 mod stale;
 mod store;
 mod stream;
+#[cfg(test)]
+mod tests;
 mod tidy;
 mod upload;
 mod writer;

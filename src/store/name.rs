@@ -74,7 +74,8 @@ impl Name {
     ///
     /// # Errors
     /// An extension has 1 to 16 characters: lower-case letters and digits, with single dots between them.
-    pub fn result(key: &Digest, extension: &str) -> Result<Self, BadName> {
+    pub fn result(key: &str, extension: &str) -> Result<Self, BadName> {
+        let _digest: Digest = key.parse().map_err(|_bad| BadName("a key has 64 hexadecimal digits in lower case"))?;
         let good = |part: &str| {
             !part.is_empty() && part.bytes().all(|c: u8| c.is_ascii_digit() || c.is_ascii_lowercase())
         };
@@ -106,7 +107,7 @@ impl Name {
         match folder {
             Folder::Inputs => file.parse().ok().map(|digest| Self::input(&digest)),
             Folder::Jobs => Self::job(file.strip_suffix(".json")?).ok(),
-            Folder::Results => file.split_once('.').and_then(|(key, extension)| Self::result(&key.parse().ok()?, extension).ok()),
+            Folder::Results => file.split_once('.').and_then(|(key, extension)| Self::result(key, extension).ok()),
         }
     }
 

@@ -1,0 +1,1 @@
+//! Faults that a disk shows on no demand.
