@@ -27,7 +27,7 @@ impl ContentKey {
     /// # Errors
     /// [`StoreError::Name`] for an extension that no file has.
     pub fn name(&self, extension: &str) -> Result<Name, StoreError> {
-        Ok(Name::result(&self.0, extension)?)
+        Ok(Name::result(&self.0.to_string(), extension)?)
     }
 }
 

@@ -5,6 +5,8 @@ use std::io;
 
 use thiserror::Error;
 
+use super::name::BadName;
+
 /// Errors of the store. Each names the place that somebody has to look at.
 #[derive(Debug, Clone, Error)]
 pub enum StoreError {
@@ -77,6 +79,9 @@ pub enum StoreError {
     /// A writer was dropped before its end; nothing is kept.
     #[error("the object was given up before its end")]
     Abandoned,
+    /// Not a name.
+    #[error(transparent)]
+    Name(#[from] BadName),
     /// Anything else that the disk or the service says.
     #[error("the store at {place} failed ({op}): {reason}")]
     Failed {
