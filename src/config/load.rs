@@ -123,6 +123,9 @@ impl Tree {
                 let expected = if size { "a whole number, or a size such as 64MiB" } else { "a whole number" };
                 Value::from(whole(text, size).ok_or_else(|| bad(expected.to_owned()))?)
             }
+            (Value::String(text), Value::Bool(_)) => {
+                Value::Bool(text.trim().parse().map_err(|_neither| bad("true or false".to_owned()))?)
+            }
             (Value::String(text), _) if text == "none" => Value::Null,
             _ => value.clone(),
         };

@@ -11,6 +11,7 @@ mod limits;
 mod load;
 mod log;
 mod server;
+mod template;
 
 use std::path::PathBuf;
 
@@ -24,6 +25,7 @@ pub use limits::LimitsConfig;
 pub use load::{Source, load, load_process};
 pub use log::{LogConfig, LogFormat};
 pub use server::ServerConfig;
+pub use template::{ProxyUrl, Template, Templates};
 
 /// The whole configuration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -37,7 +39,7 @@ pub struct Config {
     pub jobs: JobsConfig,
     /// GPUs.
     pub devices: DevicesConfig,
-    /// The folder of structures by PDB id.
+    /// Structures by PDB id.
     pub archive: ArchiveConfig,
     /// Logs.
     pub log: LogConfig,
@@ -48,5 +50,11 @@ impl Config {
     #[must_use]
     pub fn archive_dir(&self) -> PathBuf {
         self.archive.dir.clone().unwrap_or_else(|| self.server.data_dir.join("archive"))
+    }
+
+    /// The folder of copies of what a remote archive has sent.
+    #[must_use]
+    pub fn archive_cache_dir(&self) -> PathBuf {
+        self.server.data_dir.join("cache").join("archive")
     }
 }

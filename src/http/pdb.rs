@@ -1,25 +1,23 @@
 //! `GET /v1/pdb/{id}/surface.{ext}`: the mesh of an archive entry, under an address that can be cached.
 
-use std::sync::Arc;
 use std::time::Instant;
 
+use super::kinds::Kind;
+use super::meshes::{Pairs, pairs};
+use super::problem::Problem;
+use super::state::{App, Shared};
+use super::{conditional, delivery};
+use crate::archive::{Entry, FetchError, Why};
+use crate::formats::Format;
+use crate::jobs::{ContentKey, Lease, Task};
+use crate::pipeline::{Job, params};
+use crate::store::Digest;
+use crate::structure::{ArchiveError, EntryId};
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
 use axum::http::header::{self, HeaderMap};
 use axum::http::{HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
-use bytes::Bytes;
-
-use super::kinds::Kind;
-use super::meshes::{Pairs, pairs};
-use super::problem::Problem;
-use super::state::Shared;
-use super::{conditional, delivery};
-use crate::formats::Format;
-use crate::jobs::{ContentKey, Lease, Task};
-use crate::pipeline::params;
-use crate::store::Digest;
-use crate::structure::{ArchiveError, EntryId};
 
 /// Entries change a few times in their life, and then in details: a day is soon enough to notice.
 const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stale-while-revalidate=604800");
@@ -46,21 +44,19 @@ pub(super) async fn surface(
             .with("expected", format!("no value here, or the address surface.{value}")));
     }
     params::suits(&request.job, format)?;
-    let id = id.parse().map_err(|error| of_archive(&error))?;
-    let (bytes, digest, lease) = fetch(Arc::clone(&app), id).await?;
+    let id: EntryId = id.parse().map_err(|error| of_folder(&error))?;
+    let short = |digest| {
+        let is_mesh = !request.report;
+        is_mesh.then(|| without_meshing(&app, &method, &headers, &digest, &request.job, format)).flatten()
+    };
+    // A client that has the mesh already is answered without touching the entry.
+    if let Some(answer) = app.archive.known(&id).await.and_then(short) {
+        return Ok(answer);
+    }
+    let (Entry { bytes, digest, .. }, lease) = fetch(&app, &id).await?;
     let received = start.elapsed();
-    let key = ContentKey::new(&digest, &request.job, format, app.pool.backend().name());
-    let etag = delivery::etag(&key);
-    if !request.report {
-        let caching = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, CACHE)];
-        if conditional::is_unchanged(&headers, &etag) {
-            return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
-        }
-        if method == Method::HEAD {
-            // What a mesh would say about itself is known only after meshing, which HEAD is not worth.
-            let media_type = HeaderValue::from_static(format.media_type());
-            return Ok((caching, [(header::CONTENT_TYPE, media_type)]).into_response());
-        }
+    if let Some(answer) = short(digest) {
+        return Ok(answer);
     }
     let place = app.delivery()?;
     let job = request.job.clone();
@@ -89,22 +85,58 @@ fn format_of(file: &str) -> Result<Format, Problem> {
     )
 }
 
-/// Reads an entry and its digest, on a thread that may block.
-async fn fetch(app: Shared, id: EntryId) -> Result<(Bytes, Digest, Lease), Problem> {
-    let mut lease = app.pool.budget().lease();
-    let reading = tokio::task::spawn_blocking(move || {
-        let bytes = app.archive.fetch(&id)?;
-        let digest = Digest::of(&bytes);
-        Ok((Bytes::from(bytes), digest))
-    });
-    let (bytes, digest) =
-        reading.await.map_err(Problem::internal)?.map_err(|error: ArchiveError| of_archive(&error))?;
-    lease.grow(bytes.len() as u64)?;
-    Ok((bytes, digest, lease))
+/// The answer to whoever has the mesh, or wants no more than its head; none where the mesh is wanted.
+fn without_meshing(
+    app: &App,
+    method: &Method,
+    headers: &HeaderMap,
+    digest: &Digest,
+    job: &Job,
+    format: Format,
+) -> Option<Response> {
+    let etag = delivery::etag(&ContentKey::new(digest, job, format, app.pool.backend().name()));
+    let unchanged = conditional::is_unchanged(headers, &etag);
+    let caching = [(header::ETAG, etag), (header::CACHE_CONTROL, CACHE)];
+    if unchanged {
+        return Some((StatusCode::NOT_MODIFIED, caching).into_response());
+    }
+    // What a mesh would say about itself is known only after meshing, which HEAD is not worth.
+    let media_type = HeaderValue::from_static(format.media_type());
+    (*method == Method::HEAD).then(|| (caching, [(header::CONTENT_TYPE, media_type)]).into_response())
 }
 
-/// The archive's errors; its folder, and the paths in it, are nobody's business.
-fn of_archive(error: &ArchiveError) -> Problem {
+/// An entry, and a lease of the memory that it takes.
+async fn fetch(app: &App, id: &EntryId) -> Result<(Entry, Lease), Problem> {
+    let mut lease = app.pool.budget().lease();
+    let entry = app.archive.fetch(id).await.map_err(|error| of_archive(&error))?;
+    lease.grow(entry.bytes.len() as u64)?;
+    Ok((entry, lease))
+}
+
+/// The archive's errors.
+fn of_archive(error: &FetchError) -> Problem {
+    let detail = error.to_string();
+    match error {
+        FetchError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
+        FetchError::Local(error) => of_folder(error),
+        FetchError::TooLarge { bytes, limit, .. } => {
+            let problem = Problem::new(Kind::EntryTooLarge, detail).with("limit", *limit);
+            bytes.iter().fold(problem, |problem, bytes| problem.with("actual", *bytes))
+        }
+        FetchError::Unavailable { host, why, retry_after } => {
+            let problem = Problem::new(Kind::ArchiveUnavailable, detail).with("host", host.as_str());
+            let problem = match why {
+                Why::Status(status) => problem.with("found", *status),
+                _ => problem,
+            };
+            retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
+        }
+        FetchError::Internal(_) => Problem::internal(detail),
+    }
+}
+
+/// The local folder's errors; the folder, and the paths in it, are nobody's business.
+fn of_folder(error: &ArchiveError) -> Problem {
     let detail = error.to_string();
     match error {
         ArchiveError::BadId { id } => Problem::new(Kind::BadParameter, detail)
@@ -114,10 +146,6 @@ fn of_archive(error: &ArchiveError) -> Problem {
         ArchiveError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
         ArchiveError::TooLarge { bytes, limit, .. } => {
             Problem::new(Kind::InflatedTooLarge, detail).with("limit", *limit).with("actual", *bytes)
-        }
-        // The folder may be mounted later; until then it holds nothing.
-        ArchiveError::Io(io) if io.kind() == std::io::ErrorKind::NotFound => {
-            Problem::new(Kind::NotInArchive, "this server has no folder of structures")
         }
         ArchiveError::Io(io) => Problem::internal(format!("{error}: {io}")),
     }

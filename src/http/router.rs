@@ -13,7 +13,8 @@ const MARGIN: Duration = Duration::from_secs(10);
 
 /// The service.
 pub(super) fn router(app: Shared) -> Router {
-    let timeout = app.config.server.body_timeout() + app.config.jobs.deadline() + MARGIN;
+    let input = app.config.server.body_timeout().max(app.config.archive.timeout());
+    let timeout = input + app.config.jobs.deadline() + MARGIN;
     let router = Router::new()
         // Meshes.
         .route("/v1/meshes", post(meshes::create))

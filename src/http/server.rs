@@ -11,9 +11,9 @@ use tokio::sync::{Semaphore, watch};
 
 use super::state::{App, Readiness, Ready, Shared};
 use super::{accept, capabilities, metrics, router};
+use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{Budget, Pool, Settings};
-use crate::structure::Archive;
 use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, TelemetryError};
 
@@ -91,7 +91,7 @@ impl Server {
             budget: Budget::new(config.limits.memory_bytes),
         };
         let pool = Pool::start(settings, backend, reason).map_err(ServeError::Workers)?;
-        let archive = Archive::new(config.archive_dir()).with_max_bytes(config.limits.inflated_bytes);
+        let archive = Archive::new(&config);
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();

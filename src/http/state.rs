@@ -8,9 +8,9 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::kinds::Kind;
 use super::problem::Problem;
+use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::Pool;
-use crate::structure::Archive;
 use crate::surface::FoundDevice;
 
 /// State of the service, behind one pointer.
