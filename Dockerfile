@@ -16,6 +16,8 @@ FROM debian:bookworm-slim AS cpu
 RUN groupadd --gid 65532 molmesh && useradd --uid 65532 --gid 65532 --no-create-home --shell /usr/sbin/nologin molmesh \
     && install -d -o molmesh -g molmesh /data
 COPY --from=build /usr/local/bin/molmesh /usr/local/bin/molmesh
+# The archive is asked over TLS.
+COPY --from=build /etc/ssl/certs/ca-certificates.crt /etc/ssl/certs/ca-certificates.crt
 COPY LICENSE-MIT LICENSE-APACHE /usr/share/doc/molmesh/
 USER 65532:65532
 VOLUME /data

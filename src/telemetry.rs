@@ -67,6 +67,14 @@ pub const STORE_REMOVED: &str = "molmesh_store_removed_total";
 pub const STORE_ERRORS: &str = "molmesh_store_errors_total";
 /// Results asked for, by tier (`memory`, then `store`) and result (`hit`, `miss`).
 pub const CACHE_REQUESTS: &str = "molmesh_cache_requests_total";
+/// Questions for an entry of the archive, by source (`local`, `cache`, `remote`) and result.
+pub const ARCHIVE_REQUESTS: &str = "molmesh_archive_requests_total";
+/// Time of fetching an entry from the remote archive, every attempt and pause included, by result.
+pub const ARCHIVE_FETCH: &str = "molmesh_archive_fetch_seconds";
+/// 1 while a host of the remote archive is left alone, else 0, by host.
+pub const ARCHIVE_BREAKER: &str = "molmesh_archive_breaker_open";
+/// Bytes of copies of archive entries on disk.
+pub const ARCHIVE_KEPT: &str = "molmesh_archive_cache_bytes";
 /// Panics that were caught, by place.
 pub const PANICS: &str = "molmesh_panics_total";
 /// 1, labelled with the version.
@@ -126,7 +134,7 @@ pub fn init_logs(config: &LogConfig) -> Result<(), TelemetryError> {
 pub fn recorder() -> Result<PrometheusHandle, TelemetryError> {
     static RECORDER: OnceLock<Result<PrometheusHandle, String>> = OnceLock::new();
     let installed = RECORDER.get_or_init(|| {
-        let handle = [HTTP_DURATION, STAGE_DURATION]
+        let handle = [HTTP_DURATION, STAGE_DURATION, ARCHIVE_FETCH]
             .into_iter()
             .try_fold(PrometheusBuilder::new(), |builder, name| {
                 builder.set_buckets_for_metric(Matcher::Full(name.to_owned()), &BUCKETS)
@@ -169,6 +177,10 @@ fn describe() {
     describe_counter!(STORE_REMOVED, "Objects that the store removed by itself, by reason");
     describe_counter!(STORE_ERRORS, "Operations of the store that failed");
     describe_counter!(CACHE_REQUESTS, "Results asked for, by tier and result");
+    describe_counter!(ARCHIVE_REQUESTS, "Questions for an entry of the archive, by source and result");
+    describe_histogram!(ARCHIVE_FETCH, Unit::Seconds, "Time of fetching an entry from the remote archive");
+    describe_gauge!(ARCHIVE_BREAKER, "1 while a host of the remote archive is left alone");
+    describe_gauge!(ARCHIVE_KEPT, Unit::Bytes, "Bytes of copies of archive entries on disk");
     describe_counter!(PANICS, "Panics that were caught");
     describe_gauge!(BUILD_INFO, "1, labelled with the version");
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);

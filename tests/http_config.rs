@@ -51,6 +51,25 @@ fn later_layers_win() {
 }
 
 #[test]
+fn archives_are_named_as_text_or_as_a_list() {
+    let urls = |config: &Config| config.archive.url.as_ref().map(ToString::to_string);
+    let both = Some("http://a/{id} http://b/{middle}/{id_upper}".to_owned());
+    let list = file("[archive]\nurl = [\"http://a/{id}\", \"http://b/{middle}/{id_upper}\"]\nallow_private = true\n");
+    let config = load(Some(list.path()), [], &[]).unwrap();
+    assert_eq!((urls(&config), config.archive.allow_private), (both.clone(), true));
+    let env = pairs(&[
+        ("MOLMESH__ARCHIVE__URL", "http://a/{id} http://b/{middle}/{id_upper}"),
+        ("MOLMESH__ARCHIVE__ALLOW_PRIVATE", "true"),
+        ("MOLMESH__ARCHIVE__PROXY", "http://p:3128"),
+    ]);
+    let config = load(None, env, &[]).unwrap();
+    assert_eq!((urls(&config), config.archive.allow_private), (both, true));
+    assert_eq!(config.archive.proxy.unwrap().as_str(), "http://p:3128");
+    let off = load(None, pairs(&[("MOLMESH__ARCHIVE__URL", "none")]), &[]).unwrap();
+    assert_eq!((urls(&off), urls(&Config::default()).is_some()), (None, true));
+}
+
+#[test]
 fn unknown_keys_name_the_nearest_and_where_they_came_from() {
     for (text, env, flag, key, near, from) in [
         ("[limits]\nbody_byte = 1", None, None, "limits.body_byte", "limits.body_bytes", ".tmp"),
@@ -87,6 +106,11 @@ fn bad_values_name_the_key_the_value_and_what_was_expected() {
         ("server.listen", "localhost"),
         ("server.listen", "none"),
         ("log.format", "xml"),
+        ("archive.url", ""),
+        ("archive.url", "file:///pdb/{id}"),
+        ("archive.url", "https://h/4pti.cif"),
+        ("archive.proxy", "proxy"),
+        ("archive.allow_private", "maybe"),
     ] {
         let message = load(None, [], &pairs(&[(key, value)])).unwrap_err().to_string();
         assert!(message.contains(key) && message.contains("expected") && message.contains("command line"), "{message}");

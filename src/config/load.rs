@@ -125,7 +125,7 @@ impl Tree {
                 Value::from(whole(text, size).ok_or_else(|| bad(expected.to_owned()))?)
             }
             (Value::String(text), Value::Bool(_)) => {
-                Value::from(text.trim().parse::<bool>().map_err(|_refused| bad("true or false".to_owned()))?)
+                Value::Bool(text.trim().parse().map_err(|_neither| bad("true or false".to_owned()))?)
             }
             (Value::String(text), _) if text == "none" => Value::Null,
             _ => value.clone(),

@@ -12,6 +12,7 @@ mod load;
 mod log;
 mod server;
 mod store;
+mod template;
 
 use std::path::PathBuf;
 
@@ -26,6 +27,7 @@ pub use load::{Source, load, load_process};
 pub use log::{LogConfig, LogFormat};
 pub use server::ServerConfig;
 pub use store::{Secret, StoreConfig};
+pub use template::{ProxyUrl, Template, Templates};
 
 /// The whole configuration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -39,7 +41,7 @@ pub struct Config {
     pub jobs: JobsConfig,
     /// GPUs.
     pub devices: DevicesConfig,
-    /// The folder of structures by PDB id.
+    /// Structures by PDB id.
     pub archive: ArchiveConfig,
     /// What the service keeps.
     pub store: StoreConfig,
@@ -52,5 +54,11 @@ impl Config {
     #[must_use]
     pub fn archive_dir(&self) -> PathBuf {
         self.archive.dir.clone().unwrap_or_else(|| self.server.data_dir.join("archive"))
+    }
+
+    /// The folder of copies of what a remote archive has sent.
+    #[must_use]
+    pub fn archive_cache_dir(&self) -> PathBuf {
+        self.server.data_dir.join("cache").join("archive")
     }
 }

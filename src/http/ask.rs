@@ -38,6 +38,8 @@ pub(super) struct Ask {
 /// The bytes to be meshed, and the memory that they are charged to.
 pub(super) struct Input {
     pub(super) bytes: Bytes,
+    /// Of an archive's entry it may be another one than it was when the answer was looked for.
+    pub(super) digest: Digest,
     pub(super) lease: Arc<Lease>,
 }
 
@@ -91,6 +93,7 @@ impl Ask {
             drop(place);
             return self.promise(app, input, Some(ticket)).await;
         };
+        let digest = input.digest;
         drop((ticket, input));
         let finished = outcome.map_err(|failure| self.declared.explain(failure))?;
         self.declared.check_format(finished.product.report.source_format)?;
@@ -98,7 +101,7 @@ impl Ask {
             return delivery::report(&finished, self.received);
         }
         // Another backend may have stood in for the chosen one, and its bytes are others.
-        let key = ContentKey::new(&self.digest, &self.request.job, self.format, finished.product.report.backend);
+        let key = ContentKey::new(&digest, &self.request.job, self.format, finished.product.report.backend);
         let kept = results::keep_later(app, &finished, self.format, &key);
         let mut response =
             delivery::mesh(app, Arc::clone(&finished), self.format, &key, self.received, place).await?;
@@ -115,7 +118,7 @@ impl Ask {
     fn task(&self, input: &Input) -> Task {
         Task {
             input: input.bytes.clone(),
-            digest: self.digest,
+            digest: input.digest,
             strict: self.request.strict,
             job: self.request.job.clone(),
             rank: self.wish.rank,

@@ -38,9 +38,8 @@ pub(super) async fn create(
     let format = taken.request.format.unwrap_or_default();
     // Half a mesh is work as well: it takes a place among those that are made.
     let place = app.delivery()?;
-    let digest = taken.digest;
     let (declared, job) = (taken.declared.clone(), taken.request.job.clone());
-    let Input { bytes, lease } = taken.input(&app).await?;
+    let Input { bytes, digest, lease } = taken.input(&app).await?;
     let seconds = app.pool.expected(&bytes, &job);
     let stop = StopOnDrop(CancelToken::default());
     let limits = pipeline::JobLimits {

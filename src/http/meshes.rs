@@ -98,7 +98,8 @@ pub(super) async fn take(
     let (source, fields) = if upload::is_json(headers) {
         document(&bytes)?
     } else {
-        (Source::Sent(Input { bytes, lease: Arc::new(lease) }), fields)
+        let digest = ask::digest(&bytes).await?;
+        (Source::Sent(Input { bytes, digest, lease: Arc::new(lease) }), fields)
     };
     if late {
         pairs.extend(fields);
@@ -109,7 +110,7 @@ pub(super) async fn take(
         params::suits(&request.job, format)?;
     }
     let digest = match &source {
-        Source::Sent(input) => ask::digest(&input.bytes).await?,
+        Source::Sent(input) => input.digest,
         Source::Entry(id) => pdb::digest(app, id).await?,
         Source::Structure(digest) => *digest,
     };
@@ -160,7 +161,7 @@ fn document(bytes: &[u8]) -> Result<(Source, Vec<(String, String)>), Problem> {
                 .with("parameter", name.as_str())
         })?;
         let found = match name.as_str() {
-            "pdb_id" => Source::Entry(text.parse().map_err(|error| pdb::of_archive(&error))?),
+            "pdb_id" => Source::Entry(text.parse().map_err(|error| pdb::of_folder(&error))?),
             "structure" => Source::Structure(structures::digest_of(&text)?),
             _ => {
                 fields.push((name, text));

@@ -8,7 +8,6 @@ use axum::extract::{Path, State};
 use axum::http::header::{self, HeaderMap};
 use axum::http::{Extensions, HeaderValue, Method};
 use axum::response::{IntoResponse, Response};
-use bytes::Bytes;
 
 use super::ask::{Ask, Input};
 use super::declared::Declared;
@@ -18,6 +17,7 @@ use super::meshes::{Pairs, pairs};
 use super::problem::Problem;
 use super::state::Shared;
 use super::wish::Wish;
+use crate::archive::{Entry, FetchError, Why};
 use crate::formats::Format;
 use crate::pipeline::params;
 use crate::store::Digest;
@@ -38,7 +38,7 @@ pub(super) async fn surface(
     let start = Instant::now();
     let Path((id, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let (request, pairs, format) = named(&file, query)?;
-    let id: EntryId = id.parse().map_err(|error| of_archive(&error))?;
+    let id: EntryId = id.parse().map_err(|error| of_folder(&error))?;
     let digest = digest(&app, &id).await?;
     let wish = Wish::of(&headers, &extensions)?;
     let mut ask = Ask { digest, request, pairs, format, wish, cache: Some(CACHE), received: start.elapsed(), declared: Declared::Neutral };
@@ -105,30 +105,41 @@ fn format_of(file: &str) -> Result<Format, Problem> {
 
 /// The digest of an entry's file.
 pub(super) async fn digest(app: &Shared, id: &EntryId) -> Result<Digest, Problem> {
-    Ok(fetch(app, id).await?.1)
+    app.archive.digest(id).await.map_err(|error| of_archive(&error))
 }
 
 /// An entry's file.
 pub(super) async fn input(app: &Shared, id: &EntryId) -> Result<Input, Problem> {
-    let bytes = fetch(app, id).await?.0;
     let mut lease = app.pool.budget().lease();
+    let Entry { bytes, digest, .. } = app.archive.fetch(id).await.map_err(|error| of_archive(&error))?;
     lease.grow(bytes.len() as u64)?;
-    Ok(Input { bytes, lease: Arc::new(lease) })
+    Ok(Input { bytes, digest, lease: Arc::new(lease) })
 }
 
-/// Reads an entry and its digest, on a thread that may block.
-async fn fetch(app: &Shared, id: &EntryId) -> Result<(Bytes, Digest), Problem> {
-    let (app, id) = (Arc::clone(app), id.clone());
-    let reading = tokio::task::spawn_blocking(move || {
-        let bytes = app.archive.fetch(&id)?;
-        let digest = Digest::of(&bytes);
-        Ok((Bytes::from(bytes), digest))
-    });
-    reading.await.map_err(Problem::internal)?.map_err(|error: ArchiveError| of_archive(&error))
+/// The archive's errors.
+fn of_archive(error: &FetchError) -> Problem {
+    let detail = error.to_string();
+    match error {
+        FetchError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
+        FetchError::Local(error) => of_folder(error),
+        FetchError::TooLarge { bytes, limit, .. } => {
+            let problem = Problem::new(Kind::EntryTooLarge, detail).with("limit", *limit);
+            bytes.iter().fold(problem, |problem, bytes| problem.with("actual", *bytes))
+        }
+        FetchError::Unavailable { host, why, retry_after } => {
+            let problem = Problem::new(Kind::ArchiveUnavailable, detail).with("host", host.as_str());
+            let problem = match why {
+                Why::Status(status) => problem.with("found", *status),
+                _ => problem,
+            };
+            retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
+        }
+        FetchError::Internal(_) => Problem::internal(detail),
+    }
 }
 
-/// The archive's errors; its folder, and the paths in it, are nobody's business.
-pub(super) fn of_archive(error: &ArchiveError) -> Problem {
+/// The local folder's errors; the folder, and the paths in it, are nobody's business.
+pub(super) fn of_folder(error: &ArchiveError) -> Problem {
     let detail = error.to_string();
     match error {
         ArchiveError::BadId { id } => Problem::new(Kind::BadParameter, detail)
@@ -138,10 +149,6 @@ pub(super) fn of_archive(error: &ArchiveError) -> Problem {
         ArchiveError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
         ArchiveError::TooLarge { bytes, limit, .. } => {
             Problem::new(Kind::InflatedTooLarge, detail).with("limit", *limit).with("actual", *bytes)
-        }
-        // The folder may be mounted later; until then it holds nothing.
-        ArchiveError::Io(io) if io.kind() == std::io::ErrorKind::NotFound => {
-            Problem::new(Kind::NotInArchive, "this server has no folder of structures")
         }
         ArchiveError::Io(io) => Problem::internal(format!("{error}: {io}")),
     }

@@ -16,7 +16,8 @@ const MARGIN: Duration = Duration::from_secs(10);
 /// The service.
 pub(super) fn router(app: Shared) -> Router {
     let longest = app.config.jobs.deadline().max(Duration::from_secs(jobs::MAX_WAIT_S));
-    let timeout = app.config.server.body_timeout() + longest + MARGIN;
+    let input = app.config.server.body_timeout().max(app.config.archive.timeout());
+    let timeout = input + longest + MARGIN;
     let router = Router::new()
         // Meshes.
         .route("/v1/meshes", post(meshes::create))

@@ -13,10 +13,10 @@ use tokio::sync::{Semaphore, watch};
 use super::problem::Problem;
 use super::state::{App, Readiness, Ready, Shared};
 use super::{accept, capabilities, metrics, router};
+use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
 use crate::store::{Store, StoreError};
-use crate::structure::Archive;
 use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, TelemetryError};
 
@@ -113,7 +113,7 @@ impl Server {
         };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
         let ledger = Ledger::new(store.clone(), Arc::clone(&pool), promises, describe);
-        let archive = Archive::new(config.archive_dir()).with_max_bytes(config.limits.inflated_bytes);
+        let archive = Archive::new(&config);
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();

@@ -11,10 +11,10 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::results::Head;
+use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{ContentKey, Ledger, Pool};
 use crate::store::Store;
-use crate::structure::Archive;
 use crate::surface::FoundDevice;
 
 /// State of the service, behind one pointer.

@@ -118,7 +118,7 @@ pub(super) async fn input(app: &Shared, digest: &Digest) -> Result<Input, Proble
     let bytes = app.store.get(&Name::input(digest)).await?.ok_or_else(|| none(&digest.to_string()))?.bytes;
     let mut lease = app.pool.budget().lease();
     lease.grow(bytes.len() as u64)?;
-    Ok(Input { bytes, lease: Arc::new(lease) })
+    Ok(Input { bytes, digest: *digest, lease: Arc::new(lease) })
 }
 
 /// Reads a structure and says what it holds, on a thread that may block.

@@ -9,6 +9,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::time::SystemTime;
 
 use thiserror::Error;
 
@@ -51,6 +52,12 @@ impl EntryId {
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
+    }
+
+    /// The two characters by which mirrors divide: those before the last one, for ids of four the middle ones.
+    #[must_use]
+    pub fn middle(&self) -> &str {
+        &self.0[self.0.len() - 3..self.0.len() - 1]
     }
 }
 
@@ -109,17 +116,40 @@ impl Archive {
     /// # Errors
     /// Any [`ArchiveError`].
     pub fn fetch(&self, id: &EntryId) -> Result<Vec<u8>, ArchiveError> {
+        let (file, stamp) = self.open(id)?;
+        self.read(file, stamp.bytes, id)
+    }
+
+    /// The bytes of an entry's file and its stamp; none if the folder, or the entry in it, is not there. Blocks.
+    ///
+    /// # Errors
+    /// [`ArchiveError::TooLarge`] and [`ArchiveError::Io`].
+    pub fn fetch_stamped(&self, id: &EntryId) -> Result<Option<(Vec<u8>, Stamp)>, ArchiveError> {
+        let Some((file, stamp)) = present(self.open(id))? else { return Ok(None) };
+        Ok(Some((self.read(file, stamp.bytes, id)?, stamp)))
+    }
+
+    /// Which file is an entry's now, and how it looks, without reading it; none if it is not there. Blocks.
+    ///
+    /// # Errors
+    /// [`ArchiveError::Io`].
+    pub fn stamp(&self, id: &EntryId) -> Result<Option<Stamp>, ArchiveError> {
+        Ok(present(self.open(id))?.map(|(_file, stamp)| stamp))
+    }
+
+    fn open(&self, id: &EntryId) -> Result<(File, Stamp), ArchiveError> {
         let root = self.dir.canonicalize()?;
-        for candidate in candidates(id) {
-            if let Some(file) = open_inside(&root, &candidate)? {
-                return self.read(file, id);
+        for path in candidates(id) {
+            if let Some(file) = open_inside(&root, &path)? {
+                let data = file.metadata()?;
+                let stamp = Stamp { path, bytes: data.len(), modified: data.modified().ok() };
+                return Ok((file, stamp));
             }
         }
         Err(ArchiveError::NotFound { id: id.clone() })
     }
 
-    fn read(&self, file: File, id: &EntryId) -> Result<Vec<u8>, ArchiveError> {
-        let bytes = file.metadata()?.len();
+    fn read(&self, file: File, bytes: u64, id: &EntryId) -> Result<Vec<u8>, ArchiveError> {
         let too_large = |bytes| ArchiveError::TooLarge { id: id.clone(), bytes, limit: self.max_bytes };
         if bytes > self.max_bytes {
             return Err(too_large(bytes));
@@ -134,12 +164,29 @@ impl Archive {
     }
 }
 
+/// Which file an entry's bytes came from, and how it looked: its place, length and time of change. While that stays
+/// the same, so do the bytes, for all that the system says.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Stamp {
+    path: PathBuf,
+    bytes: u64,
+    modified: Option<SystemTime>,
+}
+
+/// None in place of the errors that say no more than that nothing is there.
+fn present<T>(found: Result<T, ArchiveError>) -> Result<Option<T>, ArchiveError> {
+    match found {
+        Ok(found) => Ok(Some(found)),
+        Err(ArchiveError::NotFound { .. }) => Ok(None),
+        Err(ArchiveError::Io(e)) if is_absent(&e) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
 /// Places where an entry's file may be, relative to the folder, in order of preference.
 fn candidates(id: &EntryId) -> Vec<PathBuf> {
-    let id = id.as_str();
+    let (id, middle) = (id.as_str(), id.middle());
     let long = id.strip_prefix("pdb_");
-    // Mirrors divide by the two characters before the last one; for ids of four these are the middle ones.
-    let middle = &id[id.len() - 3..id.len() - 1];
     let mut names = vec![(format!("{id}.cif"), "mmCIF")];
     if long.is_none() {
         names.push((format!("pdb_0000{id}.cif"), "mmCIF"));

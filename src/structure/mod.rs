@@ -26,7 +26,7 @@ mod sniff;
 mod text;
 mod texts;
 
-pub use archive::{Archive, ArchiveError, EntryId};
+pub use archive::{Archive, ArchiveError, EntryId, Stamp};
 pub use atoms::{SourceFormat, Structure};
 pub use contents::{Contents, Kind};
 pub use error::StructureError;

@@ -212,6 +212,8 @@ pub(crate) fn start_on(
     config.server.listen = "127.0.0.1:0".parse().unwrap();
     config.server.metrics_listen = Some("127.0.0.1:0".parse().unwrap());
     dir.path().clone_into(&mut config.server.data_dir);
+    // Tests stay on this machine unless they bring an archive of their own.
+    config.archive.url = None;
     change(&mut config);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     let chosen = Chosen { backend, reason: "a test says so".to_owned(), devices: found };
