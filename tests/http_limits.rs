@@ -120,7 +120,8 @@ fn a_full_queue_refuses_at_once_and_says_when_to_come_back() {
     });
     let server = &server;
     std::thread::scope(|scope| {
-        let accepted: Vec<_> = (0..3).map(|n| scope.spawn(move || server.post("/v1/meshes", &[], &sample(n)).status)).collect();
+        let accepted: Vec<_> =
+            (0..3).map(|n| scope.spawn(move || server.post("/v1/meshes", &[], &sample(n)).status)).collect();
         wait_for("two jobs to wait", || server.metric("molmesh_queue_depth", &[]) >= 2.0);
         wait_for("one job to run", || backend.started.load(Ordering::SeqCst) == 1);
         let start = Instant::now();

@@ -123,10 +123,10 @@ async fn what_was_put_is_there_until_it_is_deleted(place: Place) {
         assert_eq!(get(&store, name).await, Some(noise(1000, seed)));
     }
     let listed = store.list(Folder::Results).await.unwrap();
-    assert_eq!(listed.iter().map(|(name, meta)| (name.clone(), meta.size)).collect::<Vec<_>>(), [
-        (result(1), 1000),
-        (result(2), 1000)
-    ]);
+    assert_eq!(
+        listed.iter().map(|(name, meta)| (name.clone(), meta.size)).collect::<Vec<_>>(),
+        [(result(1), 1000), (result(2), 1000)]
+    );
     let age = SystemTime::now().duration_since(listed[0].1.modified).unwrap_or_default();
     assert!(age < HOUR, "{age:?}");
     assert_eq!(Folder::ALL.map(|f| store.usage(f)), [usage(1000, 1), usage(1000, 1), usage(2000, 2)]);
@@ -259,7 +259,8 @@ async fn a_writer_that_is_dropped_leaves_nothing(place: Place) {
     let store = place.open().await;
     let size = if place.is_local() { 8 * MIB } else { 60 * MIB };
     put(&store, &result(3), 5).await;
-    for (name, length, panics) in [(result(1), None, false), (result(2), Some(1 << 30), true), (result(3), None, false)] {
+    for (name, length, panics) in [(result(1), None, false), (result(2), Some(1 << 30), true), (result(3), None, false)]
+    {
         let mut writer = store.writer(&name, length);
         let (told, tell) = std::sync::mpsc::sync_channel::<()>(0);
         let thread = std::thread::spawn(move || {
@@ -314,7 +315,9 @@ async fn the_least_recently_used_goes_first(mut place: Place) {
     put(&store, &result(5), 10).await;
     assert!(!has(&store, &result(4)).await);
     put(&store, &result(6), 700).await;
-    for (name, there) in [(result(1), false), (result(2), false), (input(1), true), (result(5), true), (result(6), true)] {
+    for (name, there) in
+        [(result(1), false), (result(2), false), (input(1), true), (result(5), true), (result(6), true)]
+    {
         assert_eq!(has(&store, &name).await, there, "{name}");
     }
     assert_eq!((store.usage(Folder::Results), store.usage(Folder::Inputs)), (usage(710, 2), usage(250, 1)));
@@ -344,7 +347,10 @@ async fn what_cannot_fit_is_refused_with_numbers(mut place: Place) {
     ] {
         let message = refused.as_ref().unwrap_err().to_string();
         assert!(matches!(refused, Err(StoreError::TooLarge { bytes: 1001, max_bytes: 1000 })), "{message}");
-        assert!(message.contains("1001") && message.contains("1000") && message.contains("store.max_bytes"), "{message}");
+        assert!(
+            message.contains("1001") && message.contains("1000") && message.contains("store.max_bytes"),
+            "{message}"
+        );
     }
     // Nothing was removed for what could never fit; what fits exactly goes in.
     assert!(has(&store, &result(1)).await && !has(&store, &result(2)).await);

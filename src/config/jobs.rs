@@ -35,7 +35,16 @@ pub struct JobsConfig {
 
 impl Default for JobsConfig {
     fn default() -> Self {
-        Self { workers: 2, queue: 64, deliveries: 256, deadline_ms: 60_000, sync_wait_ms: 10_000, batch_deadline_ms: 3_600_000, attempts: 3, keepers: 4 }
+        Self {
+            workers: 2,
+            queue: 64,
+            deliveries: 256,
+            deadline_ms: 60_000,
+            sync_wait_ms: 10_000,
+            batch_deadline_ms: 3_600_000,
+            attempts: 3,
+            keepers: 4,
+        }
     }
 }
 

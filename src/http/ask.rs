@@ -56,8 +56,8 @@ impl Ask {
         method: &Method,
         headers: &HeaderMap,
     ) -> Result<Option<Response>, Problem> {
-        // A check and a report's times are those of a run.
-        if self.request.strict || self.request.report {
+        // A check and a report's times are those of a run; a promise has an address of its own.
+        if self.request.strict || self.request.report || self.wish.later {
             return Ok(None);
         }
         let key = self.key(app);
@@ -103,8 +103,7 @@ impl Ask {
         // Another backend may have stood in for the chosen one, and its bytes are others.
         let key = ContentKey::new(&digest, &self.request.job, self.format, finished.product.report.backend);
         let kept = results::keep_later(app, &finished, self.format, &key);
-        let mut response =
-            delivery::mesh(app, Arc::clone(&finished), self.format, &key, self.received, place).await?;
+        let mut response = delivery::mesh(app, Arc::clone(&finished), self.format, &key, self.received, place).await?;
         let headers = response.headers_mut();
         if kept {
             headers.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, self.format.extension())));
@@ -133,18 +132,15 @@ impl Ask {
             return Err(Problem::new(Kind::BadParameter, detail).with("parameter", "report"));
         }
         let (task, asked) = (self.task(&input), self.wish.later);
-        let order = Order {
-            task,
-            parameters: self.pairs,
-            format: self.format,
-            idempotency: self.wish.idempotency.clone(),
-        };
+        let order =
+            Order { task, parameters: self.pairs, format: self.format, idempotency: self.wish.idempotency.clone() };
         let ticket = ticket.map(|ticket| ticket.with_time(app.config.jobs.batch_deadline()));
         let ledger = app.ledger.clone();
         // Whoever leaves now has asked nevertheless: the job is promised as a whole or not at all.
         let promised = tokio::spawn(async move { ledger.promise(order, ticket).await });
         let view = promised.await.map_err(Problem::internal)??;
-        let wait = app.pool.estimated_wait() + Duration::from_secs_f64(app.pool.expected(&input.bytes, &self.request.job));
+        let wait =
+            app.pool.estimated_wait() + Duration::from_secs_f64(app.pool.expected(&input.bytes, &self.request.job));
         let mut response = jobs::accepted(&view, wait);
         if let Some(applied) = self.wish.applied(asked) {
             response.headers_mut().insert(PREFERENCE_APPLIED, applied);

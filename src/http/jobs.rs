@@ -6,16 +6,16 @@ use std::time::Duration;
 use axum::Json;
 use axum::extract::rejection::{PathRejection, QueryRejection};
 use axum::extract::{Path, Query, State};
-use axum::http::header::{self, HeaderValue};
 use axum::http::StatusCode;
+use axum::http::header::{self, HeaderValue};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
+use super::delivery;
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::state::Shared;
-use super::delivery;
 use crate::jobs::{ContentKey, JobId, Status, View, rfc3339};
 
 /// Longest poll, s: proxies commonly cut an exchange after a minute.
@@ -32,7 +32,7 @@ pub(super) struct Poll {
 /// The job of a path.
 pub(super) fn id(path: Result<Path<String>, PathRejection>) -> Result<JobId, Problem> {
     let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    text.parse().map_err(|_| none(&text))
+    text.parse().map_err(|_bad| none(&text))
 }
 
 /// There is no such job.
@@ -95,8 +95,10 @@ pub(super) async fn result(
     let record = &view.record;
     match (record.status, &record.result) {
         (Status::Successful, Some(key)) => {
-            let gone = || Problem::new(Kind::ResultGone, "the result was kept for some time and is gone; ask for the mesh again");
-            let key: ContentKey = key.parse().map_err(|_| gone())?;
+            let gone = || {
+                Problem::new(Kind::ResultGone, "the result was kept for some time and is gone; ask for the mesh again")
+            };
+            let key: ContentKey = key.parse().map_err(|_bad| gone())?;
             if app.store.head(&key.name(&record.format)?).await?.is_none() {
                 return Err(gone());
             }
@@ -123,7 +125,7 @@ fn answer(status: StatusCode, view: &View, wait: Option<Duration>) -> Response {
         headers.insert(header::LOCATION, delivery::text(&format!("/v1/jobs/{}", view.record.id)));
     }
     if !view.record.status.is_final() {
-        let seconds = wait.map_or(1, |wait| wait.as_secs_f64().ceil().clamp(1.0, 600.0) as u64);
+        let seconds = wait.map_or(1, |wait| (wait + Duration::from_millis(999)).as_secs().clamp(1, 600));
         headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
     }
     response
@@ -145,13 +147,15 @@ pub(super) fn document(view: &View) -> Value {
     }
     let parameters: Map<String, Value> =
         record.parameters.iter().map(|(name, value)| (name.clone(), value.as_str().into())).collect();
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction")]
+    let progress = (view.fraction * 100.0) as u64;
     let time = |ms: Option<u64>| ms.map(rfc3339);
     json!({
         "jobID": record.id.as_str(),
         "processID": "surface",
         "type": "process",
         "status": record.status.name(),
-        "progress": (view.fraction * 100.0).floor(),
+        "progress": progress,
         "fraction": view.fraction,
         "stage": view.stage,
         "attempts": record.attempts,

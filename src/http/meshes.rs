@@ -65,29 +65,20 @@ pub(super) async fn create(
     let Taken { request, pairs, format, digest, declared, source } = taken;
     let ask = Ask { digest, request, pairs, format, wish, cache: None, received: start.elapsed(), declared };
     // What a type says about the bytes is found out by reading them.
-    let known = if ask.declared.is_structure() {
-        None
+    let known =
+        if ask.declared.is_structure() { None } else { ask.known(&app, &Method::POST, &HeaderMap::new()).await? };
+    let mut response = if let Some(response) = known {
+        response
     } else {
-        ask.known(&app, &Method::POST, &HeaderMap::new()).await?
-    };
-    let mut response = match known {
-        Some(response) => response,
-        None => {
-            let input = source.input(&app).await?;
-            ask.make(&app, input).await?
-        }
+        let input = source.input(&app).await?;
+        ask.make(&app, input).await?
     };
     response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
     Ok(response)
 }
 
 /// Receives what a body asks for.
-pub(super) async fn take(
-    app: &Shared,
-    query: Pairs,
-    headers: &HeaderMap,
-    body: Body,
-) -> Result<Taken, Problem> {
+pub(super) async fn take(app: &Shared, query: Pairs, headers: &HeaderMap, body: Body) -> Result<Taken, Problem> {
     let mut pairs = pairs(query)?;
     // A request that will be refused is refused before its body is received.
     let mut request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
@@ -157,8 +148,11 @@ fn document(bytes: &[u8]) -> Result<(Source, Vec<(String, String)>), Problem> {
     let (mut source, mut fields) = (None, Vec::new());
     for (name, value) in members {
         let text = plain(&value).ok_or_else(|| {
-            Problem::new(Kind::BadParameter, format!("member `{name}` is neither text, number, true or false, nor a list of them"))
-                .with("parameter", name.as_str())
+            Problem::new(
+                Kind::BadParameter,
+                format!("member `{name}` is neither text, number, true or false, nor a list of them"),
+            )
+            .with("parameter", name.as_str())
         })?;
         let found = match name.as_str() {
             "pdb_id" => Source::Entry(text.parse().map_err(|error| pdb::of_folder(&error))?),
@@ -172,7 +166,8 @@ fn document(bytes: &[u8]) -> Result<(Source, Vec<(String, String)>), Problem> {
             return Err(bad("the JSON names more than one structure".to_owned()));
         }
     }
-    let source = source.ok_or_else(|| bad("the JSON names no structure: it has no `pdb_id` and no `structure`".to_owned()))?;
+    let source =
+        source.ok_or_else(|| bad("the JSON names no structure: it has no `pdb_id` and no `structure`".to_owned()))?;
     Ok((source, fields))
 }
 
@@ -184,7 +179,7 @@ fn plain(value: &Value) -> Option<String> {
         Value::Bool(flag) => Some(flag.to_string()),
         Value::Array(items) if !items.is_empty() => {
             let items: Option<Vec<String>> = items.iter().filter(|i| !i.is_array()).map(plain).collect();
-            items.filter(|found| found.len() > 0).map(|items| items.join(","))
+            items.filter(|found| !found.is_empty()).map(|items| items.join(","))
         }
         _ => None,
     }
@@ -202,8 +197,15 @@ mod tests {
         let expected = [("resolution", "0.5"), ("chains", "A,B"), ("atom_ids", "true")];
         assert_eq!(fields, expected.map(|(n, v)| (n.to_owned(), v.to_owned())));
         for bad in [
-            "[]", "{", "{}", "{\"resolution\": 1}", "{\"pdb_id\": {}}", "{\"pdb_id\": \"../x\"}", "{\"pdb_id\": null}",
-            "{\"structure\": \"xyz\"}", "{\"pdb_id\": \"4pti\", \"chains\": []}",
+            "[]",
+            "{",
+            "{}",
+            "{\"resolution\": 1}",
+            "{\"pdb_id\": {}}",
+            "{\"pdb_id\": \"../x\"}",
+            "{\"pdb_id\": null}",
+            "{\"structure\": \"xyz\"}",
+            "{\"pdb_id\": \"4pti\", \"chains\": []}",
         ] {
             assert!(document(bad.as_bytes()).is_err(), "{bad}");
         }

@@ -37,11 +37,20 @@ pub(super) async fn surface(
 ) -> Result<Response, Problem> {
     let start = Instant::now();
     let Path((id, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let (request, pairs, format) = named(&file, query)?;
+    let Named { request, pairs, format } = named(&file, query)?;
     let id: EntryId = id.parse().map_err(|error| of_folder(&error))?;
     let digest = digest(&app, &id).await?;
     let wish = Wish::of(&headers, &extensions)?;
-    let mut ask = Ask { digest, request, pairs, format, wish, cache: Some(CACHE), received: start.elapsed(), declared: Declared::Neutral };
+    let mut ask = Ask {
+        digest,
+        request,
+        pairs,
+        format,
+        wish,
+        cache: Some(CACHE),
+        received: start.elapsed(),
+        declared: Declared::Neutral,
+    };
     if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
         return Ok(response);
     }
@@ -50,8 +59,15 @@ pub(super) async fn surface(
     ask.make(&app, input).await
 }
 
+/// What an address asks for.
+pub(super) struct Named {
+    pub(super) request: params::Request,
+    pub(super) pairs: Vec<(String, String)>,
+    pub(super) format: Format,
+}
+
 /// The request behind an address that ends in `surface.{ext}`.
-pub(super) fn named(file: &str, query: Pairs) -> Result<(params::Request, Vec<(String, String)>, Format), Problem> {
+pub(super) fn named(file: &str, query: Pairs) -> Result<Named, Problem> {
     let format = format_of(file)?;
     let pairs = pairs(query)?;
     let request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
@@ -64,7 +80,7 @@ pub(super) fn named(file: &str, query: Pairs) -> Result<(params::Request, Vec<(S
             .with("expected", format!("no value here, or the address surface.{value}")));
     }
     params::suits(&request.job, format)?;
-    Ok((request, pairs, format))
+    Ok(Named { request, pairs, format })
 }
 
 impl Ask {

@@ -35,8 +35,8 @@ pub(super) struct Problem {
     kind: Kind,
     detail: String,
     members: Map<String, Value>,
-    retry_after_s: Option<u64>,
-    header: Option<(HeaderName, HeaderValue)>,
+    retry_after_s: Option<u16>,
+    header: Option<Box<(HeaderName, HeaderValue)>>,
 }
 
 impl Problem {
@@ -59,13 +59,13 @@ impl Problem {
 
     /// Says when to try again.
     pub(super) fn retry_after(mut self, wait: Duration) -> Self {
-        self.retry_after_s = Some((wait + Duration::from_millis(999)).as_secs().clamp(1, 600));
+        self.retry_after_s = u16::try_from((wait + Duration::from_millis(999)).as_secs().clamp(1, 600)).ok();
         self
     }
 
     /// Adds a header.
     pub(super) fn header(mut self, name: HeaderName, value: &str) -> Self {
-        self.header = HeaderValue::from_str(value).ok().map(|value| (name, value));
+        self.header = HeaderValue::from_str(value).ok().map(|value| Box::new((name, value)));
         self
     }
 
@@ -116,7 +116,7 @@ impl IntoResponse for Problem {
         if let Some(wait) = self.retry_after_s {
             response.headers_mut().insert(RETRY_AFTER, HeaderValue::from(wait));
         }
-        if let Some((name, value)) = self.header.clone() {
+        if let Some((name, value)) = self.header.clone().map(|header| *header) {
             response.headers_mut().insert(name, value);
         }
         response.extensions_mut().insert(self);

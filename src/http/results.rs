@@ -43,7 +43,9 @@ pub(super) async fn show(
     let (key, format) = parse(&file).ok_or_else(|| none(&file))?;
     let etag = delivery::etag(&key);
     if conditional::is_unchanged(&headers, &etag) {
-        return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag), (header::CACHE_CONTROL, IMMUTABLE)]).into_response());
+        return Ok(
+            (StatusCode::NOT_MODIFIED, [(header::ETAG, etag), (header::CACHE_CONTROL, IMMUTABLE)]).into_response()
+        );
     }
     app.kept(&key).await;
     stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| none(&file))
@@ -56,11 +58,12 @@ pub(super) async fn report(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let key: ContentKey = text.parse().map_err(|_| none(&text))?;
+    let key: ContentKey = text.parse().map_err(|_bad| none(&text))?;
     app.kept(&key).await;
     let bytes = app.store.get(&key.name(REPORT)?).await?.ok_or_else(|| none(&text))?.bytes;
     // Times are those of the run that made it, so a report has a name of its own.
-    let etag = HeaderValue::from_str(&format!("\"{}\"", crate::store::Digest::of(&bytes))).map_err(Problem::internal)?;
+    let etag =
+        HeaderValue::from_str(&format!("\"{}\"", crate::store::Digest::of(&bytes))).map_err(Problem::internal)?;
     let caching = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, HeaderValue::from_static("public, no-cache"))];
     if conditional::is_unchanged(&headers, &etag) {
         return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
@@ -70,7 +73,10 @@ pub(super) async fn report(
 
 fn none(what: &str) -> Problem {
     let shown: String = what.chars().take(80).collect();
-    Problem::new(Kind::NotFound, format!("there is no result `{shown}`: results are kept for some time; ask for the mesh again"))
+    Problem::new(
+        Kind::NotFound,
+        format!("there is no result `{shown}`: results are kept for some time; ask for the mesh again"),
+    )
 }
 
 fn parse(file: &str) -> Option<(ContentKey, Format)> {

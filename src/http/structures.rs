@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use axum::Json;
 use axum::body::Body;
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
 use axum::http::header::{self, HeaderMap};
 use axum::http::{Extensions, HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
-use axum::Json;
 use bytes::Bytes;
 use serde_json::{Value, json};
 
@@ -17,6 +17,7 @@ use super::ask::{self, Ask, Input};
 use super::declared::Declared;
 use super::kinds::Kind;
 use super::meshes::Pairs;
+use super::pdb::Named;
 use super::problem::Problem;
 use super::state::Shared;
 use super::upload::{self, Upload};
@@ -34,23 +35,21 @@ const MAX_CHAINS: usize = 1000;
 
 /// The digest that a client names.
 pub(super) fn digest_of(text: &str) -> Result<Digest, Problem> {
-    text.parse().map_err(|_| none(text))
+    text.parse().map_err(|_bad| none(text))
 }
 
 fn none(digest: &str) -> Problem {
     let shown: String = digest.chars().take(80).collect();
     Problem::new(
         Kind::NoSuchStructure,
-        format!("there is no structure `{shown}`: structures are kept for some time after their last use; upload it again"),
+        format!(
+            "there is no structure `{shown}`: structures are kept for some time after their last use; upload it again"
+        ),
     )
 }
 
 /// Takes a structure in.
-pub(super) async fn create(
-    State(app): State<Shared>,
-    headers: HeaderMap,
-    body: Body,
-) -> Result<Response, Problem> {
+pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
     let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
     if let Some((name, _)) = fields.first() {
         return Err(Problem::new(Kind::BadParameter, format!("a structure has no parameter `{name}`; meshes have"))
@@ -98,10 +97,19 @@ pub(super) async fn surface(
 ) -> Result<Response, Problem> {
     let start = Instant::now();
     let Path((text, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let (request, pairs, format) = pdb::named(&file, query)?;
+    let Named { request, pairs, format } = pdb::named(&file, query)?;
     let digest = digest_of(&text)?;
     let wish = Wish::of(&headers, &extensions)?;
-    let mut ask = Ask { digest, request, pairs, format, wish, cache: Some(CACHE), received: start.elapsed(), declared: Declared::Neutral };
+    let mut ask = Ask {
+        digest,
+        request,
+        pairs,
+        format,
+        wish,
+        cache: Some(CACHE),
+        received: start.elapsed(),
+        declared: Declared::Neutral,
+    };
     if app.store.head(&Name::input(&digest)).await?.is_none() {
         return Err(none(&text));
     }
@@ -134,9 +142,8 @@ async fn summarise(app: &Shared, digest: Digest, bytes: Bytes) -> Result<Value, 
 
 fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> Value {
     let contents = Contents::of(structure, None);
-    let counts = |c: &Counts| {
-        json!({ "polymer": c.polymer, "ligand": c.ligand, "water": c.water, "hydrogens": c.hydrogens })
-    };
+    let counts =
+        |c: &Counts| json!({ "polymer": c.polymer, "ligand": c.ligand, "water": c.water, "hydrogens": c.hydrogens });
     let chains: Vec<Value> = contents
         .chains
         .iter()

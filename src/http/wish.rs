@@ -87,10 +87,7 @@ mod tests {
     use super::*;
 
     fn wish(headers: &[(&'static str, &'static str)]) -> Result<Wish, Problem> {
-        let headers = headers
-            .iter()
-            .map(|(n, v)| (HeaderName::from_static(n), HeaderValue::from_static(v)))
-            .collect();
+        let headers = headers.iter().map(|(n, v)| (HeaderName::from_static(n), HeaderValue::from_static(v))).collect();
         Wish::of(&headers, &Extensions::new())
     }
 

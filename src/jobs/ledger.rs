@@ -16,7 +16,7 @@ use tokio::sync::watch;
 use super::promise::{Promise, Runner};
 use super::record::{JobId, Record, Status, now_ms};
 use super::results::SaveError;
-use super::{Claim, Failure, Pool, Refusal, Task, Ticket};
+use super::{Claim, ContentKey, Failure, Pool, Refusal, Task, Ticket};
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Store, StoreError};
 use crate::telemetry::{JOBS_OPEN, JOBS_RECOVERED};
@@ -137,9 +137,10 @@ impl Inner {
         self.store.put(&Name::job(record.id.as_str())?, Bytes::from(bytes)).await
     }
 
-    fn insert(&self, promise: Arc<Promise>) {
+    /// Keeps a promise in mind, unless there is one with this id; then that one counts.
+    fn enter(&self, id: &JobId, promise: &Arc<Promise>) -> Arc<Promise> {
         let mut promises = self.lock();
-        promises.insert(promise.id(), promise);
+        let entered = Arc::clone(promises.entry(id.clone()).or_insert_with(|| Arc::clone(promise)));
         if promises.len() > MOST_ENDED + MOST_ENDED / 10 {
             let mut ended: Vec<_> = promises.values().filter_map(|p| p.ended()).collect();
             ended.sort_unstable();
@@ -147,6 +148,7 @@ impl Inner {
                 promises.remove(id);
             }
         }
+        entered
     }
 }
 
@@ -193,6 +195,15 @@ impl Ledger {
             }
             return Ok(view);
         }
+        if ticket.is_none()
+            && let Some(key) = self.made(&order.task, order.format).await?
+        {
+            let ended = Some(now_ms());
+            let made = Record { status: Status::Successful, result: Some(key), finished_ms: ended, ..record };
+            inner.keep(&made).await?;
+            let promise = Arc::new(Promise::new(made));
+            return Ok(inner.enter(&id, &promise).view());
+        }
         // A place in the queue first: what is on record without one would be a promise that cannot be kept soon.
         let promise = Arc::new(Promise::new(record));
         let (input, digest) = (order.task.input.clone(), order.task.digest);
@@ -216,10 +227,20 @@ impl Ledger {
         }
         // A worker that waits for it goes on; there is none where the work runs already.
         _ = recorded.send(());
-        inner.insert(Arc::clone(&promise));
-        let view = promise.view();
-        self.spawn(Runner { promise, ticket: Some(ticket), pin, digest });
+        let entered = inner.enter(&id, &promise);
+        let view = entered.view();
+        // Otherwise somebody has asked for it since it is on record, and it was taken up: in the same flight.
+        if Arc::ptr_eq(&entered, &promise) {
+            self.spawn(Runner { promise, ticket: Some(ticket), pin, digest });
+        }
         Ok(view)
+    }
+
+    /// The key of a task's result, if it was made before. A check is made anew.
+    pub(super) async fn made(&self, task: &Task, format: Format) -> Result<Option<String>, StoreError> {
+        let key = ContentKey::new(&task.digest, &task.job, format, self.0.pool.backend().name());
+        let there = !task.strict && self.0.store.head(&key.name(format.extension())?).await?.is_some();
+        Ok(there.then(|| key.to_string()))
     }
 
     /// What is said of a job, and whatever follows; none if there is no such job.
@@ -233,7 +254,11 @@ impl Ledger {
         let Some(stored) = self.0.store.get(&Name::job(id.as_str())?).await? else { return Ok(None) };
         // A record that cannot be read is none: nothing of ours writes one.
         let Ok(record) = serde_json::from_slice::<Record>(&stored.bytes) else { return Ok(None) };
-        Ok(Some(Promise::new(record).subscribe()))
+        if record.status.is_final() {
+            return Ok(Some(Promise::new(record).subscribe()));
+        }
+        // Somebody asks before it was taken up again.
+        Ok(Some(self.take_up(record).await?.subscribe()))
     }
 
     /// What is said of a job now.
@@ -274,22 +299,32 @@ impl Ledger {
         }
         // In the order in which they were promised.
         open.sort_by_key(|record| (record.created_ms, record.id.clone()));
-        let count = open.len();
+        let before = self.0.lock().len();
         for record in open {
-            if self.0.lock().contains_key(&record.id) {
-                continue;
-            }
-            let promise = Arc::new(Promise::new(record));
-            self.0.insert(Arc::clone(&promise));
-            counter!(JOBS_RECOVERED).increment(1);
-            let Ok(digest) = promise.record().input.parse::<Digest>() else {
-                self.finish(&promise, Err(EndError::Lost { why: "its input has no name".to_owned() })).await;
-                continue;
-            };
-            let Ok(pin) = self.0.pin(&promise.id(), &digest) else { continue };
-            self.spawn(Runner { promise, ticket: None, pin, digest });
+            self.take_up(record).await?;
         }
-        Ok(count)
+        Ok(self.0.lock().len() - before)
+    }
+
+    /// Takes up a job from its record, unless that has been done.
+    async fn take_up(&self, record: Record) -> Result<Arc<Promise>, StoreError> {
+        let (id, input) = (record.id.clone(), record.input.parse::<Digest>());
+        let fresh = Arc::new(Promise::new(record));
+        let known = self.0.lock().get(&id).cloned();
+        if let Some(known) = known {
+            return Ok(known);
+        }
+        let Ok(digest) = input else {
+            self.finish(&fresh, Err(EndError::Lost { why: "its input has no name".to_owned() })).await;
+            return Ok(fresh);
+        };
+        let pin = self.0.pin(&id, &digest)?;
+        let promise = self.0.enter(&id, &fresh);
+        if Arc::ptr_eq(&promise, &fresh) {
+            counter!(JOBS_RECOVERED).increment(1);
+            self.spawn(Runner { promise: fresh, ticket: None, pin, digest });
+        }
+        Ok(promise)
     }
 
     fn spawn(&self, runner: Runner<[Pin; 2]>) {

@@ -188,18 +188,17 @@ async fn attempt(ledger: &Ledger, promise: &Arc<Promise>, ticket: &mut Option<Ti
 }
 
 /// Puts a job from the records into the queue.
-async fn submit(
-    ledger: &Ledger,
-    promise: &Arc<Promise>,
-    record: &Record,
-    digest: Digest,
-) -> Result<Ticket, Attempt> {
+async fn submit(ledger: &Ledger, promise: &Arc<Promise>, record: &Record, digest: Digest) -> Result<Ticket, Attempt> {
     let settings = &ledger.0.settings;
     if record.attempts >= settings.attempts {
         return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
     }
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
-    let (task, _) = ledger.task(record, digest).await.map_err(lost)?;
+    let (task, format) = ledger.task(record, digest).await.map_err(lost)?;
+    // An earlier process may have ended between the result and its record.
+    if let Ok(Some(key)) = ledger.made(&task, format).await {
+        return Err(Attempt::Ended(Ok(key)));
+    }
     let claim = ledger.claim(promise, None);
     ledger.0.pool.submit(task, settings.allowed, Some(claim)).map_err(|refusal| match refusal {
         Refusal::Draining => Attempt::Left,

@@ -87,13 +87,8 @@ impl Queue {
         if let Some(flight) = state.flights.iter_mut().find(same) {
             flight.waiters.push(Waiter { id: waiter, reply });
             flight.rank.batch &= task.rank.batch;
-            let place = Place {
-                flight: flight.id,
-                waiter,
-                outcome,
-                progress: Arc::clone(&flight.progress),
-                shared: true,
-            };
+            let place =
+                Place { flight: flight.id, waiter, outcome, progress: Arc::clone(&flight.progress), shared: true };
             // Work that runs cannot be held back any more: what has to be on record is recorded now.
             let late = claim.and_then(|claim| match flight.begun {
                 Some(_) => Some(claim),

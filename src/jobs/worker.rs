@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use metrics::{counter, histogram};
 
-use super::pool::Shared;
 use super::flight::Entry;
+use super::pool::Shared;
 use super::{Failure, Finished, Outcome};
 use crate::pipeline::{self, Choice, JobError, Report};
 use crate::structure::referee::{self, Diagnostic, Level};

@@ -84,7 +84,11 @@ fn of_mesh(
         meshed => meshed?.mesh,
     };
     let area = area(&mesh);
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "float-to-int casts saturate, as wanted"
+    )]
     let vertices = (1.5 * area / (h * h)).round() as u64;
     let triangles = 2 * vertices;
     let bytes = Mesh::bytes_for(vertices, triangles);

@@ -123,8 +123,13 @@ fn uploads(xml: &str) -> Vec<Unfinished> {
 
 /// A time such as `2026-01-31T12:00:00.000Z`, read by the type that the crate has for times of objects.
 fn time(text: &str) -> Option<SystemTime> {
-    let mut scratch =
-        ObjectMeta { location: Path::default(), last_modified: SystemTime::UNIX_EPOCH.into(), size: 0, e_tag: None, version: None };
+    let mut scratch = ObjectMeta {
+        location: Path::default(),
+        last_modified: SystemTime::UNIX_EPOCH.into(),
+        size: 0,
+        e_tag: None,
+        version: None,
+    };
     scratch.last_modified = text.parse().ok()?;
     Some(scratch.last_modified.into())
 }
@@ -139,7 +144,9 @@ mod tests {
         assert_eq!(of("s3://meshes"), Some(("meshes", String::new())));
         assert_eq!(of("s3://meshes/"), Some(("meshes", String::new())));
         assert_eq!(of("s3://meshes/a/b/"), Some(("meshes", "a/b".to_owned())));
-        for bad in ["", "meshes", "http://meshes", "s3://", "s3:///a", "s3://key:secret@meshes", "s3://m/a//b", "s3://m/../b"] {
+        for bad in
+            ["", "meshes", "http://meshes", "s3://", "s3:///a", "s3://key:secret@meshes", "s3://m/a//b", "s3://m/../b"]
+        {
             assert_eq!(of(bad), None, "{bad}");
         }
     }

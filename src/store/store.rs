@@ -160,7 +160,8 @@ impl Store {
             if new && name.folder() != Folder::Jobs && store.0.backend.head(&name).await?.is_some() {
                 return Ok(false);
             }
-            let kept = upload::put(&store.0.backend, &name, bytes.clone(), new && name.folder() == Folder::Jobs).await?;
+            let kept =
+                upload::put(&store.0.backend, &name, bytes.clone(), new && name.folder() == Folder::Jobs).await?;
             if kept {
                 store.commit(&name, bytes.len() as u64, Some(&bytes));
             }
@@ -195,11 +196,7 @@ impl Store {
     ///
     /// # Errors
     /// [`StoreError::Range`] if the range is empty or begins behind the end; others as they come.
-    pub async fn read(
-        &self,
-        name: &Name,
-        range: Option<Range<u64>>,
-    ) -> Result<Option<(Meta, ByteStream)>, StoreError> {
+    pub async fn read(&self, name: &Name, range: Option<Range<u64>>) -> Result<Option<(Meta, ByteStream)>, StoreError> {
         if let Some((meta, bytes)) = self.recall(name) {
             let range = range.map(|range| within(range, meta.size)).transpose()?.unwrap_or(0..meta.size);
             return Ok(Some((meta, stream::of(&bytes, range))));

@@ -112,7 +112,9 @@ async fn receive(
         if let Some(promised) = length.filter(|&promised| written > promised || last && written < promised) {
             break Err(StoreError::Length { promised, written });
         }
-        if length.is_none() && let Err(error) = room.grow(bytes.len() as u64).await {
+        if length.is_none()
+            && let Err(error) = room.grow(bytes.len() as u64).await
+        {
             break Err(error);
         }
         if last && upload.is_none() {
