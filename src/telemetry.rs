@@ -49,6 +49,16 @@ pub const MEMORY_HELD: &str = "molmesh_memory_held_bytes";
 pub const VOXELS: &str = "molmesh_voxels_processed_total";
 /// Triangles of finished meshes.
 pub const TRIANGLES: &str = "molmesh_triangles_emitted_total";
+/// Bytes kept in the store, by folder.
+pub const STORE_BYTES: &str = "molmesh_store_bytes";
+/// Objects kept in the store, by folder.
+pub const STORE_OBJECTS: &str = "molmesh_store_objects";
+/// Objects that the store removed by itself, by reason: `ttl` or `cap`.
+pub const STORE_REMOVED: &str = "molmesh_store_removed_total";
+/// Operations of the store that failed, by operation.
+pub const STORE_ERRORS: &str = "molmesh_store_errors_total";
+/// Results asked for, by tier (`memory`, then `store`) and result (`hit`, `miss`).
+pub const CACHE_REQUESTS: &str = "molmesh_cache_requests_total";
 /// Panics that were caught, by place.
 pub const PANICS: &str = "molmesh_panics_total";
 /// 1, labelled with the version.
@@ -142,6 +152,11 @@ fn describe() {
     describe_gauge!(MEMORY_HELD, Unit::Bytes, "Bytes of uploads and meshes held in memory");
     describe_counter!(VOXELS, "Samples at which the density was evaluated");
     describe_counter!(TRIANGLES, "Triangles of finished meshes");
+    describe_gauge!(STORE_BYTES, Unit::Bytes, "Bytes kept in the store");
+    describe_gauge!(STORE_OBJECTS, "Objects kept in the store");
+    describe_counter!(STORE_REMOVED, "Objects that the store removed by itself, by reason");
+    describe_counter!(STORE_ERRORS, "Operations of the store that failed");
+    describe_counter!(CACHE_REQUESTS, "Results asked for, by tier and result");
     describe_counter!(PANICS, "Panics that were caught");
     describe_gauge!(BUILD_INFO, "1, labelled with the version");
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
@@ -150,6 +165,14 @@ fn describe() {
     }
     for counter_name in [VOXELS, TRIANGLES, JOBS_FALLBACK] {
         counter!(counter_name).increment(0);
+    }
+    for reason in ["ttl", "cap"] {
+        counter!(STORE_REMOVED, "reason" => reason).increment(0);
+    }
+    for tier in ["memory", "store"] {
+        for result in ["hit", "miss"] {
+            counter!(CACHE_REQUESTS, "tier" => tier, "result" => result).increment(0);
+        }
     }
     for place in ["job", "http"] {
         counter!(PANICS, "place" => place).increment(0);

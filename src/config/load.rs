@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
+use super::store::HIDDEN;
 use super::{Config, ConfigError};
 use crate::pipeline::nearest::nearest;
 
@@ -113,7 +114,7 @@ impl Tree {
         let Some(default) = default else { return Err(self.unknown(key, source.clone())) };
         let bad = |expected: String| ConfigError::BadValue {
             key: key.to_owned(),
-            value: value.to_string(),
+            value: if key.contains("secret") { HIDDEN.to_owned() } else { value.to_string() },
             expected,
             source_layer: source.clone(),
         };
@@ -122,6 +123,9 @@ impl Tree {
                 let size = key.ends_with("_bytes");
                 let expected = if size { "a whole number, or a size such as 64MiB" } else { "a whole number" };
                 Value::from(whole(text, size).ok_or_else(|| bad(expected.to_owned()))?)
+            }
+            (Value::String(text), Value::Bool(_)) => {
+                Value::from(text.trim().parse::<bool>().map_err(|_refused| bad("true or false".to_owned()))?)
             }
             (Value::String(text), _) if text == "none" => Value::Null,
             _ => value.clone(),

@@ -11,6 +11,7 @@ mod limits;
 mod load;
 mod log;
 mod server;
+mod store;
 
 use std::path::PathBuf;
 
@@ -24,6 +25,7 @@ pub use limits::LimitsConfig;
 pub use load::{Source, load, load_process};
 pub use log::{LogConfig, LogFormat};
 pub use server::ServerConfig;
+pub use store::{Secret, StoreConfig};
 
 /// The whole configuration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -39,6 +41,8 @@ pub struct Config {
     pub devices: DevicesConfig,
     /// The folder of structures by PDB id.
     pub archive: ArchiveConfig,
+    /// What the service keeps.
+    pub store: StoreConfig,
     /// Logs.
     pub log: LogConfig,
 }

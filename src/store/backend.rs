@@ -1,0 +1,202 @@
+//! Where the bytes lie: a folder, or S3. Errors are sorted and counted here.
+
+use std::path::{Path as FilePath, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::SystemTime;
+
+use bytes::Bytes;
+use futures_util::TryStreamExt as _;
+use metrics::counter;
+use object_store::local::LocalFileSystem;
+use object_store::path::Path;
+use object_store::{GetOptions, GetRange, GetResult, ObjectMeta, ObjectStore, ObjectStoreExt as _, PutMode};
+use tokio::task::spawn_blocking;
+
+use super::error::StoreError;
+use super::name::{Folder, Name};
+use super::object::Meta;
+use super::s3::{self, Bucket};
+use super::stale;
+use crate::config::StoreConfig;
+use crate::telemetry::STORE_ERRORS;
+
+/// Bytes of a part of a large object. S3 asks for 5 MiB at least and takes 10,000 parts: 80 GB.
+const S3_PART: usize = 8 << 20;
+/// Bytes that are written to a file at once: enough that a thread is not woken for nothing.
+const FILE_PART: usize = 1 << 20;
+/// The folder of [`Backend::probe`].
+const PROBE: &str = "probe";
+
+enum Kind {
+    Local(PathBuf),
+    S3(Bucket),
+}
+
+/// A place for objects.
+pub(super) struct Backend {
+    objects: Arc<dyn ObjectStore>,
+    kind: Kind,
+    /// For messages: a folder, or a URL without credentials.
+    place: String,
+}
+
+impl Backend {
+    /// Opens what the configuration names; `data_dir` is where the folder is made otherwise.
+    pub(super) async fn open(config: &StoreConfig, data_dir: &FilePath) -> Result<Self, StoreError> {
+        if let Some(url) = &config.url {
+            let refuse = |reason| StoreError::Open { key: "store.url", place: url.clone(), reason };
+            let (objects, bucket) = s3::connect(config, url).map_err(refuse)?;
+            return Ok(Self { objects, kind: Kind::S3(bucket), place: url.trim_end_matches('/').to_owned() });
+        }
+        let root = data_dir.join("store");
+        let place = root.display().to_string();
+        let folder = root.clone();
+        let opened = spawn_blocking(move || {
+            for name in Folder::ALL.map(Folder::as_str).into_iter().chain([PROBE]) {
+                std::fs::create_dir_all(folder.join(name)).map_err(|e| e.to_string())?;
+            }
+            LocalFileSystem::new_with_prefix(&folder).map(|files| files.with_fsync(true)).map_err(|e| e.to_string())
+        });
+        let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
+        let refuse = |reason| StoreError::Open { key: "server.data_dir", place: place.clone(), reason };
+        Ok(Self { objects: Arc::new(opened.map_err(refuse)?), kind: Kind::Local(root), place })
+    }
+
+    /// A folder with other manners, for tests.
+    #[cfg(test)]
+    pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf) -> Self {
+        let place = root.display().to_string();
+        Self { objects, kind: Kind::Local(root), place }
+    }
+
+    /// For messages.
+    pub(super) fn place(&self) -> &str {
+        &self.place
+    }
+
+    /// An error of opening: the same words, with the key that says where the store is.
+    pub(super) fn refuse(&self, error: &StoreError) -> StoreError {
+        let key = if self.is_local() { "server.data_dir" } else { "store.url" };
+        StoreError::Open { key, place: self.place.clone(), reason: error.to_string() }
+    }
+
+    pub(super) fn is_local(&self) -> bool {
+        matches!(self.kind, Kind::Local(_))
+    }
+
+    /// Bytes of a part of a large object.
+    pub(super) fn part(&self) -> usize {
+        if self.is_local() { FILE_PART } else { S3_PART }
+    }
+
+    pub(super) fn objects(&self) -> &Arc<dyn ObjectStore> {
+        &self.objects
+    }
+
+    /// Sorts and counts an error; `at` is a path from the root of the store.
+    pub(super) fn fail(&self, op: &'static str, at: &str, error: &(dyn std::error::Error + 'static)) -> StoreError {
+        counter!(STORE_ERRORS, "op" => op).increment(1);
+        StoreError::sort(op, &format!("{}/{at}", self.place), error)
+    }
+
+    fn fail_at<'a>(&'a self, op: &'static str, name: &'a Name) -> impl Fn(object_store::Error) -> StoreError + 'a {
+        move |error| self.fail(op, &name.to_string(), &error)
+    }
+
+    /// Writes a whole object. With `new`, false says that there was one.
+    pub(super) async fn put(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
+        let mode = if new { PutMode::Create } else { PutMode::Overwrite };
+        match self.objects.put_opts(&name.path(), bytes.into(), mode.into()).await {
+            Ok(_) => Ok(true),
+            Err(object_store::Error::AlreadyExists { .. }) if new => Ok(false),
+            Err(e) => Err(self.fail_at("put", name)(e)),
+        }
+    }
+
+    /// Begins to read an object, or a part of it that lies within.
+    pub(super) async fn get(
+        &self,
+        name: &Name,
+        range: Option<std::ops::Range<u64>>,
+    ) -> Result<Option<GetResult>, StoreError> {
+        let options = GetOptions { range: range.map(GetRange::Bounded), ..GetOptions::default() };
+        found(self.objects.get_opts(&name.path(), options).await).map_err(self.fail_at("get", name))
+    }
+
+    /// All bytes of an object.
+    pub(super) async fn get_whole(&self, name: &Name) -> Result<Option<(Meta, Bytes)>, StoreError> {
+        let Some(read) = self.get(name, None).await? else { return Ok(None) };
+        let meta = Meta::from(&read.meta);
+        let bytes = read.bytes().await.map_err(self.fail_at("get", name))?;
+        Ok(Some((meta, bytes)))
+    }
+
+    pub(super) async fn head(&self, name: &Name) -> Result<Option<Meta>, StoreError> {
+        let found = found(self.objects.head(&name.path()).await).map_err(self.fail_at("head", name))?;
+        Ok(found.as_ref().map(Meta::from))
+    }
+
+    /// Removes an object; one that is not there is removed already.
+    pub(super) async fn delete(&self, name: &Name) -> Result<(), StoreError> {
+        found(self.objects.delete(&name.path()).await).map_err(self.fail_at("delete", name)).map(|_| ())
+    }
+
+    /// What lies in a folder under a name of ours, in the order of names.
+    pub(super) async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
+        let listed = self.objects.list(Some(&Path::from(folder.as_str())));
+        let ours = |meta: ObjectMeta| Some((Name::at(meta.location.as_ref())?, Meta::from(&meta)));
+        let fail = |e| self.fail("list", folder.as_str(), &e);
+        let mut names: Vec<_> =
+            listed.try_filter_map(|meta| std::future::ready(Ok(ours(meta)))).try_collect().await.map_err(fail)?;
+        names.sort_by(|(a, _), (b, _)| a.cmp(b));
+        Ok(names)
+    }
+
+    /// Writes, reads and removes a small object.
+    pub(super) async fn probe(&self) -> Result<(), StoreError> {
+        static COUNT: AtomicU64 = AtomicU64::new(0);
+        // Processes that share the store do not read each other's.
+        let file = format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let path = Path::from_iter([PROBE, &file]);
+        let fail = |e: object_store::Error| self.fail("probe", path.as_ref(), &e);
+        let wrote = Bytes::from(file.into_bytes());
+        self.objects.put(&path, wrote.clone().into()).await.map_err(fail)?;
+        let read = self.objects.get(&path).await.map_err(fail)?.bytes().await.map_err(fail)?;
+        self.objects.delete(&path).await.map_err(fail)?;
+        if read == wrote {
+            return Ok(());
+        }
+        Err(self.fail("probe", path.as_ref(), &std::io::Error::other("what was read is not what was written")))
+    }
+
+    /// Removes what crashed processes left: staged files, unfinished uploads, probes. Returns how many.
+    pub(super) async fn clear_stale(&self, now: SystemTime) -> Result<u64, StoreError> {
+        let fail = |e: object_store::Error| self.fail("clear", PROBE, &e);
+        let probes: Vec<_> = self.objects.list(Some(&Path::from(PROBE))).try_collect().await.map_err(fail)?;
+        let mut removed = 0;
+        for probe in probes.into_iter().filter(|probe| stale::is_stale(probe.last_modified.into(), now)) {
+            found(self.objects.delete(&probe.location).await).map_err(fail)?;
+            removed += 1;
+        }
+        let unfinished = match &self.kind {
+            Kind::Local(root) => {
+                let folders: Vec<_> =
+                    Folder::ALL.map(Folder::as_str).into_iter().chain([PROBE]).map(|name| root.join(name)).collect();
+                let cleared = spawn_blocking(move || stale::clear_files(&folders, now)).await;
+                cleared.unwrap_or_else(|e| Err(e.into())).map_err(|e| self.fail("clear", "", &e))
+            }
+            Kind::S3(bucket) => bucket.clear_uploads(now).await.map_err(|e| self.fail("clear", "", e.as_ref())),
+        };
+        unfinished.map(|unfinished| removed + unfinished)
+    }
+}
+
+/// What is not there is no error.
+fn found<T>(answer: object_store::Result<T>) -> object_store::Result<Option<T>> {
+    match answer {
+        Ok(there) => Ok(Some(there)),
+        Err(object_store::Error::NotFound { .. }) => Ok(None),
+        Err(e) => Err(e),
+    }
+}

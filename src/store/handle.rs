@@ -1,0 +1,352 @@
+//! The store: bytes by name, kept whole.
+
+use std::collections::hash_map::DefaultHasher;
+use std::fmt;
+use std::future::Future;
+use std::hash::{Hash as _, Hasher as _};
+use std::ops::Range;
+use std::path::Path;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::SystemTime;
+
+use bytes::Bytes;
+use metrics::counter;
+use tokio::runtime::Handle;
+use tokio::sync::Mutex as AsyncMutex;
+
+use super::backend::Backend;
+use super::error::StoreError;
+use super::index::{Index, Seen};
+use super::memory::Memory;
+use super::name::{Folder, Name};
+use super::object::{ByteStream, Meta, Pin, Stored, Usage};
+use super::{stream, upload};
+use crate::config::StoreConfig;
+use crate::telemetry::CACHE_REQUESTS;
+
+/// Locks for writing and removing, shared by the names that fall on one.
+const STRIPES: usize = 64;
+
+/// What the service keeps, in a folder or on S3. Clones are the same store.
+///
+/// Objects appear and disappear as a whole. Futures may be dropped at any time: what was begun is finished or undone.
+#[derive(Clone)]
+pub struct Store(pub(super) Arc<Inner>);
+
+pub(super) struct Inner {
+    pub(super) backend: Backend,
+    pub(super) config: StoreConfig,
+    index: Mutex<Index>,
+    memory: Memory,
+    stripes: [AsyncMutex<()>; STRIPES],
+    /// Held by whoever makes room, so that two do not remove twice as much; says when staged files were last looked for.
+    pub(super) tidying: AsyncMutex<SystemTime>,
+    pub(super) runtime: Handle,
+}
+
+impl fmt::Debug for Store {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("Store").field(&self.0.backend.place()).finish()
+    }
+}
+
+impl Store {
+    /// Opens the store that `config` names, by default the folder `store` in `data_dir`; tries it, removes what crashed
+    /// processes left there, and counts what it holds. Call it on the runtime that shall do the store's work.
+    ///
+    /// # Errors
+    /// [`StoreError::Open`] where it cannot be written and read.
+    pub async fn open(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
+        let backend = Backend::open(config, data_dir).await?;
+        Self::over(backend, config).await
+    }
+
+    /// [`open`](Self::open), with the backend at hand.
+    pub(super) async fn over(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
+        backend.probe().await.map_err(|e| backend.refuse(&e))?;
+        let now = SystemTime::now();
+        // The store works without this, and whoever may not list uploads may still use them.
+        let cleared = match backend.clear_stale(now).await {
+            Ok(cleared) => cleared,
+            Err(error) => {
+                tracing::warn!(%error, "what crashed processes left in the store was not removed");
+                0
+            }
+        };
+        let mut index = Index::default();
+        for folder in Folder::ALL {
+            for (name, meta) in backend.list(folder).await.map_err(|e| backend.refuse(&e))? {
+                index.commit(&name, meta.size, meta.modified);
+            }
+            index.show(folder);
+        }
+        let [inputs, jobs, results] = Folder::ALL.map(|folder| index.total(folder).1);
+        tracing::info!(place = backend.place(), inputs, jobs, results, cleared, "store opened");
+        Ok(Self(Arc::new(Inner {
+            backend,
+            index: Mutex::new(index),
+            memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
+            stripes: [const { AsyncMutex::const_new(()) }; STRIPES],
+            tidying: AsyncMutex::new(now),
+            runtime: Handle::current(),
+            config: config.clone(),
+        })))
+    }
+
+    /// Keeps `bytes` under `name`, in place of what was there. It is durable when this returns.
+    ///
+    /// # Errors
+    /// [`StoreError`]; what was there before is still there then, unless it had to make room.
+    pub async fn put(&self, name: &Name, bytes: Bytes) -> Result<(), StoreError> {
+        self.keep(name, bytes, false).await.map(|_| ())
+    }
+
+    /// Keeps `bytes` under `name` unless there is something. Returns whether it was kept; for names that follow from
+    /// the content both are good news. It is durable when this returns.
+    ///
+    /// # Errors
+    /// [`StoreError`]; nothing has changed then.
+    pub async fn put_new(&self, name: &Name, bytes: Bytes) -> Result<bool, StoreError> {
+        if self.head(name).await?.is_some() {
+            self.touch(name, SystemTime::now());
+            return Ok(false);
+        }
+        self.keep(name, bytes, true).await
+    }
+
+    async fn keep(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
+        let (store, name) = (self.clone(), name.clone());
+        self.finished(async move {
+            let room = store.room_for(&name, bytes.len() as u64).await?;
+            let _lock = store.stripe(&name).lock().await;
+            // What a content is named after is the same in both hands; only documents have to be told apart at once.
+            if new && name.folder() != Folder::Jobs && store.0.backend.head(&name).await?.is_some() {
+                return Ok(false);
+            }
+            let kept =
+                upload::put(&store.0.backend, &name, bytes.clone(), new && name.folder() == Folder::Jobs).await?;
+            if kept {
+                store.commit(&name, bytes.len() as u64, Some(&bytes));
+            }
+            drop(room);
+            Ok(kept)
+        })
+        .await
+    }
+
+    /// All bytes of an object. A result that is in memory is answered at once: no disk, no other thread. Large objects
+    /// are better read with [`read`](Self::read).
+    ///
+    /// # Errors
+    /// [`StoreError`]. An object that is not there is none: it may have been removed at any time.
+    pub async fn get(&self, name: &Name) -> Result<Option<Stored>, StoreError> {
+        if let Some((meta, bytes)) = self.recall(name) {
+            return Ok(Some(Stored { bytes, meta }));
+        }
+        let Some(seen) = self.begin_read(name) else { return Ok(None) };
+        let read = self.0.backend.get_whole(name).await?;
+        self.end_read(name, seen, read.as_ref().map(|(meta, _)| *meta));
+        let Some((meta, bytes)) = read else { return Ok(None) };
+        let index = self.index();
+        if index.is_current(name, seen) {
+            self.0.memory.put(name, meta, &bytes);
+        }
+        Ok(Some(Stored { bytes, meta }))
+    }
+
+    /// An object in pieces, or the bytes of `range` of it, whose end may lie behind the object's. What was opened can be
+    /// read to its end, even if it is removed meanwhile.
+    ///
+    /// # Errors
+    /// [`StoreError::Range`] if the range is empty or begins behind the end; others as they come.
+    pub async fn read(&self, name: &Name, range: Option<Range<u64>>) -> Result<Option<(Meta, ByteStream)>, StoreError> {
+        if let Some((meta, bytes)) = self.recall(name) {
+            let range = range.map(|range| within(range, meta.size)).transpose()?.unwrap_or(0..meta.size);
+            return Ok(Some((meta, stream::of(&bytes, range))));
+        }
+        let Some(seen) = self.begin_read(name) else { return Ok(None) };
+        let range = match range {
+            Some(range) => {
+                let Some(meta) = self.0.backend.head(name).await? else {
+                    self.end_read(name, seen, None);
+                    return Ok(None);
+                };
+                Some(within(range, meta.size)?)
+            }
+            None => None,
+        };
+        let read = self.0.backend.get(name, range).await?;
+        self.end_read(name, seen, read.as_ref().map(|read| Meta::from(&read.meta)));
+        Ok(read.map(|read| (Meta::from(&read.meta), stream::read(self.clone(), name.clone(), read))))
+    }
+
+    /// What is known of an object; this is no use of it.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub async fn head(&self, name: &Name) -> Result<Option<Meta>, StoreError> {
+        let Some(seen) = self.index().begin_read(name) else { return Ok(None) };
+        let meta = self.0.backend.head(name).await?;
+        self.reconcile(name, seen, meta);
+        Ok(meta)
+    }
+
+    /// Removes an object, pinned or not; one that is not there is removed already.
+    ///
+    /// # Errors
+    /// [`StoreError`]; the object is still there then.
+    pub async fn delete(&self, name: &Name) -> Result<(), StoreError> {
+        let (store, name) = (self.clone(), name.clone());
+        self.finished(async move {
+            let _lock = store.stripe(&name).lock().await;
+            store.index().order_removal(&name);
+            store.remove(&name).await
+        })
+        .await
+    }
+
+    /// The objects of a folder, in the order of their names, as the disk or the service has them.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
+        self.0.backend.list(folder).await
+    }
+
+    /// Notes that an object is of use at `at`: its time to live begins anew.
+    pub fn touch(&self, name: &Name, at: SystemTime) {
+        self.index().touch(name, at);
+    }
+
+    /// Keeps a name from being tidied away for as long as the pin lives, whether there is an object or not.
+    /// [`delete`](Self::delete) is stronger.
+    pub fn pin(&self, name: &Name) -> Pin {
+        self.index().pin(name);
+        Pin::new(self.clone(), name.clone())
+    }
+
+    /// Writes, reads and removes a small object: whether the store works.
+    ///
+    /// # Errors
+    /// [`StoreError`].
+    pub async fn probe(&self) -> Result<(), StoreError> {
+        self.0.backend.probe().await
+    }
+
+    /// What a folder holds.
+    #[must_use]
+    pub fn usage(&self, folder: Folder) -> Usage {
+        let (bytes, objects) = self.index().total(folder);
+        Usage { bytes, objects }
+    }
+
+    /// Bytes of results that are in memory.
+    #[must_use]
+    pub fn memory_held(&self) -> u64 {
+        self.0.memory.held()
+    }
+
+    /// Where it is, for messages.
+    #[must_use]
+    pub fn place(&self) -> &str {
+        self.0.backend.place()
+    }
+
+    pub(super) fn index(&self) -> MutexGuard<'_, Index> {
+        self.0.index.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(super) fn stripe(&self, name: &Name) -> &AsyncMutex<()> {
+        let mut hasher = DefaultHasher::new();
+        name.hash(&mut hasher);
+        let stripe = usize::try_from(hasher.finish() % STRIPES as u64).unwrap_or_default();
+        &self.0.stripes[stripe]
+    }
+
+    /// Enters what was just written under the name's lock; small results stay in memory.
+    pub(super) fn commit(&self, name: &Name, size: u64, bytes: Option<&Bytes>) {
+        let now = SystemTime::now();
+        let mut index = self.index();
+        index.commit(name, size, now);
+        match bytes {
+            Some(bytes) => self.0.memory.put(name, Meta { size, modified: now }, bytes),
+            None => self.0.memory.remove(name),
+        }
+    }
+
+    /// Removes what the index has taken out of sight, under the name's lock.
+    pub(super) async fn remove(&self, name: &Name) -> Result<(), StoreError> {
+        self.0.memory.remove(name);
+        let removed = self.0.backend.delete(name).await;
+        self.index().end_removal(name, removed.is_ok());
+        removed
+    }
+
+    /// Runs to the end what must not stop half-way, even if nobody waits for it any more.
+    pub(super) async fn finished<T: Send + 'static>(
+        &self,
+        work: impl Future<Output = Result<T, StoreError>> + Send + 'static,
+    ) -> Result<T, StoreError> {
+        let done = self.0.runtime.spawn(work).await;
+        done.unwrap_or_else(|e| Err(self.0.backend.fail("task", "", &e)))
+    }
+
+    /// A result from memory.
+    fn recall(&self, name: &Name) -> Option<(Meta, Bytes)> {
+        if name.folder() != Folder::Results {
+            return None;
+        }
+        let found = self.0.memory.get(name);
+        count("memory", found.is_some());
+        if found.is_some() {
+            self.touch(name, SystemTime::now());
+        }
+        found
+    }
+
+    /// Begins a read that is counted.
+    fn begin_read(&self, name: &Name) -> Option<Seen> {
+        let seen = self.index().begin_read(name);
+        if seen.is_none() && name.folder() == Folder::Results {
+            count("store", false);
+        }
+        seen
+    }
+
+    /// Ends it.
+    fn end_read(&self, name: &Name, seen: Seen, meta: Option<Meta>) {
+        if name.folder() == Folder::Results {
+            count("store", meta.is_some());
+        }
+        self.reconcile(name, seen, meta);
+        if meta.is_some() {
+            self.touch(name, SystemTime::now());
+        }
+    }
+
+    /// Makes the index agree with what a read found: others may write to the store and remove from it.
+    fn reconcile(&self, name: &Name, seen: Seen, meta: Option<Meta>) {
+        let mut index = self.index();
+        match meta {
+            Some(meta) => index.adopt(name, seen, meta.size, meta.modified),
+            None if index.is_current(name, seen) => {
+                index.forget(name);
+                self.0.memory.remove(name);
+            }
+            None => {}
+        }
+    }
+}
+
+/// Counts a question for a result.
+fn count(tier: &'static str, hit: bool) {
+    counter!(CACHE_REQUESTS, "tier" => tier, "result" => if hit { "hit" } else { "miss" }).increment(1);
+}
+
+/// The part of a range that lies within `size` bytes.
+fn within(range: Range<u64>, size: u64) -> Result<Range<u64>, StoreError> {
+    if range.start >= range.end.min(size) {
+        return Err(StoreError::Range { start: range.start, end: range.end, size });
+    }
+    Ok(range.start..range.end.min(size))
+}

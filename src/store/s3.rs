@@ -1,0 +1,170 @@
+//! S3, and what speaks like it.
+
+use std::error::Error as StdError;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use object_store::aws::{AmazonS3, AmazonS3Builder, AmazonS3ConfigKey};
+use object_store::client::{HttpClient, HttpConnector as _, HttpRequest, HttpRequestBody, ReqwestConnector};
+use object_store::multipart::MultipartStore as _;
+use object_store::path::Path;
+use object_store::prefix::PrefixStore;
+use object_store::signer::{SignedUrlOptions, Signer as _};
+use object_store::{BackoffConfig, ClientConfigKey, ClientOptions, ObjectMeta, ObjectStore, RetryConfig};
+
+use super::name::Name;
+use super::stale::is_stale;
+use crate::config::StoreConfig;
+
+/// How long a request is tried again. A probe for readiness must not take longer than whoever asks waits.
+const RETRY: Duration = Duration::from_secs(10);
+
+/// A bucket, for what [`ObjectStore`] has no word for.
+pub(super) struct Bucket {
+    s3: AmazonS3,
+    client: HttpClient,
+    prefix: Path,
+}
+
+/// `s3://bucket/prefix` as bucket and prefix.
+fn split(url: &str) -> Option<(&str, Path)> {
+    let rest = url.strip_prefix("s3://")?;
+    let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
+    let good = |c: u8| c.is_ascii_alphanumeric() || matches!(c, b'-' | b'.' | b'_');
+    (!bucket.is_empty() && bucket.bytes().all(good)).then_some(())?;
+    Some((bucket, Path::parse(prefix).ok()?))
+}
+
+/// The objects below the prefix, and the bucket. Nothing is sent yet.
+pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn ObjectStore>, Bucket), String> {
+    let (name, prefix) = split(url).ok_or("expected s3://bucket or s3://bucket/prefix")?;
+    let key = AmazonS3ConfigKey::Client;
+    let mut builder = AmazonS3Builder::from_env()
+        .with_bucket_name(name)
+        .with_virtual_hosted_style_request(!config.path_style)
+        // Deletions one by one: not every service knows the other way, and few go at once.
+        .with_disable_bulk_delete(true)
+        // A body may be read as slowly as its reader likes, so the whole has no time limit, only the silence.
+        .with_config(key(ClientConfigKey::Timeout), "1day")
+        .with_config(key(ClientConfigKey::ReadTimeout), format!("{}ms", config.timeout_ms))
+        .with_config(key(ClientConfigKey::ConnectTimeout), format!("{}ms", config.timeout_ms.min(5000)))
+        .with_retry(RetryConfig { backoff: BackoffConfig::default(), max_retries: 3, retry_timeout: RETRY });
+    let mut plain = ClientOptions::new().with_timeout(config.timeout());
+    if config.allow_http {
+        builder = builder.with_allow_http(true);
+        plain = plain.with_allow_http(true);
+    }
+    if let Some(region) = &config.region {
+        builder = builder.with_region(region);
+    }
+    if let Some(endpoint) = &config.endpoint {
+        builder = builder.with_endpoint(endpoint.trim_end_matches('/'));
+    }
+    if let Some(id) = &config.access_key_id {
+        builder = builder.with_access_key_id(id);
+    }
+    if let Some(secret) = &config.secret_access_key {
+        builder = builder.with_secret_access_key(secret.reveal());
+    }
+    let s3 = builder.build().map_err(|e| e.to_string())?;
+    let client = ReqwestConnector::default().connect(&plain).map_err(|e| e.to_string())?;
+    let objects: Arc<dyn ObjectStore> = Arc::new(PrefixStore::new(s3.clone(), prefix.clone()));
+    Ok((objects, Bucket { s3, client, prefix }))
+}
+
+impl Bucket {
+    /// Gives up uploads of our names that nobody will finish: the first thousand of them, the next ones next time.
+    pub(super) async fn clear_uploads(&self, now: SystemTime) -> Result<u64, Box<dyn StdError + Send + Sync>> {
+        let query = SignedUrlOptions::new().with_query([("uploads", ""), ("prefix", self.prefix.as_ref())]);
+        // The type of the method is one that we have no name for.
+        let url = self.s3.signed_url_opts("GET".parse()?, &Path::default(), RETRY, &query).await?;
+        let mut request = HttpRequest::new(HttpRequestBody::empty());
+        *request.uri_mut() = url.as_str().parse()?;
+        // The words of the client would quote the signed address.
+        let answer = self.client.execute(request).await.map_err(|e| format!("no answer: {:?}", e.kind()))?;
+        let status = answer.status();
+        let body = answer.into_body().bytes().await?;
+        if !status.is_success() {
+            return Err(format!("unfinished uploads cannot be listed: {status}").into());
+        }
+        let mut removed = 0;
+        for upload in uploads(&String::from_utf8_lossy(&body)) {
+            // Others may use the bucket, with keys that we could not even say.
+            let Ok(path) = Path::parse(&upload.key) else { continue };
+            let below = path.prefix_match(&self.prefix).map(Path::from_iter);
+            let ours = below.is_some_and(|path| Name::at(path.as_ref()).is_some());
+            if ours && is_stale(upload.begun, now) {
+                self.s3.abort_multipart(&path, &upload.id).await?;
+                removed += 1;
+            }
+        }
+        Ok(removed)
+    }
+}
+
+#[derive(Debug, PartialEq)]
+struct Unfinished {
+    key: String,
+    id: String,
+    begun: SystemTime,
+}
+
+/// The uploads of a `ListMultipartUploadsResult`. What we cannot read is not ours: our keys need no escapes.
+fn uploads(xml: &str) -> Vec<Unfinished> {
+    let one = |upload: &str| {
+        let text = |tag: &str| {
+            let (_, rest) = upload.split_once(&format!("<{tag}>"))?;
+            rest.split_once("</").map(|(text, _)| text.trim().to_owned())
+        };
+        Some(Unfinished { key: text("Key")?, id: text("UploadId")?, begun: time(&text("Initiated")?)? })
+    };
+    xml.split("<Upload>").skip(1).filter_map(one).collect()
+}
+
+/// A time such as `2026-01-31T12:00:00.000Z`, read by the type that the crate has for times of objects.
+fn time(text: &str) -> Option<SystemTime> {
+    let mut scratch = ObjectMeta {
+        location: Path::default(),
+        last_modified: SystemTime::UNIX_EPOCH.into(),
+        size: 0,
+        e_tag: None,
+        version: None,
+    };
+    scratch.last_modified = text.parse().ok()?;
+    Some(scratch.last_modified.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn urls_name_a_bucket_and_perhaps_a_prefix() {
+        let of = |url| split(url).map(|(bucket, prefix)| (bucket, prefix.to_string()));
+        assert_eq!(of("s3://meshes"), Some(("meshes", String::new())));
+        assert_eq!(of("s3://meshes/"), Some(("meshes", String::new())));
+        assert_eq!(of("s3://meshes/a/b/"), Some(("meshes", "a/b".to_owned())));
+        for bad in
+            ["", "meshes", "http://meshes", "s3://", "s3:///a", "s3://key:secret@meshes", "s3://m/a//b", "s3://m/../b"]
+        {
+            assert_eq!(of(bad), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn uploads_are_read_and_what_is_broken_is_left_alone() {
+        let upload = |key: &str, time: &str| {
+            format!("<Upload>\n<Key>{key}</Key><UploadId> x1 </UploadId><Initiated>{time}</Initiated></Upload>")
+        };
+        let xml = format!(
+            "<ListMultipartUploadsResult><Bucket>b</Bucket>{}{}<Upload><Key>c</Key></Upload></ListMultipartUploadsResult>",
+            upload("a/b", "1970-01-02T00:00:01.500Z"),
+            upload("c", "yesterday"),
+        );
+        let begun = SystemTime::UNIX_EPOCH + Duration::from_millis(86_401_500);
+        assert_eq!(uploads(&xml), [Unfinished { key: "a/b".to_owned(), id: "x1".to_owned(), begun }]);
+        assert_eq!(uploads("<ListMultipartUploadsResult/>"), []);
+        let hour = Duration::from_hours(1);
+        assert!(is_stale(begun, begun + hour) && !is_stale(begun, begun + hour / 2) && !is_stale(begun, begun - hour));
+    }
+}

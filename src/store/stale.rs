@@ -1,0 +1,38 @@
+//! What crashed processes leave behind, and how old it must be before it counts as that.
+
+use std::io;
+use std::path::PathBuf;
+use std::time::{Duration, SystemTime};
+
+/// Age at which something unfinished is nobody's: no job may take that long. Younger ones may belong to a process that
+/// shares the store, as during a rolling restart.
+pub(super) const STALE: Duration = Duration::from_hours(1);
+
+/// Whether something that was last written at `written` is nobody's at `now`.
+pub(super) fn is_stale(written: SystemTime, now: SystemTime) -> bool {
+    now.duration_since(written).is_ok_and(|age| age >= STALE)
+}
+
+/// Removes staged files from `folders`: they are named after their object, with `#` and a number. Blocks.
+pub(super) fn clear_files(folders: &[PathBuf], now: SystemTime) -> io::Result<u64> {
+    let mut removed = 0;
+    for folder in folders {
+        for entry in std::fs::read_dir(folder)? {
+            let entry = entry?;
+            let name = entry.file_name();
+            let staged = name.to_str().and_then(|name| name.rsplit_once('#'));
+            if !staged.is_some_and(|(_, count)| count.bytes().all(|c| c.is_ascii_digit())) {
+                continue;
+            }
+            // Another process may have finished or removed it meanwhile.
+            let Ok(written) = entry.metadata().and_then(|meta| meta.modified()) else { continue };
+            if is_stale(written, now) {
+                match std::fs::remove_file(entry.path()) {
+                    Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e),
+                    _ => removed += 1,
+                }
+            }
+        }
+    }
+    Ok(removed)
+}

@@ -1,0 +1,180 @@
+//! Places for a store: a folder that goes away with the test, and a bucket of an S3 service in memory (moto).
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
+use std::path::PathBuf;
+use std::process::{Child, ChildStdin, Command, Stdio};
+use std::sync::LazyLock;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use molmesh::config::{Secret, StoreConfig};
+use molmesh::store::{Digest, Name, Store, StoreError};
+use serde::Deserialize;
+use tempfile::TempDir;
+
+use crate::tools;
+
+/// An S3 service with the bucket `meshes`. It ends when this is dropped, or with the process.
+pub(crate) struct Service {
+    child: Child,
+    stdin: Option<ChildStdin>,
+    pub(crate) access: Access,
+}
+
+/// What the service says when it is ready.
+#[derive(Debug, Clone, Deserialize)]
+pub(crate) struct Access {
+    pub(crate) endpoint: String,
+    pub(crate) id: String,
+    pub(crate) secret: String,
+}
+
+impl Service {
+    pub(crate) fn start(arguments: &[&str]) -> Self {
+        let python = tools::python_interpreter();
+        let python = python.unwrap_or_else(|| panic!("the S3 service is not installed: run tests/tools/setup.sh"));
+        let script = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/tools/s3.py");
+        let mut child = Command::new(python)
+            .arg(script)
+            .args(arguments)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap_or_else(|e| panic!("the S3 service does not start: {e}"));
+        let stdin = child.stdin.take();
+        let mut line = String::new();
+        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let access = serde_json::from_str(&line).unwrap_or_else(|e| panic!("the S3 service said {line:?}: {e}"));
+        Self { child, stdin, access }
+    }
+
+    pub(crate) fn config(&self, prefix: &str) -> StoreConfig {
+        StoreConfig {
+            url: Some(format!("s3://meshes/{prefix}")),
+            endpoint: Some(self.access.endpoint.clone()),
+            region: Some("us-east-1".to_owned()),
+            allow_http: true,
+            access_key_id: Some(self.access.id.clone()),
+            secret_access_key: Some(Secret::new(&self.access.secret)),
+            ..StoreConfig::default()
+        }
+    }
+
+    /// Sends a request behind the store's back. The signature is made up: the service asks for one and does not look.
+    pub(crate) fn send(&self, method: &str, path: &str) -> String {
+        let host = self.access.endpoint.strip_prefix("http://").unwrap();
+        let mut stream = TcpStream::connect(host).unwrap();
+        let signed =
+            "AWS4-HMAC-SHA256 Credential=any/20260101/us-east-1/s3/aws4_request, SignedHeaders=host, Signature=x";
+        let head = format!("{method} {path} HTTP/1.0\r\nHost: {host}\r\nAuthorization: {signed}");
+        write!(stream, "{head}\r\nContent-Length: 0\r\n\r\n").unwrap();
+        let mut answer = String::new();
+        stream.read_to_string(&mut answer).unwrap();
+        assert!(answer.split(' ').nth(1).is_some_and(|status| status.starts_with('2')), "{method} {path}: {answer}");
+        answer
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        drop(self.stdin.take());
+        self.child.wait().unwrap();
+    }
+}
+
+static SHARED: LazyLock<Service> = LazyLock::new(|| Service::start(&[]));
+
+/// The service of all tests that need no other.
+pub(crate) fn shared() -> &'static Service {
+    &SHARED
+}
+
+/// Where a test keeps its store.
+pub(crate) struct Place {
+    pub(crate) config: StoreConfig,
+    pub(crate) dir: TempDir,
+    service: Option<(&'static Service, String)>,
+}
+
+pub(crate) fn local() -> Place {
+    Place { config: StoreConfig::default(), dir: tempfile::tempdir().unwrap(), service: None }
+}
+
+pub(crate) fn s3() -> Place {
+    static COUNT: AtomicU64 = AtomicU64::new(0);
+    let prefix = format!("test/{}", COUNT.fetch_add(1, Ordering::Relaxed));
+    let service = shared();
+    Place { config: service.config(&prefix), dir: tempfile::tempdir().unwrap(), service: Some((service, prefix)) }
+}
+
+impl Place {
+    pub(crate) async fn try_open(&self) -> Result<Store, StoreError> {
+        Store::open(&self.config, self.dir.path()).await
+    }
+
+    pub(crate) async fn open(&self) -> Store {
+        self.try_open().await.unwrap()
+    }
+
+    pub(crate) fn is_local(&self) -> bool {
+        self.service.is_none()
+    }
+
+    /// The root of a local store.
+    pub(crate) fn root(&self) -> PathBuf {
+        assert!(self.is_local());
+        self.dir.path().join("store")
+    }
+
+    /// Takes an object away behind the store's back.
+    pub(crate) fn steal(&self, name: &Name) {
+        match &self.service {
+            None => std::fs::remove_file(self.root().join(name.to_string())).unwrap(),
+            Some((service, prefix)) => drop(service.send("DELETE", &format!("/meshes/{prefix}/{name}"))),
+        }
+    }
+
+    /// What is there and unfinished: names of staged files, keys of uploads.
+    pub(crate) fn unfinished(&self) -> Vec<String> {
+        match &self.service {
+            None => {
+                let folders = ["inputs", "jobs", "results"].map(|folder| std::fs::read_dir(self.root().join(folder)));
+                let files = folders.into_iter().flat_map(Result::unwrap).map(|file| file.unwrap().file_name());
+                files.filter_map(|file| file.into_string().ok().filter(|name| name.contains('#'))).collect()
+            }
+            Some((service, prefix)) => {
+                let answer = service.send("GET", "/meshes?uploads");
+                let keys = answer.split("<Key>").skip(1).filter_map(|rest| rest.split("</Key>").next());
+                keys.filter(|key| key.starts_with(&format!("{prefix}/"))).map(str::to_owned).collect()
+            }
+        }
+    }
+}
+
+/// Names of results; the same number gives the same name.
+pub(crate) fn result(number: u64) -> Name {
+    Name::result(&format!("{number:064x}"), "glb").unwrap()
+}
+
+/// Names of inputs.
+pub(crate) fn input(number: u64) -> Name {
+    Name::input(&Digest::of(&number.to_le_bytes()))
+}
+
+/// Names of jobs.
+pub(crate) fn job(number: u64) -> Name {
+    Name::job(&format!("{number:x}")).unwrap()
+}
+
+/// Bytes that differ from place to place, and from seed to seed.
+pub(crate) fn noise(length: usize, seed: u64) -> Vec<u8> {
+    let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
+    let mut next = || {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state.to_le_bytes()
+    };
+    std::iter::repeat_with(&mut next).flatten().take(length).collect()
+}

@@ -1,0 +1,41 @@
+"""An S3 service in memory for the tests of the store: prints one line of JSON when it is ready, ends when its standard
+input does. The bucket is `meshes`. With `--guarded`, only the printed credentials are let in."""
+
+import json
+import logging
+import sys
+
+import boto3
+from moto import settings
+from moto.server import ThreadedMotoServer
+
+logging.getLogger("werkzeug").setLevel(logging.ERROR)
+server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+server.start()
+host, port = server.get_host_and_port()
+endpoint = f"http://{host}:{port}"
+
+
+def client(service):
+    return boto3.client(
+        service,
+        endpoint_url=endpoint,
+        region_name="us-east-1",
+        aws_access_key_id="setup",
+        aws_secret_access_key="setup",
+    )
+
+
+client("s3").create_bucket(Bucket="meshes")
+key = {"AccessKeyId": "any", "SecretAccessKey": "any"}
+if "--guarded" in sys.argv:
+    iam = client("iam")
+    iam.create_user(UserName="molmesh")
+    everything = {"Version": "2012-10-17", "Statement": [{"Effect": "Allow", "Action": "*", "Resource": "*"}]}
+    iam.put_user_policy(UserName="molmesh", PolicyName="all", PolicyDocument=json.dumps(everything))
+    key = iam.create_access_key(UserName="molmesh")["AccessKey"]
+    settings.INITIAL_NO_AUTH_ACTION_COUNT = 0  # from now on everybody has to say who they are
+answer = {"endpoint": endpoint, "id": key["AccessKeyId"], "secret": key["SecretAccessKey"]}
+print(json.dumps(answer), flush=True)
+sys.stdin.read()
+server.stop()
