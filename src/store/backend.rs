@@ -15,9 +15,9 @@ use tokio::task::spawn_blocking;
 
 use super::error::StoreError;
 use super::name::{Folder, Name};
+use super::object::Meta;
 use super::s3::{self, Bucket};
 use super::stale;
-use super::store::Meta;
 use crate::config::StoreConfig;
 use crate::telemetry::STORE_ERRORS;
 
@@ -61,6 +61,13 @@ impl Backend {
         let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
         let refuse = |reason| StoreError::Open { key: "server.data_dir", place: place.clone(), reason };
         Ok(Self { objects: Arc::new(opened.map_err(refuse)?), kind: Kind::Local(root), place })
+    }
+
+    /// A folder with other manners, for tests.
+    #[cfg(test)]
+    pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf) -> Self {
+        let place = root.display().to_string();
+        Self { objects, kind: Kind::Local(root), place }
     }
 
     /// For messages.

@@ -221,3 +221,67 @@ impl Index {
         gauge!(STORE_OBJECTS, "folder" => folder.as_str()).set(objects as f64);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn name(id: &str) -> Name {
+        Name::read(Folder::Inputs, &id.repeat(64)).unwrap()
+    }
+
+    fn at(seconds: u64) -> SystemTime {
+        SystemTime::UNIX_EPOCH + Duration::from_secs(seconds)
+    }
+
+    #[test]
+    fn a_read_is_current_until_somebody_writes_or_removes() {
+        let mut index = Index::default();
+        index.commit(&name("a"), 5, at(1));
+        let seen = index.begin_read(&name("a")).unwrap();
+        assert!(index.is_current(&name("a"), seen));
+        index.touch(&name("a"), at(2));
+        assert!(index.is_current(&name("a"), seen), "a use changes nothing");
+        index.commit(&name("a"), 5, at(3));
+        assert!(!index.is_current(&name("a"), seen));
+        let seen = index.begin_read(&name("a")).unwrap();
+        index.order_removal(&name("a"));
+        assert!(!index.is_current(&name("a"), seen) && index.begin_read(&name("a")).is_none());
+        index.end_removal(&name("a"), false);
+        assert!(index.is_current(&name("a"), seen), "it could not be removed");
+    }
+
+    #[test]
+    fn what_was_removed_during_a_read_is_not_adopted() {
+        let mut index = Index::default();
+        let seen = index.begin_read(&name("a")).unwrap();
+        index.adopt(&name("a"), seen, 7, at(1));
+        assert_eq!(index.total(Folder::Inputs), (7, 1));
+        let seen = index.begin_read(&name("b")).unwrap();
+        index.forget(&name("a"));
+        index.adopt(&name("b"), seen, 7, at(1));
+        assert_eq!(index.total(Folder::Inputs), (0, 0));
+    }
+
+    #[test]
+    fn a_victim_that_is_used_or_pinned_stays() {
+        let mut index = Index::default();
+        for (id, used) in [("a", 1), ("b", 2), ("c", 3)] {
+            index.commit(&name(id), 10, at(used));
+        }
+        let Err(NoRoom::Remove(victims)) = index.reserve(20, 30) else { panic!("room where there is none") };
+        assert_eq!(victims.iter().map(|v| v.name.clone()).collect::<Vec<_>>(), [name("a"), name("b")]);
+        index.touch(&name("a"), at(1));
+        index.pin(&name("b"));
+        assert!(!index.begin_removal(&victims[0]) && !index.begin_removal(&victims[1]));
+        index.unpin(&name("b"));
+        assert!(index.begin_removal(&victims[1]) && !index.begin_removal(&victims[1]));
+        index.end_removal(&name("b"), true);
+        assert_eq!((index.reserve(10, 30), index.total(Folder::Inputs)), (Ok(()), (20, 2)));
+        index.pin(&name("a"));
+        index.pin(&name("c"));
+        assert_eq!(index.reserve(1, 30), Err(NoRoom::Held(30)));
+        index.release(10);
+        assert_eq!(index.reserve(10, 30), Ok(()));
+    }
+}

@@ -5,7 +5,7 @@ use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 
 use super::name::{Folder, Name};
-use super::store::Meta;
+use super::object::Meta;
 
 /// What an entry takes beside its bytes: its name, its place in the cache.
 const OVERHEAD: u64 = 256;

@@ -10,12 +10,13 @@
 mod backend;
 mod digest;
 mod error;
+mod handle;
 mod index;
 mod memory;
 mod name;
+mod object;
 mod s3;
 mod stale;
-mod store;
 mod stream;
 #[cfg(test)]
 mod tests;
@@ -25,7 +26,8 @@ mod writer;
 
 pub use digest::{BadDigest, Digest};
 pub use error::StoreError;
+pub use handle::Store;
 pub use name::{BadName, Folder, Name};
-pub use store::{ByteStream, Meta, Pin, Store, Stored, Usage};
+pub use object::{ByteStream, Meta, Pin, Stored, Usage};
 pub use tidy::Swept;
 pub use writer::Writer;

@@ -164,7 +164,7 @@ mod tests {
         let begun = SystemTime::UNIX_EPOCH + Duration::from_millis(86_401_500);
         assert_eq!(uploads(&xml), [Unfinished { key: "a/b".to_owned(), id: "x1".to_owned(), begun }]);
         assert_eq!(uploads("<ListMultipartUploadsResult/>"), []);
-        let hour = Duration::from_secs(3600);
+        let hour = Duration::from_hours(1);
         assert!(is_stale(begun, begun + hour) && !is_stale(begun, begun + hour / 2) && !is_stale(begun, begun - hour));
     }
 }

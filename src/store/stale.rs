@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 
 /// Age at which something unfinished is nobody's: no job may take that long. Younger ones may belong to a process that
 /// shares the store, as during a rolling restart.
-pub(super) const STALE: Duration = Duration::from_secs(3600);
+pub(super) const STALE: Duration = Duration::from_hours(1);
 
 /// Whether something that was last written at `written` is nobody's at `now`.
 pub(super) fn is_stale(written: SystemTime, now: SystemTime) -> bool {

@@ -9,8 +9,9 @@ use futures_util::{StreamExt as _, TryStreamExt as _};
 use object_store::{GetResult, GetResultPayload};
 use tokio::task::spawn_blocking;
 
+use super::handle::Store;
 use super::name::Name;
-use super::store::{ByteStream, Store};
+use super::object::ByteStream;
 
 /// Bytes of a file that are read at once: a thread is woken for each piece.
 const PIECE: u64 = 256 << 10;

@@ -5,10 +5,10 @@ use std::time::{Duration, SystemTime};
 use metrics::counter;
 
 use super::error::StoreError;
+use super::handle::Store;
 use super::index::{NoRoom, Victim};
 use super::name::{Folder, Name};
 use super::stale::STALE;
-use super::store::Store;
 use crate::telemetry::STORE_REMOVED;
 
 /// Attempts to make room, where others use what was about to go or take the room that was made.

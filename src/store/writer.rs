@@ -6,8 +6,8 @@ use bytes::{Bytes, BytesMut};
 use tokio::sync::{mpsc, oneshot};
 
 use super::error::StoreError;
+use super::handle::Store;
 use super::name::Name;
-use super::store::Store;
 use super::upload::{self, Upload};
 
 /// Parts that wait for the runtime. With the one that is being filled and those on their way six are in memory at most.

@@ -10,9 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::SystemTime;
 
 use bytes::Bytes;
-use futures_util::stream::BoxStream;
 use metrics::counter;
-use object_store::ObjectMeta;
 use tokio::runtime::Handle;
 use tokio::sync::Mutex as AsyncMutex;
 
@@ -21,48 +19,13 @@ use super::error::StoreError;
 use super::index::{Index, Seen};
 use super::memory::Memory;
 use super::name::{Folder, Name};
+use super::object::{ByteStream, Meta, Pin, Stored, Usage};
 use super::{stream, upload};
 use crate::config::StoreConfig;
 use crate::telemetry::CACHE_REQUESTS;
 
 /// Locks for writing and removing, shared by the names that fall on one.
 const STRIPES: usize = 64;
-
-/// What is known of an object.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Meta {
-    /// Bytes.
-    pub size: u64,
-    /// When it was written; S3 says it to the second.
-    pub modified: SystemTime,
-}
-
-impl From<&ObjectMeta> for Meta {
-    fn from(meta: &ObjectMeta) -> Self {
-        Self { size: meta.size, modified: meta.last_modified.into() }
-    }
-}
-
-/// A whole object.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Stored {
-    /// Its bytes.
-    pub bytes: Bytes,
-    /// What is known of it.
-    pub meta: Meta,
-}
-
-/// The bytes of an object or of a part of it, in pieces.
-pub type ByteStream = BoxStream<'static, Result<Bytes, StoreError>>;
-
-/// What a folder holds.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Usage {
-    /// Bytes of all objects.
-    pub bytes: u64,
-    /// Objects.
-    pub objects: u64,
-}
 
 /// What the service keeps, in a folder or on S3. Clones are the same store.
 ///
@@ -133,7 +96,7 @@ impl Store {
     /// Keeps `bytes` under `name`, in place of what was there. It is durable when this returns.
     ///
     /// # Errors
-    /// [`StoreError`]; what was there before is still there then.
+    /// [`StoreError`]; what was there before is still there then, unless it had to make room.
     pub async fn put(&self, name: &Name, bytes: Bytes) -> Result<(), StoreError> {
         self.keep(name, bytes, false).await.map(|_| ())
     }
@@ -257,10 +220,9 @@ impl Store {
 
     /// Keeps a name from being tidied away for as long as the pin lives, whether there is an object or not.
     /// [`delete`](Self::delete) is stronger.
-    #[must_use]
     pub fn pin(&self, name: &Name) -> Pin {
         self.index().pin(name);
-        Pin { store: self.clone(), name: name.clone() }
+        Pin::new(self.clone(), name.clone())
     }
 
     /// Writes, reads and removes a small object: whether the store works.
@@ -387,18 +349,4 @@ fn within(range: Range<u64>, size: u64) -> Result<Range<u64>, StoreError> {
         return Err(StoreError::Range { start: range.start, end: range.end, size });
     }
     Ok(range.start..range.end.min(size))
-}
-
-/// Keeps a name from being tidied away; see [`Store::pin`].
-#[derive(Debug)]
-#[must_use = "the name is let go when the pin is dropped"]
-pub struct Pin {
-    store: Store,
-    name: Name,
-}
-
-impl Drop for Pin {
-    fn drop(&mut self) {
-        self.store.index().unpin(&self.name);
-    }
 }
