@@ -210,7 +210,7 @@ impl Engine {
             }
         };
         // The last brick ends with the last atom.
-        let whole = || vec![0..plan.first_atoms.last().copied().unwrap_or_default()];
+        let whole = || std::iter::once(0..plan.first_atoms.last().copied().unwrap_or_default()).collect();
         for run in part.map_or_else(whole, |part| plan.atoms_near(part, [params.back, params.ahead])) {
             let run = run.start as usize..run.end as usize;
             write("atoms", run.start * size_of::<LatticeAtom>(), bytemuck::cast_slice(&lattice.atoms[run.clone()]));

@@ -118,7 +118,9 @@ impl Queues {
             places.push(Place { lane: n, id, answer });
         }
         drop(state);
-        places.iter().for_each(|place| self.filled[place.lane].notify_one());
+        for place in &places {
+            self.filled[place.lane].notify_one();
+        }
         Some(places)
     }
 

@@ -80,7 +80,7 @@ impl<T: Pod> Column<T> {
         for column in columns {
             match column.0 {
                 Storage::Pieces { pieces: own, .. } => pieces.extend(own),
-                _ if column.len() == 0 => {}
+                _ if column.is_empty() => {}
                 _ => pieces.push(column),
             }
         }
@@ -98,6 +98,17 @@ impl<T: Pod> Column<T> {
             _ => (Some(self), &[]),
         };
         whole.into_iter().chain(pieces.iter().map(|piece| &**piece))
+    }
+
+    /// Copies pieces into one, and lets them go: what is used as a slice often need not be held twice.
+    pub fn settle(&mut self) {
+        if let Storage::Pieces { pieces, joined } = &mut self.0 {
+            let joined = joined.take().map(|column| *column);
+            *self = joined.unwrap_or_else(|| {
+                let n = pieces.iter().map(Self::len).sum();
+                Self::copied(n, pieces.iter().map(|piece| &**piece))
+            });
+        }
     }
 
     /// Whether there are no rows.
@@ -265,6 +276,10 @@ mod tests {
         let mut written = pieced();
         written[4] = 9;
         assert_eq!(written.to_vec(), [1, 2, 3, 4, 9]);
+        let mut settled = pieced();
+        settled.settle();
+        assert_eq!(settled.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
+        assert!(matches!(settled.0, Storage::Owned(_)));
         let mut longer = pieced();
         longer.edit().push(6);
         assert_eq!(longer.len(), 6);
