@@ -247,6 +247,10 @@ enum Fault {
     Idles,
 }
 
+fn over(job: &GpuJob) -> bool {
+    job.cancel.is_cancelled() || job.deadline.is_some_and(|deadline| deadline <= Instant::now())
+}
+
 /// A gate that one device opens for another.
 #[derive(Default)]
 struct Gate(Mutex<bool>, Condvar);
@@ -257,10 +261,11 @@ impl Gate {
         self.1.notify_all();
     }
 
-    fn pass(&self) {
+    /// Waits for it, as long as somebody wants the job.
+    fn pass(&self, job: &GpuJob) {
         let mut open = self.0.lock().unwrap();
-        while !*open {
-            open = self.1.wait(open).unwrap();
+        while !*open && !over(job) {
+            open = self.1.wait_timeout(open, Duration::from_millis(1)).unwrap().0;
         }
     }
 }
@@ -281,7 +286,7 @@ impl Executor for Rigged {
 
     fn part(&mut self, job: &GpuJob, share: &Share) -> Result<Finished, GpuError> {
         if self.waits {
-            self.gate.pass();
+            self.gate.pass(job);
         }
         match self.fault.take() {
             None => {}
@@ -305,7 +310,8 @@ impl Executor for Rigged {
                 });
             }
             Some(Fault::Idles) => {
-                while !job.cancel.is_cancelled() && job.deadline.is_none_or(|deadline| Instant::now() < deadline) {
+                self.gate.open();
+                while !over(job) {
                     std::thread::sleep(Duration::from_millis(1));
                 }
                 return Err(GpuError::Surface(SurfaceError::Cancelled));
@@ -321,7 +327,7 @@ impl Executor for Rigged {
 
 /// Two devices: the first does as `fault` says, the second begins its first part when that has happened. The first is
 /// built so many times.
-fn rigged(fault: Fault, good_builds: usize) -> DevicePool {
+fn rigged(fault: Fault, good_builds: usize) -> (DevicePool, Arc<Gate>) {
     let gate = Arc::new(Gate::default());
     let device = |number: usize| {
         let (gate, builds) = (Arc::clone(&gate), AtomicUsize::new(0));
@@ -333,22 +339,20 @@ fn rigged(fault: Fault, good_builds: usize) -> DevicePool {
             let (device, queue) = gpu_support::device();
             let engine = Engine::new(device.clone(), queue)?;
             let fault = Some(fault).filter(|_| number == 0 && n == 0);
-            let waits = number == 1 && fault != Some(Fault::Idles);
+            let waits = number == 1;
             Ok(Box::new(Rigged { engine, device, fault, gate: Arc::clone(&gate), waits }) as Box<dyn Executor>)
         };
         PoolDevice { number, name: format!("device {number}"), build: Box::new(build) }
     };
-    if fault == Fault::Idles {
-        gate.open();
-    }
-    DevicePool::start(vec![device(0), device(1)], &SETTINGS).unwrap()
+    let pool = DevicePool::start(vec![device(0), device(1)], &SETTINGS).unwrap();
+    (pool, gate)
 }
 
 #[test]
 fn a_device_that_is_lost_half_way_costs_another_attempt_and_nothing_else() {
     let job = job(&crowd(300), &params(KERNELS[0], 0.9));
     for fault in [Fault::LostHalfWay, Fault::LostAtOnce, Fault::Panics] {
-        let pool = rigged(fault, usize::MAX);
+        let (pool, _gate) = rigged(fault, usize::MAX);
         assert_same(&pool.ran(&job).unwrap(), &job, 1, &format!("{fault:?}"));
         let status = pool.status();
         assert_eq!((status[0].failed, status[0].rebuilds, status[1].failed), (1, 1, 0), "{fault:?} {status:?}");
@@ -360,7 +364,7 @@ fn a_device_that_is_lost_half_way_costs_another_attempt_and_nothing_else() {
 #[test]
 fn a_device_that_is_lost_for_good_leaves_the_job_to_the_other() {
     let job = job(&crowd(300), &params(KERNELS[0], 0.9));
-    let pool = rigged(Fault::LostHalfWay, 1);
+    let (pool, _gate) = rigged(Fault::LostHalfWay, 1);
     let ran = pool.ran(&job).unwrap();
     assert_same(&ran, &job, 1, "lost for good");
     assert_eq!(ran.device(), "device 1");
@@ -373,17 +377,16 @@ fn a_device_that_is_lost_for_good_leaves_the_job_to_the_other() {
 fn a_part_that_waits_for_another_is_cancelled_and_late_in_time() {
     let started = Instant::now();
     let fresh = || job(&crowd(300), &params(KERNELS[0], 0.9));
-    let pool = rigged(Fault::Idles, usize::MAX);
+    let (pool, _gate) = rigged(Fault::Idles, usize::MAX);
     let mut late = fresh();
     late.deadline = Some(started + Duration::from_millis(1500));
     assert_eq!(pool.ran(&late).map(drop).unwrap_err(), GpuError::Deadline);
-    let pool = rigged(Fault::Idles, usize::MAX);
+    let (pool, gate) = rigged(Fault::Idles, usize::MAX);
     let cancelled = fresh();
     let error = std::thread::scope(|scope| {
         let running = scope.spawn(|| pool.ran(&cancelled).map(drop));
-        while pool.status().iter().any(|device| device.waiting == 0) {
-            std::thread::sleep(Duration::from_millis(1));
-        }
+        // Its own part idles by now, and not another job's.
+        gate.pass(&cancelled);
         cancelled.cancel.cancel();
         running.join().unwrap().unwrap_err()
     });
