@@ -121,7 +121,7 @@ fn main(
         let layer = select(0u, lane & 7u, lane < 32u);
         let brick = records[id].near[which];
         if (brick != NONE) {
-            var before = offsets[brick].x + (records[brick].layers[layer] & 0xffffu);
+            var before = params.base_vertex + offsets[brick].x + (records[brick].layers[layer] & 0xffffu);
             let at = 81u * (which & 1u) + 3u * (layer + (which >> 2u) * 8u) + (which & 2u);
             let x_low = records[brick].crossing[6u * layer];
             let x_high = records[brick].crossing[6u * layer + 1u];

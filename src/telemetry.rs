@@ -37,6 +37,8 @@ pub const DEVICE_JOBS: &str = "molmesh_device_jobs_total";
 pub const DEVICE_REBUILDS: &str = "molmesh_device_rebuilds_total";
 /// Submissions that several jobs shared, by device.
 pub const DEVICE_SHARED: &str = "molmesh_device_shared_submissions_total";
+/// Jobs of which a device made a part, by device.
+pub const DEVICE_SPREAD: &str = "molmesh_device_spread_jobs_total";
 /// Bytes of a device's memory that are held, in use and pooled.
 pub const DEVICE_HELD: &str = "molmesh_device_memory_held_bytes";
 /// Jobs that wait for a device or run on it.
@@ -162,6 +164,7 @@ fn describe() {
     describe_counter!(DEVICE_JOBS, "Jobs that a device ended, by outcome");
     describe_counter!(DEVICE_REBUILDS, "Times that a device was built anew after a failure");
     describe_counter!(DEVICE_SHARED, "Submissions that several jobs shared");
+    describe_counter!(DEVICE_SPREAD, "Jobs of which a device made a part");
     describe_gauge!(DEVICE_HELD, Unit::Bytes, "Bytes of a device's memory that are held");
     describe_gauge!(DEVICE_WAITING, "Jobs that wait for a device or run on it");
     describe_histogram!(STAGE_DURATION, Unit::Seconds, "Time per stage of a job");

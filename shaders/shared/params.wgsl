@@ -48,7 +48,9 @@ struct Params {
     triangle_capacity: u32,
     // Always 0, which no compiler knows: see `rounded`.
     zero: u32,
-    pad: vec2<u32>,
+    // Vertices before the first that the device's own numbers count: those of other devices' parts.
+    base_vertex: u32,
+    pad: u32,
 }
 
 // Number of a workgroup in a dispatch of two dimensions: one has too few workgroups for large grids.

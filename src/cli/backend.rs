@@ -173,7 +173,12 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
     }
     let settings = match use_ {
         Use::Once => PoolSettings::default(),
-        Use::Service(config) => PoolSettings { queue: config.jobs, batch: config.batch, ..PoolSettings::default() },
+        Use::Service(config) => PoolSettings {
+            queue: config.jobs,
+            batch: config.batch,
+            spread_bricks: config.spread_bricks,
+            ..PoolSettings::default()
+        },
     };
     // Whoever asked for the GPU gets it or nothing.
     let fallback = match asked.backend {

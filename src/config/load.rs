@@ -118,7 +118,9 @@ impl Tree {
             expected,
             source_layer: source.clone(),
         };
+        let clears = matches!(value, Value::String(text) if text == "none");
         let typed = match (value, default) {
+            _ if clears => Value::Null,
             (Value::String(text), Value::Number(_)) => {
                 let size = key.ends_with("_bytes");
                 let expected = if size { "a whole number, or a size such as 64MiB" } else { "a whole number" };
@@ -127,7 +129,6 @@ impl Tree {
             (Value::String(text), Value::Bool(_)) => {
                 Value::Bool(text.trim().parse().map_err(|_neither| bad("true or false".to_owned()))?)
             }
-            (Value::String(text), _) if text == "none" => Value::Null,
             _ => value.clone(),
         };
         // Nothing can be served with a limit or a timeout of zero; ports are part of addresses, not numbers.
@@ -137,7 +138,9 @@ impl Tree {
         if let Some(place) = self.values.pointer_mut(&pointer) {
             *place = typed;
         }
-        self.config = serde_json::from_value(self.values.clone()).map_err(|e| bad(e.to_string()))?;
+        let number = clears && default.is_number();
+        let why = |e: serde_json::Error| bad(if number { "a whole number".to_owned() } else { e.to_string() });
+        self.config = serde_json::from_value(self.values.clone()).map_err(why)?;
         Ok(())
     }
 }

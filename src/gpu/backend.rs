@@ -6,9 +6,9 @@ use super::device::{self, Program};
 use super::discover::Discovery;
 use super::error::GpuError;
 use super::executor::GpuJob;
-use super::pool::{DevicePool, PoolDevice, PoolSettings};
+use super::lane::one_line;
+use super::pool::{self, DevicePool, PoolDevice, PoolSettings};
 use super::prepare::Prepared;
-use super::queue::one_line;
 use crate::surface::{
     Backend, Control, DeviceFacts, DeviceStatus, Meshed, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, backend::one_atom,
@@ -42,7 +42,9 @@ impl GpuBackend {
             let build = Box::new(move || device::build(&adapter, program));
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
-        let pool = DevicePool::start(devices.collect(), settings)?;
+        // The program of 2010 knows no parts.
+        let spread_bricks = settings.spread_bricks.filter(|_| program == Program::Stages);
+        let pool = DevicePool::start(devices.collect(), &PoolSettings { spread_bricks, ..*settings })?;
         Ok(Self { name: program.name(), ..Self::over(pool, fallback) })
     }
 
@@ -50,6 +52,12 @@ impl GpuBackend {
     #[must_use]
     pub fn over(pool: DevicePool, fallback: Option<Box<dyn Backend>>) -> Self {
         Self { pool, name: Program::Stages.name(), fallback }
+    }
+
+    /// The pool of its devices.
+    #[must_use]
+    pub const fn pool(&self) -> &DevicePool {
+        &self.pool
     }
 
     fn job(
@@ -88,11 +96,7 @@ impl Backend for GpuBackend {
     fn describe(&self) -> String {
         let status = self.pool.status();
         let up: Vec<&str> = status.iter().filter(|d| d.down.is_none()).map(|d| d.name.as_str()).collect();
-        match up[..] {
-            [] => "no device is up".to_owned(),
-            [one] => one.to_owned(),
-            [..] => format!("{} devices: {}", up.len(), up.join(", ")),
-        }
+        pool::describe(&up)
     }
 
     fn run(
@@ -107,7 +111,7 @@ impl Backend for GpuBackend {
         let error = match self.pool.run(&job) {
             Ok((finished, device)) => {
                 finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));
-                let served = Served { backend: self.name(), device: device.to_owned(), instead: None };
+                let served = Served { backend: self.name(), device, instead: None };
                 return Ok(Meshed { served: Some(served), ..finished.meshed });
             }
             Err(error) => error,

@@ -11,16 +11,18 @@ use wgpu::{Buffer, Device, Queue};
 
 use super::error::GpuError;
 use super::executor::{Executor, Finished, GpuJob};
-use super::flight::values;
 use super::health::{Complaint, Health};
-use super::landing::{Landing, Landings};
+use super::landing::Landings;
 use super::meter::Meter;
 use super::pipelines::{N_STAGES, Pipelines, Variant};
-use super::record::{Clock, Recording};
+use super::record::Clock;
+use super::share::Share;
 use super::workspace::{Needs, OutputRows, ROW, Workspace};
 use crate::surface::SurfaceError;
 use crate::surface::chunks::{Chunk, ChunkLimits};
+use crate::surface::lattice::LatticeAtom;
 use crate::surface::layout::{self, Params};
+use crate::surface::parts::Part;
 
 /// Storage buffers that a stage binds at most.
 const MOST_BINDINGS: u32 = 14;
@@ -67,8 +69,8 @@ pub struct Engine {
     pub(super) budget: Budget,
     /// Bytes of the largest binding.
     binding: u64,
-    pipelines: Pipelines,
-    clock: Option<Clock>,
+    pub(super) pipelines: Pipelines,
+    pub(super) clock: Option<Clock>,
     cases: Buffer,
     /// Idle ones.
     pub(super) workspaces: Vec<Workspace>,
@@ -168,20 +170,21 @@ impl Engine {
         }
     }
 
-    /// The chunks of a job.
-    pub(super) fn chunks(&self, job: &GpuJob) -> Result<Vec<Chunk>, GpuError> {
+    /// The chunks of a job, or of a part of it.
+    pub(super) fn chunks(&self, job: &GpuJob, part: Option<&Part>) -> Result<Vec<Chunk>, GpuError> {
         let plan = &job.prepared.plan;
         let limits = ChunkLimits { bricks: self.budget.chunk_bricks, candidates: self.binding / 4 };
-        plan.chunks(limits).ok_or_else(|| {
+        plan.chunks_of(part.map_or(0..plan.tiles.len(), |part| part.tiles.clone()), limits).ok_or_else(|| {
             let tile = plan.candidates.iter().max().map_or(0, |n| 4 * n) + 512 * 4 * layout::SAMPLES;
             out_of_memory(job, tile, self.budget.chunk_bricks * 4 * layout::SAMPLES)
         })
     }
 
-    /// Fills a workspace with a job.
+    /// Fills a workspace with a job, or with what a part of it needs.
     pub(super) fn load<'a>(
         &mut self,
         job: &'a GpuJob,
+        part: Option<&Part>,
         chunks: Vec<Chunk>,
         rows: OutputRows,
     ) -> Result<Loaded<'a>, GpuError> {
@@ -199,18 +202,24 @@ impl Engine {
             self.workspaces.clear();
             return Err(e);
         }
-        let write = |name: &str, bytes: &[u8]| {
+        let variant = Variant { kernel: params.kernel, nearest: params.atom_ids };
+        let params = plan.params(lattice, params);
+        let write = |name: &str, at: usize, bytes: &[u8]| {
             if !bytes.is_empty() {
-                self.queue.write_buffer(workspace.buffer(name), 0, bytes);
+                self.queue.write_buffer(workspace.buffer(name), at as u64, bytes);
             }
         };
-        write("atoms", bytemuck::cast_slice(&lattice.atoms));
-        write("reaches", bytemuck::cast_slice(&plan.reaches));
-        write("tiles", bytemuck::cast_slice(&plan.tiles));
-        write("bricks", bytemuck::cast_slice(&plan.bricks));
-        write("first_atoms", bytemuck::cast_slice(&plan.first_atoms));
-        let variant = Variant { kernel: params.kernel, nearest: params.atom_ids };
-        Ok(Loaded { job, workspace, chunks, params: plan.params(lattice, params), variant })
+        // The last brick ends with the last atom.
+        let whole = || std::iter::once(0..plan.first_atoms.last().copied().unwrap_or_default()).collect();
+        for run in part.map_or_else(whole, |part| plan.atoms_near(part, [params.back, params.ahead])) {
+            let run = run.start as usize..run.end as usize;
+            write("atoms", run.start * size_of::<LatticeAtom>(), bytemuck::cast_slice(&lattice.atoms[run.clone()]));
+            write("reaches", run.start * 4, bytemuck::cast_slice(&plan.reaches[run]));
+        }
+        write("tiles", 0, bytemuck::cast_slice(&plan.tiles));
+        write("bricks", 0, bytemuck::cast_slice(&plan.bricks));
+        write("first_atoms", 0, bytemuck::cast_slice(&plan.first_atoms));
+        Ok(Loaded { job, workspace, chunks, params, variant })
     }
 
     /// A workspace that meets `needs`: the idle one that lacks the least.
@@ -253,52 +262,6 @@ impl Engine {
         }
     }
 
-    /// Submits, waits, and returns the landings' first bytes.
-    pub(super) fn fly(
-        &self,
-        recording: Recording<'_>,
-        landings: Vec<(Landing, u64)>,
-    ) -> Result<Vec<Arc<Landing>>, GpuError> {
-        let timed = recording.timed();
-        let index = self.queue.submit([recording.encoder.finish()]);
-        for (landing, bytes) in &landings {
-            landing.request(*bytes).map_err(GpuError::Failed)?;
-        }
-        let waited = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });
-        if waited.is_err() {
-            // A loss is told by a callback, which a device that cannot wait any more has not run yet.
-            _ = self.device.poll(wgpu::PollType::Poll);
-        }
-        self.healthy()?;
-        waited.map_err(|e| GpuError::Failed(e.to_string()))?;
-        let landed: Vec<_> = landings
-            .into_iter()
-            .map(|(landing, bytes)| landing.look(bytes).map_err(GpuError::Failed))
-            .collect::<Result<_, _>>()?;
-        self.meter.count_submission();
-        if let (Some(clock), Some(landing), Some(stages)) = (&self.clock, landed.first(), timed) {
-            let ticks: &[u64] = values((**landing).as_ref(), 0, 2 * N_STAGES as u64).map_err(GpuError::Failed)?;
-            self.meter.add_span(&ticks[2 * stages.start..2 * stages.end], f64::from(clock.period));
-        }
-        Ok(landed)
-    }
-
-    pub(super) fn recording(&self) -> Recording<'_> {
-        Recording::new(&self.device, &self.pipelines, self.clock.as_ref())
-    }
-
-    /// The times of the stages from `first` to `last` in a landing.
-    pub(super) fn times(&self, landing: &Landing, stages: std::ops::Range<usize>) -> Result<Times, GpuError> {
-        let mut times = [0; N_STAGES];
-        if let Some(clock) = &self.clock {
-            let ticks: &[u64] = values(landing.as_ref(), 0, 2 * N_STAGES as u64).map_err(GpuError::Failed)?;
-            for s in stages {
-                times[s] = scaled(ticks[2 * s + 1].saturating_sub(ticks[2 * s]), f64::from(clock.period));
-            }
-        }
-        Ok(times)
-    }
-
     /// Writes a row of parameters.
     pub(super) fn write_params(&self, workspace: &Workspace, row: u64, params: &Params) {
         self.queue.write_buffer(workspace.buffer("params"), row * ROW, bytemuck::bytes_of(params));
@@ -310,9 +273,9 @@ impl Executor for Engine {
         let mut results: Vec<Option<Result<Finished, GpuError>>> = jobs.iter().map(|_| None).collect();
         let mut small = Vec::new();
         for (i, job) in jobs.iter().enumerate() {
-            let loaded = check(job).and_then(|()| self.chunks(job)).and_then(|chunks| {
+            let loaded = check(job).and_then(|()| self.chunks(job, None)).and_then(|chunks| {
                 let estimate = self.small_rows(job, &chunks);
-                let loaded = self.load(job, chunks, estimate.unwrap_or_else(Self::no_rows))?;
+                let loaded = self.load(job, None, chunks, estimate.unwrap_or_else(Self::no_rows))?;
                 Ok((loaded, estimate))
             });
             match loaded {
@@ -327,6 +290,10 @@ impl Executor for Engine {
         }
         let unanswered = || Err(GpuError::Failed("a job without an answer".to_owned()));
         results.into_iter().map(|result| result.unwrap_or_else(unanswered)).collect()
+    }
+
+    fn part(&mut self, job: &GpuJob, share: &Share) -> Result<Finished, GpuError> {
+        self.make_part(job, share)
     }
 
     fn held_bytes(&self) -> u64 {

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use super::error::GpuError;
 use super::prepare::Prepared;
+use super::share::Share;
 use crate::surface::{CancelToken, Meshed, Stage};
 
 /// A job as a device's thread sees it.
@@ -32,6 +33,16 @@ pub struct Finished {
 pub trait Executor: Send {
     /// Runs `jobs`, as few submissions as it can, and answers each: one result per job, in order.
     fn run(&mut self, jobs: &[GpuJob]) -> Vec<Result<Finished, GpuError>>;
+
+    /// Runs one part of a job that several devices make. The mesh has the part's rows, its triangles the numbers that
+    /// vertices have in the whole. Whatever becomes of it, the others are told through `share`.
+    ///
+    /// # Errors
+    /// As [`Self::run`]; [`GpuError::Failed`] where the program knows no parts.
+    fn part(&mut self, job: &GpuJob, share: &Share) -> Result<Finished, GpuError> {
+        let _ = (job, share);
+        Err(GpuError::Failed("this program makes meshes whole".to_owned()))
+    }
 
     /// Bytes of device memory that it holds now: in use and pooled.
     fn held_bytes(&self) -> u64;

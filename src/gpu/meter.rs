@@ -6,7 +6,7 @@ use std::cell::Cell;
 /// Counters since the last look.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Metered {
-    /// Submissions that came back.
+    /// Submissions that were made.
     pub submissions: u64,
     /// Device time from first to last stage of each submission, summed, ns; 0 where the device has no timestamps. Stages
     /// on a device may overlap, and gaps between them count here.

@@ -27,11 +27,11 @@ impl Bench {
     /// # Errors
     /// [`GpuError`] where it does not fit.
     pub fn new(mut engine: Engine, job: &GpuJob, vertices: u32, triangles: u32) -> Result<Self, GpuError> {
-        let chunks = engine.chunks(job)?;
+        let chunks = engine.chunks(job, None)?;
         let [chunk] = &chunks[..] else { return Err(GpuError::Failed("more than one chunk".to_owned())) };
         let chunk = chunk.clone();
         let rows = OutputRows { vertices: vertices.into(), triangles: triangles.into(), params: 1 };
-        let loaded = engine.load(job, chunks, rows)?;
+        let loaded = engine.load(job, None, chunks, rows)?;
         let params = Params {
             piece_bricks: loaded.params.n_bricks,
             vertex_capacity: vertices,

@@ -4,9 +4,10 @@ use super::assemble;
 use super::engine::{Loaded, Times};
 use super::error::GpuError;
 use super::executor::Finished;
-use super::flight::{Arrived, TALLY_AT, values};
+use super::flight::{Arrived, Places, TALLY_AT, values};
 use super::landing::Landing;
 use super::pipelines::{N_STAGES, STAGES};
+use super::submit::Flight;
 use crate::surface::chunks::Chunk;
 use crate::surface::layout::{self, GROUP, Tally};
 use crate::surface::plan::check_totals;
@@ -23,6 +24,16 @@ pub(super) struct Counted {
     pub(super) n_triangles: u64,
 }
 
+/// Output on its way.
+pub(super) struct Sent {
+    pub(super) flight: Flight,
+    pub(super) places: Places,
+    /// Vertices and triangles.
+    pub(super) rows: [u64; 2],
+    /// Whether it has vertices, and triangles.
+    pub(super) columns: [bool; 2],
+}
+
 /// A job that is being put together.
 pub(super) struct Progress<'a> {
     pub(super) loaded: Loaded<'a>,
@@ -31,6 +42,8 @@ pub(super) struct Progress<'a> {
     pub(super) flat: bool,
     pub(super) vertices: Vec<Arrived>,
     pub(super) triangles: Vec<Arrived>,
+    /// The output that was submitted last and has not been looked at.
+    pub(super) sent: Option<Sent>,
     parts: Vec<(usize, usize)>,
     surface_bricks: u64,
     /// Vertices and triangles so far.
@@ -51,6 +64,7 @@ impl<'a> Progress<'a> {
             flat: false,
             vertices: Vec::new(),
             triangles: Vec::new(),
+            sent: None,
             parts: Vec::new(),
             surface_bricks: 0,
             total: [0; 2],
@@ -60,8 +74,7 @@ impl<'a> Progress<'a> {
     /// Reads what chunk number `chunk` counted, with its groups at `at` of the landing, and adds it up.
     ///
     /// # Errors
-    /// [`GpuError::Failed`] where the counters contradict each other; [`GpuError::Surface`] where the mesh exceeds
-    /// a limit.
+    /// [`GpuError::Failed`] where the counters contradict each other.
     pub(super) fn count(&mut self, landing: &Landing, chunk: usize, at: u64) -> Result<Counted, GpuError> {
         let chunk: &Chunk = &self.loaded.chunks[chunk];
         let tally = tally(landing)?;
@@ -86,13 +99,12 @@ impl<'a> Progress<'a> {
             return Err(GpuError::Failed(format!("the scan ends at {end:?}, the groups at {:?}", self.total)));
         }
         let [n_vertices, n_triangles] = [self.total[0] - first[0], self.total[1] - first[1]];
-        // The last chunk tells whether there is a surface at all.
-        self.within_limits(1)?;
         Ok(Counted { groups, first, n_vertices, n_triangles })
     }
 
-    /// Refuses what the limits do not allow; `least` triangles are taken as there.
-    fn within_limits(&self, least: u64) -> Result<(), GpuError> {
+    /// Refuses what the limits do not allow; `least` triangles are taken as there: the last chunk tells whether there is
+    /// a surface at all.
+    pub(super) fn within_limits(&self, least: u64) -> Result<(), GpuError> {
         let job = &self.loaded.job.prepared;
         check_totals(&job.lattice, &job.params, &job.limits, self.total[0], self.total[1].max(least))?;
         Ok(())
@@ -117,14 +129,23 @@ impl<'a> Progress<'a> {
     /// # Errors
     /// [`GpuError::Failed`] where a column is not where it should be.
     pub(super) fn finish(&mut self) -> Result<Finished, GpuError> {
+        let mut finished = self.assemble()?;
+        if self.flat {
+            finished.meshed.mesh.fill_flat_normals();
+        }
+        Ok(finished)
+    }
+
+    /// The mesh as the device made it, or its part: where the gradient vanishes, normals are zero.
+    ///
+    /// # Errors
+    /// As [`Self::finish`].
+    pub(super) fn assemble(&mut self) -> Result<Finished, GpuError> {
         let (plan, lattice) = (&self.loaded.job.prepared.plan, &self.loaded.job.prepared.lattice);
         let nearest = self.loaded.variant.nearest;
         let parts = std::mem::take(&mut self.parts);
-        let mut mesh = assemble::mesh(&self.vertices, &self.triangles, lattice.centre(), nearest, parts)
+        let mesh = assemble::mesh(&self.vertices, &self.triangles, lattice.centre(), nearest, parts)
             .map_err(GpuError::Failed)?;
-        if self.flat {
-            mesh.fill_flat_normals();
-        }
         let grid = GridStats {
             bricks: plan.occupied,
             surface_bricks: self.surface_bricks,

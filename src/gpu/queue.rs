@@ -1,68 +1,18 @@
 //! What waits for which device, behind one lock: a bounded queue a device, and how each device is doing.
 
 use std::collections::VecDeque;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::error::GpuError;
 use super::executor::{Finished, GpuJob};
+use super::lane::{Entry, Health, Lane, answer, dismiss, why_down};
+use super::share::Share;
 use crate::surface::{DeviceStatus, SurfaceError};
 
 /// What comes back of a job.
 pub(super) type Answer = Result<Finished, GpuError>;
-
-/// A job that waits.
-pub(super) struct Entry {
-    id: u64,
-    pub(super) job: GpuJob,
-    /// It has failed before, and must not take others with it.
-    alone: bool,
-    reply: SyncSender<Answer>,
-}
-
-impl Entry {
-    fn shares(&self) -> bool {
-        !self.alone && self.job.prepared.is_small()
-    }
-
-    /// What it adds to a device's load: a large job is many times the work of a small one.
-    fn weight(&self) -> u64 {
-        if self.job.prepared.is_small() { 1 } else { 16 }
-    }
-
-    /// Why it need not run any more.
-    fn over(&self) -> Option<GpuError> {
-        let late = self.job.deadline.is_some_and(|deadline| deadline <= Instant::now());
-        let cancelled = self.job.cancel.is_cancelled().then_some(GpuError::Surface(SurfaceError::Cancelled));
-        cancelled.or(late.then_some(GpuError::Deadline))
-    }
-}
-
-/// How a device stands.
-enum Health {
-    /// Its thread builds it for the first time.
-    Starting,
-    Up,
-    Down(String),
-}
-
-struct Lane {
-    number: usize,
-    name: String,
-    waiting: VecDeque<Entry>,
-    /// Jobs that run now, and their weight.
-    running: usize,
-    weight: u64,
-    health: Health,
-    /// Rebuilds since the last finished job.
-    streak: usize,
-    finished: u64,
-    failed: u64,
-    rebuilds: u64,
-    shared: u64,
-    held_bytes: u64,
-}
 
 struct State {
     lanes: Vec<Lane>,
@@ -100,20 +50,7 @@ pub(super) enum NotPlaced {
 
 impl Queues {
     pub(super) fn new(devices: &[(usize, String)], limit: usize, batch: usize) -> Self {
-        let lane = |(number, name): &(usize, String)| Lane {
-            number: *number,
-            name: name.clone(),
-            waiting: VecDeque::with_capacity(limit),
-            running: 0,
-            weight: 0,
-            health: Health::Starting,
-            streak: 0,
-            finished: 0,
-            failed: 0,
-            rebuilds: 0,
-            shared: 0,
-            held_bytes: 0,
-        };
+        let lane = |(number, name): &(usize, String)| Lane::new(*number, name.clone(), limit);
         Self {
             state: Mutex::new(State { lanes: devices.iter().map(lane).collect(), closed: false, next_id: 0 }),
             moved: Condvar::new(),
@@ -146,12 +83,45 @@ impl Queues {
         let (reply, answer) = sync_channel(1);
         let id = *next_id;
         *next_id += 1;
-        let entry = Entry { id, job: job.clone(), alone: tries.iter().any(|t| *t > 0), reply };
+        let entry = Entry { id, job: job.clone(), share: None, alone: tries.iter().any(|t| *t > 0), reply };
         lane.weight += entry.weight();
         lane.waiting.push_back(entry);
         drop(state);
         self.filled[n].notify_one();
         Ok(Place { lane: n, id, answer })
+    }
+
+    /// Devices that are up and have nothing large to do, least loaded first.
+    pub(super) fn free(&self) -> Vec<usize> {
+        let state = self.lock();
+        let mut free: Vec<usize> = (0..state.lanes.len()).filter(|&n| state.lanes[n].is_free()).collect();
+        free.sort_by_key(|&n| (state.lanes[n].weight, state.lanes[n].finished));
+        free
+    }
+
+    /// Gives the parts of `job` to as many devices, all at once: so the parts of two jobs wait in the same order on every
+    /// device, and neither waits for the other's. `None` where one of the devices is not free any more.
+    pub(super) fn place_parts(&self, job: &GpuJob, parts: Vec<(usize, Share)>) -> Option<Vec<Place>> {
+        let mut state = self.lock();
+        let State { lanes, next_id, .. } = &mut *state;
+        if !parts.iter().all(|(n, _)| lanes[*n].is_free() && lanes[*n].waiting.len() < self.limit) {
+            return None;
+        }
+        let mut places = Vec::with_capacity(parts.len());
+        for (n, share) in parts {
+            let (reply, answer) = sync_channel(1);
+            let id = *next_id;
+            *next_id += 1;
+            let entry = Entry { id, job: job.clone(), share: Some(share), alone: true, reply };
+            lanes[n].weight += entry.weight();
+            lanes[n].waiting.push_back(entry);
+            places.push(Place { lane: n, id, answer });
+        }
+        drop(state);
+        for place in &places {
+            self.filled[place.lane].notify_one();
+        }
+        Some(places)
     }
 
     /// Waits until something has moved, for `most` at most.
@@ -230,7 +200,10 @@ impl Queues {
             for (job, answer) in jobs.iter().zip(&answers) {
                 lane.weight -= job.weight();
                 match answer {
-                    Ok(_) => lane.finished += 1,
+                    Ok(_) => {
+                        lane.finished += 1;
+                        lane.spread += u64::from(job.share.is_some());
+                    }
                     Err(error) if error.is_the_devices() => lane.failed += 1,
                     // The job's own fault was found out by a device that works.
                     Err(_) => {}
@@ -322,35 +295,7 @@ impl Queues {
 
     /// How every device is doing.
     pub(super) fn status(&self) -> Vec<DeviceStatus> {
-        let status = |lane: &Lane| DeviceStatus {
-            number: lane.number,
-            name: lane.name.clone(),
-            down: match &lane.health {
-                Health::Starting => Some("it is being built".to_owned()),
-                Health::Up => None,
-                Health::Down(why) => Some(why.clone()),
-            },
-            waiting: lane.waiting.len() + lane.running,
-            finished: lane.finished,
-            failed: lane.failed,
-            rebuilds: lane.rebuilds,
-            shared: lane.shared,
-            held_bytes: lane.held_bytes,
-        };
-        self.lock().lanes.iter().map(status).collect()
-    }
-}
-
-impl Lane {
-    /// Marks it down, unless it is, and hands out what waits.
-    fn fell(&mut self, why: &str) -> VecDeque<Entry> {
-        if !matches!(self.health, Health::Down(_)) {
-            self.health = Health::Down(one_line(why));
-        }
-        self.held_bytes = 0;
-        let left = std::mem::take(&mut self.waiting);
-        self.weight -= left.iter().map(Entry::weight).sum::<u64>();
-        left
+        self.lock().lanes.iter().map(Lane::status).collect()
     }
 }
 
@@ -360,30 +305,5 @@ pub(super) fn shows_health(answer: &Answer) -> bool {
         Ok(_) => true,
         Err(GpuError::Surface(error)) => *error != SurfaceError::Cancelled,
         Err(_) => false,
-    }
-}
-
-fn why_down(lanes: &[Lane]) -> String {
-    let why = |lane: &Lane| match &lane.health {
-        Health::Down(why) => Some(format!("{} {}: {why}", lane.number, lane.name)),
-        Health::Starting | Health::Up => None,
-    };
-    lanes.iter().filter_map(why).collect::<Vec<_>>().join("; ")
-}
-
-/// Drivers and validation speak in paragraphs; reasons stand on one line of a banner, an error or a header.
-pub(super) fn one_line(text: &str) -> String {
-    text.split_whitespace().collect::<Vec<_>>().join(" ")
-}
-
-fn answer(entry: Entry, answer: Answer) {
-    let Entry { reply, .. } = entry;
-    // Whoever has left does not want to know.
-    drop(reply.send(answer));
-}
-
-fn dismiss(left: VecDeque<Entry>, why: &str) {
-    for entry in left {
-        answer(entry, Err(GpuError::NoDevice(why.to_owned())));
     }
 }

@@ -71,6 +71,11 @@ impl<'a> Recording<'a> {
         Some(self.timed.iter().map(of).min()?..self.timed.iter().map(of).max()? + 1)
     }
 
+    /// Has the times of `stages` read here that ran in the submission before.
+    pub(super) fn timed_before(&mut self, stages: &[Stage]) {
+        self.timed.extend(stages);
+    }
+
     /// One stage for several jobs, or for several pieces of one with `after` recorded behind each. Dispatches without
     /// anything between them overlap on the device as far as their buffers allow.
     pub(super) fn stage(&mut self, stage: Stage, dispatches: &[Dispatch<'_>]) {

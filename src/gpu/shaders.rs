@@ -120,6 +120,7 @@ mod tests {
                 vertex_capacity,
                 triangle_capacity,
                 zero,
+                base_vertex,
                 pad
             ),
             host!("Record", Record, crossing, layers, near),

@@ -6,7 +6,8 @@ use std::time::Duration;
 
 use super::error::GpuError;
 use super::executor::{Executor, GpuJob};
-use super::queue::{Answer, Entry, Queues, shows_health};
+use super::lane::Entry;
+use super::queue::{Answer, Queues, shows_health};
 
 /// Makes what runs jobs on one device: at the start, and again after a failure.
 pub type Build = Box<dyn Fn() -> Result<Box<dyn Executor>, GpuError> + Send + Sync>;
@@ -84,7 +85,11 @@ fn built(build: &Build) -> Result<Box<dyn Executor>, GpuError> {
 fn attempt(executor: &mut dyn Executor, entries: &[Entry]) -> Vec<Answer> {
     let jobs: Vec<GpuJob> = entries.iter().map(|entry| entry.job.clone()).collect();
     let all = |error: &GpuError| jobs.iter().map(|_| Err(error.clone())).collect();
-    match catch_unwind(AssertUnwindSafe(|| executor.run(&jobs))) {
+    let run = || match entries {
+        [Entry { job, share: Some(share), .. }] => vec![executor.part(job, share)],
+        _ => executor.run(&jobs),
+    };
+    match catch_unwind(AssertUnwindSafe(run)) {
         Ok(answers) if answers.len() == jobs.len() => answers,
         Ok(answers) => all(&GpuError::Failed(format!("{} answers to {} jobs", answers.len(), jobs.len()))),
         Err(payload) => all(&panicked(&*payload)),

@@ -5,7 +5,9 @@ use std::sync::{Mutex, PoisonError};
 use metrics::{counter, gauge};
 
 use crate::surface::DeviceStatus;
-use crate::telemetry::{DEVICE_HELD, DEVICE_JOBS, DEVICE_REBUILDS, DEVICE_SHARED, DEVICE_UP, DEVICE_WAITING};
+use crate::telemetry::{
+    DEVICE_HELD, DEVICE_JOBS, DEVICE_REBUILDS, DEVICE_SHARED, DEVICE_SPREAD, DEVICE_UP, DEVICE_WAITING,
+};
 
 /// What the log knows of each device: its rebuilds, and whether it was up.
 #[derive(Debug, Default)]
@@ -25,6 +27,7 @@ impl Watch {
             gauge!(DEVICE_WAITING, "device" => number.clone()).set(device.waiting as f64);
             counter!(DEVICE_REBUILDS, "device" => number.clone()).absolute(device.rebuilds);
             counter!(DEVICE_SHARED, "device" => number.clone()).absolute(device.shared);
+            counter!(DEVICE_SPREAD, "device" => number.clone()).absolute(device.spread);
             for (outcome, count) in [("finished", device.finished), ("failed", device.failed)] {
                 counter!(DEVICE_JOBS, "device" => number.clone(), "outcome" => outcome).absolute(count);
             }

@@ -13,7 +13,7 @@ use super::{Failure, Finished, Outcome};
 use crate::pipeline::{self, Choice, JobError, Report};
 use crate::structure::referee::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
-use crate::surface::{Mesh, SurfaceError};
+use crate::surface::{Column, Mesh, SurfaceError};
 use crate::telemetry::{JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, VOXELS};
 
 /// Largest text of which the referee explains a refusal, bytes: it takes some 10 ms for so much, and 40 in the worst case.
@@ -125,7 +125,7 @@ fn count(report: &Report) {
 
 /// Bytes that a mesh holds.
 fn bytes_of(mesh: &Mesh) -> u64 {
-    let optional = mesh.atom_ids.as_ref().map_or(0, |c| c.len()) + mesh.colors.as_ref().map_or(0, |c| c.len());
+    let optional = mesh.atom_ids.as_ref().map_or(0, Column::len) + mesh.colors.as_ref().map_or(0, Column::len);
     Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64) + 4 * optional as u64
 }
 

@@ -127,7 +127,12 @@ pub fn run(
     }
     let measures = match meshed.measures.take().filter(|taken| taken.proof == job.proof) {
         Some(taken) => taken,
-        None => clock.time(Stage::Measure.name(), || Measures::of(&meshed.mesh, job.proof, &control))?,
+        None => clock.time(Stage::Measure.name(), || {
+            // Triangles ask for positions anywhere; normals stay where several devices put them.
+            meshed.mesh.positions.settle();
+            meshed.mesh.triangles.settle();
+            Measures::of(&meshed.mesh, job.proof, &control)
+        })?,
     };
     let Meshed { mesh, grid, served, .. } = meshed;
     let packing = packing(job, &spheres);

@@ -90,7 +90,11 @@ pub trait Backend: Send + Sync {
         control: &Control<'_>,
         sink: &dyn MeshSink,
     ) -> Result<Poured, SurfaceError> {
-        let Meshed { mesh, grid, measures, served } = self.run(spheres, params, limits, control)?;
+        let Meshed { mut mesh, grid, measures, served } = self.run(spheres, params, limits, control)?;
+        // It is handed on in one part.
+        mesh.positions.settle();
+        mesh.normals.settle();
+        mesh.triangles.settle();
         let measures = match measures {
             Some(measures) => measures,
             None => control.span(Stage::Measure, || Measures::of(&mesh, Proof::Checksum, control))?,

@@ -1,6 +1,8 @@
 //! A plan's bricks cut into chunks that fit a device. A chunk is a run of tiles, and the bricks behind it whose samples
 //! its cells need: those are computed again where they belong.
 
+use std::ops::Range;
+
 use super::lattice::to_u32;
 use super::layout::{NONE, Params};
 use super::plan::Plan;
@@ -74,14 +76,20 @@ impl Plan {
     /// Cuts the bricks into chunks. `None` where a single tile is more than the limits allow.
     #[must_use]
     pub fn chunks(&self, limits: ChunkLimits) -> Option<Vec<Chunk>> {
+        self.chunks_of(0..self.tiles.len(), limits)
+    }
+
+    /// Likewise, of a run of tiles.
+    #[must_use]
+    pub fn chunks_of(&self, tiles: Range<usize>, limits: ChunkLimits) -> Option<Vec<Chunk>> {
         let mut chunks = Vec::new();
-        let mut from = 0;
-        while from < self.tiles.len() {
+        let mut from = tiles.start;
+        while from < tiles.end {
             // As many tiles as fit by themselves, then fewer until the borrowed bricks fit too.
             let mut to = from;
             let (mut bricks, mut candidates) = (0, 0);
-            while to < self.tiles.len() {
-                bricks += u64::from(self.tile_end(to) - self.tiles[to].base);
+            while to < tiles.end {
+                bricks += u64::from(self.tile_start(to + 1) - self.tiles[to].base);
                 candidates += self.candidates[to];
                 if bricks > limits.bricks || candidates > limits.candidates {
                     break;
@@ -104,28 +112,34 @@ impl Plan {
         Some(chunks)
     }
 
-    /// The brick behind the last one of tile `t`.
-    fn tile_end(&self, t: usize) -> u32 {
-        self.tiles.get(t + 1).map_or(to_u32(self.bricks.len()), |next| next.base)
+    /// The first brick of tile `t`; behind the last tile, the number of bricks.
+    pub(super) fn tile_start(&self, t: usize) -> u32 {
+        self.tiles.get(t).map_or(to_u32(self.bricks.len()), |tile| tile.base)
     }
 
     fn chunk(&self, from: usize, to: usize) -> Chunk {
-        let (first, end) = (self.tiles[from].base, self.tile_end(to - 1));
-        let mut halo = Vec::new();
-        if (end as usize) < self.bricks.len() {
-            for brick in &self.bricks[first as usize..end as usize] {
-                if [7, 7 << 3, 7 << 6].iter().any(|face| brick & face == *face) {
-                    halo.extend((1..8).filter_map(|n| self.neighbour(*brick, n)).filter(|&b| b >= end));
-                }
-            }
-            halo.sort_unstable();
-            halo.dedup();
-        }
+        let (first, end) = (self.tile_start(from), self.tile_start(to));
+        let halo = self.halo(first..end);
         let mut lenders: Vec<u32> = halo.iter().map(|&b| self.bricks[b as usize] >> 9).collect();
         lenders.dedup();
         let candidates = self.candidates[from..to].iter().sum::<u64>()
             + lenders.iter().map(|&t| self.candidates[t as usize]).sum::<u64>();
         Chunk { first_brick: first, n_own: end - first, halo, candidates }
+    }
+
+    /// Bricks behind a run of whole tiles' bricks that hold samples of its cells, ascending.
+    pub(super) fn halo(&self, bricks: Range<u32>) -> Vec<u32> {
+        let mut halo = Vec::new();
+        if (bricks.end as usize) < self.bricks.len() {
+            for brick in &self.bricks[bricks.start as usize..bricks.end as usize] {
+                if [7, 7 << 3, 7 << 6].iter().any(|face| brick & face == *face) {
+                    halo.extend((1..8).filter_map(|n| self.neighbour(*brick, n)).filter(|&b| b >= bricks.end));
+                }
+            }
+            halo.sort_unstable();
+            halo.dedup();
+        }
+        halo
     }
 
     /// The neighbour towards +x (bit 0 of `n`), +y (1), +z (2) of a brick given as in [`Plan::bricks`].

@@ -5,10 +5,11 @@
 
 use std::fmt;
 use std::ops::{Deref, DerefMut, Range};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use bytemuck::Pod;
 use memmap2::MmapMut;
+use rayon::prelude::*;
 
 /// From this many bytes on, a column is mapped.
 const MAP_FROM: usize = 64 << 10;
@@ -16,16 +17,31 @@ const MAP_FROM: usize = 64 << 10;
 /// call instead of by a page fault each.
 const HUGE_FROM: usize = 4 << 20;
 
+/// Bytes that one task copies.
+const COPIED: usize = 4 << 20;
+
 /// Memory that somebody else owns and gives back when nobody looks at it any more.
 pub type Foreign = Arc<dyn AsRef<[u8]> + Send + Sync>;
 
-/// Rows of a mesh: behaves like a slice.
+/// Rows of a mesh: behaves like a slice. One that lies in several pieces is copied into one when it is first used as a
+/// slice; [`Self::pieces`] shows it as it lies.
 pub struct Column<T: Pod>(Storage<T>);
 
-enum Storage<T> {
+enum Storage<T: Pod> {
     Owned(Vec<T>),
-    Mapped { map: MmapMut, bytes: usize },
-    Foreign { owner: Foreign, bytes: Range<usize> },
+    Mapped {
+        map: MmapMut,
+        bytes: usize,
+    },
+    Foreign {
+        owner: Foreign,
+        bytes: Range<usize>,
+    },
+    /// In order, none of them pieced.
+    Pieces {
+        pieces: Vec<Column<T>>,
+        joined: OnceLock<Box<Column<T>>>,
+    },
 }
 
 impl<T: Pod> Column<T> {
@@ -57,6 +73,61 @@ impl<T: Pod> Column<T> {
         Some(Self(Storage::Foreign { owner, bytes }))
     }
 
+    /// The rows of several columns, one after the other, where they lie.
+    #[must_use]
+    pub fn pieced(columns: Vec<Self>) -> Self {
+        let mut pieces = Vec::with_capacity(columns.len());
+        for column in columns {
+            match column.0 {
+                Storage::Pieces { pieces: own, .. } => pieces.extend(own),
+                _ if column.is_empty() => {}
+                _ => pieces.push(column),
+            }
+        }
+        match pieces.len() {
+            0 => Self::default(),
+            1 => pieces.swap_remove(0),
+            _ => Self(Storage::Pieces { pieces, joined: OnceLock::new() }),
+        }
+    }
+
+    /// The rows as they lie, in order: one slice unless they lie in pieces.
+    pub fn pieces(&self) -> impl Iterator<Item = &[T]> {
+        let (whole, pieces): (Option<&[T]>, &[Self]) = match &self.0 {
+            Storage::Pieces { pieces, joined } if joined.get().is_none() => (None, pieces),
+            _ => (Some(self), &[]),
+        };
+        whole.into_iter().chain(pieces.iter().map(|piece| &**piece))
+    }
+
+    /// Copies pieces into one, and lets them go: what is used as a slice often need not be held twice.
+    pub fn settle(&mut self) {
+        if let Storage::Pieces { pieces, joined } = &mut self.0 {
+            let joined = joined.take().map(|column| *column);
+            *self = joined.unwrap_or_else(|| {
+                let n = pieces.iter().map(Self::len).sum();
+                Self::copied(n, pieces.iter().map(|piece| &**piece))
+            });
+        }
+    }
+
+    /// Whether there are no rows.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Number of rows; joins no pieces.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        match &self.0 {
+            Storage::Owned(rows) => rows.len(),
+            Storage::Mapped { bytes, .. } => bytes / size_of::<T>(),
+            Storage::Foreign { bytes, .. } => bytes.len() / size_of::<T>(),
+            Storage::Pieces { pieces, .. } => pieces.iter().map(Self::len).sum(),
+        }
+    }
+
     /// The rows as a vector, to add or remove some. Copies a column that is none yet.
     pub fn edit(&mut self) -> &mut Vec<T> {
         if !matches!(self.0, Storage::Owned(_)) {
@@ -64,8 +135,26 @@ impl<T: Pod> Column<T> {
         }
         match &mut self.0 {
             Storage::Owned(rows) => rows,
-            Storage::Mapped { .. } | Storage::Foreign { .. } => unreachable!("owned by now"),
+            _ => unreachable!("owned by now"),
         }
+    }
+
+    /// A copy in one piece.
+    fn copied<'a>(n: usize, pieces: impl Iterator<Item = &'a [T]>) -> Self
+    where
+        T: 'a,
+    {
+        let mut copy = Self::zeroed(n);
+        let mut rest: &mut [u8] = bytemuck::cast_slice_mut(&mut copy[..]);
+        let mut copies = Vec::new();
+        for piece in pieces {
+            let piece: &[u8] = bytemuck::cast_slice(piece);
+            let (target, tail) = std::mem::take(&mut rest).split_at_mut(piece.len());
+            copies.extend(target.chunks_mut(COPIED).zip(piece.chunks(COPIED)));
+            rest = tail;
+        }
+        copies.into_par_iter().for_each(|(target, source)| target.copy_from_slice(source));
+        copy
     }
 }
 
@@ -79,20 +168,24 @@ impl<T: Pod> Deref for Column<T> {
             Storage::Mapped { map, bytes } => bytemuck::cast_slice(&map[..*bytes]),
             // Checked when the column was made.
             Storage::Foreign { owner, bytes } => bytemuck::cast_slice(&(**owner).as_ref()[bytes.clone()]),
+            Storage::Pieces { pieces, joined } => {
+                let rows = || pieces.iter().map(|piece| &**piece);
+                joined.get_or_init(|| Box::new(Self::copied(self.len(), rows())))
+            }
         }
     }
 }
 
 impl<T: Pod> DerefMut for Column<T> {
     fn deref_mut(&mut self) -> &mut [T] {
-        if matches!(self.0, Storage::Foreign { .. }) {
+        if matches!(self.0, Storage::Foreign { .. } | Storage::Pieces { .. }) {
             // What belongs to somebody else is only read: the first write makes a copy.
             *self = self.clone();
         }
         match &mut self.0 {
             Storage::Owned(rows) => rows,
             Storage::Mapped { map, bytes } => bytemuck::cast_slice_mut(&mut map[..*bytes]),
-            Storage::Foreign { .. } => unreachable!("copied by now"),
+            Storage::Foreign { .. } | Storage::Pieces { .. } => unreachable!("copied by now"),
         }
     }
 }
@@ -117,9 +210,7 @@ impl<T: Pod> Default for Column<T> {
 
 impl<T: Pod> Clone for Column<T> {
     fn clone(&self) -> Self {
-        let mut copy = Self::zeroed(self.len());
-        copy.copy_from_slice(self);
-        copy
+        Self::copied(self.len(), self.pieces())
     }
 }
 
@@ -170,6 +261,30 @@ mod tests {
         for bad in [1..5, 0..6, 8..20] {
             assert!(Column::<u32>::foreign(owner.clone(), bad).is_none());
         }
+    }
+
+    #[test]
+    fn a_pieced_column_is_shown_as_it_lies_and_joined_when_used_as_a_slice() {
+        let of = |rows: &[u32]| Column::from(rows.to_vec());
+        let pieced = || Column::pieced(vec![of(&[1, 2]), of(&[]), Column::pieced(vec![of(&[3]), of(&[4, 5])])]);
+        let column = pieced();
+        assert_eq!(column.pieces().collect::<Vec<_>>(), [&[1, 2][..], &[3], &[4, 5]]);
+        assert_eq!((column.len(), column.clone().pieces().count()), (5, 1));
+        assert_eq!(column.pieces().count(), 3, "a copy leaves it as it is");
+        assert_eq!((column[3], column.len()), (4, 5));
+        assert_eq!(column.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
+        let mut written = pieced();
+        written[4] = 9;
+        assert_eq!(written.to_vec(), [1, 2, 3, 4, 9]);
+        let mut settled = pieced();
+        settled.settle();
+        assert_eq!(settled.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
+        assert!(matches!(settled.0, Storage::Owned(_)));
+        let mut longer = pieced();
+        longer.edit().push(6);
+        assert_eq!(longer.len(), 6);
+        assert_eq!(Column::pieced(vec![of(&[]), of(&[7])]).pieces().collect::<Vec<_>>(), [[7]]);
+        assert_eq!(Column::<u32>::pieced(Vec::new()).len(), 0);
     }
 
     #[test]

@@ -76,8 +76,10 @@ pub struct Params {
     pub triangle_capacity: u32,
     /// 0, which the shaders' compiler must not know.
     pub zero: u32,
+    /// Vertices before the first that the device's own numbers count: those of other devices' parts.
+    pub base_vertex: u32,
     /// Unused.
-    pub pad: [u32; 2],
+    pub pad: u32,
 }
 
 /// A tile: 8 × 8 × 8 bricks, of which those with a set bit exist.

@@ -20,6 +20,7 @@ mod marks;
 pub mod measure;
 pub mod mesh;
 pub mod params;
+pub mod parts;
 pub mod plan;
 pub mod reference;
 mod simd;

@@ -129,7 +129,7 @@ impl Executor for Fake {
 }
 
 /// No pause between rebuilds, so that tests need not wait for it.
-pub const SETTINGS: PoolSettings = PoolSettings { queue: 64, batch: 16, pause: Duration::ZERO };
+pub const SETTINGS: PoolSettings = PoolSettings { queue: 64, batch: 16, pause: Duration::ZERO, spread_bricks: None };
 
 /// The rigs as devices of a pool.
 pub fn devices(rigs: &[Arc<Rig>]) -> Vec<PoolDevice> {

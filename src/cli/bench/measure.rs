@@ -15,9 +15,9 @@ use serde::Serialize;
 use super::floor::Work;
 
 /// A benchmark's machine is its own.
-const LIMITS: SurfaceLimits = SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30 };
+pub(super) const LIMITS: SurfaceLimits = SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30 };
 /// Runs before the measured ones.
-const WARM_UP: usize = 3;
+pub(super) const WARM_UP: usize = 3;
 
 /// Median and least of several values.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -234,7 +234,7 @@ fn stage_row(stage: Stage, ms: Vec<f64>, job: &Prepared, meshed: &Meshed, rates:
 }
 
 /// Every byte of a mesh, added up in words.
-fn sum_of_bytes(mesh: &Mesh) -> u64 {
+pub(super) fn sum_of_bytes(mesh: &Mesh) -> u64 {
     fn sum(bytes: &[u8]) -> u64 {
         let words = |part: &[u8]| {
             let (words, rest) = part.as_chunks::<8>();
@@ -243,10 +243,9 @@ fn sum_of_bytes(mesh: &Mesh) -> u64 {
         };
         bytes.par_chunks(1 << 20).map(words).reduce(|| 0, u64::wrapping_add)
     }
-    let floats = |column: &[[f32; 3]]| sum(bytemuck::cast_slice(column));
-    floats(&mesh.positions)
-        .wrapping_add(floats(&mesh.normals))
-        .wrapping_add(sum(bytemuck::cast_slice(&mesh.triangles[..])))
+    // Where they lie: a column in pieces need not be joined for this.
+    let floats = mesh.positions.pieces().chain(mesh.normals.pieces()).map(bytemuck::cast_slice);
+    floats.chain(mesh.triangles.pieces().map(bytemuck::cast_slice)).map(sum).fold(0, u64::wrapping_add)
 }
 
 fn compare(

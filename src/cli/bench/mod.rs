@@ -5,6 +5,7 @@ mod floor;
 mod jobs;
 mod measure;
 mod pool;
+mod spread;
 mod table;
 
 use std::path::PathBuf;
@@ -13,7 +14,7 @@ use clap::{Args as ClapArgs, Subcommand};
 use molmesh::gpu::Paper;
 use molmesh::gpu::bench::{self, Opened};
 use molmesh::gpu::yardstick::{self, Effort, Rates};
-use molmesh::surface::DeviceChoice;
+use molmesh::surface::{DeviceChoice, Spheres, SurfaceParams};
 use serde_json::json;
 
 use super::error::CliError;
@@ -54,8 +55,12 @@ pub(crate) struct GpuArgs {
     /// Time so many jobs of 600 atoms, and some large ones, through the pool on 1, 2, … devices instead
     #[arg(long, value_name = "N", conflicts_with_all = ["jobs", "device"])]
     pub(crate) pool: Option<usize>,
-    /// Devices of `--pool`: all, software, or numbers
-    #[arg(long, value_name = "WHICH", default_value = "all", requires = "pool")]
+    /// Time each case on 1, 2, 4, … devices together instead, every device with at least so many bricks
+    #[arg(long, value_name = "BRICKS", conflicts_with_all = ["jobs", "device", "pool", "check"],
+        num_args = 0..=1, default_missing_value = "32768")]
+    pub(crate) spread: Option<u64>,
+    /// Devices of `--pool` and `--spread`: all, software, or numbers
+    #[arg(long, value_name = "WHICH", default_value = "all", conflicts_with = "device")]
     pub(crate) devices: DeviceChoice,
     /// Write everything to this file too, as JSON
     #[arg(long, value_name = "FILE")]
@@ -72,6 +77,11 @@ pub(super) fn run(bench: &Bench) -> Result<(), CliError> {
         let rates = pool::run(&args.devices, n)?;
         super::say(&pool::table(&rates))?;
         return save(args, &json!({ "pool": rates }));
+    }
+    if let Some(least) = args.spread {
+        let rows = spread::run(&args.devices, least, &loaded(args)?, args.runs)?;
+        super::say(&spread::table(&rows))?;
+        return save(args, &json!({ "spread": rows, "runs": args.runs }));
     }
     let opened = open(args.device)?;
     super::say(&format!("device {}: {}, {}\n", args.device, opened.name, opened.driver))?;
@@ -93,6 +103,24 @@ fn save(args: &GpuArgs, result: &serde_json::Value) -> Result<(), CliError> {
     std::fs::write(path, text).map_err(|source| CliError::Output { name: path.display().to_string(), source })
 }
 
+/// The cases that are asked for.
+fn chosen(args: &GpuArgs) -> impl Iterator<Item = Case> {
+    let only = args.only.clone().unwrap_or_default();
+    cases::all(args.atoms).into_iter().filter(move |case| case.name.contains(only.as_str()))
+}
+
+/// Those of them whose files are there; it is said which are not.
+fn loaded(args: &GpuArgs) -> Result<Vec<(Case, Spheres, SurfaceParams)>, CliError> {
+    let mut loaded = Vec::new();
+    for case in chosen(args) {
+        match case.load(args.data.as_deref()) {
+            Ok((spheres, params)) => loaded.push((case, spheres, params)),
+            Err(why) => super::say(&format!("{}: not measured: {why}\n", case.name))?,
+        }
+    }
+    Ok(loaded)
+}
+
 /// Measures every case. Each has an engine of its own, so that none finds what another left.
 fn cases(args: &GpuArgs, opened: Opened) -> Result<serde_json::Value, CliError> {
     let effort = if opened.software { Effort::SOFTWARE } else { Effort::HARDWARE };
@@ -101,9 +129,7 @@ fn cases(args: &GpuArgs, opened: Opened) -> Result<serde_json::Value, CliError> 
     let (name, driver) = (opened.name.clone(), opened.driver.clone());
     drop(opened);
     let mut rows = Vec::new();
-    for case in
-        cases::all(args.atoms).into_iter().filter(|c| args.only.as_ref().is_none_or(|o| c.name.contains(o.as_str())))
-    {
+    for case in chosen(args) {
         let row = one(args, &case, rates.as_ref());
         super::say(&table::row(case.name, &row))?;
         rows.push(match row {

@@ -9,8 +9,9 @@ use crate::surface::Mesh;
 
 /// Writes the buffer of `mesh`: `layout.len` bytes.
 pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
-    write_positions(out, layout.packing, &mesh.positions[..])?;
-    write_normals(out, layout.packing, &mesh.normals[..])?;
+    // Rows are written where they lie: a column in pieces is not joined for this.
+    mesh.positions.pieces().try_for_each(|rows| write_positions(out, layout.packing, rows))?;
+    mesh.normals.pieces().try_for_each(|rows| write_normals(out, layout.packing, rows))?;
     if let Some(colors) = &mesh.colors {
         let linear = linear_of_srgb();
         convert_words(out, &colors[..], |[r, g, b, a]| {
@@ -20,11 +21,11 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
     if let (Some(ids), Some((atom_type, _))) = (&mesh.atom_ids, layout.atoms) {
         match atom_type {
             // A small 32-bit integer, low byte first, is a 16-bit integer and two zero bytes.
-            AtomType::U16 => write_integers(out, &ids[..])?,
-            AtomType::F32 => convert_words(out, &ids[..], exact_f32_bytes)?,
+            AtomType::U16 => ids.pieces().try_for_each(|rows| write_integers(out, rows))?,
+            AtomType::F32 => ids.pieces().try_for_each(|rows| convert_words(out, rows, exact_f32_bytes))?,
         }
     }
-    write_indices(out, layout.indices.0, mesh.triangles[..].as_flattened())
+    mesh.triangles.pieces().try_for_each(|rows| write_indices(out, layout.indices.0, rows.as_flattened()))
 }
 
 /// Writes positions relative to the mesh's centre, Å, as the layout has them.

@@ -1,0 +1,264 @@
+//! A job's output: in pieces that a binding holds, and landings that the host can read. The next submission is made while
+//! the one before is on its way.
+
+use wgpu::Buffer;
+
+use super::engine::{Engine, Loaded, check};
+use super::error::GpuError;
+use super::flight::{Arrived, Piece, Places, TALLY_AT, pieces};
+use super::progress::{Counted, Progress, Sent};
+use super::record::{Dispatch, Recording};
+use super::run::FRONT;
+use super::submit::Flight;
+use super::workspace::{Needs, OutputRows, Workspace};
+use crate::surface::Stage;
+use crate::surface::layout::{Params, Tally};
+
+/// Rows of parameters: the chunk's, and those of the pieces of a submission.
+pub(super) const PARAM_ROWS: usize = 64;
+/// Output is made before it is counted where the buffers hold the estimate for a small job over this: most large grids need
+/// between a half and a third of it.
+const LIKELY: u64 = 4;
+
+pub(super) fn failed(why: String) -> GpuError {
+    GpuError::Failed(why)
+}
+
+/// `n` rows as 32 bits; buffers are smaller than that.
+pub(super) fn narrow(n: u64) -> Result<u32, GpuError> {
+    u32::try_from(n).map_err(|e| failed(format!("{n} rows: {e}")))
+}
+
+/// Copies counters, and the groups to where they shall lie.
+pub(super) fn copy_counts(
+    recording: &mut Recording<'_>,
+    workspace: &Workspace,
+    target: &Buffer,
+    groups: Option<(u64, u64)>,
+) {
+    let encoder = &mut recording.encoder;
+    encoder.copy_buffer_to_buffer(workspace.buffer("tally"), 0, target, TALLY_AT, size_of::<Tally>() as u64);
+    if let Some((at, bytes)) = groups {
+        encoder.copy_buffer_to_buffer(workspace.buffer("groups"), 0, target, at, bytes);
+    }
+}
+
+/// Copies the first `n` rows of 12 bytes, or of `each` bytes, of a buffer.
+pub(super) fn copy_rows(recording: &mut Recording<'_>, from: &Buffer, target: &Buffer, at: u64, bytes: u64) {
+    if bytes > 0 {
+        recording.encoder.copy_buffer_to_buffer(from, 0, target, at, bytes);
+    }
+}
+
+/// Copies the vertices in the workspace to their columns, `skip` rows in.
+pub(super) fn copy_vertices(
+    recording: &mut Recording<'_>,
+    loaded: &Loaded<'_>,
+    target: &Buffer,
+    places: &Places,
+    rows: [u64; 2],
+) {
+    let ([skip, n], workspace) = (rows, &loaded.workspace);
+    copy_rows(recording, workspace.buffer("positions"), target, places.positions + 12 * skip, 12 * n);
+    copy_rows(recording, workspace.buffer("normals"), target, places.normals + 12 * skip, 12 * n);
+    if loaded.variant.nearest {
+        copy_rows(recording, workspace.buffer("sources"), target, places.sources + 4 * skip, 4 * n);
+    }
+}
+
+impl Loaded<'_> {
+    pub(super) fn dispatch(&self, row: u64, workgroups: u32) -> Dispatch<'_> {
+        Dispatch { workspace: &self.workspace, row, workgroups, variant: self.variant }
+    }
+}
+
+impl Engine {
+    /// Vertices, triangles or both of all chunks; vertices of one only, the first.
+    pub(super) fn output(
+        &mut self,
+        progress: &mut Progress<'_>,
+        counted: &[Counted],
+        columns: [bool; 2],
+    ) -> Result<(), GpuError> {
+        let all: Vec<_> = counted.iter().enumerate().collect();
+        let pieces = self.pieces(progress, &all);
+        self.make_room(progress, &pieces)?;
+        self.send_pieces(progress, 0, &pieces, columns)?;
+        self.settle(progress)
+    }
+
+    /// Pieces of output of some chunks, each small enough for a binding.
+    pub(super) fn pieces(&self, progress: &Progress<'_>, counted: &[(usize, &Counted)]) -> Vec<Piece> {
+        let most = self.budget.piece_bytes.min(self.budget.landing_bytes / 4) / 12;
+        let cut = |&(chunk, counted): &(usize, &Counted)| {
+            let own = &progress.loaded.chunks[chunk];
+            pieces([own.first_brick, own.n_own], &counted.groups, counted.first, [most, most])
+        };
+        counted.iter().flat_map(cut).collect()
+    }
+
+    /// Output buffers for the largest of some pieces.
+    pub(super) fn make_room(&mut self, progress: &mut Progress<'_>, pieces: &[Piece]) -> Result<(), GpuError> {
+        let rows = OutputRows {
+            vertices: pieces.iter().map(|p| p.n_vertices).max().unwrap_or_default(),
+            triangles: pieces.iter().map(|p| p.n_triangles).max().unwrap_or_default(),
+            ..Self::no_rows()
+        };
+        let loaded = &mut progress.loaded;
+        let needs = Needs::new(&loaded.job.prepared.plan, &loaded.chunks, loaded.variant.nearest, rows);
+        self.grow(loaded, &needs)
+    }
+
+    /// Makes the vertices, the triangles or both of some pieces, in as few submissions as landings allow. Each is sent
+    /// before the one before it has landed; the last is left on its way.
+    pub(super) fn send_pieces(
+        &self,
+        progress: &mut Progress<'_>,
+        chunk: usize,
+        pieces: &[Piece],
+        columns: [bool; 2],
+    ) -> Result<(), GpuError> {
+        let [vertices, triangles] = columns;
+        let nearest = progress.loaded.variant.nearest;
+        let mut rest = pieces;
+        while !rest.is_empty() {
+            check(progress.loaded.job)?;
+            // As many pieces as a landing holds, one at least.
+            let (mut n, mut rows) = (0, [0, 0]);
+            let mut places = Places::new(0, 0, nearest);
+            for piece in rest.iter().take(PARAM_ROWS - 1) {
+                let more = [
+                    rows[0] + piece.n_vertices * u64::from(vertices),
+                    rows[1] + piece.n_triangles * u64::from(triangles),
+                ];
+                let larger = Places::new(more[0], more[1], nearest);
+                if n > 0 && larger.end > self.budget.landing_bytes {
+                    break;
+                }
+                (n, rows, places) = (n + 1, more, larger);
+            }
+            let (now, later) = rest.split_at(n);
+            let flight = self.send_some(&progress.loaded, chunk, now, columns, &places)?;
+            self.settle(progress)?;
+            progress.sent = Some(Sent { flight, places, rows, columns });
+            rest = later;
+        }
+        Ok(())
+    }
+
+    /// Takes the output that is on its way, if any is.
+    pub(super) fn settle(&self, progress: &mut Progress<'_>) -> Result<(), GpuError> {
+        let Some(Sent { flight, places, rows, columns: [vertices, triangles] }) = progress.sent.take() else {
+            return Ok(());
+        };
+        let landing = self.land(flight)?.pop().ok_or_else(|| failed("a submission without its landing".to_owned()))?;
+        progress.note_flat(&landing)?;
+        let first = if vertices { FRONT } else { FRONT + 1 };
+        self.add_times(progress, &landing, first..FRONT + 1 + usize::from(triangles))?;
+        let arrived = Arrived { landing, places, n_vertices: rows[0], n_triangles: rows[1] };
+        progress.vertices.extend(vertices.then(|| arrived.clone()));
+        progress.triangles.extend(triangles.then_some(arrived));
+        Ok(())
+    }
+
+    fn send_some(
+        &self,
+        loaded: &Loaded<'_>,
+        chunk: usize,
+        pieces: &[Piece],
+        [vertices, triangles]: [bool; 2],
+        places: &Places,
+    ) -> Result<Flight, GpuError> {
+        let landing = self.landings.get(&self.device, places.end);
+        let target = landing.buffer().map_err(failed)?;
+        let base = loaded.chunks[chunk].params(&loaded.params);
+        for (row, piece) in (1..).zip(pieces) {
+            let params = Params {
+                piece_brick: piece.brick,
+                piece_bricks: piece.n_bricks,
+                piece_vertex: narrow(piece.vertex)?,
+                piece_triangle: narrow(piece.triangle & u64::from(u32::MAX))?,
+                vertex_capacity: narrow(piece.n_vertices)?,
+                triangle_capacity: narrow(piece.n_triangles)?,
+                ..base
+            };
+            self.write_params(&loaded.workspace, row, &params);
+        }
+        let mut recording = self.recording();
+        let ends = |i: usize| [i == 0, i + 1 == pieces.len()];
+        let (mut n_vertices, mut n_triangles) = (0, 0);
+        for (i, piece) in pieces.iter().enumerate().filter(|_| vertices) {
+            let [first, last] = ends(i);
+            recording.part(Stage::Interpolate, &[loaded.dispatch(i as u64 + 1, piece.n_bricks)], first, last);
+            copy_vertices(&mut recording, loaded, target, places, [n_vertices, piece.n_vertices]);
+            n_vertices += piece.n_vertices;
+        }
+        for (i, piece) in pieces.iter().enumerate().filter(|_| triangles) {
+            let [first, last] = ends(i);
+            recording.part(Stage::Emit, &[loaded.dispatch(i as u64 + 1, piece.n_bricks)], first, last);
+            let at = places.triangles + 12 * n_triangles;
+            copy_rows(&mut recording, loaded.workspace.buffer("triangles"), target, at, 12 * piece.n_triangles);
+            n_triangles += piece.n_triangles;
+        }
+        recording.read_clock(target);
+        copy_counts(&mut recording, &loaded.workspace, target, None);
+        self.launch(recording, vec![(landing, places.end)])
+    }
+
+    /// Submits the whole output of a job's only chunk before it is counted, into the buffers as they are. Returns the
+    /// vertices and triangles that they hold: what is more than that is not written. None where they are so small that
+    /// it would be.
+    pub(super) fn tail_ahead(&self, progress: &Progress<'_>) -> Result<Option<[u64; 2]>, GpuError> {
+        let loaded = &progress.loaded;
+        let most = self.budget.piece_bytes.min(self.budget.landing_bytes / 4) / 12;
+        let hold = |name: &str| (loaded.workspace.buffer(name).size() / 12).min(most);
+        let [vertices, triangles] = [hold("positions").min(hold("normals")), hold("triangles")];
+        let vertices =
+            if loaded.variant.nearest { vertices.min(loaded.workspace.buffer("sources").size() / 4) } else { vertices };
+        let n_bricks = u64::from(loaded.params.n_bricks);
+        let few = self.budget.rows_per_brick.map(|each| each * n_bricks / LIKELY);
+        if vertices < few[0] || triangles < few[1] {
+            return Ok(None);
+        }
+        let params = Params {
+            piece_bricks: loaded.params.n_bricks,
+            vertex_capacity: narrow(vertices)?,
+            triangle_capacity: narrow(triangles)?,
+            ..loaded.chunks[0].params(&loaded.params)
+        };
+        self.write_params(&loaded.workspace, 1, &params);
+        let mut recording = self.recording();
+        let tail = [loaded.dispatch(1, params.n_bricks)];
+        recording.stage(Stage::Interpolate, &tail);
+        recording.stage(Stage::Emit, &tail);
+        self.launch(recording, Vec::new())?;
+        Ok(Some([vertices, triangles]))
+    }
+
+    /// Copies the output that was submitted ahead, if the buffers had room for it and a landing has. Whether they had.
+    pub(super) fn copy_tail(
+        &self,
+        progress: &mut Progress<'_>,
+        counted: &Counted,
+        room: Option<[u64; 2]>,
+    ) -> Result<bool, GpuError> {
+        let (rows, loaded) = ([counted.n_vertices, counted.n_triangles], &progress.loaded);
+        let places = Places::new(rows[0], rows[1], loaded.variant.nearest);
+        let fits = room.is_some_and(|room| rows[0] <= room[0] && rows[1] <= room[1]);
+        if !fits || places.end > self.budget.landing_bytes {
+            return Ok(false);
+        }
+        let landing = self.landings.get(&self.device, places.end);
+        let target = landing.buffer().map_err(failed)?;
+        let mut recording = self.recording();
+        copy_vertices(&mut recording, loaded, target, &places, [0, rows[0]]);
+        copy_rows(&mut recording, loaded.workspace.buffer("triangles"), target, places.triangles, 12 * rows[1]);
+        recording.timed_before(&[Stage::Interpolate, Stage::Emit]);
+        recording.read_clock(target);
+        copy_counts(&mut recording, &loaded.workspace, target, None);
+        let flight = self.launch(recording, vec![(landing, places.end)])?;
+        progress.sent = Some(Sent { flight, places, rows, columns: [true, true] });
+        self.settle(progress)?;
+        Ok(true)
+    }
+}
