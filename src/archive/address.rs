@@ -71,7 +71,7 @@ fn is_public_v6(v6: Ipv6Addr) -> bool {
     };
     match (a, b, c, d, e, f) {
         // Mapped, translated, and 6to4; the unspecified address and loopback fall under the old "compatible" form.
-        (0, 0, 0, 0, 0, 0xffff) | (0x64, 0xff9b, 0, 0, 0, 0) | (0, 0, 0, 0, 0, 0) => wrapped(g, h),
+        (0, 0, 0, 0, 0, 0 | 0xffff) | (0x64, 0xff9b, 0, 0, 0, 0) => wrapped(g, h),
         (0x2002, ..) => wrapped(b, c),
         // Global unicast is 2000::/3; protocol assignments (Teredo among them) and documentation lie in it.
         _ => {

@@ -1,6 +1,7 @@
 //! One question to a remote archive: the address of an entry to its bytes, counted while they come.
 
 use std::error::Error;
+use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use bytes::{Bytes, BytesMut};
@@ -18,6 +19,8 @@ use crate::store::Digest;
 const HOPS: usize = 3;
 /// Memory that is set aside on the word of a `Content-Length`.
 const TRUSTED: u64 = 1 << 20;
+/// Longest `Retry-After` that is taken for meant.
+const DAY: Duration = Duration::from_hours(24);
 /// Who asks.
 const USER_AGENT: &str = concat!("molmesh/", env!("CARGO_PKG_VERSION"), " (molecular surface service)");
 
@@ -112,7 +115,7 @@ pub(super) async fn get(
     known: Option<&Validators>,
     limits: Limits,
 ) -> Result<Answer, Failed> {
-    let compressed = url.path().ends_with(".gz");
+    let compressed = Path::new(url.path()).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gz"));
     let name = url.to_string();
     let mut request = client.get(url);
     if let Some(Validators { etag, last_modified }) = known {
@@ -128,6 +131,10 @@ pub(super) async fn get(
         StatusCode::OK => {}
         StatusCode::NOT_MODIFIED if known.is_some() => return Ok(Answer::Unchanged),
         StatusCode::NOT_FOUND | StatusCode::GONE => return Ok(Answer::Absent),
+        // Where the client would not even know how to follow.
+        status if status.is_redirection() && status != StatusCode::NOT_MODIFIED => {
+            return Err(Failed::other(Why::Redirect, &status));
+        }
         status => {
             let retry_after = retry_after(response.headers());
             return Err(Failed::Other { why: Why::Status(status.as_u16()), retry_after, detail: status.to_string() });
@@ -200,10 +207,10 @@ fn of_client(error: &reqwest::Error) -> Failed {
 fn retry_after(headers: &HeaderMap) -> Option<Duration> {
     let text = headers.get(RETRY_AFTER)?.to_str().ok()?.trim();
     if let Ok(seconds) = text.parse() {
-        return Some(Duration::from_secs(seconds));
+        return Some(Duration::from_secs(seconds).min(DAY));
     }
     let date = httpdate::parse_http_date(text).ok()?;
-    Some(date.duration_since(SystemTime::now()).unwrap_or_default())
+    Some(date.duration_since(SystemTime::now()).unwrap_or_default().min(DAY))
 }
 
 #[cfg(test)]
@@ -241,6 +248,7 @@ mod tests {
         let soon = httpdate::fmt_http_date(SystemTime::now() + Duration::from_secs(100));
         assert!(of(&soon).is_some_and(|d| (95..=100).contains(&d.as_secs())), "{soon}");
         assert_eq!(of("Wed, 21 Oct 2015 07:28:00 GMT"), Some(Duration::ZERO));
+        assert_eq!(of("18446744073709551615"), Some(DAY));
         assert_eq!((of("soon"), of("-1"), of("1e9")), (None, None, None));
         assert_eq!(retry_after(&HeaderMap::new()), None);
     }

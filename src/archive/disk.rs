@@ -22,7 +22,7 @@ use crate::telemetry::ARCHIVE_KEPT;
 /// Bytes of a description; validators are short.
 const NOTE_BYTES: u64 = 64 << 10;
 /// A staged file that is older was left by a process that died.
-const ABANDONED: Duration = Duration::from_secs(3600);
+const ABANDONED: Duration = Duration::from_hours(1);
 
 /// What is written beside a body.
 #[derive(Debug, Serialize, Deserialize)]

@@ -8,7 +8,10 @@ use tokio::sync::watch;
 
 use crate::structure::EntryId;
 
-type UnderWay<T> = Mutex<HashMap<EntryId, watch::Receiver<Option<T>>>>;
+type Seat<T> = watch::Receiver<Option<T>>;
+/// What it takes to start a flight.
+type Crew<T> = (watch::Sender<Option<T>>, Landing<T>);
+type UnderWay<T> = Mutex<HashMap<EntryId, Seat<T>>>;
 
 /// What is being fetched.
 #[derive(Debug)]
@@ -39,7 +42,7 @@ impl<T: Clone + Send + Sync + 'static> Flights<T> {
     }
 
     /// A seat in the flight for `id`, and what it takes to start it where there was none.
-    fn board(&self, id: &EntryId) -> (watch::Receiver<Option<T>>, Option<(watch::Sender<Option<T>>, Landing<T>)>) {
+    fn board(&self, id: &EntryId) -> (Seat<T>, Option<Crew<T>>) {
         let mut under_way = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(result) = under_way.get(id) {
             return (result.clone(), None);

@@ -15,7 +15,7 @@ use crate::config::{ArchiveConfig, Template};
 use crate::structure::EntryId;
 
 /// Longest that a host is left alone on its own word.
-const LONGEST: Duration = Duration::from_secs(600);
+const LONGEST: Duration = Duration::from_mins(10);
 /// What callers are told where nothing better is known.
 const LATER: Duration = Duration::from_secs(1);
 
