@@ -16,6 +16,7 @@ mod queue;
 mod rank;
 mod record;
 mod results;
+mod returns;
 mod ticket;
 mod worker;
 

@@ -9,6 +9,7 @@ use tokio::sync::{Notify, oneshot};
 use super::cost::{self, Rate};
 use super::flight::{Claim, Entry, Flight, Progress, Waiter, WorkKey};
 use super::rank::{self, Shares};
+use super::returns::Returns;
 use super::{Outcome, Refusal, Task};
 use crate::surface::CancelToken;
 use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT};
@@ -19,8 +20,7 @@ struct State {
     rate: Rate,
     closed: bool,
     next_id: u64,
-    /// When those that were refused were told to come back.
-    returns: Vec<Instant>,
+    returns: Returns,
     /// Waiting jobs that the gauge knows of.
     told: usize,
 }
@@ -62,7 +62,7 @@ impl Queue {
             rate: Rate::default(),
             closed: false,
             next_id: 0,
-            returns: Vec::new(),
+            returns: Returns::default(),
             told: 0,
         };
         Self { state: Mutex::new(state), filled: Condvar::new(), idle: Notify::new(), limit, workers }
@@ -105,12 +105,15 @@ impl Queue {
         }
         let now = Instant::now();
         let cost = state.rate.seconds(cost::units(&task.input, &task.job));
-        // A free worker's job counts as running, not as waiting, even before the worker has woken up.
-        if state.flights.len() >= self.limit + self.workers {
+        // A free worker's job counts as running, not as waiting, even before the worker has woken up. Places are held for those
+        // who were told to come back, but not so many that workers could run out of work if they do not.
+        let held = if state.returns.is_due(&work, now) { 0 } else { state.returns.held(now).min(self.limit / 2) };
+        if state.flights.len() + held >= self.limit + self.workers {
             let waiting = state.waiting().count();
-            let wait = self.room_in(&mut state, now);
+            let wait = self.room_in(&mut state, work, now);
             return Err(Refusal::QueueFull { waiting, limit: self.limit, wait });
         }
+        state.returns.came(&work);
         let wait = self.wait(&state, now);
         if wait > allowed {
             return Err(Refusal::TooLate { wait, allowed });
@@ -272,19 +275,12 @@ impl Queue {
         Duration::try_from_secs_f64(ahead / self.workers as f64).unwrap_or(Duration::MAX)
     }
 
-    /// When a place will be free for one who is refused now. Those who were refused before come back first: each of them
-    /// takes a place.
-    fn room_in(&self, state: &mut State, now: Instant) -> Duration {
-        state.returns.retain(|back| *back > now);
+    /// When a place will be free for one who is refused now.
+    fn room_in(&self, state: &mut State, work: WorkKey, now: Instant) -> Duration {
         let all: f64 = state.flights.iter().map(|flight| flight.cost).sum();
         let mean = state.rate.mean(all / state.flights.len().max(1) as f64) / self.workers as f64;
-        let wait = Duration::from_secs_f64((mean * (state.returns.len() + 1) as f64).min(600.0));
-        // Seconds are what can be said.
-        let said = Duration::from_secs(wait.as_secs_f64().ceil().max(1.0) as u64);
-        if state.returns.len() < MOST_RETURNS {
-            state.returns.push(now + said);
-        }
-        wait
+        let each = Duration::try_from_secs_f64(mean).unwrap_or(Duration::MAX);
+        state.returns.tell(work, each, each, now)
     }
 
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of jobs are small")]
@@ -299,6 +295,3 @@ impl Queue {
         gauge!(QUEUE_WAIT).set(self.wait(state, now).as_secs_f64());
     }
 }
-
-/// Refused ones that are kept in mind.
-const MOST_RETURNS: usize = 100_000;
