@@ -82,9 +82,11 @@ fn deadline_and_cancellation_reach_the_device() {
         SurfaceError::Deadline
     );
     let cancel = CancelToken::default();
+    // On a busy machine the deadline may have passed before the device was reached.
+    let before = rig.calls().len();
     let cancelled = std::thread::scope(|scope| {
         let running = scope.spawn(|| run(&backend, &Control { cancel: cancel.clone(), ..Control::default() }));
-        gpu_fakes::wait_for("the job to run", || rig.calls().len() == 2);
+        gpu_fakes::wait_for("the job to run", || rig.calls().len() > before);
         cancel.cancel();
         running.join().unwrap()
     });

@@ -17,6 +17,7 @@ pub(super) struct Landings(Arc<Mutex<Idle>>);
 
 #[derive(Debug, Default)]
 struct Idle {
+    /// The one that has been idle longest first.
     buffers: Vec<Buffer>,
     /// Bytes of all buffers, idle and in use.
     held: u64,
@@ -38,7 +39,7 @@ impl Landings {
         let fits = |b: &Buffer| (wanted..=2 * wanted).contains(&b.size());
         let best = (0..idle.buffers.len()).filter(|&i| fits(&idle.buffers[i])).min_by_key(|&i| idle.buffers[i].size());
         let buffer = if let Some(i) = best {
-            idle.buffers.swap_remove(i)
+            idle.buffers.remove(i)
         } else {
             idle.held += wanted;
             device.create_buffer(&wgpu::BufferDescriptor {
@@ -58,13 +59,28 @@ impl Landings {
 
     fn put(&self, buffer: Buffer) {
         let mut idle = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let kept: u64 = idle.buffers.iter().map(Buffer::size).sum();
-        if kept + buffer.size() > MOST_IDLE {
+        if buffer.size() > MOST_IDLE {
             idle.held -= buffer.size();
-        } else {
-            idle.buffers.push(buffer);
+            return;
         }
+        idle.buffers.push(buffer);
+        let sizes: Vec<u64> = idle.buffers.iter().map(Buffer::size).collect();
+        let n = surplus(&sizes, MOST_IDLE);
+        idle.held -= sizes[..n].iter().sum::<u64>();
+        idle.buffers.drain(..n);
     }
+}
+
+/// How many of the first must go, that the others are `most` bytes together: what was used last is wanted again, and what
+/// nobody asks for must not keep its place for ever.
+fn surplus(sizes: &[u64], most: u64) -> usize {
+    let mut kept: u64 = sizes.iter().sum();
+    let goes = |size: &&u64| {
+        let too_much = kept > most;
+        kept -= if too_much { **size } else { 0 };
+        too_much
+    };
+    sizes.iter().take_while(goes).count()
 }
 
 /// Sizes come in steps of a quarter of a power of two, so that buffers are used again.
@@ -120,6 +136,15 @@ impl fmt::Debug for Landing {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_oldest_idle_buffers_go_until_the_others_fit() {
+        assert_eq!(surplus(&[], 10), 0);
+        assert_eq!(surplus(&[4, 3, 3], 10), 0);
+        assert_eq!(surplus(&[4, 3, 3], 9), 1);
+        assert_eq!(surplus(&[1, 1, 5, 4, 6], 10), 3);
+        assert_eq!(surplus(&[1, 11], 10), 2);
+    }
 
     #[test]
     fn classes_are_never_too_small_and_waste_a_third_at_most() {

@@ -7,9 +7,12 @@
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
+use super::column::Column;
 use super::error::SurfaceError;
 use super::kernel::Profile;
 use super::params::SurfaceParams;
+use super::simd::dispatched;
+use super::sort::sorted;
 use super::spheres::Spheres;
 
 /// Samples along a brick's edge.
@@ -53,7 +56,7 @@ pub struct Lattice {
     /// The sample that mesh positions are relative to.
     pub centre: [i32; 3],
     /// The spheres.
-    pub atoms: Vec<LatticeAtom>,
+    pub atoms: Column<LatticeAtom>,
     /// The kernel's constants.
     pub profile: Profile,
     /// u from which on a sphere's density is 0.
@@ -72,27 +75,10 @@ impl Lattice {
         let spacing = params.resolution;
         let profile = Profile::new(params);
         let radii = || spheres.radii().par_iter().with_min_len(1 << 16).copied();
-        let smallest = radii().reduce(|| f32::MAX, f32::min);
-        let effective = |r: f32| f64::from(r) * params.radius_scale + params.radius_offset;
-        params.check_radius(smallest)?;
-        let mut atoms: Vec<LatticeAtom> = (0..spheres.len())
-            .into_par_iter()
-            .with_min_len(4096)
-            .map(|i| {
-                let length = profile.length(effective(spheres.radius(i))) / spacing;
-                let scaled = spheres.centre(i).map(|c| c / spacing);
-                let cell = scaled.map(f64::round);
-                LatticeAtom {
-                    cell: cell.map(to_i32),
-                    inv_length2: to_f32((length * length).recip()),
-                    frac: std::array::from_fn(|k| to_f32(scaled[k] - cell[k])),
-                    source: u32::try_from(i).unwrap_or(u32::MAX),
-                }
-            })
-            .collect();
-        sort_canonically(&mut atoms);
-        let reach = radii().reduce(|| 0.0, f32::max);
-        let margin = 2.0 * profile.reach(profile.length(effective(reach)));
+        params.check_radius(radii().reduce(|| f32::MAX, f32::min))?;
+        let largest = effective(radii().reduce(|| 0.0, f32::max), params);
+        let atoms = Placing { spheres, params, profile: &profile }.in_canonical_order([lo, hi]);
+        let margin = 2.0 * profile.reach(profile.length(largest));
         let box_cells = (0..3).map(|k| ((hi[k] - lo[k] + margin) / spacing).ceil()).product::<f64>();
         Ok(Self {
             spacing,
@@ -124,54 +110,123 @@ impl Lattice {
 pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
     let profile = Profile::new(params);
-    let largest = f64::from(spheres.radii().iter().copied().fold(0.0, f32::max));
-    let reach = profile.reach(profile.length(largest * params.radius_scale + params.radius_offset));
+    let largest = spheres.radii().iter().copied().fold(0.0, f32::max);
+    let reach = profile.reach(profile.length(effective(largest, params)));
     let half = (0..3).map(|k| 0.5 * (hi[k] - lo[k])).fold(0.0, f64::max);
     // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within reach.
     // Half a spacing more is far above every rounding.
     half + reach + 2.0 * params.resolution
 }
 
-/// Sorts by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order last.
-fn sort_canonically(atoms: &mut Vec<LatticeAtom>) {
-    let rank = tile_ranks(atoms);
-    let key = |atom: &LatticeAtom| {
-        let local = atom.cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
-        let brick = local.map(|c| c / BRICK.unsigned_abs());
-        let cell = local.map(|c| c % BRICK.unsigned_abs());
-        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
-        rank(tile_of(atom.cell)) << 18 | pack(brick) << 9 | pack(cell)
-    };
-    let mut keyed: Vec<(u64, u32)> =
-        atoms.par_iter().enumerate().with_min_len(4096).map(|(i, atom)| (key(atom), to_u32(i))).collect();
-    let tie = |a: &LatticeAtom, b: &LatticeAtom| {
-        let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
-        axis(2).then(axis(1)).then(axis(0)).then(a.inv_length2.total_cmp(&b.inv_length2)).then(a.source.cmp(&b.source))
-    };
-    let order =
-        |a: &(u64, u32), b: &(u64, u32)| a.0.cmp(&b.0).then_with(|| tie(&atoms[a.1 as usize], &atoms[b.1 as usize]));
-    keyed.par_sort_unstable_by(order);
-    *atoms = keyed.par_iter().with_min_len(4096).map(|&(_, i)| atoms[i as usize]).collect();
+/// The radius that counts of a sphere of radius `r`, Å.
+fn effective(r: f32, params: &SurfaceParams) -> f64 {
+    f64::from(r) * params.radius_scale + params.radius_offset
 }
 
-/// Numbers that order the tiles of `atoms`, below 2⁴⁶: places in the box around them, or ranks where the box is too large.
-fn tile_ranks(atoms: &[LatticeAtom]) -> Box<dyn Fn([i32; 3]) -> u64 + Sync> {
-    let tiles = || atoms.par_iter().with_min_len(4096).map(|atom| tile_of(atom.cell));
-    let fold = |f: fn(i32, i32) -> i32| move |a: [i32; 3], b: [i32; 3]| std::array::from_fn(|k| f(a[k], b[k]));
-    let lo: [i32; 3] = tiles().reduce(|| [i32::MAX; 3], fold(i32::min));
-    let hi = tiles().reduce(|| [i32::MIN; 3], fold(i32::max));
-    let side: [u64; 3] = std::array::from_fn(|k| u64::from(lo[k].abs_diff(hi[k])) + 1);
-    // Each side is below 2²⁰, as coordinates are bounded.
-    if side.iter().product::<u64>() < 1 << 46 {
-        return Box::new(move |tile| {
-            let [x, y, z]: [u64; 3] = std::array::from_fn(|k| u64::from(tile[k].abs_diff(lo[k])));
-            (z * side[1] + y) * side[0] + x
-        });
+/// Spheres on their way to the lattice.
+struct Placing<'a> {
+    spheres: &'a Spheres,
+    params: &'a SurfaceParams,
+    profile: &'a Profile,
+}
+
+impl Placing<'_> {
+    #[inline(always)]
+    fn atom(&self, i: usize) -> LatticeAtom {
+        let spacing = self.params.resolution;
+        let length = self.profile.length(effective(self.spheres.radius(i), self.params)) / spacing;
+        let scaled = self.spheres.centre(i).map(|c| c / spacing);
+        let cell = scaled.map(f64::round);
+        LatticeAtom {
+            cell: cell.map(to_i32),
+            inv_length2: to_f32((length * length).recip()),
+            frac: std::array::from_fn(|k| to_f32(scaled[k] - cell[k])),
+            source: u32::try_from(i).unwrap_or(u32::MAX),
+        }
     }
-    let mut order: Vec<[i32; 3]> = atoms.iter().map(|atom| tile_of(atom.cell)).collect();
-    order.par_sort_unstable_by_key(|&tile| tile_order(tile));
-    order.dedup();
-    Box::new(move |tile| order.partition_point(|&t| tile_order(t) < tile_order(tile)) as u64)
+
+    #[inline(always)]
+    fn cell(&self, c: [f64; 3]) -> [i32; 3] {
+        c.map(|c| to_i32((c / self.params.resolution).round()))
+    }
+
+    /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order last.
+    /// `bounds`: lowest and highest coordinates.
+    fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
+        let n = self.spheres.len();
+        // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
+        let rank =
+            TileRanks::new(bounds.map(|c| tile_of(self.cell(c))), n, |i| tile_of(self.cell(self.spheres.centre(i))));
+        let order = sorted(n, |first, keys| write_keys(self, &rank, first, keys));
+        let mut atoms = Column::zeroed(n);
+        atoms.par_chunks_mut(4096).zip(order.par_chunks(4096)).for_each(|(atoms, order)| place(self, order, atoms));
+        atoms.par_chunk_by_mut(|a, b| a.cell == b.cell).filter(|same| same.len() > 1).for_each(|same| {
+            same.sort_unstable_by(|a, b| {
+                let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
+                let size = a.inv_length2.total_cmp(&b.inv_length2);
+                axis(2).then(axis(1)).then(axis(0)).then(size).then(a.source.cmp(&b.source))
+            });
+        });
+        atoms
+    }
+}
+
+dispatched! {
+/// Writes the sort keys of the atoms from `first` on: tile, brick and cell above the atom's index.
+fn write_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut [u128]) {
+    for (i, key) in (first..).zip(keys) {
+        let cell = placing.cell(placing.spheres.centre(i));
+        let local = cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
+        let brick = local.map(|c| c / BRICK.unsigned_abs());
+        let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
+        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
+        let place = rank.of(tile_of(cell)) << 18 | pack(brick) << 9 | pack(cell_in_brick);
+        *key = u128::from(place) << 64 | i as u128;
+    }
+}
+}
+
+dispatched! {
+/// Writes the atoms whose keys are `order`.
+fn place(placing: &Placing<'_>, order: &[u128], atoms: &mut [LatticeAtom]) {
+    for (key, atom) in order.iter().zip(atoms) {
+        *atom = placing.atom(usize::try_from(key & u128::from(u64::MAX)).unwrap_or(usize::MAX));
+    }
+}
+}
+
+/// Numbers that order tiles, below 2⁴⁶.
+enum TileRanks {
+    /// Places in the box of these sides from the lowest tile on.
+    Box { lo: [i32; 3], side: [u64; 3] },
+    /// Places among the tiles with atoms, where the box has too many.
+    Listed(Vec<[i32; 3]>),
+}
+
+impl TileRanks {
+    /// For `n` atoms in the tiles `of_atom`, between the tiles `lo` and `hi`.
+    fn new([lo, hi]: [[i32; 3]; 2], n: usize, of_atom: impl Fn(usize) -> [i32; 3] + Sync) -> Self {
+        let side: [u64; 3] = std::array::from_fn(|k| u64::from(lo[k].abs_diff(hi[k])) + 1);
+        // Each side is below 2²⁰, as coordinates are bounded.
+        if side.iter().product::<u64>() < 1 << 46 {
+            return Self::Box { lo, side };
+        }
+        let mut order: Vec<[i32; 3]> = (0..n).into_par_iter().map(|i| tile_order(of_atom(i))).collect();
+        order.par_sort_unstable();
+        order.dedup();
+        Self::Listed(order)
+    }
+
+    #[inline(always)]
+    fn of(&self, tile: [i32; 3]) -> u64 {
+        match self {
+            Self::Box { lo, side } => {
+                let [x, y, z]: [u64; 3] = std::array::from_fn(|k| u64::from(tile[k].abs_diff(lo[k])));
+                (z * side[1] + y) * side[0] + x
+            }
+            Self::Listed(order) => order.partition_point(|&t| t < tile_order(tile)) as u64,
+        }
+    }
 }
 
 /// The tile that a sample belongs to.
@@ -215,4 +270,47 @@ pub(super) fn to_u32(n: usize) -> u32 {
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
 pub(super) fn to_u64(v: f64) -> u64 {
     v as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cmp::Ordering;
+
+    use super::*;
+    use crate::surface::params::SurfaceOptions;
+
+    /// The canonical order, said once more and slowly.
+    fn order(a: &LatticeAtom, b: &LatticeAtom) -> Ordering {
+        let place = |atom: &LatticeAtom| {
+            let brick = atom.cell.map(|c| c.div_euclid(BRICK));
+            let reversed = |[x, y, z]: [i32; 3]| [z, y, x];
+            [reversed(tile_of(atom.cell)), reversed(brick), reversed(atom.cell)]
+        };
+        let rest = |atom: &LatticeAtom| [atom.frac[2], atom.frac[1], atom.frac[0], atom.inv_length2];
+        let rest = rest(a).iter().zip(rest(b)).map(|(a, b)| a.total_cmp(&b)).find(|order| order.is_ne());
+        place(a).cmp(&place(b)).then(rest.unwrap_or(Ordering::Equal)).then(a.source.cmp(&b.source))
+    }
+
+    #[test]
+    fn atoms_are_in_canonical_order_in_any_box() {
+        let at = |i: u32, k: f64, half: f64| half * (f64::from(i) * k).sin();
+        // Many atoms a cell, few, tiles without atoms, and a box of too many tiles to be numbered by place.
+        for (resolution, half) in [(20.0, 60.0), (4.0, 60.0), (0.5, 60.0), (0.1, 60.0), (0.05, 99_999.0)] {
+            // Every seventh sphere lies where another one does, every third of these as large.
+            let of = |i: u32| if i.is_multiple_of(7) { i / 2 } else { i };
+            let column = |k: f64| (0..20_000).map(|i| at(of(i), k, half)).collect::<Vec<_>>();
+            let radii = (0..20_000_u32).map(|i| if i.is_multiple_of(3) { 1.5 } else { 1.7 }).collect();
+            let spheres = Spheres::new(column(0.37), column(1.13), column(2.71), radii).unwrap();
+            let options = SurfaceOptions { resolution: Some(resolution), ..SurfaceOptions::default() };
+            let lattice = Lattice::new(&spheres, &SurfaceParams::new(&options).unwrap()).unwrap();
+            let sorted = |atoms: &[LatticeAtom]| atoms.windows(2).all(|pair| order(&pair[0], &pair[1]).is_lt());
+            assert!(sorted(&lattice.atoms), "{resolution}");
+            let mut sources: Vec<u32> = lattice.atoms.iter().map(|atom| atom.source).collect();
+            sources.sort_unstable();
+            assert!(sources.into_iter().eq(0..20_000), "every sphere once");
+            let mut wrong = lattice.atoms.clone();
+            wrong.swap(777, 778);
+            assert!(!sorted(&wrong), "the control");
+        }
+    }
 }

@@ -24,6 +24,7 @@ pub mod plan;
 pub mod reference;
 mod simd;
 pub mod sink;
+mod sort;
 pub mod spheres;
 mod sums;
 pub mod topology;

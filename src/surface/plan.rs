@@ -6,14 +6,14 @@
 //! neighbours' first samples: cells live there too.
 
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
 
+use super::column::Column;
 use super::control::Control;
 use super::cpu::{self, Constants, SlopeConstants};
 use super::error::SurfaceError;
 use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_u32, to_u64};
 use super::layout::{NONE, Params, Tile, halves};
-use super::marks::{Bits, Marked, local_of, mark_run, merge, runs};
+use super::marks::{Bits, Marked, local_of, mark_run, merge, runs, starts};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 
@@ -26,11 +26,11 @@ pub struct Plan {
     /// Tiles with bricks, in order.
     pub tiles: Vec<Tile>,
     /// Per brick its tile, shifted by 9, and its place within the tile.
-    pub bricks: Vec<u32>,
+    pub bricks: Column<u32>,
     /// Per brick its first atom; one more entry than bricks.
-    pub first_atoms: Vec<u32>,
+    pub first_atoms: Column<u32>,
     /// Per atom how far it reaches, in spacings, with a little slack for rounding.
-    pub reaches: Vec<f32>,
+    pub reaches: Column<f32>,
     /// Per tile the entries of its bricks' candidate lists.
     pub candidates: Vec<u64>,
     /// Bricks with a sample in reach of an atom.
@@ -58,9 +58,14 @@ impl Plan {
         if atoms.len() > cpu::MAX_ATOMS {
             return Err(cpu::too_many_atoms(atoms.len()));
         }
-        let runs = runs(atoms);
-        let reaches: Vec<f32> = atoms.par_iter().with_min_len(4096).map(|atom| reach_of(lattice, atom)).collect();
-        let longest = reaches.par_iter().with_min_len(1 << 16).copied().reduce(|| 0.0, f32::max);
+        let starts = starts(atoms);
+        let runs = runs(&starts, atoms.len());
+        let mut reaches = Column::zeroed(atoms.len());
+        let part = |(reaches, atoms): (&mut [f32], &[LatticeAtom])| {
+            reaches.iter_mut().zip(atoms).for_each(|(reach, atom)| *reach = reach_of(lattice, atom));
+            reaches.iter().copied().fold(0.0, f32::max)
+        };
+        let longest = reaches.par_chunks_mut(4096).zip(atoms.par_chunks(4096)).map(part).reduce(|| 0.0, f32::max);
         refuse_early(lattice, runs.len(), longest, limits)?;
         control.check()?;
         let marks: Vec<Vec<Marked>> = runs
@@ -85,13 +90,12 @@ impl Plan {
             ..Self::default()
         };
         plan.number(&marked).ok_or_else(|| cpu::grid_too_large(lattice, u64::from(u32::MAX) * 512, limits))?;
-        plan.place(atoms);
+        plan.place(&marked, atoms, &starts);
         Ok(plan)
     }
 
     /// Numbers tiles and bricks. `None` where 32 bits do not.
     fn number(&mut self, marked: &[Marked]) -> Option<()> {
-        let index: FxHashMap<[i32; 3], u32> = marked.iter().map(|m| m.tile).zip(0..).collect();
         if marked.len() >= 1 << 23 {
             return None;
         }
@@ -112,46 +116,46 @@ impl Plan {
                     tile.before[z] = before;
                     before += word.count_ones();
                 }
-                for (n, entry) in (0_i32..27).zip(&mut tile.around) {
-                    let step = [n % 3 - 1, n / 3 % 3 - 1, n / 9 - 1];
-                    let there = std::array::from_fn(|k| m.tile[k] + step[k]);
-                    *entry = index.get(&there).copied().unwrap_or(NONE);
+                for (row, entries) in (0_i32..9).zip(tile.around.chunks_exact_mut(3)) {
+                    // The three tiles of a row follow each other, as far as they exist.
+                    let first = [m.tile[0] - 1, m.tile[1] + row % 3 - 1, m.tile[2] + row / 3 - 1];
+                    let at = marked.partition_point(|m| tile_order(m.tile) < tile_order(first));
+                    for (t, there) in (at..).zip(marked[at..].iter().take(3)) {
+                        let step = there.tile[0].abs_diff(first[0]) as usize;
+                        if there.tile[1..] == first[1..] && step < 3 {
+                            entries[step] = to_u32(t);
+                        }
+                    }
                 }
                 tile
             })
             .collect();
-        self.bricks = (0_u32..)
-            .zip(marked)
-            .flat_map(|(tile, m)| set_bits(&m.closed).map(move |local| tile << 9 | local))
-            .collect();
+        self.bricks = Column::zeroed(base as usize);
+        self.first_atoms = Column::zeroed(base as usize + 1);
         Some(())
     }
 
-    /// Finds every brick's first atom.
-    fn place(&mut self, atoms: &[LatticeAtom]) {
-        let Self { tiles, bricks, first_atoms, .. } = self;
-        first_atoms.resize(bricks.len() + 1, to_u32(atoms.len()));
-        let mut rest = &mut first_atoms[..];
-        let mut parts = Vec::with_capacity(tiles.len());
-        for (t, tile) in tiles.iter().enumerate() {
-            let end = tiles.get(t + 1).map_or(bricks.len(), |next| next.base as usize);
-            let (part, tail) = rest.split_at_mut(end - tile.base as usize);
-            parts.push((tile, part));
-            rest = tail;
+    /// Lists the bricks and finds their first atoms; `starts` tells where each tile's atoms begin.
+    fn place(&mut self, marked: &[Marked], atoms: &[LatticeAtom], starts: &[usize]) {
+        let mut parts = Vec::with_capacity(marked.len());
+        let (mut bricks, mut firsts) = (&mut self.bricks[..], &mut self.first_atoms[..]);
+        for (t, m) in (0_u32..).zip(marked) {
+            let n = usize::try_from(ones(&m.closed)).unwrap_or_default();
+            let ((own, more), (first, rest)) = (bricks.split_at_mut(n), firsts.split_at_mut(n));
+            parts.push((t, m, own, first));
+            (bricks, firsts) = (more, rest);
         }
-        parts.into_par_iter().for_each(|(tile, part)| {
-            let order = tile_order(tile.coord);
-            let mut at = atoms.partition_point(|atom| tile_order(tile_of(atom.cell)) < order);
-            let own = &bricks[tile.base as usize..][..part.len()];
-            for (brick, first) in own.iter().zip(part) {
+        firsts.fill(to_u32(atoms.len()));
+        parts.into_par_iter().for_each(|(t, m, own, firsts)| {
+            let before = |&start: &usize| tile_order(tile_of(atoms[start].cell)) < tile_order(m.tile);
+            let tile = starts.partition_point(before);
+            let [mut at, next] = [tile, tile + 1].map(|t| starts.get(t).copied().unwrap_or(atoms.len()));
+            // Of a tile without atoms the next one's are found: they are behind all its bricks.
+            let end = if atoms.get(at).is_some_and(|atom| tile_of(atom.cell) == m.tile) { next } else { at };
+            for ((local, brick), first) in set_bits(&m.closed).zip(own).zip(firsts) {
+                (*brick, *first) = (t << 9 | local, to_u32(at));
                 // Every atom's own brick exists, so none is passed over.
-                *first = to_u32(at);
-                while atoms
-                    .get(at)
-                    .is_some_and(|atom| tile_of(atom.cell) == tile.coord && local_of(atom) == brick & 511)
-                {
-                    at += 1;
-                }
+                at += atoms[at..end].iter().take_while(|atom| local_of(atom) == local).count();
             }
         });
     }

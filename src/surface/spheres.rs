@@ -1,5 +1,7 @@
 //! The input of the core: spheres as a structure of arrays.
 
+use rayon::prelude::*;
+
 use super::error::SurfaceError;
 
 /// Centres beyond this distance from the origin (Å, per axis) are refused: 32-bit vertex coordinates would
@@ -72,7 +74,13 @@ impl Spheres {
     /// Lowest and highest centre coordinate per axis, Å; `None` when there are no spheres.
     #[must_use]
     pub fn bounds(&self) -> Option<[[f64; 3]; 2]> {
-        let fold = |c: &[f64]| c.iter().fold((f64::MAX, f64::MIN), |(lo, hi), &v| (lo.min(v), hi.max(v)));
+        // Plain comparisons: no coordinate is NaN, which `f64::min` would look for.
+        let wider = |(lo, hi): (f64, f64), (low, high): (f64, f64)| {
+            (if low < lo { low } else { lo }, if high > hi { high } else { hi })
+        };
+        let none = (f64::MAX, f64::MIN);
+        let part = |part: &[f64]| part.iter().fold(none, |all, &v| wider(all, (v, v)));
+        let fold = |column: &[f64]| column.par_chunks(1 << 16).map(part).reduce(|| none, wider);
         let ([x, y, z], false) = ([&self.x, &self.y, &self.z].map(|c| fold(c)), self.is_empty()) else {
             return None;
         };
