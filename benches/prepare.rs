@@ -14,7 +14,7 @@ use molmesh::surface::{Control, Spheres, SurfaceLimits, SurfaceParams};
 const DOMAIN: (f64, usize) = (30.0, 1350);
 
 fn atoms(n: usize) -> Spheres {
-    let edge = (1..).find(|e: &usize| e.pow(3) * DOMAIN.1 >= n).unwrap_or(1);
+    let edge = (1..=n).find(|e| e.pow(3) * DOMAIN.1 >= n).unwrap_or(1);
     let mut state = 7_u64;
     let mut next = || {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
