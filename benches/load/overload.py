@@ -48,7 +48,7 @@ class Load:
         self.host, self.port = parts.hostname, parts.port or 80
         self.path = f"/v1/meshes?resolution={resolution}"
         self.structure, self.n = structure, 0
-        self.done, self.refusals, self.ratios, self.waits, self.errors = 0, [], [], [], 0
+        self.done, self.refusals, self.ratios, self.told, self.errors = 0, [], [], [], 0
 
     def body(self):
         """The structure with a remark: the same work, but not the same content."""
@@ -70,7 +70,8 @@ class Load:
                     self.refusals.append(took)
                     if refused is None:
                         refused, said = now, retry
-                    await asyncio.sleep(retry)
+                    self.told.append(retry)
+                    await asyncio.sleep(min(retry, max(0, end - now)))
                     continue
                 if status != 200:
                     self.errors += 1
@@ -88,6 +89,16 @@ def memory(pid):
             return int(line.split()[1]) / 1024
 
 
+def buckets(url, status):
+    """Requests by the service's own clock: (upper bound in seconds, requests up to it)."""
+    found = {}
+    for line in urllib.request.urlopen(f"{url}/metrics").read().decode().splitlines():
+        if line.startswith("http_server_request_duration_seconds_bucket") and f'status="{status}"' in line:
+            bound = line.split('le="')[1].split('"')[0]
+            found[float(bound)] = found.get(float(bound), 0) + float(line.rsplit(" ", 1)[1])
+    return sorted(found.items())
+
+
 async def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("url")
@@ -96,6 +107,7 @@ async def main():
     parser.add_argument("--times", type=float, default=10)
     parser.add_argument("--resolution", default="0.3")
     parser.add_argument("--pid", type=int, help="the service's process, for its memory")
+    parser.add_argument("--metrics", help="the service's metrics, for refusals by its own clock")
     args = parser.parse_args()
     limits = json.load(urllib.request.urlopen(f"{args.url}/v1/capabilities"))["limits"]
     structure = open(args.structure, "rb").read()
@@ -119,7 +131,12 @@ async def main():
     print(f"clients         {clients:8d}")
     print(f"goodput         {load.done / args.seconds:8.1f} meshes/s, {100 * load.done / args.seconds / peak:.0f} % of the peak")
     print(f"refusals        {len(load.refusals):8d}, p50 {1e3 * percent(load.refusals, 50):.1f} ms, p99 {1e3 * percent(load.refusals, 99):.1f} ms")
+    if args.metrics:
+        refused = buckets(args.metrics, 503)
+        share = lambda bound: 100 * max((n for b, n in refused if b <= bound), default=0) / max(1, refused[-1][1] if refused else 1)
+        print(f"  by the service's clock, body included: {share(0.01):.1f} % within 10 ms, {share(0.05):.1f} % within 50 ms")
     print(f"Retry-After     {100 * right:8.1f} % right within a factor of 2; ratio p50 {percent(load.ratios, 50):.2f}, p90 {percent(load.ratios, 90):.2f}, p99 {percent(load.ratios, 99):.2f}")
+    print(f"told            p50 {percent(load.told, 50):.0f} s, p99 {percent(load.told, 99):.0f} s, longest {max(load.told, default=0)} s")
     print(f"errors          {load.errors:8d}")
     if samples:
         third = len(samples) // 3

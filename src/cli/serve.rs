@@ -16,6 +16,9 @@ use super::banner::{self, Facts};
 use super::error::CliError;
 use super::style::Style;
 
+/// How much nicer threads that compute are than those that answer: their share of a busy core is a third.
+#[cfg(target_os = "linux")]
+const COMPUTING: i32 = 5;
 /// Threads of the runtime: they read and write sockets; meshing has its own.
 const RUNTIME_THREADS: usize = 2;
 
@@ -37,6 +40,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         .enable_all()
         .build()
         .map_err(failed)?;
+    give_way();
     let server = runtime
         .block_on(Server::bind(config, Chosen { backend, reason, devices }))
         .map_err(|e| CliError::Service(e.to_string()))?;
@@ -48,6 +52,19 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     // What still reads a file or computes after the drain timeout is not waited for.
     runtime.shutdown_timeout(Duration::from_millis(100));
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
+}
+
+/// Lets computing give way to answering: a refusal, a cached mesh and a probe are due in milliseconds also while every
+/// core meshes. Threads take their priority from the one that starts them: those of the runtime are there already, those that
+/// compute are not.
+fn give_way() {
+    #[cfg(target_os = "linux")]
+    if let Err(error) = rustix::process::nice(COMPUTING) {
+        tracing::debug!(%error, "computing has the priority of answering");
+    }
+    if let Err(error) = rayon::ThreadPoolBuilder::new().build_global() {
+        tracing::debug!(%error, "the threads that compute were there already");
+    }
 }
 
 /// Defaults, then the file, then the environment, then `--set`, then the flags that have names of their own.

@@ -12,7 +12,8 @@ pub struct JobsConfig {
     /// while the first reads its file or measures its mesh. GPUs take more: see `devices.jobs`.
     pub workers: usize,
     /// Jobs that wait. Default 64: at a typical 0.1 s a job on two workers the last one waits three seconds,
-    /// which is as long as anybody waits for an answer; more would only make refusals late.
+    /// which is as long as anybody waits for an answer; more would only make refusals late. As many again are there for
+    /// requests that were refused and come back when they were told to.
     pub queue: usize,
     /// Requests for meshes in the house at once, from the submission of the job to the last byte of the answer.
     /// Default 256: each holds a thread while its mesh is written, and leaves threads for reading files.

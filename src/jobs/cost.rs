@@ -46,10 +46,11 @@ impl Rate {
         self.per_job.unwrap_or(expected)
     }
 
-    /// A job that was expected to take `expected` seconds took `seconds`.
-    pub(super) fn learn(&mut self, expected: f64, seconds: f64) {
+    /// A job of so many units took `seconds`.
+    pub(super) fn learn(&mut self, units: f64, seconds: f64) {
+        // Against what is expected now, not when the job came: a full queue would correct the same mistake a hundred times.
         // By the logarithm: a job a hundred times as long as expected says no more than one a hundredth as long.
-        let miss = (seconds.max(1e-6) / expected.max(1e-6)).ln();
+        let miss = (seconds.max(1e-6) / self.seconds(units).max(1e-9)).ln();
         self.per_unit *= (NEWEST * miss.clamp(-4.0, 4.0)).exp();
         self.per_job = Some(self.per_job.map_or(seconds, |mean| mean + NEWEST * (seconds - mean)));
     }
@@ -75,13 +76,17 @@ mod tests {
     fn the_rate_follows_the_machine() {
         let mut rate = Rate::default();
         for _ in 0..50 {
-            let expected = rate.seconds(1e5);
-            rate.learn(expected, 2.0);
+            rate.learn(1e5, 2.0);
         }
         assert!((rate.seconds(1e5) - 2.0).abs() < 0.01, "{rate:?}");
         assert!((rate.mean(0.0) - 2.0).abs() < 1e-9);
         // One stray job does not turn everything over.
-        rate.learn(2.0, 2e4);
+        rate.learn(1e5, 2e4);
         assert!(rate.seconds(1e5) < 5.0, "{rate:?}");
+        // However many were expected to take something else when they came, it settles.
+        for _ in 0..500 {
+            rate.learn(1e5, 0.02);
+        }
+        assert!((rate.seconds(1e5) - 0.02).abs() < 1e-3, "{rate:?}");
     }
 }

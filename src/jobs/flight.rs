@@ -61,8 +61,8 @@ pub(super) struct Flight {
     pub(super) id: u64,
     pub(super) work: WorkKey,
     pub(super) rank: Rank,
-    /// Expected time, seconds.
-    pub(super) cost: f64,
+    /// Expected work.
+    pub(super) units: f64,
     /// Place among the clients' fair shares: lower goes first.
     pub(super) tag: f64,
     pub(super) accepted: Instant,

@@ -104,11 +104,15 @@ impl Queue {
             return Ok(place);
         }
         let now = Instant::now();
-        let cost = state.rate.seconds(cost::units(&task.input, &task.job));
+        let units = cost::units(&task.input, &task.job);
         // A free worker's job counts as running, not as waiting, even before the worker has woken up. Places are held for those
-        // who were told to come back, but not so many that workers could run out of work if they do not.
-        let held = if state.returns.is_due(&work, now) { 0 } else { state.returns.held(now).min(self.limit / 2) };
-        if state.flights.len() + held >= self.limit + self.workers {
+        // who were told to come back, but not so many that workers could run out of work if they do not. Whoever comes back
+        // on time finds as many places again: times are told in whole seconds, so they come in bursts.
+        let room = self.limit + self.workers;
+        let due = state.returns.is_due(&work, now);
+        let (held, room) =
+            if due { (0, room + self.limit) } else { (state.returns.held(now).min(self.limit / 2), room) };
+        if state.flights.len() + held >= room {
             let waiting = state.waiting().count();
             let wait = self.room_in(&mut state, work, now);
             return Err(Refusal::QueueFull { waiting, limit: self.limit, wait });
@@ -118,13 +122,13 @@ impl Queue {
         if wait > allowed {
             return Err(Refusal::TooLate { wait, allowed });
         }
-        let tag = state.shares.tag(&task.rank, cost);
+        let tag = state.shares.tag(&task.rank, units);
         let progress = Arc::new(Progress::default());
         state.flights.push(Flight {
             id: waiter,
             work,
             rank: task.rank,
-            cost,
+            units,
             tag,
             accepted: now,
             begun: None,
@@ -185,7 +189,7 @@ impl Queue {
         let Some(at) = state.find(id) else { return };
         let flight = state.flights.swap_remove(at);
         if let Some(time) = time {
-            state.rate.learn(flight.cost, time.as_secs_f64());
+            state.rate.learn(flight.units, time.as_secs_f64());
         }
         if state.flights.is_empty() {
             state.shares.settle();
@@ -268,8 +272,9 @@ impl Queue {
         }
         let left = |flight: &Flight| {
             let spent = flight.begun.map_or(0.0, |begun| now.saturating_duration_since(begun).as_secs_f64());
+            let cost = state.rate.seconds(flight.units);
             // A job that takes longer than expected is not known to be over soon.
-            (flight.cost - spent).max(0.1 * flight.cost)
+            (cost - spent).max(0.1 * cost)
         };
         let ahead: f64 = state.flights.iter().map(left).sum();
         Duration::try_from_secs_f64(ahead / self.workers as f64).unwrap_or(Duration::MAX)
@@ -277,7 +282,7 @@ impl Queue {
 
     /// When a place will be free for one who is refused now.
     fn room_in(&self, state: &mut State, work: WorkKey, now: Instant) -> Duration {
-        let all: f64 = state.flights.iter().map(|flight| flight.cost).sum();
+        let all: f64 = state.flights.iter().map(|flight| state.rate.seconds(flight.units)).sum();
         let mean = state.rate.mean(all / state.flights.len().max(1) as f64) / self.workers as f64;
         let each = Duration::try_from_secs_f64(mean).unwrap_or(Duration::MAX);
         state.returns.tell(work, each, each, now)
