@@ -207,6 +207,34 @@ fn chunks_pieces_and_landings_change_no_byte() {
 }
 
 #[test]
+fn output_that_is_made_before_it_is_counted_is_the_same_or_made_again() {
+    let crowd = |n: usize| spheres(&Random(21).cloud(n, 40.0));
+    let ids = SurfaceOptions { resolution: Some(0.6), atom_ids: true, ..SurfaceOptions::default() };
+    let (plain, ids) = (params(KERNELS[0], 0.6), SurfaceParams::new(&ids).unwrap());
+    let mut engine = engine_with(|b| b.small_bytes = 0);
+    // The first has no buffers to be made in. The second finds them; so do those with fewer rows. One with more rows, or
+    // with atoms by vertex for the first time, does not; then its like does.
+    let jobs = [
+        (400, &plain, 2),
+        (400, &plain, 3),
+        (380, &plain, 3),
+        (700, &plain, 3),
+        (700, &plain, 3),
+        (400, &ids, 2),
+        (400, &ids, 3),
+    ];
+    for (i, (n, params, submissions)) in jobs.into_iter().enumerate() {
+        let spheres = crowd(n);
+        engine.metered();
+        let meshed = mesh_of(&mut engine, &spheres, params);
+        let whole = mesh_of(&mut self::engine(), &spheres, params);
+        assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{i}");
+        assert_eq!(meshed.mesh.atom_ids, whole.mesh.atom_ids, "{i}");
+        assert_eq!(engine.metered().submissions, submissions, "{i}");
+    }
+}
+
+#[test]
 fn more_workgroups_than_one_dimension_has() {
     // Lone atoms on a grid of their own: each has a few dozen bricks and little to compute.
     let rows: Vec<[f64; 4]> = (0..8000)

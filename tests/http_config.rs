@@ -101,6 +101,8 @@ fn bad_values_name_the_key_the_value_and_what_was_expected() {
         ("jobs.workers", "0"),
         ("jobs.workers", "-1"),
         ("jobs.queue", "5MiB"),
+        ("jobs.queue", "none"),
+        ("devices.spread_bricks", "0"),
         ("limits.body_bytes", "5 MB"),
         ("limits.body_bytes", "99999999999GiB"),
         ("server.listen", "localhost"),
@@ -120,6 +122,14 @@ fn bad_values_name_the_key_the_value_and_what_was_expected() {
     let wrong = file("[jobs]\nworkers = 1.5");
     assert!(load(Some(wrong.path()), [], &[]).unwrap_err().to_string().contains("jobs.workers"));
     assert!(load(Some(Path::new("/nowhere.toml")), [], &[]).unwrap_err().to_string().contains("/nowhere.toml"));
+}
+
+#[test]
+fn a_number_that_may_be_absent_is_cleared_by_none_and_set_again() {
+    let spread = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().devices.spread_bricks;
+    assert_eq!(spread(&[]), Some(molmesh::surface::devices::SPREAD_BRICKS));
+    assert_eq!(spread(&[("devices.spread_bricks", "none")]), None);
+    assert_eq!(spread(&[("devices.spread_bricks", "none"), ("devices.spread_bricks", "5_000")]), Some(5000));
 }
 
 #[test]

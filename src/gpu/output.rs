@@ -16,9 +16,9 @@ use crate::surface::layout::{Params, Tally};
 
 /// Rows of parameters: the chunk's, and those of the pieces of a submission.
 pub(super) const PARAM_ROWS: usize = 64;
-/// Output is made before it is counted where the buffers hold the estimate for a small job over this: most large grids need
-/// between a half and a third of it.
-const LIKELY: u64 = 4;
+/// Output is made before it is counted where the buffers hold the estimate for a small job over this: a ball of 60,000
+/// atoms at 0.5 Å needs a sixth of the estimate, and what is less solid needs more.
+const LIKELY: u64 = 8;
 
 pub(super) fn failed(why: String) -> GpuError {
     GpuError::Failed(why)

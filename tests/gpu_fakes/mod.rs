@@ -169,7 +169,7 @@ pub type Ran = std::thread::JoinHandle<Result<String, GpuError>>;
 /// Runs `job` on a thread of its own.
 pub fn start(pool: &Arc<DevicePool>, job: &GpuJob) -> Ran {
     let (pool, job) = (Arc::clone(pool), job.clone());
-    std::thread::spawn(move || pool.run(&job).map(|(_, device)| device.to_owned()))
+    std::thread::spawn(move || pool.run(&job).map(|(_, device)| device))
 }
 
 #[track_caller]
