@@ -12,7 +12,7 @@ fn the_banner_is_small_and_its_line_works_as_pasted() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--devices", "cpu"]);
     assert!(service.banner.lines().count() <= 10 && !service.banner.contains('\x1b'), "{}", service.banner);
-    for part in ["viewer", "/v1/capabilities", "metrics", "device", "cpu: ", "not gpu: "] {
+    for part in ["viewer", "/docs", "metrics", "device", "cpu: ", "not gpu: "] {
         assert!(service.banner.contains(part), "no `{part}` in\n{}", service.banner);
     }
     let line = service.banner.lines().last().unwrap().trim().strip_prefix("try").unwrap().trim();

@@ -21,7 +21,7 @@ pub(crate) fn text(addr: SocketAddr, metrics: Option<SocketAddr>, facts: &Facts,
     let base = format!("http://{}", reachable(addr));
     let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
     page.row("viewer", &style.cyan(&format!("{base}/")));
-    page.row("API", &style.cyan(&format!("{base}/v1/capabilities")));
+    page.row("docs", &style.cyan(&format!("{base}/docs")));
     if let Some(metrics) = metrics {
         page.row("metrics", &style.cyan(&format!("http://{}/metrics", reachable(metrics))));
     }
@@ -62,7 +62,7 @@ mod tests {
         let text = text("0.0.0.0:81".parse().unwrap(), Some("[::]:82".parse().unwrap()), &facts, Style::PLAIN);
         for part in [
             "http://127.0.0.1:81/\n",
-            "http://127.0.0.1:81/v1/capabilities",
+            "http://127.0.0.1:81/docs\n",
             "http://[::1]:82/metrics",
             "cpu: 2 threads (auto)",
             "not gpu: none found",

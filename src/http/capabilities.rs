@@ -4,7 +4,9 @@ use axum::extract::State;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use serde_json::{Map, Value};
+use utoipa::ToSchema;
 
 use super::state::Shared;
 use crate::config::Config;
@@ -14,7 +16,176 @@ use crate::pipeline::params::{Domain, Parameter, TABLE};
 use crate::structure::{element, radii};
 use crate::surface::{DeviceStatus, FoundDevice, Kernel, Preset, SurfaceOptions, SurfaceParams};
 
-/// The document.
+/// What the service can do and what it refuses.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Capabilities {
+    /// `molmesh`.
+    name: &'static str,
+    /// The program's version.
+    version: &'static str,
+    units: Units,
+    inputs: Inputs,
+    /// Mesh formats, the best known first.
+    formats: Vec<FormatDocument>,
+    /// The format where none is asked for.
+    default_format: &'static str,
+    /// Kernel functions.
+    kernels: Vec<&'static str>,
+    /// Smoothness and isovalue of every preset.
+    #[schema(value_type = std::collections::BTreeMap<String, PresetValues>)]
+    presets: Map<String, Value>,
+    /// Every parameter of a mesh.
+    parameters: Vec<ParameterDocument>,
+    limits: Limits,
+    /// The backend that makes the meshes.
+    backends: Vec<BackendDocument>,
+    /// Every device that was found.
+    devices: Vec<DeviceDocument>,
+    radii: Radii,
+    /// Where the types of problems are listed.
+    problems: &'static str,
+}
+
+/// The units of everything.
+#[derive(Debug, Serialize, ToSchema)]
+struct Units {
+    length: &'static str,
+    area: &'static str,
+    volume: &'static str,
+}
+
+/// What can be uploaded.
+#[derive(Debug, Serialize, ToSchema)]
+struct Inputs {
+    /// Structure formats.
+    formats: &'static [&'static str],
+    /// Compressions.
+    encodings: &'static [&'static str],
+    note: &'static str,
+}
+
+/// A mesh format.
+#[derive(Debug, Serialize, ToSchema)]
+struct FormatDocument {
+    /// Its file name's extension.
+    name: &'static str,
+    media_type: &'static str,
+}
+
+/// What a preset stands for.
+#[derive(Debug, Serialize, ToSchema)]
+struct PresetValues {
+    smoothness: f64,
+    isovalue: f64,
+}
+
+/// A parameter.
+#[derive(Debug, Serialize, ToSchema)]
+struct ParameterDocument {
+    name: &'static str,
+    /// What it does.
+    doc: &'static str,
+    /// What values it takes, in words.
+    expected: String,
+    /// The value where it is absent, in words.
+    default: &'static str,
+    #[serde(flatten)]
+    domain: DomainDocument,
+}
+
+/// What values a parameter takes.
+#[derive(Debug, Serialize, ToSchema)]
+#[serde(tag = "type", rename_all = "lowercase")]
+enum DomainDocument {
+    /// A number within bounds, both included.
+    Number { min: f64, max: f64, unit: &'static str },
+    /// A whole number.
+    Integer,
+    /// `true` or `false`.
+    Boolean,
+    /// One of these words.
+    Choice { values: &'static [&'static str] },
+    /// Words of these, separated by commas.
+    Set { values: &'static [&'static str] },
+    /// Free text.
+    Text,
+}
+
+/// The limits, as they are configured.
+#[derive(Debug, Serialize, ToSchema)]
+struct Limits {
+    body_bytes: u64,
+    inflated_bytes: u64,
+    atoms: u64,
+    grid_samples: u64,
+    mesh_bytes: u64,
+    output_bytes: u64,
+    memory_bytes: u64,
+    workers: usize,
+    queue: usize,
+    deliveries: usize,
+    deadline_ms: u64,
+    sync_wait_ms: u64,
+    batch_deadline_ms: u64,
+    attempts: u32,
+    body_timeout_ms: u64,
+    header_timeout_ms: u64,
+    write_timeout_ms: u64,
+    connections: usize,
+}
+
+/// What makes the meshes.
+#[derive(Debug, Serialize, ToSchema)]
+struct BackendDocument {
+    name: &'static str,
+    /// What it runs on.
+    device: String,
+    /// Why it was taken.
+    reason: String,
+}
+
+/// A device that was found.
+#[derive(Debug, Serialize, ToSchema)]
+struct DeviceDocument {
+    /// Its number, by which it is chosen.
+    number: usize,
+    name: String,
+    /// What kind of device.
+    kind: &'static str,
+    /// The graphics API that offers it.
+    api: &'static str,
+    driver: String,
+    binding_bytes: u64,
+    buffer_bytes: u64,
+    workgroup_bytes: u64,
+    timestamps: bool,
+    /// The least and the most threads of a subgroup.
+    #[schema(required)]
+    subgroups: Option<[u32; 2]>,
+    /// It was taken when the service started.
+    taken: bool,
+    /// It takes jobs now.
+    up: bool,
+    /// Why, or why not.
+    reason: String,
+}
+
+/// Van der Waals radii.
+#[derive(Debug, Serialize, ToSchema)]
+struct Radii {
+    /// Where they are from.
+    table: &'static str,
+    unit: &'static str,
+    /// The radius of elements that the table lacks.
+    fallback: f32,
+    /// By element symbol.
+    #[schema(value_type = std::collections::BTreeMap<String, f64>)]
+    values: Map<String, Value>,
+}
+
+/// What the service can do and what it refuses.
+#[utoipa::path(get, path = "/v1/capabilities", tag = "service", operation_id = "capabilities",
+    responses((status = 200, description = "Formats, parameters, limits, devices.", body = Capabilities)))]
 pub(super) async fn show(State(app): State<Shared>) -> Response {
     let headers = [(CONTENT_TYPE, "application/json"), (CACHE_CONTROL, "no-cache")];
     let body =
@@ -24,56 +195,56 @@ pub(super) async fn show(State(app): State<Shared>) -> Response {
 
 /// Writes the document.
 pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> Bytes {
-    let formats: Vec<Value> =
-        Format::ALL.iter().map(|f| json!({ "name": f.extension(), "media_type": f.media_type() })).collect();
-    let document = json!({
-        "name": "molmesh",
-        "version": env!("CARGO_PKG_VERSION"),
-        "units": { "length": "Å", "area": "Å²", "volume": "Å³" },
-        "inputs": {
-            "formats": ["pdb", "mmcif"],
-            "encodings": ["identity", "gzip", "zstd"],
-            "note": "The bytes are looked at; Content-Type is a hint.",
+    let backend = pool.backend();
+    let document = Capabilities {
+        name: "molmesh",
+        version: env!("CARGO_PKG_VERSION"),
+        units: Units { length: "Å", area: "Å²", volume: "Å³" },
+        inputs: Inputs {
+            formats: &["pdb", "mmcif"],
+            encodings: &["identity", "gzip", "zstd"],
+            note: "The bytes are looked at; Content-Type is a hint.",
         },
-        "formats": formats,
-        "default_format": Format::default().extension(),
-        "kernels": Kernel::ALL.iter().map(|k| k.name()).collect::<Vec<_>>(),
-        "presets": presets(),
-        "parameters": TABLE.iter().map(parameter).collect::<Vec<_>>(),
-        "limits": limits(config, pool),
-        "backends": [{
-            "name": pool.backend().name(),
-            "device": pool.backend().describe(),
-            "reason": pool.reason(),
+        formats: Format::ALL.map(|f| FormatDocument { name: f.extension(), media_type: f.media_type() }).into(),
+        default_format: Format::default().extension(),
+        kernels: Kernel::ALL.iter().map(|k| k.name()).collect(),
+        presets: presets(),
+        parameters: TABLE.iter().map(parameter).collect(),
+        limits: limits(config, pool),
+        backends: vec![BackendDocument {
+            name: backend.name(),
+            device: backend.describe(),
+            reason: pool.reason().to_owned(),
         }],
-        "devices": devices(found, &pool.backend().devices()),
-        "radii": { "table": radii::TABLE, "unit": "Å", "fallback": radii::FALLBACK, "values": radii_by_symbol() },
-        "problems": "/problems",
-    });
-    Bytes::from(document.to_string())
+        devices: devices(found, &backend.devices()),
+        radii: Radii { table: radii::TABLE, unit: "Å", fallback: radii::FALLBACK, values: radii_by_symbol() },
+        problems: "/problems",
+    };
+    // A document of text and numbers can be written.
+    serde_json::to_vec(&document).map(Bytes::from).unwrap_or_default()
 }
 
 /// Every device that was found; `up` says whether it takes jobs now, `reason` why or why not.
-fn devices(found: &[FoundDevice], running: &[DeviceStatus]) -> Vec<Value> {
+fn devices(found: &[FoundDevice], running: &[DeviceStatus]) -> Vec<DeviceDocument> {
     let device = |found: &FoundDevice| {
         let status = running.iter().find(|status| status.number == found.number);
         let down = status.and_then(|status| status.down.as_ref());
         let facts = &found.facts;
-        json!({
-            "number": found.number,
-            "name": facts.name,
-            "kind": facts.kind.name(),
-            "api": facts.api,
-            "driver": facts.driver,
-            "binding_bytes": facts.binding_bytes,
-            "buffer_bytes": facts.buffer_bytes,
-            "workgroup_bytes": facts.workgroup_bytes,
-            "timestamps": facts.timestamps,
-            "subgroups": facts.subgroups,
-            "taken": found.taken,
-            "up": status.is_some() && down.is_none(),
-            "reason": down.unwrap_or(&found.reason),
-        })
+        DeviceDocument {
+            number: found.number,
+            name: facts.name.clone(),
+            kind: facts.kind.name(),
+            api: facts.api,
+            driver: facts.driver.clone(),
+            binding_bytes: facts.binding_bytes,
+            buffer_bytes: facts.buffer_bytes,
+            workgroup_bytes: facts.workgroup_bytes,
+            timestamps: facts.timestamps,
+            subgroups: facts.subgroups,
+            taken: found.taken,
+            up: status.is_some() && down.is_none(),
+            reason: down.unwrap_or(&found.reason).clone(),
+        }
     };
     found.iter().map(device).collect()
 }
@@ -82,54 +253,47 @@ fn devices(found: &[FoundDevice], running: &[DeviceStatus]) -> Vec<Value> {
 fn presets() -> Map<String, Value> {
     let values = |preset: Preset| {
         let params = SurfaceParams::new(&SurfaceOptions { preset: Some(preset), ..SurfaceOptions::default() });
-        params.map_or(Value::Null, |p| json!({ "smoothness": p.smoothness, "isovalue": p.isovalue }))
+        let values = params.map(|p| PresetValues { smoothness: p.smoothness, isovalue: p.isovalue });
+        values.ok().and_then(|values| serde_json::to_value(values).ok()).unwrap_or_default()
     };
     Preset::ALL.iter().map(|&preset| (preset.name().to_owned(), values(preset))).collect()
 }
 
-fn parameter(parameter: &Parameter) -> Value {
-    let mut entry = json!({
-        "name": parameter.name,
-        "doc": parameter.doc,
-        "expected": parameter.domain.expected(),
-        "default": parameter.default,
-    });
-    let more = match parameter.domain {
-        Domain::Number { min, max, unit } => json!({ "type": "number", "min": min, "max": max, "unit": unit }),
-        Domain::Integer => json!({ "type": "integer" }),
-        Domain::Flag => json!({ "type": "boolean" }),
-        Domain::Choice(values) => json!({ "type": "choice", "values": values }),
-        Domain::Set(values) => json!({ "type": "set", "values": values }),
-        Domain::Text { .. } => json!({ "type": "text" }),
+fn parameter(parameter: &Parameter) -> ParameterDocument {
+    let domain = match parameter.domain {
+        Domain::Number { min, max, unit } => DomainDocument::Number { min, max, unit },
+        Domain::Integer => DomainDocument::Integer,
+        Domain::Flag => DomainDocument::Boolean,
+        Domain::Choice(values) => DomainDocument::Choice { values },
+        Domain::Set(values) => DomainDocument::Set { values },
+        Domain::Text { .. } => DomainDocument::Text,
     };
-    if let (Some(entry), Value::Object(more)) = (entry.as_object_mut(), more) {
-        entry.extend(more);
-    }
-    entry
+    let Parameter { name, doc, default, .. } = *parameter;
+    ParameterDocument { name, doc, expected: parameter.domain.expected(), default, domain }
 }
 
-fn limits(config: &Config, pool: &Pool) -> Value {
+fn limits(config: &Config, pool: &Pool) -> Limits {
     let (limits, server, jobs) = (&config.limits, &config.server, &config.jobs);
-    json!({
-        "body_bytes": limits.body_bytes,
-        "inflated_bytes": limits.inflated_bytes,
-        "atoms": limits.atoms,
-        "grid_samples": limits.grid_samples,
-        "mesh_bytes": limits.mesh_bytes,
-        "output_bytes": limits.output_bytes,
-        "memory_bytes": limits.memory_bytes,
-        "workers": pool.workers(),
-        "queue": jobs.queue,
-        "deliveries": jobs.deliveries,
-        "deadline_ms": jobs.deadline_ms,
-        "sync_wait_ms": jobs.sync_wait_ms,
-        "batch_deadline_ms": jobs.batch_deadline_ms,
-        "attempts": jobs.attempts,
-        "body_timeout_ms": server.body_timeout_ms,
-        "header_timeout_ms": server.header_timeout_ms,
-        "write_timeout_ms": server.write_timeout_ms,
-        "connections": server.connections,
-    })
+    Limits {
+        body_bytes: limits.body_bytes,
+        inflated_bytes: limits.inflated_bytes,
+        atoms: limits.atoms,
+        grid_samples: limits.grid_samples,
+        mesh_bytes: limits.mesh_bytes,
+        output_bytes: limits.output_bytes,
+        memory_bytes: limits.memory_bytes,
+        workers: pool.workers(),
+        queue: jobs.queue,
+        deliveries: jobs.deliveries,
+        deadline_ms: jobs.deadline_ms,
+        sync_wait_ms: jobs.sync_wait_ms,
+        batch_deadline_ms: jobs.batch_deadline_ms,
+        attempts: jobs.attempts,
+        body_timeout_ms: server.body_timeout_ms,
+        header_timeout_ms: server.header_timeout_ms,
+        write_timeout_ms: server.write_timeout_ms,
+        connections: server.connections,
+    }
 }
 
 /// Radii by element symbol, to the hundredth of an ångström that the sources give.

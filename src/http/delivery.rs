@@ -7,15 +7,17 @@ use axum::http::HeaderValue;
 use axum::http::header::{self, HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
+use serde::Serialize;
 use serde_json::Value;
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::problem::{self, Problem};
+use super::problem::{self, Finding, Problem};
 use super::state::App;
 use super::stream;
 use crate::formats::Format;
 use crate::jobs::{ContentKey, Finished};
 use crate::pipeline::Report;
+use utoipa::ToSchema;
 
 /// Headers that sum up the report.
 pub(super) const SUMMARY: [&str; 16] = [
@@ -38,6 +40,17 @@ pub(super) const SUMMARY: [&str; 16] = [
 ];
 
 pub(super) const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
+
+/// A report, and what was found on the way to it.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct ReportDocument {
+    #[serde(flatten)]
+    report: Report,
+    /// What a second, strict reader says of the file; absent where it was not asked.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    diagnostics: Option<Vec<Finding>>,
+}
 
 /// The mesh as `format`; `place` is given back when its last byte is written.
 pub(super) async fn mesh(
@@ -64,17 +77,14 @@ pub(super) async fn mesh(
 /// The report as JSON.
 pub(super) fn report(finished: &Finished, received: Duration) -> Result<Response, Problem> {
     let report = &finished.product.report;
-    let mut document = serde_json::to_value(report).map_err(Problem::internal)?;
-    let mut headers = summary(&document);
+    let mut headers = summary(&serde_json::to_value(report).map_err(Problem::internal)?);
     headers.insert(SERVER_TIMING, server_timing(report, received));
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
     // Times differ from run to run, so no two reports are the same.
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
-    if let (Some(diagnostics), Some(members)) = (&finished.diagnostics, document.as_object_mut()) {
-        members.insert("diagnostics".to_owned(), problem::findings(diagnostics));
-    }
-    let body = document.to_string();
-    Ok((headers, body).into_response())
+    let diagnostics = finished.diagnostics.as_deref().map(problem::findings);
+    let document = ReportDocument { report: report.clone(), diagnostics };
+    Ok((headers, serde_json::to_string(&document).map_err(Problem::internal)?).into_response())
 }
 
 /// The strong validator of a mesh file.

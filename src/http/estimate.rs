@@ -5,15 +5,21 @@ use std::sync::Arc;
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
-use axum::http::header::{CACHE_CONTROL, HeaderMap};
+use axum::http::header::{ACCEPT, CACHE_CONTROL, HeaderMap};
 use axum::response::{IntoResponse, Response};
-use serde_json::{Value, json};
+use serde::Serialize;
+use serde_json::Value;
+use utoipa::ToSchema;
 
 use super::ask::Input;
+use super::kinds::Kind;
 use super::meshes::{self, Pairs};
+use super::openapi::bodies::{MeshForm, MeshOrder, StructureFile};
+use super::openapi::parameters::{Coding, MeshParameters};
+use super::openapi::problems::{BODY, NAMED, PARAMETERS, ProblemDocument, READING};
+use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
-use crate::formats::Format;
 use crate::jobs::Failure;
 use crate::pipeline::{self, Choice, Estimate, Job};
 use crate::surface::CancelToken;
@@ -27,13 +33,76 @@ impl Drop for StopOnDrop {
     }
 }
 
-/// Estimates the mesh of the body.
+/// What a mesh would come to. What stands in the grid's part is exact, what stands in the mesh's part is estimated.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct EstimateDocument {
+    /// The mesh would be made.
+    accepted: bool,
+    /// Why it would not be made.
+    #[schema(required, value_type = Option<ProblemDocument>)]
+    problem: Option<Value>,
+    /// Atoms that would be meshed.
+    atoms: u64,
+    /// Atoms in the file, all models.
+    atoms_in_file: u64,
+    /// Grid spacing, Å.
+    resolution: f64,
+    /// Kernel function.
+    kernel: &'static str,
+    /// The mesh format, as a file name's extension.
+    format: &'static str,
+    /// Cells that a dense grid would have.
+    box_cells: u64,
+    /// Bricks of the grid that some atom reaches.
+    #[schema(required)]
+    bricks: Option<u64>,
+    /// Samples that would be evaluated.
+    #[schema(required)]
+    samples: Option<u64>,
+    /// Å².
+    #[schema(required)]
+    area: Option<f64>,
+    /// Vertices.
+    #[schema(required)]
+    vertices: Option<u64>,
+    /// Triangles.
+    #[schema(required)]
+    triangles: Option<u64>,
+    /// Bytes of the mesh.
+    #[schema(required)]
+    mesh_bytes: Option<u64>,
+    /// SHA-256 of the structure.
+    structure: String,
+    /// Time that making it would take, s.
+    seconds: f64,
+    /// Time that it would wait, s.
+    wait_seconds: f64,
+    /// The backend that would make it.
+    backend: &'static str,
+}
+
+refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
+    Kind::EmptySelection, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
+]]);
+
+/// Says what a mesh would come to, without making it.
+///
+/// Takes what `POST /v1/meshes` takes.
+#[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",
+    params(MeshParameters, Coding),
+    request_body(description = "A structure, or a document that names one.", content(
+        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
+        (StructureFile = "chemical/x-mmcif"), (MeshForm = "multipart/form-data"), (MeshOrder = "application/json"),
+    )),
+    responses((status = 200, description = "The estimate.", body = EstimateDocument), EstimateRefusals))]
 pub(super) async fn create(
     State(app): State<Shared>,
     query: Pairs,
-    headers: HeaderMap,
+    mut headers: HeaderMap,
     body: Body,
 ) -> Result<Response, Problem> {
+    // What it says is of the answer, which is no mesh.
+    headers.remove(ACCEPT);
     let taken = meshes::take(&app, query, &headers, body).await?;
     let format = taken.request.format.unwrap_or_default();
     // Half a mesh is work as well: it takes a place among those that are made.
@@ -61,39 +130,38 @@ pub(super) async fn create(
         .map_err(|error| declared.explain(Failure::Job { error, diagnostics: Vec::new() }))?;
     drop(stop);
     let wait = app.pool.estimated_wait().as_secs_f64();
-    let mut document = document(&estimate, &job, format, app.config.limits.output_bytes);
-    if let Some(members) = document.as_object_mut() {
-        members.insert("structure".to_owned(), digest.to_string().into());
-        members.insert("seconds".to_owned(), seconds.into());
-        members.insert("wait_seconds".to_owned(), wait.into());
-        members.insert("backend".to_owned(), app.pool.backend().name().into());
-    }
+    let problem = refusal(&estimate, &job, app.config.limits.output_bytes);
+    let mesh = estimate.mesh.as_ref().ok();
+    let document = EstimateDocument {
+        accepted: problem.is_none(),
+        problem: problem.map(|problem| problem.record()),
+        atoms: estimate.atoms,
+        atoms_in_file: estimate.atoms_in_file,
+        resolution: job.params.resolution,
+        kernel: job.params.kernel.name(),
+        format: format.extension(),
+        box_cells: estimate.box_cells,
+        bricks: mesh.map(|m| m.bricks),
+        samples: mesh.map(|m| m.samples),
+        area: mesh.map(|m| m.area),
+        vertices: mesh.map(|m| m.vertices),
+        triangles: mesh.map(|m| m.triangles),
+        mesh_bytes: mesh.map(|m| m.bytes),
+        structure: digest.to_string(),
+        seconds,
+        wait_seconds: wait,
+        backend: app.pool.backend().name(),
+    };
     Ok(([(CACHE_CONTROL, "no-store")], Json(document)).into_response())
 }
 
-fn document(estimate: &Estimate, job: &Job, format: Format, limit: u64) -> Value {
-    let problem = match &estimate.mesh {
+/// Why the mesh would not be made, or its file of more than `limit` bytes not be sent.
+fn refusal(estimate: &Estimate, job: &Job, limit: u64) -> Option<Problem> {
+    match &estimate.mesh {
         Ok(mesh) if mesh.bytes > limit => {
             Some(super::problem::file_too_large(mesh.bytes, limit, job.params.resolution))
         }
         Ok(_) => None,
         Err(error) => Some(Problem::from(error.clone())),
-    };
-    let mesh = estimate.mesh.as_ref().ok();
-    json!({
-        "accepted": problem.is_none(),
-        "problem": problem.map(|problem| problem.record()),
-        "atoms": estimate.atoms,
-        "atoms_in_file": estimate.atoms_in_file,
-        "resolution": job.params.resolution,
-        "kernel": job.params.kernel.name(),
-        "format": format.extension(),
-        "box_cells": estimate.box_cells,
-        "bricks": mesh.map(|m| m.bricks),
-        "samples": mesh.map(|m| m.samples),
-        "area": mesh.map(|m| m.area),
-        "vertices": mesh.map(|m| m.vertices),
-        "triangles": mesh.map(|m| m.triangles),
-        "mesh_bytes": mesh.map(|m| m.bytes),
-    })
+    }
 }

@@ -14,6 +14,9 @@ use futures_util::stream;
 use tokio::sync::watch;
 
 use super::jobs;
+use super::kinds::Kind;
+use super::openapi::parameters::{JobPath, Resumption};
+use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use crate::jobs::View;
@@ -31,7 +34,17 @@ struct Listener {
     over: bool,
 }
 
-/// The events of a job.
+refusals!(EventsRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::StoreFailed]]);
+
+/// The events of a job: each is the whole job, named by its status.
+#[utoipa::path(get, path = "/v1/jobs/{id}/events", tag = "jobs", operation_id = "watchJob",
+    params(JobPath, Resumption),
+    responses(
+        (status = 200, description = "Server-sent events until the job ends; `data` is the job's document.",
+            body = String, content_type = "text/event-stream"),
+        (status = 204, description = "The last event was seen: there is nothing more to come."),
+        EventsRefusals,
+    ))]
 pub(super) async fn show(
     State(app): State<Shared>,
     path: Result<Path<String>, PathRejection>,
@@ -65,7 +78,8 @@ impl Listener {
                 let view = news.ok()?.clone();
                 (self.seen, self.over) = (view.version, view.record.status.is_final());
                 let event = Event::default().id(view.version.to_string()).event(view.record.status.name());
-                Some(event.data(jobs::document(&view).to_string()))
+                let document = serde_json::to_string(&jobs::document(&view)).ok()?;
+                Some(event.data(document))
             }
             // The stream ends with the service; clients reconnect by themselves.
             _ = self.stopping.wait_for(|stop| *stop) => None,

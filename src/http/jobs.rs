@@ -9,11 +9,15 @@ use axum::extract::{Path, Query, State};
 use axum::http::StatusCode;
 use axum::http::header::{self, HeaderValue};
 use axum::response::{IntoResponse, Response};
-use serde::Deserialize;
-use serde_json::{Map, Value, json};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use utoipa::{IntoParams, ToSchema};
 
 use super::delivery;
 use super::kinds::Kind;
+use super::openapi::parameters::JobPath;
+use super::openapi::problems::{MESHING, ProblemDocument, READING};
+use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use crate::jobs::{ContentKey, JobId, Status, View, rfc3339};
@@ -22,12 +26,92 @@ use crate::jobs::{ContentKey, JobId, Status, View, rfc3339};
 pub(super) const MAX_WAIT_S: u64 = 55;
 
 /// The long poll.
-#[derive(Debug, Default, Deserialize)]
+#[derive(Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 pub(super) struct Poll {
     /// Seconds to wait for the job's end.
+    #[param(minimum = 0, maximum = 55, nullable = false)]
     wait: Option<u64>,
 }
+
+/// How a job stands; names and statuses are those of OGC API Processes.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct JobDocument {
+    /// The job's id.
+    #[serde(rename = "jobID")]
+    job_id: String,
+    /// `surface`.
+    #[serde(rename = "processID")]
+    process_id: &'static str,
+    /// `process`.
+    r#type: &'static str,
+    #[schema(value_type = StatusSchema)]
+    status: Status,
+    /// Per cent.
+    #[schema(minimum = 0, maximum = 100)]
+    progress: u64,
+    /// The same, finer.
+    #[schema(minimum = 0, maximum = 1)]
+    fraction: f64,
+    /// What is being done.
+    #[schema(required)]
+    stage: Option<&'static str>,
+    /// Times that it was begun.
+    attempts: u32,
+    /// When it was accepted.
+    #[schema(format = DateTime)]
+    created: String,
+    /// When it was begun last.
+    #[schema(required, format = DateTime)]
+    started: Option<String>,
+    /// When it ended.
+    #[schema(required, format = DateTime)]
+    finished: Option<String>,
+    /// SHA-256 of the structure.
+    structure: String,
+    /// The mesh format, as a file name's extension.
+    format: String,
+    /// The parameters as they were given.
+    #[schema(value_type = std::collections::BTreeMap<String, String>)]
+    parameters: Map<String, Value>,
+    /// Why there is no result.
+    #[schema(required, value_type = Option<ProblemDocument>)]
+    problem: Option<Value>,
+    /// Where more is found.
+    links: Vec<Link>,
+}
+
+/// Where something is found.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Link {
+    /// What it is to this document.
+    rel: &'static str,
+    /// Its address.
+    href: String,
+    /// Its media type.
+    r#type: &'static str,
+}
+
+/// How a job stands, as text.
+#[derive(Debug, Serialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(as = JobStatus)]
+#[expect(dead_code, reason = "for the schema alone: the record's own status is what is written")]
+enum StatusSchema {
+    Accepted,
+    Running,
+    Successful,
+    Failed,
+    Dismissed,
+}
+
+refusals!(ShowRefusals: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::StoreFailed]]);
+refusals!(DismissRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::StoreFailed]]);
+refusals!(ResultRefusals: [READING, MESHING, [
+    Kind::BadRequest, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed, Kind::ResultGone, Kind::JobAbandoned,
+    Kind::StoreFull, Kind::StoreFailed,
+]]);
 
 /// The job of a path.
 pub(super) fn id(path: Result<Path<String>, PathRejection>) -> Result<JobId, Problem> {
@@ -42,6 +126,12 @@ pub(super) fn none(id: &str) -> Problem {
 }
 
 /// How a job stands; with `wait`, once it has ended or the time is over.
+#[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "showJob", params(JobPath, Poll),
+    responses(
+        (status = 200, description = "How the job stands.", body = JobDocument,
+            headers(("Retry-After" = u64, description = "Seconds, while the job goes on."))),
+        ShowRefusals,
+    ))]
 pub(super) async fn show(
     State(app): State<Shared>,
     path: Result<Path<String>, PathRejection>,
@@ -72,6 +162,8 @@ pub(super) async fn show(
 }
 
 /// Cancels a job.
+#[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "dismissJob", params(JobPath),
+    responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissRefusals))]
 pub(super) async fn dismiss(
     State(app): State<Shared>,
     path: Result<Path<String>, PathRejection>,
@@ -85,7 +177,13 @@ pub(super) async fn dismiss(
     Ok(answer(StatusCode::OK, &view, None))
 }
 
-/// The way to a job's result.
+/// The way to a job's result; if it failed, why.
+#[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
+    responses(
+        (status = 303, description = "The job was successful.",
+            headers(("Location" = String, description = "The result: /v1/results/….")),),
+        ResultRefusals,
+    ))]
 pub(super) async fn result(
     State(app): State<Shared>,
     path: Result<Path<String>, PathRejection>,
@@ -132,40 +230,38 @@ fn answer(status: StatusCode, view: &View, wait: Option<Duration>) -> Response {
 }
 
 /// A job as JSON.
-pub(super) fn document(view: &View) -> Value {
+pub(super) fn document(view: &View) -> JobDocument {
     let record = &view.record;
     let own = format!("/v1/jobs/{}", record.id);
-    let link = |rel: &str, href: &str, kind: &str| json!({ "rel": rel, "href": href, "type": kind });
-    let mut links = vec![link("self", &own, "application/json")];
+    let link = |rel, href: String, kind| Link { rel, href, r#type: kind };
+    let mut links = vec![link("self", own.clone(), "application/json")];
     if !record.status.is_final() {
-        links.push(link("monitor", &format!("{own}/events"), "text/event-stream"));
+        links.push(link("monitor", format!("{own}/events"), "text/event-stream"));
     }
     if let Some(key) = &record.result {
         let results = "http://www.opengis.net/def/rel/ogc/1.0/results";
-        links.push(link(results, &format!("{own}/result"), "application/octet-stream"));
-        links.push(link("describedby", &format!("/v1/results/{key}/report.json"), "application/json"));
+        links.push(link(results, format!("{own}/result"), "application/octet-stream"));
+        links.push(link("describedby", format!("/v1/results/{key}/report.json"), "application/json"));
     }
-    let parameters: Map<String, Value> =
-        record.parameters.iter().map(|(name, value)| (name.clone(), value.as_str().into())).collect();
+    let parameters = record.parameters.iter().map(|(name, value)| (name.clone(), value.as_str().into())).collect();
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction")]
     let progress = (view.fraction * 100.0) as u64;
-    let time = |ms: Option<u64>| ms.map(rfc3339);
-    json!({
-        "jobID": record.id.as_str(),
-        "processID": "surface",
-        "type": "process",
-        "status": record.status.name(),
-        "progress": progress,
-        "fraction": view.fraction,
-        "stage": view.stage,
-        "attempts": record.attempts,
-        "created": rfc3339(record.created_ms),
-        "started": time(record.started_ms),
-        "finished": time(record.finished_ms),
-        "structure": record.input,
-        "format": record.format,
-        "parameters": parameters,
-        "problem": record.problem,
-        "links": links,
-    })
+    JobDocument {
+        job_id: record.id.to_string(),
+        process_id: "surface",
+        r#type: "process",
+        status: record.status,
+        progress,
+        fraction: view.fraction,
+        stage: view.stage,
+        attempts: record.attempts,
+        created: rfc3339(record.created_ms),
+        started: record.started_ms.map(rfc3339),
+        finished: record.finished_ms.map(rfc3339),
+        structure: record.input.clone(),
+        format: record.format.clone(),
+        parameters,
+        problem: record.problem.clone(),
+        links,
+    }
 }

@@ -14,6 +14,11 @@ use serde_json::Value;
 use super::ask::{self, Ask, Input};
 use super::declared::Declared;
 use super::kinds::Kind;
+use super::openapi::bodies::{MeshForm, MeshOrder, StructureFile};
+use super::openapi::meshes::Uploaded;
+use super::openapi::parameters::{Coding, MeshParameters, Wishes};
+use super::openapi::problems::{ASKING, BODY, MESHING, NAMED, PARAMETERS, READING};
+use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::upload::{self, Upload};
@@ -51,7 +56,19 @@ impl Taken {
     }
 }
 
-/// Meshes the body.
+refusals!(MeshRefusals: [BODY, NAMED, PARAMETERS, READING, MESHING, ASKING, [Kind::NotAcceptable]]);
+
+/// Meshes a structure.
+///
+/// The body is a file, a form with a file, or a JSON document that names a structure. The format is that of `format`, else
+/// what `Accept` prefers, else GLB.
+#[utoipa::path(post, path = "/v1/meshes", tag = "meshes", operation_id = "createMesh",
+    params(MeshParameters, Wishes, Coding),
+    request_body(description = "A structure, or a document that names one.", content(
+        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
+        (StructureFile = "chemical/x-mmcif"), (MeshForm = "multipart/form-data"), (MeshOrder = "application/json"),
+    )),
+    responses(Uploaded, MeshRefusals))]
 pub(super) async fn create(
     State(app): State<Shared>,
     query: Pairs,

@@ -18,26 +18,21 @@ fn asset(media_type: &'static str, text: &'static str) -> Response {
     (headers, text).into_response()
 }
 
-pub(super) async fn index() -> Response {
-    asset("text/html; charset=utf-8", include_str!("../../web/index.html"))
+/// Describes a handler that answers with an embedded file, and is one.
+macro_rules! embedded {
+    ($handler:ident, $path:literal, $id:literal, $media_type:literal, $words:literal, $file:literal) => {
+        #[doc = $words]
+        #[utoipa::path(get, path = $path, tag = "page", operation_id = $id,
+                    responses((status = 200, description = $words, body = String, content_type = $media_type)))]
+        pub(super) async fn $handler() -> Response {
+            asset($media_type, include_str!($file))
+        }
+    };
 }
 
-pub(super) async fn style() -> Response {
-    asset("text/css; charset=utf-8", include_str!("../../web/app.css"))
-}
-
-pub(super) async fn script() -> Response {
-    asset("text/javascript; charset=utf-8", include_str!("../../web/app.js"))
-}
-
-pub(super) async fn viewer() -> Response {
-    asset("text/javascript; charset=utf-8", include_str!("../../web/viewer.js"))
-}
-
-pub(super) async fn icon() -> Response {
-    asset("image/svg+xml", include_str!("../../web/icon.svg"))
-}
-
-pub(super) async fn sample() -> Response {
-    asset("chemical/x-pdb", include_str!("../../samples/4pti.pdb"))
-}
+embedded!(index, "/", "page", "text/html; charset=utf-8", "The page.", "../../web/index.html");
+embedded!(style, "/app.css", "pageStyle", "text/css; charset=utf-8", "Its style.", "../../web/app.css");
+embedded!(script, "/app.js", "pageScript", "text/javascript; charset=utf-8", "Its script.", "../../web/app.js");
+embedded!(viewer, "/viewer.js", "pageViewer", "text/javascript; charset=utf-8", "Its viewer.", "../../web/viewer.js");
+embedded!(icon, "/icon.svg", "pageIcon", "image/svg+xml", "Its icon.", "../../web/icon.svg");
+embedded!(sample, "/sample.pdb", "sample", "chemical/x-pdb", "A structure to try.", "../../samples/4pti.pdb");

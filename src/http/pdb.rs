@@ -14,6 +14,10 @@ use super::declared::Declared;
 use super::delivery;
 use super::kinds::Kind;
 use super::meshes::{Pairs, pairs};
+use super::openapi::meshes::Addressed;
+use super::openapi::parameters::{EntryPath, Parts, SurfaceParameters, Unchanged, Wishes};
+use super::openapi::problems::{ASKING, MESHING, PARAMETERS, READING};
+use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::wish::Wish;
@@ -26,7 +30,19 @@ use crate::structure::{ArchiveError, EntryId};
 /// Entries change a few times in their life, and then in details: a day is soon enough to notice.
 const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stale-while-revalidate=604800");
 
-/// Meshes an entry.
+refusals!(SurfaceRefusals: [PARAMETERS, READING, MESHING, ASKING, [
+    Kind::NotFound, Kind::NotInArchive, Kind::EntryTooLarge, Kind::RangeNotSatisfiable, Kind::ArchiveUnavailable,
+]]);
+
+/// Meshes an entry of the archive.
+#[utoipa::path(
+    get,
+    path = "/v1/pdb/{id}/{file}",
+    tag = "meshes",
+    operation_id = "meshEntry",
+    params(EntryPath, SurfaceParameters, Wishes, Unchanged, Parts),
+    responses(Addressed, SurfaceRefusals)
+)]
 pub(super) async fn surface(
     State(app): State<Shared>,
     method: Method,

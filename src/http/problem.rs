@@ -12,7 +12,9 @@ use axum::http::{HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use metrics::counter;
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use serde_json::{Map, Value};
+use utoipa::ToSchema;
 
 use super::kinds::{KINDS, Kind};
 use super::request_id::RequestId;
@@ -90,7 +92,13 @@ impl Problem {
 
     /// Adds what the referee found, if it found anything.
     fn diagnosed(self, diagnostics: &[Diagnostic]) -> Self {
-        if diagnostics.is_empty() { self } else { self.with("diagnostics", findings(diagnostics)) }
+        if diagnostics.is_empty() {
+            return self;
+        }
+        match serde_json::to_value(findings(diagnostics)) {
+            Ok(findings) => self.with("diagnostics", findings),
+            Err(error) => Self::internal(error),
+        }
     }
 
     /// The document.
@@ -157,9 +165,21 @@ fn of_library(status: StatusCode, path: &str) -> Problem {
     Problem::new(Kind::of_status(status), detail)
 }
 
-/// The referee's findings as JSON.
-pub(super) fn findings(diagnostics: &[Diagnostic]) -> Value {
-    let finding = |d: &Diagnostic| json!({ "level": d.level.name(), "line": d.line, "message": d.message });
+/// What a second, strict reader found.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Finding {
+    /// `note`, `warning` or `error`.
+    level: &'static str,
+    /// Where in the file, from 1.
+    #[schema(required)]
+    line: Option<u64>,
+    /// What it is.
+    message: String,
+}
+
+/// The referee's findings.
+pub(super) fn findings(diagnostics: &[Diagnostic]) -> Vec<Finding> {
+    let finding = |d: &Diagnostic| Finding { level: d.level.name(), line: d.line, message: d.message.clone() };
     diagnostics.iter().map(finding).collect()
 }
 

@@ -4,26 +4,49 @@ use axum::Json;
 use axum::extract::Path;
 use axum::extract::rejection::PathRejection;
 use axum::response::{IntoResponse, Response};
-use serde_json::{Value, json};
+use serde::Serialize;
+use utoipa::ToSchema;
 
 use super::kinds::{KINDS, Kind, Row};
+use super::openapi::refusals;
 use super::problem::Problem;
 
-fn describe(row: &Row) -> Value {
-    json!({
-        "type": format!("/problems/{}", row.slug),
-        "status": row.status.as_u16(),
-        "title": row.title,
-        "about": row.about,
-    })
+/// What a `type` of problems means.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct ProblemType {
+    /// The problems' `type`, and the address of this document.
+    r#type: String,
+    /// The status that goes with it.
+    #[schema(minimum = 400, maximum = 599)]
+    status: u16,
+    /// The problem in a few words.
+    title: &'static str,
+    /// What it means and what to do.
+    about: &'static str,
 }
 
-/// All kinds.
+fn describe(row: &Row) -> ProblemType {
+    ProblemType {
+        r#type: format!("/problems/{}", row.slug),
+        status: row.status.as_u16(),
+        title: row.title,
+        about: row.about,
+    }
+}
+
+refusals!(OneRefusals: [[Kind::BadRequest, Kind::NotFound]]);
+
+/// Every type of problem.
+#[utoipa::path(get, path = "/problems", tag = "service", operation_id = "listProblems",
+    responses((status = 200, description = "All types.", body = Vec<ProblemType>)))]
 pub(super) async fn list() -> Response {
     Json(KINDS.iter().map(describe).collect::<Vec<_>>()).into_response()
 }
 
-/// One kind.
+/// One type of problem.
+#[utoipa::path(get, path = "/problems/{slug}", tag = "service", operation_id = "showProblem",
+    params(("slug" = String, Path, description = "Last segment of a problem's `type`.", example = "grid-too-large")),
+    responses((status = 200, description = "What it means.", body = ProblemType), OneRefusals))]
 pub(super) async fn one(path: Result<Path<String>, PathRejection>) -> Result<Response, Problem> {
     let Path(slug) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let row = KINDS.iter().find(|row| row.slug == slug);

@@ -14,12 +14,16 @@ use metrics::counter;
 use serde_json::Value;
 
 use super::kinds::Kind;
+use super::openapi::meshes::{Kept, NotModified};
+use super::openapi::parameters::{Parts, ResultFile, ResultPath, Unchanged};
+use super::openapi::refusals;
 use super::problem::Problem;
 use super::range::{self, Wanted};
 use super::state::{App, Shared};
 use super::{conditional, delivery};
 use crate::formats::Format;
 use crate::jobs::{self, ContentKey, Finished, REPORT};
+use crate::pipeline::Report;
 use crate::telemetry::RESULTS_NOT_KEPT;
 
 /// The name says what the bytes are: they never change.
@@ -32,7 +36,18 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
     format!("/v1/results/{key}.{extension}")
 }
 
-/// A result.
+refusals!(ShowRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::RangeNotSatisfiable, Kind::StoreFailed]]);
+refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
+
+/// A mesh that was made before.
+#[utoipa::path(
+    get,
+    path = "/v1/results/{file}",
+    tag = "results",
+    operation_id = "showResult",
+    params(ResultFile, Unchanged, Parts),
+    responses(Kept, ShowRefusals)
+)]
 pub(super) async fn show(
     State(app): State<Shared>,
     method: Method,
@@ -51,7 +66,14 @@ pub(super) async fn show(
     stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| none(&file))
 }
 
-/// A result's report.
+/// A result's report, of the run that made it.
+#[utoipa::path(get, path = "/v1/results/{key}/report.json", tag = "results", operation_id = "showReport",
+    params(ResultPath, Unchanged),
+    responses(
+        (status = 200, description = "The report.", body = Report,
+            headers(("ETag" = String, description = "Of the report: its times are those of one run."))),
+        NotModified, ReportRefusals,
+    ))]
 pub(super) async fn report(
     State(app): State<Shared>,
     path: Result<Path<String>, PathRejection>,

@@ -7,7 +7,8 @@ use axum::routing::{get, post};
 
 use super::state::Shared;
 use super::{
-    capabilities, estimate, events, health, jobs, meshes, middleware, page, pdb, problems, results, structures,
+    capabilities, docs, estimate, events, health, jobs, meshes, middleware, openapi, page, pdb, problems, results,
+    structures,
 };
 
 /// Time beyond the limits that are met in order, before the backstop: reading the archive, writing the head.
@@ -39,6 +40,12 @@ pub(super) fn router(app: Shared) -> Router {
         .route("/livez", get(health::live))
         .route("/readyz", get(health::ready))
         .route("/version", get(health::version))
+        .route("/openapi.yaml", get(openapi::yaml))
+        .route("/openapi.json", get(openapi::json))
+        .route("/docs", get(docs::index))
+        .route("/docs.js", get(docs::start))
+        .route("/swagger-ui.css", get(docs::style))
+        .route("/swagger-ui-bundle.js", get(docs::bundle))
         // The page.
         .route("/", get(page::index))
         .route("/app.css", get(page::style))

@@ -11,12 +11,18 @@ use axum::http::header::{self, HeaderMap};
 use axum::http::{Extensions, HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use serde_json::{Value, json};
+use serde::Serialize;
+use utoipa::ToSchema;
 
 use super::ask::{self, Ask, Input};
 use super::declared::Declared;
 use super::kinds::Kind;
 use super::meshes::Pairs;
+use super::openapi::bodies::{StructureFile, StructureForm};
+use super::openapi::meshes::{Addressed, NotModified};
+use super::openapi::parameters::{Coding, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
+use super::openapi::problems::{ASKING, BODY, MESHING, PARAMETERS, READING};
+use super::openapi::refusals;
 use super::pdb::Named;
 use super::problem::Problem;
 use super::state::Shared;
@@ -48,7 +54,90 @@ fn none(digest: &str) -> Problem {
     )
 }
 
-/// Takes a structure in.
+/// What a structure holds.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct StructureDocument {
+    /// SHA-256 of its bytes as they came.
+    digest: String,
+    /// How many these are.
+    bytes: usize,
+    /// `pdb` or `mmcif`.
+    format: &'static str,
+    /// PDB id or data block name.
+    #[schema(required)]
+    id: Option<String>,
+    /// Its title.
+    #[schema(required)]
+    title: Option<String>,
+    /// Atoms, all models.
+    atoms: u64,
+    /// The numbers of its models.
+    models: Vec<i32>,
+    /// The model that the counts are of.
+    model: i32,
+    atoms_in_model: KindCounts,
+    /// Atoms with alternative locations.
+    alternatives: u64,
+    /// Atoms of unknown elements.
+    unknown_elements: u64,
+    /// Chains.
+    chain_count: usize,
+    /// The first thousand of them.
+    chains: Vec<ChainDocument>,
+    /// A mesh of it.
+    surface: String,
+}
+
+/// A chain.
+#[derive(Debug, Serialize, ToSchema)]
+struct ChainDocument {
+    /// The author's name for it.
+    name: String,
+    /// Its atoms.
+    atoms: u64,
+    of: KindCounts,
+}
+
+/// Atoms by what they belong to.
+#[derive(Debug, Serialize, ToSchema)]
+struct KindCounts {
+    polymer: u64,
+    ligand: u64,
+    water: u64,
+    hydrogens: u64,
+}
+
+impl From<&Counts> for KindCounts {
+    fn from(counts: &Counts) -> Self {
+        let Counts { polymer, ligand, water, hydrogens } = *counts;
+        Self { polymer, ligand, water, hydrogens }
+    }
+}
+
+refusals!(CreateRefusals: [
+    BODY, READING, [Kind::BadParameter, Kind::TooManyDeliveries, Kind::StoreFull, Kind::StoreFailed],
+]);
+refusals!(ShowRefusals: [
+    READING,
+    [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+]);
+refusals!(SurfaceRefusals: [
+    PARAMETERS, READING, MESHING, ASKING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
+]);
+
+/// Takes a structure in, to be meshed many times.
+#[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure", params(Coding),
+    request_body(description = "The structure.", content(
+        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
+        (StructureFile = "chemical/x-mmcif"), (StructureForm = "multipart/form-data"),
+    )),
+    responses(
+        (status = 201, description = "It is kept now.", body = StructureDocument,
+            headers(("Location" = String, description = "The structure's address."))),
+        (status = 200, description = "It was there already.", body = StructureDocument,
+            headers(("Location" = String, description = "The structure's address."))),
+        CreateRefusals,
+    ))]
 pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
     let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
     if let Some((name, _)) = fields.first() {
@@ -59,7 +148,7 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     let digest = ask::digest(&bytes).await?;
     // Read before it is kept: what cannot be read is nobody's structure.
     let summary = summarise(&app, digest, bytes.clone()).await.map_err(|failure| declared.explain(failure))?;
-    declared.check_format(summary["format"].as_str().unwrap_or_default())?;
+    declared.check_format(summary.format)?;
     let created = app.store.put_new(&Name::input(&digest), bytes).await?;
     drop(lease);
     let status = if created { StatusCode::CREATED } else { StatusCode::OK };
@@ -67,7 +156,16 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
 }
 
-/// A structure's summary.
+/// What a structure holds.
+#[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
+    params(StructurePath, Unchanged),
+    responses(
+        (status = 200, description = "What the structure holds.", body = StructureDocument, headers(
+            ("ETag" = String, description = "The digest."),
+            ("Cache-Control" = String, description = "How long the answer stays good."),
+        )),
+        NotModified, ShowRefusals,
+    ))]
 pub(super) async fn show(
     State(app): State<Shared>,
     path: Result<Path<String>, PathRejection>,
@@ -86,7 +184,15 @@ pub(super) async fn show(
     Ok((caching, Json(summary)).into_response())
 }
 
-/// Meshes a structure.
+/// Meshes a structure that was uploaded.
+#[utoipa::path(
+    get,
+    path = "/v1/structures/{digest}/{file}",
+    tag = "meshes",
+    operation_id = "meshStructure",
+    params(StructurePath, SurfaceParameters, Wishes, Unchanged, Parts),
+    responses(Addressed, SurfaceRefusals)
+)]
 pub(super) async fn surface(
     State(app): State<Shared>,
     method: Method,
@@ -130,7 +236,7 @@ pub(super) async fn input(app: &Shared, digest: &Digest) -> Result<Input, Proble
 }
 
 /// Reads a structure and says what it holds, on a thread that may block.
-async fn summarise(app: &Shared, digest: Digest, bytes: Bytes) -> Result<Value, Failure> {
+async fn summarise(app: &Shared, digest: Digest, bytes: Bytes) -> Result<StructureDocument, Failure> {
     let limits = app.config.limits.job().read;
     let reading = tokio::task::spawn_blocking(move || {
         let structure = structure::read(&bytes, &limits)?;
@@ -140,30 +246,27 @@ async fn summarise(app: &Shared, digest: Digest, bytes: Bytes) -> Result<Value, 
     read.map_err(|error: structure::StructureError| Failure::Job { error: error.into(), diagnostics: Vec::new() })
 }
 
-fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> Value {
+fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDocument {
     let contents = Contents::of(structure, None);
-    let counts =
-        |c: &Counts| json!({ "polymer": c.polymer, "ligand": c.ligand, "water": c.water, "hydrogens": c.hydrogens });
-    let chains: Vec<Value> = contents
-        .chains
-        .iter()
-        .take(MAX_CHAINS)
-        .map(|chain| json!({ "name": chain.name, "atoms": chain.counts.total(), "of": counts(&chain.counts) }))
-        .collect();
-    json!({
-        "digest": digest.to_string(),
-        "bytes": bytes,
-        "format": structure.format.name(),
-        "id": structure.id,
-        "title": structure.title,
-        "atoms": contents.atoms,
-        "models": contents.models,
-        "model": contents.model,
-        "atoms_in_model": counts(&contents.counts),
-        "alternatives": contents.alternatives,
-        "unknown_elements": contents.unknown_elements,
-        "chain_count": contents.chains.len(),
-        "chains": chains,
-        "surface": format!("/v1/structures/{digest}/surface.glb"),
-    })
+    let chains = contents.chains.iter().take(MAX_CHAINS).map(|chain| ChainDocument {
+        name: chain.name.clone(),
+        atoms: chain.counts.total(),
+        of: (&chain.counts).into(),
+    });
+    StructureDocument {
+        digest: digest.to_string(),
+        bytes,
+        format: structure.format.name(),
+        id: structure.id.clone(),
+        title: structure.title.clone(),
+        atoms: contents.atoms,
+        models: contents.models,
+        model: contents.model,
+        atoms_in_model: (&contents.counts).into(),
+        alternatives: contents.alternatives,
+        unknown_elements: contents.unknown_elements,
+        chain_count: contents.chains.len(),
+        chains: chains.collect(),
+        surface: format!("/v1/structures/{digest}/surface.glb"),
+    }
 }

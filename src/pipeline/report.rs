@@ -10,6 +10,7 @@ use crate::surface::{GridStats, Measures, Served};
 
 /// One connected component.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct ComponentReport {
     /// Its triangles.
     pub triangles: u64,
@@ -23,6 +24,7 @@ pub struct ComponentReport {
 
 /// How coarse the file's vertices are.
 #[derive(Debug, Clone, Copy, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct Quantization {
     /// Distance between neighbouring coordinates, Å; a vertex is moved by half of it at most along each axis.
     pub step: f32,
@@ -30,10 +32,13 @@ pub struct Quantization {
 
 /// A job's report. Field names are the JSON names.
 #[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct Report {
     /// PDB id or data block name.
+    #[cfg_attr(feature = "server", schema(required))]
     pub id: Option<String>,
     /// Title of the structure.
+    #[cfg_attr(feature = "server", schema(required))]
     pub title: Option<String>,
     /// `pdb` or `mmcif`.
     pub source_format: &'static str,
@@ -101,6 +106,7 @@ pub struct Report {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fallback: Option<String>,
     /// Wall time per stage, ms.
+    #[cfg_attr(feature = "server", schema(value_type = std::collections::BTreeMap<String, f64>))]
     pub timings_ms: Map<String, Value>,
 }
 

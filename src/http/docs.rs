@@ -1,0 +1,76 @@
+//! `/docs`: the description to read and to try, in Swagger UI. Its files are embedded, packed as they came in the package
+//! `swagger-ui-dist`; nothing is loaded from elsewhere.
+
+use std::io::Read as _;
+
+use axum::http::header::{
+    ACCEPT_ENCODING, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, VARY,
+};
+use axum::http::{HeaderMap, HeaderName};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+
+use super::problem::Problem;
+
+/// Our own files and resources, as on the page; besides, Swagger UI has icons in its style, and shows downloads. What it
+/// lays out by `style` goes through the document's objects, which a policy does not touch.
+const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
+                      connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
+const BUNDLE: &[u8] = include_bytes!("../../web/swagger/swagger-ui-bundle.js.gz");
+const STYLE: &[u8] = include_bytes!("../../web/swagger/swagger-ui.css.gz");
+
+fn headers(media_type: &'static str) -> [(HeaderName, &'static str); 4] {
+    [
+        (CONTENT_TYPE, media_type),
+        (CONTENT_SECURITY_POLICY, POLICY),
+        (REFERRER_POLICY, "no-referrer"),
+        (CACHE_CONTROL, "no-cache"),
+    ]
+}
+
+/// A packed file, as it is for whoever takes it so.
+fn packed(request: &HeaderMap, media_type: &'static str, bytes: &'static [u8]) -> Result<Response, Problem> {
+    let takes = |coding: &str| {
+        let (name, weight) = coding.split_once(';').unwrap_or((coding, "q=1"));
+        matches!(name.trim(), "gzip" | "*") && weight.trim().strip_prefix("q=").is_none_or(|q| q.parse() != Ok(0.0))
+    };
+    let accepted = request.get_all(ACCEPT_ENCODING).iter().filter_map(|value| value.to_str().ok());
+    if accepted.flat_map(|value| value.split(',')).any(takes) {
+        let coding = [(CONTENT_ENCODING, "gzip"), (VARY, "accept-encoding")];
+        return Ok((headers(media_type), coding, Bytes::from_static(bytes)).into_response());
+    }
+    let mut plain = Vec::new();
+    flate2::read::GzDecoder::new(bytes).read_to_end(&mut plain).map_err(Problem::internal)?;
+    Ok((headers(media_type), [(VARY, "accept-encoding")], plain).into_response())
+}
+
+/// The description, to read and to try.
+#[utoipa::path(get, path = "/docs", tag = "page", operation_id = "docs",
+    responses((status = 200, description = "A page.", body = String, content_type = "text/html; charset=utf-8")))]
+pub(super) async fn index() -> Response {
+    (headers("text/html; charset=utf-8"), include_str!("../../web/docs.html")).into_response()
+}
+
+/// What starts the page.
+#[utoipa::path(get, path = "/docs.js", tag = "page", operation_id = "docsStart",
+    responses((status = 200, description = "A script.", body = String,
+        content_type = "text/javascript; charset=utf-8")))]
+pub(super) async fn start() -> Response {
+    (headers("text/javascript; charset=utf-8"), include_str!("../../web/docs.js")).into_response()
+}
+
+/// The style of Swagger UI.
+#[utoipa::path(get, path = "/swagger-ui.css", tag = "page", operation_id = "docsStyle",
+    responses((status = 200, description = "A style.", body = String, content_type = "text/css; charset=utf-8")))]
+pub(super) async fn style(headers: HeaderMap) -> Result<Response, Problem> {
+    packed(&headers, "text/css; charset=utf-8", STYLE)
+}
+
+/// Swagger UI.
+#[utoipa::path(get, path = "/swagger-ui-bundle.js", tag = "page", operation_id = "docsBundle",
+    responses((status = 200, description = "A script.", body = String,
+        content_type = "text/javascript; charset=utf-8")))]
+pub(super) async fn bundle(headers: HeaderMap) -> Result<Response, Problem> {
+    packed(&headers, "text/javascript; charset=utf-8", BUNDLE)
+}

@@ -1,0 +1,83 @@
+//! `/openapi.yaml` and `/openapi.json`: the description of this interface, collected from what stands beside each
+//! handler. `openapi.yaml` at the top level is the same text; a test says so, and writes it anew when told to.
+
+pub(super) mod bodies;
+pub(super) mod meshes;
+pub(super) mod parameters;
+pub(super) mod problems;
+
+use std::sync::LazyLock;
+
+use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use utoipa::OpenApi;
+
+pub(super) use problems::refusals;
+
+use super::problem::Problem;
+
+const ABOUT: &str = "Molecules in, surface meshes out.
+
+Send a PDB or mmCIF file to `POST /v1/meshes` and get a closed, oriented mesh. Whatever is not a success is a problem \
+document (RFC 9457); its `type` is an address with an explanation.
+
+Beyond what each operation lists: `HEAD` is answered wherever `GET` is. A server that holds as many connections as it \
+may answers 503 (`too-many-connections`) to the next one before it has read a request. A 500 where none is listed, or a \
+504, means a defect of the server. Every answer has an `X-Request-Id`: the client's own, if it sent one of 64 letters, \
+digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
+
+/// The description.
+#[derive(OpenApi)]
+#[openapi(
+    info(title = "molmesh", description = ABOUT, license(name = "MIT OR Apache-2.0", identifier = "MIT OR Apache-2.0")),
+    servers((url = "/", description = "This server.")),
+    tags(
+        (name = "meshes", description = "Structures to meshes."),
+        (name = "structures", description = "Structures that are uploaded once."),
+        (name = "jobs", description = "Meshes that are promised."),
+        (name = "results", description = "Meshes that were made, for as long as they are kept."),
+        (name = "service", description = "About the service."),
+        (name = "page", description = "The pages and what they consist of."),
+    ),
+    paths(
+        super::meshes::create, super::pdb::surface, super::estimate::create,
+        super::structures::create, super::structures::show, super::structures::surface,
+        super::jobs::show, super::jobs::dismiss, super::jobs::result, super::events::show,
+        super::results::show, super::results::report,
+        super::capabilities::show, super::problems::list, super::problems::one,
+        super::health::live, super::health::ready, super::health::version,
+        super::page::index, super::page::style, super::page::script, super::page::viewer, super::page::icon,
+        super::page::sample,
+        super::docs::index, super::docs::start, super::docs::style, super::docs::bundle, yaml, json,
+    ),
+    components(schemas(problems::ProblemDocument, super::delivery::ReportDocument)),
+)]
+struct Description;
+
+/// The description as YAML and as JSON.
+static TEXTS: LazyLock<Result<[Bytes; 2], String>> = LazyLock::new(|| {
+    let description = Description::openapi();
+    let yaml = description.to_yaml().map_err(|error| error.to_string())?;
+    let json = description.to_pretty_json().map_err(|error| error.to_string())?;
+    Ok([yaml.into(), json.into()])
+});
+
+fn answer(which: usize, media_type: &'static str) -> Result<Response, Problem> {
+    let texts = TEXTS.as_ref().map_err(Problem::internal)?;
+    Ok(([(CONTENT_TYPE, media_type), (CACHE_CONTROL, "no-cache")], texts[which].clone()).into_response())
+}
+
+/// This description as YAML.
+#[utoipa::path(get, path = "/openapi.yaml", tag = "service", operation_id = "describeYaml",
+    responses((status = 200, description = "The description.", body = String, content_type = "application/yaml")))]
+pub(super) async fn yaml() -> Result<Response, Problem> {
+    answer(0, "application/yaml")
+}
+
+/// This description as JSON.
+#[utoipa::path(get, path = "/openapi.json", tag = "service", operation_id = "describeJson",
+    responses((status = 200, description = "The description.", body = Object, content_type = "application/json")))]
+pub(super) async fn json() -> Result<Response, Problem> {
+    answer(1, "application/json")
+}

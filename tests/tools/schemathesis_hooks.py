@@ -1,0 +1,33 @@
+"""What Schemathesis cannot make up from the description: structures. Random bytes are sent as well, being what the schema
+allows; these make the requests get past the reader."""
+
+import gzip
+
+import schemathesis
+from hypothesis import strategies as st
+
+ATOM = "ATOM  {n:5}  CA  {residue} {chain}{n:4}    {x:8.3f}{y:8.3f}   0.000  1.00  0.00           C  \n"
+PDB = "".join(
+    ATOM.format(n=n, residue="ALA", chain="AB"[n % 2], x=3.0 * n, y=n % 2) for n in range(1, 6)
+).encode()
+CIF = b"""data_X
+loop_
+_atom_site.group_PDB
+_atom_site.id
+_atom_site.type_symbol
+_atom_site.label_atom_id
+_atom_site.label_comp_id
+_atom_site.label_asym_id
+_atom_site.label_seq_id
+_atom_site.Cartn_x
+_atom_site.Cartn_y
+_atom_site.Cartn_z
+ATOM 1 C CA ALA A 1 0.0 0.0 0.0
+ATOM 2 C CA ALA A 2 3.0 0.0 0.0
+"""
+
+any_structure = st.one_of(st.sampled_from([PDB, CIF, gzip.compress(PDB, mtime=0)]), st.binary(max_size=200))
+schemathesis.openapi.media_type("application/octet-stream", any_structure)
+schemathesis.openapi.media_type("chemical/x-pdb", st.just(PDB))
+schemathesis.openapi.media_type("chemical/x-mmcif", st.just(CIF))
+schemathesis.openapi.format("binary", any_structure)
