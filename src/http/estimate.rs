@@ -111,10 +111,8 @@ pub(super) async fn create(
     let Input { bytes, digest, lease } = taken.input(&app).await?;
     let seconds = app.pool.expected(&bytes, &job);
     let stop = StopOnDrop(CancelToken::default());
-    let limits = pipeline::JobLimits {
-        deadline: Some(std::time::Instant::now() + app.config.jobs.deadline()),
-        ..app.config.limits.job()
-    };
+    let limits = app.config.limits.job();
+    let allowed = app.config.jobs.deadline();
     let estimating = tokio::task::spawn_blocking({
         let (app, cancel, job) = (Arc::clone(&app), stop.0.clone(), job.clone());
         move || {
@@ -124,8 +122,10 @@ pub(super) async fn create(
             estimate
         }
     });
-    let estimate = estimating
+    // Leaving stops the work.
+    let estimate = tokio::time::timeout(allowed, estimating)
         .await
+        .map_err(|_elapsed| declared.explain(Failure::Deadline { limit: allowed }))?
         .map_err(Problem::internal)?
         .map_err(|error| declared.explain(Failure::Job { error, diagnostics: Vec::new() }))?;
     drop(stop);

@@ -208,13 +208,12 @@ impl Ledger {
         let promise = Arc::new(Promise::new(record));
         let (input, digest) = (order.task.input.clone(), order.task.digest);
         let pin = inner.pin(&id, &digest)?;
-        let (recorded, kept) = mpsc::channel();
-        let ticket = match ticket {
-            Some(ticket) => ticket,
-            None => {
-                let claim = self.claim(&promise, Some(kept));
-                inner.pool.submit(order.task, inner.settings.allowed, Some(claim))?
-            }
+        let (recorded, kept) = mpsc::sync_channel(1);
+        let ticket = if let Some(ticket) = ticket {
+            ticket
+        } else {
+            let claim = self.claim(&promise, Some(kept));
+            inner.pool.submit(order.task, inner.settings.allowed, Some(claim))?
         };
         inner.store.put_new(&Name::input(&digest), input).await?;
         let record = serde_json::to_vec(&promise.record()).unwrap_or_default();

@@ -224,7 +224,7 @@ async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Resu
 /// The job and the format of a record.
 fn read(record: &Record) -> Result<(crate::pipeline::Job, Format), String> {
     let request = params::parse(record.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
-    let format = record.format.parse().map_err(|_| format!("its format `{}` is unknown", record.format))?;
+    let format = record.format.parse().map_err(|_bad| format!("its format `{}` is unknown", record.format))?;
     Ok((request.job, format))
 }
 

@@ -90,13 +90,12 @@ impl Queue {
             let place =
                 Place { flight: flight.id, waiter, outcome, progress: Arc::clone(&flight.progress), shared: true };
             // Work that runs cannot be held back any more: what has to be on record is recorded now.
-            let late = claim.and_then(|claim| match flight.begun {
-                Some(_) => Some(claim),
-                None => {
-                    flight.claims.push(claim);
-                    None
-                }
-            });
+            let late = if flight.begun.is_some() {
+                claim
+            } else {
+                flight.claims.extend(claim);
+                None
+            };
             drop(state);
             if let Some(claim) = late {
                 claim();
@@ -237,7 +236,9 @@ impl Queue {
         let mut state = self.lock();
         let (left, running): (Vec<_>, Vec<_>) =
             std::mem::take(&mut state.flights).into_iter().partition(|flight| flight.begun.is_none());
-        running.iter().for_each(|flight| flight.cancel.cancel());
+        for flight in &running {
+            flight.cancel.cancel();
+        }
         state.flights = running;
         self.publish(&mut state);
         drop(state);

@@ -43,7 +43,9 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
     let outcome = shared.budget.check().map_err(Failure::from).and_then(|()| {
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
         let work = || {
-            claims.into_iter().for_each(|claim| claim());
+            for claim in claims {
+                claim();
+            }
             let diagnostics = if task.strict { Some(check(shared, &task.input)?) } else { None };
             let product = pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref())
                 .map_err(|error| explained(shared, &task.input, error))?;
