@@ -139,7 +139,7 @@ fn a_full_queue_refuses_at_once_and_says_when_to_come_back() {
         }
     });
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
-    assert!(rejected(&server, "queue-full") >= 1.0);
+    assert!(rejected(server, "queue-full") >= 1.0);
 }
 
 #[test]
