@@ -23,7 +23,7 @@ macro_rules! embedded {
     ($handler:ident, $path:literal, $id:literal, $media_type:literal, $words:literal, $file:literal) => {
         #[doc = $words]
         #[utoipa::path(get, path = $path, tag = "page", operation_id = $id,
-                    responses((status = 200, description = $words, body = String, content_type = $media_type)))]
+                            responses((status = 200, description = $words, body = String, content_type = $media_type)))]
         pub(super) async fn $handler() -> Response {
             asset($media_type, include_str!($file))
         }
