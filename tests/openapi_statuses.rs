@@ -263,23 +263,10 @@ fn restarts(seen: &Seen) {
 
 /// Puts files in the place of the store's folders.
 fn break_store(dir: &Path) {
-    let mut broken = 0;
-    for entry in std::fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().path()) {
-        match entry.file_name().and_then(|name| name.to_str()) {
-            Some("inputs" | "jobs" | "results") => {
-                std::fs::rename(&entry, entry.with_extension("away")).unwrap();
-                std::fs::write(&entry, b"no folder").unwrap();
-                broken += 1;
-            }
-            // What the store tries itself on is not what it keeps.
-            Some(name) if name != "probe" && entry.is_dir() && entry.extension().is_none() => {
-                break_store(&entry);
-                broken += 1;
-            }
-            _ => {}
-        }
+    for folder in ["inputs", "jobs", "results"].map(|name| dir.join("store").join(name)) {
+        std::fs::rename(&folder, folder.with_extension("away")).unwrap();
+        std::fs::write(&folder, b"no folder").unwrap();
     }
-    assert!(broken > 0, "nothing to break in {}", dir.display());
 }
 
 #[test]

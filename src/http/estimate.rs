@@ -111,8 +111,8 @@ pub(super) async fn create(
     let Input { bytes, digest, lease } = taken.input(&app).await?;
     let seconds = app.pool.expected(&bytes, &job);
     let stop = StopOnDrop(CancelToken::default());
-    let limits = app.config.limits.job();
-    let allowed = app.config.jobs.deadline();
+    let limit = app.config.jobs.deadline();
+    let limits = pipeline::JobLimits { deadline: Some(std::time::Instant::now() + limit), ..app.config.limits.job() };
     let estimating = tokio::task::spawn_blocking({
         let (app, cancel, job) = (Arc::clone(&app), stop.0.clone(), job.clone());
         move || {
@@ -122,10 +122,10 @@ pub(super) async fn create(
             estimate
         }
     });
-    // Leaving stops the work.
-    let estimate = tokio::time::timeout(allowed, estimating)
+    // Backends may leave the deadline to whoever can cancel them, which the end of this request does.
+    let estimate = tokio::time::timeout(limit, estimating)
         .await
-        .map_err(|_elapsed| declared.explain(Failure::Deadline { limit: allowed }))?
+        .map_err(|_elapsed| Problem::from(Failure::Deadline { limit }))?
         .map_err(Problem::internal)?
         .map_err(|error| declared.explain(Failure::Job { error, diagnostics: Vec::new() }))?;
     drop(stop);

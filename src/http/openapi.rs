@@ -23,8 +23,8 @@ Send a PDB or mmCIF file to `POST /v1/meshes` and get a closed, oriented mesh. W
 document (RFC 9457); its `type` is an address with an explanation.
 
 Beyond what each operation lists: `HEAD` is answered wherever `GET` is. A server that holds as many connections as it \
-may answers 503 (`too-many-connections`) to the next one before it has read a request. A 500 where none is listed, or a \
-504, means a defect of the server. Every answer has an `X-Request-Id`: the client's own, if it sent one of 64 letters, \
+may answers 503 (`too-many-connections`) to the next one before it has read a request. A 500 or a 504 \
+where none is listed means a defect of the server. Every answer has an `X-Request-Id`: the client's own, if it sent one of 64 letters, \
 digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
 
 /// The description.
@@ -70,7 +70,7 @@ fn answer(which: usize, media_type: &'static str) -> Result<Response, Problem> {
 
 /// This description as YAML.
 #[utoipa::path(get, path = "/openapi.yaml", tag = "service", operation_id = "describeYaml",
-    responses((status = 200, description = "The description.", body = String, content_type = "application/yaml")))]
+    responses((status = 200, description = "The description.", body = Object, content_type = "application/yaml")))]
 pub(super) async fn yaml() -> Result<Response, Problem> {
     answer(0, "application/yaml")
 }

@@ -185,7 +185,7 @@ request_headers!(
 request_headers!(
     /// The compression of an upload.
     Coding: [(
-        "Content-Encoding", Some("^(identity|gzip|x-gzip|zstd)$"), "gzip",
+        "Content-Encoding", Some("^(identity|gzip|x-gzip|zstd)?$"), "gzip",
         "How the body is compressed. It need not be said: the bytes are looked at.",
     )]
 );
