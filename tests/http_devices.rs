@@ -163,11 +163,17 @@ fn what_stands_in_is_said_in_answer_report_log_and_metrics() {
     assert_eq!((&report["device"], report.get("fallback")), (&"card 1".into(), None));
 
     *backend.instead.lock().unwrap() = Some("the card is on fire 7431");
-    let stood_in = server.post("/v1/meshes", &[], SAMPLE);
+    // The first result is kept, and would be the answer to the same request.
+    let other = http_support::sample(1);
+    let stood_in = server.post("/v1/meshes", &[], &other);
     assert_eq!(stood_in.header("molmesh-backend"), Some("cpu"));
     assert_eq!(stood_in.header("molmesh-backend-reason"), Some("a test says so; but the card is on fire 7431"));
-    assert_ne!(stood_in.header("etag"), well.header("etag"), "other bytes under one tag");
-    let report = server.post("/v1/meshes?report=json", &[], SAMPLE).json();
+    *backend.instead.lock().unwrap() = None;
+    let again = server.post("/v1/meshes", &[], &other);
+    assert_eq!(again.header("molmesh-backend"), Some("gpu"), "what stood in is no answer once the devices are back");
+    assert_ne!(stood_in.header("etag"), again.header("etag"), "other bytes under one tag");
+    *backend.instead.lock().unwrap() = Some("the card is on fire 7431");
+    let report = server.post("/v1/meshes?report=json", &[], &other).json();
     assert_eq!((&report["backend"], &report["fallback"]), (&"cpu".into(), &"the card is on fire 7431".into()));
     assert_eq!(report["device"], "the processor");
     assert_eq!(log_lines("on fire 7431").len(), 2);
