@@ -75,11 +75,11 @@ impl Listener {
         let seen = self.seen;
         tokio::select! {
             news = self.watched.wait_for(|view| view.version > seen || view.record.status.is_final()) => {
-                let view = news.ok()?.clone();
+                let view = news.ok()?;
                 (self.seen, self.over) = (view.version, view.record.status.is_final());
                 let event = Event::default().id(view.version.to_string()).event(view.record.status.name());
-                let document = serde_json::to_string(&jobs::document(&view)).ok()?;
-                Some(event.data(document))
+                let write = || serde_json::to_string(&jobs::document(&view)).unwrap_or_default();
+                Some(event.data(view.written.get_or_init(write)))
             }
             // The stream ends with the service; clients reconnect by themselves.
             _ = self.stopping.wait_for(|stop| *stop) => None,

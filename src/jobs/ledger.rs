@@ -4,7 +4,7 @@
 //! results are named by their contents; so a crash anywhere costs time and never a job.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -104,6 +104,16 @@ pub struct View {
     pub fraction: f64,
     /// Rises with every change.
     pub version: u64,
+    /// What is told of it, written by the first who tells it, for all who do.
+    pub written: Arc<OnceLock<String>>,
+}
+
+impl View {
+    /// Something has changed.
+    pub(super) fn changed(&mut self) {
+        self.version += 1;
+        self.written = Arc::default();
+    }
 }
 
 /// Writes an ending for clients.

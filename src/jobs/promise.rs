@@ -31,7 +31,7 @@ pub(super) struct Promise {
 impl Promise {
     pub(super) fn new(record: Record) -> Self {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
-        let (view, _) = watch::channel(View { record, stage: None, fraction, version: 1 });
+        let (view, _) = watch::channel(View { record, stage: None, fraction, version: 1, written: Arc::default() });
         Self { view, progress: Mutex::default(), dismissed: Notify::new() }
     }
 
@@ -63,7 +63,7 @@ impl Promise {
             view.record.attempts += 1;
             view.record.status = Status::Running;
             view.record.started_ms = Some(now_ms());
-            view.version += 1;
+            view.changed();
         });
     }
 
@@ -76,7 +76,8 @@ impl Promise {
             view.record.status = status;
             view.record.finished_ms = Some(now_ms());
             and(&mut view.record);
-            (view.stage, view.version) = (None, view.version + 1);
+            view.stage = None;
+            view.changed();
             if status == Status::Successful {
                 view.fraction = 1.0;
             }
@@ -113,7 +114,7 @@ impl Promise {
             }
             view.stage = Some(stage);
             view.fraction = view.fraction.max(fraction);
-            view.version += 1;
+            view.changed();
             true
         });
     }
