@@ -25,10 +25,12 @@ fn twins() -> Vec<u8> {
 
 fn main() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
-    let body = twins();
+    let twins = twins();
     let encode = || server.metric("molmesh_job_stage_duration_seconds_sum", &["stage=\"encode\""]) * 1e3;
     let mut overheads: Vec<f64> = (0..500)
-        .map(|_| {
+        .map(|n| {
+            // The same upload again would be answered from the store.
+            let body = [format!("REMARK 900 {n}\n").as_bytes(), &twins].concat();
             let before = encode();
             let start = Instant::now();
             let reply = server.post("/v1/meshes?resolution=1", &[], &body);

@@ -288,6 +288,7 @@ fn a_job_that_would_wait_too_long_is_refused_at_once() {
     assert!(problem["estimated_wait_s"].as_f64().unwrap() > 2.0, "{problem}");
     assert!(refused.header("retry-after").unwrap().parse::<u64>().unwrap() >= 1);
     for job in jobs {
-        assert_eq!(delete(&server, &job).status, 200);
+        // The first ones may have ended meanwhile.
+        assert!([200, 409].contains(&delete(&server, &job).status));
     }
 }
