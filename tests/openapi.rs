@@ -13,9 +13,9 @@ use std::sync::LazyLock;
 
 use http_support::{Fake, Mode, Running, send, start};
 use molmesh::pipeline::params::TABLE;
+use molmesh::store::Digest;
 use openapi_support::operations;
 use serde_json::{Value, json};
-use sha2::{Digest as _, Sha256};
 
 static SERVER: LazyLock<Running> = LazyLock::new(|| start(Fake::new(Mode::Octahedra), |_| {}));
 static DESCRIPTION: LazyLock<Value> = LazyLock::new(|| SERVER.get("/openapi.json").json());
@@ -158,7 +158,7 @@ fn swagger_ui_is_what_its_note_says_packed_or_not() {
         let path = format!("/{file}");
         let plain = SERVER.get(&path);
         assert_eq!((plain.status, plain.header("content-encoding")), (200, None));
-        let digest: String = Sha256::digest(&plain.body).iter().map(|byte| format!("{byte:02x}")).collect();
+        let digest = Digest::of(&plain.body);
         assert!(note.contains(&format!("{digest}  {file}\n")), "{file} is {digest}");
         for (accept, coding) in
             [("gzip, br", Some("gzip")), ("br;q=1, *;q=0.1", Some("gzip")), ("gzip;q=0", None), ("identity", None)]
