@@ -90,6 +90,9 @@ fn a_request_that_outlasts_its_wait_becomes_a_job_and_no_work_is_lost() {
     ended(&server, &job, "successful");
     assert_eq!(backend.started.load(Ordering::SeqCst), 1, "the job went on");
     assert!(!result(&server, &job).body.is_empty());
+    // A report cannot be promised, so it is waited for.
+    let report = server.post("/v1/meshes?report=json", &[("prefer", "wait=0")], &sample(3));
+    assert_eq!((report.status, report.json()["atoms"].as_u64()), (200, Some(454)));
     // Who would wait less is promised earlier.
     let start = Instant::now();
     let reply = server.post("/v1/meshes", &[("prefer", "wait=0")], &sample(2));
@@ -153,6 +156,26 @@ fn the_same_work_in_flight_is_done_once() {
     // The control: other parameters are other work.
     assert_eq!(server.post("/v1/meshes?resolution=0.9", &[], SAMPLE).status, 200);
     assert_eq!(backend.started.load(Ordering::SeqCst), 2);
+}
+
+#[test]
+fn a_promise_may_join_work_that_runs_already() {
+    let backend = slow(700);
+    let server = start(Arc::clone(&backend) as _, |_| {});
+    std::thread::scope(|scope| {
+        let waiting = scope.spawn(|| server.post("/v1/meshes", &[], SAMPLE));
+        wait_for("it runs", || backend.started.load(Ordering::SeqCst) == 1);
+        let begin = Instant::now();
+        let jobs: Vec<String> = (0..4).map(|_| promise(&server, "/v1/meshes", &[], SAMPLE)).collect();
+        assert!(begin.elapsed() < Duration::from_millis(600), "{:?}", begin.elapsed());
+        for job in &jobs {
+            assert_eq!(server.get(job).json()["attempts"], 1, "it runs, which is on record");
+            ended(&server, job, "successful");
+            assert!(!result(&server, job).body.is_empty());
+        }
+        assert_eq!(waiting.join().unwrap().status, 200);
+    });
+    assert_eq!(backend.started.load(Ordering::SeqCst), 1);
 }
 
 #[test]

@@ -43,6 +43,15 @@ pub(super) struct Input {
     pub(super) lease: Arc<Lease>,
 }
 
+impl Input {
+    /// Bytes that are charged to the service's budget from now on.
+    pub(super) fn new(app: &Shared, bytes: Bytes, digest: Digest) -> Result<Self, Problem> {
+        let mut lease = app.pool.budget().lease();
+        lease.grow(bytes.len() as u64)?;
+        Ok(Self { bytes, digest, lease: Arc::new(lease) })
+    }
+}
+
 impl Ask {
     /// The key of the answer, if the chosen backend makes it.
     pub(super) fn key(&self, app: &Shared) -> ContentKey {
@@ -87,8 +96,12 @@ impl Ask {
         let place = app.delivery()?;
         let task = self.task(&input);
         let mut ticket = app.pool.submit(task, app.config.jobs.deadline(), None)?;
-        let patience = app.config.jobs.sync_wait();
-        let patience = self.wish.wait.map_or(patience, |wait| wait.min(patience));
+        let patience = match self.wish.wait {
+            // A report has no address of its own that could be promised: it is waited for until its deadline.
+            _ if self.request.report => Duration::MAX,
+            Some(wait) => wait.min(app.config.jobs.sync_wait()),
+            None => app.config.jobs.sync_wait(),
+        };
         let Ok(outcome) = tokio::time::timeout(patience, ticket.wait()).await else {
             drop(place);
             return self.promise(app, input, Some(ticket)).await;

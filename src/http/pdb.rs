@@ -1,7 +1,6 @@
 //! `GET /v1/pdb/{id}/surface.{ext}`: the mesh of an archive entry, under an address that can be cached.
 
-use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
@@ -28,7 +27,7 @@ use crate::store::Digest;
 use crate::structure::{ArchiveError, EntryId};
 
 /// Entries change a few times in their life, and then in details: a day is soon enough to notice.
-const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stale-while-revalidate=604800");
+pub(super) const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stale-while-revalidate=604800");
 
 refusals!(SurfaceRefusals: [PARAMETERS, READING, MESHING, ASKING, [
     Kind::NotFound, Kind::NotInArchive, Kind::EntryTooLarge, Kind::RangeNotSatisfiable, Kind::ArchiveUnavailable,
@@ -53,20 +52,11 @@ pub(super) async fn surface(
 ) -> Result<Response, Problem> {
     let start = Instant::now();
     let Path((id, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let Named { request, pairs, format } = named(&file, query)?;
+    let named = named(&file, query)?;
     let id: EntryId = id.parse().map_err(|error| of_folder(&error))?;
     let digest = digest(&app, &id).await?;
     let wish = Wish::of(&headers, &extensions)?;
-    let mut ask = Ask {
-        digest,
-        request,
-        pairs,
-        format,
-        wish,
-        cache: Some(CACHE),
-        received: start.elapsed(),
-        declared: Declared::Neutral,
-    };
+    let mut ask = named.ask(digest, wish, start.elapsed());
     if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
         return Ok(response);
     }
@@ -80,6 +70,14 @@ pub(super) struct Named {
     pub(super) request: params::Request,
     pub(super) pairs: Vec<(String, String)>,
     pub(super) format: Format,
+}
+
+impl Named {
+    /// What is asked of the structure with this digest, whose bytes or name took `received` to be there.
+    pub(super) fn ask(self, digest: Digest, wish: Wish, received: Duration) -> Ask {
+        let Self { request, pairs, format } = self;
+        Ask { digest, request, pairs, format, wish, cache: Some(CACHE), received, declared: Declared::Neutral }
+    }
 }
 
 /// The request behind an address that ends in `surface.{ext}`.
@@ -142,10 +140,8 @@ pub(super) async fn digest(app: &Shared, id: &EntryId) -> Result<Digest, Problem
 
 /// An entry's file.
 pub(super) async fn input(app: &Shared, id: &EntryId) -> Result<Input, Problem> {
-    let mut lease = app.pool.budget().lease();
     let Entry { bytes, digest, .. } = app.archive.fetch(id).await.map_err(|error| of_archive(&error))?;
-    lease.grow(bytes.len() as u64)?;
-    Ok(Input { bytes, digest, lease: Arc::new(lease) })
+    Input::new(app, bytes, digest)
 }
 
 /// The archive's errors.

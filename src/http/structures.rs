@@ -1,6 +1,5 @@
 //! `/v1/structures`: upload once, mesh many times. A structure's name is the SHA-256 of its bytes as they came.
 
-use std::sync::Arc;
 use std::time::Instant;
 
 use axum::Json;
@@ -14,8 +13,7 @@ use bytes::Bytes;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::ask::{self, Ask, Input};
-use super::declared::Declared;
+use super::ask::{self, Input};
 use super::kinds::Kind;
 use super::meshes::Pairs;
 use super::openapi::bodies::{StructureFile, StructureForm};
@@ -23,7 +21,6 @@ use super::openapi::meshes::{Addressed, NotModified};
 use super::openapi::parameters::{Coding, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
 use super::openapi::problems::{ASKING, BODY, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
-use super::pdb::Named;
 use super::problem::Problem;
 use super::state::Shared;
 use super::upload::{self, Upload};
@@ -175,11 +172,12 @@ pub(super) async fn show(
     let digest = digest_of(&text)?;
     let etag = HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)?;
     let caching = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, CACHE)];
-    let _place = app.delivery()?;
-    let bytes = input(&app, &digest).await?.bytes;
-    if conditional::is_unchanged(&headers, &etag) {
+    // Whoever has the summary is answered without reading the structure.
+    if conditional::is_unchanged(&headers, &etag) && app.store.head(&Name::input(&digest)).await?.is_some() {
         return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
     }
+    let _place = app.delivery()?;
+    let Input { bytes, lease: _lease, .. } = input(&app, &digest).await?;
     let summary = summarise(&app, digest, bytes).await?;
     Ok((caching, Json(summary)).into_response())
 }
@@ -203,19 +201,10 @@ pub(super) async fn surface(
 ) -> Result<Response, Problem> {
     let start = Instant::now();
     let Path((text, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let Named { request, pairs, format } = pdb::named(&file, query)?;
+    let named = pdb::named(&file, query)?;
     let digest = digest_of(&text)?;
     let wish = Wish::of(&headers, &extensions)?;
-    let mut ask = Ask {
-        digest,
-        request,
-        pairs,
-        format,
-        wish,
-        cache: Some(CACHE),
-        received: start.elapsed(),
-        declared: Declared::Neutral,
-    };
+    let mut ask = named.ask(digest, wish, start.elapsed());
     if app.store.head(&Name::input(&digest)).await?.is_none() {
         return Err(none(&text));
     }
@@ -230,9 +219,7 @@ pub(super) async fn surface(
 /// The bytes of a structure.
 pub(super) async fn input(app: &Shared, digest: &Digest) -> Result<Input, Problem> {
     let bytes = app.store.get(&Name::input(digest)).await?.ok_or_else(|| none(&digest.to_string()))?.bytes;
-    let mut lease = app.pool.budget().lease();
-    lease.grow(bytes.len() as u64)?;
-    Ok(Input { bytes, digest: *digest, lease: Arc::new(lease) })
+    Input::new(app, bytes, *digest)
 }
 
 /// Reads a structure and says what it holds, on a thread that may block.

@@ -198,12 +198,7 @@ impl Ledger {
         if order.idempotency.is_some()
             && let Some(view) = self.view(&id).await?
         {
-            let known = &view.record;
-            let same = (&known.input, &known.parameters, &known.format);
-            if same != (&record.input, &record.parameters, &record.format) {
-                return Err(PromiseError::OtherRequest);
-            }
-            return Ok(view);
+            return if record.asks_as(&view.record) { Ok(view) } else { Err(PromiseError::OtherRequest) };
         }
         if ticket.is_none()
             && let Some(key) = self.made(&order.task, order.format).await?
@@ -223,7 +218,11 @@ impl Ledger {
             ticket
         } else {
             let claim = self.claim(&promise, Some(kept));
-            inner.pool.submit(order.task, inner.settings.allowed, Some(claim))?
+            let ticket = inner.pool.submit(order.task, inner.settings.allowed, Some(claim))?;
+            if ticket.came_late() {
+                promise.begin();
+            }
+            ticket
         };
         inner.store.put_new(&Name::input(&digest), input).await?;
         let record = serde_json::to_vec(&promise.record()).unwrap_or_default();
@@ -231,8 +230,8 @@ impl Ledger {
         if !inner.store.put_new(&name, Bytes::from(record)).await?
             && let Some(view) = self.view(&id).await?
         {
-            // The same request came twice at once: the other one has promised it.
-            return Ok(view);
+            // The key came twice at once: the other request was promised first.
+            return if promise.record().asks_as(&view.record) { Ok(view) } else { Err(PromiseError::OtherRequest) };
         }
         // A worker that waits for it goes on; there is none where the work runs already.
         _ = recorded.send(());
@@ -384,12 +383,16 @@ impl Ledger {
     /// A task as it is on record.
     ///
     /// # Errors
-    /// Why it cannot be had, in words.
-    pub(super) async fn task(&self, record: &Record, digest: Digest) -> Result<(Task, Format), String> {
-        let stored = self.0.store.get(&Name::input(&digest)).await.map_err(|e| e.to_string())?;
-        let input = stored.ok_or("its input is gone")?.bytes;
+    /// That of the store, which may pass; within it, why the task cannot be had any more, in words.
+    pub(super) async fn task(
+        &self,
+        record: &Record,
+        digest: Digest,
+    ) -> Result<Result<(Task, Format), String>, StoreError> {
+        let stored = self.0.store.get(&Name::input(&digest)).await?;
+        let Some(input) = stored.map(|stored| stored.bytes) else { return Ok(Err("its input is gone".to_owned())) };
         let mut lease = self.0.pool.budget().lease();
         lease.force(input.len() as u64);
-        super::promise::task(record, digest, input, lease)
+        Ok(super::promise::task(record, digest, input, lease))
     }
 }

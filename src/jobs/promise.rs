@@ -195,17 +195,27 @@ async fn submit(ledger: &Ledger, promise: &Arc<Promise>, record: &Record, digest
         return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
     }
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
-    let (task, format) = ledger.task(record, digest).await.map_err(lost)?;
+    // A store that does not answer now is no reason to give a promise up.
+    let silent = |error| {
+        tracing::warn!(job = %record.id, %error, "a job waits for the store");
+        Attempt::Again
+    };
+    let (task, format) = ledger.task(record, digest).await.map_err(silent)?.map_err(lost)?;
     // An earlier process may have ended between the result and its record.
-    if let Ok(Some(key)) = ledger.made(&task, format).await {
+    if let Some(key) = ledger.made(&task, format).await.map_err(silent)? {
         return Err(Attempt::Ended(Ok(key)));
     }
     let claim = ledger.claim(promise, None);
-    ledger.0.pool.submit(task, settings.allowed, Some(claim)).map_err(|refusal| match refusal {
+    let ticket = ledger.0.pool.submit(task, settings.allowed, Some(claim)).map_err(|refusal| match refusal {
         Refusal::Draining => Attempt::Left,
         // It was accepted once: it waits until there is room.
         Refusal::QueueFull { .. } | Refusal::TooLate { .. } => Attempt::Again,
-    })
+    })?;
+    if ticket.came_late() {
+        promise.begin();
+        ledger.0.keep(&promise.record()).await.map_err(silent)?;
+    }
+    Ok(ticket)
 }
 
 /// Keeps the result. Its key comes back.

@@ -43,6 +43,8 @@ pub(super) struct Place {
     pub(super) progress: Arc<Progress>,
     /// The same work was in the house already.
     pub(super) shared: bool,
+    /// It runs already, so that no claim is called.
+    pub(super) begun: bool,
 }
 
 /// The queue.
@@ -87,20 +89,11 @@ impl Queue {
         if let Some(flight) = state.flights.iter_mut().find(same) {
             flight.waiters.push(Waiter { id: waiter, reply });
             flight.rank.batch &= task.rank.batch;
-            let place =
-                Place { flight: flight.id, waiter, outcome, progress: Arc::clone(&flight.progress), shared: true };
-            // Work that runs cannot be held back any more: what has to be on record is recorded now.
-            let late = if flight.begun.is_some() {
-                claim
-            } else {
-                flight.claims.extend(claim);
-                None
-            };
-            drop(state);
-            if let Some(claim) = late {
-                claim();
-            }
-            return Ok(place);
+            let begun = flight.begun.is_some();
+            // Work that runs cannot be held back any more: whoever claims it records that by itself.
+            flight.claims.extend(claim.filter(|_| !begun));
+            let progress = Arc::clone(&flight.progress);
+            return Ok(Place { flight: flight.id, waiter, outcome, progress, shared: true, begun });
         }
         let now = Instant::now();
         let units = cost::units(&task.input, &task.job);
@@ -140,7 +133,7 @@ impl Queue {
         self.publish(&mut state);
         drop(state);
         self.filled.notify_one();
-        Ok(Place { flight: waiter, waiter, outcome, progress, shared: false })
+        Ok(Place { flight: waiter, waiter, outcome, progress, shared: false, begun: false })
     }
 
     /// The next job; blocks until there is one. `None` once the queue is closed and empty.

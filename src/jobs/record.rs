@@ -141,6 +141,14 @@ pub struct Record {
     pub problem: Option<Value>,
 }
 
+impl Record {
+    /// Whether both are of requests for the same thing.
+    #[must_use]
+    pub fn asks_as(&self, other: &Self) -> bool {
+        (&self.input, &self.parameters, &self.format) == (&other.input, &other.parameters, &other.format)
+    }
+}
+
 /// Milliseconds since 1970.
 #[must_use]
 pub fn now_ms() -> u64 {

@@ -41,6 +41,12 @@ impl Ticket {
         &self.place.progress
     }
 
+    /// Whether the work ran already when this ticket was given out: then its claim is not called.
+    #[must_use]
+    pub fn came_late(&self) -> bool {
+        self.place.begun
+    }
+
     /// Whether the same work was in the house already.
     #[must_use]
     pub fn is_shared(&self) -> bool {
