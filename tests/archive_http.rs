@@ -301,7 +301,7 @@ async fn redirects_stay_on_their_host_and_end() {
 async fn slow_heads_and_bodies_are_given_up() {
     let head = b"HTTP/1.1 200 X\r\ncontent-length: 9\r\n\r\nab".to_vec();
     for bytes in [b"HTTP/1.1 200 X\r\n".to_vec(), head] {
-        let remote = Remote::saying(Say::Stall(bytes, Duration::from_secs(5)));
+        let remote = Remote::saying(Say::Stall(bytes, Duration::from_secs(60)));
         let begin = Instant::now();
         let result = once(&remote.url(CIF), |c| {
             c.archive.connect_timeout_ms = 100;
@@ -310,7 +310,7 @@ async fn slow_heads_and_bodies_are_given_up() {
         })
         .await;
         assert_eq!((why(result).0, remote.count()), (Why::Timeout, 2));
-        assert!(begin.elapsed() < Duration::from_secs(5), "{:?}", begin.elapsed());
+        assert!(begin.elapsed() < Duration::from_secs(30), "{:?}", begin.elapsed());
     }
     // The time for everything ends even an answer that keeps coming.
     let remote = Remote::saying(Say::Endless);
@@ -652,7 +652,7 @@ fn a_mesh_of_an_entry_that_was_never_here() {
     assert!(server.metric("molmesh_archive_cache_bytes", &[]) > 0.0);
     let cached = counted("cache", "found");
     // Another mesh of it needs the entry's bytes; the same might be answered from the results by now.
-    assert_eq!(server.get(&format!("{SURFACE}?resolution=0.9")).status, 200);
+    assert_eq!(server.get(&SURFACE.replace("=2", "=1.9")).status, 200);
     assert!(counted("cache", "found") > cached);
     assert_eq!(server.get(SURFACE).header("etag"), reply.header("etag"));
     // Who has the mesh is answered from memory, though the copy is gone.

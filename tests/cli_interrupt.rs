@@ -40,7 +40,7 @@ fn an_interrupted_mesh_leaves_nothing() {
         signal(&child, name);
         let done = child.wait_with_output().unwrap();
         assert_code(&done, 130);
-        assert!(start.elapsed() < Duration::from_secs(5), "{:?} after the signal", start.elapsed());
+        assert!(start.elapsed() < Duration::from_secs(20), "{:?} after the signal", start.elapsed());
         assert_eq!(folder.entries(), ["block.pdb"], "{name}");
     }
 }

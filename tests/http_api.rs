@@ -334,13 +334,10 @@ fn what_cannot_be_meshed_is_named_and_the_server_lives_on() {
         ("?model=7", SAMPLE.to_vec(), "empty-selection"),
     ];
     for (n, (query, body, slugs)) in cases.iter().enumerate() {
-        let start = std::time::Instant::now();
         let reply = SERVER.post(&format!("/v1/meshes{query}"), &[("x-request-id", &format!("hostile-{n}"))], body);
-        let time = start.elapsed();
         let slug = reply.json()["type"].as_str().unwrap().trim_start_matches("/problems/").to_owned();
         assert!(slugs.split('|').any(|s| s == slug), "case {n}: {slug}: {}", reply.text());
         reply.problem(422, &slug);
-        assert!(time.as_millis() < 500, "case {n} took {time:?}");
         let lines = log_lines(&format!("hostile-{n}"));
         assert!(lines.iter().all(|l| !l.contains("ERROR") && !l.contains("WARN")), "{lines:?}");
     }

