@@ -11,6 +11,8 @@ use bytemuck::Pod;
 use memmap2::MmapMut;
 use rayon::prelude::*;
 
+use super::recycle::Recycled;
+
 /// From this many bytes on, a column is mapped.
 const MAP_FROM: usize = 64 << 10;
 /// From this many bytes on, a mapped column asks for huge pages: two of them. Below, its pages are made present in one
@@ -33,6 +35,10 @@ enum Storage<T: Pod> {
         map: MmapMut,
         bytes: usize,
     },
+    Recycled {
+        memory: Recycled,
+        bytes: usize,
+    },
     Foreign {
         owner: Foreign,
         bytes: Range<usize>,
@@ -49,18 +55,35 @@ impl<T: Pod> Column<T> {
     #[must_use]
     pub fn zeroed(n: usize) -> Self {
         let bytes = n * size_of::<T>();
-        if bytes >= MAP_FROM
-            && let Ok(map) = MmapMut::map_anon(bytes)
-        {
-            // Advice only: where the kernel has no huge pages, small ones do.
-            #[cfg(target_os = "linux")]
-            let _advised = map
-                .advise(if bytes >= HUGE_FROM { memmap2::Advice::HugePage } else { memmap2::Advice::PopulateWrite })
-                .is_ok();
-            return Self(Storage::Mapped { map, bytes });
+        match mapped(bytes) {
+            Some(map) => Self(Storage::Mapped { map, bytes }),
+            None => Self(Storage::Owned(vec![T::zeroed(); n])),
         }
-        Self(Storage::Owned(vec![T::zeroed(); n]))
     }
+
+    /// `n` rows of anything, for working memory that is written before it is read and soon dropped: earlier columns of
+    /// this kind serve again.
+    #[must_use]
+    pub(super) fn scratch(n: usize) -> Self {
+        let bytes = n * size_of::<T>();
+        if bytes < MAP_FROM {
+            return Self::zeroed(n);
+        }
+        match Recycled::new(bytes, || mapped(bytes)) {
+            Some(memory) => Self(Storage::Recycled { memory, bytes }),
+            None => Self::zeroed(n),
+        }
+    }
+}
+
+/// Zeroed memory from the system, where that is worth it.
+fn mapped(bytes: usize) -> Option<MmapMut> {
+    let map = MmapMut::map_anon(bytes).ok().filter(|_| bytes >= MAP_FROM)?;
+    // Advice only: where the kernel has no huge pages, small ones do.
+    #[cfg(target_os = "linux")]
+    let _advised =
+        map.advise(if bytes >= HUGE_FROM { memmap2::Advice::HugePage } else { memmap2::Advice::PopulateWrite }).is_ok();
+    Some(map)
 }
 
 impl<T: Pod> Column<T> {
@@ -122,7 +145,7 @@ impl<T: Pod> Column<T> {
     pub fn len(&self) -> usize {
         match &self.0 {
             Storage::Owned(rows) => rows.len(),
-            Storage::Mapped { bytes, .. } => bytes / size_of::<T>(),
+            Storage::Mapped { bytes, .. } | Storage::Recycled { bytes, .. } => bytes / size_of::<T>(),
             Storage::Foreign { bytes, .. } => bytes.len() / size_of::<T>(),
             Storage::Pieces { pieces, .. } => pieces.iter().map(Self::len).sum(),
         }
@@ -166,6 +189,7 @@ impl<T: Pod> Deref for Column<T> {
             Storage::Owned(rows) => rows,
             // A mapping begins on a page boundary, so any plain row type is aligned.
             Storage::Mapped { map, bytes } => bytemuck::cast_slice(&map[..*bytes]),
+            Storage::Recycled { memory, bytes } => bytemuck::cast_slice(&memory[..*bytes]),
             // Checked when the column was made.
             Storage::Foreign { owner, bytes } => bytemuck::cast_slice(&(**owner).as_ref()[bytes.clone()]),
             Storage::Pieces { pieces, joined } => {
@@ -185,6 +209,7 @@ impl<T: Pod> DerefMut for Column<T> {
         match &mut self.0 {
             Storage::Owned(rows) => rows,
             Storage::Mapped { map, bytes } => bytemuck::cast_slice_mut(&mut map[..*bytes]),
+            Storage::Recycled { memory, bytes } => bytemuck::cast_slice_mut(&mut memory[..*bytes]),
             Storage::Foreign { .. } | Storage::Pieces { .. } => unreachable!("copied by now"),
         }
     }
@@ -301,6 +326,12 @@ mod tests {
             assert_eq!(column, column.clone());
             column.edit().push([4.0; 3]);
             assert_eq!((column.len(), column.last()), (n + 1, Some(&[4.0; 3])));
+            let mut scratch: Column<[f32; 3]> = Column::scratch(n);
+            assert_eq!(scratch.len(), n);
+            scratch.fill([5.0; 3]);
+            assert_eq!(scratch, Column::from(vec![[5.0; 3]; n]));
+            scratch.edit().push([6.0; 3]);
+            assert_eq!((scratch.len(), scratch.last()), (n + 1, Some(&[6.0; 3])));
         }
     }
 }

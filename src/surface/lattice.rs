@@ -74,9 +74,9 @@ impl Lattice {
         let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
         let spacing = params.resolution;
         let profile = Profile::new(params);
-        let radii = || spheres.radii().par_iter().with_min_len(1 << 16).copied();
-        params.check_radius(radii().reduce(|| f32::MAX, f32::min))?;
-        let largest = effective(radii().reduce(|| 0.0, f32::max), params);
+        let (smallest, largest) = spheres.radius_range();
+        params.check_radius(smallest)?;
+        let largest = effective(largest, params);
         let atoms = Placing { spheres, params, profile: &profile }.in_canonical_order([lo, hi]);
         let margin = 2.0 * profile.reach(profile.length(largest));
         let box_cells = (0..3).map(|k| ((hi[k] - lo[k] + margin) / spacing).ceil()).product::<f64>();
@@ -157,9 +157,16 @@ impl Placing<'_> {
         // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
         let rank =
             TileRanks::new(bounds.map(|c| tile_of(self.cell(c))), n, |i| tile_of(self.cell(self.spheres.centre(i))));
-        let order = sorted(n, |first, keys| write_keys(self, &rank, first, keys));
-        let mut atoms = Column::zeroed(n);
-        atoms.par_chunks_mut(4096).zip(order.par_chunks(4096)).for_each(|(atoms, order)| place(self, order, atoms));
+        let mut atoms = Column::scratch(n);
+        if rank.end() <= u64::from(u32::MAX) >> PLACE_BITS && u32::try_from(n).is_ok() {
+            let order = sorted(n, |first, keys| write_short_keys(self, &rank, first, keys));
+            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
+            parts.for_each(|(atoms, order)| place_by_short_keys(self, order, atoms));
+        } else {
+            let order = sorted(n, |first, keys| write_keys(self, &rank, first, keys));
+            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
+            parts.for_each(|(atoms, order)| place_by_keys(self, order, atoms));
+        }
         atoms.par_chunk_by_mut(|a, b| a.cell == b.cell).filter(|same| same.len() > 1).for_each(|same| {
             same.sort_unstable_by(|a, b| {
                 let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
@@ -171,26 +178,56 @@ impl Placing<'_> {
     }
 }
 
-dispatched! {
-/// Writes the sort keys of the atoms from `first` on: tile, brick and cell above the atom's index.
-fn write_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut [u128]) {
-    for (i, key) in (first..).zip(keys) {
-        let cell = placing.cell(placing.spheres.centre(i));
+/// Atoms that one task puts in place.
+const PART: usize = 4096;
+/// Bits of an atom's brick and cell within its tile.
+const PLACE_BITS: u32 = 18;
+
+impl Placing<'_> {
+    /// What atom `i` is sorted by: tile, brick and cell.
+    #[inline(always)]
+    fn key(&self, rank: &TileRanks, i: usize) -> u64 {
+        let cell = self.cell(self.spheres.centre(i));
         let local = cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
         let brick = local.map(|c| c / BRICK.unsigned_abs());
         let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
         let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
-        let place = rank.of(tile_of(cell)) << 18 | pack(brick) << 9 | pack(cell_in_brick);
-        *key = u128::from(place) << 64 | i as u128;
+        rank.of(tile_of(cell)) << PLACE_BITS | pack(brick) << 9 | pack(cell_in_brick)
+    }
+}
+
+dispatched! {
+/// Writes the sort keys of the atoms from `first` on: their places above their indices.
+fn write_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut [u128]) {
+    for (i, key) in (first..).zip(keys) {
+        *key = u128::from(placing.key(rank, i)) << 64 | i as u128;
+    }
+}
+}
+
+dispatched! {
+/// The same where places and indices have 32 bits each: half the memory, and less time to sort.
+fn write_short_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut [u64]) {
+    for (i, key) in (first..).zip(keys) {
+        *key = placing.key(rank, i) << 32 | i as u64;
     }
 }
 }
 
 dispatched! {
 /// Writes the atoms whose keys are `order`.
-fn place(placing: &Placing<'_>, order: &[u128], atoms: &mut [LatticeAtom]) {
+fn place_by_keys(placing: &Placing<'_>, order: &[u128], atoms: &mut [LatticeAtom]) {
     for (key, atom) in order.iter().zip(atoms) {
         *atom = placing.atom(usize::try_from(key & u128::from(u64::MAX)).unwrap_or(usize::MAX));
+    }
+}
+}
+
+dispatched! {
+/// The same by short keys.
+fn place_by_short_keys(placing: &Placing<'_>, order: &[u64], atoms: &mut [LatticeAtom]) {
+    for (key, atom) in order.iter().zip(atoms) {
+        *atom = placing.atom(usize::try_from(key & u64::from(u32::MAX)).unwrap_or(usize::MAX));
     }
 }
 }
@@ -215,6 +252,14 @@ impl TileRanks {
         order.par_sort_unstable();
         order.dedup();
         Self::Listed(order)
+    }
+
+    /// Above every number.
+    fn end(&self) -> u64 {
+        match self {
+            Self::Box { side, .. } => side.iter().product(),
+            Self::Listed(order) => order.len() as u64,
+        }
     }
 
     #[inline(always)]

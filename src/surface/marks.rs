@@ -1,12 +1,17 @@
 //! Which bricks exist: atoms mark those that they reach, run by run in parallel, and the marks are merged tile by tile.
 
+use std::collections::hash_map::Entry;
+
 use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 
 use super::lattice::{BRICK, LatticeAtom, TILE, tile_of, tile_order, to_i32, to_u32};
 use super::layout::NONE;
 
 /// Atoms that one piece of parallel work marks the bricks of.
-const RUN: usize = 2048;
+const RUN: usize = 1024;
+/// From so many runs on, their marks are merged in parallel first.
+const MANY_RUNS: usize = 256;
 
 /// Bricks of a tile as bits: word z, bit `8·y + x`.
 pub(super) type Bits = [u64; 8];
@@ -62,6 +67,14 @@ fn to_usize(v: f32) -> usize {
 }
 
 impl Marked {
+    /// Adds what others mark in the same tile.
+    fn add(&mut self, other: &Self) {
+        self.closed.iter_mut().zip(other.closed).for_each(|(word, more)| *word |= more);
+        self.reached.iter_mut().zip(other.reached).for_each(|(word, more)| *word |= more);
+        self.candidates += other.candidates;
+        self.pairs += other.pairs;
+    }
+
     /// Marks the bricks of the tile that an atom reaches, by its gaps along x, y and z: the arithmetic of the CPU's stage
     /// `bin`, step by step.
     #[inline(always)]
@@ -188,20 +201,33 @@ pub(super) fn runs(starts: &[usize], n_atoms: usize) -> Vec<(usize, usize)> {
 
 /// Everything that was marked, one entry a tile, in the order of tiles.
 pub(super) fn merge(marks: &[Vec<Marked>]) -> Vec<Marked> {
-    let mut all: Vec<([i32; 3], &Marked)> = marks.par_iter().flatten().map(|m| (tile_order(m.tile), m)).collect();
-    all.par_sort_unstable_by_key(|(order, _)| *order);
-    let one = |same: &[([i32; 3], &Marked)]| {
-        let mut merged = *same[0].1;
-        for (_, mark) in &same[1..] {
-            merged.closed.iter_mut().zip(mark.closed).for_each(|(word, more)| *word |= more);
-            merged.reached.iter_mut().zip(mark.reached).for_each(|(word, more)| *word |= more);
-            merged.candidates += mark.candidates;
-            merged.pairs += mark.pairs;
-        }
-        merged
+    let mut all: Vec<Marked> = if marks.len() < MANY_RUNS {
+        merged(marks)
+    } else {
+        // Runs that follow each other share most of their tiles.
+        let parts: Vec<Vec<Marked>> = marks.par_chunks(MANY_RUNS / 4).map(merged).collect();
+        merged(&parts)
     };
     // A tile may be in an atom's range by a corner that no brick is near to.
-    all.par_chunk_by(|a, b| a.0 == b.0).map(one).filter(|merged| merged.closed != [0; 8]).collect()
+    all.retain(|mark| mark.closed != [0; 8]);
+    all.par_sort_unstable_by_key(|mark| tile_order(mark.tile));
+    all
+}
+
+/// One entry a tile, in any order.
+fn merged(marks: &[Vec<Marked>]) -> Vec<Marked> {
+    let mut all: Vec<Marked> = Vec::new();
+    let mut at: FxHashMap<[i32; 3], usize> = FxHashMap::default();
+    for mark in marks.iter().flatten() {
+        match at.entry(mark.tile) {
+            Entry::Vacant(entry) => {
+                entry.insert(all.len());
+                all.push(*mark);
+            }
+            Entry::Occupied(entry) => all[*entry.get()].add(mark),
+        }
+    }
+    all
 }
 
 /// An atom's brick within its tile.

@@ -22,6 +22,7 @@ pub mod mesh;
 pub mod params;
 pub mod parts;
 pub mod plan;
+mod recycle;
 pub mod reference;
 mod simd;
 pub mod sink;

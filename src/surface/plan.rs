@@ -60,7 +60,7 @@ impl Plan {
         }
         let starts = starts(atoms);
         let runs = runs(&starts, atoms.len());
-        let mut reaches = Column::zeroed(atoms.len());
+        let mut reaches = Column::scratch(atoms.len());
         let part = |(reaches, atoms): (&mut [f32], &[LatticeAtom])| {
             reaches.iter_mut().zip(atoms).for_each(|(reach, atom)| *reach = reach_of(lattice, atom));
             reaches.iter().copied().fold(0.0, f32::max)
@@ -130,8 +130,8 @@ impl Plan {
                 tile
             })
             .collect();
-        self.bricks = Column::zeroed(base as usize);
-        self.first_atoms = Column::zeroed(base as usize + 1);
+        self.bricks = Column::scratch(base as usize);
+        self.first_atoms = Column::scratch(base as usize + 1);
         Some(())
     }
 

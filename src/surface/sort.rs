@@ -1,37 +1,56 @@
 //! Sorting in parallel without a serial part: pieces are sorted where they are made, then each range of keys is collected
 //! from all pieces.
 
+use bytemuck::Pod;
 use rayon::prelude::*;
 
 use super::column::Column;
 
-/// Keys of a piece, and about as many of a range: they are sorted within the second-level cache.
-const PIECE: usize = 1 << 13;
+/// Most keys of a piece, and about as many of a range: they are sorted within the second-level cache.
+const LARGEST: usize = 1 << 13;
+/// Fewest: below, what is done for each pair of a piece and a range would count.
+const SMALLEST: usize = 1 << 10;
 /// One key in so many is looked at to choose the ranges.
 const EVERY: usize = 1 << 7;
 
+/// A key: whole, and in order.
+pub(super) trait Key: Pod + Ord + Send + Sync {}
+
+impl<K: Pod + Ord + Send + Sync> Key for K {}
+
+/// Keys of a piece: several pieces a thread, so that none waits long for the slowest.
+fn piece_of(n: usize) -> usize {
+    (n / (4 * rayon::current_num_threads())).clamp(SMALLEST, LARGEST).next_multiple_of(EVERY)
+}
+
 /// `n` different keys in ascending order; `make(first, piece)` writes those from number `first` on.
-pub(super) fn sorted(n: usize, make: impl Fn(usize, &mut [u128]) + Sync) -> Column<u128> {
-    let mut keys = Column::zeroed(n);
-    keys.par_chunks_mut(PIECE).enumerate().for_each(|(p, piece)| {
-        make(p * PIECE, piece);
+pub(super) fn sorted<K: Key>(n: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
+    sorted_by_pieces(n, piece_of(n), make)
+}
+
+/// [`sorted`], with `size` keys a piece, a multiple of [`EVERY`]; the result does not depend on it.
+fn sorted_by_pieces<K: Key>(n: usize, size: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
+    let mut keys = Column::scratch(n);
+    keys.par_chunks_mut(size).enumerate().for_each(|(p, piece)| {
+        make(p * size, piece);
         piece.sort_unstable();
     });
-    if n <= PIECE {
+    if n <= size {
         return keys;
     }
-    let mut samples: Vec<u128> = keys.chunks(PIECE).flat_map(|piece| piece.iter().step_by(EVERY)).copied().collect();
-    samples.sort_unstable();
-    let bounds: Vec<u128> = samples.iter().step_by(PIECE / EVERY).skip(1).copied().collect();
+    let mut samples: Vec<K> =
+        keys.par_chunks(size).flat_map_iter(|piece| piece.iter().step_by(EVERY)).copied().collect();
+    samples.par_sort_unstable();
+    let bounds: Vec<K> = samples.iter().step_by(size / EVERY).skip(1).copied().collect();
     // Per piece where each range begins in it, and where the last one ends.
     let cuts: Vec<Vec<usize>> = keys
-        .par_chunks(PIECE)
+        .par_chunks(size)
         .map(|piece| {
             let inner = bounds.iter().map(|bound| piece.partition_point(|key| key < bound));
             [0].into_iter().chain(inner).chain([piece.len()]).collect()
         })
         .collect();
-    let mut out = Column::zeroed(n);
+    let mut out = Column::scratch(n);
     let mut rest = &mut out[..];
     let mut ranges = Vec::with_capacity(bounds.len() + 1);
     for r in 0..=bounds.len() {
@@ -41,7 +60,7 @@ pub(super) fn sorted(n: usize, make: impl Fn(usize, &mut [u128]) + Sync) -> Colu
     }
     ranges.into_par_iter().enumerate().for_each(|(r, range)| {
         let mut at = 0;
-        for (piece, cut) in keys.chunks(PIECE).zip(&cuts) {
+        for (piece, cut) in keys.chunks(size).zip(&cuts) {
             let own = &piece[cut[r]..cut[r + 1]];
             range[at..at + own.len()].copy_from_slice(own);
             at += own.len();
@@ -61,15 +80,26 @@ mod tests {
         let scatter = |i: usize| (i as u128 * 0x9e37_79b9_7f4a_7c15) & 0xffff_ffff_ffff;
         let orders: [&(dyn Fn(usize) -> u128 + Sync); 4] =
             [&|i| i as u128, &|i| u128::MAX - i as u128, &scatter, &|i| (i as u128 % 3) << 64 | i as u128];
-        for n in [0, 1, 2, PIECE - 1, PIECE, PIECE + 1, 3 * PIECE + 77, 20 * PIECE] {
+        for n in [0, 1, 2, LARGEST - 1, LARGEST, LARGEST + 1, 3 * LARGEST + 77, 20 * LARGEST] {
             for order in orders {
-                let got = sorted(n, |first, piece| (first..).zip(piece).for_each(|(i, key)| *key = order(i)));
                 let mut expected: Vec<u128> = (0..n).map(order).collect();
                 let made = expected.clone();
                 expected.sort_unstable();
-                assert_eq!(expected, got, "{n}");
-                assert!(n < 2 || made.is_sorted() || made != got, "the control: what was made is not in order");
+                for size in [SMALLEST, 3 * EVERY, LARGEST, piece_of(n)] {
+                    let make = |first, piece: &mut [u128]| (first..).zip(piece).for_each(|(i, key)| *key = order(i));
+                    let got = sorted_by_pieces(n, size, make);
+                    assert_eq!(expected, got, "{n} in pieces of {size}");
+                    assert!(n < 2 || made.is_sorted() || made != got, "the control: what was made is not in order");
+                }
             }
+        }
+    }
+
+    #[test]
+    fn pieces_hold_whole_samples() {
+        for n in [0, 1, 5_000, 60_000, 1_000_000, 10_000_000] {
+            let size = piece_of(n);
+            assert!((SMALLEST..=LARGEST).contains(&size) && size.is_multiple_of(EVERY), "{size}");
         }
     }
 }

@@ -71,19 +71,54 @@ impl Spheres {
         &self.r
     }
 
+    /// The smallest and the largest radius, Å.
+    pub(super) fn radius_range(&self) -> (f32, f32) {
+        let range = |part: &[f32]| part.iter().fold((f32::MAX, 0.0_f32), |(lo, hi), &r| (lo.min(r), hi.max(r)));
+        let parts = self.r.par_chunks(PART).map(range);
+        parts.reduce(|| (f32::MAX, 0.0), |a, b| (a.0.min(b.0), a.1.max(b.1)))
+    }
+
     /// Lowest and highest centre coordinate per axis, Å; `None` when there are no spheres.
     #[must_use]
     pub fn bounds(&self) -> Option<[[f64; 3]; 2]> {
-        // Plain comparisons: no coordinate is NaN, which `f64::min` would look for.
-        let wider = |(lo, hi): (f64, f64), (low, high): (f64, f64)| {
-            (if low < lo { low } else { lo }, if high > hi { high } else { hi })
+        const NONE: [[f64; 3]; 2] = [[f64::MAX; 3], [f64::MIN; 3]];
+        let part = |x: &[f64], y: &[f64], z: &[f64]| {
+            let [x, y, z] = [x, y, z].map(outermost);
+            [[x.0, y.0, z.0], [x.1, y.1, z.1]]
         };
-        let none = (f64::MAX, f64::MIN);
-        let part = |part: &[f64]| part.iter().fold(none, |all, &v| wider(all, (v, v)));
-        let fold = |column: &[f64]| column.par_chunks(1 << 16).map(part).reduce(|| none, wider);
-        let ([x, y, z], false) = ([&self.x, &self.y, &self.z].map(|c| fold(c)), self.is_empty()) else {
-            return None;
+        let wider = |a: [[f64; 3]; 2], b: [[f64; 3]; 2]| {
+            let all = |k: usize, of: fn(f64, f64) -> f64| std::array::from_fn(|axis| of(a[k][axis], b[k][axis]));
+            [all(0, lower), all(1, higher)]
         };
-        Some([[x.0, y.0, z.0], [x.1, y.1, z.1]])
+        // One pass over all columns: tasks are few and small.
+        let parts = self.x.par_chunks(PART).zip(self.y.par_chunks(PART)).zip(self.z.par_chunks(PART));
+        let bounds = parts.map(|((x, y), z)| part(x, y, z)).reduce(|| NONE, wider);
+        (!self.is_empty()).then_some(bounds)
     }
+}
+
+/// Spheres that one task looks at.
+const PART: usize = 1 << 13;
+
+// Plain comparisons: no coordinate is NaN, which `f64::min` would look for.
+fn lower(a: f64, b: f64) -> f64 {
+    if b < a { b } else { a }
+}
+
+fn higher(a: f64, b: f64) -> f64 {
+    if b > a { b } else { a }
+}
+
+/// The lowest and the highest of `values`.
+fn outermost(values: &[f64]) -> (f64, f64) {
+    // Several of each: one alone would wait for the comparison before.
+    let (mut lo, mut hi) = ([f64::MAX; 8], [f64::MIN; 8]);
+    let (rows, rest) = values.as_chunks::<8>();
+    for row in rows {
+        for k in 0..8 {
+            (lo[k], hi[k]) = (lower(lo[k], row[k]), higher(hi[k], row[k]));
+        }
+    }
+    let all = |lanes: [f64; 8], of: fn(f64, f64) -> f64| lanes.iter().chain(rest).copied().fold(lanes[0], of);
+    (all(lo, lower), all(hi, higher))
 }
