@@ -110,6 +110,7 @@ impl Server {
             allowed: config.jobs.batch_deadline(),
             attempts: config.jobs.attempts,
             output_bytes: config.limits.output_bytes,
+            patience: config.jobs.store_patience(),
         };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
         let ledger = Ledger::new(store.clone(), Arc::clone(&pool), promises, describe);
