@@ -137,7 +137,7 @@ async fn a_store_that_is_silent_gives_no_job_up() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_result_is_held_until_the_store_takes_it() {
     let house = House::new(1, PATIENT).await;
-    house.faults.silence(Some(Folder::Results));
+    house.faults.seal(Folder::Results);
     let id = house.promise().await.unwrap().record.id;
     let mut seen = house.watch(&id).await;
     house.unanswered(3).await;
@@ -152,7 +152,7 @@ async fn a_result_is_held_until_the_store_takes_it() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_result_that_the_store_never_takes_is_made_as_often_as_may_be() {
     let house = House::new(3, Duration::ZERO).await;
-    house.faults.silence(Some(Folder::Results));
+    house.faults.seal(Folder::Results);
     let id = house.promise().await.unwrap().record.id;
     let mut seen = house.watch(&id).await;
     ended(&mut seen).await;
@@ -178,7 +178,7 @@ async fn a_result_that_the_store_never_takes_is_made_as_often_as_may_be() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_ending_is_written_down_when_the_store_answers_again() {
     let house = House::new(1, PATIENT).await;
-    house.faults.silence(Some(Folder::Results));
+    house.faults.seal(Folder::Results);
     let id = house.promise().await.unwrap().record.id;
     let mut seen = house.watch(&id).await;
     house.unanswered(1).await;
@@ -193,7 +193,7 @@ async fn an_ending_is_written_down_when_the_store_answers_again() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn nothing_is_promised_that_is_not_on_record() {
     let house = House::new(1, PATIENT).await;
-    for folder in [Folder::Inputs, Folder::Jobs] {
+    for folder in Folder::ALL {
         house.faults.silence(Some(folder));
         let refused = house.promise().await;
         assert!(matches!(refused, Err(PromiseError::Store(StoreError::Failed { .. }))), "{refused:?}");

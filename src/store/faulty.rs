@@ -27,8 +27,8 @@ pub(crate) struct Faults {
     pub(crate) full: AtomicBool,
     /// Nothing can be removed.
     pub(crate) stuck: AtomicBool,
-    /// The folder of which nothing is heard.
-    silent: Mutex<Option<Folder>>,
+    /// The folder of which nothing is heard, and whether that goes for reading too.
+    silent: Mutex<Option<(Folder, bool)>>,
     /// Questions about it that were not answered.
     pub(crate) unanswered: AtomicUsize,
 }
@@ -41,12 +41,18 @@ impl Faults {
     /// From now on nothing is heard of this folder, and of no other one.
     pub(crate) fn silence(&self, folder: Option<Folder>) {
         self.unanswered.store(0, Ordering::SeqCst);
-        *self.silent.lock().unwrap() = folder;
+        *self.silent.lock().unwrap() = folder.map(|folder| (folder, true));
     }
 
-    fn answers(&self, at: &Path) -> Result<()> {
+    /// The same for what is written there alone.
+    pub(crate) fn seal(&self, folder: Folder) {
+        self.unanswered.store(0, Ordering::SeqCst);
+        *self.silent.lock().unwrap() = Some((folder, false));
+    }
+
+    fn answers(&self, at: &Path, reading: bool) -> Result<()> {
         let silent = *self.silent.lock().unwrap();
-        if silent.is_some_and(|folder| at.as_ref().starts_with(folder.as_str())) {
+        if silent.is_some_and(|(folder, all)| at.as_ref().starts_with(folder.as_str()) && (all || !reading)) {
             self.unanswered.fetch_add(1, Ordering::SeqCst);
             return Err(error(io::ErrorKind::TimedOut));
         }
@@ -97,18 +103,18 @@ impl MultipartUpload for FaultyUpload {
 #[async_trait::async_trait]
 impl ObjectStore for Faulty {
     async fn put_opts(&self, at: &Path, payload: PutPayload, options: PutOptions) -> Result<PutResult> {
-        self.faults.answers(at)?;
+        self.faults.answers(at, false)?;
         self.faults.room()?;
         self.files.put_opts(at, payload, options).await
     }
 
     async fn put_multipart_opts(&self, at: &Path, options: PutMultipartOptions) -> Result<Box<dyn MultipartUpload>> {
-        self.faults.answers(at)?;
+        self.faults.answers(at, false)?;
         Ok(Box::new(FaultyUpload(self.files.put_multipart_opts(at, options).await?, Arc::clone(&self.faults))))
     }
 
     async fn get_opts(&self, at: &Path, options: GetOptions) -> Result<GetResult> {
-        self.faults.answers(at)?;
+        self.faults.answers(at, true)?;
         self.files.get_opts(at, options).await
     }
 
