@@ -223,7 +223,7 @@ fn what_s3_keeps_is_what_a_folder_keeps() {
         "surface.glb?resolution=1",
         "surface.stl?resolution=1",
         "surface.ply?resolution=0.7",
-        "surface.stl?resolution=0.3",
+        "surface.stl?resolution=0.24",
     ] {
         let path = format!("{structure}/{file}");
         let (fresh, expected) = (get(server.addr, &path), get(judge.addr, &path));
