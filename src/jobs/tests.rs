@@ -100,9 +100,9 @@ async fn until<F: Future<Output = bool>>(what: &str, mut holds: impl FnMut() -> 
 }
 
 #[track_caller]
-fn is<T: PartialEq + Debug>(seen: &watch::Receiver<View>, of: impl Fn(&Record) -> T, expected: T) {
+fn is<T: PartialEq + Debug>(seen: &watch::Receiver<View>, of: impl Fn(&Record) -> T, expected: &T) {
     let record = seen.borrow().record.clone();
-    assert_eq!(of(&record), expected, "{record:?}");
+    assert_eq!(&of(&record), expected, "{record:?}");
 }
 
 async fn ended(seen: &mut watch::Receiver<View>) {
@@ -119,10 +119,10 @@ async fn a_store_that_is_silent_gives_no_job_up() {
     let mut seen = house.watch(&id).await;
     // More than there are attempts: being asked for the input is none.
     house.unanswered(3).await;
-    is(&seen, |record| (record.status, record.attempts), (Status::Accepted, 0));
+    is(&seen, |record| (record.status, record.attempts), &(Status::Accepted, 0));
     house.faults.silence(None);
     ended(&mut seen).await;
-    is(&seen, |record| (record.status, record.attempts), (Status::Successful, 1));
+    is(&seen, |record| (record.status, record.attempts), &(Status::Successful, 1));
     assert_eq!(house.store.usage(Folder::Results).objects, 2);
     // A store that says that there is no input is another matter.
     let id = house.inherit().await;
@@ -130,7 +130,7 @@ async fn a_store_that_is_silent_gives_no_job_up() {
     assert_eq!(house.ledger.recover().await.unwrap(), 1);
     let mut seen = house.watch(&id).await;
     ended(&mut seen).await;
-    is(&seen, |record| record.status, Status::Failed);
+    is(&seen, |record| record.status, &Status::Failed);
     assert!(seen.borrow().record.problem.as_ref().unwrap().as_str().unwrap().starts_with("Lost"));
 }
 
@@ -141,10 +141,10 @@ async fn a_result_is_held_until_the_store_takes_it() {
     let id = house.promise().await.unwrap().record.id;
     let mut seen = house.watch(&id).await;
     house.unanswered(3).await;
-    is(&seen, |record| record.status, Status::Running);
+    is(&seen, |record| record.status, &Status::Running);
     house.faults.silence(None);
     ended(&mut seen).await;
-    is(&seen, |record| (record.status, record.attempts), (Status::Successful, 1));
+    is(&seen, |record| (record.status, record.attempts), &(Status::Successful, 1));
     until("the record", || async { house.on_record(&id).await.status == Status::Successful }).await;
     assert_eq!(house.store.usage(Folder::Results).objects, 2);
 }
@@ -156,7 +156,7 @@ async fn a_result_that_the_store_never_takes_is_made_as_often_as_may_be() {
     let id = house.promise().await.unwrap().record.id;
     let mut seen = house.watch(&id).await;
     ended(&mut seen).await;
-    is(&seen, |record| (record.status, record.attempts), (Status::Failed, 3));
+    is(&seen, |record| (record.status, record.attempts), &(Status::Failed, 3));
     let problem = seen.borrow().record.problem.clone().unwrap();
     assert!(problem.as_str().unwrap().starts_with("Save"), "why it failed, not how often: {problem}");
     assert_eq!(house.faults.unanswered.load(Ordering::SeqCst), 3, "once for each mesh");
@@ -172,7 +172,7 @@ async fn a_result_that_the_store_never_takes_is_made_as_often_as_may_be() {
     let id = house.promise().await.unwrap().record.id;
     let mut seen = house.watch(&id).await;
     ended(&mut seen).await;
-    is(&seen, |record| (record.status, record.attempts), (Status::Failed, 1));
+    is(&seen, |record| (record.status, record.attempts), &(Status::Failed, 1));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -184,7 +184,7 @@ async fn an_ending_is_written_down_when_the_store_answers_again() {
     house.unanswered(1).await;
     house.faults.silence(Some(Folder::Jobs));
     ended(&mut seen).await;
-    is(&seen, |record| record.status, Status::Successful);
+    is(&seen, |record| record.status, &Status::Successful);
     house.unanswered(2).await;
     house.faults.silence(None);
     until("the record", || async { house.on_record(&id).await.status == Status::Successful }).await;
