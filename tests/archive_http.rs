@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use archive_support::{Remote, Say, ok, status, tagged, with};
 use http_support::{Fake, Mode, SAMPLE, send, start};
-use molmesh::archive::{Archive, Entry, FetchError, Source, Why};
+use molmesh::archive::{Archive, Entry, FetchError, Source, Uncounted, Why};
 use molmesh::config::Config;
 use molmesh::store::Digest;
 use molmesh::structure::EntryId;
@@ -54,7 +54,7 @@ impl Place {
     }
 
     fn archive(&self) -> Archive {
-        Archive::new(&self.config)
+        Archive::new(&self.config, Arc::new(Uncounted))
     }
 
     fn copies(&self) -> PathBuf {
@@ -184,7 +184,7 @@ async fn old_copies_are_asked_about() {
     let mut config = place.config.clone();
     config.archive.url = Some(other.url(CIF).parse().unwrap());
     pause(1100).await;
-    assert_eq!(&Archive::new(&config).fetch(&id("4pti")).await.unwrap().bytes[..], b"third");
+    assert_eq!(&Archive::new(&config, Arc::new(Uncounted)).fetch(&id("4pti")).await.unwrap().bytes[..], b"third");
     assert_eq!(other.asked()[0].header("if-none-match"), None);
 }
 
@@ -711,6 +711,24 @@ fn a_stale_copy_is_said_so() {
     std::thread::sleep(Duration::from_millis(5));
     assert_eq!(server.get(SURFACE).status, 200);
     assert!(stale() > before && http_support::log_lines("stale copy").len() > lines);
+}
+
+#[test]
+fn entries_take_memory_while_they_come() {
+    let remote = Remote::start(|_, n| if n == 0 { Say::Endless } else { ok(SAMPLE) });
+    let server = server(&remote.url(CIF), |c| {
+        c.limits.memory_bytes = 4 << 20;
+        c.archive.breaker_failures = 1;
+    });
+    // It would end at `archive.max_bytes`, which is far more.
+    let document = server.get(SURFACE).problem(503, "memory-full");
+    assert_eq!(
+        (&document["limit"], document["actual"].as_u64().is_some_and(|held| held > 1 << 20)),
+        (&(4 << 20).into(), true)
+    );
+    http_support::wait_for("the memory", || server.metric("molmesh_memory_held_bytes", &[]) == 0.0);
+    // Nobody is to blame: the next one comes, and the first was not tried again.
+    assert_eq!((server.get(SURFACE).status, remote.count()), (200, 2));
 }
 
 #[test]

@@ -11,6 +11,7 @@ use reqwest::{Client, Proxy, Response, StatusCode, Url};
 
 use super::address::{Checked, Refused};
 use super::error::Why;
+use super::memory::{NoMemory, Share};
 use super::whole;
 use crate::config::{ArchiveConfig, Templates};
 use crate::store::Digest;
@@ -35,7 +36,7 @@ pub(super) struct Validators {
 #[derive(Debug)]
 pub(super) enum Answer {
     /// The entry.
-    Body { bytes: Bytes, digest: Digest, url: String, validators: Validators },
+    Body { bytes: Bytes, digest: Digest, url: String, validators: Validators, share: Box<dyn Share> },
     /// What we have is still the one.
     Unchanged,
     /// It has no such entry.
@@ -47,6 +48,8 @@ pub(super) enum Answer {
 pub(super) enum Failed {
     /// The answer is longer than allowed; the bytes that were announced, if any.
     TooLarge(Option<u64>),
+    /// There is no memory for it.
+    Memory(NoMemory),
     /// Anything else: what, when to come back if the host said so, details for the log.
     Other { why: Why, retry_after: Option<Duration>, detail: String },
 }
@@ -108,12 +111,13 @@ fn may_follow(from: &Url, to: &Url) -> bool {
     from.host_str() == to.host_str() && (same_place || upgrade)
 }
 
-/// Asks once.
+/// Asks once. What comes is counted by `share` while it comes, and for as long as the answer lives.
 pub(super) async fn get(
     client: &Client,
     url: Url,
     known: Option<&Validators>,
     limits: Limits,
+    mut share: Box<dyn Share>,
 ) -> Result<Answer, Failed> {
     let compressed = Path::new(url.path()).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gz"));
     let name = url.to_string();
@@ -142,7 +146,7 @@ pub(super) async fn get(
     }
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
     let validators = Validators { etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
-    let bytes = body(response, limits).await?;
+    let bytes = body(response, limits, share.as_mut()).await?;
     let (bytes, digest) = tokio::task::spawn_blocking(move || {
         if compressed && !whole::is_whole_gzip(&bytes, limits.inflated) {
             return Err(Failed::other(Why::Damaged, "the file is not whole"));
@@ -152,11 +156,11 @@ pub(super) async fn get(
     })
     .await
     .map_err(|error| Failed::other(Why::Client, &error))??;
-    Ok(Answer::Body { bytes, digest, url: name, validators })
+    Ok(Answer::Body { bytes, digest, url: name, validators, share })
 }
 
 /// Receives the body, and no more than is allowed of it.
-async fn body(mut response: Response, limits: Limits) -> Result<Bytes, Failed> {
+async fn body(mut response: Response, limits: Limits, share: &mut dyn Share) -> Result<Bytes, Failed> {
     let announced = response.content_length();
     if announced.is_some_and(|bytes| bytes > limits.bytes) {
         return Err(Failed::TooLarge(announced));
@@ -171,6 +175,7 @@ async fn body(mut response: Response, limits: Limits) -> Result<Bytes, Failed> {
         if body.len() as u64 + chunk.len() as u64 > limits.bytes {
             return Err(Failed::TooLarge(None));
         }
+        share.grow(chunk.len() as u64).map_err(Failed::Memory)?;
         body.extend_from_slice(&chunk);
     }
     match announced {

@@ -11,6 +11,7 @@ use super::client::Answer;
 use super::disk::{Disk, Found, Stored};
 use super::error::FetchError;
 use super::flight::Flights;
+use super::memory::Memory;
 use super::remote::{Origin, Remote};
 use crate::config::Config;
 use crate::store::Digest;
@@ -75,14 +76,15 @@ struct Shared {
 }
 
 impl Archive {
-    /// The archive of a configuration. Nothing is read and nobody is asked before the first entry is wanted.
+    /// The archive of a configuration. What a remote archive sends is counted by `memory` until the fetch is over. Nothing is
+    /// read and nobody is asked before the first entry is wanted.
     #[must_use]
-    pub fn new(config: &Config) -> Self {
+    pub fn new(config: &Config, memory: Arc<dyn Memory>) -> Self {
         let (archive, inflated) = (&config.archive, config.limits.inflated_bytes);
         let shared = Shared {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
-            remote: Remote::new(archive, inflated),
+            remote: Remote::new(archive, inflated, memory),
             flights: Flights::new(),
             known: Cache::new(REMEMBERED),
             absent: Cache::new(REMEMBERED),
@@ -164,16 +166,19 @@ impl Shared {
             Ok(_) => "found",
             Err(FetchError::NotFound { .. }) => "absent",
             Err(FetchError::TooLarge { .. }) => "too-large",
+            Err(FetchError::Memory { .. }) => "no-memory",
             Err(_) => "unavailable",
         };
         count("remote", result);
         histogram!(ARCHIVE_FETCH, "result" => result).record(looked.elapsed().as_secs_f64());
         match (answer, stored) {
-            (Ok(Answer::Body { bytes, digest, url, validators }), _) => {
+            (Ok(Answer::Body { bytes, digest, url, validators, share }), _) => {
                 tracing::info!(%id, url, bytes = bytes.len(), ms = looked.elapsed().as_millis(), "fetched an entry");
                 let (origin, kept) = (Origin { url, validators }, bytes.clone());
                 self.on_disk(id, "kept", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
                 self.remember(id, Known { digest, stamp: None, looked, fresh_until: Some(looked + self.fresh) });
+                // From here on whoever asked counts it.
+                drop(share);
                 Ok(Entry { bytes, digest, source: Source::Remote })
             }
             (Ok(Answer::Unchanged), Some(stored)) => {

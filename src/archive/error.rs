@@ -40,6 +40,16 @@ pub enum FetchError {
         /// When to try again; none where time alone will not help.
         retry_after: Option<Duration>,
     },
+    /// There is no memory for it now.
+    #[error("entry {id} is not fetched: {held} of {limit} bytes of memory for uploads and meshes are in use")]
+    Memory {
+        /// The entry.
+        id: EntryId,
+        /// Bytes allowed.
+        limit: u64,
+        /// Bytes in use.
+        held: u64,
+    },
     /// A defect of ours, or the service is being stopped.
     #[error("the entry could not be fetched: {0}")]
     Internal(&'static str),

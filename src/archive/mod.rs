@@ -12,8 +12,10 @@ mod disk;
 mod entries;
 mod error;
 mod flight;
+mod memory;
 mod remote;
 mod whole;
 
 pub use entries::{Archive, Entry, Source};
 pub use error::{FetchError, Why};
+pub use memory::{Memory, NoMemory, Share, Uncounted};

@@ -11,6 +11,7 @@ use tokio::time::Instant;
 use super::breaker::Breaker;
 use super::client::{self, Answer, Failed, Limits, Validators};
 use super::error::{FetchError, Why};
+use super::memory::{Memory, NoMemory};
 use crate::config::{ArchiveConfig, Template};
 use crate::structure::EntryId;
 
@@ -34,13 +35,14 @@ pub(super) struct Remote {
     config: ArchiveConfig,
     limits: Limits,
     places: Semaphore,
+    memory: Arc<dyn Memory>,
     /// Made when it is first needed: it reads the system's certificates.
     client: OnceCell<Client>,
 }
 
 impl Remote {
-    /// The archive of a configuration, if it names one.
-    pub(super) fn new(config: &ArchiveConfig, inflated: u64) -> Option<Self> {
+    /// The archive of a configuration, if it names one. What it sends is counted by `memory`.
+    pub(super) fn new(config: &ArchiveConfig, inflated: u64, memory: Arc<dyn Memory>) -> Option<Self> {
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
         for template in config.url.as_ref()?.as_slice() {
             let known = sources.iter().find(|(_, breaker)| breaker.host() == template.host());
@@ -55,7 +57,7 @@ impl Remote {
             inflated,
         };
         let places = Semaphore::new(config.concurrent);
-        Some(Self { sources, config: config.clone(), limits, places, client: OnceCell::new() })
+        Some(Self { sources, config: config.clone(), limits, places, memory, client: OnceCell::new() })
     }
 
     /// Asks every address in order until one has the entry.
@@ -66,7 +68,7 @@ impl Remote {
             match self.ask(id, template, breaker, copy, deadline).await {
                 Ok(Answer::Absent) => {}
                 Ok(answer) => return Ok(answer),
-                Err(error @ FetchError::TooLarge { .. }) => return Err(error),
+                Err(error @ (FetchError::TooLarge { .. } | FetchError::Memory { .. })) => return Err(error),
                 // Another address may still have it; if none does, this one might have had it.
                 Err(error) => {
                     failure.get_or_insert(error);
@@ -93,6 +95,9 @@ impl Remote {
                 Ok(answer) => return Ok(answer),
                 Err(Failed::TooLarge(bytes)) => {
                     return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.limits.bytes });
+                }
+                Err(Failed::Memory(NoMemory { limit, held })) => {
+                    return Err(FetchError::Memory { id: id.clone(), limit, held });
                 }
                 Err(Failed::Other { why, retry_after, detail }) => (why, retry_after, detail),
             };
@@ -141,11 +146,12 @@ impl Remote {
         let url = template.url(id).ok_or_else(|| Failed::other(Why::Client, "the address is no URL"))?;
         let known = copy.filter(|copy| copy.url == url.as_str()).map(|copy| &copy.validators);
         let pass = breaker.enter().map_err(paused)?;
-        let answer = tokio::time::timeout_at(deadline, client::get(client, url, known, self.limits))
-            .await
-            .unwrap_or_else(|_elapsed| Err(Failed::other(Why::Timeout, "not whole in time")));
+        let answer =
+            tokio::time::timeout_at(deadline, client::get(client, url, known, self.limits, self.memory.begin()))
+                .await
+                .unwrap_or_else(|_elapsed| Err(Failed::other(Why::Timeout, "not whole in time")));
         match &answer {
-            Ok(_) | Err(Failed::TooLarge(_)) => pass.succeeded(),
+            Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => pass.succeeded(),
             Err(Failed::Other { retry_after: Some(wait), why, .. })
                 if why.may_pass() && *wait > self.config.retry_after() =>
             {
@@ -176,12 +182,13 @@ fn fraction() -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::memory::Uncounted;
     use super::*;
 
     #[test]
     fn pauses_double_and_differ() {
         let config = ArchiveConfig { backoff_ms: 1000, ..ArchiveConfig::default() };
-        let remote = Remote::new(&config, 1).unwrap();
+        let remote = Remote::new(&config, 1, Arc::new(Uncounted)).unwrap();
         let longest = |attempt| (0..200).map(|_| remote.pause(attempt, None)).max().unwrap_or_default().as_millis();
         for (attempt, span) in [(1, 1000), (2, 2000), (3, 4000)] {
             let longest = longest(attempt);

@@ -29,6 +29,9 @@ pub struct JobsConfig {
     pub batch_deadline_ms: u64,
     /// Times that a promised job is begun at most. Default 3: a job that ended the process so often will end it again.
     pub attempts: u32,
+    /// Time for which a promised job's mesh is held and offered again while the store does not take it, ms. Default 60,000:
+    /// longer than a service takes that is started again. After that it is made anew, `attempts` times in all.
+    pub store_patience_ms: u64,
     /// Results of synchronous requests that are kept at once, beside their answers. Default 4: more would compete with
     /// the meshing; what is not kept is made again when somebody asks.
     pub keepers: usize,
@@ -44,6 +47,7 @@ impl Default for JobsConfig {
             sync_wait_ms: 10_000,
             batch_deadline_ms: 3_600_000,
             attempts: 3,
+            store_patience_ms: 60_000,
             keepers: 4,
         }
     }
@@ -60,6 +64,12 @@ impl JobsConfig {
     #[must_use]
     pub fn batch_deadline(&self) -> Duration {
         Duration::from_millis(self.batch_deadline_ms)
+    }
+
+    /// Time for which a promised job's mesh is held and offered again while the store does not take it.
+    #[must_use]
+    pub fn store_patience(&self) -> Duration {
+        Duration::from_millis(self.store_patience_ms)
     }
 
     /// Time from acceptance to the finished mesh.

@@ -77,9 +77,12 @@ impl Ask {
             let caching = [(header::ETAG, etag), (header::CACHE_CONTROL, cache.clone())];
             return Ok(Some((StatusCode::NOT_MODIFIED, caching).into_response()));
         }
-        let Some(mut response) = results::stored(app, &key, self.format, method, headers).await? else {
-            return Ok(None);
+        let stored = match results::stored(app, &key, self.format, method, headers).await {
+            // Nobody can tell whether it was made before, so it is made. The log has the store's words.
+            Err(problem) if problem.is(Kind::StoreFailed) => None,
+            stored => stored?,
         };
+        let Some(mut response) = stored else { return Ok(None) };
         if let Some(cache) = &self.cache {
             response.headers_mut().insert(header::CACHE_CONTROL, cache.clone());
         } else {

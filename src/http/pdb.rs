@@ -20,8 +20,9 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::wish::Wish;
-use crate::archive::{Entry, FetchError, Why};
+use crate::archive::{Entry, FetchError, Memory, NoMemory, Share, Why};
 use crate::formats::Format;
+use crate::jobs::{Budget, Exhausted, Lease};
 use crate::pipeline::params;
 use crate::store::Digest;
 use crate::structure::{ArchiveError, EntryId};
@@ -144,6 +145,22 @@ pub(super) async fn input(app: &Shared, id: &EntryId) -> Result<Input, Problem> 
     Input::new(app, bytes, digest)
 }
 
+/// The service's memory, for what an archive sends.
+#[derive(Debug)]
+pub(super) struct Fetching(pub(super) Budget);
+
+impl Memory for Fetching {
+    fn begin(&self) -> Box<dyn Share> {
+        Box::new(self.0.lease())
+    }
+}
+
+impl Share for Lease {
+    fn grow(&mut self, bytes: u64) -> Result<(), NoMemory> {
+        Self::grow(self, bytes).map_err(|Exhausted { limit, held }| NoMemory { limit, held })
+    }
+}
+
 /// The archive's errors.
 fn of_archive(error: &FetchError) -> Problem {
     let detail = error.to_string();
@@ -162,6 +179,7 @@ fn of_archive(error: &FetchError) -> Problem {
             };
             retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
         }
+        FetchError::Memory { limit, held, .. } => Exhausted { limit: *limit, held: *held }.into(),
         FetchError::Internal(_) => Problem::internal(detail),
     }
 }

@@ -53,6 +53,11 @@ impl Problem {
         Self::new(Kind::Internal, "The request could not be answered.")
     }
 
+    /// Whether it is one of `kind`.
+    pub(super) fn is(&self, kind: Kind) -> bool {
+        self.kind == kind
+    }
+
     /// Adds a member.
     pub(super) fn with(mut self, name: &str, value: impl Into<Value>) -> Self {
         self.members.insert(name.to_owned(), value.into());

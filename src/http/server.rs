@@ -12,7 +12,7 @@ use tokio::sync::{Semaphore, watch};
 
 use super::problem::Problem;
 use super::state::{App, Readiness, Ready, Shared};
-use super::{accept, capabilities, metrics, router};
+use super::{accept, capabilities, metrics, pdb, router};
 use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
@@ -110,10 +110,11 @@ impl Server {
             allowed: config.jobs.batch_deadline(),
             attempts: config.jobs.attempts,
             output_bytes: config.limits.output_bytes,
+            patience: config.jobs.store_patience(),
         };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
         let ledger = Ledger::new(store.clone(), Arc::clone(&pool), promises, describe);
-        let archive = Archive::new(&config);
+        let archive = Archive::new(&config, Arc::new(pdb::Fetching(pool.budget().clone())));
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();

@@ -1,11 +1,12 @@
-//! Why a job is not accepted, and why an accepted one ends without a mesh.
+//! Why a job is not accepted or promised, and why one that was ends without a mesh.
 
 use std::time::Duration;
 
 use thiserror::Error;
 
-use super::Exhausted;
+use super::{Exhausted, SaveError};
 use crate::pipeline::JobError;
+use crate::store::StoreError;
 use crate::structure::referee::{Diagnostic, Level};
 
 /// Why a job is not accepted.
@@ -73,4 +74,49 @@ pub enum Failure {
 
 fn errors(diagnostics: &[Diagnostic]) -> usize {
     diagnostics.iter().filter(|d| d.level == Level::Error).count()
+}
+
+/// Why a job cannot be promised.
+#[derive(Debug, Error)]
+pub enum PromiseError {
+    /// The queue has no room.
+    #[error(transparent)]
+    Refused(#[from] Refusal),
+    /// The record cannot be kept.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// The idempotency key belongs to another request.
+    #[error("the idempotency key was used for another request")]
+    OtherRequest,
+    /// No random numbers.
+    #[error("no random numbers: {0}")]
+    Random(std::io::Error),
+}
+
+/// Why a promised job ended without a result.
+#[derive(Debug, Clone, Error)]
+pub enum EndError {
+    /// There is no mesh.
+    #[error(transparent)]
+    Job(#[from] Failure),
+    /// There is one, but no file of it.
+    #[error("{error}")]
+    Save {
+        /// Why.
+        error: SaveError,
+        /// The grid spacing, Å.
+        resolution: f64,
+    },
+    /// It was begun so many times without an end that it is taken for what ended the process.
+    #[error("the job was begun {attempts} times and never ended")]
+    Poison {
+        /// Times that it was begun.
+        attempts: u32,
+    },
+    /// Its input or its parameters cannot be read any more.
+    #[error("the job cannot be taken up again: {why}")]
+    Lost {
+        /// Why.
+        why: String,
+    },
 }

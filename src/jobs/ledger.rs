@@ -10,64 +10,18 @@ use std::time::Duration;
 use bytes::Bytes;
 use metrics::{counter, gauge};
 use serde_json::Value;
-use thiserror::Error;
 use tokio::sync::watch;
 
+use super::patience::insist;
 use super::promise::{Promise, Runner};
 use super::record::{JobId, Record, Status, now_ms};
-use super::results::SaveError;
-use super::{Claim, ContentKey, Failure, Pool, Refusal, Task, Ticket};
+use super::{Claim, ContentKey, EndError, Pool, PromiseError, Task, Ticket};
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Store, StoreError};
 use crate::telemetry::{JOBS_OPEN, JOBS_RECOVERED};
 
 /// Ended jobs that are kept in mind; older ones are read from the store.
 const MOST_ENDED: usize = 10_000;
-
-/// Why a job cannot be promised.
-#[derive(Debug, Error)]
-pub enum PromiseError {
-    /// The queue has no room.
-    #[error(transparent)]
-    Refused(#[from] Refusal),
-    /// The record cannot be kept.
-    #[error(transparent)]
-    Store(#[from] StoreError),
-    /// The idempotency key belongs to another request.
-    #[error("the idempotency key was used for another request")]
-    OtherRequest,
-    /// No random numbers.
-    #[error("no random numbers: {0}")]
-    Random(std::io::Error),
-}
-
-/// Why a promised job ended without a result.
-#[derive(Debug, Clone, Error)]
-pub enum EndError {
-    /// There is no mesh.
-    #[error(transparent)]
-    Job(#[from] Failure),
-    /// There is one, but no file of it.
-    #[error("{error}")]
-    Save {
-        /// Why.
-        error: SaveError,
-        /// The grid spacing, Å.
-        resolution: f64,
-    },
-    /// It was begun so many times without an end that it is taken for what ended the process.
-    #[error("the job was begun {attempts} times and never ended")]
-    Poison {
-        /// Times that it was begun.
-        attempts: u32,
-    },
-    /// Its input or its parameters cannot be read any more.
-    #[error("the job cannot be taken up again: {why}")]
-    Lost {
-        /// Why.
-        why: String,
-    },
-}
 
 /// Sizes of a ledger.
 #[derive(Debug, Clone, Copy)]
@@ -78,6 +32,8 @@ pub struct LedgerSettings {
     pub attempts: u32,
     /// Bytes of a result at most.
     pub output_bytes: u64,
+    /// Time for which what the store does not take is held and offered again.
+    pub patience: Duration,
 }
 
 /// What a job is made of.
@@ -374,8 +330,10 @@ impl Ledger {
         if !changed {
             return;
         }
+        let (id, record) = (promise.id(), promise.record());
+        let keep = || self.0.keep(&record);
         // Without the record a restart would do the job again: a waste, but nothing is lost.
-        if let Err(error) = self.0.keep(&promise.record()).await {
+        if let Err(error) = insist(&id, self.0.settings.patience, StoreError::may_pass, keep).await {
             tracing::error!(job = %promise.id(), %error, "a job's ending cannot be recorded");
         }
     }

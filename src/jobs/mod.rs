@@ -10,6 +10,7 @@ mod error;
 mod flight;
 mod key;
 mod ledger;
+mod patience;
 mod pool;
 mod promise;
 mod queue;
@@ -17,14 +18,16 @@ mod rank;
 mod record;
 mod results;
 mod returns;
+#[cfg(test)]
+mod tests;
 mod ticket;
 mod worker;
 
 pub use budget::{Budget, Exhausted, Lease};
-pub use error::{Failure, Refusal};
+pub use error::{EndError, Failure, PromiseError, Refusal};
 pub use flight::{Claim, Progress};
 pub use key::ContentKey;
-pub use ledger::{Describe, EndError, Ledger, LedgerSettings, Order, PromiseError, View};
+pub use ledger::{Describe, Ledger, LedgerSettings, Order, View};
 pub use pool::{Pool, Settings};
 pub use rank::{Client, Rank, USUAL_URGENCY};
 pub use record::{BadJobId, JobId, Record, Status, now_ms, rfc3339};

@@ -7,11 +7,12 @@ use bytes::Bytes;
 use tokio::sync::{Notify, watch};
 
 use super::flight::Progress;
-use super::ledger::{EndError, Ledger, View};
+use super::ledger::{Ledger, View};
+use super::patience::{self, insist};
 use super::rank::{Client, Rank};
 use super::record::{JobId, Record, Status, now_ms};
-use super::results;
-use super::{ContentKey, Failure, Finished, Lease, Refusal, Task, Ticket};
+use super::results::{self, SaveError};
+use super::{ContentKey, EndError, Failure, Finished, Lease, Refusal, Task, Ticket};
 use crate::formats::Format;
 use crate::pipeline::params;
 use crate::store::Digest;
@@ -132,8 +133,10 @@ pub(super) struct Runner<P> {
 /// What became of one attempt.
 enum Attempt {
     Ended(Result<String, EndError>),
-    /// It can be tried again at once or later: nothing about the job stands against it.
+    /// It can be tried again soon: nothing about the job stands against it.
     Again,
+    /// The store does not do its part; it is asked less and less often.
+    Silent,
     /// The service stops; the record stays as it is, for the next start.
     Left,
 }
@@ -141,6 +144,7 @@ enum Attempt {
 impl<P> Runner<P> {
     pub(super) async fn run(self, ledger: &Ledger) {
         let Self { promise, mut ticket, pin, digest } = self;
+        let mut pause = patience::FIRST;
         loop {
             let attempt = attempt(ledger, &promise, &mut ticket, digest);
             let attempt = tokio::select! {
@@ -153,7 +157,14 @@ impl<P> Runner<P> {
                     ledger.finish(&promise, ending).await;
                     break;
                 }
-                Attempt::Again => tokio::time::sleep(PAUSE).await,
+                Attempt::Again => {
+                    pause = patience::FIRST;
+                    tokio::time::sleep(PAUSE).await;
+                }
+                Attempt::Silent => {
+                    tokio::time::sleep(pause).await;
+                    pause = (pause * 2).min(patience::LONGEST);
+                }
                 Attempt::Left => break,
             }
         }
@@ -180,7 +191,16 @@ async fn attempt(ledger: &Ledger, promise: &Arc<Promise>, ticket: &mut Option<Ti
     match outcome {
         Ok(finished) => {
             promise.tell("encode", 0.95);
-            Attempt::Ended(save(ledger, &record, finished).await)
+            match save(ledger, &record, finished).await {
+                // The mesh is not held for ever. As long as it may be begun again, it is made anew once the store answers.
+                Err(EndError::Save { error, .. })
+                    if error.may_pass() && promise.record().attempts < ledger.0.settings.attempts =>
+                {
+                    tracing::warn!(job = %record.id, %error, "a result was given up; it is made again");
+                    Attempt::Silent
+                }
+                ending => Attempt::Ended(ending),
+            }
         }
         Err(Failure::Stopped) => Attempt::Left,
         Err(Failure::Memory(_)) => Attempt::Again,
@@ -198,7 +218,7 @@ async fn submit(ledger: &Ledger, promise: &Arc<Promise>, record: &Record, digest
     // A store that does not answer now is no reason to give a promise up.
     let silent = |error| {
         tracing::warn!(job = %record.id, %error, "a job waits for the store");
-        Attempt::Again
+        Attempt::Silent
     };
     let (task, format) = ledger.task(record, digest).await.map_err(silent)?.map_err(lost)?;
     // An earlier process may have ended between the result and its record.
@@ -225,8 +245,9 @@ async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Resu
     let report = &finished.product.report;
     let (resolution, digest) = (report.resolution, finished.digest);
     let key = ContentKey::new(&digest, &job, format, report.backend);
-    let inner = &ledger.0;
-    results::save(&inner.store, finished, format, &key, inner.settings.output_bytes)
+    let (store, settings) = (&ledger.0.store, &ledger.0.settings);
+    let keep = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
+    insist(&record.id, settings.patience, SaveError::may_pass, keep)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
     Ok(key.to_string())

@@ -35,6 +35,14 @@ pub enum SaveError {
     Other(String),
 }
 
+impl SaveError {
+    /// Whether the same may go well later.
+    #[must_use]
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::Store(error) if error.may_pass())
+    }
+}
+
 /// Keeps a finished job as `format`: its report first, so that a mesh that is there has one. What is there already stays.
 ///
 /// # Errors

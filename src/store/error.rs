@@ -95,6 +95,12 @@ pub enum StoreError {
 }
 
 impl StoreError {
+    /// Whether the same may go well later: the store answers again, lets us again, or has room again.
+    #[must_use]
+    pub fn may_pass(&self) -> bool {
+        matches!(self, Self::Full { .. } | Self::NoSpace { .. } | Self::Denied { .. } | Self::Failed { .. })
+    }
+
     /// Sorts an error of the backend at `place` by what is to be done about it.
     pub(super) fn sort(op: &'static str, place: &str, error: &(dyn StdError + 'static)) -> Self {
         use object_store::Error as Os;

@@ -10,6 +10,8 @@
 mod backend;
 mod digest;
 mod error;
+#[cfg(test)]
+pub(crate) mod faulty;
 mod handle;
 mod index;
 mod memory;

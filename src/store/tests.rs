@@ -1,129 +1,15 @@
 //! Faults that no disk shows on demand: it is full, it does not let go. And that each error is sorted as it should be.
 
 use std::io;
-use std::ops::Range;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
-use futures_util::StreamExt as _;
-use futures_util::stream::BoxStream;
-use object_store::local::LocalFileSystem;
-use object_store::path::Path;
-use object_store::{
-    CopyOptions, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore, PutMultipartOptions,
-    PutOptions, PutPayload, PutResult, Result, UploadPart,
-};
 use tempfile::TempDir;
 
-use super::backend::Backend;
-use super::{Folder, Name, Store, StoreError};
-use crate::config::StoreConfig;
-
-#[derive(Debug, Default)]
-struct Faults {
-    full: AtomicBool,
-    stuck: AtomicBool,
-}
-
-fn error(kind: io::ErrorKind) -> object_store::Error {
-    object_store::Error::Generic { store: "Faulty", source: Box::new(io::Error::from(kind)) }
-}
-
-impl Faults {
-    fn room(&self) -> Result<()> {
-        if self.full.load(Ordering::Relaxed) { Err(error(io::ErrorKind::StorageFull)) } else { Ok(()) }
-    }
-}
-
-/// A folder on such a disk.
-#[derive(Debug)]
-struct Faulty {
-    files: LocalFileSystem,
-    faults: Arc<Faults>,
-}
-
-impl std::fmt::Display for Faulty {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Faulty")
-    }
-}
-
-#[derive(Debug)]
-struct FaultyUpload(Box<dyn MultipartUpload>, Arc<Faults>);
-
-#[async_trait::async_trait]
-impl MultipartUpload for FaultyUpload {
-    fn put_part(&mut self, data: PutPayload) -> UploadPart {
-        let part = self.0.put_part(data);
-        let room = self.1.room();
-        Box::pin(async move {
-            part.await?;
-            room
-        })
-    }
-
-    async fn complete(&mut self) -> Result<PutResult> {
-        self.0.complete().await
-    }
-
-    async fn abort(&mut self) -> Result<()> {
-        self.0.abort().await
-    }
-}
-
-#[async_trait::async_trait]
-impl ObjectStore for Faulty {
-    async fn put_opts(&self, at: &Path, payload: PutPayload, options: PutOptions) -> Result<PutResult> {
-        self.faults.room()?;
-        self.files.put_opts(at, payload, options).await
-    }
-
-    async fn put_multipart_opts(&self, at: &Path, options: PutMultipartOptions) -> Result<Box<dyn MultipartUpload>> {
-        Ok(Box::new(FaultyUpload(self.files.put_multipart_opts(at, options).await?, Arc::clone(&self.faults))))
-    }
-
-    async fn get_opts(&self, at: &Path, options: GetOptions) -> Result<GetResult> {
-        self.files.get_opts(at, options).await
-    }
-
-    async fn get_ranges(&self, at: &Path, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
-        self.files.get_ranges(at, ranges).await
-    }
-
-    fn delete_stream(&self, at: BoxStream<'static, Result<Path>>) -> BoxStream<'static, Result<Path>> {
-        if self.faults.stuck.load(Ordering::Relaxed) {
-            return at.map(|_| Err(error(io::ErrorKind::PermissionDenied))).boxed();
-        }
-        self.files.delete_stream(at)
-    }
-
-    fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, Result<ObjectMeta>> {
-        self.files.list(prefix)
-    }
-
-    async fn list_with_delimiter(&self, prefix: Option<&Path>) -> Result<ListResult> {
-        self.files.list_with_delimiter(prefix).await
-    }
-
-    async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> Result<()> {
-        self.files.copy_opts(from, to, options).await
-    }
-}
-
-async fn faulty(max_bytes: u64) -> (TempDir, Arc<Faults>, Store) {
-    let dir = tempfile::tempdir().unwrap();
-    let config = StoreConfig { max_bytes, memory_object_bytes: 1, ..StoreConfig::default() };
-    // Makes the folders.
-    drop(Store::open(&config, dir.path()).await.unwrap());
-    let (root, faults) = (dir.path().join("store"), Arc::new(Faults::default()));
-    let files = LocalFileSystem::new_with_prefix(&root).unwrap();
-    let objects = Arc::new(Faulty { files, faults: Arc::clone(&faults) });
-    let store = Store::over(Backend::over(objects, root), &config).await.unwrap();
-    (dir, faults, store)
-}
+use super::faulty::{error, faulty};
+use super::{Folder, Name, StoreError};
 
 fn name(number: u8) -> Name {
     Name::result(&format!("{number:064x}"), "glb").unwrap()

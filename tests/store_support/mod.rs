@@ -1,10 +1,11 @@
 //! Places for a store: a folder that goes away with the test, and a bucket of an S3 service in memory (moto).
+#![allow(dead_code, reason = "every test binary uses its own part")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
 use std::path::PathBuf;
-use std::process::{Child, ChildStdin, Command, Stdio};
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::sync::LazyLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -19,6 +20,7 @@ use crate::tools;
 pub(crate) struct Service {
     child: Child,
     stdin: Option<ChildStdin>,
+    stdout: BufReader<ChildStdout>,
     pub(crate) access: Access,
 }
 
@@ -43,10 +45,28 @@ impl Service {
             .spawn()
             .unwrap_or_else(|e| panic!("the S3 service does not start: {e}"));
         let stdin = child.stdin.take();
+        let mut stdout = BufReader::new(child.stdout.take().unwrap());
         let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        stdout.read_line(&mut line).unwrap();
         let access = serde_json::from_str(&line).unwrap_or_else(|e| panic!("the S3 service said {line:?}: {e}"));
-        Self { child, stdin, access }
+        Self { child, stdin, stdout, access }
+    }
+
+    /// Goes away, and keeps what it has: from now on connections are broken off without an answer.
+    pub(crate) fn away(&mut self) {
+        self.tell("away");
+    }
+
+    /// Comes back.
+    pub(crate) fn back(&mut self) {
+        self.tell("back");
+    }
+
+    fn tell(&mut self, word: &str) {
+        writeln!(self.stdin.as_mut().unwrap(), "{word}").unwrap();
+        let mut line = String::new();
+        self.stdout.read_line(&mut line).unwrap();
+        assert_eq!(line.trim(), word);
     }
 
     pub(crate) fn config(&self, prefix: &str) -> StoreConfig {

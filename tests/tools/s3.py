@@ -1,8 +1,10 @@
 """An S3 service in memory for the tests of the store: prints one line of JSON when it is ready, ends when its standard
-input does. The bucket is `meshes`. With `--guarded`, only the printed credentials are let in."""
+input does. The bucket is `meshes`. With `--guarded`, only the printed credentials are let in. After the line `away` every
+connection is broken off without an answer, after `back` it is as before; each line is answered with itself."""
 
 import json
 import logging
+import socket
 import sys
 
 import boto3
@@ -35,7 +37,25 @@ if "--guarded" in sys.argv:
     iam.put_user_policy(UserName="molmesh", PolicyName="all", PolicyDocument=json.dumps(everything))
     key = iam.create_access_key(UserName="molmesh")["AccessKey"]
     settings.INITIAL_NO_AUTH_ACTION_COUNT = 0  # from now on everybody has to say who they are
+
+
+class Gate:
+    """The service, unless it is away. Its port stays its own meanwhile, so that it can come back."""
+
+    def __init__(self, app):
+        self.app, self.away = app, False
+
+    def __call__(self, environ, start_response):
+        if self.away:
+            environ["werkzeug.socket"].shutdown(socket.SHUT_RDWR)
+            raise ConnectionAbortedError
+        return self.app(environ, start_response)
+
+
+gate = server._server.app = Gate(server._server.app)
 answer = {"endpoint": endpoint, "id": key["AccessKeyId"], "secret": key["SecretAccessKey"]}
 print(json.dumps(answer), flush=True)
-sys.stdin.read()
+for line in sys.stdin:
+    gate.away = line.strip() == "away"
+    print(line.strip(), flush=True)
 server.stop()

@@ -1,0 +1,156 @@
+//! A disk that fails on command, for tests here and of whoever keeps something in the store.
+
+use std::io;
+use std::ops::Range;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+
+use bytes::Bytes;
+use futures_util::StreamExt as _;
+use futures_util::stream::BoxStream;
+use object_store::local::LocalFileSystem;
+use object_store::path::Path;
+use object_store::{
+    CopyOptions, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta, ObjectStore, PutMultipartOptions,
+    PutOptions, PutPayload, PutResult, Result, UploadPart,
+};
+use tempfile::TempDir;
+
+use super::backend::Backend;
+use super::{Folder, Store};
+use crate::config::StoreConfig;
+
+/// What is wrong with it at the moment.
+#[derive(Debug, Default)]
+pub(crate) struct Faults {
+    /// Nothing can be written.
+    pub(crate) full: AtomicBool,
+    /// Nothing can be removed.
+    pub(crate) stuck: AtomicBool,
+    /// The folder of which nothing is heard, and whether that goes for reading too.
+    silent: Mutex<Option<(Folder, bool)>>,
+    /// Questions about it that were not answered.
+    pub(crate) unanswered: AtomicUsize,
+}
+
+pub(crate) fn error(kind: io::ErrorKind) -> object_store::Error {
+    object_store::Error::Generic { store: "Faulty", source: Box::new(io::Error::from(kind)) }
+}
+
+impl Faults {
+    /// From now on nothing is heard of this folder, and of no other one.
+    pub(crate) fn silence(&self, folder: Option<Folder>) {
+        self.unanswered.store(0, Ordering::SeqCst);
+        *self.silent.lock().unwrap() = folder.map(|folder| (folder, true));
+    }
+
+    /// The same for what is written there alone.
+    pub(crate) fn seal(&self, folder: Folder) {
+        self.unanswered.store(0, Ordering::SeqCst);
+        *self.silent.lock().unwrap() = Some((folder, false));
+    }
+
+    fn answers(&self, at: &Path, reading: bool) -> Result<()> {
+        let silent = *self.silent.lock().unwrap();
+        if silent.is_some_and(|(folder, all)| at.as_ref().starts_with(folder.as_str()) && (all || !reading)) {
+            self.unanswered.fetch_add(1, Ordering::SeqCst);
+            return Err(error(io::ErrorKind::TimedOut));
+        }
+        Ok(())
+    }
+
+    fn room(&self) -> Result<()> {
+        if self.full.load(Ordering::Relaxed) { Err(error(io::ErrorKind::StorageFull)) } else { Ok(()) }
+    }
+}
+
+/// A folder on such a disk.
+#[derive(Debug)]
+struct Faulty {
+    files: LocalFileSystem,
+    faults: Arc<Faults>,
+}
+
+impl std::fmt::Display for Faulty {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Faulty")
+    }
+}
+
+#[derive(Debug)]
+struct FaultyUpload(Box<dyn MultipartUpload>, Arc<Faults>);
+
+#[async_trait::async_trait]
+impl MultipartUpload for FaultyUpload {
+    fn put_part(&mut self, data: PutPayload) -> UploadPart {
+        let part = self.0.put_part(data);
+        let room = self.1.room();
+        Box::pin(async move {
+            part.await?;
+            room
+        })
+    }
+
+    async fn complete(&mut self) -> Result<PutResult> {
+        self.0.complete().await
+    }
+
+    async fn abort(&mut self) -> Result<()> {
+        self.0.abort().await
+    }
+}
+
+#[async_trait::async_trait]
+impl ObjectStore for Faulty {
+    async fn put_opts(&self, at: &Path, payload: PutPayload, options: PutOptions) -> Result<PutResult> {
+        self.faults.answers(at, false)?;
+        self.faults.room()?;
+        self.files.put_opts(at, payload, options).await
+    }
+
+    async fn put_multipart_opts(&self, at: &Path, options: PutMultipartOptions) -> Result<Box<dyn MultipartUpload>> {
+        self.faults.answers(at, false)?;
+        Ok(Box::new(FaultyUpload(self.files.put_multipart_opts(at, options).await?, Arc::clone(&self.faults))))
+    }
+
+    async fn get_opts(&self, at: &Path, options: GetOptions) -> Result<GetResult> {
+        self.faults.answers(at, true)?;
+        self.files.get_opts(at, options).await
+    }
+
+    async fn get_ranges(&self, at: &Path, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
+        self.files.get_ranges(at, ranges).await
+    }
+
+    fn delete_stream(&self, at: BoxStream<'static, Result<Path>>) -> BoxStream<'static, Result<Path>> {
+        if self.faults.stuck.load(Ordering::Relaxed) {
+            return at.map(|_| Err(error(io::ErrorKind::PermissionDenied))).boxed();
+        }
+        self.files.delete_stream(at)
+    }
+
+    fn list(&self, prefix: Option<&Path>) -> BoxStream<'static, Result<ObjectMeta>> {
+        self.files.list(prefix)
+    }
+
+    async fn list_with_delimiter(&self, prefix: Option<&Path>) -> Result<ListResult> {
+        self.files.list_with_delimiter(prefix).await
+    }
+
+    async fn copy_opts(&self, from: &Path, to: &Path, options: CopyOptions) -> Result<()> {
+        self.files.copy_opts(from, to, options).await
+    }
+}
+
+/// A store on such a disk, in a folder of its own, with this much room for results and inputs, bytes.
+pub(crate) async fn faulty(max_bytes: u64) -> (TempDir, Arc<Faults>, Store) {
+    let dir = tempfile::tempdir().unwrap();
+    let config = StoreConfig { max_bytes, memory_object_bytes: 1, ..StoreConfig::default() };
+    // Makes the folders.
+    drop(Store::open(&config, dir.path()).await.unwrap());
+    let (root, faults) = (dir.path().join("store"), Arc::new(Faults::default()));
+    let files = LocalFileSystem::new_with_prefix(&root).unwrap();
+    let objects = Arc::new(Faulty { files, faults: Arc::clone(&faults) });
+    let store = Store::over(Backend::over(objects, root), &config).await.unwrap();
+    (dir, faults, store)
+}
