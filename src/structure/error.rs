@@ -6,7 +6,9 @@ use thiserror::Error;
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum StructureError {
     /// The bytes are no structure file that is read here.
-    #[error("unknown structure format: {found}; expected PDB, mmCIF or BinaryCIF, plain or compressed with gzip or zstd")]
+    #[error(
+        "unknown structure format: {found}; expected PDB, mmCIF or BinaryCIF, plain or compressed with gzip or zstd"
+    )]
     UnknownFormat {
         /// What the first bytes look like.
         found: String,

@@ -66,12 +66,12 @@ def texts(variant, values):
     return [pdbx.StringArrayEncoding(data_encoding=data, offset_encoding=offsets)]
 
 
-def column(variant, name, source):
+def column(variant, category, name, source):
     values = source.as_array(str)
     mask = None
     if source.mask is not None:
         mask = np.asarray(source.mask.array, dtype=np.uint8)
-    if variant == "texts" or name not in PLACES and name not in WHOLE:
+    if variant == "texts" or category != "atom_site" or name not in PLACES and name not in WHOLE:
         if mask is not None:
             values = np.where(mask == 0, values, "")
         data = pdbx.BinaryCIFData(values, texts(variant, values))
@@ -101,7 +101,7 @@ def write(variant, source, target):
     out = pdbx.BinaryCIFBlock()
     for name in ("entry", "struct", "atom_site"):
         if name in block:
-            columns = {key: column(variant, key, value) for key, value in block[name].items()}
+            columns = {key: column(variant, name, key, value) for key, value in block[name].items()}
             out[name] = pdbx.BinaryCIFCategory(columns)
     file = pdbx.BinaryCIFFile({source.rsplit("/", 1)[-1].split(".")[0].upper(): out})
     if variant == "compressed":

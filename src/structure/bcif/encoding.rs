@@ -56,24 +56,11 @@ impl Number {
 #[derive(Debug, Clone, Copy)]
 enum Encoding<'a> {
     ByteArray(Number),
-    FixedPoint {
-        factor: f64,
-    },
-    IntervalQuantization {
-        min: f64,
-        max: f64,
-        steps: i32,
-    },
-    RunLength {
-        size: Option<usize>,
-    },
-    Delta {
-        origin: i32,
-    },
-    IntegerPacking {
-        size: Option<usize>,
-        number: Number,
-    },
+    FixedPoint { factor: f64 },
+    IntervalQuantization { min: f64, max: f64, steps: i32 },
+    RunLength { size: Option<usize> },
+    Delta { origin: i32 },
+    IntegerPacking { size: Option<usize>, number: Number },
     StringArray(Strings<'a>),
 }
 
@@ -178,11 +165,7 @@ impl<'a> Fields<'a> {
                 if steps < 2 {
                     return Err(Fault::new(format!("{steps} steps"), "at least 2").within("IntervalQuantization"));
                 }
-                Encoding::IntervalQuantization {
-                    min: present(self.min, "min")?,
-                    max: present(self.max, "max")?,
-                    steps,
-                }
+                Encoding::IntervalQuantization { min: present(self.min, "min")?, max: present(self.max, "max")?, steps }
             }
             b"RunLength" => Encoding::RunLength { size },
             b"Delta" => Encoding::Delta { origin: self.origin.unwrap_or(0) },

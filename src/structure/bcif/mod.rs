@@ -173,11 +173,7 @@ impl<'a> Block<'a> {
     }
 
     /// The atoms, if the block has some with coordinates.
-    fn atoms(
-        &self,
-        limits: &ReadLimits,
-        passed: &mut Passed,
-    ) -> Result<Option<(Columns, Tables)>, StructureError> {
+    fn atoms(&self, limits: &ReadLimits, passed: &mut Passed) -> Result<Option<(Columns, Tables)>, StructureError> {
         let Some(category) = self.atom_site.as_ref().filter(|category| category.rows > 0) else { return Ok(None) };
         let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
         let within = |fault: Box<Fault>| fault.within(category.place());

@@ -312,10 +312,15 @@ mod tests {
 
     #[test]
     fn lengths_that_lie_are_refused_before_anything_is_made_of_them() {
-        for lie in [&b"\xdf\xff\xff\xff\xff"[..], b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff"] {
+        for lie in
+            [&b"\xdf\xff\xff\xff\xff"[..], b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff"]
+        {
             assert!(refusal(lie).starts_with("byte 5: found the end of the file after 0 bytes"), "{}", refusal(lie));
         }
-        assert_eq!(refusal(b"\xde\x00\x02\xc0"), "byte 3: found the end of the file after 1 bytes, expected 4 bytes or more");
+        assert_eq!(
+            refusal(b"\xde\x00\x02\xc0"),
+            "byte 3: found the end of the file after 1 bytes, expected 4 bytes or more"
+        );
     }
 
     #[test]
@@ -351,7 +356,13 @@ mod tests {
     #[test]
     fn whole_numbers_may_be_written_as_real_ones() {
         assert_eq!(Cursor::new(b"\xcb\x40\x08\0\0\0\0\0\0").whole::<u32>("a count").unwrap(), 3);
-        for bad in [&b"\xcb\x40\x04\0\0\0\0\0\0"[..], b"\xff", b"\xcb\x7f\xf8\0\0\0\0\0\0", b"\xa11", b"\xcb\x7f\xf0\0\0\0\0\0\0"] {
+        for bad in [
+            &b"\xcb\x40\x04\0\0\0\0\0\0"[..],
+            b"\xff",
+            b"\xcb\x7f\xf8\0\0\0\0\0\0",
+            b"\xa11",
+            b"\xcb\x7f\xf0\0\0\0\0\0\0",
+        ] {
             Cursor::new(bad).whole::<u32>("a count").unwrap_err();
         }
         for bad in [&b"\xcb\x7f\xf8\0\0\0\0\0\0"[..], b"\xcb\x7f\xf0\0\0\0\0\0\0", b"\xc0"] {

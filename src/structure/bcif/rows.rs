@@ -68,10 +68,9 @@ impl atom_site::Row for Row<'_> {
             None => "nothing".to_owned(),
             Some(Cells::Int(values)) => values[self.index].to_string(),
             Some(Cells::Real(values)) => values[self.index].to_string(),
-            Some(Cells::Text(texts)) => texts.range(self.index).map_or_else(
-                || "nothing".to_owned(),
-                |(start, end)| quote(&texts.joined[start..end]),
-            ),
+            Some(Cells::Text(texts)) => texts
+                .range(self.index)
+                .map_or_else(|| "nothing".to_owned(), |(start, end)| quote(&texts.joined[start..end])),
         };
         let name = self.table.raw.get(column).map_or_else(Default::default, |raw| decode(raw.name));
         Fault::new(found, expected).within(format_args!("{name}, row {}", self.index + 1))
