@@ -99,7 +99,11 @@ fn what_biotite_writes_is_read_as_the_text_is() {
     for ((source, variant, target), written) in files.iter().zip(written) {
         let (text, binary) = (structure(source), structure(target));
         let what = format!("{} {variant}", source.display());
-        assert_eq!((binary.format, binary.len(), text.len()), (SourceFormat::BinaryCif, written.atoms, written.atoms), "{what}");
+        assert_eq!(
+            (binary.format, binary.len(), text.len()),
+            (SourceFormat::BinaryCif, written.atoms, written.atoms),
+            "{what}"
+        );
         match *variant {
             "single" => {
                 let rounded = |v: &[f64]| v.iter().map(|&v| f64::from(v as f32)).collect::<Vec<_>>();
@@ -108,7 +112,8 @@ fn what_biotite_writes_is_read_as_the_text_is() {
                 assert_eq!((&text.occupancy, &text.b_factor), (&binary.occupancy, &binary.b_factor), "{what}");
             }
             "quantized" => {
-                let range = |v: &[f64]| v.iter().fold(f64::MIN, |a, b| a.max(*b)) - v.iter().fold(f64::MAX, |a, b| a.min(*b));
+                let range =
+                    |v: &[f64]| v.iter().fold(f64::MIN, |a, b| a.max(*b)) - v.iter().fold(f64::MAX, |a, b| a.min(*b));
                 let half_step = [&text.x, &text.y, &text.z].map(|v| range(v) / 2e6).into_iter().fold(0.0, f64::max);
                 let far = farthest(&text, &binary);
                 assert!(far > 0.0 && far <= half_step * 1.000_001, "{what}: {far} Å, half a step is {half_step}");
@@ -131,7 +136,8 @@ fn what_biotite_writes_is_read_as_the_text_is() {
         }
         encodings.extend(written.encodings);
     }
-    let all = ["ByteArray", "Delta", "FixedPoint", "IntegerPacking", "IntervalQuantization", "RunLength", "StringArray"];
+    let all =
+        ["ByteArray", "Delta", "FixedPoint", "IntegerPacking", "IntervalQuantization", "RunLength", "StringArray"];
     assert_eq!(encodings, all.map(str::to_owned).into());
 }
 

@@ -251,7 +251,9 @@ fn gemmis(output: &str) -> (Vec<usize>, Rows) {
 fn gemmi_agrees_but_where_the_table_says() {
     let Some(python) = python() else { return };
     let mut found: Vec<(String, &str, usize)> = Vec::new();
-    for (file, _, _) in sources().into_iter().filter(|(file, ..)| ![&REFUSED[..], &OURS_ALONE].concat().contains(&file.as_str())) {
+    for (file, _, _) in
+        sources().into_iter().filter(|(file, ..)| ![&REFUSED[..], &OURS_ALONE].concat().contains(&file.as_str()))
+    {
         let path: PathBuf = Path::new(FOLDER).join(&file);
         let output = Command::new(&python).arg("tests/tools/gemmi_dump.py").arg(&path).output().unwrap();
         if let Some((_, words)) = GEMMI_REFUSES.iter().find(|(f, _)| *f == file) {

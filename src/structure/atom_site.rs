@@ -65,7 +65,7 @@ impl Layout {
         }
     }
 
-    /// The coordinates that are missing, for [`Passed::category`]; `None` if all are there.
+    /// The coordinates that are missing, for [`Passed::lacking`]; `None` if all are there.
     pub(super) fn missing(&self) -> Option<String> {
         let missing: Vec<&str> =
             POSITION.iter().zip(self.position).filter(|(_, column)| *column == NONE).map(|(item, _)| *item).collect();
@@ -298,7 +298,12 @@ impl Passed {
         self.categories.len() >= Self::KEPT
     }
 
-    /// A category, by name without underscore, or one with what it lacks.
+    /// A category without coordinates, as [`Layout::missing`] names it: named whatever else was passed.
+    pub(super) fn lacking(&mut self, missing: String) {
+        self.categories.push(missing);
+    }
+
+    /// A category, by name without underscore.
     pub(super) fn category(&mut self, name: impl AsRef<str> + Into<String>) {
         if !self.is_full() && !self.categories.iter().any(|c| c == name.as_ref()) {
             self.categories.push(name.into());

@@ -4,9 +4,7 @@ use std::io::Write;
 
 use serde_json::{Value, json};
 
-use crate::bcif_support::{
-    CRAMBIN, atoms, block, byte_array, category, column, file, i32s, reals, run_length,
-};
+use crate::bcif_support::{CRAMBIN, atoms, block, byte_array, category, column, file, i32s, reals, run_length};
 use crate::http_support::SAMPLE;
 
 /// Limits of the server, and of the command line where it has them; all others are the defaults.
@@ -327,8 +325,18 @@ fn binary() -> Vec<Row> {
         malformed("BinaryCIF with an unknown encoding", flipped, "encoding ", "one of BinaryCIF's seven"),
         malformed("a run of 2³¹ atoms", runs(2, i32::MAX), "Cartn_x, RunLength (encoding 1 of 2)", "at most 6"),
         malformed("a row count that lies", runs(3, 2), "BinaryCIF, atom_site, Cartn_x", "3, as rowCount says"),
-        malformed("2,000,000 arrays in arrays", [b"\x81\xaadataBlocks".as_slice(), &[0x91; 2_000_000], &[0]].concat(), "BinaryCIF", "a map"),
-        malformed("an array of 4 billion", b"\x81\xaadataBlocks\xdd\xff\xff\xff\xff", "BinaryCIF, byte 17", "bytes or more"),
+        malformed(
+            "2,000,000 arrays in arrays",
+            [b"\x81\xaadataBlocks".as_slice(), &[0x91; 2_000_000], &[0]].concat(),
+            "BinaryCIF",
+            "a map",
+        ),
+        malformed(
+            "an array of 4 billion",
+            b"\x81\xaadataBlocks\xdd\xff\xff\xff\xff",
+            "BinaryCIF, byte 17",
+            "bytes or more",
+        ),
         beyond("a row count of 2³¹", runs(i64::from(i32::MAX), i32::MAX), 422, "too-many-atoms", ATOMS),
         atomless("BinaryCIF without blocks", b"\x83\xa7encoder\xa1x\xa7version\xa1y\xaadataBlocks\x90", "BinaryCIF"),
     ]

@@ -75,10 +75,12 @@ impl<'a> Raw<'a> {
     pub(super) fn read(mut at: Cursor<'a>) -> Result<Self, Box<Fault>> {
         let (mut name, mut data, mut mask) = (None, None, None);
         at.map(|key, mut value| {
+            let mut head = value;
+            let value_is_there = head.next()? != Token::Nil;
             match key {
                 b"name" => name = Some(value.text()?),
                 b"data" => data = Some(value),
-                b"mask" if value.clone().next()? != Token::Nil => mask = Some(value),
+                b"mask" => mask = Some(value).filter(|_| value_is_there),
                 _ => {}
             }
             Ok(())

@@ -126,7 +126,7 @@ impl<'a> Category<'a> {
     /// What may be decoded; `None` if there are more rows than atoms are allowed.
     fn bounds(&self, limits: &ReadLimits) -> Option<Bounds> {
         let rows = usize::try_from(self.rows).ok().filter(|&n| n <= limits.max_rows())?;
-        // No row has more than one text of a column; what no row refers to is nevertheless common.
+        // Texts that no row refers to are allowed, but no more than there might be rows.
         Some(Bounds { rows, texts: limits.max_rows() })
     }
 }
@@ -180,7 +180,7 @@ impl<'a> Block<'a> {
         let raw = category.columns().map_err(within)?;
         let layout = layout(&raw).map_err(within)?;
         if let Some(missing) = layout.missing() {
-            passed.category(missing);
+            passed.lacking(missing);
             return Ok(None);
         }
         // What is decoded counts as inflated: runs may say in a few bytes what takes many.

@@ -196,7 +196,7 @@ impl<'a> Reader<'a> {
     fn layout(&mut self, tags: &[(usize, usize)]) -> Result<Option<Layout>, Stop> {
         let layout = row::layout(self.text, tags)?;
         if let Some(missing) = layout.missing() {
-            self.passed.category(missing);
+            self.passed.lacking(missing);
             return Ok(None);
         }
         Ok(Some(layout))
