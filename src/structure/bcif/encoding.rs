@@ -318,8 +318,8 @@ impl<'a> Bytes<'a> {
             Number::Uint8 => Values::Int(numbers(data, |b| u8::from_le_bytes(b).into())),
             Number::Uint16 => Values::Int(numbers(data, |b| u16::from_le_bytes(b).into())),
             Number::Uint32 => {
-                let values: Result<Vec<i32>, _> = numbers(data, |b| i32::try_from(u32::from_le_bytes(b)));
-                Values::Int(values.map_err(|_| Fault::new("a number of 2³¹ or more", "one below"))?)
+                let values: Option<Vec<i32>> = numbers(data, |b| i32::try_from(u32::from_le_bytes(b)).ok());
+                Values::Int(values.ok_or_else(|| Fault::new("a number of 2³¹ or more", "one below"))?)
             }
             Number::Float32 => Values::Real(numbers(data, |b| f32::from_le_bytes(b).into())),
             Number::Float64 => Values::Real(numbers(data, f64::from_le_bytes)),
@@ -392,7 +392,7 @@ fn said(n: usize, size: Option<usize>) -> Result<(), Box<Fault>> {
 }
 
 fn fits(value: i64) -> Result<i32, Box<Fault>> {
-    i32::try_from(value).map_err(|_| Fault::new(value.to_string(), "a whole number of 32 bits"))
+    i32::try_from(value).ok().ok_or_else(|| Fault::new(value.to_string(), "a whole number of 32 bits"))
 }
 
 impl Encoding<'_> {
@@ -434,7 +434,7 @@ fn repeat(pairs: &[i32], size: Option<usize>, most: usize) -> Result<Vec<i32>, B
     }
     let mut n = 0_usize;
     for &[_, count] in pairs {
-        let count = usize::try_from(count).map_err(|_| Fault::new(format!("a run of {count}"), "a count"))?;
+        let count = usize::try_from(count).ok().ok_or_else(|| Fault::new(format!("a run of {count}"), "a count"))?;
         n = n.saturating_add(count);
     }
     said(n, size)?;
