@@ -3,7 +3,8 @@
 use std::borrow::Cow;
 
 use super::super::text::decode;
-use super::encoding::{Chain, Strings, Values};
+use super::decode::Values;
+use super::encoding::{Chain, Strings};
 use super::fault::Fault;
 use super::msgpack::{Cursor, Token};
 

@@ -7,6 +7,7 @@
 //! file says has to agree with its bytes, with the rows of the category and with the limits before memory is asked for.
 
 mod column;
+mod decode;
 mod encoding;
 mod fault;
 mod msgpack;
