@@ -188,7 +188,7 @@ pub fn file(blocks: Vec<Pack>) -> Vec<u8> {
 
 /// Coordinates of `n` atoms.
 pub fn places(n: usize) -> Vec<Pack> {
-    let along = |step: f64| (0..n).map(|i| step * f64::from(u32::try_from(i).unwrap())).collect::<Vec<_>>();
+    let along = |step: f64| (0..n).map(|i| step * f64::from(u32::try_from(i % 1000).unwrap())).collect::<Vec<_>>();
     vec![reals("Cartn_x", &along(1.5)), reals("Cartn_y", &along(0.0)), reals("Cartn_z", &along(-0.25))]
 }
 

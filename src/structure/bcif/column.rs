@@ -73,15 +73,14 @@ pub(super) struct Bounds {
 }
 
 impl<'a> Raw<'a> {
-    pub(super) fn read(mut at: Cursor<'a>) -> Result<Self, Box<Fault>> {
+    pub(super) fn read(at: &mut Cursor<'a>) -> Result<Self, Box<Fault>> {
         let (mut name, mut data, mut mask) = (None, None, None);
-        at.map(|key, mut value| {
-            let mut head = value;
-            let value_is_there = head.next()? != Token::Nil;
+        at.map(|key, value| {
+            let mut head = *value;
             match key {
                 b"name" => name = Some(value.text()?),
-                b"data" => data = Some(value),
-                b"mask" => mask = Some(value).filter(|_| value_is_there),
+                b"data" => data = Some(*value),
+                b"mask" if head.next()? != Token::Nil => mask = Some(*value),
                 _ => {}
             }
             Ok(())
@@ -127,10 +126,10 @@ fn whole_column(found: usize, rows: usize) -> Result<(), Box<Fault>> {
 /// Data and how it is encoded.
 fn encoded(mut at: Cursor<'_>) -> Result<(&[u8], Chain<'_>), Box<Fault>> {
     let (mut data, mut chain) = (None, None);
-    at.map(|key, mut value| {
+    at.map(|key, value| {
         match key {
             b"data" => data = Some(value.bytes().map_err(|f| f.within("`data`"))?),
-            b"encoding" => chain = Some(value),
+            b"encoding" => chain = Some(*value),
             _ => {}
         }
         Ok(())

@@ -108,9 +108,9 @@ fn present<T>(field: Option<T>, name: &str) -> Result<T, Box<Fault>> {
 }
 
 impl<'a> Encoding<'a> {
-    fn read(mut at: Cursor<'a>) -> Result<Self, Box<Fault>> {
+    fn read(at: &mut Cursor<'a>) -> Result<Self, Box<Fault>> {
         let mut f = Fields::default();
-        at.map(|key, mut value| {
+        at.map(|key, value| {
             let key_text = || format!("`{}`", String::from_utf8_lossy(key));
             let read = match key {
                 b"kind" => value.text().map(|v| f.kind = Some(v)),
@@ -126,11 +126,11 @@ impl<'a> Encoding<'a> {
                 b"stringData" => value.text().map(|v| f.joined = Some(v)),
                 b"offsets" => value.bytes().map(|v| f.offsets = Some(v)),
                 b"offsetEncoding" => {
-                    f.offset_chain = Some(value);
+                    f.offset_chain = Some(*value);
                     Ok(())
                 }
                 b"dataEncoding" => {
-                    f.data_chain = Some(value);
+                    f.data_chain = Some(*value);
                     Ok(())
                 }
                 _ => Ok(()),

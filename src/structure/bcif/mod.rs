@@ -25,44 +25,35 @@ use super::pdb::MAX_TITLE;
 use super::read::ReadLimits;
 use super::text::{decode, tidy};
 
+/// Most columns of a category; the dictionary has about a hundred for `atom_site`.
+const MAX_COLUMNS: usize = 1000;
+
 pub(super) fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
     let mut passed = Passed::default();
-    let mut last = None;
-    for block in blocks(bytes).map_err(|fault| fault.within("BinaryCIF"))? {
-        passed.block();
-        let block = Block::read(block, &mut passed).map_err(|fault| fault.within("BinaryCIF"))?;
-        if let Some((columns, tables)) = block.atoms(limits, &mut passed)? {
-            let value = |category: &Option<Category<'_>>, item, max| -> Result<Option<String>, StructureError> {
-                let Some(category) = category else { return Ok(None) };
-                Ok(category.value(item, max, limits).map_err(|f| f.within(category.place()))?)
-            };
-            let entry = value(&block.entry, b"id", 80)?;
-            let title = value(&block.title, b"title", MAX_TITLE)?;
-            return Ok(columns.finish(tables, SourceFormat::BinaryCif, entry.or(block.name), title));
+    let (mut found, mut last, mut any) = (None, None, false);
+    let mut file = Cursor::new(bytes);
+    let frame = file.map(|key, value| {
+        if key != b"dataBlocks" {
+            return Ok(());
         }
-        last = block.name;
-    }
-    Err(passed.no_atoms("BinaryCIF", last))
-}
-
-/// The data blocks of a file.
-fn blocks(bytes: &[u8]) -> Result<Vec<Cursor<'_>>, Box<Fault>> {
-    let mut found = None;
-    Cursor::new(bytes).map(|key, value| {
-        if key == b"dataBlocks" {
-            found = Some(value);
-        }
-        Ok(())
-    })?;
-    let mut blocks = Vec::new();
-    let mut found = found.ok_or_else(|| Fault::new("nothing", "`dataBlocks`"))?;
-    found
-        .array(|_, block| {
-            blocks.push(block);
+        any = true;
+        value.array(|_, at| {
+            // What follows the atoms only has to be there.
+            if found.is_none() {
+                passed.block();
+                let block = Block::read(at, &mut passed)?;
+                found = block.structure(limits, &mut passed).transpose();
+                last = block.name;
+            }
             Ok(())
         })
-        .map_err(|fault| fault.within("`dataBlocks`"))?;
-    Ok(blocks)
+    });
+    frame.map_err(|fault| fault.within("BinaryCIF"))?;
+    match found {
+        Some(structure) => structure,
+        None if any => Err(passed.no_atoms("BinaryCIF", last)),
+        None => Err(Fault::new("nothing", "`dataBlocks`").within("BinaryCIF").into()),
+    }
 }
 
 /// A table of a block.
@@ -75,13 +66,13 @@ struct Category<'a> {
 }
 
 impl<'a> Category<'a> {
-    fn read(mut at: Cursor<'a>) -> Result<Self, Box<Fault>> {
+    fn read(at: &mut Cursor<'a>) -> Result<Self, Box<Fault>> {
         let (mut name, mut rows, mut columns) = (None, None, None);
-        at.map(|key, mut value| {
+        at.map(|key, value| {
             match key {
                 b"name" => name = Some(value.text()?),
-                b"rowCount" => rows = Some(value),
-                b"columns" => columns = Some(value),
+                b"rowCount" => rows = Some(*value),
+                b"columns" => columns = Some(*value),
                 _ => {}
             }
             Ok(())
@@ -102,6 +93,9 @@ impl<'a> Category<'a> {
         let mut columns = Vec::new();
         let mut at = self.columns;
         at.array(|_, column| {
+            if columns.len() >= MAX_COLUMNS {
+                return Err(Fault::new("more columns", format!("at most {MAX_COLUMNS}")));
+            }
             columns.push(Raw::read(column)?);
             Ok(())
         })?;
@@ -142,35 +136,54 @@ struct Block<'a> {
 }
 
 impl<'a> Block<'a> {
-    fn read(mut at: Cursor<'a>, passed: &mut Passed) -> Result<Self, Box<Fault>> {
+    fn read(at: &mut Cursor<'a>, passed: &mut Passed) -> Result<Self, Box<Fault>> {
         let mut block = Self::default();
-        let mut categories = None;
-        at.map(|key, mut value| {
+        let mut any = false;
+        at.map(|key, value| {
             match key {
                 b"header" => block.name = tidy(value.text().map_err(|f| f.within("header"))?, 80),
-                b"categories" => categories = Some(value),
+                b"categories" => {
+                    any = true;
+                    value.array(|_, at| {
+                        block.keep(Category::read(at)?, passed);
+                        Ok(())
+                    })?;
+                }
                 _ => {}
             }
             Ok(())
         })?;
-        let mut categories = categories.ok_or_else(|| Fault::new("nothing", "`categories`"))?;
-        categories.array(|_, at| {
-            let category = Category::read(at)?;
-            if !passed.is_full() {
-                passed.category(decode(category.name));
-            }
-            let place = match category.name.to_ascii_lowercase().as_slice() {
-                b"atom_site" => &mut block.atom_site,
-                b"entry" => &mut block.entry,
-                b"struct" => &mut block.title,
-                _ => return Ok(()),
-            };
-            if place.is_none() {
-                *place = Some(category);
-            }
-            Ok(())
-        })?;
-        Ok(block)
+        if any { Ok(block) } else { Err(Fault::new("nothing", "`categories`")) }
+    }
+
+    /// Keeps a category that is read.
+    fn keep(&mut self, category: Category<'a>, passed: &mut Passed) {
+        if !passed.is_full() {
+            passed.category(decode(category.name));
+        }
+        let is = |name: &[u8]| category.name.eq_ignore_ascii_case(name);
+        let place = match () {
+            () if is(b"atom_site") => &mut self.atom_site,
+            () if is(b"entry") => &mut self.entry,
+            () if is(b"struct") => &mut self.title,
+            () => return,
+        };
+        if place.is_none() {
+            *place = Some(category);
+        }
+    }
+
+    /// The structure, if the block has atoms with coordinates.
+    fn structure(&self, limits: &ReadLimits, passed: &mut Passed) -> Result<Option<Structure>, StructureError> {
+        let Some((columns, tables)) = self.atoms(limits, passed)? else { return Ok(None) };
+        let value = |category: &Option<Category<'_>>, item, max| -> Result<Option<String>, StructureError> {
+            let Some(category) = category else { return Ok(None) };
+            Ok(category.value(item, max, limits).map_err(|f| f.within(category.place()))?)
+        };
+        let entry = value(&self.entry, b"id", 80)?;
+        let title = value(&self.title, b"title", MAX_TITLE)?;
+        let id = entry.or_else(|| self.name.clone());
+        Ok(Some(columns.finish(tables, SourceFormat::BinaryCif, id, title)))
     }
 
     /// The atoms, if the block has some with coordinates.

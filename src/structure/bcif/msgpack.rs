@@ -114,10 +114,11 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// Calls `entry` with every key of a map and the place of its value, and passes the map.
+    /// Calls `entry` with every key of a map and the place of its value, and passes the map. A value that `entry` does not
+    /// read is passed; one that it reads, it reads whole, so that a file is passed over once.
     pub(super) fn map(
         &mut self,
-        mut entry: impl FnMut(&'a [u8], Self) -> Result<(), Box<Fault>>,
+        mut entry: impl FnMut(&'a [u8], &mut Self) -> Result<(), Box<Fault>>,
     ) -> Result<(), Box<Fault>> {
         let n = match self.next()? {
             Token::Map(n) => n,
@@ -125,26 +126,31 @@ impl<'a> Cursor<'a> {
         };
         for _ in 0..n {
             let key = self.text()?;
-            let value = *self;
-            self.skip()?;
-            entry(key, value)?;
+            let start = self.at;
+            entry(key, self)?;
+            if self.at == start {
+                self.skip()?;
+            }
         }
         Ok(())
     }
 
-    /// Calls `item` with the number, from 0, and the place of every value of an array, and passes the array.
+    /// Calls `item` with the number, from 0, and the place of every value of an array, and passes the array; as [`Self::map`]
+    /// does.
     pub(super) fn array(
         &mut self,
-        mut item: impl FnMut(u32, Self) -> Result<(), Box<Fault>>,
+        mut item: impl FnMut(u32, &mut Self) -> Result<(), Box<Fault>>,
     ) -> Result<(), Box<Fault>> {
         let n = match self.next()? {
             Token::Array(n) => n,
             other => return Err(Fault::new(other.words(), "an array")),
         };
         for i in 0..n {
-            let value = *self;
-            self.skip()?;
-            item(i, value)?;
+            let start = self.at;
+            item(i, self)?;
+            if self.at == start {
+                self.skip()?;
+            }
         }
         Ok(())
     }
@@ -338,9 +344,9 @@ mod tests {
         let mut seen = Vec::new();
         let mut cursor = Cursor::new(bytes);
         cursor
-            .map(|key, mut value| {
+            .map(|key, value| {
                 if key == b"a" {
-                    value.array(|i, mut item| {
+                    value.array(|i, item| {
                         seen.push((i, item.whole::<u32>("a number")?));
                         Ok(())
                     })?;
