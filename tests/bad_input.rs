@@ -6,6 +6,7 @@
 #[path = "bad_input/rows.rs"]
 mod rows;
 
+mod bcif_support;
 mod cli_support;
 mod http_support;
 

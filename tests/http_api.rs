@@ -2,11 +2,13 @@
 #![cfg(feature = "server")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
+mod bcif_support;
 mod http_support;
 
 use std::io::Write;
 use std::sync::{Arc, LazyLock};
 
+use bcif_support::CRAMBIN;
 use http_support::{Fake, Mode, Running, SAMPLE, log_lines, send, start};
 use molmesh::surface::cpu::CpuBackend;
 
@@ -16,6 +18,7 @@ static SERVER: LazyLock<Running> = LazyLock::new(|| {
     let archive = server.dir.path().join("archive/pt");
     std::fs::create_dir_all(&archive).unwrap();
     std::fs::write(archive.join("pdb4pti.ent.gz"), gzip(SAMPLE)).unwrap();
+    std::fs::write(server.dir.path().join("archive/1crn.bcif.gz"), gzip(CRAMBIN)).unwrap();
     server
 });
 
@@ -136,6 +139,9 @@ fn forms_carry_a_file_and_parameters() {
         body
     };
     let kind = ("content-type", "multipart/form-data; boundary=XX");
+    let binary = form(&[("name=\"file\"; filename=\"x.bcif\"", CRAMBIN), ("name=\"resolution\"", b"1")]);
+    let reply = SERVER.post("/v1/meshes", &[kind], &binary);
+    assert_eq!((reply.status, reply.header("molmesh-atoms")), (200, Some("327")));
     for name in ["file", "structure"] {
         let file = format!("name=\"{name}\"; filename=\"x.pdb\"");
         let body = form(&[(&file, SAMPLE), ("name=\"resolution\"", b"0.75"), ("name=\"format\"", b"ply")]);
@@ -195,6 +201,14 @@ fn a_type_that_contradicts_the_bytes_is_refused() {
         ("application/gzip", SAMPLE, 415),
         ("image/png", png, 415),
         ("application/octet-stream", png, 422),
+        ("application/octet-stream", CRAMBIN, 200),
+        ("application/x-www-form-urlencoded", CRAMBIN, 200),
+        ("chemical/x-bcif", CRAMBIN, 200),
+        ("application/vnd.msgpack", CRAMBIN, 200),
+        ("application/vnd.binarycif", SAMPLE, 415),
+        ("chemical/x-bcif", cif, 415),
+        ("chemical/x-mmcif", CRAMBIN, 415),
+        ("chemical/x-pdb", CRAMBIN, 415),
     ] {
         let reply = SERVER.post("/v1/meshes", &[("content-type", declared)], body);
         match status {
@@ -359,6 +373,39 @@ fn a_strict_check_brings_the_referees_findings() {
     assert_eq!(reply.status, 200, "{}", reply.text());
     assert!(reply.json()["diagnostics"].is_array());
     assert!(SERVER.post("/v1/meshes?report=json", &[], cif).json().get("diagnostics").is_none());
+}
+
+#[test]
+fn binary_files_are_taken_wherever_texts_are() {
+    let text = include_bytes!("../samples/1crn.cif");
+    // The same atoms make the same mesh, whatever they are wrapped in.
+    let stl = |body: &[u8], headers: &[(&str, &str)]| {
+        let reply = SERVER.post("/v1/meshes?resolution=1&format=stl", headers, body);
+        assert_eq!((reply.status, reply.header("molmesh-atoms")), (200, Some("327")));
+        reply.body
+    };
+    let expected = stl(text, &[]);
+    for body in [CRAMBIN.to_vec(), gzip(CRAMBIN), zstd(CRAMBIN)] {
+        assert!(stl(&body, &[]) == expected);
+    }
+    assert!(stl(&gzip(CRAMBIN), &[("content-encoding", "gzip")]) == expected);
+    // From the archive, and by a document that names the entry.
+    let stored = SERVER.get("/v1/pdb/1crn/surface.stl?resolution=1");
+    assert!(stored.status == 200 && stored.body == expected);
+    let order = br#"{"pdb_id": "1crn", "resolution": 1, "format": "stl"}"#;
+    let reply = SERVER.post("/v1/meshes", &[("content-type", "application/json")], order);
+    assert!(reply.status == 200 && reply.body == expected, "{}", reply.status);
+    assert_eq!(SERVER.get("/v1/pdb/1crn/surface.glb?report=json").json()["source_format"], "bcif");
+    // Uploaded once.
+    let kept = SERVER.post("/v1/structures", &[], CRAMBIN);
+    assert_eq!((kept.status, &kept.json()["format"], &kept.json()["id"]), (201, &"bcif".into(), &"1CRN".into()));
+    // The strict reader does not read it, and says so.
+    let report = SERVER.post("/v1/meshes?check=strict&report=json", &[], CRAMBIN).json();
+    assert!(report.to_string().contains("does not read BinaryCIF"), "{report}");
+    // A broken file: the problem says where.
+    let problem = SERVER.post("/v1/meshes", &[], &CRAMBIN[..CRAMBIN.len() / 2]).problem(422, "unreadable-structure");
+    assert!(problem["place"].as_str().unwrap().starts_with("BinaryCIF, byte "), "{problem}");
+    assert!(problem["found"].is_string() && problem["expected"].is_string());
 }
 
 #[test]

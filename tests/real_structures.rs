@@ -27,8 +27,7 @@ const EVERYDAY: usize = 5_000;
 const TRIMESH_LIMIT: usize = 6_000_000;
 
 /// Files that must be refused, with the reason.
-const REFUSED: &[(&str, &str)] =
-    &[("2ins_header_only.pdb.gz", "no atoms"), ("1gbt.bcif.gz", "unknown structure format")];
+const REFUSED: &[(&str, &str)] = &[("2ins_header_only.pdb.gz", "no atoms")];
 
 struct Case {
     name: String,

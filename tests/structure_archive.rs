@@ -82,6 +82,10 @@ fn every_layout_is_found_mmcif_first() {
         "divided/pdb/ab/pdb1abc.ent.gz",
         "divided/pdb/ab/pdb1abc.ent",
         "ab/pdb_00001abc.cif.gz",
+        "1abc.bcif",
+        "1abc.bcif.gz",
+        "ab/1abc.bcif",
+        "ab/pdb_00001abc.bcif.gz",
     ];
     for file in files {
         let dir = tempfile::tempdir().unwrap();
@@ -92,6 +96,13 @@ fn every_layout_is_found_mmcif_first() {
         assert_eq!(archive.fetch(&id("pdb_00001abc")).unwrap(), file.as_bytes());
     }
     let dir = tempfile::tempdir().unwrap();
+    // BinaryCIF comes last.
+    for file in ["1abc.bcif", "ab/pdb1abc.ent.gz"] {
+        put(dir.path(), file);
+    }
+    assert_eq!(Archive::new(dir.path()).fetch(&id("1abc")).unwrap(), b"ab/pdb1abc.ent.gz");
+    put(dir.path(), "pdb_87654321.bcif.gz");
+    assert_eq!(Archive::new(dir.path()).fetch(&id("pdb_87654321")).unwrap(), b"pdb_87654321.bcif.gz");
     for file in ["1abc.pdb", "pdb1abc.ent.gz", "ab/1abc.cif.gz"] {
         put(dir.path(), file);
     }

@@ -88,7 +88,7 @@ fn nothing_and_noise() {
     refused("zeros", vec![0; 1 << 20], "binary data");
     refused("random text", "lorem ipsum dolor\n".repeat(1000), "text beginning with `lorem ipsum dolor`");
     refused("HTML", "<!DOCTYPE html><title>404</title>", "an HTML page");
-    refused("BinaryCIF", b"\x83\xa7encoder\xa1x\xa7version\xa1y\xaadataBlocks\x90", "BinaryCIF");
+    refused("BinaryCIF", b"\x83\xa7encoder\xa1x\xa7version\xa1y\xaadataBlocks\x90", "no atoms: BinaryCIF");
     refused("MMTF", b"\xde\x00\x20\xabmmtfVersion\xa51.0.0", "MMTF");
     refused("bare record words", "ATOM", "expected coordinates");
     refused("bare HETATM", "HETATM\n", "expected coordinates");

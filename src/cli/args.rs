@@ -81,7 +81,7 @@ pub(crate) enum LogStyle {
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{MESH_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct MeshArgs {
-    /// Structure file, PDB or mmCIF, plain or compressed with gzip or zstd; `-` is stdin
+    /// Structure file, PDB, mmCIF or BinaryCIF, plain or compressed with gzip or zstd; `-` is stdin
     pub(crate) input: PathBuf,
     /// Mesh file; `-` is stdout
     #[arg(short, long)]

@@ -201,7 +201,7 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
         version: env!("CARGO_PKG_VERSION"),
         units: Units { length: "Å", area: "Å²", volume: "Å³" },
         inputs: Inputs {
-            formats: &["pdb", "mmcif"],
+            formats: &["pdb", "mmcif", "bcif"],
             encodings: &["identity", "gzip", "zstd"],
             note: "The bytes are looked at; Content-Type is a hint.",
         },

@@ -29,6 +29,11 @@ impl Declared {
         match (kind, subtype) {
             ("chemical", "x-pdb" | "pdb") => Self::Structure(SourceFormat::Pdb, essence),
             ("chemical", "x-mmcif" | "mmcif" | "x-cif" | "cif") => Self::Structure(SourceFormat::Mmcif, essence),
+            // BinaryCIF has no registered type; that of its container is.
+            ("chemical", "x-bcif" | "bcif" | "x-binarycif")
+            | ("application", "vnd.binarycif" | "x-bcif" | "vnd.msgpack" | "msgpack" | "x-msgpack") => {
+                Self::Structure(SourceFormat::BinaryCif, essence)
+            }
             ("application", "gzip" | "x-gzip") => Self::Compressed(&[0x1f, 0x8b], essence),
             ("application", "zstd") => Self::Compressed(&[0x28, 0xb5, 0x2f, 0xfd], essence),
             ("image" | "audio" | "video" | "font" | "model", _)
@@ -100,6 +105,11 @@ mod tests {
     fn contradictions_are_seen() {
         assert!(Declared::new("chemical/x-pdb").check_format("mmcif").is_err());
         assert!(Declared::new("chemical/x-pdb").check_format("pdb").is_ok());
+        for binary in ["chemical/x-bcif", "application/vnd.binarycif", "application/vnd.msgpack; charset=binary"] {
+            assert!(Declared::new(binary).check_format("bcif").is_ok(), "{binary}");
+            assert!(Declared::new(binary).check_format("mmcif").is_err(), "{binary}");
+        }
+        assert!(Declared::new("chemical/x-mmcif").check_format("bcif").is_err());
         assert!(Declared::new("application/gzip").check_bytes(b"ATOM").is_err());
         assert!(Declared::new("application/gzip").check_bytes(&[0x1f, 0x8b, 8]).is_ok());
     }

@@ -116,7 +116,7 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::RangeNotSatisfiable, "range-not-satisfiable", S::RANGE_NOT_SATISFIABLE, false, "The range lies outside the file",
         "`Range` asks for bytes behind the end of the file, which has `actual` bytes."),
     row(Kind::UnreadableStructure, "unreadable-structure", S::UNPROCESSABLE_ENTITY, false, "The structure cannot be read",
-        "The bytes are no PDB or mmCIF file, or a broken one. `line` and `column` give the place where there is one, `found` and `expected` what stood there and what should have; `diagnostics` is what a second, strict reader says of the file."),
+        "The bytes are no PDB, mmCIF or BinaryCIF file, or a broken one. `line` and `column` give the place in a text and `place` that in a binary file, where there is one, `found` and `expected` what stood there and what should have; `diagnostics` is what a second, strict reader says of the file."),
     row(Kind::NoAtoms, "no-atoms", S::UNPROCESSABLE_ENTITY, false, "The structure has no atoms",
         "The file was read, but holds no atoms with coordinates. `found` says what it holds instead."),
     row(Kind::EmptySelection, "empty-selection", S::UNPROCESSABLE_ENTITY, false, "The selection holds no atoms",

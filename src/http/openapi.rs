@@ -19,7 +19,7 @@ use super::problem::Problem;
 
 const ABOUT: &str = "Molecules in, surface meshes out.
 
-Send a PDB or mmCIF file to `POST /v1/meshes` and get a closed, oriented mesh. Whatever is not a success is a problem \
+Send a PDB, mmCIF or BinaryCIF file to `POST /v1/meshes` and get a closed, oriented mesh. Whatever is not a success is a problem \
 document (RFC 9457); its `type` is an address with an explanation.
 
 Beyond what each operation lists: `HEAD` is answered wherever `GET` is. A server that holds as many connections as it \

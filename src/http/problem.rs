@@ -307,6 +307,10 @@ impl From<StructureError> for Problem {
                 .with("column", column)
                 .with("found", found)
                 .with("expected", expected),
+            E::Malformed { place, found, expected } => Self::new(Kind::UnreadableStructure, detail)
+                .with("place", place)
+                .with("found", found)
+                .with("expected", expected),
             E::Decompress { encoding, .. } => Self::new(Kind::UnreadableStructure, detail).with("encoding", encoding),
             E::InflatedTooLarge { limit } => Self::new(Kind::InflatedTooLarge, detail).with("limit", limit),
             E::TooManyAtoms { limit } => Self::new(Kind::TooManyAtoms, detail).with("limit", limit),

@@ -58,7 +58,7 @@ pub(super) struct StructureDocument {
     digest: String,
     /// How many these are.
     bytes: usize,
-    /// `pdb` or `mmcif`.
+    /// `pdb`, `mmcif` or `bcif`.
     format: &'static str,
     /// PDB id or data block name.
     #[schema(required)]

@@ -40,7 +40,7 @@ pub struct Report {
     /// Title of the structure.
     #[cfg_attr(feature = "server", schema(required))]
     pub title: Option<String>,
-    /// `pdb` or `mmcif`.
+    /// `pdb`, `mmcif` or `bcif`.
     pub source_format: &'static str,
     /// Atoms meshed.
     pub atoms: u64,

@@ -1,8 +1,8 @@
 //! A local folder of structure files: entry id in, bytes out.
 //!
-//! Layouts: flat (`1abc.cif`, `1abc.pdb`, `pdb1abc.ent`), and that of the wwPDB's mirrors, divided by the two middle
+//! Layouts: flat (`1abc.cif`, `1abc.pdb`, `pdb1abc.ent`, `1abc.bcif`), and that of the wwPDB's mirrors, divided by the two middle
 //! characters (`ab/1abc.cif.gz`, `ab/pdb1abc.ent.gz`, also under `divided/mmCIF` and `divided/pdb`); every file with
-//! `.gz` or without, mmCIF first. Only a validated id ever becomes part of a path, and a file whose real place is not
+//! `.gz` or without, mmCIF first, BinaryCIF last. Only a validated id ever becomes part of a path, and a file whose real place is not
 //! in the folder (a link that leads out) does not exist here. Errors name ids, never paths.
 
 use std::fs::File;
@@ -193,6 +193,10 @@ fn candidates(id: &EntryId) -> Vec<PathBuf> {
         // Extended ids have no file in the PDB format.
         names.push((format!("{id}.pdb"), "pdb"));
         names.push((format!("pdb{id}.ent"), "pdb"));
+    }
+    names.push((format!("{id}.bcif"), "bcif"));
+    if long.is_none() {
+        names.push((format!("pdb_0000{id}.bcif"), "bcif"));
     }
     let mut out = Vec::new();
     for (name, kind) in names {

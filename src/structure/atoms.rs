@@ -11,15 +11,18 @@ pub enum SourceFormat {
     Pdb,
     /// PDBx/mmCIF.
     Mmcif,
+    /// BinaryCIF: PDBx/mmCIF in MessagePack.
+    BinaryCif,
 }
 
 impl SourceFormat {
-    /// `pdb` or `mmcif`.
+    /// `pdb`, `mmcif` or `bcif`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Pdb => "pdb",
             Self::Mmcif => "mmcif",
+            Self::BinaryCif => "bcif",
         }
     }
 }
@@ -48,7 +51,7 @@ pub struct Structure {
     pub residue: TextColumn,
     /// Chains by author name; a PDB file's blank chain is the empty text.
     pub chain: TextColumn,
-    /// Chains as mmCIF numbers them (`label_asym_id`); empty for PDB files and for mmCIF without that column.
+    /// Chains as mmCIF numbers them (`label_asym_id`); empty for PDB files and where there is no such column.
     pub label_chain: TextColumn,
     /// Residue numbers as the author gives them; 0 where the file leaves them blank.
     pub residue_number: Vec<i32>,

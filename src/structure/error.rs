@@ -6,7 +6,9 @@ use thiserror::Error;
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum StructureError {
     /// The bytes are no structure file that is read here.
-    #[error("unknown structure format: {found}; expected PDB or mmCIF text, plain or compressed with gzip or zstd")]
+    #[error(
+        "unknown structure format: {found}; expected PDB, mmCIF or BinaryCIF, plain or compressed with gzip or zstd"
+    )]
     UnknownFormat {
         /// What the first bytes look like.
         found: String,
@@ -18,6 +20,16 @@ pub enum StructureError {
         line: u64,
         /// Column, from 1.
         column: u64,
+        /// What stands there.
+        found: String,
+        /// What was expected.
+        expected: String,
+    },
+    /// A binary file could not be read.
+    #[error("{place}: found {found}, expected {expected}")]
+    Malformed {
+        /// Where, from the outside in: format, category, column, then encoding, row (from 1) or byte (from 0).
+        place: String,
         /// What stands there.
         found: String,
         /// What was expected.

@@ -1,4 +1,4 @@
-//! Structure files to atoms to spheres: PDB and mmCIF bytes in, [`crate::surface::Spheres`] out.
+//! Structure files to atoms to spheres: PDB, mmCIF and BinaryCIF bytes in, [`crate::surface::Spheres`] out.
 //!
 //! It knows nothing of grids, meshes, HTTP or paths (the archive folder excepted). Positions are Å.
 //!
@@ -7,7 +7,9 @@
 
 mod altloc;
 pub mod archive;
+mod atom_site;
 pub mod atoms;
+mod bcif;
 mod cif;
 pub mod contents;
 pub mod element;

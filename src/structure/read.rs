@@ -2,7 +2,7 @@
 
 use super::atoms::{SourceFormat, Structure};
 use super::error::StructureError;
-use super::{inflate, mmcif, pdb, sniff};
+use super::{bcif, inflate, mmcif, pdb, sniff};
 
 /// Limits of reading, checked before memory is allocated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,8 +30,8 @@ impl ReadLimits {
 /// that far: [`crate::surface::spheres::MAX_COORDINATE`].
 pub(super) use crate::surface::spheres::MAX_COORDINATE;
 
-/// Reads a structure: sniffs compression and format, never trusts a name. Lines and columns of errors are those of the
-/// inflated text.
+/// Reads a structure: sniffs compression and format, never trusts a name. Lines, columns and bytes of errors are
+/// those of the inflated text.
 ///
 /// # Errors
 /// Any [`StructureError`] of reading. No input panics.
@@ -41,6 +41,7 @@ pub fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureErr
     match sniff::sniff(text)? {
         SourceFormat::Pdb => pdb::read(text, limits),
         SourceFormat::Mmcif => mmcif::read(text, limits),
+        SourceFormat::BinaryCif => bcif::read(text, limits),
     }
 }
 

@@ -98,7 +98,14 @@ pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, Struc
         plain => plain?,
     };
     let text = without_mark(&plain);
-    let format = sniff::sniff(text)?;
+    // pdbtbx does not read BinaryCIF, so there is no second opinion on it.
+    let format = match sniff::sniff(text)? {
+        SourceFormat::Pdb => Format::Pdb,
+        SourceFormat::Mmcif => Format::Mmcif,
+        SourceFormat::BinaryCif => {
+            return Ok(vec![Diagnostic::note("not checked: the strict reader does not read BinaryCIF".to_owned())]);
+        }
+    };
     INSIDE.set(true);
     let outcome = catch_unwind(AssertUnwindSafe(|| findings(text, format)));
     INSIDE.set(false);
@@ -109,11 +116,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, Struc
     }))
 }
 
-fn findings(text: &[u8], format: SourceFormat) -> Vec<Diagnostic> {
-    let format = match format {
-        SourceFormat::Pdb => Format::Pdb,
-        SourceFormat::Mmcif => Format::Mmcif,
-    };
+fn findings(text: &[u8], format: Format) -> Vec<Diagnostic> {
     let result = ReadOptions::new().set_format(format).set_level(StrictnessLevel::Loose).read_raw(BufReader::new(text));
     let (Ok((_, errors)) | Err(errors)) = result;
     let mut found: Vec<Diagnostic> = errors.iter().take(MAX_DIAGNOSTICS).map(diagnostic).collect();

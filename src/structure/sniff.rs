@@ -18,6 +18,9 @@ const LOOKED_AT: usize = 256 << 10;
 /// The format of `text`, which begins after any byte order mark.
 pub(super) fn sniff(text: &[u8]) -> Result<SourceFormat, StructureError> {
     let unknown = |found: String| Err(StructureError::UnknownFormat { found });
+    if is_binary_cif(text) {
+        return Ok(SourceFormat::BinaryCif);
+    }
     if let Some(found) = binary(text) {
         return unknown(found);
     }
@@ -56,18 +59,31 @@ fn is_pdb_record(line: &[u8]) -> bool {
     PDB_RECORDS.contains(&&word[..end]) || (word.starts_with(b"ATOM ") && word.len() == 6)
 }
 
-/// Names binary formats by their first bytes.
-fn binary(bytes: &[u8]) -> Option<String> {
-    // A MessagePack map at the top, with these keys near the beginning.
+/// Whether the bytes are a MessagePack map.
+fn is_map(bytes: &[u8]) -> bool {
+    matches!(bytes.first(), Some(0x80..=0x8F | 0xDE | 0xDF))
+}
+
+/// Whether one of the keys stands near the beginning.
+fn has_key(bytes: &[u8], keys: [&[u8]; 2]) -> bool {
     let head = &bytes[..bytes.len().min(4096)];
-    let has = |key: &[u8]| memchr::memmem::find(head, key).is_some();
-    if matches!(bytes.first(), Some(0x80..=0x8F | 0xDE | 0xDF)) {
-        if has(b"mmtfVersion") || has(b"mmtfProducer") {
-            return Some("MMTF (MessagePack)".to_owned());
-        }
-        if has(b"dataBlocks") || has(b"encoder") {
-            return Some("BinaryCIF (MessagePack)".to_owned());
-        }
+    keys.iter().any(|key| memchr::memmem::find(head, key).is_some())
+}
+
+fn is_mmtf(bytes: &[u8]) -> bool {
+    is_map(bytes) && has_key(bytes, [b"mmtfVersion", b"mmtfProducer"])
+}
+
+/// BinaryCIF is a MessagePack map of encoder, version and data blocks, in any order.
+fn is_binary_cif(bytes: &[u8]) -> bool {
+    is_map(bytes) && !is_mmtf(bytes) && has_key(bytes, [b"dataBlocks", b"encoder"])
+}
+
+/// Names binary formats that are not read by their first bytes.
+fn binary(bytes: &[u8]) -> Option<String> {
+    let head = &bytes[..bytes.len().min(4096)];
+    if is_mmtf(bytes) {
+        return Some("MMTF (MessagePack)".to_owned());
     }
     let magic: [(&[u8], &str); 14] = [
         (b"\x1f\x8b", "gzip inside a compressed file"),
@@ -140,6 +156,9 @@ mod tests {
         ] {
             assert_eq!(sniff(pdb.as_bytes()).unwrap(), SourceFormat::Pdb, "{pdb}");
         }
+        for bcif in [&b"\x83\xa7encoder\xb6mol*/ciftools"[..], b"\xdf\0\0\0\x01\xaadataBlocks\x90"] {
+            assert_eq!(sniff(bcif).unwrap(), SourceFormat::BinaryCif, "{bcif:?}");
+        }
         for cif in ["data_1ABC\n", "# comment\n#\n\n  DATA_x", "loop_\n_atom_site.id", "_entry.id X"] {
             assert_eq!(sniff(cif.as_bytes()).unwrap(), SourceFormat::Mmcif, "{cif}");
         }
@@ -147,10 +166,11 @@ mod tests {
 
     #[test]
     fn everything_else_is_named() {
-        let cases: [(&[u8], &str); 17] = [
+        let cases: [(&[u8], &str); 18] = [
             (b"", "nothing (0 bytes)"),
             (b" \n\t", "only white space"),
-            (b"\x83\xa7encoder\xb6mol*/ciftools", "BinaryCIF"),
+            (b"\x83\xa7encoded\xb6mol*/ciftools", "`"),
+            (b"encoder of dataBlocks", "`encoder of dataBlocks`"),
             (b"\xde\x00\x20\xabmmtfVersion\xa51.0.0", "MMTF"),
             (b"PK\x03\x04rest", "ZIP"),
             (b"\xfd7zXZ\0", "xz"),

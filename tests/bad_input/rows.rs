@@ -4,6 +4,7 @@ use std::io::Write;
 
 use serde_json::{Value, json};
 
+use crate::bcif_support::{CRAMBIN, atoms, block, byte_array, category, column, file, i32s, reals, run_length};
 use crate::http_support::SAMPLE;
 
 /// Limits of the server, and of the command line where it has them; all others are the defaults.
@@ -189,7 +190,7 @@ fn strangers() -> Vec<Row> {
         stranger("JSON", "{\"pdb_id\": \"4pti\"}", "JSON"),
         stranger("ZIP", b"PK\x03\x04rest", "ZIP"),
         stranger("UTF-16", b"\xff\xfeA\0T\0O\0M\0", "UTF-16"),
-        stranger("BinaryCIF", b"\x83\xa7encoder\xa1x\xa7version\xa1y\xaadataBlocks\x90", "BinaryCIF"),
+        stranger("MMTF", b"\xde\x00\x20\xabmmtfVersion\xa51.0.0", "MMTF"),
         stranger("END alone", "END\n", "`END`"),
         stranger("gzip in gzip", gzip(&gzip(ATOM.as_bytes())), "gzip inside a compressed file"),
         stranger("gzip of nothing", gzip(b""), "nothing (0 bytes)"),
@@ -295,6 +296,49 @@ fn mmcif() -> Vec<Row> {
         Row { body: chains().into_bytes(), ..nothing_taken("none of 100,000 chains", "chains=Z", "chains", "Z", "c0") },
         beyond("100,001 atoms", many(ATOMS + 1, |_| "A . 1 1 2 3\n".to_owned()), 422, "too-many-atoms", ATOMS),
         beyond("blanks beyond every limit", vec![b' '; 9 << 20], 413, "body-too-large", BODY_BYTES),
+    ]
+}
+
+/// A binary structure that is broken at a place.
+fn malformed(name: &'static str, body: impl AsRef<[u8]>, place: &'static str, expected: &'static str) -> Row {
+    let named = vec![("place", Is::Saying(place)), ("found", Is::Saying("")), ("expected", Is::Saying(expected))];
+    Row { named, ..upload(name, body, 422, "unreadable-structure", 4) }
+}
+
+/// BinaryCIF files.
+fn binary() -> Vec<Row> {
+    let runs = |rows: i64, count: i32| {
+        let column = |name| column(name, i32s(&[0, count]), vec![run_length(count.into()), byte_array(3)]);
+        let all = ["Cartn_x", "Cartn_y", "Cartn_z"].map(column).to_vec();
+        file(vec![block("x", vec![category("_atom_site", rows, all)])])
+    };
+    let mut flipped = CRAMBIN.to_vec();
+    let at = flipped.windows(9).position(|w| w == b"ByteArray").unwrap();
+    flipped[at] = b'b';
+    let x = |values: &[f64]| atoms(values.len(), vec![reals("Cartn_x", values)]);
+    vec![
+        legal("BinaryCIF", CRAMBIN, 327),
+        legal("BinaryCIF in gzip", gzip(CRAMBIN), 327),
+        malformed("half a BinaryCIF", &CRAMBIN[..CRAMBIN.len() / 2], "BinaryCIF, byte ", "bytes or more"),
+        malformed("BinaryCIF with NaN", x(&[0.0, f64::NAN]), "BinaryCIF, atom_site, Cartn_x, row 2", "Cartn_x in Å"),
+        malformed("BinaryCIF with an atom at 1e9", x(&[1e9]), "BinaryCIF, atom_site, Cartn_x, row 1", "within ±100000"),
+        malformed("BinaryCIF with an unknown encoding", flipped, "encoding ", "one of BinaryCIF's seven"),
+        malformed("a run of 2³¹ atoms", runs(2, i32::MAX), "Cartn_x, RunLength (encoding 1 of 2)", "at most 6"),
+        malformed("a row count that lies", runs(3, 2), "BinaryCIF, atom_site, Cartn_x", "3, as rowCount says"),
+        malformed(
+            "2,000,000 arrays in arrays",
+            [b"\x81\xaadataBlocks".as_slice(), &[0x91; 2_000_000], &[0]].concat(),
+            "BinaryCIF",
+            "a map",
+        ),
+        malformed(
+            "an array of 4 billion",
+            b"\x81\xaadataBlocks\xdd\xff\xff\xff\xff",
+            "BinaryCIF, byte 17",
+            "bytes or more",
+        ),
+        beyond("a row count of 2³¹", runs(i64::from(i32::MAX), i32::MAX), 422, "too-many-atoms", ATOMS),
+        atomless("BinaryCIF without blocks", b"\x83\xa7encoder\xa1x\xa7version\xa1y\xaadataBlocks\x90", "BinaryCIF"),
     ]
 }
 
@@ -433,5 +477,5 @@ fn http() -> Vec<Row> {
 
 /// Every row.
 pub(crate) fn rows() -> Vec<Row> {
-    [strangers(), compressed(), pdb(), mmcif(), parameters(), http()].concat()
+    [strangers(), compressed(), pdb(), mmcif(), binary(), parameters(), http()].concat()
 }

@@ -24,7 +24,7 @@ impl ToSchema for StructureFile {}
 
 impl PartialSchema for StructureFile {
     fn schema() -> RefOr<Schema> {
-        RefOr::T(file("A PDB or mmCIF file, as it is or compressed with gzip or zstd.").into())
+        RefOr::T(file("A PDB, mmCIF or BinaryCIF file, as it is or compressed with gzip or zstd.").into())
     }
 }
 

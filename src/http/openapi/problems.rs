@@ -132,6 +132,7 @@ const MEMBERS: &[Member] = &[
     ("estimated_wait_s", Some(Type::Number), "How long a job would wait, s."),
     ("line", Some(Type::Integer), "Where in the file, from 1."),
     ("column", Some(Type::Integer), "Where in the line, from 1."),
+    ("place", Some(Type::String), "Where in a binary file: category, column, encoding, row (from 1) or byte (from 0)."),
     ("atom", Some(Type::Integer), "Which atom, from 0."),
     ("found", None, "What was found instead."),
     ("declared", Some(Type::String), "What `Content-Type` said."),

@@ -3,17 +3,18 @@
 //! Dictionary: PDBx/mmCIF, category `atom_site`. Author names and numbers (`auth_*`) go before the dictionary's own
 //! (`label_*`), which stand in where the author's are missing.
 
-mod atom_site;
+mod row;
 mod rows;
 
-use self::atom_site::{Layout, PREFIX};
+use self::row::PREFIX;
 use self::rows::Rows;
+use super::atom_site::{Layout, Passed};
 use super::atoms::{SourceFormat, Structure};
 use super::cif::{self, Kind, Token, Tokenizer};
 use super::error::StructureError;
 use super::pdb::MAX_TITLE;
 use super::read::ReadLimits;
-use super::text::{self, Fault, decode, tidy};
+use super::text::{Fault, decode, tidy};
 
 /// Why rows stop being read.
 #[derive(Debug)]
@@ -57,9 +58,7 @@ struct Reader<'a> {
     rows: Option<Rows<'a>>,
     /// `atom_site` given item by item, as files with one atom may: item names, and their values as offsets.
     single: SingleRow,
-    /// Categories that were passed, for the message when there are no atoms.
-    categories: Vec<String>,
-    n_blocks: usize,
+    passed: Passed,
 }
 
 impl<'a> Reader<'a> {
@@ -74,8 +73,7 @@ impl<'a> Reader<'a> {
             in_frame: false,
             rows: None,
             single: SingleRow::default(),
-            categories: Vec::new(),
-            n_blocks: 0,
+            passed: Passed::default(),
         }
     }
 
@@ -116,7 +114,7 @@ impl<'a> Reader<'a> {
         self.entry = None;
         self.title = None;
         self.in_frame = false;
-        self.n_blocks += 1;
+        self.passed.block();
     }
 
     /// A tag and its value.
@@ -196,9 +194,9 @@ impl<'a> Reader<'a> {
 
     /// The columns of `atom_site`; `None` if it has no coordinates.
     fn layout(&mut self, tags: &[(usize, usize)]) -> Result<Option<Layout>, Stop> {
-        let layout = Layout::new(self.text, tags)?;
-        if let Err(missing) = layout.check() {
-            self.categories.push(format!("atom_site without {missing}"));
+        let layout = row::layout(self.text, tags)?;
+        if let Some(missing) = layout.missing() {
+            self.passed.lacking(missing);
             return Ok(None);
         }
         Ok(Some(layout))
@@ -238,29 +236,17 @@ impl<'a> Reader<'a> {
     }
 
     fn note_category(&mut self, tag: &Token) {
-        const KEPT: usize = 10;
-        if self.categories.len() >= KEPT {
+        if self.passed.is_full() {
             return;
         }
         let name = &self.text[tag.start + 1..tag.end.min(tag.start + 80)];
-        let category = decode(name.split(|&b| b == b'.').next().unwrap_or(name));
-        if !self.categories.iter().any(|c| *c == *category) {
-            self.categories.push(category.into_owned());
-        }
+        self.passed.category(decode(name.split(|&b| b == b'.').next().unwrap_or(name)));
     }
 
     fn finish(self) -> Result<Structure, StructureError> {
         let (columns, tables) = self.rows.map(Rows::into_parts).unwrap_or_default();
         if columns.len() == 0 {
-            let block = self.block.map_or_else(|| "no named data block".to_owned(), |b| format!("data block {b}"));
-            let more = if self.n_blocks > 1 { format!(" (the last of {})", self.n_blocks) } else { String::new() };
-            let n = self.categories.len();
-            let found = if n == 0 {
-                format!("mmCIF with {block}{more} and nothing in it")
-            } else {
-                format!("mmCIF with {block}{more}, categories {}", text::list(self.categories, n))
-            };
-            return Err(StructureError::NoAtoms { found });
+            return Err(self.passed.no_atoms("mmCIF", self.block));
         }
         Ok(columns.finish(tables, SourceFormat::Mmcif, self.entry.or(self.block), self.title))
     }

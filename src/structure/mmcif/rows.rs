@@ -9,12 +9,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use rayon::prelude::*;
 
+use super::super::atom_site::{AtomSite, Layout};
 use super::super::atoms::{Atom, Columns, Slices, Tables};
 use super::super::cif::{Kind, Tokenizer, bare_kind};
 use super::super::scan::Edges;
 use super::super::text::Fault;
 use super::Stop;
-use super::atom_site::{AtomSite, Layout, Row};
+use super::row::Row;
 
 /// Bytes scanned at a time: short after a special row, as what was scanned beyond it is scanned again.
 const MIN_WINDOW: usize = 1 << 8;
@@ -339,7 +340,7 @@ mod tests {
             *at += tag.len() + 1;
             Some((start, start + tag.len()))
         });
-        Layout::new(text.as_bytes(), &tags.collect::<Vec<_>>()).unwrap()
+        super::super::row::layout(text.as_bytes(), &tags.collect::<Vec<_>>()).unwrap()
     }
 
     /// How many rows several threads read of a text with these rows and this end, and where they stop.

@@ -1,0 +1,325 @@
+//! One row of `atom_site` to one atom, whether the row is text or binary: what its items mean, which stand in for others,
+//! and what is said where they are missing or wrong.
+
+use std::collections::HashMap;
+
+use super::atoms::{Atom, Tables};
+use super::element::{self, Name, atomic_number};
+use super::error::StructureError;
+use super::number::{self, single};
+use super::read::MAX_COORDINATE;
+use super::text;
+
+/// Longest name of an atom, a residue or a chain, bytes: the dictionary's have five.
+const MAX_NAME: usize = 255;
+
+/// No such column.
+pub(super) const NONE: usize = usize::MAX;
+
+/// Where the items stand in a row; an item that is not there stands at [`NONE`].
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Layout {
+    /// Items of a row.
+    pub(super) width: usize,
+    group: usize,
+    element: usize,
+    name: [usize; 2],
+    residue: [usize; 2],
+    chain: [usize; 2],
+    number: [usize; 2],
+    insertion_code: usize,
+    altloc: usize,
+    position: [usize; 3],
+    occupancy: usize,
+    b_factor: usize,
+    model: usize,
+    label_chain: usize,
+}
+
+const POSITION: [&str; 3] = ["Cartn_x", "Cartn_y", "Cartn_z"];
+
+impl Layout {
+    /// The layout of rows of `width` items, of which `find` gives the place by name.
+    pub(super) fn new(width: usize, find: impl Fn(&str) -> Option<usize>) -> Self {
+        let column = |item: &str| find(item).unwrap_or(NONE);
+        // The author's item, then the dictionary's.
+        let pair = |auth: &str, label: &str| match (column(auth), column(label)) {
+            (NONE, label) => [label, NONE],
+            (auth, label) => [auth, label],
+        };
+        Self {
+            width,
+            group: column("group_PDB"),
+            element: column("type_symbol"),
+            name: pair("auth_atom_id", "label_atom_id"),
+            residue: pair("auth_comp_id", "label_comp_id"),
+            chain: pair("auth_asym_id", "label_asym_id"),
+            number: pair("auth_seq_id", "label_seq_id"),
+            insertion_code: column("pdbx_PDB_ins_code"),
+            altloc: column("label_alt_id"),
+            position: POSITION.map(column),
+            occupancy: column("occupancy"),
+            b_factor: column("B_iso_or_equiv"),
+            model: column("pdbx_PDB_model_num"),
+            label_chain: column("label_asym_id"),
+        }
+    }
+
+    /// The coordinates that are missing, for [`Passed::lacking`]; `None` if all are there.
+    pub(super) fn missing(&self) -> Option<String> {
+        let missing: Vec<&str> =
+            POSITION.iter().zip(self.position).filter(|(_, column)| *column == NONE).map(|(item, _)| *item).collect();
+        (!missing.is_empty()).then(|| format!("atom_site without {}", missing.join(", ")))
+    }
+
+    /// Columns of texts. The second of a pair stands in where the first says nothing.
+    pub(super) fn texts(&self) -> [[usize; 2]; 8] {
+        let alone = |column| [column, NONE];
+        let (names, others) = ([self.name, self.residue, self.chain], [self.group, self.element]);
+        let [name, residue, chain] = names;
+        let [group, element] = others.map(alone);
+        let [code, altloc, label] = [self.insertion_code, self.altloc, self.label_chain].map(alone);
+        [group, element, name, residue, chain, code, altloc, label]
+    }
+
+    /// Columns of numbers, likewise.
+    pub(super) fn numbers(&self) -> [[usize; 2]; 7] {
+        let [x, y, z] = self.position;
+        let alone = |column| [column, NONE];
+        let [x, y, z, occupancy, b_factor, model] = [x, y, z, self.occupancy, self.b_factor, self.model].map(alone);
+        [self.number, x, y, z, occupancy, b_factor, model]
+    }
+}
+
+/// `text[start..end]`, with what stands around it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Span<'a> {
+    pub(super) text: &'a [u8],
+    pub(super) start: usize,
+    pub(super) end: usize,
+}
+
+impl<'a> Span<'a> {
+    const EMPTY: Self = Span { text: &[], start: 0, end: 0 };
+
+    #[inline]
+    fn bytes(&self) -> &'a [u8] {
+        &self.text[self.start..self.end]
+    }
+
+    #[inline]
+    fn len(&self) -> usize {
+        self.end - self.start
+    }
+
+    /// The number that the text writes.
+    #[inline]
+    pub(super) fn real(self) -> Result<f64, Wrong> {
+        number::real(self.text, self.start, self.end).ok_or(Wrong)
+    }
+
+    /// The whole number that the text writes.
+    #[inline]
+    pub(super) fn integer(self) -> Result<i32, Wrong> {
+        number::integer(self.bytes()).ok_or(Wrong)
+    }
+}
+
+/// A value is there, but is no number, or none that fits.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Wrong;
+
+/// A row, wherever its values come from. Nothing stands at [`NONE`].
+pub(super) trait Row {
+    /// What is said of a value that is wrong.
+    type Fault;
+
+    /// The text at a column; `None` if nothing stands there.
+    fn text(&self, column: usize) -> Option<Span<'_>>;
+
+    /// The number at a column.
+    #[inline]
+    fn real(&self, column: usize) -> Result<Option<f64>, Wrong> {
+        self.text(column).map(Span::real).transpose()
+    }
+
+    /// The whole number at a column.
+    #[inline]
+    fn integer(&self, column: usize) -> Result<Option<i32>, Wrong> {
+        self.text(column).map(Span::integer).transpose()
+    }
+
+    /// The error for what stands at a column.
+    fn fault(&self, column: usize, expected: String) -> Self::Fault;
+}
+
+/// Turns rows into atoms.
+#[derive(Debug)]
+pub(super) struct AtomSite {
+    pub(super) layout: Layout,
+    pub(super) tables: Tables,
+    /// Guessed elements by name and residue.
+    guesses: HashMap<(u32, u32), u8>,
+}
+
+impl AtomSite {
+    pub(super) fn new(layout: Layout) -> Self {
+        Self { layout, tables: Tables::default(), guesses: HashMap::new() }
+    }
+
+    #[inline]
+    pub(super) fn atom<R: Row>(&mut self, row: &R) -> Result<Atom, R::Fault> {
+        let layout = self.layout;
+        let position = [coordinate(row, &layout, 0)?, coordinate(row, &layout, 1)?, coordinate(row, &layout, 2)?];
+        let span = name(row, layout.name)?;
+        let name_id = self.tables.name.intern(span.text, span.start, span.end);
+        let span = name(row, layout.residue)?;
+        let residue = self.tables.residue.intern(span.text, span.start, span.end);
+        let span = name(row, layout.chain)?;
+        let chain = self.tables.chain.intern(span.text, span.start, span.end);
+        let label_chain = if layout.label_chain == NONE {
+            0
+        } else {
+            let span = name(row, [layout.label_chain, NONE])?;
+            self.tables.label_chain.intern(span.text, span.start, span.end)
+        };
+        Ok(Atom {
+            position,
+            element: self.element(row, name_id, residue),
+            name: name_id,
+            residue,
+            chain,
+            label_chain,
+            residue_number: whole(row, layout.number, 0, "a residue number")?,
+            insertion_code: character(row, layout.insertion_code, "an insertion code")?,
+            altloc: character(row, layout.altloc, "an alternative location")?,
+            occupancy: optional(row, layout.occupancy, 1.0, "an occupancy")?,
+            b_factor: optional(row, layout.b_factor, 0.0, "a B-factor")?,
+            model: whole(row, [layout.model, NONE], 1, "a model number")?,
+            hetero: hetero(row, layout.group)?,
+        })
+    }
+
+    #[inline]
+    fn element<R: Row>(&mut self, row: &R, name: u32, residue: u32) -> u8 {
+        let symbol = row.text(self.layout.element).map_or(0, |span| atomic_number(span.bytes()));
+        if symbol != 0 { symbol } else { self.guess(name, residue) }
+    }
+
+    #[cold]
+    fn guess(&mut self, name: u32, residue: u32) -> u8 {
+        let tables = &self.tables;
+        *self.guesses.entry((name, residue)).or_insert_with(|| {
+            let name = Name { text: tables.name.text(name).as_bytes(), columns: None };
+            element::guess(name, tables.residue.text(residue))
+        })
+    }
+}
+
+#[inline]
+fn coordinate<R: Row>(row: &R, layout: &Layout, axis: usize) -> Result<f64, R::Fault> {
+    let column = layout.position[axis];
+    if let Ok(Some(value)) = row.real(column)
+        && value.abs() <= MAX_COORDINATE
+    {
+        return Ok(value);
+    }
+    Err(row.fault(column, format!("{} in Å, within ±{MAX_COORDINATE}", POSITION[axis])))
+}
+
+/// A name, empty where there is none.
+#[inline]
+fn name<R: Row>(row: &R, columns: [usize; 2]) -> Result<Span<'_>, R::Fault> {
+    match row.text(columns[0]).or_else(|| row.text(columns[1])) {
+        None => Ok(Span::EMPTY),
+        Some(span) if span.len() <= MAX_NAME => Ok(span),
+        Some(_) => Err(row.fault(columns[0], format!("a name of at most {MAX_NAME} bytes"))),
+    }
+}
+
+#[inline]
+fn optional<R: Row>(row: &R, column: usize, default: f32, what: &str) -> Result<f32, R::Fault> {
+    match row.real(column) {
+        Ok(value) => Ok(value.map_or(default, single)),
+        Err(Wrong) => Err(row.fault(column, format!("{what}, ? or ."))),
+    }
+}
+
+#[inline]
+fn whole<R: Row>(row: &R, columns: [usize; 2], default: i32, what: &str) -> Result<i32, R::Fault> {
+    let value = match row.integer(columns[0]) {
+        Ok(None) => row.integer(columns[1]),
+        value => value,
+    };
+    match value {
+        Ok(value) => Ok(value.unwrap_or(default)),
+        Err(Wrong) => Err(row.fault(columns[0], format!("{what} (a whole number), ? or ."))),
+    }
+}
+
+#[inline]
+fn character<R: Row>(row: &R, column: usize, what: &str) -> Result<u8, R::Fault> {
+    match row.text(column) {
+        None => Ok(0),
+        Some(span) if span.len() == 1 => Ok(span.text[span.start]),
+        // An empty or blank quoted value is another way to say that there is none.
+        Some(span) if span.bytes().iter().all(|&b| b == b' ') => Ok(0),
+        Some(_) => Err(row.fault(column, format!("{what} of one character, ? or ."))),
+    }
+}
+
+#[inline]
+fn hetero<R: Row>(row: &R, column: usize) -> Result<bool, R::Fault> {
+    let Some(span) = row.text(column) else { return Ok(false) };
+    match span.bytes() {
+        b"ATOM" => Ok(false),
+        b"HETATM" => Ok(true),
+        _ => Err(row.fault(column, "ATOM or HETATM".to_owned())),
+    }
+}
+
+/// What was passed on the way to the atoms, for the message when there are none.
+#[derive(Debug, Default)]
+pub(super) struct Passed {
+    categories: Vec<String>,
+    blocks: usize,
+}
+
+impl Passed {
+    /// So many categories are named.
+    const KEPT: usize = 10;
+
+    pub(super) fn block(&mut self) {
+        self.blocks += 1;
+    }
+
+    /// Whether more categories would not be named.
+    pub(super) fn is_full(&self) -> bool {
+        self.categories.len() >= Self::KEPT
+    }
+
+    /// A category without coordinates, as [`Layout::missing`] names it: named whatever else was passed.
+    pub(super) fn lacking(&mut self, missing: String) {
+        self.categories.push(missing);
+    }
+
+    /// A category, by name without underscore.
+    pub(super) fn category(&mut self, name: impl AsRef<str> + Into<String>) {
+        if !self.is_full() && !self.categories.iter().any(|c| c == name.as_ref()) {
+            self.categories.push(name.into());
+        }
+    }
+
+    /// The error of a file in this `format` that has come to its end, in this block, without atoms.
+    pub(super) fn no_atoms(self, format: &str, block: Option<String>) -> StructureError {
+        let block = block.map_or_else(|| "no named data block".to_owned(), |b| format!("data block {b}"));
+        let more = if self.blocks > 1 { format!(" (the last of {})", self.blocks) } else { String::new() };
+        let n = self.categories.len();
+        let found = if n == 0 {
+            format!("{format} with {block}{more} and nothing in it")
+        } else {
+            format!("{format} with {block}{more}, categories {}", text::list(self.categories, n))
+        };
+        StructureError::NoAtoms { found }
+    }
+}

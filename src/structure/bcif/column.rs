@@ -1,0 +1,217 @@
+//! A column of a category: its values, and the rows in which it has none.
+
+use std::borrow::Cow;
+
+use super::super::text::decode;
+use super::decode::Values;
+use super::encoding::{Chain, Strings};
+use super::fault::Fault;
+use super::msgpack::{Cursor, Token};
+
+/// A column as it lies in the file.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Raw<'a> {
+    pub(super) name: &'a [u8],
+    data: Cursor<'a>,
+    mask: Option<Cursor<'a>>,
+}
+
+/// Texts by row.
+#[derive(Debug)]
+pub(super) struct Texts<'a> {
+    pub(super) joined: Cow<'a, [u8]>,
+    /// Where each text begins and, behind it, the next one: one more than there are texts, all within `joined`.
+    offsets: Vec<u32>,
+    /// Numbers of texts; below zero where there is none.
+    ids: Vec<i32>,
+}
+
+impl Texts<'_> {
+    /// Start and end of the text of a row in `joined`.
+    #[inline]
+    pub(super) fn range(&self, row: usize) -> Option<(usize, usize)> {
+        let id = usize::try_from(self.ids[row]).ok()?;
+        Some((self.offsets[id] as usize, self.offsets[id + 1] as usize))
+    }
+}
+
+/// What a column holds.
+#[derive(Debug)]
+pub(super) enum Cells<'a> {
+    Int(Vec<i32>),
+    Real(Vec<f64>),
+    Text(Texts<'a>),
+}
+
+/// A column, decoded.
+#[derive(Debug)]
+pub(super) struct Column<'a> {
+    pub(super) cells: Cells<'a>,
+    /// By row: whether nothing stands there.
+    mask: Option<Vec<bool>>,
+}
+
+impl Column<'_> {
+    #[inline]
+    pub(super) fn is_null(&self, row: usize) -> bool {
+        self.mask.as_ref().is_some_and(|mask| mask[row])
+    }
+
+    /// Whether some row has no value.
+    pub(super) fn has_nulls(&self) -> bool {
+        self.mask.is_some() || matches!(&self.cells, Cells::Text(texts) if texts.ids.iter().any(|&id| id < 0))
+    }
+}
+
+/// Bounds for what is decoded.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Bounds {
+    /// Rows of the category.
+    pub(super) rows: usize,
+    /// Distinct texts of a column.
+    pub(super) texts: usize,
+}
+
+impl<'a> Raw<'a> {
+    pub(super) fn read(at: &mut Cursor<'a>) -> Result<Self, Box<Fault>> {
+        let (mut name, mut data, mut mask) = (None, None, None);
+        at.map(|key, value| {
+            let mut head = *value;
+            match key {
+                b"name" => name = Some(value.text()?),
+                b"data" => data = Some(*value),
+                b"mask" if head.next()? != Token::Nil => mask = Some(*value),
+                _ => {}
+            }
+            Ok(())
+        })?;
+        let name = name.ok_or_else(|| Fault::new("a column without a name", "`name`"))?;
+        let data = data.ok_or_else(|| Fault::new("nothing", "`data`").within(decode(name)))?;
+        Ok(Self { name, data, mask })
+    }
+
+    /// Decodes the column; whole numbers become texts if it is to have `texts`.
+    pub(super) fn load(&self, bounds: Bounds, texts: bool) -> Result<Column<'a>, Box<Fault>> {
+        self.decode(bounds, texts).map_err(|fault| fault.within(decode(self.name)))
+    }
+
+    fn decode(&self, bounds: Bounds, texts: bool) -> Result<Column<'a>, Box<Fault>> {
+        let mask = self.mask.map(|mask| nulls(mask, bounds.rows).map_err(|f| f.within("mask"))).transpose()?.flatten();
+        let (data, chain) = encoded(self.data)?;
+        if let Some(strings) = chain.strings() {
+            let cells = Cells::Text(strings.read(data, bounds).map_err(|f| f.within("StringArray"))?);
+            return Ok(Column { cells, mask });
+        }
+        let values = chain.decode(data, room(bounds.rows))?;
+        whole_column(values.len(), bounds.rows)?;
+        let cells = match values {
+            Values::Int(values) if texts => Cells::Text(written_out(&values)),
+            Values::Int(values) => Cells::Int(values),
+            Values::Real(_) if texts => return Err(Fault::new("real numbers", "texts")),
+            Values::Real(values) => Cells::Real(values),
+        };
+        Ok(Column { cells, mask })
+    }
+}
+
+/// Values that a step on the way to `n` values may have: pairs of runs are two for one.
+const fn room(n: usize) -> usize {
+    n.saturating_add(1).saturating_mul(2)
+}
+
+fn whole_column(found: usize, rows: usize) -> Result<(), Box<Fault>> {
+    if found == rows { Ok(()) } else { Err(Fault::new(format!("{found} values"), format!("{rows}, as rowCount says"))) }
+}
+
+/// Data and how it is encoded.
+fn encoded(mut at: Cursor<'_>) -> Result<(&[u8], Chain<'_>), Box<Fault>> {
+    let (mut data, mut chain) = (None, None);
+    at.map(|key, value| {
+        match key {
+            b"data" => data = Some(value.bytes().map_err(|f| f.within("`data`"))?),
+            b"encoding" => chain = Some(*value),
+            _ => {}
+        }
+        Ok(())
+    })?;
+    let data = data.ok_or_else(|| Fault::new("nothing", "`data`"))?;
+    let chain = chain.ok_or_else(|| Fault::new("nothing", "`encoding`"))?;
+    Ok((data, Chain::read(chain)?))
+}
+
+/// The rows without a value, as a mask says: 1 is `.`, 2 is `?`. `None` if there are none.
+fn nulls(mask: Cursor<'_>, rows: usize) -> Result<Option<Vec<bool>>, Box<Fault>> {
+    let (data, chain) = encoded(mask)?;
+    let values = chain.decode(data, room(rows))?.ints()?;
+    whole_column(values.len(), rows)?;
+    if let Some(odd) = values.iter().find(|value| !(0..=2).contains(*value)) {
+        return Err(Fault::new(odd.to_string(), "0 (a value), 1 (.) or 2 (?)"));
+    }
+    let nulls: Vec<bool> = values.iter().map(|&value| value != 0).collect();
+    Ok(nulls.contains(&true).then_some(nulls))
+}
+
+impl<'a> Strings<'a> {
+    fn read(&self, data: &'a [u8], bounds: Bounds) -> Result<Texts<'a>, Box<Fault>> {
+        let chain = |at, what| Chain::read(at).map_err(|f: Box<Fault>| f.within(what));
+        let offset_chain = chain(self.offset_chain, "offsetEncoding")?;
+        let offsets = offset_chain.decode(self.offsets, room(bounds.texts)).and_then(Values::ints);
+        let offsets = offsets.and_then(|o| self.byte_offsets(o)).map_err(|f| f.within("offsets"))?;
+        let ids = chain(self.data_chain, "dataEncoding")?.decode(data, room(bounds.rows)).and_then(Values::ints);
+        let ids = ids.map_err(|f| f.within("data"))?;
+        whole_column(ids.len(), bounds.rows)?;
+        let n = offsets.len().saturating_sub(1);
+        if let Some(&odd) = ids.iter().find(|&&id| usize::try_from(id).map_or(id != -1, |id| id >= n)) {
+            return Err(Fault::new(format!("text {odd}"), format!("-1 (none) or one of the {n} that are there")));
+        }
+        Ok(Texts { joined: Cow::Borrowed(self.joined), offsets, ids })
+    }
+
+    /// Checks that the offsets rise, and makes them count bytes: the file's count UTF-16 code units, as those do who defined
+    /// the format.
+    fn byte_offsets(&self, offsets: Vec<i32>) -> Result<Vec<u32>, Box<Fault>> {
+        let text = if self.joined.is_ascii() { None } else { std::str::from_utf8(self.joined).ok() };
+        let mut characters = text.map(str::chars);
+        let (mut units, mut bytes) = (0_usize, 0_usize);
+        let mut byte_offset = |offset: i32| {
+            let offset = usize::try_from(offset).ok()?;
+            let Some(characters) = &mut characters else {
+                bytes = offset;
+                return (offset <= self.joined.len()).then_some(offset);
+            };
+            while units < offset {
+                let next = characters.next()?;
+                units += next.len_utf16();
+                bytes += next.len_utf8();
+            }
+            (units == offset).then_some(bytes)
+        };
+        let mut last = 0;
+        let mut out = Vec::with_capacity(offsets.len());
+        for offset in offsets {
+            let at = byte_offset(offset).filter(|_| offset >= last).and_then(|at| u32::try_from(at).ok());
+            let Some(at) = at else {
+                let expected = format!("one from {last} to the end of {} bytes", self.joined.len());
+                return Err(Fault::new(format!("offset {offset}"), expected));
+            };
+            out.push(at);
+            last = offset;
+        }
+        Ok(out)
+    }
+}
+
+/// Whole numbers as texts, one for each run of equal ones.
+fn written_out(values: &[i32]) -> Texts<'static> {
+    let (mut joined, mut offsets, mut ids) = (Vec::new(), vec![0], Vec::with_capacity(values.len()));
+    let mut id = -1;
+    for (i, value) in values.iter().enumerate() {
+        if i == 0 || values[i - 1] != *value {
+            joined.extend_from_slice(itoa::Buffer::new().format(*value).as_bytes());
+            offsets.push(u32::try_from(joined.len()).unwrap_or(u32::MAX));
+            id += 1;
+        }
+        ids.push(id);
+    }
+    Texts { joined: Cow::Owned(joined), offsets, ids }
+}

@@ -1,0 +1,218 @@
+//! BinaryCIF: the data model of mmCIF in MessagePack, a column at a time and encoded. Read is what [`super::mmcif`] reads of
+//! a text, and it means the same ([`super::atom_site`]).
+//!
+//! Specification: <https://github.com/molstar/BinaryCIF>, version 0.3.
+//!
+//! A file is decoded where it lies, and of it only the columns that are needed. Nothing is believed about lengths: what the
+//! file says has to agree with its bytes, with the rows of the category and with the limits before memory is asked for.
+
+mod column;
+mod decode;
+mod encoding;
+mod fault;
+mod msgpack;
+mod rows;
+
+use std::collections::HashMap;
+
+use self::column::{Bounds, Cells, Raw};
+use self::fault::Fault;
+use self::msgpack::Cursor;
+use super::atom_site::{Layout, Passed};
+use super::atoms::{Columns, SourceFormat, Structure, Tables};
+use super::error::StructureError;
+use super::pdb::MAX_TITLE;
+use super::read::ReadLimits;
+use super::text::{decode, tidy};
+
+/// Most columns of a category; the dictionary has about a hundred for `atom_site`.
+const MAX_COLUMNS: usize = 1000;
+
+pub(super) fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
+    let mut passed = Passed::default();
+    let (mut found, mut last, mut any) = (None, None, false);
+    let mut file = Cursor::new(bytes);
+    let frame = file.map(|key, value| {
+        if key != b"dataBlocks" {
+            return Ok(());
+        }
+        any = true;
+        value.array(|_, at| {
+            // What follows the atoms only has to be there.
+            if found.is_none() {
+                passed.block();
+                let block = Block::read(at, &mut passed)?;
+                found = block.structure(limits, &mut passed).transpose();
+                last = block.name;
+            }
+            Ok(())
+        })
+    });
+    frame.map_err(|fault| fault.within("BinaryCIF"))?;
+    match found {
+        Some(structure) => structure,
+        None if any => Err(passed.no_atoms("BinaryCIF", last)),
+        None => Err(Fault::new("nothing", "`dataBlocks`").within("BinaryCIF").into()),
+    }
+}
+
+/// A table of a block.
+#[derive(Debug)]
+struct Category<'a> {
+    /// Without the underscore.
+    name: &'a [u8],
+    rows: u64,
+    columns: Cursor<'a>,
+}
+
+impl<'a> Category<'a> {
+    fn read(at: &mut Cursor<'a>) -> Result<Self, Box<Fault>> {
+        let (mut name, mut rows, mut columns) = (None, None, None);
+        at.map(|key, value| {
+            match key {
+                b"name" => name = Some(value.text()?),
+                b"rowCount" => rows = Some(*value),
+                b"columns" => columns = Some(*value),
+                _ => {}
+            }
+            Ok(())
+        })?;
+        let name = name.ok_or_else(|| Fault::new("a category without a name", "`name`"))?;
+        let name = name.strip_prefix(b"_").unwrap_or(name);
+        let missing = |what: &str| Fault::new("nothing", what).within(decode(name));
+        let mut rows = rows.ok_or_else(|| missing("`rowCount`"))?;
+        let rows = rows.whole("a number of rows").map_err(|f| f.within("rowCount").within(decode(name)))?;
+        Ok(Self { name, rows, columns: columns.ok_or_else(|| missing("`columns`"))? })
+    }
+
+    fn place(&self) -> String {
+        format!("BinaryCIF, {}", decode(self.name))
+    }
+
+    fn columns(&self) -> Result<Vec<Raw<'a>>, Box<Fault>> {
+        let mut columns = Vec::new();
+        let mut at = self.columns;
+        at.array(|_, column| {
+            if columns.len() >= MAX_COLUMNS {
+                return Err(Fault::new("more columns", format!("at most {MAX_COLUMNS}")));
+            }
+            columns.push(Raw::read(column)?);
+            Ok(())
+        })?;
+        Ok(columns)
+    }
+
+    /// The first value of an item, tidy and of at most `max` characters.
+    fn value(&self, item: &[u8], max: usize, limits: &ReadLimits) -> Result<Option<String>, Box<Fault>> {
+        let columns = self.columns()?;
+        let Some(raw) = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item)) else { return Ok(None) };
+        let bounds = self.bounds(limits).ok_or_else(|| {
+            Fault::new(format!("{} rows", self.rows), format!("at most {}", limits.max_rows())).within("rowCount")
+        })?;
+        if bounds.rows == 0 {
+            return Ok(None);
+        }
+        let column = raw.load(bounds, true)?;
+        let Cells::Text(texts) = &column.cells else { return Ok(None) };
+        let range = texts.range(0).filter(|_| !column.is_null(0));
+        Ok(range.and_then(|(start, end)| tidy(&texts.joined[start..end], max)))
+    }
+
+    /// What may be decoded; `None` if there are more rows than atoms are allowed.
+    fn bounds(&self, limits: &ReadLimits) -> Option<Bounds> {
+        let rows = usize::try_from(self.rows).ok().filter(|&n| n <= limits.max_rows())?;
+        // Texts that no row refers to are allowed, but no more than there might be rows.
+        Some(Bounds { rows, texts: limits.max_rows() })
+    }
+}
+
+/// A data block: the categories that are read.
+#[derive(Debug, Default)]
+struct Block<'a> {
+    name: Option<String>,
+    atom_site: Option<Category<'a>>,
+    entry: Option<Category<'a>>,
+    title: Option<Category<'a>>,
+}
+
+impl<'a> Block<'a> {
+    fn read(at: &mut Cursor<'a>, passed: &mut Passed) -> Result<Self, Box<Fault>> {
+        let mut block = Self::default();
+        let mut any = false;
+        at.map(|key, value| {
+            match key {
+                b"header" => block.name = tidy(value.text().map_err(|f| f.within("header"))?, 80),
+                b"categories" => {
+                    any = true;
+                    value.array(|_, at| {
+                        block.keep(Category::read(at)?, passed);
+                        Ok(())
+                    })?;
+                }
+                _ => {}
+            }
+            Ok(())
+        })?;
+        if any { Ok(block) } else { Err(Fault::new("nothing", "`categories`")) }
+    }
+
+    /// Keeps a category that is read.
+    fn keep(&mut self, category: Category<'a>, passed: &mut Passed) {
+        if !passed.is_full() {
+            passed.category(decode(category.name));
+        }
+        let is = |name: &[u8]| category.name.eq_ignore_ascii_case(name);
+        let place = match () {
+            () if is(b"atom_site") => &mut self.atom_site,
+            () if is(b"entry") => &mut self.entry,
+            () if is(b"struct") => &mut self.title,
+            () => return,
+        };
+        if place.is_none() {
+            *place = Some(category);
+        }
+    }
+
+    /// The structure, if the block has atoms with coordinates.
+    fn structure(&self, limits: &ReadLimits, passed: &mut Passed) -> Result<Option<Structure>, StructureError> {
+        let Some((columns, tables)) = self.atoms(limits, passed)? else { return Ok(None) };
+        let value = |category: &Option<Category<'_>>, item, max| -> Result<Option<String>, StructureError> {
+            let Some(category) = category else { return Ok(None) };
+            Ok(category.value(item, max, limits).map_err(|f| f.within(category.place()))?)
+        };
+        let entry = value(&self.entry, b"id", 80)?;
+        let title = value(&self.title, b"title", MAX_TITLE)?;
+        let id = entry.or_else(|| self.name.clone());
+        Ok(Some(columns.finish(tables, SourceFormat::BinaryCif, id, title)))
+    }
+
+    /// The atoms, if the block has some with coordinates.
+    fn atoms(&self, limits: &ReadLimits, passed: &mut Passed) -> Result<Option<(Columns, Tables)>, StructureError> {
+        let Some(category) = self.atom_site.as_ref().filter(|category| category.rows > 0) else { return Ok(None) };
+        let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
+        let within = |fault: Box<Fault>| fault.within(category.place());
+        let raw = category.columns().map_err(within)?;
+        let layout = layout(&raw).map_err(within)?;
+        if let Some(missing) = layout.missing() {
+            passed.lacking(missing);
+            return Ok(None);
+        }
+        // What is decoded counts as inflated: runs may say in a few bytes what takes many.
+        if rows::decoded_bytes(&layout, bounds.rows) > limits.max_inflated_bytes {
+            return Err(StructureError::InflatedTooLarge { limit: limits.max_inflated_bytes });
+        }
+        Ok(Some(rows::read(&raw, layout, bounds).map_err(within)?))
+    }
+}
+
+/// Finds the items among the columns.
+fn layout(raw: &[Raw<'_>]) -> Result<Layout, Box<Fault>> {
+    let mut found: HashMap<Vec<u8>, usize> = HashMap::with_capacity(raw.len());
+    for (i, column) in raw.iter().enumerate() {
+        if found.insert(column.name.to_ascii_lowercase(), i).is_some() {
+            let found = format!("two columns {}", decode(column.name));
+            return Err(Fault::new(found, "every column once in its category"));
+        }
+    }
+    Ok(Layout::new(raw.len(), |item| found.get(item.to_ascii_lowercase().as_bytes()).copied()))
+}

@@ -1,0 +1,378 @@
+//! MessagePack, read where it lies: nothing is copied and no tree is built, so that memory does not depend on what the
+//! bytes claim. Skipping a value counts what is still to come instead of calling itself, so depth costs nothing.
+//!
+//! Specification: <https://github.com/msgpack/msgpack/blob/master/spec.md>.
+
+use super::super::text::quote;
+use super::fault::Fault;
+
+/// A value, or the head of a container.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Token<'a> {
+    Nil,
+    Bool(bool),
+    Integer(i64),
+    Real(f64),
+    /// Should be UTF-8, which is not looked at.
+    Text(&'a [u8]),
+    Bytes(&'a [u8]),
+    /// So many values follow.
+    Array(u32),
+    /// So many pairs of values follow.
+    Map(u32),
+    Extension,
+}
+
+impl Token<'_> {
+    /// What it is, for a message.
+    pub(super) fn words(&self) -> String {
+        match self {
+            Self::Nil => "nil".to_owned(),
+            Self::Bool(value) => value.to_string(),
+            Self::Integer(value) => value.to_string(),
+            Self::Real(value) => value.to_string(),
+            Self::Text(text) => format!("the text {}", quote(text)),
+            Self::Bytes(bytes) => format!("{} bytes", bytes.len()),
+            Self::Array(n) => format!("an array of {n}"),
+            Self::Map(n) => format!("a map of {n}"),
+            Self::Extension => "an extension".to_owned(),
+        }
+    }
+}
+
+/// A place in the file.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Cursor<'a> {
+    bytes: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Cursor<'a> {
+    pub(super) fn new(bytes: &'a [u8]) -> Self {
+        Self { bytes, at: 0 }
+    }
+
+    /// The next value or head; a container's values come next.
+    pub(super) fn next(&mut self) -> Result<Token<'a>, Box<Fault>> {
+        let start = self.at;
+        let [first] = self.take()?;
+        Ok(match first {
+            0x00..=0x7F => Token::Integer(first.into()),
+            0x80..=0x8F => self.container(Token::Map((first & 15).into()))?,
+            0x90..=0x9F => self.container(Token::Array((first & 15).into()))?,
+            0xA0..=0xBF => Token::Text(self.slice((first & 31).into())?),
+            0xC0 => Token::Nil,
+            0xC1 => {
+                let fault = Fault::new("c1, which no value begins with", "a MessagePack value");
+                return Err(fault.within(format_args!("byte {start}")));
+            }
+            0xC2 | 0xC3 => Token::Bool(first == 0xC3),
+            0xC4..=0xC6 => {
+                let n = self.length(first - 0xC4)?;
+                Token::Bytes(self.slice(n)?)
+            }
+            0xC7..=0xC9 => {
+                let n = self.length(first - 0xC7)?;
+                self.extension(n)?
+            }
+            0xCA => Token::Real(f32::from_be_bytes(self.take()?).into()),
+            0xCB => Token::Real(f64::from_be_bytes(self.take()?)),
+            0xCC..=0xCE => Token::Integer(self.length(first - 0xCC)?.into()),
+            0xCF => unsigned(u64::from_be_bytes(self.take()?)),
+            0xD0 => Token::Integer(i8::from_be_bytes(self.take()?).into()),
+            0xD1 => Token::Integer(i16::from_be_bytes(self.take()?).into()),
+            0xD2 => Token::Integer(i32::from_be_bytes(self.take()?).into()),
+            0xD3 => Token::Integer(i64::from_be_bytes(self.take()?)),
+            0xD4..=0xD8 => self.extension(1 << (first - 0xD4))?,
+            0xD9..=0xDB => {
+                let n = self.length(first - 0xD9)?;
+                Token::Text(self.slice(n)?)
+            }
+            0xDC | 0xDD => {
+                let n = self.length(first - 0xDC + 1)?;
+                self.container(Token::Array(n))?
+            }
+            0xDE | 0xDF => {
+                let n = self.length(first - 0xDE + 1)?;
+                self.container(Token::Map(n))?
+            }
+            0xE0..=0xFF => Token::Integer(first.cast_signed().into()),
+        })
+    }
+
+    /// Passes a value and all that is in it.
+    pub(super) fn skip(&mut self) -> Result<(), Box<Fault>> {
+        let mut pending = 1_u64;
+        while pending > 0 {
+            pending -= 1;
+            match self.next()? {
+                Token::Array(n) => pending += u64::from(n),
+                Token::Map(n) => pending += 2 * u64::from(n),
+                _ => {}
+            }
+        }
+        Ok(())
+    }
+
+    /// Calls `entry` with every key of a map and the place of its value, and passes the map. A value that `entry` does not
+    /// read is passed; one that it reads, it reads whole, so that a file is passed over once.
+    pub(super) fn map(
+        &mut self,
+        mut entry: impl FnMut(&'a [u8], &mut Self) -> Result<(), Box<Fault>>,
+    ) -> Result<(), Box<Fault>> {
+        let n = match self.next()? {
+            Token::Map(n) => n,
+            other => return Err(Fault::new(other.words(), "a map")),
+        };
+        for _ in 0..n {
+            let key = self.text()?;
+            let start = self.at;
+            entry(key, self)?;
+            if self.at == start {
+                self.skip()?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Calls `item` with the number, from 0, and the place of every value of an array, and passes the array; as [`Self::map`]
+    /// does.
+    pub(super) fn array(
+        &mut self,
+        mut item: impl FnMut(u32, &mut Self) -> Result<(), Box<Fault>>,
+    ) -> Result<(), Box<Fault>> {
+        let n = match self.next()? {
+            Token::Array(n) => n,
+            other => return Err(Fault::new(other.words(), "an array")),
+        };
+        for i in 0..n {
+            let start = self.at;
+            item(i, self)?;
+            if self.at == start {
+                self.skip()?;
+            }
+        }
+        Ok(())
+    }
+
+    pub(super) fn text(&mut self) -> Result<&'a [u8], Box<Fault>> {
+        match self.next()? {
+            Token::Text(text) => Ok(text),
+            other => Err(Fault::new(other.words(), "a text")),
+        }
+    }
+
+    pub(super) fn bytes(&mut self) -> Result<&'a [u8], Box<Fault>> {
+        match self.next()? {
+            Token::Bytes(bytes) => Ok(bytes),
+            other => Err(Fault::new(other.words(), "bytes")),
+        }
+    }
+
+    /// Yes or no. Languages without such values write 1 or 0.
+    pub(super) fn truth(&mut self) -> Result<bool, Box<Fault>> {
+        match self.next()? {
+            Token::Bool(value) => Ok(value),
+            Token::Integer(value @ (0 | 1)) => Ok(value == 1),
+            other => Err(Fault::new(other.words(), "true or false")),
+        }
+    }
+
+    /// A finite number.
+    pub(super) fn number(&mut self) -> Result<f64, Box<Fault>> {
+        match self.next()? {
+            #[expect(clippy::cast_precision_loss, reason = "factors and bounds are small or were rounded before")]
+            Token::Integer(value) => Ok(value as f64),
+            Token::Real(value) if value.is_finite() => Ok(value),
+            other => Err(Fault::new(other.words(), "a finite number")),
+        }
+    }
+
+    /// A whole number of the type `T`. Languages with one type of numbers may write it as a real one.
+    pub(super) fn whole<T: TryFrom<i64>>(&mut self, expected: &str) -> Result<T, Box<Fault>> {
+        let token = self.next()?;
+        let value = match token {
+            Token::Integer(value) => Some(value),
+            #[expect(clippy::cast_possible_truncation, reason = "whole and far below 2⁵³")]
+            Token::Real(value) if value.fract() == 0.0 && value.abs() < 1e15 => Some(value as i64),
+            _ => None,
+        };
+        value.and_then(|v| T::try_from(v).ok()).ok_or_else(|| Fault::new(token.words(), expected))
+    }
+
+    fn take<const N: usize>(&mut self) -> Result<[u8; N], Box<Fault>> {
+        let found = self.bytes.get(self.at..).and_then(|rest| rest.first_chunk::<N>());
+        let Some(found) = found else { return Err(self.end(N)) };
+        self.at += N;
+        Ok(*found)
+    }
+
+    /// A big-endian number of 1, 2 or 4 bytes: two to the power `log`.
+    fn length(&mut self, log: u8) -> Result<u32, Box<Fault>> {
+        Ok(match log {
+            0 => u8::from_be_bytes(self.take()?).into(),
+            1 => u16::from_be_bytes(self.take()?).into(),
+            _ => u32::from_be_bytes(self.take()?),
+        })
+    }
+
+    fn slice(&mut self, len: u32) -> Result<&'a [u8], Box<Fault>> {
+        let len = len as usize;
+        let found = self.bytes.get(self.at..).and_then(|rest| rest.get(..len));
+        let Some(found) = found else { return Err(self.end(len)) };
+        self.at += len;
+        Ok(found)
+    }
+
+    fn extension(&mut self, len: u32) -> Result<Token<'a>, Box<Fault>> {
+        let [_kind] = self.take()?;
+        self.slice(len)?;
+        Ok(Token::Extension)
+    }
+
+    /// Refuses heads that announce more values than there are bytes.
+    fn container(&mut self, head: Token<'a>) -> Result<Token<'a>, Box<Fault>> {
+        let least = match head {
+            Token::Array(n) => n as usize,
+            Token::Map(n) => 2 * n as usize,
+            _ => 0,
+        };
+        if least > self.bytes.len() - self.at { Err(self.end(least)) } else { Ok(head) }
+    }
+
+    #[cold]
+    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
+    fn end(&self, wanted: usize) -> Box<Fault> {
+        let left = self.bytes.len() - self.at.min(self.bytes.len());
+        Fault::new(format!("the end of the file after {left} bytes"), format!("{wanted} bytes or more"))
+            .within(format_args!("byte {}", self.at))
+    }
+}
+
+/// What does not fit a signed number is no length and no id; it only has to be told from what does.
+fn unsigned(value: u64) -> Token<'static> {
+    #[expect(clippy::cast_precision_loss, reason = "only said in messages")]
+    i64::try_from(value).map_or(Token::Real(value as f64), Token::Integer)
+}
+
+#[cfg(test)]
+#[allow(clippy::pedantic, clippy::unwrap_used, reason = "tests fail by panicking")]
+mod tests {
+    use super::*;
+
+    fn token(bytes: &[u8]) -> Token<'_> {
+        let mut cursor = Cursor::new(bytes);
+        let token = cursor.next().unwrap();
+        assert_eq!(cursor.at, bytes.len(), "{bytes:x?}");
+        token
+    }
+
+    fn refusal(bytes: &[u8]) -> String {
+        let fault = Cursor::new(bytes).skip().unwrap_err();
+        super::super::super::error::StructureError::from(fault).to_string()
+    }
+
+    /// By the table of the specification, every first byte.
+    #[test]
+    fn every_form_of_every_value() {
+        let cases: [(&[u8], Token<'_>); 29] = [
+            (b"\xc0", Token::Nil),
+            (b"\xc2", Token::Bool(false)),
+            (b"\xc3", Token::Bool(true)),
+            (b"\x7f", Token::Integer(127)),
+            (b"\xe0", Token::Integer(-32)),
+            (b"\xff", Token::Integer(-1)),
+            (b"\xcc\xff", Token::Integer(255)),
+            (b"\xcd\x01\x00", Token::Integer(256)),
+            (b"\xce\xff\xff\xff\xff", Token::Integer(4_294_967_295)),
+            (b"\xcf\0\0\0\x01\0\0\0\0", Token::Integer(1 << 32)),
+            (b"\xcf\x80\0\0\0\0\0\0\0", Token::Real(9_223_372_036_854_775_808.0)),
+            (b"\xd0\x80", Token::Integer(-128)),
+            (b"\xd1\x80\0", Token::Integer(-32768)),
+            (b"\xd2\x80\0\0\0", Token::Integer(-2_147_483_648)),
+            (b"\xd3\xff\xff\xff\xff\xff\xff\xff\xfe", Token::Integer(-2)),
+            (b"\xca\x3f\xc0\0\0", Token::Real(1.5)),
+            (b"\xcb\xc0\x04\0\0\0\0\0\0", Token::Real(-2.5)),
+            (b"\xa2ab", Token::Text(b"ab")),
+            (b"\xd9\x01a", Token::Text(b"a")),
+            (b"\xda\0\x01a", Token::Text(b"a")),
+            (b"\xdb\0\0\0\x01a", Token::Text(b"a")),
+            (b"\xc4\x02\0\x01", Token::Bytes(&[0, 1])),
+            (b"\xc5\0\x01\x07", Token::Bytes(&[7])),
+            (b"\xc6\0\0\0\x01\x07", Token::Bytes(&[7])),
+            (b"\x90", Token::Array(0)),
+            (b"\x80", Token::Map(0)),
+            (b"\xd5\x01ab", Token::Extension),
+            (b"\xc7\x03\x01abc", Token::Extension),
+            (b"\xc8\0\x01\x01a", Token::Extension),
+        ];
+        for (bytes, expected) in cases {
+            assert_eq!(token(bytes), expected, "{bytes:x?}");
+            // Cut anywhere, it is no value.
+            for cut in 0..bytes.len() {
+                assert!(refusal(&bytes[..cut]).contains("the end of the file"), "{bytes:x?} cut at {cut}");
+            }
+        }
+        assert!(refusal(b"\xc1").starts_with("byte 0: found c1"));
+    }
+
+    #[test]
+    fn lengths_that_lie_are_refused_before_anything_is_made_of_them() {
+        for lie in
+            [&b"\xdf\xff\xff\xff\xff"[..], b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdb\xff\xff\xff\xff"]
+        {
+            assert!(refusal(lie).starts_with("byte 5: found the end of the file after 0 bytes"), "{}", refusal(lie));
+        }
+        assert_eq!(
+            refusal(b"\xde\x00\x02\xc0"),
+            "byte 3: found the end of the file after 1 bytes, expected 4 bytes or more"
+        );
+    }
+
+    #[test]
+    fn depth_costs_nothing() {
+        let deep = [&[0x91; 2_000_000][..], &[0xc0]].concat();
+        let mut cursor = Cursor::new(&deep);
+        cursor.skip().unwrap();
+        assert_eq!(cursor.at, deep.len());
+        assert!(refusal(&deep[..deep.len() - 1]).starts_with("byte 2000000"));
+    }
+
+    #[test]
+    fn maps_and_arrays_give_places() {
+        let bytes = b"\x82\xa1a\x93\x01\x02\x03\xa1b\x81\xa1c\xc0";
+        let mut seen = Vec::new();
+        let mut cursor = Cursor::new(bytes);
+        cursor
+            .map(|key, value| {
+                if key == b"a" {
+                    value.array(|i, item| {
+                        seen.push((i, item.whole::<u32>("a number")?));
+                        Ok(())
+                    })?;
+                }
+                Ok(())
+            })
+            .unwrap();
+        assert_eq!((seen, cursor.at), (vec![(0, 1), (1, 2), (2, 3)], bytes.len()));
+        let not_text = Cursor::new(b"\x81\x01\x02").map(|_, _| Ok(())).unwrap_err();
+        assert_eq!(not_text, Fault::new("1", "a text"));
+    }
+
+    #[test]
+    fn whole_numbers_may_be_written_as_real_ones() {
+        assert_eq!(Cursor::new(b"\xcb\x40\x08\0\0\0\0\0\0").whole::<u32>("a count").unwrap(), 3);
+        for bad in [
+            &b"\xcb\x40\x04\0\0\0\0\0\0"[..],
+            b"\xff",
+            b"\xcb\x7f\xf8\0\0\0\0\0\0",
+            b"\xa11",
+            b"\xcb\x7f\xf0\0\0\0\0\0\0",
+        ] {
+            Cursor::new(bad).whole::<u32>("a count").unwrap_err();
+        }
+        for bad in [&b"\xcb\x7f\xf8\0\0\0\0\0\0"[..], b"\xcb\x7f\xf0\0\0\0\0\0\0", b"\xc0"] {
+            Cursor::new(bad).number().unwrap_err();
+        }
+    }
+}

@@ -1,0 +1,154 @@
+//! Rows of decoded columns to atoms, by several threads where there are many.
+
+use rayon::prelude::*;
+
+use super::super::atom_site::{self, AtomSite, Layout, Span, Wrong};
+use super::super::atoms::{Columns, Tables};
+use super::super::text::{decode, quote};
+use super::column::{Bounds, Cells, Column, Raw};
+use super::fault::Fault;
+
+/// Rows that one thread turns into atoms at a time.
+const CHUNK: usize = 64 << 10;
+
+/// The columns of `atom_site`, in the file's order; only those that are needed are decoded.
+struct Table<'a> {
+    raw: &'a [Raw<'a>],
+    columns: Vec<Option<Column<'a>>>,
+}
+
+/// A row of the table.
+struct Row<'t> {
+    table: &'t Table<'t>,
+    index: usize,
+}
+
+impl Row<'_> {
+    /// A column's cells, unless nothing stands there in this row.
+    #[inline]
+    fn cells(&self, column: usize) -> Option<&Cells<'_>> {
+        let column = self.table.columns.get(column)?.as_ref()?;
+        (!column.is_null(self.index)).then_some(&column.cells)
+    }
+}
+
+impl atom_site::Row for Row<'_> {
+    type Fault = Box<Fault>;
+
+    #[inline]
+    fn text(&self, column: usize) -> Option<Span<'_>> {
+        let Some(Cells::Text(texts)) = self.cells(column) else { return None };
+        let (start, end) = texts.range(self.index)?;
+        Some(Span { text: &texts.joined, start, end })
+    }
+
+    #[inline]
+    fn real(&self, column: usize) -> Result<Option<f64>, Wrong> {
+        match self.cells(column) {
+            None => Ok(None),
+            Some(Cells::Int(values)) => Ok(Some(values[self.index].into())),
+            Some(Cells::Real(values)) => Some(values[self.index]).filter(|v| v.is_finite()).map(Some).ok_or(Wrong),
+            Some(Cells::Text(_)) => self.text(column).map(Span::real).transpose(),
+        }
+    }
+
+    #[inline]
+    fn integer(&self, column: usize) -> Result<Option<i32>, Wrong> {
+        match self.cells(column) {
+            None => Ok(None),
+            Some(Cells::Int(values)) => Ok(Some(values[self.index])),
+            Some(Cells::Real(values)) => whole(values[self.index]).map(Some),
+            Some(Cells::Text(_)) => self.text(column).map(Span::integer).transpose(),
+        }
+    }
+
+    #[cold]
+    fn fault(&self, column: usize, expected: String) -> Box<Fault> {
+        let found = match self.cells(column) {
+            None => "nothing".to_owned(),
+            Some(Cells::Int(values)) => values[self.index].to_string(),
+            Some(Cells::Real(values)) => values[self.index].to_string(),
+            Some(Cells::Text(texts)) => texts
+                .range(self.index)
+                .map_or_else(|| "nothing".to_owned(), |(start, end)| quote(&texts.joined[start..end])),
+        };
+        let name = self.table.raw.get(column).map_or_else(Default::default, |raw| decode(raw.name));
+        Fault::new(found, expected).within(format_args!("{name}, row {}", self.index + 1))
+    }
+}
+
+/// A real number that is a whole one.
+#[cold]
+fn whole(value: f64) -> Result<i32, Wrong> {
+    let fits = value.fract() == 0.0 && value.abs() <= f64::from(i32::MAX);
+    #[expect(clippy::cast_possible_truncation, reason = "it is whole and fits")]
+    if fits { Ok(value as i32) } else { Err(Wrong) }
+}
+
+/// Bytes of memory that the columns of the layout may take once they are decoded.
+pub(super) fn decoded_bytes(layout: &Layout, rows: usize) -> u64 {
+    let columns = |pairs: &[[usize; 2]]| pairs.iter().flatten().filter(|c| **c != atom_site::NONE).count();
+    let row = columns(&layout.texts()) * size_of::<i32>() + columns(&layout.numbers()) * size_of::<f64>();
+    row as u64 * rows as u64
+}
+
+/// Decodes the columns that the layout needs, and makes atoms of their rows.
+pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<(Columns, Tables), Box<Fault>> {
+    let table = Table { raw, columns: load(raw, &layout, bounds)? };
+    let mut columns = Columns::zeroed(bounds.rows);
+    let mut rest = columns.slices();
+    let mut parts = Vec::with_capacity(bounds.rows / CHUNK + 1);
+    for first in (0..bounds.rows).step_by(CHUNK) {
+        let n = CHUNK.min(bounds.rows - first);
+        let (slices, others) = rest.split(n);
+        parts.push((first..first + n, slices, AtomSite::new(layout)));
+        rest = others;
+    }
+    let done: Vec<Result<(), Box<Fault>>> = parts
+        .par_iter_mut()
+        .map(|(rows, slices, site)| {
+            for index in rows.clone() {
+                slices.put(&site.atom(&Row { table: &table, index })?);
+            }
+            Ok(())
+        })
+        .collect();
+    // The first fault of the file, whichever thread was first.
+    done.into_iter().collect::<Result<(), _>>()?;
+    let mut tables = Tables::default();
+    for (_, mut slices, site) in parts {
+        slices.adopt(&site.tables, &mut tables);
+    }
+    Ok((columns, tables))
+}
+
+/// A column and the one that stands in for it, as far as they are needed.
+type Pair<'a> = [Option<Column<'a>>; 2];
+
+/// Decodes columns. The second of a pair is needed only where the first has rows without a value.
+fn load<'a>(raw: &[Raw<'a>], layout: &Layout, bounds: Bounds) -> Result<Vec<Option<Column<'a>>>, Box<Fault>> {
+    let texts = layout.texts().map(|pair| (pair, true));
+    let numbers = layout.numbers().map(|pair| (pair, false));
+    let wanted: Vec<_> = texts.into_iter().chain(numbers).collect();
+    let loaded: Vec<Result<Pair<'a>, Box<Fault>>> = wanted
+        .par_iter()
+        .map(|&([first, second], texts)| {
+            let load = |column: usize| raw.get(column).map(|raw| raw.load(bounds, texts)).transpose();
+            let (first, mut stand_in) = (load(first)?, None);
+            if first.as_ref().is_some_and(Column::has_nulls) {
+                stand_in = load(second)?;
+            }
+            Ok([first, stand_in])
+        })
+        .collect();
+    let mut columns: Vec<Option<Column<'a>>> = Vec::new();
+    columns.resize_with(raw.len(), || None);
+    for ((places, _), pair) in wanted.into_iter().zip(loaded) {
+        for (place, column) in places.into_iter().zip(pair?) {
+            if let (Some(slot), Some(column)) = (columns.get_mut(place), column) {
+                *slot = Some(column);
+            }
+        }
+    }
+    Ok(columns)
+}

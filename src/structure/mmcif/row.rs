@@ -1,0 +1,65 @@
+//! A row of `atom_site` as it stands in the text.
+
+use std::collections::HashMap;
+
+use super::super::atom_site::{self, Layout, NONE, Span};
+use super::super::cif::unquote;
+use super::super::text::Fault;
+
+/// Tags of the category begin with this.
+pub(super) const PREFIX: &[u8] = b"_atom_site.";
+
+/// Finds the items among the tags of a loop, given as offsets into `text`.
+pub(super) fn layout(text: &[u8], tags: &[(usize, usize)]) -> Result<Layout, Box<Fault>> {
+    let mut found: HashMap<Vec<u8>, usize> = HashMap::with_capacity(tags.len());
+    for (i, &(start, end)) in tags.iter().enumerate() {
+        let tag = text[start..end].to_ascii_lowercase();
+        if found.insert(tag, i).is_some() {
+            return Err(Fault::token(text, start, end, "every tag once in its category"));
+        }
+    }
+    Ok(Layout::new(tags.len(), |item| {
+        let tag = [PREFIX, item.to_ascii_lowercase().as_bytes()].concat();
+        found.get(&tag).copied()
+    }))
+}
+
+/// A row: where its values stand in the text. Most rows have no quotes, and are spared looking for them.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Row<'a, const QUOTES: bool> {
+    pub(super) text: &'a [u8],
+    /// Offsets count from here.
+    pub(super) base: usize,
+    /// Start and end of each value, with its quotes.
+    pub(super) offsets: &'a [u32],
+}
+
+impl<const QUOTES: bool> Row<'_, QUOTES> {
+    /// Start and end of a value as it stands.
+    #[inline]
+    fn raw(&self, column: usize) -> (usize, usize) {
+        (self.base + self.offsets[2 * column] as usize, self.base + self.offsets[2 * column + 1] as usize)
+    }
+}
+
+impl<const QUOTES: bool> atom_site::Row for Row<'_, QUOTES> {
+    type Fault = Box<Fault>;
+
+    /// A value without quotes; `?` and `.` say that there is none.
+    #[inline]
+    fn text(&self, column: usize) -> Option<Span<'_>> {
+        if column == NONE {
+            return None;
+        }
+        let (start, end) = self.raw(column);
+        let (start, end, quoted) = if QUOTES { unquote(self.text, start, end) } else { (start, end, false) };
+        let null = !quoted && end - start == 1 && matches!(self.text[start], b'?' | b'.');
+        (!null).then_some(Span { text: self.text, start, end })
+    }
+
+    #[cold]
+    fn fault(&self, column: usize, expected: String) -> Box<Fault> {
+        let (start, end) = self.raw(column);
+        Fault::token(self.text, start, end, expected)
+    }
+}
