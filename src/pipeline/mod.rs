@@ -165,7 +165,7 @@ pub fn pour(
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
     let packing = packing(job, &spheres);
-    sink.pack(packing);
+    sink.store(packing);
     let poured = clock.pass(|| choice.backend.pour(&spheres, &job.params, &limits.surface, &control, sink))?;
     let counts = Counts {
         grid: poured.grid,
