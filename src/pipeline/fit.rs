@@ -10,7 +10,7 @@ use super::{Choice, Job};
 use crate::surface::{Control, Meshed, Observer, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// Meshes that are made at most, the first coarse one and a last one again included.
-pub const MOST_TRIES: u32 = 8;
+pub(super) const MOST_TRIES: u32 = 8;
 /// Tries after which the coarsest spacing is taken if none has fitted.
 const PATIENCE: u32 = 4;
 /// A mesh with this part of the triangles that it may have is fine enough.
