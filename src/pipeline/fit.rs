@@ -42,15 +42,8 @@ pub(super) enum Next {
 pub(super) struct Search {
     limit: u64,
     first: f64,
-    /// The finest spacing that fitted, with its triangles.
-    fits: Option<(f64, u64)>,
-    /// The coarsest spacing that had too many, with its triangles.
-    exceeds: Option<(f64, u64)>,
-    /// The finest spacing at which there was no surface: atoms fell through the grid.
-    hollow: Option<f64>,
-    /// The fewest triangles of all, with their spacing.
-    fewest: Option<(f64, u64)>,
-    tries: u32,
+    /// What was tried: spacings with their triangles, none where there was no surface.
+    told: Vec<(f64, Option<u64>)>,
 }
 
 impl Search {
@@ -58,62 +51,73 @@ impl Search {
     pub(super) fn new(limit: u64, params: &SurfaceParams, atoms: usize) -> Self {
         let expected = Spacing::MaxTriangles(limit).expected(params, atoms as f64);
         let first = rounded((COARSER * expected).max(COARSE).min(COARSEST));
-        Self { limit, first, fits: None, exceeds: None, hollow: None, fewest: None, tries: 0 }
+        Self { limit, first, told: Vec::new() }
     }
 
     /// Meshes that were made.
     pub(super) fn tries(&self) -> u32 {
-        self.tries
+        u32::try_from(self.told.len()).unwrap_or(u32::MAX)
     }
 
     /// Whether some mesh fitted.
     pub(super) fn fitted(&self) -> bool {
-        self.fits.is_some()
+        self.fits().is_some()
     }
 
     /// A mesh at `spacing` had so many triangles; `None` if it had no surface.
     pub(super) fn tell(&mut self, spacing: f64, triangles: Option<u64>) {
-        self.tries += 1;
-        let Some(n) = triangles else {
-            self.hollow = Some(self.hollow.map_or(spacing, |h| h.min(spacing)));
-            return;
-        };
-        if self.fewest.is_none_or(|(_, fewest)| n < fewest) {
-            self.fewest = Some((spacing, n));
-        }
-        if n > self.limit {
-            if self.exceeds.is_none_or(|(h, _)| spacing > h) {
-                self.exceeds = Some((spacing, n));
-            }
-        } else if self.fits.is_none_or(|(h, _)| spacing < h) {
-            self.fits = Some((spacing, n));
-        }
+        self.told.push((spacing, triangles));
     }
 
     /// What to do next.
     pub(super) fn next(&self) -> Next {
         // The last mesh may have to be made again, which is a try as well.
-        let spent = self.tries + 1 >= MOST_TRIES;
-        match (self.fits, self.exceeds) {
-            (Some((h, n)), exceeds) => {
-                let enough = spent || h <= FINEST || n as f64 >= FULL * self.limit as f64;
-                let finer = if enough { h } else { self.finer((h, n), exceeds) };
-                if finer < h { Next::Try(finer) } else { Next::Take(h) }
-            }
-            (None, Some(exceeds)) => self.coarser(exceeds, spent),
+        let spent = self.tries() + 1 >= MOST_TRIES;
+        if let Some((h, n)) = self.fits() {
+            let enough = spent || h <= FINEST || n as f64 >= FULL * self.limit as f64;
+            return self.finer((h, n)).filter(|_| !enough).map_or(Next::Take(h), Next::Try);
+        }
+        let coarsest = self.counts().max_by(|a, b| a.0.total_cmp(&b.0));
+        let next = match (coarsest, self.finest_hollow(0.0)) {
+            (None, None) => Some(self.first),
+            (Some(exceeds), _) => self.coarser(exceeds),
             // Nothing but air so far: finer, to where there is something, or to the end.
-            (None, None) => match self.hollow {
-                None => Next::Try(self.first),
-                Some(h) if spent || h <= FINEST => Next::Refuse { resolution: h, triangles: 0 },
-                Some(h) => Next::Try(rounded((0.5 * h).max(FINEST))),
-            },
+            (None, Some(h)) => Some(rounded((0.5 * h).max(FINEST))),
+        };
+        match next.filter(|next| !spent && self.is_new(*next)) {
+            Some(next) => Next::Try(next),
+            None => {
+                let (resolution, triangles) = self.counts().min_by_key(|(_, n)| *n).unwrap_or((FINEST, 0));
+                Next::Refuse { resolution, triangles }
+            }
         }
     }
 
-    /// A spacing below `fits` that should fit as well; `fits` itself if there is none worth a try.
-    fn finer(&self, (h, n): (f64, u64), exceeds: Option<(f64, u64)>) -> f64 {
+    /// Spacings with their triangles.
+    fn counts(&self) -> impl Iterator<Item = (f64, u64)> {
+        self.told.iter().filter_map(|(h, n)| n.map(|n| (*h, n)))
+    }
+
+    /// The finest spacing that fitted, with its triangles.
+    fn fits(&self) -> Option<(f64, u64)> {
+        self.counts().filter(|(_, n)| *n <= self.limit).min_by(|a, b| a.0.total_cmp(&b.0))
+    }
+
+    /// The finest spacing above `floor` at which atoms fell through the grid.
+    fn finest_hollow(&self, floor: f64) -> Option<f64> {
+        let hollow = self.told.iter().filter(|(h, n)| n.is_none() && *h > floor);
+        hollow.map(|(h, _)| *h).min_by(f64::total_cmp)
+    }
+
+    fn is_new(&self, spacing: f64) -> bool {
+        self.told.iter().all(|(h, _)| h.total_cmp(&spacing).is_ne())
+    }
+
+    /// A spacing below one that fits that should fit as well, if there is one worth a try.
+    fn finer(&self, (h, n): (f64, u64)) -> Option<f64> {
         let aim = AIM * self.limit as f64;
-        let guess = match exceeds.filter(|(x, _)| *x < h) {
+        let below = self.counts().filter(|(x, _)| *x < h).max_by(|a, b| a.0.total_cmp(&b.0));
+        let guess = match below {
             None => h * (n as f64 / aim).sqrt(),
             // Between two counts the law's exponent is known.
             Some((x, m)) => {
@@ -122,26 +126,20 @@ impl Search {
             }
         };
         let guess = rounded(guess.max(FINEST));
-        let above = exceeds.filter(|(x, _)| *x < h).is_none_or(|(x, _)| guess > x);
-        if above { guess.min(h) } else { h }
+        (guess < h && below.is_none_or(|(x, _)| guess > x) && self.is_new(guess)).then_some(guess)
     }
 
     /// A spacing above one that had too many triangles, below any that had no surface.
-    fn coarser(&self, (x, m): (f64, u64), spent: bool) -> Next {
-        let (resolution, triangles) = self.fewest.unwrap_or((x, m));
-        let refuse = Next::Refuse { resolution, triangles };
-        let ceiling = self.hollow.filter(|h| *h > x);
-        if spent || x >= COARSEST {
-            return refuse;
-        }
-        let guess = rounded(x * (m as f64 / (AIM * self.limit as f64)).sqrt()).max(rounded(1.01 * x));
+    fn coarser(&self, (x, m): (f64, u64)) -> Option<f64> {
+        let ceiling = self.finest_hollow(x);
+        let law = rounded(x * (m as f64 / (AIM * self.limit as f64)).sqrt()).max(rounded(1.01 * x));
         let next = match ceiling {
-            Some(h) if guess >= h => rounded((x * h).sqrt()),
-            Some(_) => guess,
-            None if self.tries >= PATIENCE => COARSEST,
-            None => guess.min(COARSEST),
+            Some(h) if law >= h => rounded((x * h).sqrt()),
+            Some(_) => law,
+            None if self.tries() >= PATIENCE => COARSEST,
+            None => law.min(COARSEST),
         };
-        if next > x && ceiling.is_none_or(|h| next < h) { Next::Try(next) } else { refuse }
+        (next > x && ceiling.is_none_or(|h| next < h)).then_some(next)
     }
 }
 
