@@ -36,7 +36,7 @@ fn encode(format: Format, storage: Storage, mesh: &Mesh) -> Vec<u8> {
     let len = bytes.len() as u64;
     assert!(encoder.encoded_len().is_none_or(|planned| planned == len), "{format} {storage:?}");
     let bound = encoder.encoded_len_bound();
-    assert!(bound >= len && bound < len + len / 4 + 100, "{format} {storage:?}: {len} of {bound}");
+    assert!(bound >= len && bound < 2 * len + 200, "{format} {storage:?}: {len} of {bound}");
     bytes
 }
 
