@@ -228,7 +228,10 @@ fn trimesh_sees_scaled_surfaces_with_and_without_normals() {
     }
     let Some(reports) = tools::trimesh(&files.paths) else { return };
     for (report, (format, storage, mesh)) in reports.iter().zip(expected) {
-        report.assert_proper();
+        let quantized = storage.packing != Packing::Full;
+        // Normals of 8 bits are as long as 1 to 0.68 %.
+        let exact = report.max_normal_error.filter(|error| !quantized || *error > 0.0068);
+        tools::TrimeshReport { max_normal_error: exact, ..report.clone() }.assert_proper();
         assert_eq!(
             (report.vertices, report.faces),
             (mesh.n_vertices() as u64, mesh.n_triangles() as u64),
@@ -236,7 +239,6 @@ fn trimesh_sees_scaled_surfaces_with_and_without_normals() {
         );
         let scale = storage.units.scale();
         let (area, volume) = area_and_volume(&mesh);
-        let quantized = storage.packing != Packing::Full;
         let tolerance = if quantized { 1e-3 } else { 1e-4 };
         assert!((report.area / (area * scale * scale) - 1.0).abs() < tolerance, "{area}: {report:#?}");
         assert!((report.volume / (volume * scale.powi(3)) - 1.0).abs() < tolerance, "{volume}: {report:#?}");
