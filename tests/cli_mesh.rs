@@ -115,6 +115,66 @@ fn a_quantised_file_has_the_bytes_that_a_pipe_gets() {
     assert!(stderr(&told).contains("quantised in steps of 0.0009765625 Å"), "{}", stderr(&told));
 }
 
+/// Levels of detail, units and normals are known before the mesh is; a bound on triangles is not, and takes the other way.
+#[test]
+fn files_have_the_bytes_of_pipes_however_they_are_stored() {
+    let folder = Folder::new();
+    let sample = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
+    let mut seen = Vec::new();
+    for flags in [
+        &["--detail", "3"][..],
+        &["--detail", "4", "--normals", "none"],
+        &["--detail", "5", "--units", "nanometer", "--compress", "quantize"],
+        &["--units", "meter", "--normals", "none", "--compress", "quantize"],
+        &["--max-triangles", "9000"],
+    ] {
+        let output = folder.path("out.glb");
+        assert_code(&mesh(sample, &output, &[flags, &["--quiet"]].concat()), 0);
+        let piped = run(["mesh", sample.to_str().unwrap(), "-o", "-", "--quiet"].iter().chain(flags));
+        assert_code(&piped, 0);
+        let file = fs::read(&output).unwrap();
+        assert!(piped.stdout == file, "{flags:?}: {} and {} bytes", piped.stdout.len(), file.len());
+        assert!(!seen.contains(&file), "{flags:?} changes the file");
+        seen.push(file);
+    }
+}
+
+#[test]
+fn the_spacing_can_follow_from_a_level_or_from_a_bound() {
+    let folder = Folder::new();
+    let sample = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
+    let output = folder.path("out.ply");
+    let report = |flags: &[&str]| {
+        let done = mesh(sample, &output, &[flags, &["--report", "json"]].concat());
+        assert_code(&done, 0);
+        json(&stdout(&done))
+    };
+    let bounded = report(&["--max-triangles", "5000"]);
+    assert!(bounded["triangles"].as_u64().is_some_and(|n| (4500..=5000).contains(&n)), "{bounded}");
+    assert_eq!((&bounded["resolution_from"], &bounded["max_triangles"]), (&"max_triangles".into(), &5000.into()));
+    assert!(bounded["tries"].as_u64().is_some_and(|n| n >= 2), "{bounded}");
+    let level = report(&["--detail", "1"]);
+    assert_eq!((&level["resolution"], &level["detail"]), (&1.4.into(), &1.into()));
+    let told = stderr(&mesh(sample, &output, &["--detail", "1", "--units", "nanometer", "--normals", "none"]));
+    assert!(told.contains("1.4 Å (detail 1)") && told.contains("in nanometers, without normals"), "{told}");
+
+    fs::remove_file(&output).unwrap();
+    let refused = mesh(sample, &output, &["--max-triangles", "20"]);
+    assert_code(&refused, 5);
+    assert!(stderr(&refused).contains("hint: try --max-triangles "), "{}", stderr(&refused));
+    for flags in [
+        &["--detail", "1", "--resolution", "1"][..],
+        &["--detail", "1", "--max-triangles", "1000"],
+        &["--max-triangles", "1000", "--resolution", "1"],
+        &["--detail", "7"],
+        &["--units", "meter"],
+        &["--normals", "flat"],
+    ] {
+        assert_code(&mesh(sample, &output, flags), 2);
+    }
+    assert!(!output.exists(), "what is refused leaves no file");
+}
+
 /// More components than a report lists, and the longest title.
 fn long_report() -> String {
     let names = ["group_PDB", "id", "type_symbol", "label_atom_id", "label_comp_id", "label_asym_id", "label_seq_id"];

@@ -23,7 +23,7 @@ fn step(mesh: &Mesh) -> Step {
 }
 
 fn packed(format: Format, packing: Packing, mesh: &Mesh) -> Vec<u8> {
-    let (encoder, mut bytes) = (Encoder::packed(format, packing, mesh, &meta()).unwrap(), Vec::new());
+    let (encoder, mut bytes) = (Encoder::stored(format, packing, mesh, &meta()).unwrap(), Vec::new());
     encoder.write(&mut bytes).unwrap();
     assert_eq!(encoder.encoded_len(), Some(bytes.len() as u64));
     bytes
@@ -145,13 +145,13 @@ fn what_a_step_does_not_reach_and_other_formats_are_refused() {
     let mesh = icosphere(2, 10.0, [0.0; 3], false);
     let small = Packing::Quantized(Step::covering(9.0 / 2.0));
     for format in [Format::Glb, Format::Gltf] {
-        let refusal = Encoder::packed(format, small, &mesh, &meta()).unwrap_err();
+        let refusal = Encoder::stored(format, small, &mesh, &meta()).unwrap_err();
         assert!(matches!(refusal, FormatError::BeyondStep { .. }), "{refusal}");
     }
     for format in [Format::Ply, Format::Stl, Format::Obj] {
-        let refusal = Encoder::packed(format, Packing::Quantized(step(&mesh)), &mesh, &meta()).unwrap_err();
+        let refusal = Encoder::stored(format, Packing::Quantized(step(&mesh)), &mesh, &meta()).unwrap_err();
         assert_eq!(refusal, FormatError::NotQuantized { format: format.extension() });
-        assert!(Encoder::packed(format, Packing::Full, &mesh, &meta()).is_ok());
+        assert!(Encoder::stored(format, Packing::Full, &mesh, &meta()).is_ok());
     }
     let file = Anywhere::default();
     assert!(matches!(placed(&file, small, &mesh, 2), Err(PlaceError::Format(FormatError::BeyondStep { .. }))));
@@ -160,7 +160,7 @@ fn what_a_step_does_not_reach_and_other_formats_are_refused() {
 /// Writes a mesh out of order.
 fn placed(file: &Anywhere, packing: Packing, mesh: &Mesh, n_parts: usize) -> Result<u64, PlaceError> {
     let sink = GlbSink::new(file);
-    sink.pack(packing);
+    sink.store(packing);
     pour(&sink, mesh, n_parts);
     sink.finish(&meta(), mesh.centre, mesh.bounds())
 }

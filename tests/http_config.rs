@@ -150,6 +150,17 @@ fn the_table_and_the_core_agree_on_every_range() {
         }
     }
     assert_eq!(numbers, 6);
+    let mut integers = 0;
+    for parameter in TABLE {
+        let Domain::Integer { min, max } = parameter.domain else { continue };
+        integers += 1;
+        let give = |value: i64| parse([(parameter.name, value.to_string())]);
+        for (good, bad) in [(min, min - 1), (max, max + 1)] {
+            give(good).unwrap_or_else(|e| panic!("{e}"));
+            assert!(matches!(give(bad), Err(ParamError::BadValue { .. })), "{} {bad}", parameter.name);
+        }
+    }
+    assert_eq!(integers, 3);
     // The paper's ranges hang on the kernel: the table gives their hull.
     let hull = |name: &str| TABLE.iter().find(|p| p.name == name).unwrap().domain;
     for (kernel, a, b) in [("gaussian", [1e-3, 100.0], [1e-2, 1e6]), ("soft-object", [1e-2, 1e6], [0.1, 50.0])] {
@@ -176,6 +187,8 @@ fn canonical_texts_tell_jobs_apart_and_nothing_else() {
         &[("format", "stl")],
         &[("report", "json")],
         &[("compress", "none")],
+        &[("normals", "smooth")],
+        &[("units", "angstrom")],
         &[("isovalue", "1e0")],
     ] {
         assert_eq!(text(same), plain, "{same:?}");
@@ -193,6 +206,14 @@ fn canonical_texts_tell_jobs_apart_and_nothing_else() {
         &[("atom_ids", "true")],
         &[("proof", "exact")],
         &[("compress", "quantize")],
+        &[("normals", "none")],
+        &[("units", "nanometer")],
+        &[("units", "meter")],
+        // The same spacing for a small structure, and others for a large one.
+        &[("detail", "4")],
+        &[("detail", "3")],
+        &[("max_triangles", "40000")],
+        &[("max_triangles", "40001")],
         &[("paper_a", "1"), ("paper_b", "2")],
         &[("paper_a", "2"), ("paper_b", "1")],
         &[("kernel", "inverse-square")],

@@ -6,17 +6,21 @@ uniform mat3 turn;
 uniform vec4 frame; // centre, 1 / radius
 uniform vec2 view; // aspect, zoom
 out vec3 n;
+out highp vec3 q;
 void main() {
   vec3 p = turn * ((position - frame.xyz) * frame.w) * view.y;
   n = turn * normal;
+  q = p;
   gl_Position = vec4(p.x / max(view.x, 1.0), p.y * min(view.x, 1.0), -p.z * 0.1, 1.0);
 }`;
 const FRAGMENT = `#version 300 es
 precision mediump float;
 in vec3 n;
+in highp vec3 q;
+uniform bool flatly; // a mesh without normals: those of its triangles
 out vec4 color;
 void main() {
-  vec3 m = normalize(n);
+  vec3 m = flatly ? vec3(normalize(cross(dFdx(q), dFdy(q)))) : normalize(n);
   float light = max(dot(m, normalize(vec3(0.4, 0.6, 0.8))), 0.0);
   float rim = pow(1.0 - abs(m.z), 2.0);
   color = vec4(vec3(0.16, 0.62, 0.5) * (0.3 + 0.7 * light) + 0.15 * rim, 1.0);
@@ -25,7 +29,7 @@ void main() {
 const TYPES = { 5120: Int8Array, 5121: Uint8Array, 5122: Int16Array, 5123: Uint16Array, 5125: Uint32Array, 5126: Float32Array };
 
 /**
- * Positions, normals and indices of the first primitive of a GLB, without copying the buffer. Positions, `min` and `max` are in the
+ * Positions, normals (if there are any) and indices of the first primitive of a GLB, without copying the buffer. Positions, `min` and `max` are in the
  * mesh's own units, whatever the node makes of them; rows may be padded.
  */
 export function readGlb(buffer) {
@@ -45,7 +49,8 @@ export function readGlb(buffer) {
     return { data, type: accessor.componentType, normalized: accessor.normalized ?? false, stride };
   };
   const { min, max } = json.accessors[attributes.POSITION];
-  return { positions: array(attributes.POSITION), normals: array(attributes.NORMAL), indices: array(indices).data, min, max };
+  const normals = attributes.NORMAL === undefined ? null : array(attributes.NORMAL);
+  return { positions: array(attributes.POSITION), normals, indices: array(indices).data, min, max };
 }
 
 /** Draws a mesh into a canvas. */
@@ -88,7 +93,10 @@ export class Viewer {
       gl.bufferData(target, data, gl.STATIC_DRAW);
       return buffer;
     };
-    this.buffers = [["position", positions], ["normal", normals]].map(([name, { data, type, normalized, stride }]) => {
+    gl.uniform1i(gl.getUniformLocation(program, "flatly"), normals ? 0 : 1);
+    if (!normals) gl.disableVertexAttribArray(gl.getAttribLocation(program, "normal"));
+    const attributes = [["position", positions], ["normal", normals]].filter(([, rows]) => rows);
+    this.buffers = attributes.map(([name, { data, type, normalized, stride }]) => {
       const buffer = upload(gl.ARRAY_BUFFER, data);
       const location = gl.getAttribLocation(program, name);
       gl.enableVertexAttribArray(location);

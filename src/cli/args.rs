@@ -93,6 +93,12 @@ pub(crate) struct MeshArgs {
     /// [default: none]
     #[arg(long, value_name = "HOW")]
     pub(crate) compress: Option<String>,
+    /// Whether vertices have normals: smooth, or none (smaller files, flat shading) [default: smooth]
+    #[arg(long, value_name = "HOW")]
+    pub(crate) normals: Option<String>,
+    /// What 1 stands for in the mesh file: angstrom, nanometer, or meter (glb and gltf only) [default: angstrom]
+    #[arg(long, value_name = "UNITS")]
+    pub(crate) units: Option<String>,
     /// What runs the meshing
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: BackendName,
@@ -150,6 +156,12 @@ pub(crate) struct SurfaceArgs {
     /// Grid spacing in Å [default: 0.5]
     #[arg(long, value_name = "Å")]
     pub(crate) resolution: Option<String>,
+    /// Grid spacing by level instead, 0 (2 Å) to 6 (0.25 Å); structures of more than 10,000 atoms get coarser ones
+    #[arg(long, value_name = "LEVEL")]
+    pub(crate) detail: Option<String>,
+    /// Instead of a spacing: the finest one, down to 0.25 Å, whose mesh has at most N triangles
+    #[arg(long, value_name = "N")]
+    pub(crate) max_triangles: Option<String>,
     /// Level of the density that is the surface [default: 1, an isolated atom's radius]
     #[arg(long, value_name = "LEVEL")]
     pub(crate) isovalue: Option<String>,

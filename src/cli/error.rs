@@ -201,6 +201,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         SurfaceError::BadParameter { .. } | SurfaceError::NoSurface { .. } => code::USAGE,
         SurfaceError::GridTooLarge { .. }
         | SurfaceError::MeshTooLarge { .. }
+        | SurfaceError::TooManyTriangles { .. }
         | SurfaceError::DeviceMemory { .. }
         | SurfaceError::Deadline => code::LIMIT,
         SurfaceError::Device { .. } => code::BACKEND,
@@ -222,6 +223,7 @@ fn format_code(error: &FormatError) -> i32 {
         | FormatError::NotUnit { .. }
         | FormatError::BeyondStep { .. }
         | FormatError::NotQuantized { .. }
+        | FormatError::NotInUnits { .. }
         | FormatError::Json { .. } => code::INTERNAL,
     }
 }
@@ -234,6 +236,7 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::MeshTooLarge { suggested_resolution, .. } => {
             Some(format!("try --resolution {suggested_resolution}, or raise --max-mesh-bytes"))
         }
+        SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
         SurfaceError::DeviceMemory { suggested_resolution, .. } => {
             Some(format!("try --resolution {suggested_resolution}, or --backend cpu"))
         }

@@ -217,7 +217,7 @@ fn finding(finding: &Diagnostic) -> String {
 fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<Report, CliError> {
     sink.progress("encode", 0.0);
     let start = Instant::now();
-    let written = Encoder::packed(format, product.packing, &product.mesh, &product.meta())?.write(out);
+    let written = Encoder::stored(format, product.storage, &product.mesh, &product.meta())?.write(out);
     let encoding = start.elapsed().saturating_sub(out.writing);
     written.map_err(|source| out.failure(source))?;
     let mut report = product.report.clone();

@@ -41,9 +41,13 @@ fn pairs(args: &MeshArgs) -> Vec<(&'static str, String)> {
     let given = [
         ("format", &args.format),
         ("compress", &args.compress),
+        ("normals", &args.normals),
+        ("units", &args.units),
         ("kernel", &surface.kernel),
         ("preset", &surface.preset),
         ("resolution", &surface.resolution),
+        ("detail", &surface.detail),
+        ("max_triangles", &surface.max_triangles),
         ("isovalue", &surface.isovalue),
         ("smoothness", &surface.smoothness),
         ("radius_scale", &surface.radius_scale),
@@ -109,6 +113,9 @@ mod tests {
                 "atom_ids" | "check" => vec![flag.as_str()],
                 "proof" => vec![&flag, "exact"],
                 "compress" => vec![&flag, "quantize"],
+                "normals" => vec![&flag, "none"],
+                "units" => vec![&flag, "nanometer"],
+                "max_triangles" => vec![&flag, "5000"],
                 "kernel" => vec![&flag, "soft-object"],
                 "preset" => vec![&flag, "blinn"],
                 "select" => vec![&flag, "water"],
@@ -129,6 +136,12 @@ mod tests {
 
     #[test]
     fn a_bad_value_is_bad_usage() {
+        let both = request(&["--detail", "3", "--resolution", "0.5"]).unwrap_err();
+        let said = both.to_string();
+        assert!(both.code() == 2 && said.contains("`detail`") && said.contains("`resolution`"), "{said}");
+        for flags in [["--detail", "7"], ["--max-triangles", "7"], ["--normals", "flat"], ["--units", "inch"]] {
+            assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
+        }
         for flags in [["--resolution", "0"], ["--resolution", "nan"], ["--kernel", "x"], ["--chains", ",,"]] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
         }

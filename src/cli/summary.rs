@@ -31,6 +31,12 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     if let Some(quantization) = report.quantization {
         page.row("vertices", &format!("quantised in steps of {} Å", quantization.step));
     }
+    let units = (report.file_units != report.report_units).then(|| format!("in {}s", report.file_units));
+    let normals = (report.normals == "none").then(|| "without normals".to_owned());
+    let stored: Vec<String> = units.into_iter().chain(normals).collect();
+    if !stored.is_empty() {
+        page.row("stored", &stored.join(", "));
+    }
     page.row("proof", &proof(report, style));
     page.row("parts", &parts(report));
     page.row("area", &format!("{} Å²", decimal(report.area)));
@@ -55,7 +61,14 @@ fn title(report: &Report) -> String {
 fn surface(report: &Report) -> String {
     let smoothness = report.smoothness.map(|a| format!(", smoothness {a}")).unwrap_or_default();
     let preset = Some(report.preset).filter(|p| *p != "default").map(|p| format!(" (preset {p})")).unwrap_or_default();
-    format!("{}, {} Å, isovalue {}{smoothness}{preset}", report.kernel, report.resolution, report.isovalue)
+    let from = match (report.detail, report.max_triangles) {
+        (Some(level), _) => format!(" (detail {level})"),
+        (None, Some(most)) => {
+            format!(" (for {} triangles at most, {} tries)", grouped(most), report.tries.unwrap_or_default())
+        }
+        (None, None) => String::new(),
+    };
+    format!("{}, {} Å{from}, isovalue {}{smoothness}{preset}", report.kernel, report.resolution, report.isovalue)
 }
 
 fn proof(report: &Report, style: Style) -> String {
@@ -171,6 +184,10 @@ mod tests {
             kernel: "gaussian",
             preset: "default",
             resolution: 0.5,
+            resolution_from: "max_triangles",
+            detail: None,
+            max_triangles: Some(40_000),
+            tries: Some(2),
             isovalue: 1.0,
             smoothness: Some(1.25),
             bricks: 300,
@@ -189,6 +206,9 @@ mod tests {
             component_list: Vec::new(),
             area: 3200.04,
             volume: 7100.0,
+            report_units: "angstrom",
+            file_units: "nanometer",
+            normals: "none",
             quantization: Some(Quantization { step: 0.000_976_562_5 }),
             backend: "cpu",
             device: "2 threads".into(),
@@ -206,6 +226,8 @@ mod tests {
             "454 of 514",
             "300 bricks",
             "153,600 samples",
+            "0.5 Å (for 40,000 triangles at most, 2 tries)",
+            "in nanometers, without normals",
             "20,000 vertices",
             "steps of 0.0009765625 Å",
             "39,996 triangles",

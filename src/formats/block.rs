@@ -58,11 +58,23 @@ pub(super) fn convert_words<const N: usize, T: Copy>(
     })
 }
 
-/// A vertex in the structure file's coordinates, Å: added in double precision, then rounded once.
-#[inline]
-#[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what the file formats ask for")]
-pub(super) fn absolute(centre: [f64; 3], position: [f32; 3]) -> [f32; 3] {
-    std::array::from_fn(|k| (centre[k] + f64::from(position[k])) as f32)
+/// What turns a vertex into the structure file's coordinates.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    /// The mesh's centre, Å.
+    pub(super) centre: [f64; 3],
+    /// What Å are multiplied by.
+    pub(super) scale: f64,
+}
+
+impl Place {
+    /// A vertex in the structure file's coordinates and the file's units: added and scaled in double precision, then
+    /// rounded once.
+    #[inline]
+    #[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what the file formats ask for")]
+    pub(super) fn absolute(self, position: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| ((self.centre[k] + f64::from(position[k])) * self.scale) as f32)
+    }
 }
 
 /// Puts three floats into `bytes`.

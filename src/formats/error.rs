@@ -72,11 +72,11 @@ pub enum FormatError {
         limit: u32,
     },
     /// A coordinate with more digits before the point than OBJ lines have room for.
-    #[error("a coordinate of {value} Å cannot be written to OBJ, the limit is ±{limit} Å")]
+    #[error("a coordinate of {value} cannot be written to OBJ, the limit is ±{limit}")]
     CoordinateTooLarge {
-        /// The coordinate, Å.
+        /// The coordinate, in the file's units.
         value: f64,
-        /// The limit, Å.
+        /// The limit, in the file's units.
         limit: f64,
     },
     /// A position that no 16-bit multiple of the step is near.
@@ -92,6 +92,14 @@ pub enum FormatError {
     NotQuantized {
         /// The format's name.
         format: &'static str,
+    },
+    /// Only glTF and GLB hold coordinates that small.
+    #[error("{format} cannot hold coordinates in {units}, glb and gltf can")]
+    NotInUnits {
+        /// The format's name.
+        format: &'static str,
+        /// The units' name.
+        units: &'static str,
     },
     /// The JSON part of a glTF could not be made.
     #[error("the glTF document cannot be written as JSON: {reason}")]

@@ -5,8 +5,9 @@
 //! whole: columns that the format holds as they are go to the writer as they lie in memory, everything else
 //! passes through one block of [`block::BLOCK_BYTES`].
 //!
-//! One unit is one ångström in every format. glTF holds positions relative to [`Mesh::centre`] under a node
-//! translated by it; PLY, STL and OBJ have no nodes and hold the structure file's own coordinates.
+//! One unit is one ångström in every format, unless [`Units`] says otherwise. glTF holds positions relative to
+//! [`Mesh::centre`], in Å, under a node that moves and scales them; PLY, STL and OBJ have no nodes and hold the structure file's
+//! own coordinates, scaled.
 
 mod block;
 mod check;
@@ -17,6 +18,7 @@ mod obj;
 mod ply;
 pub mod quantize;
 mod stl;
+mod storage;
 mod text;
 
 use std::io::{self, Write};
@@ -26,6 +28,7 @@ pub use error::FormatError;
 pub use format::{Format, UnknownFormat};
 pub use gltf::{GlbSink, PlaceBytes, PlaceError};
 pub use quantize::{Compress, Packing, Step};
+pub use storage::{Normals, Storage, Units};
 
 use crate::surface::Mesh;
 
@@ -88,7 +91,7 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn new(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::lay_out(format, Packing::Full, mesh, meta, Depth::All)
+        Self::lay_out(format, Storage::default(), mesh, meta, Depth::All)
     }
 
     /// The same for a mesh that a backend returned, whose invariants hold: does not look at normals and indices
@@ -99,35 +102,43 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn trusting(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::packed(format, Packing::Full, mesh, meta)
+        Self::stored(format, Storage::default(), mesh, meta)
     }
 
-    /// As [`Self::trusting`], with the vertices packed.
+    /// As [`Self::trusting`], with the mesh stored as asked: a [`Storage`], or a [`Packing`] alone.
     ///
     /// # Errors
-    /// Any [`FormatError`]; [`FormatError::NotQuantized`] if `format` has no such packing,
-    /// [`FormatError::BeyondStep`] if the step is too small for the mesh.
-    pub fn packed(format: Format, packing: Packing, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::lay_out(format, packing, mesh, meta, Depth::Needed(format))
+    /// Any [`FormatError`]; [`FormatError::NotQuantized`] and [`FormatError::NotInUnits`] if `format` has no such
+    /// packing or units, [`FormatError::BeyondStep`] if the step is too small for the mesh.
+    pub fn stored(
+        format: Format,
+        storage: impl Into<Storage>,
+        mesh: &'a Mesh,
+        meta: &Meta,
+    ) -> Result<Self, FormatError> {
+        Self::lay_out(format, storage.into(), mesh, meta, Depth::Needed(format))
     }
 
     fn lay_out(
         format: Format,
-        packing: Packing,
+        storage: Storage,
         mesh: &'a Mesh,
         meta: &Meta,
         depth: Depth,
     ) -> Result<Self, FormatError> {
-        if packing != Packing::Full && !format.holds_quantized() {
+        if storage.packing != Packing::Full && !format.holds_quantized() {
             return Err(FormatError::NotQuantized { format: format.extension() });
+        }
+        if !format.holds_units(storage.units) {
+            return Err(FormatError::NotInUnits { format: format.extension(), units: storage.units.name() });
         }
         let summary = check::check(mesh, depth)?;
         let plan = match format {
-            Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, packing, &summary, meta)?),
-            Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, packing, &summary, meta)?),
-            Format::Ply => Plan::Ply(ply::PlyPlan::new(mesh, meta)),
-            Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, meta)?),
-            Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, &summary, meta)?),
+            Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, storage, &summary, meta)?),
+            Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, storage, &summary, meta)?),
+            Format::Ply => Plan::Ply(ply::PlyPlan::new(mesh, storage, meta)),
+            Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, storage.units, meta)?),
+            Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, storage, &summary, meta)?),
         };
         Ok(Self { mesh, plan })
     }

@@ -1,54 +1,89 @@
 //! Wavefront OBJ: text, one line per vertex, normal and triangle; indices count from 1.
 //!
-//! Coordinates have four decimals (1e-4 Å, a thousandth of a bond and a tenth of what structure files hold), so
-//! vertices closer than that may get the same coordinates; they stay different vertices, and the surface closed.
+//! Coordinates are rounded to 1e-4 Å (four decimals, in nanometres five: a thousandth of a bond and a tenth of what structure
+//! files hold), so vertices closer than that may get the same coordinates; they stay different vertices, and the surface closed.
 
 use std::io::{self, Write};
 
-use super::block::{BLOCK_BYTES, absolute};
+use super::block::{BLOCK_BYTES, Place};
 use super::check::Summary;
 use super::error::FormatError;
-use super::{Meta, text};
+use super::{Meta, Normals, Storage, Units, text};
 use crate::surface::Mesh;
 
-/// Decimals, and ten to their power.
-const DECIMALS: usize = 4;
-const SCALE: f64 = 1e4;
+/// Decimals of a normal's component.
+const NORMAL_DECIMALS: Decimals = Decimals::Four;
 
-/// Coordinates beyond this are refused: a metre would still fit.
+/// Coordinates beyond this are refused, in the file's units.
 const MAX_COORDINATE: f64 = 1e9;
 
 /// Room for the longest line: `f` and three times `4294967296//4294967296` are 71 bytes, `v` and three
-/// coordinates of 16 characters 53.
+/// coordinates of 17 characters 56.
 const LINE_BYTES: usize = 80;
+
+/// Decimals of a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Decimals {
+    Four,
+    Five,
+}
+
+impl Decimals {
+    /// Those of a coordinate: a tenth of what structure files hold, in any unit that a file can have.
+    const fn of(units: Units) -> Self {
+        match units {
+            Units::Angstrom => Self::Four,
+            Units::Nanometer | Units::Meter => Self::Five,
+        }
+    }
+
+    const fn count(self) -> usize {
+        match self {
+            Self::Four => 4,
+            Self::Five => 5,
+        }
+    }
+
+    /// Ten to their power.
+    const fn power(self) -> u32 {
+        match self {
+            Self::Four => 10_000,
+            Self::Five => 100_000,
+        }
+    }
+}
 
 /// An OBJ file that is laid out.
 #[derive(Debug)]
 pub(super) struct ObjPlan {
     header: String,
     len_bound: u64,
+    storage: Storage,
 }
 
 impl ObjPlan {
-    pub(super) fn new(mesh: &Mesh, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
+    pub(super) fn new(mesh: &Mesh, storage: Storage, summary: &Summary, meta: &Meta) -> Result<Self, FormatError> {
+        let (smooth, decimals) = (storage.normals == Normals::Smooth, Decimals::of(storage.units));
         let mut extreme = 0.0_f64;
         for row in summary.bounds {
             for (relative, centre) in row.into_iter().zip(mesh.centre) {
-                let value = centre + f64::from(relative);
+                let value = (centre + f64::from(relative)) * storage.units.scale();
                 if value.abs() > MAX_COORDINATE {
                     return Err(FormatError::CoordinateTooLarge { value, limit: MAX_COORDINATE });
                 }
                 extreme = extreme.max(value.abs());
             }
         }
-        let header = header(mesh, meta);
+        let header = header(mesh, storage.units, meta);
         let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
         // Rounding up can add a digit, hence the one.
-        let number = |largest: f64| format!("-{:.*}", DECIMALS, largest + 1.0).len() as u64;
-        let vertex = "v   \n".len() as u64 + 3 * number(extreme);
-        let normal = "vn   \n".len() as u64 + 3 * number(1.0);
-        let face = "f //  //  //\n".len() as u64 + 6 * n_vertices.to_string().len() as u64;
-        Ok(Self { len_bound: header.len() as u64 + (vertex + normal) * n_vertices + face * n_triangles, header })
+        let number = |largest: f64, decimals: Decimals| format!("-{:.*}", decimals.count(), largest + 1.0).len() as u64;
+        let vertex = "v   \n".len() as u64 + 3 * number(extreme, decimals);
+        let normal = if smooth { "vn   \n".len() as u64 + 3 * number(1.0, NORMAL_DECIMALS) } else { 0 };
+        let digits = n_vertices.to_string().len() as u64;
+        let face = if smooth { "f //  //  //\n".len() as u64 + 6 * digits } else { "f   \n".len() as u64 + 3 * digits };
+        let len_bound = header.len() as u64 + (vertex + normal) * n_vertices + face * n_triangles;
+        Ok(Self { header, len_bound, storage })
     }
 
     pub(super) fn len_bound(&self) -> u64 {
@@ -58,11 +93,19 @@ impl ObjPlan {
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(self.header.as_bytes())?;
         let mut lines = Lines::new(out, self.len_bound);
+        let Storage { normals, units, .. } = self.storage;
+        let (place, decimals) = (Place { centre: mesh.centre, scale: units.scale() }, Decimals::of(units));
         for &position in &mesh.positions[..] {
-            lines.push(|line| line.vector(b"v", absolute(mesh.centre, position)))?;
+            lines.push(|line| line.vector(b"v", place.absolute(position), decimals))?;
+        }
+        if normals == Normals::None {
+            for &triangle in &mesh.triangles[..] {
+                lines.push(|line| line.bare_face(triangle))?;
+            }
+            return lines.finish();
         }
         for &normal in &mesh.normals[..] {
-            lines.push(|line| line.vector(b"vn", normal))?;
+            lines.push(|line| line.vector(b"vn", normal, NORMAL_DECIMALS))?;
         }
         for &triangle in &mesh.triangles[..] {
             lines.push(|line| line.face(triangle))?;
@@ -71,8 +114,9 @@ impl ObjPlan {
     }
 }
 
-fn header(mesh: &Mesh, meta: &Meta) -> String {
-    let facts = text::facts(mesh, meta, Some("0.0001"));
+fn header(mesh: &Mesh, units: Units, meta: &Meta) -> String {
+    let precision = format!("{:.*}", Decimals::of(units).count(), 1.0 / f64::from(Decimals::of(units).power()));
+    let facts = text::facts(mesh, meta, units, Some(&precision));
     let mut header: String = facts.into_iter().flat_map(|fact| ["# ".to_owned(), fact, "\n".to_owned()]).collect();
     header += "o ";
     header += &text::word(meta);
@@ -127,11 +171,11 @@ impl Line<'_> {
         self.used += text.len();
     }
 
-    fn vector(&mut self, keyword: &[u8], row: [f32; 3]) {
+    fn vector(&mut self, keyword: &[u8], row: [f32; 3], decimals: Decimals) {
         self.put(keyword);
         for value in row {
             self.put(b" ");
-            self.fixed(value);
+            self.fixed(value, decimals);
         }
         self.put(b"\n");
     }
@@ -149,21 +193,36 @@ impl Line<'_> {
         self.put(b"\n");
     }
 
-    /// A number with [`DECIMALS`] decimals, halves away from zero, without a negative zero.
+    /// A triangle whose vertices have no normals.
+    fn bare_face(&mut self, triangle: [u32; 3]) {
+        self.put(b"f");
+        let mut digits = itoa::Buffer::new();
+        for index in triangle {
+            self.put(b" ");
+            self.put(digits.format(u64::from(index) + 1).as_bytes());
+        }
+        self.put(b"\n");
+    }
+
+    /// A number with so many decimals, halves away from zero, without a negative zero.
     #[expect(
         clippy::cast_possible_truncation,
-        reason = "at most 1e13 by MAX_COORDINATE; the fraction is cut on purpose"
+        reason = "at most 1e14 by MAX_COORDINATE; the fraction is cut on purpose"
     )]
-    fn fixed(&mut self, value: f32) {
-        let scaled = f64::from(value) * SCALE;
+    fn fixed(&mut self, value: f32, decimals: Decimals) {
+        let scaled = f64::from(value) * f64::from(decimals.power());
         let rounded = (scaled + 0.5_f64.copysign(scaled)) as i64;
         if rounded < 0 {
             self.put(b"-");
         }
-        let (whole, fraction) = (rounded.unsigned_abs() / 10_000, rounded.unsigned_abs() % 10_000);
+        let power = u64::from(decimals.power());
+        let (whole, fraction) = (rounded.unsigned_abs() / power, rounded.unsigned_abs() % power);
         self.put(itoa::Buffer::new().format(whole).as_bytes());
         let digit = |power: u64| b'0' + (fraction / power % 10) as u8;
-        self.put(&[b'.', digit(1000), digit(100), digit(10), digit(1)]);
+        match decimals {
+            Decimals::Four => self.put(&[b'.', digit(1000), digit(100), digit(10), digit(1)]),
+            Decimals::Five => self.put(&[b'.', digit(10_000), digit(1000), digit(100), digit(10), digit(1)]),
+        }
     }
 }
 
@@ -172,9 +231,13 @@ mod tests {
     use super::*;
 
     fn fixed(value: f32) -> String {
+        text(value, Decimals::Four)
+    }
+
+    fn text(value: f32, decimals: Decimals) -> String {
         let mut bytes = [0; LINE_BYTES];
         let mut line = Line { bytes: &mut bytes, used: 0 };
-        line.fixed(value);
+        line.fixed(value, decimals);
         let used = line.used;
         String::from_utf8(bytes[..used].to_vec()).unwrap()
     }
@@ -193,6 +256,10 @@ mod tests {
         ];
         for (value, text) in cases {
             assert_eq!(fixed(value), text, "{value}");
+        }
+        let five = [(0.000_026, "0.00003"), (-12.345_678, "-12.34568"), (-0.000_001, "0.00000"), (0.5, "0.50000")];
+        for (value, expected) in five {
+            assert_eq!(text(value, Decimals::Five), expected, "{value}");
         }
     }
 
@@ -216,15 +283,17 @@ mod tests {
         line.face([u32::MAX; 3]);
         assert_eq!(&line.bytes[..line.used], format!("f{}\n", " 4294967296//4294967296".repeat(3)).as_bytes());
         line.used = 0;
-        line.vector(b"vn", [-1e9; 3]);
-        assert_eq!(line.used, "vn".len() + 3 * " -1000000000.0000".len() + 1);
+        line.vector(b"vn", [-1e9; 3], Decimals::Five);
+        assert_eq!(line.used, "vn".len() + 3 * " -1000000000.00000".len() + 1);
     }
 
     #[test]
     fn coordinates_without_room_are_refused() {
         let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]].into(), ..Mesh::default() };
         let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: None, translucent: false };
-        let refusal = ObjPlan::new(&mesh, &summary, &Meta::default()).unwrap_err();
+        let plan = |storage: Storage| ObjPlan::new(&mesh, storage, &summary, &Meta::default());
+        let refusal = plan(Storage::default()).unwrap_err();
         assert_eq!(refusal, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });
+        assert!(plan(Storage { units: Units::Nanometer, ..Storage::default() }).is_ok());
     }
 }

@@ -2,8 +2,8 @@
 
 use std::io::{self, Write};
 
-use super::block::{absolute, put_floats, write_records};
-use super::{Meta, text};
+use super::block::{Place, put_floats, write_records};
+use super::{Meta, Normals, Storage, text};
 use crate::surface::Mesh;
 
 /// Bytes of a face: the count 3, then three indices.
@@ -14,15 +14,16 @@ const FACE_BYTES: usize = 13;
 pub(super) struct PlyPlan {
     header: String,
     len: u64,
+    storage: Storage,
 }
 
 impl PlyPlan {
-    pub(super) fn new(mesh: &Mesh, meta: &Meta) -> Self {
-        let header = header(mesh, meta);
+    pub(super) fn new(mesh: &Mesh, storage: Storage, meta: &Meta) -> Self {
+        let header = header(mesh, storage, meta);
         let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
-        let vertex = 24 + 4 * u64::from(mesh.colors.is_some()) + 4 * u64::from(mesh.atom_ids.is_some());
+        let vertex = vertex_bytes(mesh, storage.normals) as u64;
         let len = header.len() as u64 + vertex * n_vertices + FACE_BYTES as u64 * n_triangles;
-        Self { header, len }
+        Self { header, len, storage }
     }
 
     pub(super) fn len(&self) -> u64 {
@@ -31,16 +32,13 @@ impl PlyPlan {
 
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(self.header.as_bytes())?;
-        match (mesh.colors.as_deref(), mesh.atom_ids.as_deref()) {
-            (None, None) => vertices::<24>(mesh, out, |_, _| {}),
-            (Some(colors), None) => vertices::<28>(mesh, out, |i, record| record[24..].copy_from_slice(&colors[i])),
-            (None, Some(ids)) => {
-                vertices::<28>(mesh, out, |i, record| record[24..].copy_from_slice(&ids[i].to_le_bytes()))
-            }
-            (Some(colors), Some(ids)) => vertices::<32>(mesh, out, |i, record| {
-                record[24..28].copy_from_slice(&colors[i]);
-                record[28..].copy_from_slice(&ids[i].to_le_bytes());
-            }),
+        match vertex_bytes(mesh, self.storage.normals) {
+            12 => vertices::<12>(mesh, self.storage, out),
+            16 => vertices::<16>(mesh, self.storage, out),
+            20 => vertices::<20>(mesh, self.storage, out),
+            24 => vertices::<24>(mesh, self.storage, out),
+            28 => vertices::<28>(mesh, self.storage, out),
+            _ => vertices::<32>(mesh, self.storage, out),
         }?;
         let triangles = &mesh.triangles[..];
         write_records::<FACE_BYTES>(out, triangles.len(), |range, records| {
@@ -54,25 +52,47 @@ impl PlyPlan {
     }
 }
 
-/// Writes vertex records of position, normal and whatever `rest` adds.
-fn vertices<const N: usize>(mesh: &Mesh, out: &mut dyn Write, rest: impl Fn(usize, &mut [u8; N])) -> io::Result<()> {
-    let (centre, positions, normals) = (mesh.centre, &mesh.positions[..], &mesh.normals[..]);
+/// Bytes of a vertex record: a position, then whatever of normal, colour and atom there is.
+fn vertex_bytes(mesh: &Mesh, normals: Normals) -> usize {
+    let normal = if normals == Normals::Smooth { 12 } else { 0 };
+    12 + normal + 4 * usize::from(mesh.colors.is_some()) + 4 * usize::from(mesh.atom_ids.is_some())
+}
+
+/// Writes vertex records of `N` bytes.
+fn vertices<const N: usize>(mesh: &Mesh, storage: Storage, out: &mut dyn Write) -> io::Result<()> {
+    let place = Place { centre: mesh.centre, scale: storage.units.scale() };
+    let positions = &mesh.positions[..];
+    let normals = (storage.normals == Normals::Smooth).then_some(&mesh.normals[..]);
+    let (colors, ids) = (mesh.colors.as_deref(), mesh.atom_ids.as_deref());
     write_records::<N>(out, positions.len(), |range, records| {
-        let rows = positions[range.clone()].iter().zip(&normals[range.clone()]);
-        for ((record, (&position, &normal)), i) in records.iter_mut().zip(rows).zip(range) {
+        for (record, i) in records.iter_mut().zip(range) {
             let (floats, _) = record.as_chunks_mut::<12>();
-            put_floats(&mut floats[0], absolute(centre, position));
-            put_floats(&mut floats[1], normal);
-            rest(i, record);
+            put_floats(&mut floats[0], place.absolute(positions[i]));
+            let mut at = 12;
+            if let Some(normals) = normals {
+                put_floats(&mut floats[1], normals[i]);
+                at = 24;
+            }
+            if let Some(colors) = colors {
+                record[at..at + 4].copy_from_slice(&colors[i]);
+                at += 4;
+            }
+            if let Some(ids) = ids {
+                record[at..at + 4].copy_from_slice(&ids[i].to_le_bytes());
+            }
         }
     })
 }
 
-fn header(mesh: &Mesh, meta: &Meta) -> String {
+fn header(mesh: &Mesh, storage: Storage, meta: &Meta) -> String {
     let mut lines = vec!["ply".to_owned(), "format binary_little_endian 1.0".to_owned()];
-    lines.extend(text::facts(mesh, meta, None).into_iter().map(|fact| format!("comment {fact}")));
+    lines.extend(text::facts(mesh, meta, storage.units, None).into_iter().map(|fact| format!("comment {fact}")));
     lines.push(format!("element vertex {}", mesh.positions.len()));
-    lines.extend(["x", "y", "z", "nx", "ny", "nz"].map(|name| format!("property float {name}")));
+    let floats: &[&str] = match storage.normals {
+        Normals::Smooth => &["x", "y", "z", "nx", "ny", "nz"],
+        Normals::None => &["x", "y", "z"],
+    };
+    lines.extend(floats.iter().map(|name| format!("property float {name}")));
     if mesh.colors.is_some() {
         lines.extend(["red", "green", "blue", "alpha"].map(|name| format!("property uchar {name}")));
     }

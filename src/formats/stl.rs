@@ -3,9 +3,9 @@
 
 use std::io::{self, Write};
 
-use super::block::{absolute, put_floats, write_records};
+use super::block::{Place, put_floats, write_records};
 use super::error::FormatError;
-use super::{GENERATOR, Meta, text};
+use super::{GENERATOR, Meta, Units, text};
 use crate::surface::Mesh;
 
 const HEADER_BYTES: usize = 80;
@@ -18,10 +18,11 @@ pub(super) struct StlPlan {
     /// Header and count.
     head: [u8; HEADER_BYTES + 4],
     len: u64,
+    units: Units,
 }
 
 impl StlPlan {
-    pub(super) fn new(mesh: &Mesh, meta: &Meta) -> Result<Self, FormatError> {
+    pub(super) fn new(mesh: &Mesh, units: Units, meta: &Meta) -> Result<Self, FormatError> {
         let triangles = mesh.triangles.len();
         let count = u32::try_from(triangles).map_err(|_overflow| FormatError::TooMany {
             format: "STL",
@@ -31,11 +32,11 @@ impl StlPlan {
         })?;
         let mut head = [b' '; HEADER_BYTES + 4];
         // A header that begins with "solid" says text STL; one with "COLOR=" says colours to some programs.
-        let words = format!("{GENERATOR} units=angstrom {}", text::word(meta).replace('=', "_"));
+        let words = format!("{GENERATOR} units={} {}", units.name(), text::word(meta).replace('=', "_"));
         let words = &words.as_bytes()[..words.len().min(HEADER_BYTES)];
         head[..words.len()].copy_from_slice(words);
         head[HEADER_BYTES..].copy_from_slice(&count.to_le_bytes());
-        Ok(Self { head, len: (HEADER_BYTES + 4) as u64 + TRIANGLE_BYTES as u64 * u64::from(count) })
+        Ok(Self { head, len: (HEADER_BYTES + 4) as u64 + TRIANGLE_BYTES as u64 * u64::from(count), units })
     }
 
     pub(super) fn len(&self) -> u64 {
@@ -44,14 +45,15 @@ impl StlPlan {
 
     pub(super) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(&self.head)?;
-        let (centre, positions, triangles) = (mesh.centre, &mesh.positions[..], &mesh.triangles[..]);
+        let place = Place { centre: mesh.centre, scale: self.units.scale() };
+        let (positions, triangles) = (&mesh.positions[..], &mesh.triangles[..]);
         write_records::<TRIANGLE_BYTES>(out, triangles.len(), |range, records| {
             for (record, triangle) in records.iter_mut().zip(&triangles[range]) {
                 let corners = triangle.map(|v| positions[v as usize]);
                 let (floats, attribute) = record.as_chunks_mut::<12>();
                 put_floats(&mut floats[0], face_normal(corners));
                 for (bytes, corner) in floats[1..].iter_mut().zip(corners) {
-                    put_floats(bytes, absolute(centre, corner));
+                    put_floats(bytes, place.absolute(corner));
                 }
                 attribute.fill(0);
             }
@@ -91,7 +93,7 @@ mod tests {
     fn the_header_never_says_text_or_colours() {
         for name in ["solid", "COLOR=rgba", "a very long name ".repeat(20).as_str(), ""] {
             let meta = Meta { name: Some(name.to_owned()), ..Meta::default() };
-            let plan = StlPlan::new(&Mesh::default(), &meta).unwrap();
+            let plan = StlPlan::new(&Mesh::default(), Units::Nanometer, &meta).unwrap();
             assert!(plan.head.starts_with(b"molmesh "));
             assert!(!plan.head.windows(6).any(|w| w == b"COLOR="));
             assert_eq!(plan.head[HEADER_BYTES..], [0; 4]);

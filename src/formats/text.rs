@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use serde_json::Value;
 
-use super::{GENERATOR, Meta};
+use super::{GENERATOR, Meta, Units};
 use crate::surface::Mesh;
 
 /// Characters of one fact at most: readers of PLY have line buffers of 256 and more.
@@ -39,15 +39,15 @@ pub(super) fn word(meta: &Meta) -> String {
     if name.is_empty() { NAMELESS.to_owned() } else { name }
 }
 
-/// The facts: generator, name, units, centre, and every plain value of `meta.extras`. `precision` says how the
-/// numbers of the file are rounded, if they are.
-pub(super) fn facts(mesh: &Mesh, meta: &Meta, precision: Option<&str>) -> Vec<String> {
-    let [x, y, z] = mesh.centre;
+/// The facts: generator, name, units, centre in these units, and every plain value of `meta.extras`. `precision` says how
+/// the numbers of the file are rounded, if they are.
+pub(super) fn facts(mesh: &Mesh, meta: &Meta, units: Units, precision: Option<&str>) -> Vec<String> {
+    let [x, y, z] = mesh.centre.map(|v| v * units.scale());
     let mut facts = vec![format!("generator {GENERATOR}")];
     if let Some(name) = &meta.name {
         facts.push(one_line(&format!("name {name}")));
     }
-    facts.push("units angstrom".to_owned());
+    facts.push(format!("units {}", units.name()));
     facts.extend(precision.map(|p| format!("precision {p}")));
     facts.push(format!("centre {x} {y} {z} (already in the coordinates)"));
     for (key, value) in &meta.extras {
@@ -89,7 +89,7 @@ mod tests {
             unreachable!()
         };
         let mesh = Mesh { centre: [1.5, -2.0, 0.0], ..Mesh::default() };
-        let facts = facts(&mesh, &Meta { name: Some("4PTI".into()), extras }, None);
+        let facts = facts(&mesh, &Meta { name: Some("4PTI".into()), extras }, Units::Angstrom, None);
         assert_eq!(
             facts[1..],
             [

@@ -99,8 +99,8 @@ struct ParameterDocument {
 enum DomainDocument {
     /// A number within bounds, both included.
     Number { min: f64, max: f64, unit: &'static str },
-    /// A whole number.
-    Integer,
+    /// A whole number within bounds, both included.
+    Integer { min: i64, max: i64 },
     /// `true` or `false`.
     Boolean,
     /// One of these words.
@@ -262,7 +262,7 @@ fn presets() -> Map<String, Value> {
 fn parameter(parameter: &Parameter) -> ParameterDocument {
     let domain = match parameter.domain {
         Domain::Number { min, max, unit } => DomainDocument::Number { min, max, unit },
-        Domain::Integer => DomainDocument::Integer,
+        Domain::Integer { min, max } => DomainDocument::Integer { min, max },
         Domain::Flag => DomainDocument::Boolean,
         Domain::Choice(values) => DomainDocument::Choice { values },
         Domain::Set(values) => DomainDocument::Set { values },

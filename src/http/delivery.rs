@@ -20,7 +20,7 @@ use crate::pipeline::Report;
 use utoipa::ToSchema;
 
 /// Headers that sum up the report.
-pub(super) const SUMMARY: [&str; 16] = [
+pub(super) const SUMMARY: [&str; 17] = [
     "molmesh-atoms",
     "molmesh-vertices",
     "molmesh-triangles",
@@ -33,6 +33,7 @@ pub(super) const SUMMARY: [&str; 16] = [
     "molmesh-kernel",
     "molmesh-preset",
     "molmesh-resolution",
+    "molmesh-resolution-from",
     "molmesh-isovalue",
     "molmesh-radii",
     "molmesh-backend",

@@ -21,7 +21,7 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use crate::jobs::Failure;
-use crate::pipeline::{self, Choice, Estimate, Job};
+use crate::pipeline::{self, Choice, Estimate};
 use crate::surface::CancelToken;
 
 /// Stops the work when its request ends.
@@ -45,8 +45,10 @@ pub(super) struct EstimateDocument {
     atoms: u64,
     /// Atoms in the file, all models.
     atoms_in_file: u64,
-    /// Grid spacing, Å.
+    /// Grid spacing, Å; estimated where it follows from `max_triangles`.
     resolution: f64,
+    /// The parameter that the spacing follows from: `resolution`, `detail` or `max_triangles`.
+    resolution_from: &'static str,
     /// Kernel function.
     kernel: &'static str,
     /// The mesh format, as a file name's extension.
@@ -130,14 +132,15 @@ pub(super) async fn create(
         .map_err(|error| declared.explain(Failure::Job { error, diagnostics: Vec::new() }))?;
     drop(stop);
     let wait = app.pool.estimated_wait().as_secs_f64();
-    let problem = refusal(&estimate, &job, app.config.limits.output_bytes);
+    let problem = refusal(&estimate, app.config.limits.output_bytes);
     let mesh = estimate.mesh.as_ref().ok();
     let document = EstimateDocument {
         accepted: problem.is_none(),
         problem: problem.map(|problem| problem.record()),
         atoms: estimate.atoms,
         atoms_in_file: estimate.atoms_in_file,
-        resolution: job.params.resolution,
+        resolution: estimate.resolution,
+        resolution_from: job.spacing.parameter(),
         kernel: job.params.kernel.name(),
         format: format.extension(),
         box_cells: estimate.box_cells,
@@ -156,11 +159,9 @@ pub(super) async fn create(
 }
 
 /// Why the mesh would not be made, or its file of more than `limit` bytes not be sent.
-fn refusal(estimate: &Estimate, job: &Job, limit: u64) -> Option<Problem> {
+fn refusal(estimate: &Estimate, limit: u64) -> Option<Problem> {
     match &estimate.mesh {
-        Ok(mesh) if mesh.bytes > limit => {
-            Some(super::problem::file_too_large(mesh.bytes, limit, job.params.resolution))
-        }
+        Ok(mesh) if mesh.bytes > limit => Some(super::problem::file_too_large(mesh.bytes, limit, estimate.resolution)),
         Ok(_) => None,
         Err(error) => Some(Problem::from(error.clone())),
     }

@@ -126,7 +126,7 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::GridTooLarge, "grid-too-large", S::UNPROCESSABLE_ENTITY, true, "The grid would be too large",
         "At this resolution the surface needs more than `limit` grid samples. `suggested_resolution` is a spacing in ångström that would fit."),
     row(Kind::MeshTooLarge, "mesh-too-large", S::UNPROCESSABLE_ENTITY, true, "The mesh would be too large",
-        "The mesh, or its file, would have more than `limit` bytes. `suggested_resolution` is a spacing in ångström that would fit."),
+        "The mesh, or its file, would have more than `limit` bytes; `suggested_resolution` is a spacing in ångström that would fit. Or no mesh has as few triangles as `parameter` (`max_triangles`) asks for: `actual` is the fewest, at `resolution`."),
     row(Kind::DeviceMemory, "device-memory", S::UNPROCESSABLE_ENTITY, true, "The device has too little memory",
         "At this resolution the surface needs more memory than the device has (`limit` bytes), even piece by piece. `suggested_resolution` is a spacing in ångström that would fit."),
     row(Kind::NoSurface, "no-surface", S::UNPROCESSABLE_ENTITY, false, "There is no surface",

@@ -345,6 +345,11 @@ impl From<SurfaceError> for Problem {
                 .with("limit", limit)
                 .with("actual", bytes)
                 .with("suggested_resolution", suggested_resolution),
+            E::TooManyTriangles { triangles, limit, resolution } => Self::new(Kind::MeshTooLarge, detail)
+                .with("parameter", "max_triangles")
+                .with("limit", limit)
+                .with("actual", triangles)
+                .with("resolution", resolution),
             E::NoSurface { isovalue } => {
                 Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
             }

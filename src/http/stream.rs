@@ -60,7 +60,7 @@ fn write(
     let start = Instant::now();
     let product = &finished.product;
     let resolution = product.report.resolution;
-    let encoder = match Encoder::packed(format, product.packing, &product.mesh, &product.meta()) {
+    let encoder = match Encoder::stored(format, product.storage, &product.mesh, &product.meta()) {
         Ok(encoder) if encoder.encoded_len_bound() > limit => {
             Err(problem::file_too_large(encoder.encoded_len_bound(), limit, resolution))
         }

@@ -14,6 +14,9 @@ const BINARY: f64 = 5.0;
 const DESCRIPTION: f64 = 150e3;
 /// Work of the smallest job, in atoms.
 const LEAST: f64 = 2_000.0;
+/// Time of a mesh whose spacing is searched for, in times of the one that is found: a coarse one goes before it, and now and
+/// then there is a third.
+const TRIES: f64 = 1.5;
 /// Assumed time of a unit of work before any job has run, s: an atom at 0.5 Å on two cores.
 const FIRST_GUESS: f64 = 4e-6;
 /// Weight of the newest job in the moving averages.
@@ -30,9 +33,11 @@ pub(super) fn units(input: &[u8], job: &Job) -> f64 {
         (false, true) => len.max((len - DESCRIPTION) * BINARY),
         (false, false) => len,
     };
+    let atoms = bytes / BYTES_PER_ATOM;
     // Samples go with the inverse cube of the spacing, the surface with its square, reading with neither.
-    let fineness = 0.5 / job.params.resolution;
-    (bytes / BYTES_PER_ATOM + LEAST) * (0.3 + 0.7 * fineness.powf(2.5))
+    let fineness = 0.5 / job.spacing.expected(&job.params, atoms);
+    let again = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
+    (atoms + LEAST) * (0.3 + 0.7 * again * fineness.powf(2.5))
 }
 
 /// Seconds per unit, and seconds per job, as lately measured.
@@ -85,6 +90,18 @@ mod tests {
         let binary = |first: u8| units(&[&[first][..], &[0; 450_000]].concat(), &at("1"));
         assert!(binary(0x83) > 2.0 * binary(b'A'));
         assert!((units(&text, &at("0.5")) - 3000.0).abs() < 1.0);
+    }
+
+    #[test]
+    fn a_spacing_that_is_not_given_is_guessed_from_the_bytes() {
+        let of = |name: &str, value: &str| params::parse([(name, value)]).unwrap().job;
+        let [small, large] = [90_000, 90_000_000].map(|n| vec![b'A'; n]);
+        assert!((units(&small, &of("detail", "4")) / units(&small, &of("resolution", "0.5")) - 1.0).abs() < 1e-9);
+        // A million atoms at the same level of detail get a coarser grid.
+        assert!(units(&large, &of("detail", "4")) < 0.5 * units(&large, &of("resolution", "0.5")));
+        let bounded = |most: &str| units(&large, &of("max_triangles", most));
+        assert!(bounded("1000000") < bounded("10000000"));
+        assert!(bounded("4000000000") > units(&large, &of("resolution", "0.5")));
     }
 
     #[test]

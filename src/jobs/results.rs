@@ -63,7 +63,7 @@ pub async fn save(
     let mut writer = store.writer(&mesh, None);
     let encode = move || {
         let product = &finished.product;
-        let encoder = Encoder::packed(format, product.packing, &product.mesh, &product.meta())?;
+        let encoder = Encoder::stored(format, product.storage, &product.mesh, &product.meta())?;
         let bytes = encoder.encoded_len_bound();
         if bytes > limit {
             return Err(SaveError::TooLarge { bytes, limit });

@@ -4,7 +4,7 @@
 //! of |nx| + |ny| + |nz| over the sphere of normals. Each crossing is a vertex, and a closed mesh has about two triangles a
 //! vertex. The area is that of a coarser mesh.
 
-use super::{Choice, Job, JobError, JobLimits, StageClock};
+use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock, fit};
 use crate::surface::lattice::Lattice;
 use crate::surface::plan::Plan;
 use crate::surface::{CancelToken, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
@@ -20,6 +20,8 @@ pub struct Estimate {
     pub atoms: u64,
     /// Atoms in the file, all models.
     pub atoms_in_file: u64,
+    /// Grid spacing, Å: a guess where it would be found by making meshes, else exact.
+    pub resolution: f64,
     /// Cells that a dense grid would have had.
     pub box_cells: u64,
     /// The grid and the mesh, or why there would be none.
@@ -57,14 +59,38 @@ pub fn estimate(
     let clock = StageClock::new(&());
     let (structure, selected, spheres) = super::read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, ..Control::default() };
-    let lattice = Lattice::new(&spheres, &job.params)?;
-    let box_cells = lattice.box_cells;
-    let mesh = match of_mesh(&lattice, &spheres, &job.params, &limits.surface, choice, &control) {
-        Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)) => return Err(error.into()),
-        mesh => mesh,
+    let mut params = job.params_for(spheres.len());
+    let mut refused = None;
+    if let Spacing::MaxTriangles(most) = job.spacing {
+        match fit::expected(&spheres, job, most, &limits.surface, choice, &control) {
+            Ok(resolution) => params.resolution = resolution,
+            Err(error) => {
+                if let SurfaceError::TooManyTriangles { resolution, .. } = error {
+                    params.resolution = resolution;
+                }
+                refused = Some(error);
+            }
+        }
+    }
+    let lattice = Lattice::new(&spheres, &params)?;
+    let (resolution, box_cells) = (params.resolution, lattice.box_cells);
+    let mesh = refused.map_or_else(|| of_mesh(&lattice, &spheres, &params, &limits.surface, choice, &control), Err);
+    let mesh = match (mesh, job.spacing) {
+        (Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)), _) => return Err(error.into()),
+        (Ok(mesh), Spacing::MaxTriangles(most)) => Ok(mesh.at_most(most)),
+        (mesh, _) => mesh,
     };
     let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.len() as u64);
-    Ok(Estimate { atoms, atoms_in_file, box_cells, mesh })
+    Ok(Estimate { atoms, atoms_in_file, resolution, box_cells, mesh })
+}
+
+impl MeshEstimate {
+    /// With no more triangles than there will be in any case.
+    fn at_most(self, most: u64) -> Self {
+        let triangles = self.triangles.min(most);
+        let vertices = self.vertices.min(most.div_ceil(2));
+        Self { triangles, vertices, bytes: Mesh::bytes_for(vertices, triangles), ..self }
+    }
 }
 
 fn of_mesh(

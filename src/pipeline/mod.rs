@@ -2,10 +2,12 @@
 
 mod clock;
 mod estimate;
+mod fit;
 pub mod nearest;
 pub mod params;
 mod progress;
 mod report;
+pub mod spacing;
 
 use std::time::Instant;
 
@@ -15,8 +17,9 @@ pub use clock::{ProgressSink, StageClock};
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use progress::Tracker;
 pub use report::{Quantization, Report};
+pub use spacing::Spacing;
 
-use crate::formats::{Compress, GlbSink, Meta, Packing, Step};
+use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::structure::{self, ReadLimits, Selected, Selection, Structure, StructureError};
 use crate::surface::{
     Backend, CancelToken, Control, Measures, Mesh, Meshed, Proof, Spheres, Stage, SurfaceError, SurfaceLimits,
@@ -29,12 +32,29 @@ use report::Counts;
 pub struct Job {
     /// Which atoms.
     pub selection: Selection,
-    /// Which surface.
+    /// Which surface. Its resolution stands where `spacing` is [`Spacing::Given`].
     pub params: SurfaceParams,
+    /// How the resolution is chosen.
+    pub spacing: Spacing,
     /// How the mesh is proven closed and manifold.
     pub proof: Proof,
     /// How vertices are stored, in formats that have a choice.
     pub compress: Compress,
+    /// Whether vertices have normals, in formats that have a choice.
+    pub normals: Normals,
+    /// The units of a file's coordinates.
+    pub units: Units,
+}
+
+impl Job {
+    /// The parameters for so many atoms, where the resolution does not hang on the mesh.
+    fn params_for(&self, atoms: usize) -> SurfaceParams {
+        let resolution = match self.spacing {
+            Spacing::Detail(level) => spacing::of_detail(level, atoms as f64),
+            Spacing::Given | Spacing::MaxTriangles(_) => self.params.resolution,
+        };
+        SurfaceParams { resolution, ..self.params.clone() }
+    }
 }
 
 /// Limits of one job.
@@ -61,8 +81,8 @@ pub struct Choice<'a> {
 pub struct Product {
     /// The mesh.
     pub mesh: Mesh,
-    /// How a file stores its vertices.
-    pub packing: Packing,
+    /// How a file stores it.
+    pub storage: Storage,
     /// What was measured.
     pub report: Report,
 }
@@ -120,7 +140,14 @@ pub fn run(
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
-    let mut meshed = clock.pass(|| choice.backend.run(&spheres, &job.params, &limits.surface, &control))?;
+    let mut params = job.params_for(spheres.len());
+    let (mut meshed, tries) = if let Spacing::MaxTriangles(most) = job.spacing {
+        let fitted = fit::mesh(&spheres, job, most, &limits.surface, choice, &clock, &control)?;
+        params.resolution = fitted.resolution;
+        (fitted.meshed, Some(fitted.tries))
+    } else {
+        (clock.pass(|| choice.backend.run(&spheres, &params, &limits.surface, &control))?, None)
+    };
     if let Some(ids) = &mut meshed.mesh.atom_ids {
         // The core speaks of spheres; people ask for atoms of the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
@@ -135,16 +162,18 @@ pub fn run(
         })?,
     };
     let Meshed { mesh, grid, served, .. } = meshed;
-    let packing = packing(job, &spheres);
-    let counts = Counts { grid, n_vertices: mesh.n_vertices(), n_triangles: mesh.n_triangles(), served, packing };
+    let storage = storage(job, &params, &spheres);
+    let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
+    let counts = Counts { resolution: params.resolution, tries, grid, n_vertices, n_triangles, served, storage };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
-    Ok(Product { mesh, packing, report })
+    Ok(Product { mesh, storage, report })
 }
 
-/// Whether [`pour`] can run a job: atoms by vertex and the exact proof need the whole mesh.
+/// Whether [`pour`] can run a job: atoms by vertex and the exact proof need the whole mesh, and a bound on triangles meshes that
+/// are not kept.
 #[must_use]
 pub fn can_pour(job: &Job) -> bool {
-    !job.params.atom_ids && job.proof == Proof::Checksum
+    !job.params.atom_ids && job.proof == Proof::Checksum && job.spacing.max_triangles().is_none()
 }
 
 /// Runs a job that [`can_pour`], handing the mesh on to `sink` part by part, packed as the job asks: the same mesh and report
@@ -164,27 +193,31 @@ pub fn pour(
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
-    let packing = packing(job, &spheres);
-    sink.pack(packing);
-    let poured = clock.pass(|| choice.backend.pour(&spheres, &job.params, &limits.surface, &control, sink))?;
+    let params = job.params_for(spheres.len());
+    let storage = storage(job, &params, &spheres);
+    sink.store(storage);
+    let poured = clock.pass(|| choice.backend.pour(&spheres, &params, &limits.surface, &control, sink))?;
     let counts = Counts {
+        resolution: params.resolution,
+        tries: None,
         grid: poured.grid,
         n_vertices: poured.n_vertices,
         n_triangles: poured.n_triangles,
         served: poured.served,
-        packing,
+        storage,
     };
     let report = Report::new(&structure, &selected, job, choice, &counts, &poured.measures, clock.finish());
     Ok(Poured { report, centre: poured.centre, bounds: poured.bounds })
 }
 
-/// How the vertices of `spheres` are stored. Depends on nothing that the backend computes, so a file can be written, or a
+/// How the mesh of `spheres` is stored. Depends on nothing that the backend computes, so a file can be written, or a
 /// device can fill it, before the mesh is known.
-fn packing(job: &Job, spheres: &Spheres) -> Packing {
-    match job.compress {
+fn storage(job: &Job, params: &SurfaceParams, spheres: &Spheres) -> Storage {
+    let packing = match job.compress {
         Compress::None => Packing::Full,
-        Compress::Quantize => Packing::Quantized(Step::covering(lattice::extent(spheres, &job.params))),
-    }
+        Compress::Quantize => Packing::Quantized(Step::covering(lattice::extent(spheres, params))),
+    };
+    Storage { packing, normals: job.normals, units: job.units }
 }
 
 /// Bytes to spheres.

@@ -12,9 +12,10 @@ use thiserror::Error;
 
 pub use table::{Domain, Parameter, TABLE};
 
-use super::Job;
 use super::nearest::nearest;
-use crate::formats::{Compress, Format};
+use super::spacing::{DETAILS, LEAST_TRIANGLES, MOST_TRIANGLES};
+use super::{Job, Spacing};
+use crate::formats::{Compress, Format, Normals, Units};
 use crate::structure::Selection;
 use crate::surface::{Kernel, PaperParams, Preset, Proof, SurfaceError, SurfaceOptions, SurfaceParams};
 
@@ -70,6 +71,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     let mut options = SurfaceOptions::default();
     let mut selection = Selection::default();
     let mut request = Request::default();
+    let mut spacing = None;
     for (name, value) in pairs {
         let (name, value) = (name.as_ref(), value.as_ref());
         let Some(index) = TABLE.iter().position(|p| p.name == name) else {
@@ -80,26 +82,49 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
             return Err(ParamError::Repeated { name: parameter.name });
         }
         set(parameter, value, &mut options, &mut selection, &mut request)?;
+        if SPACINGS.contains(&parameter.name)
+            && let Some(other) = spacing.replace(parameter.name)
+        {
+            return Err(contradiction(parameter.name, value, other));
+        }
     }
     request.job = Job { selection, params: SurfaceParams::new(&options)?, ..request.job };
     request.format.map_or(Ok(()), |format| suits(&request.job, format))?;
     Ok(request)
 }
 
+/// The parameters that set the grid's spacing, each in its own way.
+const SPACINGS: [&str; 3] = ["resolution", "detail", "max_triangles"];
+
+fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
+    ParamError::BadValue {
+        name,
+        value: format!("`{}`", value.chars().take(64).collect::<String>()),
+        expected: format!("nothing beside `{other}`: only one of {} sets the grid's spacing", SPACINGS.join(", ")),
+    }
+}
+
 /// Whether a job's mesh can be had in `format`: for a format that was named elsewhere than in the pairs.
 ///
 /// # Errors
-/// [`ParamError::BadValue`] for `compress` where the format has nothing of the kind.
+/// [`ParamError::BadValue`] for `compress` and `units` where the format has nothing of the kind.
 pub fn suits(job: &Job, format: Format) -> Result<(), ParamError> {
-    if job.compress == Compress::None || format.holds_quantized() {
-        return Ok(());
+    let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
+        let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::extension).collect();
+        Err(ParamError::BadValue {
+            name,
+            value: format!("`{value}` with {format}"),
+            expected: format!("{instead}, or one of the formats {}", formats.join(", ")),
+        })
+    };
+    if job.compress != Compress::None && !format.holds_quantized() {
+        return refuse("compress", job.compress.name(), Compress::None.name(), &|f| f.holds_quantized());
     }
-    let takes: Vec<_> = Format::ALL.into_iter().filter(|f| f.holds_quantized()).map(Format::extension).collect();
-    Err(ParamError::BadValue {
-        name: "compress",
-        value: format!("`{}` with {format}", job.compress.name()),
-        expected: format!("{}, or one of the formats {}", Compress::None.name(), takes.join(", ")),
-    })
+    if !format.holds_units(job.units) {
+        let instead: Vec<_> = Units::ALL.into_iter().filter(|u| format.holds_units(*u)).map(Units::name).collect();
+        return refuse("units", job.units.name(), &instead.join(", "), &|f| f.holds_units(job.units));
+    }
+    Ok(())
 }
 
 /// The refusal of an unknown name.
@@ -139,6 +164,14 @@ fn set(
         "preset" => options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
         "kernel" => options.kernel = Some(Kernel::from_str(text).ok().ok_or_else(bad)?),
         "resolution" => options.resolution = number()?,
+        "detail" => {
+            let level = whole(text).filter(|level| *level < DETAILS.len() as u64);
+            request.job.spacing = Spacing::Detail(level.and_then(|l| u8::try_from(l).ok()).ok_or_else(bad)?);
+        }
+        "max_triangles" => {
+            let most = whole(text).filter(|most| (LEAST_TRIANGLES..=MOST_TRIANGLES).contains(most));
+            request.job.spacing = Spacing::MaxTriangles(most.ok_or_else(bad)?);
+        }
         "isovalue" => options.isovalue = number()?,
         "smoothness" => options.smoothness = number()?,
         "radius_scale" => options.radius_scale = number()?,
@@ -156,10 +189,12 @@ fn set(
             expected: e.expected,
         })?,
         "altloc" => selection.altloc = Some(one_char(text).ok_or_else(bad)?),
-        "proof" => request.job.proof = proof(text).ok_or_else(bad)?,
+        "proof" => request.job.proof = named(&PROOFS, Proof::name, text).ok_or_else(bad)?,
         "check" => request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
         "format" => request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
-        "compress" => request.job.compress = compress(text).ok_or_else(bad)?,
+        "compress" => request.job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
+        "normals" => request.job.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
+        "units" => request.job.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
         "report" => request.report = (text == "json").then_some(true).ok_or_else(bad)?,
         _ => return Err(unknown(parameter.name)),
     }
@@ -174,12 +209,15 @@ fn flag(text: &str) -> Option<bool> {
     }
 }
 
-fn proof(text: &str) -> Option<Proof> {
-    [Proof::Checksum, Proof::Exact].into_iter().find(|proof| proof.name() == text)
+const PROOFS: [Proof; 2] = [Proof::Checksum, Proof::Exact];
+
+/// The value of this name.
+fn named<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, text: &str) -> Option<T> {
+    all.iter().copied().find(|value| name(*value) == text)
 }
 
-fn compress(text: &str) -> Option<Compress> {
-    Compress::ALL.into_iter().find(|compress| compress.name() == text)
+fn whole(text: &str) -> Option<u64> {
+    text.trim().parse().ok()
 }
 
 /// Words separated by commas, none of them empty or with control characters.
@@ -198,7 +236,7 @@ fn one_char(text: &str) -> Option<char> {
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a field that is added without a place here does not compile.
-    let Job { selection, params, proof, compress } = job;
+    let Job { selection, params, spacing, proof, compress, normals, units } = job;
     let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = selection;
     let SurfaceParams {
         kernel,
@@ -212,13 +250,21 @@ pub fn canonical(job: &Job) -> String {
         paper,
         atom_ids,
     } = params;
+    // What sets the spacing, and nothing else: of the other two only defaults are left.
+    let spacing = match spacing {
+        Spacing::Given => format!("resolution={resolution}"),
+        Spacing::Detail(level) => format!("detail={level}"),
+        Spacing::MaxTriangles(most) => format!("max_triangles={most}"),
+    };
     let mut text = format!(
-        "kernel={kernel}&resolution={resolution}&isovalue={isovalue}&smoothness={smoothness}\
+        "kernel={kernel}&{spacing}&isovalue={isovalue}&smoothness={smoothness}\
          &radius_scale={radius_scale}&radius_offset={radius_offset}&cutoff_tolerance={cutoff_tolerance}\
          &preset={preset}&atom_ids={atom_ids}&model={model:?}&chains={chains:?}&polymer={polymer}\
-         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}&proof={}&compress={}",
+         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}&proof={}&compress={}&normals={}&units={}",
         proof.name(),
-        compress.name()
+        compress.name(),
+        normals.name(),
+        units.name()
     );
     let paper = match paper {
         None => Ok(()),

@@ -4,7 +4,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 
 use super::{Choice, Job};
-use crate::formats::Packing;
+use crate::formats::{Storage, Units};
 use crate::structure::{Selected, Structure, radii};
 use crate::surface::{GridStats, Measures, Served};
 
@@ -56,6 +56,17 @@ pub struct Report {
     pub preset: &'static str,
     /// Grid spacing, Å.
     pub resolution: f64,
+    /// The parameter that the spacing follows from: `resolution` (as given, or its default), `detail` or `max_triangles`.
+    pub resolution_from: &'static str,
+    /// The level of detail; absent where none was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub detail: Option<u8>,
+    /// Triangles asked for at most; absent where they were not bounded.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_triangles: Option<u64>,
+    /// Meshes that were made to find the spacing; absent where it was known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tries: Option<u32>,
     /// Isovalue.
     pub isovalue: f64,
     /// The Gaussian's smoothness; absent for other kernels and raw parameters.
@@ -93,6 +104,12 @@ pub struct Report {
     pub area: f64,
     /// Å³.
     pub volume: f64,
+    /// The units of every length, area and volume in this report: `angstrom`.
+    pub report_units: &'static str,
+    /// The units of the file's coordinates: `angstrom`, `nanometer` or `meter`.
+    pub file_units: &'static str,
+    /// The normals of the file's vertices: `smooth` or `none`.
+    pub normals: &'static str,
     /// How coarse the file's vertices are; absent where they are not quantised.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub quantization: Option<Quantization>,
@@ -112,11 +129,13 @@ pub struct Report {
 
 /// What a report counts, and who made it.
 pub(super) struct Counts {
+    pub(super) resolution: f64,
+    pub(super) tries: Option<u32>,
     pub(super) grid: GridStats,
     pub(super) n_vertices: usize,
     pub(super) n_triangles: usize,
     pub(super) served: Option<Served>,
-    pub(super) packing: Packing,
+    pub(super) storage: Storage,
 }
 
 impl Report {
@@ -147,7 +166,11 @@ impl Report {
             radii: radii::TABLE,
             kernel: params.kernel.name(),
             preset: params.preset.name(),
-            resolution: params.resolution,
+            resolution: counts.resolution,
+            resolution_from: job.spacing.parameter(),
+            detail: job.spacing.detail(),
+            max_triangles: job.spacing.max_triangles(),
+            tries: counts.tries,
             isovalue: params.isovalue,
             smoothness: gaussian.then_some(params.smoothness),
             bricks: counts.grid.bricks,
@@ -173,7 +196,10 @@ impl Report {
                 .collect(),
             area: measures.area,
             volume: measures.volume,
-            quantization: counts.packing.step().map(|step| Quantization { step: step.length() }),
+            report_units: Units::Angstrom.name(),
+            file_units: counts.storage.units.name(),
+            normals: counts.storage.normals.name(),
+            quantization: counts.storage.packing.step().map(|step| Quantization { step: step.length() }),
             backend: served.backend,
             device: served.device,
             backend_reason: match &served.instead {

@@ -54,6 +54,16 @@ pub enum SurfaceError {
         /// A spacing that would fit, in Å.
         suggested_resolution: f64,
     },
+    /// No spacing that is coarse enough for a bound on triangles shows the surface.
+    #[error("the mesh has {triangles} triangles at {resolution} Å, and no coarser one has {limit} or fewer")]
+    TooManyTriangles {
+        /// The fewest that were found.
+        triangles: u64,
+        /// Triangles asked for at most.
+        limit: u64,
+        /// Where they were found, Å.
+        resolution: f64,
+    },
     /// No sample reaches the isovalue.
     #[error("no sample of the grid reaches the isovalue {isovalue}: lower it, or refine the resolution")]
     NoSurface {

@@ -7,7 +7,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
-/// What a file holds. Positions are as they stand in the file: relative to `translation` in glTF.
+/// What a file holds. Positions are as they stand in the file: relative to `translation` in glTF. Without normals there are none.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Contents {
     pub translation: [f64; 3],
@@ -80,13 +80,17 @@ pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
         let position =
             |r: &&[u8]| std::array::from_fn(|k| f32::from(i16::from_le_bytes([r[2 * k], r[2 * k + 1]])) * scale);
         let normal = |r: &&[u8]| std::array::from_fn(|k| (f32::from(r[k].cast_signed()) / 127.0).max(-1.0));
-        assert_eq!(accessor_of(json, &attributes["NORMAL"])["normalized"], true);
         assert!(accessor_of(json, &attributes["POSITION"])["normalized"].as_bool().is_none_or(|n| !n));
         contents.positions = rows(&attributes["POSITION"], 5122, "VEC3", 6).iter().map(position).collect();
-        contents.normals = rows(&attributes["NORMAL"], 5120, "VEC3", 3).iter().map(normal).collect();
+        if let Some(accessor) = attributes.get("NORMAL") {
+            assert_eq!(accessor_of(json, accessor)["normalized"], true);
+            contents.normals = rows(accessor, 5120, "VEC3", 3).iter().map(normal).collect();
+        }
     } else {
         contents.positions = rows(&attributes["POSITION"], 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
-        contents.normals = rows(&attributes["NORMAL"], 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
+        if let Some(accessor) = attributes.get("NORMAL") {
+            contents.normals = rows(accessor, 5126, "VEC3", 12).iter().map(|r| f32x3(r)).collect();
+        }
     }
     if let Some(accessor) = attributes.get("COLOR_0") {
         assert_eq!(accessor_of(json, accessor)["normalized"], true);
@@ -117,7 +121,9 @@ pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
 fn quantized_scale(json: &Value) -> Option<f32> {
     let node = &json["nodes"][0];
     let [used, required] = ["extensionsUsed", "extensionsRequired"].map(|key| json.get(key));
-    assert_eq!((used, used.is_some()), (required, node.get("scale").is_some()));
+    assert_eq!(used, required);
+    let scaled = used.is_some() || json["asset"]["extras"]["units"] != "angstrom";
+    assert_eq!(node.get("scale").is_some(), scaled);
     assert_eq!(used?, &serde_json::json!(["KHR_mesh_quantization"]));
     let scale: Vec<f64> = node["scale"].as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect();
     assert_eq!(scale, [scale[0]; 3]);
@@ -171,7 +177,9 @@ pub fn read_ply(bytes: &[u8]) -> Contents {
     let (n, m) = (count("vertex"), count("face"));
     let (colors, atoms) = (has("property uchar alpha"), has("property uint atom"));
     let mut expected = vec![format!("element vertex {n}")];
-    expected.extend(["x", "y", "z", "nx", "ny", "nz"].map(|p| format!("property float {p}")));
+    let normals = has("property float nx");
+    expected.extend(["x", "y", "z"].map(|p| format!("property float {p}")));
+    expected.extend(["nx", "ny", "nz"].iter().filter(|_| normals).map(|p| format!("property float {p}")));
     expected.extend(["red", "green", "blue", "alpha"].iter().filter(|_| colors).map(|p| format!("property uchar {p}")));
     expected.extend(atoms.then(|| "property uint atom".to_owned()));
     expected.extend([
@@ -187,7 +195,9 @@ pub fn read_ply(bytes: &[u8]) -> Contents {
     };
     for _ in 0..n {
         contents.positions.push(f32x3(take(12)));
-        contents.normals.push(f32x3(take(12)));
+        if normals {
+            contents.normals.push(f32x3(take(12)));
+        }
         if let Some(colors) = &mut contents.colors {
             colors.push(take(4).try_into().unwrap());
         }
@@ -233,8 +243,8 @@ pub fn read_obj(bytes: &[u8]) -> Contents {
                 let corners: Vec<u32> = rest
                     .split(' ')
                     .map(|word| {
-                        let (vertex, normal) = word.split_once("//").unwrap();
-                        assert_eq!(vertex, normal);
+                        let (vertex, normal) = word.split_once("//").map_or((word, None), |(v, n)| (v, Some(n)));
+                        assert_eq!(normal, (!contents.normals.is_empty()).then_some(vertex));
                         vertex.parse::<u32>().unwrap() - 1
                     })
                     .collect();

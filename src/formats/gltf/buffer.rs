@@ -10,8 +10,11 @@ use crate::surface::Mesh;
 /// Writes the buffer of `mesh`: `layout.len` bytes.
 pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
     // Rows are written where they lie: a column in pieces is not joined for this.
-    mesh.positions.pieces().try_for_each(|rows| write_positions(out, layout.packing, rows))?;
-    mesh.normals.pieces().try_for_each(|rows| write_normals(out, layout.packing, rows))?;
+    let packing = layout.storage.packing;
+    mesh.positions.pieces().try_for_each(|rows| write_positions(out, packing, rows))?;
+    if layout.normals.is_some() {
+        mesh.normals.pieces().try_for_each(|rows| write_normals(out, packing, rows))?;
+    }
     if let Some(colors) = &mesh.colors {
         let linear = linear_of_srgb();
         convert_words(out, &colors[..], |[r, g, b, a]| {

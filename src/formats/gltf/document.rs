@@ -13,7 +13,7 @@ use serde_json::{Map, Value, json};
 
 use super::layout::{AtomType, IndexType, Layout, Span};
 use crate::formats::check::Summary;
-use crate::formats::{FormatError, GENERATOR, Meta, Packing, Step};
+use crate::formats::{FormatError, GENERATOR, Meta, Packing, Step, Storage, Units};
 
 /// A calm blue, linear light. Like every constant here it is a short binary fraction, so JSON shows it short.
 const BASE_COLOR: [f32; 4] = [0.156_25, 0.390_625, 0.718_75, 1.0];
@@ -30,6 +30,7 @@ const QUANTIZED: &str = "KHR_mesh_quantization";
 pub(super) fn document(
     centre: [f64; 3],
     summary: &Summary,
+    storage: Storage,
     layout: Option<&Layout>,
     meta: &Meta,
 ) -> Result<Map<String, Value>, FormatError> {
@@ -39,7 +40,7 @@ pub(super) fn document(
         scene: Some(Index::new(0)),
         ..Root::default()
     };
-    let step = layout.and_then(|layout| layout.packing.step());
+    let step = layout.and_then(|_drawn| storage.packing.step());
     if let Some(step) = step {
         if !step.holds(&summary.bounds) {
             return Err(FormatError::BeyondStep { reach: step.reach(), step: step.length() });
@@ -57,15 +58,19 @@ pub(super) fn document(
             extras: None,
         })
     });
-    let scale = step.map(|step| [step.length(); 3]);
-    let node = root.push(Node { mesh: drawn, name, translation: Some([0.0; 3]), scale, ..Node::default() });
+    let node = root.push(Node { mesh: drawn, name, translation: Some([0.0; 3]), ..Node::default() });
     root.push(Scene { nodes: vec![node], name: None, extensions: None, extras: None });
 
     let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };
     let mut value = serde_json::to_value(&root).map_err(json)?;
-    // The crate's translation is single precision, which would move a structure far from the origin by up to 1e-5 Å.
-    value["nodes"][0]["translation"] = Value::from(centre.to_vec());
-    value["asset"]["extras"] = Value::Object(extras(centre, step, meta));
+    // The crate's numbers are single precision, which would move a structure far from the origin by up to 1e-5 Å.
+    let units = storage.units;
+    value["nodes"][0]["translation"] = Value::from(centre.map(|v| v * units.scale()).to_vec());
+    let scale = step.map_or(1.0, |step| f64::from(step.length())) * units.scale();
+    if step.is_some() || units != Units::Angstrom {
+        value["nodes"][0]["scale"] = Value::from(vec![scale; 3]);
+    }
+    value["asset"]["extras"] = Value::Object(extras(centre, units, step, meta));
     match value {
         Value::Object(map) => Ok(map),
         _ => Err(FormatError::Json { reason: "the document is no object".to_owned() }),
@@ -73,10 +78,10 @@ pub(super) fn document(
 }
 
 /// What the file says of itself: units first, then parameters and report.
-fn extras(centre: [f64; 3], step: Option<Step>, meta: &Meta) -> Map<String, Value> {
+fn extras(centre: [f64; 3], units: Units, step: Option<Step>, meta: &Meta) -> Map<String, Value> {
     let mut extras = Map::new();
-    extras.insert("units".to_owned(), Value::from("angstrom"));
-    extras.insert("unit_scale".to_owned(), Value::from(1.0));
+    extras.insert("units".to_owned(), Value::from(units.name()));
+    extras.insert("unit_scale".to_owned(), Value::from(units.length()));
     extras.insert("centre".to_owned(), Value::from(centre.to_vec()));
     if let Some(step) = step {
         extras.insert("quantization".to_owned(), json!({ "step": step.length() }));
@@ -105,7 +110,7 @@ fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
         accessor.normalized = matches!(component, ComponentType::U8 | ComponentType::I8);
         if semantic == Semantic::Positions {
             // Exactly values in the buffer: rounding keeps the order, and floats are double-precision numbers too.
-            let [low, high] = summary.bounds.map(|row| match layout.packing {
+            let [low, high] = summary.bounds.map(|row| match layout.storage.packing {
                 Packing::Full => Value::from(row.map(f64::from).to_vec()),
                 Packing::Quantized(step) => Value::from(step.position(row).to_vec()),
             });
@@ -113,14 +118,13 @@ fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
         }
         (Valid(semantic), root.push(accessor))
     };
-    let [position, normal] = match layout.packing {
+    let [position, normal] = match layout.storage.packing {
         Packing::Full => [ComponentType::F32, ComponentType::F32],
         Packing::Quantized(_) => [ComponentType::I16, ComponentType::I8],
     };
-    let mut attributes = BTreeMap::from([
-        attribute(Semantic::Positions, layout.positions, position, Type::Vec3),
-        attribute(Semantic::Normals, layout.normals, normal, Type::Vec3),
-    ]);
+    let mut attributes = BTreeMap::from([attribute(Semantic::Positions, layout.positions, position, Type::Vec3)]);
+    // Without them viewers shade each triangle flat, as the standard asks.
+    attributes.extend(layout.normals.map(|span| attribute(Semantic::Normals, span, normal, Type::Vec3)));
     attributes.extend(layout.colors.map(|span| attribute(Semantic::Colors(0), span, ComponentType::U8, Type::Vec4)));
     attributes.extend(layout.atoms.map(|(atom_type, span)| {
         let component = match atom_type {

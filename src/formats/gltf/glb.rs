@@ -6,7 +6,7 @@ use super::buffer::write_buffer;
 use super::document::document;
 use super::layout::Layout;
 use crate::formats::check::Summary;
-use crate::formats::{FormatError, Meta, Packing};
+use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::Mesh;
 
 const MAGIC: u32 = u32::from_le_bytes(*b"glTF");
@@ -36,21 +36,22 @@ pub(in crate::formats) struct GlbPlan {
 impl GlbPlan {
     pub(in crate::formats) fn new(
         mesh: &Mesh,
-        packing: Packing,
+        storage: Storage,
         summary: &Summary,
         meta: &Meta,
     ) -> Result<Self, FormatError> {
-        Self::placed(Layout::of(mesh, packing, summary)?, mesh.centre, summary, meta)
+        Self::placed(Layout::of(mesh, storage, summary)?, storage, mesh.centre, summary, meta)
     }
 
     /// The same for a mesh of which only this is known.
     pub(super) fn placed(
         layout: Option<Layout>,
+        storage: Storage,
         centre: [f64; 3],
         summary: &Summary,
         meta: &Meta,
     ) -> Result<Self, FormatError> {
-        let document = document(centre, summary, layout.as_ref(), meta)?;
+        let document = document(centre, summary, storage, layout.as_ref(), meta)?;
         let json = serde_json::to_vec(&document).map_err(|e| FormatError::Json { reason: e.to_string() })?;
         Self::wrap(json, layout)
     }
@@ -107,6 +108,7 @@ impl GlbPlan {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::formats::Packing;
 
     #[test]
     fn a_glb_of_four_gibibytes_is_refused_with_numbers() {

@@ -9,7 +9,7 @@ use super::buffer::write_buffer;
 use super::document::document;
 use super::layout::Layout;
 use crate::formats::check::Summary;
-use crate::formats::{FormatError, Meta, Packing};
+use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::Mesh;
 
 /// A `.gltf` that is laid out.
@@ -25,12 +25,12 @@ pub(in crate::formats) struct GltfPlan {
 impl GltfPlan {
     pub(in crate::formats) fn new(
         mesh: &Mesh,
-        packing: Packing,
+        storage: Storage,
         summary: &Summary,
         meta: &Meta,
     ) -> Result<Self, FormatError> {
-        let layout = Layout::of(mesh, packing, summary)?;
-        let mut document = document(mesh.centre, summary, layout.as_ref(), meta)?;
+        let layout = Layout::of(mesh, storage, summary)?;
+        let mut document = document(mesh.centre, summary, storage, layout.as_ref(), meta)?;
         // The buffer's entry comes last and is written by hand, so that its text can be left open.
         document.shift_remove("buffers");
         let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };

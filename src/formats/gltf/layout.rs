@@ -1,7 +1,7 @@
 //! What lies where in the buffer of a glTF. Pure arithmetic on counts, so that files of any size can be planned.
 
 use crate::formats::check::Summary;
-use crate::formats::{FormatError, Packing};
+use crate::formats::{FormatError, Storage};
 use crate::surface::Mesh;
 
 /// Largest integer below which every integer is a 32-bit float.
@@ -73,9 +73,9 @@ pub(super) struct Span {
 pub(super) struct Layout {
     pub(super) n_vertices: u64,
     pub(super) n_triangles: u64,
-    pub(super) packing: Packing,
+    pub(super) storage: Storage,
     pub(super) positions: Span,
-    pub(super) normals: Span,
+    pub(super) normals: Option<Span>,
     pub(super) colors: Option<Span>,
     pub(super) atoms: Option<(AtomType, Span)>,
     pub(super) indices: (IndexType, Span),
@@ -85,18 +85,18 @@ pub(super) struct Layout {
 
 impl Layout {
     /// The layout of `mesh`; `None` if there is nothing to draw, as glTF knows no empty accessors.
-    pub(super) fn of(mesh: &Mesh, packing: Packing, summary: &Summary) -> Result<Option<Self>, FormatError> {
+    pub(super) fn of(mesh: &Mesh, storage: Storage, summary: &Summary) -> Result<Option<Self>, FormatError> {
         let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
         if n_triangles == 0 {
             return Ok(None);
         }
         let atoms = summary.max_atom.map(AtomType::for_largest).transpose()?;
-        Self::new([n_vertices, n_triangles], packing, mesh.colors.is_some(), atoms).map(Some)
+        Self::new([n_vertices, n_triangles], storage, mesh.colors.is_some(), atoms).map(Some)
     }
 
     fn new(
         [n_vertices, n_triangles]: [u64; 2],
-        packing: Packing,
+        storage: Storage,
         colors: bool,
         atoms: Option<AtomType>,
     ) -> Result<Self, FormatError> {
@@ -112,24 +112,24 @@ impl Layout {
             end += len;
             Span { offset, len }
         };
-        let positions = span(packing.position_bytes() * n_vertices);
-        let normals = span(packing.normal_bytes() * n_vertices);
+        let positions = span(storage.packing.position_bytes() * n_vertices);
+        let normals = storage.normal_bytes().map(|bytes| span(bytes * n_vertices));
         let colors = colors.then(|| span(4 * n_vertices));
         let atoms = atoms.map(|atom_type| (atom_type, span(4 * n_vertices)));
         let indices = (index_type, span(3 * n_triangles * index_type.bytes()));
-        Ok(Self { n_vertices, n_triangles, packing, positions, normals, colors, atoms, indices, len: end })
+        Ok(Self { n_vertices, n_triangles, storage, positions, normals, colors, atoms, indices, len: end })
     }
 
     /// The layout of a mesh without colours and atoms; `None` if there is nothing to draw.
-    pub(super) fn plain(counts: [u64; 2], packing: Packing) -> Result<Option<Self>, FormatError> {
-        if counts[1] == 0 { Ok(None) } else { Self::new(counts, packing, false, None).map(Some) }
+    pub(super) fn plain(counts: [u64; 2], storage: impl Into<Storage>) -> Result<Option<Self>, FormatError> {
+        if counts[1] == 0 { Ok(None) } else { Self::new(counts, storage.into(), false, None).map(Some) }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::formats::Step;
+    use crate::formats::{Normals, Packing, Step};
 
     #[test]
     fn the_restart_value_is_never_an_index() {
@@ -169,12 +169,17 @@ mod tests {
     #[test]
     fn spans_are_aligned_and_follow_each_other() {
         let quantized = Packing::Quantized(Step::covering(1.0));
-        for (packing, vertices) in [(Packing::Full, 60 + 60), (quantized, 40 + 20)] {
-            let layout = Layout::new([5, 3], packing, true, Some(AtomType::U16)).unwrap();
-            let spans =
-                [layout.positions, layout.normals, layout.colors.unwrap(), layout.atoms.unwrap().1, layout.indices.1];
+        let bare = |packing: Packing| Storage { packing, normals: Normals::None, ..Storage::default() };
+        for (storage, vertices) in [
+            (Packing::Full.into(), 60 + 60),
+            (quantized.into(), 40 + 20),
+            (bare(Packing::Full), 60),
+            (bare(quantized), 40),
+        ] {
+            let layout = Layout::new([5, 3], storage, true, Some(AtomType::U16)).unwrap();
+            let rest = [layout.colors.unwrap(), layout.atoms.unwrap().1, layout.indices.1];
             let mut end = 0;
-            for span in spans {
+            for span in [layout.positions].into_iter().chain(layout.normals).chain(rest) {
                 assert_eq!((span.offset, span.offset % 4), (end, 0));
                 end += span.len;
             }

@@ -12,7 +12,7 @@ use super::buffer::{write_indices, write_normals, write_positions};
 use super::glb::{GlbPlan, HEAD_BYTES, LARGE_BUFFER_BYTES};
 use super::layout::Layout;
 use crate::formats::check::Summary;
-use crate::formats::{FormatError, Meta, Packing};
+use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::{MeshPart, MeshSink, SinkFailed};
 
 /// Something that takes bytes at any place, from several threads at once: a file.
@@ -47,7 +47,7 @@ const MOST_WAITING: usize = 48;
 /// A GLB that is being written into `out`.
 pub struct GlbSink<'a> {
     out: &'a dyn PlaceBytes,
-    packing: OnceLock<Packing>,
+    storage: OnceLock<Storage>,
     layout: OnceLock<Option<Layout>>,
     /// The buffer, if it is small.
     small: Mutex<Vec<u8>>,
@@ -66,7 +66,7 @@ impl<'a> GlbSink<'a> {
     pub fn new(out: &'a dyn PlaceBytes) -> Self {
         Self {
             out,
-            packing: OnceLock::new(),
+            storage: OnceLock::new(),
             layout: OnceLock::new(),
             small: Mutex::default(),
             lane: Mutex::default(),
@@ -76,9 +76,10 @@ impl<'a> GlbSink<'a> {
         }
     }
 
-    /// Packs the vertices. To be called before the mesh begins, as their places depend on it; a second call changes nothing.
-    pub fn pack(&self, packing: Packing) {
-        let _first = self.packing.set(packing).is_ok();
+    /// Says how the mesh is stored. To be called before it begins, as the places of vertices depend on it; a second call
+    /// changes nothing.
+    pub fn store(&self, storage: impl Into<Storage>) {
+        let _first = self.storage.set(storage.into()).is_ok();
     }
 
     /// Why a part was refused.
@@ -97,7 +98,7 @@ impl<'a> GlbSink<'a> {
         let bounds = bounds.map(|row| row.map(|v| v + 0.0));
         let summary = Summary { bounds, max_atom: None, translucent: false };
         let layout = self.layout.get().copied().flatten();
-        let plan = GlbPlan::placed(layout, centre, &summary, meta)?;
+        let plan = GlbPlan::placed(layout, *self.storage.get_or_init(Storage::default), centre, &summary, meta)?;
         let head = plan.head().len() as u64;
         let small = lock(&self.small);
         self.drain()?;
@@ -116,8 +117,8 @@ impl<'a> GlbSink<'a> {
     }
 
     fn try_begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), PlaceError> {
-        let packing = *self.packing.get_or_init(Packing::default);
-        let layout = Layout::plain([n_vertices as u64, n_triangles as u64], packing)?;
+        let storage = *self.storage.get_or_init(Storage::default);
+        let layout = Layout::plain([n_vertices as u64, n_triangles as u64], storage)?;
         if let Some(layout) = layout {
             GlbPlan::check_len(HEAD_BYTES + layout.len.next_multiple_of(4))?;
             if layout.len < LARGE_BUFFER_BYTES {
@@ -132,7 +133,7 @@ impl<'a> GlbSink<'a> {
 
     fn try_part(&self, part: &MeshPart<'_>) -> Result<(), PlaceError> {
         let Some(layout) = self.layout.get().copied().flatten() else { return Ok(()) };
-        let (packing, row) = (layout.packing, part.first_vertex as u64);
+        let (packing, row) = (layout.storage.packing, part.first_vertex as u64);
         let (position, normal) = (packing.position_bytes() * row, packing.normal_bytes() * row);
         let (index_type, indices) = layout.indices;
         let first = 3 * part.first_triangle as u64 * index_type.bytes();
@@ -148,7 +149,9 @@ impl<'a> GlbSink<'a> {
         }
         let at = |offset: u64| At { sink: self, offset, now: lane.is_some() };
         write_positions(&mut at(layout.positions.offset + position), packing, part.positions)?;
-        write_normals(&mut at(layout.normals.offset + normal), packing, part.normals)?;
+        if let Some(normals) = layout.normals {
+            write_normals(&mut at(normals.offset + normal), packing, part.normals)?;
+        }
         write_indices(&mut at(indices.offset + first), index_type, part.triangles.as_flattened())?;
         if lane.is_some() { self.drain() } else { Ok(()) }
     }

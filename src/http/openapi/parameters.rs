@@ -30,7 +30,11 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
         Domain::Number { min, max, .. } => {
             object(Type::Number).minimum(Some(min)).maximum(Some(max)).default(number).into()
         }
-        Domain::Integer => object(Type::Integer).format(Some(SchemaFormat::KnownFormat(KnownFormat::Int32))).into(),
+        Domain::Integer { min, max } => {
+            let wide = i32::try_from(min).is_err() || i32::try_from(max).is_err();
+            let format = SchemaFormat::KnownFormat(if wide { KnownFormat::Int64 } else { KnownFormat::Int32 });
+            object(Type::Integer).format(Some(format)).minimum(Some(min)).maximum(Some(max)).into()
+        }
         Domain::Flag => object(Type::Boolean).default(parameter.default.parse::<bool>().ok().map(Value::from)).into(),
         Domain::Choice(values) => {
             let default = values.contains(&parameter.default).then(|| Value::from(parameter.default));

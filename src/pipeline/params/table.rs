@@ -1,6 +1,7 @@
 //! The table of parameters: names, what values they take, what they do.
 
-use crate::formats::Compress;
+use crate::formats::{Compress, Normals, Units};
+use crate::pipeline::spacing::{LEAST_TRIANGLES, MOST_TRIANGLES};
 use crate::structure::select::KIND_NAMES;
 use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Kernel, Preset, Proof};
@@ -17,8 +18,13 @@ pub enum Domain {
         /// Unit, such as `Å`.
         unit: &'static str,
     },
-    /// A whole number of 32 bits.
-    Integer,
+    /// A whole number within bounds, both included.
+    Integer {
+        /// Lowest value.
+        min: i64,
+        /// Highest value.
+        max: i64,
+    },
     /// `true` or `false`.
     Flag,
     /// One of these words.
@@ -39,7 +45,7 @@ impl Domain {
         match self {
             Self::Number { min, max, unit: "" } => format!("a number from {min} to {max}"),
             Self::Number { min, max, unit } => format!("a number from {min} to {max} {unit}"),
-            Self::Integer => "a whole number".to_owned(),
+            Self::Integer { min, max } => format!("a whole number from {min} to {max}"),
             Self::Flag => "true or false".to_owned(),
             Self::Choice(words) => format!("one of {}", words.join(", ")),
             Self::Set(words) => format!("one or more of {}, separated by commas", words.join(", ")),
@@ -75,6 +81,8 @@ const KERNELS: &[&str] = &names(Kernel::ALL);
 const PRESETS: &[&str] = &preset_names(Preset::ALL);
 const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj"];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
+const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
+const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
 const PROOFS: &[&str] = &[Proof::Checksum.name(), Proof::Exact.name()];
 
 const fn names(all: &[Kernel]) -> [&'static str; 3] {
@@ -100,7 +108,25 @@ pub const TABLE: &[Parameter] = &[
         default: "gaussian",
         doc: "The density that one atom contributes, as a function of distance.",
     },
-    number("resolution", [MIN_RESOLUTION, MAX_RESOLUTION], "Å", "0.5", "Spacing of the grid."),
+    number(
+        "resolution",
+        [MIN_RESOLUTION, MAX_RESOLUTION],
+        "Å",
+        "0.5",
+        "Spacing of the grid. Only one of resolution, detail and max_triangles can be given.",
+    ),
+    Parameter {
+        name: "detail",
+        domain: Domain::Integer { min: 0, max: 6 },
+        default: "absent",
+        doc: "Spacing by level, instead of resolution: 2, 1.4, 1, 0.7, 0.5, 0.35 or 0.25 Å up to 10,000 atoms; beyond, that times the cube root of atoms/10,000, 4 Å at most.",
+    },
+    Parameter {
+        name: "max_triangles",
+        domain: Domain::Integer { min: LEAST_TRIANGLES as i64, max: MOST_TRIANGLES as i64 },
+        default: "absent",
+        doc: "Instead of resolution: the finest spacing from 0.25 to 4 Å whose mesh has at most so many triangles.",
+    },
     number(
         "isovalue",
         [1e-3, 1e6],
@@ -147,7 +173,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "model",
-        domain: Domain::Integer,
+        domain: Domain::Integer { min: i32::MIN as i64, max: i32::MAX as i64 },
         default: "the first of the file",
         doc: "The model to take, by its number in the file.",
     },
@@ -187,6 +213,18 @@ pub const TABLE: &[Parameter] = &[
         domain: Domain::Choice(COMPRESS),
         default: "none",
         doc: "How glb and gltf store vertices: quantize takes 12 bytes instead of 24 (16-bit positions, 8-bit normals; KHR_mesh_quantization).",
+    },
+    Parameter {
+        name: "normals",
+        domain: Domain::Choice(NORMALS),
+        default: "smooth",
+        doc: "Whether vertices have normals. With none they are left out and viewers shade each triangle flat; STL has those of its triangles in any case.",
+    },
+    Parameter {
+        name: "units",
+        domain: Domain::Choice(UNITS),
+        default: "angstrom",
+        doc: "What 1 stands for in the file's coordinates: glb and gltf scale their node, the others their numbers (angstrom or nanometer). Reports stay in Å.",
     },
     Parameter {
         name: "report",
