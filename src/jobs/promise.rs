@@ -67,6 +67,21 @@ impl Promise {
         });
     }
 
+    /// The work is left for the next start: the attempt, if there was one, does not count. True if that changed the record.
+    fn leave(&self, tried: u32) -> bool {
+        self.view.send_if_modified(|view| {
+            if view.record.status.is_final() || view.record.attempts == tried && view.record.started_ms.is_none() {
+                return false;
+            }
+            view.record.attempts = tried;
+            view.record.status = Status::Accepted;
+            view.record.started_ms = None;
+            view.stage = None;
+            view.changed();
+            true
+        })
+    }
+
     /// The job ends, unless it has. True if it did.
     pub(super) fn end(&self, status: Status, and: impl FnOnce(&mut Record)) -> bool {
         self.view.send_if_modified(|view| {
@@ -127,6 +142,8 @@ pub(super) struct Runner<P> {
     pub(super) ticket: Option<Ticket>,
     pub(super) pin: P,
     pub(super) digest: Digest,
+    /// Times that it was begun before this process took it up.
+    pub(super) tried: u32,
 }
 
 /// What became of one attempt.
@@ -134,13 +151,13 @@ enum Attempt {
     Ended(Result<String, EndError>),
     /// It can be tried again at once or later: nothing about the job stands against it.
     Again,
-    /// The service stops; the record stays as it is, for the next start.
+    /// The service stops; the job stays on record, for the next start.
     Left,
 }
 
 impl<P> Runner<P> {
     pub(super) async fn run(self, ledger: &Ledger) {
-        let Self { promise, mut ticket, pin, digest } = self;
+        let Self { promise, mut ticket, pin, digest, tried } = self;
         loop {
             let attempt = attempt(ledger, &promise, &mut ticket, digest);
             let attempt = tokio::select! {
@@ -154,7 +171,15 @@ impl<P> Runner<P> {
                     break;
                 }
                 Attempt::Again => tokio::time::sleep(PAUSE).await,
-                Attempt::Left => break,
+                Attempt::Left => {
+                    // Stopping a service is not the job's fault, however often it happens.
+                    if promise.leave(tried)
+                        && let Err(error) = ledger.0.keep(&promise.record()).await
+                    {
+                        tracing::warn!(job = %promise.id(), %error, "a job that is left counts an attempt too many");
+                    }
+                    break;
+                }
             }
         }
         drop(pin);

@@ -23,6 +23,7 @@ mod residue;
 mod scan;
 pub mod select;
 mod sniff;
+mod survey;
 mod text;
 mod texts;
 
@@ -32,4 +33,5 @@ pub use contents::{Contents, Kind};
 pub use error::StructureError;
 pub use read::{ReadLimits, read};
 pub use select::{BadKinds, Selected, Selection, select};
+pub use survey::{Survey, survey};
 pub use texts::TextColumn;

@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use molmesh::config::Config;
-use molmesh::http::{Chosen, Server};
+use molmesh::http::{Chosen, Server, Stop};
 use molmesh::surface::{
     Backend, Control, FoundDevice, GridStats, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
@@ -183,7 +183,7 @@ pub(crate) fn log_lines(text: &str) -> Vec<String> {
 pub(crate) struct Running {
     pub(crate) addr: SocketAddr,
     pub(crate) metrics: SocketAddr,
-    stop: Option<tokio::sync::oneshot::Sender<()>>,
+    orders: tokio::sync::watch::Sender<Stop>,
     thread: Option<JoinHandle<bool>>,
     pub(crate) dir: tempfile::TempDir,
 }
@@ -219,13 +219,13 @@ pub(crate) fn start_on(
     let chosen = Chosen { backend, reason: "a test says so".to_owned(), devices: found };
     let server = runtime.block_on(Server::bind(config, chosen)).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
-    let (stop, stopped) = tokio::sync::oneshot::channel();
+    let (orders, ordered) = tokio::sync::watch::channel(Stop::Serve);
     let thread = std::thread::spawn(move || {
-        let drained = runtime.block_on(server.run(async { drop(stopped.await) })).unwrap();
+        let drained = runtime.block_on(server.run(ordered)).unwrap();
         runtime.shutdown_timeout(Duration::from_secs(1));
         drained
     });
-    Running { addr, metrics, stop: Some(stop), thread: Some(thread), dir }
+    Running { addr, metrics, orders, thread: Some(thread), dir }
 }
 
 impl Running {
@@ -249,11 +249,14 @@ impl Running {
             .sum()
     }
 
-    /// Says to stop, without waiting.
+    /// Says to stop and to finish what has begun, without waiting.
     pub(crate) fn stop(&mut self) {
-        if let Some(stop) = self.stop.take() {
-            stop.send(()).unwrap_or(());
-        }
+        self.order(Stop::Drain);
+    }
+
+    /// Says to come so far to an end, unless it is further already.
+    pub(crate) fn order(&self, stop: Stop) {
+        self.orders.send_modify(|now| *now = (*now).max(stop));
     }
 
     /// Stops and waits: true if every request was finished.
