@@ -51,7 +51,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     // The service runs whether or not somebody reads its banner.
     drop(io::stderr().write_all(text.as_bytes()));
 
-    let drained = runtime.block_on(async { server.run(shutdown_signals()).await }).map_err(|e| CliError::Service(e.to_string()));
+    let drained =
+        runtime.block_on(async { server.run(shutdown_signals()).await }).map_err(|e| CliError::Service(e.to_string()));
     // What still reads a file or computes after the drain timeout is not waited for.
     runtime.shutdown_timeout(Duration::from_millis(100));
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }

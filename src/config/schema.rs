@@ -17,9 +17,10 @@ pub fn schema() -> Value {
     let mut schema = settings.into_generator().into_root_schema_for::<Config>().to_value();
     let defaults = serde_json::to_value(Config::default()).unwrap_or_default();
     schema["title"] = "Configuration of molmesh".into();
-    schema["description"] = "The file that `molmesh serve --config FILE` reads. A key that does not exist is refused; none \
+    schema["description"] =
+        "The file that `molmesh serve --config FILE` reads. A key that does not exist is refused; none \
                              is required."
-        .into();
+            .into();
     for (section, of_section) in schema["properties"].as_object_mut().into_iter().flatten() {
         let Some(of_section) = of_section.as_object_mut() else { continue };
         of_section.remove("default");

@@ -25,6 +25,14 @@ struct Verdict {
     begun: Option<Instant>,
 }
 
+impl Verdict {
+    /// Why the store does not work, if a probe may take `limit`.
+    fn failure(&self, limit: Duration) -> Option<&'static str> {
+        let silent = self.begun.is_some_and(|begun| begun.elapsed() >= limit);
+        if silent { Some("it does not answer") } else { self.failed }
+    }
+}
+
 impl Probe {
     /// A store that has just been opened, which is a probe.
     pub(super) fn new() -> Self {
@@ -37,7 +45,9 @@ impl Probe {
         let config = &app.config.store;
         let mut verdict = self.0.subscribe();
         if verdict.borrow_and_update().at.elapsed() >= config.probe() {
-            let mine = self.0.send_if_modified(|verdict| verdict.begun.is_none() && verdict.begun.replace(Instant::now()).is_none());
+            let mine = self
+                .0
+                .send_if_modified(|verdict| verdict.begun.is_none() && verdict.begun.replace(Instant::now()).is_none());
             verdict.mark_unchanged();
             if mine {
                 let app = app.clone();
@@ -48,9 +58,7 @@ impl Probe {
             }
             drop(tokio::time::timeout(PATIENCE, verdict.wait_for(|verdict| verdict.begun.is_none())).await);
         }
-        let verdict = verdict.borrow();
-        let silent = verdict.begun.is_some_and(|begun| begun.elapsed() >= config.probe_timeout());
-        if silent { Some("it does not answer") } else { verdict.failed }
+        verdict.borrow().failure(config.probe_timeout())
     }
 
     fn conclude(&self, place: &str, outcome: Result<(), StoreError>) {
@@ -67,5 +75,21 @@ impl Probe {
             }
             *verdict = Verdict { at: Instant::now(), failed, begun: None };
         });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_slow_probe_changes_nothing_until_its_time_is_up() {
+        let hour = Duration::from_hours(1);
+        let verdict = |failed, begun| Verdict { at: Instant::now(), failed, begun };
+        let now = Some(Instant::now());
+        assert_eq!(verdict(None, None).failure(Duration::ZERO), None);
+        assert_eq!(verdict(None, now).failure(hour), None);
+        assert_eq!(verdict(Some("full"), now).failure(hour), Some("full"));
+        assert_eq!(verdict(None, now).failure(Duration::ZERO), Some("it does not answer"));
     }
 }

@@ -8,6 +8,7 @@ use std::time::{Instant, SystemTime};
 use quick_cache::sync::Cache;
 use thiserror::Error;
 use tokio::sync::{Semaphore, watch};
+use tokio::task::JoinHandle;
 
 use super::probe::Probe;
 use super::problem::Problem;
@@ -151,7 +152,8 @@ impl Server {
     }
 
     /// Serves until `orders` say otherwise, then ends step by step as [`Stop`] says: `server.notice_ms` for
-    /// [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], a second for what is cancelled. Must run on a tokio
+    /// [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], a second for what is cancelled. Whatever is ordered
+    /// while it drains, once the notice is over by itself or by order, cuts it short. Must run on a tokio
     /// runtime with timers and several threads. True if every request was finished; promised jobs that were not are left
     /// for the next start.
     ///
@@ -197,43 +199,57 @@ impl Server {
             }
         });
         stop::reached(&mut orders, Stop::Notice).await;
-        self.app.readiness.end();
-        let notice = self.app.config.server.notice();
-        if orders.has_changed().is_ok() && *orders.borrow() == Stop::Notice && !notice.is_zero() {
-            stop.send_replace(Stop::Notice);
-            tracing::info!(notice_ms = notice.as_millis(), "not ready any more; everything is served for a while");
-            drop(tokio::time::timeout(notice, stop::reached(&mut orders, Stop::Drain)).await);
-        }
-        tracing::info!("stopping: what has begun is finished, nothing new is accepted");
-        let end = tokio::time::Instant::now() + self.app.config.server.drain_timeout();
-        self.app.pool.leave();
-        stop.send_replace(Stop::Drain);
-        let cut = async {
-            tokio::select! {
-                () = tokio::time::sleep_until(end) => {}
-                () = stop::reached(&mut orders, Stop::Now) => {}
-            }
-            stop.send_replace(Stop::Now);
-        };
-        tokio::pin!(cut);
-        // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
-        let mut serving = serving;
-        let requests = tokio::select! {
-            served = &mut serving => served.unwrap_or(false),
-            () = cut.as_mut() => serving.await.unwrap_or(false),
-        };
-        let over = *stop.borrow() == Stop::Now;
-        let jobs = self.app.pool.drain(async { if !over { cut.await } }).await;
-        let settled = tokio::time::timeout(CANCELLING, self.app.ledger.settled()).await.is_ok();
+        let requests = wind_down(&self.app, &stop, &mut orders, serving).await;
         for task in [upkeep, warming, recovering, sweeping] {
             task.abort();
         }
         if let Some(metrics) = metrics {
             metrics.abort();
         }
-        tracing::info!(requests, jobs, settled, "stopped");
         Ok(requests)
     }
+}
+
+/// Ends the service step by step, as far as `orders` say. True if every request was finished.
+async fn wind_down(
+    app: &Shared,
+    stop: &watch::Sender<Stop>,
+    orders: &mut watch::Receiver<Stop>,
+    mut serving: JoinHandle<bool>,
+) -> bool {
+    app.readiness.end();
+    let notice = app.config.server.notice();
+    if orders.has_changed().is_ok() && *orders.borrow() == Stop::Notice && !notice.is_zero() {
+        stop.send_replace(Stop::Notice);
+        tracing::info!(notice_ms = notice.as_millis(), "not ready any more; everything is served for a while");
+        drop(tokio::time::timeout(notice, stop::reached(orders, Stop::Drain)).await);
+    }
+    tracing::info!("stopping: what has begun is finished, nothing new is accepted");
+    let end = tokio::time::Instant::now() + app.config.server.drain_timeout();
+    // Whatever is ordered from now on is an order more.
+    orders.borrow_and_update();
+    app.pool.leave();
+    stop.send_replace(Stop::Drain);
+    let cut = async {
+        tokio::select! {
+            () = tokio::time::sleep_until(end) => {}
+            () = stop::further(orders) => {}
+        }
+        stop.send_replace(Stop::Now);
+    };
+    tokio::pin!(cut);
+    // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
+    let served = tokio::select! {
+        served = &mut serving => Some(served),
+        () = cut.as_mut() => None,
+    };
+    let (requests, jobs) = match served {
+        Some(served) => (served.unwrap_or(false), app.pool.drain(cut).await),
+        None => (serving.await.unwrap_or(false), app.pool.drain(std::future::ready(())).await),
+    };
+    let settled = tokio::time::timeout(CANCELLING, app.ledger.settled()).await.is_ok();
+    tracing::info!(requests, jobs, settled, "stopped");
+    requests
 }
 
 fn tokio_listener(

@@ -35,6 +35,13 @@ pub(super) async fn reached(orders: &mut watch::Receiver<Stop>, step: Stop) {
     }
 }
 
+/// Waits until something more is ordered.
+pub(super) async fn further(orders: &mut watch::Receiver<Stop>) {
+    if orders.changed().await.is_err() {
+        std::future::pending::<()>().await;
+    }
+}
+
 /// The end as signals order it: SIGTERM gives notice first, SIGINT (Ctrl-C) drains at once; every further signal ends the
 /// step that is under way. Must be called on a tokio runtime.
 #[must_use]

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
-use metrics::{counter, gauge};
+use metrics::counter;
 use serde_json::Value;
 use thiserror::Error;
 use tokio::sync::watch;
@@ -19,7 +19,7 @@ use super::results::SaveError;
 use super::{Claim, ContentKey, Failure, Pool, Refusal, Task, Ticket};
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Store, StoreError};
-use crate::telemetry::{JOBS_OPEN, JOBS_RECOVERED};
+use crate::telemetry::JOBS_RECOVERED;
 
 /// Ended jobs that are kept in mind; older ones are read from the store.
 const MOST_ENDED: usize = 10_000;
@@ -130,7 +130,7 @@ pub(super) struct Inner {
     pub(super) describe: Describe,
     promises: Mutex<HashMap<JobId, Arc<Promise>>>,
     /// Jobs that are seen through at this moment.
-    open: watch::Sender<usize>,
+    pub(super) open: watch::Sender<usize>,
 }
 
 impl Inner {
@@ -335,22 +335,6 @@ impl Ledger {
             self.spawn(Runner { promise: fresh, ticket: None, pin, digest, tried });
         }
         Ok(promise)
-    }
-
-    fn spawn(&self, runner: Runner<[Pin; 2]>) {
-        gauge!(JOBS_OPEN).increment(1.0);
-        self.0.open.send_modify(|open| *open += 1);
-        let ledger = self.clone();
-        tokio::spawn(async move {
-            runner.run(&ledger).await;
-            gauge!(JOBS_OPEN).decrement(1.0);
-            ledger.0.open.send_modify(|open| *open -= 1);
-        });
-    }
-
-    /// Waits until every job that was taken up has ended, or is left, and that is on record. The pool must be drained.
-    pub async fn settled(&self) {
-        drop(self.0.open.subscribe().wait_for(|open| *open == 0).await);
     }
 
     /// What the worker does before it begins: the attempt is on record by then, so that a job that ends the process is

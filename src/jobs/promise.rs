@@ -4,6 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
+use metrics::gauge;
 use tokio::sync::{Notify, watch};
 
 use super::flight::Progress;
@@ -14,7 +15,8 @@ use super::results;
 use super::{ContentKey, Failure, Finished, Lease, Refusal, Task, Ticket};
 use crate::formats::Format;
 use crate::pipeline::params;
-use crate::store::Digest;
+use crate::store::{Digest, Pin};
+use crate::telemetry::JOBS_OPEN;
 
 /// How often a running job's progress is looked at.
 const TICK: Duration = Duration::from_millis(100);
@@ -144,6 +146,25 @@ pub(super) struct Runner<P> {
     pub(super) digest: Digest,
     /// Times that it was begun before this process took it up.
     pub(super) tried: u32,
+}
+
+impl Ledger {
+    /// Sees a job through, beside everything else.
+    pub(super) fn spawn(&self, runner: Runner<[Pin; 2]>) {
+        gauge!(JOBS_OPEN).increment(1.0);
+        self.0.open.send_modify(|open| *open += 1);
+        let ledger = self.clone();
+        tokio::spawn(async move {
+            runner.run(&ledger).await;
+            gauge!(JOBS_OPEN).decrement(1.0);
+            ledger.0.open.send_modify(|open| *open -= 1);
+        });
+    }
+
+    /// Waits until every job that was taken up has ended, or is left, and that is on record. The pool must be drained.
+    pub async fn settled(&self) {
+        drop(self.0.open.subscribe().wait_for(|open| *open == 0).await);
+    }
 }
 
 /// What became of one attempt.

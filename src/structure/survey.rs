@@ -81,7 +81,9 @@ mod tests {
             assert_eq!(id(name).as_deref(), Some("4pti"), "{name}");
         }
         assert_eq!(id("pdb_12345678.cif").as_deref(), Some("pdb_12345678"));
-        for name in ["4pti", "4pti.ent", "pdb4pti.pdb", "README.md", "4PTI.cif", "4pti.cif.bz2", ".cif", "pdb_12345678.pdb"] {
+        for name in
+            ["4pti", "4pti.ent", "pdb4pti.pdb", "README.md", "4PTI.cif", "4pti.cif.bz2", ".cif", "pdb_12345678.pdb"]
+        {
             assert_eq!(id(name), None, "{name}");
         }
     }
@@ -95,7 +97,9 @@ mod tests {
             std::fs::write(path, "").unwrap();
         };
         assert_eq!(survey(dir.path(), 9).unwrap(), Survey::default());
-        for path in ["4pti.cif", "pt/4pti.cif.gz", "cr/1crn.cif", "divided/pdb/gb/pdb1gbt.ent.gz", "notes.txt", "ab/x/2abc.cif"] {
+        for path in
+            ["4pti.cif", "pt/4pti.cif.gz", "cr/1crn.cif", "divided/pdb/gb/pdb1gbt.ent.gz", "notes.txt", "ab/x/2abc.cif"]
+        {
             file(path);
         }
         let found = survey(dir.path(), 9).unwrap();

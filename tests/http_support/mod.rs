@@ -27,6 +27,8 @@ pub(crate) enum Mode {
     Octahedra,
     /// The same after a while, unless it is cancelled.
     Slow(Duration),
+    /// The same once another mode is set.
+    Held,
     /// Never looks at the cancel token.
     Deaf(Duration),
     /// Panics.
@@ -47,6 +49,8 @@ pub(crate) struct Fake {
     pub(crate) started: AtomicUsize,
     pub(crate) finished: AtomicUsize,
     pub(crate) cancelled: AtomicUsize,
+    /// Atoms of every job, in the order in which they began.
+    pub(crate) begun: Mutex<Vec<usize>>,
 }
 
 impl Fake {
@@ -57,6 +61,7 @@ impl Fake {
             started: AtomicUsize::new(0),
             finished: AtomicUsize::new(0),
             cancelled: AtomicUsize::new(0),
+            begun: Mutex::default(),
         })
     }
 
@@ -84,6 +89,7 @@ impl Backend for Fake {
         let warm_up = spheres.len() == 1 && !self.also_warm.load(Ordering::SeqCst);
         let mode = if warm_up { Mode::Octahedra } else { *self.mode.lock().unwrap() };
         if !warm_up {
+            self.begun.lock().unwrap().push(spheres.len());
             self.started.fetch_add(1, Ordering::SeqCst);
         }
         match mode {
@@ -91,6 +97,15 @@ impl Backend for Fake {
             Mode::Slow(time) => {
                 let end = Instant::now() + time;
                 while Instant::now() < end {
+                    if let Err(error) = control.check() {
+                        self.cancelled.fetch_add(1, Ordering::SeqCst);
+                        return Err(error);
+                    }
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+            }
+            Mode::Held => {
+                while *self.mode.lock().unwrap() == Mode::Held {
                     if let Err(error) = control.check() {
                         self.cancelled.fetch_add(1, Ordering::SeqCst);
                         return Err(error);
@@ -256,12 +271,17 @@ impl Running {
 
     /// Says to come so far to an end, unless it is further already.
     pub(crate) fn order(&self, stop: Stop) {
-        self.orders.send_modify(|now| *now = (*now).max(stop));
+        self.orders.send_if_modified(|now| std::mem::replace(now, (*now).max(stop)) < stop);
     }
 
     /// Stops and waits: true if every request was finished.
     pub(crate) fn join(mut self) -> bool {
         self.stop();
+        self.wait()
+    }
+
+    /// Waits for the end that was ordered: true if every request was finished. The folder is still there then.
+    pub(crate) fn wait(&mut self) -> bool {
         self.thread.take().unwrap().join().unwrap()
     }
 }
@@ -378,10 +398,10 @@ fn unchunk(mut raw: &[u8]) -> (Vec<u8>, bool) {
     }
 }
 
-/// Waits for something to become true, five seconds at most.
+/// Waits for something to become true, half a minute at most: machines may be busy.
 #[track_caller]
 pub(crate) fn wait_for(what: &str, mut is: impl FnMut() -> bool) {
-    let end = Instant::now() + Duration::from_secs(5);
+    let end = Instant::now() + Duration::from_secs(30);
     while !is() {
         assert!(Instant::now() < end, "waited too long for: {what}");
         std::thread::sleep(Duration::from_millis(5));

@@ -111,7 +111,8 @@ pub(super) fn memory(machine: &Machine, config: &Config, workers: usize) -> Chec
     match machine.memory() {
         None => Check::new("memory", State::Ok, format!("{budget}; how much there is is not known")),
         Some((bytes, whose)) if most > bytes => {
-            let detail = format!("{budget} do not fit into the {} of {whose}: the system may end the process", size(bytes));
+            let detail =
+                format!("{budget} do not fit into the {} of {whose}: the system may end the process", size(bytes));
             Check::new("memory", State::Warning, detail)
         }
         Some((bytes, whose)) => Check::new("memory", State::Ok, format!("{budget}, of {} of {whose}", size(bytes))),

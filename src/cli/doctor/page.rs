@@ -24,7 +24,9 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     let vectors: Vec<&str> = machine::vectors().collect();
     page.row("vectors", &if vectors.is_empty() { "none that is known here".to_owned() } else { vectors.join(" ") });
     let memory = machine.bytes.map_or("unknown".to_owned(), size);
-    let limit = machine.limit.map_or("no limit of a control group".to_owned(), |(bytes, whose)| format!("{} for {whose}", size(bytes)));
+    let limit = machine
+        .limit
+        .map_or("no limit of a control group".to_owned(), |(bytes, whose)| format!("{} for {whose}", size(bytes)));
     page.row("memory", &format!("{memory}, {limit}"));
     for candidate in findings.backends.iter().filter(|candidate| !candidate.is_device()) {
         let said = match &candidate.state {

@@ -41,7 +41,8 @@ pub(super) async fn store(config: &Config, limit: Duration) -> Check {
         Ok(Ok(store)) => {
             let usage = Folder::ALL.map(|folder| (folder, store.usage(folder)));
             let bytes: u64 = usage.iter().map(|(_, usage)| usage.bytes).sum();
-            let held: Vec<_> = usage.iter().map(|(folder, usage)| format!("{} {}", usage.objects, folder.as_str())).collect();
+            let held: Vec<_> =
+                usage.iter().map(|(folder, usage)| format!("{} {}", usage.objects, folder.as_str())).collect();
             let (place, most) = (store.place(), size(config.store.max_bytes));
             let detail = format!("{place} can be written and read; {}, {} of {most}", held.join(", "), size(bytes));
             Check::new("store", State::Ok, detail)

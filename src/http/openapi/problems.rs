@@ -179,10 +179,7 @@ impl PartialSchema for ProblemDocument {
         let problem = problem
             .property("nearest", nearest)
             .property("available", strings.description(Some("What there is instead.")))
-            .property(
-                "checks",
-                ArrayBuilder::new().items(check).description(Some("What `/readyz` looked at.")),
-            )
+            .property("checks", ArrayBuilder::new().items(check).description(Some("What `/readyz` looked at.")))
             .property(
                 "diagnostics",
                 ArrayBuilder::new().items(finding).description(Some("What a second, strict reader says of the file.")),
