@@ -140,13 +140,22 @@ pub(crate) struct DeviceArgs {
     pub(crate) devices: DeviceChoice,
 }
 
+/// How `doctor` reports.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum DoctorStyle {
+    /// A page for people
+    Text,
+    /// JSON for programs
+    Json,
+}
+
 /// `molmesh doctor`.
 #[derive(Debug, ClapArgs)]
 #[command(after_help = DOCTOR_CODES)]
 pub(crate) struct DoctorArgs {
     /// How the report is written, on stdout
     #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
-    pub(crate) report: ReportStyle,
+    pub(crate) report: DoctorStyle,
     /// Seconds for an answer of the store, and of the remote archive
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0)]
     pub(crate) timeout: f64,

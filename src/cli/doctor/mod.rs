@@ -12,7 +12,7 @@ use molmesh::config::{Config, Loaded};
 use molmesh::surface::FoundDevice;
 use serde_json::{Value, json};
 
-use super::args::{DoctorArgs, ReportStyle};
+use super::args::{DoctorArgs, DoctorStyle};
 use super::backend::{self, Asked, Candidate, Picked, Use};
 use super::error::CliError;
 use super::style::Style;
@@ -36,8 +36,8 @@ pub(super) fn run(args: &DoctorArgs) -> Result<(), CliError> {
     let loaded = super::config::load(&args.serve)?;
     let findings = examine(args, loaded, limit)?;
     super::say(&match args.report {
-        ReportStyle::Text => page::text(&findings, Style::stdout()),
-        ReportStyle::Json => super::config::pretty(&findings.document()),
+        DoctorStyle::Text => page::text(&findings, Style::stdout()),
+        DoctorStyle::Json => super::config::pretty(&findings.document()),
     })?;
     let failed: Vec<_> = findings.checks.iter().filter(|c| c.state == State::Failed).map(|c| c.name).collect();
     if failed.is_empty() {

@@ -84,10 +84,11 @@ fn limits(page: &mut Page, findings: &Findings) {
     }
 }
 
-/// Bytes, with a binary suffix where that is exact.
+/// Bytes, with a binary suffix; rounded where that would take many digits.
 pub(super) fn size(bytes: u64) -> String {
     let suffixes = [("GiB", 30), ("MiB", 20), ("KiB", 10)];
     let exact = suffixes.iter().find(|(_, shift)| bytes >= 1 << shift && bytes.trailing_zeros() >= *shift);
+    let exact = exact.filter(|(_, shift)| *shift == 30 || bytes >> shift < 100_000);
     match exact {
         Some((suffix, shift)) => format!("{}{suffix}", bytes >> shift),
         None if bytes < 1 << 20 => format!("{bytes} bytes"),
@@ -117,6 +118,6 @@ mod tests {
     #[test]
     fn sizes_are_exact_or_rounded() {
         assert_eq!([0, 1000, 1024, 64 << 20, 3 << 30].map(size), ["0 bytes", "1000 bytes", "1KiB", "64MiB", "3GiB"]);
-        assert_eq!(size((3 << 29) + 1), "1.5GiB");
+        assert_eq!([(3 << 29) + 1, 24_684_084 << 10].map(size), ["1.5GiB", "23.5GiB"]);
     }
 }
