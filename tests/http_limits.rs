@@ -336,7 +336,7 @@ fn clients_of_http2_are_told_how_much_they_may_ask() {
     let mut head = [0; 9];
     stream.read_exact(&mut head).unwrap();
     assert_eq!(head[3], 4, "a frame of settings");
-    let mut settings = vec![0; usize::from(head[1]) << 8 | usize::from(head[2])];
+    let mut settings = vec![0; usize::from(u16::from_be_bytes([head[1], head[2]]))];
     stream.read_exact(&mut settings).unwrap();
     let value = |id: u8| settings.chunks(6).find(|s| s[1] == id).map(|s| u32::from_be_bytes([s[2], s[3], s[4], s[5]]));
     // Streams at once, and bytes of a head.
