@@ -106,9 +106,15 @@ fn secrets_are_not_shown_only_that_there_is_one() {
             assert_code(&done, 0);
             stdout(&done)
         };
-        let from_file = print(&|command| drop(command.arg("--config").arg(&file)));
-        let from_env = print(&|command| drop(command.env(variable, "hush-one")));
-        let named = print(&|command| drop(command.env(&file_variable, &secret)));
+        let from_file = print(&|command| {
+            command.arg("--config").arg(&file);
+        });
+        let from_env = print(&|command| {
+            command.env(variable, "hush-one");
+        });
+        let named = print(&|command| {
+            command.env(&file_variable, &secret);
+        });
         for (text, source) in [
             (&from_file, file.display().to_string()),
             (&from_env, variable.to_owned()),
