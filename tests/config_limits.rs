@@ -52,11 +52,7 @@ const ROWS: &[Row] = &[
     ),
     ("jobs.keepers", "molmesh_results_not_kept_total", "http_limits::so_many_results_are_kept_at_once"),
     ("devices.jobs", "molmesh_device_jobs", "http_devices::devices_are_listed_with_their_reasons"),
-    (
-        "devices.batch",
-        "molmesh_device_shared_submissions_total",
-        "gpu_meshes::several_jobs_share_a_submission_and_none_sees_another",
-    ),
+    ("devices.batch", "molmesh_device_shared_submissions_total", "gpu_pool::small_jobs_share_a_submission"),
     (
         "devices.spread_bricks",
         "molmesh_device_spread_jobs_total",

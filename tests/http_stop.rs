@@ -41,7 +41,7 @@ fn promise(server: &Running, n: usize) -> String {
 
 /// What is on record of a job.
 fn record(server: &Running, id: &str) -> Value {
-    let bytes = std::fs::read(server.dir.path().join("store/jobs").join(id)).unwrap();
+    let bytes = std::fs::read(server.dir.path().join(format!("store/jobs/{id}.json"))).unwrap();
     serde_json::from_slice(&bytes).unwrap()
 }
 
