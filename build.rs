@@ -7,8 +7,20 @@
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-changed=shaders");
+    built_by();
     #[cfg(feature = "gpu")]
     shaders::build();
+}
+
+/// Notes the target and the compiler, for `molmesh doctor`.
+fn built_by() {
+    let target = std::env::var("TARGET").unwrap_or_default();
+    let compiler = std::env::var_os("RUSTC").and_then(|rustc| {
+        let said = std::process::Command::new(rustc).arg("--version").output().ok()?;
+        Some(String::from_utf8(said.stdout).ok()?.trim().to_owned())
+    });
+    println!("cargo::rustc-env=MOLMESH_TARGET={target}");
+    println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
 }
 
 #[cfg(feature = "gpu")]

@@ -107,13 +107,25 @@ pub enum TelemetryError {
     },
 }
 
+/// Whether logs could be set up so.
+///
+/// # Errors
+/// [`TelemetryError::Filter`].
+pub fn check_logs(config: &LogConfig) -> Result<(), TelemetryError> {
+    filter(config).map(|_filter| ())
+}
+
+fn filter(config: &LogConfig) -> Result<EnvFilter, TelemetryError> {
+    EnvFilter::try_new(&config.filter)
+        .map_err(|e| TelemetryError::Filter { filter: config.filter.clone(), reason: e.to_string() })
+}
+
 /// Sends logs to standard error and panics to the log.
 ///
 /// # Errors
 /// [`TelemetryError`].
 pub fn init_logs(config: &LogConfig) -> Result<(), TelemetryError> {
-    let filter = EnvFilter::try_new(&config.filter)
-        .map_err(|e| TelemetryError::Filter { filter: config.filter.clone(), reason: e.to_string() })?;
+    let filter = filter(config)?;
     let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
     let installed = match config.format {
         LogFormat::Pretty => {

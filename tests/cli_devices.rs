@@ -4,7 +4,7 @@
 
 mod cli_support;
 
-use cli_support::{Folder, Service, assert_code, mesh, molmesh, rod, run, stderr, stdout};
+use cli_support::{Folder, Service, assert_code, doctor, mesh, molmesh, rod, run, stderr, stdout};
 
 fn report(flags: &[&str]) -> serde_json::Value {
     let folder = Folder::new();
@@ -35,9 +35,16 @@ fn devices_that_cannot_be_meant_are_bad_usage() {
 fn the_environment_is_read_and_flags_win() {
     let bad = molmesh().env("MOLMESH__DEVICES__USE", "abacus").args(["doctor"]).output().unwrap();
     assert_eq!(bad.status.code(), Some(2), "{}", stderr(&bad));
-    let flagged =
-        molmesh().env("MOLMESH__DEVICES__USE", "abacus").args(["doctor", "--devices", "cpu"]).output().unwrap();
-    assert_code(&flagged, 0);
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let mesh = |devices: &str, flags: &[&str]| {
+        let mut command = molmesh();
+        command.env("MOLMESH__DEVICES__USE", devices).arg("mesh").arg(&input).arg("-o").arg(folder.path("out.glb"));
+        command.args(flags).output().unwrap()
+    };
+    assert_eq!(mesh("abacus", &[]).status.code(), Some(2));
+    assert_code(&mesh("abacus", &["--devices", "cpu"]), 0);
+    assert_code(&mesh("77", &["--devices", "cpu"]), 0);
 }
 
 #[test]
@@ -64,7 +71,7 @@ fn a_device_that_is_asked_for_and_not_there_is_not_replaced_in_silence() {
 
 #[test]
 fn doctor_lists_every_device_with_its_reason() {
-    let done = run(["doctor"]);
+    let done = doctor(&[]);
     assert_code(&done, 0);
     let text = stdout(&done);
     for row in ["cpu", "reference", "gpu", "auto"] {
@@ -78,7 +85,7 @@ fn doctor_lists_every_device_with_its_reason() {
         assert!(said.contains("yes ") || said.contains("no "), "{line}");
         assert!(said.contains(": "), "no reason: {line}");
     }
-    let cpu = run(["doctor", "--devices", "cpu"]);
+    let cpu = doctor(&["--devices", "cpu"]);
     for line in stdout(&cpu).lines().filter(|line| line.trim_start().starts_with("device ")) {
         assert!(line.contains("the CPU was asked for"), "{line}");
     }

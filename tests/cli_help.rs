@@ -26,6 +26,9 @@ fn help_is_stable() {
     snapshot("molmesh", &["--help"]);
     snapshot("mesh", &["mesh", "--help"]);
     snapshot("serve", &["serve", "--help"]);
+    snapshot("doctor", &["doctor", "--help"]);
+    snapshot("config", &["config", "--help"]);
+    snapshot("config-print", &["config", "print", "--help"]);
     snapshot("healthcheck", &["healthcheck", "--help"]);
 }
 

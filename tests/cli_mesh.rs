@@ -343,7 +343,7 @@ fn version_and_doctor_answer_on_stdout() {
     let version = run(["version"]);
     assert_code(&version, 0);
     assert!(stdout(&version).starts_with(concat!("molmesh ", env!("CARGO_PKG_VERSION"))));
-    let doctor = run(["doctor"]);
+    let doctor = cli_support::doctor(&[]);
     assert_code(&doctor, 0);
     let text = stdout(&doctor);
     for part in ["cpu", "reference", "gpu", "paper", "auto", "limits", "cores", "vectors"] {

@@ -316,3 +316,96 @@ fn an_idle_http2_connection_is_closed() {
     });
     assert!(time > Duration::from_millis(250), "{time:?}");
 }
+
+#[test]
+fn heads_are_limited() {
+    let server = fake(|c| c.server.head_bytes = 8 << 10);
+    let with = |n: usize| send(server.addr, "GET", "/livez", &[("x-long", &"x".repeat(n))], b"").status;
+    let before = rejected(&server, "head-too-large");
+    assert_eq!((with(7000), with(9000)), (200, 431));
+    wait_for("it is counted", || rejected(&server, "head-too-large") > before);
+    assert_eq!(fake(|_| {}).get(&format!("/livez?{}", "x".repeat(9000))).status, 200, "the default allows more");
+}
+
+#[test]
+fn clients_of_http2_are_told_how_much_they_may_ask() {
+    let server = fake(|c| (c.server.streams, c.server.head_bytes) = (7, 9000));
+    let mut stream = connect(server.addr);
+    // The preface and empty settings; the server's settings are its first frame (RFC 9113, 3.4).
+    stream.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").unwrap();
+    let mut head = [0; 9];
+    stream.read_exact(&mut head).unwrap();
+    assert_eq!(head[3], 4, "a frame of settings");
+    let mut settings = vec![0; usize::from(u16::from_be_bytes([head[1], head[2]]))];
+    stream.read_exact(&mut settings).unwrap();
+    let value = |id: u8| settings.chunks(6).find(|s| s[1] == id).map(|s| u32::from_be_bytes([s[2], s[3], s[4], s[5]]));
+    // Streams at once, and bytes of a head.
+    assert_eq!((value(3), value(6)), (Some(7), Some(9000)));
+}
+
+#[test]
+fn silent_event_streams_give_signs_of_life() {
+    let server = start(Fake::new(Mode::Held), |c| {
+        (c.server.heartbeat_ms, c.server.drain_timeout_ms) = (20, 100);
+    });
+    let promised = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
+    assert_eq!(promised.status, 202);
+    let mut stream = connect(server.addr);
+    write!(stream, "GET {}/events HTTP/1.1\r\nhost: t\r\n\r\n", promised.header("location").unwrap()).unwrap();
+    let mut text = String::new();
+    let mut some = [0; 1024];
+    // Comments: lines that begin with a colon.
+    while text.matches("\n:\n").count() + text.matches("\n: \n").count() < 3 {
+        let n = stream.read(&mut some).unwrap();
+        assert!(n > 0, "it ended: {text}");
+        text.push_str(&String::from_utf8_lossy(&some[..n]));
+    }
+}
+
+#[test]
+fn promised_jobs_stand_back_for_so_long() {
+    for (patience_ms, order) in [(1, [2, 3, 4]), (3_600_000, [2, 4, 3])] {
+        let backend = Fake::new(Mode::Held);
+        let server = start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.jobs.patience_ms) = (1, patience_ms));
+        let server = &server;
+        std::thread::scope(|scope| {
+            let running = scope.spawn(|| server.post("/v1/meshes", &[], &carbons(2)).status);
+            wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 1);
+            assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], &carbons(3)).status, 202);
+            let waiting = scope.spawn(|| server.post("/v1/meshes", &[], &carbons(4)).status);
+            wait_for("two to wait", || server.metric("molmesh_queue_depth", &[]) >= 2.0);
+            std::thread::sleep(Duration::from_millis(5));
+            backend.set(Mode::Octahedra);
+            assert_eq!((running.join().unwrap(), waiting.join().unwrap()), (200, 200));
+        });
+        wait_for("all to have begun", || backend.started.load(Ordering::SeqCst) == 3);
+        assert_eq!(*backend.begun.lock().unwrap(), order, "patience of {patience_ms} ms");
+    }
+}
+
+#[test]
+fn so_many_results_are_kept_at_once() {
+    let server = fake(|c| (c.jobs.keepers, c.jobs.queue) = (1, 100));
+    let (server, busy) = (&server, || server.metric("molmesh_results_not_kept_total", &["reason=\"busy\""]));
+    let (before, end) = (busy(), Instant::now() + Duration::from_mins(1));
+    for round in 0.. {
+        std::thread::scope(|scope| {
+            for n in 0..6 {
+                scope.spawn(move || server.post("/v1/meshes", &[], &carbons(5_000 + 10 * round + n)).status);
+            }
+        });
+        if busy() > before {
+            break;
+        }
+        assert!(Instant::now() < end, "every one of six results at once was kept");
+    }
+}
+
+#[test]
+fn what_is_too_old_is_swept_as_often_as_configured() {
+    let server = fake(|c| (c.store.sweep_ms, c.store.result_ttl_ms) = (20, 1));
+    let removed = || server.metric("molmesh_store_removed_total", &["reason=\"ttl\""]);
+    let before = removed();
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    wait_for("the result is gone", || removed() > before);
+}

@@ -111,6 +111,11 @@ fn may_follow(from: &Url, to: &Url) -> bool {
     from.host_str() == to.host_str() && (same_place || upgrade)
 }
 
+/// Asks for a head alone: the status of the answer.
+pub(super) async fn head(client: &Client, url: Url) -> Result<u16, Failed> {
+    client.head(url).send().await.map(|answer| answer.status().as_u16()).map_err(|error| of_client(&error))
+}
+
 /// Asks once. What comes is counted by `share` while it comes, and for as long as the answer lives.
 pub(super) async fn get(
     client: &Client,

@@ -106,6 +106,15 @@ impl Archive {
         flight.await.unwrap_or(Err(FetchError::Internal("its fetch ended without a result")))
     }
 
+    /// Asks every host of the remote archive for the head of one entry, each for `limit` at most: the host, and the status of its
+    /// answer or why there is none. Empty where there is no remote archive. No copy is made.
+    pub async fn reach(&self, id: &EntryId, limit: Duration) -> Vec<(String, Result<u16, String>)> {
+        match &self.shared.remote {
+            Some(remote) => remote.reach(id, limit).await,
+            None => Vec::new(),
+        }
+    }
+
     /// The digest of an entry's bytes, without reading them where they are known and fresh.
     ///
     /// # Errors

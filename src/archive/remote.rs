@@ -60,6 +60,26 @@ impl Remote {
         Some(Self { sources, config: config.clone(), limits, places, memory, client: OnceCell::new() })
     }
 
+    /// Asks every address for the head of one well-known entry: whether somebody answers there, each host with its status.
+    pub(super) async fn reach(&self, id: &EntryId, limit: Duration) -> Vec<(String, Result<u16, String>)> {
+        let mut reached = Vec::new();
+        for (template, breaker) in &self.sources {
+            let ask = async {
+                let failed = |failed: Failed| match failed {
+                    Failed::TooLarge(_) => "too large".to_owned(),
+                    Failed::Other { detail, .. } => detail,
+                };
+                let client = self.client().await.map_err(failed)?;
+                let url = template.url(id).ok_or("the address is no URL")?;
+                client::head(client, url).await.map_err(failed)
+            };
+            let answer = tokio::time::timeout(limit, ask).await;
+            let silent = |_elapsed| Err(format!("no answer within {} ms", limit.as_millis()));
+            reached.push((breaker.host().to_owned(), answer.unwrap_or_else(silent)));
+        }
+        reached
+    }
+
     /// Asks every address in order until one has the entry.
     pub(super) async fn fetch(&self, id: &EntryId, copy: Option<&Origin>) -> Result<Answer, FetchError> {
         let deadline = Instant::now() + self.config.timeout();

@@ -16,6 +16,13 @@ Examples:
   molmesh mesh 1gbt.cif.gz -o - --format ply --resolution 0.3 > 1gbt.ply
   curl -s http://127.0.0.1:8080/sample.pdb | molmesh mesh - -o 4pti.stl --report json";
 
+const DOCTOR_CODES: &str = "\
+Exit codes:
+    0  a service with this configuration would start and be ready; warnings do not count
+    1  it would not: an address is taken, the store cannot be used, or the log filter is wrong
+    2  bad usage or a bad configuration
+    6  no such backend or device on this machine, or it cannot make a mesh";
+
 /// Molecules in, proven surface meshes out.
 #[derive(Debug, Parser)]
 #[command(name = "molmesh", version, arg_required_else_help = true, disable_help_subcommand = true)]
@@ -31,9 +38,12 @@ pub(crate) enum Command {
     /// Mesh the surface of one structure
     Mesh(Box<MeshArgs>),
     /// Serve meshes over HTTP
-    Serve(ServeArgs),
-    /// Say what this machine has, and what of it is used
-    Doctor(DoctorArgs),
+    Serve(Box<ServeArgs>),
+    /// Say what this machine has, what of it is used, and whether a service would start and be ready
+    Doctor(Box<DoctorArgs>),
+    /// Print the configuration of the service, or describe it
+    #[command(subcommand)]
+    Config(ConfigCommand),
     /// Ask a running service whether it is ready; exit code 0 if so
     Healthcheck(HealthcheckArgs),
     /// Time what this machine has
@@ -136,11 +146,55 @@ pub(crate) struct DeviceArgs {
     pub(crate) devices: DeviceChoice,
 }
 
+/// How `doctor` reports.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum DoctorStyle {
+    /// A page for people
+    Text,
+    /// JSON for programs
+    Json,
+}
+
 /// `molmesh doctor`.
 #[derive(Debug, ClapArgs)]
+#[command(after_help = DOCTOR_CODES)]
 pub(crate) struct DoctorArgs {
+    /// How the report is written, on stdout
+    #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
+    pub(crate) report: DoctorStyle,
+    /// Seconds for an answer of the store, and of the remote archive
+    #[arg(long, value_name = "SECONDS", default_value_t = 5.0)]
+    pub(crate) timeout: f64,
     #[command(flatten)]
-    pub(crate) devices: DeviceArgs,
+    pub(crate) serve: ServeArgs,
+}
+
+/// `molmesh config`.
+#[derive(Debug, Subcommand)]
+pub(crate) enum ConfigCommand {
+    /// Print the effective configuration, each value with its source; secrets are not shown
+    Print(Box<PrintArgs>),
+    /// Print the JSON Schema of the configuration file
+    Schema,
+}
+
+/// How the configuration is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum ConfigStyle {
+    /// A configuration file, sources in comments
+    Toml,
+    /// `config` and `sources`
+    Json,
+}
+
+/// `molmesh config print`.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct PrintArgs {
+    /// How it is written
+    #[arg(long, value_enum, default_value = "toml")]
+    pub(crate) format: ConfigStyle,
+    #[command(flatten)]
+    pub(crate) serve: ServeArgs,
 }
 
 /// Which surface.
@@ -255,7 +309,7 @@ pub(crate) struct ServeArgs {
     /// Configuration file (TOML)
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
-    /// Set one value of the configuration, such as `limits.max_atoms=100000`; may be repeated
+    /// Set one value of the configuration, such as `limits.atoms=100000`; may be repeated
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     pub(crate) set: Vec<String>,
     /// What runs the meshing

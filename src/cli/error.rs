@@ -117,6 +117,14 @@ pub(crate) enum CliError {
     /// The service could not start, or is not healthy.
     #[error("{0}")]
     Service(String),
+    /// A service would not start, or not be ready.
+    #[error("a service would not start or not be ready: {}", failed.join(", "))]
+    Unfit {
+        /// The checks that failed.
+        failed: Vec<&'static str>,
+        /// Whether it is for want of a backend.
+        backend: bool,
+    },
     /// A defect of ours.
     #[error("internal error: {0}")]
     Internal(String),
@@ -151,10 +159,10 @@ impl CliError {
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
             Self::Strict { .. } => code::STRUCTURE,
             Self::Format(error) => format_code(error),
-            Self::NoBackend { .. } => code::BACKEND,
+            Self::NoBackend { .. } | Self::Unfit { backend: true, .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
             Self::Interrupted => code::INTERRUPTED,
-            Self::Service(_) | Self::Internal(_) => code::INTERNAL,
+            Self::Service(_) | Self::Unfit { .. } | Self::Internal(_) => code::INTERNAL,
         }
     }
 
@@ -254,9 +262,11 @@ mod tests {
     fn every_kind_of_failure_has_its_code() {
         let job = |source: JobError| CliError::Job { name: "x".into(), source, opinion: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
-        let cases: [(CliError, i32); 16] = [
+        let cases: [(CliError, i32); 18] = [
             (CliError::Internal(String::new()), 1),
+            (CliError::Unfit { failed: vec!["store"], backend: false }, 1),
             (CliError::usage("x"), 2),
+            (CliError::Unfit { failed: vec!["devices", "store"], backend: true }, 6),
             (CliError::Input { name: "x".into(), source: missing() }, 3),
             (job(StructureError::NoAtoms { found: "nothing".into() }.into()), 4),
             (job(SurfaceError::NoSpheres.into()), 4),

@@ -13,16 +13,21 @@ const MAX_ANSWER: u64 = 64 << 10;
 /// Runs the command: prints the answer's status, fails unless it is 200.
 pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
     let url = Url::parse(&args.url)?;
-    let timeout = Some(args.timeout)
-        .filter(|seconds| (0.001..=3600.0).contains(seconds))
-        .map(Duration::from_secs_f64)
-        .ok_or_else(|| CliError::usage("parameter `timeout`: expected seconds from 0.001 to 3600"))?;
+    let timeout = timeout(args.timeout)?;
     let answer = get(&url, timeout).map_err(|e| CliError::Service(format!("{} does not answer: {e}", args.url)))?;
     match status(&answer) {
         Some(200) => super::say("200 ok\n"),
         Some(code) => Err(CliError::Service(format!("{} answers {code}", args.url))),
         None => Err(CliError::Service(format!("{} does not speak HTTP", args.url))),
     }
+}
+
+/// The time that was asked for.
+pub(super) fn timeout(seconds: f64) -> Result<Duration, CliError> {
+    Some(seconds)
+        .filter(|seconds| (0.001..=3600.0).contains(seconds))
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| CliError::usage("parameter `timeout`: expected seconds from 0.001 to 3600"))
 }
 
 /// The parts of an `http://` address.

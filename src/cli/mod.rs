@@ -7,6 +7,7 @@ mod backend;
 mod banner;
 #[cfg(feature = "gpu")]
 mod bench;
+mod config;
 mod doctor;
 mod error;
 mod healthcheck;
@@ -40,6 +41,7 @@ pub(crate) fn main() -> i32 {
         Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
         Command::Serve(args) => serve::run(&args),
         Command::Doctor(args) => doctor::run(&args),
+        Command::Config(command) => config::run(&command),
         Command::Healthcheck(args) => healthcheck::run(&args),
         #[cfg(feature = "gpu")]
         Command::Bench(bench) => bench::run(&bench),
@@ -72,11 +74,13 @@ fn usage(error: &clap::Error) -> i32 {
 
 /// `molmesh version`.
 fn version() -> Result<(), CliError> {
-    let features: Vec<&str> = [("cli", true), ("server", true), ("gpu", cfg!(feature = "gpu"))]
-        .into_iter()
-        .filter_map(|(name, on)| on.then_some(name))
-        .collect();
-    say(&format!("molmesh {} (features: {})\n", env!("CARGO_PKG_VERSION"), features.join(", ")))
+    say(&format!("molmesh {} (features: {})\n", env!("CARGO_PKG_VERSION"), features().join(", ")))
+}
+
+/// The features of this build.
+fn features() -> Vec<&'static str> {
+    let features = [("cli", true), ("server", true), ("gpu", cfg!(feature = "gpu"))];
+    features.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
 }
 
 /// Writes `text` to stdout at once.

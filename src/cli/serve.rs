@@ -4,13 +4,13 @@ use std::io::{self, Write};
 use std::sync::Arc;
 use std::time::Duration;
 
-use molmesh::config::{self, Config};
-use molmesh::http::{Chosen, Server, shutdown_signal};
+use molmesh::config::Loaded;
+use molmesh::http::{Chosen, Server, shutdown_signals};
 use molmesh::structure::referee;
 use molmesh::surface::Backend;
 use molmesh::telemetry;
 
-use super::args::{LogStyle, ServeArgs};
+use super::args::ServeArgs;
 use super::backend::{self, Asked, Picked};
 use super::banner::{self, Facts};
 use super::error::CliError;
@@ -24,8 +24,11 @@ const RUNTIME_THREADS: usize = 2;
 
 /// Runs the command: returns when the service was stopped and has finished what it was doing.
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
-    let config = config(args)?;
+    let Loaded { config, warnings, .. } = super::config::load(args)?;
     telemetry::init_logs(&config.log).map_err(|e| CliError::usage(e.to_string()))?;
+    for warning in warnings {
+        tracing::warn!("{warning}");
+    }
     referee::quiet_panics();
     let asked = Asked { backend: args.backend, devices: &config.devices.choice, threads: None };
     let picked = backend::pick(&asked, &backend::Use::Service(config.devices.clone()))?;
@@ -48,7 +51,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     // The service runs whether or not somebody reads its banner.
     drop(io::stderr().write_all(text.as_bytes()));
 
-    let drained = runtime.block_on(server.run(shutdown_signal())).map_err(|e| CliError::Service(e.to_string()));
+    let drained =
+        runtime.block_on(async { server.run(shutdown_signals()).await }).map_err(|e| CliError::Service(e.to_string()));
     // What still reads a file or computes after the drain timeout is not waited for.
     runtime.shutdown_timeout(Duration::from_millis(100));
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
@@ -65,31 +69,4 @@ fn give_way() {
     if let Err(error) = rayon::ThreadPoolBuilder::new().build_global() {
         tracing::debug!(%error, "the threads that compute were there already");
     }
-}
-
-/// Defaults, then the file, then the environment, then `--set`, then the flags that have names of their own.
-fn config(args: &ServeArgs) -> Result<Config, CliError> {
-    let mut flags = Vec::new();
-    for set in &args.set {
-        let (key, value) = set.split_once('=').ok_or_else(|| CliError::Usage {
-            message: format!("parameter `set`: `{set}` is not allowed; expected section.key=value"),
-            hint: None,
-        })?;
-        flags.push((key.to_owned(), value.to_owned()));
-    }
-    let path = |p: &std::path::PathBuf| p.to_string_lossy().into_owned();
-    let log = args.log.map(|style| match style {
-        LogStyle::Pretty => "pretty".to_owned(),
-        LogStyle::Json => "json".to_owned(),
-    });
-    let named = [
-        ("server.listen", args.listen.map(|a| a.to_string())),
-        ("server.metrics_listen", args.metrics_listen.map(|a| a.to_string())),
-        ("server.data_dir", args.data_dir.as_ref().map(path)),
-        ("devices.use", args.devices.clone()),
-        ("archive.dir", args.archive.as_ref().map(path)),
-        ("log.format", log),
-    ];
-    flags.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
-    config::load_process(args.config.as_deref(), &flags).map_err(|e| CliError::usage(e.to_string()))
 }

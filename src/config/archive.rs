@@ -3,15 +3,16 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{ProxyUrl, Templates};
 
 /// The folder of structures, the remote archive, and the copies that are kept of it.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ArchiveConfig {
-    /// The folder, flat or in wwPDB's `divided` layout. None: `archive` in the data folder, so that one folder is
+    /// The folder, flat or in wwPDB's `divided` layout. Default `none`: `archive` in the data folder, so that one folder is
     /// all that an operator has to mount.
     pub dir: Option<PathBuf>,
     /// How long a file of the folder is believed to be as it was, ms. Default 1,000: looking at it again costs a

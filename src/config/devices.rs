@@ -1,17 +1,19 @@
 //! Which devices run the meshing, and how much of it at once.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::surface::DeviceChoice;
 use crate::surface::devices::{EXPECTED, SPREAD_BRICKS};
 
 /// GPUs.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DevicesConfig {
     /// Which devices may be used: `auto`, `all`, `cpu`, or a list such as `0,2` or `software`. Default `auto`: the
     /// best kind of GPU that there is, else the CPU.
     #[serde(rename = "use", serialize_with = "write", deserialize_with = "read")]
+    #[schemars(with = "String")]
     pub choice: DeviceChoice,
     /// Jobs that run at once for each device, instead of `jobs.workers` where there are more of them so. Default 16: a
     /// device is done with a small job before the next file is read, and only jobs that are there can share a

@@ -35,6 +35,26 @@ pub enum ConfigError {
         /// The layer that it came from.
         source_layer: Source,
     },
+    /// A secret is given twice.
+    #[error("`{}` ({}) and `{}` ({}) exclude each other: give one of them", one.0, one.1, other.0, other.1)]
+    Both {
+        /// The key and the layer that it came from.
+        one: (String, Source),
+        /// The key that names its file, and the layer.
+        other: (String, Source),
+    },
+    /// The file of a secret cannot be used.
+    #[error("{source_layer}: `{key}`: cannot read {}: {reason}", path.display())]
+    SecretFile {
+        /// The key as `section.key`.
+        key: String,
+        /// The file.
+        path: PathBuf,
+        /// The system's words.
+        reason: String,
+        /// The layer that it came from.
+        source_layer: Source,
+    },
     /// A value has the wrong type or is out of range.
     #[error("{source_layer}: `{key}` is {value}; expected {expected}")]
     BadValue {

@@ -2,10 +2,11 @@
 
 use std::time::Duration;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The worker pool.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct JobsConfig {
     /// Jobs that run at once. Default 2: the backend spreads one job over all cores, and a second one fills them
@@ -27,6 +28,9 @@ pub struct JobsConfig {
     /// Time from acceptance to the result of a promised job, ms, waiting included. Default 3,600,000: nobody holds a
     /// connection for it.
     pub batch_deadline_ms: u64,
+    /// Time after which a promised job that waits goes as well, ms, whoever else waits. Default 10,000: people's requests come
+    /// first, but nobody waits for ever.
+    pub patience_ms: u64,
     /// Times that a promised job is begun at most. Default 3: a job that ended the process so often will end it again.
     pub attempts: u32,
     /// Time for which a promised job's mesh is held and offered again while the store does not take it, ms. Default 60,000:
@@ -46,6 +50,7 @@ impl Default for JobsConfig {
             deadline_ms: 60_000,
             sync_wait_ms: 10_000,
             batch_deadline_ms: 3_600_000,
+            patience_ms: 10_000,
             attempts: 3,
             store_patience_ms: 60_000,
             keepers: 4,
@@ -70,6 +75,12 @@ impl JobsConfig {
     #[must_use]
     pub fn store_patience(&self) -> Duration {
         Duration::from_millis(self.store_patience_ms)
+    }
+
+    /// Time after which a promised job that waits goes as well.
+    #[must_use]
+    pub fn patience(&self) -> Duration {
+        Duration::from_millis(self.patience_ms)
     }
 
     /// Time from acceptance to the finished mesh.

@@ -1,5 +1,6 @@
 //! What one request may cost, checked before anything is allocated for it.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::pipeline::JobLimits;
@@ -7,7 +8,7 @@ use crate::structure::ReadLimits;
 use crate::surface::SurfaceLimits;
 
 /// Limits of a request, and of all of them together.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LimitsConfig {
     /// Bytes of a request body as sent. Default 256 MiB: the largest entries of the archive are about 100 MB

@@ -1,10 +1,12 @@
 //! The layers: each sets single keys of a tree whose shape the defaults give.
 
+use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
+use super::secrets;
 use super::store::HIDDEN;
 use super::{Config, ConfigError};
 use crate::pipeline::nearest::nearest;
@@ -15,6 +17,8 @@ const PREFIX: &str = "MOLMESH__";
 /// Where a value came from.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Source {
+    /// Nobody said anything.
+    Default,
     /// The TOML file.
     File(PathBuf),
     /// An environment variable.
@@ -26,6 +30,7 @@ pub enum Source {
 impl fmt::Display for Source {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
+            Self::Default => f.write_str("default"),
             Self::File(path) => write!(f, "{}", path.display()),
             Self::Environment(name) => f.write_str(name),
             Self::Flag => f.write_str("command line"),
@@ -33,19 +38,43 @@ impl fmt::Display for Source {
     }
 }
 
+/// A configuration and where its values are from.
+#[derive(Debug, Clone)]
+pub struct Loaded {
+    /// The configuration; secrets that files hold are in it.
+    pub config: Config,
+    /// What an operator should know, one sentence each.
+    pub warnings: Vec<String>,
+    sources: BTreeMap<String, Source>,
+}
+
+impl Loaded {
+    /// Where the value of `section.key` is from.
+    #[must_use]
+    pub fn source(&self, key: &str) -> Source {
+        self.sources.get(key).cloned().unwrap_or(Source::Default)
+    }
+
+    /// Every key that is not at its default because nobody said anything, with who did.
+    pub fn sources(&self) -> impl Iterator<Item = (&str, &Source)> {
+        self.sources.iter().map(|(key, source)| (key.as_str(), source))
+    }
+}
+
 /// Loads the configuration of this process: `file`, then the environment, then `flags`.
 ///
 /// # Errors
 /// See [`load`].
-pub fn load_process(file: Option<&Path>, flags: &[(String, String)]) -> Result<Config, ConfigError> {
+pub fn load_process(file: Option<&Path>, flags: &[(String, String)]) -> Result<Loaded, ConfigError> {
     let env = std::env::vars_os().filter_map(|(k, v)| Some((k.into_string().ok()?, v.to_string_lossy().into_owned())));
-    load(file, env, flags)
+    load_with_sources(file, env, flags)
 }
 
 /// Loads a configuration: defaults, then `file`, then the variables of `env` that begin with `MOLMESH__`, then
 /// `flags` as pairs of a path such as `server.listen` and a value.
 ///
-/// Values from the environment and flags are text: `none` clears a key, sizes may be written as `64MiB`.
+/// Values from the environment and flags are text: `none` clears a key, sizes may be written as `64MiB`. A secret may be given
+/// by a file that the key with `_file` behind its name names.
 ///
 /// # Errors
 /// [`ConfigError`] names the first key that is unknown or whose value cannot be used.
@@ -54,6 +83,18 @@ pub fn load(
     env: impl IntoIterator<Item = (String, String)>,
     flags: &[(String, String)],
 ) -> Result<Config, ConfigError> {
+    load_with_sources(file, env, flags).map(|loaded| loaded.config)
+}
+
+/// [`load`], with the source of every value.
+///
+/// # Errors
+/// See [`load`].
+pub fn load_with_sources(
+    file: Option<&Path>,
+    env: impl IntoIterator<Item = (String, String)>,
+    flags: &[(String, String)],
+) -> Result<Loaded, ConfigError> {
     let mut tree = Tree::new();
     if let Some(path) = file {
         let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Read { path: path.to_owned(), error })?;
@@ -78,7 +119,8 @@ pub fn load(
     for (key, value) in flags {
         tree.set(key, &Value::String(value.clone()), &Source::Flag)?;
     }
-    Ok(tree.config)
+    let warnings = tree.read_secrets()?;
+    Ok(Loaded { config: tree.config, warnings, sources: tree.sources })
 }
 
 /// The configuration so far, typed and as a tree.
@@ -86,13 +128,14 @@ struct Tree {
     defaults: Value,
     values: Value,
     config: Config,
+    sources: BTreeMap<String, Source>,
 }
 
 impl Tree {
     fn new() -> Self {
         let config = Config::default();
         let defaults = serde_json::to_value(&config).unwrap_or(Value::Null);
-        Self { values: defaults.clone(), defaults, config }
+        Self { values: defaults.clone(), defaults, config, sources: BTreeMap::new() }
     }
 
     fn unknown(&self, key: &str, source_layer: Source) -> ConfigError {
@@ -112,9 +155,10 @@ impl Tree {
         let pointer = format!("/{}", key.replace('.', "/"));
         let default = self.defaults.pointer(&pointer).filter(|d| !d.is_object());
         let Some(default) = default else { return Err(self.unknown(key, source.clone())) };
+        let hidden = secrets::is_hidden(key, value.as_str().unwrap_or_default());
         let bad = |expected: String| ConfigError::BadValue {
             key: key.to_owned(),
-            value: if key.contains("secret") { HIDDEN.to_owned() } else { value.to_string() },
+            value: if hidden { HIDDEN.to_owned() } else { value.to_string() },
             expected,
             source_layer: source.clone(),
         };
@@ -131,9 +175,9 @@ impl Tree {
             }
             _ => value.clone(),
         };
-        // Nothing can be served with a limit or a timeout of zero; ports are part of addresses, not numbers.
-        if typed.as_f64().is_some_and(|v| v < 1.0) {
-            return Err(bad("1 or more".to_owned()));
+        let least = least(key);
+        if typed.as_f64().is_some_and(|v| v < least as f64) {
+            return Err(bad(format!("{least} or more")));
         }
         if let Some(place) = self.values.pointer_mut(&pointer) {
             *place = typed;
@@ -141,7 +185,51 @@ impl Tree {
         let number = clears && default.is_number();
         let why = |e: serde_json::Error| bad(if number { "a whole number".to_owned() } else { e.to_string() });
         self.config = serde_json::from_value(self.values.clone()).map_err(why)?;
+        self.sources.insert(key.to_owned(), source.clone());
         Ok(())
+    }
+
+    /// Takes secrets from the files that are named for them. What is to be said about the files comes back.
+    fn read_secrets(&mut self) -> Result<Vec<String>, ConfigError> {
+        let mut warnings = Vec::new();
+        for key in secrets::SECRETS {
+            let file_key = secrets::file_key(key);
+            let at = |key: &str| format!("/{}", key.replace('.', "/"));
+            let Some(path) = secrets::path_of(self.values.pointer(&at(&file_key))) else { continue };
+            let source = |key: &str| self.sources.get(key).cloned().unwrap_or(Source::Default);
+            if self.values.pointer(&at(key)).is_some_and(|value| !value.is_null()) {
+                let [one, other] = [key, &file_key].map(|key| (key.to_owned(), source(key)));
+                return Err(ConfigError::Both { one, other });
+            }
+            let source_layer = source(&file_key);
+            let read = secrets::read(&path).map_err(|reason| ConfigError::SecretFile {
+                key: file_key.clone(),
+                path: path.clone(),
+                reason,
+                source_layer,
+            })?;
+            warnings.extend(read.warning.map(|warning| format!("{file_key}: {warning}")));
+            if let Some(place) = self.values.pointer_mut(&at(key)) {
+                *place = Value::String(read.text);
+            }
+            self.config = serde_json::from_value(self.values.clone()).map_err(|e| ConfigError::BadValue {
+                key: key.to_owned(),
+                value: HIDDEN.to_owned(),
+                expected: e.to_string(),
+                source_layer: Source::File(path),
+            })?;
+        }
+        Ok(warnings)
+    }
+}
+
+/// The least that a number may be. Nothing can be served with a limit or a timeout of zero; ports are part of addresses, not
+/// numbers.
+pub(super) fn least(key: &str) -> u64 {
+    match key {
+        // What the parser of requests needs for itself.
+        "server.head_bytes" => 8 << 10,
+        _ => 1,
     }
 }
 

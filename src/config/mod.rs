@@ -10,12 +10,16 @@ mod jobs;
 mod limits;
 mod load;
 mod log;
+mod print;
+mod schema;
+mod secrets;
 mod server;
 mod store;
 mod template;
 
 use std::path::PathBuf;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use archive::ArchiveConfig;
@@ -23,14 +27,15 @@ pub use devices::DevicesConfig;
 pub use error::ConfigError;
 pub use jobs::JobsConfig;
 pub use limits::LimitsConfig;
-pub use load::{Source, load, load_process};
+pub use load::{Loaded, Source, load, load_process, load_with_sources};
 pub use log::{LogConfig, LogFormat};
+pub use schema::schema;
 pub use server::ServerConfig;
 pub use store::{Secret, StoreConfig};
 pub use template::{ProxyUrl, Template, Templates};
 
 /// The whole configuration.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
     /// Addresses, connections and their timeouts.

@@ -4,10 +4,11 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
 use std::time::Duration;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// The listeners and what a connection may do.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServerConfig {
     /// Address of the service. Default 127.0.0.1:8080: nothing is exposed until somebody says so. Port 0 takes
@@ -16,7 +17,8 @@ pub struct ServerConfig {
     /// Address of `/metrics`. Default `none`: there is no port that is free on every machine. It is apart from
     /// the service, so that a proxy in front cannot expose it by accident.
     pub metrics_listen: Option<SocketAddr>,
-    /// Folder of everything that the service keeps; the archive is looked for in it.
+    /// Folder of everything that the service keeps; the archive is looked for in it. Default `molmesh-data` in the working
+    /// folder: it can be written where the service can be started.
     pub data_dir: PathBuf,
     /// Connections at once. Default 1,024: the usual limit of open files leaves no room for more. One more is
     /// answered with 503 and closed.
@@ -30,10 +32,22 @@ pub struct ServerConfig {
     /// Time in which a client must take some bytes of an answer, ms. Default 30,000: a mesh is kept in memory
     /// until it is sent.
     pub write_timeout_ms: u64,
+    /// Bytes of the head of a request: its line and its headers, 8 KiB at least. Default 64 KiB: browsers and proxies send a
+    /// few; 431 beyond.
+    pub head_bytes: u32,
+    /// Requests at once on one HTTP/2 connection. Default 64: a page asks for a dozen; who wants more opens another
+    /// connection, which is counted.
+    pub streams: u32,
+    /// Longest silence of an event stream, ms, before a sign of life is sent. Default 15,000: proxies commonly give up
+    /// after half a minute.
+    pub heartbeat_ms: u64,
     /// How long an idle HTTP/2 connection is kept, ms. Default 120,000: front-ends come back within that time.
     pub idle_timeout_ms: u64,
-    /// Time for running requests to finish after a stop signal, ms. Default 20,000: orchestrators commonly kill
-    /// after 30 seconds.
+    /// Time after SIGTERM in which `/readyz` says 503 and everything is served as before, new connections too, ms; `none`:
+    /// no such time. Default 3,000: load balancers and orchestrators need a second or two until they send nothing more.
+    pub notice_ms: Option<u64>,
+    /// Time behind that for requests and jobs that run to finish, ms. Default 20,000: orchestrators commonly kill
+    /// after 30 seconds; with `notice_ms` and the last second for what is cancelled it makes 24.
     pub drain_timeout_ms: u64,
 }
 
@@ -47,7 +61,11 @@ impl Default for ServerConfig {
             header_timeout_ms: 15_000,
             body_timeout_ms: 60_000,
             write_timeout_ms: 30_000,
+            head_bytes: 64 << 10,
+            streams: 64,
+            heartbeat_ms: 15_000,
             idle_timeout_ms: 120_000,
+            notice_ms: Some(3000),
             drain_timeout_ms: 20_000,
         }
     }
@@ -78,7 +96,19 @@ impl ServerConfig {
         Duration::from_millis(self.idle_timeout_ms)
     }
 
-    /// Time for running requests to finish after a stop signal.
+    /// Longest silence of an event stream.
+    #[must_use]
+    pub fn heartbeat(&self) -> Duration {
+        Duration::from_millis(self.heartbeat_ms)
+    }
+
+    /// Time after SIGTERM in which everything is served as before.
+    #[must_use]
+    pub fn notice(&self) -> Duration {
+        Duration::from_millis(self.notice_ms.unwrap_or_default())
+    }
+
+    /// Time behind that for running requests and jobs to finish.
     #[must_use]
     pub fn drain_timeout(&self) -> Duration {
         Duration::from_millis(self.drain_timeout_ms)

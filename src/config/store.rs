@@ -1,12 +1,15 @@
 //! What the service keeps: where, how much of it, how long.
 
+use std::borrow::Cow;
 use std::fmt;
+use std::path::PathBuf;
 use std::time::Duration;
 
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// The store of inputs, results and job documents.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct StoreConfig {
     /// `s3://bucket` or `s3://bucket/prefix`. Default `none`: the folder `store` in `server.data_dir`.
@@ -24,9 +27,20 @@ pub struct StoreConfig {
     pub access_key_id: Option<String>,
     /// Key. Default `none`: `AWS_SECRET_ACCESS_KEY`. Better given by the environment than by a file.
     pub secret_access_key: Option<Secret>,
+    /// File that holds the key, one line break at its end aside. Default `none`. So that secrets that containers get as files
+    /// stay there; it and `secret_access_key` exclude each other.
+    pub secret_access_key_file: Option<PathBuf>,
     /// Time without an answer after which a request to S3 is given up or tried again, ms. Default 30,000: a part of
     /// 8 MiB at 2 Mbit/s.
     pub timeout_ms: u64,
+    /// How long the answer to whether the store works is believed, ms: `/readyz` writes, reads and removes a small object
+    /// no more often. Default 5,000: orchestrators ask every few seconds.
+    pub probe_ms: u64,
+    /// Time without an answer to that after which the store counts as not working, ms. Default 10,000: a busy disk takes
+    /// seconds, and load shall not make the service unready.
+    pub probe_timeout_ms: u64,
+    /// How often what is too old is removed, ms. Default 60,000: times to live are hours.
+    pub sweep_ms: u64,
     /// Bytes of results and inputs together. Default 10 GiB: thousands of meshes. What was used least recently goes
     /// when there is no room.
     pub max_bytes: u64,
@@ -38,7 +52,7 @@ pub struct StoreConfig {
     /// Time that the document of a job is kept after it was last written or read, ms. Default 86,400,000 (a day): as
     /// long as its result.
     pub job_ttl_ms: u64,
-    /// Bytes of small results that are kept in memory as well. Default 256 MiB.
+    /// Bytes of small results that are kept in memory as well. Default 256 MiB: thousands of small proteins.
     pub memory_bytes: u64,
     /// Largest result that is kept in memory. Default 4 MiB: a small protein, so that hundreds fit.
     pub memory_object_bytes: u64,
@@ -54,7 +68,11 @@ impl Default for StoreConfig {
             path_style: true,
             access_key_id: None,
             secret_access_key: None,
+            secret_access_key_file: None,
             timeout_ms: 30_000,
+            probe_ms: 5000,
+            probe_timeout_ms: 10_000,
+            sweep_ms: 60_000,
             max_bytes: 10 << 30,
             result_ttl_ms: 86_400_000,
             input_ttl_ms: 604_800_000,
@@ -70,6 +88,24 @@ impl StoreConfig {
     #[must_use]
     pub fn timeout(&self) -> Duration {
         Duration::from_millis(self.timeout_ms)
+    }
+
+    /// How long the answer to whether the store works is believed.
+    #[must_use]
+    pub fn probe(&self) -> Duration {
+        Duration::from_millis(self.probe_ms)
+    }
+
+    /// Time without an answer to that after which the store counts as not working.
+    #[must_use]
+    pub fn probe_timeout(&self) -> Duration {
+        Duration::from_millis(self.probe_timeout_ms)
+    }
+
+    /// How often what is too old is removed.
+    #[must_use]
+    pub fn sweep(&self) -> Duration {
+        Duration::from_millis(self.sweep_ms)
     }
 
     /// Time that a result is kept after its last use.
@@ -121,6 +157,20 @@ impl fmt::Debug for Secret {
 impl Serialize for Secret {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.serialize_str(HIDDEN)
+    }
+}
+
+impl JsonSchema for Secret {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> Cow<'static, str> {
+        "Secret".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({ "type": "string", "writeOnly": true })
     }
 }
 

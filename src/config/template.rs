@@ -1,9 +1,11 @@
 //! Addresses of a remote archive, with places for an entry's id.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::str::FromStr;
 
 use reqwest::Url;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use crate::structure::EntryId;
@@ -122,6 +124,24 @@ impl Serialize for Templates {
     }
 }
 
+impl JsonSchema for Templates {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> Cow<'static, str> {
+        "Templates".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        let one = r"https?://[^/\s]+/\S*\{id(_upper)?\}\S*";
+        json_schema!({ "anyOf": [
+            { "type": "string", "pattern": format!(r"^\s*{one}(\s+{one})*\s*$") },
+            { "type": "array", "minItems": 1, "items": { "type": "string", "pattern": format!("^{one}$") } },
+        ] })
+    }
+}
+
 impl<'de> Deserialize<'de> for Templates {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         #[derive(Deserialize)]
@@ -148,6 +168,20 @@ impl ProxyUrl {
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
+    }
+}
+
+impl JsonSchema for ProxyUrl {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> Cow<'static, str> {
+        "ProxyUrl".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({ "type": "string", "pattern": "^(none|https?://.+)$" })
     }
 }
 

@@ -152,6 +152,10 @@ impl Backend for GpuBackend {
         }
     }
 
+    fn able(&self) -> bool {
+        self.fallback.is_some() || self.pool.status().iter().any(|device| device.down.is_none())
+    }
+
     fn devices(&self) -> Vec<DeviceStatus> {
         self.pool.status()
     }

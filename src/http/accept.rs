@@ -9,7 +9,9 @@ use std::time::Duration;
 
 use axum::Router;
 use axum::body::Body;
-use axum::http::Request;
+use axum::http::header::{CONNECTION, HeaderValue};
+use axum::http::{Request, Response, Version};
+use futures_util::FutureExt as _;
 use hyper::body::Incoming;
 use hyper::service::service_fn;
 use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
@@ -25,14 +27,13 @@ use tower::ServiceExt as _;
 use super::io::Guarded;
 use super::kinds::Kind;
 use super::problem::{MEDIA_TYPE, Problem};
+use super::stop::{self, Stop};
 use super::wish::Peer;
 use crate::config::ServerConfig;
 use crate::telemetry::{CONNECTIONS, REJECTED};
 
-/// Most that is buffered of a request's head; a head that is longer is refused.
-const MAX_HEAD_BYTES: u32 = 64 << 10;
-/// Requests at once on one HTTP/2 connection.
-const MAX_STREAMS: u32 = 64;
+/// How long the first request of a connection is waited for once the service stops: it may be on its way.
+const UNDER_WAY: Duration = Duration::from_millis(500);
 /// Pause after the system could not accept, most likely for want of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// Clients at once that are being told that there are too many.
@@ -43,25 +44,38 @@ const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
 /// How often an HTTP/2 client is asked whether it is still there.
 const PING: Duration = Duration::from_secs(20);
 
-/// Serves `router` on `listener` until `stop` turns true; then lets requests finish until `drain` has passed.
-/// True if all of them did.
+/// Serves `router` on `listener` until it is told to drain; then lets requests finish until the drain timeout has passed or
+/// it is told to stop now. True if all of them did.
 pub(super) async fn serve(
     listener: TcpListener,
     router: Router,
     config: Arc<ServerConfig>,
-    mut stop: watch::Receiver<bool>,
+    mut stop: watch::Receiver<Stop>,
 ) -> bool {
     let places = Arc::new(Semaphore::new(config.connections));
     let refusals = Arc::new(Semaphore::new(MAX_REFUSALS));
     let mut connections = JoinSet::new();
+    let mut stopping = false;
     loop {
-        let accepted = tokio::select! {
-            accepted = listener.accept() => accepted,
-            Some(_ended) = connections.join_next() => continue,
-            _ = stop.wait_for(|stop| *stop) => break,
+        let accepted = if stopping {
+            // Who was let in by the system before the listener closed is served as well.
+            match listener.accept().now_or_never() {
+                Some(accepted) => accepted,
+                None => break,
+            }
+        } else {
+            tokio::select! {
+                accepted = listener.accept() => accepted,
+                Some(_ended) = connections.join_next() => continue,
+                () = stop::reached(&mut stop, Stop::Drain) => {
+                    stopping = true;
+                    continue;
+                }
+            }
         };
         let (stream, peer) = match accepted {
             Ok(accepted) => accepted,
+            Err(_) if stopping => break,
             Err(error) => {
                 tracing::warn!(%error, "cannot accept a connection");
                 tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -86,7 +100,10 @@ pub(super) async fn serve(
     }
     drop(listener);
     let all = async { while connections.join_next().await.is_some() {} };
-    let drained = tokio::time::timeout(config.drain_timeout(), all).await.is_ok();
+    let drained = tokio::select! {
+        ended = tokio::time::timeout(config.drain_timeout(), all) => ended.is_ok(),
+        () = stop::reached(&mut stop, Stop::Now) => false,
+    };
     connections.shutdown().await;
     drained
 }
@@ -158,24 +175,33 @@ async fn connection(
     peer: Peer,
     router: Router,
     config: Arc<ServerConfig>,
-    mut stop: watch::Receiver<bool>,
+    mut stop: watch::Receiver<Stop>,
 ) {
     let activity = Arc::new(Activity::default());
+    let phase = stop.clone();
     let service = service_fn(|request: Request<Incoming>| {
         let working = Working::on(&activity);
+        let (phase, version) = (phase.clone(), request.version());
         let mut request = request.map(Body::new);
         request.extensions_mut().insert(peer);
         let answer = router.clone().oneshot(request);
         async move {
-            let answer = answer.await;
+            let mut answer: Result<Response<Body>, Infallible> = answer.await;
             drop(working);
-            answer as Result<_, Infallible>
+            // So that clients turn elsewhere for their next request, before connections are closed on them.
+            if let Ok(answer) = &mut answer
+                && *phase.borrow() >= Stop::Notice
+                && version < Version::HTTP_2
+            {
+                answer.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
+            }
+            answer
         }
     });
     let builder = builder(&config);
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     tokio::pin!(connection);
-    let mut stopping = false;
+    let (mut stopping, mut patient) = (false, false);
     let mut look = Instant::now() + config.header_timeout();
     loop {
         tokio::select! {
@@ -185,11 +211,20 @@ async fn connection(
                 }
                 return;
             }
-            _ = stop.wait_for(|stop| *stop), if !stopping => {
+            () = stop::reached(&mut stop, Stop::Drain), if !stopping => {
                 stopping = true;
-                connection.as_mut().graceful_shutdown();
+                if activity.begun.load(Ordering::Relaxed) {
+                    connection.as_mut().graceful_shutdown();
+                } else {
+                    (look, patient) = (Instant::now() + UNDER_WAY, true);
+                }
             }
-            () = tokio::time::sleep_until(look) => {
+            () = tokio::time::sleep_until(look), if patient => {
+                patient = false;
+                connection.as_mut().graceful_shutdown();
+                look = Instant::now() + config.header_timeout();
+            }
+            () = tokio::time::sleep_until(look), if !patient => {
                 // hyper's own timer starts only once the protocol's version is known.
                 if !activity.begun.load(Ordering::Relaxed) {
                     late();
@@ -211,7 +246,7 @@ fn builder(config: &ServerConfig) -> auto::Builder<TokioExecutor> {
         .http1()
         .timer(TokioTimer::new())
         .header_read_timeout(config.header_timeout())
-        .max_buf_size(MAX_HEAD_BYTES as usize);
+        .max_buf_size(config.head_bytes as usize);
     builder
         .http2()
         .timer(TokioTimer::new())
@@ -219,8 +254,8 @@ fn builder(config: &ServerConfig) -> auto::Builder<TokioExecutor> {
         .keep_alive_timeout(PING)
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
-        .max_concurrent_streams(MAX_STREAMS)
-        .max_header_list_size(MAX_HEAD_BYTES);
+        .max_concurrent_streams(config.streams)
+        .max_header_list_size(config.head_bytes);
     builder
 }
 
@@ -230,6 +265,9 @@ fn report(error: &(dyn Error + Send + Sync + 'static)) {
     if hyper.is_some_and(hyper::Error::is_timeout) {
         late();
         return;
+    }
+    if hyper.is_some_and(hyper::Error::is_parse_too_large) {
+        counter!(REJECTED, "reason" => "head-too-large").increment(1);
     }
     let mut cause = Some(error as &(dyn Error + 'static));
     while let Some(error) = cause {

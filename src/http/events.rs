@@ -2,7 +2,6 @@
 //! comes back with `Last-Event-ID` misses nothing that still matters.
 
 use std::convert::Infallible;
-use std::time::Duration;
 
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
@@ -19,17 +18,16 @@ use super::openapi::parameters::{JobPath, Resumption};
 use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
+use super::stop::{self, Stop};
 use crate::jobs::View;
 
-/// A sign of life between events: proxies commonly give up after half a minute of silence.
-const HEARTBEAT: Duration = Duration::from_secs(15);
 /// The last event that a client has seen.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
 /// What a listener has seen, and where it looks.
 struct Listener {
     watched: watch::Receiver<View>,
-    stopping: watch::Receiver<bool>,
+    stopping: watch::Receiver<Stop>,
     seen: u64,
     over: bool,
 }
@@ -64,7 +62,7 @@ pub(super) async fn show(
         let event = listener.next().await?;
         Some((Ok::<_, Infallible>(event), listener))
     });
-    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(HEARTBEAT)).into_response())
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(app.config.server.heartbeat())).into_response())
 }
 
 impl Listener {
@@ -82,7 +80,7 @@ impl Listener {
                 Some(event.data(view.written.get_or_init(write)))
             }
             // The stream ends with the service; clients reconnect by themselves.
-            _ = self.stopping.wait_for(|stop| *stop) => None,
+            () = stop::reached(&mut self.stopping, Stop::Drain) => None,
         }
     }
 }

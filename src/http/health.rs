@@ -12,14 +12,14 @@ use utoipa::ToSchema;
 use super::kinds::Kind;
 use super::openapi::refusals;
 use super::problem::Problem;
-use super::state::{Ready, Shared};
+use super::state::{Shared, Warm};
 
 const NO_STORE: [(axum::http::HeaderName, &str); 1] = [(CACHE_CONTROL, "no-store")];
 
 /// What a probe is told.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Health {
-    /// `live` or `ready`.
+    /// `live`.
     status: &'static str,
 }
 
@@ -39,21 +39,89 @@ pub(super) async fn live() -> Response {
     (NO_STORE, Json(Health { status: "live" })).into_response()
 }
 
+/// Whether requests should come here, with what was looked at.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct ReadyDocument {
+    /// `ready`.
+    status: &'static str,
+    /// Each check; all are `ok`.
+    checks: Vec<Check>,
+}
+
+/// Something without which the service is not ready.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Check {
+    /// `accepting`, `devices` or `store`.
+    name: &'static str,
+    /// Whether it is as it should be.
+    ok: bool,
+    /// What was found, in words.
+    detail: String,
+}
+
+impl Check {
+    fn new(name: &'static str, found: Result<String, String>) -> Self {
+        let (ok, detail) = match found {
+            Ok(detail) => (true, detail),
+            Err(detail) => (false, detail),
+        };
+        Self { name, ok, detail }
+    }
+}
+
 refusals!(ReadyRefusals: [[Kind::NotReady]]);
 
 /// Whether requests should come here.
 ///
-/// A mesh was computed and the service is not shutting down. Load does not change the answer.
+/// The service was not told to stop, a mesh was computed and a device (or what stands in for it) takes jobs, and the store
+/// can be written and read. Load does not change the answer. `checks` says each, also in the problem.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
-    responses((status = 200, description = "The service takes requests.", body = Health), ReadyRefusals))]
+    responses((status = 200, description = "The service takes requests.", body = ReadyDocument), ReadyRefusals))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
-    let why = match app.readiness.get() {
-        Ready::Yes => return Ok((NO_STORE, Json(Health { status: "ready" })).into_response()),
-        Ready::Warming => "the first mesh is being computed",
-        Ready::Broken => "the first mesh could not be computed; the log says why",
-        Ready::ShuttingDown => "the service is shutting down",
+    let checks = [accepting(&app), devices(&app), store(&app).await];
+    let failing = checks.iter().find(|check| !check.ok).map(|check| check.detail.clone());
+    match failing {
+        None => {
+            let document = ReadyDocument { status: "ready", checks: checks.into() };
+            Ok((NO_STORE, Json(document)).into_response())
+        }
+        Some(why) => {
+            let checks = serde_json::to_value(checks).unwrap_or_default();
+            Err(Problem::new(Kind::NotReady, why).with("checks", checks).retry_after(Duration::from_secs(1)))
+        }
+    }
+}
+
+fn accepting(app: &Shared) -> Check {
+    let ending = app.readiness.is_ending();
+    let found = if ending { Err("the service is shutting down") } else { Ok("requests are accepted") };
+    Check::new("accepting", found.map(str::to_owned).map_err(str::to_owned))
+}
+
+fn devices(app: &Shared) -> Check {
+    let backend = app.pool.backend();
+    let found = match app.readiness.warm() {
+        Warm::Warming => Err("the first mesh is being computed".to_owned()),
+        Warm::Broken => Err("the first mesh could not be computed; the log says why".to_owned()),
+        Warm::Yes if !backend.able() => Err("no device takes jobs any more, and nothing stands in for them".to_owned()),
+        Warm::Yes => {
+            let devices = backend.devices();
+            let up = devices.iter().filter(|device| device.down.is_none()).count();
+            Ok(match devices.len() {
+                0 => format!("{} has made its first mesh", backend.name()),
+                all => format!("{} has made its first mesh; {up} of {all} devices take jobs", backend.name()),
+            })
+        }
     };
-    Err(Problem::new(Kind::NotReady, why).retry_after(Duration::from_secs(1)))
+    Check::new("devices", found)
+}
+
+async fn store(app: &Shared) -> Check {
+    let found = match app.probe.failure(app).await {
+        None => Ok("it can be written and read".to_owned()),
+        Some(why) => Err(format!("the store does not work: {why}")),
+    };
+    Check::new("store", found)
 }
 
 /// What is running.

@@ -20,6 +20,7 @@ use super::openapi::problems::{MESHING, ProblemDocument, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
+use super::stop::{self, Stop};
 use crate::jobs::{ContentKey, JobId, Status, View, rfc3339};
 
 /// Longest poll, s: proxies commonly cut an exchange after a minute.
@@ -153,7 +154,7 @@ pub(super) async fn show(
         tokio::select! {
             _ = watched.wait_for(|view| view.record.status.is_final()) => {}
             // The service ends: the client asks again, here after the restart or elsewhere.
-            _ = stopping.wait_for(|stop| *stop) => {}
+            () = stop::reached(&mut stopping, Stop::Drain) => {}
         }
     };
     drop(tokio::time::timeout(Duration::from_secs(wait), ended).await);

@@ -1,6 +1,5 @@
 //! The server: binds its listeners, warms the backend up, serves until it is told to stop, drains.
 
-use std::future::Future;
 use std::io;
 use std::net::{SocketAddr, TcpListener};
 use std::sync::{Arc, Mutex};
@@ -9,9 +8,12 @@ use std::time::{Instant, SystemTime};
 use quick_cache::sync::Cache;
 use thiserror::Error;
 use tokio::sync::{Semaphore, watch};
+use tokio::task::JoinHandle;
 
+use super::probe::Probe;
 use super::problem::Problem;
-use super::state::{App, Readiness, Ready, Shared};
+use super::state::{App, Readiness, Shared, Warm};
+use super::stop::{self, Stop};
 use super::{accept, capabilities, metrics, pdb, router};
 use crate::archive::Archive;
 use crate::config::Config;
@@ -23,14 +25,12 @@ use crate::telemetry::{self, TelemetryError};
 /// How often the recorder tidies up its histograms.
 const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
 
-/// How often the store is tidied.
-const SWEEP: std::time::Duration = std::time::Duration::from_mins(1);
 /// Between two attempts to list the jobs of earlier processes.
 const RECOVER_PAUSE: std::time::Duration = std::time::Duration::from_secs(5);
 /// Results whose headers are kept at hand: a kilobyte each.
 const HEADS: usize = 4096;
 
-/// Time for a job to notice that it was cancelled.
+/// Time for jobs to notice that they were cancelled, and for that to be on record.
 const CANCELLING: std::time::Duration = std::time::Duration::from_secs(1);
 
 /// Why the server cannot start.
@@ -74,7 +74,7 @@ pub struct Server {
     metrics_listener: Option<TcpListener>,
     addr: SocketAddr,
     metrics_addr: Option<SocketAddr>,
-    stop: watch::Sender<bool>,
+    stop: watch::Sender<Stop>,
 }
 
 fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
@@ -101,6 +101,7 @@ impl Server {
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
+            patience: config.jobs.patience(),
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
         };
@@ -119,7 +120,7 @@ impl Server {
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();
         let keepers = Arc::new(Semaphore::new(config.jobs.keepers));
-        let (stop, stopping) = watch::channel(false);
+        let (stop, stopping) = watch::channel(Stop::Serve);
         let app = Arc::new(App {
             config,
             pool,
@@ -132,6 +133,7 @@ impl Server {
             stopping,
             deliveries,
             readiness,
+            probe: Probe::new(),
             found,
             capabilities,
         });
@@ -150,12 +152,15 @@ impl Server {
         self.metrics_addr
     }
 
-    /// Serves until `shutdown` is done, then lets running requests finish, for the drain timeout at most. Must run
-    /// on a tokio runtime with timers and several threads. True if every request was finished.
+    /// Serves until `orders` say otherwise, then ends step by step as [`Stop`] says: `server.notice_ms` for
+    /// [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], a second for what is cancelled. Whatever is ordered
+    /// while it drains, once the notice is over by itself or by order, cuts it short. Must run on a tokio
+    /// runtime with timers and several threads. True if every request was finished; promised jobs that were not are left
+    /// for the next start.
     ///
     /// # Errors
     /// [`ServeError`].
-    pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<bool, ServeError> {
+    pub async fn run(self, mut orders: watch::Receiver<Stop>) -> Result<bool, ServeError> {
         let handle = telemetry::recorder()?;
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
@@ -168,10 +173,10 @@ impl Server {
             async move { recover(&ledger).await }
         });
         let sweeping = tokio::spawn({
-            let store = self.app.store.clone();
+            let (store, every) = (self.app.store.clone(), self.app.config.store.sweep());
             async move {
                 loop {
-                    tokio::time::sleep(SWEEP).await;
+                    tokio::time::sleep(every).await;
                     store.sweep(SystemTime::now()).await;
                 }
             }
@@ -194,24 +199,58 @@ impl Server {
                 handle.run_upkeep();
             }
         });
-        shutdown.await;
-        tracing::info!("stopping: running requests are finished, new ones are refused");
-        self.app.readiness.set(Ready::ShuttingDown);
-        let deadline = Instant::now() + self.app.config.server.drain_timeout();
-        stop.send_replace(true);
-        // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
-        let requests = serving.await.unwrap_or(false);
-        let jobs = self.app.pool.drain(deadline.max(Instant::now() + CANCELLING)).await;
+        stop::reached(&mut orders, Stop::Notice).await;
+        let requests = wind_down(&self.app, &stop, &mut orders, serving).await;
         for task in [upkeep, warming, recovering, sweeping] {
             task.abort();
         }
         if let Some(metrics) = metrics {
             metrics.abort();
         }
-        let drained = jobs && requests;
-        tracing::info!(drained, "stopped");
-        Ok(drained)
+        Ok(requests)
     }
+}
+
+/// Ends the service step by step, as far as `orders` say. True if every request was finished.
+async fn wind_down(
+    app: &Shared,
+    stop: &watch::Sender<Stop>,
+    orders: &mut watch::Receiver<Stop>,
+    mut serving: JoinHandle<bool>,
+) -> bool {
+    app.readiness.end();
+    let notice = app.config.server.notice();
+    if orders.has_changed().is_ok() && *orders.borrow() == Stop::Notice && !notice.is_zero() {
+        stop.send_replace(Stop::Notice);
+        tracing::info!(notice_ms = notice.as_millis(), "not ready any more; everything is served for a while");
+        drop(tokio::time::timeout(notice, stop::reached(orders, Stop::Drain)).await);
+    }
+    tracing::info!("stopping: what has begun is finished, nothing new is accepted");
+    let end = tokio::time::Instant::now() + app.config.server.drain_timeout();
+    // Whatever is ordered from now on is an order more.
+    orders.borrow_and_update();
+    app.pool.leave();
+    stop.send_replace(Stop::Drain);
+    let cut = async {
+        tokio::select! {
+            () = tokio::time::sleep_until(end) => {}
+            () = stop::further(orders) => {}
+        }
+        stop.send_replace(Stop::Now);
+    };
+    tokio::pin!(cut);
+    // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
+    let served = tokio::select! {
+        served = &mut serving => Some(served),
+        () = cut.as_mut() => None,
+    };
+    let (requests, jobs) = match served {
+        Some(served) => (served.unwrap_or(false), app.pool.drain(cut).await),
+        None => (serving.await.unwrap_or(false), app.pool.drain(std::future::ready(())).await),
+    };
+    let settled = tokio::time::timeout(CANCELLING, app.ledger.settled()).await.is_ok();
+    tracing::info!(requests, jobs, settled, "stopped");
+    requests
 }
 
 fn tokio_listener(
@@ -248,41 +287,15 @@ fn warm_up(app: &App) {
             let ms = start.elapsed().as_secs_f64() * 1e3;
             let (device, reason) = (backend.describe(), app.pool.reason());
             tracing::info!(ms, backend = backend.name(), device, reason, "ready");
-            app.readiness.set(Ready::Yes);
+            app.readiness.set(Warm::Yes);
         }
         Ok(Err(error)) => {
             tracing::error!(%error, backend = backend.name(), "the first mesh failed");
-            app.readiness.set(Ready::Broken);
+            app.readiness.set(Warm::Broken);
         }
         Err(_payload) => {
             tracing::error!(backend = backend.name(), "the first mesh panicked");
-            app.readiness.set(Ready::Broken);
+            app.readiness.set(Warm::Broken);
         }
-    }
-}
-
-/// Done on the first SIGTERM, or SIGINT (Ctrl-C).
-pub async fn shutdown_signal() {
-    let interrupt = async {
-        if let Err(error) = tokio::signal::ctrl_c().await {
-            tracing::warn!(%error, "cannot listen for Ctrl-C");
-            std::future::pending::<()>().await;
-        }
-    };
-    #[cfg(unix)]
-    let terminate = async {
-        match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
-            Ok(mut signal) => drop(signal.recv().await),
-            Err(error) => {
-                tracing::warn!(%error, "cannot listen for SIGTERM");
-                std::future::pending::<()>().await;
-            }
-        }
-    };
-    #[cfg(not(unix))]
-    let terminate = std::future::pending::<()>();
-    tokio::select! {
-        () = interrupt => {}
-        () = terminate => {}
     }
 }

@@ -1,7 +1,7 @@
 //! What the handlers share.
 
 use std::collections::HashMap;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex};
 
 use bytes::Bytes;
@@ -9,8 +9,10 @@ use quick_cache::sync::Cache;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 
 use super::kinds::Kind;
+use super::probe::Probe;
 use super::problem::Problem;
 use super::results::Head;
+use super::stop::Stop;
 use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{ContentKey, Ledger, Pool};
@@ -30,11 +32,13 @@ pub(super) struct App {
     pub(super) keepers: Arc<Semaphore>,
     /// Results that are being kept at this moment; their receivers hang up when it is over.
     pub(super) keeping: Mutex<HashMap<ContentKey, watch::Receiver<()>>>,
-    /// Turns true when the service ends: long answers end with it.
-    pub(super) stopping: watch::Receiver<bool>,
+    /// How far the service's end has come: long answers end with it.
+    pub(super) stopping: watch::Receiver<Stop>,
     /// Places for requests for meshes: see `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
     pub(super) readiness: Readiness,
+    /// Whether the store works.
+    pub(super) probe: Probe,
     /// The devices that were found when the service started.
     pub(super) found: Vec<FoundDevice>,
     /// The body of `/v1/capabilities`, which changes only where devices can fail: with devices it is written anew.
@@ -56,34 +60,45 @@ impl App {
 /// What handlers extract.
 pub(super) type Shared = Arc<App>;
 
-/// Whether requests should come here.
+/// Whether requests should come here, as far as the process itself knows.
 #[derive(Debug, Default)]
-pub(super) struct Readiness(AtomicU8);
+pub(super) struct Readiness {
+    warm: AtomicU8,
+    ending: AtomicBool,
+}
 
-/// The answer.
+/// How the first mesh went.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
-pub(super) enum Ready {
-    /// The first mesh is being computed.
+pub(super) enum Warm {
+    /// It is being computed.
     Warming = 0,
     Yes = 1,
-    /// The first mesh could not be computed.
+    /// It could not be computed.
     Broken = 2,
-    ShuttingDown = 3,
 }
 
 impl Readiness {
-    pub(super) fn get(&self) -> Ready {
-        match self.0.load(Ordering::Relaxed) {
-            0 => Ready::Warming,
-            1 => Ready::Yes,
-            2 => Ready::Broken,
-            _ => Ready::ShuttingDown,
+    pub(super) fn warm(&self) -> Warm {
+        match self.warm.load(Ordering::Relaxed) {
+            0 => Warm::Warming,
+            1 => Warm::Yes,
+            _ => Warm::Broken,
         }
     }
 
-    /// Takes the new value unless the service is shutting down, which is final.
-    pub(super) fn set(&self, ready: Ready) {
-        self.0.fetch_max(ready as u8, Ordering::Relaxed);
+    /// Notes how the first mesh went.
+    pub(super) fn set(&self, warm: Warm) {
+        self.warm.store(warm as u8, Ordering::Relaxed);
+    }
+
+    /// Whether the service has been told to stop.
+    pub(super) fn is_ending(&self) -> bool {
+        self.ending.load(Ordering::Relaxed)
+    }
+
+    /// The service has been told to stop. That is final.
+    pub(super) fn end(&self) {
+        self.ending.store(true, Ordering::Relaxed);
     }
 }

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
-use metrics::{counter, gauge};
+use metrics::counter;
 use serde_json::Value;
 use tokio::sync::watch;
 
@@ -18,7 +18,7 @@ use super::record::{JobId, Record, Status, now_ms};
 use super::{Claim, ContentKey, EndError, Pool, PromiseError, Task, Ticket};
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Store, StoreError};
-use crate::telemetry::{JOBS_OPEN, JOBS_RECOVERED};
+use crate::telemetry::JOBS_RECOVERED;
 
 /// Ended jobs that are kept in mind; older ones are read from the store.
 const MOST_ENDED: usize = 10_000;
@@ -85,6 +85,8 @@ pub(super) struct Inner {
     pub(super) settings: LedgerSettings,
     pub(super) describe: Describe,
     promises: Mutex<HashMap<JobId, Arc<Promise>>>,
+    /// Jobs that are seen through at this moment.
+    pub(super) open: watch::Sender<usize>,
 }
 
 impl Inner {
@@ -122,7 +124,7 @@ impl Ledger {
     /// A ledger over `store`, whose jobs run on `pool`.
     #[must_use]
     pub fn new(store: Store, pool: Arc<Pool>, settings: LedgerSettings, describe: Describe) -> Self {
-        Self(Arc::new(Inner { store, pool, settings, describe, promises: Mutex::default() }))
+        Self(Arc::new(Inner { store, pool, settings, describe, promises: Mutex::default(), open: watch::channel(0).0 }))
     }
 
     /// Promises a job: when this returns, it survives the process. `ticket` is that of a job that waits or runs already.
@@ -195,7 +197,7 @@ impl Ledger {
         let view = entered.view();
         // Otherwise somebody has asked for it since it is on record, and it was taken up: in the same flight.
         if Arc::ptr_eq(&entered, &promise) {
-            self.spawn(Runner { promise, ticket: Some(ticket), pin, digest });
+            self.spawn(Runner { promise, ticket: Some(ticket), pin, digest, tried: 0 });
         }
         Ok(view)
     }
@@ -272,7 +274,7 @@ impl Ledger {
 
     /// Takes up a job from its record, unless that has been done.
     async fn take_up(&self, record: Record) -> Result<Arc<Promise>, StoreError> {
-        let (id, input) = (record.id.clone(), record.input.parse::<Digest>());
+        let (id, input, tried) = (record.id.clone(), record.input.parse::<Digest>(), record.attempts);
         let fresh = Arc::new(Promise::new(record));
         let known = self.0.lock().get(&id).cloned();
         if let Some(known) = known {
@@ -286,18 +288,9 @@ impl Ledger {
         let promise = self.0.enter(&id, &fresh);
         if Arc::ptr_eq(&promise, &fresh) {
             counter!(JOBS_RECOVERED).increment(1);
-            self.spawn(Runner { promise: fresh, ticket: None, pin, digest });
+            self.spawn(Runner { promise: fresh, ticket: None, pin, digest, tried });
         }
         Ok(promise)
-    }
-
-    fn spawn(&self, runner: Runner<[Pin; 2]>) {
-        gauge!(JOBS_OPEN).increment(1.0);
-        let ledger = self.clone();
-        tokio::spawn(async move {
-            runner.run(&ledger).await;
-            gauge!(JOBS_OPEN).decrement(1.0);
-        });
     }
 
     /// What the worker does before it begins: the attempt is on record by then, so that a job that ends the process is

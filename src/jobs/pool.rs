@@ -20,6 +20,8 @@ pub struct Settings {
     pub workers: usize,
     /// Jobs that wait.
     pub queue: usize,
+    /// How long promised jobs stand back for those that somebody waits for.
+    pub patience: Duration,
     /// Limits of every job.
     pub limits: JobLimits,
     /// Memory for uploads and meshes.
@@ -55,9 +57,9 @@ impl Pool {
     /// # Errors
     /// That of the system, if a thread cannot be started.
     pub fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
-        let Settings { workers, queue, limits, budget } = settings;
+        let Settings { workers, queue, patience, limits, budget } = settings;
         let workers = workers.max(1);
-        let queue = Arc::new(Queue::new(queue, workers));
+        let queue = Arc::new(Queue::new(queue, workers, patience));
         let pool = Self {
             shared: Arc::new(Shared { queue, backend, reason, limits, budget, workers, watch: Watch::default() }),
         };
@@ -123,11 +125,19 @@ impl Pool {
         &self.shared.budget
     }
 
-    /// Accepts no more jobs and waits for those that were accepted, until `deadline` at most; then cancels the
-    /// rest. True if all of them ended by themselves.
-    pub async fn drain(&self, deadline: Instant) -> bool {
+    /// From now on promised jobs that do not run yet are left: their tickets end as stopped.
+    pub fn leave(&self) {
+        self.shared.queue.leave();
+    }
+
+    /// Accepts no more jobs and waits for those that were accepted, until `end` at most; then cancels the rest, whose
+    /// tickets end as stopped. True if all of them ended by themselves.
+    pub async fn drain(&self, end: impl Future<Output = ()>) -> bool {
         self.shared.queue.close();
-        let in_time = tokio::time::timeout_at(deadline.into(), self.shared.queue.idle()).await.is_ok();
+        let in_time = tokio::select! {
+            () = self.shared.queue.idle() => true,
+            () = end => false,
+        };
         if !in_time {
             self.shared.queue.cancel_all();
         }

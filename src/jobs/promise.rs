@@ -4,6 +4,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bytes::Bytes;
+use metrics::gauge;
 use tokio::sync::{Notify, watch};
 
 use super::flight::Progress;
@@ -15,7 +16,8 @@ use super::results::{self, SaveError};
 use super::{ContentKey, EndError, Failure, Finished, Lease, Refusal, Task, Ticket};
 use crate::formats::Format;
 use crate::pipeline::params;
-use crate::store::Digest;
+use crate::store::{Digest, Pin};
+use crate::telemetry::JOBS_OPEN;
 
 /// How often a running job's progress is looked at.
 const TICK: Duration = Duration::from_millis(100);
@@ -66,6 +68,21 @@ impl Promise {
             view.record.started_ms = Some(now_ms());
             view.changed();
         });
+    }
+
+    /// The work is left for the next start: the attempt, if there was one, does not count. True if that changed the record.
+    fn leave(&self, tried: u32) -> bool {
+        self.view.send_if_modified(|view| {
+            if view.record.status.is_final() || view.record.attempts == tried && view.record.started_ms.is_none() {
+                return false;
+            }
+            view.record.attempts = tried;
+            view.record.status = Status::Accepted;
+            view.record.started_ms = None;
+            view.stage = None;
+            view.changed();
+            true
+        })
     }
 
     /// The job ends, unless it has. True if it did.
@@ -128,6 +145,27 @@ pub(super) struct Runner<P> {
     pub(super) ticket: Option<Ticket>,
     pub(super) pin: P,
     pub(super) digest: Digest,
+    /// Times that it was begun before this process took it up.
+    pub(super) tried: u32,
+}
+
+impl Ledger {
+    /// Sees a job through, beside everything else.
+    pub(super) fn spawn(&self, runner: Runner<[Pin; 2]>) {
+        gauge!(JOBS_OPEN).increment(1.0);
+        self.0.open.send_modify(|open| *open += 1);
+        let ledger = self.clone();
+        tokio::spawn(async move {
+            runner.run(&ledger).await;
+            gauge!(JOBS_OPEN).decrement(1.0);
+            ledger.0.open.send_modify(|open| *open -= 1);
+        });
+    }
+
+    /// Waits until every job that was taken up has ended, or is left, and that is on record. The pool must be drained.
+    pub async fn settled(&self) {
+        drop(self.0.open.subscribe().wait_for(|open| *open == 0).await);
+    }
 }
 
 /// What became of one attempt.
@@ -137,13 +175,13 @@ enum Attempt {
     Again,
     /// The store does not do its part; it is asked less and less often.
     Silent,
-    /// The service stops; the record stays as it is, for the next start.
+    /// The service stops; the job stays on record, for the next start.
     Left,
 }
 
 impl<P> Runner<P> {
     pub(super) async fn run(self, ledger: &Ledger) {
-        let Self { promise, mut ticket, pin, digest } = self;
+        let Self { promise, mut ticket, pin, digest, tried } = self;
         let mut pause = patience::FIRST;
         loop {
             let attempt = attempt(ledger, &promise, &mut ticket, digest);
@@ -165,7 +203,15 @@ impl<P> Runner<P> {
                     tokio::time::sleep(pause).await;
                     pause = (pause * 2).min(patience::LONGEST);
                 }
-                Attempt::Left => break,
+                Attempt::Left => {
+                    // Stopping a service is not the job's fault, however often it happens.
+                    if promise.leave(tried)
+                        && let Err(error) = ledger.0.keep(&promise.record()).await
+                    {
+                        tracing::warn!(job = %promise.id(), %error, "a job that is left counts an attempt too many");
+                    }
+                    break;
+                }
             }
         }
         drop(pin);

@@ -19,6 +19,8 @@ struct State {
     shares: Shares,
     rate: Rate,
     closed: bool,
+    /// Promised jobs that do not run yet are left for the next start.
+    leaving: bool,
     next_id: u64,
     returns: Returns,
     /// Waiting jobs that the gauge knows of.
@@ -54,20 +56,23 @@ pub(super) struct Queue {
     idle: Notify,
     limit: usize,
     workers: usize,
+    patience: Duration,
 }
 
 impl Queue {
-    pub(super) fn new(limit: usize, workers: usize) -> Self {
+    /// A queue of so many places in front of so many workers; `patience` is how long promised jobs stand back.
+    pub(super) fn new(limit: usize, workers: usize, patience: Duration) -> Self {
         let state = State {
             flights: Vec::with_capacity(limit.min(1024) + workers),
             shares: Shares::default(),
             rate: Rate::default(),
             closed: false,
+            leaving: false,
             next_id: 0,
             returns: Returns::default(),
             told: 0,
         };
-        Self { state: Mutex::new(state), filled: Condvar::new(), idle: Notify::new(), limit, workers }
+        Self { state: Mutex::new(state), filled: Condvar::new(), idle: Notify::new(), limit, workers, patience }
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -94,6 +99,11 @@ impl Queue {
             flight.claims.extend(claim.filter(|_| !begun));
             let progress = Arc::clone(&flight.progress);
             return Ok(Place { flight: flight.id, waiter, outcome, progress, shared: true, begun });
+        }
+        if state.leaving && task.rank.batch {
+            // Its promise is kept by the next process: nobody will answer on the other end.
+            let progress = Arc::default();
+            return Ok(Place { flight: waiter, waiter, outcome, progress, shared: false, begun: false });
         }
         let now = Instant::now();
         let units = cost::units(&task.input, &task.job);
@@ -140,7 +150,7 @@ impl Queue {
     pub(super) fn pop(&self) -> Option<Entry> {
         let mut state = self.lock();
         loop {
-            if let Some(entry) = Self::take(&mut state) {
+            if let Some(entry) = self.take(&mut state) {
                 self.publish(&mut state);
                 return Some(entry);
             }
@@ -152,9 +162,10 @@ impl Queue {
     }
 
     /// The job whose turn it is: the client's with the lowest tag, and of this client's the most urgent one.
-    fn take(state: &mut State) -> Option<Entry> {
+    fn take(&self, state: &mut State) -> Option<Entry> {
         let now = Instant::now();
-        let turn = |f: &Flight| rank::turn(&f.rank, f.tag, f.id, f.accepted, now);
+        let waited = |f: &Flight| now.saturating_duration_since(f.accepted);
+        let turn = |f: &Flight| rank::turn(&f.rank, f.tag, f.id, waited(f), self.patience);
         let next = state.waiting().reduce(|a, b| if rank::before(&turn(b), &turn(a)) { b } else { a })?;
         let (client, batch) = (next.rank.client, next.rank.batch);
         let own = state.waiting().filter(|f| f.rank.client == client && f.rank.batch == batch);
@@ -224,18 +235,35 @@ impl Queue {
         self.filled.notify_all();
     }
 
-    /// Cancels what runs and drops what waits.
+    /// From now on promised jobs that do not run yet are left: whoever waits for them is told that it was stopped.
+    pub(super) fn leave(&self) {
+        let mut state = self.lock();
+        state.leaving = true;
+        let (left, stay): (Vec<_>, Vec<_>) =
+            std::mem::take(&mut state.flights).into_iter().partition(|f| f.begun.is_none() && f.rank.batch);
+        state.flights = stay;
+        if state.flights.is_empty() {
+            self.idle.notify_waiters();
+        }
+        self.publish(&mut state);
+        drop(state);
+        drop(left);
+    }
+
+    /// Cancels what runs and drops what waits. Whoever waits is told that it was stopped, not that it was cancelled.
     pub(super) fn cancel_all(&self) {
         let mut state = self.lock();
-        let (left, running): (Vec<_>, Vec<_>) =
+        let (left, mut running): (Vec<_>, Vec<_>) =
             std::mem::take(&mut state.flights).into_iter().partition(|flight| flight.begun.is_none());
-        for flight in &running {
+        let mut told = Vec::new();
+        for flight in &mut running {
             flight.cancel.cancel();
+            told.append(&mut flight.waiters);
         }
         state.flights = running;
         self.publish(&mut state);
         drop(state);
-        drop(left);
+        drop((left, told));
     }
 
     /// Waits until nothing runs and nothing waits.

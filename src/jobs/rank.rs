@@ -4,12 +4,10 @@
 //! client's earlier jobs would be done; the lowest tag goes first.
 
 use std::hash::{BuildHasher as _, BuildHasherDefault};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rustc_hash::{FxHashMap, FxHasher};
 
-/// Work that nobody watches comes before people's when it has waited so long.
-const PATIENCE: Duration = Duration::from_secs(10);
 /// Urgency of a request that does not say one (RFC 9218).
 pub const USUAL_URGENCY: u8 = 3;
 
@@ -57,10 +55,9 @@ impl Default for Rank {
 /// What orders two jobs: lower goes first.
 pub(super) type Turn = (bool, f64, u64);
 
-/// The turn of a job.
-pub(super) fn turn(rank: &Rank, tag: f64, id: u64, accepted: Instant, now: Instant) -> Turn {
-    let patient = rank.batch && now.saturating_duration_since(accepted) < PATIENCE;
-    (patient, tag, id)
+/// The turn of a job that has waited so long. Work that nobody watches stands back for people's until its `patience` is over.
+pub(super) fn turn(rank: &Rank, tag: f64, id: u64, waited: Duration, patience: Duration) -> Turn {
+    (rank.batch && waited < patience, tag, id)
 }
 
 /// Whether `a` goes before `b`.
@@ -127,13 +124,14 @@ mod tests {
 
     #[test]
     fn people_come_before_batches_until_these_have_waited_long() {
-        let start = Instant::now();
+        let patience = Duration::from_secs(7);
         let (person, batch) = (rank("a", false), rank("b", true));
-        let at = |rank, tag, id, now| turn(rank, tag, id, start, now);
-        assert!(before(&at(&person, 5.0, 2, start), &at(&batch, 0.0, 1, start)));
-        let later = start + PATIENCE;
-        assert!(before(&at(&batch, 0.0, 1, later), &at(&person, 5.0, 2, later)));
-        assert!(before(&at(&person, 1.0, 1, start), &at(&person, 1.0, 2, start)));
+        let at = |rank, tag, id, waited| turn(rank, tag, id, waited, patience);
+        for waited in [Duration::ZERO, patience / 2] {
+            assert!(before(&at(&person, 5.0, 2, waited), &at(&batch, 0.0, 1, waited)));
+        }
+        assert!(before(&at(&batch, 0.0, 1, patience), &at(&person, 5.0, 2, patience)));
+        assert!(before(&at(&person, 1.0, 1, patience), &at(&person, 1.0, 2, patience)));
     }
 
     #[test]

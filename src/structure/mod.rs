@@ -25,6 +25,7 @@ mod residue;
 mod scan;
 pub mod select;
 mod sniff;
+mod survey;
 mod text;
 mod texts;
 
@@ -34,4 +35,5 @@ pub use contents::{Contents, Kind};
 pub use error::StructureError;
 pub use read::{ReadLimits, read};
 pub use select::{BadKinds, Selected, Selection, select};
+pub use survey::{Survey, survey};
 pub use texts::TextColumn;

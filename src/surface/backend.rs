@@ -114,6 +114,12 @@ pub trait Backend: Send + Sync {
         self.run(&one_atom()?, &params, &limits, &Control::default()).map(|_mesh| ())
     }
 
+    /// Whether it can run jobs at all: a device is up, or something stands in for them.
+    fn able(&self) -> bool {
+        let devices = self.devices();
+        devices.is_empty() || devices.iter().any(|device| device.down.is_none())
+    }
+
     /// How the devices behind it are doing; empty where there are none but the processor.
     fn devices(&self) -> Vec<DeviceStatus> {
         Vec::new()

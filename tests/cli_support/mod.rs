@@ -47,8 +47,9 @@ pub fn molmesh() -> Command {
     }
     // A layer of Mesa's complains on stderr where there is no desktop.
     command.env("NODEVICE_SELECT", "1");
-    // Tests stay on this machine.
+    // Tests stay on this machine, and there is no load balancer that would have to notice the end of a service.
     command.env("MOLMESH__ARCHIVE__URL", "none");
+    command.env("MOLMESH__SERVER__NOTICE_MS", "none");
     command.stdin(Stdio::null());
     command
 }
@@ -56,6 +57,13 @@ pub fn molmesh() -> Command {
 /// Runs `molmesh` with `args`.
 pub fn run<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Output {
     molmesh().args(args).output().unwrap()
+}
+
+/// Runs `molmesh doctor` for a service on a free port with a folder of its own.
+pub fn doctor(more: &[&str]) -> Output {
+    let folder = Folder::new();
+    let data = folder.path("data");
+    molmesh().args(["doctor", "--listen", "127.0.0.1:0", "--data-dir"]).arg(data).args(more).output().unwrap()
 }
 
 /// Runs `molmesh mesh input -o output` and more flags.
@@ -163,9 +171,19 @@ impl Service {
     }
 
     /// Sends it a signal; returns its exit code and its log.
-    pub fn stop(mut self, signal: &str) -> (Option<i32>, String) {
+    pub fn stop(self, signal: &str) -> (Option<i32>, String) {
+        self.signal(signal);
+        self.wait()
+    }
+
+    /// Sends it a signal.
+    pub fn signal(&self, signal: &str) {
         let id = self.child.id().to_string();
         assert!(Command::new("kill").args([&format!("-{signal}"), &id]).status().unwrap().success());
+    }
+
+    /// Waits for its end; returns its exit code and its log.
+    pub fn wait(mut self) -> (Option<i32>, String) {
         let code = self.child.wait().unwrap().code();
         (code, self.log.take().unwrap().join().unwrap())
     }

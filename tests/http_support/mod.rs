@@ -12,7 +12,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use molmesh::config::Config;
-use molmesh::http::{Chosen, Server};
+use molmesh::http::{Chosen, Server, Stop};
 use molmesh::surface::{
     Backend, Control, FoundDevice, GridStats, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
@@ -27,6 +27,8 @@ pub(crate) enum Mode {
     Octahedra,
     /// The same after a while, unless it is cancelled.
     Slow(Duration),
+    /// The same once another mode is set.
+    Held,
     /// Never looks at the cancel token.
     Deaf(Duration),
     /// Panics.
@@ -47,6 +49,8 @@ pub(crate) struct Fake {
     pub(crate) started: AtomicUsize,
     pub(crate) finished: AtomicUsize,
     pub(crate) cancelled: AtomicUsize,
+    /// Atoms of every job, in the order in which they began.
+    pub(crate) begun: Mutex<Vec<usize>>,
 }
 
 impl Fake {
@@ -57,6 +61,7 @@ impl Fake {
             started: AtomicUsize::new(0),
             finished: AtomicUsize::new(0),
             cancelled: AtomicUsize::new(0),
+            begun: Mutex::default(),
         })
     }
 
@@ -84,6 +89,7 @@ impl Backend for Fake {
         let warm_up = spheres.len() == 1 && !self.also_warm.load(Ordering::SeqCst);
         let mode = if warm_up { Mode::Octahedra } else { *self.mode.lock().unwrap() };
         if !warm_up {
+            self.begun.lock().unwrap().push(spheres.len());
             self.started.fetch_add(1, Ordering::SeqCst);
         }
         match mode {
@@ -91,6 +97,15 @@ impl Backend for Fake {
             Mode::Slow(time) => {
                 let end = Instant::now() + time;
                 while Instant::now() < end {
+                    if let Err(error) = control.check() {
+                        self.cancelled.fetch_add(1, Ordering::SeqCst);
+                        return Err(error);
+                    }
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+            }
+            Mode::Held => {
+                while *self.mode.lock().unwrap() == Mode::Held {
                     if let Err(error) = control.check() {
                         self.cancelled.fetch_add(1, Ordering::SeqCst);
                         return Err(error);
@@ -183,7 +198,7 @@ pub(crate) fn log_lines(text: &str) -> Vec<String> {
 pub(crate) struct Running {
     pub(crate) addr: SocketAddr,
     pub(crate) metrics: SocketAddr,
-    stop: Option<tokio::sync::oneshot::Sender<()>>,
+    orders: tokio::sync::watch::Sender<Stop>,
     thread: Option<JoinHandle<bool>>,
     pub(crate) dir: tempfile::TempDir,
 }
@@ -219,13 +234,13 @@ pub(crate) fn start_on(
     let chosen = Chosen { backend, reason: "a test says so".to_owned(), devices: found };
     let server = runtime.block_on(Server::bind(config, chosen)).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
-    let (stop, stopped) = tokio::sync::oneshot::channel();
+    let (orders, ordered) = tokio::sync::watch::channel(Stop::Serve);
     let thread = std::thread::spawn(move || {
-        let drained = runtime.block_on(server.run(async { drop(stopped.await) })).unwrap();
+        let drained = runtime.block_on(server.run(ordered)).unwrap();
         runtime.shutdown_timeout(Duration::from_secs(1));
         drained
     });
-    Running { addr, metrics, stop: Some(stop), thread: Some(thread), dir }
+    Running { addr, metrics, orders, thread: Some(thread), dir }
 }
 
 impl Running {
@@ -249,16 +264,24 @@ impl Running {
             .sum()
     }
 
-    /// Says to stop, without waiting.
+    /// Says to stop and to finish what has begun, without waiting.
     pub(crate) fn stop(&mut self) {
-        if let Some(stop) = self.stop.take() {
-            stop.send(()).unwrap_or(());
-        }
+        self.order(Stop::Drain);
+    }
+
+    /// Says to come so far to an end, unless it is further already.
+    pub(crate) fn order(&self, stop: Stop) {
+        self.orders.send_if_modified(|now| std::mem::replace(now, (*now).max(stop)) < stop);
     }
 
     /// Stops and waits: true if every request was finished.
     pub(crate) fn join(mut self) -> bool {
         self.stop();
+        self.wait()
+    }
+
+    /// Waits for the end that was ordered: true if every request was finished. The folder is still there then.
+    pub(crate) fn wait(&mut self) -> bool {
         self.thread.take().unwrap().join().unwrap()
     }
 }
@@ -375,10 +398,10 @@ fn unchunk(mut raw: &[u8]) -> (Vec<u8>, bool) {
     }
 }
 
-/// Waits for something to become true, five seconds at most.
+/// Waits for something to become true, half a minute at most: machines may be busy.
 #[track_caller]
 pub(crate) fn wait_for(what: &str, mut is: impl FnMut() -> bool) {
-    let end = Instant::now() + Duration::from_secs(5);
+    let end = Instant::now() + Duration::from_secs(30);
     while !is() {
         assert!(Instant::now() < end, "waited too long for: {what}");
         std::thread::sleep(Duration::from_millis(5));

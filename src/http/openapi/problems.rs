@@ -159,6 +159,10 @@ impl PartialSchema for ProblemDocument {
             .property("level", text("`note`, `warning` or `error`."))
             .property("line", ObjectBuilder::new().schema_type(SchemaType::from_iter([Type::Integer, Type::Null])))
             .property("message", text("What it is."));
+        let check = ObjectBuilder::new()
+            .property("name", text("`accepting`, `devices` or `store`."))
+            .property("ok", ObjectBuilder::new().schema_type(Type::Boolean))
+            .property("detail", text("What was found."));
         let mut problem = ObjectBuilder::new()
             .description(Some("Something to tell the client instead of what it asked for (RFC 9457)."))
             .property("type", text("What kind of problem; GET it for an explanation.").enum_values(Some(types)))
@@ -176,6 +180,7 @@ impl PartialSchema for ProblemDocument {
         let problem = problem
             .property("nearest", nearest)
             .property("available", strings.description(Some("What there is instead.")))
+            .property("checks", ArrayBuilder::new().items(check).description(Some("What `/readyz` looked at.")))
             .property(
                 "diagnostics",
                 ArrayBuilder::new().items(finding).description(Some("What a second, strict reader says of the file.")),

@@ -1,0 +1,72 @@
+//! `molmesh config`: what the configuration is, and what it may be. Flags become keys here, for every command that takes them.
+
+use clap::ValueEnum as _;
+
+use molmesh::config::{self, Loaded};
+use serde_json::Value;
+
+use super::args::{ConfigCommand, ConfigStyle, LogStyle, PrintArgs, ServeArgs};
+use super::error::CliError;
+
+/// Runs the command.
+pub(super) fn run(command: &ConfigCommand) -> Result<(), CliError> {
+    match command {
+        ConfigCommand::Print(args) => super::say(&print(args)?),
+        ConfigCommand::Schema => super::say(&pretty(&config::schema())),
+    }
+}
+
+/// A document as it is printed.
+pub(super) fn pretty(document: &Value) -> String {
+    format!("{document:#}\n")
+}
+
+fn print(args: &PrintArgs) -> Result<String, CliError> {
+    let loaded = load(&args.serve)?;
+    let backend = args.serve.backend.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default();
+    let warnings = &loaded.warnings;
+    Ok(match args.format {
+        ConfigStyle::Toml => {
+            let warnings: String = warnings.iter().map(|warning| format!("# Warning: {warning}\n")).collect();
+            format!(
+                "# The effective configuration of molmesh {}; behind each value, where it is from.\n\
+                 # Not a matter of this file: --backend {backend}\n{warnings}\n{}",
+                env!("CARGO_PKG_VERSION"),
+                loaded.to_toml()
+            )
+        }
+        ConfigStyle::Json => {
+            let mut document = loaded.to_json();
+            document["backend"] = backend.into();
+            document["warnings"] = warnings.clone().into();
+            pretty(&document)
+        }
+    })
+}
+
+/// Defaults, then the file, then the environment, then `--set`, then the flags that have names of their own.
+pub(super) fn load(args: &ServeArgs) -> Result<Loaded, CliError> {
+    let mut flags = Vec::new();
+    for set in &args.set {
+        let (key, value) = set.split_once('=').ok_or_else(|| CliError::Usage {
+            message: format!("parameter `set`: `{set}` is not allowed; expected section.key=value"),
+            hint: None,
+        })?;
+        flags.push((key.to_owned(), value.to_owned()));
+    }
+    let path = |p: &std::path::PathBuf| p.to_string_lossy().into_owned();
+    let log = args.log.map(|style| match style {
+        LogStyle::Pretty => "pretty".to_owned(),
+        LogStyle::Json => "json".to_owned(),
+    });
+    let named = [
+        ("server.listen", args.listen.map(|a| a.to_string())),
+        ("server.metrics_listen", args.metrics_listen.map(|a| a.to_string())),
+        ("server.data_dir", args.data_dir.as_ref().map(path)),
+        ("devices.use", args.devices.clone()),
+        ("archive.dir", args.archive.as_ref().map(path)),
+        ("log.format", log),
+    ];
+    flags.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
+    config::load_process(args.config.as_deref(), &flags).map_err(|e| CliError::usage(e.to_string()))
+}

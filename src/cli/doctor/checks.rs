@@ -1,0 +1,142 @@
+//! Checks that look at nothing outside the process, and what a check is.
+
+use std::path::Path;
+use std::time::Instant;
+
+use molmesh::config::{Config, Loaded, Source};
+use molmesh::surface::Backend;
+use molmesh::telemetry;
+
+use super::machine::Machine;
+use super::page::size;
+
+/// The check of the backend: where it fails, the exit code is another one.
+pub(super) const DEVICES: &str = "devices";
+
+/// How a check ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum State {
+    /// As it should be.
+    Ok,
+    /// A service would start and be ready, but somebody should know.
+    Warning,
+    /// It would not.
+    Failed,
+}
+
+impl State {
+    /// Its name, for programs.
+    pub(super) const fn name(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Warning => "warning",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+/// Something that was looked at.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Check {
+    /// Its name.
+    pub(super) name: &'static str,
+    /// How it ended.
+    pub(super) state: State,
+    /// What was found, in words.
+    pub(super) detail: String,
+}
+
+impl Check {
+    /// A check.
+    pub(super) fn new(name: &'static str, state: State, detail: impl Into<String>) -> Self {
+        Self { name, state, detail: detail.into() }
+    }
+}
+
+/// Where the configuration is from. One that cannot be used has ended the command before.
+pub(super) fn sources(file: Option<&Path>, loaded: &Loaded) -> Check {
+    let (mut from_file, mut variables, mut flags) = (0, Vec::new(), 0);
+    for (_, source) in loaded.sources() {
+        match source {
+            Source::Default => {}
+            Source::File(_) => from_file += 1,
+            Source::Environment(name) => variables.push(name.as_str()),
+            Source::Flag => flags += 1,
+        }
+    }
+    let file = file.map_or("no file".to_owned(), |file| format!("{} ({from_file} in effect)", file.display()));
+    let variables = if variables.is_empty() { "no variable".to_owned() } else { variables.join(" ") };
+    Check::new("config", State::Ok, format!("{file}; {variables}; {flags} from the command line"))
+}
+
+/// Files of secrets that others can read.
+pub(super) fn secrets(loaded: &Loaded) -> impl Iterator<Item = Check> {
+    loaded.warnings.iter().map(|warning| Check::new("secrets", State::Warning, warning.clone()))
+}
+
+/// Whether logs could be set up.
+pub(super) fn log(config: &Config) -> Check {
+    match telemetry::check_logs(&config.log) {
+        Ok(()) => Check::new("log", State::Ok, format!("`{}`, to stderr", config.log.filter)),
+        Err(error) => Check::new("log", State::Failed, error.to_string()),
+    }
+}
+
+/// Whether the backend makes a mesh, as a service does before it is ready.
+pub(super) fn first_mesh(backend: &dyn Backend) -> Check {
+    let start = Instant::now();
+    match backend.warm() {
+        Ok(()) => {
+            let ms = start.elapsed().as_secs_f64() * 1e3;
+            Check::new(DEVICES, State::Ok, format!("{} made a first mesh in {ms:.1} ms", backend.name()))
+        }
+        Err(error) => Check::new(DEVICES, State::Failed, format!("{} cannot make a mesh: {error}", backend.name())),
+    }
+}
+
+/// Whether what may be held in memory fits into it.
+pub(super) fn memory(machine: &Machine, config: &Config, workers: usize) -> Check {
+    let (limits, archive) = (&config.limits, &config.archive);
+    let workers = u64::try_from(workers).unwrap_or(u64::MAX);
+    let fetches = if archive.url.is_some() { archive.concurrent as u64 } else { 0 };
+    let parts = [
+        ("limits.memory_bytes", limits.memory_bytes),
+        ("meshes of running jobs", limits.mesh_bytes.saturating_mul(workers)),
+        ("store.memory_bytes", config.store.memory_bytes),
+        ("entries that are fetched", archive.max_bytes.saturating_mul(fetches)),
+    ];
+    let most = parts.iter().fold(0_u64, |sum, (_, bytes)| sum.saturating_add(*bytes));
+    let sum: Vec<String> = parts.iter().map(|(name, bytes)| format!("{} {name}", size(*bytes))).collect();
+    let budget = format!("{} at most ({})", size(most), sum.join(", "));
+    match machine.memory() {
+        None => Check::new("memory", State::Ok, format!("{budget}; how much there is is not known")),
+        Some((bytes, whose)) if most > bytes => {
+            let detail =
+                format!("{budget} do not fit into the {} of {whose}: the system may end the process", size(bytes));
+            Check::new("memory", State::Warning, detail)
+        }
+        Some((bytes, whose)) => Check::new("memory", State::Ok, format!("{budget}, of {} of {whose}", size(bytes))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn budgets_that_do_not_fit_are_a_warning() {
+        let mut config = Config::default();
+        config.limits.memory_bytes = 1 << 30;
+        config.limits.mesh_bytes = 1 << 20;
+        config.store.memory_bytes = 1 << 20;
+        config.archive.url = None;
+        let machine = |limit| Machine { limit, ..Machine::default() };
+        let state = |limit| memory(&machine(limit), &config, 2).state;
+        let enough = (1 << 30) + (3 << 20);
+        assert_eq!(state(Some((enough, "this control group"))), State::Ok);
+        assert_eq!(state(Some((enough - 1, "this control group"))), State::Warning);
+        assert_eq!(state(None), State::Ok);
+        let said = memory(&machine(Some((enough - 1, "this control group"))), &config, 2).detail;
+        assert!(said.contains("1027MiB at most") && said.contains("this control group"), "{said}");
+    }
+}

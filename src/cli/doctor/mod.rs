@@ -1,0 +1,119 @@
+//! `molmesh doctor`: what this machine has, what of it is used and why the rest is not, and whether a service with this
+//! configuration would start and be ready.
+
+mod checks;
+mod machine;
+mod page;
+mod places;
+
+use std::time::Duration;
+
+use molmesh::config::{Config, Loaded};
+use molmesh::surface::FoundDevice;
+use serde_json::{Value, json};
+
+use super::args::{DoctorArgs, DoctorStyle};
+use super::backend::{self, Asked, Candidate, Picked, Use};
+use super::error::CliError;
+use super::style::Style;
+use checks::{Check, State};
+use machine::Machine;
+
+/// What was found.
+struct Findings {
+    machine: Machine,
+    loaded: Loaded,
+    backends: Vec<Candidate>,
+    devices: Vec<FoundDevice>,
+    /// What would run: its name and why.
+    taken: Option<(&'static str, String)>,
+    checks: Vec<Check>,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &DoctorArgs) -> Result<(), CliError> {
+    let limit = super::healthcheck::timeout(args.timeout)?;
+    let loaded = super::config::load(&args.serve)?;
+    let findings = examine(args, loaded, limit)?;
+    super::say(&match args.report {
+        DoctorStyle::Text => page::text(&findings, Style::stdout()),
+        DoctorStyle::Json => super::config::pretty(&findings.document()),
+    })?;
+    let failed: Vec<_> = findings.checks.iter().filter(|c| c.state == State::Failed).map(|c| c.name).collect();
+    if failed.is_empty() {
+        return Ok(());
+    }
+    Err(CliError::Unfit { backend: failed.contains(&checks::DEVICES), failed })
+}
+
+fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Findings, CliError> {
+    let machine = Machine::look();
+    let config: Config = loaded.config.clone();
+    let mut checks = vec![checks::sources(args.serve.config.as_deref(), &loaded), checks::log(&config)];
+    checks.extend(checks::secrets(&loaded));
+    // As a service would do it: every driver is asked, the stages are built on what is taken, and a mesh is made.
+    let asked = Asked { backend: args.serve.backend, devices: &config.devices.choice, threads: None };
+    let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
+    match backend::pick(&asked, &Use::Service(config.devices.clone())) {
+        Ok(picked) => {
+            backends = backend::survey(&picked);
+            let Picked { backend, reason, devices: found, .. } = picked;
+            checks.push(checks::first_mesh(backend.as_ref()));
+            let workers = config.jobs.workers.max(config.devices.jobs * backend.devices().len());
+            checks.push(checks::memory(&machine, &config, workers));
+            (devices, taken) = (found, Some((backend.name(), reason)));
+        }
+        Err(error @ CliError::NoBackend { .. }) => {
+            checks.push(Check::new(checks::DEVICES, State::Failed, error.to_string()));
+            checks.push(checks::memory(&machine, &config, config.jobs.workers));
+        }
+        Err(error) => return Err(error),
+    }
+    checks.extend(places::listeners(&config));
+    let failed = |e: std::io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().map_err(failed)?;
+    checks.push(runtime.block_on(places::store(&config, limit)));
+    checks.push(places::archive(&config));
+    checks.extend(runtime.block_on(places::remote(&config, limit)));
+    // What has not answered by now is not waited for.
+    runtime.shutdown_background();
+    Ok(Findings { machine, loaded, backends, devices, taken, checks })
+}
+
+impl Findings {
+    /// What was found, for programs.
+    fn document(&self) -> Value {
+        let backend = |candidate: &Candidate| {
+            let (ok, detail) = match &candidate.state {
+                Ok(device) => (true, device),
+                Err(why) => (false, why),
+            };
+            json!({ "name": candidate.name, "ok": ok, "detail": detail })
+        };
+        let device = |device: &FoundDevice| {
+            let facts = &device.facts;
+            json!({
+                "number": device.number, "taken": device.taken, "reason": device.reason, "name": facts.name,
+                "kind": facts.kind.name(), "api": facts.api, "driver": facts.driver,
+                "binding_bytes": facts.binding_bytes, "buffer_bytes": facts.buffer_bytes,
+                "workgroup_bytes": facts.workgroup_bytes, "timestamps": facts.timestamps, "subgroups": facts.subgroups,
+            })
+        };
+        let check = |check: &Check| json!({ "name": check.name, "state": check.state.name(), "detail": check.detail });
+        let configuration = self.loaded.to_json();
+        json!({
+            "ok": self.checks.iter().all(|check| check.state != State::Failed),
+            "molmesh": {
+                "version": env!("CARGO_PKG_VERSION"), "features": super::features(),
+                "target": machine::TARGET, "compiler": machine::COMPILER,
+            },
+            "machine": self.machine.document(),
+            "backends": self.backends.iter().filter(|b| !b.is_device()).map(backend).collect::<Vec<_>>(),
+            "devices": self.devices.iter().map(device).collect::<Vec<_>>(),
+            "backend": self.taken.as_ref().map(|(name, reason)| json!({ "name": name, "reason": reason })),
+            "checks": self.checks.iter().map(check).collect::<Vec<_>>(),
+            "config": configuration["config"],
+            "sources": configuration["sources"],
+        })
+    }
+}

@@ -1,0 +1,123 @@
+//! The findings on a page, for people.
+
+use molmesh::config::Source;
+use molmesh::structure::radii;
+use molmesh::surface::DeviceFacts;
+
+use super::Findings;
+use super::checks::State;
+use super::machine::{self, COMPILER, TARGET};
+use crate::cli::page::Page;
+use crate::cli::style::Style;
+
+/// Columns that values take before a row is wrapped.
+const WIDTH: usize = 100;
+
+/// The page.
+pub(super) fn text(findings: &Findings, style: Style) -> String {
+    let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
+    let machine = &findings.machine;
+    page.row("build", &format!("{TARGET}, {} ({COMPILER})", crate::cli::features().join(", ")));
+    page.row("system", &format!("{} {}", std::env::consts::OS, std::env::consts::ARCH));
+    let cores = machine.cores.map_or("an unknown number".to_owned(), |cores| cores.to_string());
+    page.row("cores", &format!("{cores} for this process"));
+    let vectors: Vec<&str> = machine::vectors().collect();
+    page.row("vectors", &if vectors.is_empty() { "none that is known here".to_owned() } else { vectors.join(" ") });
+    let memory = machine.bytes.map_or("unknown".to_owned(), size);
+    let limit = machine
+        .limit
+        .map_or("no limit of a control group".to_owned(), |(bytes, whose)| format!("{} for {whose}", size(bytes)));
+    page.row("memory", &format!("{memory}, {limit}"));
+    for candidate in findings.backends.iter().filter(|candidate| !candidate.is_device()) {
+        let said = match &candidate.state {
+            Ok(device) => format!("{} {device}", style.green("yes")),
+            Err(why) => format!("{} {why}", style.dim("no ")),
+        };
+        page.row(&candidate.name, &said);
+    }
+    for device in &findings.devices {
+        let facts = &device.facts;
+        let taken = if device.taken { style.green("yes") } else { style.dim("no ") };
+        page.row(&format!("device {}", device.number), &format!("{taken} {}: {}", facts.name, device.reason));
+        page.row("", &format!("    {}, {}, {}", facts.kind.name(), facts.api, facts.driver));
+        page.row("", &format!("    {}", abilities(facts)));
+    }
+    if let Some((name, reason)) = &findings.taken {
+        page.row("auto", &format!("{name} ({reason})"));
+    }
+    page.row("radii", radii::TABLE);
+    limits(&mut page, findings);
+    page.line(String::new());
+    for check in &findings.checks {
+        let state = match check.state {
+            State::Ok => style.green("ok     "),
+            State::Warning => style.bold("warning"),
+            State::Failed => style.red("failed "),
+        };
+        page.line(format!("  {state} {}: {}", style.bold(check.name), check.detail));
+    }
+    page.finish()
+}
+
+/// Every number of the configuration, a star behind those that somebody has set.
+fn limits(page: &mut Page, findings: &Findings) {
+    let document = findings.loaded.to_json();
+    for (section, keys) in document["config"].as_object().into_iter().flatten() {
+        let mut rows = vec![String::new()];
+        for (key, value) in keys.as_object().into_iter().flatten() {
+            let Some(number) = value.as_u64() else { continue };
+            let set = findings.loaded.source(&format!("{section}.{key}")) != Source::Default;
+            let value = if key.ends_with("_bytes") { size(number) } else { number.to_string() };
+            let word = format!("{key} {value}{}", if set { "*" } else { "" });
+            match rows.last_mut() {
+                Some(row) if row.is_empty() => *row = word,
+                Some(row) if row.chars().count() + word.chars().count() < WIDTH => {
+                    row.push_str(", ");
+                    row.push_str(&word);
+                }
+                _ => rows.push(word),
+            }
+        }
+        for (n, row) in rows.iter().enumerate().filter(|(_, row)| !row.is_empty()) {
+            page.row(if n == 0 { section } else { "" }, row);
+        }
+    }
+}
+
+/// Bytes, with a binary suffix; rounded where that would take many digits.
+pub(super) fn size(bytes: u64) -> String {
+    let suffixes = [("GiB", 30), ("MiB", 20), ("KiB", 10)];
+    let exact = suffixes.iter().find(|(_, shift)| bytes >= 1 << shift && bytes.trailing_zeros() >= *shift);
+    let exact = exact.filter(|(_, shift)| *shift == 30 || bytes >> shift < 100_000);
+    match exact {
+        Some((suffix, shift)) => format!("{}{suffix}", bytes >> shift),
+        None if bytes < 1 << 20 => format!("{bytes} bytes"),
+        None => format!("{:.1}GiB", bytes as f64 / f64::from(1 << 30)),
+    }
+}
+
+/// What of a device matters to the stages.
+fn abilities(facts: &DeviceFacts) -> String {
+    let mib = |bytes: u64| format!("{} MiB", bytes >> 20);
+    let subgroups = facts.subgroups.map_or("no subgroups".to_owned(), |[least, most]| {
+        if least == most { format!("subgroups of {least}") } else { format!("subgroups of {least} to {most}") }
+    });
+    format!(
+        "bindings to {}, buffers to {}, {} KiB a workgroup, {}, {subgroups}",
+        mib(facts.binding_bytes),
+        mib(facts.buffer_bytes),
+        facts.workgroup_bytes >> 10,
+        if facts.timestamps { "timestamps" } else { "no timestamps" },
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_are_exact_or_rounded() {
+        assert_eq!([0, 1000, 1024, 64 << 20, 3 << 30].map(size), ["0 bytes", "1000 bytes", "1KiB", "64MiB", "3GiB"]);
+        assert_eq!([(3 << 29) + 1, 24_684_084 << 10].map(size), ["1.5GiB", "23.5GiB"]);
+    }
+}

@@ -1,0 +1,130 @@
+//! The end of a service, step by step, and the signals that ask for it.
+
+use tokio::sync::watch;
+
+/// How far the end has come; each step holds what the ones before it hold.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Stop {
+    /// Everything is served.
+    #[default]
+    Serve,
+    /// `/readyz` is 503; everything is served as before, but connections are not kept after an answer.
+    Notice,
+    /// The listener is closed; what has begun is finished.
+    Drain,
+    /// What has not finished is cut off.
+    Now,
+}
+
+impl Stop {
+    /// The step behind this one.
+    #[must_use]
+    pub const fn next(self) -> Self {
+        match self {
+            Self::Serve => Self::Notice,
+            Self::Notice => Self::Drain,
+            Self::Drain | Self::Now => Self::Now,
+        }
+    }
+}
+
+/// Waits until the end has come as far as `step`. Where nobody can order it any more, that is an order to drain.
+pub(super) async fn reached(orders: &mut watch::Receiver<Stop>, step: Stop) {
+    if orders.wait_for(|stop| *stop >= step).await.is_err() && step > Stop::Drain {
+        std::future::pending::<()>().await;
+    }
+}
+
+/// Waits until something more is ordered.
+pub(super) async fn further(orders: &mut watch::Receiver<Stop>) {
+    if orders.changed().await.is_err() {
+        std::future::pending::<()>().await;
+    }
+}
+
+/// The end as signals order it: SIGTERM gives notice first, SIGINT (Ctrl-C) drains at once; every further signal ends the
+/// step that is under way. Must be called on a tokio runtime.
+#[must_use]
+pub fn shutdown_signals() -> watch::Receiver<Stop> {
+    let (order, orders) = watch::channel(Stop::Serve);
+    tokio::spawn(async move {
+        let mut signals = Signals::new();
+        loop {
+            let first = signals.next().await;
+            order.send_modify(|stop| *stop = (*stop).next().max(first));
+        }
+    });
+    orders
+}
+
+/// Signals that end a service, each with the step that it asks for at least.
+#[cfg(unix)]
+struct Signals {
+    terminate: Option<tokio::signal::unix::Signal>,
+    interrupt: Option<tokio::signal::unix::Signal>,
+}
+
+#[cfg(unix)]
+impl Signals {
+    fn new() -> Self {
+        use tokio::signal::unix::{SignalKind, signal};
+        let listen = |kind: SignalKind, name: &str| {
+            signal(kind).inspect_err(|error| tracing::warn!(%error, "cannot listen for {name}")).ok()
+        };
+        Self {
+            terminate: listen(SignalKind::terminate(), "SIGTERM"),
+            interrupt: listen(SignalKind::interrupt(), "Ctrl-C"),
+        }
+    }
+
+    async fn next(&mut self) -> Stop {
+        async fn one(signal: &mut Option<tokio::signal::unix::Signal>) {
+            let came = match signal {
+                Some(signal) => signal.recv().await.is_some(),
+                None => false,
+            };
+            if !came {
+                std::future::pending::<()>().await;
+            }
+        }
+        tokio::select! {
+            () = one(&mut self.terminate) => Stop::Notice,
+            () = one(&mut self.interrupt) => Stop::Drain,
+        }
+    }
+}
+
+#[cfg(not(unix))]
+struct Signals;
+
+#[cfg(not(unix))]
+impl Signals {
+    fn new() -> Self {
+        Self
+    }
+
+    async fn next(&mut self) -> Stop {
+        if let Err(error) = tokio::signal::ctrl_c().await {
+            tracing::warn!(%error, "cannot listen for Ctrl-C");
+            std::future::pending::<()>().await;
+        }
+        Stop::Drain
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_signal_goes_a_step_further_and_ctrl_c_gives_no_notice() {
+        let order = |stop: Stop, signal: Stop| stop.next().max(signal);
+        let (terminate, interrupt) = (Stop::Notice, Stop::Drain);
+        assert_eq!(order(Stop::Serve, terminate), Stop::Notice);
+        assert_eq!(order(Stop::Serve, interrupt), Stop::Drain);
+        assert_eq!(order(Stop::Notice, terminate), Stop::Drain);
+        assert_eq!(order(Stop::Notice, interrupt), Stop::Drain);
+        assert_eq!(order(Stop::Drain, terminate), Stop::Now);
+        assert_eq!(order(Stop::Now, interrupt), Stop::Now);
+    }
+}

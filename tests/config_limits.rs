@@ -1,0 +1,216 @@
+//! Every number of the configuration is on the list: where it is met, what counts it, and that the operator's table says the
+//! same.
+#![cfg(feature = "server")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use serde_json::Value;
+
+/// A key; what counts that it was met, as a metric or as a reason of `molmesh_requests_rejected_total` (nothing where nobody
+/// is refused and nothing is lost); the test that meets it.
+type Row = (&'static str, &'static str, &'static str);
+
+const ROWS: &[Row] = &[
+    ("server.connections", "too-many-connections", "http_limits::one_connection_too_many_is_told_so"),
+    ("server.header_timeout_ms", "header-timeout", "http_limits::slow_heads_and_silent_connections_are_closed"),
+    ("server.body_timeout_ms", "body-timeout", "http_limits::a_body_that_trickles_is_given_up"),
+    (
+        "server.write_timeout_ms",
+        "write-timeout",
+        "http_limits::a_client_that_takes_nothing_is_given_up_and_its_mesh_freed",
+    ),
+    ("server.head_bytes", "head-too-large", "http_limits::heads_are_limited"),
+    ("server.streams", "molmesh_connections", "http_limits::clients_of_http2_are_told_how_much_they_may_ask"),
+    ("server.heartbeat_ms", "", "http_limits::silent_event_streams_give_signs_of_life"),
+    ("server.idle_timeout_ms", "molmesh_connections", "http_limits::an_idle_http2_connection_is_closed"),
+    ("server.notice_ms", "", "http_stop::the_notice_has_an_end_and_can_be_none"),
+    ("server.drain_timeout_ms", "", "http_lifecycle::a_drain_has_a_deadline"),
+    ("limits.body_bytes", "body-too-large", "http_limits::bodies_are_limited_whether_announced_or_not"),
+    ("limits.inflated_bytes", "inflated-too-large", "http_limits::compression_bombs_stop_at_the_inflated_limit"),
+    ("limits.atoms", "too-many-atoms", "http_limits::atoms_are_limited"),
+    ("limits.grid_samples", "grid-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
+    ("limits.mesh_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
+    ("limits.output_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
+    ("limits.memory_bytes", "memory-full", "http_limits::memory_is_shared_and_limited"),
+    ("jobs.workers", "molmesh_queue_depth", "http_limits::a_full_queue_refuses_at_once_and_says_when_to_come_back"),
+    ("jobs.queue", "queue-full", "http_limits::a_full_queue_refuses_at_once_and_says_when_to_come_back"),
+    ("jobs.deliveries", "too-many-deliveries", "http_limits::slow_takers_cannot_use_up_the_threads"),
+    ("jobs.deadline_ms", "deadline", "http_limits::the_deadline_counts_waiting_and_stops_the_job"),
+    (
+        "jobs.sync_wait_ms",
+        "molmesh_jobs_submitted_total",
+        "http_jobs::a_request_that_outlasts_its_wait_becomes_a_job_and_no_work_is_lost",
+    ),
+    ("jobs.batch_deadline_ms", "molmesh_jobs_finished_total", "openapi_statuses::jobs"),
+    ("jobs.patience_ms", "molmesh_queue_oldest_age_seconds", "http_limits::promised_jobs_stand_back_for_so_long"),
+    (
+        "jobs.attempts",
+        "molmesh_jobs_finished_total",
+        "jobs_durable::a_job_that_ends_the_process_again_and_again_is_given_up",
+    ),
+    ("jobs.keepers", "molmesh_results_not_kept_total", "http_limits::so_many_results_are_kept_at_once"),
+    ("devices.jobs", "molmesh_device_jobs", "http_devices::devices_are_listed_with_their_reasons"),
+    ("devices.batch", "molmesh_device_shared_submissions_total", "gpu_pool::small_jobs_share_a_submission"),
+    (
+        "devices.spread_bricks",
+        "molmesh_device_spread_jobs_total",
+        "gpu_spread::callers_at_once_neither_wait_for_each_other_for_ever_nor_mix_their_parts",
+    ),
+    ("archive.check_ms", "", "archive_http::digests_are_known_without_reading"),
+    (
+        "archive.connect_timeout_ms",
+        "molmesh_archive_requests_total",
+        "archive_http::slow_heads_and_bodies_are_given_up",
+    ),
+    (
+        "archive.first_byte_timeout_ms",
+        "molmesh_archive_requests_total",
+        "archive_http::slow_heads_and_bodies_are_given_up",
+    ),
+    ("archive.timeout_ms", "molmesh_archive_requests_total", "archive_http::slow_heads_and_bodies_are_given_up"),
+    ("archive.attempts", "molmesh_archive_fetch_seconds", "archive_http::slow_heads_and_bodies_are_given_up"),
+    ("archive.backoff_ms", "molmesh_archive_fetch_seconds", "archive/remote::pauses_double_and_differ"),
+    ("archive.retry_after_ms", "molmesh_archive_breaker_open", "archive_http::hosts_are_asked_when_they_say"),
+    ("archive.max_bytes", "entry-too-large", "archive_http::bodies_are_limited_while_they_come"),
+    ("archive.concurrent", "molmesh_archive_fetch_seconds", "archive_http::so_many_are_fetched_at_once_and_no_more"),
+    ("archive.fresh_ms", "molmesh_archive_requests_total", "archive_http::old_copies_are_asked_about"),
+    (
+        "archive.absent_ms",
+        "molmesh_archive_requests_total",
+        "archive_http::what_nobody_has_is_not_found_and_not_asked_for_again_soon",
+    ),
+    (
+        "archive.cache_bytes",
+        "molmesh_archive_cache_bytes",
+        "archive_http::copies_take_so_much_room_and_the_least_used_goes",
+    ),
+    ("archive.breaker_failures", "molmesh_archive_breaker_open", "archive_http::the_breaker_is_a_metric"),
+    (
+        "archive.breaker_ms",
+        "molmesh_archive_breaker_open",
+        "archive_http::a_dead_archive_costs_milliseconds_and_comes_back",
+    ),
+    ("store.timeout_ms", "molmesh_store_errors_total", "cli_doctor::a_store_that_is_silent_is_given_up"),
+    ("store.probe_ms", "molmesh_store_errors_total", "http_ready::the_store_is_not_asked_more_often_than_configured"),
+    (
+        "store.probe_timeout_ms",
+        "molmesh_store_errors_total",
+        "http/probe::a_slow_probe_changes_nothing_until_its_time_is_up",
+    ),
+    ("store.sweep_ms", "molmesh_store_removed_total", "http_limits::what_is_too_old_is_swept_as_often_as_configured"),
+    ("store.max_bytes", "store-full", "store::what_cannot_fit_is_refused_with_numbers"),
+    ("store.result_ttl_ms", "molmesh_store_removed_total", "store::time_is_up_by_folder_and_use_prolongs_it"),
+    ("store.input_ttl_ms", "molmesh_store_removed_total", "store::time_is_up_by_folder_and_use_prolongs_it"),
+    ("store.job_ttl_ms", "molmesh_store_removed_total", "store::time_is_up_by_folder_and_use_prolongs_it"),
+    ("store.memory_bytes", "molmesh_cache_requests_total", "store::memory_is_bounded_and_forgets_what_is_removed"),
+    ("store.memory_object_bytes", "molmesh_cache_requests_total", "store::hot_results_are_answered_from_memory"),
+];
+
+fn read(path: &str) -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
+    std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// The numbers of the schema: key and default.
+fn numbers() -> Vec<(String, Value)> {
+    let schema = molmesh::config::schema();
+    let mut found = Vec::new();
+    for (section, of_section) in schema["properties"].as_object().unwrap() {
+        for (key, of_key) in of_section["properties"].as_object().unwrap() {
+            if of_key.get("minimum").is_some() {
+                found.push((format!("{section}.{key}"), of_key["default"].clone()));
+            }
+        }
+    }
+    found
+}
+
+/// What is wrong with a list of rows.
+fn faults(rows: &[Row]) -> Vec<String> {
+    let mut faults = Vec::new();
+    let listed: BTreeSet<String> = rows.iter().map(|(key, ..)| (*key).to_owned()).collect();
+    let known: BTreeSet<String> = numbers().into_iter().map(|(key, _)| key).collect();
+    faults.extend(listed.symmetric_difference(&known).map(|key| format!("{key} is on one side only")));
+    let (names, kinds) = (read("src/telemetry.rs"), read("src/http/kinds.rs") + &read("src/http/accept.rs"));
+    for (key, counted, test) in rows {
+        let quoted = format!("\"{counted}\"");
+        if !counted.is_empty() && !names.contains(&quoted) && !kinds.contains(&quoted) {
+            faults.push(format!("{key}: nothing counts {counted}"));
+        }
+        let (file, name) = test.split_once("::").unwrap();
+        let folder = if file.contains('/') { "src" } else { "tests" };
+        let source = read(&format!("{folder}/{file}.rs"));
+        let field = key.split_once('.').unwrap().1.trim_end_matches("_ms");
+        if !source.contains(&format!("fn {name}(")) || !source.contains(field) && folder == "tests" {
+            faults.push(format!("{key}: {file} has no {name}, or does not name the key"));
+        }
+    }
+    faults
+}
+
+#[test]
+fn every_number_is_counted_and_tested() {
+    assert_eq!(faults(ROWS), Vec::<String>::new());
+    // The control: a key that is missing, one that there is not, a metric and a test that there are not.
+    assert!(faults(&ROWS[1..])[0].contains("server.connections"));
+    for bad in [
+        ("server.nothing", "deadline", "http_limits::atoms_are_limited"),
+        ("limits.atoms", "molmesh_nothing", "http_limits::atoms_are_limited"),
+        ("limits.atoms", "too-many-atoms", "http_limits::nothing"),
+        ("store.probe_ms", "", "http_limits::atoms_are_limited"),
+    ] {
+        assert_eq!(faults(&[ROWS, &[bad]].concat()).len(), 1, "{bad:?}");
+    }
+}
+
+/// What is wrong with the operator's table.
+fn differences(page: &str) -> Vec<String> {
+    let mut rows: Vec<(String, String, String)> = Vec::new();
+    for line in page.lines().filter(|line| line.starts_with("| `")) {
+        let cells: Vec<&str> = line.trim_matches('|').split(" | ").map(|cell| cell.trim_matches([' ', '`'])).collect();
+        if let [key, default, .., counted] = cells[..]
+            && key.contains('.')
+        {
+            rows.push((key.to_owned(), default.to_owned(), counted.replace('`', "")));
+        }
+    }
+    let mut faults = Vec::new();
+    for (key, default) in numbers() {
+        let default = default.as_u64().map_or_else(|| default.to_string(), |n| shown(&key, n));
+        let counted = ROWS.iter().find(|row| row.0 == key).map(|row| row.1).unwrap_or_default();
+        let counted = if counted.is_empty() { "–" } else { counted };
+        let of_key: Vec<_> = rows.iter().filter(|row| row.0 == key).collect();
+        match of_key[..] {
+            [(_, said, by)] if *said == default && by == counted => {}
+            _ => faults.push(format!("`{key}` | {default} | … | `{counted}`, not {of_key:?}")),
+        }
+    }
+    let known: BTreeSet<String> = numbers().into_iter().map(|(key, _)| key).collect();
+    faults.extend(rows.iter().filter(|row| !known.contains(&row.0)).map(|row| format!("{} is no limit", row.0)));
+    faults
+}
+
+/// A number as the table shows it.
+fn shown(key: &str, n: u64) -> String {
+    if key.ends_with("_bytes") {
+        let (shift, suffix) = [(30, "GiB"), (20, "MiB"), (10, "KiB")].into_iter().find(|(s, _)| n >= 1 << s).unwrap();
+        assert_eq!(n >> shift << shift, n, "{key}");
+        return format!("{} {suffix}", n >> shift);
+    }
+    let digits = n.to_string();
+    let grouped: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|c| std::str::from_utf8(c).unwrap()).collect();
+    let unit = if key.ends_with("_ms") { " ms" } else { "" };
+    format!("{}{unit}", grouped.join(","))
+}
+
+#[test]
+fn the_operators_table_is_the_list() {
+    let page = read("docs/operations.md");
+    assert_eq!(differences(&page), Vec::<String>::new());
+    // The control: another default, a row too few.
+    assert_eq!(differences(&page.replace("| 1,024 |", "| 1,025 |")).len(), 1);
+    let fewer: String = page.lines().filter(|l| !l.contains("`jobs.queue`")).map(|l| format!("{l}\n")).collect();
+    assert_eq!(differences(&fewer).len(), 1);
+}
