@@ -67,6 +67,7 @@ impl Remote {
             let ask = async {
                 let failed = |failed: Failed| match failed {
                     Failed::TooLarge(_) => "too large".to_owned(),
+                    Failed::Memory(none) => format!("no memory: {} of {} bytes are in use", none.held, none.limit),
                     Failed::Other { detail, .. } => detail,
                 };
                 let client = self.client().await.map_err(failed)?;

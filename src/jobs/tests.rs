@@ -36,7 +36,13 @@ struct House {
 impl House {
     async fn new(attempts: u32, patience: Duration) -> Self {
         let (dir, faults, store) = faulty(1 << 30).await;
-        let settings = Settings { workers: 1, queue: 8, limits: JobLimits::default(), budget: Budget::new(1 << 30) };
+        let settings = Settings {
+            workers: 1,
+            queue: 8,
+            patience: Duration::from_secs(10),
+            limits: JobLimits::default(),
+            budget: Budget::new(1 << 30),
+        };
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test says so".to_owned()).unwrap());
         let settings = LedgerSettings { allowed: PATIENT, attempts, output_bytes: 1 << 30, patience };
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
