@@ -40,12 +40,33 @@ fn text(args: &DoctorArgs, style: Style) -> Result<String, CliError> {
         line("", &format!("    {}, {}, {}", facts.kind.name(), facts.api, facts.driver));
         line("", &format!("    {}", abilities(facts)));
     }
+    for (i, driver) in drivers().iter().enumerate() {
+        line(if i == 0 { "drivers" } else { "" }, driver);
+    }
     line("auto", &format!("{} ({})", picked.backend.name(), picked.reason));
     let JobLimits { read, surface, .. } = JobLimits::default();
     line("limits", &format!("{} atoms, {} bytes inflated", read.max_atoms, read.max_inflated_bytes));
     line("", &format!("{} samples, {} bytes of mesh", surface.max_samples, surface.max_mesh_bytes));
     line("radii", radii::TABLE);
     Ok(page.finish())
+}
+
+/// What announces itself as a Vulkan driver, whether or not it starts.
+#[cfg(feature = "gpu")]
+fn drivers() -> Vec<String> {
+    if !cfg!(target_os = "linux") {
+        return Vec::new();
+    }
+    let found = molmesh::gpu::manifests();
+    if found.is_empty() {
+        return vec!["no manifest of a Vulkan driver is where a loader looks (/usr/share/vulkan/icd.d and the like)".to_owned()];
+    }
+    found.iter().map(ToString::to_string).collect()
+}
+
+#[cfg(not(feature = "gpu"))]
+fn drivers() -> Vec<String> {
+    Vec::new()
 }
 
 /// What of a device matters to the stages.
