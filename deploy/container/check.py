@@ -67,6 +67,8 @@ class Image:
         self.name, self.kind = name, kind
         [found] = json.loads(engine("image", "inspect", name).stdout)
         self.size, self.config = found["Size"], found["Config"]
+        # docker keeps the health check in the configuration, podman beside it.
+        self.health = (self.config.get("Healthcheck") or found.get("Healthcheck") or {}).get("Test") or []
         made = engine("create", name).stdout.strip()
         try:
             packed = engine("export", made, text=False).stdout
@@ -110,8 +112,7 @@ def stops_by_draining(image):
 
 
 def checks_its_health(image):
-    test = (image.config.get("Healthcheck") or {}).get("Test")
-    need(test == ["CMD", "molmesh", "healthcheck"], f"its health check is {test}")
+    need(image.health == ["CMD", "molmesh", "healthcheck"], f"its health check is {image.health}")
 
 
 def has_no_setuid(image):
@@ -263,17 +264,17 @@ def privileges(container):
 def serves(image):
     """The whole life of a service: ready, a mesh, a restart, the mesh again, an orderly end."""
     engine("volume", "rm", "--force", VOLUME, code=None)
-    test = image.config["Healthcheck"]["Test"][1:]
+    test = image.health[1:]
     container = Container(image.name, "--read-only")
     container.wait_until_healthy(test)
     need(container.run(*test, "--url", "http://127.0.0.1:1/", code=1).returncode == 1, "control: health of nothing")
     uid, capabilities, no_new = privileges(container)
     need((uid, int(capabilities, 16), no_new) == (str(USER), 0, "1"), f"uid {uid}, {capabilities}, {no_new}")
-    status, glb = container.curl("/v1/meshes", "--data-binary", f"@{ROOT}/samples/4pti.pdb", "-D", "/dev/stderr")
+    status, glb = container.curl("/v1/meshes", "--data-binary", f"@{ROOT}/samples/4pti.pdb")
     need(status == 200 and glb.startswith(b"glTF\x02\x00\x00\x00"), f"a mesh: {status} {glb[:300]!r}")
     status, job = container.curl("/v1/meshes?resolution=0.7", "--data-binary", f"@{ROOT}/samples/4pti.pdb", "-H", "Prefer: respond-async")
     need(status == 202, f"a promise: {status} {job[:300]!r}")
-    address = json.loads(job)["id"]
+    address = json.loads(job)["jobID"]
     end = time.monotonic() + READY_SECONDS
     while json.loads(container.curl(f"/v1/jobs/{address}?wait=20")[1])["status"] != "successful":
         need(time.monotonic() < end, "the promised mesh does not come")
@@ -341,6 +342,8 @@ def main():
             good, why = not fails, "control: the broken image was let through" if fails else ""
         except Failed as failed:
             good, why = fails, f"{failed}"
+        except (LookupError, ValueError, OSError) as error:
+            good, why = False, repr(error)
         failures += not good
         mark = ("objects" if fails else "ok") if good else "FAILED"
         print(f"{target:4} {mark:8} {name} ({time.monotonic() - begun:.1f} s){'' if good and not fails else ': ' + why[:1500]}", flush=True)
