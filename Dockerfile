@@ -35,7 +35,11 @@ FROM ${BINARY} AS binary
 
 # The archive is asked over TLS: the list of certificates, without the programs that Debian keeps it with.
 FROM ${BASE_IMAGE} AS certificates
-RUN apt-get update && apt-get install -y --no-install-recommends ca-certificates
+RUN apt-get update && apt-get install -y --no-install-recommends ca-certificates \
+    && install -D -m 0644 /etc/ssl/certs/ca-certificates.crt /parts/etc/ssl/certs/ca-certificates.crt \
+    && install -D -m 0644 /usr/share/doc/ca-certificates/copyright /parts/usr/share/doc/ca-certificates/copyright \
+    # What of a package is here without dpkg's knowledge is noted where scanners look for it.
+    && mkdir -p /parts/var/lib/dpkg/status.d && dpkg-query --status ca-certificates >/parts/var/lib/dpkg/status.d/ca-certificates
 
 # ------------------------------------------------------------------------------------------------------- for CPUs
 FROM ${BASE_IMAGE} AS cpu
@@ -45,7 +49,7 @@ RUN groupadd --gid 65532 molmesh \
     && install -d -o molmesh -g molmesh -m 0750 /data \
     && find / -xdev -type f -perm /6000 -exec chmod a-s {} + \
     && rm -f /var/log/*.log /var/log/apt/* /etc/passwd- /etc/group- /etc/shadow- /etc/gshadow-
-COPY --from=certificates /etc/ssl/certs/ca-certificates.crt /etc/ssl/certs/ca-certificates.crt
+COPY --from=certificates /parts/ /
 COPY deploy/container/molmesh.toml /etc/molmesh/molmesh.toml
 COPY --from=binary /stage/ /
 # A binary that does not fit this libc is found out here.
@@ -77,8 +81,12 @@ CMD ["serve", "--config", "/etc/molmesh/molmesh.toml"]
 # package wants all of Mesa beside it (200 MB); the library itself is two files.
 FROM ${BASE_IMAGE} AS egl
 WORKDIR /deb
-RUN apt-get update && apt-get download libegl1 libglvnd0 && for deb in *.deb; do dpkg-deb --extract "$deb" /egl; done \
-    && rm -rf /egl/usr/share/lintian /egl/usr/share/bug
+RUN apt-get update && apt-get download libegl1 libglvnd0 && mkdir -p /parts/var/lib/dpkg/status.d \
+    && for deb in *.deb; do \
+        dpkg-deb --extract "$deb" /parts \
+        && dpkg-deb --field "$deb" >"/parts/var/lib/dpkg/status.d/$(dpkg-deb --field "$deb" Package)" || exit 1; \
+    done \
+    && rm -rf /parts/usr/share/lintian /parts/usr/share/bug
 
 FROM cpu AS gpu
 USER 0:0
@@ -86,7 +94,7 @@ USER 0:0
 RUN apt-get update \
     && apt-get install -y --no-install-recommends libvulkan1 libx11-6 libxext6 \
     && rm -rf /var/lib/apt/lists/* /var/cache/apt/* /var/log/*.log /var/log/apt/* /var/cache/ldconfig/aux-cache
-COPY --from=egl /egl/ /
+COPY --from=egl /parts/ /
 # Who the drivers are. The toolkit mounts its own over these where the host has them; where both are read, molmesh sees
 # that a device comes twice.
 COPY deploy/container/nvidia_icd.json /usr/share/vulkan/icd.d/nvidia_icd.json

@@ -10,7 +10,7 @@ use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
-use deploy_support::{Recipe, at, bytes, kinds, read, root, sections, strings, under, yaml};
+use deploy_support::{Recipe, at, bytes, kinds, only, read, root, sections, strings, under, yaml};
 use molmesh::config::{Config, load};
 use serde_json::{Value, json};
 
@@ -113,7 +113,7 @@ fn every_file_that_the_recipe_copies_is_there_and_sent() {
     for stage in recipe().stages.iter() {
         for line in stage.all("COPY").filter(|line| !line.starts_with("--from")) {
             let words: Vec<&str> = line.split_whitespace().collect();
-            for file in words[..words.len() - 1].iter().filter(|file| !["." , "dist/image/"].contains(*file)) {
+            for file in words[..words.len() - 1].iter().filter(|file| ![".", "dist/image/"].contains(*file)) {
                 assert!(root().join(file).is_file(), "{file}");
                 assert!(deploy_support::sent(&ignore, Path::new(file)), "{file} is not sent");
                 n += 1;
@@ -224,7 +224,11 @@ fn kustomizations_name_what_is_there() {
     for folder in ["base", "scaled", "gpu"].map(|name| root().join("deploy/kubernetes").join(name)) {
         for file in std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()) {
             let path = file.strip_prefix(root()).unwrap().to_owned();
-            assert!(path.ends_with("kustomization.yaml") || everything.contains(&path), "{} is nobody's", path.display());
+            assert!(
+                path.ends_with("kustomization.yaml") || everything.contains(&path),
+                "{} is nobody's",
+                path.display()
+            );
             n += 1;
         }
     }
@@ -246,7 +250,7 @@ fn the_pod_agrees_with_the_image_and_its_configuration() {
     let Some(found) = yaml(&["deployment", "storage", "service", "network"].map(|f| format!("{BASE}/{f}.yaml"))) else {
         return;
     };
-    let [deployment, storage, service, network] = found.each_document();
+    let [deployment, storage, service, network] = only(&found);
     let config = config(CONFIGURATIONS[1]);
     let pod = &deployment["spec"]["template"]["spec"];
     let container = &pod["containers"][0];
@@ -258,12 +262,17 @@ fn the_pod_agrees_with_the_image_and_its_configuration() {
         (&security["readOnlyRootFilesystem"], &security["allowPrivilegeEscalation"], &security["capabilities"]["drop"]),
         (&json!(true), &json!(false), &json!(["ALL"]))
     );
-    let named: Vec<_> = container["ports"].as_array().unwrap().iter().map(|p| p["containerPort"].as_u64().unwrap()).collect();
+    let named: Vec<_> =
+        container["ports"].as_array().unwrap().iter().map(|p| p["containerPort"].as_u64().unwrap()).collect();
     let [service_port, metrics_port] = ports(&config).map(u64::from);
     assert_eq!(named, [service_port, metrics_port]);
-    assert_eq!(deployment["spec"]["template"]["metadata"]["annotations"]["prometheus.io/port"], json!(metrics_port.to_string()));
+    assert_eq!(
+        deployment["spec"]["template"]["metadata"]["annotations"]["prometheus.io/port"],
+        json!(metrics_port.to_string())
+    );
     assert_eq!(service["spec"]["ports"][0]["targetPort"], container["ports"][0]["name"]);
-    let open: Vec<_> = network["spec"]["ingress"].as_array().unwrap().iter().map(|rule| &rule["ports"][0]["port"]).collect();
+    let open: Vec<_> =
+        network["spec"]["ingress"].as_array().unwrap().iter().map(|rule| &rule["ports"][0]["port"]).collect();
     assert_eq!(open, [&json!(service_port), &json!(metrics_port)]);
     // Time to stop: the pause, the drain, a margin.
     let grace = pod["terminationGracePeriodSeconds"].as_u64().unwrap();
@@ -282,14 +291,17 @@ fn the_pod_agrees_with_the_image_and_its_configuration() {
         assert!(described.contains(&format!("\n  {path}:\n")), "{path} is not described");
     }
     // Mounts: where the configuration and the data are looked for.
-    let mounts: Vec<_> = container["volumeMounts"].as_array().unwrap().iter().map(|m| m["mountPath"].as_str().unwrap()).collect();
+    let mounts: Vec<_> =
+        container["volumeMounts"].as_array().unwrap().iter().map(|m| m["mountPath"].as_str().unwrap()).collect();
     assert_eq!(mounts, [config.server.data_dir.to_str().unwrap(), "/etc/molmesh", "/tmp"]);
 }
 
 #[test]
 fn many_pods_promise_nothing_that_only_one_of_them_keeps() {
-    let Some(found) = yaml(&["deployment", "autoscaler"].map(|f| format!("deploy/kubernetes/scaled/{f}.yaml"))) else { return };
-    let [patch, autoscaler] = found.each_document();
+    let Some(found) = yaml(&["deployment", "autoscaler"].map(|f| format!("deploy/kubernetes/scaled/{f}.yaml"))) else {
+        return;
+    };
+    let [patch, autoscaler] = only(&found);
     let pod = &patch["spec"]["template"]["spec"];
     let environment: Vec<(String, String)> = pod["containers"][0]["env"]
         .as_array()
@@ -339,7 +351,9 @@ fn the_documentation_names_what_is_there() {
 
 #[test]
 fn control_patterns_decide_what_is_sent() {
-    let sent = |path: &str| deploy_support::sent("# all\n*\n!src\n!web\nweb/node_modules\n!deploy/container\n", Path::new(path));
+    let sent = |path: &str| {
+        deploy_support::sent("# all\n*\n!src\n!web\nweb/node_modules\n!deploy/container\n", Path::new(path))
+    };
     assert!(sent("src/a/b.rs") && sent("web/app.js") && sent("deploy/container/x") && sent("src"));
     assert!(!sent("build.rs") && !sent("web/node_modules/x") && !sent("deploy/compose.yaml") && !sent("srcs/a"));
 }
@@ -356,7 +370,10 @@ fn control_a_recipe_is_taken_apart() {
 
 #[test]
 fn control_sizes_and_keys_are_read() {
-    assert_eq!([bytes("1Ki"), bytes("5376Mi"), bytes("2Gi"), bytes("10G")], [1 << 10, 5376 << 20, 2 << 30, 10_000_000_000]);
+    assert_eq!(
+        [bytes("1Ki"), bytes("5376Mi"), bytes("2Gi"), bytes("10G")],
+        [1 << 10, 5376 << 20, 2 << 30, 10_000_000_000]
+    );
     let defaults = serde_json::to_value(Config::default()).unwrap();
     assert_eq!(sections("`store.nothing` and `limits.atoms`, not `x.y`", &defaults), ["store.nothing", "limits.atoms"]);
     assert!(at(&defaults, "store.nothing").is_none() && at(&defaults, "limits.atoms").is_some());

@@ -59,7 +59,9 @@ fn drivers() -> Vec<String> {
     }
     let found = molmesh::gpu::manifests();
     if found.is_empty() {
-        return vec!["no manifest of a Vulkan driver is where a loader looks (/usr/share/vulkan/icd.d and the like)".to_owned()];
+        return vec![
+            "no manifest of a Vulkan driver is where a loader looks (/usr/share/vulkan/icd.d and the like)".to_owned(),
+        ];
     }
     found.iter().map(ToString::to_string).collect()
 }

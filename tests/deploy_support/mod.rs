@@ -93,20 +93,12 @@ pub(crate) struct Manifest {
     pub(crate) errors: Vec<String>,
 }
 
-/// Several files.
-pub(crate) trait Manifests {
-    /// The one document of each.
-    fn each_document<const N: usize>(&self) -> [&Value; N];
-}
-
-impl Manifests for Vec<Manifest> {
-    #[track_caller]
-    fn each_document<const N: usize>(&self) -> [&Value; N] {
-        let only = |manifest: &'_ Manifest| assert_eq!(manifest.documents.len(), 1, "{manifest:?}");
-        self.iter().for_each(only);
-        let documents: Vec<&Value> = self.iter().map(|manifest| &manifest.documents[0]).collect();
-        documents.try_into().unwrap()
-    }
+/// The one document of each file.
+#[track_caller]
+pub(crate) fn only<const N: usize>(found: &[Manifest]) -> [&Value; N] {
+    assert!(found.iter().all(|manifest| manifest.documents.len() == 1), "{found:?}");
+    let documents: Vec<&Value> = found.iter().map(|manifest| &manifest.documents[0]).collect();
+    documents.try_into().unwrap()
 }
 
 /// Reads YAML files, by their paths from the root.
@@ -121,9 +113,10 @@ pub(crate) fn under(folder: &str, files: impl Fn(&Value, &Path) -> Vec<PathBuf>)
         std::fs::read_dir(root().join(folder)).unwrap().map(|e| e.unwrap().path()).filter(|p| p.is_dir()).collect();
     folders.sort();
     let found = yaml(&folders.iter().map(|folder| folder.join("kustomization.yaml")).collect::<Vec<_>>())?;
-    let each = folders.iter().zip(&found).flat_map(|(folder, manifest)| {
-        files(&manifest.documents[0], folder.strip_prefix(root()).unwrap())
-    });
+    let each = folders
+        .iter()
+        .zip(&found)
+        .flat_map(|(folder, manifest)| files(&manifest.documents[0], folder.strip_prefix(root()).unwrap()));
     Some(each.collect())
 }
 
