@@ -28,10 +28,13 @@ NAME = "molmesh-check"
 BROKEN = "molmesh:broken"
 LIBRARIES = "/usr/lib/x86_64-linux-gnu"
 
-if os.environ.get("ENGINE") == "docker" or (not os.environ.get("ENGINE") and not shutil.which("podman")):
-    ENGINE, RUN = ["docker"], []
-else:
-    ENGINE = ["podman"]
+def docker_answers():
+    return shutil.which("docker") and subprocess.run(["docker", "info"], capture_output=True, check=False).returncode == 0
+
+
+# As engine.sh chooses, which build.sh asks.
+ENGINE, RUN = [os.environ.get("ENGINE") or ("docker" if docker_answers() else "podman")], []
+if ENGINE == ["podman"]:
     if runc := shutil.which("runc"):
         ENGINE += ["--runtime", runc]
     # A machine that lowers its own limits cannot give containers more. What is writable is said here, not guessed.
@@ -248,9 +251,8 @@ class Container:
 
     def stop(self):
         """SIGTERM; the exit status."""
-        engine("stop", "--time", str(STOP_SECONDS), NAME)
-        code = self.state()["ExitCode"]
-        return code
+        engine("stop", "-t", str(STOP_SECONDS), NAME)
+        return self.state()["ExitCode"]
 
     def remove(self):
         engine("rm", "--force", NAME, code=None)
@@ -321,7 +323,7 @@ def notices_what_goes_wrong(image):
     need("/var/tmp/x" in container.written(), f"a file that was written is not seen: {container.written()}")
     need(container.state()["ExitCode"] == 3, "an exit status is not seen")
     # Not to be served without a place to write to.
-    flags = ["--read-only", "--mount", "type=tmpfs,destination=/data,ro=true"]
+    flags = ["--read-only", "--tmpfs", "/data:ro,size=1m"]
     container = Container(image.name, *flags, volume=False)
     while container.state()["Running"]:
         need(time.monotonic() < end, f"it runs without its volume: {container.logs()[-2000:]}")
