@@ -80,16 +80,27 @@ fn the_recipe_builds_with_the_compiler_that_the_package_asks_for() {
     assert!(tag.ends_with(&suite), "what is built on {image} may not run on {base}");
 }
 
-/// Files that the compiler has read for the binary, relative to the root.
-fn read_by_the_build() -> Vec<PathBuf> {
-    let list = Path::new(env!("CARGO_BIN_EXE_molmesh")).with_extension("d");
-    let text = std::fs::read_to_string(&list).unwrap_or_else(|e| panic!("{}: {e}", list.display()));
-    let (_, files) = text.split_once(": ").unwrap();
-    let files = files.replace("\\ ", "\u{0}");
-    let paths = files.split_whitespace().map(|path| PathBuf::from(path.replace('\u{0}', " ")));
-    let ours = paths.filter_map(|path| path.strip_prefix(root()).map(Path::to_owned).ok());
-    let built = root().join("target");
-    ours.filter(|path| !root().join(path).starts_with(&built)).collect()
+/// Files that the build reads, relative to the root: sources, shaders, what sources name by a path of their own (`"../web/…"`),
+/// and the targets of the package, without which cargo refuses it.
+fn read_by_the_build() -> BTreeSet<PathBuf> {
+    let mut files: BTreeSet<PathBuf> = ["src", "shaders"].into_iter().flat_map(deploy_support::files).collect();
+    let named: Vec<PathBuf> = files
+        .iter()
+        .filter(|path| path.extension().is_some_and(|extension| extension == "rs"))
+        .flat_map(|path| {
+            let folder = path.parent().unwrap().to_owned();
+            let text = std::fs::read_to_string(root().join(path)).unwrap();
+            let literals: Vec<String> = text.split('"').filter(|l| l.starts_with("../")).map(str::to_owned).collect();
+            literals.into_iter().map(move |literal| deploy_support::plain(&folder.join(literal)))
+        })
+        .filter(|path| root().join(path).is_file())
+        .collect();
+    assert!(named.iter().any(|path| path.starts_with("web")), "no page is named in {named:?}");
+    let manifest: toml::Table = read("Cargo.toml").parse().unwrap();
+    let benches = manifest["bench"].as_array().unwrap().iter();
+    let benches = benches.map(|bench| PathBuf::from(format!("benches/{}.rs", bench["name"].as_str().unwrap())));
+    files.extend(named.into_iter().chain(benches));
+    files
 }
 
 #[test]
@@ -98,7 +109,7 @@ fn the_build_sees_every_file_that_it_reads() {
     let mut files = read_by_the_build();
     assert!(files.len() > 100, "only {} files are said to be read", files.len());
     let more = ["Cargo.toml", "Cargo.lock", "build.rs", "LICENSE-MIT", "LICENSE-APACHE", "web/swagger/NOTICE"];
-    files.extend(more.into_iter().chain(CONFIGURATIONS.into_iter().take(1)).map(PathBuf::from));
+    files.extend(more.into_iter().chain([CONFIGURATIONS[0], "deploy/notices.py"]).map(PathBuf::from));
     let left_out: Vec<_> = files.iter().filter(|path| !deploy_support::sent(&ignore, path)).collect();
     assert!(left_out.is_empty(), "left out of the build: {left_out:?}");
     for other in [".git/config", "target/release/molmesh", "tests/deploy.rs", "web/node_modules/x/y.js", "dist/x.tar"] {

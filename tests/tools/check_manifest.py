@@ -30,7 +30,9 @@ def against_kubernetes(document):
         return []
     try:
         kubernetes_validate.validate(document, KUBERNETES, strict=True)
-    except (kubernetes_validate.ValidationError, kubernetes_validate.SchemaNotFoundError, kubernetes_validate.InvalidSchemaError) as error:
+    except kubernetes_validate.SchemaNotFoundError:
+        return [f"no such kind: {document.get('apiVersion')} {document.get('kind')}"]
+    except kubernetes_validate.ValidationError as error:
         return [str(error).splitlines()[0]]
     return []
 
