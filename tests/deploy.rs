@@ -121,7 +121,7 @@ fn the_build_sees_every_file_that_it_reads() {
 fn every_file_that_the_recipe_copies_is_there_and_sent() {
     let ignore = read(".dockerignore");
     let mut n = 0;
-    for stage in recipe().stages.iter() {
+    for stage in &recipe().stages {
         for line in stage.all("COPY").filter(|line| !line.starts_with("--from")) {
             let words: Vec<&str> = line.split_whitespace().collect();
             for file in words[..words.len() - 1].iter().filter(|file| ![".", "dist/image/"].contains(*file)) {

@@ -9,7 +9,7 @@ pick_engine() {
         if docker info >/dev/null 2>&1; then
             engine=(docker)
         else
-            command -v podman >/dev/null || install_packages podman runc crun-
+            command -v podman >/dev/null || install_packages podman runc
             engine=(podman)
         fi
         ;;

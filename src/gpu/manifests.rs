@@ -18,8 +18,11 @@ pub struct Manifest {
 
 impl fmt::Display for Manifest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let library = self.library.as_ref().map_or_else(|why| why.clone(), |name| format!("names {name}"));
-        write!(f, "{} {library}", self.path.display())
+        let path = self.path.display();
+        match &self.library {
+            Ok(name) => write!(f, "{path} names {name}"),
+            Err(why) => write!(f, "{path} {why}"),
+        }
     }
 }
 
@@ -47,7 +50,7 @@ fn under(root: &Path, variable: impl Fn(&str) -> Option<String>) -> Vec<Manifest
     let set = |name: &str| variable(name).filter(|value| !value.is_empty());
     let listed = |value: String| value.split(':').map(|path| inside(root, path)).collect::<Vec<_>>();
     let instead = INSTEAD.into_iter().find_map(set);
-    let places = instead.map(listed).unwrap_or_else(|| {
+    let of_the_system = || {
         let mut places = set(BESIDE).map(listed).unwrap_or_default();
         let home = set("HOME").unwrap_or_default();
         for (name, default) in FOLDERS {
@@ -58,7 +61,8 @@ fn under(root: &Path, variable: impl Fn(&str) -> Option<String>) -> Vec<Manifest
             places.extend(folders.map(|folder| inside(root, folder).join(BELOW)));
         }
         places
-    });
+    };
+    let places = instead.map_or_else(of_the_system, listed);
     let mut found: Vec<Manifest> = Vec::new();
     for path in places.iter().flat_map(|place| files(place)) {
         if !found.iter().any(|other| other.path == path) {
