@@ -8,7 +8,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test tools fmt fmt-check lint matrix deny deny-if-installed tests bench release clean
+.PHONY: help run test tools fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench release clean
 
 help: ## This list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -45,6 +45,19 @@ deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (th
 deny-if-installed:
 	@if command -v cargo-deny >/dev/null; then $(MAKE) --no-print-directory deny; \
 	else echo "SKIPPED: cargo-deny is not installed; make deny installs and runs it"; fi
+
+audit: ## Known vulnerabilities of all dependencies; ADVISORY_DB=FOLDER for a copy of the database, ALLOW_SKIP=1 if none may do
+	deploy/audit.sh
+
+sbom: ## The bill of materials: dist/molmesh.cdx.json
+	deploy/sbom.sh
+
+# BINARY=FILE takes one that is there. Images of bases are made here, so that no registry of images is needed.
+container: $(if $(BINARY),,release) ## Build the images and run them: two minutes and the binary; needs root on Debian, or docker
+	deploy/container/build.sh --binary $(or $(BINARY),target/release/molmesh) --base-from-debootstrap
+	deploy/container/check.py
+	deploy/kubernetes/check.sh
+	deploy/sbom.sh cpu gpu
 
 tests: ## The tests alone
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)

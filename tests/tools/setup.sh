@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs the outside oracles of the tests (trimesh, gemmi, moto, jsonschema, gltf-validator) into target/test-tools, which git
+# Installs the outside oracles of the tests (trimesh, gemmi, moto, schemas, gltf-validator) into target/test-tools, which git
 # ignores, and Mesa's software Vulkan (lavapipe) into the system where there is none: the shaders are tested on it. Does
 # nothing when all is there and up to date; says nothing unless it installs or fails.
 set -eu

@@ -19,6 +19,8 @@ pub(super) struct Machine {
     pub(super) bytes: Option<u64>,
     /// Bytes that this process may take, and by whose word, where there is a limit.
     pub(super) limit: Option<(u64, &'static str)>,
+    /// What announces itself as a Vulkan driver, whether or not it starts; a sentence where nothing does.
+    pub(super) drivers: Vec<String>,
 }
 
 impl Machine {
@@ -28,6 +30,7 @@ impl Machine {
             cores: std::thread::available_parallelism().ok().map(std::num::NonZero::get),
             bytes: fs::read_to_string("/proc/meminfo").ok().and_then(|text| total(&text)),
             limit: limit(Path::new("/")).map(|bytes| (bytes, "this control group")),
+            drivers: drivers(),
         }
     }
 
@@ -43,8 +46,28 @@ impl Machine {
         json!({
             "os": std::env::consts::OS, "arch": std::env::consts::ARCH, "cores": self.cores, "vectors": vectors,
             "memory_bytes": self.bytes, "memory_limit_bytes": self.limit.map(|(bytes, _)| bytes),
+            "drivers": self.drivers,
         })
     }
+}
+
+#[cfg(feature = "gpu")]
+fn drivers() -> Vec<String> {
+    if !cfg!(target_os = "linux") {
+        return Vec::new();
+    }
+    let found = molmesh::gpu::manifests();
+    if found.is_empty() {
+        return vec![
+            "no manifest of a Vulkan driver is where a loader looks (/usr/share/vulkan/icd.d and the like)".to_owned(),
+        ];
+    }
+    found.iter().map(ToString::to_string).collect()
+}
+
+#[cfg(not(feature = "gpu"))]
+fn drivers() -> Vec<String> {
+    Vec::new()
 }
 
 /// The total of `/proc/meminfo`, bytes.

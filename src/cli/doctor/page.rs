@@ -42,6 +42,9 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
         page.row("", &format!("    {}, {}, {}", facts.kind.name(), facts.api, facts.driver));
         page.row("", &format!("    {}", abilities(facts)));
     }
+    for (i, driver) in findings.machine.drivers.iter().enumerate() {
+        page.row(if i == 0 { "drivers" } else { "" }, driver);
+    }
     if let Some((name, reason)) = &findings.taken {
         page.row("auto", &format!("{name} ({reason})"));
     }

@@ -1,0 +1,372 @@
+#!/usr/bin/env python3
+"""Runs the images molmesh:cpu and molmesh:gpu as they are meant to be run, and looks at what is in them.
+
+Each check is put to an image that breaks it as well (`molmesh:broken`, made here) or to an event that it must notice, and
+fails if it does not. Needs docker or podman with its daemon on this machine, and root: requests go in through the
+container's own network, which has no way out. Usage: deploy/container/check.py [cpu|gpu ...]
+"""
+
+import io
+import json
+import os
+import pathlib
+import shutil
+import stat
+import subprocess
+import sys
+import tarfile
+import time
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent.parent
+USER = 65532
+# Bytes of all layers, as the engine counts them.
+MOST_BYTES = {"cpu": 120_000_000, "gpu": 130_000_000}
+READY_SECONDS = 120
+STOP_SECONDS = 60
+VOLUME = "molmesh-check"
+NAME = "molmesh-check"
+BROKEN = "molmesh:broken"
+LIBRARIES = "/usr/lib/x86_64-linux-gnu"
+
+def docker_answers():
+    return shutil.which("docker") and subprocess.run(["docker", "info"], capture_output=True, check=False).returncode == 0
+
+
+# As engine.sh chooses, which build.sh asks.
+ENGINE, RUN = [os.environ.get("ENGINE") or ("docker" if docker_answers() else "podman")], []
+if ENGINE == ["podman"]:
+    if runc := shutil.which("runc"):
+        ENGINE += ["--runtime", runc]
+    # A machine that lowers its own limits cannot give containers more. What is writable is said here, not guessed.
+    RUN = ["--ulimit", "nofile=1024:1024", "--ulimit", "nproc=4096:4096", "--read-only-tmpfs=false", "--no-healthcheck"]
+SAFE = ["--cap-drop", "ALL", "--security-opt", "no-new-privileges", "--network", "none"]
+
+
+def engine(*arguments, code=0, text=True, stdin=None):
+    """Runs the engine; `code` is the exit status that is expected, None for any."""
+    done = subprocess.run([*ENGINE, *arguments], capture_output=True, text=text, input=stdin, check=False)
+    if code is not None and done.returncode != code:
+        said = done.stderr if text else done.stderr.decode(errors="replace")
+        raise Failed(f"{' '.join(arguments)} ended with {done.returncode}, not {code}: {said.strip()[-2000:]}")
+    return done
+
+
+class Failed(Exception):
+    """A check that did not hold."""
+
+
+def need(holds, why):
+    if not holds:
+        raise Failed(why)
+
+
+# ------------------------------------------------------------------------------------------- what an image says and holds
+
+
+class Image:
+    """An image: its configuration, and every file of its root by path."""
+
+    def __init__(self, name, kind):
+        self.name, self.kind = name, kind
+        [found] = json.loads(engine("image", "inspect", name).stdout)
+        self.size, self.config = found["Size"], found["Config"]
+        # docker keeps the health check in the configuration, podman beside it.
+        self.health = (self.config.get("Healthcheck") or found.get("Healthcheck") or {}).get("Test") or []
+        made = engine("create", "--no-healthcheck", name).stdout.strip()
+        try:
+            packed = engine("export", made, text=False).stdout
+        finally:
+            engine("rm", made)
+        self.archive = tarfile.open(fileobj=io.BytesIO(packed))
+        self.files = {"/" + member.name.strip("./"): member for member in self.archive}
+
+    def read(self, path):
+        need(path in self.files, f"{path} is not there")
+        return self.archive.extractfile(self.files[path]).read()
+
+
+def runs_as_nobody(image):
+    need(image.config["User"] == f"{USER}:{USER}", f"runs as `{image.config['User']}`")
+    passwd = image.read("/etc/passwd").decode()
+    need(f"molmesh:x:{USER}:{USER}:" in passwd, "the user has no name")
+
+
+def is_small(image):
+    most = MOST_BYTES[image.kind]
+    need(image.size <= most, f"{image.size:,} bytes, {most:,} are allowed")
+
+
+def is_labelled(image):
+    labels = image.config.get("Labels") or {}
+    for name in ("title", "description", "licenses", "version", "revision", "created"):
+        need(labels.get(f"org.opencontainers.image.{name}", "unknown") not in ("", "unknown"), f"no label {name}")
+
+
+def has_one_volume_and_its_ports(image):
+    volumes, ports = image.config.get("Volumes") or {}, image.config.get("ExposedPorts") or {}
+    need(list(volumes) == ["/data"], f"volumes: {list(volumes)}")
+    need(sorted(ports) == ["8080/tcp", "9090/tcp"], f"ports: {sorted(ports)}")
+    data = image.files["/data"]
+    need((data.uid, data.gid, data.mode & 0o777) == (USER, USER, 0o750), f"/data is {data.uid}:{data.gid} {data.mode:o}")
+
+
+def stops_by_draining(image):
+    need(image.config.get("StopSignal") in ("SIGTERM", "15"), f"stops by {image.config.get('StopSignal')}")
+
+
+def checks_its_health(image):
+    need(image.health == ["CMD", "molmesh", "healthcheck"], f"its health check is {image.health}")
+
+
+def has_no_setuid(image):
+    found = [path for path, m in image.files.items() if m.isfile() and m.mode & (stat.S_ISUID | stat.S_ISGID)]
+    need(not found, f"setuid or setgid: {found}")
+
+
+def belongs_to_root(image):
+    """Nothing but /data can be changed by whom it runs as."""
+    mine = [path for path, m in image.files.items() if USER in (m.uid, m.gid) and path != "/data"]
+    need(not mine, f"belongs to {USER}: {mine}")
+    sticky = (stat.S_ISVTX, stat.S_IWOTH)
+    loose = [p for p, m in image.files.items() if not m.issym() and m.mode & sticky[1] and not m.mode & sticky[0]]
+    need(not loose, f"everybody may write: {loose}")
+
+
+def brings_licences(image):
+    doc = "/usr/share/doc/molmesh/"
+    for name in ("LICENSE-MIT", "LICENSE-APACHE"):
+        need(image.read(doc + name) == (ROOT / name).read_bytes(), f"{name} is not ours")
+    notices = image.read(doc + "THIRD-PARTY.txt").decode()
+    for held in ("  tokio ", "  aws-lc-sys ", "Swagger UI", "the Rust standard library", "Permission is hereby granted"):
+        need(held in notices, f"the notices lack `{held}`")
+
+
+def brings_certificates(image):
+    need("/var/lib/dpkg/status.d/ca-certificates" in image.files, "nothing says whose certificates these are")
+    n = image.read("/etc/ssl/certs/ca-certificates.crt").count(b"BEGIN CERTIFICATE")
+    need(n >= 50, f"{n} certificates")
+
+
+def brings_nothing_of_the_build(image):
+    tools = ("/usr/bin/gcc", "/usr/bin/python3", "/usr/local/cargo", "/root/.cargo", "/build", "/stage")
+    rest = [p for p in image.files if p in tools or p.startswith("/var/lib/apt/lists/") and image.files[p].isfile()]
+    need(not rest, f"left over: {rest[:9]}")
+
+
+def has_what_its_kind_needs(image):
+    wanted = [f"{LIBRARIES}/{name}" for name in ("libvulkan.so.1", "libEGL.so.1", "libX11.so.6", "libXext.so.6")]
+    wanted += ["/usr/share/vulkan/icd.d/nvidia_icd.json", "/usr/share/glvnd/egl_vendor.d/10_nvidia.json"]
+    there = [path for path in wanted if path in image.files]
+    environment = dict(pair.split("=", 1) for pair in image.config["Env"])
+    capabilities = environment.get("NVIDIA_DRIVER_CAPABILITIES", "").split(",")
+    if image.kind == "cpu":
+        need(not there and capabilities == [""], f"a CPU's image has {there} {capabilities}")
+        return
+    need(there == wanted, f"lacks {set(wanted) - set(there)}")
+    need({"graphics", "utility", "compute"} <= set(capabilities), f"capabilities: {capabilities}")
+    for path in wanted[4:]:
+        need(json.loads(image.read(path))["ICD"]["library_path"].startswith("lib"), path)
+    for path in wanted[:4]:
+        said = engine("run", "--rm", *RUN, *SAFE, "--entrypoint", "ldd", image.name, path).stdout
+        need("=>" in said and "not found" not in said, f"{path} lacks libraries: {said}")
+
+
+LOOKS = [
+    runs_as_nobody,
+    is_small,
+    is_labelled,
+    has_one_volume_and_its_ports,
+    stops_by_draining,
+    checks_its_health,
+    has_no_setuid,
+    belongs_to_root,
+    brings_licences,
+    brings_certificates,
+    brings_nothing_of_the_build,
+    has_what_its_kind_needs,
+]
+
+
+def broken(target):
+    """An image to which every look must object."""
+    recipe = f"""FROM molmesh:{target}
+USER 0:0
+RUN chmod u+s /usr/bin/ldd && mkdir -m 0777 /loose && touch /usr/bin/gcc && head -c 60000000 /dev/urandom >/ballast \\
+    && rm /usr/share/doc/molmesh/THIRD-PARTY.txt /etc/ssl/certs/ca-certificates.crt && rm -f {LIBRARIES}/libEGL.so.1
+LABEL org.opencontainers.image.revision="unknown"
+ENV NVIDIA_DRIVER_CAPABILITIES=utility
+EXPOSE 22
+STOPSIGNAL SIGKILL
+HEALTHCHECK NONE
+"""
+    how = ["--format", "docker", "--isolation", "chroot", "--network", "host"] if ENGINE[0] == "podman" else []
+    engine("build", *how, "--tag", BROKEN, "-", stdin=recipe)
+    return Image(BROKEN, target)
+
+
+# ------------------------------------------------------------------------------------------------------- running it
+
+
+class Container:
+    """A running image. The volume outlives it."""
+
+    def __init__(self, image, *flags, command=(), volume=True):
+        engine("rm", "--force", NAME, code=None)
+        data = ["--volume", f"{VOLUME}:/data"] if volume else []
+        engine("run", "--detach", "--name", NAME, *RUN, *SAFE, *data, *flags, image, *command)
+
+    def state(self):
+        [found] = json.loads(engine("container", "inspect", NAME).stdout)
+        return found["State"]
+
+    def run(self, *command, code=0):
+        return engine("exec", NAME, *command, code=code)
+
+    def wait_until_healthy(self, test):
+        end = time.monotonic() + READY_SECONDS
+        while self.run(*test, code=None).returncode != 0:
+            need(self.state()["Running"], f"ended: {self.logs()[-3000:]}")
+            need(time.monotonic() < end, f"not healthy after {READY_SECONDS} s: {self.logs()[-3000:]}")
+            time.sleep(0.2)
+
+    def curl(self, path, *flags, port=8080):
+        """One request from inside the container's network: the status, the body."""
+        inside = ["nsenter", "--target", str(self.state()["Pid"]), "--net"]
+        command = ["curl", "-sS", "--max-time", "60", "-w", "\n%{http_code}", f"http://127.0.0.1:{port}{path}", *flags]
+        done = subprocess.run([*inside, *command], capture_output=True, check=False)
+        need(done.returncode == 0, f"curl {path}: {done.stderr.decode()}")
+        body, _, status = done.stdout.rpartition(b"\n")
+        return int(status), body
+
+    def logs(self):
+        done = engine("logs", NAME, code=None)
+        return done.stdout + done.stderr
+
+    def written(self):
+        """Files that were added or changed outside of volumes; folders are made for mounts."""
+        lines = [line.split(" ", 1) for line in engine("diff", NAME).stdout.splitlines()]
+        made_for_mounts = {"/data", "/dev", "/etc", "/proc", "/run", "/run/secrets", "/sys", "/etc/mtab"}
+        given = {"/etc/hosts", "/etc/hostname", "/etc/resolv.conf", "/run/.containerenv", "/.dockerenv"}
+        return [path for _, path in lines if path not in made_for_mounts | given]
+
+    def stop(self):
+        """SIGTERM; the exit status."""
+        engine("stop", "-t", str(STOP_SECONDS), NAME)
+        return self.state()["ExitCode"]
+
+    def remove(self):
+        engine("rm", "--force", NAME, code=None)
+
+
+def privileges(container):
+    lines = pathlib.Path(f"/proc/{container.state()['Pid']}/status").read_text().splitlines()
+    status = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
+    return status["Uid"].split()[0], status["CapBnd"], status["NoNewPrivs"]
+
+
+def serves(image):
+    """The whole life of a service: ready, a mesh, a restart, the mesh again, an orderly end."""
+    engine("volume", "rm", "--force", VOLUME, code=None)
+    test = image.health[1:]
+    container = Container(image.name, "--read-only")
+    container.wait_until_healthy(test)
+    need(container.run(*test, "--url", "http://127.0.0.1:1/", code=1).returncode == 1, "control: health of nothing")
+    uid, capabilities, no_new = privileges(container)
+    need((uid, int(capabilities, 16), no_new) == (str(USER), 0, "1"), f"uid {uid}, {capabilities}, {no_new}")
+    status, glb = container.curl("/v1/meshes", "--data-binary", f"@{ROOT}/samples/4pti.pdb")
+    need(status == 200 and glb.startswith(b"glTF\x02\x00\x00\x00"), f"a mesh: {status} {glb[:300]!r}")
+    status, job = container.curl("/v1/meshes?resolution=0.7", "--data-binary", f"@{ROOT}/samples/4pti.pdb", "-H", "Prefer: respond-async")
+    need(status == 202, f"a promise: {status} {job[:300]!r}")
+    address = json.loads(job)["jobID"]
+    end = time.monotonic() + READY_SECONDS
+    while json.loads(container.curl(f"/v1/jobs/{address}?wait=20")[1])["status"] != "successful":
+        need(time.monotonic() < end, "the promised mesh does not come")
+    status, first = container.curl(f"/v1/jobs/{address}/result", "-L")
+    need(status == 200 and first.startswith(b"glTF"), f"its result: {status}")
+    status, metrics = container.curl("/metrics", port=9090)
+    need(status == 200 and b"molmesh_build_info" in metrics, f"metrics: {status}")
+    need(not container.written(), f"written outside of /data: {container.written()}")
+    code = container.stop()
+    need(code == 0 and "stopped" in container.logs(), f"SIGTERM: exit {code}: {container.logs()[-2000:]}")
+
+    # Again, where it might write: another container, the same volume.
+    container = Container(image.name)
+    container.wait_until_healthy(test)
+    status, again = container.curl(f"/v1/jobs/{address}/result", "-L")
+    need((status, again) == (200, first), f"after a restart: {status}")
+    need(container.curl("/v1/jobs/0123456789abcdef0123456789abcdef")[0] == 404, "control: a job that never was")
+    status, _ = container.curl("/v1/meshes", "--data-binary", f"@{ROOT}/samples/1crn.cif")
+    need(status == 200, f"a mesh: {status}")
+    need(not container.written(), f"written outside of /data: {container.written()}")
+    need(container.stop() == 0, "SIGTERM after a restart")
+
+
+def examines_itself(image):
+    done = engine("run", "--rm", *RUN, *SAFE, "--read-only", image.name, "doctor")
+    said = done.stdout
+    need("  cpu        yes" in said and "  gpu        no" in said, f"doctor: {said}")
+    if image.kind == "gpu":
+        driver = "/usr/share/vulkan/icd.d/nvidia_icd.json names libGLX_nvidia.so.0"
+        need(driver in said, f"doctor names no driver: {said}")
+        need("no driver offers an adapter" in said and "no device node" in said, f"doctor gives no reason: {said}")
+    else:
+        need("no manifest of a Vulkan driver" in said, f"doctor sees a driver: {said}")
+
+
+def notices_what_goes_wrong(image):
+    """What the checks above rest on can be seen to fail."""
+    container = Container(image.name, "--user", "0:0", "--entrypoint", "sh", command=["-c", "echo x >/var/tmp/x; exit 3"])
+    end = time.monotonic() + READY_SECONDS
+    while container.state()["Running"]:
+        need(time.monotonic() < end, "a command that ends at once does not end")
+        time.sleep(0.1)
+    need("/var/tmp/x" in container.written(), f"a file that was written is not seen: {container.written()}")
+    need(container.state()["ExitCode"] == 3, "an exit status is not seen")
+    # Not to be served without a place to write to.
+    flags = ["--read-only", "--tmpfs", "/data:ro,size=1m"]
+    container = Container(image.name, *flags, volume=False)
+    while container.state()["Running"]:
+        need(time.monotonic() < end, f"it runs without its volume: {container.logs()[-2000:]}")
+        time.sleep(0.1)
+    need(container.state()["ExitCode"] != 0, "it ends well without its volume")
+    container.remove()
+
+
+def main():
+    targets = sys.argv[1:] or ["cpu", "gpu"]
+    failures = 0
+
+    def report(target, check, *arguments, fails=False):
+        nonlocal failures
+        begun = time.monotonic()
+        name = check.__name__.replace("_", " ")
+        try:
+            check(*arguments)
+            good, why = not fails, "control: the broken image was let through" if fails else ""
+        except Failed as failed:
+            good, why = fails, f"{failed}"
+        except (LookupError, ValueError, OSError) as error:
+            good, why = False, repr(error)
+        failures += not good
+        mark = ("objects" if fails else "ok") if good else "FAILED"
+        print(f"{target:4} {mark:8} {name} ({time.monotonic() - begun:.1f} s){'' if good and not fails else ': ' + why[:1500]}", flush=True)
+
+    for target in targets:
+        image = Image(f"molmesh:{target}", target)
+        print(f"{target:4} {image.size:,} bytes, {len(image.files):,} files", flush=True)
+        for look in LOOKS:
+            report(target, look, image)
+        bad = broken(target)
+        for look in LOOKS:
+            report(target, look, bad, fails=True)
+        engine("rmi", "--force", BROKEN)
+        for check in (examines_itself, serves, notices_what_goes_wrong):
+            report(target, check, image)
+    engine("rm", "--force", NAME, code=None)
+    engine("volume", "rm", "--force", VOLUME, code=None)
+    print(f"{failures} failed")
+    sys.exit(failures != 0)
+
+
+if __name__ == "__main__":
+    main()

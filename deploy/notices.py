@@ -1,0 +1,133 @@
+#!/usr/bin/env python3
+"""Writes the licences of everything that the binary holds to standard output.
+
+Crates are those that cargo links into `molmesh` (normal dependencies on the target, all default features), with every
+licence and notice file that they bring; the standard library; the parts of the web page that others wrote. A crate without
+a licence file gets the text of a licence that it names: Apache-2.0's, which is the same for everybody, or MIT's with its
+authors. Where neither is allowed, the command fails and names the crate.
+
+Usage: deploy/notices.py [--target TRIPLE]
+"""
+
+import argparse
+import collections
+import json
+import pathlib
+import re
+import subprocess
+import sys
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+# Files that carry a licence or a notice, by the beginnings of their names, and folders of such files.
+NAMES = re.compile(r"^(licen[cs]e|copying|copyright|notice|unlicense)", re.IGNORECASE)
+# Sources are not texts; what only the crate's own tests use is not in the binary.
+SOURCES = (".rs", ".py", ".toml", ".json", ".go", ".sh", ".c", ".h")
+UNUSED = {"tests", "test", "examples", "benches", ".github"}
+MOST_BYTES = 1 << 20
+
+
+def cargo(*arguments):
+    done = subprocess.run(["cargo", *arguments], cwd=ROOT, check=True, stdout=subprocess.PIPE)
+    return done.stdout
+
+
+def host():
+    lines = subprocess.run(["rustc", "-vV"], check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()
+    return next(line.split()[1] for line in lines if line.startswith("host:"))
+
+
+def linked(metadata):
+    """The packages that are linked into molmesh, without itself, by name and version."""
+    packages = {package["id"]: package for package in metadata["packages"]}
+    nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
+    root = metadata["resolve"]["root"]
+    seen, todo = {root}, [root]
+    while todo:
+        for dep in nodes[todo.pop()]["deps"]:
+            normal = any(kind["kind"] is None for kind in dep["dep_kinds"])
+            if normal and dep["pkg"] not in seen:
+                seen.add(dep["pkg"])
+                todo.append(dep["pkg"])
+    seen.discard(root)
+    return sorted((packages[i] for i in seen), key=lambda p: (p["name"], p["version"]))
+
+
+def files(folder):
+    """Licence and notice files of a crate and of what it brings along, such as C sources."""
+
+    def wanted(path):
+        parts = path.relative_to(folder).parts
+        named = NAMES.match(path.name) or (len(parts) > 1 and parts[-2].lower() == "licenses")
+        return named and path.suffix not in SOURCES and not UNUSED & set(parts[:-1])
+
+    found = [p for p in sorted(folder.rglob("*")) if p.is_file() and wanted(p)]
+    large = [p for p in found if p.stat().st_size > MOST_BYTES]
+    if large:
+        sys.exit(f"too large for a licence: {large}")
+    return found
+
+
+def stand_in(package):
+    """The text of a licence that a crate without one names."""
+    allowed = package["license"] or ""
+    if re.search(r"\bApache-2\.0\b", allowed):
+        return "Apache License 2.0", (ROOT / "LICENSE-APACHE").read_text()
+    if re.search(r"\bMIT\b", allowed):
+        terms = (ROOT / "LICENSE-MIT").read_text()
+        at = terms.index("Permission is hereby granted")
+        authors = ", ".join(re.sub(r"\s*<[^>]*>", "", a) for a in package["authors"]) or f"the {package['name']} authors"
+        return "MIT", f"MIT License\n\nCopyright (c) {authors}\n\n{terms[at:]}"
+    return None
+
+
+def texts(packages):
+    """Text to the crates that it belongs to: equal texts are one."""
+    of = collections.OrderedDict()
+
+    def add(text, who):
+        lines = [line.rstrip() for line in text.replace("\f", "\n").strip().splitlines()]
+        of.setdefault("\n".join(lines), []).append(who)
+
+    missing = []
+    for package in packages:
+        who = f"{package['name']} {package['version']}"
+        folder = pathlib.Path(package["manifest_path"]).parent
+        own = files(folder)
+        for path in own:
+            add(path.read_text(encoding="utf-8", errors="replace"), f"{who} ({path.relative_to(folder)})")
+        # A notice alone is no licence.
+        if not any(not path.name.lower().startswith("notice") for path in own):
+            text = stand_in(package)
+            if text is None:
+                missing.append(f"{who}: {package['license']}")
+            else:
+                add(text[1], f"{who} (brings no text; {text[0]} of {package['license']})")
+    web = ROOT / "web" / "swagger"
+    for name in ("LICENSE", "NOTICE", "swagger-ui-bundle.js.LICENSE.txt"):
+        add((web / name).read_text(encoding="utf-8"), f"Swagger UI ({name})")
+    std = "the Rust standard library (MIT OR Apache-2.0)"
+    add((ROOT / "LICENSE-APACHE").read_text(), std)
+    if missing:
+        sys.exit("no text of a licence for:\n" + "\n".join(missing))
+    return of
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--target", default=host())
+    target = parser.parse_args().target
+    metadata = json.loads(cargo("metadata", "--format-version=1", "--locked", f"--filter-platform={target}"))
+    packages = linked(metadata)
+    line = "-" * 100
+    print("molmesh is licensed under MIT OR Apache-2.0, at your option. It holds the work of others, listed here with their")
+    print(f"licences ({target}).\n")
+    for package in packages:
+        print(f"  {package['name']} {package['version']}: {package['license'] or 'see its text'}")
+    print("  Swagger UI, in the page at /docs: Apache-2.0")
+    print("  the Rust standard library: MIT OR Apache-2.0")
+    for text, who in texts(packages).items():
+        print(f"\n{line}\n" + "\n".join(who) + f"\n{line}\n\n{text}")
+
+
+if __name__ == "__main__":
+    main()

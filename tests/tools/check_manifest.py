@@ -1,0 +1,50 @@
+"""Reads YAML files of deployments: one path per line on standard input, one line of JSON per path on standard output, with
+the file's documents and what a schema says against them: that of Compose where the file is named compose*, else that of
+Kubernetes for each document that has one there. Kustomize's own files have none; they are only read."""
+
+import importlib.resources
+import json
+import pathlib
+import sys
+
+import jsonschema
+import kubernetes_validate
+import yaml
+
+KUBERNETES = "1.37"
+KUSTOMIZE = "kustomize.config.k8s.io/"
+
+
+def compose_schema():
+    schemas = importlib.resources.files("check_jsonschema") / "builtin_schemas" / "vendor" / "compose-spec.json"
+    schema = json.loads(schemas.read_text())
+    return jsonschema.validators.validator_for(schema)(schema)
+
+
+def against_compose(document):
+    return [f"{error.json_path}: {error.message}" for error in compose_schema().iter_errors(document)]
+
+
+def against_kubernetes(document):
+    if str(document.get("apiVersion", "")).startswith(KUSTOMIZE):
+        return []
+    try:
+        kubernetes_validate.validate(document, KUBERNETES, strict=True)
+    except kubernetes_validate.SchemaNotFoundError:
+        return [f"no such kind: {document.get('apiVersion')} {document.get('kind')}"]
+    except kubernetes_validate.ValidationError as error:
+        return [str(error).splitlines()[0]]
+    return []
+
+
+def look(path):
+    try:
+        documents = [d for d in yaml.safe_load_all(path.read_text()) if d is not None]
+    except yaml.YAMLError as error:
+        return {"documents": [], "errors": [f"no YAML: {error}"]}
+    check = against_compose if path.name.startswith("compose") else against_kubernetes
+    return {"documents": documents, "errors": [error for document in documents for error in check(document)]}
+
+
+for line in sys.stdin:
+    print(json.dumps(look(pathlib.Path(line.strip()))), flush=True)
