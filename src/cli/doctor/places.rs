@@ -2,9 +2,10 @@
 
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
-use molmesh::archive::Archive;
+use molmesh::archive::{Archive, Uncounted};
 use molmesh::config::Config;
 use molmesh::store::{Folder, Store};
 use molmesh::structure::{self, EntryId};
@@ -128,5 +129,6 @@ pub(super) async fn remote(config: &Config, limit: Duration) -> Vec<Check> {
         Ok(status) => Check::new("remote", State::Warning, format!("{host} answers {status} for {id}")),
         Err(why) => Check::new("remote", State::Warning, format!("{host} cannot be asked: {why}")),
     };
-    Archive::new(config).reach(&id, limit).await.into_iter().map(check).collect()
+    // Heads are asked for, no bytes.
+    Archive::new(config, Arc::new(Uncounted)).reach(&id, limit).await.into_iter().map(check).collect()
 }
