@@ -53,7 +53,7 @@ sbom: ## The bill of materials: dist/molmesh.cdx.json
 	deploy/sbom.sh
 
 # BINARY=FILE takes one that is there. Images of bases are made here, so that no registry of images is needed.
-container: $(if $(BINARY),,release) ## Build the images and run them: two minutes and the binary; needs root on Debian, or docker
+container: $(if $(BINARY),,release) ## Build the images and run them: two to four minutes and the binary; needs root on Debian, or docker
 	deploy/container/build.sh --binary $(or $(BINARY),target/release/molmesh) --base-from-debootstrap
 	deploy/container/check.py
 	deploy/kubernetes/check.sh
