@@ -1,6 +1,6 @@
 //! The grid's spacing where it is not given: levels of detail, and a bound on triangles that holds for whatever is meshed.
 
-#![expect(clippy::unwrap_used, clippy::panic, reason = "a test says what it expects by panicking")]
+#![expect(clippy::unwrap_used, reason = "a test says what it expects by panicking")]
 
 use molmesh::pipeline::spacing::{COARSEST, FINEST};
 use molmesh::pipeline::{Choice, Estimate, JobError, JobLimits, Product, Report, estimate, params, run};

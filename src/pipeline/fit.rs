@@ -50,7 +50,7 @@ impl Search {
     /// For at most `limit` triangles of so many atoms.
     pub(super) fn new(limit: u64, params: &SurfaceParams, atoms: usize) -> Self {
         let expected = Spacing::MaxTriangles(limit).expected(params, atoms as f64);
-        let first = rounded((COARSER * expected).max(COARSE).min(COARSEST));
+        let first = rounded((COARSER * expected).clamp(COARSE, COARSEST));
         Self { limit, first, told: Vec::new() }
     }
 
@@ -84,13 +84,11 @@ impl Search {
             // Nothing but air so far: finer, to where there is something, or to the end.
             (None, Some(h)) => Some(rounded((0.5 * h).max(FINEST))),
         };
-        match next.filter(|next| !spent && self.is_new(*next)) {
-            Some(next) => Next::Try(next),
-            None => {
-                let (resolution, triangles) = self.counts().min_by_key(|(_, n)| *n).unwrap_or((FINEST, 0));
-                Next::Refuse { resolution, triangles }
-            }
+        if let Some(next) = next.filter(|next| !spent && self.is_new(*next)) {
+            return Next::Try(next);
         }
+        let (resolution, triangles) = self.counts().min_by_key(|(_, n)| *n).unwrap_or((FINEST, 0));
+        Next::Refuse { resolution, triangles }
     }
 
     /// Spacings with their triangles.
@@ -339,7 +337,7 @@ mod tests {
             // A count that jumps, with holes, but the same at the same spacing.
             let count = |h: f64| {
                 let mixed = (h.to_bits() ^ seed).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40;
-                (mixed % 5 > 0).then_some(mixed % 20_000)
+                (!mixed.is_multiple_of(5)).then_some(mixed % 20_000)
             };
             match search(3000, 500, count).0 {
                 Next::Take(h) => {

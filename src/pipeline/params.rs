@@ -169,7 +169,8 @@ fn set(
             request.job.spacing = Spacing::Detail(level.and_then(|l| u8::try_from(l).ok()).ok_or_else(bad)?);
         }
         "max_triangles" => {
-            let most = whole(text).filter(|most| (LEAST_TRIANGLES..=MOST_TRIANGLES).contains(most));
+            let most =
+                whole(text).filter(|most| (u64::from(LEAST_TRIANGLES)..=u64::from(MOST_TRIANGLES)).contains(most));
             request.job.spacing = Spacing::MaxTriangles(most.ok_or_else(bad)?);
         }
         "isovalue" => options.isovalue = number()?,

@@ -31,6 +31,7 @@ pub struct Quantization {
 }
 
 /// A job's report. Field names are the JSON names.
+#[expect(clippy::struct_field_names, reason = "the fields are named like the members of the JSON")]
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct Report {

@@ -12,9 +12,9 @@ pub const DETAILS: [f64; 7] = [2.0, 1.4, 1.0, 0.7, 0.5, 0.35, FINEST];
 /// Atoms up to which [`DETAILS`] holds as it stands.
 pub const DETAIL_ATOMS: f64 = 10_000.0;
 /// The least bound on triangles: no closed mesh on a grid has fewer.
-pub const LEAST_TRIANGLES: u64 = 8;
+pub const LEAST_TRIANGLES: u32 = 8;
 /// The largest bound on triangles.
-pub const MOST_TRIANGLES: u64 = u32::MAX as u64;
+pub const MOST_TRIANGLES: u32 = u32::MAX;
 
 /// Area of a surface per atom, Å², about: heavy atoms of a protein with the default parameters.
 const AREA_PER_ATOM: f64 = 7.5;
