@@ -75,6 +75,11 @@ const ROOMS: &[Room] = &[
     },
     Room { name: "telemetry", rooms: &[("config", Any)], crates: &["axum", "tower", "hyper", "wgpu", "clap"] },
     Room {
+        name: "access",
+        rooms: &[("pipeline", Only(&["nearest"])), ("config", Any)],
+        crates: &["tokio", "axum", "tower", "tower_http", "hyper", "hyper_util", "tracing", "metrics", "wgpu", "clap", "reqwest"],
+    },
+    Room {
         name: "store",
         rooms: &[("config", Any), ("telemetry", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
@@ -109,6 +114,7 @@ const ROOMS: &[Room] = &[
             ("store", Any),
             ("archive", Any),
             ("jobs", Any),
+            ("access", Any),
         ],
         crates: &["wgpu", "clap", "rayon"],
     },

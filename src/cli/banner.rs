@@ -14,6 +14,8 @@ pub(crate) struct Facts {
     pub(crate) reason: String,
     /// Every backend and its state.
     pub(crate) others: Vec<Candidate>,
+    /// A key is asked for.
+    pub(crate) keys: bool,
 }
 
 /// The banner of a service that listens on `addr`.
@@ -31,7 +33,8 @@ pub(crate) fn text(addr: SocketAddr, metrics: Option<SocketAddr>, facts: &Facts,
             page.row("", &style.dim(&format!("not {name}: {why}")));
         }
     }
-    page.row("try", &format!("curl -sS {base}/sample.pdb | curl -sS --data-binary @- {base}/v1/meshes -o 4pti.glb"));
+    let key = if facts.keys { " -H \"X-Api-Key: $MOLMESH_KEY\"" } else { "" };
+    page.row("try", &format!("curl -sS {base}/sample.pdb | curl -sS{key} --data-binary @- {base}/v1/meshes -o 4pti.glb"));
     page.finish()
 }
 

@@ -11,6 +11,7 @@ mod doctor;
 mod error;
 mod healthcheck;
 mod interrupt;
+mod key;
 mod mesh;
 mod output;
 mod page;
@@ -18,6 +19,7 @@ mod panics;
 mod progress;
 mod request;
 mod serve;
+mod sign;
 mod style;
 mod summary;
 
@@ -41,6 +43,8 @@ pub(crate) fn main() -> i32 {
         Command::Serve(args) => serve::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::Key(command) => key::run(&command),
+        Command::Sign(args) => sign::run(&args),
         #[cfg(feature = "gpu")]
         Command::Bench(bench) => bench::run(&bench),
         Command::Version => version(),

@@ -1,11 +1,12 @@
 //! `molmesh serve`: flags to a configuration, a runtime, a banner, and the service until it is told to stop.
 
 use std::io::{self, Write};
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use molmesh::config::{self, Config};
-use molmesh::http::{Chosen, Server, shutdown_signal};
+use molmesh::http::{Chosen, ServeError, Server, shutdown_signal};
 use molmesh::structure::referee;
 use molmesh::surface::Backend;
 use molmesh::telemetry;
@@ -32,7 +33,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let others = backend::survey(&picked);
     let Picked { backend, reason, devices, .. } = picked;
     let backend: Arc<dyn Backend> = Arc::from(backend);
-    let facts = Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others };
+    let keys = config.access.keys_file.is_some();
+    let facts = Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others, keys };
     let failed = |e: io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(RUNTIME_THREADS)
@@ -43,7 +45,11 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     give_way();
     let server = runtime
         .block_on(Server::bind(config, Chosen { backend, reason, devices }))
-        .map_err(|e| CliError::Service(e.to_string()))?;
+        .map_err(|error| match error {
+            // Keys and secrets are the caller's, as the rest of the configuration is.
+            ServeError::Access(error) => CliError::usage(error.to_string()),
+            error => CliError::Service(error.to_string()),
+        })?;
     let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
     // The service runs whether or not somebody reads its banner.
     drop(io::stderr().write_all(text.as_bytes()));
@@ -69,14 +75,6 @@ fn give_way() {
 
 /// Defaults, then the file, then the environment, then `--set`, then the flags that have names of their own.
 fn config(args: &ServeArgs) -> Result<Config, CliError> {
-    let mut flags = Vec::new();
-    for set in &args.set {
-        let (key, value) = set.split_once('=').ok_or_else(|| CliError::Usage {
-            message: format!("parameter `set`: `{set}` is not allowed; expected section.key=value"),
-            hint: None,
-        })?;
-        flags.push((key.to_owned(), value.to_owned()));
-    }
     let path = |p: &std::path::PathBuf| p.to_string_lossy().into_owned();
     let log = args.log.map(|style| match style {
         LogStyle::Pretty => "pretty".to_owned(),
@@ -90,6 +88,24 @@ fn config(args: &ServeArgs) -> Result<Config, CliError> {
         ("archive.dir", args.archive.as_ref().map(path)),
         ("log.format", log),
     ];
-    flags.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
-    config::load_process(args.config.as_deref(), &flags).map_err(|e| CliError::usage(e.to_string()))
+    let named = named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?)));
+    configuration(args.config.as_deref(), &args.set, named)
+}
+
+/// The configuration of a file, the environment, `--set`, and flags as pairs of a key and a value.
+pub(super) fn configuration(
+    file: Option<&Path>,
+    set: &[String],
+    named: impl IntoIterator<Item = (String, String)>,
+) -> Result<Config, CliError> {
+    let mut flags = Vec::new();
+    for set in set {
+        let (key, value) = set.split_once('=').ok_or_else(|| CliError::Usage {
+            message: format!("parameter `set`: `{set}` is not allowed; expected section.key=value"),
+            hint: None,
+        })?;
+        flags.push((key.to_owned(), value.to_owned()));
+    }
+    flags.extend(named);
+    config::load_process(file, &flags).map_err(|e| CliError::usage(e.to_string()))
 }

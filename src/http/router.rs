@@ -1,5 +1,6 @@
 //! Every resource of the service: the table of contents.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
@@ -53,6 +54,6 @@ pub(super) fn router(app: Shared) -> Router {
         .route("/viewer.js", get(page::viewer))
         .route("/icon.svg", get(page::icon))
         .route("/sample.pdb", get(page::sample))
-        .with_state(app);
-    middleware::apply(router, timeout)
+        .with_state(Arc::clone(&app));
+    middleware::apply(router, timeout, &app)
 }

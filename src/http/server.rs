@@ -10,9 +10,11 @@ use quick_cache::sync::Cache;
 use thiserror::Error;
 use tokio::sync::{Semaphore, watch};
 
+use super::guard::Bill;
 use super::problem::Problem;
 use super::state::{App, Readiness, Ready, Shared};
-use super::{accept, capabilities, metrics, router};
+use super::{accept, capabilities, metrics, renew, router};
+use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
@@ -49,6 +51,9 @@ pub enum ServeError {
     /// A worker thread cannot be started.
     #[error("cannot start the worker threads: {0}")]
     Workers(io::Error),
+    /// Keys, signatures or quotas cannot be set up.
+    #[error(transparent)]
+    Access(#[from] AccessError),
     /// What the service keeps cannot be kept.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -94,6 +99,7 @@ impl Server {
     /// [`ServeError`].
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, devices: found } = chosen;
+        let access = Arc::new(Access::open(&config)?);
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
         let (metrics_listener, metrics_addr) = metrics.unzip();
@@ -103,6 +109,7 @@ impl Server {
             queue: config.jobs.queue,
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
+            meter: Some(Arc::new(Bill(Arc::clone(&access)))),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
@@ -121,6 +128,7 @@ impl Server {
         let (stop, stopping) = watch::channel(false);
         let app = Arc::new(App {
             config,
+            access,
             pool,
             archive,
             store,
@@ -190,9 +198,11 @@ impl Server {
             loop {
                 tokio::time::sleep(UPKEEP).await;
                 watched.pool.publish_devices();
+                renew::tell(&watched.access);
                 handle.run_upkeep();
             }
         });
+        let renewing = tokio::spawn(renew::keys(Arc::clone(&self.app.access)));
         shutdown.await;
         tracing::info!("stopping: running requests are finished, new ones are refused");
         self.app.readiness.set(Ready::ShuttingDown);
@@ -201,7 +211,7 @@ impl Server {
         // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
         let requests = serving.await.unwrap_or(false);
         let jobs = self.app.pool.drain(deadline.max(Instant::now() + CANCELLING)).await;
-        for task in [upkeep, warming, recovering, sweeping] {
+        for task in [upkeep, warming, recovering, sweeping, renewing] {
             task.abort();
         }
         if let Some(metrics) = metrics {

@@ -11,6 +11,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::results::Head;
+use crate::access::Access;
 use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{ContentKey, Ledger, Pool};
@@ -20,6 +21,7 @@ use crate::surface::FoundDevice;
 /// State of the service, behind one pointer.
 pub(super) struct App {
     pub(super) config: Config,
+    pub(super) access: Arc<Access>,
     pub(super) pool: Arc<Pool>,
     pub(super) archive: Archive,
     pub(super) store: Store,

@@ -25,7 +25,7 @@ pub use error::{Failure, Refusal};
 pub use flight::{Claim, Progress};
 pub use key::ContentKey;
 pub use ledger::{Describe, EndError, Ledger, LedgerSettings, Order, PromiseError, View};
-pub use pool::{Pool, Settings};
+pub use pool::{Meter, Pool, Settings};
 pub use rank::{Client, Rank, USUAL_URGENCY};
 pub use record::{BadJobId, JobId, Record, Status, now_ms, rfc3339};
 pub use results::{REPORT, SaveError, save};
