@@ -77,7 +77,19 @@ const ROOMS: &[Room] = &[
     Room {
         name: "access",
         rooms: &[("pipeline", Only(&["nearest"])), ("config", Any)],
-        crates: &["tokio", "axum", "tower", "tower_http", "hyper", "hyper_util", "tracing", "metrics", "wgpu", "clap", "reqwest"],
+        crates: &[
+            "tokio",
+            "axum",
+            "tower",
+            "tower_http",
+            "hyper",
+            "hyper_util",
+            "tracing",
+            "metrics",
+            "wgpu",
+            "clap",
+            "reqwest",
+        ],
     },
     Room {
         name: "store",

@@ -27,6 +27,10 @@ fn help_is_stable() {
     snapshot("mesh", &["mesh", "--help"]);
     snapshot("serve", &["serve", "--help"]);
     snapshot("healthcheck", &["healthcheck", "--help"]);
+    snapshot("key", &["key", "--help"]);
+    snapshot("key_new", &["key", "new", "--help"]);
+    snapshot("key_signing", &["key", "signing", "--help"]);
+    snapshot("sign", &["sign", "--help"]);
 }
 
 #[test]

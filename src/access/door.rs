@@ -174,7 +174,8 @@ mod tests {
 
     fn written(id: &str) -> (String, String) {
         let token::Minted { text, hash } = token::mint(id).unwrap();
-        let key = Key { id: id.into(), hash, scopes: vec![Scope::Read], quota: Arc::default(), expires: None, note: None };
+        let key =
+            Key { id: id.into(), hash, scopes: vec![Scope::Read], quota: Arc::default(), expires: None, note: None };
         (text, file::entry(&key))
     }
 

@@ -54,11 +54,16 @@ mod tests {
             "\"requests\";q=100;w=60, \"work\";q=600;qu=\"molmesh-work-seconds\";w=60, \
              \"concurrency\";q=4;qu=\"concurrent-requests\""
         );
-        let standing =
-            Standing { requests: 50, work: Duration::from_millis(1001), running: 1, left: Duration::from_millis(29_001) };
+        let standing = Standing {
+            requests: 50,
+            work: Duration::from_millis(1001),
+            running: 1,
+            left: Duration::from_millis(29_001),
+        };
         let field = limits(&quota, &standing).unwrap();
         assert_eq!(field, "\"requests\";r=50;t=30, \"work\";r=598;t=30, \"concurrency\";r=3");
-        let beyond = Standing { requests: 1000, work: Duration::from_hours(1), running: 9, left: Duration::from_secs(1) };
+        let beyond =
+            Standing { requests: 1000, work: Duration::from_hours(1), running: 9, left: Duration::from_secs(1) };
         let field = limits(&quota, &beyond).unwrap();
         assert_eq!(field, "\"requests\";r=0;t=1, \"work\";r=0;t=1, \"concurrency\";r=0");
         let only = Quota { requests: Some(1), ..Quota::default() };

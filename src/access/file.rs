@@ -2,7 +2,6 @@
 //! have put a key's text where its hash belongs.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -16,8 +15,7 @@ use super::token;
 use crate::pipeline::nearest::nearest;
 
 /// What a key may say.
-const NAMES: [&str; 9] =
-    ["id", "hash", "scopes", "requests", "work_s", "concurrent", "window_s", "expires", "note"];
+const NAMES: [&str; 9] = ["id", "hash", "scopes", "requests", "work_s", "concurrent", "window_s", "expires", "note"];
 
 type Field<'a> = (Range<usize>, &'a DeValue<'a>);
 
@@ -35,7 +33,8 @@ pub fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> {
         }
         let entries = value.get_ref().as_array().ok_or_else(|| wrong(name.span(), "expected [[key]]".to_owned()))?;
         for entry in entries {
-            let fields = entry.get_ref().as_table().ok_or_else(|| wrong(entry.span(), "expected [[key]]".to_owned()))?;
+            let fields =
+                entry.get_ref().as_table().ok_or_else(|| wrong(entry.span(), "expected [[key]]".to_owned()))?;
             let key = key(fields, entry.span(), window_s).map_err(|(span, what)| wrong(span, what))?;
             let (span, id) = (entry.span(), key.id.clone());
             if keys.insert(id.clone(), Arc::new(key)).is_some() {
@@ -142,7 +141,8 @@ pub fn entry(key: &Key) -> String {
     // JSON's escapes are among TOML's; what JSON leaves bare and TOML does not take is left out.
     let quote = |text: &str| serde_json::Value::from(text.replace('\u{7f}', "")).to_string();
     let scopes: Vec<String> = key.scopes.iter().map(|scope| quote(scope.name())).collect();
-    let mut lines = format!("[[key]]\nid = {}\nhash = \"{}\"\nscopes = [{}]\n", quote(&key.id), key.hash, scopes.join(", "));
+    let mut lines =
+        format!("[[key]]\nid = {}\nhash = \"{}\"\nscopes = [{}]\n", quote(&key.id), key.hash, scopes.join(", "));
     let counts = [
         ("requests", key.quota.requests),
         ("work_s", key.quota.work_s),
@@ -153,8 +153,7 @@ pub fn entry(key: &Key) -> String {
     let expires = key.expires.map(|time| ("expires", quote(&humantime::format_rfc3339_seconds(time).to_string())));
     let note = key.note.as_deref().map(|note| ("note", quote(note)));
     for (name, value) in counts.chain(expires).chain(note) {
-        // Writing to a text cannot fail.
-        let _: std::fmt::Result = writeln!(lines, "{name} = {value}");
+        lines.extend([name, " = ", &value, "\n"]);
     }
     lines
 }
@@ -186,7 +185,10 @@ mod tests {
         for key in [&full, &plain] {
             let read = &ring.0[&key.id];
             assert!(read.hash.same(&key.hash));
-            assert_eq!((&read.scopes, &read.quota, &read.expires, &read.note), (&key.scopes, &key.quota, &key.expires, &key.note));
+            assert_eq!(
+                (&read.scopes, &read.quota, &read.expires, &read.note),
+                (&key.scopes, &key.quota, &key.expires, &key.note)
+            );
         }
         assert!(!entry(&plain).contains("window_s") && parse("", 60).unwrap().is_empty());
     }
@@ -222,7 +224,10 @@ mod tests {
             assert!(error.what.contains(what), "{error}\n{text}");
             assert!(!error.what.contains(&hash.to_string()[20..]), "{error}");
         }
-        assert_eq!(parse(&format!("{good}{good}"), 60).unwrap_err(), KeyFileError { line: 5, what: "there are two keys `a`".into() });
+        assert_eq!(
+            parse(&format!("{good}{good}"), 60).unwrap_err(),
+            KeyFileError { line: 5, what: "there are two keys `a`".into() }
+        );
         assert!(parse(&good, 60).is_ok());
     }
 }

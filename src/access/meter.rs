@@ -234,7 +234,7 @@ mod tests {
         assert_eq!(refused, Exceeded { policy: "requests", limit: 3, wait: 7 * S });
         let standing = meter.standing(&me, start + 5 * S);
         assert_eq!(standing, Standing { requests: 3, work: Duration::ZERO, running: 0, left: 6 * S });
-        assert!(meter.admit(&me, start + 11 * S - Duration::from_nanos(1)).is_err());
+        assert!(meter.admit(&me, start + Duration::from_nanos(10_999_999_999)).is_err());
         drop(meter.admit(&me, start + 11 * S).unwrap());
         assert_eq!(meter.standing(&me, start + 11 * S).requests, 1, "refusals do not count");
         // Nobody else pays for that.

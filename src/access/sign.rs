@@ -89,10 +89,13 @@ impl SigningKeys {
         let mut keys: Vec<(String, Hmac<Sha256>)> = Vec::new();
         for (n, word) in text.split_whitespace().enumerate() {
             let nth = n + 1;
-            let expected = || format!("key {nth} is not written ID:SECRET, the id of lower-case letters, digits and `-`");
+            let expected =
+                || format!("key {nth} is not written ID:SECRET, the id of lower-case letters, digits and `-`");
             let (id, secret) = word.split_once(':').filter(|(id, _)| token::is_id(id)).ok_or_else(expected)?;
             if secret.len() < MIN_SECRET {
-                return Err(format!("the secret of `{id}` has less than {MIN_SECRET} characters; `molmesh key signing` makes one"));
+                return Err(format!(
+                    "the secret of `{id}` has less than {MIN_SECRET} characters; `molmesh key signing` makes one"
+                ));
             }
             if keys.iter().any(|(other, _)| other == id) {
                 return Err(format!("there are two keys `{id}`"));
@@ -255,7 +258,9 @@ mod tests {
         assert_eq!(check(&only_new, &both.sign(None, "/x", 100).unwrap(), 0), Signed::Valid);
         let renamed = signed.replace("key_id=old", "key_id=new");
         assert_eq!(check(&both, &renamed, 0), Signed::Invalid);
-        assert!(matches!(both.sign(Some("x"), "/x", 1), Err(SignError::UnknownKey { available, .. }) if available == "new, old"));
+        assert!(
+            matches!(both.sign(Some("x"), "/x", 1), Err(SignError::UnknownKey { available, .. }) if available == "new, old")
+        );
     }
 
     #[test]

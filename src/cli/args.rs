@@ -288,7 +288,7 @@ Examples:
 pub(crate) enum KeyCommand {
     /// Make a key: the lines for the file of keys go to stdout, the key itself, once, to stderr
     New(Box<NewKeyArgs>),
-    /// Make a key that signs addresses, as access.signing_secret takes it
+    /// Make a key that signs addresses, as `access.signing_secret` takes it
     Signing(SigningKeyArgs),
 }
 
@@ -339,7 +339,7 @@ pub(crate) struct SignArgs {
     /// When it ends: a time from now such as 1h, or a date such as 2030-01-31T00:00:00Z
     #[arg(long, value_name = "WHEN", default_value = "1h")]
     pub(crate) expires: String,
-    /// Which key signs; the first one of access.signing_secret by default
+    /// Which key signs; the first one of `access.signing_secret` by default
     #[arg(long, value_name = "NAME")]
     pub(crate) key_id: Option<String>,
     /// Configuration file (TOML), the service's own

@@ -37,7 +37,8 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
     };
     let minted = access::mint(id).map_err(|error| CliError::Internal(error.to_string()))?;
     let expires = args.expires.as_deref().map(end).transpose()?;
-    let key = Key { id: id.to_owned(), hash: minted.hash, scopes, quota: Arc::new(quota), expires, note: args.note.clone() };
+    let key =
+        Key { id: id.to_owned(), hash: minted.hash, scopes, quota: Arc::new(quota), expires, note: args.note.clone() };
     super::say(&access::entry(&key))?;
     let text = format!("\nThe key, which is not shown again:\n{}\n", minted.text);
     io::stderr().write_all(text.as_bytes()).map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
@@ -58,7 +59,8 @@ fn id(id: &str) -> Result<&str, CliError> {
 /// A time such as `1h`, whole seconds of it, at least one.
 pub(super) fn seconds(parameter: &str, text: &str) -> Result<u64, CliError> {
     let seconds = humantime::parse_duration(text).map(|time| time.as_secs()).ok().filter(|seconds| *seconds >= 1);
-    let message = || format!("parameter `{parameter}`: `{text}` is not allowed; expected a time such as 90s, 1h or 30d");
+    let message =
+        || format!("parameter `{parameter}`: `{text}` is not allowed; expected a time such as 90s, 1h or 30d");
     seconds.ok_or_else(|| CliError::usage(message()))
 }
 

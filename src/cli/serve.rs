@@ -43,9 +43,8 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         .build()
         .map_err(failed)?;
     give_way();
-    let server = runtime
-        .block_on(Server::bind(config, Chosen { backend, reason, devices }))
-        .map_err(|error| match error {
+    let server =
+        runtime.block_on(Server::bind(config, Chosen { backend, reason, devices })).map_err(|error| match error {
             // Keys and secrets are the caller's, as the rest of the configuration is.
             ServeError::Access(error) => CliError::usage(error.to_string()),
             error => CliError::Service(error.to_string()),

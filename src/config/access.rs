@@ -100,7 +100,9 @@ impl FromStr for Origins {
             url.is_some_and(|url| url.origin().ascii_serialization() == **origin)
         };
         if let Some(bad) = all.iter().find(|origin| !as_written(origin)) {
-            return Err(format!("*, none, or origins such as https://viewer.example without a path, which `{bad}` is not"));
+            return Err(format!(
+                "*, none, or origins such as https://viewer.example without a path, which `{bad}` is not"
+            ));
         }
         if all.is_empty() {
             return Err("*, none, or origins such as https://viewer.example".to_owned());
@@ -139,7 +141,8 @@ mod tests {
         assert_eq!("*".parse(), Ok(Origins::Any));
         let two = "https://a.example http://localhost:3000";
         assert_eq!(two.parse::<Origins>().unwrap().to_string(), two);
-        for bad in ["", "https://a.example/", "https://a.example:443", "a.example", "null", "ftp://a", "* https://a.b"] {
+        for bad in ["", "https://a.example/", "https://a.example:443", "a.example", "null", "ftp://a", "* https://a.b"]
+        {
             assert!(bad.parse::<Origins>().is_err(), "{bad}");
         }
     }

@@ -150,7 +150,7 @@ fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -
         Presented::Nonsense => Err(Denied::Unknown),
         Presented::Nothing => return by_signature(&worth).map(|()| Caller::address(access, request)),
     };
-    let key = found.map_err(|denied| no_key(denied))?;
+    let key = found.map_err(no_key)?;
     Span::current().record("key", key.id.as_str());
     if !key.allows(scope) {
         let detail = format!("this needs the scope `{}`, which the key `{}` does not have", scope.name(), key.id);
@@ -180,7 +180,8 @@ fn by_signature(worth: &Signed) -> Result<(), Problem> {
         )
         .header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\"")),
         Signed::Invalid => {
-            let detail = "the signature is not one of this address; it must be used as it was given, with nothing changed";
+            let detail =
+                "the signature is not one of this address; it must be used as it was given, with nothing changed";
             Err(Problem::new(Kind::SignatureInvalid, detail))
         }
         Signed::Expired(end) => {
@@ -325,7 +326,9 @@ mod tests {
 
     #[test]
     fn addresses_are_clients_by_network() {
-        for (address, name) in [("192.0.2.1", "192.0.2.1"), ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"), ("::1", "0:0:0:0::/64")] {
+        for (address, name) in
+            [("192.0.2.1", "192.0.2.1"), ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"), ("::1", "0:0:0:0::/64")]
+        {
             assert_eq!(place(address.parse().unwrap()), name);
         }
     }

@@ -87,7 +87,9 @@ mod tests {
         let operations = lines.flat_map(|line| {
             let (path, handlers) = line.split_once("\", ").unwrap_or_default();
             let methods = ["get", "post", "put", "patch", "delete"].into_iter();
-            let is = |method: &&str| handlers.starts_with(&format!("{method}(")) || handlers.contains(&format!(".{method}("));
+            let is = |method: &&str| {
+                handlers.starts_with(&format!("{method}(")) || handlers.contains(&format!(".{method}("))
+            };
             methods.filter(is).map(|method| format!("{} {path}", method.to_uppercase())).collect::<Vec<_>>()
         });
         operations.collect()

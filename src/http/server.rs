@@ -184,7 +184,7 @@ impl Server {
             }
         });
         let listener = tokio_listener("server.listen", self.addr, self.listener)?;
-        let service = router::router(Arc::clone(&self.app));
+        let service = router::router(&self.app);
         let serving = tokio::spawn(accept::serve(listener, service, Arc::clone(&config), stopped.clone()));
         let metrics = match self.metrics_listener.zip(self.metrics_addr) {
             Some((listener, addr)) => {

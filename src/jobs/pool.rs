@@ -69,7 +69,16 @@ impl Pool {
         let workers = workers.max(1);
         let queue = Arc::new(Queue::new(queue, workers));
         let pool = Self {
-            shared: Arc::new(Shared { queue, backend, reason, limits, budget, workers, meter, watch: Watch::default() }),
+            shared: Arc::new(Shared {
+                queue,
+                backend,
+                reason,
+                limits,
+                budget,
+                workers,
+                meter,
+                watch: Watch::default(),
+            }),
         };
         for n in 0..workers {
             let shared = Arc::clone(&pool.shared);

@@ -162,10 +162,15 @@ impl Service {
         run(["healthcheck", "--url", &format!("http://{}/readyz", self.addr)]).status.success()
     }
 
-    /// Sends it a signal; returns its exit code and its log.
-    pub fn stop(mut self, signal: &str) -> (Option<i32>, String) {
+    /// Sends it a signal.
+    pub fn signal(&self, signal: &str) {
         let id = self.child.id().to_string();
         assert!(Command::new("kill").args([&format!("-{signal}"), &id]).status().unwrap().success());
+    }
+
+    /// Sends it a signal that ends it; returns its exit code and its log.
+    pub fn stop(mut self, signal: &str) -> (Option<i32>, String) {
+        self.signal(signal);
         let code = self.child.wait().unwrap().code();
         (code, self.log.take().unwrap().join().unwrap())
     }

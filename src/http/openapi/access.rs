@@ -35,7 +35,8 @@ impl Modify for Rights {
             .description(Some("A key, where the operator asks for one."))
             .build();
         components.add_security_scheme(BEARER, SecurityScheme::Http(bearer));
-        let header = ApiKeyValue::with_description("X-Api-Key", "The same key, for clients whose `Authorization` is taken.");
+        let header =
+            ApiKeyValue::with_description("X-Api-Key", "The same key, for clients whose `Authorization` is taken.");
         components.add_security_scheme(API_KEY, SecurityScheme::ApiKey(ApiKey::Header(header)));
         let query = ApiKeyValue::with_description(
             SIGNATURE,
