@@ -18,18 +18,23 @@ pub(super) fn tell(access: &Access) {
 }
 
 /// Reads the file of keys again whenever it has changed, and on SIGHUP. Without keys, does nothing: SIGHUP then means what
-/// it means to other programs.
-pub(super) async fn keys(access: Arc<Access>) {
-    if !access.has_keys() {
-        return;
+/// it means to other programs. The signal is listened for from the call on, not from the first poll.
+pub(super) fn keys(access: Arc<Access>) -> impl Future<Output = ()> + Send + 'static {
+    let hangup = access.has_keys().then(Hangup::listen);
+    async move {
+        if let Some(hangup) = hangup {
+            renew(&access, hangup).await;
+        }
     }
-    let mut hangup = Hangup::listen();
+}
+
+async fn renew(access: &Arc<Access>, mut hangup: Hangup) {
     loop {
         let told = tokio::select! {
             () = hangup.next() => true,
             () = tokio::time::sleep(LOOK) => false,
         };
-        let access = Arc::clone(&access);
+        let access = Arc::clone(access);
         match tokio::task::spawn_blocking(move || access.refresh(told)).await {
             Ok(Ok(None)) => {}
             Ok(Ok(Some(keys))) => tracing::info!(keys, "the keys were read again"),

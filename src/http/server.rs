@@ -166,6 +166,7 @@ impl Server {
         let handle = telemetry::recorder()?;
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
+        let renewing = tokio::spawn(renew::keys(Arc::clone(&self.app.access)));
         let warming = tokio::task::spawn_blocking({
             let app = Arc::clone(&self.app);
             move || warm_up(&app)
@@ -202,7 +203,6 @@ impl Server {
                 handle.run_upkeep();
             }
         });
-        let renewing = tokio::spawn(renew::keys(Arc::clone(&self.app.access)));
         shutdown.await;
         tracing::info!("stopping: running requests are finished, new ones are refused");
         self.app.readiness.set(Ready::ShuttingDown);
