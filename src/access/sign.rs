@@ -279,7 +279,7 @@ mod tests {
             signed.replace("key_id=new&", ""),
             signed.replace("/x", "/y"),
             signed.replace("a=1", "%61=1"),
-            signed.replace("signature=", "signature"),
+            format!("{}signature", signed.split("signature=").next().unwrap()),
         ] {
             assert_eq!(check(&keys, &other, 0), Signed::Invalid, "{other}");
         }
