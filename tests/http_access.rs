@@ -244,7 +244,7 @@ fn work_is_charged_and_what_needs_none_is_still_answered() {
 #[test]
 fn requests_at_once_are_counted_to_the_last_byte() {
     let keys = Keys::new(&[("a", "mesh,read", "concurrent = 1")]);
-    let server = server(Mode::Slow(Duration::from_secs(600)), |c| {
+    let server = server(Mode::Slow(Duration::from_mins(10)), |c| {
         c.access.keys_file = Some(keys.path());
         // The job that never ends is not waited for.
         c.server.drain_timeout_ms = 100;

@@ -46,7 +46,7 @@ impl Keys {
 /// Waits for something to become true, a minute at most.
 #[track_caller]
 pub(crate) fn eventually(what: &str, mut is: impl FnMut() -> bool) {
-    let end = Instant::now() + Duration::from_secs(60);
+    let end = Instant::now() + Duration::from_mins(1);
     while !is() {
         assert!(Instant::now() < end, "waited too long for: {what}");
         std::thread::sleep(Duration::from_millis(20));
