@@ -10,6 +10,8 @@ pub mod structure;
 pub mod surface;
 
 #[cfg(feature = "server")]
+pub mod access;
+#[cfg(feature = "server")]
 pub mod archive;
 #[cfg(feature = "server")]
 pub mod config;

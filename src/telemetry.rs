@@ -53,6 +53,8 @@ pub const QUEUE_AGE: &str = "molmesh_queue_oldest_age_seconds";
 pub const QUEUE_WAIT: &str = "molmesh_queue_estimated_wait_seconds";
 /// Requests refused by a limit, by the limit's problem type.
 pub const REJECTED: &str = "molmesh_requests_rejected_total";
+/// Clients whose quotas are counted one by one.
+pub const QUOTA_CLIENTS: &str = "molmesh_quota_clients";
 /// Bytes of uploads and meshes held in memory.
 pub const MEMORY_HELD: &str = "molmesh_memory_held_bytes";
 /// Samples at which the density was evaluated.
@@ -184,6 +186,7 @@ fn describe() {
     describe_gauge!(QUEUE_AGE, Unit::Seconds, "How long the oldest job has waited");
     describe_gauge!(QUEUE_WAIT, Unit::Seconds, "How long a job that is accepted now would wait");
     describe_counter!(REJECTED, "Requests refused by a limit");
+    describe_gauge!(QUOTA_CLIENTS, "Clients whose quotas are counted one by one");
     describe_gauge!(MEMORY_HELD, Unit::Bytes, "Bytes of uploads and meshes held in memory");
     describe_counter!(VOXELS, "Samples at which the density was evaluated");
     describe_counter!(TRIANGLES, "Triangles of finished meshes");
@@ -199,7 +202,7 @@ fn describe() {
     describe_counter!(PANICS, "Panics that were caught");
     describe_gauge!(BUILD_INFO, "1, labelled with the version");
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
-    for gauge_name in [CONNECTIONS, JOBS_OPEN, QUEUE_DEPTH, QUEUE_AGE, QUEUE_WAIT, MEMORY_HELD] {
+    for gauge_name in [CONNECTIONS, JOBS_OPEN, QUEUE_DEPTH, QUEUE_AGE, QUEUE_WAIT, MEMORY_HELD, QUOTA_CLIENTS] {
         gauge!(gauge_name).set(0.0);
     }
     for counter_name in [VOXELS, TRIANGLES, JOBS_FALLBACK, JOBS_RECOVERED] {

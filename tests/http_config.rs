@@ -113,6 +113,14 @@ fn bad_values_name_the_key_the_value_and_what_was_expected() {
         ("archive.url", "https://h/4pti.cif"),
         ("archive.proxy", "proxy"),
         ("archive.allow_private", "maybe"),
+        ("server.trusted_proxies", "proxy"),
+        ("server.forwarded_header", "x-real-ip"),
+        ("access.address_requests", "many"),
+        ("access.address_requests", "0"),
+        ("access.hsts_s", "-1"),
+        ("access.window_s", "0"),
+        ("access.cors_origins", "https://viewer.example/"),
+        ("access.cors_credentials", "perhaps"),
     ] {
         let message = load(None, [], &pairs(&[(key, value)])).unwrap_err().to_string();
         assert!(message.contains(key) && message.contains("expected") && message.contains("command line"), "{message}");
@@ -130,6 +138,28 @@ fn a_number_that_may_be_absent_is_cleared_by_none_and_set_again() {
     assert_eq!(spread(&[]), Some(molmesh::surface::devices::SPREAD_BRICKS));
     assert_eq!(spread(&[("devices.spread_bricks", "none")]), None);
     assert_eq!(spread(&[("devices.spread_bricks", "none"), ("devices.spread_bricks", "5_000")]), Some(5000));
+}
+
+#[test]
+fn counts_that_are_absent_by_default_are_read_from_every_layer() {
+    let requests = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().access.address_requests;
+    assert_eq!(requests(&[]), None);
+    assert_eq!(requests(&[("access.address_requests", "1_000")]), Some(1000));
+    assert_eq!(requests(&[("access.address_requests", "5"), ("access.address_requests", "none")]), None);
+    let lists = file(
+        "[access]\naddress_requests = 7\ncors_origins = [\"https://a.example\", \"http://b.example:81\"]\n\
+         [server]\ntrusted_proxies = [\"10.0.0.0/8\", \"::1\"]\nforwarded_header = \"forwarded\"",
+    );
+    let config = load(Some(lists.path()), [], &[]).unwrap();
+    assert_eq!(config.access.address_requests, Some(7));
+    assert_eq!(config.access.cors_origins.unwrap().to_string(), "https://a.example http://b.example:81");
+    assert!(config.server.trusted_proxies.unwrap().contains("10.9.9.9".parse().unwrap()));
+    let off = load(None, [], &pairs(&[("access.cors_origins", "none")])).unwrap();
+    assert_eq!(off.access.cors_origins, None);
+    // A secret is nowhere to be seen.
+    let config = load(None, pairs(&[("MOLMESH__ACCESS__SIGNING_SECRET", "a:geheim")]), &[]).unwrap();
+    assert_eq!(config.access.signing_secret.as_ref().unwrap().reveal(), "a:geheim");
+    assert!(!format!("{config:?}").contains("geheim"));
 }
 
 #[test]

@@ -3,6 +3,7 @@
 #![cfg(feature = "server")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
+mod access_support;
 #[path = "archive_support/mod.rs"]
 #[allow(dead_code, reason = "a part of it is used")]
 mod archive_support;
@@ -16,7 +17,9 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use archive_support::{Remote, status};
-use http_support::{Fake, Mode, Reply, Running, SAMPLE, connect, read_reply, sample, start, start_cold, wait_for};
+use http_support::{
+    Fake, Mode, Reply, Running, SAMPLE, connect, read_reply, sample, send, start, start_cold, wait_for,
+};
 use molmesh::config::Config;
 use molmesh::surface::CpuBackend;
 use openapi_support::Seen;
@@ -261,6 +264,32 @@ fn restarts(seen: &Seen) {
     seen.expect(503, server.addr, ("DELETE", &job), &[], b"");
 }
 
+/// Keys and quotas: every operation that takes a key, without one, with another one's, and beyond its quota.
+fn rights(seen: &Seen) {
+    let keys = access_support::Keys::new(&[
+        ("reads", "read", ""),
+        ("makes", "mesh", ""),
+        ("once", "mesh,read", "requests = 1\nwindow_s = 86400"),
+    ]);
+    let server = fake(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let once = [("x-api-key", keys.text("once"))];
+    assert_eq!(send(server.addr, "GET", "/v1/capabilities", &once, b"").status, 200);
+    let operations: Vec<_> = seen.described().filter(|(_, path)| path.starts_with("/v1/")).collect();
+    assert!(operations.len() > 10, "{operations:?}");
+    for (method, path) in operations {
+        let path = path.replace("{file}", "surface.glb").replace(['{', '}'], "");
+        let ask = |status, headers: &[(&str, &str)]| seen.expect(status, server.addr, (method, &path), headers, b"");
+        ask(401, &[]);
+        let others =
+            ["reads", "makes"].map(|id| send(server.addr, method, &path, &[("x-api-key", keys.text(id))], b""));
+        let refused = others.iter().filter(|reply| reply.status == 403).inspect(|reply| {
+            seen.note(method, &path, reply).unwrap_or_else(|wrong| panic!("{wrong}"));
+        });
+        assert_eq!(refused.count(), 1, "{method} {path} needs one scope");
+        ask(429, &once);
+    }
+}
+
 /// Puts files in the place of the store's folders.
 fn break_store(dir: &Path) {
     for folder in ["inputs", "jobs", "results"].map(|name| dir.join("store").join(name)) {
@@ -281,6 +310,7 @@ fn every_described_status_is_given_and_no_other() {
     sizes(&seen);
     failures(&seen);
     restarts(&seen);
+    rights(&seen);
     let cold = Fake::new(Mode::NoSurface);
     cold.also_warm.store(true, Ordering::SeqCst);
     let cold = start_cold(cold, |_| {});

@@ -4,7 +4,7 @@ import { Viewer, readGlb } from "/viewer.js";
 const $ = (id) => document.getElementById(id);
 const MAIN = ["preset", "resolution", "isovalue", "smoothness", "select", "format"];
 const ELSEWHERE = ["report"];
-const state = { file: null, name: "", capabilities: null, abort: null, url: null, viewer: null };
+const state = { file: null, name: "", capabilities: null, abort: null, url: null, viewer: null, key: "" };
 
 /** An element with text and attributes; text is never parsed as markup. */
 function element(tag, text = "", attributes = {}) {
@@ -12,6 +12,12 @@ function element(tag, text = "", attributes = {}) {
   if (text) node.textContent = text;
   for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
   return node;
+}
+
+/** A request to this server, with the key where one was given. */
+function ask(path, options = {}) {
+  const key = state.key ? { authorization: `Bearer ${state.key}` } : {};
+  return fetch(path, { ...options, headers: { ...options.headers, ...key } });
 }
 
 function field(parameter) {
@@ -43,7 +49,7 @@ function showCurl() {
   const format = $("p-format")?.value || "glb";
   const name = state.name || "4pti.pdb";
   const fetchSample = state.name ? "" : `curl -o 4pti.pdb ${location.origin}/sample.pdb\n`;
-  $("curl").textContent = `${fetchSample}curl --data-binary @${quoted(name)} -o surface.${format} ${quoted(location.origin + "/v1/meshes" + query())}`;
+  $("curl").textContent = `${fetchSample}curl ${state.key ? '-H "X-Api-Key: $MOLMESH_KEY" ' : ""}--data-binary @${quoted(name)} -o surface.${format} ${quoted(location.origin + "/v1/meshes" + query())}`;
 }
 
 function choose(file, name) {
@@ -122,7 +128,7 @@ async function run(event) {
   $("cancel").hidden = false;
   const start = performance.now();
   try {
-    const reply = await fetch(`/v1/meshes${query()}`, { method: "POST", body: state.file, signal: abort.signal, headers: { "content-type": "application/octet-stream" } });
+    const reply = await ask(`/v1/meshes${query()}`, { method: "POST", body: state.file, signal: abort.signal, headers: { "content-type": "application/octet-stream" } });
     if (!reply.ok) {
       $("status").textContent = `Refused (${reply.status}).`;
       showProblem(await reply.json());
@@ -147,7 +153,14 @@ async function run(event) {
 }
 
 async function start() {
-  const reply = await fetch("/v1/capabilities");
+  const reply = await ask("/v1/capabilities");
+  $("problem").hidden = reply.ok;
+  // The key stays in this page, and is gone with it.
+  $("key-form").hidden = ![401, 403].includes(reply.status);
+  if (!reply.ok) {
+    showProblem(await reply.json());
+    return;
+  }
   state.capabilities = await reply.json();
   $("version").textContent = `Version ${state.capabilities.version}, ${state.capabilities.backends.map((b) => b.name).join(", ")} backend.`;
   for (const parameter of state.capabilities.parameters) {
@@ -174,4 +187,13 @@ async function start() {
   showCurl();
 }
 
-start().catch((error) => { $("status").textContent = `This page could not start: ${error.message}`; });
+function begin() {
+  start().catch((error) => { $("status").textContent = `This page could not start: ${error.message}`; });
+}
+
+$("key-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  state.key = $("key").value.trim();
+  begin();
+});
+begin();

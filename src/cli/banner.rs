@@ -14,6 +14,8 @@ pub(crate) struct Facts {
     pub(crate) reason: String,
     /// Every backend and its state.
     pub(crate) others: Vec<Candidate>,
+    /// A key is asked for.
+    pub(crate) keys: bool,
 }
 
 /// The banner of a service that listens on `addr`.
@@ -31,7 +33,11 @@ pub(crate) fn text(addr: SocketAddr, metrics: Option<SocketAddr>, facts: &Facts,
             page.row("", &style.dim(&format!("not {name}: {why}")));
         }
     }
-    page.row("try", &format!("curl -sS {base}/sample.pdb | curl -sS --data-binary @- {base}/v1/meshes -o 4pti.glb"));
+    let key = if facts.keys { " -H \"X-Api-Key: $MOLMESH_KEY\"" } else { "" };
+    page.row(
+        "try",
+        &format!("curl -sS {base}/sample.pdb | curl -sS{key} --data-binary @- {base}/v1/meshes -o 4pti.glb"),
+    );
     page.finish()
 }
 
@@ -58,6 +64,7 @@ mod tests {
                 Candidate { name: "cpu".into(), state: Ok("2 threads".into()) },
                 Candidate { name: "gpu".into(), state: Err("none found".into()) },
             ],
+            keys: false,
         };
         let text = text("0.0.0.0:81".parse().unwrap(), Some("[::]:82".parse().unwrap()), &facts, Style::PLAIN);
         for part in [
@@ -70,6 +77,9 @@ mod tests {
         ] {
             assert!(text.contains(part), "no `{part}` in\n{text}");
         }
+        let asking = Facts { keys: true, ..facts };
+        let closed = super::text("0.0.0.0:81".parse().unwrap(), None, &asking, Style::PLAIN);
+        assert!(closed.contains("curl -sS -H \"X-Api-Key: $MOLMESH_KEY\" --data-binary"), "{closed}");
         assert!(!text.contains("not cpu") && text.lines().count() <= 8, "{text}");
     }
 }

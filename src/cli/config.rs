@@ -1,5 +1,7 @@
 //! `molmesh config`: what the configuration is, and what it may be. Flags become keys here, for every command that takes them.
 
+use std::path::Path;
+
 use clap::ValueEnum as _;
 
 use molmesh::config::{self, Loaded};
@@ -46,14 +48,6 @@ fn print(args: &PrintArgs) -> Result<String, CliError> {
 
 /// Defaults, then the file, then the environment, then `--set`, then the flags that have names of their own.
 pub(super) fn load(args: &ServeArgs) -> Result<Loaded, CliError> {
-    let mut flags = Vec::new();
-    for set in &args.set {
-        let (key, value) = set.split_once('=').ok_or_else(|| CliError::Usage {
-            message: format!("parameter `set`: `{set}` is not allowed; expected section.key=value"),
-            hint: None,
-        })?;
-        flags.push((key.to_owned(), value.to_owned()));
-    }
     let path = |p: &std::path::PathBuf| p.to_string_lossy().into_owned();
     let log = args.log.map(|style| match style {
         LogStyle::Pretty => "pretty".to_owned(),
@@ -67,6 +61,24 @@ pub(super) fn load(args: &ServeArgs) -> Result<Loaded, CliError> {
         ("archive.dir", args.archive.as_ref().map(path)),
         ("log.format", log),
     ];
-    flags.extend(named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
-    config::load_process(args.config.as_deref(), &flags).map_err(|e| CliError::usage(e.to_string()))
+    let named = named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?)));
+    of(args.config.as_deref(), &args.set, named)
+}
+
+/// The configuration of a file, the environment, `--set`, and flags as pairs of a key and a value.
+pub(super) fn of(
+    file: Option<&Path>,
+    set: &[String],
+    named: impl IntoIterator<Item = (String, String)>,
+) -> Result<Loaded, CliError> {
+    let mut flags = Vec::new();
+    for set in set {
+        let (key, value) = set.split_once('=').ok_or_else(|| CliError::Usage {
+            message: format!("parameter `set`: `{set}` is not allowed; expected section.key=value"),
+            hint: None,
+        })?;
+        flags.push((key.to_owned(), value.to_owned()));
+    }
+    flags.extend(named);
+    config::load_process(file, &flags).map_err(|e| CliError::usage(e.to_string()))
 }

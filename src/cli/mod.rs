@@ -12,6 +12,7 @@ mod doctor;
 mod error;
 mod healthcheck;
 mod interrupt;
+mod key;
 mod mesh;
 mod output;
 mod page;
@@ -19,6 +20,7 @@ mod panics;
 mod progress;
 mod request;
 mod serve;
+mod sign;
 mod style;
 mod summary;
 
@@ -43,6 +45,8 @@ pub(crate) fn main() -> i32 {
         Command::Doctor(args) => doctor::run(&args),
         Command::Config(command) => config::run(&command),
         Command::Healthcheck(args) => healthcheck::run(&args),
+        Command::Key(command) => key::run(&command),
+        Command::Sign(args) => sign::run(&args),
         #[cfg(feature = "gpu")]
         Command::Bench(bench) => bench::run(&bench),
         Command::Version => version(),

@@ -3,6 +3,7 @@
 //! One small struct per concern. Every key says its unit and why its default is what it is; keys end in their
 //! unit (`_ms`, `_bytes`). A key that does not exist is refused, whichever layer it comes from.
 
+mod access;
 mod archive;
 mod devices;
 mod error;
@@ -11,6 +12,7 @@ mod limits;
 mod load;
 mod log;
 mod print;
+mod proxies;
 mod schema;
 mod secrets;
 mod server;
@@ -20,8 +22,9 @@ mod template;
 use std::path::PathBuf;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
+pub use access::{AccessConfig, Origins};
 pub use archive::ArchiveConfig;
 pub use devices::DevicesConfig;
 pub use error::ConfigError;
@@ -29,6 +32,7 @@ pub use jobs::JobsConfig;
 pub use limits::LimitsConfig;
 pub use load::{Loaded, Source, load, load_process, load_with_sources};
 pub use log::{LogConfig, LogFormat};
+pub use proxies::{ForwardedHeader, Proxies};
 pub use schema::schema;
 pub use server::ServerConfig;
 pub use store::{Secret, StoreConfig};
@@ -50,6 +54,8 @@ pub struct Config {
     pub archive: ArchiveConfig,
     /// What the service keeps.
     pub store: StoreConfig,
+    /// Who may ask for what.
+    pub access: AccessConfig,
     /// Logs.
     pub log: LogConfig,
 }
@@ -66,4 +72,18 @@ impl Config {
     pub fn archive_cache_dir(&self) -> PathBuf {
         self.server.data_dir.join("cache").join("archive")
     }
+}
+
+/// Words with blanks between them, or a list of them, as one text.
+fn words<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged)]
+    enum Written {
+        Text(String),
+        List(Vec<String>),
+    }
+    Ok(match Written::deserialize(deserializer)? {
+        Written::Text(text) => text,
+        Written::List(texts) => texts.join(" "),
+    })
 }

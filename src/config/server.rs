@@ -7,6 +7,8 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::{ForwardedHeader, Proxies};
+
 /// The listeners and what a connection may do.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
@@ -49,6 +51,12 @@ pub struct ServerConfig {
     /// Time behind that for requests and jobs that run to finish, ms. Default 20,000: orchestrators commonly kill
     /// after 30 seconds; with `notice_ms` and the last second for what is cancelled it makes 24.
     pub drain_timeout_ms: u64,
+    /// Proxies in front, by address or network, whose word about their clients is taken. Default `none`: whoever connects is
+    /// the client, and what he says about others is not looked at.
+    pub trusted_proxies: Option<Proxies>,
+    /// The header in which they name their clients: `x-forwarded-for` (default) or `forwarded` (RFC 7239). Only this one
+    /// is looked at: the other one may be the client's own, passed on.
+    pub forwarded_header: ForwardedHeader,
 }
 
 impl Default for ServerConfig {
@@ -67,6 +75,8 @@ impl Default for ServerConfig {
             idle_timeout_ms: 120_000,
             notice_ms: Some(3000),
             drain_timeout_ms: 20_000,
+            trusted_proxies: None,
+            forwarded_header: ForwardedHeader::default(),
         }
     }
 }

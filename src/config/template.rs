@@ -144,17 +144,7 @@ impl JsonSchema for Templates {
 
 impl<'de> Deserialize<'de> for Templates {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        #[derive(Deserialize)]
-        #[serde(untagged)]
-        enum Written {
-            Text(String),
-            List(Vec<String>),
-        }
-        let text = match Written::deserialize(deserializer)? {
-            Written::Text(text) => text,
-            Written::List(texts) => texts.join(" "),
-        };
-        text.parse().map_err(serde::de::Error::custom)
+        super::words(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 

@@ -24,11 +24,11 @@ use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tower::ServiceExt as _;
 
+use super::guard::Peer;
 use super::io::Guarded;
 use super::kinds::Kind;
 use super::problem::{MEDIA_TYPE, Problem};
 use super::stop::{self, Stop};
-use super::wish::Peer;
 use crate::config::ServerConfig;
 use crate::telemetry::{CONNECTIONS, REJECTED};
 

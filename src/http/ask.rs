@@ -93,6 +93,7 @@ impl Ask {
 
     /// Makes the mesh, or promises to.
     pub(super) async fn make(self, app: &Shared, input: Input) -> Result<Response, Problem> {
+        app.admit_work(&self.wish.caller)?;
         if self.wish.later {
             return self.promise(app, input, None).await;
         }

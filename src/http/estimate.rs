@@ -1,10 +1,12 @@
 //! `POST /v1/estimate`: what a mesh would cost, and what would fit if it were refused. Takes what `POST /v1/meshes` takes.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
+use axum::http::Extensions;
 use axum::http::header::{ACCEPT, CACHE_CONTROL, HeaderMap};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
@@ -12,6 +14,7 @@ use serde_json::Value;
 use utoipa::ToSchema;
 
 use super::ask::Input;
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::meshes::{self, Pairs};
 use super::openapi::bodies::{MeshForm, MeshOrder, StructureFile};
@@ -101,8 +104,11 @@ pub(super) async fn create(
     State(app): State<Shared>,
     query: Pairs,
     mut headers: HeaderMap,
+    extensions: Extensions,
     body: Body,
 ) -> Result<Response, Problem> {
+    let caller = Caller::of(&extensions);
+    app.admit_work(&caller)?;
     // What it says is of the answer, which is no mesh.
     headers.remove(ACCEPT);
     let taken = meshes::take(&app, query, &headers, body).await?;
@@ -114,12 +120,14 @@ pub(super) async fn create(
     let seconds = app.pool.expected(&bytes, &job);
     let stop = StopOnDrop(CancelToken::default());
     let limit = app.config.jobs.deadline();
-    let limits = pipeline::JobLimits { deadline: Some(std::time::Instant::now() + limit), ..app.config.limits.job() };
+    let limits = pipeline::JobLimits { deadline: Some(Instant::now() + limit), ..app.config.limits.job() };
     let estimating = tokio::task::spawn_blocking({
         let (app, cancel, job) = (Arc::clone(&app), stop.0.clone(), job.clone());
         move || {
+            let start = Instant::now();
             let choice = Choice { backend: app.pool.backend().as_ref(), reason: app.pool.reason() };
             let estimate = pipeline::estimate(&bytes, &job, &limits, &choice, &cancel);
+            app.charge(&caller, start.elapsed());
             drop((lease, place));
             estimate
         }

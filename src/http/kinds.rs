@@ -7,6 +7,12 @@ use axum::http::StatusCode;
 pub(super) enum Kind {
     BadRequest,
     BadParameter,
+    KeyRequired,
+    KeyInvalid,
+    KeyExpired,
+    ScopeMissing,
+    SignatureInvalid,
+    SignatureExpired,
     NotFound,
     NotInArchive,
     NoSuchStructure,
@@ -34,6 +40,7 @@ pub(super) enum Kind {
     NoSurface,
     OtherRequest,
     ArchiveUnavailable,
+    QuotaExceeded,
     Internal,
     JobAbandoned,
     NotReady,
@@ -57,7 +64,7 @@ pub(super) struct Row {
     pub(super) title: &'static str,
     /// What it means and what to do, for people.
     pub(super) about: &'static str,
-    /// A limit was reached: counted as a rejection.
+    /// A limit was reached, or a right was missing: counted as a rejection.
     pub(super) limit: bool,
 }
 
@@ -81,6 +88,18 @@ pub(super) const KINDS: &[Row] = &[
         "The request could not be understood as HTTP or as multipart/form-data. `detail` says what was found."),
     row(Kind::BadParameter, "bad-parameter", S::BAD_REQUEST, false, "A parameter cannot be used",
         "A parameter is unknown, given twice, malformed, out of range, or does not go with another one. `parameter` names it, `value` is what was given, `expected` says what is allowed, `nearest` is the known name that is nearest to an unknown one. /v1/capabilities lists all of them."),
+    row(Kind::KeyRequired, "key-required", S::UNAUTHORIZED, true, "A key is needed",
+        "This server asks for a key: `Authorization: Bearer mm_…`, or `X-Api-Key: mm_…`. Its operator gives them out. A GET may have a signed address instead."),
+    row(Kind::KeyInvalid, "key-invalid", S::UNAUTHORIZED, true, "The key is not known",
+        "The key that was sent is none of this server's, was withdrawn, or was cut off when it was copied."),
+    row(Kind::KeyExpired, "key-expired", S::UNAUTHORIZED, true, "The key has expired",
+        "The key was good until `expired`. Ask the operator for another one."),
+    row(Kind::ScopeMissing, "scope-missing", S::FORBIDDEN, true, "The key is not for this",
+        "The key is good, but not for what was asked: it has no scope `scope`. `mesh` is to compute, `read` to read what there is."),
+    row(Kind::SignatureInvalid, "signature-invalid", S::FORBIDDEN, true, "The signature does not hold",
+        "The address has a signature that is not its own. A signed address is used as it was given: path, parameters and their spelling are signed."),
+    row(Kind::SignatureExpired, "signature-expired", S::FORBIDDEN, true, "The signed address has expired",
+        "The address was signed until `expired`. Ask for another one where it came from."),
     row(Kind::NotFound, "not-found", S::NOT_FOUND, false, "There is nothing here",
         "No resource has this path. /v1/capabilities and / say what there is."),
     row(Kind::NotInArchive, "not-in-archive", S::NOT_FOUND, false, "The archive has no such entry",
@@ -135,6 +154,8 @@ pub(super) const KINDS: &[Row] = &[
         "`Idempotency-Key` was used before, with another structure, other parameters or another format."),
     row(Kind::ArchiveUnavailable, "archive-unavailable", S::FAILED_DEPENDENCY, false, "The archive cannot be reached",
         "This server has no copy of the entry, and the archive at `host` could not be asked for it: `detail` says why, `found` is the status that it answered with, if it did. Try again after `Retry-After` seconds, or POST the file to /v1/meshes."),
+    row(Kind::QuotaExceeded, "quota-exceeded", S::TOO_MANY_REQUESTS, true, "The quota is used up",
+        "`violated-policies` names the quota that this client has used up: `requests` in a window, `work` (seconds of computing in a window), or `concurrency` (requests at once). `RateLimit-Policy` and `RateLimit` say what there is and what is left. Try again after `Retry-After` seconds; what is refused does not count."),
     row(Kind::Internal, "internal", S::INTERNAL_SERVER_ERROR, false, "Our mistake",
         "Something failed that should not have. The log has the details under the request id that `instance` gives."),
     row(Kind::JobAbandoned, "job-abandoned", S::INTERNAL_SERVER_ERROR, false, "The job was given up",

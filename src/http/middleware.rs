@@ -3,76 +3,44 @@
 //! 1. **request id**: everything below can name the request;
 //! 2. **observe**: the span, one log line, the duration metric; it sees the final status;
 //! 3. **problems**: errors of everything below become `application/problem+json`;
-//! 4. **security headers**: also on problems that a layer below made;
+//! 4. **browsers**: what they must not do with an answer, also with problems that a layer below made;
 //! 5. **CORS**: answers preflights; errors below carry its headers, so that scripts can read them;
 //! 6. **panics**: a panic of a handler is a 500, and the connection lives on;
-//! 7. **timeout**: a backstop above the body's timeout and the job's deadline, which are the ones that are met;
-//! 8. the router. Limits of bodies, queue and memory are where the resource is used.
+//! 7. **guard**: keys, signed addresses, quotas; nothing below sees a key or a signature;
+//! 8. **timeout**: a backstop above the body's timeout and the job's deadline, which are the ones that are met;
+//! 9. the router. Limits of bodies, queue and memory are where the resource is used.
 
 use std::panic::AssertUnwindSafe;
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
 use axum::extract::{Request, State};
-use axum::http::header::{self, HeaderName};
-use axum::http::{HeaderValue, Method};
 use axum::middleware::{Next, from_fn, from_fn_with_state};
 use axum::response::{IntoResponse, Response};
 use futures_util::FutureExt as _;
 use metrics::counter;
 use tower::ServiceBuilder;
-use tower_http::cors::{Any, CorsLayer};
 
 use super::kinds::Kind;
 use super::problem::{self, Problem};
-use super::{delivery, observe, request_id};
+use super::state::Shared;
+use super::{browsers, guard, observe, request_id};
 use crate::telemetry::PANICS;
 
 /// Puts the layers around `router`.
-pub(super) fn apply(router: Router, timeout: Duration) -> Router {
+pub(super) fn apply(router: Router, timeout: Duration, app: &Shared) -> Router {
     router.layer(
         ServiceBuilder::new()
             .layer(from_fn(request_id::assign))
             .layer(from_fn(observe::request))
             .layer(from_fn(problem::render))
-            .layer(from_fn(security_headers))
-            .layer(cors())
+            .layer(from_fn_with_state(Arc::clone(app), browsers::restrain))
+            .layer(browsers::cors(&app.access))
             .layer(from_fn(catch_panics))
+            .layer(from_fn_with_state(Arc::clone(app), guard::check))
             .layer(from_fn_with_state(timeout, backstop)),
     )
-}
-
-async fn security_headers(request: Request, next: Next) -> Response {
-    let mut response = next.run(request).await;
-    // Meshes are data: no browser should take one for a script or a page.
-    response.headers_mut().insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    response
-}
-
-/// Any origin may read anything: there are no cookies and nothing private here.
-fn cors() -> CorsLayer {
-    let exposed = [
-        header::ETAG,
-        header::LOCATION,
-        header::CONTENT_LOCATION,
-        header::CONTENT_RANGE,
-        header::ACCEPT_RANGES,
-        header::CONTENT_DISPOSITION,
-        header::RETRY_AFTER,
-        HeaderName::from_static("server-timing"),
-        request_id::HEADER,
-    ];
-    CorsLayer::new()
-        .allow_origin(Any)
-        .allow_methods([Method::GET, Method::HEAD, Method::POST, Method::DELETE])
-        .allow_headers(Any)
-        .expose_headers(
-            exposed
-                .into_iter()
-                .chain(delivery::SUMMARY.iter().map(|name| HeaderName::from_static(name)))
-                .collect::<Vec<_>>(),
-        )
-        .max_age(Duration::from_hours(24))
 }
 
 async fn catch_panics(request: Request, next: Next) -> Response {

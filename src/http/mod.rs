@@ -6,6 +6,7 @@
 
 mod accept;
 mod ask;
+mod browsers;
 mod capabilities;
 mod conditional;
 mod declared;
@@ -13,6 +14,7 @@ mod delivery;
 mod docs;
 mod estimate;
 mod events;
+mod guard;
 mod health;
 mod io;
 mod jobs;
@@ -29,9 +31,11 @@ mod probe;
 mod problem;
 mod problems;
 mod range;
+mod renew;
 mod request_id;
 mod results;
 mod router;
+mod scopes;
 mod server;
 mod state;
 mod stop;

@@ -23,7 +23,9 @@ pub(super) async fn request(request: Request, next: Next) -> Response {
     let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
     let route = request.extensions().get::<MatchedPath>().cloned();
     let method = request.method().clone();
-    let span = tracing::info_span!("request", id = id.as_str(), %method, path = request.uri().path());
+    // The query stays out: a signature may stand in it. The guard adds whose key it is.
+    let path = request.uri().path();
+    let span = tracing::info_span!("request", id = id.as_str(), %method, path, key = tracing::field::Empty);
     let mut log = Log { start, method, route, status: None, span: span.clone(), bytes: 0, complete: false };
     let response = next.run(request).instrument(span).await;
     log.status = Some(response.status().as_u16());

@@ -1,6 +1,7 @@
 //! `/openapi.yaml` and `/openapi.json`: the description of this interface, collected from what stands beside each
 //! handler. `openapi.yaml` at the top level is the same text; a test says so, and writes it anew when told to.
 
+pub(super) mod access;
 pub(super) mod bodies;
 pub(super) mod meshes;
 pub(super) mod parameters;
@@ -13,6 +14,7 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use utoipa::OpenApi;
 
+use access::Rights;
 pub(super) use problems::refusals;
 
 use super::problem::Problem;
@@ -24,7 +26,9 @@ document (RFC 9457); its `type` is an address with an explanation.
 
 Beyond what each operation lists: `HEAD` is answered wherever `GET` is. A server that holds as many connections as it \
 may answers 503 (`too-many-connections`) to the next one before it has read a request. A 500 or a 504 \
-where none is listed means a defect of the server. Every answer has an `X-Request-Id`: the client's own, if it sent one of 64 letters, \
+where none is listed means a defect of the server. Where a quota applies, answers have `RateLimit-Policy` and `RateLimit` \
+(draft-ietf-httpapi-ratelimit-headers-11). Whether keys are asked for is the operator's choice: without that no answer is \
+401 or 403, and every key is ignored. Every answer has an `X-Request-Id`: the client's own, if it sent one of 64 letters, \
 digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
 
 /// The description.
@@ -52,6 +56,7 @@ digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
         super::docs::index, super::docs::start, super::docs::style, super::docs::bundle, yaml, json,
     ),
     components(schemas(problems::ProblemDocument, super::delivery::ReportDocument)),
+    modifiers(&Rights),
 )]
 struct Description;
 

@@ -37,7 +37,7 @@ pub(super) struct Problem {
     kind: Kind,
     detail: String,
     members: Map<String, Value>,
-    retry_after_s: Option<u16>,
+    retry_after_s: Option<u32>,
     header: Option<Box<(HeaderName, HeaderValue)>>,
 }
 
@@ -66,7 +66,13 @@ impl Problem {
 
     /// Says when to try again.
     pub(super) fn retry_after(mut self, wait: Duration) -> Self {
-        self.retry_after_s = u16::try_from((wait + Duration::from_millis(999)).as_secs().clamp(1, 600)).ok();
+        self.retry_after_s = u32::try_from((wait + Duration::from_millis(999)).as_secs().clamp(1, 600)).ok();
+        self
+    }
+
+    /// Says when to try again, however far away that is: a quota's window is known to the second.
+    pub(super) fn retry_after_window(mut self, wait: Duration) -> Self {
+        self.retry_after_s = u32::try_from(wait.as_millis().div_ceil(1000).max(1)).ok();
         self
     }
 

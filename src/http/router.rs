@@ -1,5 +1,6 @@
 //! Every resource of the service: the table of contents.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
@@ -15,7 +16,7 @@ use super::{
 const MARGIN: Duration = Duration::from_secs(10);
 
 /// The service.
-pub(super) fn router(app: Shared) -> Router {
+pub(super) fn router(app: &Shared) -> Router {
     let longest = app.config.jobs.deadline().max(Duration::from_secs(jobs::MAX_WAIT_S));
     let input = app.config.server.body_timeout().max(app.config.archive.timeout());
     let timeout = input + longest + MARGIN;
@@ -53,6 +54,6 @@ pub(super) fn router(app: Shared) -> Router {
         .route("/viewer.js", get(page::viewer))
         .route("/icon.svg", get(page::icon))
         .route("/sample.pdb", get(page::sample))
-        .with_state(app);
-    middleware::apply(router, timeout)
+        .with_state(Arc::clone(app));
+    middleware::apply(router, timeout, app)
 }

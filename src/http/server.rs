@@ -10,11 +10,13 @@ use thiserror::Error;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinHandle;
 
+use super::guard::Bill;
 use super::probe::Probe;
 use super::problem::Problem;
 use super::state::{App, Readiness, Shared, Warm};
 use super::stop::{self, Stop};
-use super::{accept, capabilities, metrics, pdb, router};
+use super::{accept, capabilities, metrics, pdb, renew, router};
+use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
@@ -49,6 +51,9 @@ pub enum ServeError {
     /// A worker thread cannot be started.
     #[error("cannot start the worker threads: {0}")]
     Workers(io::Error),
+    /// Keys, signatures or quotas cannot be set up.
+    #[error(transparent)]
+    Access(#[from] AccessError),
     /// What the service keeps cannot be kept.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -94,6 +99,7 @@ impl Server {
     /// [`ServeError`].
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, devices: found } = chosen;
+        let access = Arc::new(Access::open(&config)?);
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
         let (metrics_listener, metrics_addr) = metrics.unzip();
@@ -104,6 +110,7 @@ impl Server {
             patience: config.jobs.patience(),
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
+            meter: Some(Arc::new(Bill(Arc::clone(&access)))),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
@@ -123,6 +130,7 @@ impl Server {
         let (stop, stopping) = watch::channel(Stop::Serve);
         let app = Arc::new(App {
             config,
+            access,
             pool,
             archive,
             store,
@@ -164,6 +172,7 @@ impl Server {
         let handle = telemetry::recorder()?;
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
+        let renewing = tokio::spawn(renew::keys(Arc::clone(&self.app.access)));
         let warming = tokio::task::spawn_blocking({
             let app = Arc::clone(&self.app);
             move || warm_up(&app)
@@ -182,7 +191,7 @@ impl Server {
             }
         });
         let listener = tokio_listener("server.listen", self.addr, self.listener)?;
-        let service = router::router(Arc::clone(&self.app));
+        let service = router::router(&self.app);
         let serving = tokio::spawn(accept::serve(listener, service, Arc::clone(&config), stopped.clone()));
         let metrics = match self.metrics_listener.zip(self.metrics_addr) {
             Some((listener, addr)) => {
@@ -196,12 +205,13 @@ impl Server {
             loop {
                 tokio::time::sleep(UPKEEP).await;
                 watched.pool.publish_devices();
+                renew::tell(&watched.access);
                 handle.run_upkeep();
             }
         });
         stop::reached(&mut orders, Stop::Notice).await;
         let requests = wind_down(&self.app, &stop, &mut orders, serving).await;
-        for task in [upkeep, warming, recovering, sweeping] {
+        for task in [upkeep, warming, recovering, sweeping, renewing] {
             task.abort();
         }
         if let Some(metrics) = metrics {

@@ -13,6 +13,7 @@ use super::probe::Probe;
 use super::problem::Problem;
 use super::results::Head;
 use super::stop::Stop;
+use crate::access::Access;
 use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{ContentKey, Ledger, Pool};
@@ -22,6 +23,7 @@ use crate::surface::FoundDevice;
 /// State of the service, behind one pointer.
 pub(super) struct App {
     pub(super) config: Config,
+    pub(super) access: Arc<Access>,
     pub(super) pool: Arc<Pool>,
     pub(super) archive: Archive,
     pub(super) store: Store,

@@ -1,29 +1,25 @@
 //! How an answer is wished for: at once or later, how urgently, and under which key it may be asked for again.
 
-use std::net::IpAddr;
 use std::time::Duration;
 
 use axum::http::header::HeaderName;
 use axum::http::{Extensions, HeaderMap, HeaderValue};
 
+use super::guard::Caller;
 use super::kinds::Kind;
 use super::problem::Problem;
-use crate::jobs::{Client, Rank, USUAL_URGENCY};
+use crate::jobs::{Rank, USUAL_URGENCY};
 
 /// `Prefer` (RFC 7240).
 pub(super) const PREFER: HeaderName = HeaderName::from_static("prefer");
 /// What of it was heeded.
 pub(super) const PREFERENCE_APPLIED: HeaderName = HeaderName::from_static("preference-applied");
 /// `Priority` (RFC 9218).
-const PRIORITY: HeaderName = HeaderName::from_static("priority");
+pub(super) const PRIORITY: HeaderName = HeaderName::from_static("priority");
 /// The key under which a request may be sent again.
-const IDEMPOTENCY_KEY: HeaderName = HeaderName::from_static("idempotency-key");
+pub(super) const IDEMPOTENCY_KEY: HeaderName = HeaderName::from_static("idempotency-key");
 /// Characters of such a key at most.
 const MAX_KEY: usize = 255;
-
-/// Where a request comes from.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Peer(pub(super) IpAddr);
 
 /// The wishes of a request.
 #[derive(Debug, Clone)]
@@ -33,6 +29,8 @@ pub(super) struct Wish {
     /// `wait=`: how long the client would wait for the mesh itself.
     pub(super) wait: Option<Duration>,
     pub(super) rank: Rank,
+    /// Whose request it is.
+    pub(super) caller: Caller,
     pub(super) idempotency: Option<String>,
 }
 
@@ -46,11 +44,12 @@ impl Wish {
             .find_map(|p| parameter(p, "u")?.parse().ok())
             .filter(|u| (0..=7).contains(u))
             .unwrap_or(USUAL_URGENCY);
-        let client = extensions.get::<Peer>().map_or_else(Client::default, |peer| Client::named(&peer.0.to_string()));
+        let caller = Caller::of(extensions);
         Ok(Self {
             later,
             wait,
-            rank: Rank { client, batch: later, urgency },
+            rank: Rank { client: caller.client, batch: later, urgency },
+            caller,
             idempotency: headers.get(&IDEMPOTENCY_KEY).map(key).transpose()?,
         })
     }

@@ -28,7 +28,7 @@ pub use error::{EndError, Failure, PromiseError, Refusal};
 pub use flight::{Claim, Progress};
 pub use key::ContentKey;
 pub use ledger::{Describe, Ledger, LedgerSettings, Order, View};
-pub use pool::{Pool, Settings};
+pub use pool::{Meter, Pool, Settings};
 pub use rank::{Client, Rank, USUAL_URGENCY};
 pub use record::{BadJobId, JobId, Record, Status, now_ms, rfc3339};
 pub use results::{REPORT, SaveError, save};

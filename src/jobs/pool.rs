@@ -8,7 +8,7 @@ use metrics::counter;
 
 use super::devices::Watch;
 use super::queue::Queue;
-use super::{Budget, Claim, Refusal, Task, Ticket, cost, worker};
+use super::{Budget, Claim, Client, Refusal, Task, Ticket, cost, worker};
 use crate::pipeline::{Job, JobLimits};
 use crate::surface::Backend;
 use crate::telemetry::JOBS_SUBMITTED;
@@ -26,6 +26,15 @@ pub struct Settings {
     pub limits: JobLimits,
     /// Memory for uploads and meshes.
     pub budget: Budget,
+    /// Who is told what workers spend; none: nobody.
+    pub meter: Option<Arc<dyn Meter>>,
+}
+
+/// Is told what clients cost.
+pub trait Meter: std::fmt::Debug + Send + Sync {
+    /// A worker has spent `time` on a job of `client`, well or in vain. Work that several take part in is the first one's.
+    /// Called before anybody gets the outcome.
+    fn spent(&self, client: Client, time: Duration);
 }
 
 /// What workers share.
@@ -36,6 +45,7 @@ pub(super) struct Shared {
     pub(super) limits: JobLimits,
     pub(super) budget: Budget,
     pub(super) workers: usize,
+    pub(super) meter: Option<Arc<dyn Meter>>,
     watch: Watch,
 }
 
@@ -57,11 +67,20 @@ impl Pool {
     /// # Errors
     /// That of the system, if a thread cannot be started.
     pub fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
-        let Settings { workers, queue, patience, limits, budget } = settings;
+        let Settings { workers, queue, patience, limits, budget, meter } = settings;
         let workers = workers.max(1);
         let queue = Arc::new(Queue::new(queue, workers, patience));
         let pool = Self {
-            shared: Arc::new(Shared { queue, backend, reason, limits, budget, workers, watch: Watch::default() }),
+            shared: Arc::new(Shared {
+                queue,
+                backend,
+                reason,
+                limits,
+                budget,
+                workers,
+                meter,
+                watch: Watch::default(),
+            }),
         };
         for n in 0..workers {
             let shared = Arc::clone(&pool.shared);

@@ -3,10 +3,10 @@
 //! Clients share by start-time fair queueing (Goyal, Vin, Cheng, 1996): a job's tag is the time, counted in work, at which its
 //! client's earlier jobs would be done; the lowest tag goes first.
 
-use std::hash::{BuildHasher as _, BuildHasherDefault};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use rustc_hash::{FxHashMap, FxHasher};
+use rustc_hash::FxHashMap;
+use sha2::{Digest as _, Sha256};
 
 /// Urgency of a request that does not say one (RFC 9218).
 pub const USUAL_URGENCY: u8 = 3;
@@ -39,10 +39,10 @@ impl Client {
         Self(number)
     }
 
-    /// The client that is known by `name`: an address, a key.
+    /// The client that is known by `name`: an address, a key. Nobody can look for a name with the number of another.
     #[must_use]
     pub fn named(name: &str) -> Self {
-        Self(BuildHasherDefault::<FxHasher>::default().hash_one(name))
+        Self(Sha256::digest(name.as_bytes()).iter().take(8).fold(0, |number, byte| number << 8 | u64::from(*byte)))
     }
 }
 

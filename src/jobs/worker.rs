@@ -22,9 +22,12 @@ const MAX_EXPLAINED: u64 = 512 << 10;
 /// Runs jobs until the queue is closed and empty.
 pub(super) fn work(shared: &Shared) {
     while let Some(entry) = shared.queue.pop() {
-        let id = entry.id;
+        let (id, client) = (entry.id, entry.task.rank.client);
         let start = Instant::now();
         let outcome = run(shared, entry);
+        if let Some(meter) = &shared.meter {
+            meter.spent(client, start.elapsed());
+        }
         shared.publish_devices();
         // Only a mesh says how long jobs take.
         let time = matches!(outcome, Some(Ok(_))).then(|| start.elapsed());

@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 
+use axum::http::StatusCode;
 use serde_json::Value;
 use utoipa::openapi::schema::{AdditionalProperties, AllOfBuilder, SchemaFormat, SchemaType, Type};
 use utoipa::openapi::{
-    ArrayBuilder, ContentBuilder, HeaderBuilder, KnownFormat, Object, ObjectBuilder, Ref, RefOr, Response,
+    ArrayBuilder, ContentBuilder, Header, HeaderBuilder, KnownFormat, Object, ObjectBuilder, Ref, RefOr, Response,
     ResponseBuilder, Schema,
 };
 use utoipa::{PartialSchema, ToSchema};
@@ -90,6 +91,16 @@ fn response(rows: &[&Row]) -> Response {
         response =
             response.header("Retry-After", HeaderBuilder::new().schema(Some(seconds)).description(Some(doc)).build());
     }
+    if rows.iter().any(|row| row.kind == Kind::QuotaExceeded) {
+        let seconds = ObjectBuilder::new().schema_type(Type::Integer).minimum(Some(1));
+        response = response
+            .header("Retry-After", header(seconds, "Seconds until there is some of the quota again."))
+            .header("RateLimit-Policy", header(text(), "What the quota is, as a structured field."))
+            .header("RateLimit", header(text(), "What is left of it, as a structured field."));
+    }
+    if rows.iter().any(|row| row.status == StatusCode::UNAUTHORIZED) {
+        response = response.header("WWW-Authenticate", header(text(), "`Bearer`, and why (RFC 6750)."));
+    }
     if rows.iter().any(|row| row.kind == Kind::RangeNotSatisfiable) {
         let text = ObjectBuilder::new().schema_type(Type::String);
         let doc = "`bytes */LENGTH`: how long the file is.";
@@ -97,6 +108,14 @@ fn response(rows: &[&Row]) -> Response {
             response.header("Content-Range", HeaderBuilder::new().schema(Some(text)).description(Some(doc)).build());
     }
     response.build()
+}
+
+fn text() -> ObjectBuilder {
+    ObjectBuilder::new().schema_type(Type::String)
+}
+
+fn header(schema: ObjectBuilder, doc: &str) -> Header {
+    HeaderBuilder::new().schema(Some(schema)).description(Some(doc)).build()
 }
 
 fn is_archives(row: &Row) -> bool {
@@ -139,6 +158,8 @@ const MEMBERS: &[Member] = &[
     ("encoding", Some(Type::String), "The compression of the file."),
     ("host", Some(Type::String), "The archive that was asked."),
     ("status_name", Some(Type::String), "How the job stands."),
+    ("scope", Some(Type::String), "The scope that the key does not have."),
+    ("expired", Some(Type::String), "When the key or the signed address ended."),
 ];
 
 impl PartialSchema for ProblemDocument {
@@ -179,6 +200,12 @@ impl PartialSchema for ProblemDocument {
         }
         let problem = problem
             .property("nearest", nearest)
+            .property(
+                "violated-policies",
+                ArrayBuilder::new()
+                    .items(Object::with_type(Type::String))
+                    .description(Some("The quotas that are used up: `requests`, `work`, `concurrency`.")),
+            )
             .property("available", strings.description(Some("What there is instead.")))
             .property("checks", ArrayBuilder::new().items(check).description(Some("What `/readyz` looked at.")))
             .property(

@@ -1,0 +1,322 @@
+//! Signed addresses: whoever has one may GET it until it expires, without a key.
+//!
+//! What is signed is the path as it is sent and every parameter of the query as it is sent, in the order of their bytes: no
+//! parameter can be added, taken away or written otherwise. Three parameters carry the signature: [`EXPIRES`] in seconds of
+//! Unix time, [`KEY_ID`], and [`SIGNATURE`], an HMAC-SHA-256 in base64url. The host is not signed: behind proxies the
+//! service does not know its own.
+
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use base64::Engine as _;
+use base64::engine::general_purpose::URL_SAFE_NO_PAD;
+use hmac::{Hmac, KeyInit as _, Mac as _};
+use sha2::Sha256;
+use thiserror::Error;
+
+use super::token;
+
+/// When the address ends, s of Unix time.
+pub const EXPIRES: &str = "expires";
+/// Which key has signed it.
+pub const KEY_ID: &str = "key_id";
+/// The signature.
+pub const SIGNATURE: &str = "signature";
+
+/// What is hashed first, so that a signature of something else never is one of an address.
+const DOMAIN: &str = "molmesh-address-1\n";
+/// Characters of a secret at least: 128 bits, if they are hexadecimal digits. [`new_secret`] makes twice as many.
+const MIN_SECRET: usize = 32;
+
+/// A fresh secret, 256 random bits as text.
+///
+/// # Errors
+/// That of the system, if it has no random numbers.
+pub fn new_secret() -> Result<String, getrandom::Error> {
+    token::random_hex()
+}
+
+/// Why an address cannot be signed.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum SignError {
+    /// It is no path.
+    #[error("it has no path that begins with `/`")]
+    NoPath,
+    /// Browsers would change it before they send it.
+    #[error("`{0}` has to be written as %XX in an address")]
+    Character(char),
+    /// It has one of our own parameters.
+    #[error("it has a parameter `{0}` already")]
+    Signed(&'static str),
+    /// There is no such key.
+    #[error("no key that signs is named `{asked}`; there are: {available}")]
+    UnknownKey {
+        /// The name that was given.
+        asked: String,
+        /// Those that there are.
+        available: String,
+    },
+}
+
+/// What a signature is worth.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Signed {
+    /// There is none.
+    No,
+    /// It holds.
+    Valid,
+    /// It does not. Which part is wrong is not said.
+    Invalid,
+    /// It did until then, s of Unix time.
+    Expired(u64),
+}
+
+/// The keys that sign. The first one signs, all are accepted.
+#[derive(Clone)]
+pub struct SigningKeys(Vec<(String, Hmac<Sha256>)>);
+
+impl std::fmt::Debug for SigningKeys {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_list().entries(self.0.iter().map(|(id, _)| id)).finish()
+    }
+}
+
+impl SigningKeys {
+    /// Reads `ID:SECRET`, one or more with blanks or line breaks between them.
+    ///
+    /// # Errors
+    /// What was expected, without the text.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let mut keys: Vec<(String, Hmac<Sha256>)> = Vec::new();
+        for (n, word) in text.split_whitespace().enumerate() {
+            let nth = n + 1;
+            let expected =
+                || format!("key {nth} is not written ID:SECRET, the id of lower-case letters, digits and `-`");
+            let (id, secret) = word.split_once(':').filter(|(id, _)| token::is_id(id)).ok_or_else(expected)?;
+            if secret.len() < MIN_SECRET {
+                return Err(format!(
+                    "the secret of `{id}` has less than {MIN_SECRET} characters; `molmesh key signing` makes one"
+                ));
+            }
+            if keys.iter().any(|(other, _)| other == id) {
+                return Err(format!("there are two keys `{id}`"));
+            }
+            // HMAC takes keys of any length.
+            let mac = Hmac::new_from_slice(secret.as_bytes()).map_err(|error| error.to_string())?;
+            keys.push((id.to_owned(), mac));
+        }
+        if keys.is_empty() { Err("there is no key; expected ID:SECRET".to_owned()) } else { Ok(Self(keys)) }
+    }
+
+    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time), with the key of this name, else the
+    /// first one. The target comes back with the three parameters behind it.
+    ///
+    /// # Errors
+    /// [`SignError`].
+    pub fn sign(&self, key_id: Option<&str>, target: &str, expires: u64) -> Result<String, SignError> {
+        if !target.starts_with('/') {
+            return Err(SignError::NoPath);
+        }
+        let kept = |c: &char| c.is_ascii_alphanumeric() || "-._~:/?@!$&()*+,;=%".contains(*c);
+        if let Some(other) = target.chars().find(|c| !kept(c)) {
+            return Err(SignError::Character(other));
+        }
+        let (path, query) = target.split_once('?').map_or((target, None), |(path, query)| (path, Some(query)));
+        let mut parameters: Vec<&str> = query.into_iter().flat_map(|query| query.split('&')).collect();
+        let ours = [EXPIRES, KEY_ID, SIGNATURE];
+        if let Some(name) = ours.into_iter().find(|ours| parameters.iter().any(|p| name_of(p) == *ours)) {
+            return Err(SignError::Signed(name));
+        }
+        let (id, mac) = match key_id {
+            None => self.0.first(),
+            Some(asked) => self.0.iter().find(|(id, _)| id == asked),
+        }
+        .ok_or_else(|| SignError::UnknownKey {
+            asked: key_id.unwrap_or_default().to_owned(),
+            available: self.0.iter().map(|(id, _)| id.as_str()).collect::<Vec<_>>().join(", "),
+        })?;
+        let own = format!("{EXPIRES}={expires}&{KEY_ID}={id}");
+        let separator = if query.is_none() { '?' } else { '&' };
+        parameters.extend(own.split('&'));
+        let tag = message(mac, path, parameters).finalize().into_bytes();
+        Ok(format!("{target}{separator}{own}&{SIGNATURE}={}", URL_SAFE_NO_PAD.encode(tag)))
+    }
+
+    /// What the signature of a request's path and query is worth now. Tags are compared in constant time.
+    #[must_use]
+    pub fn check(&self, path: &str, query: Option<&str>, now: SystemTime) -> Signed {
+        let parameters: Vec<&str> = query.into_iter().flat_map(|query| query.split('&')).collect();
+        if !parameters.iter().any(|parameter| name_of(parameter) == SIGNATURE) {
+            return Signed::No;
+        }
+        let [Some(expires), Some(key_id), Some(signature)] =
+            [EXPIRES, KEY_ID, SIGNATURE].map(|name| only(&parameters, name))
+        else {
+            return Signed::Invalid;
+        };
+        let Ok(tag) = URL_SAFE_NO_PAD.decode(signature) else { return Signed::Invalid };
+        let signed = parameters.iter().copied().filter(|parameter| name_of(parameter) != SIGNATURE).collect();
+        // An id that nobody has takes as long as one that somebody has.
+        let found = self.0.iter().find(|(id, _)| id == key_id);
+        let Some((_, mac)) = found.or(self.0.first()) else { return Signed::Invalid };
+        let holds = message(mac, path, signed).verify_slice(&tag).is_ok();
+        if !holds || found.is_none() {
+            return Signed::Invalid;
+        }
+        // Only our own signers write this, so text that is no number is none of ours.
+        let Ok(end) = expires.parse::<u64>() else { return Signed::Invalid };
+        if UNIX_EPOCH.checked_add(Duration::from_secs(end)).is_some_and(|end| end <= now) {
+            return Signed::Expired(end);
+        }
+        Signed::Valid
+    }
+}
+
+/// A query without the three parameters; none if nothing else is in it.
+#[must_use]
+pub fn without(query: &str) -> Option<String> {
+    let ours = [EXPIRES, KEY_ID, SIGNATURE];
+    let rest: Vec<&str> = query.split('&').filter(|p| !ours.contains(&name_of(p))).collect();
+    (!rest.is_empty()).then(|| rest.join("&"))
+}
+
+fn name_of(parameter: &str) -> &str {
+    parameter.split('=').next().unwrap_or_default()
+}
+
+/// The value of a parameter that is there once.
+fn only<'a>(parameters: &[&'a str], name: &str) -> Option<&'a str> {
+    let mut values = parameters.iter().filter(|parameter| name_of(parameter) == name);
+    let (first, more) = (values.next()?, values.next());
+    first.split_once('=').map(|(_, value)| value).filter(|_| more.is_none())
+}
+
+/// The hash of a path and its parameters. Neither can hold a line break, so no two pairs are hashed alike.
+fn message(mac: &Hmac<Sha256>, path: &str, mut parameters: Vec<&str>) -> Hmac<Sha256> {
+    parameters.sort_unstable();
+    let mut mac = mac.clone();
+    for part in [DOMAIN, path, "\n", &parameters.join("&")] {
+        mac.update(part.as_bytes());
+    }
+    mac
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn keys() -> SigningKeys {
+        let secrets = ["new", "old"].map(|id| format!("{id}:{}", id.repeat(11)));
+        SigningKeys::parse(&secrets.join("\n ")).unwrap()
+    }
+
+    fn check(keys: &SigningKeys, target: &str, now: u64) -> Signed {
+        let (path, query) = target.split_once('?').map_or((target, None), |(path, query)| (path, Some(query)));
+        keys.check(path, query, UNIX_EPOCH + Duration::from_secs(now))
+    }
+
+    #[test]
+    fn the_hash_is_hmac_sha_256() {
+        // RFC 4231, test case 2.
+        let mut mac: Hmac<Sha256> = Hmac::new_from_slice(b"Jefe").unwrap();
+        mac.update(b"what do ya want for nothing?");
+        let tag = mac.finalize().into_bytes();
+        assert_eq!(tag[..4], [0x5b, 0xdc, 0xc1, 0x46]);
+        assert_eq!(tag[28..], [0x64, 0xec, 0x38, 0x43]);
+    }
+
+    #[test]
+    fn what_was_signed_holds_until_its_end() {
+        let keys = keys();
+        for (target, rest) in [
+            ("/v1/pdb/4pti/surface.glb", None),
+            ("/v1/pdb/4pti/surface.glb?resolution=1&chains=A,B", Some("resolution=1&chains=A,B")),
+            ("/x?", Some("")),
+            ("/x?a", Some("a")),
+        ] {
+            let signed = keys.sign(None, target, 100).unwrap();
+            assert!(signed.starts_with(target) && signed.contains("expires=100&key_id=new&signature="), "{signed}");
+            assert_eq!(check(&keys, &signed, 99), Signed::Valid, "{signed}");
+            assert_eq!(without(signed.split_once('?').unwrap().1).as_deref(), rest);
+            assert_eq!(check(&keys, &signed, 100), Signed::Expired(100));
+            assert_eq!(check(&keys, target, 99), Signed::No);
+        }
+        // The order of parameters says nothing.
+        let signed = keys.sign(None, "/x?b=1&a=2", 100).unwrap();
+        let (_, query) = signed.split_once('?').unwrap();
+        let turned: Vec<&str> = query.split('&').rev().collect();
+        assert_eq!(check(&keys, &format!("/x?{}", turned.join("&")), 0), Signed::Valid);
+    }
+
+    #[test]
+    fn one_key_takes_over_from_another() {
+        let both = keys();
+        let signed = both.sign(Some("old"), "/x", 100).unwrap();
+        assert_eq!(check(&both, &signed, 0), Signed::Valid);
+        let only_new = SigningKeys::parse(&format!("new:{}", "new".repeat(11))).unwrap();
+        assert_eq!(check(&only_new, &signed, 0), Signed::Invalid);
+        assert_eq!(check(&only_new, &both.sign(None, "/x", 100).unwrap(), 0), Signed::Valid);
+        let renamed = signed.replace("key_id=old", "key_id=new");
+        assert_eq!(check(&both, &renamed, 0), Signed::Invalid);
+        assert!(
+            matches!(both.sign(Some("x"), "/x", 1), Err(SignError::UnknownKey { available, .. }) if available == "new, old")
+        );
+    }
+
+    #[test]
+    fn nothing_can_be_added_taken_away_or_said_twice() {
+        let keys = keys();
+        let signed = keys.sign(None, "/x?a=1&b=2", 100).unwrap();
+        for other in [
+            format!("{signed}&c=3"),
+            format!("{signed}&"),
+            format!("{signed}&signature=x"),
+            format!("{signed}&expires=200"),
+            signed.replace("b=2&", ""),
+            signed.replace("a=1&b=2", "a=1&b=2&b=2"),
+            signed.replace("expires=100", "expires=200"),
+            signed.replace("expires=100&", ""),
+            signed.replace("key_id=new&", ""),
+            signed.replace("/x", "/y"),
+            signed.replace("a=1", "%61=1"),
+            format!("{}signature", signed.split("signature=").next().unwrap()),
+        ] {
+            assert_eq!(check(&keys, &other, 0), Signed::Invalid, "{other}");
+        }
+        // An early end is told to whom has the whole address alone.
+        assert_eq!(check(&keys, &signed.replace("a=1", "a=2"), 200), Signed::Invalid);
+    }
+
+    proptest! {
+        #[test]
+        fn every_character_counts(at in 0_usize..200, to in "[!-~]") {
+            let keys = keys();
+            let signed = keys.sign(None, "/v1/pdb/4pti/surface.glb?resolution=1&chains=A,B", 100).unwrap();
+            let at = at % signed.len();
+            let other = format!("{}{to}{}", &signed[..at], &signed[at + 1..]);
+            prop_assume!(other != signed);
+            let worth = check(&keys, &other, 0);
+            // A broken name of the signature's parameter leaves an address without one.
+            prop_assert!(matches!(worth, Signed::Invalid | Signed::No), "{other}: {worth:?}");
+        }
+    }
+
+    #[test]
+    fn secrets_are_long_and_named_and_not_shown() {
+        for (bad, why) in [
+            ("", "no key"),
+            ("justasecretjustasecretjustasecret", "key 1"),
+            ("A:justasecretjustasecretjustasecret", "key 1"),
+            ("a:short", "less than 32"),
+            ("a:justasecretjustasecretjustasecret a:justasecretjustasecretjustasecret", "two keys `a`"),
+        ] {
+            let said = SigningKeys::parse(bad).unwrap_err();
+            assert!(said.contains(why) && !said.contains("justasecret") && !said.contains("short"), "{said}");
+        }
+        assert_eq!(format!("{:?}", keys()), "[\"new\", \"old\"]");
+        assert_eq!(new_secret().unwrap().len(), 64);
+        for bad in ["x", "", "http://h/x", "/a b", "/x#y", "/x?é", "/x?a=1&signature=2"] {
+            assert!(keys().sign(None, bad, 1).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! `molmesh key`: makes keys and prints what goes where. Nothing is kept: whoever loses a key gets another one.
+
+use std::io::{self, Write as _};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use molmesh::access::{self, Key, Quota, Scope};
+
+use super::args::{KeyCommand, NewKeyArgs, SigningKeyArgs};
+use super::error::CliError;
+
+/// Runs the command.
+pub(super) fn run(command: &KeyCommand) -> Result<(), CliError> {
+    match command {
+        KeyCommand::New(args) => new(args),
+        KeyCommand::Signing(args) => signing(args),
+    }
+}
+
+/// The key goes to stderr for whoever is to have it, its lines to stdout, so that `>> keys.toml` keeps the one apart from
+/// the other.
+fn new(args: &NewKeyArgs) -> Result<(), CliError> {
+    let id = id(&args.id)?;
+    let scope = |name: &str| {
+        let known = Scope::ALL.map(Scope::name).join(" and ");
+        let message = format!("parameter `scopes`: `{name}` is not allowed; there are {known}");
+        Scope::named(name.trim()).ok_or_else(|| CliError::usage(message))
+    };
+    let mut scopes = args.scopes.split(',').map(scope).collect::<Result<Vec<_>, _>>()?;
+    scopes.sort_unstable();
+    scopes.dedup();
+    let quota = Quota {
+        requests: args.requests,
+        work_s: args.work.as_deref().map(|text| seconds("work", text)).transpose()?,
+        concurrent: args.concurrent,
+        window_s: seconds("window", &args.window)?,
+    };
+    let minted = access::mint(id).map_err(|error| CliError::Internal(error.to_string()))?;
+    let expires = args.expires.as_deref().map(end).transpose()?;
+    let key =
+        Key { id: id.to_owned(), hash: minted.hash, scopes, quota: Arc::new(quota), expires, note: args.note.clone() };
+    super::say(&access::entry(&key))?;
+    let text = format!("\nThe key, which is not shown again:\n{}\n", minted.text);
+    io::stderr().write_all(text.as_bytes()).map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
+}
+
+fn signing(args: &SigningKeyArgs) -> Result<(), CliError> {
+    let id = id(&args.id)?;
+    let secret = access::new_secret().map_err(|error| CliError::Internal(error.to_string()))?;
+    super::say(&format!("{id}:{secret}\n"))
+}
+
+fn id(id: &str) -> Result<&str, CliError> {
+    let message =
+        || format!("parameter `id`: `{id}` is not allowed; expected 1 to 32 lower-case letters, digits and hyphens");
+    Some(id).filter(|id| access::is_id(id)).ok_or_else(|| CliError::usage(message()))
+}
+
+/// A time such as `1h`, whole seconds of it, at least one.
+pub(super) fn seconds(parameter: &str, text: &str) -> Result<u64, CliError> {
+    let seconds = humantime::parse_duration(text).map(|time| time.as_secs()).ok().filter(|seconds| *seconds >= 1);
+    let message =
+        || format!("parameter `{parameter}`: `{text}` is not allowed; expected a time such as 90s, 1h or 30d");
+    seconds.ok_or_else(|| CliError::usage(message()))
+}
+
+/// When something ends: a time from now, or a date.
+pub(super) fn end(text: &str) -> Result<SystemTime, CliError> {
+    let message = || {
+        let expected = "expected a time from now such as 1h or 90d, or a date such as 2030-01-31T00:00:00Z";
+        CliError::usage(format!("parameter `expires`: `{text}` is not allowed; {expected}"))
+    };
+    if let Ok(date) = humantime::parse_rfc3339(text) {
+        return Ok(date);
+    }
+    let from_now = seconds("expires", text).map_err(|_other| message())?;
+    SystemTime::now().checked_add(Duration::from_secs(from_now)).filter(is_a_date).ok_or_else(message)
+}
+
+/// Whether a time can be written: years have four digits.
+fn is_a_date(time: &SystemTime) -> bool {
+    const YEAR_10000_S: u64 = 253_402_300_800;
+    time.duration_since(SystemTime::UNIX_EPOCH).is_ok_and(|since| since.as_secs() < YEAR_10000_S)
+}

@@ -1,0 +1,57 @@
+//! `molmesh sign`: an address that opens by itself until it expires, signed with the service's own key.
+
+use std::time::SystemTime;
+
+use molmesh::access::SigningKeys;
+use molmesh::config::Config;
+
+use super::args::SignArgs;
+use super::error::CliError;
+use super::key;
+
+/// Runs the command: prints the signed address.
+pub(super) fn run(args: &SignArgs) -> Result<(), CliError> {
+    let keys = keys(&super::config::of(args.config.as_deref(), &args.set, [])?.config)?;
+    let (origin, target) = split(&args.url)?;
+    let end = key::end(&args.expires)?;
+    let expires = end.duration_since(SystemTime::UNIX_EPOCH).map(|since| since.as_secs()).unwrap_or_default();
+    let signed = keys.sign(args.key_id.as_deref(), target, expires);
+    let signed = signed.map_err(|why| CliError::usage(format!("cannot sign `{}`: {why}", args.url)))?;
+    super::say(&format!("{origin}{signed}\n"))
+}
+
+fn keys(config: &Config) -> Result<SigningKeys, CliError> {
+    let secret = config.access.signing_secret.as_ref().ok_or_else(|| CliError::Usage {
+        message: "there is no key that signs: access.signing_secret is not set".to_owned(),
+        hint: Some("molmesh key signing makes one; give it by --config or MOLMESH__ACCESS__SIGNING_SECRET".to_owned()),
+    })?;
+    SigningKeys::parse(secret.reveal()).map_err(|why| CliError::usage(format!("access.signing_secret: {why}")))
+}
+
+/// An address as its origin, which is not signed, and the rest; of a path the origin is empty.
+fn split(url: &str) -> Result<(&str, &str), CliError> {
+    let Some((scheme, rest)) = url.split_once("://").filter(|(scheme, _)| !scheme.contains('/')) else {
+        return Ok(("", url));
+    };
+    let path = rest.find('/').filter(|_| ["http", "https"].contains(&scheme));
+    let message = || format!("parameter `url`: `{url}` is not allowed; expected http(s)://host/path, or a path");
+    let at = path.ok_or_else(|| CliError::usage(message()))?;
+    Ok(url.split_at(scheme.len() + "://".len() + at))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_address_is_split_before_its_path() {
+        for (url, parts) in [
+            ("https://h:8080/v1/x?a=b", Some(("https://h:8080", "/v1/x?a=b"))),
+            ("/v1/x?next=http://h/", Some(("", "/v1/x?next=http://h/"))),
+            ("https://h", None),
+            ("ftp://h/x", None),
+        ] {
+            assert_eq!(split(url).ok(), parts, "{url}");
+        }
+    }
+}

@@ -1,0 +1,101 @@
+//! Which peers are proxies whose word about their clients is taken.
+
+use std::fmt;
+use std::net::IpAddr;
+use std::str::FromStr;
+
+use ipnet::IpNet;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+/// Addresses and networks of proxies; at least one. Text with blanks between them, or a list of texts.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Proxies(Vec<IpNet>);
+
+impl Proxies {
+    /// Whether `address` is one of theirs. IPv4 written as IPv6 counts as IPv4.
+    #[must_use]
+    pub fn contains(&self, address: IpAddr) -> bool {
+        let address = address.to_canonical();
+        self.0.iter().any(|net| net.contains(&address))
+    }
+}
+
+impl FromStr for Proxies {
+    type Err = String;
+
+    /// The error says what was expected.
+    fn from_str(text: &str) -> Result<Self, String> {
+        const EXPECTED: &str = "none, or addresses and networks such as 10.0.0.7 or 10.0.0.0/8";
+        let net = |word: &str| {
+            let net = word.parse::<IpNet>().ok().or_else(|| word.parse::<IpAddr>().ok().map(IpNet::from));
+            net.ok_or_else(|| format!("{EXPECTED}, which `{word}` is not"))
+        };
+        let nets = text.split_whitespace().map(net).collect::<Result<Vec<_>, _>>()?;
+        if nets.is_empty() { Err(EXPECTED.to_owned()) } else { Ok(Self(nets)) }
+    }
+}
+
+impl fmt::Display for Proxies {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let texts: Vec<String> = self.0.iter().map(ToString::to_string).collect();
+        f.write_str(&texts.join(" "))
+    }
+}
+
+impl Serialize for Proxies {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for Proxies {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        super::words(deserializer)?.parse().map_err(serde::de::Error::custom)
+    }
+}
+
+/// The header in which the proxies name their clients.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ForwardedHeader {
+    /// `X-Forwarded-For`, which most proxies write.
+    #[default]
+    XForwardedFor,
+    /// `Forwarded` (RFC 7239).
+    Forwarded,
+}
+
+impl ForwardedHeader {
+    /// Its name.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::XForwardedFor => "x-forwarded-for",
+            Self::Forwarded => "forwarded",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_and_networks_are_told_from_others() {
+        let proxies: Proxies = "10.0.0.0/8 192.0.2.7 2001:db8::/32".parse().unwrap();
+        for (address, trusted) in [
+            ("10.1.2.3", true),
+            ("::ffff:10.1.2.3", true),
+            ("11.0.0.1", false),
+            ("192.0.2.7", true),
+            ("192.0.2.8", false),
+            ("2001:db8::1", true),
+            ("2001:db9::1", false),
+        ] {
+            assert_eq!(proxies.contains(address.parse().unwrap()), trusted, "{address}");
+        }
+        for bad in ["", "proxy", "10.0.0.0/33", "10.0.0.0/8,11.0.0.0/8"] {
+            assert!(bad.parse::<Proxies>().is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,348 @@
+//! Who asks, whether he may, and whether it is too much: keys, signed addresses and quotas in front of the handlers.
+//!
+//! What is counted is a request that may be made, on an operation that needs a scope: those without a right are refused
+//! before, those beyond a quota do not count either. Work is charged when it is done, to whoever asked for it first.
+
+use std::net::IpAddr;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant, SystemTime};
+
+use axum::body::Body;
+use axum::extract::{Request, State};
+use axum::http::header::{self, AUTHORIZATION, HeaderMap, HeaderName, WWW_AUTHENTICATE};
+use axum::http::uri::{PathAndQuery, Uri};
+use axum::http::{Extensions, HeaderValue, Method};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use hyper::body::{Body as HttpBody, Frame, SizeHint};
+use tracing::Span;
+
+use super::kinds::Kind;
+use super::problem::Problem;
+use super::scopes;
+use super::state::{App, Shared};
+use crate::access::{Access, Account, Denied, Exceeded, Key, Quota, Running, Scope, Signed, limits, policies, without};
+use crate::jobs::{Client, Meter, rfc3339};
+
+/// Where a key may stand instead of `Authorization`.
+pub(super) const API_KEY: HeaderName = HeaderName::from_static("x-api-key");
+/// What there is, and what of it is left.
+pub(super) const RATE_LIMIT_POLICY: HeaderName = HeaderName::from_static("ratelimit-policy");
+pub(super) const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
+
+/// Where a request comes from.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Peer(pub(super) IpAddr);
+
+/// Whom a request belongs to.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Caller {
+    /// Whom its jobs belong to: a key, else an address.
+    pub(super) client: Client,
+    /// What it is counted on; none: nothing is limited.
+    account: Option<Account>,
+}
+
+impl Caller {
+    /// The caller that the guard has found.
+    pub(super) fn of(extensions: &Extensions) -> Self {
+        extensions.get::<Self>().cloned().unwrap_or_default()
+    }
+
+    fn new(name: &str, is_key: bool, quota: Option<&Arc<Quota>>) -> Self {
+        let client = Client::named(name);
+        let quota = quota.filter(|quota| !quota.is_unlimited()).cloned();
+        Self { client, account: quota.map(|quota| Account { client: client.number(), is_key, quota }) }
+    }
+
+    fn key(key: &Key) -> Self {
+        Self::new(&format!("key {}", key.id), true, Some(&key.quota))
+    }
+
+    fn address(access: &Access, request: &Request) -> Self {
+        let Some(Peer(peer)) = request.extensions().get::<Peer>() else { return Self::default() };
+        let values = request.headers().get_all(access.forwarded_header()).iter().filter_map(|v| v.to_str().ok());
+        Self::new(&place(access.client(*peer, values)), false, access.address_quota())
+    }
+}
+
+/// An address as a client: of IPv6 the network, as everybody has 2⁶⁴ addresses in his.
+fn place(address: IpAddr) -> String {
+    match address {
+        IpAddr::V4(address) => address.to_string(),
+        IpAddr::V6(address) => {
+            let [a, b, c, d, ..] = address.segments();
+            format!("{a:x}:{b:x}:{c:x}:{d:x}::/64")
+        }
+    }
+}
+
+/// Lets a request through to its handler, or not.
+pub(super) async fn check(State(app): State<Shared>, mut request: Request, next: Next) -> Response {
+    let key = presented(request.headers());
+    // From here on nobody sees a key.
+    request.headers_mut().remove(AUTHORIZATION);
+    request.headers_mut().remove(API_KEY);
+    let Some(scope) = scopes::needed(&request) else { return next.run(request).await };
+    let caller = match enter(&app.access, scope, key, &mut request) {
+        Ok(caller) => caller,
+        Err(problem) => return problem.into_response(),
+    };
+    let account = caller.account.clone();
+    let running = account.as_ref().map(|account| app.access.meter().admit(account, Instant::now())).transpose();
+    request.extensions_mut().insert(caller);
+    let mut response = match running {
+        Ok(None) => next.run(request).await,
+        Ok(Some(running)) => next.run(request).await.map(|body| Body::new(Held { body, _running: running })),
+        Err(exceeded) => refusal(&exceeded).into_response(),
+    };
+    if let Some(account) = &account {
+        tell(&app.access, account, &mut response);
+    }
+    if app.access.is_closed() {
+        keep_private(response.headers_mut());
+    }
+    response
+}
+
+/// What a request presents as a key.
+enum Presented {
+    Nothing,
+    Text(String),
+    /// More than one, or no text.
+    Nonsense,
+}
+
+fn presented(headers: &HeaderMap) -> Presented {
+    const SCHEME: &str = "bearer ";
+    let bearer = headers.get_all(AUTHORIZATION).iter().filter_map(|value| {
+        let value = value.as_bytes();
+        // Other schemes are for somebody else, such as a proxy.
+        let ours = value.len() > SCHEME.len() && value[..SCHEME.len()].eq_ignore_ascii_case(SCHEME.as_bytes());
+        ours.then(|| value[SCHEME.len()..].trim_ascii())
+    });
+    let plain = headers.get_all(API_KEY).iter().map(HeaderValue::as_bytes);
+    let mut texts = bearer.chain(plain);
+    let Some(first) = texts.next() else { return Presented::Nothing };
+    match str::from_utf8(first) {
+        Ok(text) if texts.all(|other| other == first) => Presented::Text(text.to_owned()),
+        _ => Presented::Nonsense,
+    }
+}
+
+/// Finds out whose request it is, and whether he may make it. Takes a signature out of the address.
+fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -> Result<Caller, Problem> {
+    if !access.is_closed() {
+        return Ok(Caller::address(access, request));
+    }
+    let now = SystemTime::now();
+    let may_be_signed = [Method::GET, Method::HEAD].contains(request.method());
+    let uri = request.uri();
+    let worth = if may_be_signed { access.signed(uri.path(), uri.query(), now) } else { Signed::No };
+    if worth != Signed::No {
+        *request.uri_mut() = unsigned(request.uri())?;
+    }
+    let found = match key {
+        Presented::Text(text) => access.verify(&text, now),
+        Presented::Nonsense => Err(Denied::Unknown),
+        Presented::Nothing => return by_signature(&worth).map(|()| Caller::address(access, request)),
+    };
+    let key = found.map_err(no_key)?;
+    Span::current().record("key", key.id.as_str());
+    if !key.allows(scope) {
+        let detail = format!("this needs the scope `{}`, which the key `{}` does not have", scope.name(), key.id);
+        let challenge = format!("Bearer realm=\"molmesh\", error=\"insufficient_scope\", scope=\"{}\"", scope.name());
+        return Err(Problem::new(Kind::ScopeMissing, detail)
+            .with("scope", scope.name())
+            .header(WWW_AUTHENTICATE, &challenge));
+    }
+    Ok(Caller::key(&key))
+}
+
+/// The address without its signature.
+fn unsigned(uri: &Uri) -> Result<Uri, Problem> {
+    let rest = uri.query().and_then(without);
+    let target = rest.map_or_else(|| uri.path().to_owned(), |rest| format!("{}?{rest}", uri.path()));
+    let mut parts = uri.clone().into_parts();
+    parts.path_and_query = Some(PathAndQuery::try_from(target).map_err(Problem::internal)?);
+    Uri::from_parts(parts).map_err(Problem::internal)
+}
+
+fn by_signature(worth: &Signed) -> Result<(), Problem> {
+    match worth {
+        Signed::Valid => Ok(()),
+        Signed::No => Err(Problem::new(
+            Kind::KeyRequired,
+            "this needs a key, in `Authorization: Bearer …` or `X-Api-Key`; a GET may have a signed address instead",
+        )
+        .header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\"")),
+        Signed::Invalid => {
+            let detail =
+                "the signature is not one of this address; it must be used as it was given, with nothing changed";
+            Err(Problem::new(Kind::SignatureInvalid, detail))
+        }
+        Signed::Expired(end) => {
+            let end = rfc3339(end.saturating_mul(1000));
+            let detail = format!("the address was signed until {end}");
+            Err(Problem::new(Kind::SignatureExpired, detail).with("expired", end))
+        }
+    }
+}
+
+fn no_key(denied: Denied) -> Problem {
+    let problem = match denied {
+        Denied::Unknown => Problem::new(Kind::KeyInvalid, "the key is not known here"),
+        Denied::Expired(end) => {
+            let end = humantime::format_rfc3339_seconds(end).to_string();
+            Problem::new(Kind::KeyExpired, format!("the key was good until {end}")).with("expired", end)
+        }
+    };
+    problem.header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\", error=\"invalid_token\"")
+}
+
+/// The refusal of a request beyond a quota.
+fn refusal(exceeded: &Exceeded) -> Problem {
+    let Exceeded { policy, limit, wait } = *exceeded;
+    let what = match policy {
+        "work" => format!("the jobs of this client took {limit} s of this window or more, which is its quota"),
+        "concurrency" => format!("{limit} requests of this client are under way, which is its quota"),
+        _ => format!("this client has made {limit} requests in this window, which is its quota"),
+    };
+    Problem::new(Kind::QuotaExceeded, what)
+        .with("violated-policies", vec![policy])
+        .with("limit", limit)
+        .retry_after_window(wait)
+}
+
+impl App {
+    /// Whether a job may be begun for `caller`.
+    pub(super) fn admit_work(&self, caller: &Caller) -> Result<(), Problem> {
+        let Some(account) = &caller.account else { return Ok(()) };
+        self.access.meter().admit_work(account, Instant::now()).map_err(|exceeded| refusal(&exceeded))
+    }
+
+    /// `time` was spent on work for `caller` that is no job.
+    pub(super) fn charge(&self, caller: &Caller, time: Duration) {
+        self.access.meter().spent(caller.client.number(), time, Instant::now());
+    }
+}
+
+/// Charges jobs to the clients that they are for.
+#[derive(Debug)]
+pub(super) struct Bill(pub(super) Arc<Access>);
+
+impl Meter for Bill {
+    fn spent(&self, client: Client, time: Duration) {
+        self.0.meter().spent(client.number(), time, Instant::now());
+    }
+}
+
+/// Tells a client how it stands.
+fn tell(access: &Access, account: &Account, response: &mut Response) {
+    // A client that has nothing left would not follow a redirect at once.
+    let redirects = response.headers().contains_key(header::LOCATION) && response.status().is_redirection();
+    let standing = access.meter().standing(account, Instant::now());
+    let fields = [
+        (RATE_LIMIT_POLICY, policies(&account.quota)),
+        (RATE_LIMIT, limits(&account.quota, &standing).filter(|_| !redirects)),
+    ];
+    for (name, value) in fields {
+        if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
+            response.headers_mut().insert(name, value);
+        }
+    }
+}
+
+/// What a key or a signature has opened is not for caches that others share.
+fn keep_private(headers: &mut HeaderMap) {
+    let Some(value) = headers.get(header::CACHE_CONTROL).and_then(|value| value.to_str().ok()) else { return };
+    let private = value.strip_prefix("public").map(|rest| HeaderValue::try_from(format!("private{rest}")));
+    if let Some(Ok(value)) = private {
+        headers.insert(header::CACHE_CONTROL, value);
+    }
+}
+
+/// A body that counts as a request under way until it is gone.
+struct Held {
+    body: Body,
+    _running: Running,
+}
+
+impl HttpBody for Held {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        Pin::new(&mut self.body).poll_frame(cx)
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_key_may_stand_in_two_places_but_there_is_one() {
+        let text = |pairs: &[(&'static str, &'static str)]| {
+            let mut headers = HeaderMap::new();
+            for (name, value) in pairs {
+                headers.append(HeaderName::from_static(name), HeaderValue::from_static(value));
+            }
+            match presented(&headers) {
+                Presented::Nothing => None,
+                Presented::Text(text) => Some(text),
+                Presented::Nonsense => Some("nonsense".to_owned()),
+            }
+        };
+        let (auth, key) = ("authorization", "x-api-key");
+        for (pairs, expected) in [
+            (&[][..], None),
+            (&[(auth, "Bearer abc")], Some("abc")),
+            (&[(auth, "bearer   abc ")], Some("abc")),
+            (&[(auth, "Basic abc")], None),
+            (&[(auth, "Bearer")], None),
+            (&[(key, "abc")], Some("abc")),
+            (&[(auth, "Basic abc"), (key, "abc")], Some("abc")),
+            (&[(auth, "Bearer abc"), (key, "abc")], Some("abc")),
+            (&[(auth, "Bearer abc"), (key, "abd")], Some("nonsense")),
+            (&[(key, "abc"), (key, "abd")], Some("nonsense")),
+        ] {
+            assert_eq!(text(pairs).as_deref(), expected, "{pairs:?}");
+        }
+        let no_text = HeaderMap::from_iter([(API_KEY, HeaderValue::from_bytes(b"\xff").unwrap())]);
+        assert!(matches!(presented(&no_text), Presented::Nonsense));
+    }
+
+    #[test]
+    fn addresses_are_clients_by_network() {
+        for (address, name) in
+            [("192.0.2.1", "192.0.2.1"), ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"), ("::1", "0:0:0:0::/64")]
+        {
+            assert_eq!(place(address.parse().unwrap()), name);
+        }
+    }
+
+    #[test]
+    fn what_was_public_is_private() {
+        for (value, private) in [
+            ("public, max-age=5, immutable", "private, max-age=5, immutable"),
+            ("no-store", "no-store"),
+            ("public, no-cache", "private, no-cache"),
+        ] {
+            let mut headers = HeaderMap::from_iter([(header::CACHE_CONTROL, HeaderValue::from_static(value))]);
+            keep_private(&mut headers);
+            assert_eq!(headers[header::CACHE_CONTROL], private);
+        }
+    }
+}

@@ -1,0 +1,78 @@
+//! Rights in the description: how a key is presented, which operations take one, and what they are refused with.
+
+use utoipa::Modify;
+use utoipa::openapi::path::Operation;
+use utoipa::openapi::security::{
+    ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder, SecurityRequirement, SecurityScheme,
+};
+use utoipa::openapi::{ComponentsBuilder, OpenApi};
+
+use super::problems::responses;
+use crate::access::{SIGNATURE, Scope};
+use crate::http::kinds::Kind;
+use crate::http::scopes::TABLE;
+
+/// Names of the schemes.
+const BEARER: &str = "bearer";
+const API_KEY: &str = "apiKey";
+const SIGNED: &str = "signedAddress";
+
+/// What an operation that takes a key may be refused with.
+const REFUSALS: &[Kind] =
+    &[Kind::KeyRequired, Kind::KeyInvalid, Kind::KeyExpired, Kind::ScopeMissing, Kind::QuotaExceeded];
+/// What a signed address adds.
+const OF_ADDRESSES: &[Kind] = &[Kind::SignatureInvalid, Kind::SignatureExpired];
+
+/// Writes rights into the description, from the table that requests are checked with.
+pub(super) struct Rights;
+
+impl Modify for Rights {
+    fn modify(&self, api: &mut OpenApi) {
+        let components = api.components.get_or_insert_with(|| ComponentsBuilder::new().build());
+        let bearer = HttpBuilder::new()
+            .scheme(HttpAuthScheme::Bearer)
+            .bearer_format("mm_ID_SECRET")
+            .description(Some("A key, where the operator asks for one."))
+            .build();
+        components.add_security_scheme(BEARER, SecurityScheme::Http(bearer));
+        let header =
+            ApiKeyValue::with_description("X-Api-Key", "The same key, for clients whose `Authorization` is taken.");
+        components.add_security_scheme(API_KEY, SecurityScheme::ApiKey(ApiKey::Header(header)));
+        let query = ApiKeyValue::with_description(
+            SIGNATURE,
+            "An address that `molmesh sign` has signed, with `expires` and `key_id`: it opens by itself, until it expires.",
+        );
+        components.add_security_scheme(SIGNED, SecurityScheme::ApiKey(ApiKey::Query(query)));
+        for row in TABLE {
+            let Some(scope) = row.scope else { continue };
+            let item = api.paths.paths.get_mut(row.path);
+            let operation = item.and_then(|item| match row.method.as_str() {
+                "GET" => item.get.as_mut(),
+                "POST" => item.post.as_mut(),
+                "DELETE" => item.delete.as_mut(),
+                _ => None,
+            });
+            if let Some(operation) = operation {
+                restrict(operation, scope, row.method == axum::http::Method::GET);
+            }
+        }
+    }
+}
+
+fn restrict(operation: &mut Operation, scope: Scope, is_get: bool) {
+    let scopes = || [scope.name()];
+    let nothing: [&str; 0] = [];
+    // Nothing at all is enough where the operator asks for nothing.
+    let mut security = vec![
+        SecurityRequirement::default(),
+        SecurityRequirement::new(BEARER, scopes()),
+        SecurityRequirement::new(API_KEY, scopes()),
+    ];
+    let mut groups = vec![REFUSALS];
+    if is_get {
+        security.push(SecurityRequirement::new(SIGNED, nothing));
+        groups.push(OF_ADDRESSES);
+    }
+    operation.security = Some(security);
+    operation.responses.responses.extend(responses(&groups));
+}

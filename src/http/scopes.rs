@@ -1,0 +1,116 @@
+//! What each operation needs: the one table of who may do what. The description of the interface is made from it, and a test
+//! compares it with the table of contents.
+
+use axum::extract::{MatchedPath, Request};
+use axum::http::Method;
+
+use crate::access::Scope;
+
+/// An operation, and the scope that it needs; none: it is open to everybody.
+pub(super) struct Row {
+    pub(super) method: Method,
+    pub(super) path: &'static str,
+    pub(super) scope: Option<Scope>,
+}
+
+const fn row(method: Method, path: &'static str, scope: Option<Scope>) -> Row {
+    Row { method, path, scope }
+}
+
+const MESH: Option<Scope> = Some(Scope::Mesh);
+const READ: Option<Scope> = Some(Scope::Read);
+const OPEN: Option<Scope> = None;
+
+/// Every operation of the router.
+#[rustfmt::skip]
+pub(super) const TABLE: &[Row] = &[
+    row(Method::POST, "/v1/meshes", MESH),
+    row(Method::GET, "/v1/pdb/{id}/{file}", MESH),
+    row(Method::POST, "/v1/structures", MESH),
+    row(Method::GET, "/v1/structures/{digest}", READ),
+    row(Method::GET, "/v1/structures/{digest}/{file}", MESH),
+    row(Method::POST, "/v1/estimate", MESH),
+    row(Method::GET, "/v1/jobs/{id}", READ),
+    row(Method::DELETE, "/v1/jobs/{id}", MESH),
+    row(Method::GET, "/v1/jobs/{id}/events", READ),
+    row(Method::GET, "/v1/jobs/{id}/result", READ),
+    row(Method::GET, "/v1/results/{file}", READ),
+    row(Method::GET, "/v1/results/{key}/report.json", READ),
+    row(Method::GET, "/v1/capabilities", READ),
+    // Explanations, orchestrators, people.
+    row(Method::GET, "/problems", OPEN),
+    row(Method::GET, "/problems/{slug}", OPEN),
+    row(Method::GET, "/livez", OPEN),
+    row(Method::GET, "/readyz", OPEN),
+    row(Method::GET, "/version", OPEN),
+    row(Method::GET, "/openapi.yaml", OPEN),
+    row(Method::GET, "/openapi.json", OPEN),
+    row(Method::GET, "/docs", OPEN),
+    row(Method::GET, "/docs.js", OPEN),
+    row(Method::GET, "/swagger-ui.css", OPEN),
+    row(Method::GET, "/swagger-ui-bundle.js", OPEN),
+    row(Method::GET, "/", OPEN),
+    row(Method::GET, "/app.css", OPEN),
+    row(Method::GET, "/app.js", OPEN),
+    row(Method::GET, "/viewer.js", OPEN),
+    row(Method::GET, "/icon.svg", OPEN),
+    row(Method::GET, "/sample.pdb", OPEN),
+];
+
+/// The scope that a request needs; none: it is open.
+pub(super) fn needed(request: &Request) -> Option<Scope> {
+    let path = request.extensions().get::<MatchedPath>().map(MatchedPath::as_str);
+    // Where there is nothing, there is nothing to be kept from anybody.
+    path.and_then(|path| of(request.method(), path))
+}
+
+/// What is not in the table needs more than most have: a route without a row is closed, not open.
+fn of(method: &Method, path: &str) -> Option<Scope> {
+    let method = if *method == Method::HEAD { &Method::GET } else { method };
+    let mut rows = TABLE.iter().filter(|row| row.path == path);
+    let same = rows.clone().find(|row| row.method == *method);
+    match same.or_else(|| rows.next()) {
+        Some(row) => row.scope,
+        None => MESH,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    /// The operations of the table of contents.
+    fn routes() -> BTreeSet<String> {
+        let lines = include_str!("router.rs").lines().filter_map(|line| line.trim().strip_prefix(".route(\""));
+        let operations = lines.flat_map(|line| {
+            let (path, handlers) = line.split_once("\", ").unwrap_or_default();
+            let methods = ["get", "post", "put", "patch", "delete"].into_iter();
+            let is = |method: &&str| {
+                handlers.starts_with(&format!("{method}(")) || handlers.contains(&format!(".{method}("))
+            };
+            methods.filter(is).map(|method| format!("{} {path}", method.to_uppercase())).collect::<Vec<_>>()
+        });
+        operations.collect()
+    }
+
+    #[test]
+    fn every_route_has_a_row_and_every_row_a_route() {
+        let rows: BTreeSet<String> = TABLE.iter().map(|row| format!("{} {}", row.method, row.path)).collect();
+        assert_eq!(rows.len(), TABLE.len());
+        assert_eq!(routes(), rows);
+        assert!(rows.contains("DELETE /v1/jobs/{id}"));
+    }
+
+    #[test]
+    fn heads_are_gets_and_what_is_unknown_is_closed() {
+        assert_eq!(of(&Method::HEAD, "/v1/jobs/{id}"), READ);
+        assert_eq!(of(&Method::DELETE, "/v1/jobs/{id}"), MESH);
+        assert_eq!(of(&Method::TRACE, "/v1/meshes"), MESH);
+        assert_eq!(of(&Method::GET, "/v2/secrets"), MESH);
+        assert_eq!(of(&Method::GET, "/"), OPEN);
+        // Everything under /v1 is closed.
+        assert!(TABLE.iter().all(|row| row.path.starts_with("/v1/") == row.scope.is_some()));
+    }
+}

@@ -1,0 +1,524 @@
+//! Keys, quotas and signed addresses, through the real server: off by default, complete when on.
+#![cfg(feature = "server")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+mod access_support;
+mod http_support;
+
+use std::io::{Read as _, Write as _};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use access_support::{Keys, eventually};
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, connect, sample, send, start};
+use molmesh::access::SigningKeys;
+use molmesh::config::{Config, Secret};
+
+const ZERO: &str = "0000000000000000000000000000000000000000000000000000000000000000";
+const ENTRY: &str = "/v1/pdb/4pti/surface.glb";
+
+/// A server with one entry in its archive.
+fn server(mode: Mode, change: impl FnOnce(&mut Config)) -> Running {
+    on(Fake::new(mode), change)
+}
+
+fn on(backend: Arc<Fake>, change: impl FnOnce(&mut Config)) -> Running {
+    let server = start(backend, change);
+    let folder = server.dir.path().join("archive");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("4pti.pdb"), SAMPLE).unwrap();
+    server
+}
+
+fn get(server: &Running, path: &str, headers: &[(&str, &str)]) -> Reply {
+    send(server.addr, "GET", path, headers, b"")
+}
+
+/// A GET with a key.
+fn with(server: &Running, key: &str, path: &str) -> Reply {
+    get(server, path, &[("x-api-key", key)])
+}
+
+/// Only uploads have a body.
+fn body_of(method: &str) -> &'static [u8] {
+    if method == "POST" { SAMPLE } else { b"" }
+}
+
+/// Every operation that takes a key, with its scope.
+fn operations() -> Vec<(&'static str, String, &'static str)> {
+    vec![
+        ("POST", "/v1/meshes".into(), "mesh"),
+        ("GET", ENTRY.into(), "mesh"),
+        ("HEAD", ENTRY.into(), "mesh"),
+        ("POST", "/v1/structures".into(), "mesh"),
+        ("GET", format!("/v1/structures/{ZERO}"), "read"),
+        ("GET", format!("/v1/structures/{ZERO}/surface.glb"), "mesh"),
+        ("POST", "/v1/estimate".into(), "mesh"),
+        ("GET", "/v1/jobs/x".into(), "read"),
+        ("DELETE", "/v1/jobs/x".into(), "mesh"),
+        ("GET", "/v1/jobs/x/events".into(), "read"),
+        ("GET", "/v1/jobs/x/result".into(), "read"),
+        ("GET", format!("/v1/results/{ZERO}.glb"), "read"),
+        ("GET", format!("/v1/results/{ZERO}/report.json"), "read"),
+        ("GET", "/v1/capabilities".into(), "read"),
+    ]
+}
+
+#[test]
+fn by_default_nothing_is_asked_for_and_nothing_is_counted() {
+    let server = server(Mode::Octahedra, |_| {});
+    for (method, path, _) in operations() {
+        for headers in [&[][..], &[("authorization", "Bearer mm_nobody_x"), ("x-api-key", "y")]] {
+            let reply = send(server.addr, method, &path, headers, body_of(method));
+            assert!(![401, 403, 429].contains(&reply.status), "{method} {path}: {}", reply.status);
+            assert_eq!((reply.header("ratelimit"), reply.header("ratelimit-policy")), (None, None));
+        }
+    }
+    assert!(get(&server, ENTRY, &[]).header("cache-control").unwrap().starts_with("public"));
+    for name in ["signature", "expires", "key_id"] {
+        let problem = get(&server, &format!("{ENTRY}?{name}=1"), &[]).problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], name);
+    }
+}
+
+#[test]
+fn every_operation_wants_a_good_key_with_its_scope() {
+    let mut keys = Keys::new(&[
+        ("reads", "read", ""),
+        ("makes", "mesh", ""),
+        ("both", "read,mesh", "expires = \"2999-01-01T00:00:00Z\""),
+        ("past", "read,mesh", "expires = \"2020-02-03T04:05:06Z\""),
+        ("gone", "read,mesh", ""),
+    ]);
+    keys.write(&[
+        ("reads", "read", ""),
+        ("makes", "mesh", ""),
+        ("both", "read,mesh", "expires = \"2999-01-01T00:00:00Z\""),
+        ("past", "read,mesh", "expires = \"2020-02-03T04:05:06Z\""),
+    ]);
+    let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let other_secret = keys.text("both").replace("mm_both", "mm_reads");
+    for (method, path, scope) in operations() {
+        let ask = |headers: &[(&str, &str)]| send(server.addr, method, &path, headers, body_of(method));
+        let refused = |headers: &[(&str, &str)], status: u16, slug: &str, challenge: &str| {
+            let reply = ask(headers);
+            assert!(reply.header("www-authenticate").unwrap().starts_with("Bearer realm=\"molmesh\""));
+            assert!(reply.header("www-authenticate").unwrap().contains(challenge), "{reply:?}");
+            if method == "HEAD" {
+                assert_eq!(reply.status, status);
+                return None;
+            }
+            Some(reply.problem(status, slug))
+        };
+        refused(&[], 401, "key-required", "");
+        refused(&[("authorization", "Basic YTpi")], 401, "key-required", "");
+        for wrong in ["x", "mm_reads_", &other_secret, keys.text("gone"), &keys.text("both").to_uppercase()] {
+            refused(&[("x-api-key", wrong)], 401, "key-invalid", "error=\"invalid_token\"");
+        }
+        if let Some(problem) = refused(&[("x-api-key", keys.text("past"))], 401, "key-expired", "invalid_token") {
+            assert_eq!(problem["expired"], "2020-02-03T04:05:06Z");
+        }
+        let lacks = if scope == "mesh" { "reads" } else { "makes" };
+        if let Some(problem) = refused(&[("x-api-key", keys.text(lacks))], 403, "scope-missing", "insufficient_scope") {
+            assert_eq!(problem["scope"], scope);
+        }
+        let has = if scope == "mesh" { "makes" } else { "reads" };
+        let bearer = format!("Bearer {}", keys.text(has));
+        for headers in [("authorization", bearer.as_str()), ("x-api-key", keys.text("both"))] {
+            let reply = ask(&[headers]);
+            assert!(![401, 403].contains(&reply.status), "{method} {path}: {}", reply.status);
+            assert_eq!(reply.header("ratelimit-policy"), None, "no quota, no fields");
+        }
+        // Two keys are none.
+        refused(&[("authorization", &bearer), ("x-api-key", keys.text("both"))], 401, "key-invalid", "invalid_token");
+    }
+    for open in
+        ["/", "/docs", "/openapi.yaml", "/problems/key-required", "/livez", "/readyz", "/version", "/sample.pdb"]
+    {
+        assert_eq!(get(&server, open, &[]).status, 200, "{open}");
+    }
+    get(&server, "/v1/nothing", &[]).problem(404, "not-found");
+    let mesh = with(&server, keys.text("makes"), ENTRY);
+    assert_eq!((mesh.status, mesh.header("cache-control").unwrap().split(',').next()), (200, Some("private")));
+    for reason in ["key-required", "key-invalid", "key-expired", "scope-missing"] {
+        let label = format!("reason=\"{reason}\"");
+        assert!(server.metric("molmesh_requests_rejected_total", &[&label]) >= 1.0, "{reason}");
+    }
+}
+
+fn forwarded(address: &str) -> (&'static str, &str) {
+    ("x-forwarded-for", address)
+}
+
+/// The parameters of an item of a structured list.
+fn item(reply: &Reply, field: &str, policy: &str) -> Vec<(String, u64)> {
+    let items = reply.header(field).unwrap_or_else(|| panic!("no {field}: {reply:?}")).split(", ");
+    let of = items.filter_map(|item| item.strip_prefix(&format!("\"{policy}\";")));
+    let parameters = of.flat_map(|item| item.split(';')).filter_map(|p| p.split_once('='));
+    parameters.filter_map(|(name, value)| Some((name.to_owned(), value.parse().ok()?))).collect()
+}
+
+fn number(reply: &Reply, field: &str, policy: &str, parameter: &str) -> u64 {
+    let parameters = item(reply, field, policy);
+    parameters.iter().find(|(name, _)| name == parameter).unwrap_or_else(|| panic!("{parameters:?}")).1
+}
+
+#[test]
+fn requests_are_counted_by_key_and_the_fields_say_so() {
+    let keys =
+        Keys::new(&[("a", "read", "requests = 3\nwindow_s = 86400"), ("b", "read", "requests = 3\nwindow_s = 86400")]);
+    let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let mut last = 86_400;
+    for left in [2, 1, 0] {
+        let reply = with(&server, keys.text("a"), "/v1/capabilities");
+        assert_eq!(reply.status, 200);
+        assert_eq!(reply.header("ratelimit-policy"), Some("\"requests\";q=3;w=86400"));
+        assert_eq!(number(&reply, "ratelimit", "requests", "r"), left);
+        let t = number(&reply, "ratelimit", "requests", "t");
+        assert!((1..=last).contains(&t), "{t} after {last}");
+        last = t;
+        // What is open, and what is refused for another reason, is not counted.
+        assert_eq!(with(&server, keys.text("a"), "/livez").header("ratelimit"), None);
+        assert_eq!(with(&server, keys.text("a"), ENTRY).status, 403);
+    }
+    for _ in 0..3 {
+        let refused = with(&server, keys.text("a"), "/v1/capabilities");
+        let problem = refused.problem(429, "quota-exceeded");
+        assert_eq!((&problem["violated-policies"], &problem["limit"]), (&serde_json::json!(["requests"]), &3.into()));
+        assert_eq!(number(&refused, "ratelimit", "requests", "r"), 0);
+        let wait: u64 = refused.header("retry-after").unwrap().parse().unwrap();
+        // Both are rounded up, the field a moment later.
+        let t = number(&refused, "ratelimit", "requests", "t");
+        assert!(wait >= t && wait <= last && t > 600, "{wait} {t}");
+    }
+    assert_eq!(with(&server, keys.text("b"), "/v1/capabilities").status, 200);
+    assert!(server.metric("molmesh_requests_rejected_total", &["reason=\"quota-exceeded\""]) >= 3.0);
+    eventually("the gauge", || server.metric("molmesh_quota_clients", &[]) >= 2.0);
+}
+
+#[test]
+fn a_quota_that_is_used_up_comes_back() {
+    let keys = Keys::new(&[("a", "read", "requests = 1\nwindow_s = 1")]);
+    let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let status = || with(&server, keys.text("a"), "/v1/capabilities").status;
+    for _ in 0..2 {
+        eventually("it is used up", || status() == 429);
+        eventually("it is back", || status() == 200);
+    }
+}
+
+#[test]
+fn work_is_charged_and_what_needs_none_is_still_answered() {
+    let keys =
+        Keys::new(&[("a", "mesh,read", "work_s = 1\nwindow_s = 86400"), ("b", "mesh", "work_s = 1\nwindow_s = 86400")]);
+    let backend = Fake::new(Mode::Slow(Duration::from_millis(1100)));
+    let server = on(Arc::clone(&backend), |c| c.access.keys_file = Some(keys.path()));
+    let post = |key: &str, path: &str, n: usize, more: &[(&str, &str)]| {
+        server.post(path, &[&[("x-api-key", keys.text(key))], more].concat(), &sample(n))
+    };
+    let first = post("a", "/v1/meshes", 1, &[]);
+    assert_eq!(first.status, 200, "{}", first.text());
+    let policy = first.header("ratelimit-policy").unwrap();
+    assert_eq!(policy, "\"work\";q=1;qu=\"molmesh-work-seconds\";w=86400");
+    assert_eq!(number(&first, "ratelimit", "work", "r"), 0);
+    for (path, more) in [("/v1/meshes", &[][..]), ("/v1/meshes", &[("prefer", "respond-async")]), ("/v1/estimate", &[])]
+    {
+        let problem = post("a", path, 2, more).problem(429, "quota-exceeded");
+        assert_eq!(problem["violated-policies"], serde_json::json!(["work"]), "{path}");
+    }
+    assert_eq!(with(&server, keys.text("a"), "/v1/capabilities").status, 200);
+    eventually("what is kept costs nothing", || post("a", "/v1/meshes", 1, &[]).status == 200);
+    assert_eq!(post("b", "/v1/meshes", 3, &[]).status, 200, "the other one has his own");
+    // A promised job is charged as well, when it is done.
+    let keys = Keys::new(&[("c", "mesh,read", "work_s = 1\nwindow_s = 86400")]);
+    let server = on(backend, |c| c.access.keys_file = Some(keys.path()));
+    let ask = |n: usize, more: &[(&str, &str)]| {
+        server.post("/v1/meshes", &[&[("x-api-key", keys.text("c"))], more].concat(), &sample(n))
+    };
+    let promised = ask(4, &[("prefer", "respond-async")]);
+    let job = promised.header("location").unwrap();
+    eventually("it ends", || with(&server, keys.text("c"), job).json()["status"] == "successful");
+    assert_eq!(ask(5, &[]).status, 429);
+}
+
+#[test]
+fn requests_at_once_are_counted_to_the_last_byte() {
+    let keys = Keys::new(&[("a", "mesh,read", "concurrent = 1")]);
+    let server = server(Mode::Slow(Duration::from_mins(10)), |c| {
+        c.access.keys_file = Some(keys.path());
+        // The job that never ends is not waited for.
+        c.server.drain_timeout_ms = 100;
+    });
+    let promised = server.post("/v1/meshes", &[("x-api-key", keys.text("a")), ("prefer", "respond-async")], SAMPLE);
+    assert_eq!(promised.status, 202);
+    assert_eq!(promised.header("ratelimit-policy"), Some("\"concurrency\";q=1;qu=\"concurrent-requests\""));
+    assert_eq!(promised.header("ratelimit"), Some("\"concurrency\";r=0"));
+    let job = promised.header("location").unwrap();
+    let mut listening = connect(server.addr);
+    let head = format!("GET {job}/events HTTP/1.1\r\nhost: t\r\nx-api-key: {}\r\n\r\n", keys.text("a"));
+    let mut begun = [0; 12];
+    eventually("the promise's own request is over", || {
+        listening = connect(server.addr);
+        listening.write_all(head.as_bytes()).unwrap();
+        listening.read_exact(&mut begun).unwrap();
+        &begun == b"HTTP/1.1 200"
+    });
+    let refused = with(&server, keys.text("a"), "/v1/capabilities");
+    let problem = refused.problem(429, "quota-exceeded");
+    assert_eq!(
+        (&problem["violated-policies"], refused.header("retry-after")),
+        (&serde_json::json!(["concurrency"]), Some("1"))
+    );
+    drop(listening);
+    eventually("the listener is gone", || with(&server, keys.text("a"), "/v1/capabilities").status == 200);
+}
+
+#[test]
+fn addresses_have_quotas_and_proxies_of_ours_name_them() {
+    let limited = |c: &mut Config| (c.access.address_requests, c.access.window_s) = (Some(2), 86_400);
+    let own = server(Mode::Octahedra, limited);
+    let ask = |server: &Running, header: (&str, &str)| get(server, "/v1/capabilities", &[header]).status;
+    // Whoever connects is the client, whatever he says.
+    let statuses = ["198.51.100.1", "198.51.100.2", "198.51.100.3"].map(|address| ask(&own, forwarded(address)));
+    assert_eq!(statuses, [200, 200, 429]);
+    let behind = server(Mode::Octahedra, |c| {
+        limited(c);
+        c.server.trusted_proxies = "127.0.0.0/8".parse().ok();
+    });
+    for client in ["198.51.100.1", "198.51.100.2", "2001:db8:0:1::1"] {
+        let statuses = ["", "203.0.113.7, ", "203.0.113.8, "]
+            .map(|made_up| ask(&behind, forwarded(&format!("{made_up}{client}"))));
+        assert_eq!(statuses, [200, 200, 429], "{client}");
+    }
+    // The same network is the same client; the other header is not looked at.
+    assert_eq!(ask(&behind, forwarded("2001:db8:0:1:ffff::1")), 429);
+    assert_eq!(ask(&behind, forwarded("2001:db8:0:2::1")), 200);
+    let statuses = ["198.51.100.7", "198.51.100.8", "198.51.100.9"]
+        .map(|address| ask(&behind, ("forwarded", &format!("for={address}"))));
+    assert_eq!(statuses, [200, 200, 429]);
+    let standard = server(Mode::Octahedra, |c| {
+        limited(c);
+        c.server.trusted_proxies = "127.0.0.1".parse().ok();
+        c.server.forwarded_header = molmesh::config::ForwardedHeader::Forwarded;
+    });
+    let statuses =
+        ["a", "b", "c"].map(|by| ask(&standard, ("forwarded", &format!("for=\"[2001:db8::1]:81\";by=_{by}"))));
+    assert_eq!(statuses, [200, 200, 429]);
+    assert_eq!(ask(&standard, ("forwarded", "for=192.0.2.9")), 200);
+}
+
+#[test]
+fn a_key_is_a_client_wherever_it_comes_from() {
+    let keys = Keys::new(&[("a", "mesh", ""), ("b", "mesh", "")]);
+    let server = server(Mode::Octahedra, |c| {
+        c.access.keys_file = Some(keys.path());
+        c.server.trusted_proxies = "127.0.0.1".parse().ok();
+    });
+    let promise = |key: &str, address: &str| {
+        let headers = [
+            ("x-api-key", keys.text(key)),
+            ("x-forwarded-for", address),
+            ("prefer", "respond-async"),
+            ("idempotency-key", "mine"),
+        ];
+        let reply = server.post("/v1/meshes", &headers, SAMPLE);
+        assert_eq!(reply.status, 202, "{}", reply.text());
+        reply.header("location").unwrap().to_owned()
+    };
+    let first = promise("a", "198.51.100.1");
+    assert_eq!(promise("a", "198.51.100.2"), first);
+    assert_ne!(promise("b", "198.51.100.1"), first);
+}
+
+const SECRETS: &str = "new:0123456789abcdef0123456789abcdef old:fedcba9876543210fedcba9876543210";
+
+fn now() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs()
+}
+
+fn sign(target: &str, key: Option<&str>) -> String {
+    SigningKeys::parse(SECRETS).unwrap().sign(key, target, now() + 3600).unwrap()
+}
+
+fn signing(keys: &Keys, secrets: &str) -> Running {
+    server(Mode::Octahedra, |c| {
+        c.access.keys_file = Some(keys.path());
+        c.access.signing_secret = Some(Secret::new(secrets));
+    })
+}
+
+#[test]
+fn a_signed_address_opens_in_place_of_a_key_and_changes_nothing_else() {
+    let keys = Keys::new(&[("a", "mesh,read", "")]);
+    let server = signing(&keys, SECRETS);
+    for target in [format!("{ENTRY}?resolution=1&atom_ids=true"), ENTRY.to_owned(), "/v1/capabilities".to_owned()] {
+        let (signed, keyed) = (get(&server, &sign(&target, None), &[]), with(&server, keys.text("a"), &target));
+        assert_eq!((signed.status, keyed.status), (200, 200), "{}", signed.text());
+        assert!(signed.body == keyed.body);
+        for name in ["etag", "content-type", "cache-control"] {
+            assert_eq!(signed.header(name), keyed.header(name), "{name}");
+        }
+        assert!(!signed.headers.iter().any(|(_, value)| value.contains("signature")), "{:?}", signed.headers);
+        // A key beside it does no harm, nor does it hide that the key is none.
+        assert_eq!(with(&server, keys.text("a"), &sign(&target, None)).status, 200);
+        assert_eq!(with(&server, "mm_a_x", &sign(&target, None)).status, 401);
+    }
+    let target = sign(ENTRY, None);
+    assert_eq!(send(server.addr, "HEAD", &target, &[], b"").status, 200);
+    let etag = get(&server, &target, &[]).header("etag").unwrap().to_owned();
+    assert_eq!(get(&server, &target, &[("if-none-match", &etag)]).status, 304);
+    // Where the same bytes are found does not depend on it.
+    let fresh = get(&server, &sign(&format!("{ENTRY}?resolution=0.9"), None), &[]);
+    let place = fresh.header("content-location").unwrap();
+    assert!(place.starts_with("/v1/results/") && !place.contains('?'), "{place}");
+    eventually("it is kept", || get(&server, &sign(place, None), &[]).body == fresh.body);
+    // It opens for reading alone.
+    send(server.addr, "POST", &sign("/v1/meshes", None), &[], SAMPLE).problem(401, "key-required");
+    send(server.addr, "DELETE", &sign("/v1/jobs/x", None), &[], b"").problem(401, "key-required");
+    // Its own names are no parameters elsewhere, and no name is one of them that is not signed.
+    let key = [("x-api-key", keys.text("a"))];
+    send(server.addr, "POST", &sign("/v1/meshes", None), &key, SAMPLE).problem(400, "bad-parameter");
+    get(&server, &format!("{ENTRY}?expires=1"), &key).problem(400, "bad-parameter");
+    get(&server, &sign(&format!("{ENTRY}?sginature=1"), None), &[]).problem(400, "bad-parameter");
+}
+
+#[test]
+fn a_signature_holds_for_one_address_until_its_end() {
+    let keys = Keys::new(&[("a", "mesh,read", "")]);
+    let server = signing(&keys, SECRETS);
+    let good = sign(&format!("{ENTRY}?resolution=1"), None);
+    assert_eq!(get(&server, &good, &[]).status, 200);
+    for bad in [
+        format!("{good}&compress=quantize"),
+        good.replace("resolution=1", "resolution=2"),
+        good.replace("resolution=1&", ""),
+        good.replace("surface.glb", "surface.stl"),
+        good.replace("4pti", "4PTI"),
+        good.replace("key_id=new", "key_id=old"),
+        good.replace("key_id=new", "key_id=other"),
+        format!("{good}&{}", good.split('&').next_back().unwrap()),
+    ] {
+        let problem = get(&server, &bad, &[]).problem(403, "signature-invalid");
+        assert!(!problem["detail"].as_str().unwrap().contains("key_id"), "{problem}");
+    }
+    let past = SigningKeys::parse(SECRETS).unwrap().sign(None, ENTRY, 1_577_836_800).unwrap();
+    let problem = get(&server, &past, &[]).problem(403, "signature-expired");
+    assert!(problem["expired"].as_str().unwrap().starts_with("2020-01-01T00:00:00"), "{problem}");
+    // The end is told to whom had the address alone.
+    get(&server, &past.replace(".glb", ".stl"), &[]).problem(403, "signature-invalid");
+    assert!(server.metric("molmesh_requests_rejected_total", &["reason=\"signature-invalid\""]) >= 8.0);
+    assert!(server.metric("molmesh_requests_rejected_total", &["reason=\"signature-expired\""]) >= 1.0);
+}
+
+#[test]
+fn every_byte_of_a_signed_address_counts() {
+    let keys = Keys::new(&[("a", "mesh,read", "")]);
+    let server = signing(&keys, SECRETS);
+    let good = sign(&format!("{ENTRY}?resolution=1"), None);
+    assert_eq!(get(&server, &good, &[]).status, 200);
+    for at in 0..good.len() {
+        let other = if good.as_bytes()[at] == b'a' { "b" } else { "a" };
+        let other = format!("{}{other}{}", &good[..at], &good[at + 1..]);
+        let status = get(&server, &other, &[]).status;
+        assert!([400, 401, 403, 404].contains(&status), "{status} for {other}");
+    }
+}
+
+#[test]
+fn keys_that_sign_take_over_from_each_other() {
+    let keys = Keys::new(&[]);
+    let both = signing(&keys, SECRETS);
+    for key in ["new", "old"] {
+        assert_eq!(get(&both, &sign(ENTRY, Some(key)), &[]).status, 200, "{key}");
+    }
+    let later = signing(&keys, SECRETS.split(' ').next().unwrap());
+    assert_eq!(get(&later, &sign(ENTRY, Some("new")), &[]).status, 200);
+    get(&later, &sign(ENTRY, Some("old")), &[]).problem(403, "signature-invalid");
+    // Without a file of keys nothing but a signature opens; what is open stays open.
+    let alone = server(Mode::Octahedra, |c| c.access.signing_secret = Some(Secret::new(SECRETS)));
+    assert_eq!(get(&alone, &sign(ENTRY, None), &[]).status, 200);
+    get(&alone, ENTRY, &[]).problem(401, "key-required");
+    with(&alone, "mm_a_b", ENTRY).problem(401, "key-invalid");
+    assert_eq!(get(&alone, "/", &[]).status, 200);
+}
+
+#[test]
+fn keys_that_change_are_read_again() {
+    let mut keys = Keys::new(&[("a", "read", "")]);
+    let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let status = |key: &str| with(&server, key, "/v1/capabilities").status;
+    assert_eq!(status(keys.text("a")), 200);
+    keys.write(&[("b", "read", "note = \"instead of a\"")]);
+    eventually("the new key is known", || status(keys.text("b")) == 200);
+    assert_eq!(status(keys.text("a")), 401);
+    std::fs::write(keys.path(), "[[key]]\nnmae = 3").unwrap();
+    eventually("the log says what is wrong", || !http_support::log_lines("line 2: unknown name `nmae`").is_empty());
+    assert_eq!(status(keys.text("b")), 200);
+}
+
+#[test]
+fn pages_of_the_origins_that_are_listed_may_read() {
+    let (ours, others) = ("https://viewer.example", "https://other.example");
+    let preflight = |server: &Running, origin: &str| {
+        let headers = [
+            ("origin", origin),
+            ("access-control-request-method", "POST"),
+            ("access-control-request-headers", "authorization,content-type"),
+        ];
+        send(server.addr, "OPTIONS", "/v1/meshes", &headers, b"")
+    };
+    let listed = server(Mode::Octahedra, |c| {
+        c.access.cors_origins = ours.parse().ok();
+        c.access.cors_credentials = true;
+    });
+    let reply = preflight(&listed, ours);
+    assert_eq!(reply.header("access-control-allow-origin"), Some(ours));
+    assert_eq!(reply.header("access-control-allow-credentials"), Some("true"));
+    assert!(reply.header("access-control-allow-headers").unwrap().contains("authorization"));
+    assert_eq!(preflight(&listed, others).header("access-control-allow-origin"), None);
+    let plain = get(&listed, "/v1/capabilities", &[("origin", ours)]);
+    assert_eq!(plain.header("access-control-allow-origin"), Some(ours));
+    assert!(plain.header("vary").unwrap().to_ascii_lowercase().contains("origin"));
+    assert_eq!(plain.header("cross-origin-resource-policy"), Some("same-origin"));
+    let exposed = plain.header("access-control-expose-headers").unwrap();
+    assert!(exposed.contains("ratelimit") && exposed.contains("retry-after") && !exposed.contains('*'), "{exposed}");
+
+    let keys = Keys::new(&[]);
+    let anybody = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let reply = preflight(&anybody, others);
+    assert_eq!(reply.header("access-control-allow-origin"), Some("*"));
+    assert_eq!(reply.header("access-control-allow-credentials"), None);
+    // `*` does not stand for this one.
+    assert!(reply.header("access-control-allow-headers").unwrap().contains("authorization"));
+    let refused = get(&anybody, "/v1/capabilities", &[("origin", others)]);
+    assert_eq!(
+        (refused.status, refused.header("access-control-allow-origin")),
+        (401, Some("*")),
+        "scripts can read why"
+    );
+    let nobody = server(Mode::Octahedra, |c| c.access.cors_origins = None);
+    assert_eq!(preflight(&nobody, ours).header("access-control-allow-origin"), None);
+    assert_eq!(get(&nobody, "/v1/capabilities", &[("origin", ours)]).header("access-control-allow-origin"), None);
+}
+
+#[test]
+fn browsers_are_told_what_not_to_do() {
+    let plain = server(Mode::Octahedra, |_| {});
+    for path in ["/", "/docs", "/v1/capabilities", ENTRY, "/v1/nothing"] {
+        let reply = get(&plain, path, &[]);
+        assert_eq!(reply.header("x-content-type-options"), Some("nosniff"), "{path}");
+        assert_eq!(reply.header("referrer-policy"), Some("no-referrer"), "{path}");
+        assert_eq!(reply.header("cross-origin-resource-policy"), Some("cross-origin"), "{path}");
+        let policy = reply.header("content-security-policy").unwrap();
+        assert!(
+            policy.starts_with("default-src 'none'") && policy.contains("frame-ancestors 'none'"),
+            "{path}: {policy}"
+        );
+        assert_eq!(policy.contains("script-src 'self'"), ["/", "/docs"].contains(&path), "{path}: {policy}");
+        assert_eq!((reply.header("strict-transport-security"), reply.header("server")), (None, None), "{path}");
+        let version = env!("CARGO_PKG_VERSION");
+        assert!(!reply.headers.iter().any(|(_, value)| value.contains(version)), "{path}: {:?}", reply.headers);
+    }
+    let strict = server(Mode::Octahedra, |c| c.access.hsts_s = Some(31_536_000));
+    assert_eq!(get(&strict, "/", &[]).header("strict-transport-security"), Some("max-age=31536000"));
+}
