@@ -121,6 +121,9 @@ impl Tree {
         let clears = matches!(value, Value::String(text) if text == "none");
         let typed = match (value, default) {
             _ if clears => Value::Null,
+            (Value::String(text), Value::Number(number)) if number.is_f64() => {
+                Value::from(text.trim().parse::<f64>().map_err(|_none| bad("a number".to_owned()))?)
+            }
             (Value::String(text), Value::Number(_)) => {
                 let size = key.ends_with("_bytes");
                 let expected = if size { "a whole number, or a size such as 64MiB" } else { "a whole number" };
@@ -132,7 +135,8 @@ impl Tree {
             _ => value.clone(),
         };
         // Nothing can be served with a limit or a timeout of zero; ports are part of addresses, not numbers.
-        if typed.as_f64().is_some_and(|v| v < 1.0) {
+        // What may be a fraction says its own range.
+        if !default.is_f64() && typed.as_f64().is_some_and(|v| v < 1.0) {
             return Err(bad("1 or more".to_owned()));
         }
         if let Some(place) = self.values.pointer_mut(&pointer) {

@@ -12,6 +12,7 @@ mod load;
 mod log;
 mod server;
 mod store;
+mod telemetry;
 mod template;
 
 use std::path::PathBuf;
@@ -27,6 +28,7 @@ pub use load::{Source, load, load_process};
 pub use log::{LogConfig, LogFormat};
 pub use server::ServerConfig;
 pub use store::{Secret, StoreConfig};
+pub use telemetry::{CollectorUrl, Ratio, SecretHeaders, TelemetryConfig};
 pub use template::{ProxyUrl, Template, Templates};
 
 /// The whole configuration.
@@ -47,6 +49,8 @@ pub struct Config {
     pub store: StoreConfig,
     /// Logs.
     pub log: LogConfig,
+    /// Traces.
+    pub telemetry: TelemetryConfig,
 }
 
 impl Config {

@@ -1,7 +1,7 @@
 //! What every request goes through, outermost first. This file is the documented order:
 //!
 //! 1. **request id**: everything below can name the request;
-//! 2. **observe**: the span, one log line, the duration metric; it sees the final status;
+//! 2. **observe**: the place in the trace, the span, one log line, metrics, `Server-Timing`; it sees the final status;
 //! 3. **problems**: errors of everything below become `application/problem+json`;
 //! 4. **security headers**: also on problems that a layer below made;
 //! 5. **CORS**: answers preflights; errors below carry its headers, so that scripts can read them;
@@ -25,15 +25,15 @@ use tower_http::cors::{Any, CorsLayer};
 
 use super::kinds::Kind;
 use super::problem::{self, Problem};
-use super::{delivery, observe, request_id};
-use crate::telemetry::PANICS;
+use super::{delivery, observe, request_id, timing};
+use crate::telemetry::{PANICS, Tracer};
 
 /// Puts the layers around `router`.
-pub(super) fn apply(router: Router, timeout: Duration) -> Router {
+pub(super) fn apply(router: Router, timeout: Duration, tracer: Tracer) -> Router {
     router.layer(
         ServiceBuilder::new()
             .layer(from_fn(request_id::assign))
-            .layer(from_fn(observe::request))
+            .layer(from_fn_with_state(tracer, observe::request))
             .layer(from_fn(problem::render))
             .layer(from_fn(security_headers))
             .layer(cors())
@@ -59,7 +59,8 @@ fn cors() -> CorsLayer {
         header::ACCEPT_RANGES,
         header::CONTENT_DISPOSITION,
         header::RETRY_AFTER,
-        HeaderName::from_static("server-timing"),
+        timing::SERVER_TIMING,
+        observe::TRACEPARENT,
         request_id::HEADER,
     ];
     CorsLayer::new()

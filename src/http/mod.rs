@@ -35,6 +35,7 @@ mod server;
 mod state;
 mod stream;
 mod structures;
+mod timing;
 mod upload;
 mod wish;
 

@@ -18,7 +18,7 @@ const MARGIN: Duration = Duration::from_secs(10);
 pub(super) fn router(app: Shared) -> Router {
     let longest = app.config.jobs.deadline().max(Duration::from_secs(jobs::MAX_WAIT_S));
     let input = app.config.server.body_timeout().max(app.config.archive.timeout());
-    let timeout = input + longest + MARGIN;
+    let (timeout, tracer) = (input + longest + MARGIN, app.tracer.clone());
     let router = Router::new()
         // Meshes.
         .route("/v1/meshes", post(meshes::create))
@@ -54,5 +54,5 @@ pub(super) fn router(app: Shared) -> Router {
         .route("/icon.svg", get(page::icon))
         .route("/sample.pdb", get(page::sample))
         .with_state(app);
-    middleware::apply(router, timeout)
+    middleware::apply(router, timeout, tracer)
 }

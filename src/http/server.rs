@@ -18,7 +18,7 @@ use crate::config::Config;
 use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
 use crate::store::{Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
-use crate::telemetry::{self, TelemetryError};
+use crate::telemetry::{self, Exporter, TelemetryError};
 
 /// How often the recorder tidies up its histograms.
 const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
@@ -75,6 +75,7 @@ pub struct Server {
     addr: SocketAddr,
     metrics_addr: Option<SocketAddr>,
     stop: watch::Sender<bool>,
+    exporter: Option<Exporter>,
 }
 
 fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
@@ -98,11 +99,13 @@ impl Server {
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
         let (metrics_listener, metrics_addr) = metrics.unzip();
         telemetry::recorder()?;
+        let (tracer, exporter) = Exporter::start(&config.telemetry);
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
+            tracer: tracer.clone(),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
@@ -131,10 +134,11 @@ impl Server {
             stopping,
             deliveries,
             readiness,
+            tracer,
             found,
             capabilities,
         });
-        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop })
+        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop, exporter })
     }
 
     /// Address of the service.
@@ -189,7 +193,7 @@ impl Server {
         let upkeep = tokio::spawn(async move {
             loop {
                 tokio::time::sleep(UPKEEP).await;
-                watched.pool.publish_devices();
+                watched.pool.publish();
                 handle.run_upkeep();
             }
         });
@@ -206,6 +210,9 @@ impl Server {
         }
         if let Some(metrics) = metrics {
             metrics.abort();
+        }
+        if let Some(exporter) = self.exporter {
+            exporter.finish().await;
         }
         let drained = jobs && requests;
         tracing::info!(drained, "stopped");
@@ -241,7 +248,7 @@ fn warm_up(app: &App) {
     let start = Instant::now();
     let backend = Arc::clone(app.pool.backend());
     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| backend.warm()));
-    app.pool.publish_devices();
+    app.pool.publish();
     match result {
         Ok(Ok(())) => {
             let ms = start.elapsed().as_secs_f64() * 1e3;

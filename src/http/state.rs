@@ -16,6 +16,7 @@ use crate::config::Config;
 use crate::jobs::{ContentKey, Ledger, Pool};
 use crate::store::Store;
 use crate::surface::FoundDevice;
+use crate::telemetry::Tracer;
 
 /// State of the service, behind one pointer.
 pub(super) struct App {
@@ -35,6 +36,8 @@ pub(super) struct App {
     /// Places for requests for meshes: see `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
     pub(super) readiness: Readiness,
+    /// Where spans go.
+    pub(super) tracer: Tracer,
     /// The devices that were found when the service started.
     pub(super) found: Vec<FoundDevice>,
     /// The body of `/v1/capabilities`, which changes only where devices can fail: with devices it is written anew.

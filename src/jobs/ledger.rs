@@ -12,9 +12,10 @@ use metrics::{counter, gauge};
 use serde_json::Value;
 use thiserror::Error;
 use tokio::sync::watch;
+use tracing::Instrument as _;
 
 use super::promise::{Promise, Runner};
-use super::record::{JobId, Record, Status, now_ms};
+use super::record::{JobId, Record, Requester, Status, now_ms};
 use super::results::SaveError;
 use super::{Claim, ContentKey, Failure, Pool, Refusal, Task, Ticket};
 use crate::formats::Format;
@@ -194,6 +195,7 @@ impl Ledger {
             finished_ms: None,
             result: None,
             problem: None,
+            requester: Requester::of(&order.task.origin),
         };
         if order.idempotency.is_some()
             && let Some(view) = self.view(&id).await?
@@ -218,7 +220,8 @@ impl Ledger {
             ticket
         } else {
             let claim = self.claim(&promise, Some(kept));
-            let ticket = inner.pool.submit(order.task, inner.settings.allowed, Some(claim))?;
+            let task = Task { id: Some(id.clone()), ..order.task };
+            let ticket = inner.pool.submit(task, inner.settings.allowed, Some(claim))?;
             if ticket.came_late() {
                 promise.begin();
             }
@@ -338,10 +341,12 @@ impl Ledger {
     fn spawn(&self, runner: Runner<[Pin; 2]>) {
         gauge!(JOBS_OPEN).increment(1.0);
         let ledger = self.clone();
-        tokio::spawn(async move {
+        let log = runner.log(self.0.pool.tracer());
+        let run = async move {
             runner.run(&ledger).await;
             gauge!(JOBS_OPEN).decrement(1.0);
-        });
+        };
+        tokio::spawn(run.instrument(log));
     }
 
     /// What the worker does before it begins: the attempt is on record by then, so that a job that ends the process is
@@ -356,7 +361,7 @@ impl Ledger {
             }
             promise.begin();
             if let Err(error) = runtime.block_on(ledger.0.keep(&promise.record())) {
-                tracing::error!(job = %promise.id(), %error, "a job's attempt cannot be recorded");
+                tracing::error!(job_id = %promise.id(), %error, "a job's attempt cannot be recorded");
             }
         })
     }
@@ -366,7 +371,7 @@ impl Ledger {
         let changed = match ending {
             Ok(key) => promise.end(Status::Successful, |record| record.result = Some(key)),
             Err(error) => {
-                tracing::info!(job = %promise.id(), %error, "a job failed");
+                tracing::info!(job_id = %promise.id(), %error, "a job failed");
                 let problem = (self.0.describe)(&error);
                 promise.end(Status::Failed, |record| record.problem = Some(problem))
             }
@@ -376,7 +381,7 @@ impl Ledger {
         }
         // Without the record a restart would do the job again: a waste, but nothing is lost.
         if let Err(error) = self.0.keep(&promise.record()).await {
-            tracing::error!(job = %promise.id(), %error, "a job's ending cannot be recorded");
+            tracing::error!(job_id = %promise.id(), %error, "a job's ending cannot be recorded");
         }
     }
 
@@ -393,6 +398,6 @@ impl Ledger {
         let Some(input) = stored.map(|stored| stored.bytes) else { return Ok(Err("its input is gone".to_owned())) };
         let mut lease = self.0.pool.budget().lease();
         lease.force(input.len() as u64);
-        Ok(super::promise::task(record, digest, input, lease))
+        Ok(super::promise::task(record, digest, input, lease, self.0.pool.tracer()))
     }
 }

@@ -1,7 +1,7 @@
 //! One promised job from its acceptance to its end, and whoever watches it.
 
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use tokio::sync::{Notify, watch};
@@ -15,6 +15,7 @@ use super::{ContentKey, Failure, Finished, Lease, Refusal, Task, Ticket};
 use crate::formats::Format;
 use crate::pipeline::params;
 use crate::store::Digest;
+use crate::telemetry::{Closing, Scope, Tracer};
 
 /// How often a running job's progress is looked at.
 const TICK: Duration = Duration::from_millis(100);
@@ -139,6 +140,12 @@ enum Attempt {
 }
 
 impl<P> Runner<P> {
+    /// The span of its log lines.
+    pub(super) fn log(&self, tracer: &Tracer) -> tracing::Span {
+        let record = self.promise.record();
+        Scope::open(&record.requester.origin(tracer), Instant::now()).log(Some(record.id.as_str()))
+    }
+
     pub(super) async fn run(self, ledger: &Ledger) {
         let Self { promise, mut ticket, pin, digest } = self;
         loop {
@@ -197,7 +204,7 @@ async fn submit(ledger: &Ledger, promise: &Arc<Promise>, record: &Record, digest
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
     // A store that does not answer now is no reason to give a promise up.
     let silent = |error| {
-        tracing::warn!(job = %record.id, %error, "a job waits for the store");
+        tracing::warn!(job_id = %record.id, %error, "a job waits for the store");
         Attempt::Again
     };
     let (task, format) = ledger.task(record, digest).await.map_err(silent)?.map_err(lost)?;
@@ -226,9 +233,11 @@ async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Resu
     let (resolution, digest) = (report.resolution, finished.digest);
     let key = ContentKey::new(&digest, &job, format, report.backend);
     let inner = &ledger.0;
+    let scope = Scope::open(&record.requester.origin(inner.pool.tracer()), Instant::now());
     results::save(&inner.store, finished, format, &key, inner.settings.output_bytes)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
+    scope.close(|| Closing::of("keep"));
     Ok(key.to_string())
 }
 
@@ -240,9 +249,16 @@ fn read(record: &Record) -> Result<(crate::pipeline::Job, Format), String> {
 }
 
 /// The task of a record, with its input.
-pub(super) fn task(record: &Record, digest: Digest, input: Bytes, lease: Lease) -> Result<(Task, Format), String> {
+pub(super) fn task(
+    record: &Record,
+    digest: Digest,
+    input: Bytes,
+    lease: Lease,
+    tracer: &Tracer,
+) -> Result<(Task, Format), String> {
     let (job, format) = read(record)?;
     let rank = Rank { client: Client::numbered(record.client), batch: true, urgency: record.urgency };
     let strict = record.parameters.iter().any(|(name, _)| name == "check");
-    Ok((Task { input, digest, strict, job, rank, lease: Some(Arc::new(lease)) }, format))
+    let (origin, id) = (record.requester.origin(tracer), Some(record.id.clone()));
+    Ok((Task { input, digest, strict, job, rank, lease: Some(Arc::new(lease)), origin, id }, format))
 }

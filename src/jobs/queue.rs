@@ -12,7 +12,7 @@ use super::rank::{self, Shares};
 use super::returns::Returns;
 use super::{Outcome, Refusal, Task};
 use crate::surface::CancelToken;
-use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT};
+use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, Scope};
 
 struct State {
     flights: Vec<Flight>,
@@ -41,6 +41,8 @@ pub(super) struct Place {
     pub(super) waiter: u64,
     pub(super) outcome: oneshot::Receiver<Outcome>,
     pub(super) progress: Arc<Progress>,
+    /// The span of the work.
+    pub(super) scope: Scope,
     /// The same work was in the house already.
     pub(super) shared: bool,
     /// It runs already, so that no claim is called.
@@ -92,8 +94,11 @@ impl Queue {
             let begun = flight.begun.is_some();
             // Work that runs cannot be held back any more: whoever claims it records that by itself.
             flight.claims.extend(claim.filter(|_| !begun));
-            let progress = Arc::clone(&flight.progress);
-            return Ok(Place { flight: flight.id, waiter, outcome, progress, shared: true, begun });
+            if let Some(context) = &task.origin.context {
+                flight.scope.link(context);
+            }
+            let (progress, scope) = (Arc::clone(&flight.progress), flight.scope.clone());
+            return Ok(Place { flight: flight.id, waiter, outcome, progress, scope, shared: true, begun });
         }
         let now = Instant::now();
         let units = cost::units(&task.input, &task.job);
@@ -115,7 +120,7 @@ impl Queue {
             return Err(Refusal::TooLate { wait, allowed });
         }
         let tag = state.shares.tag(&task.rank, units);
-        let progress = Arc::new(Progress::default());
+        let (progress, scope) = (Arc::new(Progress::default()), Scope::open(&task.origin, now));
         state.flights.push(Flight {
             id: waiter,
             work,
@@ -126,6 +131,7 @@ impl Queue {
             begun: None,
             cancel: CancelToken::default(),
             progress: Arc::clone(&progress),
+            scope: scope.clone(),
             waiters: vec![Waiter { id: waiter, reply }],
             claims: claim.into_iter().collect(),
             task: Some(task),
@@ -133,7 +139,7 @@ impl Queue {
         self.publish(&mut state);
         drop(state);
         self.filled.notify_one();
-        Ok(Place { flight: waiter, waiter, outcome, progress, shared: false, begun: false })
+        Ok(Place { flight: waiter, waiter, outcome, progress, scope, shared: false, begun: false })
     }
 
     /// The next job; blocks until there is one. `None` once the queue is closed and empty.
@@ -172,6 +178,7 @@ impl Queue {
             progress: Arc::clone(&flight.progress),
             claims: std::mem::take(&mut flight.claims),
             accepted: flight.accepted,
+            scope: flight.scope.clone(),
         })
     }
 
@@ -280,6 +287,11 @@ impl Queue {
         let mean = state.rate.mean(all / state.flights.len().max(1) as f64) / self.workers as f64;
         let each = Duration::try_from_secs_f64(mean).unwrap_or(Duration::MAX);
         state.returns.tell(work, each, each, now)
+    }
+
+    /// Tells metrics how it stands: what waits grows older while nothing happens.
+    pub(super) fn refresh(&self) {
+        self.publish(&mut self.lock());
     }
 
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of jobs are small")]
