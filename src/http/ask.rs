@@ -167,17 +167,7 @@ impl Ask {
         let ticket = ticket.map(|ticket| ticket.with_time(app.config.jobs.batch_deadline()));
         let ledger = app.ledger.clone();
         // Whoever leaves now has asked nevertheless: the job is promised as a whole or not at all.
-        let scope = Scope::current();
-        let promised = tokio::spawn(
-            async move {
-                let promise = ledger.promise(order, ticket);
-                match scope {
-                    Some(scope) => scope.run(promise).await,
-                    None => promise.await,
-                }
-            }
-            .in_current_span(),
-        );
+        let promised = tokio::spawn(async move { ledger.promise(order, ticket).await }.in_current_span());
         let view = promised.await.map_err(Problem::internal)??;
         let wait =
             app.pool.estimated_wait() + Duration::from_secs_f64(app.pool.expected(&input.bytes, &self.request.job));

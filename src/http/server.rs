@@ -98,7 +98,10 @@ impl Server {
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
         let (metrics_listener, metrics_addr) = metrics.unzip();
-        telemetry::recorder()?;
+        // Before anything is counted; what nobody can read is not.
+        if metrics_listener.is_some() {
+            telemetry::recorder()?;
+        }
         let (tracer, exporter) = Exporter::start(&config.telemetry);
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
@@ -159,7 +162,6 @@ impl Server {
     /// # Errors
     /// [`ServeError`].
     pub async fn run(self, shutdown: impl Future<Output = ()>) -> Result<bool, ServeError> {
-        let handle = telemetry::recorder()?;
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
         let warming = tokio::task::spawn_blocking({
@@ -185,16 +187,18 @@ impl Server {
         let metrics = match self.metrics_listener.zip(self.metrics_addr) {
             Some((listener, addr)) => {
                 let listener = tokio_listener("server.metrics_listen", addr, listener)?;
-                Some(tokio::spawn(accept::serve(listener, metrics::router(handle.clone()), config, stopped)))
+                let router = metrics::router(telemetry::recorder()?);
+                Some(tokio::spawn(accept::serve(listener, router, config, stopped)))
             }
             None => None,
         };
         let watched = Arc::clone(&self.app);
+        let recorder = self.metrics_addr.map(|_| telemetry::recorder()).transpose()?;
         let upkeep = tokio::spawn(async move {
             loop {
                 tokio::time::sleep(UPKEEP).await;
                 watched.pool.publish();
-                handle.run_upkeep();
+                recorder.iter().for_each(telemetry::Recorder::run_upkeep);
             }
         });
         shutdown.await;

@@ -13,8 +13,9 @@ use super::record::{JobId, Record, Status, now_ms};
 use super::results;
 use super::{ContentKey, Failure, Finished, Lease, Refusal, Task, Ticket};
 use crate::formats::Format;
-use crate::pipeline::params;
+use crate::pipeline::{JobError, params};
 use crate::store::Digest;
+use crate::surface::SurfaceError;
 use crate::telemetry::{Closing, Scope, Tracer};
 
 /// How often a running job's progress is looked at.
@@ -189,7 +190,8 @@ async fn attempt(ledger: &Ledger, promise: &Arc<Promise>, ticket: &mut Option<Ti
             promise.tell("encode", 0.95);
             Attempt::Ended(save(ledger, &record, finished).await)
         }
-        Err(Failure::Stopped) => Attempt::Left,
+        // Work that somebody waits for is cancelled by the end of the service alone.
+        Err(Failure::Stopped | Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => Attempt::Left,
         Err(Failure::Memory(_)) => Attempt::Again,
         Err(failure) => Attempt::Ended(Err(failure.into())),
     }

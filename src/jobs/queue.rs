@@ -12,7 +12,7 @@ use super::rank::{self, Shares};
 use super::returns::Returns;
 use super::{Outcome, Refusal, Task};
 use crate::surface::CancelToken;
-use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, Scope};
+use crate::telemetry::{Closing, QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, Scope};
 
 struct State {
     flights: Vec<Flight>,
@@ -222,7 +222,10 @@ impl Queue {
         self.publish(&mut state);
         drop(state);
         // The input, which may be large, is freed outside the lock.
-        drop(left);
+        if let Some(flight) = left {
+            let error = Some("nobody waits for it any more".to_owned());
+            flight.scope.close(|| Closing { error, ..Closing::of("job") });
+        }
     }
 
     /// Accepts no more jobs. Those that were accepted still run.
