@@ -8,11 +8,10 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
-use metrics::{counter, gauge};
+use metrics::counter;
 use serde_json::Value;
 use thiserror::Error;
 use tokio::sync::watch;
-use tracing::Instrument as _;
 
 use super::promise::{Promise, Runner};
 use super::record::{JobId, Record, Requester, Status, now_ms};
@@ -20,7 +19,7 @@ use super::results::SaveError;
 use super::{Claim, ContentKey, Failure, Pool, Refusal, Task, Ticket};
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Store, StoreError};
-use crate::telemetry::{JOBS_OPEN, JOBS_RECOVERED};
+use crate::telemetry::JOBS_RECOVERED;
 
 /// Ended jobs that are kept in mind; older ones are read from the store.
 const MOST_ENDED: usize = 10_000;
@@ -242,7 +241,7 @@ impl Ledger {
         let view = entered.view();
         // Otherwise somebody has asked for it since it is on record, and it was taken up: in the same flight.
         if Arc::ptr_eq(&entered, &promise) {
-            self.spawn(Runner { promise, ticket: Some(ticket), pin, digest });
+            Runner { promise, ticket: Some(ticket), pin, digest }.spawn(self);
         }
         Ok(view)
     }
@@ -333,20 +332,9 @@ impl Ledger {
         let promise = self.0.enter(&id, &fresh);
         if Arc::ptr_eq(&promise, &fresh) {
             counter!(JOBS_RECOVERED).increment(1);
-            self.spawn(Runner { promise: fresh, ticket: None, pin, digest });
+            Runner { promise: fresh, ticket: None, pin, digest }.spawn(self);
         }
         Ok(promise)
-    }
-
-    fn spawn(&self, runner: Runner<[Pin; 2]>) {
-        gauge!(JOBS_OPEN).increment(1.0);
-        let ledger = self.clone();
-        let log = runner.log(self.0.pool.tracer());
-        let run = async move {
-            runner.run(&ledger).await;
-            gauge!(JOBS_OPEN).decrement(1.0);
-        };
-        tokio::spawn(run.instrument(log));
     }
 
     /// What the worker does before it begins: the attempt is on record by then, so that a job that ends the process is

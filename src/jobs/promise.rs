@@ -4,7 +4,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use metrics::gauge;
 use tokio::sync::{Notify, watch};
+use tracing::Instrument as _;
 
 use super::flight::Progress;
 use super::ledger::{EndError, Ledger, View};
@@ -16,7 +18,7 @@ use crate::formats::Format;
 use crate::pipeline::{JobError, params};
 use crate::store::Digest;
 use crate::surface::SurfaceError;
-use crate::telemetry::{Closing, Scope, Tracer};
+use crate::telemetry::{Closing, JOBS_OPEN, Scope, Tracer};
 
 /// How often a running job's progress is looked at.
 const TICK: Duration = Duration::from_millis(100);
@@ -140,14 +142,22 @@ enum Attempt {
     Left,
 }
 
-impl<P> Runner<P> {
-    /// The span of its log lines.
-    pub(super) fn log(&self, tracer: &Tracer) -> tracing::Span {
+impl<P: Send + 'static> Runner<P> {
+    /// Sees it through on its own, in the name of the request that asked for it.
+    pub(super) fn spawn(self, ledger: &Ledger) {
         let record = self.promise.record();
-        Scope::open(&record.requester.origin(tracer), Instant::now()).log(Some(record.id.as_str()))
+        let origin = record.requester.origin(ledger.0.pool.tracer());
+        let log = Scope::open(&origin, Instant::now()).log(Some(record.id.as_str()));
+        let ledger = ledger.clone();
+        let run = async move {
+            gauge!(JOBS_OPEN).increment(1.0);
+            self.run(&ledger).await;
+            gauge!(JOBS_OPEN).decrement(1.0);
+        };
+        tokio::spawn(run.instrument(log));
     }
 
-    pub(super) async fn run(self, ledger: &Ledger) {
+    async fn run(self, ledger: &Ledger) {
         let Self { promise, mut ticket, pin, digest } = self;
         loop {
             let attempt = attempt(ledger, &promise, &mut ticket, digest);

@@ -43,7 +43,7 @@ metrics! {
     REJECTED = "molmesh_requests_rejected_total", Counter, reason: "slugs of problem types, `header-timeout`, `write-timeout`";
     /// Jobs accepted, by mode and by whether they took part in work that was in the house.
     JOBS_SUBMITTED = "molmesh_jobs_submitted_total", Counter, mode: "sync|async", dedup: "yes|no";
-    /// Jobs ended.
+    /// Jobs that ended.
     JOBS_FINISHED = "molmesh_jobs_finished_total", Counter, outcome: "successful|failed|dismissed|panicked";
     /// Promised jobs that have not ended.
     JOBS_OPEN = "molmesh_jobs_open", Gauge;
