@@ -39,7 +39,7 @@ const ROWS: &[Row] = &[
     (t::JOBS_RECOVERED, &[], restart),
     (t::JOBS_FALLBACK, &[], devices),
     (t::STAGE_DURATION, &["stage=\"field\""], meshes),
-    (t::RESULTS_NOT_KEPT, &["reason=\"failed\""], broken_store),
+    (t::RESULTS_NOT_KEPT, &["reason=\"failed\""], tiny_store),
     (t::QUEUE_DEPTH, &[], held),
     (t::QUEUE_AGE, &[], held),
     (t::QUEUE_WAIT, &[], held),
@@ -59,7 +59,7 @@ const ROWS: &[Row] = &[
     (t::STORE_BYTES, &["folder=\"results\""], meshes),
     (t::STORE_OBJECTS, &["folder=\"results\""], meshes),
     (t::STORE_REMOVED, &["reason=\"cap\""], full_store),
-    (t::STORE_ERRORS, &["op=\"put\""], broken_store),
+    (t::STORE_ERRORS, &["op="], broken_store),
     (t::ARCHIVE_REQUESTS, &["source=\"remote\"", "result=\"found\""], archive),
     (t::ARCHIVE_FETCH, &["result=\"found\""], archive),
     (t::ARCHIVE_BREAKER, &["host=\"127.0.0.1\""], dead_archive),
@@ -139,6 +139,13 @@ fn broken_store(look: &dyn Fn()) {
     let folder = server.dir.path().join("store/results");
     std::fs::remove_dir_all(&folder).unwrap();
     std::fs::write(&folder, "").unwrap();
+    server.post("/v1/meshes", &[], SAMPLE).problem(503, "store-failed");
+    look();
+}
+
+/// Room for no mesh.
+fn tiny_store(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |config| config.store.max_bytes = 3000);
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
     look();
 }
