@@ -89,6 +89,8 @@ fn a_request_its_job_and_every_stage_are_one_tree() {
     let headers = [("traceparent", PARENT), ("tracestate", "rojo=1, congo=2"), ("x-request-id", "tree-1")];
     let reply = server.post("/v1/meshes?check=strict", &headers, SAMPLE);
     assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+    // Asking for what is kept waits until it is.
+    assert_eq!(server.get(reply.header("content-location").unwrap()).status, 200);
     // Somebody who does not want to be recorded is not.
     let other = PARENT.replace(TRACE, "11111111111111111111111111111111").replace("-01", "-00");
     assert_eq!(send(server.addr, "GET", "/version", &[("traceparent", &other)], b"").status, 200);

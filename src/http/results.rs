@@ -192,8 +192,8 @@ pub(super) fn keep_later(app: &Shared, finished: &Arc<Finished>, format: Format,
             counter!(RESULTS_NOT_KEPT, "reason" => "failed").increment(1);
             tracing::warn!(%error, "a result cannot be kept");
         }
-        drop((keeping, place));
         scope.close(|| Closing::of("keep"));
+        drop((keeping, place));
     };
     tokio::spawn(keep.in_current_span());
     true
