@@ -32,6 +32,7 @@ fn calls_behind_a_slow_job(batch: usize, n: usize) -> (Vec<usize>, u64) {
     served(ran);
     let status = pool.status().remove(0);
     assert_eq!((status.finished, status.waiting), (n as u64 + 1, 0));
+    assert!(!status.busy.is_zero());
     (rig.calls(), status.shared)
 }
 
@@ -171,7 +172,7 @@ fn a_lost_device_is_rebuilt_and_its_job_is_done() {
         pool.run(&job(1)).unwrap();
         let status = pool.status().remove(0);
         assert_eq!(rig.calls(), [1, 1], "{fault:?}");
-        assert_eq!((status.finished, status.failed, status.rebuilds), (1, 1, 1), "{fault:?}");
+        assert_eq!((status.finished, status.failed, status.rebuilds, status.lost), (1, 1, 1, 1), "{fault:?}");
         assert_eq!((rig.builds.load(Ordering::SeqCst), rig.drops.load(Ordering::SeqCst)), (2, 1), "{fault:?}");
     }
 }
@@ -204,6 +205,8 @@ fn a_device_that_keeps_failing_is_given_up_and_the_other_serves() {
     assert_eq!(status[0].rebuilds, MOST_REBUILDS as u64);
     assert_eq!(rigs[0].calls().len(), MOST_REBUILDS + 1);
     assert_eq!((status[1].finished, status[1].rebuilds, &status[1].down), (6, 0, &None));
+    // The last failure has no rebuild any more.
+    assert_eq!((status[0].lost, status[1].lost), (MOST_REBUILDS as u64 + 1, 0));
 }
 
 #[test]

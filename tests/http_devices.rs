@@ -77,6 +77,8 @@ impl Backend for Devices {
             rebuilds: if down.is_some() { 3 } else { 0 },
             down,
             waiting: 0,
+            busy: Duration::from_millis(1500),
+            lost: 5,
             finished: 11,
             failed: 2,
             shared: 4,
@@ -198,7 +200,7 @@ fn devices_are_counted_and_their_end_is_logged_once() {
         ("molmesh_device_jobs_total", &["device=\"1\"", "outcome=\"failed\""], 2.0),
         ("molmesh_device_shared_submissions_total", &["device=\"0\""], 4.0),
         ("molmesh_device_spread_jobs_total", &["device=\"1\""], 3.0),
-        ("molmesh_device_memory_held_bytes", &["device=\"1\""], f64::from(1 << 20)),
+        ("molmesh_device_memory_bytes", &["device=\"1\""], f64::from(1 << 20)),
     ] {
         assert!((value(name, labels) - expected).abs() < 0.5, "{name}: {}", value(name, labels));
     }

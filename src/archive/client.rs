@@ -15,6 +15,7 @@ use super::memory::{NoMemory, Share};
 use super::whole;
 use crate::config::{ArchiveConfig, Templates};
 use crate::store::Digest;
+use crate::telemetry::TraceContext;
 
 /// Redirects that are followed.
 const HOPS: usize = 3;
@@ -24,6 +25,9 @@ const TRUSTED: u64 = 1 << 20;
 const DAY: Duration = Duration::from_hours(24);
 /// Who asks.
 const USER_AGENT: &str = concat!("molmesh/", env!("CARGO_PKG_VERSION"), " (molecular surface service)");
+
+const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
+const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
 /// What an archive says of the version that it sent, to ask later whether that is still the one.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -123,10 +127,12 @@ pub(super) async fn get(
     known: Option<&Validators>,
     limits: Limits,
     mut share: Box<dyn Share>,
+    trace: &TraceContext,
 ) -> Result<Answer, Failed> {
     let compressed = Path::new(url.path()).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gz"));
     let name = url.to_string();
-    let mut request = client.get(url);
+    let mut request = client.get(url).header(TRACEPARENT, trace.to_string());
+    request = trace.tracestate().into_iter().fold(request, |request, state| request.header(TRACESTATE, state));
     if let Some(Validators { etag, last_modified }) = known {
         for (header, value) in [(IF_NONE_MATCH, etag), (IF_MODIFIED_SINCE, last_modified)] {
             request = value.iter().fold(request, |request, value| request.header(header.clone(), value));

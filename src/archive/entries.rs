@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use metrics::{counter, histogram};
 use quick_cache::sync::Cache;
+use tracing::Instrument as _;
 
 use super::client::Answer;
 use super::disk::{Disk, Found, Stored};
@@ -16,7 +17,7 @@ use super::remote::{Origin, Remote};
 use crate::config::Config;
 use crate::store::Digest;
 use crate::structure::{Archive as Folder, EntryId, Stamp};
-use crate::telemetry::{ARCHIVE_FETCH, ARCHIVE_REQUESTS};
+use crate::telemetry::{ARCHIVE_FETCH, ARCHIVE_REQUESTS, Scope};
 
 /// Entries whose digests are remembered: more than a day's visitors ask for, in a few megabytes.
 const REMEMBERED: usize = 16_384;
@@ -102,7 +103,18 @@ impl Archive {
     /// Any [`FetchError`].
     pub async fn fetch(&self, id: &EntryId) -> Result<Entry, FetchError> {
         let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
-        let flight = self.shared.flights.join(id, move || async move { shared.find(&wanted).await });
+        // It goes on without whoever starts it, but it is done in their name.
+        let flight = self.shared.flights.join(id, move || {
+            let scope = Scope::current();
+            let find = async move { shared.find(&wanted).await };
+            let find = async move {
+                match scope {
+                    Some(scope) => scope.run(find).await,
+                    None => find.await,
+                }
+            };
+            find.in_current_span()
+        });
         flight.await.unwrap_or(Err(FetchError::Internal("its fetch ended without a result")))
     }
 

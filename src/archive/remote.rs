@@ -14,6 +14,7 @@ use super::error::{FetchError, Why};
 use super::memory::{Memory, NoMemory};
 use crate::config::{ArchiveConfig, Template};
 use crate::structure::EntryId;
+use crate::telemetry::{Closing, Scope, SpanKind};
 
 /// Longest that a host is left alone on its own word.
 const LONGEST: Duration = Duration::from_mins(10);
@@ -167,10 +168,12 @@ impl Remote {
         let url = template.url(id).ok_or_else(|| Failed::other(Why::Client, "the address is no URL"))?;
         let known = copy.filter(|copy| copy.url == url.as_str()).map(|copy| &copy.validators);
         let pass = breaker.enter().map_err(paused)?;
-        let answer =
-            tokio::time::timeout_at(deadline, client::get(client, url, known, self.limits, self.memory.begin()))
-                .await
-                .unwrap_or_else(|_elapsed| Err(Failed::other(Why::Timeout, "not whole in time")));
+        let scope = Scope::open(&Scope::current_origin(), std::time::Instant::now());
+        let get = client::get(client, url, known, self.limits, self.memory.begin(), scope.context());
+        let answer = tokio::time::timeout_at(deadline, get)
+            .await
+            .unwrap_or_else(|_elapsed| Err(Failed::other(Why::Timeout, "not whole in time")));
+        scope.close(|| closing(id, breaker.host(), &answer));
         match &answer {
             Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => pass.succeeded(),
             Err(Failed::Other { retry_after: Some(wait), why, .. })
@@ -193,6 +196,28 @@ impl Remote {
         };
         self.client.get_or_try_init(make).await
     }
+}
+
+/// What is known of an attempt once it is over.
+fn closing(id: &EntryId, host: &str, answer: &Result<Answer, Failed>) -> Closing {
+    let mut attributes = vec![
+        ("http.request.method", "GET".into()),
+        ("server.address", host.to_owned().into()),
+        ("molmesh.entry", id.as_str().to_owned().into()),
+    ];
+    let (status, error) = match answer {
+        Ok(Answer::Body { .. }) | Err(Failed::TooLarge(_)) => (Some(200), None),
+        Ok(Answer::Unchanged) => (Some(304), None),
+        // It may have been 410: what counts is that there is none.
+        Ok(Answer::Absent) => (Some(404), None),
+        Err(Failed::Memory(_)) => (Some(200), Some("no memory for it".to_owned())),
+        Err(Failed::Other { why, detail, .. }) => match why {
+            Why::Status(status) => (Some(u64::from(*status)), Some(detail.clone())),
+            _ => (None, Some(detail.clone())),
+        },
+    };
+    attributes.extend(status.map(|status| ("http.response.status_code", status.into())));
+    Closing { name: "GET".into(), kind: SpanKind::Client, attributes, error }
 }
 
 /// A random number of [0, 1). The standard library seeds its hashers at random, which is all that pauses need.

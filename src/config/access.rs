@@ -1,17 +1,19 @@
 //! Who may ask for what, and how much of it: keys, quotas, signed addresses, and which pages may read answers.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
 use reqwest::Url;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
 
 use super::Secret;
 
 /// Keys, quotas, signed addresses; what browsers are told.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AccessConfig {
     /// TOML file of keys, which `molmesh key new` writes the lines of. Default `none`: no key is asked for. The file is read
@@ -20,6 +22,8 @@ pub struct AccessConfig {
     /// Keys that sign addresses, as `ID:SECRET` with blanks or line breaks between them; the first one signs, all are
     /// accepted, so that one can take over from another. Default `none`: no signature is accepted.
     pub signing_secret: Option<Secret>,
+    /// File with `signing_secret`, in its place. Default `none`.
+    pub signing_secret_file: Option<PathBuf>,
     /// Requests of one address in a window. Default `none`: any number. Those who present a key have the key's quota instead.
     #[serde(deserialize_with = "count")]
     pub address_requests: Option<u64>,
@@ -53,6 +57,7 @@ impl Default for AccessConfig {
         Self {
             keys_file: None,
             signing_secret: None,
+            signing_secret_file: None,
             address_requests: None,
             address_work_s: None,
             address_concurrent: None,
@@ -123,6 +128,23 @@ impl fmt::Display for Origins {
 impl Serialize for Origins {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         serializer.collect_str(self)
+    }
+}
+
+impl JsonSchema for Origins {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> Cow<'static, str> {
+        "Origins".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({ "anyOf": [
+            { "type": "string", "pattern": r"^\s*(\*|https?://\S+(\s+https?://\S+)*)\s*$" },
+            { "type": "array", "minItems": 1, "items": { "type": "string", "pattern": r"^(\*|https?://\S+)$" } },
+        ] })
     }
 }
 

@@ -165,6 +165,9 @@ impl Tree {
         let clears = matches!(value, Value::String(text) if text == "none");
         let typed = match (value, default) {
             _ if clears => Value::Null,
+            (Value::String(text), Value::Number(number)) if number.is_f64() => {
+                Value::from(text.trim().parse::<f64>().map_err(|_none| bad("a number".to_owned()))?)
+            }
             (Value::String(text), Value::Number(_)) => {
                 let size = key.ends_with("_bytes");
                 let expected = if size { "a whole number, or a size such as 64MiB" } else { "a whole number" };
@@ -175,8 +178,9 @@ impl Tree {
             }
             _ => value.clone(),
         };
+        // What may be a fraction says its own range.
         let least = least(key);
-        if typed.as_f64().is_some_and(|v| v < least as f64) {
+        if !default.is_f64() && typed.as_f64().is_some_and(|v| v < least as f64) {
             return Err(bad(format!("{least} or more")));
         }
         if let Some(place) = self.values.pointer_mut(&pointer) {

@@ -17,6 +17,7 @@ mod schema;
 mod secrets;
 mod server;
 mod store;
+mod telemetry;
 mod template;
 
 use std::path::PathBuf;
@@ -36,6 +37,7 @@ pub use proxies::{ForwardedHeader, Proxies};
 pub use schema::schema;
 pub use server::ServerConfig;
 pub use store::{Secret, StoreConfig};
+pub use telemetry::{CollectorUrl, Ratio, SecretHeaders, TelemetryConfig};
 pub use template::{ProxyUrl, Template, Templates};
 
 /// The whole configuration.
@@ -58,6 +60,8 @@ pub struct Config {
     pub access: AccessConfig,
     /// Logs.
     pub log: LogConfig,
+    /// Traces.
+    pub telemetry: TelemetryConfig,
 }
 
 impl Config {

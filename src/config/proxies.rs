@@ -1,10 +1,12 @@
 //! Which peers are proxies whose word about their clients is taken.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::net::IpAddr;
 use std::str::FromStr;
 
 use ipnet::IpNet;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// Addresses and networks of proxies; at least one. Text with blanks between them, or a list of texts.
@@ -48,6 +50,23 @@ impl Serialize for Proxies {
     }
 }
 
+impl JsonSchema for Proxies {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> Cow<'static, str> {
+        "Proxies".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({ "anyOf": [
+            { "type": "string", "pattern": r"^\s*[0-9A-Fa-f.:/]+(\s+[0-9A-Fa-f.:/]+)*\s*$" },
+            { "type": "array", "minItems": 1, "items": { "type": "string", "pattern": "^[0-9A-Fa-f.:/]+$" } },
+        ] })
+    }
+}
+
 impl<'de> Deserialize<'de> for Proxies {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         super::words(deserializer)?.parse().map_err(serde::de::Error::custom)
@@ -55,7 +74,7 @@ impl<'de> Deserialize<'de> for Proxies {
 }
 
 /// The header in which the proxies name their clients.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ForwardedHeader {
     /// `X-Forwarded-For`, which most proxies write.

@@ -5,7 +5,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Keys whose values are secret. Each has a namesake that ends in `_file`.
-pub(super) const SECRETS: [&str; 1] = ["store.secret_access_key"];
+pub(super) const SECRETS: [&str; 3] = ["store.secret_access_key", "access.signing_secret", "telemetry.secret_headers"];
 
 /// Bytes of a secret at most: keys and tokens have a few hundred.
 const MAX_BYTES: u64 = 64 << 10;

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::sync::mpsc::SyncSender;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::error::GpuError;
 use super::executor::GpuJob;
@@ -42,6 +42,18 @@ impl Entry {
     }
 }
 
+/// What a device's thread found out while it ran jobs.
+pub(super) struct Run {
+    /// How long it took.
+    pub(super) time: Duration,
+    /// Bytes of the device's memory that are held now.
+    pub(super) held_bytes: u64,
+    /// It failed: what ran there is thrown away.
+    pub(super) lost: bool,
+    /// Why it is given up, if it is.
+    pub(super) down: Option<String>,
+}
+
 /// How a device stands.
 pub(super) enum Health {
     /// Its thread builds it for the first time.
@@ -63,6 +75,10 @@ pub(super) struct Lane {
     pub(super) streak: usize,
     pub(super) finished: u64,
     pub(super) failed: u64,
+    /// Time that it spent on jobs.
+    pub(super) busy: Duration,
+    /// Times that what ran on it was thrown away.
+    pub(super) lost: u64,
     pub(super) rebuilds: u64,
     pub(super) shared: u64,
     /// Parts of jobs, among the finished.
@@ -83,6 +99,8 @@ impl Lane {
             streak: 0,
             finished: 0,
             failed: 0,
+            busy: Duration::ZERO,
+            lost: 0,
             rebuilds: 0,
             shared: 0,
             spread: 0,
@@ -108,6 +126,8 @@ impl Lane {
             waiting: self.waiting.len() + self.running,
             finished: self.finished,
             failed: self.failed,
+            busy: self.busy,
+            lost: self.lost,
             rebuilds: self.rebuilds,
             shared: self.shared,
             spread: self.spread,

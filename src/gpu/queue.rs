@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use super::error::GpuError;
 use super::executor::{Finished, GpuJob};
-use super::lane::{Entry, Health, Lane, answer, dismiss, why_down};
+use super::lane::{Entry, Health, Lane, Run, answer, dismiss, why_down};
 use super::share::Share;
 use crate::surface::{DeviceStatus, SurfaceError};
 
@@ -192,7 +192,8 @@ impl Queues {
 
     /// Device `n` has run `jobs`: books the outcomes, then answers. A verdict on the device comes before the answers,
     /// so that whoever tries again finds it as it stands.
-    pub(super) fn done(&self, n: usize, jobs: Vec<Entry>, answers: Vec<Answer>, held_bytes: u64, down: Option<String>) {
+    pub(super) fn done(&self, n: usize, jobs: Vec<Entry>, answers: Vec<Answer>, run: Run) {
+        let Run { time, held_bytes, lost, down } = run;
         let mut left = VecDeque::new();
         {
             let mut state = self.lock();
@@ -213,6 +214,8 @@ impl Queues {
                 lane.streak = 0;
             }
             lane.running = 0;
+            lane.busy += time;
+            lane.lost += u64::from(lost);
             lane.held_bytes = held_bytes;
             if let Some(why) = &down {
                 left = lane.fell(why);

@@ -2,11 +2,11 @@
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::error::GpuError;
 use super::executor::{Executor, GpuJob};
-use super::lane::Entry;
+use super::lane::{Entry, Run};
 use super::queue::{Answer, Queues, shows_health};
 
 /// Makes what runs jobs on one device: at the start, and again after a failure.
@@ -32,16 +32,17 @@ fn run(queues: &Queues, n: usize, build: &Build, pause: Duration) {
     };
     queues.up(n);
     while let Some(entries) = queues.next(n) {
+        let begun = Instant::now();
         let answers = attempt(executor.as_mut(), &entries);
-        let held_bytes = executor.held_bytes();
+        let (time, held_bytes) = (begun.elapsed(), executor.held_bytes());
         let Some(why) = answers.iter().find_map(blame) else {
-            queues.done(n, entries, answers, held_bytes, None);
+            queues.done(n, entries, answers, Run { time, held_bytes, lost: false, down: None });
             continue;
         };
         let given_up = |why: &str| format!("given up after {MOST_REBUILDS} rebuilds without a finished job: {why}");
         // A job that came to its end beside the failed one starts the count anew.
         let hopeless = queues.streak(n) >= MOST_REBUILDS && !answers.iter().any(shows_health);
-        queues.done(n, entries, answers, held_bytes, hopeless.then(|| given_up(&why)));
+        queues.done(n, entries, answers, Run { time, held_bytes, lost: true, down: hopeless.then(|| given_up(&why)) });
         discard(executor);
         if hopeless {
             return;

@@ -7,17 +7,20 @@ use axum::http::header::{self, HeaderMap};
 use axum::http::{HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
+use tracing::Instrument as _;
 
 use super::declared::Declared;
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::state::Shared;
+use super::timing::Timing;
 use super::wish::{PREFERENCE_APPLIED, Wish};
 use super::{conditional, delivery, jobs, results};
 use crate::formats::Format;
 use crate::jobs::{ContentKey, Lease, Order, Task, Ticket};
 use crate::pipeline::params::Request;
 use crate::store::Digest;
+use crate::telemetry::Scope;
 
 /// A mesh, or its report, that somebody asks for.
 pub(super) struct Ask {
@@ -29,8 +32,8 @@ pub(super) struct Ask {
     pub(super) wish: Wish,
     /// How long the answer stays good; none: it belongs to this request alone.
     pub(super) cache: Option<HeaderValue>,
-    /// Time until the input was there.
-    pub(super) received: Duration,
+    /// Where the time went so far.
+    pub(super) timing: Timing,
     /// What the input's type says that it is.
     pub(super) declared: Declared,
 }
@@ -92,7 +95,7 @@ impl Ask {
     }
 
     /// Makes the mesh, or promises to.
-    pub(super) async fn make(self, app: &Shared, input: Input) -> Result<Response, Problem> {
+    pub(super) async fn make(mut self, app: &Shared, input: Input) -> Result<Response, Problem> {
         app.admit_work(&self.wish.caller)?;
         if self.wish.later {
             return self.promise(app, input, None).await;
@@ -100,6 +103,11 @@ impl Ask {
         let place = app.delivery()?;
         let task = self.task(&input);
         let mut ticket = app.pool.submit(task, app.config.jobs.deadline(), None)?;
+        if ticket.is_shared()
+            && let Some(scope) = Scope::current()
+        {
+            scope.link(ticket.scope().context());
+        }
         let patience = match self.wish.wait {
             // A report has no address of its own that could be promised: it is waited for until its deadline.
             _ if self.request.report => Duration::MAX,
@@ -111,16 +119,23 @@ impl Ask {
             return self.promise(app, input, Some(ticket)).await;
         };
         let digest = input.digest;
+        let joined = ticket.is_shared();
         drop((ticket, input));
         let finished = outcome.map_err(|failure| self.declared.explain(failure))?;
+        if joined {
+            // The stages ran for somebody else too, and partly before this request was there.
+            self.timing.lap("joined");
+        } else {
+            self.timing.job(&finished.product.report);
+        }
         self.declared.check_format(finished.product.report.source_format)?;
         if self.request.report {
-            return delivery::report(&finished, self.received);
+            return delivery::report(&finished, self.timing);
         }
         // Another backend may have stood in for the chosen one, and its bytes are others.
         let key = ContentKey::new(&digest, &self.request.job, self.format, finished.product.report.backend);
         let kept = results::keep_later(app, &finished, self.format, &key);
-        let mut response = delivery::mesh(app, Arc::clone(&finished), self.format, &key, self.received, place).await?;
+        let mut response = delivery::mesh(app, Arc::clone(&finished), self.format, &key, self.timing, place).await?;
         let headers = response.headers_mut();
         if kept {
             headers.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, self.format.extension())));
@@ -139,6 +154,8 @@ impl Ask {
             job: self.request.job.clone(),
             rank: self.wish.rank,
             lease: Some(Arc::clone(&input.lease)),
+            origin: Scope::current_origin(),
+            id: None,
         }
     }
 
@@ -154,7 +171,7 @@ impl Ask {
         let ticket = ticket.map(|ticket| ticket.with_time(app.config.jobs.batch_deadline()));
         let ledger = app.ledger.clone();
         // Whoever leaves now has asked nevertheless: the job is promised as a whole or not at all.
-        let promised = tokio::spawn(async move { ledger.promise(order, ticket).await });
+        let promised = tokio::spawn(async move { ledger.promise(order, ticket).await }.in_current_span());
         let view = promised.await.map_err(Problem::internal)??;
         let wait =
             app.pool.estimated_wait() + Duration::from_secs_f64(app.pool.expected(&input.bytes, &self.request.job));

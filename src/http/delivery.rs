@@ -1,7 +1,6 @@
 //! A finished job as an answer: the mesh with its summary in headers, or the report.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use axum::http::HeaderValue;
 use axum::http::header::{self, HeaderMap, HeaderName};
@@ -14,6 +13,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use super::problem::{self, Finding, Problem};
 use super::state::App;
 use super::stream;
+use super::timing::Timing;
 use crate::formats::Format;
 use crate::jobs::{ContentKey, Finished};
 use crate::pipeline::Report;
@@ -40,8 +40,6 @@ pub(super) const SUMMARY: [&str; 17] = [
     "molmesh-backend-reason",
 ];
 
-pub(super) const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
-
 /// A report, and what was found on the way to it.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReportDocument {
@@ -59,12 +57,11 @@ pub(super) async fn mesh(
     finished: Arc<Finished>,
     format: Format,
     key: &ContentKey,
-    received: Duration,
+    mut timing: Timing,
     place: OwnedSemaphorePermit,
 ) -> Result<Response, Problem> {
     let report = &finished.product.report;
     let mut headers = summary(&serde_json::to_value(report).map_err(Problem::internal)?);
-    headers.insert(SERVER_TIMING, server_timing(report, received));
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
     headers.insert(header::ETAG, etag(key));
@@ -72,20 +69,25 @@ pub(super) async fn mesh(
     if let Some(length) = length {
         headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     }
-    Ok((headers, body).into_response())
+    timing.head();
+    let mut response = (headers, body).into_response();
+    response.extensions_mut().insert(timing);
+    Ok(response)
 }
 
 /// The report as JSON.
-pub(super) fn report(finished: &Finished, received: Duration) -> Result<Response, Problem> {
+pub(super) fn report(finished: &Finished, mut timing: Timing) -> Result<Response, Problem> {
     let report = &finished.product.report;
     let mut headers = summary(&serde_json::to_value(report).map_err(Problem::internal)?);
-    headers.insert(SERVER_TIMING, server_timing(report, received));
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
     // Times differ from run to run, so no two reports are the same.
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     let diagnostics = finished.diagnostics.as_deref().map(problem::findings);
     let document = ReportDocument { report: report.clone(), diagnostics };
-    Ok((headers, serde_json::to_string(&document).map_err(Problem::internal)?).into_response())
+    let mut response = (headers, serde_json::to_string(&document).map_err(Problem::internal)?).into_response();
+    timing.head();
+    response.extensions_mut().insert(timing);
+    Ok(response)
 }
 
 /// The strong validator of a mesh file.
@@ -122,11 +124,4 @@ pub(super) fn summary(report: &Value) -> HeaderMap {
         (HeaderName::from_static(name), text(&value))
     };
     SUMMARY.into_iter().map(header).collect()
-}
-
-/// Time of every stage that is over when the head is sent; writing the file is not.
-fn server_timing(report: &Report, received: Duration) -> HeaderValue {
-    let stages = report.timings_ms.iter().map(|(name, ms)| format!("{name};dur={ms}"));
-    let receive = format!("receive;dur={:.3}", received.as_secs_f64() * 1e3);
-    text(&std::iter::once(receive).chain(stages).collect::<Vec<_>>().join(", "))
 }

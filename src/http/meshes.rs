@@ -1,7 +1,6 @@
 //! `POST /v1/meshes`: the mesh of an upload, or of what a JSON document names.
 
 use std::sync::Arc;
-use std::time::Instant;
 
 use axum::body::Body;
 use axum::extract::rejection::QueryRejection;
@@ -21,6 +20,7 @@ use super::openapi::problems::{ASKING, BODY, MESHING, NAMED, PARAMETERS, READING
 use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
+use super::timing::Timing;
 use super::upload::{self, Upload};
 use super::wish::Wish;
 use super::{negotiate, pdb, structures};
@@ -76,18 +76,21 @@ pub(super) async fn create(
     extensions: Extensions,
     body: Body,
 ) -> Result<Response, Problem> {
-    let start = Instant::now();
+    let mut timing = Timing::start();
     let wish = Wish::of(&headers, &extensions)?;
     let taken = take(&app, query, &headers, body).await?;
     let Taken { request, pairs, format, digest, declared, source } = taken;
-    let ask = Ask { digest, request, pairs, format, wish, cache: None, received: start.elapsed(), declared };
+    timing.lap("receive");
+    let mut ask = Ask { digest, request, pairs, format, wish, cache: None, timing, declared };
     // What a type says about the bytes is found out by reading them.
     let known =
         if ask.declared.is_structure() { None } else { ask.known(&app, &Method::POST, &HeaderMap::new()).await? };
     let mut response = if let Some(response) = known {
         response
     } else {
+        ask.timing.lap("lookup");
         let input = source.input(&app).await?;
+        ask.timing.lap("load");
         ask.make(&app, input).await?
     };
     response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));

@@ -5,15 +5,18 @@ use axum::http::header::CONTENT_TYPE;
 use axum::middleware::from_fn;
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
-use metrics_exporter_prometheus::PrometheusHandle;
 
-use super::problem;
+use super::problem::{self, Problem};
+use crate::telemetry::Recorder;
 
 /// The metrics' router.
-pub(super) fn router(handle: PrometheusHandle) -> Router {
+pub(super) fn router(recorder: Recorder) -> Router {
     let show = move || {
-        let text = handle.render();
-        async move { answer(text) }
+        let recorder = recorder.clone();
+        async move {
+            // Looking at the process reads files.
+            tokio::task::spawn_blocking(move || recorder.render()).await.map(answer).map_err(Problem::internal)
+        }
     };
     Router::new().route("/metrics", get(show)).layer(from_fn(problem::render))
 }

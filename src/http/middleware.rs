@@ -1,7 +1,7 @@
 //! What every request goes through, outermost first. This file is the documented order:
 //!
 //! 1. **request id**: everything below can name the request;
-//! 2. **observe**: the span, one log line, the duration metric; it sees the final status;
+//! 2. **observe**: the place in the trace, the span, one log line, metrics, `Server-Timing`; it sees the final status;
 //! 3. **problems**: errors of everything below become `application/problem+json`;
 //! 4. **browsers**: what they must not do with an answer, also with problems that a layer below made;
 //! 5. **CORS**: answers preflights; errors below carry its headers, so that scripts can read them;
@@ -33,7 +33,7 @@ pub(super) fn apply(router: Router, timeout: Duration, app: &Shared) -> Router {
     router.layer(
         ServiceBuilder::new()
             .layer(from_fn(request_id::assign))
-            .layer(from_fn(observe::request))
+            .layer(from_fn_with_state(app.tracer.clone(), observe::request))
             .layer(from_fn(problem::render))
             .layer(from_fn_with_state(Arc::clone(app), browsers::restrain))
             .layer(browsers::cors(&app.access))

@@ -41,6 +41,7 @@ mod state;
 mod stop;
 mod stream;
 mod structures;
+mod timing;
 mod upload;
 mod wish;
 

@@ -1,33 +1,76 @@
-//! The span of a request, its log line and its duration, which ends with the last byte of the answer.
+//! The span of a request, its place in a trace, its log line and its metrics, which end with the last byte of the answer.
 
 use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::task::{Context, Poll};
 use std::time::Instant;
 
 use axum::body::Body;
-use axum::extract::{MatchedPath, Request};
-use axum::http::Method;
+use axum::extract::{MatchedPath, Request, State};
+use axum::http::{HeaderName, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::Response;
 use bytes::Bytes;
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
-use metrics::histogram;
+use metrics::{gauge, histogram};
 use tracing::Instrument as _;
 
 use super::request_id::RequestId;
-use crate::telemetry::HTTP_DURATION;
+use super::timing;
+use crate::telemetry::{
+    Closing, HTTP_ACTIVE, HTTP_DURATION, HTTP_REQUEST_SIZE, HTTP_RESPONSE_SIZE, Origin, Scope, SpanKind, TraceContext,
+    Tracer, Value,
+};
+
+/// W3C's name for a place in a trace: in and out.
+pub(super) const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
+/// What vendors add to it: in alone, and on to whom we ask.
+const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
 /// Watches one request.
-pub(super) async fn request(request: Request, next: Next) -> Response {
+pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next: Next) -> Response {
     let start = Instant::now();
     let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
     let route = request.extensions().get::<MatchedPath>().cloned();
     let method = request.method().clone();
+    let scope = {
+        let all = |name| request.headers().get_all(name).iter().map(HeaderValue::as_bytes);
+        let context = TraceContext::read(all(TRACEPARENT), all(TRACESTATE));
+        Scope::open(&Origin { request: Some(id.as_str().into()), context, tracer }, start)
+    };
     // The query stays out: a signature may stand in it. The guard adds whose key it is.
     let path = request.uri().path();
-    let span = tracing::info_span!("request", id = id.as_str(), %method, path, key = tracing::field::Empty);
-    let mut log = Log { start, method, route, status: None, span: span.clone(), bytes: 0, complete: false };
-    let response = next.run(request).instrument(span).await;
+    let span = tracing::info_span!(
+        "request",
+        request_id = id.as_str(),
+        trace_id = %scope.trace_id(),
+        %method,
+        path,
+        key = tracing::field::Empty
+    );
+    let received = Arc::new(AtomicU64::new(0));
+    gauge!(HTTP_ACTIVE, "method" => known(&method)).increment(1.0);
+    let path = if scope.is_recorded() { path.to_owned() } else { String::new() };
+    let mut log = Log {
+        start,
+        method,
+        route,
+        path,
+        status: None,
+        span: span.clone(),
+        scope: scope.clone(),
+        received: Arc::clone(&received),
+        bytes: 0,
+        complete: false,
+    };
+    let request = request.map(|body| Body::new(Received { body, bytes: received }));
+    let place = HeaderValue::from_str(&scope.context().to_string());
+    let mut response = scope.run(next.run(request)).instrument(span).await;
+    timing::tell(&mut response, start.elapsed());
+    if let Ok(place) = place {
+        response.headers_mut().insert(TRACEPARENT, place);
+    }
     log.status = Some(response.status().as_u16());
     response.map(|body| {
         // Nobody polls a body that is empty, or the answer to HEAD.
@@ -41,9 +84,15 @@ struct Log {
     start: Instant,
     method: Method,
     route: Option<MatchedPath>,
+    /// Of a request whose span is recorded.
+    path: String,
     /// None if the client left before there was an answer.
     status: Option<u16>,
     span: tracing::Span,
+    scope: Scope,
+    /// Bytes of the request's body.
+    received: Arc<AtomicU64>,
+    /// Bytes of the answer's.
     bytes: usize,
     complete: bool,
 }
@@ -54,8 +103,16 @@ impl Drop for Log {
         let route = self.route.as_ref().map_or("unmatched", MatchedPath::as_str).to_owned();
         let Self { status, bytes, complete, .. } = *self;
         let label = status.map_or_else(|| "none".to_owned(), |status| status.to_string());
-        histogram!(HTTP_DURATION, "method" => known(&self.method), "route" => route, "status" => label)
-            .record(time.as_secs_f64());
+        let method = known(&self.method);
+        let received = self.received.load(Ordering::Relaxed);
+        gauge!(HTTP_ACTIVE, "method" => method).decrement(1.0);
+        for (name, value) in [
+            (HTTP_DURATION, time.as_secs_f64()),
+            (HTTP_REQUEST_SIZE, received as f64),
+            (HTTP_RESPONSE_SIZE, bytes as f64),
+        ] {
+            histogram!(name, "method" => method, "route" => route.clone(), "status" => label.clone()).record(value);
+        }
         let ms = (time.as_secs_f64() * 1e6).round() / 1e3;
         self.span.in_scope(|| {
             if let Some(status) = status {
@@ -64,6 +121,29 @@ impl Drop for Log {
                 tracing::info!(ms, "the client left before it was answered");
             }
         });
+        self.scope.close(|| self.closing(method, route, received));
+    }
+}
+
+impl Log {
+    /// The span, with attributes as OpenTelemetry names them.
+    fn closing(&self, method: &'static str, route: String, received: u64) -> Closing {
+        let mut attributes: Vec<(&'static str, Value)> = vec![
+            ("http.request.method", method.into()),
+            ("url.path", self.path.clone().into()),
+            ("http.request.body.size", received.into()),
+            ("http.response.body.size", (self.bytes as u64).into()),
+            ("molmesh.request.id", self.scope.request().to_owned().into()),
+            ("molmesh.complete", Value::Flag(self.complete)),
+        ];
+        let name = if self.route.is_some() { format!("{method} {route}") } else { method.to_owned() };
+        if self.route.is_some() {
+            attributes.push(("http.route", route.into()));
+        }
+        attributes.extend(self.status.map(|status| ("http.response.status_code", u64::from(status).into())));
+        // What the client did wrong is no failure of ours.
+        let error = self.status.filter(|status| *status >= 500).map(|status| format!("answered with {status}"));
+        Closing { name: name.into(), kind: SpanKind::Server, attributes, error }
     }
 }
 
@@ -81,7 +161,34 @@ fn known(method: &Method) -> &'static str {
     }
 }
 
-/// A body that is counted.
+/// A request's body that is counted.
+struct Received {
+    body: Body,
+    bytes: Arc<AtomicU64>,
+}
+
+impl HttpBody for Received {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        let polled = Pin::new(&mut self.body).poll_frame(cx);
+        if let Poll::Ready(Some(Ok(frame))) = &polled {
+            self.bytes.fetch_add(frame.data_ref().map_or(0, Bytes::len) as u64, Ordering::Relaxed);
+        }
+        polled
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        self.body.size_hint()
+    }
+}
+
+/// An answer's body that is counted.
 struct Observed {
     body: Body,
     log: Log,

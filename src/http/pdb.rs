@@ -1,7 +1,5 @@
 //! `GET /v1/pdb/{id}/surface.{ext}`: the mesh of an archive entry, under an address that can be cached.
 
-use std::time::{Duration, Instant};
-
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
 use axum::http::header::{self, HeaderMap};
@@ -19,6 +17,7 @@ use super::openapi::problems::{ASKING, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
+use super::timing::Timing;
 use super::wish::Wish;
 use crate::archive::{Entry, FetchError, Memory, NoMemory, Share, Why};
 use crate::formats::Format;
@@ -51,18 +50,20 @@ pub(super) async fn surface(
     headers: HeaderMap,
     extensions: Extensions,
 ) -> Result<Response, Problem> {
-    let start = Instant::now();
+    let mut timing = Timing::start();
     let Path((id, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let named = named(&file, query)?;
     let id: EntryId = id.parse().map_err(|error| of_folder(&error))?;
     let digest = digest(&app, &id).await?;
     let wish = Wish::of(&headers, &extensions)?;
-    let mut ask = named.ask(digest, wish, start.elapsed());
+    timing.lap("receive");
+    let mut ask = named.ask(digest, wish, timing);
     if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
         return Ok(response);
     }
+    ask.timing.lap("lookup");
     let input = input(&app, &id).await?;
-    ask.received = start.elapsed();
+    ask.timing.lap("load");
     ask.make(&app, input).await
 }
 
@@ -74,10 +75,10 @@ pub(super) struct Named {
 }
 
 impl Named {
-    /// What is asked of the structure with this digest, whose bytes or name took `received` to be there.
-    pub(super) fn ask(self, digest: Digest, wish: Wish, received: Duration) -> Ask {
+    /// What is asked of the structure with this digest; `timing` says how long that took to be known.
+    pub(super) fn ask(self, digest: Digest, wish: Wish, timing: Timing) -> Ask {
         let Self { request, pairs, format } = self;
-        Ask { digest, request, pairs, format, wish, cache: Some(CACHE), received, declared: Declared::Neutral }
+        Ask { digest, request, pairs, format, wish, cache: Some(CACHE), timing, declared: Declared::Neutral }
     }
 }
 

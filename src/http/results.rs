@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use axum::body::Body;
 use axum::extract::rejection::PathRejection;
@@ -12,6 +12,7 @@ use axum::http::{HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use metrics::counter;
 use serde_json::Value;
+use tracing::Instrument as _;
 
 use super::kinds::Kind;
 use super::openapi::meshes::{Kept, NotModified};
@@ -20,11 +21,12 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::range::{self, Wanted};
 use super::state::{App, Shared};
+use super::timing::SERVER_TIMING;
 use super::{conditional, delivery};
 use crate::formats::Format;
 use crate::jobs::{self, ContentKey, Finished, REPORT};
 use crate::pipeline::Report;
-use crate::telemetry::RESULTS_NOT_KEPT;
+use crate::telemetry::{Closing, RESULTS_NOT_KEPT, Scope};
 
 /// The name says what the bytes are: they never change.
 pub(super) const IMMUTABLE: HeaderValue = HeaderValue::from_static("public, max-age=31536000, immutable");
@@ -168,7 +170,7 @@ async fn head(app: &App, key: &ContentKey, format: Format) -> Result<Option<Arc<
     headers.insert(header::ACCEPT_RANGES, HeaderValue::from_static("bytes"));
     headers.insert(header::CACHE_CONTROL, IMMUTABLE);
     headers.insert(header::CONTENT_LOCATION, delivery::text(&path(key, format.extension())));
-    headers.insert(delivery::SERVER_TIMING, HeaderValue::from_static("cache;desc=hit"));
+    headers.insert(SERVER_TIMING, HeaderValue::from_static("cache;desc=hit"));
     let head = Arc::new(Head { headers });
     app.heads.insert(*key, Arc::clone(&head));
     Ok(Some(head))
@@ -183,14 +185,17 @@ pub(super) fn keep_later(app: &Shared, finished: &Arc<Finished>, format: Format,
     };
     let (app, finished, key) = (Arc::clone(app), Arc::clone(finished), *key);
     let keeping = app.begin_keeping(&key);
-    tokio::spawn(async move {
+    let scope = Scope::open(&Scope::current_origin(), Instant::now());
+    let keep = async move {
         let limit = app.config.limits.output_bytes;
         if let Err(error) = jobs::save(&app.store, finished, format, &key, limit).await {
             counter!(RESULTS_NOT_KEPT, "reason" => "failed").increment(1);
             tracing::warn!(%error, "a result cannot be kept");
         }
+        scope.close(|| Closing::of("keep"));
         drop((keeping, place));
-    });
+    };
+    tokio::spawn(keep.in_current_span());
     true
 }
 

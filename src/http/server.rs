@@ -22,7 +22,7 @@ use crate::config::Config;
 use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
 use crate::store::{Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
-use crate::telemetry::{self, TelemetryError};
+use crate::telemetry::{self, Exporter, TelemetryError};
 
 /// How often the recorder tidies up its histograms.
 const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
@@ -80,6 +80,7 @@ pub struct Server {
     addr: SocketAddr,
     metrics_addr: Option<SocketAddr>,
     stop: watch::Sender<Stop>,
+    exporter: Option<Exporter>,
 }
 
 fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
@@ -103,7 +104,11 @@ impl Server {
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
         let (metrics_listener, metrics_addr) = metrics.unzip();
-        telemetry::recorder()?;
+        // Before anything is counted; what nobody can read is not.
+        if metrics_listener.is_some() {
+            telemetry::recorder()?;
+        }
+        let (tracer, exporter) = Exporter::start(&config.telemetry);
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
@@ -111,6 +116,7 @@ impl Server {
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
             meter: Some(Arc::new(Bill(Arc::clone(&access)))),
+            tracer: tracer.clone(),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
@@ -142,10 +148,11 @@ impl Server {
             deliveries,
             readiness,
             probe: Probe::new(),
+            tracer,
             found,
             capabilities,
         });
-        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop })
+        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop, exporter })
     }
 
     /// Address of the service.
@@ -169,7 +176,6 @@ impl Server {
     /// # Errors
     /// [`ServeError`].
     pub async fn run(self, mut orders: watch::Receiver<Stop>) -> Result<bool, ServeError> {
-        let handle = telemetry::recorder()?;
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
         let renewing = tokio::spawn(renew::keys(Arc::clone(&self.app.access)));
@@ -196,17 +202,19 @@ impl Server {
         let metrics = match self.metrics_listener.zip(self.metrics_addr) {
             Some((listener, addr)) => {
                 let listener = tokio_listener("server.metrics_listen", addr, listener)?;
-                Some(tokio::spawn(accept::serve(listener, metrics::router(handle.clone()), config, stopped)))
+                let router = metrics::router(telemetry::recorder()?);
+                Some(tokio::spawn(accept::serve(listener, router, config, stopped)))
             }
             None => None,
         };
         let watched = Arc::clone(&self.app);
+        let recorder = self.metrics_addr.map(|_| telemetry::recorder()).transpose()?;
         let upkeep = tokio::spawn(async move {
             loop {
                 tokio::time::sleep(UPKEEP).await;
-                watched.pool.publish_devices();
+                watched.pool.publish();
                 renew::tell(&watched.access);
-                handle.run_upkeep();
+                recorder.iter().for_each(telemetry::Recorder::run_upkeep);
             }
         });
         stop::reached(&mut orders, Stop::Notice).await;
@@ -216,6 +224,9 @@ impl Server {
         }
         if let Some(metrics) = metrics {
             metrics.abort();
+        }
+        if let Some(exporter) = self.exporter {
+            exporter.finish().await;
         }
         Ok(requests)
     }
@@ -291,7 +302,7 @@ fn warm_up(app: &App) {
     let start = Instant::now();
     let backend = Arc::clone(app.pool.backend());
     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| backend.warm()));
-    app.pool.publish_devices();
+    app.pool.publish();
     match result {
         Ok(Ok(())) => {
             let ms = start.elapsed().as_secs_f64() * 1e3;

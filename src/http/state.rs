@@ -19,6 +19,7 @@ use crate::config::Config;
 use crate::jobs::{ContentKey, Ledger, Pool};
 use crate::store::Store;
 use crate::surface::FoundDevice;
+use crate::telemetry::Tracer;
 
 /// State of the service, behind one pointer.
 pub(super) struct App {
@@ -41,6 +42,8 @@ pub(super) struct App {
     pub(super) readiness: Readiness,
     /// Whether the store works.
     pub(super) probe: Probe,
+    /// Where spans go.
+    pub(super) tracer: Tracer,
     /// The devices that were found when the service started.
     pub(super) found: Vec<FoundDevice>,
     /// The body of `/v1/capabilities`, which changes only where devices can fail: with devices it is written anew.

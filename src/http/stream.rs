@@ -16,7 +16,7 @@ use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 use super::problem::{self, Problem};
 use crate::formats::{Encoder, Format};
 use crate::jobs::Finished;
-use crate::telemetry::STAGE_DURATION;
+use crate::telemetry::{STAGE_DURATION, Scope};
 
 /// Bytes of a piece: few wake-ups for large meshes, small enough to be in a cache while it is sent.
 const PIECE: usize = 256 << 10;
@@ -39,9 +39,9 @@ pub(super) async fn start(
 ) -> Result<(Option<u64>, Body), Problem> {
     let (head, answer) = oneshot::channel();
     let (pieces, receiver) = mpsc::channel(PIECES);
-    let span = tracing::Span::current();
+    let (span, scope) = (tracing::Span::current(), Scope::current());
     tokio::task::spawn_blocking(move || {
-        span.in_scope(|| write(&finished, format, limit, head, pieces));
+        span.in_scope(|| write(&finished, format, limit, head, pieces, scope.as_ref()));
         drop(place);
     });
     // A writer that panics drops its end; the panic hook has logged it.
@@ -56,6 +56,7 @@ fn write(
     limit: u64,
     head: oneshot::Sender<Result<Option<u64>, Problem>>,
     pieces: mpsc::Sender<Piece>,
+    scope: Option<&Scope>,
 ) {
     let start = Instant::now();
     let product = &finished.product;
@@ -76,7 +77,13 @@ fn write(
     let Some(encoder) = encoder.filter(|_| !gone) else { return };
     let mut writer = Pieces { pieces, buffer: BytesMut::new() };
     match encoder.write(&mut writer).and_then(|()| writer.finish()) {
-        Ok(()) => histogram!(STAGE_DURATION, "stage" => "encode").record(start.elapsed().as_secs_f64()),
+        Ok(()) => {
+            let time = start.elapsed();
+            histogram!(STAGE_DURATION, "stage" => "encode").record(time.as_secs_f64());
+            if let Some(scope) = scope {
+                scope.part("encode", start, time);
+            }
+        }
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => tracing::debug!("the client left"),
         // The body ends without its end, which breaks the connection off: a truncated mesh must not look whole.
         Err(error) => tracing::error!(%error, format = format.extension(), "writing a mesh failed"),

@@ -1,7 +1,5 @@
 //! `/v1/structures`: upload once, mesh many times. A structure's name is the SHA-256 of its bytes as they came.
 
-use std::time::Instant;
-
 use axum::Json;
 use axum::body::Body;
 use axum::extract::rejection::PathRejection;
@@ -23,6 +21,7 @@ use super::openapi::problems::{ASKING, BODY, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
+use super::timing::Timing;
 use super::upload::{self, Upload};
 use super::wish::Wish;
 use super::{conditional, delivery, pdb};
@@ -199,20 +198,22 @@ pub(super) async fn surface(
     headers: HeaderMap,
     extensions: Extensions,
 ) -> Result<Response, Problem> {
-    let start = Instant::now();
+    let mut timing = Timing::start();
     let Path((text, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let named = pdb::named(&file, query)?;
     let digest = digest_of(&text)?;
     let wish = Wish::of(&headers, &extensions)?;
-    let mut ask = named.ask(digest, wish, start.elapsed());
+    timing.lap("receive");
+    let mut ask = named.ask(digest, wish, timing);
     if app.store.head(&Name::input(&digest)).await?.is_none() {
         return Err(none(&text));
     }
     if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
         return Ok(response);
     }
+    ask.timing.lap("lookup");
     let input = input(&app, &digest).await?;
-    ask.received = start.elapsed();
+    ask.timing.lap("load");
     ask.make(&app, input).await
 }
 

@@ -6,7 +6,8 @@ use metrics::{counter, gauge};
 
 use crate::surface::DeviceStatus;
 use crate::telemetry::{
-    DEVICE_HELD, DEVICE_JOBS, DEVICE_REBUILDS, DEVICE_SHARED, DEVICE_SPREAD, DEVICE_UP, DEVICE_WAITING,
+    DEVICE_BUSY, DEVICE_JOBS, DEVICE_LOST, DEVICE_MEMORY, DEVICE_REBUILDS, DEVICE_SHARED, DEVICE_SPREAD, DEVICE_UP,
+    DEVICE_WAITING,
 };
 
 /// What the log knows of each device: its rebuilds, and whether it was up.
@@ -23,8 +24,10 @@ impl Watch {
             let number = device.number.to_string();
             let up = device.down.is_none();
             gauge!(DEVICE_UP, "device" => number.clone()).set(f64::from(u8::from(up)));
-            gauge!(DEVICE_HELD, "device" => number.clone()).set(device.held_bytes as f64);
+            gauge!(DEVICE_MEMORY, "device" => number.clone()).set(device.held_bytes as f64);
             gauge!(DEVICE_WAITING, "device" => number.clone()).set(device.waiting as f64);
+            gauge!(DEVICE_BUSY, "device" => number.clone()).set(device.busy.as_secs_f64());
+            counter!(DEVICE_LOST, "device" => number.clone()).absolute(device.lost);
             counter!(DEVICE_REBUILDS, "device" => number.clone()).absolute(device.rebuilds);
             counter!(DEVICE_SHARED, "device" => number.clone()).absolute(device.shared);
             counter!(DEVICE_SPREAD, "device" => number.clone()).absolute(device.spread);

@@ -1,8 +1,8 @@
 //! A piece of work in the house: whoever asks for the same while it waits or runs takes part in it.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
@@ -11,6 +11,7 @@ use super::{Outcome, Task};
 use crate::pipeline::{Job, ProgressSink, Tracker, params};
 use crate::store::Digest;
 use crate::surface::CancelToken;
+use crate::telemetry::Scope;
 
 /// What makes two tasks one: the same input, the same parameters, the same check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -27,6 +28,7 @@ impl WorkKey {
 pub struct Progress {
     begun: AtomicBool,
     tracker: Tracker,
+    ended: Mutex<Vec<(&'static str, Instant, Duration)>>,
 }
 
 impl Progress {
@@ -39,11 +41,20 @@ impl Progress {
     pub(super) fn begin(&self) {
         self.begun.store(true, Ordering::Release);
     }
+
+    /// The stages that are over, with when they began and how long they took.
+    pub(super) fn stages(&self) -> Vec<(&'static str, Instant, Duration)> {
+        std::mem::take(&mut *self.ended.lock().unwrap_or_else(PoisonError::into_inner))
+    }
 }
 
 impl ProgressSink for Progress {
     fn progress(&self, stage: &'static str, fraction: f64) {
         self.tracker.progress(stage, fraction);
+    }
+
+    fn ended(&self, stage: &'static str, begun: Instant, time: Duration) {
+        self.ended.lock().unwrap_or_else(PoisonError::into_inner).push((stage, begun, time));
     }
 }
 
@@ -69,6 +80,8 @@ pub(super) struct Flight {
     pub(super) begun: Option<Instant>,
     pub(super) cancel: CancelToken,
     pub(super) progress: Arc<Progress>,
+    /// The span of the work, from its acceptance on, under that of the first who asked.
+    pub(super) scope: Scope,
     pub(super) waiters: Vec<Waiter>,
     pub(super) claims: Vec<Claim>,
     /// Taken by the worker.
@@ -83,4 +96,5 @@ pub(super) struct Entry {
     pub(super) progress: Arc<Progress>,
     pub(super) claims: Vec<Claim>,
     pub(super) accepted: Instant,
+    pub(super) scope: Scope,
 }

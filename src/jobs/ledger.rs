@@ -14,7 +14,7 @@ use tokio::sync::watch;
 
 use super::patience::insist;
 use super::promise::{Promise, Runner};
-use super::record::{JobId, Record, Status, now_ms};
+use super::record::{JobId, Record, Requester, Status, now_ms};
 use super::{Claim, ContentKey, EndError, Pool, PromiseError, Task, Ticket};
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Store, StoreError};
@@ -152,6 +152,7 @@ impl Ledger {
             finished_ms: None,
             result: None,
             problem: None,
+            requester: Requester::of(&order.task.origin),
         };
         if order.idempotency.is_some()
             && let Some(view) = self.view(&id).await?
@@ -176,7 +177,8 @@ impl Ledger {
             ticket
         } else {
             let claim = self.claim(&promise, Some(kept));
-            let ticket = inner.pool.submit(order.task, inner.settings.allowed, Some(claim))?;
+            let task = Task { id: Some(id.clone()), ..order.task };
+            let ticket = inner.pool.submit(task, inner.settings.allowed, Some(claim))?;
             if ticket.came_late() {
                 promise.begin();
             }
@@ -305,7 +307,7 @@ impl Ledger {
             }
             promise.begin();
             if let Err(error) = runtime.block_on(ledger.0.keep(&promise.record())) {
-                tracing::error!(job = %promise.id(), %error, "a job's attempt cannot be recorded");
+                tracing::error!(job_id = %promise.id(), %error, "a job's attempt cannot be recorded");
             }
         })
     }
@@ -315,7 +317,7 @@ impl Ledger {
         let changed = match ending {
             Ok(key) => promise.end(Status::Successful, |record| record.result = Some(key)),
             Err(error) => {
-                tracing::info!(job = %promise.id(), %error, "a job failed");
+                tracing::info!(job_id = %promise.id(), %error, "a job failed");
                 let problem = (self.0.describe)(&error);
                 promise.end(Status::Failed, |record| record.problem = Some(problem))
             }
@@ -327,7 +329,7 @@ impl Ledger {
         let keep = || self.0.keep(&record);
         // Without the record a restart would do the job again: a waste, but nothing is lost.
         if let Err(error) = insist(&id, self.0.settings.patience, StoreError::may_pass, keep).await {
-            tracing::error!(job = %promise.id(), %error, "a job's ending cannot be recorded");
+            tracing::error!(job_id = %promise.id(), %error, "a job's ending cannot be recorded");
         }
     }
 
@@ -344,6 +346,6 @@ impl Ledger {
         let Some(input) = stored.map(|stored| stored.bytes) else { return Ok(Err("its input is gone".to_owned())) };
         let mut lease = self.0.pool.budget().lease();
         lease.force(input.len() as u64);
-        Ok(super::promise::task(record, digest, input, lease))
+        Ok(super::promise::task(record, digest, input, lease, self.0.pool.tracer()))
     }
 }

@@ -30,7 +30,7 @@ pub use key::ContentKey;
 pub use ledger::{Describe, Ledger, LedgerSettings, Order, View};
 pub use pool::{Meter, Pool, Settings};
 pub use rank::{Client, Rank, USUAL_URGENCY};
-pub use record::{BadJobId, JobId, Record, Status, now_ms, rfc3339};
+pub use record::{BadJobId, JobId, Record, Requester, Status, now_ms, rfc3339};
 pub use results::{REPORT, SaveError, save};
 pub use ticket::Ticket;
 
@@ -42,6 +42,7 @@ use bytes::Bytes;
 use crate::pipeline::{Job, Product};
 use crate::store::Digest;
 use crate::structure::referee::Diagnostic;
+use crate::telemetry::Origin;
 
 /// One job to run.
 #[derive(Debug)]
@@ -58,6 +59,10 @@ pub struct Task {
     pub rank: Rank,
     /// Memory that the input is charged to, given back with it.
     pub lease: Option<Arc<Lease>>,
+    /// Who asked for it.
+    pub origin: Origin,
+    /// The id of the job that was promised; none if somebody waits.
+    pub id: Option<JobId>,
 }
 
 /// A finished job.

@@ -30,7 +30,7 @@ pub(super) async fn insist<T, E: Display, F: Future<Output = Result<T, E>>>(
             Err(error) if may_pass(&error) && Instant::now() + pause <= end => error,
             done => return done,
         };
-        tracing::warn!(job = %id, %error, "a job waits for the store to take something");
+        tracing::warn!(job_id = %id, %error, "a job waits for the store to take something");
         tokio::time::sleep(pause).await;
         pause = (pause * 2).min(LONGEST);
     }

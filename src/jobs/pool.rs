@@ -11,7 +11,7 @@ use super::queue::Queue;
 use super::{Budget, Claim, Client, Refusal, Task, Ticket, cost, worker};
 use crate::pipeline::{Job, JobLimits};
 use crate::surface::Backend;
-use crate::telemetry::JOBS_SUBMITTED;
+use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 
 /// Sizes of a pool.
 #[derive(Debug, Clone)]
@@ -28,6 +28,8 @@ pub struct Settings {
     pub budget: Budget,
     /// Who is told what workers spend; none: nobody.
     pub meter: Option<Arc<dyn Meter>>,
+    /// Where the spans of jobs go that come from an earlier process.
+    pub tracer: Tracer,
 }
 
 /// Is told what clients cost.
@@ -46,6 +48,7 @@ pub(super) struct Shared {
     pub(super) budget: Budget,
     pub(super) workers: usize,
     pub(super) meter: Option<Arc<dyn Meter>>,
+    tracer: Tracer,
     watch: Watch,
 }
 
@@ -67,21 +70,12 @@ impl Pool {
     /// # Errors
     /// That of the system, if a thread cannot be started.
     pub fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
-        let Settings { workers, queue, patience, limits, budget, meter } = settings;
+        let Settings { workers, queue, patience, limits, budget, meter, tracer } = settings;
         let workers = workers.max(1);
         let queue = Arc::new(Queue::new(queue, workers, patience));
-        let pool = Self {
-            shared: Arc::new(Shared {
-                queue,
-                backend,
-                reason,
-                limits,
-                budget,
-                workers,
-                meter,
-                watch: Watch::default(),
-            }),
-        };
+        let watch = Watch::default();
+        let shared = Shared { queue, backend, reason, limits, budget, workers, meter, tracer, watch };
+        let pool = Self { shared: Arc::new(shared) };
         for n in 0..workers {
             let shared = Arc::clone(&pool.shared);
             std::thread::Builder::new().name(format!("molmesh-job-{n}")).spawn(move || worker::work(&shared))?;
@@ -133,9 +127,15 @@ impl Pool {
         self.shared.workers
     }
 
-    /// Tells metrics and log how the backend's devices are doing, as every finished job does.
-    pub fn publish_devices(&self) {
+    /// Tells metrics and log how the queue and the backend's devices are doing, as every finished job does.
+    pub fn publish(&self) {
+        self.shared.queue.refresh();
         self.shared.publish_devices();
+    }
+
+    /// Where the spans of jobs go that come from an earlier process.
+    pub(super) fn tracer(&self) -> &Tracer {
+        &self.shared.tracer
     }
 
     /// Memory for uploads and meshes.

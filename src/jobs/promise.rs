@@ -1,11 +1,12 @@
 //! One promised job from its acceptance to its end, and whoever watches it.
 
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use metrics::gauge;
 use tokio::sync::{Notify, watch};
+use tracing::Instrument as _;
 
 use super::flight::Progress;
 use super::ledger::{Ledger, View};
@@ -15,9 +16,10 @@ use super::record::{JobId, Record, Status, now_ms};
 use super::results::{self, SaveError};
 use super::{ContentKey, EndError, Failure, Finished, Lease, Refusal, Task, Ticket};
 use crate::formats::Format;
-use crate::pipeline::params;
+use crate::pipeline::{JobError, params};
 use crate::store::{Digest, Pin};
-use crate::telemetry::JOBS_OPEN;
+use crate::surface::SurfaceError;
+use crate::telemetry::{Closing, JOBS_OPEN, Scope, Tracer};
 
 /// How often a running job's progress is looked at.
 const TICK: Duration = Duration::from_millis(100);
@@ -150,16 +152,20 @@ pub(super) struct Runner<P> {
 }
 
 impl Ledger {
-    /// Sees a job through, beside everything else.
+    /// Sees a job through, beside everything else, in the name of the request that asked for it.
     pub(super) fn spawn(&self, runner: Runner<[Pin; 2]>) {
+        let record = runner.promise.record();
+        let origin = record.requester.origin(self.0.pool.tracer());
+        let log = Scope::open(&origin, Instant::now()).log(Some(record.id.as_str()));
         gauge!(JOBS_OPEN).increment(1.0);
         self.0.open.send_modify(|open| *open += 1);
         let ledger = self.clone();
-        tokio::spawn(async move {
+        let run = async move {
             runner.run(&ledger).await;
             gauge!(JOBS_OPEN).decrement(1.0);
             ledger.0.open.send_modify(|open| *open -= 1);
-        });
+        };
+        tokio::spawn(run.instrument(log));
     }
 
     /// Waits until every job that was taken up has ended, or is left, and that is on record. The pool must be drained.
@@ -208,7 +214,7 @@ impl<P> Runner<P> {
                     if promise.leave(tried)
                         && let Err(error) = ledger.0.keep(&promise.record()).await
                     {
-                        tracing::warn!(job = %promise.id(), %error, "a job that is left counts an attempt too many");
+                        tracing::warn!(job_id = %promise.id(), %error, "a job that is left counts an attempt too many");
                     }
                     break;
                 }
@@ -242,13 +248,14 @@ async fn attempt(ledger: &Ledger, promise: &Arc<Promise>, ticket: &mut Option<Ti
                 Err(EndError::Save { error, .. })
                     if error.may_pass() && promise.record().attempts < ledger.0.settings.attempts =>
                 {
-                    tracing::warn!(job = %record.id, %error, "a result was given up; it is made again");
+                    tracing::warn!(job_id = %record.id, %error, "a result was given up; it is made again");
                     Attempt::Silent
                 }
                 ending => Attempt::Ended(ending),
             }
         }
-        Err(Failure::Stopped) => Attempt::Left,
+        // Work that somebody waits for is cancelled by the end of the service alone.
+        Err(Failure::Stopped | Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => Attempt::Left,
         Err(Failure::Memory(_)) => Attempt::Again,
         Err(failure) => Attempt::Ended(Err(failure.into())),
     }
@@ -263,7 +270,7 @@ async fn submit(ledger: &Ledger, promise: &Arc<Promise>, record: &Record, digest
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
     // A store that does not answer now is no reason to give a promise up.
     let silent = |error| {
-        tracing::warn!(job = %record.id, %error, "a job waits for the store");
+        tracing::warn!(job_id = %record.id, %error, "a job waits for the store");
         Attempt::Silent
     };
     let (task, format) = ledger.task(record, digest).await.map_err(silent)?.map_err(lost)?;
@@ -292,10 +299,12 @@ async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Resu
     let (resolution, digest) = (report.resolution, finished.digest);
     let key = ContentKey::new(&digest, &job, format, report.backend);
     let (store, settings) = (&ledger.0.store, &ledger.0.settings);
+    let scope = Scope::open(&record.requester.origin(ledger.0.pool.tracer()), Instant::now());
     let keep = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
     insist(&record.id, settings.patience, SaveError::may_pass, keep)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
+    scope.close(|| Closing::of("keep"));
     Ok(key.to_string())
 }
 
@@ -307,9 +316,16 @@ fn read(record: &Record) -> Result<(crate::pipeline::Job, Format), String> {
 }
 
 /// The task of a record, with its input.
-pub(super) fn task(record: &Record, digest: Digest, input: Bytes, lease: Lease) -> Result<(Task, Format), String> {
+pub(super) fn task(
+    record: &Record,
+    digest: Digest,
+    input: Bytes,
+    lease: Lease,
+    tracer: &Tracer,
+) -> Result<(Task, Format), String> {
     let (job, format) = read(record)?;
     let rank = Rank { client: Client::numbered(record.client), batch: true, urgency: record.urgency };
     let strict = record.parameters.iter().any(|(name, _)| name == "check");
-    Ok((Task { input, digest, strict, job, rank, lease: Some(Arc::new(lease)) }, format))
+    let (origin, id) = (record.requester.origin(tracer), Some(record.id.clone()));
+    Ok((Task { input, digest, strict, job, rank, lease: Some(Arc::new(lease)), origin, id }, format))
 }

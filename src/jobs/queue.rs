@@ -12,7 +12,7 @@ use super::rank::{self, Shares};
 use super::returns::Returns;
 use super::{Outcome, Refusal, Task};
 use crate::surface::CancelToken;
-use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT};
+use crate::telemetry::{Closing, QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, Scope};
 
 struct State {
     flights: Vec<Flight>,
@@ -43,6 +43,8 @@ pub(super) struct Place {
     pub(super) waiter: u64,
     pub(super) outcome: oneshot::Receiver<Outcome>,
     pub(super) progress: Arc<Progress>,
+    /// The span of the work.
+    pub(super) scope: Scope,
     /// The same work was in the house already.
     pub(super) shared: bool,
     /// It runs already, so that no claim is called.
@@ -97,13 +99,16 @@ impl Queue {
             let begun = flight.begun.is_some();
             // Work that runs cannot be held back any more: whoever claims it records that by itself.
             flight.claims.extend(claim.filter(|_| !begun));
-            let progress = Arc::clone(&flight.progress);
-            return Ok(Place { flight: flight.id, waiter, outcome, progress, shared: true, begun });
+            if let Some(context) = &task.origin.context {
+                flight.scope.link(context);
+            }
+            let (progress, scope) = (Arc::clone(&flight.progress), flight.scope.clone());
+            return Ok(Place { flight: flight.id, waiter, outcome, progress, scope, shared: true, begun });
         }
         if state.leaving && task.rank.batch {
             // Its promise is kept by the next process: nobody will answer on the other end.
-            let progress = Arc::default();
-            return Ok(Place { flight: waiter, waiter, outcome, progress, shared: false, begun: false });
+            let (progress, scope) = (Arc::default(), Scope::open(&task.origin, Instant::now()));
+            return Ok(Place { flight: waiter, waiter, outcome, progress, scope, shared: false, begun: false });
         }
         let now = Instant::now();
         let units = cost::units(&task.input, &task.job);
@@ -125,7 +130,7 @@ impl Queue {
             return Err(Refusal::TooLate { wait, allowed });
         }
         let tag = state.shares.tag(&task.rank, units);
-        let progress = Arc::new(Progress::default());
+        let (progress, scope) = (Arc::new(Progress::default()), Scope::open(&task.origin, now));
         state.flights.push(Flight {
             id: waiter,
             work,
@@ -136,6 +141,7 @@ impl Queue {
             begun: None,
             cancel: CancelToken::default(),
             progress: Arc::clone(&progress),
+            scope: scope.clone(),
             waiters: vec![Waiter { id: waiter, reply }],
             claims: claim.into_iter().collect(),
             task: Some(task),
@@ -143,7 +149,7 @@ impl Queue {
         self.publish(&mut state);
         drop(state);
         self.filled.notify_one();
-        Ok(Place { flight: waiter, waiter, outcome, progress, shared: false, begun: false })
+        Ok(Place { flight: waiter, waiter, outcome, progress, scope, shared: false, begun: false })
     }
 
     /// The next job; blocks until there is one. `None` once the queue is closed and empty.
@@ -183,6 +189,7 @@ impl Queue {
             progress: Arc::clone(&flight.progress),
             claims: std::mem::take(&mut flight.claims),
             accepted: flight.accepted,
+            scope: flight.scope.clone(),
         })
     }
 
@@ -226,7 +233,10 @@ impl Queue {
         self.publish(&mut state);
         drop(state);
         // The input, which may be large, is freed outside the lock.
-        drop(left);
+        if let Some(flight) = left {
+            let error = Some("nobody waits for it any more".to_owned());
+            flight.scope.close(|| Closing { error, ..Closing::of("job") });
+        }
     }
 
     /// Accepts no more jobs. Those that were accepted still run.
@@ -308,6 +318,11 @@ impl Queue {
         let mean = state.rate.mean(all / state.flights.len().max(1) as f64) / self.workers as f64;
         let each = Duration::try_from_secs_f64(mean).unwrap_or(Duration::MAX);
         state.returns.tell(work, each, each, now)
+    }
+
+    /// Tells metrics how it stands: what waits grows older while nothing happens.
+    pub(super) fn refresh(&self) {
+        self.publish(&mut self.lock());
     }
 
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of jobs are small")]

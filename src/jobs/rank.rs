@@ -3,7 +3,7 @@
 //! Clients share by start-time fair queueing (Goyal, Vin, Cheng, 1996): a job's tag is the time, counted in work, at which its
 //! client's earlier jobs would be done; the lowest tag goes first.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rustc_hash::FxHashMap;
 use sha2::{Digest as _, Sha256};

@@ -9,6 +9,7 @@ use serde_json::Value;
 use thiserror::Error;
 
 use crate::store::Digest;
+use crate::telemetry::{Origin, TraceContext, Tracer};
 
 /// Not a job's id: 32 hexadecimal digits in lower case are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
@@ -139,6 +140,45 @@ pub struct Record {
     pub result: Option<String>,
     /// Why there is none: a problem document.
     pub problem: Option<Value>,
+    /// Who asked for it.
+    #[serde(default)]
+    pub requester: Requester,
+}
+
+/// Who asked for a job: the request, and its place in a trace as W3C writes it.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Requester {
+    /// The request's id.
+    pub request: Option<String>,
+    /// The span of the request.
+    pub traceparent: Option<String>,
+    /// What vendors had added.
+    pub tracestate: Option<String>,
+}
+
+impl Requester {
+    /// What is to be kept of an origin.
+    #[must_use]
+    pub fn of(origin: &Origin) -> Self {
+        Self {
+            request: origin.request.as_deref().map(str::to_owned),
+            traceparent: origin.context.as_ref().map(ToString::to_string),
+            tracestate: origin.context.as_ref().and_then(TraceContext::tracestate).map(str::to_owned),
+        }
+    }
+
+    /// The origin that was kept, whose spans go to `tracer` now.
+    #[must_use]
+    pub fn origin(&self, tracer: &Tracer) -> Origin {
+        let bytes = |text: &Option<String>| text.clone().map(String::into_bytes);
+        let (parent, state) = (bytes(&self.traceparent), bytes(&self.tracestate));
+        Origin {
+            request: self.request.as_deref().map(Into::into),
+            context: TraceContext::read(parent.as_deref(), state.as_deref()),
+            tracer: tracer.clone(),
+        }
+    }
 }
 
 impl Record {
@@ -198,11 +238,30 @@ mod tests {
             finished_ms: None,
             result: None,
             problem: None,
+            requester: Requester { request: Some("r".to_owned()), ..Requester::default() },
         };
         let text = serde_json::to_vec(&record).unwrap();
         assert_eq!(serde_json::from_slice::<Record>(&text).unwrap(), record);
+        // Records of earlier versions say nothing of who asked.
+        let mut old = serde_json::to_value(&record).unwrap();
+        old.as_object_mut().unwrap().remove("requester").unwrap();
+        assert_eq!(serde_json::from_value::<Record>(old).unwrap().requester, Requester::default());
         let hostile = String::from_utf8(text).unwrap().replace(record.id.as_str(), "../../x");
         assert!(serde_json::from_str::<Record>(&hostile).is_err());
+    }
+
+    #[test]
+    fn who_asked_comes_back_as_it_was() {
+        let parent = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
+        let context = TraceContext::read([parent.as_bytes()], [&b"a=1"[..]]);
+        let origin = Origin { request: Some("r".into()), context, tracer: Tracer::default() };
+        let kept = Requester::of(&origin);
+        assert_eq!(kept.traceparent.as_deref(), Some(parent));
+        let back = kept.origin(&Tracer::default());
+        assert_eq!((&back.request, &back.context), (&origin.request, &origin.context));
+        // Whoever changes a record cannot put more into it than into a request.
+        let hostile = Requester { traceparent: Some("00-x".to_owned()), ..kept };
+        assert_eq!(hostile.origin(&Tracer::default()).context, None);
     }
 
     #[test]

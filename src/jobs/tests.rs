@@ -13,7 +13,7 @@ use tokio::sync::watch;
 
 use super::rank::{Client, Rank, USUAL_URGENCY};
 use super::{
-    Budget, EndError, JobId, Ledger, LedgerSettings, Order, Pool, PromiseError, Record, Settings, Status, Task, View,
+    Budget, EndError, JobId, Ledger, LedgerSettings, Order, Pool, PromiseError, Record, Requester, Settings, Status, Task, View,
     now_ms,
 };
 use crate::formats::Format;
@@ -21,6 +21,7 @@ use crate::pipeline::{JobLimits, params};
 use crate::store::faulty::{Faults, faulty};
 use crate::store::{Digest, Folder, Name, Store, StoreError};
 use crate::surface::ReferenceBackend;
+use crate::telemetry::{Origin, Tracer};
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 const PATIENT: Duration = Duration::from_mins(2);
@@ -42,6 +43,8 @@ impl House {
             patience: Duration::from_secs(10),
             limits: JobLimits::default(),
             budget: Budget::new(1 << 30),
+            meter: None,
+            tracer: Tracer::default(),
         };
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test says so".to_owned()).unwrap());
         let settings = LedgerSettings { allowed: PATIENT, attempts, output_bytes: 1 << 30, patience };
@@ -54,7 +57,7 @@ impl House {
         let request = params::parse(pairs.iter().map(|(name, value)| (name, value))).unwrap();
         let rank = Rank { client: Client::named("a"), batch: true, urgency: USUAL_URGENCY };
         let (input, digest) = (Bytes::from_static(SAMPLE), Digest::of(SAMPLE));
-        let task = Task { input, digest, strict: false, job: request.job, rank, lease: None };
+        let task = Task { input, digest, strict: false, job: request.job, rank, lease: None, origin: Origin::default(), id: None };
         let order = Order { task, parameters: pairs.to_vec(), format: Format::Stl, idempotency: None };
         self.ledger.promise(order, None).await
     }
@@ -69,6 +72,7 @@ impl House {
             client: 1,
             urgency: USUAL_URGENCY,
             status: Status::Accepted,
+            requester: Requester::default(),
             attempts: 0,
             created_ms: now_ms(),
             started_ms: None,

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use super::flight::Progress;
 use super::queue::{Place, Queue};
 use super::{Failure, Outcome};
+use crate::telemetry::Scope;
 
 /// An accepted job.
 #[must_use = "dropping the ticket cancels the job"]
@@ -39,6 +40,12 @@ impl Ticket {
     #[must_use]
     pub fn progress(&self) -> &Arc<Progress> {
         &self.place.progress
+    }
+
+    /// The span of the work.
+    #[must_use]
+    pub fn scope(&self) -> &Scope {
+        &self.place.scope
     }
 
     /// Whether the work ran already when this ticket was given out: then its claim is not called.

@@ -9,12 +9,14 @@ use metrics::{counter, histogram};
 
 use super::flight::Entry;
 use super::pool::Shared;
-use super::{Failure, Finished, Outcome};
-use crate::pipeline::{self, Choice, JobError, Report};
+use super::{Failure, Finished, JobId, Outcome};
+use crate::pipeline::{self, Choice, JobError, ProgressSink as _, Report};
 use crate::structure::referee::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, Mesh, SurfaceError};
-use crate::telemetry::{JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, VOXELS};
+use crate::telemetry::{
+    Closing, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, Scope, SpanKind, TRIANGLES, VOXELS,
+};
 
 /// Largest text of which the referee explains a refusal, bytes: it takes some 10 ms for so much, and 40 in the worst case.
 const MAX_EXPLAINED: u64 = 512 << 10;
@@ -37,21 +39,37 @@ pub(super) fn work(shared: &Shared) {
 
 /// Runs one job. None if nobody wants it any more.
 fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
-    let Entry { task, cancel, progress, claims, accepted, .. } = entry;
+    let Entry { task, cancel, progress, claims, accepted, scope, .. } = entry;
+    let log = scope.log(task.id.as_ref().map(JobId::as_str));
+    let _entered = log.enter();
+    let trace = Trace { scope, promised: task.rank.batch, job: task.id.clone() };
     if cancel.is_cancelled() {
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
+        trace.close("dismissed", None);
         return None;
     }
     let waited = accepted.elapsed();
+    trace.scope.part("queue", accepted, waited);
     let outcome = shared.budget.check().map_err(Failure::from).and_then(|()| {
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
         let work = || {
             for claim in claims {
                 claim();
             }
-            let diagnostics = if task.strict { Some(check(shared, &task.input)?) } else { None };
-            let product = pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref())
-                .map_err(|error| explained(shared, &task.input, error))?;
+            let (diagnostics, checked) = if task.strict {
+                let begun = Instant::now();
+                let found = check(shared, &task.input);
+                progress.ended("check", begun, begun.elapsed());
+                (Some(found?), Some(begun.elapsed()))
+            } else {
+                (None, None)
+            };
+            let mut product =
+                pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref())
+                    .map_err(|error| explained(shared, &task.input, error))?;
+            if let Some(time) = checked {
+                product.report.add_timing("check", ms(time));
+            }
             Ok::<_, Failure>((diagnostics, product))
         };
         let (diagnostics, mut product) =
@@ -69,8 +87,41 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
     // The input is freed before the answer goes out: the receiver then sees the memory that is really held.
     drop(task);
     let outcome = outcome.map(Arc::new);
-    tell(&outcome);
+    for (stage, begun, time) in progress.stages() {
+        trace.scope.part(stage, begun, time);
+    }
+    trace.close(tell(&outcome), Some(&outcome));
     Some(outcome)
+}
+
+/// The span of a job.
+struct Trace {
+    scope: Scope,
+    promised: bool,
+    job: Option<JobId>,
+}
+
+impl Trace {
+    fn close(&self, label: &'static str, outcome: Option<&Outcome>) {
+        self.scope.close(|| {
+            let mut attributes = vec![("molmesh.job.outcome", label.into())];
+            attributes.extend(self.job.iter().map(|id| ("molmesh.job.id", id.to_string().into())));
+            if let Some(Ok(finished)) = outcome {
+                let report = &finished.product.report;
+                attributes.extend([
+                    ("molmesh.backend", report.backend.into()),
+                    ("molmesh.device", report.device.clone().into()),
+                    ("molmesh.atoms", report.atoms.into()),
+                    ("molmesh.samples", report.samples.into()),
+                    ("molmesh.triangles", report.triangles.into()),
+                ]);
+            }
+            // A promise is kept after its request was answered: nobody waits for it there.
+            let kind = if self.promised { SpanKind::Consumer } else { SpanKind::Internal };
+            let error = outcome.and_then(|outcome| outcome.as_ref().err()).map(ToString::to_string);
+            Closing { name: "job".into(), kind, attributes, error }
+        });
+    }
 }
 
 /// The strict check: the referee's findings, or a refusal if there are errors among them.
@@ -100,8 +151,8 @@ fn log_device(failure: &Failure) {
     }
 }
 
-/// Counts an outcome, and logs what is for the log.
-fn tell(outcome: &Outcome) {
+/// Counts an outcome, and logs what is for the log. What it is called comes back.
+fn tell(outcome: &Outcome) -> &'static str {
     let label = match outcome {
         Ok(_) => "successful",
         Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => "dismissed",
@@ -112,6 +163,7 @@ fn tell(outcome: &Outcome) {
         log_device(failure);
     }
     counter!(JOBS_FINISHED, "outcome" => label).increment(1);
+    label
 }
 
 fn panicked(payload: &(dyn Any + Send)) -> Failure {

@@ -2,7 +2,7 @@
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use crate::surface::{Observer, Stage};
 
@@ -12,6 +12,11 @@ pub trait ProgressSink: Sync {
     fn progress(&self, stage: &'static str, fraction: f64) {
         let _ = (stage, fraction);
     }
+
+    /// Told of a stage that is over: when it began, and its wall time. Stages that ran interleaved are laid one after another.
+    fn ended(&self, stage: &'static str, begun: Instant, time: Duration) {
+        let _ = (stage, begun, time);
+    }
 }
 
 impl ProgressSink for () {}
@@ -19,7 +24,8 @@ impl ProgressSink for () {}
 /// Measures stages. Stages that run interleaved on several threads (the backend's) share the wall time of
 /// their pass in proportion to the threads' time in each, so the stages add up to the wall time. Where a device told
 /// the times of its stages they stand as told, and what is left of the pass is its `roundtrip`: waiting for the
-/// device, transfers, everything that is no stage.
+/// device, transfers, everything that is no stage. Devices that worked side by side may tell more than the pass took; then
+/// their stages share its wall time too.
 pub struct StageClock<'a> {
     sink: &'a dyn ProgressSink,
     busy_ns: [AtomicU64; Stage::ALL.len()],
@@ -39,7 +45,7 @@ impl<'a> StageClock<'a> {
         self.sink.progress(name, 0.0);
         let start = Instant::now();
         let value = work();
-        self.push(name, start.elapsed().as_secs_f64() * 1e3);
+        self.push(name, start, start.elapsed().as_secs_f64() * 1e3);
         value
     }
 
@@ -48,23 +54,25 @@ impl<'a> StageClock<'a> {
         let start = Instant::now();
         let value = work();
         let wall = start.elapsed().as_secs_f64() * 1e3;
-        let busy = self.busy_ns.each_ref().map(|ns| ns.swap(0, Ordering::Relaxed) as f64);
-        let total: f64 = busy.iter().sum();
-        let device = self.device_ns.each_ref().map(|ns| ns.swap(0, Ordering::Relaxed) as f64);
-        if device.iter().any(|ns| *ns > 0.0) {
-            for ((stage, host), device) in Stage::ALL.into_iter().zip(busy).zip(device) {
-                if host + device > 0.0 {
-                    self.push(stage.name(), (host + device) / 1e6);
-                }
+        let take =
+            |ns: &[AtomicU64; Stage::ALL.len()]| ns.each_ref().map(|ns| ns.swap(0, Ordering::Relaxed) as f64 / 1e6);
+        let (busy, device) = (take(&self.busy_ns), take(&self.device_ns));
+        let told: f64 = busy.iter().chain(&device).sum();
+        let by_device = device.iter().any(|ms| *ms > 0.0);
+        // The host's threads share the pass; what a device tells stands, as long as the pass has room for it.
+        let scale = if by_device && told <= wall { 1.0 } else { wall / told };
+        let mut begun = start;
+        let mut push = |name, ms: f64| {
+            self.push(name, begun, ms);
+            begun += duration(ms);
+        };
+        for ((stage, host), device) in Stage::ALL.into_iter().zip(busy).zip(device) {
+            if host + device > 0.0 {
+                push(stage.name(), (host + device) * scale);
             }
-            let stages = (total + device.iter().sum::<f64>()) / 1e6;
-            self.push("roundtrip", (wall - stages).max(0.0));
-            return value;
         }
-        for (stage, share) in Stage::ALL.into_iter().zip(busy) {
-            if share > 0.0 {
-                self.push(stage.name(), wall * share / total);
-            }
+        if by_device {
+            push("roundtrip", (wall - told * scale).max(0.0));
         }
         value
     }
@@ -76,13 +84,18 @@ impl<'a> StageClock<'a> {
     }
 
     /// A stage that runs more than once has the time of all its runs.
-    fn push(&self, name: &'static str, ms: f64) {
+    fn push(&self, name: &'static str, begun: Instant, ms: f64) {
+        self.sink.ended(name, begun, duration(ms));
         let mut times = self.wall_ms.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         match times.iter_mut().find(|(known, _)| *known == name) {
             Some((_, sum)) => *sum += ms,
             None => times.push((name, ms)),
         }
     }
+}
+
+fn duration(ms: f64) -> Duration {
+    Duration::try_from_secs_f64(ms / 1e3).unwrap_or_default()
 }
 
 impl Observer for StageClock<'_> {
@@ -130,6 +143,43 @@ mod tests {
         let times = clock.finish();
         assert_eq!(times.iter().filter(|(name, _)| *name == "field").count(), 1, "{times:?}");
         assert!(times.iter().any(|(name, ms)| *name == "field" && (ms - 2.0).abs() < 1e-9), "{times:?}");
+    }
+
+    #[test]
+    fn devices_that_worked_side_by_side_share_the_wall_time() {
+        let clock = StageClock::new(&());
+        let start = Instant::now();
+        clock.pass(|| {
+            clock.elapsed(Stage::Field, 3_000_000_000_000);
+            clock.elapsed(Stage::Emit, 1_000_000_000_000);
+        });
+        let (wall, times) = (start.elapsed().as_secs_f64() * 1e3, clock.finish());
+        let of = |name: &str| times.iter().find(|(n, _)| *n == name).map(|(_, ms)| *ms).unwrap();
+        assert!((of("field") / of("emit") - 3.0).abs() < 1e-6 && of("roundtrip") < 1e-6, "{times:?}");
+        assert!(of("field") + of("emit") <= wall, "{times:?}: more than {wall}");
+    }
+
+    #[test]
+    fn whoever_watches_is_told_when_stages_began() {
+        struct Watch(Mutex<Vec<(&'static str, Instant, Duration)>>);
+        impl ProgressSink for Watch {
+            fn ended(&self, stage: &'static str, begun: Instant, time: Duration) {
+                self.0.lock().unwrap().push((stage, begun, time));
+            }
+        }
+        let (watch, start) = (Watch(Mutex::default()), Instant::now());
+        let clock = StageClock::new(&watch);
+        clock.time("read", || ());
+        clock.pass(|| {
+            clock.elapsed(Stage::Field, 1000);
+            clock.elapsed(Stage::Emit, 1000);
+            std::thread::sleep(Duration::from_millis(1));
+        });
+        let told = watch.0.into_inner().unwrap();
+        assert_eq!(told.iter().map(|(name, ..)| *name).collect::<Vec<_>>(), ["read", "field", "emit", "roundtrip"]);
+        for pair in told.windows(2) {
+            assert!(pair[0].1 >= start && pair[0].1 + pair[0].2 <= pair[1].1, "{told:?}");
+        }
     }
 
     #[test]

@@ -3,6 +3,7 @@
 
 use std::fmt;
 use std::str::FromStr;
+use std::time::Duration;
 
 /// Bricks that each device gets at least of a structure that several make together. On an H200 a brick takes about 0.1 µs
 /// from the upload to the host's memory, so that these take 3 ms; a part costs a tenth to a quarter of that beside them:
@@ -166,6 +167,10 @@ pub struct DeviceStatus {
     pub finished: u64,
     /// Jobs that failed for its sake.
     pub failed: u64,
+    /// Time that it spent on jobs.
+    pub busy: Duration,
+    /// Times it failed and what ran on it was thrown away.
+    pub lost: u64,
     /// Times it was built anew after a failure.
     pub rebuilds: u64,
     /// Submissions that several jobs shared.

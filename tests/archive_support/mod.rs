@@ -1,4 +1,5 @@
 //! A remote archive over plain HTTP/1.1 that misbehaves on command, and counts what it is asked.
+#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 #![allow(clippy::format_push_string, reason = "answers read best as they are sent")]
 

@@ -126,6 +126,45 @@ pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
     Some(ask(Path::new("node"), "validate_gltf.mjs", paths))
 }
 
+/// What a script of `promql.py` says of an expression.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Expression {
+    /// The panel or rule that it stands in.
+    pub place: String,
+    /// Why it is no PromQL.
+    pub error: Option<String>,
+    pub selectors: Vec<Selector>,
+}
+
+/// What an expression selects.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Selector {
+    pub metric: Option<String>,
+    /// Label, value, and whether the value is a regular expression.
+    pub matchers: Vec<(String, String, bool)>,
+    /// Labels that are named around it: by aggregations, legends, annotations.
+    pub around: Vec<String>,
+}
+
+/// The queries of a dashboard or a file of rules.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Queries {
+    /// Why the file cannot be read.
+    pub error: Option<String>,
+    pub expressions: Vec<Expression>,
+}
+
+/// Reads the queries of dashboards (`.json`) and rules (`.yaml`).
+pub fn queries(paths: &[impl AsRef<Path>]) -> Option<Vec<Queries>> {
+    python("promql.py", paths)
+}
+
+/// Prometheus' own tool for rules, if `setup.sh` could get it.
+pub fn promtool() -> Option<PathBuf> {
+    let tool = installed_here().join("promtool");
+    if tool.is_file() { Some(tool) } else { missing("promtool") }
+}
+
 /// Gives paths to a script of `tests/tools` run by the Python with the pinned packages, one path per line, and
 /// takes one line of JSON per path.
 pub fn python<T: DeserializeOwned>(script: &str, paths: &[impl AsRef<Path>]) -> Option<Vec<T>> {

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs the outside oracles of the tests (trimesh, gemmi, moto, schemas, gltf-validator) into target/test-tools, which git
+# Installs the outside oracles of the tests (trimesh, gemmi, moto, schemas, gltf-validator, promtool) into target/test-tools, which git
 # ignores, and Mesa's software Vulkan (lavapipe) into the system where there is none: the shaders are tested on it. Does
 # nothing when all is there and up to date; says nothing unless it installs or fails.
 set -eu
@@ -53,6 +53,25 @@ mkdir -p "$tools"
 if command -v flock >/dev/null 2>&1; then
     exec 9>"$tools/.lock"
     flock 9
+fi
+
+# Prometheus' tool for rules, taken out of Debian's package: the package would bring a server, and start it.
+if [ ! -x "$tools/promtool" ]; then
+    if command -v apt-get >/dev/null 2>&1 && command -v dpkg-deb >/dev/null 2>&1; then
+        echo "taking promtool out of the package prometheus into target/test-tools" >&2
+        folder=$(mktemp -d)
+        get() { (cd "$folder" && apt-get download -qq prometheus) >"$folder/log" 2>&1; }
+        as_root=
+        if [ "$(id -u)" -ne 0 ]; then as_root="sudo -n"; fi
+        # Where nothing is known of packages, or of older ones alone, the lists come first.
+        get || { $as_root apt-get update -qq >>"$folder/log" 2>&1 && get; } ||
+            { tail -5 "$folder/log" >&2; rm -rf "$folder"; fail "apt-get could not download the package prometheus"; }
+        dpkg-deb --fsys-tarfile "$folder"/prometheus_*.deb | tar -x -C "$folder" ./usr/bin/promtool
+        mv "$folder/usr/bin/promtool" "$tools/promtool.new" && mv "$tools/promtool.new" "$tools/promtool"
+        rm -rf "$folder"
+    else
+        echo "tests/tools/setup.sh: without apt-get, put promtool (of Prometheus) into target/test-tools by hand" >&2
+    fi
 fi
 
 stamp=$(digest "$("$python" -VV) $root" "$here/requirements.txt")

@@ -52,7 +52,9 @@ fn mesh(doc: &str) -> ResponseBuilder {
         .header("ETag", text("The strong validator of the file: the same key, the same bytes."))
         .header(
             "Server-Timing",
-            text("How long each stage took, ms; `cache;desc=hit` for a file that was made before."),
+            text(
+                "Where the time went, ms: entries add up to `total`; `cache;desc=hit` for a file that was made before.",
+            ),
         );
     let response = summary().fold(response, |response, (name, header)| response.header(name, header));
     Format::ALL.iter().fold(response, |response, format| response.content(format.media_type(), file()))

@@ -1,0 +1,236 @@
+//! What Prometheus reads, taken apart; backends that make it move.
+#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+pub(crate) mod queries;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex};
+use std::time::{Duration, Instant};
+
+use molmesh::surface::{
+    Backend, Control, DeviceStatus, Meshed, Served, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+};
+use molmesh::telemetry::{Kind, Metric};
+
+use crate::http_support::{Fake, Mode};
+
+/// One sample: name, labels as they are written, value.
+#[derive(Debug, Clone)]
+pub(crate) struct Sample {
+    pub(crate) name: String,
+    pub(crate) labels: BTreeMap<String, String>,
+    text: String,
+    pub(crate) value: f64,
+}
+
+/// What was exposed at a moment.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Scrape {
+    pub(crate) samples: Vec<Sample>,
+    pub(crate) kinds: BTreeMap<String, String>,
+    pub(crate) helps: BTreeSet<String>,
+}
+
+impl Scrape {
+    pub(crate) fn of(text: &str) -> Self {
+        let mut scrape = Self::default();
+        for line in text.lines().filter(|line| !line.is_empty()) {
+            if let Some(rest) = line.strip_prefix("# TYPE ") {
+                let (name, kind) = rest.split_once(' ').unwrap();
+                scrape.kinds.insert(name.to_owned(), kind.to_owned());
+            } else if let Some(rest) = line.strip_prefix("# HELP ") {
+                scrape.helps.insert(rest.split(' ').next().unwrap().to_owned());
+            } else {
+                let (series, value) = line.rsplit_once(' ').unwrap();
+                let (name, labels) = series.split_once('{').unwrap_or((series, ""));
+                let text = labels.trim_end_matches('}').to_owned();
+                scrape.samples.push(Sample {
+                    name: name.to_owned(),
+                    labels: labels_of(&text),
+                    text,
+                    value: value.parse().unwrap(),
+                });
+            }
+        }
+        scrape
+    }
+
+    /// The samples of a metric whose labels hold all of `labels`: of a histogram those that count.
+    fn of_metric<'a>(&'a self, name: &str, labels: &'a [&str]) -> impl Iterator<Item = &'a Sample> {
+        let count = format!("{name}_count");
+        let name = name.to_owned();
+        self.samples.iter().filter(move |sample| {
+            (sample.name == name || sample.name == count) && labels.iter().all(|label| sample.text.contains(label))
+        })
+    }
+
+    /// The sum of what was counted or is.
+    pub(crate) fn moves(&self, name: &str, labels: &[&str]) -> f64 {
+        self.of_metric(name, labels).map(|sample| sample.value).sum()
+    }
+
+    /// The sets of labels of a metric.
+    pub(crate) fn series(&self, name: &str) -> BTreeSet<String> {
+        self.of_metric(name, &[]).map(|sample| sample.text.clone()).collect()
+    }
+}
+
+fn labels_of(text: &str) -> BTreeMap<String, String> {
+    // No value of ours holds a quote or a comma.
+    let pairs = text.split("\",").filter(|pair| !pair.is_empty());
+    pairs
+        .map(|pair| pair.split_once("=\"").unwrap())
+        .map(|(n, v)| (n.to_owned(), v.trim_end_matches('"').to_owned()))
+        .collect()
+}
+
+/// What is exposed and not described, or otherwise than described.
+pub(crate) fn check(scrape: &Scrape, metrics: &[Metric]) -> Vec<String> {
+    let mut faults = Vec::new();
+    for Sample { name, labels, .. } in &scrape.samples {
+        let base = ["_bucket", "_sum", "_count"].iter().find_map(|suffix| {
+            let base = name.strip_suffix(suffix)?;
+            metrics.iter().find(|m| m.name == base && m.kind == Kind::Histogram)
+        });
+        let Some(metric) = base.or_else(|| metrics.iter().find(|m| m.name == name && m.kind != Kind::Histogram)) else {
+            faults.push(format!("{name} is not described"));
+            continue;
+        };
+        let mut expected: BTreeSet<&str> = metric.labels.iter().map(|label| label.name).collect();
+        if name.ends_with("_bucket") {
+            expected.insert("le");
+        }
+        let found: BTreeSet<&str> = labels.keys().map(String::as_str).collect();
+        if found != expected {
+            faults.push(format!("{name} has the labels {found:?}, not {expected:?}"));
+        }
+        for label in metric.labels {
+            let (Some(mut values), Some(value)) = (label.closed(), labels.get(label.name)) else { continue };
+            if !values.any(|known| known == value) {
+                faults.push(format!("{name}: {} is {value}, which is not among {}", label.name, label.values));
+            }
+        }
+        match scrape.kinds.get(metric.name) {
+            Some(kind) if kind == metric.kind.name() => {}
+            kind => faults.push(format!("{}: its kind is {kind:?}", metric.name)),
+        }
+        if !scrape.helps.contains(metric.name) {
+            faults.push(format!("{} has no help", metric.name));
+        }
+    }
+    faults
+}
+
+/// Waits for something to become true, for as long as a slow machine may need.
+#[track_caller]
+pub(crate) fn until(what: &str, mut is: impl FnMut() -> bool) {
+    let end = Instant::now() + Duration::from_mins(1);
+    while !is() {
+        assert!(Instant::now() < end, "waited too long for: {what}");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// A backend that holds its jobs until it is let go.
+pub(crate) struct Held {
+    fake: Arc<Fake>,
+    open: Mutex<bool>,
+    changed: Condvar,
+    /// A job is there.
+    pub(crate) holds: AtomicBool,
+}
+
+impl Held {
+    pub(crate) fn new() -> Arc<Self> {
+        Arc::new(Self {
+            fake: Fake::new(Mode::Octahedra),
+            open: Mutex::new(false),
+            changed: Condvar::new(),
+            holds: AtomicBool::new(false),
+        })
+    }
+
+    pub(crate) fn let_go(&self) {
+        *self.open.lock().unwrap() = true;
+        self.changed.notify_all();
+    }
+}
+
+impl Backend for Held {
+    fn name(&self) -> &'static str {
+        "held"
+    }
+
+    fn describe(&self) -> String {
+        "nothing".to_owned()
+    }
+
+    fn run(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<Meshed, SurfaceError> {
+        // The warm-up is one sphere.
+        if spheres.len() > 1 {
+            self.holds.store(true, Ordering::SeqCst);
+            let mut open = self.open.lock().unwrap();
+            while !*open {
+                control.check()?;
+                open = self.changed.wait_timeout(open, Duration::from_millis(5)).unwrap().0;
+            }
+        }
+        self.fake.run(spheres, params, limits, control)
+    }
+}
+
+/// A backend with a device that has seen everything, and that something else stands in for.
+pub(crate) struct Devices(Arc<Fake>);
+
+impl Devices {
+    pub(crate) fn new() -> Arc<Self> {
+        Arc::new(Self(Fake::new(Mode::Octahedra)))
+    }
+}
+
+impl Backend for Devices {
+    fn name(&self) -> &'static str {
+        "gpu"
+    }
+
+    fn describe(&self) -> String {
+        "a device".to_owned()
+    }
+
+    fn run(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<Meshed, SurfaceError> {
+        let instead = Some("as told".to_owned());
+        let served = Some(Served { backend: "cpu", device: "the processor".to_owned(), instead });
+        Ok(Meshed { served, ..self.0.run(spheres, params, limits, control)? })
+    }
+
+    fn devices(&self) -> Vec<DeviceStatus> {
+        vec![DeviceStatus {
+            number: 0,
+            name: "card 0".to_owned(),
+            down: None,
+            waiting: 7,
+            busy: Duration::from_millis(2500),
+            finished: 11,
+            failed: 2,
+            lost: 5,
+            rebuilds: 3,
+            shared: 4,
+            spread: 3,
+            held_bytes: 1 << 20,
+        }]
+    }
+}
