@@ -131,6 +131,8 @@ impl Backend for OneDevice {
             waiting: 0,
             finished: 0,
             failed: 0,
+            busy: Duration::ZERO,
+            lost: 0,
             rebuilds: 0,
             shared: 0,
             spread: 0,

@@ -1,7 +1,6 @@
 //! `molmesh serve`: flags to a configuration, a runtime, a banner, and the service until it is told to stop.
 
 use std::io::{self, Write};
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
