@@ -222,6 +222,7 @@ fn format_code(error: &FormatError) -> i32 {
         | FormatError::NotUnit { .. }
         | FormatError::BeyondStep { .. }
         | FormatError::NotQuantized { .. }
+        | FormatError::OtherPacking { .. }
         | FormatError::Json { .. } => code::INTERNAL,
     }
 }

@@ -88,7 +88,7 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn new(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::lay_out(format, Packing::Full, mesh, meta, Depth::All)
+        Self::lay_out(format, Packing::of(mesh), mesh, meta, Depth::All)
     }
 
     /// The same for a mesh that a backend returned, whose invariants hold: does not look at normals and indices
@@ -99,14 +99,15 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn trusting(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::packed(format, Packing::Full, mesh, meta)
+        Self::packed(format, Packing::of(mesh), mesh, meta)
     }
 
-    /// As [`Self::trusting`], with the vertices packed.
+    /// As [`Self::trusting`], with the vertices packed. Those of a mesh that has them so already are written as they lie.
     ///
     /// # Errors
     /// Any [`FormatError`]; [`FormatError::NotQuantized`] if `format` has no such packing,
-    /// [`FormatError::BeyondStep`] if the step is too small for the mesh.
+    /// [`FormatError::BeyondStep`] if the step is too small for the mesh, [`FormatError::OtherPacking`] if the mesh is
+    /// packed otherwise.
     pub fn packed(format: Format, packing: Packing, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
         Self::lay_out(format, packing, mesh, meta, Depth::Needed(format))
     }
@@ -120,6 +121,11 @@ impl<'a> Encoder<'a> {
     ) -> Result<Self, FormatError> {
         if packing != Packing::Full && !format.holds_quantized() {
             return Err(FormatError::NotQuantized { format: format.extension() });
+        }
+        if let Packing::Quantized(step) = Packing::of(mesh)
+            && packing != Packing::Quantized(step)
+        {
+            return Err(FormatError::OtherPacking { step: step.length() });
         }
         let summary = check::check(mesh, depth)?;
         let plan = match format {

@@ -59,7 +59,8 @@ pub fn estimate(
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, ..Control::default() };
     let lattice = Lattice::new(&spheres, &job.params)?;
     let box_cells = lattice.box_cells;
-    let mesh = match of_mesh(&lattice, &spheres, &job.params, &limits.surface, choice, &control) {
+    let (_, params) = super::packed(job, &spheres);
+    let mesh = match of_mesh(&lattice, &spheres, &params, &limits.surface, choice, &control) {
         Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)) => return Err(error.into()),
         mesh => mesh,
     };
@@ -77,10 +78,11 @@ fn of_mesh(
 ) -> Result<MeshEstimate, SurfaceError> {
     let plan = Plan::new(lattice, limits, control)?;
     let h = params.resolution;
-    let coarse = SurfaceParams { resolution: (COARSER * h).max(COARSE).max(h), atom_ids: false, ..params.clone() };
+    let single = SurfaceParams { atom_ids: false, quantize: None, ..params.clone() };
+    let coarse = SurfaceParams { resolution: (COARSER * h).max(COARSE).max(h), ..single.clone() };
     let mesh = match choice.backend.run(spheres, &coarse, limits, control) {
         // Single small spheres fall through a coarse grid: then the grid itself is taken.
-        Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, params, limits, control)?.mesh,
+        Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, &single, limits, control)?.mesh,
         meshed => meshed?.mesh,
     };
     let area = area(&mesh);
@@ -91,7 +93,7 @@ fn of_mesh(
     )]
     let vertices = (1.5 * area / (h * h)).round() as u64;
     let triangles = 2 * vertices;
-    let bytes = Mesh::bytes_for(vertices, triangles);
+    let bytes = params.mesh_bytes(vertices, triangles);
     let estimate =
         MeshEstimate { bricks: plan.occupied, samples: plan.occupied * 512, area, vertices, triangles, bytes };
     if bytes > limits.max_mesh_bytes {

@@ -120,7 +120,14 @@ pub fn run(
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
-    let mut meshed = clock.pass(|| choice.backend.run(&spheres, &job.params, &limits.surface, &control))?;
+    let (packing, params) = packed(job, &spheres);
+    let mut meshed = clock.pass(|| choice.backend.run(&spheres, &params, &limits.surface, &control))?;
+    // What a backend that does not round has measured is not what is handed on.
+    if let Some(step) = params.quantize
+        && meshed.mesh.quantize(step)
+    {
+        meshed.measures = None;
+    }
     if let Some(ids) = &mut meshed.mesh.atom_ids {
         // The core speaks of spheres; people ask for atoms of the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
@@ -129,13 +136,11 @@ pub fn run(
         Some(taken) => taken,
         None => clock.time(Stage::Measure.name(), || {
             // Triangles ask for positions anywhere; normals stay where several devices put them.
-            meshed.mesh.positions.settle();
-            meshed.mesh.triangles.settle();
+            meshed.mesh.settle_geometry();
             Measures::of(&meshed.mesh, job.proof, &control)
         })?,
     };
     let Meshed { mesh, grid, served, .. } = meshed;
-    let packing = packing(job, &spheres);
     let counts = Counts { grid, n_vertices: mesh.n_vertices(), n_triangles: mesh.n_triangles(), served, packing };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     Ok(Product { mesh, packing, report })
@@ -164,9 +169,9 @@ pub fn pour(
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
-    let packing = packing(job, &spheres);
+    let (packing, params) = packed(job, &spheres);
     sink.pack(packing);
-    let poured = clock.pass(|| choice.backend.pour(&spheres, &job.params, &limits.surface, &control, sink))?;
+    let poured = clock.pass(|| choice.backend.pour(&spheres, &params, &limits.surface, &control, sink))?;
     let counts = Counts {
         grid: poured.grid,
         n_vertices: poured.n_vertices,
@@ -178,13 +183,15 @@ pub fn pour(
     Ok(Poured { report, centre: poured.centre, bounds: poured.bounds })
 }
 
-/// How the vertices of `spheres` are stored. Depends on nothing that the backend computes, so a file can be written, or a
-/// device can fill it, before the mesh is known.
-fn packing(job: &Job, spheres: &Spheres) -> Packing {
-    match job.compress {
-        Compress::None => Packing::Full,
-        Compress::Quantize => Packing::Quantized(Step::covering(lattice::extent(spheres, &job.params))),
-    }
+/// How the vertices of `spheres` are stored, and what a backend is to be asked for so. Depends on nothing that the backend
+/// computes: a file can be written, and a device can fill it, before the mesh is known.
+fn packed(job: &Job, spheres: &Spheres) -> (Packing, SurfaceParams) {
+    let step = match job.compress {
+        Compress::None => None,
+        Compress::Quantize => Some(Step::covering(lattice::extent(spheres, &job.params))),
+    };
+    let params = SurfaceParams { quantize: step, ..job.params.clone() };
+    (step.map_or(Packing::Full, Packing::Quantized), params)
 }
 
 /// Bytes to spheres.

@@ -211,6 +211,8 @@ pub fn canonical(job: &Job) -> String {
         preset,
         paper,
         atom_ids,
+        // Follows from `compress` and the spheres.
+        quantize: _,
     } = params;
     let mut text = format!(
         "kernel={kernel}&resolution={resolution}&isovalue={isovalue}&smoothness={smoothness}\
