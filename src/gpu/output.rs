@@ -258,7 +258,13 @@ impl Engine {
         let target = landing.buffer().map_err(failed)?;
         let mut recording = self.recording();
         copy_vertices(&mut recording, loaded, target, &places, [0, rows[0]]);
-        copy_rows(&mut recording, loaded.workspace.buffer("triangles"), target, places.triangles, TRIANGLE_BYTES * rows[1]);
+        copy_rows(
+            &mut recording,
+            loaded.workspace.buffer("triangles"),
+            target,
+            places.triangles,
+            TRIANGLE_BYTES * rows[1],
+        );
         recording.timed_before(&[Stage::Interpolate, Stage::Emit]);
         recording.read_clock(target);
         copy_counts(&mut recording, &loaded.workspace, target, None);

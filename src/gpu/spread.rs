@@ -135,8 +135,7 @@ impl DevicePool {
         mesh.positions = Column::pieced(positions);
         mesh.normals = Column::pieced(normals);
         let (rounded_positions, rounded_normals) = (Column::pieced(rounded.0), Column::pieced(rounded.1));
-        mesh.quantized =
-            step.map(|step| Quantized { step, positions: rounded_positions, normals: rounded_normals });
+        mesh.quantized = step.map(|step| Quantized { step, positions: rounded_positions, normals: rounded_normals });
         mesh.triangles = Column::pieced(triangles);
         mesh.atom_ids = (!atom_ids.is_empty()).then(|| Column::pieced(atom_ids));
         if flat {

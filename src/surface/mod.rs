@@ -40,7 +40,7 @@ pub use error::SurfaceError;
 pub use measure::{Component, Measures, Proof};
 pub use mesh::{Mesh, Quantized};
 pub use params::{Kernel, PaperParams, Preset, SurfaceLimits, SurfaceOptions, SurfaceParams};
-pub use reference::ReferenceBackend;
 pub use quantize::Step;
+pub use reference::ReferenceBackend;
 pub use sink::{MeshPart, MeshSink, Poured, SinkFailed, Vertices};
 pub use spheres::Spheres;

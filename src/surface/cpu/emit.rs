@@ -9,8 +9,8 @@ use glam::Vec3A;
 
 use super::bin::SIDE;
 use super::classify::SurfaceBrick;
-use super::sheets::{self, Sheets};
 use super::interpolate::position;
+use super::sheets::{self, Sheets};
 use crate::surface::cases::{CASES, MAX_TRIANGLES, cell_edge};
 use crate::surface::lattice::to_f32;
 use crate::surface::quantize::Step;
@@ -252,8 +252,7 @@ impl BrickTable {
                 let place = LAYER[bit as usize % 64] + layer + along * t;
                 let steps = step.position(position(own, place.to_array(), h));
                 // Double precision, as a large offset is taken off.
-                let at: [f32; 3] =
-                    std::array::from_fn(|k| to_f32(f64::from(steps[k]) * length / spacing - offset[k]));
+                let at: [f32; 3] = std::array::from_fn(|k| to_f32(f64::from(steps[k]) * length / spacing - offset[k]));
                 self.at[edge_at(bit, z, axis, far)] = Vec3A::from_array(at);
             }
         });

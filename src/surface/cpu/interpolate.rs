@@ -126,7 +126,9 @@ impl<'a> Rows<'a> {
     /// Splits the first `n` rows off.
     pub(super) fn take(&mut self, n: usize) -> Self {
         match self {
-            Self::Single { positions, normals } => Self::Single { positions: take(positions, n), normals: take(normals, n) },
+            Self::Single { positions, normals } => {
+                Self::Single { positions: take(positions, n), normals: take(normals, n) }
+            }
             Self::Quantized { step, positions, normals } => {
                 Self::Quantized { step: *step, positions: take(positions, n), normals: take(normals, n) }
             }
