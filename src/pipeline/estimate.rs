@@ -139,6 +139,19 @@ mod tests {
     }
 
     #[test]
+    fn rounded_vertices_are_estimated_at_half_the_bytes() {
+        let backend = CpuBackend::new(None).unwrap();
+        let choice = Choice { backend: &backend, reason: "" };
+        let of = |compress: &str| {
+            let job = params::parse([("compress", compress)]).unwrap().job;
+            estimate(SAMPLE, &job, &JobLimits::default(), &choice, &CancelToken::default()).unwrap().mesh.unwrap()
+        };
+        let (single, rounded) = (of("none"), of("quantize"));
+        assert_eq!((single.vertices, single.triangles), (rounded.vertices, rounded.triangles));
+        assert_eq!(single.bytes - rounded.bytes, 12 * single.vertices);
+    }
+
+    #[test]
     fn what_would_be_refused_is_said_with_what_would_fit() {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };

@@ -255,6 +255,7 @@ fn numbers_of<T>(rows: &[T], such: impl Fn(&T) -> bool) -> Vec<u32> {
 }
 
 #[cfg(test)]
+#[expect(clippy::float_cmp, reason = "rounded numbers and multiples of powers of two are exact")]
 mod tests {
     use super::*;
 

@@ -5,7 +5,6 @@
 use super::measure::Component;
 use super::mesh::Mesh;
 use super::simd::dispatched;
-use super::sink::Vertices;
 
 /// No label: see [`sum`].
 pub(super) const NONE: u32 = u32::MAX;
@@ -53,9 +52,10 @@ pub(super) enum Positions<'a> {
 
 impl<'a> From<&'a Mesh> for Positions<'a> {
     fn from(mesh: &'a Mesh) -> Self {
-        match mesh.vertices() {
-            Vertices::Single { positions, .. } => Self::Single(positions),
-            Vertices::Quantized { step, positions, .. } => Self::Quantized(positions, step.length()),
+        // Normals stay where they lie, in pieces if need be.
+        match &mesh.quantized {
+            None => Self::Single(&mesh.positions),
+            Some(quantized) => Self::Quantized(&quantized.positions, quantized.step.length()),
         }
     }
 }
