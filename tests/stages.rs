@@ -387,7 +387,9 @@ fn rounded(step: Step, positions: &[[f32; 3]], normals: &[[f32; 3]]) -> [Vec<u8>
         raw(&positions.iter().map(row).collect::<Vec<[i16; 4]>>()),
         raw(&normals.iter().map(unit).collect::<Vec<[i8; 4]>>()),
     ];
-    bytes.iter_mut().for_each(|column| column.resize(12 * positions.len(), 0xa5));
+    for column in &mut bytes {
+        column.resize(12 * positions.len(), 0xa5);
+    }
     bytes
 }
 

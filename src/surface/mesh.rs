@@ -159,15 +159,14 @@ impl Mesh {
         rounded.positions.par_chunks_mut(ROWS).enumerate().for_each(|(chunk, out)| {
             out.iter_mut().zip(chunk * ROWS..).for_each(|(out, i)| *out = position_row(step, rows(i)));
         });
-        match self.quantized.take() {
+        if let Some(quantized) = self.quantized.take() {
             // Another step: normals have none.
-            Some(quantized) => rounded.normals = quantized.normals,
-            None => {
-                let normals = rounded.normals.par_chunks_mut(ROWS).zip(self.normals.par_chunks(ROWS));
-                normals.for_each(|(out, normals)| {
-                    out.iter_mut().zip(normals).for_each(|(out, normal)| *out = normal_row(*normal));
-                });
-            }
+            rounded.normals = quantized.normals;
+        } else {
+            let normals = rounded.normals.par_chunks_mut(ROWS).zip(self.normals.par_chunks(ROWS));
+            normals.for_each(|(out, normals)| {
+                out.iter_mut().zip(normals).for_each(|(out, normal)| *out = normal_row(*normal));
+            });
         }
         (self.positions, self.normals) = (Column::default(), Column::default());
         self.quantized = Some(rounded);

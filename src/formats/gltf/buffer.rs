@@ -10,15 +10,12 @@ use crate::surface::Mesh;
 /// Writes the buffer of `mesh`: `layout.len` bytes.
 pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
     // Rows are written where they lie: a column in pieces is not joined for this.
-    match &mesh.quantized {
-        Some(quantized) => {
-            quantized.positions.pieces().try_for_each(|rows| write_shorts(out, rows))?;
-            quantized.normals.pieces().try_for_each(|rows| write_bytes(out, rows))?;
-        }
-        None => {
-            mesh.positions.pieces().try_for_each(|rows| write_positions(out, layout.packing, rows))?;
-            mesh.normals.pieces().try_for_each(|rows| write_normals(out, layout.packing, rows))?;
-        }
+    if let Some(quantized) = &mesh.quantized {
+        quantized.positions.pieces().try_for_each(|rows| write_shorts(out, rows))?;
+        quantized.normals.pieces().try_for_each(|rows| write_bytes(out, rows))?;
+    } else {
+        mesh.positions.pieces().try_for_each(|rows| write_positions(out, layout.packing, rows))?;
+        mesh.normals.pieces().try_for_each(|rows| write_normals(out, layout.packing, rows))?;
     }
     if let Some(colors) = &mesh.colors {
         let linear = linear_of_srgb();
