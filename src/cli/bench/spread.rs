@@ -152,7 +152,9 @@ fn by_device(all: &[Ran]) -> Vec<DeviceRow> {
 fn digest(mesh: &Mesh) -> Vec<u8> {
     use sha2::{Digest as _, Sha256};
     let mut sum = Sha256::new();
-    bytes_of(mesh).into_iter().for_each(|part| sum.update(part));
+    for part in bytes_of(mesh) {
+        sum.update(part);
+    }
     sum.finalize().to_vec()
 }
 
