@@ -7,6 +7,7 @@
 #include shared/chunk.wgsl
 #include shared/kernel.wgsl
 #include shared/record.wgsl
+#include shared/quantize.wgsl
 
 // Whether to find the nearest atom of each vertex.
 override NEAREST: bool = false;
@@ -29,8 +30,9 @@ struct Tally {
 @group(0) @binding(8) var<storage, read> records: array<Record>;
 @group(0) @binding(9) var<storage, read> counts: array<u32>;
 @group(0) @binding(10) var<storage, read> offsets: array<vec2<u32>>;
-@group(0) @binding(11) var<storage, read_write> positions: array<f32>;
-@group(0) @binding(12) var<storage, read_write> normals: array<f32>;
+// Words of the vertex layout that is asked for: three of either, or two of a position and one of a normal.
+@group(0) @binding(11) var<storage, read_write> positions: array<u32>;
+@group(0) @binding(12) var<storage, read_write> normals: array<u32>;
 @group(0) @binding(13) var<storage, read_write> sources: array<u32>;
 @group(0) @binding(14) var<storage, read_write> tally: Tally;
 
@@ -193,13 +195,23 @@ fn main(
             }
             // Whole steps are exact; the fraction is added before the one multiplication.
             let position = (vec3<f32>(origin - params.centre) + p) * params.spacing;
-            let at = 3u * (first + vertex);
-            positions[at] = position.x;
-            positions[at + 1u] = position.y;
-            positions[at + 2u] = position.z;
-            normals[at] = normal.x;
-            normals[at + 1u] = normal.y;
-            normals[at + 2u] = normal.z;
+            if (params.steps_per_angstrom > 0.0) {
+                let at = first + vertex;
+                let rounded = quantized_position(position * params.steps_per_angstrom);
+                positions[2u * at] = rounded.x;
+                positions[2u * at + 1u] = rounded.y;
+                normals[at] = quantized_normal(normal);
+            } else {
+                let at = 3u * (first + vertex);
+                let words = bitcast<vec3<u32>>(position);
+                let unit = bitcast<vec3<u32>>(normal);
+                positions[at] = words.x;
+                positions[at + 1u] = words.y;
+                positions[at + 2u] = words.z;
+                normals[at] = unit.x;
+                normals[at + 1u] = unit.y;
+                normals[at + 2u] = unit.z;
+            }
         }
     }
 }

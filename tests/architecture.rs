@@ -64,7 +64,7 @@ const ROOMS: &[Room] = &[
     },
     Room {
         name: "formats",
-        rooms: &[("surface", Only(&["Mesh", "MeshPart", "MeshSink", "SinkFailed"]))],
+        rooms: &[("surface", Only(&["Mesh", "MeshPart", "MeshSink", "SinkFailed", "Vertices", "quantize"]))],
         crates: &["tokio", "axum", "tower", "hyper", "tracing", "wgpu", "pdbtbx", "clap"],
     },
     Room { name: "pipeline", rooms: &[("surface", Any), ("structure", Any), ("formats", Any)], crates: SERVICE },

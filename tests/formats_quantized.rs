@@ -125,6 +125,91 @@ fn the_document_says_what_was_done() {
     }
 }
 
+/// A mesh whose vertices are integers already.
+fn rounded(mesh: &Mesh) -> Mesh {
+    let mut rounded = mesh.clone();
+    assert!(rounded.quantize(step(mesh)));
+    rounded
+}
+
+#[test]
+fn vertices_that_are_integers_already_are_written_as_they_lie() {
+    for (name, mesh, ..) in cases() {
+        let small = rounded(&mesh);
+        for format in [Format::Glb, Format::Gltf] {
+            let expected = quantized(format, &mesh);
+            assert!(packed(format, Packing::Quantized(step(&mesh)), &small) == expected, "{name} {format}");
+            // Nobody has to say so: the mesh does. This way looks at everything.
+            let mut looked_at = Vec::new();
+            Encoder::new(format, &small, &meta()).unwrap().write(&mut looked_at).unwrap();
+            assert!(looked_at == expected, "{name} {format}");
+            let mut trusted = Vec::new();
+            Encoder::trusting(format, &small, &meta()).unwrap().write(&mut trusted).unwrap();
+            assert!(trusted == expected, "{name} {format}");
+        }
+        if mesh.colors.is_none() && mesh.atom_ids.is_none() {
+            for n_parts in [1, 3] {
+                let file = Anywhere::default();
+                placed(&file, Packing::Quantized(step(&mesh)), &small, n_parts).unwrap();
+                assert!(file.bytes() == quantized(Format::Glb, &mesh), "{name} in {n_parts}");
+            }
+        }
+        let mut moved = small.clone();
+        moved.quantized.as_mut().unwrap().positions[7 % mesh.n_vertices()][1] ^= 1;
+        assert!(quantized_as(&moved, &mesh) != quantized(Format::Glb, &mesh), "{name}: one integer");
+    }
+}
+
+/// The GLB of a mesh of integers, by the step of the mesh that it was.
+fn quantized_as(small: &Mesh, mesh: &Mesh) -> Vec<u8> {
+    packed(Format::Glb, Packing::Quantized(step(mesh)), small)
+}
+
+#[test]
+fn integers_are_neither_rounded_again_nor_made_longer() {
+    let mesh = icosphere(2, 10.0, [0.0; 3], false);
+    let small = rounded(&mesh);
+    let own = FormatError::OtherPacking { step: step(&mesh).length() };
+    let other = Packing::Quantized(Step::covering(40.0));
+    for format in [Format::Glb, Format::Gltf] {
+        for packing in [Packing::Full, other] {
+            assert_eq!(Encoder::packed(format, packing, &small, &meta()).unwrap_err(), own);
+        }
+    }
+    for format in [Format::Ply, Format::Stl, Format::Obj] {
+        let refusal = FormatError::NotQuantized { format: format.extension() };
+        assert_eq!(Encoder::new(format, &small, &meta()).unwrap_err(), refusal);
+        assert_eq!(Encoder::packed(format, Packing::Full, &small, &meta()).unwrap_err(), own);
+    }
+    for packing in [Packing::Full, other] {
+        let (file, sink_failed) = (Anywhere::default(), |sink: &GlbSink<'_>| sink.failure());
+        let sink = GlbSink::new(&file);
+        sink.pack(packing);
+        pour(&sink, &small, 1);
+        assert!(matches!(sink_failed(&sink), Some(PlaceError::Format(FormatError::OtherPacking { .. }))));
+    }
+    assert!(Encoder::packed(Format::Glb, Packing::of(&small), &small, &meta()).is_ok());
+}
+
+#[test]
+fn integers_out_of_reach_and_numbers_that_were_none_are_refused() {
+    let mesh = icosphere(2, 10.0, [0.0; 3], false);
+    let sizes = [f32::NAN, f32::INFINITY, 40.0, -40.0];
+    for (row, bad) in sizes.into_iter().enumerate() {
+        let mut broken = mesh.clone();
+        broken.positions[20 * row][row % 3] = bad;
+        assert!(broken.quantize(step(&mesh)));
+        let packing = Packing::of(&broken);
+        for format in [Format::Glb, Format::Gltf] {
+            let refusal = Encoder::packed(format, packing, &broken, &meta()).unwrap_err();
+            assert!(matches!(refusal, FormatError::BeyondStep { .. }), "{bad}: {refusal}");
+        }
+        let file = Anywhere::default();
+        let refusal = placed(&file, packing, &broken, 2);
+        assert!(matches!(refusal, Err(PlaceError::Format(FormatError::BeyondStep { .. }))), "{bad}: {refusal:?}");
+    }
+}
+
 #[test]
 fn a_vertex_takes_half_the_bytes() {
     let mesh = torus(300, 300);

@@ -247,8 +247,8 @@ fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
 
     let sink = GlbSink::new(&Full);
     sink.begin(mesh.n_vertices(), mesh.n_triangles()).unwrap();
-    let (positions, normals, triangles) = (&mesh.positions[..], &mesh.normals[..], &mesh.triangles[..]);
-    let part = MeshPart { first_vertex: 0, positions, normals, first_triangle: 0, triangles };
+    let (vertices, triangles) = (mesh.vertices(), &mesh.triangles[..]);
+    let part = MeshPart { first_vertex: 0, vertices, first_triangle: 0, triangles };
     assert!(sink.part(&part).is_err());
     assert!(matches!(sink.failure(), Some(PlaceError::Io(e)) if e.kind() == ErrorKind::StorageFull));
 

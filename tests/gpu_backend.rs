@@ -13,7 +13,7 @@ use gpu_fakes::Step::{Hold, Lose, OutOfMemory, Serve};
 use gpu_fakes::{Rig, SETTINGS, devices, spheres};
 use molmesh::gpu::{DevicePool, GpuBackend, GpuError, Look, Program, discover};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, Meshed, Observer, Stage, SurfaceError,
+    Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, Meshed, Observer, Stage, Step, SurfaceError,
     SurfaceLimits, SurfaceParams,
 };
 
@@ -54,6 +54,10 @@ fn the_cpu_stands_in_and_says_so() {
         assert_eq!(why.contains("no device is up"), n >= 2, "{n}: {why}");
     }
     assert_eq!(backend.describe(), "no device is up");
+    // It rounds vertices as the device would have.
+    let small = SurfaceParams { quantize: Some(Step::covering(8.0)), ..SurfaceParams::default() };
+    let stood_in = backend.run(&spheres(2), &small, &SurfaceLimits::default(), &Control::default()).unwrap();
+    assert!(stood_in.mesh.quantized.is_some() && stood_in.measures.is_some());
     // A device that works is not stood in for.
     let well = run(&over(&[Rig::new(&[])], true), &Control::default()).unwrap().served.unwrap();
     assert_eq!((well.backend, well.instead), ("gpu", None));

@@ -4,11 +4,17 @@
 
 mod gpu_support;
 
-use gpu_support::{KERNELS, Random, engine, engine_with, job, measures, mesh_of, params, run, sample, spheres};
-use molmesh::gpu::{Budget, Executor, GpuError};
+use std::sync::Arc;
+
+use gpu_support::{
+    KERNELS, Random, engine, engine_with, job, measures, mesh_of, params, rounded, run, sample, spheres,
+};
+use molmesh::gpu::{Budget, Engine, Executor, GpuError, GpuJob, Prepared};
 use molmesh::surface::chunks::ChunkLimits;
+use molmesh::surface::quantize::BEYOND;
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Mesh, Meshed, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    Backend, Control, CpuBackend, Mesh, Meshed, Quantized, Spheres, SurfaceError, SurfaceLimits, SurfaceOptions,
+    SurfaceParams,
 };
 
 fn cpu(spheres: &Spheres, params: &SurfaceParams) -> Meshed {
@@ -56,6 +62,154 @@ fn structures_are_as_on_the_cpu_with_every_kernel() {
             let params = params(kernel, 0.5);
             let meshed = mesh_of(&mut engine(), &spheres, &params);
             assert_equal(&meshed, &spheres, &params, &format!("{name} {kernel}"));
+        }
+    }
+}
+
+/// Asserts that the engine's rounded vertices are its own single-precision ones rounded by the host, bit for bit, and that
+/// everything else is as it was. Returns the rounded mesh.
+#[track_caller]
+fn assert_rounded(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams, what: &str) -> Meshed {
+    let single = mesh_of(engine, spheres, params).mesh;
+    let small = rounded(spheres, params);
+    let meshed = mesh_of(engine, spheres, &small);
+    let mut expected = single.clone();
+    assert!(expected.quantize(small.quantize.unwrap()));
+    assert!(meshed.mesh == expected, "{what}");
+    assert!(meshed.mesh.positions.is_empty() && meshed.mesh.normals.is_empty());
+    assert_eq!(single.bytes() - meshed.mesh.bytes(), 12 * single.n_vertices() as u64, "{what}");
+    let quantized = meshed.mesh.quantized.as_ref().unwrap();
+    assert!(quantized.positions.iter().all(|row| row[3] == 0 && !row.contains(&BEYOND)), "{what}");
+    // Control: a vertex that is off by one, and a normal.
+    let changed = |change: &dyn Fn(&mut Quantized)| {
+        let mut mesh = meshed.mesh.clone();
+        change(mesh.quantized.as_mut().unwrap());
+        mesh != expected
+    };
+    assert!(changed(&|q| q.positions[5][2] += 1) && changed(&|q| q.normals[5][0] ^= 1));
+    meshed
+}
+
+#[test]
+fn rounded_vertices_are_those_in_single_precision_rounded_with_every_kernel() {
+    for name in ["4pti.pdb", "1crn.cif"] {
+        let spheres = sample(name);
+        for kernel in KERNELS {
+            let params = params(kernel, 0.5);
+            let meshed = assert_rounded(&mut engine(), &spheres, &params, &format!("{name} {kernel}"));
+            let (found, cpu) = (measures(&meshed), measures(&cpu(&spheres, &rounded(&spheres, &params))));
+            assert!(found.closed && found.oriented && found.manifold, "{name} {kernel}: {found:?}");
+            assert_eq!((found.euler, found.components.len()), (cpu.euler, cpu.components.len()));
+            assert!((found.area / cpu.area - 1.0).abs() < 1e-5 && (found.volume / cpu.volume - 1.0).abs() < 1e-5);
+        }
+    }
+}
+
+#[test]
+fn hard_cases_are_rounded_alike() {
+    for (name, rows, resolution) in hard_cases() {
+        let spheres = spheres(&rows);
+        for kernel in KERNELS {
+            let params = params(kernel, resolution);
+            if run(&mut engine(), &job(&spheres, &params)).is_ok() {
+                assert_rounded(&mut engine(), &spheres, &params, &format!("{name} {kernel}"));
+            }
+        }
+    }
+}
+
+#[test]
+fn rounded_vertices_in_chunks_pieces_and_landings_are_the_same_bytes() {
+    let cloud: Vec<[f64; 4]> =
+        Random(11).cloud(1500, 70.0).iter().map(|[x, y, z, r]| [x - 20.0, y + 3.0, z - 40.0, *r]).collect();
+    let crowd = spheres(&cloud);
+    let ids = SurfaceOptions { resolution: Some(0.5), atom_ids: true, ..SurfaceOptions::default() };
+    let ids = SurfaceParams::new(&ids).unwrap();
+    let whole = assert_rounded(&mut engine(), &crowd, &ids, "whole");
+    let small = rounded(&crowd, &ids);
+    let cut: [(&str, Change); 5] = [
+        ("chunks", |b| b.chunk_bricks = 900),
+        ("pieces", |b| (b.small_bytes, b.piece_bytes) = (0, 1 << 20)),
+        ("landings", |b| (b.small_bytes, b.landing_bytes) = (0, 2 << 20)),
+        ("all three", |b| (b.chunk_bricks, b.piece_bytes, b.landing_bytes) = (1200, 1 << 20, 2 << 20)),
+        ("counted first", |b| b.small_bytes = 0),
+    ];
+    for (what, change) in cut {
+        let mut engine = engine_with(change);
+        // After a job with vertices of the other kind, whose buffers are found again, and after itself.
+        for params in [&small, &ids, &small, &small] {
+            let meshed = mesh_of(&mut engine, &crowd, params);
+            assert_eq!(meshed.mesh.quantized.is_some(), params.quantize.is_some());
+            if params.quantize.is_some() {
+                assert!(meshed.mesh == Mesh { parts: meshed.mesh.parts.clone(), ..whole.mesh.clone() }, "{what}");
+            }
+        }
+    }
+}
+
+#[test]
+fn jobs_with_vertices_of_either_kind_share_a_submission() {
+    let mut random = Random(5);
+    let clouds: Vec<Spheres> = (2..=7).map(|n| spheres(&random.cloud(n * n * 7, 6.0 * n as f64))).collect();
+    let wanted = |(i, cloud): (usize, &Spheres)| {
+        let plain = params(KERNELS[i % 3], 0.5);
+        job(cloud, &if i % 2 == 0 { plain } else { rounded(cloud, &plain) })
+    };
+    let jobs: Vec<_> = clouds.iter().enumerate().map(wanted).collect();
+    let mut engine = engine_with(|_| ());
+    engine.metered();
+    let answers = engine.run(&jobs);
+    assert_eq!(engine.metered().submissions, 1);
+    for ((i, answer), job) in answers.into_iter().enumerate().zip(&jobs) {
+        let (together, alone) = (answer.unwrap().meshed, run(&mut engine, job).unwrap().meshed);
+        assert_eq!(together.mesh.quantized.is_some(), i % 2 == 1);
+        assert!(together.mesh == alone.mesh, "{i}");
+    }
+    // An estimate that is too low costs a second round and nothing else.
+    let mut engine = engine_with(|b| b.rows_per_brick = [20, 20]);
+    let again = mesh_of(&mut engine, &clouds[1], &jobs[1].prepared.params);
+    assert!(again.mesh == run(&mut engine_with(|_| ()), &jobs[1]).unwrap().meshed.mesh);
+}
+
+#[test]
+fn a_rounded_mesh_takes_less_of_the_host_and_of_a_limit() {
+    let spheres = sample("1crn.cif");
+    let plain = params(KERNELS[0], 0.4);
+    let small = rounded(&spheres, &plain);
+    let held = |params: &SurfaceParams| {
+        let mut engine = engine_with(|b| b.small_bytes = 0);
+        let meshed = mesh_of(&mut engine, &spheres, params);
+        (engine.held_bytes(), meshed.mesh.n_vertices() as u64)
+    };
+    let ((much, n), (less, _)) = (held(&plain), held(&small));
+    // Twelve bytes a vertex on the device, and as many in the landing; sizes come in steps.
+    assert!(much > less + 14 * n, "{much} {less} {n}");
+    let bytes = mesh_of(&mut engine(), &spheres, &small).mesh.bytes();
+    let within = |params: &SurfaceParams, max_mesh_bytes| {
+        let limits = SurfaceLimits { max_mesh_bytes, ..SurfaceLimits::default() };
+        let prepared = Prepared::new(&spheres, params, &limits, &Control::default()).unwrap();
+        run(&mut engine(), &GpuJob { prepared: Arc::new(prepared), ..job(&spheres, params) })
+    };
+    assert!(within(&small, bytes).is_ok());
+    for refused in [within(&small, bytes - 1), within(&plain, bytes)] {
+        assert!(matches!(refused, Err(GpuError::Surface(SurfaceError::MeshTooLarge { .. }))));
+    }
+}
+
+/// A spacing so wide that vertices lie where no atom reaches: their normals come from the triangles around them.
+#[test]
+fn rounded_vertices_without_a_gradient_have_normals() {
+    let (spheres, params) = (spheres(&[[0.0, 0.0, 0.0, 1.7]]), params(KERNELS[0], 8.0));
+    let small = rounded(&spheres, &params);
+    for small_bytes in [0, 16 << 20] {
+        let mut engine = engine_with(|b| b.small_bytes = small_bytes);
+        let (single, meshed) = (mesh_of(&mut engine, &spheres, &params), mesh_of(&mut engine, &spheres, &small));
+        let normals = &meshed.mesh.quantized.as_ref().unwrap().normals;
+        assert_eq!((normals.len(), single.mesh.normals.len()), (6, 6));
+        for (found, unit) in normals.iter().zip(&single.mesh.normals) {
+            // Of the triangles as they are delivered, so off by what rounding turns them.
+            let off = (0..3).map(|k| (f32::from(found[k]) - 127.0 * unit[k]).abs()).fold(0.0, f32::max);
+            assert!(off < 1.5 && *found != [0; 4], "{found:?} {unit:?}");
         }
     }
 }

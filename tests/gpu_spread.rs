@@ -9,13 +9,13 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
-use gpu_support::{KERNELS, Random, engine, job, params, run, sample, spheres};
+use gpu_support::{KERNELS, Random, engine, job, params, rounded, run, sample, spheres};
 use molmesh::gpu::{
     Budget, DevicePool, Engine, Executor, Finished, GpuBackend, GpuError, GpuJob, PoolDevice, PoolSettings, Ran, Share,
 };
 use molmesh::surface::{
-    Backend, Control, Kernel, Measures, Mesh, Proof, Spheres, SurfaceError, SurfaceLimits, SurfaceOptions,
-    SurfaceParams,
+    Backend, Control, Kernel, Measures, Mesh, Proof, Quantized, Spheres, Step, SurfaceError, SurfaceLimits,
+    SurfaceOptions, SurfaceParams,
 };
 
 /// Every job is spread that can be.
@@ -36,7 +36,11 @@ fn difference(a: &Mesh, b: &Mesh) -> Option<&'static str> {
         bytemuck::cast_slice(rows)
     }
     let ids = |mesh: &Mesh| mesh.atom_ids.as_ref().map(|ids| bytes(ids).to_vec());
+    let steps = |mesh: &Mesh| mesh.quantized.as_ref().map(|q| (q.step, bytes(&q.positions).to_vec()));
+    let units = |mesh: &Mesh| mesh.quantized.as_ref().map(|q| bytes(&q.normals).to_vec());
     [
+        ("rounded positions", steps(a) == steps(b)),
+        ("rounded normals", units(a) == units(b)),
         ("positions", bytes(&a.positions) == bytes(&b.positions)),
         ("normals", bytes(&a.normals) == bytes(&b.normals)),
         ("triangles", bytes(&a.triangles) == bytes(&b.triangles)),
@@ -94,14 +98,17 @@ fn a_spread_mesh_is_that_of_one_device_to_the_byte() {
     for (name, spheres, resolution) in cases {
         for (i, kernel) in KERNELS.into_iter().enumerate() {
             // Nearest atoms with one kernel each.
-            let ids = (name.len() + i).is_multiple_of(3);
-            let job = job(&spheres, &if ids { with_ids(kernel, resolution) } else { params(kernel, resolution) });
+            let ids = (name.len() + i) % 3 == 1;
+            let params = if ids { with_ids(kernel, resolution) } else { params(kernel, resolution) };
+            // And rounded vertices with two of three.
+            let small = !(name.len() + i).is_multiple_of(3);
+            let job = job(&spheres, &if small { rounded(&spheres, &params) } else { params });
             for (n, pool) in &pools {
                 let parts = job.prepared.plan.parts(*n);
                 let what = format!("{name} {kernel} on {n}");
                 let ran = pool.ran(&job).unwrap();
                 let mesh = assert_same(&ran, &job, parts.len(), &what);
-                assert_eq!(mesh.atom_ids.is_some(), ids);
+                assert_eq!((mesh.atom_ids.is_some(), mesh.quantized.is_some()), (ids, small));
                 let measures = Measures::of(&ran.finished.meshed.mesh, Proof::Exact, &Control::default()).unwrap();
                 assert!(measures.closed && measures.manifold, "{what}");
             }
@@ -132,6 +139,17 @@ fn the_comparison_finds_fault_and_parts_need_each_other() {
     assert_eq!(changed(&|m| m.positions[3][1] = f32::from_bits(m.positions[3][1].to_bits() ^ 1)), Some("positions"));
     assert_eq!(changed(&|m| m.normals[3][0] = -m.normals[3][0]), Some("normals"));
     assert_eq!(changed(&|m| m.atom_ids.as_mut().unwrap()[5] += 1), Some("atom ids"));
+    let mut good = good;
+    good.quantize(Step::covering(100.0));
+    let changed = |change: &dyn Fn(&mut Quantized)| {
+        let mut mesh = good.clone();
+        change(mesh.quantized.as_mut().unwrap());
+        difference(&mesh, &good)
+    };
+    assert_eq!(changed(&|_| ()), None);
+    assert_eq!(changed(&|q| q.positions[3][1] ^= 1), Some("rounded positions"));
+    assert_eq!(changed(&|q| q.step = Step::covering(1.0)), Some("rounded positions"));
+    assert_eq!(changed(&|q| q.normals[3][0] ^= 1), Some("rounded normals"));
 }
 
 #[test]
@@ -154,7 +172,9 @@ type Change = fn(&mut Budget);
 
 #[test]
 fn parts_in_chunks_pieces_and_landings_are_the_same_bytes() {
-    let job = job(&crowd(900), &with_ids(KERNELS[0], 0.5));
+    let crowd = crowd(900);
+    let plain = with_ids(KERNELS[0], 0.5);
+    let jobs = [job(&crowd, &plain), job(&crowd, &rounded(&crowd, &plain))];
     let cut: [(&str, Change); 3] = [
         ("chunks", |b| b.chunk_bricks = 900),
         ("landings", |b| b.landing_bytes = 1 << 20),
@@ -162,9 +182,9 @@ fn parts_in_chunks_pieces_and_landings_are_the_same_bytes() {
     ];
     for (what, change) in cut {
         let pool = pool(2, change, SETTINGS);
-        for _ in 0..2 {
-            // The second time with buffers that still hold the first.
-            assert_same(&pool.ran(&job).unwrap(), &job, 2, what);
+        for job in [&jobs[0], &jobs[0], &jobs[1], &jobs[1], &jobs[0]] {
+            // The second time with buffers that still hold the first, and other vertices.
+            assert_same(&pool.ran(job).unwrap(), job, 2, what);
         }
     }
 }
@@ -350,7 +370,8 @@ fn rigged(fault: Fault, good_builds: usize) -> (DevicePool, Arc<Gate>) {
 
 #[test]
 fn a_device_that_is_lost_half_way_costs_another_attempt_and_nothing_else() {
-    let job = job(&crowd(300), &params(KERNELS[0], 0.9));
+    let (crowd, params) = (crowd(300), params(KERNELS[0], 0.9));
+    let job = job(&crowd, &rounded(&crowd, &params));
     for fault in [Fault::LostHalfWay, Fault::LostAtOnce, Fault::Panics] {
         let (pool, _gate) = rigged(fault, usize::MAX);
         assert_same(&pool.ran(&job).unwrap(), &job, 1, &format!("{fault:?}"));

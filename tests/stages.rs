@@ -12,9 +12,11 @@ use gpu_support::{KERNELS, Random, engine_with, job, params, sample, spheres};
 use molmesh::gpu::GpuJob;
 use molmesh::gpu::probe::Bench;
 use molmesh::surface::cpu::probe::{Probe, ProbedBrick, ProbedSurface, probe};
+use molmesh::surface::lattice::LatticeAtom;
 use molmesh::surface::layout::{GROUP, NONE, Record, Tally};
 use molmesh::surface::plan::Plan;
-use molmesh::surface::{Kernel, Spheres, Stage, SurfaceLimits};
+use molmesh::surface::quantize::{BEYOND, normal};
+use molmesh::surface::{Kernel, Spheres, Stage, Step, SurfaceLimits};
 
 /// Densities differ by at most this part of them, or of a tenth where they are smaller.
 const FIELD_BOUND: f32 = 1e-5;
@@ -316,17 +318,8 @@ fn scan_numbers_bricks_in_order() {
 #[test]
 fn interpolate_is_within_its_bounds() {
     for (name, setup) in setups() {
-        let (entries, heads) = setup.lists();
         setup.poison(&["positions", "normals"]);
-        let inputs = [
-            ("lists", raw(&entries)),
-            ("heads", raw(&heads)),
-            ("field", raw(&setup.samples())),
-            ("records", raw(&setup.records())),
-            ("counts", raw(&setup.counts())),
-            ("offsets", raw(&setup.offsets())),
-            ("tally", raw(&[Tally::default()])),
-        ];
+        let inputs = interpolate_inputs(&setup);
         let out = setup.run(Stage::Interpolate, &inputs, &["positions", "normals", "tally"]);
         let mesh = &setup.probe.mesh;
         let (positions, normals): (Vec<f32>, Vec<f32>) = (cast(&out[0]), cast(&out[1]));
@@ -347,6 +340,133 @@ fn interpolate_is_within_its_bounds() {
         wrong[normals.len() / 3] += 2.0 * NORMAL_BOUND;
         assert!(error(&wrong, &want_normals, NORMAL_BOUND).is_some());
     }
+}
+
+/// What `interpolate` needs from the stages before it.
+fn interpolate_inputs(setup: &Setup) -> Vec<(&'static str, Vec<u8>)> {
+    let (entries, heads) = setup.lists();
+    vec![
+        ("lists", raw(&entries)),
+        ("heads", raw(&heads)),
+        ("field", raw(&setup.samples())),
+        ("records", raw(&setup.records())),
+        ("counts", raw(&setup.counts())),
+        ("offsets", raw(&setup.offsets())),
+        ("tally", raw(&[Tally::default()])),
+    ]
+}
+
+/// Positions and normals as `interpolate` writes them in single precision.
+fn single(setup: &mut Setup) -> [Vec<[f32; 3]>; 2] {
+    setup.bench.params.steps_per_angstrom = 0.0;
+    setup.poison(&["positions", "normals"]);
+    let out = setup.run(Stage::Interpolate, &interpolate_inputs(setup), &["positions", "normals"]);
+    [cast(&out[0]), cast(&out[1])]
+}
+
+/// The same in steps: all bytes that single precision would have taken.
+fn in_steps(setup: &mut Setup, step: Step) -> [Vec<u8>; 2] {
+    setup.bench.params.steps_per_angstrom = step.per_angstrom();
+    setup.poison(&["positions", "normals"]);
+    let out = setup.run(Stage::Interpolate, &interpolate_inputs(setup), &["positions", "normals"]);
+    setup.bench.params.steps_per_angstrom = 0.0;
+    out.try_into().unwrap()
+}
+
+/// What the host makes of vertices in single precision, and poison for the rest of the memory that those took.
+fn rounded(step: Step, positions: &[[f32; 3]], normals: &[[f32; 3]]) -> [Vec<u8>; 2] {
+    let row = |p: &[f32; 3]| {
+        let [x, y, z] = step.position(*p);
+        [x, y, z, 0]
+    };
+    let unit = |n: &[f32; 3]| {
+        let [x, y, z] = normal(*n);
+        [x, y, z, 0]
+    };
+    let mut bytes = [
+        raw(&positions.iter().map(row).collect::<Vec<[i16; 4]>>()),
+        raw(&normals.iter().map(unit).collect::<Vec<[i8; 4]>>()),
+    ];
+    for column in &mut bytes {
+        column.resize(12 * positions.len(), 0xa5);
+    }
+    bytes
+}
+
+#[test]
+fn interpolate_rounds_as_the_host_does() {
+    for (name, mut setup) in setups() {
+        let [positions, normals] = single(&mut setup);
+        let extent = positions.as_flattened().iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+        // The step that fits, one of an ångström, and one that does not reach the outermost vertices.
+        let steps = [extent, 20_000.0, 0.5 * extent].map(|reach| Step::covering(f64::from(reach)));
+        for (i, step) in steps.into_iter().enumerate() {
+            let got = in_steps(&mut setup, step);
+            let expected = rounded(step, &positions, &normals);
+            assert_eq!(unequal(&got[0], &expected[0]), None, "{name} {step:?}: positions");
+            // A driver that makes one operation of the last product and its rounding may be off by one. This one does not.
+            assert_eq!(unequal(&got[1], &expected[1]), None, "{name} {step:?}: normals");
+            let n_beyond = cast::<i16>(&got[0][..8 * positions.len()]).iter().filter(|&&v| v == BEYOND).count();
+            assert_eq!(n_beyond > 0, i == 2, "{name} {step:?}: {n_beyond} beyond");
+            // Controls: another step, and a vertex moved by the width of a rounding.
+            let other = rounded(Step::covering(2.1 * f64::from(step.reach())), &positions, &normals);
+            assert!(unequal(&got[0], &other[0]).is_some());
+            let (mut moved, mut turned) = (positions.clone(), normals.clone());
+            moved[7][1] += step.length();
+            turned[7] = turned[7].map(|c| c + 1.5 / 127.0);
+            let other = rounded(step, &moved, &turned);
+            assert!(unequal(&got[0], &other[0]).is_some() || n_beyond > 0, "{name}");
+            assert!(unequal(&got[1], &other[1]).is_some());
+        }
+    }
+}
+
+#[test]
+fn interpolate_marks_what_is_no_number() {
+    let mut setup = Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5);
+    let spacing = setup.bench.params.spacing;
+    for (bad, marked) in [(f32::NAN, true), (f32::INFINITY, true), (spacing, false)] {
+        setup.bench.params.spacing = bad;
+        let [positions, _] = in_steps(&mut setup, Step::covering(4.0));
+        let n = setup.probe.mesh.n_vertices();
+        let rows: Vec<[i16; 4]> = cast(&positions[..8 * n]);
+        // Infinity times nothing is no number either.
+        let all = |row: &[i16; 4]| row[..3].iter().all(|&v| (v == BEYOND) == marked) && row[3] == 0;
+        assert!(rows.iter().all(all), "{bad}: {rows:?}");
+    }
+}
+
+/// Near one direction and its mirror images rounding makes a normal too long. No structure meets it by chance: the atom is
+/// put so that one vertex looks that way.
+#[test]
+fn interpolate_shortens_the_normals_that_the_host_shortens() {
+    let mut setup = Setup::new(&spheres(&[[0.3, 0.1, 0.2, 1.7]]), Kernel::Gaussian, 0.5);
+    let [positions, _] = single(&mut setup);
+    let (h, centre) = (f64::from(setup.bench.params.spacing), setup.bench.params.centre);
+    let atom = setup.job.prepared.lattice.atoms[0];
+    let steep = [66.5_f64, 75.5, 77.5];
+    let length = steep.iter().map(|c| c * c).sum::<f64>().sqrt();
+    let orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+    let mut shortened = 0;
+    for (signs, order) in (0..8).flat_map(|signs| orders.map(|order| (signs, order))) {
+        let sign = |k: usize| if signs >> k & 1 == 1 { -1.0 } else { 1.0 };
+        let way: [f64; 3] = std::array::from_fn(|k| sign(k) * steep[order[k]] / length);
+        // Three spacings before the vertex.
+        let at: [f64; 3] =
+            std::array::from_fn(|k| f64::from(positions[9][k]) / h + f64::from(centre[k]) - 3.0 * way[k]);
+        #[expect(clippy::cast_possible_truncation, reason = "a few spacings, and a fraction of one")]
+        let moved =
+            LatticeAtom { cell: at.map(|c| c.round() as i32), frac: at.map(|c| (c - c.round()) as f32), ..atom };
+        setup.bench.write("atoms", bytemuck::bytes_of(&moved));
+        let [positions, normals] = single(&mut setup);
+        let step = Step::covering(8.0);
+        let expected = rounded(step, &positions, &normals);
+        let got = in_steps(&mut setup, step);
+        assert_eq!(unequal(&got[1], &expected[1]), None, "{way:?}");
+        let plain = normals[9].map(|c| (127.0 * c).round_ties_even().abs());
+        shortened += usize::from(plain.iter().map(|c| c * c).sum::<f32>() > 16_347.0);
+    }
+    assert!(shortened > 24, "{shortened} of 48 normals were too long");
 }
 
 #[test]

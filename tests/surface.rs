@@ -11,7 +11,8 @@
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, Kernel, Measures, Mesh, MeshPart, MeshSink, Meshed, Observer, Proof,
-    ReferenceBackend, SinkFailed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceOptions, SurfaceParams, lattice,
+    Quantized, ReferenceBackend, SinkFailed, Spheres, Stage, Step, SurfaceError, SurfaceLimits, SurfaceOptions,
+    SurfaceParams, Vertices, lattice,
 };
 use std::collections::BTreeSet;
 use std::sync::Mutex;
@@ -494,6 +495,7 @@ struct Collected(Mutex<(Mesh, usize)>);
 impl MeshSink for Collected {
     fn begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), SinkFailed> {
         let (mesh, _) = &mut *self.0.lock().unwrap();
+        // Which of the two are filled is seen when the first part comes.
         mesh.positions = vec![[f32::NAN; 3]; n_vertices].into();
         mesh.normals = vec![[f32::NAN; 3]; n_vertices].into();
         mesh.triangles = vec![[u32::MAX; 3]; n_triangles].into();
@@ -502,10 +504,24 @@ impl MeshSink for Collected {
 
     fn part(&self, part: &MeshPart<'_>) -> Result<(), SinkFailed> {
         let (mesh, came) = &mut *self.0.lock().unwrap();
-        *came += part.positions.len();
-        let (v, t) = (part.first_vertex, part.first_triangle);
-        mesh.positions[v..v + part.positions.len()].copy_from_slice(part.positions);
-        mesh.normals[v..v + part.normals.len()].copy_from_slice(part.normals);
+        *came += part.vertices.len();
+        let (v, t) = (part.first_vertex..part.first_vertex + part.vertices.len(), part.first_triangle);
+        match part.vertices {
+            Vertices::Single { positions, normals } => {
+                mesh.positions[v.clone()].copy_from_slice(positions);
+                mesh.normals[v].copy_from_slice(normals);
+            }
+            Vertices::Quantized { step, positions, normals } => {
+                let n = mesh.positions.len();
+                let quantized = mesh.quantized.get_or_insert_with(|| Quantized {
+                    step,
+                    positions: vec![[i16::MAX; 4]; n].into(),
+                    normals: vec![[i8::MAX; 4]; n].into(),
+                });
+                quantized.positions[v.clone()].copy_from_slice(positions);
+                quantized.normals[v].copy_from_slice(normals);
+            }
+        }
         mesh.triangles[t..t + part.triangles.len()].copy_from_slice(part.triangles);
         Ok(())
     }
@@ -516,22 +532,80 @@ fn what_is_poured_is_what_is_returned() {
     // Tiles side by side; and a spacing so wide that vertices lie where no atom reaches. There is no gradient there, and
     // normals are taken from the triangles: every row comes a second time.
     let lone = spheres(&[[0.0, 0.0, 0.0, 1.7]]);
-    for (at, h, times) in [(spheres(&Random(5).cloud(900, 60.0)), 0.5, 1), (lone, 8.0, 2)] {
+    let (many, wide) = (spheres(&Random(5).cloud(900, 60.0)), 8.0);
+    for (at, h, times, quantized) in
+        [(&many, 0.5, 1, false), (&lone, wide, 2, false), (&many, 0.5, 1, true), (&lone, wide, 2, true)]
+    {
         let p = params(Kernel::Gaussian, h);
-        let whole = run(&at, &p);
+        let p = if quantized { rounded(at, &p) } else { p };
+        let whole = run(at, &p);
         for threads in [1, 3] {
             let sink = Collected::default();
             let backend = CpuBackend::new(Some(threads)).unwrap();
-            let poured = backend.pour(&at, &p, &SurfaceLimits::default(), &Control::default(), &sink).unwrap();
-            let (mesh, came) = sink.0.into_inner().unwrap();
+            let poured = backend.pour(at, &p, &SurfaceLimits::default(), &Control::default(), &sink).unwrap();
+            let (mut mesh, came) = sink.0.into_inner().unwrap();
             assert_eq!(came, times * mesh.n_vertices(), "{h} Å");
+            assert_eq!(mesh.quantized.is_some(), quantized);
+            if quantized {
+                (mesh.positions, mesh.normals) = Default::default();
+            }
             assert!(mesh.positions == whole.mesh.positions && mesh.normals == whole.mesh.normals);
+            assert!(mesh.quantized == whole.mesh.quantized);
             assert!(mesh.triangles == whole.mesh.triangles);
             assert_eq!((poured.n_vertices, poured.n_triangles), (mesh.n_vertices(), mesh.n_triangles()));
             assert_eq!((poured.bounds, poured.centre, poured.grid), (mesh.bounds(), whole.mesh.centre, whole.grid));
             assert_eq!(Some(&poured.measures), whole.measures.as_ref());
         }
     }
+}
+
+/// The same parameters, with vertices rounded to the smallest step that reaches them all.
+fn rounded(spheres: &Spheres, params: &SurfaceParams) -> SurfaceParams {
+    SurfaceParams { quantize: Some(Step::covering(lattice::extent(spheres, params))), ..params.clone() }
+}
+
+#[test]
+fn rounded_vertices_are_the_computed_ones_rounded_and_are_what_is_measured() {
+    let relative = |a: f64, b: f64| (a / b - 1.0).abs();
+    for (at, h) in [(spheres(&Random(5).cloud(400, 50.0)), 0.5), (spheres(&[[900.0, 0.0, -77.0, 1.7]]), 0.3)] {
+        for kernel in Kernel::ALL {
+            let single = params(*kernel, h);
+            let whole = run(&at, &single);
+            // The smallest step, and one so coarse that rounding shows in area and volume.
+            for step in [rounded(&at, &single).quantize.unwrap(), Step::covering(4000.0)] {
+                let meshed = run(&at, &SurfaceParams { quantize: Some(step), ..single.clone() });
+                let mut expected = whole.mesh.clone();
+                assert!(expected.quantize(step));
+                assert!(meshed.mesh == expected, "{kernel} {step:?}");
+                let found = Measures::of(&meshed.mesh, Proof::Checksum, &Control::default()).unwrap();
+                let taken = meshed.measures.unwrap();
+                let unrounded = whole.measures.as_ref().unwrap();
+                assert_eq!((taken.euler, taken.components.len()), (found.euler, found.components.len()));
+                assert!(relative(taken.area, found.area) < 2e-6, "{kernel} {step:?}: {taken:?} {found:?}");
+                assert!(relative(taken.volume, found.volume) < 1e-5, "{kernel} {step:?}: {taken:?} {found:?}");
+                // Control: what was computed before rounding is not what is measured.
+                if step == Step::covering(4000.0) {
+                    assert!(relative(taken.area, unrounded.area) > 1e-4, "{kernel}: {taken:?} {unrounded:?}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_limit_counts_the_bytes_of_the_vertices_that_are_delivered() {
+    let at = spheres(&Random(5).cloud(100, 30.0));
+    let single = params(Kernel::Gaussian, 0.5);
+    let small = rounded(&at, &single);
+    let (n, bytes) = (run(&at, &single).mesh.n_vertices() as u64, run(&at, &small).mesh.bytes());
+    assert_eq!(run(&at, &single).mesh.bytes(), bytes + 12 * n);
+    let limits = SurfaceLimits { max_mesh_bytes: bytes, ..SurfaceLimits::default() };
+    let backend = CpuBackend::new(Some(2)).unwrap();
+    let within = |p: &SurfaceParams, limits: &SurfaceLimits| backend.run(&at, p, limits, &Control::default());
+    assert!(within(&small, &limits).is_ok());
+    assert!(matches!(within(&single, &limits), Err(SurfaceError::MeshTooLarge { .. })));
+    let less = SurfaceLimits { max_mesh_bytes: bytes - 1, ..limits };
+    assert!(matches!(within(&small, &less), Err(SurfaceError::MeshTooLarge { .. })));
 }
 
 #[test]

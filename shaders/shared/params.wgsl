@@ -50,7 +50,8 @@ struct Params {
     zero: u32,
     // Vertices before the first that the device's own numbers count: those of other devices' parts.
     base_vertex: u32,
-    pad: u32,
+    // What positions are multiplied by before they are rounded, 1/Å; 0: vertices are single-precision numbers.
+    steps_per_angstrom: f32,
 }
 
 // Number of a workgroup in a dispatch of two dimensions: one has too few workgroups for large grids.

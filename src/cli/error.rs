@@ -232,6 +232,7 @@ fn format_code(error: &FormatError) -> i32 {
         | FormatError::BeyondStep { .. }
         | FormatError::NotQuantized { .. }
         | FormatError::NotInUnits { .. }
+        | FormatError::OtherPacking { .. }
         | FormatError::Json { .. } => code::INTERNAL,
     }
 }

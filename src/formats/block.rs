@@ -36,6 +36,20 @@ pub(super) fn write_floats(out: &mut dyn Write, rows: &[[f32; 3]]) -> io::Result
     }
 }
 
+/// Writes rows of four 16-bit integers.
+pub(super) fn write_shorts(out: &mut dyn Write, rows: &[[i16; 4]]) -> io::Result<()> {
+    if cfg!(target_endian = "little") {
+        out.write_all(bytemuck::must_cast_slice(rows))
+    } else {
+        convert_words(out, rows.as_flattened(), i16::to_le_bytes)
+    }
+}
+
+/// Writes rows of four 8-bit integers.
+pub(super) fn write_bytes(out: &mut dyn Write, rows: &[[i8; 4]]) -> io::Result<()> {
+    out.write_all(bytemuck::must_cast_slice(rows))
+}
+
 /// Writes integers.
 pub(super) fn write_integers(out: &mut dyn Write, values: &[u32]) -> io::Result<()> {
     if cfg!(target_endian = "little") {
@@ -98,6 +112,12 @@ mod tests {
         convert_words(&mut converted, rows.as_flattened(), f32::to_le_bytes).unwrap();
         assert_eq!(direct, converted);
         assert_eq!(&direct[12..16], &1.0_f32.to_le_bytes());
+        let rows: Vec<[i16; 4]> = (0..30_000).map(|i| [i, -i, 1, 0]).collect();
+        let (mut direct, mut converted) = (Vec::new(), Vec::new());
+        write_shorts(&mut direct, &rows).unwrap();
+        convert_words(&mut converted, rows.as_flattened(), i16::to_le_bytes).unwrap();
+        assert_eq!(direct, converted);
+        assert_eq!(&direct[8..12], &[1, 0, 0xff, 0xff]);
     }
 
     #[test]

@@ -53,10 +53,10 @@ pub(super) struct Summary {
 
 /// Checks that columns have one length, numbers are finite and indices in range.
 pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
-    let positions = &mesh.positions[..];
-    let n = positions.len();
+    let n = mesh.n_vertices();
+    let n_normals = mesh.quantized.as_ref().map_or(mesh.normals.len(), |quantized| quantized.normals.len());
     let lengths = [
-        ("normals", Some(mesh.normals.len())),
+        ("normals", Some(n_normals)),
         ("atom_ids", mesh.atom_ids.as_ref().map(|c| c[..].len())),
         ("colors", mesh.colors.as_ref().map(|c| c[..].len())),
     ];
@@ -68,12 +68,13 @@ pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
     if let Some((axis, &value)) = mesh.centre.iter().enumerate().find(|(_, v)| !v.is_finite()) {
         return Err(FormatError::NotFinite { column: "centre", row: axis as u64, value });
     }
-    let bounds = extent("position", positions)?.unwrap_or_default();
+    let bounds = match &mesh.quantized {
+        // A coordinate out of reach, or one that was no number, lies beyond the step: whoever writes the file refuses it.
+        Some(_) => mesh.bounds().map(|row| row.map(|v| v + 0.0)),
+        None => extent("position", &mesh.positions[..])?.unwrap_or_default(),
+    };
     if depth.normals() {
-        let longest = extent("normal", &mesh.normals[..])?.unwrap_or_default();
-        if let Some(&value) = longest.as_flattened().iter().find(|v| v.abs() > MAX_NORMAL) {
-            return Err(FormatError::NotUnit { value });
-        }
+        normals(mesh)?;
     }
     if depth.indices(n) {
         in_range(&mesh.triangles[..], n)?;
@@ -83,6 +84,20 @@ pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
         max_atom: mesh.atom_ids.as_ref().map(|ids| maximum(&ids[..]).unwrap_or(0)),
         translucent: mesh.colors.as_ref().is_some_and(|colors| colors.iter().any(|c| c[3] != u8::MAX)),
     })
+}
+
+/// Refuses normals that are longer than unit vectors.
+fn normals(mesh: &Mesh) -> Result<(), FormatError> {
+    let longest = match &mesh.quantized {
+        // The lowest integer is the only one that is too large.
+        Some(quantized) => {
+            let lowest = quantized.normals.iter().flatten().min().copied().unwrap_or_default();
+            [[f32::from(lowest) / 127.0; 3]; 2]
+        }
+        None => extent("normal", &mesh.normals[..])?.unwrap_or_default(),
+    };
+    let beyond = longest.as_flattened().iter().find(|v| v.abs() > MAX_NORMAL);
+    beyond.map_or(Ok(()), |&value| Err(FormatError::NotUnit { value }))
 }
 
 /// Lowest and highest value per axis; `None` without rows. Refuses numbers that are not finite.
@@ -169,6 +184,7 @@ fn in_range(triangles: &[[u32; 3]], n_vertices: usize) -> Result<(), FormatError
 #[expect(clippy::cast_precision_loss, reason = "small integers are exact")]
 mod tests {
     use super::*;
+    use crate::formats::Step;
 
     /// Rows whose extremes are known: a ramp with one low and one high outlier.
     fn rows(n: usize) -> Vec<[f32; 3]> {
@@ -236,6 +252,18 @@ mod tests {
                 matches!(check(&mesh, Depth::All), Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name),
                 "{name}"
             );
+        }
+        let mut rounded = whole.clone();
+        rounded.quantize(Step::covering(1.0));
+        assert!(check(&rounded, Depth::All).is_ok());
+        if let Some(quantized) = &mut rounded.quantized {
+            quantized.normals[1][2] = -128;
+            assert_eq!(check(&rounded, Depth::All), Err(FormatError::NotUnit { value: -128.0 / 127.0 }));
+            assert!(check(&rounded, Depth::Needed(Format::Glb)).is_ok());
+        }
+        if let Some(quantized) = &mut rounded.quantized {
+            quantized.normals.edit().pop();
+            assert!(matches!(check(&rounded, Depth::All), Err(FormatError::ColumnLength { column: "normals", .. })));
         }
         let adrift = Mesh { centre: [0.0, f64::NAN, 0.0], ..whole };
         assert!(matches!(

@@ -101,6 +101,12 @@ pub enum FormatError {
         /// The units' name.
         units: &'static str,
     },
+    /// Vertices that were rounded before are not rounded again, nor are they made longer than they are.
+    #[error("the mesh's vertices are quantised in steps of {step} Å, and can be stored in no other way")]
+    OtherPacking {
+        /// The mesh's step, Å.
+        step: f32,
+    },
     /// The JSON part of a glTF could not be made.
     #[error("the glTF document cannot be written as JSON: {reason}")]
     Json {

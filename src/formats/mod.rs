@@ -91,7 +91,7 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn new(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::lay_out(format, Storage::default(), mesh, meta, Depth::All)
+        Self::lay_out(format, Packing::of(mesh).into(), mesh, meta, Depth::All)
     }
 
     /// The same for a mesh that a backend returned, whose invariants hold: does not look at normals and indices
@@ -102,14 +102,16 @@ impl<'a> Encoder<'a> {
     /// # Errors
     /// Any [`FormatError`].
     pub fn trusting(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::stored(format, Storage::default(), mesh, meta)
+        Self::stored(format, Packing::of(mesh), mesh, meta)
     }
 
-    /// As [`Self::trusting`], with the mesh stored as asked: a [`Storage`], or a [`Packing`] alone.
+    /// As [`Self::trusting`], with the mesh stored as asked: a [`Storage`], or a [`Packing`] alone. Vertices that are packed so
+    /// already are written as they lie.
     ///
     /// # Errors
     /// Any [`FormatError`]; [`FormatError::NotQuantized`] and [`FormatError::NotInUnits`] if `format` has no such
-    /// packing or units, [`FormatError::BeyondStep`] if the step is too small for the mesh.
+    /// packing or units, [`FormatError::BeyondStep`] if the step is too small for the mesh, [`FormatError::OtherPacking`] if
+    /// the mesh is packed otherwise.
     pub fn stored(
         format: Format,
         storage: impl Into<Storage>,
@@ -131,6 +133,11 @@ impl<'a> Encoder<'a> {
         }
         if !format.holds_units(storage.units) {
             return Err(FormatError::NotInUnits { format: format.extension(), units: storage.units.name() });
+        }
+        if let Packing::Quantized(step) = Packing::of(mesh)
+            && storage.packing != Packing::Quantized(step)
+        {
+            return Err(FormatError::OtherPacking { step: step.length() });
         }
         let summary = check::check(mesh, depth)?;
         let plan = match format {

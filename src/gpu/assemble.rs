@@ -3,10 +3,10 @@
 use bytemuck::Pod;
 
 use super::flight::Arrived;
-use crate::surface::{Column, Mesh};
+use crate::surface::{Column, Mesh, Quantized, SurfaceParams};
 
 /// A mesh of its parts, which are in order; vertices and triangles may come in different parts. Positions are
-/// relative to `centre`.
+/// relative to `centre`, in the layout that `params` ask for.
 ///
 /// # Errors
 /// In words, where a part is not where it should be.
@@ -14,19 +14,25 @@ pub(super) fn mesh(
     vertices: &[Arrived],
     triangles: &[Arrived],
     centre: [f64; 3],
-    nearest: bool,
+    params: &SurfaceParams,
     parts: Vec<(usize, usize)>,
 ) -> Result<Mesh, String> {
     let of_vertices = |place: fn(&Arrived) -> u64| move |a: &Arrived| (place(a), a.n_vertices);
-    Ok(Mesh {
+    let (positions, normals) = (of_vertices(|a| a.places.positions), of_vertices(|a| a.places.normals));
+    let mut mesh = Mesh {
         centre,
-        positions: column(vertices, of_vertices(|a| a.places.positions))?,
-        normals: column(vertices, of_vertices(|a| a.places.normals))?,
         triangles: column(triangles, |a| (a.places.triangles, a.n_triangles))?,
-        atom_ids: if nearest { Some(column(vertices, of_vertices(|a| a.places.sources))?) } else { None },
-        colors: None,
+        atom_ids: params.atom_ids.then(|| column(vertices, of_vertices(|a| a.places.sources))).transpose()?,
         parts,
-    })
+        ..Mesh::default()
+    };
+    if let Some(step) = params.quantize {
+        let (positions, normals) = (column(vertices, positions)?, column(vertices, normals)?);
+        mesh.quantized = Some(Quantized { step, positions, normals });
+    } else {
+        (mesh.positions, mesh.normals) = (column(vertices, positions)?, column(vertices, normals)?);
+    }
+    Ok(mesh)
 }
 
 /// One column; `place` tells a part's offset and rows.

@@ -11,6 +11,7 @@ use wgpu::{Buffer, Device, Queue};
 
 use super::error::GpuError;
 use super::executor::{Executor, Finished, GpuJob};
+use super::flight::VertexBytes;
 use super::health::{Complaint, Health};
 use super::landing::Landings;
 use super::meter::Meter;
@@ -86,6 +87,7 @@ pub(super) struct Loaded<'a> {
     pub(super) chunks: Vec<Chunk>,
     pub(super) params: Params,
     pub(super) variant: Variant,
+    pub(super) vertex: VertexBytes,
 }
 
 /// Device time per stage, ns.
@@ -190,7 +192,8 @@ impl Engine {
     ) -> Result<Loaded<'a>, GpuError> {
         check(job)?;
         let (plan, lattice, params) = (&job.prepared.plan, &job.prepared.lattice, &job.prepared.params);
-        let needs = Needs::new(plan, &chunks, params.atom_ids, rows);
+        let vertex = VertexBytes::of(params);
+        let needs = Needs::new(plan, &chunks, vertex, rows);
         if needs.total() > self.budget.memory || needs.largest() > self.binding {
             let available = if needs.largest() > self.binding { self.binding } else { self.budget.memory };
             return Err(out_of_memory(job, needs.total().max(needs.largest()), available));
@@ -219,7 +222,7 @@ impl Engine {
         write("tiles", 0, bytemuck::cast_slice(&plan.tiles));
         write("bricks", 0, bytemuck::cast_slice(&plan.bricks));
         write("first_atoms", 0, bytemuck::cast_slice(&plan.first_atoms));
-        Ok(Loaded { job, workspace, chunks, params, variant })
+        Ok(Loaded { job, workspace, chunks, params, variant, vertex })
     }
 
     /// A workspace that meets `needs`: the idle one that lacks the least.

@@ -6,6 +6,7 @@ use bytemuck::Pod;
 
 use super::landing::Landing;
 use super::record::CLOCK_BYTES;
+use crate::surface::SurfaceParams;
 use crate::surface::layout::{GROUP, Tally};
 
 /// Where the counters lie in a landing, behind the timestamps.
@@ -57,6 +58,26 @@ pub(super) fn pieces(
     pieces
 }
 
+/// Bytes of a vertex in each column.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct VertexBytes {
+    pub(super) positions: u64,
+    pub(super) normals: u64,
+    /// 0 where nearest atoms are not asked for.
+    pub(super) sources: u64,
+}
+
+impl VertexBytes {
+    /// As a job wants its vertices.
+    pub(super) const fn of(params: &SurfaceParams) -> Self {
+        let (positions, normals) = if params.quantize.is_some() { (8, 4) } else { (12, 12) };
+        Self { positions, normals, sources: if params.atom_ids { 4 } else { 0 } }
+    }
+}
+
+/// Bytes of a triangle.
+pub(super) const TRIANGLE_BYTES: u64 = 12;
+
 /// Where the columns of some pieces lie in a landing: byte offsets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub(super) struct Places {
@@ -70,13 +91,14 @@ pub(super) struct Places {
 
 impl Places {
     /// Places for so many rows.
-    pub(super) fn new(n_vertices: u64, n_triangles: u64, nearest: bool) -> Self {
+    pub(super) fn new(n_vertices: u64, n_triangles: u64, vertex: VertexBytes) -> Self {
         let positions = BODY_AT;
-        let normals = positions + 12 * n_vertices;
-        let sources = normals + 12 * n_vertices;
-        let triangles = sources + if nearest { 4 * n_vertices } else { 0 };
+        let normals = positions + vertex.positions * n_vertices;
+        let sources = normals + vertex.normals * n_vertices;
+        let triangles = sources + vertex.sources * n_vertices;
         // A mapped range is a multiple of 8 bytes.
-        Self { positions, normals, sources, triangles, end: (triangles + 12 * n_triangles).next_multiple_of(8) }
+        let end = (triangles + TRIANGLE_BYTES * n_triangles).next_multiple_of(8);
+        Self { positions, normals, sources, triangles, end }
     }
 }
 
@@ -100,6 +122,23 @@ pub(super) fn values<T: Pod>(bytes: &[u8], offset: u64, n: u64) -> Result<&[T], 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::surface::Step;
+
+    #[test]
+    fn rounded_vertices_take_half_the_place() {
+        let single = SurfaceParams::default();
+        let rounded = SurfaceParams { quantize: Some(Step::covering(9.0)), ..single.clone() };
+        for atom_ids in [false, true] {
+            let [single, rounded] = [&single, &rounded]
+                .map(|params| VertexBytes::of(&SurfaceParams { atom_ids, ..params.clone() }))
+                .map(|vertex| Places::new(1000, 2001, vertex));
+            assert_eq!(single.triangles - rounded.triangles, 12 * 1000);
+            assert_eq!(single.end - rounded.end, 12 * 1000);
+            let columns = [rounded.positions, rounded.normals, rounded.sources, rounded.triangles];
+            let n_ids = if atom_ids { 4000 } else { 0 };
+            assert_eq!(columns.map(|at| at - BODY_AT), [0, 8000, 12_000, 12_000 + n_ids]);
+        }
+    }
 
     #[test]
     fn pieces_cover_every_group_once_and_keep_to_the_limits() {

@@ -5,7 +5,7 @@ use wgpu::Buffer;
 
 use super::engine::{Engine, Loaded, check};
 use super::error::GpuError;
-use super::flight::{Arrived, Piece, Places, TALLY_AT, pieces};
+use super::flight::{Arrived, Piece, Places, TALLY_AT, TRIANGLE_BYTES, VertexBytes, pieces};
 use super::progress::{Counted, Progress, Sent};
 use super::record::{Dispatch, Recording};
 use super::run::FRONT;
@@ -43,7 +43,7 @@ pub(super) fn copy_counts(
     }
 }
 
-/// Copies the first `n` rows of 12 bytes, or of `each` bytes, of a buffer.
+/// Copies the first `bytes` bytes of a buffer.
 pub(super) fn copy_rows(recording: &mut Recording<'_>, from: &Buffer, target: &Buffer, at: u64, bytes: u64) {
     if bytes > 0 {
         recording.encoder.copy_buffer_to_buffer(from, 0, target, at, bytes);
@@ -59,11 +59,10 @@ pub(super) fn copy_vertices(
     rows: [u64; 2],
 ) {
     let ([skip, n], workspace) = (rows, &loaded.workspace);
-    copy_rows(recording, workspace.buffer("positions"), target, places.positions + 12 * skip, 12 * n);
-    copy_rows(recording, workspace.buffer("normals"), target, places.normals + 12 * skip, 12 * n);
-    if loaded.variant.nearest {
-        copy_rows(recording, workspace.buffer("sources"), target, places.sources + 4 * skip, 4 * n);
-    }
+    let VertexBytes { positions, normals, sources } = loaded.vertex;
+    copy_rows(recording, workspace.buffer("positions"), target, places.positions + positions * skip, positions * n);
+    copy_rows(recording, workspace.buffer("normals"), target, places.normals + normals * skip, normals * n);
+    copy_rows(recording, workspace.buffer("sources"), target, places.sources + sources * skip, sources * n);
 }
 
 impl Loaded<'_> {
@@ -89,12 +88,18 @@ impl Engine {
 
     /// Pieces of output of some chunks, each small enough for a binding.
     pub(super) fn pieces(&self, progress: &Progress<'_>, counted: &[(usize, &Counted)]) -> Vec<Piece> {
-        let most = self.budget.piece_bytes.min(self.budget.landing_bytes / 4) / 12;
+        let most = self.most_rows(progress.loaded.vertex);
         let cut = |&(chunk, counted): &(usize, &Counted)| {
             let own = &progress.loaded.chunks[chunk];
-            pieces([own.first_brick, own.n_own], &counted.groups, counted.first, [most, most])
+            pieces([own.first_brick, own.n_own], &counted.groups, counted.first, most)
         };
         counted.iter().flat_map(cut).collect()
+    }
+
+    /// Vertices and triangles of the largest piece of output.
+    fn most_rows(&self, vertex: VertexBytes) -> [u64; 2] {
+        let most = self.budget.piece_bytes.min(self.budget.landing_bytes / 4);
+        [most / vertex.positions, most / TRIANGLE_BYTES]
     }
 
     /// Output buffers for the largest of some pieces.
@@ -105,7 +110,7 @@ impl Engine {
             ..Self::no_rows()
         };
         let loaded = &mut progress.loaded;
-        let needs = Needs::new(&loaded.job.prepared.plan, &loaded.chunks, loaded.variant.nearest, rows);
+        let needs = Needs::new(&loaded.job.prepared.plan, &loaded.chunks, loaded.vertex, rows);
         self.grow(loaded, &needs)
     }
 
@@ -119,19 +124,19 @@ impl Engine {
         columns: [bool; 2],
     ) -> Result<(), GpuError> {
         let [vertices, triangles] = columns;
-        let nearest = progress.loaded.variant.nearest;
+        let vertex = progress.loaded.vertex;
         let mut rest = pieces;
         while !rest.is_empty() {
             check(progress.loaded.job)?;
             // As many pieces as a landing holds, one at least.
             let (mut n, mut rows) = (0, [0, 0]);
-            let mut places = Places::new(0, 0, nearest);
+            let mut places = Places::new(0, 0, vertex);
             for piece in rest.iter().take(PARAM_ROWS - 1) {
                 let more = [
                     rows[0] + piece.n_vertices * u64::from(vertices),
                     rows[1] + piece.n_triangles * u64::from(triangles),
                 ];
-                let larger = Places::new(more[0], more[1], nearest);
+                let larger = Places::new(more[0], more[1], vertex);
                 if n > 0 && larger.end > self.budget.landing_bytes {
                     break;
                 }
@@ -196,8 +201,8 @@ impl Engine {
         for (i, piece) in pieces.iter().enumerate().filter(|_| triangles) {
             let [first, last] = ends(i);
             recording.part(Stage::Emit, &[loaded.dispatch(i as u64 + 1, piece.n_bricks)], first, last);
-            let at = places.triangles + 12 * n_triangles;
-            copy_rows(&mut recording, loaded.workspace.buffer("triangles"), target, at, 12 * piece.n_triangles);
+            let (at, bytes) = (places.triangles + TRIANGLE_BYTES * n_triangles, TRIANGLE_BYTES * piece.n_triangles);
+            copy_rows(&mut recording, loaded.workspace.buffer("triangles"), target, at, bytes);
             n_triangles += piece.n_triangles;
         }
         recording.read_clock(target);
@@ -210,11 +215,12 @@ impl Engine {
     /// it would be.
     pub(super) fn tail_ahead(&self, progress: &Progress<'_>) -> Result<Option<[u64; 2]>, GpuError> {
         let loaded = &progress.loaded;
-        let most = self.budget.piece_bytes.min(self.budget.landing_bytes / 4) / 12;
-        let hold = |name: &str| (loaded.workspace.buffer(name).size() / 12).min(most);
-        let [vertices, triangles] = [hold("positions").min(hold("normals")), hold("triangles")];
-        let vertices =
-            if loaded.variant.nearest { vertices.min(loaded.workspace.buffer("sources").size() / 4) } else { vertices };
+        let [most_vertices, most_triangles] = self.most_rows(loaded.vertex);
+        let hold = |name: &str, each: u64| loaded.workspace.buffer(name).size().checked_div(each).unwrap_or(u64::MAX);
+        let VertexBytes { positions, normals, sources } = loaded.vertex;
+        let columns = [hold("positions", positions), hold("normals", normals), hold("sources", sources)];
+        let vertices = columns.into_iter().fold(most_vertices, u64::min);
+        let triangles = hold("triangles", TRIANGLE_BYTES).min(most_triangles);
         let n_bricks = u64::from(loaded.params.n_bricks);
         let few = self.budget.rows_per_brick.map(|each| each * n_bricks / LIKELY);
         if vertices < few[0] || triangles < few[1] {
@@ -243,7 +249,7 @@ impl Engine {
         room: Option<[u64; 2]>,
     ) -> Result<bool, GpuError> {
         let (rows, loaded) = ([counted.n_vertices, counted.n_triangles], &progress.loaded);
-        let places = Places::new(rows[0], rows[1], loaded.variant.nearest);
+        let places = Places::new(rows[0], rows[1], loaded.vertex);
         let fits = room.is_some_and(|room| rows[0] <= room[0] && rows[1] <= room[1]);
         if !fits || places.end > self.budget.landing_bytes {
             return Ok(false);
@@ -252,7 +258,13 @@ impl Engine {
         let target = landing.buffer().map_err(failed)?;
         let mut recording = self.recording();
         copy_vertices(&mut recording, loaded, target, &places, [0, rows[0]]);
-        copy_rows(&mut recording, loaded.workspace.buffer("triangles"), target, places.triangles, 12 * rows[1]);
+        copy_rows(
+            &mut recording,
+            loaded.workspace.buffer("triangles"),
+            target,
+            places.triangles,
+            TRIANGLE_BYTES * rows[1],
+        );
         recording.timed_before(&[Stage::Interpolate, Stage::Emit]);
         recording.read_clock(target);
         copy_counts(&mut recording, &loaded.workspace, target, None);

@@ -25,7 +25,7 @@ use super::prepare::Prepared;
 use super::record::Recording;
 use crate::surface::layout::Params;
 use crate::surface::plan::check_totals;
-use crate::surface::{Column, GridStats, Kernel, Mesh, Meshed, Stage, SurfaceError};
+use crate::surface::{Column, GridStats, Kernel, Mesh, Meshed, Stage, SurfaceError, SurfaceParams};
 
 /// Fixed-point units of the isovalue, as the shaders have it. Rounding a term moves a density by less than 3·10⁻⁷ of the
 /// isovalue, and densities up to 1024 isovalues are told from those that may have overflowed.
@@ -167,7 +167,9 @@ impl Paper {
         let [n_active, n_triangles] = counts;
         let (lattice, limits) = (&prepared.lattice, &prepared.limits);
         let n_vertices = 3 * u64::from(n_triangles);
-        check_totals(lattice, &prepared.params, limits, n_vertices, n_triangles.into())?;
+        // Its vertices are single-precision numbers, whatever was asked for.
+        let single = SurfaceParams { quantize: None, ..prepared.params.clone() };
+        check_totals(lattice, &single, limits, n_vertices, n_triangles.into())?;
         let most = self.engine.binding_bytes();
         if 12 * n_vertices > most {
             let excess = (12 * n_vertices) as f64 / most as f64;

@@ -3,6 +3,7 @@
 use super::engine::Engine;
 use super::error::GpuError;
 use super::executor::GpuJob;
+use super::flight::VertexBytes;
 use super::pipelines::Variant;
 use super::record::Dispatch;
 use super::workspace::{Needs, OutputRows, Workspace};
@@ -16,6 +17,7 @@ pub struct Bench {
     engine: Engine,
     workspace: Workspace,
     variant: Variant,
+    vertex: VertexBytes,
     /// Row of parameters that the stages read: one chunk and one piece of output hold everything.
     pub params: Params,
     chunk: Chunk,
@@ -38,8 +40,8 @@ impl Bench {
             triangle_capacity: triangles,
             ..chunk.params(&loaded.params)
         };
-        let (workspace, variant) = (loaded.workspace, loaded.variant);
-        Ok(Self { engine, workspace, variant, params, chunk })
+        let (workspace, variant, vertex) = (loaded.workspace, loaded.variant, loaded.vertex);
+        Ok(Self { engine, workspace, variant, vertex, params, chunk })
     }
 
     /// Bytes that the job needs of a buffer; the buffer may be larger.
@@ -50,7 +52,7 @@ impl Bench {
             triangles: self.params.triangle_capacity.into(),
             params: 1,
         };
-        Needs::new(&job.prepared.plan, std::slice::from_ref(&self.chunk), self.variant.nearest, rows).of(name)
+        Needs::new(&job.prepared.plan, std::slice::from_ref(&self.chunk), self.vertex, rows).of(name)
     }
 
     /// Writes the start of a buffer.

@@ -142,9 +142,8 @@ impl<'a> Progress<'a> {
     /// As [`Self::finish`].
     pub(super) fn assemble(&mut self) -> Result<Finished, GpuError> {
         let (plan, lattice) = (&self.loaded.job.prepared.plan, &self.loaded.job.prepared.lattice);
-        let nearest = self.loaded.variant.nearest;
-        let parts = std::mem::take(&mut self.parts);
-        let mesh = assemble::mesh(&self.vertices, &self.triangles, lattice.centre(), nearest, parts)
+        let (params, parts) = (&self.loaded.job.prepared.params, std::mem::take(&mut self.parts));
+        let mesh = assemble::mesh(&self.vertices, &self.triangles, lattice.centre(), params, parts)
             .map_err(GpuError::Failed)?;
         let grid = GridStats {
             bricks: plan.occupied,

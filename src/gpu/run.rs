@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::engine::{Engine, Loaded, check, scaled};
 use super::error::GpuError;
 use super::executor::{Finished, GpuJob};
-use super::flight::{Arrived, BODY_AT, Places};
+use super::flight::{Arrived, BODY_AT, Places, TRIANGLE_BYTES, VertexBytes};
 use super::landing::Landing;
 use super::output::{PARAM_ROWS, copy_counts, copy_rows, copy_vertices, failed, narrow};
 use super::pipelines::N_STAGES;
@@ -30,8 +30,10 @@ impl Engine {
         // Small lattices cross a brick more often than large ones.
         let n = job.prepared.plan.bricks.len() as u64 + 8;
         let [vertices, triangles] = self.budget.rows_per_brick.map(|each| each * n);
-        let bytes = Places::new(vertices, triangles, job.prepared.params.atom_ids).end;
-        let fits = 12 * vertices.max(triangles) <= self.budget.piece_bytes && bytes <= self.budget.landing_bytes;
+        let vertex = VertexBytes::of(&job.prepared.params);
+        let bytes = Places::new(vertices, triangles, vertex).end;
+        let largest = (vertex.positions * vertices).max(TRIANGLE_BYTES * triangles);
+        let fits = largest <= self.budget.piece_bytes && bytes <= self.budget.landing_bytes;
         let small = chunks.len() == 1 && bytes <= self.budget.small_bytes && fits;
         small.then_some(OutputRows { vertices, triangles, params: PARAM_ROWS as u64 })
     }
@@ -86,7 +88,7 @@ impl Engine {
         recording.stage(Stage::Emit, &tails);
         let mut landings = Vec::with_capacity(jobs.len());
         for (_, loaded, rows) in jobs {
-            let places = Places::new(rows.vertices, rows.triangles, loaded.variant.nearest);
+            let places = Places::new(rows.vertices, rows.triangles, loaded.vertex);
             let groups = group_bytes(&loaded.chunks[0]);
             let landing = self.landings.get(&self.device, places.end + groups);
             let target = landing.buffer().map_err(failed)?;
@@ -94,7 +96,7 @@ impl Engine {
             copy_counts(&mut recording, &loaded.workspace, target, Some((places.end, groups)));
             copy_vertices(&mut recording, loaded, target, &places, [0, rows.vertices]);
             let triangles = loaded.workspace.buffer("triangles");
-            copy_rows(&mut recording, triangles, target, places.triangles, 12 * rows.triangles);
+            copy_rows(&mut recording, triangles, target, places.triangles, TRIANGLE_BYTES * rows.triangles);
             landings.push((landing, places.end + groups));
         }
         self.fly(recording, landings)
@@ -108,7 +110,7 @@ impl Engine {
         landing: &Arc<Landing>,
         share: f64,
     ) -> Result<Finished, GpuError> {
-        let places = Places::new(rows.vertices, rows.triangles, progress.loaded.variant.nearest);
+        let places = Places::new(rows.vertices, rows.triangles, progress.loaded.vertex);
         let counted = progress.count(landing, 0, places.end)?;
         progress.within_limits(1)?;
         progress.complete()?;

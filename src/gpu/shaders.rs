@@ -121,7 +121,7 @@ mod tests {
                 triangle_capacity,
                 zero,
                 base_vertex,
-                pad
+                steps_per_angstrom
             ),
             host!("Record", Record, crossing, layers, near),
             host!("Tally", Tally, list_end, vertices, triangles, flat),

@@ -11,7 +11,7 @@ use super::executor::{Finished, GpuJob};
 use super::pool::{DevicePool, Ran, TICK, Work, over, thread_ended};
 use super::queue::{Answer, Place};
 use super::share::Share;
-use crate::surface::{Column, GridStats, Mesh, Meshed, Stage, SurfaceError};
+use crate::surface::{Column, GridStats, Mesh, Meshed, Quantized, Stage, SurfaceError};
 
 /// How many devices of `free` ones make a job of `n_bricks`: as many as get `least` bricks each. 1: it is not spread.
 pub(super) fn n_parts(n_bricks: u64, free: usize, least: Option<u64>) -> usize {
@@ -110,6 +110,7 @@ impl DevicePool {
     fn joined(&self, made: Vec<(usize, Finished)>, flat: bool) -> Ran {
         let mut mesh = Mesh::default();
         let (mut positions, mut normals, mut triangles, mut atom_ids) = (vec![], vec![], vec![], vec![]);
+        let (mut step, mut rounded) = (None, (vec![], vec![]));
         let mut grid = GridStats::default();
         let mut by = Vec::with_capacity(made.len());
         let mut before = (0, 0);
@@ -120,6 +121,11 @@ impl DevicePool {
             before = (before.0 + part.n_vertices(), before.1 + part.n_triangles());
             positions.push(part.positions);
             normals.push(part.normals);
+            if let Some(quantized) = part.quantized {
+                step = Some(quantized.step);
+                rounded.0.push(quantized.positions);
+                rounded.1.push(quantized.normals);
+            }
             triangles.push(part.triangles);
             atom_ids.extend(part.atom_ids);
             let surface_bricks = grid.surface_bricks + meshed.grid.surface_bricks;
@@ -128,6 +134,8 @@ impl DevicePool {
         }
         mesh.positions = Column::pieced(positions);
         mesh.normals = Column::pieced(normals);
+        let (rounded_positions, rounded_normals) = (Column::pieced(rounded.0), Column::pieced(rounded.1));
+        mesh.quantized = step.map(|step| Quantized { step, positions: rounded_positions, normals: rounded_normals });
         mesh.triangles = Column::pieced(triangles);
         mesh.atom_ids = (!atom_ids.is_empty()).then(|| Column::pieced(atom_ids));
         if flat {

@@ -2,6 +2,7 @@
 
 use wgpu::{BindGroup, Buffer, BufferUsages, Device};
 
+use super::flight::{TRIANGLE_BYTES, VertexBytes};
 use super::landing::size_class;
 use super::pipelines::{Pipelines, STAGES, number};
 use super::shaders::SHADERS;
@@ -61,7 +62,7 @@ pub(super) struct OutputRows {
 
 impl Needs {
     /// For a job of `plan` in `chunks`.
-    pub(super) fn new(plan: &Plan, chunks: &[Chunk], nearest: bool, rows: OutputRows) -> Self {
+    pub(super) fn new(plan: &Plan, chunks: &[Chunk], vertex: VertexBytes, rows: OutputRows) -> Self {
         let most = |of: &dyn Fn(&Chunk) -> u64| chunks.iter().map(of).max().unwrap_or_default();
         let bytes = |n: usize, each: usize| (n * each) as u64;
         let n_bricks = plan.bricks.len();
@@ -84,10 +85,10 @@ impl Needs {
             ("offsets", bytes(n_bricks, 8)),
             ("groups", most(&|c| 16 * u64::from(c.n_own.div_ceil(GROUP)))),
             ("tally", size_of::<Tally>() as u64),
-            ("positions", 12 * rows.vertices),
-            ("normals", 12 * rows.vertices),
-            ("sources", if nearest { 4 * rows.vertices } else { 0 }),
-            ("triangles", 12 * rows.triangles),
+            ("positions", vertex.positions * rows.vertices),
+            ("normals", vertex.normals * rows.vertices),
+            ("sources", vertex.sources * rows.vertices),
+            ("triangles", TRIANGLE_BYTES * rows.triangles),
         ] {
             needs[place(name)] = size;
         }

@@ -183,7 +183,7 @@ fn count(report: &Report) {
 /// Bytes that a mesh holds.
 fn bytes_of(mesh: &Mesh) -> u64 {
     let optional = mesh.atom_ids.as_ref().map_or(0, Column::len) + mesh.colors.as_ref().map_or(0, Column::len);
-    Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64) + 4 * optional as u64
+    mesh.bytes() + 4 * optional as u64
 }
 
 fn ms(time: Duration) -> f64 {

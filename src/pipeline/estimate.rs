@@ -72,12 +72,13 @@ pub fn estimate(
             }
         }
     }
+    let _storage = super::storage(job, &mut params, &spheres);
     let lattice = Lattice::new(&spheres, &params)?;
     let (resolution, box_cells) = (params.resolution, lattice.box_cells);
     let mesh = refused.map_or_else(|| of_mesh(&lattice, &spheres, &params, &limits.surface, choice, &control), Err);
     let mesh = match (mesh, job.spacing) {
         (Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)), _) => return Err(error.into()),
-        (Ok(mesh), Spacing::MaxTriangles(most)) => Ok(mesh.at_most(most)),
+        (Ok(mesh), Spacing::MaxTriangles(most)) => Ok(mesh.at_most(most, &params)),
         (mesh, _) => mesh,
     };
     let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.len() as u64);
@@ -86,10 +87,10 @@ pub fn estimate(
 
 impl MeshEstimate {
     /// With no more triangles than there will be in any case.
-    fn at_most(self, most: u64) -> Self {
+    fn at_most(self, most: u64, params: &SurfaceParams) -> Self {
         let triangles = self.triangles.min(most);
         let vertices = self.vertices.min(most.div_ceil(2));
-        Self { triangles, vertices, bytes: Mesh::bytes_for(vertices, triangles), ..self }
+        Self { triangles, vertices, bytes: params.mesh_bytes(vertices, triangles), ..self }
     }
 }
 
@@ -103,10 +104,11 @@ fn of_mesh(
 ) -> Result<MeshEstimate, SurfaceError> {
     let plan = Plan::new(lattice, limits, control)?;
     let h = params.resolution;
-    let coarse = SurfaceParams { resolution: (COARSER * h).max(COARSE).max(h), atom_ids: false, ..params.clone() };
+    let single = SurfaceParams { atom_ids: false, quantize: None, ..params.clone() };
+    let coarse = SurfaceParams { resolution: (COARSER * h).max(COARSE).max(h), ..single.clone() };
     let mesh = match choice.backend.run(spheres, &coarse, limits, control) {
         // Single small spheres fall through a coarse grid: then the grid itself is taken.
-        Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, params, limits, control)?.mesh,
+        Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, &single, limits, control)?.mesh,
         meshed => meshed?.mesh,
     };
     let area = area(&mesh);
@@ -117,7 +119,7 @@ fn of_mesh(
     )]
     let vertices = (1.5 * area / (h * h)).round() as u64;
     let triangles = 2 * vertices;
-    let bytes = Mesh::bytes_for(vertices, triangles);
+    let bytes = params.mesh_bytes(vertices, triangles);
     let estimate =
         MeshEstimate { bricks: plan.occupied, samples: plan.occupied * 512, area, vertices, triangles, bytes };
     if bytes > limits.max_mesh_bytes {
@@ -160,6 +162,19 @@ mod tests {
             let ratio = mesh.triangles as f64 / report.triangles as f64;
             assert!((0.8..1.25).contains(&ratio), "{resolution}: {ratio}");
         }
+    }
+
+    #[test]
+    fn rounded_vertices_are_estimated_at_half_the_bytes() {
+        let backend = CpuBackend::new(None).unwrap();
+        let choice = Choice { backend: &backend, reason: "" };
+        let of = |compress: &str| {
+            let job = params::parse([("compress", compress)]).unwrap().job;
+            estimate(SAMPLE, &job, &JobLimits::default(), &choice, &CancelToken::default()).unwrap().mesh.unwrap()
+        };
+        let (single, rounded) = (of("none"), of("quantize"));
+        assert_eq!((single.vertices, single.triangles), (rounded.vertices, rounded.triangles));
+        assert_eq!(single.bytes - rounded.bytes, 12 * single.vertices);
     }
 
     #[test]

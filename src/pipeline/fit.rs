@@ -185,7 +185,8 @@ pub(super) fn mesh(
         };
         // One mesh at a time is held.
         last = None;
-        let params = SurfaceParams { resolution: spacing, ..job.params.clone() };
+        let mut params = SurfaceParams { resolution: spacing, ..job.params.clone() };
+        let _storage = super::storage(job, &mut params, spheres);
         let quiet = Quiet(clock);
         let observer: &dyn Observer = if search.tries() == 0 { &quiet } else { clock };
         let control = Control { observer, ..control.clone() };

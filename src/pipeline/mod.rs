@@ -141,13 +141,20 @@ pub fn run(
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
     let mut params = job.params_for(spheres.len());
-    let (mut meshed, tries) = if let Spacing::MaxTriangles(most) = job.spacing {
+    let (mut meshed, tries, storage) = if let Spacing::MaxTriangles(most) = job.spacing {
         let fitted = fit::mesh(&spheres, job, most, &limits.surface, choice, &clock, &control)?;
         params.resolution = fitted.resolution;
-        (fitted.meshed, Some(fitted.tries))
+        (fitted.meshed, Some(fitted.tries), storage(job, &mut params, &spheres))
     } else {
-        (clock.pass(|| choice.backend.run(&spheres, &params, &limits.surface, &control))?, None)
+        let storage = storage(job, &mut params, &spheres);
+        (clock.pass(|| choice.backend.run(&spheres, &params, &limits.surface, &control))?, None, storage)
     };
+    // What a backend that does not round has measured is not what is handed on.
+    if let Some(step) = params.quantize
+        && meshed.mesh.quantize(step)
+    {
+        meshed.measures = None;
+    }
     if let Some(ids) = &mut meshed.mesh.atom_ids {
         // The core speaks of spheres; people ask for atoms of the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
@@ -156,13 +163,11 @@ pub fn run(
         Some(taken) => taken,
         None => clock.time(Stage::Measure.name(), || {
             // Triangles ask for positions anywhere; normals stay where several devices put them.
-            meshed.mesh.positions.settle();
-            meshed.mesh.triangles.settle();
+            meshed.mesh.settle_geometry();
             Measures::of(&meshed.mesh, job.proof, &control)
         })?,
     };
     let Meshed { mesh, grid, served, .. } = meshed;
-    let storage = storage(job, &params, &spheres);
     let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
     let counts = Counts { resolution: params.resolution, tries, grid, n_vertices, n_triangles, served, storage };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
@@ -193,8 +198,8 @@ pub fn pour(
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
-    let params = job.params_for(spheres.len());
-    let storage = storage(job, &params, &spheres);
+    let mut params = job.params_for(spheres.len());
+    let storage = storage(job, &mut params, &spheres);
     sink.store(storage);
     let poured = clock.pass(|| choice.backend.pour(&spheres, &params, &limits.surface, &control, sink))?;
     let counts = Counts {
@@ -210,13 +215,14 @@ pub fn pour(
     Ok(Poured { report, centre: poured.centre, bounds: poured.bounds })
 }
 
-/// How the mesh of `spheres` is stored. Depends on nothing that the backend computes, so a file can be written, or a
-/// device can fill it, before the mesh is known.
-fn storage(job: &Job, params: &SurfaceParams, spheres: &Spheres) -> Storage {
-    let packing = match job.compress {
-        Compress::None => Packing::Full,
-        Compress::Quantize => Packing::Quantized(Step::covering(lattice::extent(spheres, params))),
+/// How the mesh of `spheres` is stored; `params` ask the backend for vertices of that kind then. Depends on nothing that the
+/// backend computes: a file can be written, and a device can fill it, before the mesh is known.
+fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage {
+    params.quantize = match job.compress {
+        Compress::None => None,
+        Compress::Quantize => Some(Step::covering(lattice::extent(spheres, params))),
     };
+    let packing = params.quantize.map_or(Packing::Full, Packing::Quantized);
     Storage { packing, normals: job.normals, units: job.units }
 }
 

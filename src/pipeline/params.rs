@@ -250,6 +250,8 @@ pub fn canonical(job: &Job) -> String {
         preset,
         paper,
         atom_ids,
+        // Follows from `compress` and the spheres.
+        quantize: _,
     } = params;
     // What sets the spacing, and nothing else: of the other two only defaults are left.
     let spacing = match spacing {

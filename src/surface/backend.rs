@@ -32,7 +32,8 @@ pub struct Meshed {
     /// Its grid.
     pub grid: GridStats,
     /// Its measures with [`Proof::Checksum`](super::measure::Proof::Checksum), if the backend took them on the way and
-    /// the mesh is closed. What [`Measures::of`] finds in the finished mesh is the same up to the rounding of positions.
+    /// the mesh is closed. They are those of the vertices as the mesh has them: what [`Measures::of`] finds is the same up
+    /// to the rounding of single precision.
     pub measures: Option<Measures>,
     /// Who made it, where that is known only afterwards: one of several devices, or a stand-in for them.
     pub served: Option<Served>,
@@ -92,9 +93,7 @@ pub trait Backend: Send + Sync {
     ) -> Result<Poured, SurfaceError> {
         let Meshed { mut mesh, grid, measures, served } = self.run(spheres, params, limits, control)?;
         // It is handed on in one part.
-        mesh.positions.settle();
-        mesh.normals.settle();
-        mesh.triangles.settle();
+        mesh.settle();
         let measures = match measures {
             Some(measures) => measures,
             None => control.span(Stage::Measure, || Measures::of(&mesh, Proof::Checksum, control))?,
@@ -130,8 +129,8 @@ pub trait Backend: Send + Sync {
 fn pour_whole(mesh: &Mesh, sink: &dyn MeshSink) -> Result<(), SurfaceError> {
     let failed = |SinkFailed| SurfaceError::Sink;
     sink.begin(mesh.n_vertices(), mesh.n_triangles()).map_err(failed)?;
-    let (positions, normals, triangles) = (&mesh.positions[..], &mesh.normals[..], &mesh.triangles[..]);
-    sink.part(&MeshPart { first_vertex: 0, positions, normals, first_triangle: 0, triangles }).map_err(failed)
+    let (vertices, triangles) = (mesh.vertices(), &mesh.triangles[..]);
+    sink.part(&MeshPart { first_vertex: 0, vertices, first_triangle: 0, triangles }).map_err(failed)
 }
 
 /// The smallest structure that has a surface: one carbon.

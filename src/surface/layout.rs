@@ -78,8 +78,8 @@ pub struct Params {
     pub zero: u32,
     /// Vertices before the first that the device's own numbers count: those of other devices' parts.
     pub base_vertex: u32,
-    /// Unused.
-    pub pad: u32,
+    /// What positions are multiplied by before they are rounded, 1/Å; 0: vertices are single-precision numbers.
+    pub steps_per_angstrom: f32,
 }
 
 /// A tile: 8 × 8 × 8 bricks, of which those with a set bit exist.

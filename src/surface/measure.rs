@@ -9,7 +9,7 @@ use super::control::Control;
 use super::error::SurfaceError;
 use super::labels::{self, Joined, Labels};
 use super::mesh::Mesh;
-use super::sums::{self, Sums};
+use super::sums::{self, Positions, Sums};
 use super::topology;
 
 /// How closedness and manifoldness are established.
@@ -70,7 +70,7 @@ pub struct Measures {
 }
 
 impl Measures {
-    /// Measures `mesh`.
+    /// Measures `mesh` by its vertices as they are, rounded ones where it has such.
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`].
@@ -132,13 +132,14 @@ impl Totals {
     /// Labels and sums each part while it is in cache, then joins the parts.
     fn of(mesh: &Mesh) -> Self {
         let mut of_vertex = Column::zeroed(mesh.n_vertices());
+        let positions = Positions::from(mesh);
         let (joined, sums): (Vec<Joined>, Vec<Sums>) = labels::split(mesh, &mut of_vertex)
             .into_par_iter()
             .with_max_len(1)
             .map(|mut part| {
                 let joined = part.label();
                 let n = joined.equal.len();
-                let sums = sums::sum(&mesh.positions, part.triangles, part.first, part.labels, n);
+                let sums = sums::sum(positions, part.triangles, part.first, part.labels, n);
                 (joined, sums)
             })
             .unzip();

@@ -1,11 +1,19 @@
 //! The output of the core: an indexed triangle mesh with normals.
 
+use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
 use super::column::Column;
 use super::lattice::to_f32;
+use super::quantize::{self, Step};
+use super::sink::Vertices;
 
-/// An indexed triangle mesh. Vertex `i` lies at `centre + positions[i]`, in Å.
+/// Rows that one task looks at.
+const ROWS: usize = 1 << 16;
+
+/// An indexed triangle mesh. Vertex `i` lies at `centre + position(i)`, in Å.
+///
+/// Its vertices lie in `positions` and `normals`, or in `quantized`: then those two are empty.
 ///
 /// Invariants of every mesh that a backend returns: each index is in range, normals have length 1 and point
 /// outwards, triangles wind counter-clockwise seen from outside, and the surface is closed.
@@ -17,6 +25,8 @@ pub struct Mesh {
     pub positions: Column<[f32; 3]>,
     /// Unit normals, one per vertex, pointing out of the molecule.
     pub normals: Column<[f32; 3]>,
+    /// The vertices as small integers, instead of the two columns above.
+    pub quantized: Option<Quantized>,
     /// Vertex indices, counter-clockwise seen from outside.
     pub triangles: Column<[u32; 3]>,
     /// Per vertex the index of the nearest sphere in the input, if it was asked for.
@@ -28,11 +38,72 @@ pub struct Mesh {
     pub parts: Vec<(usize, usize)>,
 }
 
+/// Vertices in 12 bytes. The fourth number of a row is 0.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Quantized {
+    /// What an integer of a position is multiplied by, Å.
+    pub step: Step,
+    /// Positions relative to the mesh's centre, in steps; [`BEYOND`](quantize::BEYOND) where a coordinate is out of reach.
+    pub positions: Column<[i16; 4]>,
+    /// Unit normals, one per position, in units of 1/127.
+    pub normals: Column<[i8; 4]>,
+}
+
+impl Quantized {
+    /// `n` rows of zeros.
+    #[must_use]
+    pub fn zeroed(step: Step, n: usize) -> Self {
+        Self { step, positions: Column::zeroed(n), normals: Column::zeroed(n) }
+    }
+
+    /// Lowest and highest position per axis, in steps; none without rows.
+    #[must_use]
+    pub fn bounds(&self) -> Option<[[i16; 3]; 2]> {
+        self.positions.pieces().filter_map(bounds_in_steps).reduce(joined)
+    }
+}
+
+/// Lowest and highest row per axis.
+fn bounds_in_steps(rows: &[[i16; 4]]) -> Option<[[i16; 3]; 2]> {
+    let of = |rows: &[[i16; 4]]| {
+        // Whole rows at once: four rows are a vector, and the fourth number is 0.
+        let (low, high) = rows.iter().fold(([i16::MAX; 4], [i16::MIN; 4]), |(low, high), row| {
+            (std::array::from_fn(|k| low[k].min(row[k])), std::array::from_fn(|k| high[k].max(row[k])))
+        });
+        [low, high].map(|[x, y, z, _]| [x, y, z])
+    };
+    if rows.is_empty() {
+        return None;
+    }
+    if rows.len() <= ROWS { Some(of(rows)) } else { rows.par_chunks(ROWS).map(of).reduce_with(joined) }
+}
+
+/// The bounds of both.
+fn joined([a, b]: [[i16; 3]; 2], [c, d]: [[i16; 3]; 2]) -> [[i16; 3]; 2] {
+    [std::array::from_fn(|k| a[k].min(c[k])), std::array::from_fn(|k| b[k].max(d[k]))]
+}
+
+/// A position as a row.
+#[inline]
+#[must_use]
+pub(crate) fn position_row(step: Step, position: [f32; 3]) -> [i16; 4] {
+    let [x, y, z] = step.position(position);
+    [x, y, z, 0]
+}
+
+/// A unit normal as a row, or a zero one.
+#[inline]
+#[must_use]
+pub(crate) fn normal_row(normal: [f32; 3]) -> [i8; 4] {
+    let [x, y, z] = quantize::normal(normal);
+    [x, y, z, 0]
+}
+
 impl Mesh {
     /// Number of vertices.
     #[must_use]
     pub fn n_vertices(&self) -> usize {
-        self.positions.len()
+        self.quantized.as_ref().map_or(self.positions.len(), |quantized| quantized.positions.len())
     }
 
     /// Number of triangles.
@@ -41,24 +112,98 @@ impl Mesh {
         self.triangles.len()
     }
 
+    /// All vertices, each column in one piece.
+    #[must_use]
+    pub fn vertices(&self) -> Vertices<'_> {
+        match &self.quantized {
+            None => Vertices::Single { positions: &self.positions, normals: &self.normals },
+            Some(Quantized { step, positions, normals }) => Vertices::Quantized { step: *step, positions, normals },
+        }
+    }
+
+    /// The position of vertex `i` relative to `centre`, Å.
+    ///
+    /// # Panics
+    /// Where there is no such vertex.
+    #[must_use]
+    pub fn position(&self, i: usize) -> [f32; 3] {
+        match &self.quantized {
+            None => self.positions[i],
+            Some(Quantized { step, positions, .. }) => {
+                let [x, y, z, _] = positions[i];
+                step.decoded([x, y, z])
+            }
+        }
+    }
+
     /// Lowest and highest relative position per axis; zeros for an empty mesh.
     #[must_use]
     pub fn bounds(&self) -> [[f32; 3]; 2] {
+        if let Some(quantized) = &self.quantized {
+            return quantized.bounds().unwrap_or_default().map(|row| quantized.step.decoded(row));
+        }
         let Some(&first) = self.positions.first() else { return [[0.0; 3]; 2] };
         self.positions.iter().fold([first, first], |[lo, hi], p| {
             [std::array::from_fn(|k| lo[k].min(p[k])), std::array::from_fn(|k| hi[k].max(p[k]))]
         })
     }
 
+    /// Rounds the vertices to integers. A mesh that has such with this step stays as it is. Whether anything changed.
+    pub fn quantize(&mut self, step: Step) -> bool {
+        if self.quantized.as_ref().is_some_and(|quantized| quantized.step == step) {
+            return false;
+        }
+        let rows = |i: usize| self.position(i);
+        let n = self.n_vertices();
+        let mut rounded = Quantized::zeroed(step, n);
+        rounded.positions.par_chunks_mut(ROWS).enumerate().for_each(|(chunk, out)| {
+            out.iter_mut().zip(chunk * ROWS..).for_each(|(out, i)| *out = position_row(step, rows(i)));
+        });
+        if let Some(quantized) = self.quantized.take() {
+            // Another step: normals have none.
+            rounded.normals = quantized.normals;
+        } else {
+            let normals = rounded.normals.par_chunks_mut(ROWS).zip(self.normals.par_chunks(ROWS));
+            normals.for_each(|(out, normals)| {
+                out.iter_mut().zip(normals).for_each(|(out, normal)| *out = normal_row(*normal));
+            });
+        }
+        (self.positions, self.normals) = (Column::default(), Column::default());
+        self.quantized = Some(rounded);
+        true
+    }
+
+    /// Copies what lies in pieces into one: positions and triangles, which measures look up anywhere.
+    pub fn settle_geometry(&mut self) {
+        self.positions.settle();
+        self.triangles.settle();
+        if let Some(quantized) = &mut self.quantized {
+            quantized.positions.settle();
+        }
+    }
+
+    /// Likewise for normals, too.
+    pub fn settle(&mut self) {
+        self.settle_geometry();
+        self.normals.settle();
+        if let Some(quantized) = &mut self.quantized {
+            quantized.normals.settle();
+        }
+    }
+
+    /// Vertices whose normal is zero.
+    fn flat_vertices(&self) -> Vec<u32> {
+        // Half a unit of a component is far below every unit vector's longest one.
+        match &self.quantized {
+            None => numbers_of(&self.normals, |n: &[f32; 3]| n.iter().all(|c| c.abs() < 0.5)),
+            Some(quantized) => numbers_of(&quantized.normals, |n: &[i8; 4]| *n == [0; 4]),
+        }
+    }
+
     /// Gives every vertex whose normal is zero the area-weighted mean normal of its triangles: at a saddle of the
     /// density the gradient vanishes and has no direction.
     pub(crate) fn fill_flat_normals(&mut self) {
-        let flat: FxHashMap<u32, usize> = (0_u32..)
-            .zip(&self.normals)
-            .filter(|(_, n)| n.iter().all(|c| c.abs() < 0.5))
-            .zip(0..)
-            .map(|((v, _), i)| (v, i))
-            .collect();
+        let flat: FxHashMap<u32, usize> = self.flat_vertices().into_iter().zip(0..).collect();
         let mut sums = vec![[0.0_f64; 3]; flat.len()];
         for t in &self.triangles {
             for v in t {
@@ -73,22 +218,111 @@ impl Mesh {
         for (v, i) in order {
             let length = sums[i].iter().map(|c| c * c).sum::<f64>().sqrt();
             // A vertex whose triangles cancel to nothing still needs a unit vector.
-            let unit = if length > 0.0 { sums[i].map(|c| c / length) } else { [0.0, 0.0, 1.0] };
-            self.normals[v as usize] = unit.map(to_f32);
+            let unit = if length > 0.0 { sums[i].map(|c| c / length) } else { [0.0, 0.0, 1.0] }.map(to_f32);
+            match &mut self.quantized {
+                None => self.normals[v as usize] = unit,
+                Some(quantized) => quantized.normals[v as usize] = normal_row(unit),
+            }
         }
     }
 
     /// Twice the area of a triangle times its unit normal, Å².
     #[must_use]
     pub fn face_normal(&self, triangle: [u32; 3]) -> [f64; 3] {
-        let [a, b, c] = triangle.map(|v| self.positions[v as usize].map(f64::from));
+        let [a, b, c] = triangle.map(|v| self.position(v as usize).map(f64::from));
         let (u, v): ([f64; 3], [f64; 3]) = (std::array::from_fn(|k| b[k] - a[k]), std::array::from_fn(|k| c[k] - a[k]));
         [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
     }
 
-    /// Bytes of positions, normals and indices for so many vertices and triangles.
+    /// Bytes of positions, normals and indices.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        let each = if self.quantized.is_some() { 12 } else { 24 };
+        each * self.n_vertices() as u64 + 12 * self.n_triangles() as u64
+    }
+
+    /// Bytes of positions and normals in single precision, and of indices, for so many vertices and triangles.
     #[must_use]
     pub fn bytes_for(n_vertices: u64, n_triangles: u64) -> u64 {
         24 * n_vertices + 12 * n_triangles
+    }
+}
+
+/// Numbers of the rows that are such.
+fn numbers_of<T>(rows: &[T], such: impl Fn(&T) -> bool) -> Vec<u32> {
+    (0_u32..).zip(rows).filter(|(_, row)| such(row)).map(|(v, _)| v).collect()
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "rounded numbers and multiples of powers of two are exact")]
+mod tests {
+    use super::*;
+
+    /// A fan of triangles around vertex 0, which has no normal, at the height `z`.
+    fn fan(z: f32) -> Mesh {
+        let rim = [[1.0, 0.0, z], [0.0, 1.0, z], [-1.0, 0.0, z], [0.0, -1.0, z]];
+        Mesh {
+            positions: std::iter::once([0.0, 0.0, z]).chain(rim).collect(),
+            normals: std::iter::once([0.0; 3]).chain([[0.0, 0.6, 0.8]; 4]).collect(),
+            triangles: (1..=4).map(|i| [0, i, i % 4 + 1]).collect(),
+            ..Mesh::default()
+        }
+    }
+
+    #[test]
+    fn a_mesh_is_rounded_once_and_says_what_it_is() {
+        let (mut mesh, step) = (fan(0.3), Step::covering(1.0));
+        let single = mesh.clone();
+        assert_eq!((mesh.bytes(), mesh.n_vertices()), (5 * 24 + 4 * 12, 5));
+        assert!(mesh.quantize(step) && !mesh.quantize(step), "the second time there is nothing to do");
+        assert_eq!((mesh.bytes(), mesh.n_vertices()), (5 * 12 + 4 * 12, 5));
+        assert!(mesh.positions.is_empty() && mesh.normals.is_empty());
+        let half = 0.5 * step.length();
+        for (i, position) in single.positions.iter().enumerate() {
+            let found = mesh.position(i);
+            assert!((0..3).all(|k| (found[k] - position[k]).abs() <= half), "{found:?} {position:?}");
+            assert_eq!(found, step.decoded(step.position(*position)));
+        }
+        assert_eq!(mesh.bounds(), single.bounds().map(|row| step.decoded(step.position(row))));
+        // A coarser step takes the integers for what they are.
+        let coarse = Step::covering(100.0);
+        assert!(mesh.quantize(coarse));
+        assert_eq!(mesh.position(1)[0], 1.0, "a multiple of both");
+        assert_eq!(mesh.quantized.as_ref().unwrap().normals[1], normal_row([0.0, 0.6, 0.8]));
+        assert_eq!(Mesh { quantized: Some(Quantized::zeroed(step, 0)), ..Mesh::default() }.bounds(), [[0.0; 3]; 2]);
+    }
+
+    #[test]
+    fn bounds_of_integers_are_found_in_any_row_of_any_piece() {
+        let step = Step::covering(1.0);
+        for n in [1, 5, ROWS, 2 * ROWS + 3] {
+            for row in [0, n / 2, n - 1] {
+                let mut rows = vec![[1, 2, 3, 0]; n];
+                rows[row] = [-7, 9, quantize::BEYOND, 0];
+                let cut = n / 3;
+                let pieces = vec![Column::from(rows[..cut].to_vec()), Column::from(rows[cut..].to_vec())];
+                let quantized = Quantized { positions: Column::pieced(pieces), ..Quantized::zeroed(step, 0) };
+                let [low, high] = [[-7, 2, quantize::BEYOND], [1, 9, 3]];
+                let expected = if n == 1 { [[-7, 9, quantize::BEYOND]; 2] } else { [low, high] };
+                assert_eq!(quantized.bounds(), Some(expected), "{row} of {n}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_vertex_without_a_gradient_gets_the_normal_of_its_triangles_either_way() {
+        for quantized in [false, true] {
+            let mut mesh = fan(0.25);
+            if quantized {
+                mesh.quantize(Step::covering(2.0));
+            }
+            mesh.fill_flat_normals();
+            match mesh.vertices() {
+                Vertices::Single { normals, .. } => assert_eq!(normals[..2], [[0.0, 0.0, 1.0], [0.0, 0.6, 0.8]]),
+                Vertices::Quantized { normals, .. } => {
+                    assert_eq!(normals[..2], [[0, 0, 127, 0], normal_row([0.0, 0.6, 0.8])]);
+                }
+            }
+        }
     }
 }

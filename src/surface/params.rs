@@ -4,6 +4,8 @@ use std::fmt;
 use std::str::FromStr;
 
 use super::error::SurfaceError;
+use super::mesh::Mesh;
+use super::quantize::Step;
 
 /// Finest grid spacing that is accepted, Å.
 pub const MIN_RESOLUTION: f64 = 0.01;
@@ -160,6 +162,9 @@ pub struct SurfaceParams {
     pub paper: Option<PaperParams>,
     /// Find the nearest atom of every vertex.
     pub atom_ids: bool,
+    /// Deliver vertices as [`Quantized`](super::mesh::Quantized) ones with this step, which reaches as far as the surface
+    /// does; else in single precision. A backend that cannot delivers single precision, which the caller may round.
+    pub quantize: Option<Step>,
 }
 
 /// Limits of a run, checked before memory is allocated.
@@ -256,11 +261,18 @@ impl SurfaceParams {
             preset,
             paper,
             atom_ids: options.atom_ids,
+            quantize: None,
         })
     }
 }
 
 impl SurfaceParams {
+    /// Bytes of the vertices and triangles of such a mesh, nearest atoms aside.
+    #[must_use]
+    pub fn mesh_bytes(&self, n_vertices: u64, n_triangles: u64) -> u64 {
+        if self.quantize.is_some() { 12 * (n_vertices + n_triangles) } else { Mesh::bytes_for(n_vertices, n_triangles) }
+    }
+
     /// Whether scale and offset leave the smallest radius usable.
     ///
     /// # Errors

@@ -14,8 +14,8 @@ use super::error::SurfaceError;
 use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_u32, to_u64};
 use super::layout::{NONE, Params, Tile, halves};
 use super::marks::{Bits, Marked, local_of, mark_run, merge, runs, starts};
-use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
+use super::quantize::Step;
 
 /// More tiles than this in all runs together, and the grid is looked at before it is built.
 const MANY_TILES: f64 = 1e6;
@@ -186,6 +186,7 @@ impl Plan {
             ahead: bricks(self.reach + 8.51),
             n_tiles: to_u32(self.tiles.len()),
             n_bricks: to_u32(self.bricks.len()),
+            steps_per_angstrom: params.quantize.map_or(0.0, Step::per_angstrom),
             ..bytemuck::Zeroable::zeroed()
         }
     }
@@ -205,8 +206,8 @@ pub fn check_totals(
     if n_triangles == 0 {
         return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
     }
-    let bytes = Mesh::bytes_for(n_vertices, n_triangles);
-    let most = limits.max_mesh_bytes.min(Mesh::bytes_for(u64::from(u32::MAX), 0));
+    let bytes = params.mesh_bytes(n_vertices, n_triangles);
+    let most = limits.max_mesh_bytes.min(params.mesh_bytes(u64::from(u32::MAX), 0));
     if bytes <= most { Ok(()) } else { Err(cpu::mesh_too_large(bytes, lattice.spacing, most)) }
 }
 

@@ -2,16 +2,53 @@
 
 use super::backend::{GridStats, Served};
 use super::measure::Measures;
+use super::quantize::Step;
+
+/// Vertices as they lie in memory, in rows of equal number.
+#[derive(Debug, Clone, Copy)]
+pub enum Vertices<'a> {
+    /// In single precision.
+    Single {
+        /// Positions relative to the mesh's centre, Å.
+        positions: &'a [[f32; 3]],
+        /// Unit normals.
+        normals: &'a [[f32; 3]],
+    },
+    /// As small integers: see [`Quantized`](super::mesh::Quantized).
+    Quantized {
+        /// What an integer of a position is multiplied by, Å.
+        step: Step,
+        /// Positions relative to the mesh's centre, in steps.
+        positions: &'a [[i16; 4]],
+        /// Unit normals, in units of 1/127.
+        normals: &'a [[i8; 4]],
+    },
+}
+
+impl Vertices<'_> {
+    /// Rows.
+    #[must_use]
+    pub const fn len(&self) -> usize {
+        match self {
+            Self::Single { positions, .. } => positions.len(),
+            Self::Quantized { positions, .. } => positions.len(),
+        }
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+}
 
 /// A part of a mesh: rows of its columns, each in its final place.
 #[derive(Debug, Clone, Copy)]
 pub struct MeshPart<'a> {
     /// Row of the first vertex.
     pub first_vertex: usize,
-    /// Positions relative to the mesh's centre, Å.
-    pub positions: &'a [[f32; 3]],
-    /// Unit normals, one per position.
-    pub normals: &'a [[f32; 3]],
+    /// Its vertices; all parts of a mesh have the same kind.
+    pub vertices: Vertices<'a>,
     /// Row of the first triangle.
     pub first_triangle: usize,
     /// Vertex indices, counted over the whole mesh.

@@ -3,6 +3,7 @@
 //! Everything that can fill vectors is done for a batch of triangles at a time.
 
 use super::measure::Component;
+use super::mesh::Mesh;
 use super::simd::dispatched;
 
 /// No label: see [`sum`].
@@ -40,6 +41,25 @@ fn edge_share(from: u32, to: u32) -> u64 {
     if from < to { key } else { key.wrapping_neg() }
 }
 
+/// Where vertices are, relative to the mesh's centre.
+#[derive(Clone, Copy)]
+pub(super) enum Positions<'a> {
+    /// Å.
+    Single(&'a [[f32; 3]]),
+    /// In steps of so many Å.
+    Quantized(&'a [[i16; 4]], f32),
+}
+
+impl<'a> From<&'a Mesh> for Positions<'a> {
+    fn from(mesh: &'a Mesh) -> Self {
+        // Normals stay where they lie, in pieces if need be.
+        match &mesh.quantized {
+            None => Self::Single(&mesh.positions),
+            Some(quantized) => Self::Quantized(&quantized.positions, quantized.step.length()),
+        }
+    }
+}
+
 /// Triangles whose geometry is computed together: enough that what was gathered lane by lane has left the store
 /// buffer when it is read back as vectors.
 const LANES: usize = 128;
@@ -50,7 +70,7 @@ type Lanes = [[f32; LANES]; 2];
 dispatched! {
 /// Sums `triangles` by the label of their vertices. `labels` are those of the vertices from `first` on; the label of a
 /// triangle is that of its first corner among them, if any is.
-pub(super) fn sum(positions: &[[f32; 3]], triangles: &[[u32; 3]], first: u32, labels: &[u32], n_labels: usize) -> Sums {
+pub(super) fn sum(positions: Positions<'_>, triangles: &[[u32; 3]], first: u32, labels: &[u32], n_labels: usize) -> Sums {
     let mut sums = Sums { by_label: vec![Component::default(); n_labels], ..Sums::default() };
     for batch in triangles.chunks(LANES) {
         let (shares, degenerate) = edge_shares(batch);
@@ -113,18 +133,32 @@ pub(super) fn edge_shares(triangles: &[[u32; 3]]) -> (u64, bool) {
     (sum.iter().fold(0, |all, s| all.wrapping_add(*s)), twice.contains(&true))
 }
 
-/// Areas and signed volumes against the mesh's centre. Single precision inside a triangle: differences of close
-/// positions are nearly exact, and the sums over triangles are double.
+/// The corners of triangles, lane by lane.
 #[inline(always)]
-fn geometry(positions: &[[f32; 3]], batch: &[[u32; 3]]) -> Lanes {
+fn gather(batch: &[[u32; 3]], at: impl Fn(usize) -> [f32; 3]) -> [[f32; LANES]; 9] {
     let mut p = [[0.0_f32; LANES]; 9];
     for (lane, t) in batch.iter().enumerate() {
-        let [a, b, c] = [positions[t[0] as usize], positions[t[1] as usize], positions[t[2] as usize]];
+        let [a, b, c] = t.map(|v| at(v as usize));
         for k in 0..3 {
             (p[k][lane], p[3 + k][lane], p[6 + k][lane]) = (a[k], b[k], c[k]);
         }
     }
-    let [ax, ay, az, bx, by, bz, cx, cy, cz] = p;
+    p
+}
+
+/// Areas and signed volumes against the mesh's centre. Single precision inside a triangle: differences of close
+/// positions are nearly exact, and the sums over triangles are double.
+#[inline(always)]
+fn geometry(positions: Positions<'_>, batch: &[[u32; 3]]) -> Lanes {
+    let corners = match positions {
+        Positions::Single(rows) => gather(batch, |v| rows[v]),
+        Positions::Quantized(rows, step) => gather(batch, |v| {
+            let [x, y, z, _] = rows[v];
+            // A power of two: exact.
+            [x, y, z].map(|c| f32::from(c) * step)
+        }),
+    };
+    let [ax, ay, az, bx, by, bz, cx, cy, cz] = corners;
     let (mut area, mut volume) = ([0.0; LANES], [0.0; LANES]);
     for i in 0..LANES {
         let (ux, uy, uz) = (bx[i] - ax[i], by[i] - ay[i], bz[i] - az[i]);

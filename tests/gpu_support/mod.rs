@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
 use molmesh::gpu::{Budget, Engine, Executor, Finished, GpuError, GpuJob, Prepared};
 use molmesh::surface::{
-    CancelToken, Control, Kernel, Measures, Meshed, Proof, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    CancelToken, Control, Kernel, Measures, Meshed, Proof, Spheres, Step, SurfaceLimits, SurfaceOptions, SurfaceParams,
 };
 
 pub(crate) const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
@@ -69,6 +69,12 @@ pub(crate) fn spheres(rows: &[[f64; 4]]) -> Spheres {
 pub(crate) fn params(kernel: Kernel, resolution: f64) -> SurfaceParams {
     let options = SurfaceOptions { kernel: Some(kernel), resolution: Some(resolution), ..SurfaceOptions::default() };
     SurfaceParams::new(&options).expect("valid")
+}
+
+/// The same parameters, with vertices rounded to the smallest step that reaches them all.
+pub(crate) fn rounded(spheres: &Spheres, params: &SurfaceParams) -> SurfaceParams {
+    let step = Step::covering(molmesh::surface::lattice::extent(spheres, params));
+    SurfaceParams { quantize: Some(step), ..params.clone() }
 }
 
 pub(crate) fn measures(meshed: &Meshed) -> Measures {

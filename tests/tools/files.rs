@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use std::{fs, io};
 
 use molmesh::formats::{GlbSink, PlaceBytes};
-use molmesh::surface::{Mesh, MeshPart, MeshSink};
+use molmesh::surface::{Mesh, MeshPart, MeshSink, Vertices};
 use tempfile::TempDir;
 
 /// Files in a folder that goes away.
@@ -54,8 +54,18 @@ pub fn pour(sink: &GlbSink<'_>, mesh: &Mesh, n_parts: usize) {
         let cut = |len: usize| part * len / n_parts..(part + 1) * len / n_parts;
         let (v, t) = (cut(n), cut(m));
         let (first_vertex, first_triangle) = (v.start, t.start);
-        let (positions, normals) = (&mesh.positions[v.clone()], &mesh.normals[v]);
+        let vertices = match mesh.vertices() {
+            Vertices::Single { positions, normals } => {
+                Vertices::Single { positions: &positions[v.clone()], normals: &normals[v] }
+            }
+            Vertices::Quantized { step, positions, normals } => {
+                Vertices::Quantized { step, positions: &positions[v.clone()], normals: &normals[v] }
+            }
+        };
         let triangles = &mesh.triangles[t];
-        sink.part(&MeshPart { first_vertex, positions, normals, first_triangle, triangles }).unwrap();
+        // Whoever made the sink asks it why.
+        if sink.part(&MeshPart { first_vertex, vertices, first_triangle, triangles }).is_err() {
+            return;
+        }
     }
 }

@@ -10,7 +10,7 @@
 //! | field | the lists, 32 B an atom | 2 KiB a brick | 2 multiply-adds a pair of sample and atom |
 //! | classify | 2 KiB a brick | 292 B a brick | – |
 //! | scan | 4 B a brick | 8 B a brick | – |
-//! | interpolate | 2 KiB, 248 B and the lists of a brick with surface, 32 B an atom | 24 B a vertex | 10 an atom that reaches a vertex's brick |
+//! | interpolate | 2 KiB, 248 B and the lists of a brick with surface, 32 B an atom | 24 B a vertex, 12 B a rounded one | 10 an atom that reaches a vertex's brick |
 //! | emit | 300 B a brick with surface | 12 B a triangle | – |
 
 use molmesh::gpu::Prepared;
@@ -41,8 +41,9 @@ impl Work {
             Stage::Scan => (12.0 * bricks, 0.0),
             Stage::Interpolate => {
                 let lists = 4.0 * entries * surface / bricks.max(1.0);
+                let each = if meshed.mesh.quantized.is_some() { 12.0 } else { 24.0 };
                 let reach = pairs / job.plan.occupied.max(1) as f64;
-                ((2048.0 + 248.0) * surface + lists + 32.0 * atoms + 24.0 * vertices, 10.0 * vertices * reach)
+                ((2048.0 + 248.0) * surface + lists + 32.0 * atoms + each * vertices, 10.0 * vertices * reach)
             }
             Stage::Emit => (300.0 * surface + 12.0 * triangles, 0.0),
             Stage::Write | Stage::Measure => (0.0, 0.0),

@@ -6,7 +6,7 @@ use std::time::Instant;
 use molmesh::gpu::yardstick::Rates;
 use molmesh::gpu::{Engine, Executor, GpuJob, Paper, Prepared};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Measures, Mesh, Meshed, Proof, Spheres, Stage, SurfaceLimits,
+    Backend, CancelToken, Control, CpuBackend, Measures, Mesh, Meshed, Proof, Spheres, Stage, Step, SurfaceLimits,
     SurfaceParams,
 };
 use rayon::prelude::*;
@@ -65,6 +65,8 @@ pub(super) struct Row {
     pub(super) pairs: u64,
     pub(super) vertices: usize,
     pub(super) triangles: usize,
+    /// What vertices are rounded to, Å; none: they are single-precision numbers.
+    pub(super) step: Option<f32>,
     /// Bytes of the mesh.
     pub(super) bytes: u64,
     /// A run's submissions.
@@ -200,7 +202,7 @@ pub(super) fn measure(
     let rows: Vec<_> = stages.into_iter().map(|(stage, ms)| stage_row(stage, ms, &prepared, meshed, rates)).collect();
     let floor_ms = rows.iter().map(|row| row.floor_ms).sum::<Option<f64>>().filter(|floor| *floor > 0.0);
     let device_ms = Spread::of(device);
-    let bytes = Mesh::bytes_for(meshed.mesh.n_vertices() as u64, meshed.mesh.n_triangles() as u64);
+    let bytes = meshed.mesh.bytes();
     Ok(Row {
         resolution: params.resolution,
         atoms: spheres.len(),
@@ -210,6 +212,7 @@ pub(super) fn measure(
         pairs: prepared.plan.pairs,
         vertices: meshed.mesh.n_vertices(),
         triangles: meshed.mesh.n_triangles(),
+        step: params.quantize.map(Step::length),
         bytes,
         submissions: metered.submissions,
         stages: rows,
@@ -243,9 +246,16 @@ pub(super) fn sum_of_bytes(mesh: &Mesh) -> u64 {
         };
         bytes.par_chunks(1 << 20).map(words).reduce(|| 0, u64::wrapping_add)
     }
-    // Where they lie: a column in pieces need not be joined for this.
+    bytes_of(mesh).into_iter().map(sum).fold(0, u64::wrapping_add)
+}
+
+/// Every column of a mesh, where it lies: one in pieces need not be joined for this.
+pub(super) fn bytes_of(mesh: &Mesh) -> Vec<&[u8]> {
     let floats = mesh.positions.pieces().chain(mesh.normals.pieces()).map(bytemuck::cast_slice);
-    floats.chain(mesh.triangles.pieces().map(bytemuck::cast_slice)).map(sum).fold(0, u64::wrapping_add)
+    let rounded = mesh.quantized.iter().flat_map(|q| {
+        q.positions.pieces().map(bytemuck::cast_slice).chain(q.normals.pieces().map(bytemuck::cast_slice))
+    });
+    floats.chain(rounded).chain(mesh.triangles.pieces().map(bytemuck::cast_slice)).collect()
 }
 
 fn compare(
@@ -289,6 +299,11 @@ mod tests {
         assert_eq!(sum_of_bytes(&mesh), before + 1);
         mesh.positions[4][2] = 1.5;
         assert_ne!(sum_of_bytes(&mesh), before + 1);
+        mesh.quantize(Step::covering(2.0));
+        let (before, read) = (sum_of_bytes(&mesh), bytes_of(&mesh).iter().map(|part| part.len() as u64).sum::<u64>());
+        assert_eq!(read, mesh.bytes());
+        mesh.quantized.iter_mut().for_each(|q| q.normals[4][0] += 1);
+        assert_ne!(sum_of_bytes(&mesh), before);
     }
 
     #[test]

@@ -11,10 +11,11 @@ mod table;
 use std::path::PathBuf;
 
 use clap::{Args as ClapArgs, Subcommand};
+use molmesh::formats::Compress;
 use molmesh::gpu::Paper;
 use molmesh::gpu::bench::{self, Opened};
 use molmesh::gpu::yardstick::{self, Effort, Rates};
-use molmesh::surface::{DeviceChoice, Spheres, SurfaceParams};
+use molmesh::surface::{DeviceChoice, Spheres, Step, SurfaceParams, lattice};
 use serde_json::json;
 
 use super::error::CliError;
@@ -46,6 +47,10 @@ pub(crate) struct GpuArgs {
     /// Atoms of the made-up case, which needs no file
     #[arg(long, value_name = "N", default_value_t = 60_000)]
     pub(crate) atoms: usize,
+    /// How vertices come back: none (single precision, 24 bytes each), or quantize (12 bytes, as glb stores them)
+    #[arg(long, value_name = "HOW", default_value = Compress::None.name(), conflicts_with_all = ["jobs", "pool"],
+        value_parser = [Compress::None.name(), Compress::Quantize.name()])]
+    pub(crate) compress: String,
     /// Compare each mesh with the CPU's
     #[arg(long)]
     pub(crate) check: bool,
@@ -109,11 +114,19 @@ fn chosen(args: &GpuArgs) -> impl Iterator<Item = Case> {
     cases::all(args.atoms).into_iter().filter(move |case| case.name.contains(only.as_str()))
 }
 
+/// A case's spheres and its surface, with the vertices that are asked for.
+fn load(args: &GpuArgs, case: &Case) -> Result<(Spheres, SurfaceParams), String> {
+    let (spheres, params) = case.load(args.data.as_deref())?;
+    let rounded = args.compress == Compress::Quantize.name();
+    let quantize = rounded.then(|| Step::covering(lattice::extent(&spheres, &params)));
+    Ok((spheres, SurfaceParams { quantize, ..params }))
+}
+
 /// Those of them whose files are there; it is said which are not.
 fn loaded(args: &GpuArgs) -> Result<Vec<(Case, Spheres, SurfaceParams)>, CliError> {
     let mut loaded = Vec::new();
     for case in chosen(args) {
-        match case.load(args.data.as_deref()) {
+        match load(args, &case) {
             Ok((spheres, params)) => loaded.push((case, spheres, params)),
             Err(why) => super::say(&format!("{}: not measured: {why}\n", case.name))?,
         }
@@ -144,7 +157,7 @@ fn cases(args: &GpuArgs, opened: Opened) -> Result<serde_json::Value, CliError> 
 
 /// One case, or why it was not measured.
 fn one(args: &GpuArgs, case: &Case, rates: Option<&Rates>) -> Result<Row, String> {
-    let (spheres, params) = case.load(args.data.as_deref())?;
+    let (spheres, params) = load(args, case)?;
     let mut opened = bench::open(args.device).map_err(|e| e.to_string())?;
     let mut row = measure::measure(&mut opened.engine, &spheres, &params, args.runs, rates, args.check)?;
     if case.with_paper {

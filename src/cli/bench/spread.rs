@@ -6,12 +6,12 @@ use std::time::Instant;
 
 use molmesh::gpu::{GpuBackend, GpuJob, Look, PoolSettings, Prepared, Program, Ran, discover};
 use molmesh::surface::devices::DeviceName;
-use molmesh::surface::{Backend, CancelToken, Control, DeviceChoice, Mesh, Spheres, SurfaceParams};
+use molmesh::surface::{Backend, CancelToken, Control, DeviceChoice, Mesh, Spheres, Step, SurfaceParams};
 use serde::Serialize;
 
 use super::super::error::CliError;
 use super::cases::Case;
-use super::measure::{LIMITS, Spread, WARM_UP, sum_of_bytes};
+use super::measure::{LIMITS, Spread, WARM_UP, bytes_of, sum_of_bytes};
 
 /// A case on so many devices. Times are in ms.
 #[derive(Debug, Clone, Serialize)]
@@ -22,6 +22,8 @@ pub(super) struct SpreadRow {
     atoms: usize,
     bricks: usize,
     triangles: usize,
+    /// What vertices are rounded to, Å; none: they are single-precision numbers.
+    step: Option<f32>,
     /// Bytes of the mesh.
     bytes: u64,
     /// On the host, before the devices: lattice and plan.
@@ -114,7 +116,8 @@ fn measure(
         atoms: spheres.len(),
         bricks: prepared.plan.bricks.len(),
         triangles: mesh.n_triangles(),
-        bytes: Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64),
+        step: prepared.params.quantize.map(Step::length),
+        bytes: mesh.bytes(),
         prepare_ms: Spread::of(prepare),
         ready_ms: Spread::of(ready),
         read_ms: Spread::of(read),
@@ -149,9 +152,9 @@ fn by_device(all: &[Ran]) -> Vec<DeviceRow> {
 fn digest(mesh: &Mesh) -> Vec<u8> {
     use sha2::{Digest as _, Sha256};
     let mut sum = Sha256::new();
-    mesh.positions.pieces().for_each(|rows| sum.update(bytemuck::cast_slice::<_, u8>(rows)));
-    mesh.normals.pieces().for_each(|rows| sum.update(bytemuck::cast_slice::<_, u8>(rows)));
-    mesh.triangles.pieces().for_each(|rows| sum.update(bytemuck::cast_slice::<_, u8>(rows)));
+    for part in bytes_of(mesh) {
+        sum.update(part);
+    }
     sum.finalize().to_vec()
 }
 

@@ -33,7 +33,7 @@ pub(super) fn row(name: &str, row: &Result<Row, String>) -> String {
         Err(why) => return format!("{name}: not measured: {why}\n\n"),
     };
     let mut text = format!(
-        "{name}: {} atoms at {:.4} Å, {} cells in the box, {} bricks ({} with surface), {} pairs, {} vertices, {} triangles, {:.1} MB, {} submissions\n",
+        "{name}: {} atoms at {:.4} Å, {} cells in the box, {} bricks ({} with surface), {} pairs, {} vertices{}, {} triangles, {:.1} MB, {} submissions\n",
         row.atoms,
         row.resolution,
         row.box_cells,
@@ -41,6 +41,7 @@ pub(super) fn row(name: &str, row: &Result<Row, String>) -> String {
         row.surface_bricks,
         row.pairs,
         row.vertices,
+        row.step.map(|step| format!(" in steps of {step} Å")).unwrap_or_default(),
         row.triangles,
         row.bytes as f64 * 1e-6,
         row.submissions,

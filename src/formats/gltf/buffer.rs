@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use super::layout::{AtomType, IndexType, Layout};
-use crate::formats::block::{convert_words, write_floats, write_integers};
+use crate::formats::block::{convert_words, write_bytes, write_floats, write_integers, write_shorts};
 use crate::formats::{Packing, quantize};
 use crate::surface::Mesh;
 
@@ -11,9 +11,17 @@ use crate::surface::Mesh;
 pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
     // Rows are written where they lie: a column in pieces is not joined for this.
     let packing = layout.storage.packing;
-    mesh.positions.pieces().try_for_each(|rows| write_positions(out, packing, rows))?;
-    if layout.normals.is_some() {
-        mesh.normals.pieces().try_for_each(|rows| write_normals(out, packing, rows))?;
+    let normals = layout.normals.is_some();
+    if let Some(quantized) = &mesh.quantized {
+        quantized.positions.pieces().try_for_each(|rows| write_shorts(out, rows))?;
+        if normals {
+            quantized.normals.pieces().try_for_each(|rows| write_bytes(out, rows))?;
+        }
+    } else {
+        mesh.positions.pieces().try_for_each(|rows| write_positions(out, packing, rows))?;
+        if normals {
+            mesh.normals.pieces().try_for_each(|rows| write_normals(out, packing, rows))?;
+        }
     }
     if let Some(colors) = &mesh.colors {
         let linear = linear_of_srgb();

@@ -86,7 +86,7 @@ pub(super) struct Layout {
 impl Layout {
     /// The layout of `mesh`; `None` if there is nothing to draw, as glTF knows no empty accessors.
     pub(super) fn of(mesh: &Mesh, storage: Storage, summary: &Summary) -> Result<Option<Self>, FormatError> {
-        let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
+        let (n_vertices, n_triangles) = (mesh.n_vertices() as u64, mesh.triangles.len() as u64);
         if n_triangles == 0 {
             return Ok(None);
         }

@@ -11,9 +11,10 @@ use thiserror::Error;
 use super::buffer::{write_indices, write_normals, write_positions};
 use super::glb::{GlbPlan, HEAD_BYTES, LARGE_BUFFER_BYTES};
 use super::layout::Layout;
+use crate::formats::block::{write_bytes, write_shorts};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
-use crate::surface::{MeshPart, MeshSink, SinkFailed};
+use crate::surface::{MeshPart, MeshSink, SinkFailed, Vertices};
 
 /// Something that takes bytes at any place, from several threads at once: a file.
 pub trait PlaceBytes: Sync {
@@ -148,9 +149,23 @@ impl<'a> GlbSink<'a> {
             self.drain()?;
         }
         let at = |offset: u64| At { sink: self, offset, now: lane.is_some() };
-        write_positions(&mut at(layout.positions.offset + position), packing, part.positions)?;
-        if let Some(normals) = layout.normals {
-            write_normals(&mut at(normals.offset + normal), packing, part.normals)?;
+        let mut positions = at(layout.positions.offset + position);
+        let mut normals = layout.normals.map(|normals| at(normals.offset + normal));
+        match part.vertices {
+            Vertices::Single { positions: rows, normals: units } => {
+                write_positions(&mut positions, packing, rows)?;
+                if let Some(normals) = &mut normals {
+                    write_normals(normals, packing, units)?;
+                }
+            }
+            Vertices::Quantized { step, positions: rows, normals: units } if packing.step() == Some(step) => {
+                write_shorts(&mut positions, rows)?;
+                if let Some(normals) = &mut normals {
+                    write_bytes(normals, units)?;
+                }
+            }
+            Vertices::Quantized { step, .. } => return Err(FormatError::OtherPacking { step: step.length() }.into()),
+        }
         }
         write_indices(&mut at(indices.offset + first), index_type, part.triangles.as_flattened())?;
         if lane.is_some() { self.drain() } else { Ok(()) }

@@ -6,8 +6,8 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use super::bin::{Tiles, slot_origin};
-use super::emit::{self, BrickTable, Numbered};
-use super::interpolate::{self, Batch, SlopeConstants, Source, Target};
+use super::emit::{self, BrickTable, Numbered, Rounding};
+use super::interpolate::{self, Batch, Rows, SlopeConstants, Source, Target, take};
 use super::join;
 use super::sheets::Sheets;
 use super::tally::Tally;
@@ -17,7 +17,8 @@ use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::Lattice;
 use crate::surface::measure::Measures;
-use crate::surface::mesh::Mesh;
+use crate::surface::mesh::{Mesh, Quantized};
+use crate::surface::quantize::Step;
 
 thread_local! {
     // As the first pass's scratch: kept per thread, not per piece of work.
@@ -48,17 +49,22 @@ pub(super) fn build(
     control: &Control<'_>,
 ) -> Result<(Mesh, Option<Measures>), SurfaceError> {
     let Scanned { lattice, done, totals, pieces, .. } = scanned;
+    let n_single = if scanned.quantize.is_some() { 0 } else { totals.vertices };
     let mut mesh = Mesh {
         centre: lattice.centre(),
-        positions: Column::zeroed(totals.vertices),
-        normals: Column::zeroed(totals.vertices),
+        positions: Column::zeroed(n_single),
+        normals: Column::zeroed(n_single),
+        quantized: scanned.quantize.map(|step| Quantized::zeroed(step, totals.vertices)),
         triangles: Column::zeroed(totals.triangles),
         atom_ids: atom_ids.then(|| Column::zeroed(totals.vertices)),
         colors: None,
         parts: done.iter().map(|tile| (tile.first_vertex, tile.first_triangle)).collect(),
     };
     let mut work = Vec::with_capacity(pieces.len());
-    let (mut positions, mut normals) = (&mut mesh.positions[..], &mut mesh.normals[..]);
+    let mut rows = match &mut mesh.quantized {
+        Some(quantized) => Rows::of(quantized),
+        None => Rows::Single { positions: &mut mesh.positions, normals: &mut mesh.normals },
+    };
     let (mut triangles, mut ids) = (&mut mesh.triangles[..], mesh.atom_ids.as_deref_mut());
     for piece in pieces {
         let (tile, [start, end]) = (&done[piece.tile], done[piece.tile].span(piece));
@@ -66,8 +72,7 @@ pub(super) fn build(
         work.push(Mutex::new(TilePart {
             tile,
             bricks: piece.bricks.clone(),
-            positions: take(&mut positions, n),
-            normals: take(&mut normals, n),
+            rows: rows.take(n),
             triangles: take(&mut triangles, m),
             atom_ids: ids.as_mut().map(|ids| take(ids, n)),
         }));
@@ -92,21 +97,12 @@ pub(super) fn build(
     Ok((mesh, measures))
 }
 
-/// Splits the first `n` rows off.
-#[expect(clippy::mut_mut, reason = "it moves the caller's slice forward")]
-fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
-    let (head, tail) = std::mem::take(rest).split_at_mut(n);
-    *rest = tail;
-    head
-}
-
 /// Bricks of a tile with their part of the mesh.
 pub(super) struct TilePart<'a> {
     pub(super) tile: &'a Tile,
     /// Which of its surface bricks.
     pub(super) bricks: Range<usize>,
-    pub(super) positions: &'a mut [[f32; 3]],
-    pub(super) normals: &'a mut [[f32; 3]],
+    pub(super) rows: Rows<'a>,
     pub(super) triangles: &'a mut [[u32; 3]],
     pub(super) atom_ids: Option<&'a mut [u32]>,
 }
@@ -139,9 +135,8 @@ impl TilePart<'_> {
             let candidates = &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize];
             let rows = all.start - base..all.end - base;
             let target = Target {
-                positions: &mut self.positions[rows.clone()],
-                normals: &mut self.normals[rows.clone()],
-                atom_ids: self.atom_ids.as_deref_mut().map(|ids| &mut ids[rows.clone()]),
+                rows: self.rows.slice(rows.clone()),
+                atom_ids: self.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
             };
             let source = Source { tile: self.tile.coord, candidates, t: &found.t[all] };
             flat += interpolate::interpolate(lattice, slope, brick, &source, batch, target);
@@ -165,10 +160,20 @@ impl TilePart<'_> {
                 0 | 1 => &[][..],
                 n => &found.sheets[brick.sheets as usize..][..n],
             };
-            emit::emit(table, sheets, &around, cases, own_sheets, out);
             let origin = slot_origin(self.tile.coord, usize::from(brick.slot));
+            let rounding = scanned.quantize.map(|step| scanned.rounding(step, origin));
+            emit::emit(table, sheets, &around, cases, own_sheets, rounding, out);
             tally.add(table, sheets, &around, origin, out);
         }
+    }
+}
+
+impl Scanned {
+    /// How vertices of the brick at `origin` are rounded.
+    fn rounding(&self, step: Step, origin: [i32; 3]) -> Rounding {
+        let Lattice { spacing, centre, .. } = &self.lattice;
+        let offset = std::array::from_fn(|k| f64::from(origin[k] - centre[k]));
+        Rounding { step, spacing: *spacing, offset }
     }
 }
 

@@ -9,8 +9,11 @@ use glam::Vec3A;
 
 use super::bin::SIDE;
 use super::classify::SurfaceBrick;
+use super::interpolate::position;
 use super::sheets::{self, Sheets};
 use crate::surface::cases::{CASES, MAX_TRIANGLES, cell_edge};
+use crate::surface::lattice::to_f32;
+use crate::surface::quantize::Step;
 use crate::surface::simd::dispatched;
 
 /// Samples along a brick's edge with the neighbours' first layer.
@@ -227,6 +230,34 @@ impl BrickTable {
         }
     }
 
+    /// Moves the vertices of a brick that lies `n` away to where they are after rounding.
+    #[inline(always)]
+    fn round(&mut self, of: &Numbered<'_>, n: usize, rounding: &Rounding) {
+        let Rounding { step, spacing, offset } = *rounding;
+        let far = far(n);
+        // As the vertex's own brick has it: so a vertex is at one place in all bricks that use it.
+        let own: [f32; 3] = std::array::from_fn(|k| to_f32(offset[k] + far[k] as f64));
+        let (h, length) = (to_f32(spacing), f64::from(step.length()));
+        shared_words(n, |z, axis, mask| {
+            let w = 3 * z + axis;
+            let word = of.brick.crossing[w];
+            let (layer, along) = (Vec3A::new(0.0, 0.0, z as f32), Vec3A::AXES[axis % 3]);
+            let before = u32::from(of.brick.before[w]);
+            let mut edges = word & mask;
+            while edges != 0 {
+                let bit = edges.trailing_zeros();
+                let rank = before + (word & ((1 << bit) - 1)).count_ones();
+                edges &= edges - 1;
+                let t = of.t.get(rank as usize).copied().unwrap_or_default();
+                let place = LAYER[bit as usize % 64] + layer + along * t;
+                let steps = step.position(position(own, place.to_array(), h));
+                // Double precision, as a large offset is taken off.
+                let at: [f32; 3] = std::array::from_fn(|k| to_f32(f64::from(steps[k]) * length / spacing - offset[k]));
+                self.at[edge_at(bit, z, axis, far)] = Vec3A::from_array(at);
+            }
+        });
+    }
+
     /// Corners of the triangles of the active cells, in order. If `JOIN`, vertices that a loop joins come onto one sheet.
     #[inline(always)]
     fn triangulate<const JOIN: bool>(&mut self, active: &[u64; 8], cases: &[u8], sheets: &mut Sheets) {
@@ -283,20 +314,37 @@ impl BrickTable {
     }
 }
 
+/// How vertices are rounded.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rounding {
+    pub(super) step: Step,
+    /// Å.
+    pub(super) spacing: f64,
+    /// From the mesh's centre to the brick's first sample, in spacings.
+    pub(super) offset: [f64; 3],
+}
+
 dispatched! {
 /// Writes the triangles of a brick. `cases` are those of its active cells in order, `own_sheets` the cells of each sheet
 /// if there are several and they are known. Leaves in `table` and `sheets`
-/// what the sums need.
+/// what the sums need, with vertices where `rounding` puts them.
 pub(super) fn emit(
     table: &mut BrickTable,
     sheets: &mut Sheets,
     around: &[Option<Numbered<'_>>; 8],
     cases: &[u8],
     own_sheets: &[[u64; 8]],
+    rounding: Option<Rounding>,
     out: &mut [[u32; 3]],
 ) {
     let Some(own) = around[0] else { return };
     table.fill(around);
+    if let Some(rounding) = &rounding {
+        for (n, near) in around.iter().enumerate() {
+            let Some(near) = near else { continue };
+            table.round(near, n, rounding);
+        }
+    }
     sheets.clear();
     match own.brick.n_sheets {
         None => table.triangulate::<true>(&own.brick.active, cases, sheets),

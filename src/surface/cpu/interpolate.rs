@@ -1,10 +1,14 @@
 //! Stage `interpolate`: vertex positions on crossing edges, analytic normals, and nearest atoms on request.
 
+use std::ops::Range;
+
 use super::bin::{NORMAL_ONLY, slot_origin};
 use super::classify::SurfaceBrick;
 use crate::surface::kernel::{MIN_DISTANCE2, Profile};
 use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
+use crate::surface::mesh::{Quantized, normal_row, position_row};
 use crate::surface::params::Kernel;
+use crate::surface::quantize::Step;
 use crate::surface::simd::{dispatched, exp2, fma};
 
 /// Vertices are shaded in batches of this many: one AVX-512 vector, two AVX ones.
@@ -92,12 +96,57 @@ pub(super) struct Source<'a> {
     pub(super) t: &'a [f32],
 }
 
+/// Rows of a mesh's vertices. Normals are zero where the gradient vanishes, to be filled from the triangles.
+pub(super) enum Rows<'a> {
+    /// Positions relative to the mesh's centre, Å, and unit normals.
+    Single { positions: &'a mut [[f32; 3]], normals: &'a mut [[f32; 3]] },
+    /// The same in steps, and in units of 1/127.
+    Quantized { step: Step, positions: &'a mut [[i16; 4]], normals: &'a mut [[i8; 4]] },
+}
+
+impl<'a> Rows<'a> {
+    /// All rows of some quantised vertices.
+    pub(super) fn of(quantized: &'a mut Quantized) -> Self {
+        let Quantized { step, positions, normals } = quantized;
+        Self::Quantized { step: *step, positions, normals }
+    }
+
+    /// Some of the rows.
+    pub(super) fn slice(&mut self, rows: Range<usize>) -> Rows<'_> {
+        match self {
+            Self::Single { positions, normals } => {
+                Rows::Single { positions: &mut positions[rows.clone()], normals: &mut normals[rows] }
+            }
+            Self::Quantized { step, positions, normals } => {
+                Rows::Quantized { step: *step, positions: &mut positions[rows.clone()], normals: &mut normals[rows] }
+            }
+        }
+    }
+
+    /// Splits the first `n` rows off.
+    pub(super) fn take(&mut self, n: usize) -> Self {
+        match self {
+            Self::Single { positions, normals } => {
+                Self::Single { positions: take(positions, n), normals: take(normals, n) }
+            }
+            Self::Quantized { step, positions, normals } => {
+                Self::Quantized { step: *step, positions: take(positions, n), normals: take(normals, n) }
+            }
+        }
+    }
+}
+
+/// Splits the first `n` rows off.
+#[expect(clippy::mut_mut, reason = "it moves the caller's slice forward")]
+pub(super) fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
+    let (head, tail) = std::mem::take(rest).split_at_mut(n);
+    *rest = tail;
+    head
+}
+
 /// Where a brick's vertices go.
 pub(super) struct Target<'a> {
-    /// Positions relative to the mesh's centre, Å.
-    pub(super) positions: &'a mut [[f32; 3]],
-    /// Unit normals; zero where the gradient vanishes, to be filled from the triangles.
-    pub(super) normals: &'a mut [[f32; 3]],
+    pub(super) rows: Rows<'a>,
     /// Nearest sphere of each vertex, in the caller's numbering.
     pub(super) atom_ids: Option<&'a mut [u32]>,
 }
@@ -118,28 +167,70 @@ pub(super) fn interpolate(
         nearest_atoms(&lattice.atoms, candidates, origin, &batch.p, ids);
     }
     let offset: [f64; 3] = std::array::from_fn(|k| f64::from(origin[k] - lattice.centre[k]));
-    finish(lattice.spacing, offset, batch, target.positions, target.normals)
+    match target.rows {
+        Rows::Single { positions, normals } => finish(lattice.spacing, offset, batch, positions, normals),
+        Rows::Quantized { step, positions, normals } => round(lattice.spacing, offset, batch, step, positions, normals),
+    }
+}
+
+/// A position in Å, from a brick's offset from the mesh's centre and a place in the brick, both in spacings. Whole
+/// lattice steps are exact in f32; the fraction is added before the one multiplication.
+#[inline(always)]
+pub(super) fn position(offset: [f32; 3], place: [f32; 3], spacing: f32) -> [f32; 3] {
+    std::array::from_fn(|k| (offset[k] + place[k]) * spacing)
+}
+
+/// A gradient scaled to length 1, if it can be.
+#[inline(always)]
+fn normal([x, y, z]: [f32; 3]) -> ([f32; 3], bool) {
+    let length2 = x * x + y * y + z * z;
+    // Below this, single precision has no direction left.
+    let usable = length2 > 1e-14;
+    let scale = if usable { length2.sqrt().recip() } else { 0.0 };
+    ([x * scale, y * scale, z * scale], usable)
+}
+
+/// Writes the rows of a batch. Returns how many gradients have no direction.
+#[inline(always)]
+fn write<P, N>(
+    spacing: f64,
+    offset: [f64; 3],
+    batch: &Batch,
+    (positions, position_of): (&mut [P], impl Fn([f32; 3]) -> P),
+    (normals, normal_of): (&mut [N], impl Fn([f32; 3]) -> N),
+) -> usize {
+    let (h, offset) = (to_f32(spacing), offset.map(to_f32));
+    let ([px, py, pz], [nx, ny, nz]) = (&batch.p, &batch.n);
+    for (row, ((x, y), z)) in positions.iter_mut().zip(px.iter().zip(py).zip(pz)) {
+        *row = position_of(position(offset, [*x, *y, *z], h));
+    }
+    let mut flat = 0;
+    for (row, ((x, y), z)) in normals.iter_mut().zip(nx.iter().zip(ny).zip(nz)) {
+        let (unit, usable) = normal([*x, *y, *z]);
+        flat += usize::from(!usable);
+        *row = normal_of(unit);
+    }
+    flat
 }
 
 dispatched! {
 /// Positions in Å and normals of length 1, row by row.
 fn finish(spacing: f64, offset: [f64; 3], batch: &Batch, positions: &mut [[f32; 3]], normals: &mut [[f32; 3]]) -> usize {
-    // Whole lattice steps are exact in f32; the fraction is added before the one multiplication.
-    let (h, offset) = (to_f32(spacing), offset.map(to_f32));
-    let ([px, py, pz], [nx, ny, nz]) = (&batch.p, &batch.n);
-    for (row, ((x, y), z)) in positions.iter_mut().zip(px.iter().zip(py).zip(pz)) {
-        *row = [(offset[0] + x) * h, (offset[1] + y) * h, (offset[2] + z) * h];
-    }
-    let mut flat = 0;
-    for (row, ((x, y), z)) in normals.iter_mut().zip(nx.iter().zip(ny).zip(nz)) {
-        let length2 = x * x + y * y + z * z;
-        // Below this, single precision has no direction left.
-        let usable = length2 > 1e-14;
-        flat += usize::from(!usable);
-        let scale = if usable { length2.sqrt().recip() } else { 0.0 };
-        *row = [x * scale, y * scale, z * scale];
-    }
-    flat
+    write(spacing, offset, batch, (positions, |p| p), (normals, |n| n))
+}
+}
+
+dispatched! {
+/// The same numbers, rounded.
+fn round(
+    spacing: f64,
+    offset: [f64; 3],
+    batch: &Batch,
+    step: Step,
+    positions: &mut [[i16; 4]],
+    normals: &mut [[i8; 4]],
+) -> usize {
+    write(spacing, offset, batch, (positions, |p| position_row(step, p)), (normals, normal_row))
 }
 }
 

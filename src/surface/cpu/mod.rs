@@ -44,6 +44,7 @@ use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::lattice::{Lattice, to_f32, to_u32};
 use super::params::{SurfaceLimits, SurfaceParams};
+use super::quantize::Step;
 use super::simd;
 use super::sink::{MeshSink, Poured};
 use super::spheres::Spheres;
@@ -165,6 +166,8 @@ struct Scanned {
     totals: Totals,
     grid: GridStats,
     pieces: Vec<Piece>,
+    /// How vertices are rounded, if they are.
+    quantize: Option<Step>,
 }
 
 /// Surface bricks of a tile whose part of the mesh is written by one thread in one go.
@@ -222,6 +225,7 @@ fn scan_lattice(
         tiles: &tiles,
         constants: Constants::new(&lattice.profile, lattice.spacing),
         iso: to_f32(params.isovalue),
+        params,
         limits,
         tally: sample::Tally::default(),
         control,
@@ -234,7 +238,7 @@ fn scan_lattice(
     done.sort_unstable_by_key(|(t, _)| *t);
     let mut done: Vec<Tile> = done.into_iter().map(|(_, tile)| tile).collect();
     control.check()?;
-    let totals = control.span(Stage::Scan, || scan::scan(&mut done, lattice.spacing, limits))?;
+    let totals = control.span(Stage::Scan, || scan::scan(&mut done, params, limits))?;
     if totals.triangles == 0 {
         return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
     }
@@ -248,7 +252,7 @@ fn scan_lattice(
         candidates: tally.candidates.into_inner(),
     };
     let pieces = pieces(&mut done);
-    Ok(Scanned { lattice, tiles, done, totals, grid, pieces })
+    Ok(Scanned { lattice, tiles, done, totals, grid, pieces, quantize: params.quantize })
 }
 
 fn run(

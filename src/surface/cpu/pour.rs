@@ -4,12 +4,12 @@ use std::cell::RefCell;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::build::{Shading, TilePart, Written};
-use super::interpolate::SlopeConstants;
+use super::interpolate::{Rows, SlopeConstants};
 use super::{Piece, Scanned, build, join, threads};
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::measure::{Measures, Proof};
-use crate::surface::sink::{MeshPart, MeshSink, Poured, SinkFailed};
+use crate::surface::sink::{MeshPart, MeshSink, Poured, SinkFailed, Vertices};
 
 /// What one thread keeps from tile to tile.
 #[derive(Default)]
@@ -17,6 +17,7 @@ struct Scratch {
     shading: Shading,
     positions: Vec<[f32; 3]>,
     normals: Vec<[f32; 3]>,
+    quantized: (Vec<[i16; 4]>, Vec<[i8; 4]>),
     triangles: Vec<[u32; 3]>,
 }
 
@@ -60,8 +61,8 @@ pub(super) fn pour(scanned: &Scanned, control: &Control<'_>, sink: &dyn MeshSink
         // whole mesh, then, and the same rows once more.
         found => {
             let (mesh, _) = build::build(scanned, false, control)?;
-            let (positions, normals, triangles) = (&mesh.positions[..], &mesh.normals[..], &mesh.triangles[..]);
-            let whole = MeshPart { first_vertex: 0, positions, normals, first_triangle: 0, triangles };
+            let (vertices, triangles) = (mesh.vertices(), &mesh.triangles[..]);
+            let whole = MeshPart { first_vertex: 0, vertices, first_triangle: 0, triangles };
             sink.part(&whole).map_err(failed)?;
             found.map_or_else(|| Measures::of(&mesh, Proof::Checksum, control), Ok)?
         }
@@ -90,25 +91,49 @@ impl Scratch {
         let tile = &scanned.done[piece.tile];
         let [start, end] = tile.span(piece);
         let (n, m) = (end.vertices - start.vertices, end.triangles - start.triangles);
-        let Self { shading, positions, normals, triangles } = self;
-        positions.resize(positions.len().max(n), [0.0; 3]);
-        normals.resize(normals.len().max(n), [0.0; 3]);
-        triangles.resize(triangles.len().max(m), [0; 3]);
-        let (positions, normals, triangles) = (&mut positions[..n], &mut normals[..n], &mut triangles[..m]);
+        let Self { shading, positions, normals, quantized, triangles } = self;
+        let rows = match scanned.quantize {
+            None => Rows::Single { positions: first(positions, n), normals: first(normals, n) },
+            Some(step) => {
+                let (positions, normals) = quantized;
+                Rows::Quantized { step, positions: first(positions, n), normals: first(normals, n) }
+            }
+        };
         let mut written = Written::default();
-        let mut part = TilePart { tile, bricks: piece.bricks.clone(), positions, normals, triangles, atom_ids: None };
+        let triangles = first(triangles, m);
+        let mut part = TilePart { tile, bricks: piece.bricks.clone(), rows, triangles, atom_ids: None };
         part.write(scanned, slope, shading, control, &mut written);
-        let TilePart { positions, normals, triangles, .. } = part;
-        let bounds = positions.iter().fold(NOWHERE, |bounds, p| join_bounds(bounds, [*p, *p]));
+        let TilePart { rows, triangles, .. } = part;
+        let vertices = match rows {
+            Rows::Single { positions, normals } => Vertices::Single { positions, normals },
+            Rows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
+        };
+        let bounds = bounds_of(&vertices);
         let part = MeshPart {
             first_vertex: tile.first_vertex + start.vertices,
-            positions,
-            normals,
+            vertices,
             first_triangle: tile.first_triangle + start.triangles,
             triangles,
         };
         control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
         Ok((written, bounds))
+    }
+}
+
+/// The first `n` rows of a scratch, which grows for them.
+fn first<T: Clone + Default>(rows: &mut Vec<T>, n: usize) -> &mut [T] {
+    rows.resize(rows.len().max(n), T::default());
+    &mut rows[..n]
+}
+
+/// Lowest and highest position, Å.
+fn bounds_of(vertices: &Vertices<'_>) -> Bounds {
+    let of = |bounds, p| join_bounds(bounds, [p, p]);
+    match vertices {
+        Vertices::Single { positions, .. } => positions.iter().fold(NOWHERE, |bounds, p| of(bounds, *p)),
+        Vertices::Quantized { step, positions, .. } => {
+            positions.iter().fold(NOWHERE, |bounds, [x, y, z, _]| of(bounds, step.decoded([*x, *y, *z])))
+        }
     }
 }
 

@@ -10,8 +10,7 @@ use super::{NO_BRICK, Tile, scan};
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK_SAMPLES, Lattice};
-use crate::surface::mesh::Mesh;
-use crate::surface::params::SurfaceLimits;
+use crate::surface::params::{SurfaceLimits, SurfaceParams};
 
 /// What one thread keeps from tile to tile.
 struct Scratch {
@@ -73,6 +72,7 @@ pub(super) struct Pass<'a> {
     pub(super) tiles: &'a Tiles,
     pub(super) constants: Constants,
     pub(super) iso: f32,
+    pub(super) params: &'a SurfaceParams,
     pub(super) limits: &'a SurfaceLimits,
     pub(super) tally: Tally,
     pub(super) control: &'a Control<'a>,
@@ -102,7 +102,7 @@ impl Pass<'_> {
         }
         self.control.span(Stage::Field, || scratch.evaluate(self, coord));
         let (found, bricks) = self.control.span(Stage::Classify, || scratch.classify(self.iso));
-        let bytes = Mesh::bytes_for(u64::from(found.vertices), u64::from(found.triangles));
+        let bytes = self.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
         let so_far = tally.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         if so_far > self.limits.max_mesh_bytes {
             let all = tally.all_tiles(so_far, self.tiles.len());

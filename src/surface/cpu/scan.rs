@@ -3,8 +3,7 @@
 use super::Tile;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::roomier;
-use crate::surface::mesh::Mesh;
-use crate::surface::params::SurfaceLimits;
+use crate::surface::params::{SurfaceLimits, SurfaceParams};
 
 /// Totals of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,17 +18,17 @@ pub(super) struct Totals {
 ///
 /// # Errors
 /// [`SurfaceError::MeshTooLarge`] where the mesh would exceed the limit, or 32-bit indices.
-pub(super) fn scan(tiles: &mut [Tile], spacing: f64, limits: &SurfaceLimits) -> Result<Totals, SurfaceError> {
+pub(super) fn scan(tiles: &mut [Tile], params: &SurfaceParams, limits: &SurfaceLimits) -> Result<Totals, SurfaceError> {
     let (mut vertices, mut triangles) = (0, 0);
     for tile in &mut *tiles {
         (tile.first_vertex, tile.first_triangle) = (vertices, triangles);
         vertices += tile.found.vertices as usize;
         triangles += tile.found.triangles as usize;
     }
-    let bytes = Mesh::bytes_for(vertices as u64, triangles as u64);
+    let bytes = params.mesh_bytes(vertices as u64, triangles as u64);
     // The highest value of an index is the primitive restart of graphics interfaces.
-    let most = limits.max_mesh_bytes.min(Mesh::bytes_for(u64::from(u32::MAX), 0));
-    if bytes <= most { Ok(Totals { vertices, triangles }) } else { Err(too_large(bytes, spacing, most)) }
+    let most = limits.max_mesh_bytes.min(params.mesh_bytes(u64::from(u32::MAX), 0));
+    if bytes <= most { Ok(Totals { vertices, triangles }) } else { Err(too_large(bytes, params.resolution, most)) }
 }
 
 /// The refusal of a mesh of `bytes` bytes. Areas stay while cells shrink: bytes grow with the inverse square of the
