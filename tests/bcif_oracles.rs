@@ -114,9 +114,10 @@ fn what_biotite_writes_is_read_as_the_text_is() {
             "quantized" => {
                 let range =
                     |v: &[f64]| v.iter().fold(f64::MIN, |a, b| a.max(*b)) - v.iter().fold(f64::MAX, |a, b| a.min(*b));
-                let half_step = [&text.x, &text.y, &text.z].map(|v| range(v) / 2e6).into_iter().fold(0.0, f64::max);
+                // That writer takes the step above a value, not the nearest.
+                let step = [&text.x, &text.y, &text.z].map(|v| range(v) / 1e6).into_iter().fold(0.0, f64::max);
                 let far = farthest(&text, &binary);
-                assert!(far > 0.0 && far <= half_step * 1.000_001, "{what}: {far} Å, half a step is {half_step}");
+                assert!(far > 0.0 && far <= step * 1.000_001, "{what}: {far} Å, a step is {step}");
                 assert_eq!(with_numbers_of(&text, &binary), anonymous(&binary), "{what}");
             }
             _ => {

@@ -105,6 +105,21 @@ const ROWS: &[Row] = &[
     ("store.input_ttl_ms", "molmesh_store_removed_total", "store::time_is_up_by_folder_and_use_prolongs_it"),
     ("store.job_ttl_ms", "molmesh_store_removed_total", "store::time_is_up_by_folder_and_use_prolongs_it"),
     ("store.memory_bytes", "molmesh_cache_requests_total", "store::memory_is_bounded_and_forgets_what_is_removed"),
+    (
+        "jobs.store_patience_ms",
+        "molmesh_store_errors_total",
+        "service_s3::while_s3_is_away_the_service_says_so_and_keeps_its_promises",
+    ),
+    ("access.address_requests", "quota-exceeded", "http_access::addresses_have_quotas_and_proxies_of_ours_name_them"),
+    ("access.address_work_s", "quota-exceeded", "http_access::addresses_have_the_other_quotas_too"),
+    ("access.address_concurrent", "quota-exceeded", "http_access::addresses_have_the_other_quotas_too"),
+    ("access.window_s", "quota-exceeded", "http_access::addresses_have_the_other_quotas_too"),
+    ("access.clients", "molmesh_quota_clients", "access/meter::memory_is_bounded_and_nobody_is_forgotten_for_it"),
+    ("access.hsts_s", "", "http_access::browsers_are_told_what_not_to_do"),
+    ("telemetry.sample_ratio", "molmesh_trace_spans_total", "traces::a_share_of_the_traces_is_recorded"),
+    ("telemetry.timeout_ms", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
+    ("telemetry.queue", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
+    ("telemetry.flush_timeout_ms", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
     ("store.memory_object_bytes", "molmesh_cache_requests_total", "store::hot_results_are_answered_from_memory"),
 ];
 
@@ -133,7 +148,7 @@ fn faults(rows: &[Row]) -> Vec<String> {
     let listed: BTreeSet<String> = rows.iter().map(|(key, ..)| (*key).to_owned()).collect();
     let known: BTreeSet<String> = numbers().into_iter().map(|(key, _)| key).collect();
     faults.extend(listed.symmetric_difference(&known).map(|key| format!("{key} is on one side only")));
-    let (names, kinds) = (read("src/telemetry.rs"), read("src/http/kinds.rs") + &read("src/http/accept.rs"));
+    let (names, kinds) = (read("src/telemetry/names.rs"), read("src/http/kinds.rs") + &read("src/http/accept.rs"));
     for (key, counted, test) in rows {
         let quoted = format!("\"{counted}\"");
         if !counted.is_empty() && !names.contains(&quoted) && !kinds.contains(&quoted) {
@@ -142,7 +157,7 @@ fn faults(rows: &[Row]) -> Vec<String> {
         let (file, name) = test.split_once("::").unwrap();
         let folder = if file.contains('/') { "src" } else { "tests" };
         let source = read(&format!("{folder}/{file}.rs"));
-        let field = key.split_once('.').unwrap().1.trim_end_matches("_ms");
+        let field = key.split_once('.').unwrap().1.trim_end_matches("_ms").trim_end_matches("_s");
         if !source.contains(&format!("fn {name}(")) || !source.contains(field) && folder == "tests" {
             faults.push(format!("{key}: {file} has no {name}, or does not name the key"));
         }
@@ -178,7 +193,11 @@ fn differences(page: &str) -> Vec<String> {
     }
     let mut faults = Vec::new();
     for (key, default) in numbers() {
-        let default = default.as_u64().map_or_else(|| default.to_string(), |n| shown(&key, n));
+        let default = match (default.as_u64(), default.as_str()) {
+            (Some(n), _) => shown(&key, n),
+            (None, Some(text)) => text.to_owned(),
+            (None, None) => default.to_string(),
+        };
         let counted = ROWS.iter().find(|row| row.0 == key).map(|row| row.1).unwrap_or_default();
         let counted = if counted.is_empty() { "–" } else { counted };
         let of_key: Vec<_> = rows.iter().filter(|row| row.0 == key).collect();
@@ -201,7 +220,8 @@ fn shown(key: &str, n: u64) -> String {
     }
     let digits = n.to_string();
     let grouped: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|c| std::str::from_utf8(c).unwrap()).collect();
-    let unit = if key.ends_with("_ms") { " ms" } else { "" };
+    let unit =
+        [("_ms", " ms"), ("_s", " s")].into_iter().find(|(end, _)| key.ends_with(end)).map_or("", |(_, unit)| unit);
     format!("{}{unit}", grouped.join(","))
 }
 

@@ -173,22 +173,22 @@ fn integers_are_neither_rounded_again_nor_made_longer() {
     let other = Packing::Quantized(Step::covering(40.0));
     for format in [Format::Glb, Format::Gltf] {
         for packing in [Packing::Full, other] {
-            assert_eq!(Encoder::packed(format, packing, &small, &meta()).unwrap_err(), own);
+            assert_eq!(Encoder::stored(format, packing, &small, &meta()).unwrap_err(), own);
         }
     }
     for format in [Format::Ply, Format::Stl, Format::Obj] {
         let refusal = FormatError::NotQuantized { format: format.extension() };
         assert_eq!(Encoder::new(format, &small, &meta()).unwrap_err(), refusal);
-        assert_eq!(Encoder::packed(format, Packing::Full, &small, &meta()).unwrap_err(), own);
+        assert_eq!(Encoder::stored(format, Packing::Full, &small, &meta()).unwrap_err(), own);
     }
     for packing in [Packing::Full, other] {
         let (file, sink_failed) = (Anywhere::default(), |sink: &GlbSink<'_>| sink.failure());
         let sink = GlbSink::new(&file);
-        sink.pack(packing);
+        sink.store(packing);
         pour(&sink, &small, 1);
         assert!(matches!(sink_failed(&sink), Some(PlaceError::Format(FormatError::OtherPacking { .. }))));
     }
-    assert!(Encoder::packed(Format::Glb, Packing::of(&small), &small, &meta()).is_ok());
+    assert!(Encoder::stored(Format::Glb, Packing::of(&small), &small, &meta()).is_ok());
 }
 
 #[test]
@@ -201,7 +201,7 @@ fn integers_out_of_reach_and_numbers_that_were_none_are_refused() {
         assert!(broken.quantize(step(&mesh)));
         let packing = Packing::of(&broken);
         for format in [Format::Glb, Format::Gltf] {
-            let refusal = Encoder::packed(format, packing, &broken, &meta()).unwrap_err();
+            let refusal = Encoder::stored(format, packing, &broken, &meta()).unwrap_err();
             assert!(matches!(refusal, FormatError::BeyondStep { .. }), "{bad}: {refusal}");
         }
         let file = Anywhere::default();

@@ -308,6 +308,29 @@ fn addresses_have_quotas_and_proxies_of_ours_name_them() {
 }
 
 #[test]
+fn addresses_have_the_other_quotas_too() {
+    let server = server(Mode::Slow(Duration::from_secs(2)), |c| {
+        c.access.address_work_s = Some(1);
+        c.access.address_concurrent = Some(1);
+        c.access.window_s = 86_400;
+    });
+    let first = server.post("/v1/meshes", &[], SAMPLE);
+    assert_eq!(first.status, 200);
+    let policy = first.header("ratelimit-policy").unwrap();
+    assert!(policy.contains("\"work\";q=1") && policy.contains("\"concurrency\";q=1"), "{policy}");
+    // Two seconds of work are more than one; what needs no work is answered.
+    let again = server.post("/v1/meshes?resolution=1.5", &[], SAMPLE);
+    assert_eq!(again.problem(429, "quota-exceeded")["violated-policies"], serde_json::json!(["work"]));
+    eventually("nothing is under way", || get(&server, "/v1/capabilities", &[]).status == 200);
+    // A body that is still to come is a request under way.
+    let mut sending = connect(server.addr);
+    sending.write_all(b"POST /v1/structures HTTP/1.1\r\nhost: t\r\ncontent-length: 1000\r\n\r\nATOM").unwrap();
+    eventually("there is no room beside it", || get(&server, "/v1/capabilities", &[]).status == 429);
+    drop(sending);
+    eventually("it is gone", || get(&server, "/v1/capabilities", &[]).status == 200);
+}
+
+#[test]
 fn a_key_is_a_client_wherever_it_comes_from() {
     let keys = Keys::new(&[("a", "mesh", ""), ("b", "mesh", "")]);
     let server = server(Mode::Octahedra, |c| {

@@ -49,7 +49,7 @@ fn made(backend: &dyn Backend, job: &Job) -> Product {
 }
 
 fn glb(product: &Product) -> Vec<u8> {
-    let encoder = Encoder::packed(Format::Glb, product.packing, &product.mesh, &product.meta()).unwrap();
+    let encoder = Encoder::stored(Format::Glb, product.storage, &product.mesh, &product.meta()).unwrap();
     let mut bytes = Vec::new();
     encoder.write(&mut bytes).unwrap();
     bytes
@@ -82,13 +82,13 @@ fn every_backend_hands_integers_on_and_reports_what_they_measure() {
         let product = made(backend, &job);
         let name = backend.name();
         assert!(product.mesh.quantized.is_some() && product.mesh.positions.is_empty(), "{name}");
-        assert_eq!(Packing::of(&product.mesh), product.packing, "{name}");
+        assert_eq!(Packing::of(&product.mesh), product.storage.packing, "{name}");
         let [area, volume] = measured(&glb(&product));
         assert!(near(product.report.area, area, 3e-6) && near(product.report.volume, volume, 3e-6), "{name}");
         assert!(product.report.closed && product.report.manifold, "{name}");
         // Without the parameter vertices are single-precision numbers.
         let plain = made(backend, &plain);
-        assert!(plain.mesh.quantized.is_none() && plain.packing == Packing::Full, "{name}");
+        assert!(plain.mesh.quantized.is_none() && plain.storage.packing == Packing::Full, "{name}");
         assert_eq!(
             (plain.report.vertices, plain.report.triangles),
             (product.report.vertices, product.report.triangles)
@@ -170,7 +170,7 @@ fn a_step_that_does_not_reach_is_refused_when_the_file_is_made() {
     for backend in [&devices(1) as &dyn Backend, &CpuBackend::new(Some(2)).unwrap()] {
         let meshed = backend.run(&spheres, &short, &SurfaceLimits::default(), &Control::default()).unwrap();
         let packing = Packing::of(&meshed.mesh);
-        let refusal = Encoder::packed(Format::Glb, packing, &meshed.mesh, &molmesh::formats::Meta::default());
+        let refusal = Encoder::stored(Format::Glb, packing, &meshed.mesh, &molmesh::formats::Meta::default());
         assert!(matches!(refusal, Err(FormatError::BeyondStep { .. })), "{}", backend.name());
     }
 }

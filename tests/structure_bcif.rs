@@ -525,7 +525,7 @@ fn the_frame_that_lies() {
         (one(site(Int(2)).with("columns", Int(1))), "BinaryCIF, atom_site: found 1, expected an array"),
         (one(Nil), "BinaryCIF: found nil, expected a map"),
         (top(vec![("encoder", text("x"))]), "BinaryCIF: found nothing, expected `dataBlocks`"),
-        (top(vec![("dataBlocks", Int(1))]), "BinaryCIF, `dataBlocks`: found 1, expected an array"),
+        (top(vec![("dataBlocks", Int(1))]), "BinaryCIF: found 1, expected an array"),
         (top(vec![("dataBlocks", Array(vec![Map(vec![])]))]), "BinaryCIF: found nothing, expected `categories`"),
         (
             file(vec![block(

@@ -13,8 +13,8 @@ use tokio::sync::watch;
 
 use super::rank::{Client, Rank, USUAL_URGENCY};
 use super::{
-    Budget, EndError, JobId, Ledger, LedgerSettings, Order, Pool, PromiseError, Record, Requester, Settings, Status, Task, View,
-    now_ms,
+    Budget, EndError, JobId, Ledger, LedgerSettings, Order, Pool, PromiseError, Record, Requester, Settings, Status,
+    Task, View, now_ms,
 };
 use crate::formats::Format;
 use crate::pipeline::{JobLimits, params};
@@ -57,7 +57,16 @@ impl House {
         let request = params::parse(pairs.iter().map(|(name, value)| (name, value))).unwrap();
         let rank = Rank { client: Client::named("a"), batch: true, urgency: USUAL_URGENCY };
         let (input, digest) = (Bytes::from_static(SAMPLE), Digest::of(SAMPLE));
-        let task = Task { input, digest, strict: false, job: request.job, rank, lease: None, origin: Origin::default(), id: None };
+        let task = Task {
+            input,
+            digest,
+            strict: false,
+            job: request.job,
+            rank,
+            lease: None,
+            origin: Origin::default(),
+            id: None,
+        };
         let order = Order { task, parameters: pairs.to_vec(), format: Format::Stl, idempotency: None };
         self.ledger.promise(order, None).await
     }

@@ -166,7 +166,6 @@ impl<'a> GlbSink<'a> {
             }
             Vertices::Quantized { step, .. } => return Err(FormatError::OtherPacking { step: step.length() }.into()),
         }
-        }
         write_indices(&mut at(indices.offset + first), index_type, part.triangles.as_flattened())?;
         if lane.is_some() { self.drain() } else { Ok(()) }
     }
