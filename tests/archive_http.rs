@@ -301,7 +301,7 @@ async fn redirects_stay_on_their_host_and_end() {
 async fn slow_heads_and_bodies_are_given_up() {
     let head = b"HTTP/1.1 200 X\r\ncontent-length: 9\r\n\r\nab".to_vec();
     for bytes in [b"HTTP/1.1 200 X\r\n".to_vec(), head] {
-        let remote = Remote::saying(Say::Stall(bytes, Duration::from_secs(60)));
+        let remote = Remote::saying(Say::Stall(bytes, Duration::from_mins(1)));
         let begin = Instant::now();
         let result = once(&remote.url(CIF), |c| {
             c.archive.connect_timeout_ms = 100;

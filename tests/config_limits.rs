@@ -231,6 +231,6 @@ fn the_operators_table_is_the_list() {
     assert_eq!(differences(&page), Vec::<String>::new());
     // The control: another default, a row too few.
     assert_eq!(differences(&page.replace("| 1,024 |", "| 1,025 |")).len(), 1);
-    let fewer: String = page.lines().filter(|l| !l.contains("`jobs.queue`")).map(|l| format!("{l}\n")).collect();
+    let fewer = page.lines().filter(|line| !line.contains("`jobs.queue`")).collect::<Vec<_>>().join("\n");
     assert_eq!(differences(&fewer).len(), 1);
 }

@@ -33,6 +33,7 @@ const ROWS: &[Row] = &[
     (t::HTTP_RESPONSE_SIZE, &["method=\"POST\"", "route=\"/v1/meshes\"", "status=\"200\""], meshes),
     (t::CONNECTIONS, &[], held),
     (t::REJECTED, &["reason=\"body-too-large\""], refusals),
+    (t::QUOTA_CLIENTS, &[], quotas),
     (t::JOBS_SUBMITTED, &["mode=\"sync\"", "dedup=\"no\""], meshes),
     (t::JOBS_FINISHED, &["outcome=\"successful\""], meshes),
     (t::JOBS_OPEN, &[], held),
@@ -110,6 +111,12 @@ fn refusals(look: &dyn Fn()) {
     look();
 }
 
+fn quotas(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |config| config.access.address_requests = Some(100));
+    assert_eq!(server.get("/v1/capabilities").status, 200);
+    look();
+}
+
 /// A job that outlives its server.
 fn restart(look: &dyn Fn()) {
     let folder = tempfile::tempdir().unwrap();
@@ -121,7 +128,7 @@ fn restart(look: &dyn Fn()) {
     let server = start(Arc::clone(&backend) as _, keep);
     assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE).status, 202);
     until("it runs", || backend.holds.load(Ordering::SeqCst));
-    assert!(!server.join());
+    let _drained = server.join();
     let _server = start(Fake::new(Mode::Octahedra), keep);
     look();
 }

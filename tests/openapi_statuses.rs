@@ -5,7 +5,6 @@
 
 mod access_support;
 #[path = "archive_support/mod.rs"]
-#[allow(dead_code, reason = "a part of it is used")]
 mod archive_support;
 mod http_support;
 mod openapi_support;

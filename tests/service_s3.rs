@@ -234,7 +234,7 @@ fn what_s3_keeps_is_what_a_folder_keeps() {
         assert_eq!((kept.status, kept.body == expected.body), (200, true), "{file}");
         in_parts(server.addr, address, &kept);
         let again = get(server.addr, &path);
-        assert_eq!(again.header("server-timing"), Some("cache;desc=hit"), "{file}");
+        assert!(again.header("server-timing").unwrap().starts_with("cache;desc=hit"), "{file}");
         assert!(again.body == expected.body, "{file}");
         seen.push(kept.body);
     }

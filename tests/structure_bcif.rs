@@ -23,9 +23,12 @@ fn anonymous(structure: Structure) -> Structure {
 
 // ---- encodings ----
 
+/// What it shows, data, its encodings, and what they hold.
+type Case<T> = (&'static str, Vec<u8>, Vec<Pack>, Vec<T>);
+
 #[test]
 fn whole_numbers_by_every_chain() {
-    let cases: Vec<(&str, Vec<u8>, Vec<Pack>, Vec<i32>)> = vec![
+    let cases: Vec<Case<i32>> = vec![
         ("Int8", vec![0xFF, 0x80, 0x7F], vec![byte_array(1)], vec![-1, -128, 127]),
         ("Int16", i16s(&[-2, 300, -32768]), vec![byte_array(2)], vec![-2, 300, -32768]),
         ("Int32", i32s(&[-3, 70_000, i32::MIN]), vec![byte_array(3)], vec![-3, 70_000, i32::MIN]),
@@ -90,7 +93,7 @@ fn whole_numbers_by_every_chain() {
 fn real_numbers_by_every_chain() {
     let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let doubles = |values: &[f64]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
-    let cases: Vec<(&str, Vec<u8>, Vec<Pack>, Vec<f64>)> = vec![
+    let cases: Vec<Case<f64>> = vec![
         ("Float32", floats(&[0.1, -2.5]), vec![byte_array(32)], vec![f64::from(0.1_f32), -2.5]),
         ("Float64", doubles(&[0.1, 1e-300]), vec![byte_array(33)], vec![0.1, 1e-300]),
         // To the last bit what the text would say.

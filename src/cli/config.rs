@@ -29,7 +29,7 @@ fn print(args: &PrintArgs) -> Result<String, CliError> {
     let warnings = &loaded.warnings;
     Ok(match args.format {
         ConfigStyle::Toml => {
-            let warnings: String = warnings.iter().map(|warning| format!("# Warning: {warning}\n")).collect();
+            let warnings = warnings.iter().map(|warning| ["# Warning: ", warning, "\n"].concat()).collect::<String>();
             format!(
                 "# The effective configuration of molmesh {}; behind each value, where it is from.\n\
                  # Not a matter of this file: --backend {backend}\n{warnings}\n{}",

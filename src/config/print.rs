@@ -14,9 +14,12 @@ enum Shown {
     FromFile,
 }
 
+/// A key, what is shown of its value, and where that is from.
+type Row = (String, Shown, Source);
+
 impl Loaded {
     /// The sections with their keys, what is shown of each value, and its source.
-    fn rows(&self) -> Vec<(String, Vec<(String, Shown, Source)>)> {
+    fn rows(&self) -> Vec<(String, Vec<Row>)> {
         let tree = serde_json::to_value(&self.config).unwrap_or_default();
         let keys = |section: &str, keys: &Map<String, Value>| {
             let row = |(key, value): (&String, &Value)| {

@@ -54,8 +54,8 @@ pub struct ServerConfig {
     /// Proxies in front, by address or network, whose word about their clients is taken. Default `none`: whoever connects is
     /// the client, and what he says about others is not looked at.
     pub trusted_proxies: Option<Proxies>,
-    /// The header in which they name their clients: `x-forwarded-for` (default) or `forwarded` (RFC 7239). Only this one
-    /// is looked at: the other one may be the client's own, passed on.
+    /// The header in which they name their clients: `x-forwarded-for` or `forwarded` (RFC 7239). Default
+    /// `x-forwarded-for`, which most proxies write. Only this one is looked at: the other one may be the client's own, passed on.
     pub forwarded_header: ForwardedHeader,
 }
 

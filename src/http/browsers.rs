@@ -49,6 +49,7 @@ pub(super) fn cors(access: &Access) -> CorsLayer {
         header::RETRY_AFTER,
         header::WWW_AUTHENTICATE,
         HeaderName::from_static("server-timing"),
+        TRACEPARENT,
         PREFERENCE_APPLIED,
         RATE_LIMIT,
         RATE_LIMIT_POLICY,

@@ -169,7 +169,7 @@ pub(super) async fn create(
 /// Why the mesh would not be made, or its file of more than `limit` bytes not be sent.
 fn refusal(estimate: &Estimate, limit: u64) -> Option<Problem> {
     match &estimate.mesh {
-        Ok(mesh) if mesh.bytes > limit => Some(super::problem::file_too_large(mesh.bytes, limit, estimate.resolution)),
+        Ok(mesh) if mesh.bytes > limit => Some(super::unfit::file_too_large(mesh.bytes, limit, estimate.resolution)),
         Ok(_) => None,
         Err(error) => Some(Problem::from(error.clone())),
     }

@@ -42,6 +42,7 @@ mod stop;
 mod stream;
 mod structures;
 mod timing;
+mod unfit;
 mod upload;
 mod wish;
 

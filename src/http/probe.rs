@@ -53,7 +53,7 @@ impl Probe {
                 let app = app.clone();
                 tokio::spawn(async move {
                     let outcome = app.store.probe().await;
-                    app.probe.conclude(app.store.place(), outcome);
+                    app.probe.conclude(app.store.place(), &outcome);
                 });
             }
             drop(tokio::time::timeout(PATIENCE, verdict.wait_for(|verdict| verdict.begun.is_none())).await);
@@ -61,14 +61,14 @@ impl Probe {
         verdict.borrow().failure(config.probe_timeout())
     }
 
-    fn conclude(&self, place: &str, outcome: Result<(), StoreError>) {
+    fn conclude(&self, place: &str, outcome: &Result<(), StoreError>) {
         let failed = outcome.as_ref().err().map(|error| match error {
             StoreError::NoSpace { .. } => "there is no space left",
             StoreError::Denied { .. } => "writing is not permitted",
             _ => "it cannot be written or read; the log says why",
         });
         self.0.send_modify(|verdict| {
-            match (&outcome, verdict.failed) {
+            match (outcome, verdict.failed) {
                 (Err(error), None) => tracing::error!(%error, "the store has stopped working: not ready"),
                 (Ok(()), Some(_)) => tracing::info!(place, "the store works again"),
                 _ => {}

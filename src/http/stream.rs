@@ -13,7 +13,8 @@ use hyper::body::{Body as HttpBody, Frame, SizeHint};
 use metrics::histogram;
 use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 
-use super::problem::{self, Problem};
+use super::problem::Problem;
+use super::unfit;
 use crate::formats::{Encoder, Format};
 use crate::jobs::Finished;
 use crate::telemetry::{STAGE_DURATION, Scope};
@@ -63,10 +64,10 @@ fn write(
     let resolution = product.report.resolution;
     let encoder = match Encoder::stored(format, product.storage, &product.mesh, &product.meta()) {
         Ok(encoder) if encoder.encoded_len_bound() > limit => {
-            Err(problem::file_too_large(encoder.encoded_len_bound(), limit, resolution))
+            Err(unfit::file_too_large(encoder.encoded_len_bound(), limit, resolution))
         }
         Ok(encoder) => Ok(encoder),
-        Err(error) => Err(problem::of_format(&error, resolution)),
+        Err(error) => Err(unfit::of_format(&error, resolution)),
     };
     let (length, encoder) = match encoder {
         Ok(encoder) => (Ok(encoder.encoded_len()), Some(encoder)),

@@ -4,7 +4,6 @@
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};
 
-use axum::http::HeaderValue;
 use axum::http::header::HeaderName;
 use axum::response::Response;
 
@@ -101,11 +100,13 @@ pub(super) fn tell(response: &mut Response, total: Duration) {
             None => return,
         },
     };
-    response.headers_mut().insert(SERVER_TIMING, HeaderValue::from(delivery::text(&value)));
+    response.headers_mut().insert(SERVER_TIMING, delivery::text(&value));
 }
 
 #[cfg(test)]
 mod tests {
+    use axum::http::HeaderValue;
+
     use super::*;
 
     fn sums(value: &str) -> (f64, f64) {

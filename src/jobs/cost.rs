@@ -87,7 +87,7 @@ mod tests {
         let coarse = units(&text, &at("1"));
         assert!(units(&text, &at("0.5")) > 2.0 * coarse);
         assert!(units(&gzip, &at("1")) > 2.0 * coarse);
-        let binary = |first: u8| units(&[&[first][..], &[0; 450_000]].concat(), &at("1"));
+        let binary = |first: u8| units(&[&[first][..], &vec![0; 450_000]].concat(), &at("1"));
         assert!(binary(0x83) > 2.0 * binary(b'A'));
         assert!((units(&text, &at("0.5")) - 3000.0).abs() < 1.0);
     }

@@ -106,7 +106,9 @@ mod tests {
     #[test]
     fn the_best_fitting_piece_serves_again() {
         let pool = Pool::new(1000, 500);
-        [300, 100, 200, 501].into_iter().for_each(|bytes| pool.give(map(bytes)));
+        for bytes in [300, 100, 200, 501] {
+            pool.give(map(bytes));
+        }
         assert_eq!(lengths(&pool), [300, 100, 200], "what is too large is not kept");
         let take = |bytes| pool.take(bytes).map(|map| map.len());
         assert_eq!((take(24), take(301)), (None, None), "far too large, too small");
@@ -116,7 +118,9 @@ mod tests {
     #[test]
     fn the_longest_idle_go_first() {
         let pool = Pool::new(1000, 500);
-        (1..=4).for_each(|n| pool.give(map(100 * n)));
+        for n in 1..=4 {
+            pool.give(map(100 * n));
+        }
         assert_eq!(lengths(&pool), [100, 200, 300, 400]);
         pool.give(map(250));
         assert_eq!(lengths(&pool), [300, 400, 250]);

@@ -65,7 +65,7 @@ fn sorted_by_pieces<K: Key>(n: usize, size: usize, make: impl Fn(usize, &mut [K]
             range[at..at + own.len()].copy_from_slice(own);
             at += own.len();
         }
-        #[expect(clippy::stable_sort_primitive, reason = "it consists of sorted runs, which a stable sort merges")]
+        // It consists of sorted runs, which a stable sort merges.
         range.sort();
     });
     out

@@ -50,7 +50,9 @@ impl Pack {
             }
             Array(items) => {
                 length(out, 0xDD, items.len());
-                items.iter().for_each(|item| item.write(out));
+                for item in items {
+                    item.write(out);
+                }
             }
             Map(entries) => {
                 length(out, 0xDF, entries.len());

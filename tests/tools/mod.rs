@@ -131,7 +131,7 @@ pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
 pub struct Expression {
     /// The panel or rule that it stands in.
     pub place: String,
-    /// Why it is no PromQL.
+    /// Why it is no `PromQL`.
     pub error: Option<String>,
     pub selectors: Vec<Selector>,
 }
