@@ -146,7 +146,8 @@ fn broken_store(look: &dyn Fn()) {
     let folder = server.dir.path().join("store/results");
     std::fs::remove_dir_all(&folder).unwrap();
     std::fs::write(&folder, "").unwrap();
-    server.post("/v1/meshes", &[], SAMPLE).problem(503, "store-failed");
+    // Who waits gets a mesh that cannot be kept.
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
     look();
 }
 
