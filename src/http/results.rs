@@ -209,6 +209,13 @@ impl App {
         }
     }
 
+    /// Waits until no result is being kept. Nothing new may be made by then.
+    pub(super) async fn all_kept(&self) {
+        let places = u32::try_from(self.config.jobs.keepers).unwrap_or(u32::MAX);
+        // It is never closed.
+        drop(self.keepers.acquire_many(places).await);
+    }
+
     fn begin_keeping(self: &Arc<Self>, key: &ContentKey) -> Keeping {
         let (done, waiting) = tokio::sync::watch::channel(());
         self.keeping.lock().unwrap_or_else(std::sync::PoisonError::into_inner).insert(*key, waiting);

@@ -269,7 +269,9 @@ async fn wind_down(
         Some(served) => (served.unwrap_or(false), app.pool.drain(cut).await),
         None => (serving.await.unwrap_or(false), app.pool.drain(std::future::ready(())).await),
     };
-    let settled = tokio::time::timeout(CANCELLING, app.ledger.settled()).await.is_ok();
+    // Endings of promised jobs go on record, and results that are on their way into the store arrive.
+    let ends = async { tokio::join!(app.ledger.settled(), app.all_kept()) };
+    let settled = tokio::time::timeout(CANCELLING, ends).await.is_ok();
     tracing::info!(requests, jobs, settled, "stopped");
     requests
 }
