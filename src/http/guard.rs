@@ -17,6 +17,7 @@ use axum::http::{Extensions, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
+use http_body_util::BodyExt as _;
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
 use tracing::Span;
 
@@ -89,7 +90,10 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     let Some(scope) = scopes::needed(&request) else { return next.run(request).await };
     let caller = match enter(&app.access, scope, key, &mut request) {
         Ok(caller) => caller,
-        Err(problem) => return problem.into_response(),
+        Err(problem) => {
+            swallow(request).await;
+            return problem.into_response();
+        }
     };
     let account = caller.account.clone();
     let running = account.as_ref().map(|account| app.access.meter().admit(account, Instant::now())).transpose();
@@ -97,7 +101,10 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     let mut response = match running {
         Ok(None) => next.run(request).await,
         Ok(Some(running)) => next.run(request).await.map(|body| Body::new(Held { body, _running: running })),
-        Err(exceeded) => refusal(&exceeded).into_response(),
+        Err(exceeded) => {
+            swallow(request).await;
+            refusal(&exceeded).into_response()
+        }
     };
     if let Some(account) = &account {
         tell(&app.access, account, &mut response);
@@ -106,6 +113,28 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
         keep_private(response.headers_mut());
     }
     response
+}
+
+/// Reads the body of a request that is refused, if it is small and comes at once: over HTTP/2, some clients take an answer
+/// that overtakes their own last bytes for a broken stream.
+async fn swallow(request: Request) {
+    const MOST: u64 = 64 << 10;
+    const PATIENCE: Duration = Duration::from_millis(500);
+    let asks_first = request.headers().contains_key(header::EXPECT);
+    let mut body = request.into_body();
+    if asks_first || HttpBody::size_hint(&body).lower() > MOST {
+        return;
+    }
+    let read = async {
+        let mut seen = 0;
+        while let Some(Ok(frame)) = body.frame().await {
+            seen += frame.data_ref().map_or(0, |data| data.len() as u64);
+            if seen > MOST {
+                break;
+            }
+        }
+    };
+    drop(tokio::time::timeout(PATIENCE, read).await);
 }
 
 /// What a request presents as a key.
