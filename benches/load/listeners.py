@@ -4,8 +4,8 @@
     molmesh serve --listen 127.0.0.1:8080 --backend reference --set archive.url=none --set server.connections=4000 --set jobs.workers=1 &
     python3 benches/load/listeners.py http://127.0.0.1:8080 samples/4pti.pdb --pid $!
 
-Long jobs of the slow reference backend keep the only worker busy; the listeners watch another one, which waits. Then the long ones are cancelled, so that
-the watched one runs and ends: the lag is the time from its `finished` (by the service's clock, on this machine) to the event.
+Long jobs of the slow reference backend, more than there is time for, keep the only worker busy; the listeners watch another one, which waits behind them. Then
+the long ones are cancelled, so that the watched one runs and ends: the lag is the time from its `finished` (by the service's clock, on this machine) to the event.
 
 What a listener costs is how much the server's resident memory (VmRSS) rises with the second half of the listeners, by their number: the
 first half takes what earlier work has left free. The long jobs have many atoms on few samples, so that their own memory is small and does not
@@ -78,7 +78,7 @@ async def main():
     parts = urlsplit(args.url)
     structure = open(args.structure, "rb").read()
     crowded = crowd(structure, 200)
-    long = [promise(args.url, crowded + b"REMARK 900 %d\n" % n, "?resolution=0.7") for n in range(2)]
+    long = [promise(args.url, crowded + b"REMARK 900 %d\n" % n, "?resolution=0.7") for n in range(24)]
     watched = promise(args.url, structure, "?resolution=2")
     alone = await settled(args.pid)
     await asyncio.sleep(3)
@@ -93,7 +93,8 @@ async def main():
     each = (taken[1] - taken[0]) / (args.listeners // 2)
     if lags:
         raise SystemExit("the long jobs were too short")
-    for job in long:
+    # The last ones first, so that none of them begins.
+    for job in reversed(long):
         try:
             urllib.request.urlopen(urllib.request.Request(f"{args.url}/v1/jobs/{job}", method="DELETE"))
         except urllib.error.HTTPError:

@@ -8,7 +8,9 @@ use axum::response::Response;
 use tower_http::cors::{AllowHeaders, AllowOrigin, Any, CorsLayer};
 
 use super::guard::{API_KEY, RATE_LIMIT, RATE_LIMIT_POLICY};
+use super::observe::TRACEPARENT;
 use super::state::Shared;
+use super::timing::SERVER_TIMING;
 use super::wish::{IDEMPOTENCY_KEY, PREFER, PREFERENCE_APPLIED, PRIORITY};
 use super::{delivery, request_id};
 use crate::access::Access;
@@ -35,7 +37,6 @@ const ALLOWED: [HeaderName; 14] = [
     request_id::HEADER,
 ];
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
-const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
 
 /// Answers preflights and says who may read answers.
 pub(super) fn cors(access: &Access) -> CorsLayer {
@@ -48,7 +49,7 @@ pub(super) fn cors(access: &Access) -> CorsLayer {
         header::CONTENT_DISPOSITION,
         header::RETRY_AFTER,
         header::WWW_AUTHENTICATE,
-        HeaderName::from_static("server-timing"),
+        SERVER_TIMING,
         TRACEPARENT,
         PREFERENCE_APPLIED,
         RATE_LIMIT,
