@@ -17,9 +17,9 @@ SMOOTHNESS, TOLERANCE = 1.25, 0.01
 
 def read(path):
     """Positions (N × 3, float64, Å) and radii (N, float32, Å) of a structure file's first model."""
-    model = gemmi.read_structure(path)[0]
+    structure = gemmi.read_structure(path)
     positions, radii = [], []
-    for row in model.all():
+    for row in structure[0].all():
         positions.append(row.atom.pos.tolist())
         radii.append(RADII[row.atom.element.name.upper()])
     return np.array(positions), np.array(radii, dtype=np.float32)

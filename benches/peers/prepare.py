@@ -16,9 +16,17 @@ import gemmi
 import numpy as np
 
 
+def read(path):
+    """The structure; of PDB files from before 1996, which number their lines where elements are now, the columns before."""
+    try:
+        return gemmi.read_structure(str(path))
+    except RuntimeError:
+        return gemmi.read_pdb(str(path), max_line_length=72)
+
+
 def heavy(path):
     """The structure with what is compared, and nothing else."""
-    structure = gemmi.read_structure(str(path))
+    structure = read(path)
     while len(structure) > 1:
         del structure[-1]
     structure.remove_alternative_conformations()
