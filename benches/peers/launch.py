@@ -5,6 +5,7 @@ A process of its own, as small as can be: what a process had in memory before it
 the largest resident set of any process of the tree in kB, the exit status, and whether it was ended at LIMIT seconds.
 """
 
+import contextlib
 import os
 import signal
 import sys
@@ -17,7 +18,8 @@ late = False
 def stop(_signal, _frame):
     global late
     late = True
-    os.killpg(child, signal.SIGKILL)
+    with contextlib.suppress(ProcessLookupError):  # it has just ended
+        os.killpg(child, signal.SIGKILL)
 
 
 signal.signal(signal.SIGALRM, stop)

@@ -180,7 +180,8 @@ def main():
             same_atoms(given.molmesh, structure)
             job = Job(structure["name"], Path(structure["file"]), Path(folder), given.spacing, Path(folder) / "mesh")
             programs = compare(peers, absent, job, given)
-        result["structures"].append({"name": structure["name"], "atoms": structure["atoms"], "programs": programs})
+        result["structures"].append({"name": structure["name"], "atoms": structure["atoms"], "load": os.getloadavg()[0],
+                                     "programs": programs})  # fmt: skip
         title, rows = tables.section(result["structures"][-1])
         print(f"\n{title}\n{tables.terminal(rows)}", flush=True)
     if given.json:

@@ -140,9 +140,10 @@ def page(result):
     """All of it as Markdown, machine and versions first."""
     machine = result["machine"]
     versions = "; ".join(version for version in dict.fromkeys(result["versions"].values()) if version)
+    loads = [machine["load"], *(s["load"] for s in result["structures"] if "load" in s)]
     parts = [
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB, {machine['system']}; load at the"
-        f" start {machine['load']:.1f}. {result['date']}, grid {result['spacing']:g} Å, {result['rounds']} rounds after"
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB, {machine['system']}; load between"
+        f" {min(loads):.1f} and {max(loads):.1f}. {result['date']}, grid {result['spacing']:g} Å, {result['rounds']} rounds after"
         f" one that is not timed, {result['limit']:g} s a run at most. {versions}.",
         overview(result),
     ]
