@@ -8,7 +8,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test tools fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench release clean
+.PHONY: help run test tools fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures release clean
 
 help: ## This list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -64,6 +64,10 @@ tests: ## The tests alone
 
 bench: ## The benchmarks
 	$(CARGO) bench
+
+# The results of other machines lie in docs/results too: `molmesh bench paper --out FOLDER` writes them.
+figures: ## The tables of docs/paper.md and its figures, from docs/results
+	$(CARGO) run --bin molmesh -- bench figures docs/results --out docs/figures --page docs/paper.md
 
 release: ## The optimised binary: target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh

@@ -58,7 +58,8 @@ mod shaders {
                         let bindings = bindings(&module);
                         writeln!(
                             generated,
-                            "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}] }},"
+                            "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}], {} }},",
+                            workgroup(&module)
                         )
                         .expect("a string takes it");
                         layouts.extend(structs(&module));
@@ -108,6 +109,14 @@ mod shaders {
             [entry] if entry.name == "main" => Ok(module),
             others => Err(format!("{} entry points; one named main is wanted", others.len())),
         }
+    }
+
+    /// The threads of a workgroup, and the bytes that they share.
+    fn workgroup(module: &Module) -> String {
+        let threads: u32 = module.entry_points.iter().map(|entry| entry.workgroup_size.iter().product::<u32>()).sum();
+        let shared = module.global_variables.iter().filter(|(_, global)| global.space == AddressSpace::WorkGroup);
+        let bytes: u32 = shared.map(|(_, global)| module.types[global.ty].inner.size(module.to_ctx())).sum();
+        format!("workgroup_size: {threads}, workgroup_bytes: {bytes}")
     }
 
     fn bindings(module: &Module) -> String {
