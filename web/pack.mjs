@@ -3,7 +3,7 @@ import { readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { gzipSync } from "node:zlib";
 
 const here = new URL("./", import.meta.url);
-const dist = new URL("dist/", here);
+const dist = new URL(`${process.argv[2] ?? "dist"}/`, here);
 const bundled = [
   ["three.js", "three.txt", "node_modules/three/LICENSE"],
   ["the decoder of meshoptimizer", "meshoptimizer.txt", "node_modules/meshoptimizer/LICENSE.md"],

@@ -57,6 +57,8 @@ export class Viewer {
     canvas.addEventListener("webglcontextlost", () => options.onLost?.(true));
     canvas.addEventListener("webglcontextrestored", () => {
       options.onLost?.(false);
+      // A new context has forgotten what it clears with; everything else is sent to it again by itself.
+      this.clear();
       this.invalidate();
     });
     this.size.observe(canvas);
@@ -181,9 +183,13 @@ export class Viewer {
   theme(background: string, plain: string): void {
     this.haze = new Color(background);
     this.plain = new Color(plain);
-    if (!this.options.transparent) this.renderer.setClearColor(this.haze, 1);
+    this.clear();
     this.dress();
     this.invalidate();
+  }
+
+  private clear(): void {
+    if (!this.options.transparent) this.renderer.setClearColor(this.haze, 1);
   }
 
   /** Triangles that are drawn. */
