@@ -13,15 +13,23 @@
 ARG BASE_IMAGE=docker.io/library/debian:trixie-slim
 # Built where it will run: no symbol is newer than the base's libc. Pin by digest likewise.
 ARG RUST_IMAGE=docker.io/library/rust:1.95-slim-trixie
+# Where the viewer is built. Pin by digest likewise.
+ARG NODE_IMAGE=docker.io/library/node:20-slim
 # Where the binary and the notices come from: `build` compiles them here, `prebuilt` takes what lies in dist/image.
 ARG BINARY=build
 
 # ------------------------------------------------------------------------------------------------- what goes in
+FROM ${NODE_IMAGE} AS viewer
+WORKDIR /build
+COPY . .
+RUN --mount=type=cache,target=/root/.npm sh web/build.sh
+
 FROM ${RUST_IMAGE} AS build
 # Python collects the licences of what is linked.
 RUN apt-get update && apt-get install -y --no-install-recommends python3 && rm -rf /var/lib/apt/lists/*
 WORKDIR /build
 COPY . .
+COPY --from=viewer /build/web/dist web/dist
 # The caches stay on the builder; what is wanted is laid out as it will lie in the image.
 RUN --mount=type=cache,target=/usr/local/cargo/registry \
     --mount=type=cache,target=/build/target \

@@ -109,11 +109,11 @@ fn the_build_sees_every_file_that_it_reads() {
     let ignore = read(".dockerignore");
     let mut files = read_by_the_build();
     assert!(files.len() > 100, "only {} files are said to be read", files.len());
-    let more = ["Cargo.toml", "Cargo.lock", "build.rs", "LICENSE-MIT", "LICENSE-APACHE", "web/swagger/NOTICE"];
+    let more = ["Cargo.toml", "Cargo.lock", "build.rs", "LICENSE-MIT", "LICENSE-APACHE", "web/swagger/NOTICE", "web/build.sh"];
     files.extend(more.into_iter().chain([CONFIGURATIONS[0], "deploy/notices.py"]).map(PathBuf::from));
     let left_out: Vec<_> = files.iter().filter(|path| !deploy_support::sent(&ignore, path)).collect();
     assert!(left_out.is_empty(), "left out of the build: {left_out:?}");
-    for other in [".git/config", "target/release/molmesh", "tests/deploy.rs", "web/node_modules/x/y.js", "dist/x.tar"] {
+    for other in [".git/config", "target/release/molmesh", "tests/deploy.rs", "web/node_modules/x/y.js", "web/dist/index.html.gz"] {
         assert!(!deploy_support::sent(&ignore, Path::new(other)), "{other} is sent to the builder");
     }
 }
