@@ -581,15 +581,16 @@ fn packed_files_are_unpacked_for_those_who_take_them_plain() {
 
 #[test]
 fn atoms_are_listed_as_meshes_count_them() {
-    let structure = SERVER.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
-    let reply = SERVER.get(&format!("{structure}/atoms"));
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let reply = server.get(&format!("{structure}/atoms"));
     assert_eq!(reply.status, 200);
     let (etag, list) = (reply.header("etag").unwrap().to_owned(), reply.json());
-    let unchanged = send(SERVER.addr, "GET", &format!("{structure}/atoms"), &[("if-none-match", &etag)], b"");
+    let unchanged = send(server.addr, "GET", &format!("{structure}/atoms"), &[("if-none-match", &etag)], b"");
     assert_eq!(unchanged.status, 304);
-    assert_eq!(list["count"], SERVER.get(&structure).json()["atoms"]);
+    assert_eq!(list["count"], server.get(&structure).json()["atoms"]);
     // The rows that a mesh names are those of its polymer: LYS 15 among them, water not.
-    let ply = SERVER.get(&format!("{structure}/surface.ply?atom_ids=true&resolution=1")).body;
+    let ply = server.get(&format!("{structure}/surface.ply?atom_ids=true&resolution=1")).body;
     let head = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let text = std::str::from_utf8(&ply[..head]).unwrap();
     let n: usize = text.lines().find_map(|l| l.strip_prefix("element vertex ")).unwrap().parse().unwrap();
