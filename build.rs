@@ -44,7 +44,8 @@ mod page {
             let name = file.strip_prefix(dist).expect("it lies there").to_string_lossy().replace('\\', "/");
             let path = name.trim_end_matches(".gz");
             let file = root.join(file);
-            writeln!(table, "    File {{ path: {path:?}, packed: include_bytes!({file:?}) }},").expect("a string takes it");
+            writeln!(table, "    File {{ path: {path:?}, packed: include_bytes!({file:?}) }},")
+                .expect("a string takes it");
         }
         table.push_str("];\n");
         let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));

@@ -109,11 +109,18 @@ fn the_build_sees_every_file_that_it_reads() {
     let ignore = read(".dockerignore");
     let mut files = read_by_the_build();
     assert!(files.len() > 100, "only {} files are said to be read", files.len());
-    let more = ["Cargo.toml", "Cargo.lock", "build.rs", "LICENSE-MIT", "LICENSE-APACHE", "web/swagger/NOTICE", "web/build.sh"];
+    let more =
+        ["Cargo.toml", "Cargo.lock", "build.rs", "LICENSE-MIT", "LICENSE-APACHE", "web/swagger/NOTICE", "web/build.sh"];
     files.extend(more.into_iter().chain([CONFIGURATIONS[0], "deploy/notices.py"]).map(PathBuf::from));
     let left_out: Vec<_> = files.iter().filter(|path| !deploy_support::sent(&ignore, path)).collect();
     assert!(left_out.is_empty(), "left out of the build: {left_out:?}");
-    for other in [".git/config", "target/release/molmesh", "tests/deploy.rs", "web/node_modules/x/y.js", "web/dist/index.html.gz"] {
+    for other in [
+        ".git/config",
+        "target/release/molmesh",
+        "tests/deploy.rs",
+        "web/node_modules/x/y.js",
+        "web/dist/index.html.gz",
+    ] {
         assert!(!deploy_support::sent(&ignore, Path::new(other)), "{other} is sent to the builder");
     }
 }
@@ -366,7 +373,7 @@ fn control_patterns_decide_what_is_sent() {
     let sent = |path: &str| {
         deploy_support::sent("# all\n*\n!src\n!web\nweb/node_modules\n!deploy/container\n", Path::new(path))
     };
-    assert!(sent("src/a/b.rs") && sent("web/app.js") && sent("deploy/container/x") && sent("src"));
+    assert!(sent("src/a/b.rs") && sent("web/index.html") && sent("deploy/container/x") && sent("src"));
     assert!(!sent("build.rs") && !sent("web/node_modules/x") && !sent("deploy/compose.yaml") && !sent("srcs/a"));
 }
 

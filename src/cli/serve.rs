@@ -36,7 +36,13 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let Picked { backend, reason, devices, .. } = picked;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();
-    let facts = Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others, keys, viewer: has_viewer() };
+    let facts = Facts {
+        device: backend::describe(backend.as_ref()),
+        reason: reason.clone(),
+        others,
+        keys,
+        viewer: has_viewer(),
+    };
     let failed = |e: io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(RUNTIME_THREADS)

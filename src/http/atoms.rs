@@ -239,7 +239,10 @@ mod tests {
         let listed = document(&structure);
         let text = std::str::from_utf8(text).unwrap();
         let lines: Vec<&str> = text.lines().filter(|l| l.starts_with("ATOM") || l.starts_with("HETATM")).collect();
-        assert_eq!((listed.count, listed.atoms.name.len(), listed.atoms.element.len()), (lines.len(), lines.len(), lines.len()));
+        assert_eq!(
+            (listed.count, listed.atoms.name.len(), listed.atoms.element.len()),
+            (lines.len(), lines.len(), lines.len())
+        );
         let mut ends = listed.residues.first[1..].to_vec();
         ends.push(lines.len());
         for (r, (&first, &end)) in listed.residues.first.iter().zip(&ends).enumerate() {

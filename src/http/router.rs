@@ -8,8 +8,8 @@ use axum::routing::{get, post};
 
 use super::state::Shared;
 use super::{
-    atoms, capabilities, docs, estimate, events, health, jobs, meshes, middleware, openapi, page, pdb, problems, results,
-    structures,
+    atoms, capabilities, docs, estimate, events, health, jobs, meshes, middleware, openapi, page, pdb, problems,
+    results, structures,
 };
 
 /// Time beyond the limits that are met in order, before the backstop: reading the archive, writing the head.

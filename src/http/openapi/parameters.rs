@@ -2,8 +2,8 @@
 
 use serde_json::Value;
 use utoipa::IntoParams;
-use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn, ParameterStyle};
 use utoipa::openapi::extensions::Extensions;
+use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn, ParameterStyle};
 use utoipa::openapi::schema::{SchemaFormat, Type};
 use utoipa::openapi::{ArrayBuilder, KnownFormat, ObjectBuilder, Required, Schema};
 
@@ -30,12 +30,9 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
     // A form has no use for what a query's schema tells front ends.
     let hints = if place == Place::Query { hints(parameter) } else { None };
     match parameter.domain {
-        Domain::Number { min, max, .. } => object(Type::Number)
-            .minimum(Some(min))
-            .maximum(Some(max))
-            .default(number)
-            .extensions(hints)
-            .into(),
+        Domain::Number { min, max, .. } => {
+            object(Type::Number).minimum(Some(min)).maximum(Some(max)).default(number).extensions(hints).into()
+        }
         Domain::Integer { min, max } => {
             let wide = i32::try_from(min).is_err() || i32::try_from(max).is_err();
             let format = SchemaFormat::KnownFormat(if wide { KnownFormat::Int64 } else { KnownFormat::Int32 });
