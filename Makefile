@@ -8,7 +8,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test tools fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench release clean
+.PHONY: help run test tools fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench gallery release clean
 
 help: ## This list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -64,6 +64,9 @@ tests: ## The tests alone
 
 bench: ## The benchmarks
 	$(CARGO) bench
+
+gallery: release ## Draw docs/gallery anew; DATA=FOLDER holds the structures, named by their PDB ids
+	docs/gallery/make.py $(if $(DATA),--data $(DATA))
 
 release: ## The optimised binary: target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh

@@ -18,6 +18,7 @@ mod output;
 mod page;
 mod panics;
 mod progress;
+mod render;
 mod request;
 mod serve;
 mod sign;
@@ -41,6 +42,7 @@ pub(crate) fn main() -> i32 {
     };
     let result = match args.command {
         Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
+        Command::Render(args) => panics::contained(|| render::run(&args)),
         Command::Serve(args) => serve::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Config(command) => config::run(&command),

@@ -82,7 +82,9 @@ impl IntoParams for SurfaceParameters {
         let file = ObjectBuilder::new()
             .schema_type(Type::String)
             .enum_values(Some(Format::ALL.map(|format| format!("surface.{}", format.extension()))));
-        let file = path("file", "The mesh, by the extension of its format.").schema(Some(file)).build();
+        let file = path("file", "The mesh, by the extension of its format; or `surface.png`, its picture.")
+            .schema(Some(file))
+            .build();
         std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
     }
 }
