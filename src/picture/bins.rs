@@ -25,12 +25,16 @@ pub(super) fn twice_area([a, b, c]: [Corner; 3]) -> i64 {
     ab[0] * ac[1] - ab[1] * ac[0]
 }
 
+/// Added to a number, it leaves the nearest whole one in the last bits: several times as fast as a call to round, which is
+/// what processors without the instruction get.
+const ROUNDING: f64 = 6_755_399_441_055_744.0;
+
 /// The corner at which a position in pixels is.
 #[inline]
 pub(super) fn corner(place: [f32; 3]) -> Corner {
-    // Below 2²³ in any picture, and `as` keeps what is out of range at the ends.
-    #[expect(clippy::cast_possible_truncation, reason = "16,384 pixels of 256 parts")]
-    [place[0], place[1]].map(|c| (c * PARTS as f32).round_ties_even() as i32)
+    #[expect(clippy::cast_possible_truncation, reason = "the last bits are what is wanted")]
+    let round = |parts: f64| ((parts + ROUNDING).to_bits() as u32).cast_signed();
+    [place[0], place[1]].map(|c| round(f64::from(c) * f64::from(PARTS)))
 }
 
 /// The tiles of a picture.
@@ -111,4 +115,20 @@ fn bin(positions: &[[f32; 3]], part: &[[u32; 3]], first: usize, camera: &Camera,
         *at += 1;
     }
     Chunk { starts, triangles }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn corners_are_the_nearest_parts_and_areas_have_a_sign() {
+        for (pixels, parts) in
+            [(0.0, 0), (1.0, 256), (-1.0, -256), (16_384.0, 1 << 22), (0.3, 77), (-0.3, -77), (100.75, 25_792)]
+        {
+            assert_eq!(corner([pixels, -pixels, 0.0]), [parts, -parts], "{pixels}");
+        }
+        assert_eq!(twice_area([[0, 0], [4, 0], [0, 2]]), 8);
+        assert_eq!(twice_area([[0, 0], [0, 2], [4, 0]]), -8);
+    }
 }

@@ -39,7 +39,7 @@ const RADIUS_SHARE: f64 = 0.07;
 /// Sine above the tangent plane below which a neighbour shades nothing: roundness is no pocket.
 const BIAS: f32 = 0.12;
 /// How dark it gets.
-const STRENGTH: f32 = 2.2;
+const STRENGTH: f32 = 2.8;
 /// Least light that shading leaves.
 const DARKEST: f32 = 0.25;
 /// A step in depth becomes a line from here on, Å and pixels, and is one at so many times that.
@@ -137,22 +137,23 @@ fn taps(radius: f64, pixel: f64) -> Vec<Tap> {
 pub(super) fn finish(layers: &Layers, numbers: &Finish, params: &PictureParams) -> Image {
     let levels = Levels::get();
     let mut pixels = vec![[0; 4]; layers.width * layers.height];
-    pixels.par_chunks_mut(layers.width.max(1)).enumerate().for_each(|(y, row)| {
-        for (x, pixel) in row.iter_mut().enumerate() {
-            *pixel = color(layers, numbers, levels, x, y);
+    pixels.par_chunks_mut(layers.width.max(1)).enumerate().for_each_init(Row::default, |row, (y, out)| {
+        row.shade(layers, numbers, y);
+        for (x, pixel) in out.iter_mut().enumerate() {
+            *pixel = color(layers, numbers, levels, row.open.get(x).copied(), x, y);
         }
     });
     Image { width: params.width, height: params.height, pixels }
 }
 
-/// One pixel.
-fn color(layers: &Layers, numbers: &Finish, levels: &Levels, x: usize, y: usize) -> [u8; 4] {
+/// One pixel; `open` is how much light its neighbours let through, where that is asked.
+fn color(layers: &Layers, numbers: &Finish, levels: &Levels, open: Option<f32>, x: usize, y: usize) -> [u8; 4] {
     let at = y * layers.width + x;
     let share = layers.facing[at].share();
     let mut light = layers.light[at];
     if share > 0.0 {
-        if !numbers.taps.is_empty() {
-            light *= open(layers, numbers, x, y);
+        if let Some(open) = open {
+            light *= open;
         }
         if numbers.line > 0 {
             light *= 1.0 - numbers.ink * line(layers, numbers, x, y);
@@ -171,35 +172,79 @@ fn color(layers: &Layers, numbers: &Finish, levels: &Levels, x: usize, y: usize)
     [level(0), level(1), level(2), alpha]
 }
 
+/// A row of pixels on its way: a column for each number, so that several pixels are computed at once.
+#[derive(Default)]
+struct Row {
+    normal: [Vec<f32>; 3],
+    /// How much light reaches a pixel past its neighbours, 0 to 1; empty where nothing is shaded so.
+    open: Vec<f32>,
+}
+
+impl Row {
+    /// Finds out how much light reaches the pixels of row `y`: each neighbour that rises above a pixel's tangent plane takes its
+    /// part, the more the steeper and the nearer it is.
+    fn shade(&mut self, layers: &Layers, numbers: &Finish, y: usize) {
+        self.open.clear();
+        if numbers.taps.is_empty() {
+            return;
+        }
+        let width = layers.width;
+        let row = |y: usize| y * width..(y + 1) * width;
+        let facing = &layers.facing[row(y)];
+        for (k, column) in self.normal.iter_mut().enumerate() {
+            column.clear();
+            column.extend(facing.iter().map(|facing| facing.direction()[k]));
+        }
+        self.open.resize(width, 0.0);
+        let first = facing.iter().position(|facing| facing.covered > 0).unwrap_or(width);
+        let end = facing.iter().rposition(|facing| facing.covered > 0).map_or(first, |last| last + 1);
+        let depth = &layers.depth[row(y)];
+        for tap in &numbers.taps {
+            let Some(there) = y.checked_add_signed(tap.dy as isize).filter(|y| *y < layers.height) else { continue };
+            // The columns whose neighbour is in the picture.
+            let shift = tap.dx.unsigned_abs() as usize;
+            let (from, to) =
+                if tap.dx < 0 { (first.max(shift), end) } else { (first, end.min(width.saturating_sub(shift))) };
+            if from >= to {
+                continue;
+            }
+            let begin = if tap.dx < 0 { from - shift } else { from + shift };
+            let other = &layers.depth[row(there)][begin..begin + to - from];
+            let normal = self.normal.each_ref().map(|column| &column[from..to]);
+            taken(&mut self.open[from..to], &depth[from..to], other, normal, *tap, [numbers.bias, numbers.falloff]);
+        }
+        let scale = numbers.strength / numbers.taps.len() as f32;
+        self.open.iter_mut().for_each(|shade| *shade = (1.0 - *shade * scale).max(numbers.darkest));
+    }
+}
+
+/// Adds what the neighbours at `tap` take of the light. All slices have one length.
+fn taken(
+    shade: &mut [f32],
+    depth: &[f32],
+    other: &[f32],
+    [right, up, toward]: [&[f32]; 3],
+    tap: Tap,
+    [bias, falloff]: [f32; 2],
+) {
+    let n = shade.len();
+    let (depth, other, right, up, toward) = (&depth[..n], &other[..n], &right[..n], &up[..n], &toward[..n]);
+    let flat = tap.right * tap.right + tap.up * tap.up;
+    for i in 0..n {
+        let rise = depth[i] - other[i];
+        let square = flat + rise * rise;
+        let sine = (right[i] * tap.right + up[i] * tap.up + toward[i] * rise) / square.sqrt() - bias;
+        // Where nothing is seen, here or there, the sine is no number, and nothing is taken.
+        shade[i] += if sine > 0.0 { sine / (1.0 + square * falloff) } else { 0.0 };
+    }
+}
+
 /// The pixel that lies so far from (x, y), if it is in the picture.
 #[inline]
 fn neighbour(layers: &Layers, x: usize, y: usize, dx: i32, dy: i32) -> Option<usize> {
     let x = x.checked_add_signed(dx as isize).filter(|x| *x < layers.width)?;
     let y = y.checked_add_signed(dy as isize).filter(|y| *y < layers.height)?;
     Some(y * layers.width + x)
-}
-
-/// How much light reaches a pixel past its neighbours, 0 to 1: each that rises above the tangent plane takes its part, the
-/// more the steeper and the nearer it is.
-fn open(layers: &Layers, numbers: &Finish, x: usize, y: usize) -> f32 {
-    let at = y * layers.width + x;
-    let (depth, normal) = (layers.depth[at], layers.facing[at].direction());
-    let mut shade = 0.0;
-    for tap in &numbers.taps {
-        let Some(other) = neighbour(layers, x, y, tap.dx, tap.dy) else { continue };
-        if layers.depth[other] >= NOTHING {
-            continue;
-        }
-        let toward = depth - layers.depth[other];
-        let square = tap.right * tap.right + tap.up * tap.up + toward * toward;
-        let rise = normal[0] * tap.right + normal[1] * tap.up + normal[2] * toward;
-        let sine = rise / square.sqrt() - numbers.bias;
-        if sine > 0.0 {
-            shade += sine / (1.0 + square * numbers.falloff);
-        }
-    }
-    let shade = shade * numbers.strength / numbers.taps.len() as f32;
-    (1.0 - shade).max(numbers.darkest)
 }
 
 /// How much of a line a pixel is, 0 to 1: on the near side of a step in depth, and at the rim.

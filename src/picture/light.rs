@@ -7,11 +7,11 @@ use super::camera::dot;
 /// Where the light comes from, as the viewer sees it: right, up, towards. A unit vector.
 pub const LIGHT: [f32; 3] = [-2.0 / 7.0, 3.0 / 7.0, 6.0 / 7.0];
 /// Light that comes from everywhere.
-pub const AMBIENT: f32 = 0.25;
+pub const AMBIENT: f32 = 0.15;
 /// Light that comes from [`LIGHT`].
-pub const DIFFUSE: f32 = 0.75;
+pub const DIFFUSE: f32 = 0.85;
 /// The surface's colour in full light, sRGB.
-pub const COLOR: [u8; 3] = [0x93, 0xbb, 0xe0];
+pub const COLOR: [u8; 3] = [0xb4, 0xd2, 0xf0];
 /// Steps of the table of sRGB: at its dark end, where it is steepest, one is less than half a level.
 const STEPS: usize = 1 << 13;
 

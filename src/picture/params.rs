@@ -175,7 +175,7 @@ impl PictureParams {
     ///
     /// # Errors
     /// [`PictureError::TooLarge`].
-    pub fn check(&self, limits: &PictureLimits) -> Result<(), PictureError> {
+    pub fn check(&self, limits: PictureLimits) -> Result<(), PictureError> {
         let limit = limits.max_side;
         for (side, pixels) in [("width", self.width), ("height", self.height)] {
             if pixels > limit {
@@ -238,7 +238,7 @@ mod tests {
     #[test]
     fn a_side_may_be_as_long_as_the_limit_and_no_longer() {
         let limits = PictureLimits { max_side: 100 };
-        let of = |width, height| PictureParams { width, height, ..PictureParams::default() }.check(&limits);
+        let of = |width, height| PictureParams { width, height, ..PictureParams::default() }.check(limits);
         assert_eq!(of(100, 100), Ok(()));
         assert_eq!(of(101, 1), Err(PictureError::TooLarge { side: "width", pixels: 101, limit: 100 }));
         assert_eq!(of(1, 101), Err(PictureError::TooLarge { side: "height", pixels: 101, limit: 100 }));

@@ -41,70 +41,106 @@ impl Default for Samples {
     }
 }
 
-/// A triangle that faces the viewer, with what is interpolated over it.
+/// A triangle that faces the viewer.
 struct Facet {
+    /// Its vertices, the other way around: edges' functions are positive inside.
+    vertices: [u32; 3],
     corners: [[i32; 2]; 3],
-    /// Depth, light and normal of each corner, each divided by the triangle's doubled area.
-    values: [[f32; 5]; 3],
+    /// Depth of each corner, divided by the triangle's doubled area.
+    depths: [f32; 3],
+    /// One by that area.
+    share: f32,
+}
+
+/// The function of an edge: positive on the triangle's side, 0 on the edge.
+struct Edge {
+    /// What a column and a row add.
+    column: i64,
+    row: i64,
+    /// Its value at the samples of the pixel that was drawn last.
+    at: [i64; SAMPLES],
+}
+
+impl Edge {
+    /// The edge from `p` to `q`, at the pixel in column `x` of row `y`.
+    fn new(p: [i32; 2], q: [i32; 2], x: i64, y: i64) -> Self {
+        let ([px, py], [qx, qy]) = (p.map(i64::from), q.map(i64::from));
+        let (column, row, parts) = (py - qy, qx - px, i64::from(PARTS));
+        let at =
+            PATTERN.map(|[dx, dy]| column * (x * parts + i64::from(dx) - px) + row * (y * parts + i64::from(dy) - py));
+        Self { column: column * parts, row: row * parts, at }
+    }
+
+    #[inline]
+    fn step(&mut self, by: i64) {
+        self.at = self.at.map(|value| value + by);
+    }
 }
 
 impl Facet {
     fn new(shape: Shape<'_>, triangle: u32, camera: &Camera) -> Self {
-        // The other way around, so that the edges' functions are positive inside.
         let [a, c, b] = shape.triangles[triangle as usize];
-        let placed = [a, b, c].map(|v| camera.place(shape.positions[v as usize]));
+        let vertices = [a, b, c];
+        let placed = vertices.map(|v| camera.place(shape.positions[v as usize]));
         let corners = placed.map(corner);
         let share = 1.0 / twice_area(corners) as f32;
-        let mut values = [[0.0; 5]; 3];
-        for ((value, v), place) in values.iter_mut().zip([a, b, c]).zip(placed) {
+        Self { vertices, corners, depths: placed.map(|place| place[2] * share), share }
+    }
+
+    /// Light and normal of each corner, divided by the triangle's doubled area.
+    fn shades(&self, shape: Shape<'_>, camera: &Camera) -> [[f32; 4]; 3] {
+        self.vertices.map(|v| {
             let normal = camera.turn(shape.normals[v as usize]);
-            *value = [place[2], lambert(normal), normal[0], normal[1], normal[2]].map(|x| x * share);
-        }
-        Self { corners, values }
+            [lambert(normal), normal[0], normal[1], normal[2]].map(|x| x * self.share)
+        })
     }
 
     /// First and last pixel of an axis that samples may be covered in, within a tile that begins at `from` and has `n`.
     fn span(&self, axis: usize, from: i64, n: i64) -> std::ops::Range<i64> {
-        let along = self.corners.map(|c| i64::from(c[axis]));
-        let (low, high) = (along.iter().min(), along.iter().max());
-        let parts = i64::from(PARTS);
-        let pixel = |at: Option<&i64>| at.copied().unwrap_or_default().div_euclid(parts);
-        pixel(low).max(from)..(pixel(high) + 1).min(from + n)
+        let [a, b, c] = self.corners.map(|c| c[axis].div_euclid(PARTS));
+        i64::from(a.min(b).min(c)).max(from)..(i64::from(a.max(b).max(c)) + 1).min(from + n)
     }
 
     /// Puts its samples where they are nearer than what is there.
-    fn draw(&self, [left, top]: [i64; 2], [width, height]: [i64; 2], samples: &mut Samples) {
-        let [a, b, c] = self.corners.map(|c| c.map(i64::from));
-        // The function of the edge from `p` to `q`: its step per part of a column and of a row, and its value at (0, 0).
-        let edge = |p: [i64; 2], q: [i64; 2]| {
-            let (x, y) = (p[1] - q[1], q[0] - p[0]);
-            (x, y, -(x * p[0] + y * p[1]))
-        };
-        let edges = [edge(b, c), edge(c, a), edge(a, b)];
-        let parts = i64::from(PARTS);
-        for y in self.span(1, top, height) {
-            for x in self.span(0, left, width) {
+    fn draw(
+        &self,
+        shape: Shape<'_>,
+        camera: &Camera,
+        [left, top]: [i64; 2],
+        [width, height]: [i64; 2],
+        samples: &mut Samples,
+    ) {
+        let (rows, columns) = (self.span(1, top, height), self.span(0, left, width));
+        let [a, b, c] = self.corners;
+        let mut edges = [[b, c], [c, a], [a, b]].map(|[p, q]| Edge::new(p, q, columns.start, rows.start));
+        // Most triangles are small and many hidden: normals are looked up once something is seen.
+        let mut shades = None;
+        for y in rows {
+            for x in columns.clone() {
                 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the tile")]
                 let pixel = (y - top) as usize * TILE_WIDTH + (x - left) as usize;
-                for (s, [dx, dy]) in PATTERN.iter().enumerate() {
-                    let at = [x * parts + i64::from(*dx), y * parts + i64::from(*dy)];
-                    let inside = edges.map(|(x, y, base)| x * at[0] + y * at[1] + base);
+                for s in 0..SAMPLES {
+                    let inside = [edges[0].at[s], edges[1].at[s], edges[2].at[s]];
                     // Neighbours may both have a sample on their common edge: the first of them keeps it.
-                    if inside.iter().any(|e| *e < 0) {
+                    if inside[0] | inside[1] | inside[2] < 0 {
                         continue;
                     }
-                    let weights = inside.map(|e| e as f32);
-                    let value = |k: usize| {
-                        weights[0] * self.values[0][k] + weights[1] * self.values[1][k] + weights[2] * self.values[2][k]
-                    };
-                    let (i, depth) = (pixel * SAMPLES + s, value(0));
-                    if depth < samples.depth[i] {
-                        samples.depth[i] = depth;
-                        samples.light[i] = value(1);
-                        samples.normal[i] = [value(2), value(3), value(4)];
+                    let [u, v, w] = inside.map(|e| e as f32);
+                    let depth = u * self.depths[0] + v * self.depths[1] + w * self.depths[2];
+                    let i = pixel * SAMPLES + s;
+                    if depth >= samples.depth[i] {
+                        continue;
                     }
+                    let [a, b, c] = shades.get_or_insert_with(|| self.shades(shape, camera));
+                    let value = |k: usize| u * a[k] + v * b[k] + w * c[k];
+                    samples.depth[i] = depth;
+                    samples.light[i] = value(0);
+                    samples.normal[i] = [value(1), value(2), value(3)];
                 }
+                edges.iter_mut().for_each(|edge| edge.step(edge.column));
             }
+            let back = columns.end - columns.start;
+            edges.iter_mut().for_each(|edge| edge.step(edge.row - back * edge.column));
         }
     }
 }
@@ -130,7 +166,7 @@ pub(super) fn fill(
         let signed = |n: [usize; 2]| n.map(|n| i64::try_from(n).unwrap_or(i64::MAX));
         let (corner, size) = (signed([left, band.top]), signed([width, height]));
         for triangle in triangles {
-            Facet::new(shape, triangle, camera).draw(corner, size, samples);
+            Facet::new(shape, triangle, camera).draw(shape, camera, corner, size, samples);
         }
         for y in 0..height {
             for x in 0..width {
@@ -158,6 +194,6 @@ fn resolve(samples: &Samples, pixel: usize) -> (f32, f32, Facing) {
     // Opposite normals in one pixel cancel: it is seen from the front then.
     let unit = if length > 0.0 { normal.map(|c| c / length) } else { [0.0, 0.0, 1.0] };
     #[expect(clippy::cast_possible_truncation, reason = "components of a unit vector")]
-    let normal = unit.map(|c| (c * UNIT).round_ties_even() as i16);
+    let normal = unit.map(|c| (c * UNIT + 0.5_f32.copysign(c)) as i16);
     (nearest, light / f32::from(covered), Facing { normal, covered })
 }

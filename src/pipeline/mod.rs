@@ -59,7 +59,7 @@ impl Job {
     /// # Errors
     /// [`JobError::Picture`].
     pub fn check(&self, limits: &JobLimits) -> Result<(), JobError> {
-        self.picture.map_or(Ok(()), |picture| picture.check(&limits.picture)).map_err(JobError::Picture)
+        self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
     }
 
     /// The parameters for so many atoms, where the resolution does not hang on the mesh.
