@@ -60,12 +60,12 @@ fn picture(criterion: &mut Criterion) {
             for style in Style::ALL {
                 let params = PictureParams { style, ..size };
                 group.bench_function(BenchmarkId::new(format!("draw {}", style.name()), side), |b| {
-                    b.iter(|| draw(&params))
+                    b.iter(|| draw(&params));
                 });
             }
             let mut image = draw(&size).image;
             group.bench_function(BenchmarkId::new("png", side), |b| {
-                b.iter(|| png::encode(black_box(&image)).unwrap().len())
+                b.iter(|| png::encode(black_box(&image)).unwrap().len());
             });
             group.bench_function(BenchmarkId::new("all", side), |b| {
                 b.iter(|| png::encode(&draw(&size).image).unwrap().len());

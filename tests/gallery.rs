@@ -36,7 +36,7 @@ fn faults(page: &str) -> Vec<String> {
     let there: BTreeSet<String> = fs::read_dir(docs().join("gallery"))
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .filter(|name| name.ends_with(".png"))
+        .filter(|name| Path::new(name).extension().is_some_and(|extension| extension == "png"))
         .collect();
     let mut faults: Vec<String> =
         named.symmetric_difference(&there).map(|name| format!("{name}: on one side")).collect();

@@ -137,10 +137,14 @@ impl Facet {
                     samples.light[i] = value(0);
                     samples.normal[i] = [value(1), value(2), value(3)];
                 }
-                edges.iter_mut().for_each(|edge| edge.step(edge.column));
+                for edge in &mut edges {
+                    edge.step(edge.column);
+                }
             }
             let back = columns.end - columns.start;
-            edges.iter_mut().for_each(|edge| edge.step(edge.row - back * edge.column));
+            for edge in &mut edges {
+                edge.step(edge.row - back * edge.column);
+            }
         }
     }
 }
