@@ -38,8 +38,11 @@ fn every_route_of_a_mesh_gives_its_picture() {
     let json = ("content-type", "application/json");
     let named = br#"{"pdb_id": "4pti", "format": "png", "width": 40, "height": 30, "view": "front"}"#;
     let query = "width=40&height=30&view=front";
+    let first = server.get(&format!("/v1/pdb/4pti/surface.png?{query}"));
+    // That answer waits until the result is kept.
+    assert_eq!(server.get(first.header("content-location").unwrap()).status, 200);
     let replies = [
-        server.get(&format!("/v1/pdb/4pti/surface.png?{query}")),
+        first,
         server.get(&format!("{structure}/surface.png?{query}")),
         server.post(&format!("/v1/meshes?format=png&{query}"), &[], SAMPLE),
         server.post(&format!("/v1/meshes?{query}"), &[("accept", "image/png")], SAMPLE),
