@@ -77,9 +77,10 @@ mod shaders {
 
     /// What is generated of a folder of shaders: the table's name, its layouts' name, the folder, and the shaders in the
     /// order in which they run.
-    const TABLES: [(&str, &str, &str, &[&str]); 3] = [
+    const TABLES: [(&str, &str, &str, &[&str]); 4] = [
         ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit"]),
         ("PAPER", "PAPER_LAYOUTS", "paper/", &["field", "classify", "scan", "add", "map", "vertices", "normals"]),
+        ("PICTURE", "PICTURE_LAYOUTS", "picture/", &["vertex", "fragment", "resolve", "finish"]),
         ("YARDSTICKS", "YARDSTICK_LAYOUTS", "bench/", &["copy", "fma"]),
     ];
 

@@ -18,6 +18,7 @@ mod output;
 mod page;
 mod panics;
 mod progress;
+mod render;
 mod request;
 mod serve;
 mod sign;
@@ -47,6 +48,7 @@ fn run() -> i32 {
     };
     let result = match args.command {
         Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
+        Command::Render(args) => panics::contained(|| render::run(&args)),
         Command::Serve(args) => serve::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Config(command) => config::run(&command),

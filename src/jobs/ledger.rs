@@ -206,7 +206,7 @@ impl Ledger {
 
     /// The key of a task's result, if it was made before. A check is made anew.
     pub(super) async fn made(&self, task: &Task, format: Format) -> Result<Option<String>, StoreError> {
-        let key = ContentKey::new(&task.digest, &task.job, format, self.0.pool.backend().name());
+        let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job));
         let there = !task.strict && self.0.store.head(&key.name(format.extension())?).await?.is_some();
         Ok(there.then(|| key.to_string()))
     }
