@@ -8,6 +8,7 @@ fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-changed=shaders");
     built_by();
+    page::build();
     #[cfg(feature = "gpu")]
     shaders::build();
 }
@@ -21,6 +22,46 @@ fn built_by() {
     });
     println!("cargo::rustc-env=MOLMESH_TARGET={target}");
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
+}
+
+/// The page, if it was built: a table of what lies in `web/dist`.
+mod page {
+    use std::fmt::Write as _;
+    use std::path::{Path, PathBuf};
+    use std::{env, fs};
+
+    pub(super) fn build() {
+        let dist = Path::new("web/dist");
+        // A path that is not there would have this script run each time; the folder around it is there.
+        let watched = if dist.is_dir() { dist } else { Path::new("web") };
+        println!("cargo::rerun-if-changed={}", watched.display());
+        let root = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets CARGO_MANIFEST_DIR"));
+        let mut found = Vec::new();
+        files(dist, &mut found);
+        found.sort();
+        let mut table = String::from("static FILES: &[File] = &[\n");
+        for file in &found {
+            let name = file.strip_prefix(dist).expect("it lies there").to_string_lossy().replace('\\', "/");
+            let path = name.trim_end_matches(".gz");
+            let file = root.join(file);
+            writeln!(table, "    File {{ path: {path:?}, packed: include_bytes!({file:?}) }},").expect("a string takes it");
+        }
+        table.push_str("];\n");
+        let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
+        fs::write(out.join("page.rs"), table).expect("OUT_DIR can be written");
+    }
+
+    /// The packed files below `folder`; none where there is no such folder.
+    fn files(folder: &Path, found: &mut Vec<PathBuf>) {
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.is_dir() {
+                files(&path, found);
+            } else if path.extension().is_some_and(|extension| extension == "gz") {
+                found.push(path);
+            }
+        }
+    }
 }
 
 #[cfg(feature = "gpu")]
@@ -58,7 +99,8 @@ mod shaders {
                         let bindings = bindings(&module);
                         writeln!(
                             generated,
-                            "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}] }},"
+                            "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}], {} }},",
+                            workgroup(&module)
                         )
                         .expect("a string takes it");
                         layouts.extend(structs(&module));
@@ -108,6 +150,14 @@ mod shaders {
             [entry] if entry.name == "main" => Ok(module),
             others => Err(format!("{} entry points; one named main is wanted", others.len())),
         }
+    }
+
+    /// The threads of a workgroup, and the bytes that they share.
+    fn workgroup(module: &Module) -> String {
+        let threads: u32 = module.entry_points.iter().map(|entry| entry.workgroup_size.iter().product::<u32>()).sum();
+        let shared = module.global_variables.iter().filter(|(_, global)| global.space == AddressSpace::WorkGroup);
+        let bytes: u32 = shared.map(|(_, global)| module.types[global.ty].inner.size(module.to_ctx())).sum();
+        format!("workgroup_size: {threads}, workgroup_bytes: {bytes}")
     }
 
     fn bindings(module: &Module) -> String {

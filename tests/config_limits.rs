@@ -30,6 +30,7 @@ const ROWS: &[Row] = &[
     ("limits.body_bytes", "body-too-large", "http_limits::bodies_are_limited_whether_announced_or_not"),
     ("limits.inflated_bytes", "inflated-too-large", "http_limits::compression_bombs_stop_at_the_inflated_limit"),
     ("limits.atoms", "too-many-atoms", "http_limits::atoms_are_limited"),
+    ("limits.labels", "too-many-atoms", "http_limits::atoms_that_are_listed_are_limited"),
     ("limits.grid_samples", "grid-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
     ("limits.mesh_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
     ("limits.output_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),

@@ -315,7 +315,7 @@ pub(crate) struct ServeArgs {
     #[arg(long, value_name = "DIR")]
     pub(crate) archive: Option<PathBuf>,
     /// Configuration file (TOML)
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", env = "MOLMESH_CONFIG", hide_env_values = true)]
     pub(crate) config: Option<PathBuf>,
     /// Set one value of the configuration, such as `limits.atoms=100000`; may be repeated
     #[arg(long, value_name = "SECTION.KEY=VALUE")]

@@ -35,6 +35,12 @@ use style::Style;
 
 /// Runs the command that the process's arguments name. Returns the exit code.
 pub(crate) fn main() -> i32 {
+    let status = run();
+    // Standard output may still hold the end of what was printed, and nobody looks after it once the process leaves.
+    if io::stdout().flush().is_err() && status == code::OK { code::OUTPUT } else { status }
+}
+
+fn run() -> i32 {
     let args = match Args::try_parse() {
         Ok(args) => args,
         Err(error) => return usage(&error),
@@ -58,6 +64,16 @@ pub(crate) fn main() -> i32 {
             error.code()
         }
     }
+}
+
+/// Ends the process as it is. Not by returning: freeing a mesh of a few hundred megabytes that nobody will look at again
+/// takes longer than writing it. Nor by `exit`, which runs what drivers have registered for the end: NVIDIA's takes down
+/// what its own threads still use, and a service that had stopped in order died of it, now and then.
+pub(crate) fn leave(status: i32) -> ! {
+    #[cfg(unix)]
+    signal_hook::low_level::exit(status);
+    #[cfg(not(unix))]
+    std::process::exit(status);
 }
 
 /// Prints what clap has to say: help is an answer, anything else is a mistake of the caller.

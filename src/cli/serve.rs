@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use molmesh::config::Loaded;
-use molmesh::http::{Chosen, ServeError, Server, shutdown_signals};
+use molmesh::http::{Chosen, ServeError, Server, has_viewer, shutdown_signals};
 use molmesh::structure::referee;
 use molmesh::surface::Backend;
 use molmesh::telemetry;
@@ -36,7 +36,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let Picked { backend, reason, devices, .. } = picked;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();
-    let facts = Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others, keys };
+    let facts = Facts { device: backend::describe(backend.as_ref()), reason: reason.clone(), others, keys, viewer: has_viewer() };
     let failed = |e: io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(RUNTIME_THREADS)

@@ -20,6 +20,9 @@ pub struct LimitsConfig {
     /// Atoms in all models of a structure. Default 10,000,000: four times the largest entry of the archive; at
     /// 80 bytes each they take 800 MB.
     pub atoms: u64,
+    /// Atoms of a structure whose names are listed, for front ends that show them. Default 1,000,000: some 10 MB of
+    /// JSON; beyond that a browser is better served without.
+    pub labels: u64,
     /// Grid samples in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; as 32-bit numbers
     /// they take 4 GiB.
     pub grid_samples: u64,
@@ -39,6 +42,7 @@ impl Default for LimitsConfig {
             body_bytes: 256 << 20,
             inflated_bytes: 2 << 30,
             atoms: 10_000_000,
+            labels: 1_000_000,
             grid_samples: 1 << 30,
             mesh_bytes: 2 << 30,
             output_bytes: 3 << 30,

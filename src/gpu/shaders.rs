@@ -29,6 +29,10 @@ pub(super) struct Shader {
     /// Its text, fragments included.
     pub(super) source: &'static str,
     pub(super) bindings: &'static [Binding],
+    /// Threads of a workgroup.
+    pub(super) workgroup_size: u32,
+    /// Bytes that they share.
+    pub(super) workgroup_bytes: u32,
 }
 
 /// A struct that lies in a buffer, as a shader declares it.

@@ -8,6 +8,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
+use super::page;
 use super::state::Shared;
 use crate::config::Config;
 use crate::formats::Format;
@@ -42,6 +43,8 @@ pub(super) struct Capabilities {
     /// Every device that was found.
     devices: Vec<DeviceDocument>,
     radii: Radii,
+    /// Whether the page at `/` is the viewer; without it, it says how to get it.
+    viewer: bool,
     /// Where the types of problems are listed.
     problems: &'static str,
 }
@@ -117,6 +120,7 @@ struct Limits {
     body_bytes: u64,
     inflated_bytes: u64,
     atoms: u64,
+    labels: u64,
     grid_samples: u64,
     mesh_bytes: u64,
     output_bytes: u64,
@@ -218,6 +222,7 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
         }],
         devices: devices(found, &backend.devices()),
         radii: Radii { table: radii::TABLE, unit: "Å", fallback: radii::FALLBACK, values: radii_by_symbol() },
+        viewer: page::has_viewer(),
         problems: "/problems",
     };
     // A document of text and numbers can be written.
@@ -278,6 +283,7 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         body_bytes: limits.body_bytes,
         inflated_bytes: limits.inflated_bytes,
         atoms: limits.atoms,
+        labels: limits.labels,
         grid_samples: limits.grid_samples,
         mesh_bytes: limits.mesh_bytes,
         output_bytes: limits.output_bytes,

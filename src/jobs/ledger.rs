@@ -315,7 +315,14 @@ impl Ledger {
     /// Writes an ending down. The ending of a job that was dismissed meanwhile is none.
     pub(super) async fn finish(&self, promise: &Promise, ending: Result<String, EndError>) {
         let changed = match ending {
-            Ok(key) => promise.end(Status::Successful, |record| record.result = Some(key)),
+            Ok(key) => {
+                let changed = promise.end(Status::Successful, |record| record.result = Some(key));
+                // Nobody's request ends now, so no other line tells of it.
+                if changed {
+                    tracing::info!(job_id = %promise.id(), "a job is done");
+                }
+                changed
+            }
             Err(error) => {
                 tracing::info!(job_id = %promise.id(), %error, "a job failed");
                 let problem = (self.0.describe)(&error);

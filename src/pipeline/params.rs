@@ -10,7 +10,7 @@ use std::str::FromStr;
 
 use thiserror::Error;
 
-pub use table::{Domain, Parameter, TABLE};
+pub use table::{Domain, Parameter, TABLE, usual};
 
 use super::nearest::nearest;
 use super::spacing::{DETAILS, LEAST_TRIANGLES, MOST_TRIANGLES};
@@ -94,7 +94,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
 }
 
 /// The parameters that set the grid's spacing, each in its own way.
-const SPACINGS: [&str; 3] = ["resolution", "detail", "max_triangles"];
+pub(crate) const SPACINGS: [&str; 3] = ["resolution", "detail", "max_triangles"];
 
 fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
     ParamError::BadValue {

@@ -3,6 +3,7 @@
 use serde_json::Value;
 use utoipa::IntoParams;
 use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn, ParameterStyle};
+use utoipa::openapi::extensions::Extensions;
 use utoipa::openapi::schema::{SchemaFormat, Type};
 use utoipa::openapi::{ArrayBuilder, KnownFormat, ObjectBuilder, Required, Schema};
 
@@ -26,14 +27,19 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
     let object = |kind: Type| ObjectBuilder::new().schema_type(kind).description(Some(doc.as_str()));
     let words = |words: &[&str]| words.iter().map(|word| Value::from(*word)).collect::<Vec<_>>();
     let number: Option<Value> = parameter.default.parse::<f64>().ok().map(Value::from);
+    // A form has no use for what a query's schema tells front ends.
+    let hints = if place == Place::Query { hints(parameter) } else { None };
     match parameter.domain {
-        Domain::Number { min, max, .. } => {
-            object(Type::Number).minimum(Some(min)).maximum(Some(max)).default(number).into()
-        }
+        Domain::Number { min, max, .. } => object(Type::Number)
+            .minimum(Some(min))
+            .maximum(Some(max))
+            .default(number)
+            .extensions(hints)
+            .into(),
         Domain::Integer { min, max } => {
             let wide = i32::try_from(min).is_err() || i32::try_from(max).is_err();
             let format = SchemaFormat::KnownFormat(if wide { KnownFormat::Int64 } else { KnownFormat::Int32 });
-            object(Type::Integer).format(Some(format)).minimum(Some(min)).maximum(Some(max)).into()
+            object(Type::Integer).format(Some(format)).minimum(Some(min)).maximum(Some(max)).extensions(hints).into()
         }
         Domain::Flag => object(Type::Boolean).default(parameter.default.parse::<bool>().ok().map(Value::from)).into(),
         Domain::Choice(values) => {
@@ -50,6 +56,25 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
         }
         Domain::Text { expected } => object(Type::String).min_length(Some(1)).title(Some(expected)).into(),
     }
+}
+
+/// What front ends build controls from, as `x-control`: `unit`, `usual` (the part of the bounds for a slider), and
+/// `instead_of` (parameters that cannot stand beside this one). One member, as their order would be anybody's.
+fn hints(parameter: &params::Parameter) -> Option<Extensions> {
+    let mut control = serde_json::Map::new();
+    if let Domain::Number { unit, .. } = parameter.domain
+        && !unit.is_empty()
+    {
+        control.insert("unit".to_owned(), unit.into());
+    }
+    if let Some(usual) = params::usual(parameter) {
+        control.insert("usual".to_owned(), usual.to_vec().into());
+    }
+    if params::SPACINGS.contains(&parameter.name) {
+        let others: Vec<&str> = params::SPACINGS.into_iter().filter(|name| *name != parameter.name).collect();
+        control.insert("instead_of".to_owned(), others.into());
+    }
+    (!control.is_empty()).then(|| Extensions::from_iter([("x-control", Value::from(control))]))
 }
 
 fn query(parameter: &params::Parameter) -> Parameter {
@@ -120,6 +145,10 @@ segment!(
     /// `{digest}` of a structure.
     StructurePath, "digest", "SHA-256 of the structure's bytes as they came.",
     "^[0-9a-f]{64}$", "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+);
+segment!(
+    /// `{file}` of the page.
+    AssetPath, "file", "The file's name.", "^[A-Za-z0-9._-]{1,100}$", "icon.svg"
 );
 segment!(
     /// `{id}` of a job.

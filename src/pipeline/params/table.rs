@@ -77,6 +77,21 @@ const fn number(
     Parameter { name, domain: Domain::Number { min, max, unit }, default, doc }
 }
 
+/// The part of a number's bounds that people mostly want, for sliders; the bounds themselves where nothing is said of it.
+#[must_use]
+pub fn usual(parameter: &Parameter) -> Option<[f64; 2]> {
+    let Domain::Number { min, max, .. } = parameter.domain else { return None };
+    Some(match parameter.name {
+        "resolution" => [0.2, 2.0],
+        "isovalue" => [0.2, 4.0],
+        "smoothness" => [0.4, 10.0],
+        "radius_scale" => [0.5, 2.0],
+        "radius_offset" => [-1.0, 3.0],
+        "cutoff_tolerance" => [1e-4, 0.1],
+        _ => [min, max],
+    })
+}
+
 const KERNELS: &[&str] = &names(Kernel::ALL);
 const PRESETS: &[&str] = &preset_names(Preset::ALL);
 const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj"];
