@@ -184,9 +184,9 @@ def main():
                                      "programs": programs})  # fmt: skip
         title, rows = tables.section(result["structures"][-1])
         print(f"\n{title}\n{tables.terminal(rows)}", flush=True)
-    if given.json:
-        given.json.parent.mkdir(parents=True, exist_ok=True)
-        given.json.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+        if given.json:  # after each structure: a run that is ended leaves what it has
+            given.json.parent.mkdir(parents=True, exist_ok=True)
+            given.json.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     if given.page:
         given.page.write_text(tables.between(given.page.read_text(), tables.page(result)))
 
