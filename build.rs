@@ -39,13 +39,12 @@ mod page {
         let mut found = Vec::new();
         files(dist, &mut found);
         found.sort();
-        let mut table = String::from("static FILES: &[File] = &[\n");
+        let mut table = String::from("static FILES: &[(&str, &[u8])] = &[\n");
         for file in &found {
             let name = file.strip_prefix(dist).expect("it lies there").to_string_lossy().replace('\\', "/");
             let path = name.trim_end_matches(".gz");
             let file = root.join(file);
-            writeln!(table, "    File {{ path: {path:?}, packed: include_bytes!({file:?}) }},")
-                .expect("a string takes it");
+            writeln!(table, "    ({path:?}, include_bytes!({file:?})),").expect("a string takes it");
         }
         table.push_str("];\n");
         let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));

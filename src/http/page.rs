@@ -20,15 +20,7 @@ const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; 
                       img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
                       frame-ancestors 'none'";
 
-/// A file of the built page.
-struct File {
-    /// Its path below `web/dist`.
-    path: &'static str,
-    /// Its bytes, packed with gzip.
-    packed: &'static [u8],
-}
-
-// `static FILES: &[File]`: what lay in `web/dist`; nothing, if nothing did.
+// `static FILES`: the paths of what lay in `web/dist`, and the bytes, packed with gzip; nothing, if nothing did.
 include!(concat!(env!("OUT_DIR"), "/page.rs"));
 
 /// Instead of the viewer.
@@ -45,7 +37,7 @@ pub fn has_viewer() -> bool {
 }
 
 fn found(path: &str) -> Option<&'static [u8]> {
-    FILES.iter().find(|file| file.path == path).map(|file| file.packed)
+    FILES.iter().find(|(name, _)| *name == path).map(|(_, packed)| *packed)
 }
 
 fn headers(path: &str) -> [(HeaderName, &'static str); 4] {

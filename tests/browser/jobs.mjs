@@ -26,7 +26,7 @@ await run({
       if (id !== first) return route.continue();
       return route.fulfill({ contentType: "text/event-stream", body: `id: 1\nevent: running\ndata: ${JSON.stringify({ ...document, jobID: id })}\n\n` });
     });
-    await page.locator("#p-resolution").fill("0.18");
+    await page.locator("#p-resolution").fill("0.22");
     await page.locator("#p-resolution").press("Enter");
     await page.locator("#busy").waitFor();
     await page.waitForFunction(() => /field, 40 %/.test(document.querySelector("#busy-text").textContent), null, { timeout: PATIENCE });

@@ -14,7 +14,7 @@ export const ROOT = MOLMESH_ROOT;
 export const require = createRequire(path.join(MODULES, "x.js"));
 export const { chromium } = require("playwright-core");
 /** Longer than anything takes on a machine that does ten other things. */
-export const PATIENCE = 90_000;
+export const PATIENCE = 180_000;
 
 /** A browser that finds nothing but this machine. Surfaces are drawn by the processor. */
 export async function browser(...flags) {
