@@ -373,7 +373,7 @@ fn control_patterns_decide_what_is_sent() {
     let sent = |path: &str| {
         deploy_support::sent("# all\n*\n!src\n!web\nweb/node_modules\n!deploy/container\n", Path::new(path))
     };
-    assert!(sent("src/a/b.rs") && sent("web/app.js") && sent("deploy/container/x") && sent("src"));
+    assert!(sent("src/a/b.rs") && sent("web/index.html") && sent("deploy/container/x") && sent("src"));
     assert!(!sent("build.rs") && !sent("web/node_modules/x") && !sent("deploy/compose.yaml") && !sent("srcs/a"));
 }
 

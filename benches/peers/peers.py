@@ -39,6 +39,7 @@ def options():
     parser.add_argument("--molmesh", type=Path, default=ROOT / "target/release/molmesh", help="our binary")
     parser.add_argument("--json", type=Path, help="write the figures there")
     parser.add_argument("--page", type=Path, help="write the tables there, between its markers")
+    parser.add_argument("--note", default="", help="a sentence for the tables' header: who else used the machine, say")
     parser.add_argument("--publish", action="store_true", help="--json docs/results/peers.json --page docs/peers.md")
     given = parser.parse_args()
     if given.rounds < 1 or given.limit <= 0 or given.spacing <= 0:
@@ -87,7 +88,8 @@ def launch(peer, job, limit):
     environment = {**os.environ, **peer.environment()}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=job.folder)
     if done.returncode != 0:
-        return {"failed": done.stderr.strip().splitlines()[-1]}
+        words = done.stderr.strip().splitlines()
+        return {"failed": words[-1] if words else f"what measures it ended with {done.returncode}"}
     said = json.loads(done.stdout)
     mesh = Path(job.mesh(peer.extension))
     if said["late"]:
@@ -172,7 +174,7 @@ def main():
     if "molmesh" in absent:
         sys.exit(f"{absent['molmesh']}: cargo build --release, or --molmesh BINARY")
     result = {"date": datetime.date.today().isoformat(), "machine": machine(), "spacing": given.spacing,
-              "rounds": given.rounds, "limit": given.limit, "versions": versions, "structures": []}  # fmt: skip
+              "rounds": given.rounds, "limit": given.limit, "note": given.note, "versions": versions, "structures": []}  # fmt: skip
     ram = "/dev/shm" if os.path.isdir("/dev/shm") else None
     for file in chosen_files(given):
         with tempfile.TemporaryDirectory(dir=ram, prefix="peers-") as folder:
@@ -184,9 +186,9 @@ def main():
                                      "programs": programs})  # fmt: skip
         title, rows = tables.section(result["structures"][-1])
         print(f"\n{title}\n{tables.terminal(rows)}", flush=True)
-    if given.json:
-        given.json.parent.mkdir(parents=True, exist_ok=True)
-        given.json.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+        if given.json:  # after each structure: a run that is ended leaves what it has
+            given.json.parent.mkdir(parents=True, exist_ok=True)
+            given.json.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     if given.page:
         given.page.write_text(tables.between(given.page.read_text(), tables.page(result)))
 

@@ -134,6 +134,7 @@ class Runs(unittest.TestCase):
         self.assertEqual(self.launch("true"), {"failed": "status 0"})
         self.assertIn("failed", self.launch("/no/such/program"))
         self.assertEqual(self.launch("sh", "-c", "sleep 600 & wait", limit=0.2), {"limit": 0.2})
+        self.assertEqual(self.launch("sh", "-c", "kill -9 $PPID"), {"failed": "what measures it ended with -9"})
 
     def test_memory_is_the_commands_own(self):
         write = "open('mesh.out', 'w').write('x')"

@@ -1,5 +1,6 @@
 /** `<molmesh-viewer src="…/surface.glb">`: a surface in any page. */
 
+import { bytesOf } from "./api/bytes";
 import { load } from "./scene/load";
 import { contextOf, Viewer } from "./scene/viewer";
 
@@ -61,7 +62,7 @@ export class MolmeshViewer extends HTMLElement {
     try {
       const reply = await fetch(src, { signal: abort.signal });
       if (reply.status !== 200) throw new Error(`${src}: ${reply.status} ${reply.statusText}`);
-      const loaded = await load(await reply.arrayBuffer());
+      const loaded = await load(await bytesOf(reply));
       if (abort.signal.aborted) return;
       await this.viewer?.show(loaded, true);
       if (this.hasAttribute("turn")) this.viewer?.turn(true);

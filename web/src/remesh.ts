@@ -1,5 +1,6 @@
 /** Meshes on request, the latest one wins: what was asked for before is cancelled, here and in the service. */
 
+import { bytesOf } from "./api/bytes";
 import type { Client } from "./api/client";
 import { fetchFile, type Progress } from "./api/jobs";
 
@@ -93,7 +94,7 @@ export class Remesher {
     try {
       const reply = await fetchFile(this.client, wish.path, abort.signal, (job) => isLatest() && this.listener.progress(job));
       const answered = performance.now();
-      const bytes = await reply.arrayBuffer();
+      const bytes = await bytesOf(reply);
       const received = performance.now();
       if (isLatest()) await this.listener.show({ wish, answered, received, bytes, headers: reply.headers });
     } catch (error) {

@@ -189,8 +189,9 @@ pub(super) mod tests {
     use super::*;
 
     fn timed(seconds: f64, device: bool, stages: &[&str]) -> Timed {
-        let spread = |s: f64| Spread { median: s, min: s };
-        let stages = stages.iter().map(|name| ((*name).to_owned(), seconds / 2.0 / stages.len() as f64)).collect();
+        let spread = |s: f64| Spread { median: digits(s), min: digits(s) };
+        let each = digits(seconds / 2.0 / stages.len() as f64);
+        let stages = stages.iter().map(|name| ((*name).to_owned(), each)).collect();
         Timed {
             runs: 3,
             seconds: spread(seconds),

@@ -33,6 +33,10 @@ pub(super) fn sides(cubes: u64) -> Option<[f64; 3]> {
     best.map(|n| n.map(|n| (n as f64 + 0.5) * CUBE - 2.0 * AROUND))
 }
 
+/// Where the box lies, Å: anywhere, but not at one place of the grid along all axes, or layers of cubes would come and go along
+/// all of them at once.
+const ORIGIN: [f64; 3] = [11.313, 23.976, 37.149];
+
 /// `n` atoms in a box of these sides, one in the first and one in the last corner. The same arguments give the same atoms.
 ///
 /// # Errors
@@ -57,7 +61,7 @@ pub(super) fn spheres(n: usize, sides: [f64; 3]) -> Result<Spheres, String> {
     for (i, place) in corners.into_iter().chain(places.into_iter().map(|(_, place)| place)).take(n).enumerate() {
         for k in 0..3 {
             let off = 0.5 * SIDE * shake.next();
-            columns[k].push(if i < 2 { place[k] } else { (place[k] + off).clamp(0.0, sides[k]) });
+            columns[k].push(ORIGIN[k] + if i < 2 { place[k] } else { (place[k] + off).clamp(0.0, sides[k]) });
         }
         radii.push(radius(shake.next() + 0.5));
     }
@@ -104,7 +108,8 @@ mod tests {
             let sides = sides(entry.cubes[0]).unwrap();
             assert_eq!(cubes(sides), entry.cubes[0], "{}", entry.id);
             let made = spheres(entry.atoms, sides).unwrap();
-            assert_eq!((made.len(), made.bounds().unwrap()), (entry.atoms, [[0.0; 3], sides]), "{}", entry.id);
+            let corners = [ORIGIN, [0, 1, 2].map(|k| ORIGIN[k] + sides[k])];
+            assert_eq!((made.len(), made.bounds().unwrap()), (entry.atoms, corners), "{}", entry.id);
             assert_eq!(made, spheres(entry.atoms, sides).unwrap(), "the same every time");
             assert_ne!(made, spheres(entry.atoms + 1, sides).unwrap());
         }
