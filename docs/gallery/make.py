@@ -19,7 +19,7 @@ ROOT = HERE.parent.parent
 PAGE = HERE.parent / "gallery.md"
 BEGIN, END = "<!-- pictures: docs/gallery/make.py writes from here -->\n", "<!-- to here -->\n"
 KERNELS = ["gaussian", "soft-object", "inverse-square"]
-VIEW = ["--width", "400", "--height", "300", "--background", "white"]
+VIEW = ["--width", "320", "--height", "240", "--background", "white"]
 # PDB id, what it is, what its mesh needs to be asked for besides its kernel.
 SHOWN = [
     ("4PTI", "trypsin inhibitor; an entry of the paper", []),
