@@ -24,8 +24,8 @@ VIEW = ["--width", "320", "--height", "240", "--background", "white"]
 SHOWN = [
     ("4PTI", "trypsin inhibitor; an entry of the paper", []),
     ("2HHB", "deoxyhaemoglobin; stands in for the paper's 1BIJ, another haemoglobin", []),
-    ("1A0Q", "a Fab fragment", []),
-    ("7CTH", "a complex of antibodies and a receptor-binding domain", ["--detail", "4"]),
+    ("1A0Q", "a Fab fragment, the antibody 29G11", []),
+    ("7CTH", "dengue virus serotype 2 with fragments of the antibody EDE1 C10", ["--detail", "4"]),
     ("6ZU5", "a microsporidian ribosome", ["--detail", "4"]),
 ]
 MORE = [("110D", "", []), ("1BK2", "", []), ("1QL2", "", []), ("1AON", "", ["--detail", "4"]), ("7CGO", "", ["--detail", "4"])]
