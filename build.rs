@@ -43,7 +43,7 @@ mod page {
         for file in &found {
             let name = file.strip_prefix(dist).expect("it lies there").to_string_lossy().replace('\\', "/");
             let path = name.trim_end_matches(".gz");
-            let file = root.join(file);
+            let file = root.join(file).display().to_string();
             writeln!(table, "    ({path:?}, include_bytes!({file:?})),").expect("a string takes it");
         }
         table.push_str("];\n");

@@ -16,8 +16,8 @@ pub fn encode(image: &Image) -> Result<Vec<u8>, PictureError> {
     encoder.set_depth(BitDepth::Eight);
     encoder.set_color(if opaque { ColorType::Rgb } else { ColorType::Rgba });
     encoder.set_source_srgb(SrgbRenderingIntent::Perceptual);
-    encoder.set_compression(Compression::Balanced);
-    // Neighbours above are as like as any: choosing row by row takes longer and gains nothing.
+    encoder.set_compression(Compression::Fast);
+    // A tenth of the time for a third more bytes; a picture is waited for. Neighbours above are as like as any others.
     encoder.set_filter(Filter::Up);
     let mut writer = encoder.write_header().map_err(failed)?;
     if opaque {
