@@ -13,15 +13,23 @@
 ARG BASE_IMAGE=docker.io/library/debian:trixie-slim
 # Built where it will run: no symbol is newer than the base's libc. Pin by digest likewise.
 ARG RUST_IMAGE=docker.io/library/rust:1.95-slim-trixie
+# Where the viewer is built. Pin by digest likewise.
+ARG NODE_IMAGE=docker.io/library/node:20-slim
 # Where the binary and the notices come from: `build` compiles them here, `prebuilt` takes what lies in dist/image.
 ARG BINARY=build
 
 # ------------------------------------------------------------------------------------------------- what goes in
+FROM ${NODE_IMAGE} AS viewer
+WORKDIR /build
+COPY . .
+RUN --mount=type=cache,target=/root/.npm sh web/build.sh
+
 FROM ${RUST_IMAGE} AS build
 # Python collects the licences of what is linked.
 RUN apt-get update && apt-get install -y --no-install-recommends python3 && rm -rf /var/lib/apt/lists/*
 WORKDIR /build
 COPY . .
+COPY --from=viewer /build/web/dist web/dist
 # The caches stay on the builder; what is wanted is laid out as it will lie in the image.
 RUN --mount=type=cache,target=/usr/local/cargo/registry \
     --mount=type=cache,target=/build/target \
@@ -74,7 +82,9 @@ HEALTHCHECK --interval=10s --timeout=4s --start-period=30s --retries=3 CMD ["mol
 # SIGTERM, the default, drains; see server.drain_timeout_ms.
 STOPSIGNAL SIGTERM
 ENTRYPOINT ["molmesh"]
-CMD ["serve", "--config", "/etc/molmesh/molmesh.toml"]
+# Every command in the image reads it: `docker run … molmesh:cpu doctor` examines what the service would be.
+ENV MOLMESH_CONFIG=/etc/molmesh/molmesh.toml
+CMD ["serve"]
 
 # ----------------------------------------------------------------------------------------------- for NVIDIA's GPUs
 # NVIDIA's Vulkan driver opens libEGL.so.1 before anything else and does not start without it, display or none. Debian's

@@ -8,18 +8,25 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test tools fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures release clean
+.PHONY: help run test tools web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## This list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
 
-run: ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
+run: web-if-possible ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
 	$(CARGO) run --release --bin molmesh -- serve $(ARGS)
 
-test: tools fmt-check lint deny-if-installed matrix tests ## Everything that must hold; installs what it needs
+test: tools web fmt-check lint deny-if-installed matrix tests ## Everything that must hold; installs what it needs
 
-tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan)
+tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan, Chromium)
 	@if [ -f tests/tools/setup.sh ]; then bash tests/tools/setup.sh; fi
+
+web: ## Build the viewer into web/dist, which the next build of the server takes in; needs Node 20.19 or later
+	@sh web/build.sh
+
+# A service without its viewer is a service: where there is no Node, or no network for its packages, this says so and goes on.
+web-if-possible:
+	@sh web/build.sh || echo "without the viewer: the page at / will say how to get it" >&2
 
 fmt: ## Format
 	$(CARGO) fmt --all
@@ -65,13 +72,16 @@ tests: ## The tests alone
 bench: ## The benchmarks
 	$(CARGO) bench
 
-# The results of other machines lie in docs/results too: `molmesh bench paper --out FOLDER` writes them.
-figures: ## The tables of docs/paper.md and its figures, from docs/results
-	$(CARGO) run --bin molmesh -- bench figures docs/results --out docs/figures --page docs/paper.md
+gallery: release ## Draw docs/gallery anew; DATA=FOLDER holds the structures, named by their PDB ids
+	docs/gallery/make.py $(if $(DATA),--data $(DATA))
 
-release: ## The optimised binary: target/release/molmesh
+# The results of other machines lie in docs/results/paper too: `molmesh bench paper --out FOLDER` writes them.
+figures: ## The tables of docs/paper.md and its figures, from docs/results/paper
+	$(CARGO) run --bin molmesh -- bench figures docs/results/paper --out docs/figures --page docs/paper.md
+
+release: web-if-possible ## The optimised binary: target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh
 
 clean: ## Remove everything that was built
 	$(CARGO) clean
-	rm -rf dist
+	rm -rf dist web/dist

@@ -8,6 +8,7 @@ fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-changed=shaders");
     built_by();
+    page::build();
     #[cfg(feature = "gpu")]
     shaders::build();
 }
@@ -23,6 +24,46 @@ fn built_by() {
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
 }
 
+/// The page, if it was built: a table of what lies in `web/dist`.
+mod page {
+    use std::fmt::Write as _;
+    use std::path::{Path, PathBuf};
+    use std::{env, fs};
+
+    pub(super) fn build() {
+        let dist = Path::new("web/dist");
+        // A path that is not there would have this script run each time; the folder around it is there.
+        let watched = if dist.is_dir() { dist } else { Path::new("web") };
+        println!("cargo::rerun-if-changed={}", watched.display());
+        let root = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets CARGO_MANIFEST_DIR"));
+        let mut found = Vec::new();
+        files(dist, &mut found);
+        found.sort();
+        let mut table = String::from("static FILES: &[(&str, &[u8])] = &[\n");
+        for file in &found {
+            let name = file.strip_prefix(dist).expect("it lies there").to_string_lossy().replace('\\', "/");
+            let path = name.trim_end_matches(".gz");
+            let file = root.join(file);
+            writeln!(table, "    ({path:?}, include_bytes!({file:?})),").expect("a string takes it");
+        }
+        table.push_str("];\n");
+        let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
+        fs::write(out.join("page.rs"), table).expect("OUT_DIR can be written");
+    }
+
+    /// The packed files below `folder`; none where there is no such folder.
+    fn files(folder: &Path, found: &mut Vec<PathBuf>) {
+        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.is_dir() {
+                files(&path, found);
+            } else if path.extension().is_some_and(|extension| extension == "gz") {
+                found.push(path);
+            }
+        }
+    }
+}
+
 #[cfg(feature = "gpu")]
 mod shaders {
     use std::collections::BTreeSet;
@@ -35,9 +76,10 @@ mod shaders {
 
     /// What is generated of a folder of shaders: the table's name, its layouts' name, the folder, and the shaders in the
     /// order in which they run.
-    const TABLES: [(&str, &str, &str, &[&str]); 3] = [
+    const TABLES: [(&str, &str, &str, &[&str]); 4] = [
         ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit"]),
         ("PAPER", "PAPER_LAYOUTS", "paper/", &["field", "classify", "scan", "add", "map", "vertices", "normals"]),
+        ("PICTURE", "PICTURE_LAYOUTS", "picture/", &["vertex", "fragment", "resolve", "finish"]),
         ("YARDSTICKS", "YARDSTICK_LAYOUTS", "bench/", &["copy", "fma"]),
     ];
 

@@ -24,6 +24,8 @@ NAMES = re.compile(r"^(licen[cs]e|copying|copyright|notice|unlicense)", re.IGNOR
 SOURCES = (".rs", ".py", ".toml", ".json", ".go", ".sh", ".c", ".h")
 UNUSED = {"tests", "test", "examples", "benches", ".github"}
 MOST_BYTES = 1 << 20
+# What the page at / bundles; the build of the page checks that the texts are theirs.
+VIEWER = (("three.js", "three.txt"), ("meshoptimizer's decoder", "meshoptimizer.txt"))
 
 
 def cargo(*arguments):
@@ -105,6 +107,8 @@ def texts(packages):
     web = ROOT / "web" / "swagger"
     for name in ("LICENSE", "NOTICE", "swagger-ui-bundle.js.LICENSE.txt"):
         add((web / name).read_text(encoding="utf-8"), f"Swagger UI ({name})")
+    for name, file in VIEWER:
+        add((ROOT / "web" / "licences" / file).read_text(encoding="utf-8"), f"{name} (in the page at /)")
     std = "the Rust standard library (MIT OR Apache-2.0)"
     add((ROOT / "LICENSE-APACHE").read_text(), std)
     if missing:
@@ -124,6 +128,8 @@ def main():
     for package in packages:
         print(f"  {package['name']} {package['version']}: {package['license'] or 'see its text'}")
     print("  Swagger UI, in the page at /docs: Apache-2.0")
+    for name, _ in VIEWER:
+        print(f"  {name}, in the page at /: MIT")
     print("  the Rust standard library: MIT OR Apache-2.0")
     for text, who in texts(packages).items():
         print(f"\n{line}\n" + "\n".join(who) + f"\n{line}\n\n{text}")

@@ -9,6 +9,7 @@ Usage: deploy/sbom.py CRATES.json [--root ROOT.tar --name molmesh:cpu] >OUT.cdx.
 """
 
 import argparse
+import base64
 import json
 import pathlib
 import re
@@ -54,7 +55,7 @@ def crates(path):
 
 
 def swagger():
-    """The one part of the web page that others wrote, as its README beside it says."""
+    """What others wrote of the page at /docs, as its README beside it says."""
     text = (ROOT / "web/swagger/README.md").read_text()
     version = re.search(r"`swagger-ui-dist` (\S+) \(Apache-2\.0", text)[1]
     files = re.findall(r"^    ([0-9a-f]{64})  (\S+)$", text, re.MULTILINE)
@@ -73,6 +74,25 @@ def swagger():
             for digest, name in files
         ],
     }
+
+
+def viewer():
+    """What others wrote of the page at /, as its lock says: three.js, and the decoder that comes with it."""
+    lock = json.loads((ROOT / "web/package-lock.json").read_text())["packages"]
+    for name in ("three", "meshoptimizer"):
+        package = lock[f"node_modules/{name}"]
+        algorithm, digest = package["integrity"].split("-", 1)
+        assert algorithm == "sha512", algorithm
+        yield {
+            "type": "library",
+            "bom-ref": f"npm/{name}@{package['version']}",
+            "name": name,
+            "version": package["version"],
+            "scope": "required",
+            "hashes": [{"alg": "SHA-512", "content": base64.b64decode(digest).hex()}],
+            "licenses": [{"expression": package["license"]}],
+            "purl": f"pkg:npm/{name}@{package['version']}",
+        }
 
 
 def packages(status, how):
@@ -123,10 +143,10 @@ def main():
     parser.add_argument("--name", default=APPLICATION)
     arguments = parser.parse_args()
     bom = crates(arguments.crates)
-    web = swagger()
-    bom["components"].append(web)
-    next(edge for edge in bom["dependencies"] if edge["ref"] == APPLICATION)["dependsOn"].append(web["bom-ref"])
-    bom["dependencies"].append({"ref": web["bom-ref"], "dependsOn": []})
+    for web in (swagger(), *viewer()):
+        bom["components"].append(web)
+        next(edge for edge in bom["dependencies"] if edge["ref"] == APPLICATION)["dependsOn"].append(web["bom-ref"])
+        bom["dependencies"].append({"ref": web["bom-ref"], "dependsOn": []})
     if arguments.root:
         image(bom, arguments.root, arguments.name)
     bom.pop("serialNumber", None)

@@ -56,7 +56,8 @@ fn the_recipe_and_its_configuration_agree() {
     assert_eq!(cpu.last("VOLUME").map(Path::new), Some(config.server.data_dir.as_path()));
     let copied = format!("{} /etc/molmesh/molmesh.toml", CONFIGURATIONS[0]);
     assert!(cpu.all("COPY").any(|line| *line == copied), "the configuration is not copied");
-    assert_eq!(cpu.last("CMD").unwrap(), r#"["serve", "--config", "/etc/molmesh/molmesh.toml"]"#);
+    assert_eq!(cpu.last("CMD").unwrap(), r#"["serve"]"#);
+    assert_eq!(cpu.last("ENV").unwrap(), "MOLMESH_CONFIG=/etc/molmesh/molmesh.toml");
     assert_eq!(cpu.last("ENTRYPOINT").unwrap(), r#"["molmesh"]"#);
     // The check asks the address that the configuration listens at, unless told otherwise.
     assert!(cpu.last("HEALTHCHECK").unwrap().ends_with(r#"CMD ["molmesh", "healthcheck"]"#));
@@ -108,11 +109,18 @@ fn the_build_sees_every_file_that_it_reads() {
     let ignore = read(".dockerignore");
     let mut files = read_by_the_build();
     assert!(files.len() > 100, "only {} files are said to be read", files.len());
-    let more = ["Cargo.toml", "Cargo.lock", "build.rs", "LICENSE-MIT", "LICENSE-APACHE", "web/swagger/NOTICE"];
+    let more =
+        ["Cargo.toml", "Cargo.lock", "build.rs", "LICENSE-MIT", "LICENSE-APACHE", "web/swagger/NOTICE", "web/build.sh"];
     files.extend(more.into_iter().chain([CONFIGURATIONS[0], "deploy/notices.py"]).map(PathBuf::from));
     let left_out: Vec<_> = files.iter().filter(|path| !deploy_support::sent(&ignore, path)).collect();
     assert!(left_out.is_empty(), "left out of the build: {left_out:?}");
-    for other in [".git/config", "target/release/molmesh", "tests/deploy.rs", "web/node_modules/x/y.js", "dist/x.tar"] {
+    for other in [
+        ".git/config",
+        "target/release/molmesh",
+        "tests/deploy.rs",
+        "web/node_modules/x/y.js",
+        "web/dist/index.html.gz",
+    ] {
         assert!(!deploy_support::sent(&ignore, Path::new(other)), "{other} is sent to the builder");
     }
 }
@@ -365,7 +373,7 @@ fn control_patterns_decide_what_is_sent() {
     let sent = |path: &str| {
         deploy_support::sent("# all\n*\n!src\n!web\nweb/node_modules\n!deploy/container\n", Path::new(path))
     };
-    assert!(sent("src/a/b.rs") && sent("web/app.js") && sent("deploy/container/x") && sent("src"));
+    assert!(sent("src/a/b.rs") && sent("web/index.html") && sent("deploy/container/x") && sent("src"));
     assert!(!sent("build.rs") && !sent("web/node_modules/x") && !sent("deploy/compose.yaml") && !sent("srcs/a"));
 }
 

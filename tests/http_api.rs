@@ -5,7 +5,7 @@
 mod bcif_support;
 mod http_support;
 
-use std::io::Write;
+use std::io::{Read as _, Write};
 use std::sync::{Arc, LazyLock};
 
 use bcif_support::CRAMBIN;
@@ -111,7 +111,9 @@ fn formats_are_negotiated() {
         ("", "text/html,application/xhtml+xml,*/*;q=0.8", 200, "model/gltf-binary"),
         ("?format=obj", "model/stl", 200, "model/obj"),
         ("?format=stl", "text/html", 200, "model/stl"),
-        ("", "image/png", 406, "application/problem+json"),
+        ("", "image/png", 200, "image/png"),
+        ("?format=png", "model/stl", 200, "image/png"),
+        ("", "image/webp", 406, "application/problem+json"),
         ("", "application/json", 406, "application/problem+json"),
     ] {
         let headers: &[(&str, &str)] = if accept.is_empty() { &[] } else { &[("accept", accept)] };
@@ -119,7 +121,7 @@ fn formats_are_negotiated() {
         assert_eq!((reply.status, reply.header("content-type")), (status, Some(media_type)), "{query} {accept}");
         assert!(reply.complete);
         if status == 406 {
-            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 5);
+            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 6);
         } else {
             assert!(reply.body.len() > 1000);
         }
@@ -533,7 +535,9 @@ fn the_page_needs_nothing_from_elsewhere() {
     let page = SERVER.get("/");
     assert_eq!(page.header("content-type"), Some("text/html; charset=utf-8"));
     let policy = page.header("content-security-policy").unwrap();
-    assert!(policy.contains("default-src 'none'") && !policy.contains("unsafe"), "{policy}");
+    // WebAssembly is a module of ours, not text that is evaluated.
+    let unsafe_ones = policy.replace("'wasm-unsafe-eval'", "");
+    assert!(policy.contains("default-src 'none'") && !unsafe_ones.contains("unsafe"), "{policy}");
     let html = page.text();
     assert!(!html.contains("<style") && !html.contains(" style=") && !html.contains(" onclick"));
     let mut found = 0;
@@ -545,12 +549,62 @@ fn the_page_needs_nothing_from_elsewhere() {
         }
     }
     assert!(found >= 4, "{found}");
-    for asset in ["/app.js", "/app.css", "/viewer.js", "/icon.svg"] {
-        let text = SERVER.get(asset).text();
-        let outside = text.replace("http://www.w3.org/2000/svg", "");
-        assert!(!outside.contains("http://") && !outside.contains("https://"), "{asset}");
-    }
+    // What it does in a browser is for tests/browser.rs to see.
+    assert!(!html.contains("http://") && !html.contains("https://"));
+    assert_eq!(SERVER.get("/v1/capabilities").json()["viewer"], molmesh::http::has_viewer());
+    assert_eq!(html.contains("/assets/index-"), molmesh::http::has_viewer());
+    assert!(html.contains("/docs") && html.contains("curl"));
+    let component = SERVER.get("/molmesh-viewer.js");
+    assert_eq!(component.header("content-type"), Some("text/javascript; charset=utf-8"));
+    assert_eq!(component.header("cache-control"), Some("no-cache"));
+    SERVER.get("/assets/none.js").problem(404, "not-found");
     assert_eq!(SERVER.get("/sample.pdb").body, SAMPLE);
+}
+
+#[test]
+fn packed_files_are_unpacked_for_those_who_take_them_plain() {
+    let html = SERVER.get("/").text();
+    let paths = html.split('"').filter(|text| text.starts_with("/assets/"));
+    for path in paths.chain(["/", "/molmesh-viewer.js"]) {
+        let plain = SERVER.get(path);
+        let packed = send(SERVER.addr, "GET", path, &[("accept-encoding", "gzip")], b"");
+        assert_eq!((plain.status, packed.status), (200, 200), "{path}");
+        assert_eq!(plain.header("content-encoding"), None, "{path}");
+        let named = path.contains("-") && path.starts_with("/assets/");
+        assert_eq!(plain.header("cache-control").unwrap().contains("immutable"), named, "{path}");
+        if packed.header("content-encoding").is_some() {
+            let mut unpacked = Vec::new();
+            flate2::read::GzDecoder::new(&packed.body[..]).read_to_end(&mut unpacked).unwrap();
+            assert_eq!(unpacked, plain.body, "{path}");
+            assert!(packed.body.len() < plain.body.len() || plain.body.len() < 500, "{path}");
+        }
+    }
+}
+
+#[test]
+fn atoms_are_listed_as_meshes_count_them() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let reply = server.get(&format!("{structure}/atoms"));
+    assert_eq!(reply.status, 200);
+    let (etag, list) = (reply.header("etag").unwrap().to_owned(), reply.json());
+    let unchanged = send(server.addr, "GET", &format!("{structure}/atoms"), &[("if-none-match", &etag)], b"");
+    assert_eq!(unchanged.status, 304);
+    assert_eq!(list["count"], server.get(&structure).json()["atoms"]);
+    // The rows that a mesh names are those of its polymer: LYS 15 among them, water not.
+    let ply = server.get(&format!("{structure}/surface.ply?atom_ids=true&resolution=1")).body;
+    let head = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let text = std::str::from_utf8(&ply[..head]).unwrap();
+    let n: usize = text.lines().find_map(|l| l.strip_prefix("element vertex ")).unwrap().parse().unwrap();
+    let named: std::collections::BTreeSet<u64> = (0..n)
+        .map(|i| u64::from(u32::from_le_bytes(ply[head + 28 * i + 24..head + 28 * i + 28].try_into().unwrap())))
+        .collect();
+    let rows = |column: &str| list["residues"][column].as_array().unwrap();
+    let residue = |atom: u64| rows("first").iter().rposition(|first| first.as_u64().unwrap() <= atom).unwrap();
+    let others: Vec<u64> = named.iter().copied().filter(|atom| rows("kind")[residue(*atom)] != "polymer").collect();
+    assert!(others.is_empty(), "{others:?} of {named:?}");
+    assert!(named.iter().any(|atom| rows("name")[residue(*atom)] == "LYS" && rows("number")[residue(*atom)] == 15));
+    assert!(rows("kind").iter().any(|kind| kind == "water"));
 }
 
 #[test]

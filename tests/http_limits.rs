@@ -95,6 +95,20 @@ fn atoms_are_limited() {
 }
 
 #[test]
+fn atoms_that_are_listed_are_limited() {
+    let server = fake(|c| c.limits.labels = 100);
+    let listed = |atoms| {
+        let structure = server.post("/v1/structures", &[], &carbons(atoms)).header("location").unwrap().to_owned();
+        server.get(&format!("{structure}/atoms"))
+    };
+    assert_eq!(listed(101).problem(422, "too-many-atoms")["limit"], 100);
+    assert_eq!(listed(100).json()["count"], 100);
+    assert!(rejected(&server, "too-many-atoms") >= 1.0);
+    // Its mesh is made nevertheless.
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).status, 200);
+}
+
+#[test]
 fn grids_and_meshes_are_limited_and_what_would_fit_fits() {
     for (slug, change) in [
         ("grid-too-large", Box::new(|c: &mut Config| c.limits.grid_samples = 60_000) as Box<dyn FnOnce(&mut Config)>),

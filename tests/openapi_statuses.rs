@@ -71,6 +71,8 @@ fn plain(seen: &Seen, server: &Running) {
     }
     seen.expect(200, server.addr, ("GET", "/problems/internal"), &[], b"");
     seen.expect(404, server.addr, ("GET", "/problems/none"), &[], b"");
+    seen.expect(200, server.addr, ("GET", "/assets/icon.svg"), &[], b"");
+    seen.expect(404, server.addr, ("GET", "/assets/none.js"), &[], b"");
 }
 
 /// Uploads, good and bad.
@@ -87,7 +89,7 @@ fn uploads(seen: &Seen, server: &Running) {
     let post = ("POST", "/v1/meshes");
     seen.expect(200, addr, ("POST", "/v1/meshes?report=json"), &[], SAMPLE);
     seen.expect(202, addr, post, &[LATER], SAMPLE);
-    seen.expect(406, addr, post, &[("accept", "image/png")], SAMPLE);
+    seen.expect(406, addr, post, &[("accept", "image/webp")], SAMPLE);
     // An estimate is no mesh: whatever is asked for, it is JSON.
     seen.expect(200, addr, ("POST", "/v1/estimate"), &[("accept", "application/json")], SAMPLE);
     for path in &UPLOADS[..2] {
@@ -118,6 +120,9 @@ fn surfaces(seen: &Seen, server: &Running) {
         get(kept, &[("range", "bytes=0-9")], 206);
         get(kept, &[("range", "bytes=99999999-")], 416);
         get(kept, &[("if-none-match", "*")], 304);
+        let atoms = format!("{base}/atoms");
+        let tag = get(&atoms, &[], 200).header("etag").unwrap().to_owned();
+        get(&atoms, &[("if-none-match", &tag)], 304);
         let report = kept.replace(".glb", "/report.json");
         let tag = get(&report, &[], 200).header("etag").unwrap().to_owned();
         get(&report, &[("if-none-match", &tag)], 304);
@@ -127,6 +132,8 @@ fn surfaces(seen: &Seen, server: &Running) {
     let etag = get(&structure, &[], 200).header("etag").unwrap().to_owned();
     get(&structure, &[("if-none-match", &etag)], 304);
     get(&format!("/v1/structures/{ZERO}"), &[], 404);
+    get(&format!("/v1/structures/{ZERO}/atoms"), &[], 404);
+    get("/v1/pdb/9xyz/atoms", &[], 404);
     get(&format!("/v1/results/{ZERO}.glb"), &[], 404);
     get(&format!("/v1/results/{ZERO}/report.json"), &[], 404);
 }
@@ -181,6 +188,7 @@ fn sizes(seen: &Seen) {
         seen.note("POST", path, &late).unwrap();
     }
     seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
+    seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
     let remote = Remote::saying(status(500));
     let away = fake(Mode::Octahedra, |c| {
         c.archive.url = Some(remote.url("/{id}.cif").parse().unwrap());
@@ -188,6 +196,9 @@ fn sizes(seen: &Seen) {
         c.archive.attempts = 1;
     });
     seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/surface.glb"), &[], b"");
+    seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/atoms"), &[], b"");
+    let few = fake(Mode::Octahedra, |c| c.limits.labels = 10);
+    seen.expect(422, few.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
     for path in &UPLOADS[..2] {
         seen.expect(424, away.addr, ("POST", path), &[JSON], br#"{"pdb_id": "9xyz"}"#);
     }
@@ -218,6 +229,7 @@ fn failures(seen: &Seen) {
         seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
     });
     let crowded = fake(Mode::Octahedra, |c| c.limits.memory_bytes = 1_000);
+    seen.expect(503, crowded.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
     for path in UPLOADS {
         seen.expect(503, crowded.addr, ("POST", path), &[], SAMPLE);
     }
@@ -244,13 +256,16 @@ fn restarts(seen: &Seen) {
     let get = |server: &Running, path: &str, status| seen.expect(status, server.addr, ("GET", path), &[], b"");
     let server = begin(|c| c.limits.inflated_bytes = 1_000);
     get(&server, &structure, 413);
+    get(&server, &format!("{structure}/atoms"), 413);
     get(&server, &format!("{surface}?resolution=2"), 413);
     assert!(server.join());
     let server = begin(|c| c.limits.atoms = 10);
     get(&server, &structure, 422);
+    get(&server, &format!("{structure}/atoms"), 422);
     assert!(server.join());
     let server = begin(|c| c.limits.memory_bytes = 1_000);
     get(&server, &structure, 503);
+    get(&server, &format!("{structure}/atoms"), 503);
     get(&server, &format!("{surface}?resolution=2"), 503);
     assert!(server.join());
 

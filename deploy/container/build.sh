@@ -6,9 +6,10 @@
 #   deploy/container/build.sh --base-from-debootstrap  over a Debian made here: no registry of images is asked
 #   deploy/container/build.sh --target cpu             one image alone
 #
-# A binary that was built here must not need a newer libc than the base has; the build fails if it does. Beside the
+# The viewer is in the image that is built in containers; a binary that was built here has it if `make web` ran before it was
+# built (`make release` does so). Such a binary must not need a newer libc than the base has; the build fails if it does. Beside the
 # images, dist/molmesh-TARGET.cdx.json says what is in them. The environment may set
-# SUITE (trixie), BASE_IMAGE, RUST_IMAGE, and SOURCE, the address of the sources for the image's label.
+# SUITE (trixie), BASE_IMAGE, RUST_IMAGE, NODE_IMAGE, and SOURCE, the address of the sources for the image's label.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
 # shellcheck source=deploy/container/engine.sh
@@ -48,6 +49,7 @@ if $debootstrap; then
 fi
 if [ -n "${BASE_IMAGE:-}" ]; then arguments+=(--build-arg "BASE_IMAGE=$BASE_IMAGE"); fi
 if [ -n "${RUST_IMAGE:-}" ]; then arguments+=(--build-arg "RUST_IMAGE=$RUST_IMAGE"); fi
+if [ -n "${NODE_IMAGE:-}" ]; then arguments+=(--build-arg "NODE_IMAGE=$NODE_IMAGE"); fi
 if [ "${engine[0]}" = podman ]; then
     # OCI's own format has no health check. The steps need the host's network, and no daemon's help to become root.
     arguments+=(--format docker --isolation chroot --network host)

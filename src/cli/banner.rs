@@ -16,6 +16,8 @@ pub(crate) struct Facts {
     pub(crate) others: Vec<Candidate>,
     /// A key is asked for.
     pub(crate) keys: bool,
+    /// The page is the viewer.
+    pub(crate) viewer: bool,
 }
 
 /// The banner of a service that listens on `addr`.
@@ -23,6 +25,9 @@ pub(crate) fn text(addr: SocketAddr, metrics: Option<SocketAddr>, facts: &Facts,
     let base = format!("http://{}", reachable(addr));
     let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
     page.row("viewer", &style.cyan(&format!("{base}/")));
+    if !facts.viewer {
+        page.row("", &style.dim("not in this build: make web, then build again (make run does both)"));
+    }
     page.row("docs", &style.cyan(&format!("{base}/docs")));
     if let Some(metrics) = metrics {
         page.row("metrics", &style.cyan(&format!("http://{}/metrics", reachable(metrics))));
@@ -65,6 +70,7 @@ mod tests {
                 Candidate { name: "gpu".into(), state: Err("none found".into()) },
             ],
             keys: false,
+            viewer: true,
         };
         let text = text("0.0.0.0:81".parse().unwrap(), Some("[::]:82".parse().unwrap()), &facts, Style::PLAIN);
         for part in [
@@ -80,6 +86,9 @@ mod tests {
         let asking = Facts { keys: true, ..facts };
         let closed = super::text("0.0.0.0:81".parse().unwrap(), None, &asking, Style::PLAIN);
         assert!(closed.contains("curl -sS -H \"X-Api-Key: $MOLMESH_KEY\" --data-binary"), "{closed}");
+        let bare = Facts { keys: false, viewer: false, ..asking };
+        let bare = super::text("0.0.0.0:81".parse().unwrap(), None, &bare, Style::PLAIN);
+        assert!(bare.contains("make web") && !text.contains("make web"), "{bare}");
         assert!(!text.contains("not cpu") && text.lines().count() <= 8, "{text}");
     }
 }

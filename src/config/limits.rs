@@ -3,6 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::picture::PictureLimits;
 use crate::pipeline::JobLimits;
 use crate::structure::ReadLimits;
 use crate::surface::SurfaceLimits;
@@ -20,6 +21,9 @@ pub struct LimitsConfig {
     /// Atoms in all models of a structure. Default 10,000,000: four times the largest entry of the archive; at
     /// 80 bytes each they take 800 MB.
     pub atoms: u64,
+    /// Atoms of a structure whose names are listed, for front ends that show them. Default 1,000,000: some 10 MB of
+    /// JSON; beyond that a browser is better served without.
+    pub labels: u64,
     /// Grid samples in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; as 32-bit numbers
     /// they take 4 GiB.
     pub grid_samples: u64,
@@ -31,6 +35,9 @@ pub struct LimitsConfig {
     /// Bytes of uploads and finished meshes that all requests together hold in memory. Default 8 GiB. A new
     /// upload or job is refused while it is used up; running jobs may overshoot it by `mesh_bytes` each.
     pub memory_bytes: u64,
+    /// Pixels of a picture's width and of its height. Default 4,096: at 40 bytes a pixel the working memory of the largest is
+    /// 640 MiB, and drawing it takes seconds.
+    pub picture_side: u32,
 }
 
 impl Default for LimitsConfig {
@@ -39,21 +46,24 @@ impl Default for LimitsConfig {
             body_bytes: 256 << 20,
             inflated_bytes: 2 << 30,
             atoms: 10_000_000,
+            labels: 1_000_000,
             grid_samples: 1 << 30,
             mesh_bytes: 2 << 30,
             output_bytes: 3 << 30,
             memory_bytes: 8 << 30,
+            picture_side: 4096,
         }
     }
 }
 
 impl LimitsConfig {
-    /// The limits of reading and meshing.
+    /// The limits of reading, meshing and drawing.
     #[must_use]
     pub fn job(&self) -> JobLimits {
         JobLimits {
             read: ReadLimits { max_inflated_bytes: self.inflated_bytes, max_atoms: self.atoms },
             surface: SurfaceLimits { max_samples: self.grid_samples, max_mesh_bytes: self.mesh_bytes },
+            picture: PictureLimits { max_side: self.picture_side },
             deadline: None,
         }
     }

@@ -173,6 +173,23 @@ mod tests {
     }
 
     #[test]
+    fn the_pictures_structs_are_laid_out_alike_on_both_sides() {
+        use crate::gpu::picture_targets::{Numbers, Tap, View};
+        let mut all = vec![
+            host!("View", View, right, up, toward, light, size, offset, scale, reach, diffuse, pad),
+            host!(
+                "Numbers", Numbers, color, behind, size, n_taps, line, falloff, bias, strength, darkest, step_from,
+                step_to, ink, pad
+            ),
+            host!("Tap", Tap, pixels, length),
+        ];
+        assert_eq!(all.len(), PICTURE_LAYOUTS.len());
+        assert_eq!(differences(PICTURE_LAYOUTS, &all), Vec::<String>::new());
+        all[2].1 += 4;
+        assert!(!differences(PICTURE_LAYOUTS, &all).is_empty());
+    }
+
+    #[test]
     fn a_moved_field_a_wrong_size_and_an_unknown_struct_are_found() {
         let mut host = host();
         host[0].2[1].1 += 4;

@@ -8,6 +8,7 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
+use super::page;
 use super::state::Shared;
 use crate::config::Config;
 use crate::formats::Format;
@@ -25,7 +26,7 @@ pub(super) struct Capabilities {
     version: &'static str,
     units: Units,
     inputs: Inputs,
-    /// Mesh formats, the best known first.
+    /// Formats, the best known first; png is a picture.
     formats: Vec<FormatDocument>,
     /// The format where none is asked for.
     default_format: &'static str,
@@ -39,9 +40,13 @@ pub(super) struct Capabilities {
     limits: Limits,
     /// The backend that makes the meshes.
     backends: Vec<BackendDocument>,
+    /// What draws pictures.
+    renderers: Vec<BackendDocument>,
     /// Every device that was found.
     devices: Vec<DeviceDocument>,
     radii: Radii,
+    /// Whether the page at `/` is the viewer; without it, it says how to get it.
+    viewer: bool,
     /// Where the types of problems are listed.
     problems: &'static str,
 }
@@ -64,7 +69,7 @@ struct Inputs {
     note: &'static str,
 }
 
-/// A mesh format.
+/// A format.
 #[derive(Debug, Serialize, ToSchema)]
 struct FormatDocument {
     /// Its file name's extension.
@@ -117,10 +122,12 @@ struct Limits {
     body_bytes: u64,
     inflated_bytes: u64,
     atoms: u64,
+    labels: u64,
     grid_samples: u64,
     mesh_bytes: u64,
     output_bytes: u64,
     memory_bytes: u64,
+    picture_side: u32,
     workers: usize,
     queue: usize,
     deliveries: usize,
@@ -134,7 +141,7 @@ struct Limits {
     connections: usize,
 }
 
-/// What makes the meshes.
+/// What makes meshes, or draws them.
 #[derive(Debug, Serialize, ToSchema)]
 struct BackendDocument {
     name: &'static str,
@@ -195,7 +202,7 @@ pub(super) async fn show(State(app): State<Shared>) -> Response {
 
 /// Writes the document.
 pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> Bytes {
-    let backend = pool.backend();
+    let (backend, drawer) = (pool.backend(), pool.drawer());
     let document = Capabilities {
         name: "molmesh",
         version: env!("CARGO_PKG_VERSION"),
@@ -216,8 +223,14 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
             device: backend.describe(),
             reason: pool.reason().to_owned(),
         }],
+        renderers: vec![BackendDocument {
+            name: drawer.renderer.name(),
+            device: drawer.renderer.describe(),
+            reason: drawer.reason.clone(),
+        }],
         devices: devices(found, &backend.devices()),
         radii: Radii { table: radii::TABLE, unit: "Å", fallback: radii::FALLBACK, values: radii_by_symbol() },
+        viewer: page::has_viewer(),
         problems: "/problems",
     };
     // A document of text and numbers can be written.
@@ -278,10 +291,12 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         body_bytes: limits.body_bytes,
         inflated_bytes: limits.inflated_bytes,
         atoms: limits.atoms,
+        labels: limits.labels,
         grid_samples: limits.grid_samples,
         mesh_bytes: limits.mesh_bytes,
         output_bytes: limits.output_bytes,
         memory_bytes: limits.memory_bytes,
+        picture_side: limits.picture_side,
         workers: pool.workers(),
         queue: jobs.queue,
         deliveries: jobs.deliveries,

@@ -1,15 +1,11 @@
 //! `/docs`: the description to read and to try, in Swagger UI. Its files are embedded, packed as they came in the package
 //! `swagger-ui-dist`; nothing is loaded from elsewhere.
 
-use std::io::Read as _;
-
-use axum::http::header::{
-    ACCEPT_ENCODING, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, VARY,
-};
+use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY};
 use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
-use bytes::Bytes;
 
+use super::packed;
 use super::problem::Problem;
 
 /// Our own files and resources, as on the page; besides, Swagger UI has icons in its style, and shows downloads. What it
@@ -29,20 +25,9 @@ fn headers(media_type: &'static str) -> [(HeaderName, &'static str); 4] {
     ]
 }
 
-/// A packed file, as it is for whoever takes it so.
+/// A packed file with what it is.
 fn packed(request: &HeaderMap, media_type: &'static str, bytes: &'static [u8]) -> Result<Response, Problem> {
-    let takes = |coding: &str| {
-        let (name, weight) = coding.split_once(';').unwrap_or((coding, "q=1"));
-        matches!(name.trim(), "gzip" | "*") && weight.trim().strip_prefix("q=").is_none_or(|q| q.parse() != Ok(0.0))
-    };
-    let accepted = request.get_all(ACCEPT_ENCODING).iter().filter_map(|value| value.to_str().ok());
-    if accepted.flat_map(|value| value.split(',')).any(takes) {
-        let coding = [(CONTENT_ENCODING, "gzip"), (VARY, "accept-encoding")];
-        return Ok((headers(media_type), coding, Bytes::from_static(bytes)).into_response());
-    }
-    let mut plain = Vec::new();
-    flate2::read::GzDecoder::new(bytes).read_to_end(&mut plain).map_err(Problem::internal)?;
-    Ok((headers(media_type), [(VARY, "accept-encoding")], plain).into_response())
+    Ok((headers(media_type), packed::file(request, bytes)?).into_response())
 }
 
 /// The description, to read and to try.

@@ -6,6 +6,7 @@
 
 mod accept;
 mod ask;
+mod atoms;
 mod browsers;
 mod capabilities;
 mod conditional;
@@ -25,6 +26,7 @@ mod middleware;
 mod negotiate;
 mod observe;
 mod openapi;
+mod packed;
 mod page;
 mod pdb;
 mod probe;
@@ -46,5 +48,6 @@ mod unfit;
 mod upload;
 mod wish;
 
+pub use page::has_viewer;
 pub use server::{Chosen, ServeError, Server};
 pub use stop::{Stop, shutdown_signals};

@@ -1,38 +1,142 @@
-//! `/`: a page that tries the service out, with its script and style, embedded. Nothing is loaded from elsewhere.
+//! `/`: the viewer, if it was there when this was built, and `<molmesh-viewer>` for other pages. All is embedded: nothing is
+//! loaded from elsewhere.
 
+use axum::extract::Path;
+use axum::extract::rejection::PathRejection;
 use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY};
+use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
-/// Only our own files run, only our own resources are asked.
-const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; \
-                      base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+use super::kinds::Kind;
+use super::openapi::parameters::AssetPath;
+use super::openapi::refusals;
+use super::packed;
+use super::problem::Problem;
 
-fn asset(media_type: &'static str, text: &'static str) -> Response {
-    let headers = [
+/// Only our own files run, only our own resources are asked. WebAssembly is allowed, evaluating text is not: the decoder of
+/// meshes that are compressed with meshopt is a module of it, and no other part of the page. Pictures may be blobs, since an
+/// image's own address could not carry a key.
+const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; \
+                      img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
+                      frame-ancestors 'none'";
+
+// `static FILES`: the paths of what lay in `web/dist`, and the bytes, packed with gzip; nothing, if nothing did.
+include!(concat!(env!("OUT_DIR"), "/page.rs"));
+
+/// Instead of the viewer.
+const NONE: &str = include_str!("../../web/none.html");
+const ICON: &str = include_str!("../../web/public/assets/icon.svg");
+/// Instead of the component: whoever embeds it finds out why nothing is shown.
+const NO_COMPONENT: &str =
+    "console.error(\"This server was built without its viewer, and has no <molmesh-viewer> to give.\");\n";
+
+/// Whether the viewer was there when this was built.
+#[must_use]
+pub fn has_viewer() -> bool {
+    found("index.html").is_some()
+}
+
+fn found(path: &str) -> Option<&'static [u8]> {
+    FILES.iter().find(|(name, _)| *name == path).map(|(_, packed)| *packed)
+}
+
+fn headers(path: &str) -> [(HeaderName, &'static str); 4] {
+    let media_type = match path.rsplit('.').next().unwrap_or_default() {
+        "html" => "text/html; charset=utf-8",
+        "js" => "text/javascript; charset=utf-8",
+        "css" => "text/css; charset=utf-8",
+        "svg" => "image/svg+xml",
+        _ => "text/plain; charset=utf-8",
+    };
+    let caching = if is_named_by_contents(path) { "public, max-age=31536000, immutable" } else { "no-cache" };
+    [
         (CONTENT_TYPE, media_type),
         (CONTENT_SECURITY_POLICY, POLICY),
         (REFERRER_POLICY, "no-referrer"),
-        // Small, and changed by every release: asked for anew each time.
-        (CACHE_CONTROL, "no-cache"),
-    ];
-    (headers, text).into_response()
+        (CACHE_CONTROL, caching),
+    ]
 }
 
-/// Describes a handler that answers with an embedded file, and is one.
-macro_rules! embedded {
-    ($handler:ident, $path:literal, $id:literal, $media_type:literal, $words:literal, $file:literal) => {
-        #[doc = $words]
-        #[utoipa::path(get, path = $path, tag = "page", operation_id = $id,
-                            responses((status = 200, description = $words, body = String, content_type = $media_type)))]
-        pub(super) async fn $handler() -> Response {
-            asset($media_type, include_str!($file))
+/// Whether a name ends in a hash of eight characters before its extension: `index-Dx3k_9aZ.js`.
+fn is_named_by_contents(path: &str) -> bool {
+    let stem = path.rsplit_once('.').map_or(path, |(stem, _)| stem).as_bytes();
+    path.starts_with("assets/") && stem.len() > 16 && stem[stem.len() - 9] == b'-'
+}
+
+/// A file of the page, or what stands in for it.
+fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Response, Problem> {
+    match found(path) {
+        Some(bytes) => Ok((headers(path), packed::file(request, bytes)?).into_response()),
+        None => Ok((headers(path), instead).into_response()),
+    }
+}
+
+/// The page.
+#[utoipa::path(get, path = "/", tag = "page", operation_id = "page",
+    responses((status = 200, description = "The viewer, or how to get it.", body = String,
+        content_type = "text/html; charset=utf-8")))]
+pub(super) async fn index(request: HeaderMap) -> Result<Response, Problem> {
+    answer(&request, "index.html", NONE)
+}
+
+/// `<molmesh-viewer>`, for pages elsewhere.
+///
+/// A module that defines the element; what it needs it loads from beside itself.
+#[utoipa::path(get, path = "/molmesh-viewer.js", tag = "page", operation_id = "component",
+    responses((status = 200, description = "A script.", body = String,
+        content_type = "text/javascript; charset=utf-8")))]
+pub(super) async fn component(request: HeaderMap) -> Result<Response, Problem> {
+    answer(&request, "molmesh-viewer.js", NO_COMPONENT)
+}
+
+refusals!(AssetRefusals: [[Kind::BadRequest, Kind::NotFound]]);
+
+/// What the page consists of.
+#[utoipa::path(get, path = "/assets/{file}", tag = "page", operation_id = "asset", params(AssetPath),
+    responses(
+        (status = 200, description = "A script, a style, a picture or a text.", content(
+            (String = "text/javascript; charset=utf-8"), (String = "text/css; charset=utf-8"),
+            (String = "image/svg+xml"), (String = "text/plain; charset=utf-8"),
+        ), headers(("Cache-Control" = String, description = "For ever, where the name says the contents."))),
+        AssetRefusals,
+    ))]
+pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: HeaderMap) -> Result<Response, Problem> {
+    let Path(file) = file.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let path = format!("assets/{file}");
+    if found(&path).is_none() && file != "icon.svg" {
+        let shown: String = file.chars().take(80).collect();
+        return Err(Problem::new(Kind::NotFound, format!("the page has no `{shown}`; reload it")));
+    }
+    answer(&request, &path, ICON)
+}
+
+/// A structure to try.
+#[utoipa::path(get, path = "/sample.pdb", tag = "page", operation_id = "sample",
+    responses((status = 200, description = "A structure to try.", body = String,
+        content_type = "chemical/x-pdb")))]
+pub(super) async fn sample() -> Response {
+    let mut headers = headers("sample.pdb");
+    headers[0].1 = "chemical/x-pdb";
+    (headers, include_str!("../../samples/4pti.pdb")).into_response()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_names_that_say_the_contents_are_kept_for_ever() {
+        for (path, kept) in [
+            ("assets/index-CGvWO8zU.css", true),
+            ("assets/viewer-BuD58--0.js", true),
+            ("assets/icon.svg", false),
+            ("assets/licences.txt", false),
+            ("molmesh-viewer.js", false),
+            ("index.html", false),
+        ] {
+            assert_eq!(is_named_by_contents(path), kept, "{path}");
+            assert_eq!(headers(path)[3].1.contains("immutable"), kept, "{path}");
         }
-    };
+        assert!(!POLICY.contains("unsafe-inline") && !POLICY.contains("'unsafe-eval'"));
+    }
 }
-
-embedded!(index, "/", "page", "text/html; charset=utf-8", "The page.", "../../web/index.html");
-embedded!(style, "/app.css", "pageStyle", "text/css; charset=utf-8", "Its style.", "../../web/app.css");
-embedded!(script, "/app.js", "pageScript", "text/javascript; charset=utf-8", "Its script.", "../../web/app.js");
-embedded!(viewer, "/viewer.js", "pageViewer", "text/javascript; charset=utf-8", "Its viewer.", "../../web/viewer.js");
-embedded!(icon, "/icon.svg", "pageIcon", "image/svg+xml", "Its icon.", "../../web/icon.svg");
-embedded!(sample, "/sample.pdb", "sample", "chemical/x-pdb", "A structure to try.", "../../samples/4pti.pdb");

@@ -8,8 +8,8 @@ use axum::routing::{get, post};
 
 use super::state::Shared;
 use super::{
-    capabilities, docs, estimate, events, health, jobs, meshes, middleware, openapi, page, pdb, problems, results,
-    structures,
+    atoms, capabilities, docs, estimate, events, health, jobs, meshes, middleware, openapi, page, pdb, problems,
+    results, structures,
 };
 
 /// Time beyond the limits that are met in order, before the backstop: reading the archive, writing the head.
@@ -24,8 +24,10 @@ pub(super) fn router(app: &Shared) -> Router {
         // Meshes.
         .route("/v1/meshes", post(meshes::create))
         .route("/v1/pdb/{id}/{file}", get(pdb::surface))
+        .route("/v1/pdb/{id}/atoms", get(atoms::of_entry))
         .route("/v1/structures", post(structures::create))
         .route("/v1/structures/{digest}", get(structures::show))
+        .route("/v1/structures/{digest}/atoms", get(atoms::of_structure))
         .route("/v1/structures/{digest}/{file}", get(structures::surface))
         .route("/v1/estimate", post(estimate::create))
         // Jobs and what they have made.
@@ -49,10 +51,8 @@ pub(super) fn router(app: &Shared) -> Router {
         .route("/swagger-ui-bundle.js", get(docs::bundle))
         // The page.
         .route("/", get(page::index))
-        .route("/app.css", get(page::style))
-        .route("/app.js", get(page::script))
-        .route("/viewer.js", get(page::viewer))
-        .route("/icon.svg", get(page::icon))
+        .route("/assets/{file}", get(page::asset))
+        .route("/molmesh-viewer.js", get(page::component))
         .route("/sample.pdb", get(page::sample))
         .with_state(Arc::clone(app));
     middleware::apply(router, timeout, app)

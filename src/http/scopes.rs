@@ -26,8 +26,10 @@ const OPEN: Option<Scope> = None;
 pub(super) const TABLE: &[Row] = &[
     row(Method::POST, "/v1/meshes", MESH),
     row(Method::GET, "/v1/pdb/{id}/{file}", MESH),
+    row(Method::GET, "/v1/pdb/{id}/atoms", MESH),
     row(Method::POST, "/v1/structures", MESH),
     row(Method::GET, "/v1/structures/{digest}", READ),
+    row(Method::GET, "/v1/structures/{digest}/atoms", READ),
     row(Method::GET, "/v1/structures/{digest}/{file}", MESH),
     row(Method::POST, "/v1/estimate", MESH),
     row(Method::GET, "/v1/jobs/{id}", READ),
@@ -50,10 +52,8 @@ pub(super) const TABLE: &[Row] = &[
     row(Method::GET, "/swagger-ui.css", OPEN),
     row(Method::GET, "/swagger-ui-bundle.js", OPEN),
     row(Method::GET, "/", OPEN),
-    row(Method::GET, "/app.css", OPEN),
-    row(Method::GET, "/app.js", OPEN),
-    row(Method::GET, "/viewer.js", OPEN),
-    row(Method::GET, "/icon.svg", OPEN),
+    row(Method::GET, "/assets/{file}", OPEN),
+    row(Method::GET, "/molmesh-viewer.js", OPEN),
     row(Method::GET, "/sample.pdb", OPEN),
 ];
 

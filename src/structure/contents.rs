@@ -16,6 +16,18 @@ pub enum Kind {
     Water,
 }
 
+impl Kind {
+    /// `polymer`, `ligand` or `water`.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Polymer => "polymer",
+            Self::Ligand => "ligand",
+            Self::Water => "water",
+        }
+    }
+}
+
 /// Atoms by kind; hydrogens and deuterium are counted by themselves.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {

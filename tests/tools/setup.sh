@@ -1,7 +1,7 @@
 #!/bin/sh
 # Installs the outside oracles of the tests (trimesh, gemmi, moto, schemas, gltf-validator, promtool) into target/test-tools, which git
-# ignores, and Mesa's software Vulkan (lavapipe) into the system where there is none: the shaders are tested on it. Does
-# nothing when all is there and up to date; says nothing unless it installs or fails.
+# ignores, and into the system, where there is none, Mesa's software Vulkan (lavapipe), on which the shaders are tested, and
+# Chromium, in which the viewer is. Does nothing when all is there and up to date; says nothing unless it installs or fails.
 set -eu
 
 here=$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)
@@ -29,18 +29,32 @@ software_vulkan() {
     [ "$(uname -s)" != Linux ] || [ -n "${VK_DRIVER_FILES:-}${VK_ICD_FILENAMES:-}" ]
 }
 
-if ! software_vulkan; then
-    command -v apt-get >/dev/null 2>&1 ||
-        fail "the tests of the shaders need Mesa's software Vulkan (lavapipe): install it (Fedora: mesa-vulkan-drivers, Arch: vulkan-swrast)"
-    echo "installing mesa-vulkan-drivers, for the tests of the shaders" >&2
+install() {
+    echo "installing $1, $2" >&2
     as_root=
     if [ "$(id -u)" -ne 0 ]; then as_root="sudo -n"; fi
     log=$(mktemp)
     { $as_root apt-get update -qq &&
-        $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends mesa-vulkan-drivers; } >"$log" 2>&1 ||
-        { tail -5 "$log" >&2; rm -f "$log"; fail "apt-get could not install mesa-vulkan-drivers; install it as root"; }
+        $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$1"; } >"$log" 2>&1 ||
+        { tail -5 "$log" >&2; rm -f "$log"; fail "apt-get could not install $1; install it as root"; }
     rm -f "$log"
+}
+
+if ! software_vulkan; then
+    command -v apt-get >/dev/null 2>&1 ||
+        fail "the tests of the shaders need Mesa's software Vulkan (lavapipe): install it (Fedora: mesa-vulkan-drivers, Arch: vulkan-swrast)"
+    install mesa-vulkan-drivers "for the tests of the shaders"
 fi
+
+browser() {
+    for name in chromium chromium-browser google-chrome; do
+        if command -v "$name" >/dev/null 2>&1; then return 0; fi
+    done
+    # Elsewhere the tests say what they miss.
+    ! command -v apt-get >/dev/null 2>&1
+}
+
+if ! browser; then install chromium "for the tests of the viewer"; fi
 
 # A stamp says what an installation was made from; it is written last, so a broken one is made again.
 digest() {

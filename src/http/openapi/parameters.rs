@@ -2,6 +2,7 @@
 
 use serde_json::Value;
 use utoipa::IntoParams;
+use utoipa::openapi::extensions::Extensions;
 use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn, ParameterStyle};
 use utoipa::openapi::schema::{SchemaFormat, Type};
 use utoipa::openapi::{ArrayBuilder, KnownFormat, ObjectBuilder, Required, Schema};
@@ -26,19 +27,21 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
     let object = |kind: Type| ObjectBuilder::new().schema_type(kind).description(Some(doc.as_str()));
     let words = |words: &[&str]| words.iter().map(|word| Value::from(*word)).collect::<Vec<_>>();
     let number: Option<Value> = parameter.default.parse::<f64>().ok().map(Value::from);
+    // A form has no use for what a query's schema tells front ends.
+    let hints = if place == Place::Query { hints(parameter) } else { None };
     match parameter.domain {
         Domain::Number { min, max, .. } => {
-            object(Type::Number).minimum(Some(min)).maximum(Some(max)).default(number).into()
+            object(Type::Number).minimum(Some(min)).maximum(Some(max)).default(number).extensions(hints).into()
         }
         Domain::Integer { min, max } => {
             let wide = i32::try_from(min).is_err() || i32::try_from(max).is_err();
             let format = SchemaFormat::KnownFormat(if wide { KnownFormat::Int64 } else { KnownFormat::Int32 });
-            object(Type::Integer).format(Some(format)).minimum(Some(min)).maximum(Some(max)).into()
+            object(Type::Integer).format(Some(format)).minimum(Some(min)).maximum(Some(max)).extensions(hints).into()
         }
         Domain::Flag => object(Type::Boolean).default(parameter.default.parse::<bool>().ok().map(Value::from)).into(),
         Domain::Choice(values) => {
             let default = values.contains(&parameter.default).then(|| Value::from(parameter.default));
-            object(Type::String).enum_values(Some(words(values))).default(default).into()
+            object(Type::String).enum_values(Some(words(values))).default(default).extensions(hints).into()
         }
         Domain::Set(values) if place == Place::Form => {
             let one = values.join("|");
@@ -48,8 +51,32 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
             let item = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(words(values)));
             ArrayBuilder::new().items(item).min_items(Some(1)).description(Some(doc)).into()
         }
-        Domain::Text { expected } => object(Type::String).min_length(Some(1)).title(Some(expected)).into(),
+        Domain::Text { expected } => {
+            object(Type::String).min_length(Some(1)).title(Some(expected)).extensions(hints).into()
+        }
     }
+}
+
+/// What front ends build controls from, as `x-control`: `unit`, `usual` (the part of the bounds for a slider), `instead_of`
+/// (parameters that cannot stand beside this one), and `format` (the only one that it goes with). One member, as their order would be anybody's.
+fn hints(parameter: &params::Parameter) -> Option<Extensions> {
+    let mut control = serde_json::Map::new();
+    if let Domain::Number { unit, .. } = parameter.domain
+        && !unit.is_empty()
+    {
+        control.insert("unit".to_owned(), unit.into());
+    }
+    if let Some(usual) = params::usual(parameter) {
+        control.insert("usual".to_owned(), usual.to_vec().into());
+    }
+    if params::PICTURES.contains(&parameter.name) {
+        control.insert("format".to_owned(), Format::Png.extension().into());
+    }
+    if params::SPACINGS.contains(&parameter.name) {
+        let others: Vec<&str> = params::SPACINGS.into_iter().filter(|name| *name != parameter.name).collect();
+        control.insert("instead_of".to_owned(), others.into());
+    }
+    (!control.is_empty()).then(|| Extensions::from_iter([("x-control", Value::from(control))]))
 }
 
 fn query(parameter: &params::Parameter) -> Parameter {
@@ -82,7 +109,9 @@ impl IntoParams for SurfaceParameters {
         let file = ObjectBuilder::new()
             .schema_type(Type::String)
             .enum_values(Some(Format::ALL.map(|format| format!("surface.{}", format.extension()))));
-        let file = path("file", "The mesh, by the extension of its format.").schema(Some(file)).build();
+        let file = path("file", "The mesh, by the extension of its format; or `surface.png`, its picture.")
+            .schema(Some(file))
+            .build();
         std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
     }
 }
@@ -120,6 +149,10 @@ segment!(
     /// `{digest}` of a structure.
     StructurePath, "digest", "SHA-256 of the structure's bytes as they came.",
     "^[0-9a-f]{64}$", "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+);
+segment!(
+    /// `{file}` of the page.
+    AssetPath, "file", "The file's name.", "^[A-Za-z0-9._-]{1,100}$", "icon.svg"
 );
 segment!(
     /// `{id}` of a job.

@@ -14,7 +14,7 @@ use super::{figures, markdown};
 #[derive(Debug, ClapArgs)]
 pub(crate) struct FiguresArgs {
     /// Results of `molmesh bench paper --out`: JSON files, or folders with some
-    #[arg(value_name = "RESULTS", default_value = "docs/results")]
+    #[arg(value_name = "RESULTS", default_value = "docs/results/paper")]
     pub(crate) results: Vec<PathBuf>,
     /// Folder for the figures
     #[arg(long, value_name = "DIR", default_value = "docs/figures")]

@@ -1,0 +1,265 @@
+//! `…/atoms`: who the atoms of a structure are, in columns whose rows are what `_ATOM` of a mesh counts.
+
+use axum::body::Body;
+use axum::extract::rejection::PathRejection;
+use axum::extract::{Path, State};
+use axum::http::header::{self, HeaderMap};
+use axum::http::{HeaderValue, StatusCode};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::ask::Input;
+use super::kinds::Kind;
+use super::openapi::meshes::NotModified;
+use super::openapi::parameters::{EntryPath, StructurePath, Unchanged};
+use super::openapi::problems::READING;
+use super::openapi::refusals;
+use super::problem::Problem;
+use super::state::Shared;
+use super::{conditional, pdb, structures};
+use crate::jobs::{Failure, Lease};
+use crate::store::{Digest, Name};
+use crate::structure::{self, Structure, StructureError, element};
+
+/// Bytes of the document that are set aside for an atom: two numbers, and a tenth of a residue's five.
+const BYTES_PER_ATOM: u64 = 24;
+
+/// The atoms of a structure: every model, in the order of the file, which is what `_ATOM` counts from 0.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct AtomsDocument {
+    /// Atoms: rows of `atoms`.
+    count: usize,
+    /// The distinct names of atoms.
+    names: Vec<String>,
+    /// The distinct elements; `?` is an unknown one.
+    elements: Vec<&'static str>,
+    atoms: AtomColumns,
+    residues: ResidueColumns,
+}
+
+/// A row for each atom.
+#[derive(Debug, Default, Serialize, ToSchema)]
+struct AtomColumns {
+    /// Which of `names`.
+    name: Vec<u32>,
+    /// Which of `elements`.
+    element: Vec<u8>,
+}
+
+/// A row for each residue.
+#[derive(Debug, Default, Serialize, ToSchema)]
+struct ResidueColumns {
+    /// Its first atom; the last is the one before the next residue's first.
+    first: Vec<usize>,
+    /// Its name.
+    name: Vec<String>,
+    /// Its number, as the author gives it.
+    number: Vec<i32>,
+    /// Its insertion code; empty where there is none.
+    insertion_code: Vec<String>,
+    /// The author's name for its chain; empty where the file leaves it blank.
+    chain: Vec<String>,
+    /// Its model.
+    model: Vec<i32>,
+    /// What its first atom is: `polymer`, `ligand` or `water`.
+    kind: Vec<&'static str>,
+}
+
+refusals!(StructureRefusals: [
+    READING,
+    [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+]);
+refusals!(EntryRefusals: [READING, [
+    Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
+    Kind::MemoryFull, Kind::TooManyDeliveries,
+]]);
+
+/// Who the atoms of a structure are.
+///
+/// For meshes with `atom_ids=true`: their `_ATOM` (in PLY `atom`) counts the rows of `atoms` here.
+#[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
+    params(StructurePath, Unchanged),
+    responses(
+        (status = 200, description = "The atoms.", body = AtomsDocument, headers(
+            ("ETag" = String, description = "The digest."),
+            ("Cache-Control" = String, description = "How long the answer stays good."),
+        )),
+        NotModified, StructureRefusals,
+    ))]
+pub(super) async fn of_structure(
+    State(app): State<Shared>,
+    path: Result<Path<String>, PathRejection>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let digest = structures::digest_of(&text)?;
+    let caching = caching(&digest)?;
+    if conditional::is_unchanged(&headers, &caching[0].1) && app.store.head(&Name::input(&digest)).await?.is_some() {
+        return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
+    }
+    let _place = app.delivery()?;
+    let input = structures::input(&app, &digest).await?;
+    Ok((caching, list(&app, input).await?).into_response())
+}
+
+/// Who the atoms of an entry are.
+///
+/// For meshes with `atom_ids=true`: their `_ATOM` (in PLY `atom`) counts the rows of `atoms` here.
+#[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
+    params(EntryPath, Unchanged),
+    responses(
+        (status = 200, description = "The atoms.", body = AtomsDocument, headers(
+            ("ETag" = String, description = "The digest of the entry's file."),
+            ("Cache-Control" = String, description = "How long the answer stays good."),
+        )),
+        NotModified, EntryRefusals,
+    ))]
+pub(super) async fn of_entry(
+    State(app): State<Shared>,
+    path: Result<Path<String>, PathRejection>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let id = text.parse().map_err(|error| pdb::of_folder(&error))?;
+    let unchanged = caching(&pdb::digest(&app, &id).await?)?;
+    if conditional::is_unchanged(&headers, &unchanged[0].1) {
+        return Ok((StatusCode::NOT_MODIFIED, unchanged).into_response());
+    }
+    let _place = app.delivery()?;
+    let input = pdb::input(&app, &id).await?;
+    Ok((caching(&input.digest)?, list(&app, input).await?).into_response())
+}
+
+fn caching(digest: &Digest) -> Result<[(header::HeaderName, HeaderValue); 2], Problem> {
+    let etag = HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)?;
+    Ok([(header::ETAG, etag), (header::CACHE_CONTROL, pdb::CACHE)])
+}
+
+/// Reads a structure and lists its atoms, on a thread that may block. What is listed is charged until it is sent.
+async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
+    let mut limits = app.config.limits.job().read;
+    limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
+    let mut lease = app.pool.budget().lease();
+    let listing = tokio::task::spawn_blocking(move || {
+        let structure = structure::read(&input.bytes, &limits)?;
+        lease.grow(BYTES_PER_ATOM * structure.len() as u64).map_err(Failed::Memory)?;
+        let text = serde_json::to_vec(&document(&structure)).map_err(Failed::Writing)?;
+        Ok(Bytes::from_owner(Leased { text, _lease: lease }))
+    });
+    let listed: Result<Bytes, Failed> = listing.await.map_err(Problem::internal)?;
+    let text = listed.map_err(Problem::from)?;
+    Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
+}
+
+/// A text, and the memory that it is charged to.
+struct Leased {
+    text: Vec<u8>,
+    _lease: Lease,
+}
+
+impl AsRef<[u8]> for Leased {
+    fn as_ref(&self) -> &[u8] {
+        &self.text
+    }
+}
+
+/// Why atoms cannot be listed.
+enum Failed {
+    Structure(StructureError),
+    Memory(crate::jobs::Exhausted),
+    Writing(serde_json::Error),
+}
+
+impl From<StructureError> for Failed {
+    fn from(error: StructureError) -> Self {
+        Self::Structure(error)
+    }
+}
+
+impl From<Failed> for Problem {
+    fn from(failed: Failed) -> Self {
+        match failed {
+            Failed::Structure(error) => Failure::Job { error: error.into(), diagnostics: Vec::new() }.into(),
+            Failed::Memory(error) => error.into(),
+            Failed::Writing(error) => Self::internal(error),
+        }
+    }
+}
+
+/// The columns of a structure.
+fn document(structure: &Structure) -> AtomsDocument {
+    let count = structure.len();
+    let mut elements: Vec<&'static str> = Vec::new();
+    // Where each atomic number stands among the elements of this structure.
+    let mut element_at = [u8::MAX; 1 + element::SYMBOLS.len()];
+    let mut atoms = AtomColumns { name: structure.name.ids().to_vec(), element: Vec::with_capacity(count) };
+    let mut residues = ResidueColumns::default();
+    let water = structure.water_residues();
+    for i in 0..count {
+        let number = usize::from(structure.element[i]);
+        if element_at[number] == u8::MAX {
+            element_at[number] = u8::try_from(elements.len()).unwrap_or(0);
+            elements.push(if number == 0 { "?" } else { element::SYMBOLS[number - 1] });
+        }
+        atoms.element.push(element_at[number]);
+        if i > 0 && same_residue(structure, i - 1, i) {
+            continue;
+        }
+        residues.first.push(i);
+        residues.name.push(structure.residue.get(i).to_owned());
+        residues.number.push(structure.residue_number[i]);
+        let code = structure.insertion_code[i];
+        residues.insertion_code.push(if code == 0 { String::new() } else { char::from(code).to_string() });
+        residues.chain.push(structure.chain.get(i).to_owned());
+        residues.model.push(structure.model[i]);
+        residues.kind.push(structure.kind(i, &water).name());
+    }
+    AtomsDocument { count, names: structure.name.texts().map(str::to_owned).collect(), elements, atoms, residues }
+}
+
+fn same_residue(structure: &Structure, a: usize, b: usize) -> bool {
+    structure.residue_number[a] == structure.residue_number[b]
+        && structure.insertion_code[a] == structure.insertion_code[b]
+        && structure.residue.id(a) == structure.residue.id(b)
+        && structure.chain.id(a) == structure.chain.id(b)
+        && structure.model[a] == structure.model[b]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::structure::ReadLimits;
+
+    #[test]
+    fn rows_are_those_of_the_file() {
+        let text = include_bytes!("../../samples/4pti.pdb");
+        let structure = structure::read(text, &ReadLimits::default()).unwrap();
+        let listed = document(&structure);
+        let text = std::str::from_utf8(text).unwrap();
+        let lines: Vec<&str> = text.lines().filter(|l| l.starts_with("ATOM") || l.starts_with("HETATM")).collect();
+        assert_eq!(
+            (listed.count, listed.atoms.name.len(), listed.atoms.element.len()),
+            (lines.len(), lines.len(), lines.len())
+        );
+        let mut ends = listed.residues.first[1..].to_vec();
+        ends.push(lines.len());
+        for (r, (&first, &end)) in listed.residues.first.iter().zip(&ends).enumerate() {
+            assert!(first < end);
+            for (row, line) in lines.iter().enumerate().take(end).skip(first) {
+                let [name, residue, chain, number] = [12..16, 17..20, 21..22, 22..26].map(|c| line[c].trim());
+                assert_eq!(listed.names[listed.atoms.name[row] as usize], name, "{line}");
+                assert_eq!(listed.elements[usize::from(listed.atoms.element[row])], line[76..78].trim(), "{line}");
+                assert_eq!(listed.residues.name[r], residue, "{line}");
+                assert_eq!(listed.residues.chain[r], chain, "{line}");
+                assert_eq!(listed.residues.number[r].to_string(), number, "{line}");
+            }
+        }
+        assert_eq!(listed.residues.kind.first(), Some(&"polymer"));
+        assert_eq!(listed.residues.kind.last(), Some(&"water"));
+        // What is set aside is enough.
+        let bytes = serde_json::to_vec(&listed).unwrap().len() as u64;
+        assert!(bytes < BYTES_PER_ATOM * listed.count as u64, "{bytes}");
+    }
+}

@@ -1,0 +1,132 @@
+//! The viewer and the examples in a real browser: Debian's Chromium, driven by the scripts of `tests/browser`, against the
+//! built server.
+#![cfg(all(unix, feature = "cli", feature = "server"))]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+
+mod access_support;
+mod cli_support;
+mod tools;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use cli_support::{Folder, Service};
+
+/// Where Chromium is, under the names that it has in distributions.
+fn chromium() -> Option<PathBuf> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    let names = ["chromium", "chromium-browser", "google-chrome"];
+    let mut places = std::env::split_paths(&path).flat_map(|folder| names.map(|name| folder.join(name)));
+    places.find(|place| place.is_file())
+}
+
+/// A service with the samples as its archive, small enough that a fine resolution is refused.
+fn service(folder: &Folder, more: &[&str]) -> Service {
+    let samples = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples");
+    let all = ["--devices", "cpu", "--archive", samples.to_str().unwrap(), "--set", "limits.grid_samples=4000000"];
+    Service::start(folder, &[&all, more].concat())
+}
+
+/// Runs a script of `tests/browser` against a service; it fails with what it said.
+fn drive(script: &str, more: &[&str], variables: &[(&str, &str)]) {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    if !molmesh::http::has_viewer() {
+        return tools::missing("the viewer (make web, then build again)").unwrap_or_default();
+    }
+    let modules = root.join("target/test-tools/node");
+    let Some(chromium) = chromium().filter(|_| modules.join(".stamp").is_file()) else {
+        return tools::missing("Chromium, or what drives it,").unwrap_or_default();
+    };
+    let folder = Folder::new();
+    let service = service(&folder, more);
+    let done = Command::new("node")
+        .arg(root.join("tests/browser").join(script))
+        .env("MOLMESH_URL", format!("http://{}", service.addr))
+        .env("MOLMESH_MODULES", modules.join("node_modules"))
+        .env("MOLMESH_CHROMIUM", chromium)
+        .env("MOLMESH_ROOT", root)
+        .envs(variables.iter().copied())
+        .output()
+        .unwrap();
+    let said = [done.stdout, done.stderr].concat();
+    let said = String::from_utf8_lossy(&said);
+    assert!(done.status.success() && said.contains("ok "), "{script}:\n{said}");
+}
+
+#[test]
+fn the_page_does_what_it_promises() {
+    drive("page.mjs", &[], &[]);
+}
+
+#[test]
+fn long_meshes_are_followed_as_jobs() {
+    drive("jobs.mjs", &["--set", "jobs.sync_wait_ms=1"], &[]);
+}
+
+#[test]
+fn a_key_is_asked_for_where_one_is_needed() {
+    let keys = access_support::Keys::new(&[("page", "mesh,read", "")]);
+    let set = format!("access.keys_file={}", keys.path().display());
+    drive("keys.mjs", &["--set", &set], &[("MOLMESH_KEY", keys.text("page"))]);
+}
+
+#[test]
+fn without_webgl_there_is_a_message_and_a_picture() {
+    drive("plain.mjs", &[], &[]);
+}
+
+#[test]
+fn every_flavour_is_loaded_by_other_viewers() {
+    drive("flavours.mjs", &[], &[]);
+}
+
+#[test]
+fn the_examples_work_on_pages_elsewhere() {
+    drive("examples.mjs", &[], &[]);
+}
+
+#[test]
+fn the_python_example_measures_what_the_service_reports() {
+    let Some(python) = tools::python_interpreter() else {
+        return tools::missing("the Python for examples/measure.py").unwrap_or_default();
+    };
+    let folder = Folder::new();
+    let service = service(&folder, &[]);
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let run = |file: &Path| {
+        let server = format!("http://{}", service.addr);
+        let script = root.join("examples/measure.py");
+        Command::new(&python).arg(script).arg(file).arg(server).env("PYTHONDONTWRITEBYTECODE", "1").output().unwrap()
+    };
+    let done = run(&root.join("samples/1crn.cif"));
+    let said = String::from_utf8_lossy(&done.stdout);
+    assert!(done.status.success(), "{said}{}", String::from_utf8_lossy(&done.stderr));
+    assert!(said.contains("closed True, the service says true"), "{said}");
+    let mut n = 0;
+    for line in said.lines().filter(|line| !line.starts_with("closed")) {
+        let numbers: Vec<f64> = line.split([' ', ',']).filter_map(|word| word.parse().ok()).collect();
+        let [ours, theirs] = numbers[..] else { panic!("{line}") };
+        assert!((ours - theirs).abs() <= 2e-3 * theirs, "{line}");
+        n += 1;
+    }
+    assert_eq!(n, 3, "{said}");
+    // What is no structure is refused in the service's words.
+    let poem = folder.file("poem.txt", "Whose woods these are I think I know");
+    let refused = run(&poem);
+    assert!(!refused.status.success());
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("The structure cannot be read"));
+}
+
+#[test]
+fn the_notices_name_what_the_viewer_bundles() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let lock: serde_json::Value =
+        serde_json::from_str(&std::fs::read_to_string(root.join("web/package-lock.json")).unwrap()).unwrap();
+    let notices = std::fs::read_to_string(root.join("deploy/notices.py")).unwrap();
+    for (package, kept) in [("three", "three.txt"), ("meshoptimizer", "meshoptimizer.txt")] {
+        assert_eq!(lock["packages"][format!("node_modules/{package}")]["license"], "MIT", "{package}");
+        let text = std::fs::read_to_string(root.join("web/licences").join(kept)).unwrap();
+        assert!(text.contains("Permission is hereby granted"), "{kept}");
+        assert!(notices.contains(kept), "{kept}");
+    }
+}

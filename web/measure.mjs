@@ -1,0 +1,48 @@
+// How long it takes from a slider's move to the frame after the one that shows the new surface, in a real browser, at full
+// resolution and without previews. Needs a server and the tools of the tests (make tools):
+//
+//   node web/measure.mjs FILE [SERVER] [RUNS]
+//
+// A line for each run: ms in all, to the head of the answer, to its last byte, to the frame after. Then median and worst.
+import { createRequire } from "node:module";
+
+const [file, server = "http://127.0.0.1:8080", runs = "25"] = process.argv.slice(2);
+if (!file) throw new Error("usage: node web/measure.mjs FILE [SERVER] [RUNS]");
+const require = createRequire(new URL("../target/test-tools/node/x.js", import.meta.url));
+const { chromium } = require("playwright-core");
+const executablePath = process.env.CHROMIUM ?? "/usr/bin/chromium";
+const args = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"];
+const browser = await chromium.launch({ executablePath, args: process.env.GPU ? ["--no-sandbox"] : args });
+const page = await browser.newPage({ viewport: { width: 1280, height: 800 }, reducedMotion: "reduce" });
+await page.addInitScript(() => {
+  window.seen = [];
+  new PerformanceObserver((list) => window.seen.push(...list.getEntries().map((e) => ({ ms: e.duration, ...e.detail })))).observe({ type: "measure", buffered: true });
+});
+await page.goto(server);
+await page.waitForFunction(() => window.seen.length > 0);
+await page.setInputFiles("#file", file);
+await page.waitForFunction(() => window.seen.length > 1);
+await page.waitForTimeout(1500);
+console.log(`${await page.locator("#structure-name").textContent()}: ${await page.locator('[data-row="atoms"] td').textContent()} atoms, ${await page.locator('[data-row="resolution"] td').textContent()}`);
+const all = [];
+for (let run = 0; run < Number(runs); run += 1) {
+  const position = 480 + ((run * 37) % 61);
+  const seen = await page.evaluate((position) => {
+    const before = window.seen.length;
+    const slider = document.querySelector('[data-slider="isovalue"]');
+    slider.value = String(position);
+    // As a key does: the value is set and final.
+    for (const type of ["input", "change"]) slider.dispatchEvent(new Event(type, { bubbles: true }));
+    return new Promise((resolve) => {
+      const look = () => (window.seen.length > before ? resolve(window.seen.at(-1)) : setTimeout(look, 5));
+      look();
+    });
+  }, position);
+  all.push(seen.ms);
+  console.log([seen.ms, seen.answered, seen.received, seen.drawn].map((ms) => ms.toFixed(1).padStart(7)).join(" "), seen.triangles, "triangles");
+  // What goes on after a mesh was sent (it is kept, its report is fetched) is over by then.
+  await page.waitForTimeout(600);
+}
+all.sort((a, b) => a - b);
+console.log(`median ${all[all.length >> 1].toFixed(1)} ms, worst ${all.at(-1).toFixed(1)} ms`);
+await browser.close();

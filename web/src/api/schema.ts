@@ -1,0 +1,106 @@
+/** The parameters of a mesh, read from the service's own description: what it learns, the page has. */
+
+export type Kind = "number" | "integer" | "boolean" | "choice" | "set" | "text";
+
+export interface Parameter {
+  name: string;
+  doc: string;
+  kind: Kind;
+  /** Bounds of numbers. */
+  min: number;
+  max: number;
+  /** The part of them that a slider spans. */
+  usual: [number, number];
+  unit: string;
+  /** The value where it is absent; undefined where it hangs on others. */
+  fallback: string | undefined;
+  /** The same in words. */
+  fallbackWords: string;
+  /** Words of choices and sets. */
+  values: string[];
+  /** What is expected, in words. */
+  expected: string;
+  /** Parameters that cannot be given beside it. */
+  insteadOf: string[];
+}
+
+interface Schema {
+  type?: string | string[];
+  title?: string;
+  description?: string;
+  default?: unknown;
+  minimum?: number;
+  maximum?: number;
+  enum?: string[];
+  items?: { enum?: string[] };
+  "x-control"?: { usual?: [number, number]; unit?: string; instead_of?: string[]; format?: string };
+}
+
+interface Described {
+  name: string;
+  in: string;
+  description?: string;
+  schema?: Schema;
+}
+
+export interface OpenApi {
+  paths: Record<string, Record<string, { operationId?: string; parameters?: Described[] }>>;
+}
+
+/** What is chosen elsewhere than in the form: files are asked for by their address, the report is read along. */
+const ELSEWHERE = ["format", "report"];
+
+function described(api: OpenApi): Described[] {
+  const operations = Object.values(api.paths).flatMap((path) => Object.values(path));
+  const mesh = operations.find((operation) => operation.operationId === "createMesh");
+  return (mesh?.parameters ?? []).filter((parameter) => parameter.in === "query");
+}
+
+/** Every parameter that changes the mesh, in the order of the description; those of pictures go with no mesh. */
+export function parametersOf(api: OpenApi): Parameter[] {
+  const mesh = (parameter: Described) => !ELSEWHERE.includes(parameter.name) && !parameter.schema?.["x-control"]?.format;
+  return described(api).filter(mesh).map(parameterOf);
+}
+
+/** The formats that a mesh can be had in, by their files' extensions. */
+export function formatsOf(api: OpenApi): string[] {
+  return described(api).find((parameter) => parameter.name === "format")?.schema?.enum ?? ["glb"];
+}
+
+function kindOf(schema: Schema): Kind {
+  const type = Array.isArray(schema.type) ? schema.type.find((t) => t !== "null") : schema.type;
+  if (type === "array") return schema.items?.enum ? "set" : "text";
+  if (type === "boolean" || type === "number" || type === "integer") return type;
+  return schema.enum ? "choice" : "text";
+}
+
+function parameterOf(parameter: Described): Parameter {
+  const schema = parameter.schema ?? {};
+  const min = schema.minimum ?? Number.NEGATIVE_INFINITY;
+  const max = schema.maximum ?? Number.POSITIVE_INFINITY;
+  const { usual: span, unit, instead_of: insteadOf } = schema["x-control"] ?? {};
+  const value = schema.default;
+  const words = /Default: (.*)\.$/s.exec(schema.description ?? "")?.[1];
+  return {
+    name: parameter.name,
+    doc: parameter.description ?? "",
+    kind: kindOf(schema),
+    min,
+    max,
+    usual: span ?? usual(min, max, Number(value)),
+    unit: unit ?? "",
+    fallback: value === undefined || value === null ? undefined : String(value),
+    fallbackWords: words ?? (value === undefined ? "absent" : String(value)),
+    values: schema.enum ?? schema.items?.enum ?? [],
+    expected: schema.title ?? "",
+    insteadOf: insteadOf ?? [],
+  };
+}
+
+/** The part of the bounds that a slider spans where the description does not say it: three octaves around the default. */
+function usual(min: number, max: number, value: number): [number, number] {
+  const wide = !Number.isFinite(min) || !Number.isFinite(max) || (min > 0 ? max / min > 100 : max - min > 1000);
+  if (!wide) return [min, max];
+  const middle = Number.isFinite(value) && value > 0 ? value : Math.max(min, 1);
+  return [Math.max(min, middle / 8), Math.min(max, middle * 8)];
+}

@@ -1,0 +1,135 @@
+/** Structures: where they are, what they hold, and who is behind the numbers of `_ATOM`. */
+
+import type { Client } from "./client";
+
+/** What is meshed: an upload, by the digest of its bytes, or an entry of the archive. */
+export interface Source {
+  /** The part of the address before `/surface.glb`. */
+  path: string;
+  /** What people call it. */
+  name: string;
+  /** The file's name, for the command line. */
+  file: string;
+  /** The bytes, to be sent again when the service has forgotten them. */
+  blob?: Blob;
+  summary?: Summary;
+}
+
+export interface Summary {
+  digest: string;
+  id: string | null;
+  title: string | null;
+  atoms: number;
+  models: number[];
+  chains: { name: string; atoms: number }[];
+  atoms_in_model: { polymer: number; ligand: number; water: number; hydrogens: number };
+}
+
+/** Sends a structure in, once; meshes are asked for under its address. */
+export async function upload(client: Client, blob: Blob, file: string, signal?: AbortSignal): Promise<Source> {
+  const options: RequestInit = { method: "POST", body: blob, headers: { "content-type": "application/octet-stream" } };
+  if (signal) options.signal = signal;
+  const summary = await client.json<Summary>("/v1/structures", options);
+  return { path: `/v1/structures/${summary.digest}`, name: summary.id ?? file, file, blob, summary };
+}
+
+/** An entry of the archive. */
+export function entry(id: string): Source {
+  const name = id.trim();
+  return { path: `/v1/pdb/${encodeURIComponent(name.toLowerCase())}`, name: name.toUpperCase(), file: "" };
+}
+
+/** `GET …/atoms`: columns whose rows are what `_ATOM` counts. */
+interface AtomsDocument {
+  count: number;
+  names: string[];
+  elements: string[];
+  atoms: { name: number[]; element: number[] };
+  residues: { first: number[]; name: string[]; number: number[]; insertion_code: string[]; chain: string[]; model: number[]; kind: string[] };
+}
+
+export interface Atom {
+  row: number;
+  atom: string;
+  element: string;
+  residue: string;
+  number: number;
+  insertion: string;
+  chain: string;
+  kind: string;
+  /** Rows of its residue, both included. */
+  first: number;
+  last: number;
+}
+
+export class Labels {
+  constructor(private readonly document: AtomsDocument) {}
+
+  get count(): number {
+    return this.document.count;
+  }
+
+  /** Who `row` is. */
+  of(row: number): Atom | null {
+    const { atoms, names, elements, residues, count } = this.document;
+    if (!(row >= 0 && row < count)) return null;
+    let [low, high] = [0, residues.first.length];
+    while (high - low > 1) {
+      const middle = (low + high) >> 1;
+      if ((residues.first[middle] ?? 0) <= row) low = middle;
+      else high = middle;
+    }
+    return {
+      row,
+      atom: names[atoms.name[row] ?? -1] ?? "?",
+      element: elements[atoms.element[row] ?? -1] ?? "?",
+      residue: residues.name[low] ?? "?",
+      number: residues.number[low] ?? 0,
+      insertion: residues.insertion_code[low] ?? "",
+      chain: residues.chain[low] ?? "",
+      kind: residues.kind[low] ?? "",
+      first: residues.first[low] ?? 0,
+      last: (residues.first[low + 1] ?? count) - 1,
+    };
+  }
+
+  /** The first atom, preferably the alpha carbon, of a residue that people name: `15`, `LYS 15`, `A:15`, `A LYS 15`. */
+  find(text: string): Atom | null {
+    const words = text.trim().toUpperCase().split(/[\s:/.,]+/).filter(Boolean);
+    const { residues, names, atoms } = this.document;
+    const fits = (i: number) => {
+      const own = [`${residues.number[i]}${residues.insertion_code[i]}`, residues.name[i], residues.chain[i]].map((s) => String(s).toUpperCase());
+      return words.every((word) => own.includes(word) || own[1] + own[0]! === word);
+    };
+    const at = words.length ? residues.first.findIndex((_, i) => fits(i)) : -1;
+    if (at < 0) return null;
+    const [first, end] = [residues.first[at] ?? 0, residues.first[at + 1] ?? this.count];
+    for (let row = first; row < end; row += 1) if (["CA", "P", "C1'"].includes(names[atoms.name[row] ?? -1] ?? "")) return this.of(row);
+    return this.of(first);
+  }
+
+  /** A number per atom, for colours: which chain (in order of appearance) or which element. */
+  classes(by: "chain" | "element"): { of: Uint16Array; names: string[] } {
+    const { residues, atoms, elements, count } = this.document;
+    if (by === "element") return { of: Uint16Array.from(atoms.element), names: elements };
+    const names: string[] = [];
+    const of = new Uint16Array(count);
+    residues.first.forEach((first, i) => {
+      const chain = residues.chain[i] ?? "";
+      let at = names.indexOf(chain);
+      if (at < 0) at = names.push(chain) - 1;
+      of.fill(at, first, residues.first[i + 1] ?? count);
+    });
+    return { of, names };
+  }
+}
+
+/** The labels of a structure's atoms. */
+export async function labels(client: Client, source: Source, signal: AbortSignal): Promise<Labels> {
+  return new Labels(await client.json<AtomsDocument>(`${source.path}/atoms`, { signal }));
+}
+
+/** How an atom is called: `LYS 15 A · CA`. */
+export function nameOf(atom: Atom): string {
+  return `${atom.residue} ${atom.number}${atom.insertion} ${atom.chain || "(blank)"} · ${atom.atom}`;
+}

@@ -1,0 +1,50 @@
+/** The surface as a file, in every format: made with what is set now, byte for byte what the address gives. */
+
+import type { Client } from "./api/client";
+import { fetchFile } from "./api/jobs";
+import type { Source } from "./api/structures";
+import { type Choices, stem, surface } from "./request";
+import { $, bytes, el } from "./ui/dom";
+
+export class Downloads {
+  constructor(
+    private readonly client: Client,
+    formats: string[],
+    private readonly wanted: () => { source: Source; choices: Choices } | null,
+    private readonly failed: (error: unknown) => void,
+  ) {
+    const buttons = formats.map((format) => {
+      const button = el("button", { type: "button", "data-format": format, "aria-label": `Download as ${format.toUpperCase()}` }, format);
+      button.addEventListener("click", () => void this.save(format, button));
+      return button;
+    });
+    $("formats").replaceChildren(...buttons);
+  }
+
+  private async save(format: string, button: HTMLButtonElement): Promise<void> {
+    const wanted = this.wanted();
+    if (!wanted) return;
+    const said = $("saved");
+    button.disabled = true;
+    said.textContent = `Making the ${format.toUpperCase()}…`;
+    try {
+      const path = surface(wanted.source, format, wanted.choices);
+      const reply = await fetchFile(this.client, path, new AbortController().signal, ({ fraction }) => {
+        said.textContent = `Making the ${format.toUpperCase()}: ${Math.round(100 * fraction)} %`;
+      });
+      const blob = await reply.blob();
+      const name = /filename="([^"]+)"/.exec(reply.headers.get("content-disposition") ?? "")?.[1] ?? `${stem(wanted.source)}.${format}`;
+      const url = URL.createObjectURL(blob);
+      const link = el("a", { href: url, download: name });
+      link.click();
+      // The browser has taken it by then.
+      setTimeout(() => URL.revokeObjectURL(url), 60_000);
+      said.textContent = `${name}, ${bytes(blob.size)}`;
+    } catch (error) {
+      said.textContent = "";
+      this.failed(error);
+    } finally {
+      button.disabled = false;
+    }
+  }
+}

@@ -1,0 +1,41 @@
+/** The page: a structure and parameters on one side, their surface in the middle, what is known of it on the other. */
+
+import { Client } from "./api/client";
+import { asProblem, Problem } from "./api/problem";
+import { formatsOf, type OpenApi, parametersOf } from "./api/schema";
+import { theme } from "./ui/theme";
+import { Page } from "./page";
+import { $, show } from "./ui/dom";
+
+const client = new Client();
+const page = new Page(client);
+theme(() => page.stage.theme());
+
+/** Begins, or begins anew with a key. */
+async function begin(): Promise<void> {
+  try {
+    const [api, capabilities] = await Promise.all([
+      client.json<OpenApi>("/openapi.json"),
+      client.json<{ version: string; limits: Record<string, number>; backends: { name: string }[] }>("/v1/capabilities"),
+    ]);
+    show($("key-form"), false);
+    $("version").textContent = `molmesh ${capabilities.version}, ${capabilities.backends.map((b) => b.name).join(", ")} backend`;
+    await page.start(parametersOf(api), formatsOf(api));
+  } catch (error) {
+    const problem = asProblem(error);
+    const asksForKey = error instanceof Problem && [401, 403].includes(problem.document.status);
+    show($("key-form"), asksForKey);
+    if (asksForKey && !client.key) {
+      page.greet("A key is needed", "This server's operator gives them out.");
+      $("key").focus();
+    } else page.problem(problem, () => void begin());
+  }
+}
+
+$("key-form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  client.key = $<HTMLInputElement>("key").value.trim();
+  page.clear();
+  void begin();
+});
+void begin();

@@ -1,0 +1,134 @@
+/** Whose surface it is: under the pointer while it hovers, pinned by a click, found by name. */
+
+import { type Atom, type Labels, nameOf } from "./api/structures";
+import { chainColors, elementColors } from "./scene/colors";
+import { palette } from "./scene/material";
+import type { Viewer } from "./scene/viewer";
+import { $, el, show } from "./ui/dom";
+
+/** A mesh of so many triangles is searched on a click alone: going through it would make the pointer stick. */
+const MOST_HOVERED = 1_500_000;
+
+export class Picker {
+  private labels: Labels | null = null;
+  private pinned: number | null = null;
+  private readonly tip = $("tip");
+  private readonly colour = $<HTMLSelectElement>("colour");
+  private pending: { x: number; y: number } | null = null;
+
+  constructor(private readonly viewer: Viewer, private readonly say: (words: string) => void) {
+    const canvas = viewer.canvas;
+    let down = { x: 0, y: 0, moved: true };
+    canvas.addEventListener("pointerdown", ({ offsetX: x, offsetY: y }) => {
+      down = { x, y, moved: false };
+      this.hover(null);
+    });
+    canvas.addEventListener("pointermove", ({ offsetX: x, offsetY: y, buttons, pointerType }) => {
+      if (Math.hypot(x - down.x, y - down.y) > 5) down.moved = true;
+      if (buttons === 0 && pointerType !== "touch") this.soon({ x, y });
+    });
+    canvas.addEventListener("pointerleave", () => this.hover(null));
+    canvas.addEventListener("click", ({ offsetX: x, offsetY: y }) => {
+      if (!down.moved) this.pin(this.under(x, y));
+    });
+    $("unpin").addEventListener("click", () => this.pin(null));
+    $("find-form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.find($<HTMLInputElement>("find").value);
+    });
+    this.colour.addEventListener("change", () => this.paint());
+  }
+
+  /** The labels of what is shown from now on; null: they are not there (yet). */
+  know(labels: Labels | null): void {
+    this.labels = labels;
+    this.pin(null, false);
+    this.hover(null);
+    this.colour.disabled = !labels;
+    this.paint();
+  }
+
+  /** Pins what is in the middle of the canvas. */
+  pinMiddle(): void {
+    this.pin(this.viewer.pick(0, 0)?.atom ?? null);
+  }
+
+  release(): void {
+    this.pin(null);
+  }
+
+  private find(text: string): void {
+    const atom = this.labels?.find(text);
+    if (!atom) return this.tell([el("span", {}, text.trim() ? `There is no residue “${text.trim()}”.` : "Type a residue, such as A LYS 15.")]);
+    this.pin(atom.row);
+    if (!this.viewer.face(atom.first, atom.last)) $("picked").append(el("span", {}, " It has no part in the surface."));
+  }
+
+  /** Hovers in the next frame: pointers move more often than that. */
+  private soon(place: { x: number; y: number }): void {
+    if (this.viewer.triangles > MOST_HOVERED || this.viewer.isTurning) return;
+    const waiting = this.pending !== null;
+    this.pending = place;
+    if (waiting) return;
+    requestAnimationFrame(() => {
+      const at = this.pending;
+      this.pending = null;
+      if (at) this.hover(this.under(at.x, at.y), at);
+    });
+  }
+
+  private under(x: number, y: number): number | null {
+    const { clientWidth, clientHeight } = this.viewer.canvas;
+    const hit = this.viewer.pick((2 * x) / clientWidth - 1, 1 - (2 * y) / clientHeight);
+    return hit && hit.atom >= 0 ? hit.atom : null;
+  }
+
+  private hover(row: number | null, at?: { x: number; y: number }): void {
+    if (row === null) {
+      this.pending = null;
+      show(this.tip, false);
+      return this.viewer.mark("hovered", null);
+    }
+    const atom = this.labels?.of(row) ?? null;
+    this.viewer.mark("hovered", atom ? [atom.first, atom.last] : [row, row]);
+    this.tip.textContent = atom ? nameOf(atom) : `Atom ${row + 1}`;
+    show(this.tip, true);
+    if (!at) return;
+    const left = Math.min(at.x + 14, this.viewer.canvas.clientWidth - this.tip.offsetWidth - 6);
+    this.tip.style.transform = `translate(${Math.max(4, left)}px, ${Math.max(4, at.y - 34)}px)`;
+  }
+
+  private pin(row: number | null, aloud = true): void {
+    const was = this.pinned;
+    this.pinned = row;
+    show($("unpin"), row !== null);
+    if (row === null) {
+      this.viewer.mark("pinned", null);
+      if (was !== null || !aloud) this.tell([el("span", { class: "hint" }, "Point at the surface; a click pins an atom.")]);
+      return;
+    }
+    const atom = this.labels?.of(row) ?? null;
+    this.viewer.mark("pinned", atom ? [atom.first, atom.last] : [row, row]);
+    this.tell(atom ? described(atom) : [el("strong", {}, `Atom ${row + 1} of the file`)]);
+    if (aloud) this.say(atom ? `Pinned ${nameOf(atom)}` : `Pinned atom ${row + 1}`);
+  }
+
+  private tell(nodes: Node[]): void {
+    $("picked").replaceChildren(...nodes);
+  }
+
+  private paint(): void {
+    const by = this.colour.value;
+    if (!this.labels || (by !== "chain" && by !== "element")) return this.viewer.colour(null, 0);
+    const { of, names } = this.labels.classes(by);
+    this.viewer.colour(palette(of, by === "chain" ? chainColors(names) : elementColors(names)), of.length);
+  }
+}
+
+function described(atom: Atom): Node[] {
+  const residue = `${atom.residue} ${atom.number}${atom.insertion}`;
+  return [
+    el("strong", {}, `${residue} · ${atom.atom}`),
+    el("span", {}, `chain ${atom.chain || "(blank)"}, ${atom.kind}, element ${atom.element}, atom ${atom.row + 1} of the file`),
+  ];
+}

@@ -1,0 +1,305 @@
+/** A surface on a canvas: drawn when something has changed, and at no other time. */
+
+import { Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, Vector3, WebGLRenderer } from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import type { Loaded } from "./load";
+import { SurfaceMaterial } from "./material";
+import { type Hit, pick, placeOf } from "./pick";
+
+export interface ViewerOptions {
+  /** The canvas lets what is behind it shine through. */
+  transparent?: boolean;
+  /** The context was lost (true), or is there again (false). */
+  onLost?: (lost: boolean) => void;
+  /** The turn has begun or ended. */
+  onTurn?: (turning: boolean) => void;
+}
+
+/** How long a turn lasts that nobody asked for, ms: one round. */
+const TURN = 14_000;
+/** Pixels of the screen per pixel of the page at most: more is not seen, and costs. */
+const MOST_PIXELS = 2;
+/** A frame that takes longer than this makes the picture coarser while it moves, ms. */
+const SLOW = 40;
+
+/** WebGL 2 on `canvas`, or null where the browser has none. */
+export function contextOf(canvas: HTMLCanvasElement, transparent: boolean): WebGL2RenderingContext | null {
+  const attributes = { antialias: true, alpha: transparent, premultipliedAlpha: true, powerPreference: "high-performance" as const, preserveDrawingBuffer: false };
+  return canvas.getContext("webgl2", attributes) as WebGL2RenderingContext | null;
+}
+
+export class Viewer {
+  readonly controls: OrbitControls;
+  private readonly renderer: WebGLRenderer;
+  private readonly scene = new Scene();
+  private readonly camera = new PerspectiveCamera(28, 1, 0.1, 1000);
+  private mesh: Mesh | null = null;
+  private loaded: Loaded | null = null;
+  private colors: { texture: DataTexture; atoms: number } | null = null;
+  private haze = new Color("#ffffff");
+  private plain = new Color("#5fb3a1");
+  private marked = { hovered: [-2, -2], pinned: [-2, -2] };
+  private frame = 0;
+  private lastFrame = 0;
+  private slowness = 0;
+  private turnUntil = 0;
+  private settle = 0;
+  private readonly size = new ResizeObserver(() => this.resize());
+  private readonly calm = matchMedia("(prefers-reduced-motion: reduce)");
+
+  /** Draws on `canvas`, whose context `gl` is. */
+  constructor(readonly canvas: HTMLCanvasElement, gl: WebGL2RenderingContext, private readonly options: ViewerOptions = {}) {
+    this.renderer = new WebGLRenderer({ canvas, context: gl, antialias: true, alpha: options.transparent ?? false });
+    this.renderer.outputColorSpace = SRGBColorSpace;
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.addEventListener("change", () => this.invalidate());
+    this.controls.addEventListener("start", () => this.turn(false));
+    canvas.addEventListener("webglcontextlost", () => options.onLost?.(true));
+    canvas.addEventListener("webglcontextrestored", () => {
+      options.onLost?.(false);
+      // A new context has forgotten what it clears with; everything else is sent to it again by itself.
+      this.clear();
+      this.invalidate();
+    });
+    this.size.observe(canvas);
+    this.resize();
+  }
+
+  /** Shows a surface. The view stays as it is, unless it is `fresh`: another molecule. Resolves in the frame after the one that shows it. */
+  show(loaded: Loaded, fresh: boolean): Promise<number> {
+    const first = !this.loaded;
+    this.mesh?.geometry.dispose();
+    (this.mesh?.material as SurfaceMaterial | undefined)?.dispose();
+    if (this.mesh) this.scene.remove(this.mesh);
+    const material = new SurfaceMaterial(loaded.geometry);
+    this.mesh = new Mesh(loaded.geometry, material);
+    this.mesh.matrixAutoUpdate = false;
+    this.mesh.matrix.copy(loaded.matrix);
+    this.mesh.frustumCulled = false;
+    this.loaded = loaded;
+    material.set("unit", loaded.sphere.radius / Math.max(radius(loaded), 1e-9));
+    this.scene.add(this.mesh);
+    this.dress();
+    if (fresh || first) this.reset();
+    else this.clip();
+    return this.drawn();
+  }
+
+  /** Resolves in the frame after the next one that is drawn, with the time then. */
+  drawn(): Promise<number> {
+    this.invalidate();
+    return new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(() => resolve(performance.now()))));
+  }
+
+  /** Looks at the whole from the front. */
+  reset(): void {
+    if (!this.loaded) return;
+    const { center, radius } = this.loaded.sphere;
+    const aspect = Math.min(1, this.camera.aspect);
+    const distance = (0.8 * radius) / Math.sin((this.camera.fov * Math.PI) / 360) / aspect;
+    this.controls.target.copy(center);
+    this.camera.up.set(0, 1, 0);
+    this.camera.position.copy(center).add(new Vector3(0.25, 0.2, 1).normalize().multiplyScalar(distance));
+    this.clip();
+    this.controls.update();
+    this.invalidate();
+  }
+
+  /** Turns the molecule, or stops. Without a word from the user it turns once, and not at all for those who want no motion. */
+  turn(on: boolean, asked = false): void {
+    const now = performance.now();
+    const was = this.isTurning;
+    this.turnUntil = !on || (this.calm.matches && !asked) ? 0 : asked ? Number.POSITIVE_INFINITY : now + TURN;
+    this.controls.autoRotate = this.isTurning;
+    this.controls.autoRotateSpeed = (60_000 / TURN);
+    if (was !== this.isTurning) this.options.onTurn?.(this.isTurning);
+    this.invalidate();
+  }
+
+  get isTurning(): boolean {
+    return this.turnUntil > performance.now();
+  }
+
+  /** Turns by angles (radians) and comes nearer by a factor: what the keyboard does. */
+  move(right: number, down: number, nearer = 1): void {
+    this.turn(false);
+    const offset = this.camera.position.clone().sub(this.controls.target);
+    const sphere = { r: offset.length(), theta: Math.atan2(offset.x, offset.z), phi: Math.acos(Math.max(-1, Math.min(1, offset.y / offset.length()))) };
+    sphere.theta -= right;
+    sphere.phi = Math.max(0.02, Math.min(Math.PI - 0.02, sphere.phi - down));
+    offset.setFromSphericalCoords(sphere.r / nearer, sphere.phi, sphere.theta);
+    this.camera.position.copy(this.controls.target).add(offset);
+    this.controls.update();
+    this.invalidate();
+  }
+
+  /** The atom under a point of the canvas, whose middle is (0, 0) and upper right corner (1, 1). */
+  pick(x: number, y: number): Hit | null {
+    if (!this.loaded) return null;
+    const caster = new Raycaster();
+    this.camera.updateMatrixWorld();
+    caster.setFromCamera(new Vector2(x, y), this.camera);
+    return pick(this.loaded.geometry, this.loaded.matrix, caster.ray);
+  }
+
+  /** Turns so that the surface of the atoms `first` to `last` faces the eye. False where they have none. */
+  face(first: number, last: number): boolean {
+    const place = this.loaded && placeOf(this.loaded.geometry, this.loaded.matrix, first, last);
+    if (!place || !this.loaded) return false;
+    this.turn(false);
+    const distance = this.camera.position.distanceTo(this.controls.target);
+    const direction = place.sub(this.loaded.sphere.center).normalize();
+    this.camera.position.copy(this.controls.target).addScaledVector(direction, distance);
+    this.controls.update();
+    this.invalidate();
+    return true;
+  }
+
+  /** Where a place of the scene is on the canvas, in the coordinates of `pick`. */
+  project(place: Vector3): { x: number; y: number } {
+    this.camera.updateMatrixWorld();
+    const { x, y } = place.clone().project(this.camera);
+    return { x, y };
+  }
+
+  /** Marks atoms by their rows, both included; null marks none. */
+  mark(which: "hovered" | "pinned", rows: [number, number] | null): void {
+    const next = rows ?? [-2, -2];
+    if (this.marked[which].every((row, i) => row === next[i])) return;
+    this.marked[which] = next;
+    this.dress();
+    this.invalidate();
+  }
+
+  /** Colours by atom; null: one colour. */
+  colour(texture: DataTexture | null, atoms: number): void {
+    this.colors?.texture.dispose();
+    this.colors = texture ? { texture, atoms } : null;
+    this.dress();
+    this.invalidate();
+  }
+
+  /** Colours of what is around, and of a surface without colours of its own. */
+  theme(background: string, plain: string): void {
+    this.haze = new Color(background);
+    this.plain = new Color(plain);
+    this.clear();
+    this.dress();
+    this.invalidate();
+  }
+
+  private clear(): void {
+    if (!this.options.transparent) this.renderer.setClearColor(this.haze, 1);
+  }
+
+  /** Triangles that are drawn. */
+  get triangles(): number {
+    return (this.loaded?.geometry.getIndex()?.count ?? 0) / 3;
+  }
+
+  /** Waits until what was drawn is there: for measuring, as drawing goes on beside the script. */
+  finish(): void {
+    const gl = this.renderer.getContext();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+  }
+
+  dispose(): void {
+    cancelAnimationFrame(this.frame);
+    this.size.disconnect();
+    this.controls.dispose();
+    this.mesh?.geometry.dispose();
+    this.colors?.texture.dispose();
+    this.renderer.dispose();
+  }
+
+  /** Draws in the next frame. */
+  invalidate(): void {
+    if (!this.frame) this.frame = requestAnimationFrame((now) => this.draw(now));
+  }
+
+  private draw(now: number): void {
+    this.frame = 0;
+    const turning = this.isTurning;
+    if (this.controls.autoRotate && !turning) this.turn(false);
+    const step = now - this.lastFrame;
+    this.lastFrame = now;
+    if (step < 500) this.slowness += 0.3 * (step - this.slowness);
+    if (turning) this.controls.update(Math.min(step, 100) / 1000);
+    // Without a GPU a moving picture of fewer pixels is better than a jerking one; at rest it is sharp again.
+    const moving = step < 250;
+    this.sharpen(moving && this.slowness > SLOW ? Math.max(0.5, Math.sqrt(SLOW / this.slowness)) : 1);
+    this.renderer.render(this.scene, this.camera);
+    clearTimeout(this.settle);
+    if (turning) this.invalidate();
+    else if (this.coarse < 1) this.settle = window.setTimeout(() => this.rest(), 200);
+  }
+
+  private coarse = 1;
+
+  private rest(): void {
+    this.lastFrame = 0;
+    this.slowness = 0;
+    this.invalidate();
+  }
+
+  private sharpen(coarse: number): void {
+    const next = Math.round(coarse * 4) / 4;
+    if (next === this.coarse) return;
+    this.coarse = next;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MOST_PIXELS) * next);
+  }
+
+  private resize(): void {
+    const { clientWidth, clientHeight } = this.canvas;
+    if (!clientWidth || !clientHeight) return;
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, MOST_PIXELS) * this.coarse);
+    this.renderer.setSize(clientWidth, clientHeight, false);
+    const before = Math.min(1, this.camera.aspect);
+    this.camera.aspect = clientWidth / clientHeight;
+    this.camera.updateProjectionMatrix();
+    // A picture that becomes narrower still shows the whole.
+    const nearer = before / Math.min(1, this.camera.aspect);
+    if (nearer !== 1) this.camera.position.sub(this.controls.target).multiplyScalar(nearer).add(this.controls.target);
+    this.clip();
+    // A canvas that has changed its size is empty until it is drawn.
+    cancelAnimationFrame(this.frame);
+    this.frame = 0;
+    this.renderer.render(this.scene, this.camera);
+    this.invalidate();
+  }
+
+  /** Near and far, around what there is. */
+  private clip(): void {
+    if (!this.loaded) return;
+    const { radius } = this.loaded.sphere;
+    this.controls.minDistance = radius * 0.25;
+    this.controls.maxDistance = radius * 14;
+    this.camera.near = radius * 0.02;
+    this.camera.far = radius * 18;
+    this.camera.updateProjectionMatrix();
+  }
+
+  /** Gives the surface its colours and marks. */
+  private dress(): void {
+    const material = this.mesh?.material as SurfaceMaterial | undefined;
+    if (!material || !this.mesh) return;
+    material.set("plain", this.plain);
+    material.set("haze", this.haze);
+    material.set("hovered", new Vector2(...this.marked.hovered));
+    material.set("pinned", new Vector2(...this.marked.pinned));
+    material.set("atoms", this.colors?.atoms ?? 0);
+    if (this.colors) material.set("palette", this.colors.texture);
+    this.mesh.onBeforeRender = () => {
+      const distance = this.camera.position.distanceTo(this.loaded?.sphere.center ?? this.controls.target);
+      const radius = this.loaded?.sphere.radius ?? 1;
+      material.set("depths", new Vector2(distance - 0.5 * radius, distance + radius));
+      material.uniformsNeedUpdate = true;
+    };
+  }
+}
+
+/** The radius in Å, where the file says its units. */
+function radius(loaded: Loaded): number {
+  const scale = Number(loaded.extras["unit_scale"] ?? 1);
+  return loaded.sphere.radius * (Number.isFinite(scale) ? scale : 1);
+}

@@ -1,0 +1,173 @@
+/** One parameter as a control: slider, menu, switch, boxes or text, whatever its schema asks for. */
+
+import type { Parameter } from "../api/schema";
+import { el, number } from "./dom";
+import { Scale } from "./scale";
+
+export interface Field {
+  readonly parameter: Parameter;
+  readonly element: HTMLElement;
+  /** The value that is set; none: the default. */
+  value: string | undefined;
+  /** What the service took where nothing was set. */
+  effective(value: string | number | undefined): void;
+}
+
+/** Called when a value is set or taken back (undefined); `live` while a slider is dragged. */
+export type Changed = (name: string, value: string | undefined, live: boolean) => void;
+
+export function field(parameter: Parameter, changed: Changed): Field {
+  const { kind } = parameter;
+  if (kind === "number" || kind === "integer") return numeric(parameter, changed);
+  if (kind === "choice") return menu(parameter, changed);
+  if (kind === "boolean") return toggle(parameter, changed);
+  return kind === "set" ? boxes(parameter, changed) : text(parameter, changed);
+}
+
+const title = (parameter: Parameter) => parameter.name.replaceAll("_", " ");
+
+/** What all have: a name, a description, a way back to the default. */
+function frame(parameter: Parameter, changed: Changed, group = false) {
+  const id = `p-${parameter.name}`;
+  const reset = el("button", { type: "button", class: "reset", hidden: true, "aria-label": `Reset ${title(parameter)} to its default`, title: "Back to the default" }, "↺");
+  const name = group ? el("span", { class: "name", id: `${id}-name` }, title(parameter)) : el("label", { class: "name", for: id }, title(parameter));
+  const head = el("div", { class: "field-head" }, name, reset);
+  const doc = el("p", { class: "doc", id: `${id}-doc` }, `${parameter.doc} Default: ${parameter.fallbackWords}.`);
+  const help = el("button", { type: "button", class: "help", "aria-label": `About ${title(parameter)}`, "aria-expanded": "false", "aria-controls": `${id}-doc` }, "?");
+  doc.hidden = true;
+  help.addEventListener("click", () => {
+    doc.hidden = !doc.hidden;
+    help.setAttribute("aria-expanded", String(!doc.hidden));
+  });
+  name.after(help);
+  const element = el("div", { class: "field", "data-parameter": parameter.name, ...(group ? { role: "group", "aria-labelledby": `${id}-name` } : {}) }, head, doc);
+  reset.addEventListener("click", () => changed(parameter.name, undefined, false));
+  const mark = (set: boolean) => {
+    reset.hidden = !set;
+    element.classList.toggle("is-set", set);
+  };
+  return { id, element, head, doc, mark };
+}
+
+function numeric(parameter: Parameter, changed: Changed): Field {
+  const { id, element, head, doc, mark } = frame(parameter, changed);
+  const whole = parameter.kind === "integer";
+  const scale = new Scale(...parameter.usual, whole);
+  const exact = el("input", { type: "number", id, class: "exact", step: "any", min: parameter.min, max: parameter.max, placeholder: parameter.fallback ?? "–", inputmode: whole ? "numeric" : "decimal" });
+  const slider = el("input", { type: "range", min: 0, max: scale.steps, step: 1, "aria-label": `${title(parameter)} (slider)`, "data-slider": parameter.name });
+  head.append(el("span", { class: "number" }, exact, el("span", { class: "unit", "aria-hidden": "true" }, parameter.unit)));
+  doc.before(slider);
+  if (parameter.unit) exact.setAttribute("aria-description", `in ${parameter.unit}`);
+  let [value, shown] = [undefined as string | undefined, parameter.fallback];
+  let dragging = false;
+  const say = () => {
+    const now = value ?? shown;
+    const known = now !== undefined && now !== "" && Number.isFinite(Number(now));
+    if (!dragging) slider.value = String(known ? scale.position(Number(now)) : Math.round(scale.steps / 2));
+    slider.setAttribute("aria-valuetext", known ? `${number(Number(now), 3)} ${parameter.unit}`.trim() : parameter.fallbackWords);
+    slider.classList.toggle("vague", !known);
+    if (document.activeElement !== exact) exact.value = value ?? "";
+    exact.placeholder = shown === undefined ? "–" : number(Number(shown), 3);
+    mark(value !== undefined);
+  };
+  slider.addEventListener("pointerdown", () => (dragging = true));
+  for (const end of ["pointerup", "pointercancel"]) slider.addEventListener(end, () => (dragging = false));
+  slider.addEventListener("input", () => changed(parameter.name, String(scale.value(slider.valueAsNumber)), dragging));
+  slider.addEventListener("change", () => {
+    dragging = false;
+    changed(parameter.name, String(scale.value(slider.valueAsNumber)), false);
+  });
+  exact.addEventListener("change", () => changed(parameter.name, exact.value.trim() === "" ? undefined : exact.value.trim(), false));
+  say();
+  return {
+    parameter,
+    element,
+    get value() {
+      return value;
+    },
+    set value(next) {
+      value = next;
+      if (document.activeElement === exact && exact.value !== (next ?? "")) exact.value = next ?? "";
+      say();
+    },
+    effective(next) {
+      shown = next === undefined ? parameter.fallback : String(next);
+      say();
+    },
+  };
+}
+
+function menu(parameter: Parameter, changed: Changed): Field {
+  const { id, element, head, mark } = frame(parameter, changed);
+  const select = el("select", { id, "aria-describedby": `${id}-doc` });
+  const named = parameter.fallback !== undefined && parameter.values.includes(parameter.fallback);
+  if (!named) select.append(el("option", { value: "" }, parameter.fallbackWords === "absent" ? "off" : parameter.fallbackWords));
+  for (const word of parameter.values) select.append(el("option", { value: word }, word));
+  head.append(select);
+  select.addEventListener("change", () => changed(parameter.name, select.value === "" || select.value === parameter.fallback ? undefined : select.value, false));
+  let value: string | undefined;
+  const say = () => {
+    select.value = value ?? (named ? (parameter.fallback ?? "") : "");
+    mark(value !== undefined);
+  };
+  say();
+  return { parameter, element, get value() { return value; }, set value(next) { value = next; say(); }, effective: () => undefined };
+}
+
+function toggle(parameter: Parameter, changed: Changed): Field {
+  const { id, element, head, mark } = frame(parameter, changed);
+  const box = el("input", { type: "checkbox", id, role: "switch", "aria-describedby": `${id}-doc` });
+  head.append(box);
+  const standard = parameter.fallback === "true";
+  box.addEventListener("change", () => changed(parameter.name, box.checked === standard ? undefined : String(box.checked), false));
+  let value: string | undefined;
+  const say = () => {
+    box.checked = value === undefined ? standard : value === "true";
+    mark(value !== undefined);
+  };
+  say();
+  return { parameter, element, get value() { return value; }, set value(next) { value = next; say(); }, effective: () => undefined };
+}
+
+function boxes(parameter: Parameter, changed: Changed): Field {
+  const { element, mark } = frame(parameter, changed, true);
+  const standard = parameter.fallbackWords.split(",").filter((word) => parameter.values.includes(word));
+  const inputs = parameter.values.map((word) => el("input", { type: "checkbox", value: word }));
+  element.append(el("div", { class: "chips" }, ...inputs.map((input) => el("label", { class: "chip" }, input, el("span", {}, input.value)))));
+  const taken = () => inputs.filter((input) => input.checked).map((input) => input.value);
+  for (const input of inputs) {
+    input.addEventListener("change", () => {
+      const words = taken();
+      changed(parameter.name, words.length === 0 || words.join() === standard.join() ? undefined : words.join(","), false);
+    });
+  }
+  let value: string | undefined;
+  const say = () => {
+    const words = value?.split(",") ?? standard;
+    for (const input of inputs) input.checked = words.includes(input.value);
+    mark(value !== undefined);
+  };
+  say();
+  return { parameter, element, get value() { return value; }, set value(next) { value = next; say(); }, effective: () => undefined };
+}
+
+function text(parameter: Parameter, changed: Changed): Field {
+  const { id, element, head, mark } = frame(parameter, changed);
+  const input = el("input", { type: "text", id, class: "wide", autocomplete: "off", spellcheck: "false", placeholder: parameter.fallbackWords, "aria-describedby": `${id}-doc` });
+  head.append(input);
+  input.addEventListener("change", () => changed(parameter.name, input.value.trim() === "" ? undefined : input.value.trim(), false));
+  let value: string | undefined;
+  const say = () => {
+    input.value = value ?? "";
+    mark(value !== undefined);
+  };
+  return {
+    parameter,
+    element,
+    get value() { return value; },
+    set value(next) { value = next; say(); },
+    effective(next) {
+      input.placeholder = next === undefined ? parameter.fallbackWords : String(next);
+    },
+  };
+}

@@ -1,0 +1,39 @@
+/** A refusal, in the words of the service, and what can be done about it. */
+
+import { type Problem } from "../api/problem";
+import { el } from "./dom";
+
+export interface Remedies {
+  /** Takes a spacing that fits. */
+  takeResolution(resolution: number): void;
+  /** Takes a parameter back to its default. */
+  reset(parameter: string): void;
+  /** Tries again. */
+  again(): void;
+}
+
+export function problem(home: HTMLElement, { document, numbers }: Problem, remedies: Remedies): void {
+  const act = (words: string, action: () => void, primary = false) => {
+    const button = el("button", { type: "button", class: primary ? "primary" : "" }, words);
+    button.addEventListener("click", () => {
+      home.hidden = true;
+      action();
+    });
+    return button;
+  };
+  const actions: HTMLElement[] = [];
+  const suggested = document.suggested_resolution;
+  if (typeof suggested === "number") actions.push(act(`Take ${suggested} Å`, () => remedies.takeResolution(suggested), true));
+  const parameter = document.parameter;
+  if (typeof parameter === "string") actions.push(act(`Reset ${parameter.replaceAll("_", " ")}`, () => remedies.reset(parameter)));
+  if (document.status === 0 || document.status >= 500 || document.status === 429) actions.push(act("Try again", () => remedies.again()));
+  actions.push(act("Close", () => undefined));
+  const list = numbers.filter(([name]) => name !== "suggested resolution").flatMap(([name, value]) => [el("dt", {}, name), el("dd", {}, value)]);
+  home.replaceChildren(
+    el("strong", {}, document.title),
+    ...(document.detail ? [el("p", {}, document.detail)] : []),
+    ...(list.length ? [el("dl", {}, ...list)] : []),
+    el("div", { class: "row" }, ...actions),
+  );
+  home.hidden = false;
+}
