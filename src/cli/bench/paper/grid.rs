@@ -2,6 +2,8 @@
 
 /// How far off the number of cubes may be.
 pub(super) const TOLERANCE: f64 = 0.01;
+/// What is not worth a further look.
+const CLOSE: f64 = 0.002;
 
 /// A spacing, and the number of cubes there.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -11,7 +13,7 @@ pub(super) struct Grid {
     pub(super) cubes: u64,
 }
 
-/// The spacing whose number of cubes comes closest to `cubes`. `cubes_at` falls with the spacing, in steps: whole layers of
+/// A spacing whose number of cubes is that of `cubes`, as closely as there is one. `cubes_at` falls with the spacing, in steps: whole layers of
 /// cubes come and go.
 ///
 /// # Errors
@@ -24,11 +26,15 @@ pub(super) fn for_cubes(cubes: u64, cubes_at: &dyn Fn(f64) -> Result<u64, String
     }
     let off = |found: u64| (found as f64 / cubes as f64 - 1.0).abs();
     let mut best: Option<Grid> = None;
-    for step in -100..=100_i32 {
+    // From there outwards, until it is close enough.
+    for step in (0..=100_i32).flat_map(|step| [step, -step]) {
         let spacing = coarse * (1.0 + 3e-4 * f64::from(step));
         let found = cubes_at(spacing)?;
         if best.is_none_or(|best| off(found) < off(best.cubes)) {
             best = Some(Grid { spacing, cubes: found });
+        }
+        if best.is_some_and(|best| off(best.cubes) <= CLOSE) {
+            break;
         }
     }
     best.filter(|best| off(best.cubes) <= TOLERANCE).ok_or_else(|| format!("no spacing gives {cubes} cubes within 1 %"))

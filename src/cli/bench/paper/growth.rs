@@ -101,11 +101,9 @@ fn size(
     let start = Instant::now();
     runner.once(spheres, params)?;
     let once = start.elapsed().as_secs_f64().max(1e-6);
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 1 and 31")]
-    let runs = (PATIENCE / once).clamp(1.0, 31.0) as usize;
-    let warm_up = usize::from(runs > 1);
     // Few runs of many seconds each have no need of more warmth than the one before.
-    timed(runner, spheres, params, [warm_up, runs.max(plan.runs.min(3))])
+    let runs = (1..plan.runs).take_while(|n| *n as f64 * once < PATIENCE).count() + 1;
+    timed(runner, spheres, params, [usize::from(runs > 1), runs])
 }
 
 #[cfg(test)]

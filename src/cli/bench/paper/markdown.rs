@@ -99,7 +99,8 @@ fn what(row: &Row) -> String {
 fn cell(cell: &Cell) -> String {
     match (cell.seconds(), &cell.not_run) {
         (Some(s), _) => seconds(s),
-        (None, why) => format!("not run: {}", why.as_deref().unwrap_or("unknown").replace('|', "/")),
+        (None, Some(why)) if why != "not asked for" => format!("not run: {}", why.replace('|', "/")),
+        (None, _) => "not run".to_owned(),
     }
 }
 

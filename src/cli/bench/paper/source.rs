@@ -10,6 +10,7 @@ use molmesh::surface::Spheres;
 use super::super::super::error::CliError;
 use super::entries::Entry;
 use super::standin;
+use super::text::MARK;
 
 /// The structure that is built in.
 pub(super) const SAMPLE: &[u8] = include_bytes!("../../../../samples/4pti.pdb");
@@ -45,14 +46,14 @@ pub(super) fn find(entry: &Entry, folder: Option<&Path>) -> Result<Found, CliErr
     if entry.id == "1BIJ"
         && let Some(path) = file(folder, "2HHB")?
     {
-        let source = format!("stand-in: 2HHB, file {}", name(&path));
+        let source = format!("{MARK}: 2HHB, file {}", name(&path));
         return Ok(Found { spheres: read(&path)?, source, stand_in: true });
     }
     let made = standin::sides(entry.cubes[0])
         .ok_or_else(|| format!("{} cubes are no box", entry.cubes[0]))
         .and_then(|sides| standin::spheres(entry.atoms, sides))
         .map_err(CliError::Internal)?;
-    Ok(Found { spheres: made, source: "stand-in: made up".to_owned(), stand_in: true })
+    Ok(Found { spheres: made, source: format!("{MARK}: made up"), stand_in: true })
 }
 
 /// The atoms of the built-in sample.

@@ -43,7 +43,7 @@ pub(super) fn row(row: &Row) -> String {
     text = text.trim_end_matches(" |").to_owned() + "\n";
     let mut note = |what: String| _ = writeln!(text, "           {what}");
     if row.stand_in {
-        note(format!("{MARK}: {}", row.source));
+        note(row.source.clone());
     } else if row.atoms != row.paper_atoms {
         note(format!("{}; the paper counts {} atoms", row.source, row.paper_atoms));
     }

@@ -13,7 +13,7 @@ use super::{grown, label};
 /// Colours of stages, from below.
 const COLOURS: [&str; 8] = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999", "#117733"];
 /// Least atoms of a bar: fewer are latency, which has a figure of its own.
-const LEAST: usize = 1_000;
+const LEAST: usize = 10_000;
 
 /// Time an atom by stage, for each size of a program's series: the last results that have one.
 pub(super) fn stages(documents: &[&Document], program: &str) -> Option<String> {

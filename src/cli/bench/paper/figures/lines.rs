@@ -12,7 +12,7 @@ use super::super::fit::Fit;
 
 /// Pixels of a figure: as wide as a page's text, and what is left for names at its right.
 const SIZE: [f64; 2] = [860.0, 460.0];
-const NAMES: f64 = 290.0;
+const NAMES: f64 = 300.0;
 const TEXT: u32 = 12;
 
 /// A chart over atoms.
@@ -78,16 +78,16 @@ impl Chart {
         }
         let all = || self.lines.iter().flat_map(|line| line.points.iter().copied());
         let edge = |of: fn(f64, f64) -> f64, start: f64, axis: fn((f64, f64)) -> f64| all().map(axis).fold(start, of);
-        let (left, right) = (edge(f64::min, f64::MAX, |p| p.0), edge(f64::max, 0.0, |p| p.0));
+        let (first, right) = (edge(f64::min, f64::MAX, |p| p.0), edge(f64::max, 0.0, |p| p.0));
         let (low, high) = (edge(f64::min, f64::MAX, |p| p.1), edge(f64::max, 0.0, |p| p.1));
-        if all().next().is_none() || low <= 0.0 || left <= 0.0 {
+        if all().next().is_none() || low <= 0.0 || first <= 0.0 {
             return None;
         }
         let layout = framed(Layout::auto_from_plots(&plots), &self.title)
             .with_x_label("atoms")
             .with_y_label(self.y)
             .with_log_scale()
-            .with_x_axis_min(left)
+            .with_x_axis_min(10_f64.powf(first.log10().floor()))
             .with_x_axis_max(right)
             .with_y_axis_min(10_f64.powf(low.log10().floor()))
             .with_y_axis_max(10_f64.powf(high.log10().ceil()))

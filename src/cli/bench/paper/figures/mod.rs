@@ -6,6 +6,7 @@
 mod bars;
 mod lines;
 
+use super::entries::{ENTRIES, Entry};
 use super::fit;
 use super::result::{Cell, Document, Growth, Point, Row, Series, Timed};
 use super::text::fits;
@@ -62,8 +63,9 @@ fn tables(documents: &[&Document], gpu: bool) -> Chart {
     let side = |row: &Row| if gpu { row.gpu.clone() } else { row.cpu.clone() };
     let rows = |d: &Document| -> Vec<Row> { d.rows.iter().filter(|row| row.kernel == "gaussian").cloned().collect() };
     let mut lines: Vec<Line> = Vec::new();
-    if let Some(document) = documents.iter().find(|d| !rows(d).is_empty()) {
-        let points = rows(document).iter().map(|row| (row.paper_atoms as f64, side(row).paper_seconds)).collect();
+    if documents.iter().any(|d| !rows(d).is_empty()) {
+        let seconds = |entry: &Entry| if gpu { entry.gpu[0] } else { entry.cpu[0] };
+        let points = ENTRIES.iter().map(|entry| (entry.atoms as f64, seconds(entry))).collect();
         let card = if gpu { "GeForce GTX 280" } else { "Core 2 Quad Q9550" };
         lines.push(Line::new(format!("the paper, {card}"), PAPERS, points));
     }
@@ -83,7 +85,7 @@ fn tables(documents: &[&Document], gpu: bool) -> Chart {
             let name = label(program, document);
             lines.extend(some(Line::new(name.clone(), colour(program), of(&Cell::seconds, ours)).beside(&lines)));
             let device = of(&Cell::device_seconds, ours);
-            lines.extend(some(Line::new(format!("{name}: device alone"), colour(program), device).dotted()));
+            lines.extend(some(Line::new(format!("{name}: stages"), colour(program), device).dotted()));
         }
     }
     let title = if gpu { "The paper's structures on a GPU" } else { "The paper's structures on a CPU" };
@@ -105,7 +107,7 @@ fn growth(documents: &[&Document], gpu: bool) -> Chart {
             let all = points(series, &|t| Some(t.seconds.median));
             lines.extend(some(Line::new(name.clone(), colour, all).beside(&lines).fitted(fit("time"))));
             let device = points(series, &|t| t.device_seconds.map(|s| s.median));
-            let device = Line::new(format!("{name}: device alone"), colour, device).dotted();
+            let device = Line::new(format!("{name}: stages"), colour, device).dotted();
             lines.extend(some(device.fitted(fit("device time"))));
         }
     }
@@ -152,7 +154,6 @@ fn some(line: Line) -> Option<Line> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::entries::ENTRIES;
     use super::super::result::tests::made_up;
     use super::*;
 
@@ -230,11 +231,11 @@ mod tests {
             ("paper-cpu.svg", "the paper, Core 2 Quad Q9550"),
             ("paper-cpu.svg", "sequential reference"),
             ("paper-gpu.svg", "the paper, GeForce GTX 280"),
-            ("paper-gpu.svg", "ours, A Card: device alone"),
+            ("paper-gpu.svg", "ours, A Card: stages"),
             ("growth-cpu.svg", "sequential reference ∝ n^2.00"),
             ("growth-cpu.svg", "native, 2 threads ∝ n^1.00"),
             ("growth-gpu.svg", "2010 program, A Card ∝ n^1.00"),
-            ("growth-gpu.svg", "ours, A Card: device alone ∝ n^1.00"),
+            ("growth-gpu.svg", "ours, A Card: stages ∝ n^1.00"),
             ("memory.svg", "native, 2 threads: host"),
             ("memory.svg", "ours, A Card: device"),
             ("stages-cpu.svg", "emit"),
