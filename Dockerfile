@@ -82,7 +82,9 @@ HEALTHCHECK --interval=10s --timeout=4s --start-period=30s --retries=3 CMD ["mol
 # SIGTERM, the default, drains; see server.drain_timeout_ms.
 STOPSIGNAL SIGTERM
 ENTRYPOINT ["molmesh"]
-CMD ["serve", "--config", "/etc/molmesh/molmesh.toml"]
+# Every command in the image reads it: `docker run … molmesh:cpu doctor` examines what the service would be.
+ENV MOLMESH_CONFIG=/etc/molmesh/molmesh.toml
+CMD ["serve"]
 
 # ----------------------------------------------------------------------------------------------- for NVIDIA's GPUs
 # NVIDIA's Vulkan driver opens libEGL.so.1 before anything else and does not start without it, display or none. Debian's

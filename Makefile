@@ -8,7 +8,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test tools web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench release clean
+.PHONY: help run test tools web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## This list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -71,6 +71,13 @@ tests: ## The tests alone
 
 bench: ## The benchmarks
 	$(CARGO) bench
+
+gallery: release ## Draw docs/gallery anew; DATA=FOLDER holds the structures, named by their PDB ids
+	docs/gallery/make.py $(if $(DATA),--data $(DATA))
+
+# The results of other machines lie in docs/results/paper too: `molmesh bench paper --out FOLDER` writes them.
+figures: ## The tables of docs/paper.md and its figures, from docs/results/paper
+	$(CARGO) run --bin molmesh -- bench figures docs/results/paper --out docs/figures --page docs/paper.md
 
 release: web-if-possible ## The optimised binary: target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh

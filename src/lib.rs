@@ -1,10 +1,11 @@
 //! molmesh: molecules in, proven surface meshes out.
 //!
 //! The crate is a meshing core ([`surface`]) with rooms around it: [`structure`] reads files into spheres,
-//! [`formats`] writes meshes, [`pipeline`] ties the three together, and the `server` feature adds the HTTP
-//! service. `ARCHITECTURE.md` is the map; lengths are ångström everywhere.
+//! [`formats`] writes meshes, [`picture`] draws them, [`pipeline`] ties these together, and the `server` feature
+//! adds the HTTP service. `ARCHITECTURE.md` is the map; lengths are ångström everywhere.
 
 pub mod formats;
+pub mod picture;
 pub mod pipeline;
 pub mod structure;
 pub mod surface;

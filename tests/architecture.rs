@@ -53,10 +53,11 @@ const NOT_CORE: &[&str] = &[
     "ruzstd",
 ];
 
-/// `surface ← gpu, structure, formats ← pipeline ← jobs ← http`; the binary may name everything.
+/// `surface ← picture ← gpu; surface ← structure, formats, picture ← pipeline ← jobs ← http`; the binary may name everything.
 const ROOMS: &[Room] = &[
     Room { name: "surface", rooms: &[], crates: NOT_CORE },
-    Room { name: "gpu", rooms: &[("surface", Any)], crates: SERVICE },
+    Room { name: "picture", rooms: &[("surface", Any)], crates: NOT_CORE },
+    Room { name: "gpu", rooms: &[("surface", Any), ("picture", Any)], crates: SERVICE },
     Room {
         name: "structure",
         rooms: &[("surface", Only(&["Spheres", "SurfaceError", "spheres"]))],
@@ -67,10 +68,14 @@ const ROOMS: &[Room] = &[
         rooms: &[("surface", Only(&["Mesh", "MeshPart", "MeshSink", "SinkFailed", "Vertices", "quantize"]))],
         crates: &["tokio", "axum", "tower", "hyper", "tracing", "wgpu", "pdbtbx", "clap"],
     },
-    Room { name: "pipeline", rooms: &[("surface", Any), ("structure", Any), ("formats", Any)], crates: SERVICE },
+    Room {
+        name: "pipeline",
+        rooms: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any)],
+        crates: SERVICE,
+    },
     Room {
         name: "config",
-        rooms: &[("surface", Any), ("structure", Any), ("formats", Any), ("pipeline", Any)],
+        rooms: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any), ("pipeline", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "wgpu", "clap"],
     },
     Room { name: "telemetry", rooms: &[("config", Any)], crates: &["axum", "tower", "hyper", "wgpu", "clap"] },
@@ -107,6 +112,7 @@ const ROOMS: &[Room] = &[
             ("surface", Any),
             ("structure", Any),
             ("formats", Any),
+            ("picture", Any),
             ("pipeline", Any),
             ("config", Any),
             ("telemetry", Any),
@@ -120,6 +126,7 @@ const ROOMS: &[Room] = &[
             ("surface", Any),
             ("structure", Any),
             ("formats", Any),
+            ("picture", Any),
             ("pipeline", Any),
             ("config", Any),
             ("telemetry", Any),
@@ -511,6 +518,8 @@ fn control_wrong_edges_are_seen() {
         ("src/formats/glb.rs", "use crate::surface::Backend;"),
         ("src/formats/glb.rs", "use crate::surface::{\n    Mesh,\n    Measures,\n};"),
         ("src/jobs/pool.rs", "use crate::gpu::Device;"),
+        ("src/picture/cpu.rs", "use crate::formats::Format;"),
+        ("src/picture/cpu.rs", "fn f(_: wgpu::Device) {}"),
         ("src/jobs/pool.rs", "use crate::http::problem;"),
         ("src/jobs/pool.rs", "fn f() -> axum::Router { loop {} }"),
         ("src/http/router.rs", "let x = r#\"a \"quoted\" b\"#; let x = crate::gpu::unavailable();"),

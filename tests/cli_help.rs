@@ -25,6 +25,7 @@ fn snapshot(name: &str, args: &[&str]) {
 fn help_is_stable() {
     snapshot("molmesh", &["--help"]);
     snapshot("mesh", &["mesh", "--help"]);
+    snapshot("render", &["render", "--help"]);
     snapshot("serve", &["serve", "--help"]);
     snapshot("doctor", &["doctor", "--help"]);
     snapshot("config", &["config", "--help"]);

@@ -37,6 +37,52 @@ fn it_stops_when_told_and_says_nothing_bad() {
 }
 
 #[test]
+fn lines_of_the_log_say_whose_they_are() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--log", "json", "--set", "log.filter=info"]);
+    let pdb = folder.file("rod.pdb", cli_support::rod());
+    let trace = "0af7651916cd43dd8448eb211c80319c";
+    let ask = |id: &str, more: &[&str]| {
+        let answer = Command::new("curl")
+            .args(["-sS", "-H", &format!("X-Request-Id: {id}")])
+            .args(["-H", &format!("traceparent: 00-{trace}-b7ad6b7169203331-01")])
+            .args(more)
+            .output();
+        serde_json::from_slice::<serde_json::Value>(&answer.unwrap().stdout).unwrap()
+    };
+    let job = ask(
+        "asked-for-it",
+        &[
+            "-H",
+            "Prefer: respond-async",
+            "--data-binary",
+            &format!("@{}", pdb.display()),
+            &format!("http://{}/v1/meshes", service.addr),
+        ],
+    );
+    let job = job["jobID"].as_str().unwrap().to_owned();
+    let done = ask("looked-at-it", &[&format!("http://{}/v1/jobs/{job}?wait=30", service.addr)]);
+    assert_eq!(done["status"], "successful", "{done}");
+    let (code, log) = service.stop("TERM");
+    assert_eq!(code, Some(0), "{log}");
+
+    let lines: Vec<serde_json::Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let of = |key: &str, value: &str| -> Vec<_> { lines.iter().filter(|l| l["span"][key] == value).collect() };
+    for id in ["asked-for-it", "looked-at-it"] {
+        let answered: Vec<_> = of("request_id", id).into_iter().filter(|l| l["message"] == "answered").collect();
+        assert_eq!(answered.len(), 1, "one line a request\n{log}");
+        assert_eq!(answered[0]["span"]["trace_id"], trace, "{log}");
+        assert!(answered[0]["ms"].is_number() && answered[0]["status"].is_u64(), "{}", answered[0]);
+    }
+    // The job's own lines name the request that asked for it, not the one that looked.
+    let of_job = of("job_id", &job);
+    assert!(!of_job.is_empty(), "no line of the job\n{log}");
+    for line in of_job {
+        assert_eq!((&line["span"]["request_id"], &line["span"]["trace_id"]), (&"asked-for-it".into(), &trace.into()));
+    }
+}
+
+#[test]
 fn flags_reach_the_service() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--set", "limits.atoms=5", "--backend", "reference"]);

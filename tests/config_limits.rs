@@ -35,6 +35,11 @@ const ROWS: &[Row] = &[
     ("limits.mesh_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
     ("limits.output_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
     ("limits.memory_bytes", "memory-full", "http_limits::memory_is_shared_and_limited"),
+    (
+        "limits.picture_side",
+        "picture-too-large",
+        "http_pictures::pictures_are_limited_before_anything_is_done_for_them",
+    ),
     ("jobs.workers", "molmesh_queue_depth", "http_limits::a_full_queue_refuses_at_once_and_says_when_to_come_back"),
     ("jobs.queue", "queue-full", "http_limits::a_full_queue_refuses_at_once_and_says_when_to_come_back"),
     ("jobs.deliveries", "too-many-deliveries", "http_limits::slow_takers_cannot_use_up_the_threads"),

@@ -56,7 +56,8 @@ fn the_recipe_and_its_configuration_agree() {
     assert_eq!(cpu.last("VOLUME").map(Path::new), Some(config.server.data_dir.as_path()));
     let copied = format!("{} /etc/molmesh/molmesh.toml", CONFIGURATIONS[0]);
     assert!(cpu.all("COPY").any(|line| *line == copied), "the configuration is not copied");
-    assert_eq!(cpu.last("CMD").unwrap(), r#"["serve", "--config", "/etc/molmesh/molmesh.toml"]"#);
+    assert_eq!(cpu.last("CMD").unwrap(), r#"["serve"]"#);
+    assert_eq!(cpu.last("ENV").unwrap(), "MOLMESH_CONFIG=/etc/molmesh/molmesh.toml");
     assert_eq!(cpu.last("ENTRYPOINT").unwrap(), r#"["molmesh"]"#);
     // The check asks the address that the configuration listens at, unless told otherwise.
     assert!(cpu.last("HEALTHCHECK").unwrap().ends_with(r#"CMD ["molmesh", "healthcheck"]"#));

@@ -189,7 +189,7 @@ fn obj_gives_coordinates_back_to_its_decimals() {
 #[test]
 fn lengths_are_known_before_a_byte_is_written() {
     for (name, mesh) in cases() {
-        for format in Format::ALL {
+        for format in Format::MESHES {
             let len = encode(format, &mesh, &meta()).len() as u64;
             let (exact, bound) = (
                 formats::encoded_len(format, &mesh, &meta()),
@@ -261,7 +261,7 @@ fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
 fn bytes_do_not_depend_on_the_number_of_threads() {
     // More vertices and triangles than one task looks at.
     let mesh = dressed(icosphere(7, 20.0, [0.0; 3], false), 100_000);
-    for format in Format::ALL {
+    for format in Format::MESHES {
         let with = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| encode(format, &mesh, &meta()))
@@ -295,7 +295,7 @@ impl Write for Meter {
 #[test]
 fn columns_go_out_whole_and_conversions_in_large_blocks() {
     let mesh = icosphere(7, 20.0, [0.0; 3], false);
-    for format in Format::ALL {
+    for format in Format::MESHES {
         let mut meter = Meter { room: usize::MAX, calls: Vec::new() };
         formats::write(format, &mesh, &meta(), &mut meter).unwrap();
         let (total, largest) = (meter.calls.iter().sum::<usize>(), *meter.calls.iter().max().unwrap());
@@ -313,7 +313,7 @@ fn columns_go_out_whole_and_conversions_in_large_blocks() {
 #[test]
 fn a_full_disk_is_an_error_wherever_it_happens() {
     let mesh = dressed(torus(20, 20), 900);
-    for format in Format::ALL {
+    for format in Format::MESHES {
         let whole = encode(format, &mesh, &meta()).len();
         for room in [0, 10, 500, whole / 2, whole - 1] {
             let mut meter = Meter { room, calls: Vec::new() };
@@ -343,7 +343,7 @@ fn broken_meshes_are_refused_before_the_first_byte() {
         ("normal 4 holds inf", broken(|m| m.normals[4][0] = f32::INFINITY)),
         ("centre 1 holds inf", broken(|m| m.centre[1] = f64::INFINITY)),
     ];
-    for format in Format::ALL {
+    for format in Format::MESHES {
         for (words, mesh) in &cases {
             let mut bytes = Vec::new();
             let error = formats::write(format, mesh, &meta(), &mut bytes).unwrap_err();
@@ -359,7 +359,7 @@ fn broken_meshes_are_refused_before_the_first_byte() {
 #[test]
 fn only_gltf_refuses_atom_indices_that_floats_cannot_hold() {
     let mesh = dressed(torus(4, 5), 16_777_217);
-    for format in Format::ALL {
+    for format in Format::MESHES {
         let encoder = Encoder::new(format, &mesh, &meta());
         match format {
             Format::Glb | Format::Gltf => {
@@ -404,7 +404,7 @@ proptest! {
 #[test]
 fn trusted_meshes_give_the_same_bytes() {
     for (name, mesh) in cases() {
-        for format in Format::ALL {
+        for format in Format::MESHES {
             let mut bytes = Vec::new();
             Encoder::trusting(format, &mesh, &meta()).unwrap().write(&mut bytes).unwrap();
             assert!(bytes == encode(format, &mesh, &meta()), "{name} as {format}");
@@ -423,7 +423,7 @@ fn trust_in_a_broken_mesh_never_panics() {
         not_finite.positions[1][2] = f32::NAN;
         let mut short = torus(n, 300);
         short.normals.edit().pop();
-        for format in Format::ALL {
+        for format in Format::MESHES {
             let refused = |mesh: &Mesh| {
                 let encoder = Encoder::trusting(format, mesh, &meta());
                 if let Ok(encoder) = &encoder {

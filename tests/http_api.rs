@@ -111,7 +111,9 @@ fn formats_are_negotiated() {
         ("", "text/html,application/xhtml+xml,*/*;q=0.8", 200, "model/gltf-binary"),
         ("?format=obj", "model/stl", 200, "model/obj"),
         ("?format=stl", "text/html", 200, "model/stl"),
-        ("", "image/png", 406, "application/problem+json"),
+        ("", "image/png", 200, "image/png"),
+        ("?format=png", "model/stl", 200, "image/png"),
+        ("", "image/webp", 406, "application/problem+json"),
         ("", "application/json", 406, "application/problem+json"),
     ] {
         let headers: &[(&str, &str)] = if accept.is_empty() { &[] } else { &[("accept", accept)] };
@@ -119,7 +121,7 @@ fn formats_are_negotiated() {
         assert_eq!((reply.status, reply.header("content-type")), (status, Some(media_type)), "{query} {accept}");
         assert!(reply.complete);
         if status == 406 {
-            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 5);
+            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 6);
         } else {
             assert!(reply.body.len() > 1000);
         }

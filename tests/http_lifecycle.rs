@@ -209,7 +209,12 @@ fn an_address_in_use_is_named_with_its_key() {
     let server = running(&backend);
     let mut config = molmesh::config::Config::default();
     config.server.listen = server.addr;
-    let chosen = molmesh::http::Chosen { backend, reason: String::new(), devices: Vec::new() };
+    let chosen = molmesh::http::Chosen {
+        backend,
+        reason: String::new(),
+        drawer: molmesh::picture::Drawer::cpu("a test says so"),
+        devices: Vec::new(),
+    };
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let error = runtime.block_on(molmesh::http::Server::bind(config, chosen)).err().unwrap().to_string();
     assert!(error.contains("server.listen") && error.contains(&server.addr.to_string()), "{error}");

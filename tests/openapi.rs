@@ -96,7 +96,7 @@ fn the_parameters_are_those_of_the_table() {
     let parameters = DESCRIPTION["paths"]["/v1/meshes"]["post"]["parameters"].as_array().unwrap();
     let schema = |name: &str| &parameters.iter().find(|p| p["name"] == name).unwrap()["schema"];
     assert_eq!((&schema("resolution")["type"], &schema("resolution")["default"]), (&json!("number"), &json!(0.5)));
-    assert_eq!(schema("format")["enum"].as_array().unwrap().len(), 5);
+    assert_eq!(schema("format")["enum"].as_array().unwrap().len(), 6);
 }
 
 #[test]

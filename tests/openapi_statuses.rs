@@ -89,7 +89,7 @@ fn uploads(seen: &Seen, server: &Running) {
     let post = ("POST", "/v1/meshes");
     seen.expect(200, addr, ("POST", "/v1/meshes?report=json"), &[], SAMPLE);
     seen.expect(202, addr, post, &[LATER], SAMPLE);
-    seen.expect(406, addr, post, &[("accept", "image/png")], SAMPLE);
+    seen.expect(406, addr, post, &[("accept", "image/webp")], SAMPLE);
     // An estimate is no mesh: whatever is asked for, it is JSON.
     seen.expect(200, addr, ("POST", "/v1/estimate"), &[("accept", "application/json")], SAMPLE);
     for path in &UPLOADS[..2] {

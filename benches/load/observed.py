@@ -6,8 +6,11 @@
 Three servers of the same binary run side by side on data of their own: `off` (no metrics, no traces), `metrics` (read every
 second), `all` (metrics, and every span sent to a collector that this script plays). They are asked in turn, round by round, one
 at a time, by `--clients` clients on connections that are kept; each figure is the median of the rounds, each ratio the
-median of the ratios within a round. Two kinds of requests: meshes that must be computed (a fresh remark each, at a coarse
-grid, so that what surrounds the computing counts), and a mesh that lies in memory.
+median of the ratios within a round. Three kinds of requests: meshes that must be computed at the default grid (a fresh
+remark each), the same at a coarse grid, so that what surrounds the computing counts, and a mesh that lies in memory.
+
+The clients and the collector share the machine with the servers, and cost more than what is looked for. So beside the
+requests a second there is the server's own processor time a request: what a server that has its cores to itself loses.
 """
 
 import argparse
@@ -69,6 +72,12 @@ class Service:
                 return
             time.sleep(1)
 
+    def cpu(self):
+        """Processor seconds so far."""
+        with open(f"/proc/{self.process.pid}/stat") as stat:
+            fields = stat.read().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
     def stop(self):
         self.process.terminate()
         self.process.wait()
@@ -86,10 +95,12 @@ async def client(port, request, end, counts):
     writer.close()
 
 
-async def measure(port, request, seconds, clients):
-    counts, begin = [0], time.perf_counter()
-    await asyncio.gather(*(client(port, request, begin + seconds, counts) for _ in range(clients)))
-    return counts[0] / (time.perf_counter() - begin)
+async def measure(service, request, seconds, clients):
+    """Requests a second, and the server's microseconds of processor time for each."""
+    counts, cpu, begin = [0], service.cpu(), time.perf_counter()
+    await asyncio.gather(*(client(service.port, request, begin + seconds, counts) for _ in range(clients)))
+    rate = counts[0] / (time.perf_counter() - begin)
+    return rate, 1e6 * (service.cpu() - cpu) / counts[0]
 
 
 def main():
@@ -113,23 +124,30 @@ def main():
         structure = file.read()
     count = iter(range(1 << 62))
 
-    def fresh():
-        body = structure + b"REMARK 900 %d %d\n" % (os.getpid(), next(count))
-        return b"POST /v1/meshes?resolution=3 HTTP/1.1\r\nhost: x\r\ncontent-length: %d\r\n\r\n" % len(body) + body
+    def post(resolution, body):
+        head = f"POST /v1/meshes?resolution={resolution} HTTP/1.1\r\nhost: x\r\ncontent-length: {len(body)}\r\n\r\n"
+        return head.encode() + body
 
-    same = b"POST /v1/meshes?resolution=3 HTTP/1.1\r\nhost: x\r\ncontent-length: %d\r\n\r\n" % len(structure) + structure
-    for what, request in (("computed", fresh), ("from memory", lambda: same)):
+    def fresh(resolution):
+        return lambda: post(resolution, structure + b"REMARK 900 %d %d\n" % (os.getpid(), next(count)))
+
+    same = post(3, structure)
+    print(f"{'':12} {'':8} {'requests/s':>12} {'of off':>9} {'us of the server':>18} {'of off':>9}")
+    for what, request in (("default grid", fresh(0.5)), ("coarse grid", fresh(3)), ("from memory", lambda: same)):
         rounds = []
         for n in range(args.rounds + 1):
             # Whoever comes first in one round comes last in the next.
             turn = services if n % 2 else services[::-1]
-            rates = {s.name: asyncio.run(measure(s.port, request, args.seconds, args.clients)) for s in turn}
+            took = {s.name: asyncio.run(measure(s, request, args.seconds, args.clients)) for s in turn}
             if n > 0:
-                rounds.append(rates)
+                rounds.append(took)
         for service in services:
-            rate = median(r[service.name] for r in rounds)
-            ratio = median(r[service.name] / r["off"] for r in rounds)
-            print(f"{what:12} {service.name:8} {rate:9.1f} /s  {100 * (ratio - 1):+6.2f} % of off", flush=True)
+            line = f"{what:12} {service.name:8}"
+            for column, width, digits in ((0, 12, 1), (1, 18, 1)):
+                figure = median(r[service.name][column] for r in rounds)
+                ratio = median(r[service.name][column] / r["off"][column] for r in rounds)
+                line += f" {figure:{width}.{digits}f} {100 * (ratio - 1):+8.2f}%"
+            print(line, flush=True)
     print(f"bytes of spans: {Collector.bytes}")
     for service in services:
         service.stop()

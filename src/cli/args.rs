@@ -2,6 +2,7 @@
 //! and HTTP alike, so that both refuse them with the same words.
 
 mod keys;
+mod render;
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -12,6 +13,7 @@ use molmesh::surface::DeviceChoice;
 
 use super::error::EXIT_CODES;
 pub(crate) use keys::{KeyCommand, NewKeyArgs, SignArgs, SigningKeyArgs};
+pub(crate) use render::{PictureArgs, RenderArgs};
 
 const MESH_EXAMPLES: &str = "\
 Examples:
@@ -40,6 +42,8 @@ pub(crate) struct Args {
 pub(crate) enum Command {
     /// Mesh the surface of one structure
     Mesh(Box<MeshArgs>),
+    /// Draw the surface of one structure as a PNG
+    Render(Box<RenderArgs>),
     /// Serve meshes over HTTP
     Serve(Box<ServeArgs>),
     /// Say what this machine has, what of it is used, and whether a service would start and be ready
@@ -82,7 +86,7 @@ pub(crate) enum BackendName {
 pub(crate) enum ReportStyle {
     /// A summary on stderr
     Text,
-    /// JSON on stdout (on stderr when the mesh goes to stdout)
+    /// JSON on stdout (on stderr when the file goes to stdout)
     Json,
 }
 
@@ -117,6 +121,13 @@ pub(crate) struct MeshArgs {
     /// What 1 stands for in the mesh file: angstrom, nanometer, or meter (glb and gltf only) [default: angstrom]
     #[arg(long, value_name = "UNITS")]
     pub(crate) units: Option<String>,
+    #[command(flatten)]
+    pub(crate) job: JobArgs,
+}
+
+/// What every job has, whatever becomes of its mesh.
+#[derive(Debug, ClapArgs)]
+pub(crate) struct JobArgs {
     /// What runs the meshing
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: BackendName,
@@ -315,7 +326,7 @@ pub(crate) struct ServeArgs {
     #[arg(long, value_name = "DIR")]
     pub(crate) archive: Option<PathBuf>,
     /// Configuration file (TOML)
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", env = "MOLMESH_CONFIG", hide_env_values = true)]
     pub(crate) config: Option<PathBuf>,
     /// Set one value of the configuration, such as `limits.atoms=100000`; may be repeated
     #[arg(long, value_name = "SECTION.KEY=VALUE")]

@@ -1,11 +1,17 @@
 //! The only place that picks a backend, and gives the reason in words.
 
+#[cfg(feature = "gpu")]
+use std::sync::Arc;
+
 use molmesh::config::DevicesConfig;
+#[cfg(feature = "gpu")]
+use molmesh::picture::CpuRenderer;
+use molmesh::picture::Drawer;
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::reference::ReferenceBackend;
 use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
 
-use super::args::BackendName;
+use super::args::{BackendName, JobArgs};
 use super::error::CliError;
 
 /// What was asked for.
@@ -19,12 +25,21 @@ pub(crate) struct Asked<'a> {
     pub(crate) threads: Option<usize>,
 }
 
+impl<'a> Asked<'a> {
+    /// What the flags of a single job ask for.
+    pub(crate) fn once(args: &'a JobArgs) -> Self {
+        Self { backend: args.backend, devices: &args.devices.devices, threads: args.threads }
+    }
+}
+
 /// A backend and why it was taken.
 pub(crate) struct Picked {
     /// The backend.
     pub(crate) backend: Box<dyn Backend>,
     /// Why, in words.
     pub(crate) reason: String,
+    /// What draws pictures, and why it was taken; the CPU where no pictures are wanted.
+    pub(crate) drawer: Drawer,
     /// Every device that was found on the way, taken or not.
     pub(crate) devices: Vec<FoundDevice>,
     /// Why no GPU runs, if none does.
@@ -51,6 +66,8 @@ impl Candidate {
 pub(crate) enum Use {
     /// One mesh, by the calling thread.
     Once,
+    /// One mesh and its picture, likewise.
+    Picture,
     /// Many, by the threads of a service.
     Service(DevicesConfig),
 }
@@ -72,6 +89,7 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     let unasked = |backend: Box<dyn Backend>| Picked {
         backend,
         reason: "asked for".to_owned(),
+        drawer: Drawer::cpu("as another backend than the GPU was asked for"),
         devices: Vec::new(),
         no_gpu: Some("not looked for, as another backend was asked for".to_owned()),
     };
@@ -84,14 +102,14 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
 
 /// A GPU, or the CPU where any backend will do.
 fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
-    let Gpu { backend, devices, mut state } = gpu(asked, use_);
-    if let (Some(backend), Ok(reason)) = (backend, &state) {
+    let Gpu { backend, drawer, devices, mut state } = gpu(asked, use_);
+    if let (Some(backend), Some(drawer), Ok(reason)) = (backend, drawer, &state) {
         let reason = match (asked.backend, asked.devices) {
             (_, DeviceChoice::These(_)) => format!("--devices {}", asked.devices),
             (BackendName::Auto, _) => format!("auto: {reason}"),
             _ => "asked for".to_owned(),
         };
-        return Ok(Picked { backend, reason, devices, no_gpu: None });
+        return Ok(Picked { backend, reason, drawer, devices, no_gpu: None });
     }
     let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
     // Whoever asks for a device by name does not want to learn from a report that it was not used.
@@ -103,7 +121,8 @@ fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
         DeviceChoice::Cpu => "--devices cpu".to_owned(),
         _ => format!("auto: no GPU, as {why}"),
     };
-    Ok(Picked { backend: cpu(asked.threads, use_)?, reason, devices, no_gpu: Some(why) })
+    let drawer = Drawer::cpu(&reason);
+    Ok(Picked { backend: cpu(asked.threads, use_)?, reason, drawer, devices, no_gpu: Some(why) })
 }
 
 /// A backend's name and what it runs on.
@@ -135,7 +154,7 @@ pub(crate) fn survey(picked: &Picked) -> Vec<Candidate> {
 
 fn cpu(threads: Option<usize>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
     let backend = match use_ {
-        Use::Once => CpuBackend::on_this_thread(threads),
+        Use::Once | Use::Picture => CpuBackend::on_this_thread(threads),
         Use::Service(_) => CpuBackend::new(threads),
     };
     let backend = backend.map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
@@ -145,6 +164,7 @@ fn cpu(threads: Option<usize>, use_: &Use) -> Result<Box<dyn Backend>, CliError>
 /// What came of looking for GPUs.
 struct Gpu {
     backend: Option<Box<dyn Backend>>,
+    drawer: Option<Drawer>,
     devices: Vec<FoundDevice>,
     /// Why it is taken, or why there is none.
     state: Result<String, String>,
@@ -152,7 +172,7 @@ struct Gpu {
 
 #[cfg(not(feature = "gpu"))]
 fn gpu(_asked: &Asked<'_>, _use: &Use) -> Gpu {
-    Gpu { backend: None, devices: Vec::new(), state: Err("this build has no GPU support".to_owned()) }
+    Gpu { backend: None, drawer: None, devices: Vec::new(), state: Err("this build has no GPU support".to_owned()) }
 }
 
 #[cfg(feature = "gpu")]
@@ -160,9 +180,10 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
     use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, Program, discover};
 
     // One mesh is not worth asking drivers that have nothing to drive; who asks for a GPU wants to know of all.
-    let look = if *use_ == Use::Once && asked.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
+    let once = matches!(use_, Use::Once | Use::Picture);
+    let look = if once && asked.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
     let discovery = discover(asked.devices, look);
-    let none = |devices, why| Gpu { backend: None, devices, state: Err(why) };
+    let none = |devices, why| Gpu { backend: None, drawer: None, devices, state: Err(why) };
     let missing = discovery.missing(asked.devices);
     if !missing.is_empty() {
         let there = discovery.why_none().map(|why| format!(" ({why})")).unwrap_or_default();
@@ -172,7 +193,7 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
         return none(discovery.devices, why);
     }
     let settings = match use_ {
-        Use::Once => PoolSettings::default(),
+        Use::Once | Use::Picture => PoolSettings::default(),
         Use::Service(config) => PoolSettings {
             queue: config.jobs,
             batch: config.batch,
@@ -187,6 +208,10 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
     };
     let program = if asked.backend == BackendName::Paper { Program::Paper } else { Program::Stages };
     let started = GpuBackend::start(&discovery, program, &settings, fallback);
+    let drawer = match drawer(asked, use_, &discovery) {
+        Ok(drawer) => drawer,
+        Err(why) => return none(discovery.devices, why),
+    };
     let mut devices = discovery.devices;
     match started {
         Ok(backend) => {
@@ -201,7 +226,7 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
                 [one] => format!("a GPU ({one})"),
                 _ => format!("{} GPUs", up.len()),
             };
-            Gpu { backend: Some(Box::new(backend)), devices, state: Ok(reason) }
+            Gpu { backend: Some(Box::new(backend)), drawer: Some(drawer), devices, state: Ok(reason) }
         }
         Err(error) => {
             let why = match error {
@@ -213,5 +238,24 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
             }
             none(devices, why)
         }
+    }
+}
+
+/// What draws where a GPU makes the meshes: that GPU. Where it cannot and another backend would do, the CPU, with the reason.
+#[cfg(feature = "gpu")]
+fn drawer(asked: &Asked<'_>, use_: &Use, discovery: &molmesh::gpu::Discovery) -> Result<Drawer, String> {
+    use molmesh::gpu::GpuRenderer;
+
+    if *use_ == Use::Once {
+        return Ok(Drawer::cpu("no pictures are wanted"));
+    }
+    let auto = asked.backend == BackendName::Auto;
+    match GpuRenderer::start(discovery, auto.then(CpuRenderer::default)) {
+        Ok(renderer) => {
+            let reason = "the device that makes meshes draws them".to_owned();
+            Ok(Drawer { renderer: Arc::new(renderer), reason })
+        }
+        Err(error) if auto => Ok(Drawer::cpu(&format!("the GPU cannot draw: {error}"))),
+        Err(error) => Err(format!("it cannot draw: {error}")),
     }
 }

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use molmesh::formats::FormatError;
+use molmesh::picture::PictureError;
 use molmesh::pipeline::JobError;
 use molmesh::structure::StructureError;
 use molmesh::surface::SurfaceError;
@@ -157,6 +158,7 @@ impl CliError {
             Self::InputTooLarge { .. } => code::LIMIT,
             Self::Job { source: JobError::Structure(error), .. } => structure_code(error),
             Self::Job { source: JobError::Surface(error), .. } => surface_code(error),
+            Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
             Self::Strict { .. } => code::STRUCTURE,
             Self::Format(error) => format_code(error),
             Self::NoBackend { .. } | Self::Unfit { backend: true, .. } => code::BACKEND,
@@ -218,6 +220,15 @@ fn surface_code(error: &SurfaceError) -> i32 {
     }
 }
 
+fn picture_code(error: &PictureError) -> i32 {
+    match error {
+        PictureError::TooLarge { .. } => code::LIMIT,
+        PictureError::Device { .. } => code::BACKEND,
+        PictureError::Cancelled => code::INTERRUPTED,
+        PictureError::Quantized | PictureError::Png(_) => code::INTERNAL,
+    }
+}
+
 fn format_code(error: &FormatError) -> i32 {
     match error {
         FormatError::TooMany { .. }
@@ -232,6 +243,7 @@ fn format_code(error: &FormatError) -> i32 {
         | FormatError::BeyondStep { .. }
         | FormatError::NotQuantized { .. }
         | FormatError::NotInUnits { .. }
+        | FormatError::NotAMesh { .. }
         | FormatError::OtherPacking { .. }
         | FormatError::Json { .. } => code::INTERNAL,
     }

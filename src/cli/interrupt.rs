@@ -55,7 +55,7 @@ pub(crate) fn watch(token: &CancelToken) -> std::io::Result<()> {
     fn give_up() -> ! {
         discard();
         CliError::Interrupted.print(Style::stderr());
-        std::process::exit(code::INTERRUPTED)
+        super::leave(code::INTERRUPTED)
     }
 
     let mut signals = Signals::new([SIGINT, SIGTERM])?;

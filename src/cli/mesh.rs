@@ -16,7 +16,7 @@ use molmesh::structure::referee::{self, Diagnostic, Level};
 use molmesh::surface::{CancelToken, SurfaceError};
 use serde_json::{Value, json};
 
-use super::args::{MeshArgs, ReportStyle};
+use super::args::{JobArgs, MeshArgs, ReportStyle};
 use super::backend::{self, Asked, Picked};
 use super::error::CliError;
 use super::output::{Output, is_stdio};
@@ -27,20 +27,27 @@ use super::{interrupt, request};
 
 /// Runs the command. The order is that of cost: flags, backend, output, input, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
-    let Request { job, format: asked, strict, .. } = request::parse(args)?;
+    let Request { mut job, format: asked, strict, .. } = request::of_mesh(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
-    request::suits(&job, format)?;
+    if format.is_picture() {
+        return Err(CliError::Usage {
+            message: format!("{format} is a picture, not a mesh"),
+            hint: Some("molmesh render draws pictures".to_owned()),
+        });
+    }
+    request::settle(&mut job, format)?;
+    let (output_path, input_path, args) = (&args.output, &args.input, &args.job);
     let limits = request::limits(&args.limits);
-    let asked = Asked { backend: args.backend, devices: &args.devices.devices, threads: args.threads };
+    let asked = Asked::once(args);
     let picked = backend::pick(&asked, &backend::Use::Once)?;
     let cancel = CancelToken::default();
     interrupt::watch(&cancel).map_err(|e| CliError::Internal(format!("cannot watch for signals: {e}")))?;
-    let mut output = Output::open(&args.output, &cancel)?;
-    let input = read(&args.input, limits.read.max_inflated_bytes)?;
+    let mut output = Output::open(output_path, &cancel)?;
+    let input = read(input_path, limits.read.max_inflated_bytes)?;
 
     let progress = Progress::new(!args.quiet);
-    let findings = if strict { Some(check(args, &input, &limits)?) } else { None };
-    let work = Work { args, job: &job, limits: &limits, picked: &picked, input: &input, cancel: &cancel };
+    let findings = if strict { Some(check(input_path, &input, &limits)?) } else { None };
+    let work = Work { path: input_path, job: &job, limits: &limits, picked: &picked, input: &input, cancel: &cancel };
     let mut poured = None;
     if format == Format::Glb && pipeline::can_pour(&job) {
         poured = work.pour(&mut output, &progress)?;
@@ -59,7 +66,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     output.finish()?;
     report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
 
-    let name = if to_stdout { "stdout".to_owned() } else { args.output.display().to_string() };
+    let name = if to_stdout { "stdout".to_owned() } else { output_path.display().to_string() };
     let written = Written { name: &name, format: format.extension(), bytes };
     tell(args, &report, findings.as_deref(), &written, to_stdout)
 }
@@ -80,7 +87,7 @@ fn format(output: &Path) -> Result<Format, CliError> {
 }
 
 /// The whole input, at most `limit` bytes of it: compressed or not, what inflates from it is no smaller.
-fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
+pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
     let stdin = is_stdio(path);
     let name = || name_of(path);
     let read = || -> io::Result<Vec<u8>> {
@@ -112,7 +119,7 @@ fn name_of(input: &Path) -> String {
 
 /// What there is to do.
 struct Work<'a> {
-    args: &'a MeshArgs,
+    path: &'a Path,
     job: &'a Job,
     limits: &'a JobLimits,
     picked: &'a Picked,
@@ -126,13 +133,7 @@ impl Work<'_> {
     }
 
     fn failure(&self, source: JobError) -> CliError {
-        match source {
-            JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
-            source => {
-                let (name, opinion) = (name_of(&self.args.input), opinion(&source, self.input, self.limits));
-                CliError::Job { name, opinion, source }
-            }
-        }
+        failure(self.path, self.input, self.limits, source)
     }
 
     /// Meshes, then writes the mesh in order. Returns the report.
@@ -173,6 +174,17 @@ impl Work<'_> {
     }
 }
 
+/// What it means that a job failed.
+pub(super) fn failure(path: &Path, input: &[u8], limits: &JobLimits, source: JobError) -> CliError {
+    match source {
+        JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
+        source => {
+            let (name, opinion) = (name_of(path), opinion(&source, input, limits));
+            CliError::Job { name, opinion, source }
+        }
+    }
+}
+
 /// What it means that a mesh could not be placed.
 #[cfg(unix)]
 fn place_failure(output: &Output, error: Option<PlaceError>) -> CliError {
@@ -185,8 +197,8 @@ fn place_failure(output: &Output, error: Option<PlaceError>) -> CliError {
 }
 
 /// The strict check: the referee's findings, or a refusal if there are errors among them.
-fn check(args: &MeshArgs, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
-    let name = || name_of(&args.input);
+pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
+    let name = || name_of(path);
     let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
         name: name(),
         source: source.into(),
@@ -225,13 +237,13 @@ fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn Progre
     Ok(report)
 }
 
-/// Writes the report where the mesh did not go.
-fn tell(
-    args: &MeshArgs,
+/// Writes the report where the file did not go.
+pub(super) fn tell(
+    args: &JobArgs,
     report: &Report,
     findings: Option<&[Diagnostic]>,
     written: &Written<'_>,
-    mesh_on_stdout: bool,
+    file_on_stdout: bool,
 ) -> Result<(), CliError> {
     match args.report {
         ReportStyle::Text if args.quiet => Ok(()),
@@ -245,7 +257,7 @@ fn tell(
         }
         ReportStyle::Json => {
             let text = json_report(report, findings, written)?;
-            let told = if mesh_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
+            let told = if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
             told.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
         }
     }

@@ -18,6 +18,7 @@ mod output;
 mod page;
 mod panics;
 mod progress;
+mod render;
 mod request;
 mod serve;
 mod sign;
@@ -35,12 +36,19 @@ use style::Style;
 
 /// Runs the command that the process's arguments name. Returns the exit code.
 pub(crate) fn main() -> i32 {
+    let status = run();
+    // Standard output may still hold the end of what was printed, and nobody looks after it once the process leaves.
+    if io::stdout().flush().is_err() && status == code::OK { code::OUTPUT } else { status }
+}
+
+fn run() -> i32 {
     let args = match Args::try_parse() {
         Ok(args) => args,
         Err(error) => return usage(&error),
     };
     let result = match args.command {
         Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
+        Command::Render(args) => panics::contained(|| render::run(&args)),
         Command::Serve(args) => serve::run(&args),
         Command::Doctor(args) => doctor::run(&args),
         Command::Config(command) => config::run(&command),
@@ -58,6 +66,16 @@ pub(crate) fn main() -> i32 {
             error.code()
         }
     }
+}
+
+/// Ends the process as it is. Not by returning: freeing a mesh of a few hundred megabytes that nobody will look at again
+/// takes longer than writing it. Nor by `exit`, which runs what drivers have registered for the end: NVIDIA's takes down
+/// what its own threads still use, and a service that had stopped in order died of it, now and then.
+pub(crate) fn leave(status: i32) -> ! {
+    #[cfg(unix)]
+    signal_hook::low_level::exit(status);
+    #[cfg(not(unix))]
+    std::process::exit(status);
 }
 
 /// Prints what clap has to say: help is an answer, anything else is a mistake of the caller.

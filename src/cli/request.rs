@@ -4,17 +4,40 @@ use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError, Request};
 use molmesh::pipeline::{Job, JobLimits};
 
-use super::args::{LimitArgs, MeshArgs};
+use super::args::{JobArgs, LimitArgs, MeshArgs, PictureArgs, RenderArgs};
 use super::error::CliError;
 
-/// What the flags ask for.
-pub(super) fn parse(args: &MeshArgs) -> Result<Request, CliError> {
-    params::parse(pairs(args)).map_err(|error| refusal(&error))
+/// What the flags of `mesh` ask for.
+pub(super) fn of_mesh(args: &MeshArgs) -> Result<Request, CliError> {
+    let own =
+        [("format", &args.format), ("compress", &args.compress), ("normals", &args.normals), ("units", &args.units)];
+    parse(&own, &args.job)
 }
 
-/// Refuses what does not go with the format that the output's name says.
-pub(super) fn suits(job: &Job, format: Format) -> Result<(), CliError> {
-    params::suits(job, format).map_err(|error| refusal(&error))
+/// What the flags of `render` ask for.
+pub(super) fn of_render(args: &RenderArgs) -> Result<Request, CliError> {
+    let PictureArgs { width, height, view, azimuth, elevation, background, style } = &args.picture;
+    let own = [
+        ("width", width),
+        ("height", height),
+        ("view", view),
+        ("azimuth", azimuth),
+        ("elevation", elevation),
+        ("background", background),
+        ("style", style),
+    ];
+    let mut request = parse(&own, &args.job)?;
+    settle(&mut request.job, Format::Png)?;
+    Ok(request)
+}
+
+fn parse(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Result<Request, CliError> {
+    params::parse(pairs(own, args)).map_err(|error| refusal(&error))
+}
+
+/// Makes the job one for the format that the output's name says.
+pub(super) fn settle(job: &mut Job, format: Format) -> Result<(), CliError> {
+    params::settle(job, format).map_err(|error| refusal(&error))
 }
 
 fn refusal(error: &ParamError) -> CliError {
@@ -36,13 +59,9 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
 }
 
 /// Names and values, as a query would have them.
-fn pairs(args: &MeshArgs) -> Vec<(&'static str, String)> {
+fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'static str, String)> {
     let (surface, atoms) = (&args.surface, &args.selection);
     let given = [
-        ("format", &args.format),
-        ("compress", &args.compress),
-        ("normals", &args.normals),
-        ("units", &args.units),
         ("kernel", &surface.kernel),
         ("preset", &surface.preset),
         ("resolution", &surface.resolution),
@@ -62,7 +81,7 @@ fn pairs(args: &MeshArgs) -> Vec<(&'static str, String)> {
         ("proof", &args.proof),
     ];
     let mut pairs: Vec<_> =
-        given.into_iter().filter_map(|(name, value)| value.clone().map(|value| (name, value))).collect();
+        own.iter().copied().chain(given).filter_map(|(name, value)| value.clone().map(|value| (name, value))).collect();
     if surface.atom_ids {
         pairs.push(("atom_ids", "true".to_owned()));
     }
@@ -90,7 +109,13 @@ mod tests {
     fn request(flags: &[&str]) -> Result<Request, CliError> {
         let line = ["molmesh", "mesh", "in.pdb", "-o", "out.glb"].iter().chain(flags);
         let Command::Mesh(args) = Args::try_parse_from(line).unwrap().command else { panic!("not mesh") };
-        parse(&args)
+        of_mesh(&args)
+    }
+
+    fn drawn(flags: &[&str]) -> Result<Request, CliError> {
+        let line = ["molmesh", "render", "in.pdb", "-o", "out.png"].iter().chain(flags);
+        let Command::Render(args) = Args::try_parse_from(line).unwrap().command else { panic!("not render") };
+        of_render(&args)
     }
 
     #[test]
@@ -105,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn every_parameter_of_a_mesh_has_a_flag() {
+    fn every_parameter_has_a_flag() {
         // `report` is how HTTP asks for what `--report json` always gives.
         for parameter in params::TABLE.iter().filter(|p| p.name != "report") {
             let flag = format!("--{}", parameter.name.replace('_', "-"));
@@ -125,12 +150,20 @@ mod tests {
                 "paper_c" => vec![&flag, "0.5", "--paper-b", "3", "--kernel", "inverse-square"],
                 "radius_offset" => vec![&flag, "-0.1"],
                 "cutoff_tolerance" => vec![&flag, "0.02"],
+                "view" => vec![&flag, "top"],
+                "background" => vec![&flag, "#102030"],
+                "style" => vec![&flag, "gouraud"],
                 _ => vec![&flag, "2"],
             };
             let key = |r: &Request| (params::canonical(&r.job), r.format, r.strict);
-            let changed = request(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
-            let changed = key(&changed) != key(&request(&[]).unwrap());
-            assert!(changed, "{flag} changes nothing");
+            let pictures = parameter.doc.contains("picture") && parameter.name != "format";
+            let ask = if pictures { drawn } else { request };
+            let changed = ask(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
+            assert_ne!(key(&changed), key(&ask(&[]).unwrap()), "{flag} changes nothing");
+            // Whatever makes another mesh makes another picture.
+            if !["format", "compress", "normals", "units"].contains(&parameter.name) {
+                assert_ne!(key(&drawn(&value).unwrap()), key(&drawn(&[]).unwrap()), "{flag} changes no picture");
+            }
         }
     }
 
@@ -141,6 +174,17 @@ mod tests {
         assert!(both.code() == 2 && said.contains("`detail`") && said.contains("`resolution`"), "{said}");
         for flags in [["--detail", "7"], ["--max-triangles", "7"], ["--normals", "flat"], ["--units", "inch"]] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
+        }
+        for flags in [
+            ["--width", "0"],
+            ["--height", "16385"],
+            ["--view", "inside"],
+            ["--azimuth", "361"],
+            ["--elevation", "nan"],
+            ["--background", "plaid"],
+            ["--style", "cubist"],
+        ] {
+            assert_eq!(drawn(&flags).unwrap_err().code(), 2, "{flags:?}");
         }
         for flags in [["--resolution", "0"], ["--resolution", "nan"], ["--kernel", "x"], ["--chains", ",,"]] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");

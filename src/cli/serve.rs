@@ -33,7 +33,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let asked = Asked { backend: args.backend, devices: &config.devices.choice, threads: None };
     let picked = backend::pick(&asked, &backend::Use::Service(config.devices.clone()))?;
     let others = backend::survey(&picked);
-    let Picked { backend, reason, devices, .. } = picked;
+    let Picked { backend, reason, drawer, devices, .. } = picked;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();
     let facts = Facts {
@@ -51,12 +51,13 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         .build()
         .map_err(failed)?;
     give_way();
-    let server =
-        runtime.block_on(Server::bind(config, Chosen { backend, reason, devices })).map_err(|error| match error {
+    let server = runtime.block_on(Server::bind(config, Chosen { backend, reason, drawer, devices })).map_err(
+        |error| match error {
             // Keys and secrets are the caller's, as the rest of the configuration is.
             ServeError::Access(error) => CliError::usage(error.to_string()),
             error => CliError::Service(error.to_string()),
-        })?;
+        },
+    )?;
     let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
     // The service runs whether or not somebody reads its banner.
     drop(io::stderr().write_all(text.as_bytes()));

@@ -1,6 +1,6 @@
 //! The report of a mesh on one screen, for people. Pure: a report in, text out.
 
-use molmesh::pipeline::Report;
+use molmesh::pipeline::{PictureReport, Report};
 
 use super::page::Page;
 use super::style::Style;
@@ -30,6 +30,10 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
     if let Some(quantization) = report.quantization {
         page.row("vertices", &format!("quantised in steps of {} Å", quantization.step));
+    }
+    if let Some(picture) = &report.picture {
+        page.row("picture", &drawn(picture));
+        page.row("renderer", &format!("{}: {} ({})", picture.renderer, picture.device, picture.reason));
     }
     let units = (report.file_units != report.report_units).then(|| format!("in {}s", report.file_units));
     let normals = (report.normals == "none").then(|| "without normals".to_owned());
@@ -69,6 +73,15 @@ fn surface(report: &Report) -> String {
         (None, None) => String::new(),
     };
     format!("{}, {} Å{from}, isovalue {}{smoothness}{preset}", report.kernel, report.resolution, report.isovalue)
+}
+
+fn drawn(picture: &PictureReport) -> String {
+    let PictureReport { width, height, view, azimuth, elevation, background, style, pixel, .. } = picture;
+    let turned = match (*azimuth, *elevation) {
+        (0.0, 0.0) => String::new(),
+        (azimuth, elevation) => format!(", azimuth {azimuth}°, elevation {elevation}°"),
+    };
+    format!("{width} × {height}, {view} view{turned}, {style}, {background} background, {pixel:.4} Å a pixel")
 }
 
 fn proof(report: &Report, style: Style) -> String {
@@ -214,6 +227,20 @@ mod tests {
             device: "2 threads".into(),
             backend_reason: "asked for".into(),
             fallback: None,
+            picture: Some(PictureReport {
+                width: 640,
+                height: 480,
+                view: "principal",
+                azimuth: 30.0,
+                elevation: 0.0,
+                background: "transparent".into(),
+                style: "surface",
+                pixel: 0.12345,
+                renderer: "cpu",
+                device: "CPU rasteriser, 2 threads".into(),
+                reason: "auto: no GPU".into(),
+                fallback: None,
+            }),
             timings_ms: [("read".to_owned(), 0.25.into()), ("field".to_owned(), 2.5.into())].into_iter().collect(),
         }
     }
@@ -237,11 +264,13 @@ mod tests {
             "7,100.0 Å³",
             "cpu: 2 threads (asked for)",
             "a.glb (glb, 720,000 bytes)",
+            "640 × 480, principal view, azimuth 30°, elevation 0°, surface, transparent background, 0.1235 Å a pixel",
+            "cpu: CPU rasteriser, 2 threads (auto: no GPU)",
             "2.75 ms",
             "field",
         ] {
             assert!(text.contains(part), "no `{part}` in\n{text}");
         }
-        assert!(text.lines().count() <= 24, "{text}");
+        assert!(text.lines().count() <= 26, "{text}");
     }
 }

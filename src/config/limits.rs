@@ -3,6 +3,7 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::picture::PictureLimits;
 use crate::pipeline::JobLimits;
 use crate::structure::ReadLimits;
 use crate::surface::SurfaceLimits;
@@ -34,6 +35,9 @@ pub struct LimitsConfig {
     /// Bytes of uploads and finished meshes that all requests together hold in memory. Default 8 GiB. A new
     /// upload or job is refused while it is used up; running jobs may overshoot it by `mesh_bytes` each.
     pub memory_bytes: u64,
+    /// Pixels of a picture's width and of its height. Default 4,096: at 40 bytes a pixel the working memory of the largest is
+    /// 640 MiB, and drawing it takes seconds.
+    pub picture_side: u32,
 }
 
 impl Default for LimitsConfig {
@@ -47,17 +51,19 @@ impl Default for LimitsConfig {
             mesh_bytes: 2 << 30,
             output_bytes: 3 << 30,
             memory_bytes: 8 << 30,
+            picture_side: 4096,
         }
     }
 }
 
 impl LimitsConfig {
-    /// The limits of reading and meshing.
+    /// The limits of reading, meshing and drawing.
     #[must_use]
     pub fn job(&self) -> JobLimits {
         JobLimits {
             read: ReadLimits { max_inflated_bytes: self.inflated_bytes, max_atoms: self.atoms },
             surface: SurfaceLimits { max_samples: self.grid_samples, max_mesh_bytes: self.mesh_bytes },
+            picture: PictureLimits { max_side: self.picture_side },
             deadline: None,
         }
     }

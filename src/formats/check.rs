@@ -35,7 +35,7 @@ impl Depth {
         match self {
             Self::All | Self::Needed(Format::Stl) => true,
             Self::Needed(Format::Glb | Format::Gltf) => u16::try_from(n_vertices).is_ok(),
-            Self::Needed(Format::Ply | Format::Obj) => false,
+            Self::Needed(Format::Ply | Format::Obj | Format::Png) => false,
         }
     }
 }

@@ -101,6 +101,12 @@ pub enum FormatError {
         /// The units' name.
         units: &'static str,
     },
+    /// Pictures are drawn, not written.
+    #[error("{format} is a picture of a mesh, and holds none")]
+    NotAMesh {
+        /// The format's name.
+        format: &'static str,
+    },
     /// Vertices that were rounded before are not rounded again, nor are they made longer than they are.
     #[error("the mesh's vertices are quantised in steps of {step} Å, and can be stored in no other way")]
     OtherPacking {

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use thiserror::Error;
 
-/// A mesh file format.
+/// What a file is: a mesh, or a picture of one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Format {
     /// glTF 2.0, binary container.
@@ -19,16 +19,21 @@ pub enum Format {
     Stl,
     /// Wavefront OBJ.
     Obj,
+    /// A picture, PNG.
+    Png,
 }
 
 /// No format has this name.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("unknown format `{0}`; expected one of glb, gltf, ply, stl, obj")]
+#[error("unknown format `{0}`; expected one of glb, gltf, ply, stl, obj, png")]
 pub struct UnknownFormat(pub String);
 
 impl Format {
     /// Every format.
-    pub const ALL: [Self; 5] = [Self::Glb, Self::Gltf, Self::Ply, Self::Stl, Self::Obj];
+    pub const ALL: [Self; 6] = [Self::Glb, Self::Gltf, Self::Ply, Self::Stl, Self::Obj, Self::Png];
+
+    /// Those that hold a mesh.
+    pub const MESHES: [Self; 5] = [Self::Glb, Self::Gltf, Self::Ply, Self::Stl, Self::Obj];
 
     /// File extension and name, without a dot.
     #[must_use]
@@ -39,7 +44,14 @@ impl Format {
             Self::Ply => "ply",
             Self::Stl => "stl",
             Self::Obj => "obj",
+            Self::Png => "png",
         }
+    }
+
+    /// Whether it shows a mesh instead of holding it: no writer of this room makes such a file.
+    #[must_use]
+    pub const fn is_picture(self) -> bool {
+        matches!(self, Self::Png)
     }
 
     /// Whether it can hold quantised vertices.
@@ -57,6 +69,7 @@ impl Format {
             Self::Ply => "application/ply",
             Self::Stl => "model/stl",
             Self::Obj => "model/obj",
+            Self::Png => "image/png",
         }
     }
 
@@ -75,6 +88,7 @@ impl Format {
             | "application/x-stl"
             | "application/vnd.ms-pki.stl" => Some(Self::Stl),
             "model/obj" | "application/x-obj" => Some(Self::Obj),
+            "image/png" => Some(Self::Png),
             _ => None,
         }
     }
@@ -121,6 +135,7 @@ mod tests {
             ("model/*", None),
             ("*/*", None),
             ("text/plain", None),
+            ("IMAGE/png", Some(Format::Png)),
             ("application/json", None),
             ("", None),
         ];

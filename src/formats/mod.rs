@@ -146,6 +146,7 @@ impl<'a> Encoder<'a> {
             Format::Ply => Plan::Ply(ply::PlyPlan::new(mesh, storage, meta)),
             Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, storage.units, meta)?),
             Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, storage, &summary, meta)?),
+            Format::Png => return Err(FormatError::NotAMesh { format: format.extension() }),
         };
         Ok(Self { mesh, plan })
     }

@@ -79,7 +79,12 @@ impl Format {
     /// than some fixed distance make one of all of them: only formats with a node, which scales for itself, hold that.
     #[must_use]
     pub const fn holds_units(self, units: Units) -> bool {
-        matches!((self, units), (Self::Glb | Self::Gltf, _) | (_, Units::Angstrom | Units::Nanometer))
+        match (self, units) {
+            (Self::Glb | Self::Gltf, _) | (_, Units::Angstrom) => true,
+            // A picture has no coordinates.
+            (format, Units::Nanometer) => !format.is_picture(),
+            (_, Units::Meter) => false,
+        }
     }
 }
 

@@ -5,6 +5,7 @@ use super::discover::{Look, discover};
 use super::engine::Engine;
 use super::error::GpuError;
 use super::meter::Metered;
+use super::shaders::{PAPER, SHADERS, Shader};
 use crate::surface::{DeviceChoice, DeviceKind, DeviceName};
 
 /// A device that is measured.
@@ -40,9 +41,59 @@ pub fn open(number: usize) -> Result<Opened, GpuError> {
     })
 }
 
+/// A stage as the build reflected its shader.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StageShape {
+    /// Whether it belongs to the 2010 program.
+    pub paper: bool,
+    /// Its name.
+    pub stage: &'static str,
+    /// Threads of a workgroup.
+    pub workgroup_size: u32,
+    /// Bytes that a workgroup shares.
+    pub workgroup_bytes: u32,
+}
+
+/// The shapes of our stages, then of the 2010 program's, in the order in which they run.
+#[must_use]
+pub fn shapes() -> Vec<StageShape> {
+    let shape = |paper| {
+        move |shader: &Shader| StageShape {
+            paper,
+            stage: shader.stage,
+            workgroup_size: shader.workgroup_size,
+            workgroup_bytes: shader.workgroup_bytes,
+        }
+    };
+    SHADERS.iter().map(shape(false)).chain(PAPER.iter().map(shape(true))).collect()
+}
+
 impl Engine {
     /// What was counted since the last call.
     pub fn metered(&mut self) -> Metered {
         self.meter.take()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_are_those_of_the_shaders() {
+        let shapes = shapes();
+        let of = |paper, stage| *shapes.iter().find(|s| s.paper == paper && s.stage == stage).unwrap();
+        // As shaders/paper/field.wgsl and classify.wgsl have it.
+        assert_eq!((of(true, "field").workgroup_size, of(true, "field").workgroup_bytes), (64, 0));
+        assert_eq!(of(true, "classify").workgroup_size, 256);
+        assert!(of(false, "field").workgroup_bytes > 0 && of(true, "scan").workgroup_bytes > 0);
+        for (shape, shader) in shapes.iter().zip(SHADERS.iter().chain(&PAPER)) {
+            // Sizes that are written as numbers.
+            if let Some((_, rest)) = shader.source.split_once("@workgroup_size(")
+                && let Some(size) = rest.split(')').next().and_then(|n| n.trim_end_matches('u').parse::<u32>().ok())
+            {
+                assert_eq!(shape.workgroup_size, size, "{}", shape.stage);
+            }
+        }
     }
 }

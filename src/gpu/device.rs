@@ -54,7 +54,7 @@ pub(super) fn build(adapter: &Adapter, program: Program) -> Result<Box<dyn Execu
 ///
 /// # Errors
 /// [`GpuError::Failed`] where the driver refuses.
-fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
+pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
     let descriptor = DeviceDescriptor {
         label: Some("molmesh"),
         required_features: adapter.features() & WANTED,

@@ -23,6 +23,7 @@ use super::landing::Landing;
 use super::paper_pipelines::{Bound, PaperPipelines};
 use super::prepare::Prepared;
 use super::record::Recording;
+use crate::surface::lattice::Lattice;
 use crate::surface::layout::Params;
 use crate::surface::plan::check_totals;
 use crate::surface::{Column, GridStats, Kernel, Mesh, Meshed, Stage, SurfaceError, SurfaceParams};
@@ -64,17 +65,34 @@ pub struct Paper {
     times: [u64; STAGES.len()],
 }
 
+/// Lowest and highest sample of the program's box along an axis.
+fn bounds(lattice: &Lattice, k: usize, reach: f64) -> (f64, f64) {
+    let cells = || lattice.atoms.iter().map(move |atom| atom.position(k));
+    let (lo, hi) = (cells().fold(f64::MAX, f64::min), cells().fold(f64::MIN, f64::max));
+    // Two beyond what is reached, for the differences.
+    ((lo - reach).floor() - 2.0, (hi + reach).ceil() + 2.0)
+}
+
+/// The furthest that an atom reaches, in spacings.
+fn furthest(lattice: &Lattice) -> f64 {
+    lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max)
+}
+
+/// Cubes along each axis of the box that the program would visit.
+#[must_use]
+pub fn cubes(lattice: &Lattice) -> [u64; 3] {
+    let reach = furthest(lattice);
+    [0, 1, 2].map(|k| {
+        let (lo, hi) = bounds(lattice, k, reach);
+        whole(hi - lo)
+    })
+}
+
 /// The samples of a job's box.
 fn box_of(job: &Prepared, most: u64) -> Result<Box, SurfaceError> {
     let lattice = &job.lattice;
-    let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max);
-    let bounds = |k: usize| {
-        let cells = || lattice.atoms.iter().map(move |atom| atom.position(k));
-        let (lo, hi) = (cells().fold(f64::MAX, f64::min), cells().fold(f64::MIN, f64::max));
-        // Two beyond what is reached, for the differences.
-        ((lo - reach).floor() - 2.0, (hi + reach).ceil() + 2.0)
-    };
-    let bounds = [bounds(0), bounds(1), bounds(2)];
+    let reach = furthest(lattice);
+    let bounds = [0, 1, 2].map(|k| bounds(lattice, k, reach));
     let sides = bounds.map(|(lo, hi)| hi - lo + 1.0);
     let samples = sides.iter().product::<f64>();
     let limit = most.min(job.limits.max_samples);

@@ -29,6 +29,10 @@ pub(super) struct Shader {
     /// Its text, fragments included.
     pub(super) source: &'static str,
     pub(super) bindings: &'static [Binding],
+    /// Threads of a workgroup.
+    pub(super) workgroup_size: u32,
+    /// Bytes that they share.
+    pub(super) workgroup_bytes: u32,
 }
 
 /// A struct that lies in a buffer, as a shader declares it.
@@ -166,6 +170,23 @@ mod tests {
         assert_eq!(differences(PAPER_LAYOUTS, &all), Vec::<String>::new());
         all[2].1 += 4;
         assert!(!differences(PAPER_LAYOUTS, &all).is_empty());
+    }
+
+    #[test]
+    fn the_pictures_structs_are_laid_out_alike_on_both_sides() {
+        use crate::gpu::picture_targets::{Numbers, Tap, View};
+        let mut all = vec![
+            host!("View", View, right, up, toward, light, size, offset, scale, reach, diffuse, pad),
+            host!(
+                "Numbers", Numbers, color, behind, size, n_taps, line, falloff, bias, strength, darkest, step_from,
+                step_to, ink, pad
+            ),
+            host!("Tap", Tap, pixels, length),
+        ];
+        assert_eq!(all.len(), PICTURE_LAYOUTS.len());
+        assert_eq!(differences(PICTURE_LAYOUTS, &all), Vec::<String>::new());
+        all[2].1 += 4;
+        assert!(!differences(PICTURE_LAYOUTS, &all).is_empty());
     }
 
     #[test]

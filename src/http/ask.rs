@@ -58,7 +58,7 @@ impl Input {
 impl Ask {
     /// The key of the answer, if the chosen backend makes it.
     pub(super) fn key(&self, app: &Shared) -> ContentKey {
-        ContentKey::new(&self.digest, &self.request.job, self.format, app.pool.backend().name())
+        ContentKey::new(&self.digest, &self.request.job, self.format, &app.pool.maker(&self.request.job))
     }
 
     /// The answer that is known already.
@@ -133,7 +133,7 @@ impl Ask {
             return delivery::report(&finished, self.timing);
         }
         // Another backend may have stood in for the chosen one, and its bytes are others.
-        let key = ContentKey::new(&digest, &self.request.job, self.format, finished.product.report.backend);
+        let key = ContentKey::new(&digest, &self.request.job, self.format, &finished.product.report.maker());
         let kept = results::keep_later(app, &finished, self.format, &key);
         let mut response = delivery::mesh(app, Arc::clone(&finished), self.format, &key, self.timing, place).await?;
         let headers = response.headers_mut();

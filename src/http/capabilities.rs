@@ -26,7 +26,7 @@ pub(super) struct Capabilities {
     version: &'static str,
     units: Units,
     inputs: Inputs,
-    /// Mesh formats, the best known first.
+    /// Formats, the best known first; png is a picture.
     formats: Vec<FormatDocument>,
     /// The format where none is asked for.
     default_format: &'static str,
@@ -40,6 +40,8 @@ pub(super) struct Capabilities {
     limits: Limits,
     /// The backend that makes the meshes.
     backends: Vec<BackendDocument>,
+    /// What draws pictures.
+    renderers: Vec<BackendDocument>,
     /// Every device that was found.
     devices: Vec<DeviceDocument>,
     radii: Radii,
@@ -67,7 +69,7 @@ struct Inputs {
     note: &'static str,
 }
 
-/// A mesh format.
+/// A format.
 #[derive(Debug, Serialize, ToSchema)]
 struct FormatDocument {
     /// Its file name's extension.
@@ -125,6 +127,7 @@ struct Limits {
     mesh_bytes: u64,
     output_bytes: u64,
     memory_bytes: u64,
+    picture_side: u32,
     workers: usize,
     queue: usize,
     deliveries: usize,
@@ -138,7 +141,7 @@ struct Limits {
     connections: usize,
 }
 
-/// What makes the meshes.
+/// What makes meshes, or draws them.
 #[derive(Debug, Serialize, ToSchema)]
 struct BackendDocument {
     name: &'static str,
@@ -199,7 +202,7 @@ pub(super) async fn show(State(app): State<Shared>) -> Response {
 
 /// Writes the document.
 pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> Bytes {
-    let backend = pool.backend();
+    let (backend, drawer) = (pool.backend(), pool.drawer());
     let document = Capabilities {
         name: "molmesh",
         version: env!("CARGO_PKG_VERSION"),
@@ -219,6 +222,11 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
             name: backend.name(),
             device: backend.describe(),
             reason: pool.reason().to_owned(),
+        }],
+        renderers: vec![BackendDocument {
+            name: drawer.renderer.name(),
+            device: drawer.renderer.describe(),
+            reason: drawer.reason.clone(),
         }],
         devices: devices(found, &backend.devices()),
         radii: Radii { table: radii::TABLE, unit: "Å", fallback: radii::FALLBACK, values: radii_by_symbol() },
@@ -288,6 +296,7 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         mesh_bytes: limits.mesh_bytes,
         output_bytes: limits.output_bytes,
         memory_bytes: limits.memory_bytes,
+        picture_side: limits.picture_side,
         workers: pool.workers(),
         queue: jobs.queue,
         deliveries: jobs.deliveries,

@@ -40,6 +40,14 @@ pub(super) const SUMMARY: [&str; 17] = [
     "molmesh-backend-reason",
 ];
 
+/// Headers that sum up the report of a picture, and the members of its `picture`.
+pub(super) const PICTURE: [(&str, &str); 4] = [
+    ("molmesh-renderer", "renderer"),
+    ("molmesh-renderer-device", "device"),
+    ("molmesh-renderer-reason", "reason"),
+    ("molmesh-pixel", "pixel"),
+];
+
 /// A report, and what was found on the way to it.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReportDocument {
@@ -95,12 +103,13 @@ pub(super) fn etag(key: &ContentKey) -> HeaderValue {
     HeaderValue::from_str(&format!("\"{key}\"")).unwrap_or_else(|_| HeaderValue::from_static("\"\""))
 }
 
-/// A file name for browsers.
+/// A file name for browsers, which show pictures and save meshes.
 pub(super) fn disposition(id: Option<&str>, format: Format) -> HeaderValue {
     let safe = |c: &char| c.is_ascii_alphanumeric() || "-_.".contains(*c);
     let stem: String = id.unwrap_or_default().chars().filter(safe).take(64).collect();
     let stem = if stem.trim_matches('.').is_empty() { "surface" } else { &stem };
-    text(&format!("attachment; filename=\"{stem}.{}\"", format.extension()))
+    let way = if format.is_picture() { "inline" } else { "attachment" };
+    text(&format!("{way}; filename=\"{stem}.{}\"", format.extension()))
 }
 
 /// A header value; characters that headers cannot hold are written as `?`.
@@ -111,17 +120,21 @@ pub(super) fn text(value: &str) -> HeaderValue {
 
 /// The headers that sum up a report, from its JSON: fresh or kept, the same.
 pub(super) fn summary(report: &Value) -> HeaderMap {
-    let header = |name: &'static str| {
-        let member = name.trim_start_matches("molmesh-").replace('-', "_");
-        let value = match &report[member.as_str()] {
+    let header = |name: &'static str, value: &Value| {
+        let value = match value {
             Value::String(text) => text.replace('Å', "A"),
             // Areas and volumes to a thousandth.
-            Value::Number(number) if member == "area" || member == "volume" => {
+            Value::Number(number) if name == "molmesh-area" || name == "molmesh-volume" => {
                 format!("{:.3}", number.as_f64().unwrap_or_default())
             }
             other => other.to_string(),
         };
         (HeaderName::from_static(name), text(&value))
     };
-    SUMMARY.into_iter().map(header).collect()
+    let member = |name: &str| name.trim_start_matches("molmesh-").replace('-', "_");
+    let mut headers: HeaderMap = SUMMARY.into_iter().map(|name| header(name, &report[member(name).as_str()])).collect();
+    if let Some(picture) = report.get("picture") {
+        headers.extend(PICTURE.into_iter().map(|(name, of)| header(name, &picture[of])));
+    }
+    headers
 }

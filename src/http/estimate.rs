@@ -87,7 +87,7 @@ pub(super) struct EstimateDocument {
 }
 
 refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
-    Kind::EmptySelection, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
+    Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
 ]]);
 
 /// Says what a mesh would come to, without making it.
@@ -140,7 +140,9 @@ pub(super) async fn create(
         .map_err(|error| declared.explain(Failure::Job { error, diagnostics: Vec::new() }))?;
     drop(stop);
     let wait = app.pool.estimated_wait().as_secs_f64();
-    let problem = refusal(&estimate, app.config.limits.output_bytes);
+    // A picture is as large as its pixels, however large the mesh.
+    let limit = if format.is_picture() { u64::MAX } else { app.config.limits.output_bytes };
+    let problem = refusal(&estimate, limit);
     let mesh = estimate.mesh.as_ref().ok();
     let document = EstimateDocument {
         accepted: problem.is_none(),

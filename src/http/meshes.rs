@@ -19,7 +19,7 @@ use super::openapi::parameters::{Coding, MeshParameters, Wishes};
 use super::openapi::problems::{ASKING, BODY, MESHING, NAMED, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
-use super::state::Shared;
+use super::state::{App, Shared};
 use super::timing::Timing;
 use super::upload::{self, Upload};
 use super::wish::Wish;
@@ -103,8 +103,7 @@ pub(super) async fn take(app: &Shared, query: Pairs, headers: &HeaderMap, body: 
     // A request that will be refused is refused before its body is received.
     let mut request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
     let late = upload::is_multipart(headers) || upload::is_json(headers);
-    let early = if late { None } else { Some(format(&request, headers)?) };
-    early.map_or(Ok(()), |format| params::suits(&request.job, format))?;
+    let early = if late { None } else { Some(settled(app, &mut request, headers)?) };
     let Upload { bytes, lease, fields, declared } = upload::receive(app, headers, body).await?;
     let (source, fields) = if upload::is_json(headers) {
         document(&bytes)?
@@ -116,10 +115,7 @@ pub(super) async fn take(app: &Shared, query: Pairs, headers: &HeaderMap, body: 
         pairs.extend(fields);
         request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
     }
-    let format = early.map_or_else(|| format(&request, headers), Ok)?;
-    if !request.report {
-        params::suits(&request.job, format)?;
-    }
+    let format = early.map_or_else(|| settled(app, &mut request, headers), Ok)?;
     let digest = match &source {
         Source::Sent(input) => input.digest,
         Source::Entry(id) => pdb::digest(app, id).await?,
@@ -130,13 +126,16 @@ pub(super) async fn take(app: &Shared, query: Pairs, headers: &HeaderMap, body: 
     Ok(Taken { request, pairs, format, digest, declared, source })
 }
 
-/// The format that is asked for; a report has the default one, of which nothing is written.
-pub(super) fn format(request: &Request, headers: &HeaderMap) -> Result<Format, Problem> {
-    match (request.format, request.report) {
-        (Some(format), _) => Ok(format),
-        (None, true) => Ok(Format::default()),
-        (None, false) => negotiate::format(headers),
-    }
+/// The format that is asked for, with a request that goes with it. A report has the default format, of which nothing is written.
+fn settled(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Format, Problem> {
+    let format = match (request.format, request.report) {
+        (Some(format), _) => format,
+        (None, true) => Format::default(),
+        (None, false) => negotiate::format(headers)?,
+    };
+    params::settle(&mut request.job, format)?;
+    app.accepts(&request.job)?;
+    Ok(format)
 }
 
 /// Where the bytes come from.

@@ -16,7 +16,7 @@ use super::openapi::parameters::{EntryPath, Parts, SurfaceParameters, Unchanged,
 use super::openapi::problems::{ASKING, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
-use super::state::Shared;
+use super::state::{App, Shared};
 use super::timing::Timing;
 use super::wish::Wish;
 use crate::archive::{Entry, FetchError, Memory, NoMemory, Share, Why};
@@ -52,7 +52,7 @@ pub(super) async fn surface(
 ) -> Result<Response, Problem> {
     let mut timing = Timing::start();
     let Path((id, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let named = named(&file, query)?;
+    let named = named(&app, &file, query)?;
     let id: EntryId = id.parse().map_err(|error| of_folder(&error))?;
     let digest = digest(&app, &id).await?;
     let wish = Wish::of(&headers, &extensions)?;
@@ -83,10 +83,10 @@ impl Named {
 }
 
 /// The request behind an address that ends in `surface.{ext}`.
-pub(super) fn named(file: &str, query: Pairs) -> Result<Named, Problem> {
+pub(super) fn named(app: &App, file: &str, query: Pairs) -> Result<Named, Problem> {
     let format = format_of(file)?;
     let pairs = pairs(query)?;
-    let request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
+    let mut request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
     if let Some(other) = request.format {
         let value = other.extension();
         let detail = format!("parameter `format`: the address already says {}", format.extension());
@@ -95,7 +95,8 @@ pub(super) fn named(file: &str, query: Pairs) -> Result<Named, Problem> {
             .with("value", value)
             .with("expected", format!("no value here, or the address surface.{value}")));
     }
-    params::suits(&request.job, format)?;
+    params::settle(&mut request.job, format)?;
+    app.accepts(&request.job)?;
     Ok(Named { request, pairs, format })
 }
 

@@ -20,6 +20,7 @@ use super::kinds::{KINDS, Kind};
 use super::request_id::RequestId;
 use super::unfit;
 use crate::jobs::{EndError, Exhausted, Failure, PromiseError, Refusal, SaveError};
+use crate::picture::PictureError;
 use crate::pipeline::JobError;
 use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
@@ -240,6 +241,7 @@ impl From<Failure> for Problem {
                 Self::from(error).diagnosed(&diagnostics)
             }
             Failure::Job { error: JobError::Surface(error), .. } => error.into(),
+            Failure::Job { error: JobError::Picture(error), .. } => error.into(),
             Failure::Check { ref diagnostics } => Self::new(Kind::UnreadableStructure, error.to_string())
                 .with("parameter", "check")
                 .diagnosed(diagnostics),
@@ -326,6 +328,20 @@ impl From<StructureError> for Problem {
                 .with("parameter", if what == "chain" { "chains" } else { what })
                 .with("value", asked.trim_matches('`'))
                 .with("expected", available),
+        }
+    }
+}
+
+impl From<PictureError> for Problem {
+    fn from(error: PictureError) -> Self {
+        let detail = error.to_string();
+        match error {
+            PictureError::TooLarge { side, pixels, limit } => Self::new(Kind::PictureTooLarge, detail)
+                .with("parameter", side)
+                .with("limit", limit)
+                .with("actual", pixels),
+            // The rest is dealt with before it comes here.
+            _ => Self::internal(detail),
         }
     }
 }

@@ -20,6 +20,7 @@ use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
+use crate::picture::Drawer;
 use crate::store::{Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, Exporter, TelemetryError};
@@ -68,6 +69,8 @@ pub struct Chosen {
     pub backend: Arc<dyn Backend>,
     /// Why it was taken.
     pub reason: String,
+    /// What draws pictures, and why.
+    pub drawer: Drawer,
     /// Every device that was found, taken or not.
     pub devices: Vec<FoundDevice>,
 }
@@ -99,7 +102,7 @@ impl Server {
     /// # Errors
     /// [`ServeError`].
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
-        let Chosen { backend, reason, devices: found } = chosen;
+        let Chosen { backend, reason, drawer, devices: found } = chosen;
         let access = Arc::new(Access::open(&config)?);
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
@@ -115,6 +118,7 @@ impl Server {
             patience: config.jobs.patience(),
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
+            drawer,
             meter: Some(Arc::new(Bill(Arc::clone(&access)))),
             tracer: tracer.clone(),
         };

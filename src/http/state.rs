@@ -16,7 +16,8 @@ use super::stop::Stop;
 use crate::access::Access;
 use crate::archive::Archive;
 use crate::config::Config;
-use crate::jobs::{ContentKey, Ledger, Pool};
+use crate::jobs::{ContentKey, Failure, Ledger, Pool};
+use crate::pipeline::Job;
 use crate::store::Store;
 use crate::surface::FoundDevice;
 use crate::telemetry::Tracer;
@@ -51,6 +52,12 @@ pub(super) struct App {
 }
 
 impl App {
+    /// Refuses what can be refused before anything is read.
+    pub(super) fn accepts(&self, job: &Job) -> Result<(), Problem> {
+        let refused = |error| Failure::Job { error, diagnostics: Vec::new() };
+        job.check(&self.config.limits.job()).map_err(|error| refused(error).into())
+    }
+
     /// A place for one request for a mesh.
     pub(super) fn delivery(&self) -> Result<OwnedSemaphorePermit, Problem> {
         Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {

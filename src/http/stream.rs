@@ -15,7 +15,7 @@ use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 
 use super::problem::Problem;
 use super::unfit;
-use crate::formats::{Encoder, Format};
+use crate::formats::Format;
 use crate::jobs::Finished;
 use crate::telemetry::{STAGE_DURATION, Scope};
 
@@ -62,22 +62,20 @@ fn write(
     let start = Instant::now();
     let product = &finished.product;
     let resolution = product.report.resolution;
-    let encoder = match Encoder::stored(format, product.storage, &product.mesh, &product.meta()) {
-        Ok(encoder) if encoder.encoded_len_bound() > limit => {
-            Err(unfit::file_too_large(encoder.encoded_len_bound(), limit, resolution))
-        }
-        Ok(encoder) => Ok(encoder),
+    let file = match product.file(format) {
+        Ok(file) if file.bytes_bound() > limit => Err(unfit::file_too_large(file.bytes_bound(), limit, resolution)),
+        Ok(file) => Ok(file),
         Err(error) => Err(unfit::of_format(&error, resolution)),
     };
-    let (length, encoder) = match encoder {
-        Ok(encoder) => (Ok(encoder.encoded_len()), Some(encoder)),
+    let (length, file) = match file {
+        Ok(file) => (Ok(file.bytes()), Some(file)),
         Err(problem) => (Err(problem), None),
     };
     // Without a receiver the client is gone; the first piece would find out as well.
     let gone = head.send(length).is_err();
-    let Some(encoder) = encoder.filter(|_| !gone) else { return };
+    let Some(file) = file.filter(|_| !gone) else { return };
     let mut writer = Pieces { pieces, buffer: BytesMut::new() };
-    match encoder.write(&mut writer).and_then(|()| writer.finish()) {
+    match file.write(&mut writer).and_then(|()| writer.finish()) {
         Ok(()) => {
             let time = start.elapsed();
             histogram!(STAGE_DURATION, "stage" => "encode").record(time.as_secs_f64());

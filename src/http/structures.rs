@@ -200,7 +200,7 @@ pub(super) async fn surface(
 ) -> Result<Response, Problem> {
     let mut timing = Timing::start();
     let Path((text, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let named = pdb::named(&file, query)?;
+    let named = pdb::named(&app, &file, query)?;
     let digest = digest_of(&text)?;
     let wish = Wish::of(&headers, &extensions)?;
     timing.lap("receive");

@@ -12,11 +12,12 @@ use crate::store::{BadDigest, Digest, Name, StoreError};
 pub struct ContentKey(Digest);
 
 impl ContentKey {
-    /// The key of what `backend` makes of an input. The version is part of it, as any release may move a bit.
+    /// The key of what `maker` makes of an input: a backend, and behind it what draws a picture. The version is part of it, as
+    /// any release may move a bit.
     #[must_use]
-    pub fn new(input: &Digest, job: &Job, format: Format, backend: &str) -> Self {
+    pub fn new(input: &Digest, job: &Job, format: Format, maker: &str) -> Self {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
-        let text = format!("molmesh {version}\n{backend}\n{}\n{canonical}\n{input}\n", format.extension());
+        let text = format!("molmesh {version}\n{maker}\n{}\n{canonical}\n{input}\n", format.extension());
         Self(Digest::of(text.as_bytes()))
     }
 }
@@ -54,6 +55,8 @@ mod tests {
         let plain = Job::default();
         let fine = params::parse([("resolution", "0.4")]).unwrap().job;
         let chain = params::parse([("chains", "A")]).unwrap().job;
+        let png = params::parse([("format", "png")]).unwrap().job;
+        let wide = params::parse([("format", "png"), ("width", "600")]).unwrap().job;
         let (a, b) = (Digest::of(b"a"), Digest::of(b"b"));
         let mut keys = vec![
             ContentKey::new(&a, &plain, Format::Glb, "cpu"),
@@ -62,10 +65,13 @@ mod tests {
             ContentKey::new(&a, &chain, Format::Glb, "cpu"),
             ContentKey::new(&a, &plain, Format::Ply, "cpu"),
             ContentKey::new(&a, &plain, Format::Glb, "gpu"),
+            ContentKey::new(&a, &png, Format::Png, "cpu+cpu"),
+            ContentKey::new(&a, &png, Format::Png, "cpu+gpu"),
+            ContentKey::new(&a, &wide, Format::Png, "cpu+cpu"),
         ];
         assert_eq!(keys[0], ContentKey::new(&a, &Job::default(), Format::Glb, "cpu"));
         keys.sort_by_key(ToString::to_string);
         keys.dedup();
-        assert_eq!(keys.len(), 6);
+        assert_eq!(keys.len(), 9);
     }
 }

@@ -206,7 +206,7 @@ impl Ledger {
 
     /// The key of a task's result, if it was made before. A check is made anew.
     pub(super) async fn made(&self, task: &Task, format: Format) -> Result<Option<String>, StoreError> {
-        let key = ContentKey::new(&task.digest, &task.job, format, self.0.pool.backend().name());
+        let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job));
         let there = !task.strict && self.0.store.head(&key.name(format.extension())?).await?.is_some();
         Ok(there.then(|| key.to_string()))
     }
@@ -315,7 +315,14 @@ impl Ledger {
     /// Writes an ending down. The ending of a job that was dismissed meanwhile is none.
     pub(super) async fn finish(&self, promise: &Promise, ending: Result<String, EndError>) {
         let changed = match ending {
-            Ok(key) => promise.end(Status::Successful, |record| record.result = Some(key)),
+            Ok(key) => {
+                let changed = promise.end(Status::Successful, |record| record.result = Some(key));
+                // Nobody's request ends now, so no other line tells of it.
+                if changed {
+                    tracing::info!(job_id = %promise.id(), "a job is done");
+                }
+                changed
+            }
             Err(error) => {
                 tracing::info!(job_id = %promise.id(), %error, "a job failed");
                 let problem = (self.0.describe)(&error);

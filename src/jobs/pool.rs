@@ -9,12 +9,13 @@ use metrics::counter;
 use super::devices::Watch;
 use super::queue::Queue;
 use super::{Budget, Claim, Client, Refusal, Task, Ticket, cost, worker};
-use crate::pipeline::{Job, JobLimits};
+use crate::picture::Drawer;
+use crate::pipeline::{Job, JobLimits, maker};
 use crate::surface::Backend;
 use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 
 /// Sizes of a pool.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub struct Settings {
     /// Jobs that run at once, at least 1.
     pub workers: usize,
@@ -26,6 +27,8 @@ pub struct Settings {
     pub limits: JobLimits,
     /// Memory for uploads and meshes.
     pub budget: Budget,
+    /// What draws pictures.
+    pub drawer: Drawer,
     /// Who is told what workers spend; none: nobody.
     pub meter: Option<Arc<dyn Meter>>,
     /// Where the spans of jobs go that come from an earlier process.
@@ -47,6 +50,7 @@ pub(super) struct Shared {
     pub(super) limits: JobLimits,
     pub(super) budget: Budget,
     pub(super) workers: usize,
+    pub(super) drawer: Drawer,
     pub(super) meter: Option<Arc<dyn Meter>>,
     tracer: Tracer,
     watch: Watch,
@@ -70,11 +74,11 @@ impl Pool {
     /// # Errors
     /// That of the system, if a thread cannot be started.
     pub fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
-        let Settings { workers, queue, patience, limits, budget, meter, tracer } = settings;
+        let Settings { workers, queue, patience, limits, budget, drawer, meter, tracer } = settings;
         let workers = workers.max(1);
         let queue = Arc::new(Queue::new(queue, workers, patience));
         let watch = Watch::default();
-        let shared = Shared { queue, backend, reason, limits, budget, workers, meter, tracer, watch };
+        let shared = Shared { queue, backend, reason, limits, budget, workers, drawer, meter, tracer, watch };
         let pool = Self { shared: Arc::new(shared) };
         for n in 0..workers {
             let shared = Arc::clone(&pool.shared);
@@ -119,6 +123,19 @@ impl Pool {
     #[must_use]
     pub fn reason(&self) -> &str {
         &self.shared.reason
+    }
+
+    /// What draws pictures.
+    #[must_use]
+    pub fn drawer(&self) -> &Drawer {
+        &self.shared.drawer
+    }
+
+    /// Who makes a job's file, if nothing stands in for the backend and for what draws.
+    #[must_use]
+    pub fn maker(&self, job: &Job) -> String {
+        let renderer = job.picture.map(|_| self.shared.drawer.renderer.name());
+        maker(self.shared.backend.name(), renderer)
     }
 
     /// Jobs that run at once.

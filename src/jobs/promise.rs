@@ -297,7 +297,7 @@ async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Resu
     let (job, format) = read(record).map_err(lost)?;
     let report = &finished.product.report;
     let (resolution, digest) = (report.resolution, finished.digest);
-    let key = ContentKey::new(&digest, &job, format, report.backend);
+    let key = ContentKey::new(&digest, &job, format, &report.maker());
     let (store, settings) = (&ledger.0.store, &ledger.0.settings);
     let scope = Scope::open(&record.requester.origin(ledger.0.pool.tracer()), Instant::now());
     let keep = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
@@ -310,8 +310,9 @@ async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Resu
 
 /// The job and the format of a record.
 fn read(record: &Record) -> Result<(crate::pipeline::Job, Format), String> {
-    let request = params::parse(record.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
+    let mut request = params::parse(record.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
     let format = record.format.parse().map_err(|_bad| format!("its format `{}` is unknown", record.format))?;
+    params::settle(&mut request.job, format).map_err(|e| e.to_string())?;
     Ok((request.job, format))
 }
 

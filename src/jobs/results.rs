@@ -7,7 +7,7 @@ use bytes::Bytes;
 use thiserror::Error;
 
 use super::{ContentKey, Finished};
-use crate::formats::{Encoder, Format, FormatError};
+use crate::formats::{Format, FormatError};
 use crate::store::{Store, StoreError};
 
 /// The extension of a result's report.
@@ -62,13 +62,12 @@ pub async fn save(
     store.put(&report, Bytes::from(document)).await?;
     let mut writer = store.writer(&mesh, None);
     let encode = move || {
-        let product = &finished.product;
-        let encoder = Encoder::stored(format, product.storage, &product.mesh, &product.meta())?;
-        let bytes = encoder.encoded_len_bound();
+        let file = finished.product.file(format)?;
+        let bytes = file.bytes_bound();
         if bytes > limit {
             return Err(SaveError::TooLarge { bytes, limit });
         }
-        encoder.write(&mut writer).and_then(|()| writer.flush()).map_err(of_io)?;
+        file.write(&mut writer).and_then(|()| writer.flush()).map_err(of_io)?;
         Ok(writer.finish()?)
     };
     tokio::task::spawn_blocking(encode).await.map_err(|e| SaveError::Other(e.to_string()))?

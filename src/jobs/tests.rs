@@ -17,6 +17,7 @@ use super::{
     Task, View, now_ms,
 };
 use crate::formats::Format;
+use crate::picture::Drawer;
 use crate::pipeline::{JobLimits, params};
 use crate::store::faulty::{Faults, faulty};
 use crate::store::{Digest, Folder, Name, Store, StoreError};
@@ -43,6 +44,7 @@ impl House {
             patience: Duration::from_secs(10),
             limits: JobLimits::default(),
             budget: Budget::new(1 << 30),
+            drawer: Drawer::cpu("a test says so"),
             meter: None,
             tracer: Tracer::default(),
         };

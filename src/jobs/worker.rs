@@ -10,10 +10,10 @@ use metrics::{counter, histogram};
 use super::flight::Entry;
 use super::pool::Shared;
 use super::{Failure, Finished, JobId, Outcome};
-use crate::pipeline::{self, Choice, JobError, ProgressSink as _, Report};
+use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report};
 use crate::structure::referee::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
-use crate::surface::{Column, Mesh, SurfaceError};
+use crate::surface::{Column, SurfaceError};
 use crate::telemetry::{
     Closing, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, Scope, SpanKind, TRIANGLES, VOXELS,
 };
@@ -51,6 +51,9 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
     let waited = accepted.elapsed();
     trace.scope.part("queue", accepted, waited);
     let outcome = shared.budget.check().map_err(Failure::from).and_then(|()| {
+        // Drawing's memory is known before anything is done for it.
+        let mut drawing = shared.budget.lease();
+        drawing.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
         let work = || {
             for claim in claims {
@@ -67,6 +70,10 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
             let mut product =
                 pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref())
                     .map_err(|error| explained(shared, &task.input, error))?;
+            if let Some(picture) = &task.job.picture {
+                pipeline::draw(&mut product, picture, &shared.drawer, &cancel, progress.as_ref())
+                    .map_err(|error| Failure::Job { error, diagnostics: Vec::new() })?;
+            }
             if let Some(time) = checked {
                 product.report.add_timing("check", ms(time));
             }
@@ -80,8 +87,14 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
             counter!(JOBS_FALLBACK).increment(1);
             tracing::warn!(backend = product.report.backend, why, "another backend served a job");
         }
+        if let Some((renderer, why)) =
+            product.report.picture.as_ref().and_then(|p| Some((p.renderer, p.fallback.as_ref()?)))
+        {
+            counter!(JOBS_FALLBACK).increment(1);
+            tracing::warn!(renderer, why, "another renderer drew a picture");
+        }
         let mut lease = shared.budget.lease();
-        lease.force(bytes_of(&product.mesh));
+        lease.force(bytes_of(&product));
         Ok(Finished { product, diagnostics, digest: task.digest, waited, lease })
     });
     // The input is freed before the answer goes out: the receiver then sees the memory that is really held.
@@ -115,6 +128,7 @@ impl Trace {
                     ("molmesh.samples", report.samples.into()),
                     ("molmesh.triangles", report.triangles.into()),
                 ]);
+                attributes.extend(report.picture.iter().map(|p| ("molmesh.renderer", p.renderer.into())));
             }
             // A promise is kept after its request was answered: nobody waits for it there.
             let kind = if self.promised { SpanKind::Consumer } else { SpanKind::Internal };
@@ -180,10 +194,11 @@ fn count(report: &Report) {
     }
 }
 
-/// Bytes that a mesh holds.
-fn bytes_of(mesh: &Mesh) -> u64 {
+/// Bytes that a product holds.
+fn bytes_of(Product { mesh, picture, .. }: &Product) -> u64 {
+    let drawn = picture.as_ref().map_or(0, Vec::len) as u64;
     let optional = mesh.atom_ids.as_ref().map_or(0, Column::len) + mesh.colors.as_ref().map_or(0, Column::len);
-    mesh.bytes() + 4 * optional as u64
+    mesh.bytes() + 4 * optional as u64 + drawn
 }
 
 fn ms(time: Duration) -> f64 {

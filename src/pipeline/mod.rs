@@ -1,7 +1,9 @@
 //! One job from end to end: structure bytes to spheres to mesh to report. No HTTP, no paths, no queue.
 
 mod clock;
+mod draw;
 mod estimate;
+mod file;
 mod fit;
 pub mod nearest;
 pub mod params;
@@ -14,12 +16,15 @@ use std::time::Instant;
 use thiserror::Error;
 
 pub use clock::{ProgressSink, StageClock};
+pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
+pub use file::File;
 pub use progress::Tracker;
-pub use report::{Quantization, Report};
+pub use report::{PictureReport, Quantization, Report, maker};
 pub use spacing::Spacing;
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
+use crate::picture::{PictureError, PictureLimits, PictureParams};
 use crate::structure::{self, ReadLimits, Selected, Selection, Structure, StructureError};
 use crate::surface::{
     Backend, CancelToken, Control, Measures, Mesh, Meshed, Proof, Spheres, Stage, SurfaceError, SurfaceLimits,
@@ -44,9 +49,19 @@ pub struct Job {
     pub normals: Normals,
     /// The units of a file's coordinates.
     pub units: Units,
+    /// What a picture of the mesh is to look like; none: the mesh itself is wanted.
+    pub picture: Option<PictureParams>,
 }
 
 impl Job {
+    /// Fails where its picture would be larger than allowed: before anything else is done for it.
+    ///
+    /// # Errors
+    /// [`JobError::Picture`].
+    pub fn check(&self, limits: &JobLimits) -> Result<(), JobError> {
+        self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
+    }
+
     /// The parameters for so many atoms, where the resolution does not hang on the mesh.
     fn params_for(&self, atoms: usize) -> SurfaceParams {
         let resolution = match self.spacing {
@@ -64,6 +79,8 @@ pub struct JobLimits {
     pub read: ReadLimits,
     /// Limits of meshing.
     pub surface: SurfaceLimits,
+    /// Limits of drawing.
+    pub picture: PictureLimits,
     /// When the mesh must be there; none: whenever.
     pub deadline: Option<Instant>,
 }
@@ -85,6 +102,8 @@ pub struct Product {
     pub storage: Storage,
     /// What was measured.
     pub report: Report,
+    /// The PNG, once it was drawn: then the mesh is gone.
+    pub picture: Option<Vec<u8>>,
 }
 
 impl Product {
@@ -104,6 +123,20 @@ pub enum JobError {
     /// Meshing failed.
     #[error(transparent)]
     Surface(#[from] SurfaceError),
+    /// Drawing failed.
+    #[error(transparent)]
+    Picture(PictureError),
+}
+
+impl From<PictureError> for JobError {
+    fn from(error: PictureError) -> Self {
+        match error {
+            // Whoever stops a job asks for one kind of end.
+            PictureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
+            PictureError::Device { why } => Self::Surface(SurfaceError::Device { why }),
+            error => Self::Picture(error),
+        }
+    }
 }
 
 /// A job whose mesh went into a sink.
@@ -137,6 +170,7 @@ pub fn run(
     cancel: &CancelToken,
     progress: &dyn ProgressSink,
 ) -> Result<Product, JobError> {
+    job.check(limits)?;
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
@@ -171,7 +205,7 @@ pub fn run(
     let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
     let counts = Counts { resolution: params.resolution, tries, grid, n_vertices, n_triangles, served, storage };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
-    Ok(Product { mesh, storage, report })
+    Ok(Product { mesh, storage, report, picture: None })
 }
 
 /// Whether [`pour`] can run a job: atoms by vertex and the exact proof need the whole mesh, and a bound on triangles meshes that

@@ -16,6 +16,7 @@ use super::nearest::nearest;
 use super::spacing::{DETAILS, LEAST_TRIANGLES, MOST_TRIANGLES};
 use super::{Job, Spacing};
 use crate::formats::{Compress, Format, Normals, Units};
+use crate::picture::{Background, MOST_SIDE, PictureParams, Style, View};
 use crate::structure::Selection;
 use crate::surface::{Kernel, PaperParams, Preset, Proof, SurfaceError, SurfaceOptions, SurfaceParams};
 
@@ -71,7 +72,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     let mut options = SurfaceOptions::default();
     let mut selection = Selection::default();
     let mut request = Request::default();
-    let mut spacing = None;
+    let (mut spacing, mut picture) = (None, PictureParams::default());
     for (name, value) in pairs {
         let (name, value) = (name.as_ref(), value.as_ref());
         let Some(index) = TABLE.iter().position(|p| p.name == name) else {
@@ -81,6 +82,11 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         if std::mem::replace(&mut seen[index], true) {
             return Err(ParamError::Repeated { name: parameter.name });
         }
+        if PICTURES.contains(&parameter.name) {
+            set_picture(parameter, value, &mut picture)?;
+            request.job.picture = Some(picture);
+            continue;
+        }
         set(parameter, value, &mut options, &mut selection, &mut request)?;
         if SPACINGS.contains(&parameter.name)
             && let Some(other) = spacing.replace(parameter.name)
@@ -89,9 +95,14 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         }
     }
     request.job = Job { selection, params: SurfaceParams::new(&options)?, ..request.job };
-    request.format.map_or(Ok(()), |format| suits(&request.job, format))?;
+    if let Some(format) = request.format {
+        settle(&mut request.job, format)?;
+    }
     Ok(request)
 }
+
+/// The parameters of a picture.
+pub(crate) const PICTURES: [&str; 7] = ["width", "height", "view", "azimuth", "elevation", "background", "style"];
 
 /// The parameters that set the grid's spacing, each in its own way.
 pub(crate) const SPACINGS: [&str; 3] = ["resolution", "detail", "max_triangles"];
@@ -104,11 +115,13 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
     }
 }
 
-/// Whether a job's mesh can be had in `format`: for a format that was named elsewhere than in the pairs.
+/// Makes a job one for `format`: for a format that was named elsewhere than in the pairs. A job for a picture has one from then
+/// on.
 ///
 /// # Errors
-/// [`ParamError::BadValue`] for `compress` and `units` where the format has nothing of the kind.
-pub fn suits(job: &Job, format: Format) -> Result<(), ParamError> {
+/// [`ParamError::BadValue`] for `compress`, `units`, `normals` and a picture's parameters where the format has nothing of the
+/// kind.
+pub fn settle(job: &mut Job, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::extension).collect();
         Err(ParamError::BadValue {
@@ -124,7 +137,20 @@ pub fn suits(job: &Job, format: Format) -> Result<(), ParamError> {
         let instead: Vec<_> = Units::ALL.into_iter().filter(|u| format.holds_units(*u)).map(Units::name).collect();
         return refuse("units", job.units.name(), &instead.join(", "), &|f| f.holds_units(job.units));
     }
-    Ok(())
+    if job.normals == Normals::None && format.is_picture() {
+        return refuse("normals", job.normals.name(), Normals::Smooth.name(), &|f| !f.is_picture());
+    }
+    if format.is_picture() {
+        job.picture.get_or_insert_default();
+        return Ok(());
+    }
+    let Some(picture) = &job.picture else { return Ok(()) };
+    // The first that is not as it would be anyway; all of them may be.
+    let (given, plain) = (picture.canonical(), PictureParams::default().canonical());
+    let pairs = given.split('&').zip(plain.split('&')).find(|(given, plain)| given != plain);
+    let (name, value) = pairs.map_or(("width", "512"), |(given, _)| given.split_once('=').unwrap_or_default());
+    let name = PICTURES.into_iter().find(|known| *known == name).unwrap_or("width");
+    refuse(name, value, "nothing", &|f| f.is_picture())
 }
 
 /// The refusal of an unknown name.
@@ -202,6 +228,31 @@ fn set(
     Ok(())
 }
 
+/// Puts one value of a picture where it belongs.
+fn set_picture(parameter: &Parameter, text: &str, picture: &mut PictureParams) -> Result<(), ParamError> {
+    let bad = || ParamError::BadValue {
+        name: parameter.name,
+        value: format!("`{}`", text.chars().take(64).collect::<String>()),
+        expected: parameter.domain.expected(),
+    };
+    let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MOST_SIDE).contains(n));
+    let angle = || {
+        let Domain::Number { min, max, .. } = parameter.domain else { return None };
+        text.trim().parse::<f64>().ok().filter(|angle| (min..=max).contains(angle))
+    };
+    match parameter.name {
+        "width" => picture.width = side().ok_or_else(bad)?,
+        "height" => picture.height = side().ok_or_else(bad)?,
+        "view" => picture.view = named(&View::ALL, View::name, text).ok_or_else(bad)?,
+        "azimuth" => picture.azimuth = angle().ok_or_else(bad)?,
+        "elevation" => picture.elevation = angle().ok_or_else(bad)?,
+        "background" => picture.background = text.parse::<Background>().ok().ok_or_else(bad)?,
+        "style" => picture.style = named(&Style::ALL, Style::name, text).ok_or_else(bad)?,
+        _ => return Err(unknown(parameter.name)),
+    }
+    Ok(())
+}
+
 fn flag(text: &str) -> Option<bool> {
     match text {
         "true" | "1" => Some(true),
@@ -237,7 +288,7 @@ fn one_char(text: &str) -> Option<char> {
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a field that is added without a place here does not compile.
-    let Job { selection, params, spacing, proof, compress, normals, units } = job;
+    let Job { selection, params, spacing, proof, compress, normals, units, picture } = job;
     let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = selection;
     let SurfaceParams {
         kernel,
@@ -276,6 +327,10 @@ pub fn canonical(job: &Job) -> String {
         }
         Some(PaperParams::InverseSquare { c, b }) => write!(text, "&paper_c={c}&paper_b={b}"),
     };
+    if let Some(picture) = picture {
+        text.push('&');
+        text.push_str(&picture.canonical());
+    }
     debug_assert!(paper.is_ok(), "writing to a string does not fail");
     text
 }

@@ -8,7 +8,7 @@ use super::ProgressSink;
 const UNIT: f64 = 1000.0;
 
 /// Stages with their usual share of the time, in the order in which they run.
-const STAGES: [(&str, f64); 11] = [
+const STAGES: [(&str, f64); 13] = [
     ("read", 0.10),
     ("select", 0.02),
     ("bin", 0.03),
@@ -18,8 +18,10 @@ const STAGES: [(&str, f64); 11] = [
     ("interpolate", 0.10),
     ("emit", 0.10),
     ("write", 0.05),
-    ("measure", 0.08),
-    ("encode", 0.05),
+    ("measure", 0.05),
+    ("draw", 0.03),
+    ("png", 0.01),
+    ("encode", 0.04),
 ];
 
 /// Stages of which several run at a time, on different bricks.

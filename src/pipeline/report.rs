@@ -5,6 +5,7 @@ use serde_json::{Map, Value};
 
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
+use crate::picture::{Drawer, PictureParams, Rendered};
 use crate::structure::{Selected, Structure, radii};
 use crate::surface::{GridStats, Measures, Served};
 
@@ -28,6 +29,64 @@ pub struct ComponentReport {
 pub struct Quantization {
     /// Distance between neighbouring coordinates, Å; a vertex is moved by half of it at most along each axis.
     pub step: f32,
+}
+
+/// A picture, and who drew it.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct PictureReport {
+    /// Pixels of a row.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// From where the molecule is seen.
+    pub view: &'static str,
+    /// How far the viewer has walked around from there, degrees.
+    pub azimuth: f64,
+    /// How far the viewer has climbed then, degrees.
+    pub elevation: f64,
+    /// What is behind the molecule: `transparent`, or a colour.
+    pub background: String,
+    /// How the surface is shaded.
+    pub style: &'static str,
+    /// Å that a pixel is wide and high: the projection is orthographic.
+    pub pixel: f64,
+    /// What drew it: `cpu` or `gpu`.
+    pub renderer: &'static str,
+    /// What that ran on.
+    pub device: String,
+    /// Why it was taken.
+    pub reason: String,
+    /// Why `renderer` stood in for the one that was chosen; absent where none had to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fallback: Option<String>,
+}
+
+impl PictureReport {
+    pub(super) fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
+        let served = drawn.served.clone().unwrap_or_else(|| Served {
+            backend: drawer.renderer.name(),
+            device: drawer.renderer.describe(),
+            instead: None,
+        });
+        Self {
+            width: params.width,
+            height: params.height,
+            view: params.view.name(),
+            azimuth: params.azimuth,
+            elevation: params.elevation,
+            background: params.background.to_string(),
+            style: params.style.name(),
+            pixel: drawn.pixel,
+            renderer: served.backend,
+            device: served.device,
+            reason: match &served.instead {
+                Some(why) => format!("{}; but {why}", drawer.reason),
+                None => drawer.reason.clone(),
+            },
+            fallback: served.instead,
+        }
+    }
 }
 
 /// A job's report. Field names are the JSON names.
@@ -123,6 +182,9 @@ pub struct Report {
     /// Why `backend` stood in for the one that was chosen; absent where none had to.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fallback: Option<String>,
+    /// The picture; absent where the mesh itself was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub picture: Option<PictureReport>,
     /// Wall time per stage, ms.
     #[cfg_attr(feature = "server", schema(value_type = std::collections::BTreeMap<String, f64>))]
     pub timings_ms: Map<String, Value>,
@@ -208,6 +270,7 @@ impl Report {
                 None => choice.reason.to_owned(),
             },
             fallback: served.instead,
+            picture: None,
             timings_ms: timings
                 .into_iter()
                 .map(|(name, ms)| (name.to_owned(), Value::from((ms * 1e3).round() / 1e3)))
@@ -221,6 +284,12 @@ impl Report {
         self.timings_ms.insert(stage.to_owned(), Value::from(((before + ms) * 1e3).round() / 1e3));
     }
 
+    /// Who made the file, as its key says: the backend, and behind it what drew a picture.
+    #[must_use]
+    pub fn maker(&self) -> String {
+        maker(self.backend, self.picture.as_ref().map(|picture| picture.renderer))
+    }
+
     /// The report as a mesh file's extras: without what differs from run to run, so that the same input gives
     /// the same bytes.
     #[must_use]
@@ -231,4 +300,10 @@ impl Report {
         }
         map
     }
+}
+
+/// Who makes a file: a backend, and whatever draws its mesh.
+#[must_use]
+pub fn maker(backend: &str, renderer: Option<&str>) -> String {
+    renderer.map_or_else(|| backend.to_owned(), |renderer| format!("{backend}+{renderer}"))
 }

@@ -13,6 +13,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::config::Config;
 use molmesh::http::{Chosen, Server, Stop};
+use molmesh::picture::Drawer;
 use molmesh::surface::{
     Backend, Control, FoundDevice, GridStats, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
@@ -231,7 +232,8 @@ pub(crate) fn start_on(
     config.archive.url = None;
     change(&mut config);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
-    let chosen = Chosen { backend, reason: "a test says so".to_owned(), devices: found };
+    let drawer = Drawer::cpu("a test says so");
+    let chosen = Chosen { backend, reason: "a test says so".to_owned(), drawer, devices: found };
     let server = runtime.block_on(Server::bind(config, chosen)).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
     let (orders, ordered) = tokio::sync::watch::channel(Stop::Serve);

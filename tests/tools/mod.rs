@@ -159,6 +159,24 @@ pub fn queries(paths: &[impl AsRef<Path>]) -> Option<Vec<Queries>> {
     python("promql.py", paths)
 }
 
+/// What Pillow reads in a PNG file.
+#[derive(Debug, Clone, Deserialize)]
+pub struct Png {
+    pub width: u32,
+    pub height: u32,
+    /// `RGB` or `RGBA`, as the file has it.
+    pub mode: String,
+    /// Whether the file says that it is sRGB.
+    pub srgb: bool,
+    /// Red, green, blue, alpha, in rows from the top.
+    pub pixels: Vec<[u8; 4]>,
+}
+
+/// Reads PNG files.
+pub fn png(paths: &[impl AsRef<Path>]) -> Option<Vec<Png>> {
+    python("read_png.py", paths)
+}
+
 /// Prometheus' own tool for rules, if `setup.sh` could get it.
 pub fn promtool() -> Option<PathBuf> {
     let tool = installed_here().join("promtool");

@@ -93,5 +93,5 @@ export class Stage {
 
 /** How a file's vertices are stored means nothing to a picture. */
 function pictured(choices: Choices): Choices {
-  return new Map([...choices].filter(([name]) => !["compress", "units", "atom_ids"].includes(name)));
+  return new Map([...choices].filter(([name]) => !["compress", "normals", "units", "atom_ids"].includes(name)));
 }

@@ -74,7 +74,7 @@ pub(crate) struct SignArgs {
     #[arg(long, value_name = "NAME")]
     pub(crate) key_id: Option<String>,
     /// Configuration file (TOML), the service's own
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", env = "MOLMESH_CONFIG", hide_env_values = true)]
     pub(crate) config: Option<PathBuf>,
     /// Set one value of the configuration; may be repeated
     #[arg(long, value_name = "SECTION.KEY=VALUE")]

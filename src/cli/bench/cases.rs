@@ -143,12 +143,7 @@ fn tiled(one: &Spheres, copies: [u32; 2]) -> Result<Spheres, String> {
 /// `n` atoms in a ball, as dense as the heavy atoms of proteins (one in 19.3 Å³): on a shaken cubic lattice, so that there
 /// are neither clumps nor holes. The same `n` and `seed` give the same atoms.
 pub(super) fn ball(n: usize, seed: u64) -> Spheres {
-    const SIDE: f64 = 2.683;
-    let mut state = seed;
-    let mut next = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
-    };
+    let mut shake = Shake::new(seed);
     let half = (1_i32..2000).find(|h| 4.0 * f64::from(*h).powi(3) > n as f64).unwrap_or(1) + 1;
     let mut places: Vec<[i32; 3]> =
         (-half..=half).flat_map(|z| (-half..=half).flat_map(move |y| (-half..=half).map(move |x| [x, y, z]))).collect();
@@ -156,19 +151,39 @@ pub(super) fn ball(n: usize, seed: u64) -> Spheres {
     places.truncate(n);
     let (mut columns, mut radii) = ([const { Vec::new() }; 3], Vec::new());
     for place in places {
-        (0..3).for_each(|k| columns[k].push(SIDE * (f64::from(place[k]) + 0.5 * next())));
-        // Carbon, nitrogen and oxygen as often as in proteins.
-        let element = next() + 0.5;
-        radii.push(if element < 0.63 {
-            1.7
-        } else if element < 0.80 {
-            1.55
-        } else {
-            1.52
-        });
+        (0..3).for_each(|k| columns[k].push(SIDE * (f64::from(place[k]) + 0.5 * shake.next())));
+        radii.push(radius(shake.next() + 0.5));
     }
     let [x, y, z] = columns;
     Spheres::new(x, y, z, radii).unwrap_or_default()
+}
+
+/// Å between atoms on a cubic lattice that is as dense as the heavy atoms of proteins.
+pub(super) const SIDE: f64 = 2.683;
+
+/// Numbers of [−½, ½) that look random and are the same for the same seed.
+pub(super) struct Shake(u64);
+
+impl Shake {
+    pub(super) const fn new(seed: u64) -> Self {
+        Self(seed)
+    }
+
+    pub(super) fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
+    }
+}
+
+/// The radius, Å, of the element at a number of [0, 1): carbon, nitrogen and oxygen as often as in proteins.
+pub(super) fn radius(element: f64) -> f32 {
+    if element < 0.63 {
+        1.7
+    } else if element < 0.80 {
+        1.55
+    } else {
+        1.52
+    }
 }
 
 #[cfg(test)]

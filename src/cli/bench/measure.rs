@@ -10,7 +10,7 @@ use molmesh::surface::{
     SurfaceParams,
 };
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::floor::Work;
 
@@ -20,7 +20,7 @@ pub(super) const LIMITS: SurfaceLimits = SurfaceLimits { max_samples: 1 << 40, m
 pub(super) const WARM_UP: usize = 3;
 
 /// Median and least of several values.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(super) struct Spread {
     pub(super) median: f64,
     pub(super) min: f64,

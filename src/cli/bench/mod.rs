@@ -4,6 +4,7 @@ mod cases;
 mod floor;
 mod jobs;
 mod measure;
+mod paper;
 mod pool;
 mod spread;
 mod table;
@@ -26,7 +27,13 @@ use measure::Row;
 #[derive(Debug, Subcommand)]
 pub(crate) enum Bench {
     /// Time the stages on a GPU, beside the floor that the device's own rates give
-    Gpu(GpuArgs),
+    Gpu(Box<GpuArgs>),
+    /// Run the tables of the 2010 paper: its programs and ours, on the CPU and on a GPU
+    Paper(Box<paper::PaperArgs>),
+    /// Fetch the paper's structures from the archive
+    Fetch(paper::fetch::FetchArgs),
+    /// Draw figures, and fill tables into a page, from results that were measured before
+    Figures(paper::redraw::FiguresArgs),
 }
 
 /// `molmesh bench gpu`.
@@ -74,7 +81,15 @@ pub(crate) struct GpuArgs {
 
 /// Runs the command.
 pub(super) fn run(bench: &Bench) -> Result<(), CliError> {
-    let Bench::Gpu(args) = bench;
+    match bench {
+        Bench::Gpu(args) => gpu(args),
+        Bench::Paper(args) => paper::run(args),
+        Bench::Fetch(args) => paper::fetch::run(args),
+        Bench::Figures(args) => paper::redraw::run(args),
+    }
+}
+
+fn gpu(args: &GpuArgs) -> Result<(), CliError> {
     if args.runs == 0 || args.atoms == 0 || args.jobs == Some(0) || args.pool == Some(0) {
         return Err(CliError::usage("nothing is measured with 0 runs, atoms or jobs"));
     }

@@ -9,7 +9,7 @@ use utoipa::openapi::{
 use utoipa::{IntoResponses, ToSchema};
 
 use crate::formats::Format;
-use crate::http::delivery::{ReportDocument, SUMMARY};
+use crate::http::delivery::{PICTURE, ReportDocument, SUMMARY};
 use crate::http::jobs::JobDocument;
 
 fn header(kind: Type, doc: &str) -> Header {
@@ -30,10 +30,15 @@ fn summary() -> impl Iterator<Item = (&'static str, Header)> {
         "molmesh-closed" | "molmesh-manifold" => Type::Boolean,
         _ => Type::String,
     };
-    SUMMARY.into_iter().map(move |name| {
+    let summary = SUMMARY.into_iter().map(move |name| {
         let member = name.trim_start_matches("molmesh-").replace('-', "_");
         (name, header(of(name), &format!("`{member}` of the report.")))
-    })
+    });
+    let picture = PICTURE.into_iter().map(|(name, member)| {
+        let kind = if member == "pixel" { Type::Number } else { Type::String };
+        (name, header(kind, &format!("`{member}` of the report's `picture`; a picture alone has it.")))
+    });
+    summary.chain(picture)
 }
 
 /// The schema of a mesh file: bytes, of which the format's own standard says more.

@@ -41,7 +41,7 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
         Domain::Flag => object(Type::Boolean).default(parameter.default.parse::<bool>().ok().map(Value::from)).into(),
         Domain::Choice(values) => {
             let default = values.contains(&parameter.default).then(|| Value::from(parameter.default));
-            object(Type::String).enum_values(Some(words(values))).default(default).into()
+            object(Type::String).enum_values(Some(words(values))).default(default).extensions(hints).into()
         }
         Domain::Set(values) if place == Place::Form => {
             let one = values.join("|");
@@ -51,12 +51,14 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
             let item = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(words(values)));
             ArrayBuilder::new().items(item).min_items(Some(1)).description(Some(doc)).into()
         }
-        Domain::Text { expected } => object(Type::String).min_length(Some(1)).title(Some(expected)).into(),
+        Domain::Text { expected } => {
+            object(Type::String).min_length(Some(1)).title(Some(expected)).extensions(hints).into()
+        }
     }
 }
 
-/// What front ends build controls from, as `x-control`: `unit`, `usual` (the part of the bounds for a slider), and
-/// `instead_of` (parameters that cannot stand beside this one). One member, as their order would be anybody's.
+/// What front ends build controls from, as `x-control`: `unit`, `usual` (the part of the bounds for a slider), `instead_of`
+/// (parameters that cannot stand beside this one), and `format` (the only one that it goes with). One member, as their order would be anybody's.
 fn hints(parameter: &params::Parameter) -> Option<Extensions> {
     let mut control = serde_json::Map::new();
     if let Domain::Number { unit, .. } = parameter.domain
@@ -66,6 +68,9 @@ fn hints(parameter: &params::Parameter) -> Option<Extensions> {
     }
     if let Some(usual) = params::usual(parameter) {
         control.insert("usual".to_owned(), usual.to_vec().into());
+    }
+    if params::PICTURES.contains(&parameter.name) {
+        control.insert("format".to_owned(), Format::Png.extension().into());
     }
     if params::SPACINGS.contains(&parameter.name) {
         let others: Vec<&str> = params::SPACINGS.into_iter().filter(|name| *name != parameter.name).collect();
@@ -104,7 +109,9 @@ impl IntoParams for SurfaceParameters {
         let file = ObjectBuilder::new()
             .schema_type(Type::String)
             .enum_values(Some(Format::ALL.map(|format| format!("surface.{}", format.extension()))));
-        let file = path("file", "The mesh, by the extension of its format.").schema(Some(file)).build();
+        let file = path("file", "The mesh, by the extension of its format; or `surface.png`, its picture.")
+            .schema(Some(file))
+            .build();
         std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
     }
 }

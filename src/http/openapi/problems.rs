@@ -36,6 +36,7 @@ pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::EmptySelection,
     Kind::GridTooLarge,
     Kind::MeshTooLarge,
+    Kind::PictureTooLarge,
     Kind::DeviceMemory,
     Kind::NoSurface,
     Kind::Internal,

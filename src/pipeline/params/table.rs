@@ -1,6 +1,7 @@
 //! The table of parameters: names, what values they take, what they do.
 
 use crate::formats::{Compress, Normals, Units};
+use crate::picture::{Background, MOST_SIDE, Style, View};
 use crate::pipeline::spacing::{LEAST_TRIANGLES, MOST_TRIANGLES};
 use crate::structure::select::KIND_NAMES;
 use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
@@ -94,7 +95,9 @@ pub fn usual(parameter: &Parameter) -> Option<[f64; 2]> {
 
 const KERNELS: &[&str] = &names(Kernel::ALL);
 const PRESETS: &[&str] = &preset_names(Preset::ALL);
-const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj"];
+const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj", "png"];
+const VIEWS: &[&str] = &view_names(View::ALL);
+const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
 const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
@@ -106,6 +109,11 @@ const fn names(all: &[Kernel]) -> [&'static str; 3] {
 
 const fn preset_names(all: &[Preset]) -> [&'static str; 6] {
     [all[0].name(), all[1].name(), all[2].name(), all[3].name(), all[4].name(), all[5].name()]
+}
+
+const fn view_names(all: [View; 7]) -> [&'static str; 7] {
+    let [a, b, c, d, e, f, g] = all;
+    [a.name(), b.name(), c.name(), d.name(), e.name(), f.name(), g.name()]
 }
 
 /// Every parameter, in documentation order. The bounds repeat those of [`SurfaceParams::new`]; a test says that
@@ -222,7 +230,12 @@ pub const TABLE: &[Parameter] = &[
         default: "absent",
         doc: "Refuse a file in which a second, strict reader finds errors.",
     },
-    Parameter { name: "format", domain: Domain::Choice(FORMATS), default: "glb", doc: "The mesh file format." },
+    Parameter {
+        name: "format",
+        domain: Domain::Choice(FORMATS),
+        default: "glb",
+        doc: "The file: a mesh format, or png for a picture of the mesh.",
+    },
     Parameter {
         name: "compress",
         domain: Domain::Choice(COMPRESS),
@@ -240,6 +253,44 @@ pub const TABLE: &[Parameter] = &[
         domain: Domain::Choice(UNITS),
         default: "angstrom",
         doc: "What 1 stands for in the file's coordinates: glb and gltf scale their node, the others their numbers (angstrom or nanometer). Reports stay in Å.",
+    },
+    Parameter {
+        name: "width",
+        domain: Domain::Integer { min: 1, max: MOST_SIDE as i64 },
+        default: "512",
+        doc: "Pixels of a picture's rows. This and the next six go with the format png alone.",
+    },
+    Parameter {
+        name: "height",
+        domain: Domain::Integer { min: 1, max: MOST_SIDE as i64 },
+        default: "512",
+        doc: "Rows of a picture.",
+    },
+    Parameter {
+        name: "view",
+        domain: Domain::Choice(VIEWS),
+        default: "principal",
+        doc: "From where a picture shows the molecule: along the least of its surface's principal axes, the greatest lying horizontally; or along the file's axes, front being from +z with y up.",
+    },
+    number(
+        "azimuth",
+        [-360.0, 360.0],
+        "°",
+        "0",
+        "How far a picture's viewer walks around the view's upright axis, to the right.",
+    ),
+    number("elevation", [-90.0, 90.0], "°", "0", "How far a picture's viewer climbs then."),
+    Parameter {
+        name: "background",
+        domain: Domain::Text { expected: Background::EXPECTED },
+        default: "transparent",
+        doc: "What is behind the molecule in a picture.",
+    },
+    Parameter {
+        name: "style",
+        domain: Domain::Choice(STYLES),
+        default: "surface",
+        doc: "How a picture is shaded: gouraud is light by vertex, interpolated; surface adds ambient occlusion and a soft outline.",
     },
     Parameter {
         name: "report",

@@ -33,7 +33,7 @@ interface Schema {
   maximum?: number;
   enum?: string[];
   items?: { enum?: string[] };
-  "x-control"?: { usual?: [number, number]; unit?: string; instead_of?: string[] };
+  "x-control"?: { usual?: [number, number]; unit?: string; instead_of?: string[]; format?: string };
 }
 
 interface Described {
@@ -56,9 +56,10 @@ function described(api: OpenApi): Described[] {
   return (mesh?.parameters ?? []).filter((parameter) => parameter.in === "query");
 }
 
-/** Every parameter that changes the mesh, in the order of the description. */
+/** Every parameter that changes the mesh, in the order of the description; those of pictures go with no mesh. */
 export function parametersOf(api: OpenApi): Parameter[] {
-  return described(api).filter((parameter) => !ELSEWHERE.includes(parameter.name)).map(parameterOf);
+  const mesh = (parameter: Described) => !ELSEWHERE.includes(parameter.name) && !parameter.schema?.["x-control"]?.format;
+  return described(api).filter(mesh).map(parameterOf);
 }
 
 /** The formats that a mesh can be had in, by their files' extensions. */

@@ -1,0 +1,88 @@
+"""Who is compared: how each is started, and what kind of surface it makes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Callable
+
+import install
+
+HERE = Path(__file__).resolve().parent
+# Splashsurf's radius is a particle's; its kernel reaches 1.7 of it. The level gives about as many triangles as ours.
+SPLASH = ["-r", "1", "-l", "1.7", "-t", "0.15", "--normals=on", "-q"]
+
+
+@dataclass
+class Job:
+    """One structure, prepared, and what the mesh is to be called (without extension)."""
+
+    name: str
+    file: Path
+    folder: Path
+    spacing: float
+    target: Path
+
+    def beside(self, extension):
+        return str(self.folder / (self.name + extension))
+
+    def mesh(self, extension):
+        return str(self.target.with_suffix(extension))
+
+
+@dataclass
+class Peer:
+    name: str
+    #: "same" (our very density), "gaussian" (near it), "ses" (another surface)
+    surface: str
+    extension: str
+    command: Callable[[Job], list]
+    #: Installs it where it is absent and returns its version; raises `install.Missing` with the reason.
+    ready: Callable[[], str]
+    environment: Callable[[], dict] = dict
+
+
+def script(name, job, extension=".ply"):
+    return [install.python(), str(HERE / name), str(job.file), job.mesh(extension), str(job.spacing)]
+
+
+def pymol(kind):
+    def command(job):
+        arguments = [str(HERE / "pymol_peer.py"), "--", str(job.file), job.mesh(".obj"), str(job.spacing), kind]
+        return ["/usr/bin/python3", "-m", "pymol.__init__", "-cqk", *arguments]
+
+    return command
+
+
+def catalog(molmesh):
+    """All of them, ours first; `molmesh` is our binary."""
+    def ours(job):
+        spacing = ["--resolution", str(job.spacing)]
+        return [str(molmesh), "mesh", str(job.file), "--backend", "cpu", "--quiet", *spacing, "-o", job.mesh(".glb")]
+
+    def splashsurf(job):
+        spacing = ["-c", str(job.spacing)]
+        return [install.splashsurf(), "reconstruct", job.beside(".xyz"), *SPLASH, *spacing, "-o", job.mesh(".ply")]
+
+    def molstar(job):
+        arguments = [str(install.NODE / "node_modules"), str(job.file), job.mesh(".ply"), str(job.spacing)]
+        return ["node", "--max-old-space-size=12288", str(HERE / "molstar_peer.cjs"), *arguments]
+
+    def edtsurf(job):
+        # -t 1: marching cubes; -s 3: molecular surface; -h 1: cavities too; -f: cells an ångström.
+        options = ["-t", "1", "-s", "3", "-h", "1", "-f", str(1 / job.spacing)]
+        return [install.edtsurf(), "-i", job.beside(".edt.pdb"), *options, "-o", str(job.target)]
+
+    def cache():
+        return {"NUMBA_CACHE_DIR": str(install.FOLDER / "numba")}
+
+    return [
+        Peer("molmesh", "same", ".glb", ours, lambda: install.molmesh_version(molmesh)),
+        Peer("splashsurf", "gaussian", ".ply", splashsurf, install.splashsurf_version),
+        Peer("vtk", "same", ".ply", lambda job: script("vtk_peer.py", job), install.packages("vtk", "numba"), cache),
+        Peer("scikit-image", "same", ".ply", lambda job: script("skimage_peer.py", job),
+             install.packages("scikit-image", "numba"), cache),
+        Peer("molstar", "gaussian", ".ply", molstar, install.molstar_version),
+        Peer("ovito", "gaussian", ".ply", lambda job: script("ovito_peer.py", job), install.packages("ovito")),
+        Peer("edtsurf", "ses", ".ply", edtsurf, install.debian("edtsurf")),
+        Peer("pymol", "ses", ".obj", pymol("ses"), install.debian("pymol"), install.pymol_environment),
+        Peer("pymol-gaussian", "other", ".obj", pymol("gaussian"), install.debian("pymol"), install.pymol_environment),
+    ]  # fmt: skip

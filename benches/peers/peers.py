@@ -1,0 +1,197 @@
+"""Structure file to mesh file: molmesh and other programs on the same files, in turn, on a RAM disk.
+
+    python3 benches/peers/peers.py                                       # the samples
+    python3 benches/peers/peers.py --data FOLDER --publish               # 1UBQ, 1A0Q, 7CTH, 6ZU5 of a folder; writes the page
+    python3 benches/peers/peers.py --files A.pdb B.cif --only molmesh,splashsurf --rounds 9
+
+Needs `cargo build --release`, Python 3.11, and what the registries of each program need (cargo, npm, apt-get); programs that
+are absent are installed into target/peers. What cannot be installed, fails or takes too long has its row with the reason.
+Every run is a whole process, from a file to a file. docs/peers.md says what is compared with what.
+"""
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import tables
+from catalog import Job, catalog
+from install import ROOT, Missing, helper
+
+HERE = Path(__file__).resolve().parent
+DEFAULT = ("1ubq", "1a0q", "7cth", "6zu5")
+SUFFIXES = (".pdb", ".ent", ".cif", ".pdb.gz", ".ent.gz", ".cif.gz")
+
+
+def options():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=ROOT / "samples", help="folder of structures [samples]")
+    parser.add_argument("--files", type=Path, nargs="+", help="these instead: PDB or mmCIF, plain or gzip")
+    parser.add_argument("--rounds", type=int, default=5, help="timed runs of each program [5]")
+    parser.add_argument("--only", help="programs, comma-separated; molmesh is always among them")
+    parser.add_argument("--limit", type=float, default=120, help="seconds after which a run is ended [120]")
+    parser.add_argument("--spacing", type=float, default=0.5, help="of the grid, Å [0.5]")
+    parser.add_argument("--molmesh", type=Path, default=ROOT / "target/release/molmesh", help="our binary")
+    parser.add_argument("--json", type=Path, help="write the figures there")
+    parser.add_argument("--page", type=Path, help="write the tables there, between its markers")
+    parser.add_argument("--note", default="", help="a sentence for the tables' header: who else used the machine, say")
+    parser.add_argument("--publish", action="store_true", help="--json docs/results/peers.json --page docs/peers.md")
+    given = parser.parse_args()
+    if given.rounds < 1 or given.limit <= 0 or given.spacing <= 0:
+        parser.error("--rounds, --limit and --spacing must be positive")
+    if given.publish:
+        given.json, given.page = ROOT / "docs/results/peers.json", ROOT / "docs/peers.md"
+    return given
+
+
+def chosen_files(given):
+    """What `--files` says, or the default structures of the folder, or all of it where it has none of them."""
+    if given.files:
+        return given.files
+    there = sorted(path for path in given.data.iterdir() if path.name.lower().endswith(SUFFIXES))
+    known = [path for name in DEFAULT for path in there if path.name.lower().split(".")[0] == name]
+    return known or there or sys.exit(f"no structures in {given.data}")
+
+
+def machine():
+    """What the figures were measured on."""
+    cpu, memory = platform.processor() or platform.machine(), 0
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            cpu = line.split(":", 1)[1].strip()
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        if line.startswith("MemTotal"):
+            memory = int(line.split()[1]) / 1e6
+    return {"cpu": cpu, "cores": len(os.sched_getaffinity(0)), "memory_gb": memory,
+            "system": f"{platform.system()} {platform.release()}", "load": os.getloadavg()[0]}  # fmt: skip
+
+
+def ask(script, *arguments):
+    """Lines of JSON from one of the scripts beside this one."""
+    done = subprocess.run([helper(), str(HERE / script), *map(str, arguments)], capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(f"{script}: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else 'failed'}")
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def launch(peer, job, limit):
+    """One measured run: seconds and kB, or why there are none (`failed`, `limit`)."""
+    for old in job.folder.glob(job.target.name + "*"):
+        old.unlink()
+    errors = job.folder / "errors.txt"
+    command = [sys.executable, "-I", "-S", str(HERE / "launch.py"), str(limit), str(errors), *peer.command(job)]
+    environment = {**os.environ, **peer.environment()}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=job.folder)
+    if done.returncode != 0:
+        words = done.stderr.strip().splitlines()
+        return {"failed": words[-1] if words else f"what measures it ended with {done.returncode}"}
+    said = json.loads(done.stdout)
+    mesh = Path(job.mesh(peer.extension))
+    if said["late"]:
+        return {"limit": limit}
+    if said["status"] != 0 or not mesh.exists() or mesh.stat().st_size == 0:
+        words = errors.read_text(errors="replace").strip().splitlines()
+        return {"failed": f"status {said['status']}" + (f", {words[-1][:160]}" if words else "")}
+    return {"wall": said["wall"], "kb": said["kb"]}
+
+
+def first(peer, job, limit):
+    """The round that is not timed: its mesh is looked at."""
+    entry = {"surface": peer.surface}
+    outcome = launch(peer, job, limit)
+    if "wall" not in outcome:
+        return {**entry, **outcome}
+    try:
+        return {**entry, "runs": [], "mesh": ask("check.py", job.mesh(peer.extension))[0]}
+    except RuntimeError as error:
+        return {**entry, "failed": str(error)}
+
+
+def compare(peers, absent, job, given):
+    """All programs on one structure; entries by name in the catalogue's order."""
+    programs = {}
+    for peer in peers:
+        if peer.name in absent:
+            programs[peer.name] = {"surface": peer.surface, "missing": absent[peer.name]}
+        else:
+            note(f"{job.name}: {peer.name}")
+            programs[peer.name] = first(peer, job, given.limit)
+    running = [peer for peer in peers if "runs" in programs[peer.name]]
+    for number in range(given.rounds):
+        note(f"{job.name}: round {number + 1} of {given.rounds}")
+        # Each round begins with another one, so that none has the same predecessor's traces every time.
+        for peer in running[number % len(running) :] + running[: number % len(running)] if running else []:
+            entry, outcome = programs[peer.name], launch(peer, job, given.limit)
+            if "wall" in outcome:
+                entry["runs"].append({"round": number, **outcome})
+            else:
+                entry.update(outcome)
+        running = [peer for peer in running if not {"failed", "limit"} & programs[peer.name].keys()]
+    return tables.summary(programs)
+
+
+def note(words):
+    print(words, file=sys.stderr, flush=True)
+
+
+def same_atoms(molmesh, structure):
+    """Ends where we would not mesh just the atoms that the others are given."""
+    command = [molmesh, "mesh", structure["file"], "--backend", "cpu", "--report", "json", "-o", os.devnull, "--format", "ply"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    if done.returncode != 0:
+        sys.exit(done.stderr.strip())
+    atoms = json.loads(done.stdout)["atoms"]
+    if atoms != structure["atoms"]:
+        sys.exit(f"{structure['name']}: molmesh takes {atoms} atoms, the others {structure['atoms']}")
+
+
+def ready(peers):
+    """Versions by name, and why programs are absent."""
+    versions, absent = {}, {}
+    for peer in peers:
+        try:
+            versions[peer.name] = peer.ready()
+        except Missing as error:
+            absent[peer.name] = str(error)
+    return versions, absent
+
+
+def main():
+    given = options()
+    peers = catalog(given.molmesh.resolve())
+    if given.only:
+        names = {"molmesh", *given.only.split(",")}
+        unknown = names - {peer.name for peer in peers}
+        if unknown:
+            sys.exit(f"no such program: {', '.join(sorted(unknown))}; there are {', '.join(p.name for p in peers)}")
+        peers = [peer for peer in peers if peer.name in names]
+    versions, absent = ready(peers)
+    if "molmesh" in absent:
+        sys.exit(f"{absent['molmesh']}: cargo build --release, or --molmesh BINARY")
+    result = {"date": datetime.date.today().isoformat(), "machine": machine(), "spacing": given.spacing,
+              "rounds": given.rounds, "limit": given.limit, "note": given.note, "versions": versions, "structures": []}  # fmt: skip
+    ram = "/dev/shm" if os.path.isdir("/dev/shm") else None
+    for file in chosen_files(given):
+        with tempfile.TemporaryDirectory(dir=ram, prefix="peers-") as folder:
+            structure = ask("prepare.py", folder, file)[0]
+            same_atoms(given.molmesh, structure)
+            job = Job(structure["name"], Path(structure["file"]), Path(folder), given.spacing, Path(folder) / "mesh")
+            programs = compare(peers, absent, job, given)
+        result["structures"].append({"name": structure["name"], "atoms": structure["atoms"], "load": os.getloadavg()[0],
+                                     "programs": programs})  # fmt: skip
+        title, rows = tables.section(result["structures"][-1])
+        print(f"\n{title}\n{tables.terminal(rows)}", flush=True)
+        if given.json:  # after each structure: a run that is ended leaves what it has
+            given.json.parent.mkdir(parents=True, exist_ok=True)
+            given.json.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    if given.page:
+        given.page.write_text(tables.between(given.page.read_text(), tables.page(result)))
+
+
+if __name__ == "__main__":
+    main()

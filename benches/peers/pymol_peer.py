@@ -1,0 +1,22 @@
+"""Structure file to OBJ by PyMOL, run inside it: `pymol -cqk pymol_peer.py -- IN OUT SPACING ses|gaussian`.
+
+`ses` is what its `surface` shows, at quality 1 (its distance between dots is 0.5 Å then). `gaussian` is the surface of its
+Gaussian map: atomic scattering, blurred to 3 Å with the same B factor for all, at one standard deviation of the map.
+"""
+
+import sys
+
+from pymol import cmd
+
+source, target, spacing, kind = sys.argv[-4:]
+cmd.load(source, "m")
+cmd.hide("everything")
+if kind == "ses":
+    cmd.set("surface_quality", 1)
+    cmd.show("surface", "m")
+else:
+    cmd.alter("m", "b=20")
+    cmd.set("gaussian_resolution", 3.0)
+    cmd.map_new("g", "gaussian", float(spacing), "m", 5.0)
+    cmd.isosurface("s", "g", 1.0)
+cmd.save(target)

@@ -1,0 +1,163 @@
+"""Figures of a run to tables: medians, ratios, Markdown. Nothing here measures anything."""
+
+from statistics import median
+
+# Beyond this difference in triangles times are also compared per triangle.
+NEAR = 0.05
+SURFACES = {
+    "same": "ours",
+    "gaussian": "Gaussian, near ours",
+    "other": "another Gaussian",
+    "ses": "solvent-excluded",
+}
+HEAD = ["program", "surface", "s", "× time", "MB", "× memory", "triangles", "a triangle: × time", "× memory",
+        "closed", "area Å²", "volume Å³"]  # fmt: skip
+
+
+def summary(runs):
+    """Medians of rounds (each with `wall` in s and `kb`); ratios are taken between runs of the same round."""
+    ours = {run["round"]: run for run in runs["molmesh"]["runs"]} if "runs" in runs.get("molmesh", {}) else {}
+    for entry in runs.values():
+        if not entry.get("runs"):
+            continue
+        entry["seconds"] = median(run["wall"] for run in entry["runs"])
+        entry["megabytes"] = median(run["kb"] for run in entry["runs"]) / 1024
+        pairs = [(run, ours[run["round"]]) for run in entry["runs"] if run["round"] in ours]
+        if pairs:
+            entry["times_ours"] = median(theirs["wall"] / own["wall"] for theirs, own in pairs)
+            entry["memory_ours"] = median(theirs["kb"] / own["kb"] for theirs, own in pairs)
+        near_equal(entry, runs["molmesh"].get("mesh"))
+    late(runs)
+    return runs
+
+
+def near_equal(entry, ours):
+    """Ratios per triangle where the counts differ by more than `NEAR`."""
+    theirs = entry.get("mesh")
+    if not (ours and theirs and theirs["triangles"] and "times_ours" in entry):
+        return
+    factor = ours["triangles"] / theirs["triangles"]
+    if abs(1 / factor - 1) > NEAR:
+        entry["times_ours_per_triangle"] = entry["times_ours"] * factor
+        entry["memory_ours_per_triangle"] = entry["memory_ours"] * factor
+
+
+def late(runs):
+    """What was ended at the limit took more than so many times ours."""
+    ours = runs.get("molmesh", {}).get("seconds")
+    for entry in runs.values():
+        if "limit" in entry and ours:
+            entry["times_ours_at_least"] = entry["limit"] / ours
+
+
+def significant(value, digits=3):
+    """A few digits, without an exponent."""
+    if value == 0:
+        return "0"
+    text = f"{value:.{digits}g}"
+    return f"{float(text):,.0f}" if "e" in text or abs(value) >= 1000 else text
+
+
+def mesh_cells(mesh):
+    if not mesh:
+        return ["–"] * 4
+    if mesh["closed"]:
+        closed = "yes"
+    else:
+        closed = f"no: {mesh['open_edges']:,} open edges, {mesh['crowded_edges']:,} with more than two triangles"
+    if mesh["merged"]:
+        closed += " (merged)"
+    return [f"{mesh['triangles']:,}", closed, significant(mesh["area"], 4), significant(mesh["volume"], 4)]
+
+
+def row(name, entry):
+    """The cells of one program, as `HEAD` names them."""
+    surface = SURFACES[entry["surface"]]
+    triangles, closed, area, volume = mesh_cells(entry.get("mesh"))
+    if "missing" in entry or "failed" in entry:
+        why = f"not to be had: {entry['missing']}" if "missing" in entry else f"failed: {entry['failed']}"
+        return [name, surface, why.replace("|", "/"), *["–"] * (len(HEAD) - 3)]
+    if "limit" in entry:
+        ratio = f"> {significant(entry['times_ours_at_least'])}" if "times_ours_at_least" in entry else "–"
+        return [name, surface, f"more than {entry['limit']:g}", ratio, *["–"] * (len(HEAD) - 4)]
+
+    def optional(key):
+        return significant(entry[key]) if key in entry else "–"
+
+    return [
+        name, surface, significant(entry["seconds"]), optional("times_ours"), f"{entry['megabytes']:,.0f}",
+        optional("memory_ours"), triangles, optional("times_ours_per_triangle"), optional("memory_ours_per_triangle"),
+        closed, area, volume,
+    ]  # fmt: skip
+
+
+def markdown(rows):
+    lines = ["| " + " | ".join(HEAD) + " |", "|" + "---|" * len(HEAD)]
+    return "\n".join(lines + ["| " + " | ".join(cells) + " |" for cells in rows])
+
+
+def terminal(rows):
+    """Columns of the widths that they need; texts to the left, figures to the right."""
+    rows = [HEAD, *rows]
+    widths = [max(len(cells[k]) for cells in rows if len(cells[2]) < 24 or k < 2) for k in range(len(HEAD))]
+    left = {0, 1, HEAD.index("closed")}
+
+    def line(cells):
+        if len(cells[2]) >= 24:  # a reason, not a figure
+            return f"{cells[0]:<{widths[0]}}  {cells[1]:<{widths[1]}}  {cells[2]}"
+        return "  ".join(f"{c:<{w}}" if k in left else f"{c:>{w}}" for k, (c, w) in enumerate(zip(cells, widths)))
+
+    return "\n".join(line(cells).rstrip() for cells in rows)
+
+
+def section(structure):
+    """Title and rows of one structure of the run."""
+    title = f"{structure['name'].upper()}: {structure['atoms']:,} atoms"
+    return title, [row(name, entry) for name, entry in structure["programs"].items()]
+
+
+def overview(result):
+    """× time of every program and structure, one row a program."""
+    structures = result["structures"]
+    lines = ["| × our time | " + " | ".join(s["name"].upper() for s in structures) + " |",
+             "|" + "---|" * (len(structures) + 1)]  # fmt: skip
+    names = list(dict.fromkeys(name for s in structures for name in s["programs"] if name != "molmesh"))
+    for name in names:
+        cells = []
+        for structure in structures:
+            entry = structure["programs"].get(name, {})
+            if "times_ours" in entry:
+                cells.append(significant(entry["times_ours"]))
+            elif "times_ours_at_least" in entry:
+                cells.append(f"> {significant(entry['times_ours_at_least'])}")
+            else:
+                cells.append("–")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def page(result):
+    """All of it as Markdown, machine and versions first."""
+    machine = result["machine"]
+    versions = "; ".join(version for version in dict.fromkeys(result["versions"].values()) if version)
+    loads = [machine["load"], *(s["load"] for s in result["structures"] if "load" in s)]
+    note = f" {result['note']}" if result.get("note") else ""
+    load = f"load {loads[0]:.1f} at the start" if len(loads) == 1 else f"load between {min(loads):.1f} and {max(loads):.1f}"
+    parts = [
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB, {machine['system']}; {load}."
+        f" {result['date']}, grid {result['spacing']:g} Å, {result['rounds']} rounds after"
+        f" one that is not timed, {result['limit']:g} s a run at most.{note} {versions}.",
+        overview(result),
+    ]
+    for structure in result["structures"]:
+        title, rows = section(structure)
+        parts += [f"### {title}", markdown(rows)]
+    return "\n\n".join(parts)
+
+
+def between(text, content, begin="<!-- peers: begin -->", end="<!-- peers: end -->"):
+    """`text` with what is between the two markers replaced. Raises ValueError where there are not both, once each."""
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"the page must have {begin} and {end}, once each and in this order")
+    head, rest = text.split(begin)
+    return f"{head}{begin}\n\n{content}\n\n{end}{rest.split(end)[1]}"

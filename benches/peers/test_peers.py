@@ -1,0 +1,178 @@
+"""The comparison's own parts, on things whose answer is known: `MOLMESH=BINARY python test_peers.py`.
+
+Needs what tests/tools/setup.sh installs (gemmi, numpy, trimesh); no peer.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy as np
+
+import check
+import gpu_field
+import peers
+import prepare
+import tables
+from catalog import Job, Peer
+from install import ROOT
+from radii import RADII
+
+HERE = Path(__file__).resolve().parent
+MOLMESH = os.environ["MOLMESH"]
+SAMPLE = ROOT / "samples/4pti.pdb"
+CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float64)
+SIDES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+class Checker(unittest.TestCase):
+    def test_a_tetrahedron_is_closed(self):
+        report = check.report(CORNERS, SIDES)
+        self.assertTrue(report["closed"] and not report["merged"])
+        self.assertAlmostEqual(report["volume"], 1 / 6)
+        self.assertAlmostEqual(report["area"], 1.5 + 3**0.5 / 2)
+        self.assertLess(check.report(CORNERS, SIDES[:, ::-1])["volume"], 0)
+
+    def test_a_missing_triangle_opens_it(self):
+        report = check.report(CORNERS, SIDES[1:])
+        self.assertEqual((report["closed"], report["open_edges"], report["crowded_edges"]), (False, 3, 0))
+
+    def test_a_doubled_triangle_is_found(self):
+        report = check.report(CORNERS, np.concatenate([SIDES, SIDES[:1]]))
+        self.assertEqual((report["closed"], report["open_edges"], report["crowded_edges"]), (False, 0, 3))
+
+    def test_only_a_soup_is_merged(self):
+        soup = CORNERS[SIDES].reshape(-1, 3), np.arange(12).reshape(4, 3)
+        report = check.report(*soup)
+        self.assertTrue(report["closed"] and report["merged"])
+        self.assertEqual(report["vertices"], 4)
+        self.assertEqual(check.report(soup[0][:9], soup[1][:3])["open_edges"], 3)
+        # The last triangle has corners of its own at the same places: indices decide.
+        report = check.report(np.concatenate([CORNERS, CORNERS[1:]]), np.concatenate([SIDES[:3], [[4, 5, 6]]]))
+        self.assertEqual((report["closed"], report["merged"], report["open_edges"]), (False, False, 6))
+
+    def test_text_files_are_read(self):
+        with tempfile.TemporaryDirectory() as folder:
+            obj, ply = str(Path(folder) / "a.obj"), str(Path(folder) / "a.ply")
+            lines = [f"v {x} {y} {z}\nvn 0 0 1" for x, y, z in CORNERS]
+            Path(obj).write_text("\n".join(lines + [" ".join(["f", *(f"{i + 1}//{i + 1}" for i in f)]) for f in SIDES]))
+            head = ["ply", "format ascii 1.0", "element vertex 4", "property float x", "property float y",
+                    "property float z", "property uchar red", "element face 4", "property list uchar int vertex_indices",
+                    "property uchar red", "end_header"]  # fmt: skip
+            body = [f"{x} {y} {z} 7" for x, y, z in CORNERS] + [f"3 {a} {b} {c} 9" for a, b, c in SIDES]
+            Path(ply).write_text("\n".join(head + body) + "\n")
+            for path in (obj, ply):
+                vertices, faces = check.load(path)
+                self.assertTrue(np.array_equal(vertices, CORNERS) and np.array_equal(faces, SIDES), path)
+
+
+class Tables(unittest.TestCase):
+    def programs(self):
+        mesh = {"triangles": 1000, "closed": True, "merged": False, "open_edges": 0, "crowded_edges": 0,
+                "area": 10.0, "volume": 2.0}  # fmt: skip
+
+        def runs(*walls):
+            return [{"round": i, "wall": wall, "kb": 2048 * wall} for i, wall in enumerate(walls)]
+
+        return tables.summary({
+            "molmesh": {"surface": "same", "runs": runs(1, 2, 4), "mesh": mesh},
+            # Ratios 10, 3, 1: their median is 3; that of the medians, 6 and 2, as well; the next one's differ.
+            "near": {"surface": "same", "runs": runs(10, 6, 4), "mesh": {**mesh, "triangles": 1049}},
+            "far": {"surface": "ses", "runs": runs(3, 4, 20), "mesh": {**mesh, "triangles": 500, "closed": False,
+                                                                       "open_edges": 3, "merged": True}},
+            "slow": {"surface": "gaussian", "limit": 60},
+            "broken": {"surface": "other", "failed": "status 1, a | b"},
+            "absent": {"surface": "ses", "missing": "no such package"},
+        })  # fmt: skip
+
+    def test_medians_and_ratios(self):
+        programs = self.programs()
+        self.assertEqual((programs["molmesh"]["seconds"], programs["molmesh"]["times_ours"]), (2, 1))
+        self.assertEqual((programs["near"]["seconds"], programs["near"]["times_ours"]), (6, 3))
+        self.assertNotIn("times_ours_per_triangle", programs["near"])
+        self.assertEqual((programs["far"]["seconds"], programs["far"]["times_ours"]), (4, 3))
+        self.assertEqual(programs["far"]["times_ours_per_triangle"], 6)
+        self.assertEqual(programs["slow"]["times_ours_at_least"], 30)
+
+    def test_nobody_is_left_out(self):
+        programs = self.programs()
+        structure = {"name": "4pti", "atoms": 454, "programs": programs}
+        title, rows = tables.section(structure)
+        self.assertEqual(title, "4PTI: 454 atoms")
+        self.assertEqual([cells[0] for cells in rows], list(programs))
+        self.assertTrue(all(len(cells) == len(tables.HEAD) for cells in rows))
+        text = tables.markdown(rows)
+        for words in ("more than 60", "> 30", "failed: status 1, a / b", "not to be had: no such package",
+                      "no: 3 open edges, 0 with more than two triangles (merged)"):  # fmt: skip
+            self.assertIn(words, text)
+            if "open edges" not in words:
+                self.assertIn(words, tables.terminal(rows))
+        overview = tables.overview({"structures": [structure]})
+        for line in ("| near | 3 |", "| slow | > 30 |", "| absent | – |"):
+            self.assertIn(line, overview)
+
+    def test_the_page_is_replaced_between_its_markers(self):
+        begin, end = "<!-- peers: begin -->", "<!-- peers: end -->"
+        self.assertEqual(tables.between(f"a\n{begin}\nold\n{end}\nb", "new"), f"a\n{begin}\n\nnew\n\n{end}\nb")
+        for broken in (f"{begin} only", f"{end} {begin}", f"{begin} {begin} {end}"):
+            self.assertRaises(ValueError, tables.between, broken, "new")
+
+
+class Runs(unittest.TestCase):
+    def launch(self, *command, limit=60):
+        with tempfile.TemporaryDirectory() as folder:
+            job = Job("x", SAMPLE, Path(folder), 1.0, Path(folder) / "mesh")
+            peer = Peer("x", "same", ".out", lambda job: [*command], lambda: "1")
+            return peers.launch(peer, job, limit)
+
+    def test_failures_are_told(self):
+        self.assertEqual(self.launch("sh", "-c", "echo no atoms >&2; exit 4"), {"failed": "status 4, no atoms"})
+        self.assertEqual(self.launch("true"), {"failed": "status 0"})
+        self.assertIn("failed", self.launch("/no/such/program"))
+        self.assertEqual(self.launch("sh", "-c", "sleep 600 & wait", limit=0.2), {"limit": 0.2})
+        self.assertEqual(self.launch("sh", "-c", "kill -9 $PPID"), {"failed": "what measures it ended with -9"})
+
+    def test_memory_is_the_commands_own(self):
+        write = "open('mesh.out', 'w').write('x')"
+        small = self.launch("sh", "-c", "echo x > mesh.out")
+        large = self.launch("sh", "-c", f"{sys.executable} -S -c \"b = bytearray(200 << 20); {write}\"; true")
+        self.assertLess(small["kb"], 100 << 10)
+        self.assertGreater(large["kb"], 200 << 10)
+
+    def test_molmesh_alone(self):
+        with tempfile.TemporaryDirectory() as folder:
+            target = Path(folder) / "peers.json"
+            command = [sys.executable, str(HERE / "peers.py"), "--molmesh", MOLMESH, "--only", "molmesh", "--files",
+                       str(SAMPLE), "--rounds", "1", "--spacing", "1", "--json", str(target)]  # fmt: skip
+            done = subprocess.run(command, capture_output=True, text=True)
+            self.assertEqual(done.returncode, 0, done.stderr)
+            (structure,) = json.loads(target.read_text())["structures"]
+        self.assertEqual((structure["name"], structure["atoms"]), ("4pti", 454))
+        (entry,) = structure["programs"].values()
+        self.assertEqual(len(entry["runs"]), 1)
+        self.assertTrue(entry["mesh"]["closed"] and not entry["mesh"]["merged"])
+        self.assertIn("4PTI: 454 atoms", done.stdout)
+
+    def test_the_array_program_makes_our_mesh(self):
+        with tempfile.TemporaryDirectory() as folder:
+            structure = prepare.heavy(SAMPLE)
+            rows = list(structure[0].all())
+            radii = np.array([RADII[row.atom.element.name.upper()] for row in rows], np.float32)
+            atoms = Path(folder) / "4pti.npz"
+            np.savez(atoms, positions=np.array([row.atom.pos.tolist() for row in rows]), radii=radii)
+            command = [MOLMESH, "mesh", str(SAMPLE), "--resolution", "2", "--backend", "cpu", "--report", "json"]
+            done = subprocess.run([*command, "-o", str(Path(folder) / "x.ply")], capture_output=True, text=True)
+            ours, case = json.loads(done.stdout), gpu_field.Case(atoms, 2.0)
+            measured, _ = gpu_field.measure(gpu_field.NumpyBaseline(), case, 0, 1)
+        self.assertEqual((measured["triangles"], measured["bad_edges"]), (ours["triangles"], 0))
+        self.assertAlmostEqual(measured["volume"] / ours["volume"], 1, places=5)
+        self.assertLess(measured["largest_field_error"], 1e-5)
+        self.assertEqual(gpu_field.open_edges(SIDES[1:], 4), 3)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,11 @@
+// One sample of one pixel: what was interpolated is kept as it is.
+
+struct Sample {
+    @location(0) shade: vec4<f32>,
+    @location(1) depth: f32,
+}
+
+@fragment
+fn main(@location(0) @interpolate(linear) shade: vec4<f32>, @location(1) @interpolate(linear) depth: f32) -> Sample {
+    return Sample(shade, depth);
+}

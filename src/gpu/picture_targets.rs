@@ -1,0 +1,208 @@
+//! What a picture takes on a device: textures, buffers, and whether its limits allow them.
+
+use bytemuck::{Pod, Zeroable};
+use wgpu::{
+    Buffer, BufferUsages, Device, Extent3d, Limits, Texture, TextureDescriptor, TextureDimension, TextureFormat,
+    TextureUsages, TextureView, TextureViewDescriptor, TextureViewDimension,
+};
+
+use crate::picture::PictureParams;
+use crate::picture::camera::Camera;
+use crate::picture::finish::Finish;
+use crate::picture::light::{AMBIENT, DIFFUSE, LIGHT};
+use crate::surface::Mesh;
+
+/// Where the samples of a pixel lie, in pixels: as on the CPU.
+pub(super) const PATTERN: [[f32; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
+/// Normal and light of a sample.
+pub(super) const SHADE: TextureFormat = TextureFormat::Rgba16Float;
+/// Depth of a sample, Å.
+pub(super) const DEPTH: TextureFormat = TextureFormat::R32Float;
+/// What decides which sample is nearest.
+pub(super) const NEAREST: TextureFormat = TextureFormat::Depth32Float;
+/// Deeper than anything.
+pub(super) const NOTHING: f64 = 3.0e38;
+
+/// A view, as `shaders/picture/vertex.wgsl` reads it.
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct View {
+    pub(super) right: [f32; 4],
+    pub(super) up: [f32; 4],
+    pub(super) toward: [f32; 4],
+    pub(super) light: [f32; 4],
+    pub(super) size: [f32; 2],
+    pub(super) offset: [f32; 2],
+    pub(super) scale: f32,
+    pub(super) reach: f32,
+    pub(super) diffuse: f32,
+    pub(super) pad: f32,
+}
+
+impl View {
+    pub(super) fn new(camera: &Camera, offset: [f32; 2]) -> Self {
+        let row = |k: usize| {
+            let [x, y, z] = camera.axes[k];
+            [x, y, z, camera.shift[k]]
+        };
+        let [x, y, z] = LIGHT;
+        Self {
+            right: row(0),
+            up: row(1),
+            toward: row(2),
+            light: [x, y, z, AMBIENT],
+            size: camera.middle.map(|half| 2.0 * half),
+            offset,
+            scale: camera.scale,
+            reach: camera.reach,
+            diffuse: DIFFUSE,
+            pad: 0.0,
+        }
+    }
+}
+
+/// What a picture is finished with, as `shaders/shared/picture.wgsl` reads it.
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Numbers {
+    pub(super) color: [f32; 4],
+    pub(super) behind: [f32; 4],
+    pub(super) size: [u32; 2],
+    pub(super) n_taps: u32,
+    pub(super) line: i32,
+    pub(super) falloff: f32,
+    pub(super) bias: f32,
+    pub(super) strength: f32,
+    pub(super) darkest: f32,
+    pub(super) step_from: f32,
+    pub(super) step_to: f32,
+    pub(super) ink: f32,
+    pub(super) pad: f32,
+}
+
+impl Numbers {
+    pub(super) fn new(finish: &Finish, params: &PictureParams) -> Self {
+        let [r, g, b] = finish.color;
+        let [step_from, step_to] = finish.steps;
+        Self {
+            color: [r, g, b, 0.0],
+            behind: finish.behind,
+            size: [params.width, params.height],
+            n_taps: u32::try_from(finish.taps.len()).unwrap_or(0),
+            line: finish.line,
+            falloff: finish.falloff,
+            bias: finish.bias,
+            strength: finish.strength,
+            darkest: finish.darkest,
+            step_from,
+            step_to,
+            ink: finish.ink,
+            pad: 0.0,
+        }
+    }
+}
+
+/// A neighbour, as `shaders/picture/finish.wgsl` reads it.
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Tap {
+    pub(super) pixels: [i32; 2],
+    pub(super) length: [f32; 2],
+}
+
+/// Every neighbour; one that is never looked at where there are none, as buffers are not empty.
+pub(super) fn taps(finish: &Finish) -> Vec<Tap> {
+    let mut all: Vec<Tap> =
+        finish.taps.iter().map(|tap| Tap { pixels: [tap.dx, tap.dy], length: [tap.right, tap.up] }).collect();
+    if all.is_empty() {
+        all.push(Tap::zeroed());
+    }
+    all
+}
+
+/// What a picture needs of a device.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Needs {
+    side: u32,
+    /// Bytes of the largest storage buffer.
+    binding: u64,
+    /// Bytes of the largest buffer.
+    buffer: u64,
+}
+
+impl Needs {
+    pub(super) fn of(mesh: &Mesh, params: &PictureParams) -> Self {
+        let binding = u64::from(params.width) * u64::from(params.height) * 16;
+        let columns = 12 * mesh.n_vertices().max(mesh.n_triangles()) as u64;
+        Self { side: params.width.max(params.height), binding, buffer: columns.max(binding) }
+    }
+
+    /// Why a device with these limits cannot draw it.
+    pub(super) fn check(&self, limits: &Limits) -> Result<(), String> {
+        let too_large = |what: &str, needed: u64, limit: u64| {
+            if needed > limit {
+                Err(format!("{what} of {needed} is needed, the device's limit is {limit}"))
+            } else {
+                Ok(())
+            }
+        };
+        too_large("a texture's side", self.side.into(), limits.max_texture_dimension_2d.into())?;
+        too_large("a storage buffer in bytes", self.binding, limits.max_storage_buffer_binding_size)?;
+        too_large("a buffer in bytes", self.buffer, limits.max_buffer_size)
+    }
+}
+
+/// A texture with a layer for each sample.
+pub(super) struct Layered {
+    texture: Texture,
+}
+
+impl Layered {
+    pub(super) fn new(device: &Device, label: &str, format: TextureFormat, params: &PictureParams) -> Self {
+        let usage = TextureUsages::RENDER_ATTACHMENT | TextureUsages::TEXTURE_BINDING;
+        Self { texture: texture(device, label, format, params, PATTERN.len(), usage) }
+    }
+
+    /// The layer of one sample, to be drawn to.
+    pub(super) fn layer(&self, sample: u32) -> TextureView {
+        self.texture.create_view(&TextureViewDescriptor {
+            dimension: Some(TextureViewDimension::D2),
+            base_array_layer: sample,
+            array_layer_count: Some(1),
+            ..TextureViewDescriptor::default()
+        })
+    }
+
+    /// All layers, to be read.
+    pub(super) fn all(&self) -> TextureView {
+        let dimension = Some(TextureViewDimension::D2Array);
+        self.texture.create_view(&TextureViewDescriptor { dimension, ..TextureViewDescriptor::default() })
+    }
+}
+
+/// A texture as large as the picture.
+pub(super) fn texture(
+    device: &Device,
+    label: &str,
+    format: TextureFormat,
+    params: &PictureParams,
+    layers: usize,
+    usage: TextureUsages,
+) -> Texture {
+    let depth_or_array_layers = u32::try_from(layers).unwrap_or(1);
+    device.create_texture(&TextureDescriptor {
+        label: Some(label),
+        size: Extent3d { width: params.width, height: params.height, depth_or_array_layers },
+        mip_level_count: 1,
+        sample_count: 1,
+        dimension: TextureDimension::D2,
+        format,
+        usage,
+        view_formats: &[],
+    })
+}
+
+/// An empty buffer.
+pub(super) fn buffer(device: &Device, label: &str, size: u64, usage: BufferUsages) -> Buffer {
+    device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false })
+}

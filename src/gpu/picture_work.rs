@@ -1,0 +1,323 @@
+//! The passes of a picture on one device: four that draw, one that resolves, one that finishes.
+
+use std::sync::Arc;
+
+use wgpu::{
+    BindGroup, BindGroupEntry, BindGroupLayout, BindGroupLayoutEntry, BindingResource, BindingType, Buffer,
+    BufferBindingType, BufferUsages, CommandEncoder, ComputePipeline, Device, Limits, LoadOp, MapMode, Operations,
+    PollType, Queue, RenderPassColorAttachment, RenderPassDepthStencilAttachment, RenderPipeline, ShaderModule,
+    ShaderStages, StoreOp, TextureSampleType, TextureUsages, TextureViewDescriptor, TextureViewDimension,
+    VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
+};
+
+use super::error::GpuError;
+use super::health::{Complaint, Health};
+use super::picture_targets::{DEPTH, Layered, NEAREST, NOTHING, Numbers, PATTERN, SHADE, View, buffer, taps, texture};
+use super::shaders::{PICTURE, Shader};
+use crate::picture::PictureParams;
+use crate::picture::camera::Camera;
+use crate::picture::finish::Finish;
+use crate::picture::light::Levels;
+
+/// Pixels of a workgroup's side, as the shaders have it.
+const GROUP: u32 = 8;
+
+/// A compute pass and what it binds.
+struct Step {
+    pipeline: ComputePipeline,
+    layout: BindGroupLayout,
+}
+
+/// An open device that draws.
+pub(super) struct Painter {
+    device: Device,
+    queue: Queue,
+    health: Arc<Health>,
+    draw: RenderPipeline,
+    view: BindGroupLayout,
+    resolve: Step,
+    finish: Step,
+    levels: Buffer,
+}
+
+impl Painter {
+    /// Compiles everything.
+    ///
+    /// # Errors
+    /// What the device says.
+    pub(super) fn new(device: Device, queue: Queue) -> Result<Self, GpuError> {
+        let health = Health::of(&device);
+        let [vertex, fragment, resolve, finish] = &PICTURE;
+        let view = layout(&device, "view", &[uniform(0, ShaderStages::VERTEX)]);
+        let draw = drawing(&device, &view, [vertex, fragment]);
+        let compute = ShaderStages::COMPUTE;
+        let resolved = [uniform(0, compute), layers(1), layers(2), storage(3, false), storage(4, false)];
+        let finished = [
+            uniform(0, compute),
+            storage(1, true),
+            storage(2, true),
+            storage(3, true),
+            storage(4, true),
+            storage(5, false),
+        ];
+        let table: Vec<u32> = Levels::get().table().iter().copied().map(u32::from).collect();
+        let levels = filled(&device, &queue, "levels", bytemuck::cast_slice(&table), BufferUsages::STORAGE);
+        let painter = Self {
+            resolve: step(&device, resolve, &resolved),
+            finish: step(&device, finish, &finished),
+            device,
+            queue,
+            health,
+            draw,
+            view,
+            levels,
+        };
+        painter.healthy()?;
+        Ok(painter)
+    }
+
+    /// The device's limits.
+    pub(super) fn limits(&self) -> Limits {
+        self.device.limits()
+    }
+
+    /// Draws; pixels in rows from the top. What [`Needs`](super::picture_targets::Needs) says must be within the device's limits.
+    ///
+    /// # Errors
+    /// What the device says; [`GpuError::Lost`] if it is gone.
+    pub(super) fn paint(
+        &self,
+        positions: &[[f32; 3]],
+        normals: &[[f32; 3]],
+        triangles: &[[u32; 3]],
+        params: &PictureParams,
+        camera: &Camera,
+    ) -> Result<Vec<[u8; 4]>, GpuError> {
+        let (device, queue) = (&self.device, &self.queue);
+        let n_pixels = u64::from(params.width) * u64::from(params.height);
+        let column = |label: &str, bytes: &[u8], usage| filled(device, queue, label, bytes, usage);
+        let places = column("positions", bytemuck::cast_slice(positions), BufferUsages::VERTEX);
+        let facing = column("normals", bytemuck::cast_slice(normals), BufferUsages::VERTEX);
+        let corners = column("triangles", bytemuck::cast_slice(triangles), BufferUsages::INDEX);
+        let n_corners = u32::try_from(3 * triangles.len()).map_err(|_too_many| {
+            GpuError::Failed(format!("{} triangles are too many for one draw", triangles.len()))
+        })?;
+        let shades = Layered::new(device, "molmesh.picture.shades", SHADE, params);
+        let depths = Layered::new(device, "molmesh.picture.depths", DEPTH, params);
+        let attachment = TextureUsages::RENDER_ATTACHMENT;
+        let nearest = texture(device, "molmesh.picture.nearest", NEAREST, params, 1, attachment);
+        let nearest = nearest.create_view(&TextureViewDescriptor::default());
+        self.healthy()?;
+
+        let mut encoder =
+            device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("molmesh.picture") });
+        for (sample, offset) in (0_u32..).zip(PATTERN) {
+            let view = View::new(camera, offset);
+            let view = column("view", bytemuck::bytes_of(&view), BufferUsages::UNIFORM);
+            let group = bind(device, &self.view, &[view.as_entire_binding()]);
+            let views = [shades.layer(sample), depths.layer(sample)];
+            let mut pass = begin(&mut encoder, &views, &nearest);
+            pass.set_pipeline(&self.draw);
+            pass.set_bind_group(0, &group, &[]);
+            pass.set_vertex_buffer(0, places.slice(..));
+            pass.set_vertex_buffer(1, facing.slice(..));
+            pass.set_index_buffer(corners.slice(..), wgpu::IndexFormat::Uint32);
+            pass.draw_indexed(0..n_corners, 0, 0..1);
+        }
+        let finish = Finish::new(params, camera);
+        let numbers = Numbers::new(&finish, params);
+        let numbers = column("numbers", bytemuck::bytes_of(&numbers), BufferUsages::UNIFORM);
+        let around = column("taps", bytemuck::cast_slice(&taps(&finish)), BufferUsages::STORAGE);
+        let rows = |label| buffer(device, label, 16 * n_pixels, BufferUsages::STORAGE);
+        let (seen, facing) = (rows("molmesh.picture.seen"), rows("molmesh.picture.facing"));
+        let both = BufferUsages::STORAGE | BufferUsages::COPY_SRC;
+        let pixels = buffer(device, "molmesh.picture.pixels", 4 * n_pixels, both);
+        let landing = BufferUsages::COPY_DST | BufferUsages::MAP_READ;
+        let landing = buffer(device, "molmesh.picture.landing", 4 * n_pixels, landing);
+        let groups = [params.width.div_ceil(GROUP), params.height.div_ceil(GROUP)];
+        let (all_shades, all_depths) = (shades.all(), depths.all());
+        let resources = [
+            numbers.as_entire_binding(),
+            BindingResource::TextureView(&all_shades),
+            BindingResource::TextureView(&all_depths),
+            seen.as_entire_binding(),
+            facing.as_entire_binding(),
+        ];
+        self.resolve.run(device, &mut encoder, &resources, groups);
+        let resources = [&numbers, &seen, &facing, &around, &self.levels, &pixels].map(Buffer::as_entire_binding);
+        self.finish.run(device, &mut encoder, &resources, groups);
+        encoder.copy_buffer_to_buffer(&pixels, 0, &landing, 0, 4 * n_pixels);
+        queue.submit([encoder.finish()]);
+        self.read(&landing)
+    }
+
+    /// What a buffer holds once everything that was submitted is done.
+    fn read(&self, landing: &Buffer) -> Result<Vec<[u8; 4]>, GpuError> {
+        landing.map_async(MapMode::Read, .., |_mapped| {});
+        let waited = self.device.poll(PollType::wait_indefinitely());
+        self.healthy()?;
+        waited.map_err(|error| GpuError::Failed(error.to_string()))?;
+        let view = landing.get_mapped_range(..).map_err(|error| GpuError::Failed(error.to_string()))?;
+        let pixels = bytemuck::cast_slice::<u8, [u8; 4]>(&view).to_vec();
+        drop(view);
+        landing.unmap();
+        Ok(pixels)
+    }
+
+    /// Whether the device has complained.
+    fn healthy(&self) -> Result<(), GpuError> {
+        match self.health.complaint() {
+            None => Ok(()),
+            Some(Complaint::Lost(why)) => Err(GpuError::Lost(why)),
+            Some(Complaint::OutOfMemory) => {
+                Err(GpuError::Failed("it has too little memory for the picture".to_owned()))
+            }
+            Some(Complaint::Failed(why)) => Err(GpuError::Failed(why)),
+        }
+    }
+}
+
+impl Step {
+    fn run(&self, device: &Device, encoder: &mut CommandEncoder, resources: &[BindingResource<'_>], groups: [u32; 2]) {
+        let group = bind(device, &self.layout, resources);
+        let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: None, timestamp_writes: None });
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &group, &[]);
+        pass.dispatch_workgroups(groups[0], groups[1], 1);
+    }
+}
+
+/// Begins to draw one sample of every pixel, over nothing.
+fn begin<'a>(
+    encoder: &'a mut CommandEncoder,
+    views: &[wgpu::TextureView; 2],
+    nearest: &wgpu::TextureView,
+) -> wgpu::RenderPass<'a> {
+    let cleared =
+        |r: f64| Operations { load: LoadOp::Clear(wgpu::Color { r, g: 0.0, b: 0.0, a: 0.0 }), store: StoreOp::Store };
+    let color =
+        |view, r| Some(RenderPassColorAttachment { view, depth_slice: None, resolve_target: None, ops: cleared(r) });
+    encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
+        label: Some("molmesh.picture"),
+        color_attachments: &[color(&views[0], 0.0), color(&views[1], NOTHING)],
+        depth_stencil_attachment: Some(RenderPassDepthStencilAttachment {
+            view: nearest,
+            depth_ops: Some(Operations { load: LoadOp::Clear(1.0), store: StoreOp::Discard }),
+            stencil_ops: None,
+        }),
+        timestamp_writes: None,
+        occlusion_query_set: None,
+        multiview_mask: None,
+    })
+}
+
+/// The pipeline that draws.
+fn drawing(device: &Device, view: &BindGroupLayout, [vertex, fragment]: [&Shader; 2]) -> RenderPipeline {
+    let attributes =
+        [0, 1].map(|shader_location| [VertexAttribute { format: VertexFormat::Float32x3, offset: 0, shader_location }]);
+    let columns = attributes
+        .each_ref()
+        .map(|attributes| Some(VertexBufferLayout { array_stride: 12, step_mode: VertexStepMode::Vertex, attributes }));
+    let [vertex, fragment] = [vertex, fragment].map(|shader| module(device, shader));
+    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: Some("molmesh.picture"),
+        bind_group_layouts: &[Some(view)],
+        immediate_size: 0,
+    });
+    let target = |format| Some(wgpu::ColorTargetState { format, blend: None, write_mask: wgpu::ColorWrites::ALL });
+    device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
+        label: Some("molmesh.picture"),
+        layout: Some(&layout),
+        vertex: wgpu::VertexState {
+            module: &vertex,
+            entry_point: Some("main"),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            buffers: &columns,
+        },
+        primitive: wgpu::PrimitiveState {
+            front_face: wgpu::FrontFace::Ccw,
+            cull_mode: Some(wgpu::Face::Back),
+            ..wgpu::PrimitiveState::default()
+        },
+        depth_stencil: Some(wgpu::DepthStencilState {
+            format: NEAREST,
+            depth_write_enabled: Some(true),
+            depth_compare: Some(wgpu::CompareFunction::Less),
+            stencil: wgpu::StencilState::default(),
+            bias: wgpu::DepthBiasState::default(),
+        }),
+        multisample: wgpu::MultisampleState::default(),
+        fragment: Some(wgpu::FragmentState {
+            module: &fragment,
+            entry_point: Some("main"),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            targets: &[target(SHADE), target(DEPTH)],
+        }),
+        multiview_mask: None,
+        cache: None,
+    })
+}
+
+fn module(device: &Device, shader: &Shader) -> ShaderModule {
+    let source = wgpu::ShaderSource::Wgsl(shader.source.into());
+    device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(shader.stage), source })
+}
+
+fn step(device: &Device, shader: &Shader, entries: &[BindGroupLayoutEntry]) -> Step {
+    let layout = layout(device, shader.stage, entries);
+    let of_pipeline = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+        label: Some(shader.stage),
+        bind_group_layouts: &[Some(&layout)],
+        immediate_size: 0,
+    });
+    let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+        label: Some(shader.stage),
+        layout: Some(&of_pipeline),
+        module: &module(device, shader),
+        entry_point: Some("main"),
+        compilation_options: wgpu::PipelineCompilationOptions::default(),
+        cache: None,
+    });
+    Step { pipeline, layout }
+}
+
+fn layout(device: &Device, label: &str, entries: &[BindGroupLayoutEntry]) -> BindGroupLayout {
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(label), entries })
+}
+
+fn bind(device: &Device, layout: &BindGroupLayout, resources: &[BindingResource<'_>]) -> BindGroup {
+    let entries: Vec<_> = (0..)
+        .zip(resources)
+        .map(|(binding, resource)| BindGroupEntry { binding, resource: resource.clone() })
+        .collect();
+    device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout, entries: &entries })
+}
+
+fn entry(binding: u32, visibility: ShaderStages, ty: BindingType) -> BindGroupLayoutEntry {
+    BindGroupLayoutEntry { binding, visibility, ty, count: None }
+}
+
+fn of_buffer(ty: BufferBindingType) -> BindingType {
+    BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None }
+}
+
+fn uniform(binding: u32, visibility: ShaderStages) -> BindGroupLayoutEntry {
+    entry(binding, visibility, of_buffer(BufferBindingType::Uniform))
+}
+
+fn storage(binding: u32, read_only: bool) -> BindGroupLayoutEntry {
+    entry(binding, ShaderStages::COMPUTE, of_buffer(BufferBindingType::Storage { read_only }))
+}
+
+fn layers(binding: u32) -> BindGroupLayoutEntry {
+    let sample_type = TextureSampleType::Float { filterable: false };
+    let view_dimension = TextureViewDimension::D2Array;
+    entry(binding, ShaderStages::COMPUTE, BindingType::Texture { sample_type, view_dimension, multisampled: false })
+}
+
+/// A buffer that holds `bytes`, a multiple of four.
+fn filled(device: &Device, queue: &Queue, label: &str, bytes: &[u8], usage: BufferUsages) -> Buffer {
+    let buffer = buffer(device, label, bytes.len() as u64, usage | BufferUsages::COPY_DST);
+    queue.write_buffer(&buffer, 0, bytes);
+    buffer
+}

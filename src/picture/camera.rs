@@ -1,0 +1,182 @@
+//! Where the viewer stands: directions, scale and place of the picture, from the mesh and the view.
+
+use rayon::prelude::*;
+
+use super::axes;
+use super::{PictureParams, View};
+
+/// Vertices that one task looks at.
+const CHUNK: usize = 1 << 14;
+/// Part of the picture that stays free on each side.
+const MARGIN: f64 = 0.04;
+
+/// An orthographic view.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Camera {
+    /// Unit vectors of the mesh's coordinates: right, up, towards the viewer.
+    pub axes: [[f32; 3]; 3],
+    /// What is added to the projections of a position: the middle of the mesh lies in the middle of the picture, the point
+    /// next to the viewer at depth 0. Å.
+    pub shift: [f32; 3],
+    /// Pixels per Å.
+    pub scale: f32,
+    /// Depth of the point farthest from the viewer, Å.
+    pub reach: f32,
+    /// Half of width and height, pixels.
+    pub middle: [f32; 2],
+}
+
+impl Camera {
+    /// The view of a mesh that fills the picture.
+    #[must_use]
+    pub fn new(positions: &[[f32; 3]], triangles: &[[u32; 3]], params: &PictureParams) -> Self {
+        let wide = turned(directions(positions, triangles, params.view), params.azimuth, params.elevation);
+        #[expect(clippy::cast_possible_truncation, reason = "components of unit vectors")]
+        let axes = wide.map(|axis| axis.map(|c| c as f32));
+        let [low, high] = bounds(positions, &axes);
+        let size: [f64; 2] = std::array::from_fn(|k| f64::from(high[k]) - f64::from(low[k]));
+        let pixels = [params.width, params.height].map(f64::from);
+        let room = 1.0 - 2.0 * MARGIN;
+        // A mesh without extent is as good as one of 1 Å.
+        let fits = |k: usize| pixels[k] * room / if size[k] > 0.0 { size[k] } else { 1.0 };
+        #[expect(clippy::cast_possible_truncation, reason = "16,384 pixels at most, over the extent of a mesh")]
+        let (scale, middle) = (fits(0).min(fits(1)) as f32, pixels.map(|n| (n / 2.0) as f32));
+        let shift = [-0.5 * (low[0] + high[0]), -0.5 * (low[1] + high[1]), high[2]];
+        Self { axes, shift, scale, reach: high[2] - low[2], middle }
+    }
+
+    /// Å that a pixel is wide.
+    #[must_use]
+    pub fn pixel(&self) -> f64 {
+        1.0 / f64::from(self.scale)
+    }
+
+    /// Column and row in pixels from the upper left corner, and depth in Å behind the nearest point.
+    #[inline]
+    #[must_use]
+    pub fn place(&self, position: [f32; 3]) -> [f32; 3] {
+        let [right, up, toward] = self.axes.map(|axis| dot(axis, position));
+        [
+            (right + self.shift[0]) * self.scale + self.middle[0],
+            self.middle[1] - (up + self.shift[1]) * self.scale,
+            self.shift[2] - toward,
+        ]
+    }
+
+    /// A direction as the viewer sees it: right, up, towards.
+    #[inline]
+    #[must_use]
+    pub fn turn(&self, direction: [f32; 3]) -> [f32; 3] {
+        self.axes.map(|axis| dot(axis, direction))
+    }
+}
+
+#[inline]
+pub(super) fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+/// Right, up and towards the viewer.
+fn directions(positions: &[[f32; 3]], triangles: &[[u32; 3]], view: View) -> [[f64; 3]; 3] {
+    const X: [f64; 3] = [1.0, 0.0, 0.0];
+    const Y: [f64; 3] = [0.0, 1.0, 0.0];
+    const Z: [f64; 3] = [0.0, 0.0, 1.0];
+    let minus = |axis: [f64; 3]| axis.map(|c| -c);
+    match view {
+        View::Principal => axes::principal(positions, triangles),
+        View::Front => [X, Y, Z],
+        View::Back => [minus(X), Y, minus(Z)],
+        View::Left => [Z, Y, minus(X)],
+        View::Right => [minus(Z), Y, X],
+        View::Top => [X, minus(Z), Y],
+        View::Bottom => [X, Z, minus(Y)],
+    }
+}
+
+/// The same, after a walk around the upright axis and a climb, in degrees.
+fn turned([right, up, toward]: [[f64; 3]; 3], azimuth: f64, elevation: f64) -> [[f64; 3]; 3] {
+    let mix = |a: [f64; 3], x: f64, b: [f64; 3], y: f64| std::array::from_fn(|k| a[k] * x + b[k] * y);
+    let (sin, cos) = azimuth.to_radians().sin_cos();
+    let (toward, right): ([f64; 3], [f64; 3]) = (mix(toward, cos, right, sin), mix(right, cos, toward, -sin));
+    let (sin, cos) = elevation.to_radians().sin_cos();
+    [right, mix(up, cos, toward, -sin), mix(toward, cos, up, sin)]
+}
+
+/// Lowest and highest projection on each axis.
+fn bounds(positions: &[[f32; 3]], axes: &[[f32; 3]; 3]) -> [[f32; 3]; 2] {
+    let of_chunk = |chunk: &[[f32; 3]]| {
+        chunk.iter().fold([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]], |[low, high], position| {
+            let at = axes.map(|axis| dot(axis, *position));
+            [std::array::from_fn(|k| low[k].min(at[k])), std::array::from_fn(|k| high[k].max(at[k]))]
+        })
+    };
+    let joined = |a: [[f32; 3]; 2], b: [[f32; 3]; 2]| {
+        [std::array::from_fn(|k| a[0][k].min(b[0][k])), std::array::from_fn(|k| a[1][k].max(b[1][k]))]
+    };
+    positions.par_chunks(CHUNK).map(of_chunk).reduce_with(joined).unwrap_or_default()
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "file axes are exact")]
+mod tests {
+    use super::*;
+
+    /// A box of 2 × 4 × 6 Å as eight corners.
+    fn corners() -> Vec<[f32; 3]> {
+        let mut all = Vec::new();
+        for x in [-1.0, 1.0] {
+            for y in [-2.0, 2.0] {
+                for z in [-3.0, 3.0] {
+                    all.push([x, y, z]);
+                }
+            }
+        }
+        all
+    }
+
+    fn camera(view: View, azimuth: f64, elevation: f64) -> Camera {
+        let params = PictureParams { width: 300, height: 200, view, azimuth, elevation, ..PictureParams::default() };
+        Camera::new(&corners(), &[], &params)
+    }
+
+    #[test]
+    fn every_view_shows_the_side_that_it_names() {
+        for (view, toward, right) in [
+            (View::Front, [0., 0., 1.], [1., 0., 0.]),
+            (View::Back, [0., 0., -1.], [-1., 0., 0.]),
+            (View::Left, [-1., 0., 0.], [0., 0., 1.]),
+            (View::Right, [1., 0., 0.], [0., 0., -1.]),
+            (View::Top, [0., 1., 0.], [1., 0., 0.]),
+            (View::Bottom, [0., -1., 0.], [1., 0., 0.]),
+        ] {
+            let camera = camera(view, 0.0, 0.0);
+            assert_eq!((camera.axes[2], camera.axes[0]), (toward, right), "{view:?}");
+            // Right-handed: nothing is seen in a mirror.
+            let [r, u, t] = camera.axes;
+            let crossed = [r[1] * u[2] - r[2] * u[1], r[2] * u[0] - r[0] * u[2], r[0] * u[1] - r[1] * u[0]];
+            assert_eq!(crossed, t, "{view:?}");
+        }
+    }
+
+    #[test]
+    fn the_mesh_fills_the_picture_and_stays_within() {
+        let front = camera(View::Front, 0.0, 0.0);
+        // 4 Å of height in 92 % of 200 pixels.
+        assert!((front.pixel() - 4.0 / 184.0).abs() < 1e-6, "{front:?}");
+        let near = front.place([1.0, 2.0, 3.0]);
+        assert!((near[0] - (150.0 + 46.0)).abs() < 1e-3 && (near[1] - 8.0).abs() < 1e-3 && near[2] == 0.0, "{near:?}");
+        assert_eq!(front.place([0.0, 0.0, -3.0]), [150.0, 100.0, 6.0]);
+        assert_eq!(front.reach, 6.0);
+        assert!(Camera::new(&[[1.0; 3]], &[], &PictureParams::default()).scale.is_finite());
+    }
+
+    #[test]
+    fn a_quarter_turn_leads_to_the_next_view() {
+        let close = |a: &Camera, b: &Camera| (0..3).all(|i| (0..3).all(|k| (a.axes[i][k] - b.axes[i][k]).abs() < 1e-6));
+        assert!(close(&camera(View::Front, 90.0, 0.0), &camera(View::Right, 0.0, 0.0)));
+        assert!(close(&camera(View::Front, -90.0, 0.0), &camera(View::Left, 0.0, 0.0)));
+        assert!(close(&camera(View::Front, 0.0, 90.0), &camera(View::Top, 0.0, 0.0)));
+        assert!(close(&camera(View::Back, 180.0, -90.0), &camera(View::Bottom, 0.0, 0.0)));
+        assert!(!close(&camera(View::Front, 90.0, 0.0), &camera(View::Left, 0.0, 0.0)));
+    }
+}

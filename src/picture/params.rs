@@ -1,0 +1,268 @@
+//! What a picture is to look like.
+
+use std::fmt;
+use std::str::FromStr;
+
+use super::PictureError;
+
+/// Width and height where none is given, pixels.
+pub const DEFAULT_SIDE: u32 = 512;
+/// Largest width and height that can be asked for at all, pixels: the largest texture that devices have in common.
+pub const MOST_SIDE: u32 = 16_384;
+/// Bytes of working memory that a pixel takes at most: depth, light, normal, and the pixel itself, twice on a device.
+const PIXEL_BYTES: u64 = 40;
+
+/// From where the molecule is seen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum View {
+    /// Along the least of the surface's principal axes, the greatest lying horizontally.
+    #[default]
+    Principal,
+    /// From +z of the file's axes; x points right, y up.
+    Front,
+    /// From −z.
+    Back,
+    /// From −x.
+    Left,
+    /// From +x.
+    Right,
+    /// From +y.
+    Top,
+    /// From −y.
+    Bottom,
+}
+
+impl View {
+    /// Every view.
+    pub const ALL: [Self; 7] =
+        [Self::Principal, Self::Front, Self::Back, Self::Left, Self::Right, Self::Top, Self::Bottom];
+
+    /// Its name.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Principal => "principal",
+            Self::Front => "front",
+            Self::Back => "back",
+            Self::Left => "left",
+            Self::Right => "right",
+            Self::Top => "top",
+            Self::Bottom => "bottom",
+        }
+    }
+}
+
+/// How the surface is shaded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Style {
+    /// Gouraud shading, with ambient occlusion and a soft outline.
+    #[default]
+    Surface,
+    /// Gouraud shading alone: light by vertex, interpolated.
+    Gouraud,
+}
+
+impl Style {
+    /// Every style.
+    pub const ALL: [Self; 2] = [Self::Surface, Self::Gouraud];
+
+    /// Its name.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Surface => "surface",
+            Self::Gouraud => "gouraud",
+        }
+    }
+}
+
+/// What is behind the molecule: red, green, blue (sRGB) and alpha, not premultiplied.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Background(pub [u8; 4]);
+
+impl Background {
+    /// Nothing.
+    pub const TRANSPARENT: Self = Self([0; 4]);
+    /// White.
+    pub const WHITE: Self = Self([255; 4]);
+    /// Black.
+    pub const BLACK: Self = Self([0, 0, 0, 255]);
+    /// What is expected, in words.
+    pub const EXPECTED: &'static str = "transparent, white, black, or a colour as RRGGBB or RRGGBBAA in hexadecimal";
+}
+
+impl FromStr for Background {
+    type Err = ();
+
+    fn from_str(text: &str) -> Result<Self, ()> {
+        match text {
+            "transparent" => return Ok(Self::TRANSPARENT),
+            "white" => return Ok(Self::WHITE),
+            "black" => return Ok(Self::BLACK),
+            _ => {}
+        }
+        let digits = text.strip_prefix('#').unwrap_or(text);
+        if !matches!(digits.len(), 6 | 8) || !digits.bytes().all(|b| b.is_ascii_hexdigit()) {
+            return Err(());
+        }
+        let mut color = [255; 4];
+        for (k, channel) in color.iter_mut().enumerate().take(digits.len() / 2) {
+            *channel = u8::from_str_radix(&digits[2 * k..2 * k + 2], 16).map_err(|_not_hex| ())?;
+        }
+        Ok(Self(color))
+    }
+}
+
+impl fmt::Display for Background {
+    /// The colour with its alpha; equal for equal backgrounds however they were written.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::TRANSPARENT => f.write_str("transparent"),
+            Self([r, g, b, 255]) => write!(f, "#{r:02x}{g:02x}{b:02x}"),
+            Self([r, g, b, a]) => write!(f, "#{r:02x}{g:02x}{b:02x}{a:02x}"),
+        }
+    }
+}
+
+/// Limits of a picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PictureLimits {
+    /// Largest width and height, pixels.
+    pub max_side: u32,
+}
+
+impl Default for PictureLimits {
+    fn default() -> Self {
+        Self { max_side: MOST_SIDE }
+    }
+}
+
+/// What a picture is to look like.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PictureParams {
+    /// Pixels of a row, 1 to [`MOST_SIDE`].
+    pub width: u32,
+    /// Rows, 1 to [`MOST_SIDE`].
+    pub height: u32,
+    /// From where.
+    pub view: View,
+    /// How far the viewer walks around the view's upright axis from there, to the right, degrees.
+    pub azimuth: f64,
+    /// How far the viewer climbs then, degrees.
+    pub elevation: f64,
+    /// What is behind the molecule.
+    pub background: Background,
+    /// How the surface is shaded.
+    pub style: Style,
+}
+
+impl Default for PictureParams {
+    fn default() -> Self {
+        Self {
+            width: DEFAULT_SIDE,
+            height: DEFAULT_SIDE,
+            view: View::default(),
+            azimuth: 0.0,
+            elevation: 0.0,
+            background: Background::default(),
+            style: Style::default(),
+        }
+    }
+}
+
+impl PictureParams {
+    /// Fails where a side is longer than allowed.
+    ///
+    /// # Errors
+    /// [`PictureError::TooLarge`].
+    pub fn check(&self, limits: PictureLimits) -> Result<(), PictureError> {
+        let limit = limits.max_side;
+        for (side, pixels) in [("width", self.width), ("height", self.height)] {
+            if pixels > limit {
+                return Err(PictureError::TooLarge { side, pixels, limit });
+            }
+        }
+        Ok(())
+    }
+
+    /// Bytes of working memory that drawing takes, the mesh apart.
+    #[must_use]
+    pub fn bytes(&self) -> u64 {
+        u64::from(self.width) * u64::from(self.height) * PIXEL_BYTES
+    }
+
+    /// Everything that decides what the picture looks like, as text: equal for equal pictures.
+    #[must_use]
+    pub fn canonical(&self) -> String {
+        let Self { width, height, view, azimuth, elevation, background, style } = self;
+        let (view, style) = (view.name(), style.name());
+        // −0 and 0 are one angle.
+        let (azimuth, elevation) = (azimuth + 0.0, elevation + 0.0);
+        format!(
+            "width={width}&height={height}&view={view}&azimuth={azimuth}&elevation={elevation}\
+             &background={background}&style={style}"
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn backgrounds_are_read_in_every_spelling() {
+        for (text, expected) in [
+            ("transparent", Some([0, 0, 0, 0])),
+            ("white", Some([255; 4])),
+            ("#FFffFF", Some([255; 4])),
+            ("black", Some([0, 0, 0, 255])),
+            ("1020ff80", Some([16, 32, 255, 128])),
+            ("#1020ff", Some([16, 32, 255, 255])),
+            ("#00000000", Some([0; 4])),
+            ("", None),
+            ("#", None),
+            ("red", None),
+            ("#12345", None),
+            ("#1234567", None),
+            ("##123456", None),
+            ("+12345", None),
+            ("12345é", None),
+        ] {
+            assert_eq!(text.parse().ok(), expected.map(Background), "{text}");
+        }
+        assert_eq!(Background([255; 4]).to_string(), "#ffffff");
+        assert_eq!("#00000000".parse::<Background>().map(|b| b.to_string()), Ok("transparent".to_owned()));
+        assert_eq!(Background([1, 2, 3, 4]).to_string(), "#01020304");
+    }
+
+    #[test]
+    fn a_side_may_be_as_long_as_the_limit_and_no_longer() {
+        let limits = PictureLimits { max_side: 100 };
+        let of = |width, height| PictureParams { width, height, ..PictureParams::default() }.check(limits);
+        assert_eq!(of(100, 100), Ok(()));
+        assert_eq!(of(101, 1), Err(PictureError::TooLarge { side: "width", pixels: 101, limit: 100 }));
+        assert_eq!(of(1, 101), Err(PictureError::TooLarge { side: "height", pixels: 101, limit: 100 }));
+    }
+
+    #[test]
+    fn canonical_texts_differ_where_pictures_do() {
+        let plain = PictureParams::default();
+        let mut all = vec![
+            plain,
+            PictureParams { width: 100, ..plain },
+            PictureParams { height: 100, ..plain },
+            PictureParams { view: View::Front, ..plain },
+            PictureParams { azimuth: 1.0, ..plain },
+            PictureParams { elevation: 1.0, ..plain },
+            PictureParams { background: Background::WHITE, ..plain },
+            PictureParams { style: Style::Gouraud, ..plain },
+        ]
+        .iter()
+        .map(PictureParams::canonical)
+        .collect::<Vec<_>>();
+        assert_eq!(all[0], PictureParams { azimuth: -0.0, ..plain }.canonical());
+        all.sort_unstable();
+        all.dedup();
+        assert_eq!(all.len(), 8);
+    }
+}

@@ -1,0 +1,56 @@
+//! Pixels to PNG: eight bits, straight alpha, marked as sRGB.
+
+use png::{BitDepth, ColorType, Compression, Encoder, Filter, SrgbRenderingIntent};
+
+use super::{Image, PictureError};
+
+/// The bytes of a PNG file. The same image gives the same bytes.
+///
+/// # Errors
+/// [`PictureError::Png`], for an image whose pixels are not as many as it says.
+pub fn encode(image: &Image) -> Result<Vec<u8>, PictureError> {
+    let failed = |error: png::EncodingError| PictureError::Png(error.to_string());
+    let opaque = image.pixels.iter().all(|pixel| pixel[3] == u8::MAX);
+    let mut bytes = Vec::new();
+    let mut encoder = Encoder::new(&mut bytes, image.width, image.height);
+    encoder.set_depth(BitDepth::Eight);
+    encoder.set_color(if opaque { ColorType::Rgb } else { ColorType::Rgba });
+    encoder.set_source_srgb(SrgbRenderingIntent::Perceptual);
+    encoder.set_compression(Compression::Fast);
+    // A tenth of the time for a third more bytes; a picture is waited for. Neighbours above are as like as any others.
+    encoder.set_filter(Filter::Up);
+    let mut writer = encoder.write_header().map_err(failed)?;
+    if opaque {
+        let rgb: Vec<[u8; 3]> = image.pixels.iter().map(|[r, g, b, _]| [*r, *g, *b]).collect();
+        writer.write_image_data(rgb.as_flattened()).map_err(failed)?;
+    } else {
+        writer.write_image_data(image.pixels.as_flattened()).map_err(failed)?;
+    }
+    writer.finish().map_err(failed)?;
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_come_back_as_they_were() {
+        for alpha in [255, 128] {
+            let pixels: Vec<_> = (0..6_u8).map(|n| [n, 2 * n, 255 - n, if n == 3 { alpha } else { 255 }]).collect();
+            let image = Image { width: 3, height: 2, pixels };
+            let bytes = encode(&image).unwrap();
+            let mut reader = png::Decoder::new(std::io::Cursor::new(&bytes)).read_info().unwrap();
+            let mut out = vec![0; reader.output_buffer_size().unwrap()];
+            let info = reader.next_frame(&mut out).unwrap();
+            let channels = if alpha == 255 { 3 } else { 4 };
+            assert_eq!((info.width, info.height, info.color_type.samples()), (3, 2, channels));
+            for (pixel, expected) in out.chunks(channels).zip(&image.pixels) {
+                assert_eq!(pixel, &expected[..channels]);
+            }
+            assert_eq!(reader.info().srgb, Some(SrgbRenderingIntent::Perceptual));
+        }
+        let short = Image { width: 3, height: 2, pixels: vec![[0; 4]; 5] };
+        assert!(matches!(encode(&short), Err(PictureError::Png(_))));
+    }
+}

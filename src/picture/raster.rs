@@ -1,0 +1,203 @@
+//! What is seen in one tile: the nearest triangle at four samples of every pixel.
+
+use super::bins::{Bins, PARTS, TILE_HEIGHT, TILE_WIDTH, Tiles, corner, twice_area};
+use super::camera::{Camera, dot};
+use super::layers::{Facing, NOTHING, SAMPLES, UNIT};
+use super::light::lambert;
+
+/// Where the samples of a pixel lie, in parts of it: the pattern that graphics devices have.
+const PATTERN: [[i32; 2]; SAMPLES] = [[96, 32], [224, 96], [32, 160], [160, 224]];
+/// Samples of a tile.
+const N: usize = TILE_WIDTH * TILE_HEIGHT * SAMPLES;
+
+/// Positions, normals and triangles of a mesh.
+#[derive(Clone, Copy)]
+pub(super) struct Shape<'a> {
+    pub(super) positions: &'a [[f32; 3]],
+    pub(super) normals: &'a [[f32; 3]],
+    pub(super) triangles: &'a [[u32; 3]],
+}
+
+/// A row of tiles of the layers.
+pub(super) struct Band<'a> {
+    /// Its first row of pixels.
+    pub(super) top: usize,
+    pub(super) width: usize,
+    pub(super) depth: &'a mut [f32],
+    pub(super) light: &'a mut [f32],
+    pub(super) facing: &'a mut [Facing],
+}
+
+/// The samples of a tile.
+pub(super) struct Samples {
+    depth: Vec<f32>,
+    light: Vec<f32>,
+    normal: Vec<[f32; 3]>,
+}
+
+impl Default for Samples {
+    fn default() -> Self {
+        Self { depth: vec![NOTHING; N], light: vec![0.0; N], normal: vec![[0.0; 3]; N] }
+    }
+}
+
+/// A triangle that faces the viewer.
+struct Facet {
+    /// Its vertices, the other way around: edges' functions are positive inside.
+    vertices: [u32; 3],
+    corners: [[i32; 2]; 3],
+    /// Depth of each corner, divided by the triangle's doubled area.
+    depths: [f32; 3],
+    /// One by that area.
+    share: f32,
+}
+
+/// The function of an edge: positive on the triangle's side, 0 on the edge.
+struct Edge {
+    /// What a column and a row add.
+    column: i64,
+    row: i64,
+    /// Its value at the samples of the pixel that was drawn last.
+    at: [i64; SAMPLES],
+}
+
+impl Edge {
+    /// The edge from `p` to `q`, at the pixel in column `x` of row `y`.
+    fn new(p: [i32; 2], q: [i32; 2], x: i64, y: i64) -> Self {
+        let ([px, py], [qx, qy]) = (p.map(i64::from), q.map(i64::from));
+        let (column, row, parts) = (py - qy, qx - px, i64::from(PARTS));
+        let at =
+            PATTERN.map(|[dx, dy]| column * (x * parts + i64::from(dx) - px) + row * (y * parts + i64::from(dy) - py));
+        Self { column: column * parts, row: row * parts, at }
+    }
+
+    #[inline]
+    fn step(&mut self, by: i64) {
+        self.at = self.at.map(|value| value + by);
+    }
+}
+
+impl Facet {
+    fn new(shape: Shape<'_>, triangle: u32, camera: &Camera) -> Self {
+        let [a, c, b] = shape.triangles[triangle as usize];
+        let vertices = [a, b, c];
+        let placed = vertices.map(|v| camera.place(shape.positions[v as usize]));
+        let corners = placed.map(corner);
+        let share = 1.0 / twice_area(corners) as f32;
+        Self { vertices, corners, depths: placed.map(|place| place[2] * share), share }
+    }
+
+    /// Light and normal of each corner, divided by the triangle's doubled area.
+    fn shades(&self, shape: Shape<'_>, camera: &Camera) -> [[f32; 4]; 3] {
+        self.vertices.map(|v| {
+            let normal = camera.turn(shape.normals[v as usize]);
+            [lambert(normal), normal[0], normal[1], normal[2]].map(|x| x * self.share)
+        })
+    }
+
+    /// First and last pixel of an axis that samples may be covered in, within a tile that begins at `from` and has `n`.
+    fn span(&self, axis: usize, from: i64, n: i64) -> std::ops::Range<i64> {
+        let [a, b, c] = self.corners.map(|c| c[axis].div_euclid(PARTS));
+        i64::from(a.min(b).min(c)).max(from)..(i64::from(a.max(b).max(c)) + 1).min(from + n)
+    }
+
+    /// Puts its samples where they are nearer than what is there.
+    fn draw(
+        &self,
+        shape: Shape<'_>,
+        camera: &Camera,
+        [left, top]: [i64; 2],
+        [width, height]: [i64; 2],
+        samples: &mut Samples,
+    ) {
+        let (rows, columns) = (self.span(1, top, height), self.span(0, left, width));
+        let [a, b, c] = self.corners;
+        let mut edges = [[b, c], [c, a], [a, b]].map(|[p, q]| Edge::new(p, q, columns.start, rows.start));
+        // Most triangles are small and many hidden: normals are looked up once something is seen.
+        let mut shades = None;
+        for y in rows {
+            for x in columns.clone() {
+                #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within the tile")]
+                let pixel = (y - top) as usize * TILE_WIDTH + (x - left) as usize;
+                for s in 0..SAMPLES {
+                    let inside = [edges[0].at[s], edges[1].at[s], edges[2].at[s]];
+                    // Neighbours may both have a sample on their common edge: the first of them keeps it.
+                    if inside[0] | inside[1] | inside[2] < 0 {
+                        continue;
+                    }
+                    let [u, v, w] = inside.map(|e| e as f32);
+                    let depth = u * self.depths[0] + v * self.depths[1] + w * self.depths[2];
+                    let i = pixel * SAMPLES + s;
+                    if depth >= samples.depth[i] {
+                        continue;
+                    }
+                    let [a, b, c] = shades.get_or_insert_with(|| self.shades(shape, camera));
+                    let value = |k: usize| u * a[k] + v * b[k] + w * c[k];
+                    samples.depth[i] = depth;
+                    samples.light[i] = value(0);
+                    samples.normal[i] = [value(1), value(2), value(3)];
+                }
+                for edge in &mut edges {
+                    edge.step(edge.column);
+                }
+            }
+            let back = columns.end - columns.start;
+            for edge in &mut edges {
+                edge.step(edge.row - back * edge.column);
+            }
+        }
+    }
+}
+
+/// Fills a row of tiles: what is seen of `shape` there.
+pub(super) fn fill(
+    shape: Shape<'_>,
+    camera: &Camera,
+    bins: &Bins,
+    tiles: Tiles,
+    band: &mut Band<'_>,
+    samples: &mut Samples,
+) {
+    let height = band.depth.len() / band.width;
+    for column in 0..tiles.across {
+        let left = column * TILE_WIDTH;
+        let width = TILE_WIDTH.min(band.width - left);
+        let mut triangles = bins.of(band.top / TILE_HEIGHT * tiles.across + column).peekable();
+        if triangles.peek().is_none() {
+            continue;
+        }
+        samples.depth.fill(NOTHING);
+        let signed = |n: [usize; 2]| n.map(|n| i64::try_from(n).unwrap_or(i64::MAX));
+        let (corner, size) = (signed([left, band.top]), signed([width, height]));
+        for triangle in triangles {
+            Facet::new(shape, triangle, camera).draw(shape, camera, corner, size, samples);
+        }
+        for y in 0..height {
+            for x in 0..width {
+                let (pixel, at) = (y * TILE_WIDTH + x, y * band.width + left + x);
+                (band.depth[at], band.light[at], band.facing[at]) = resolve(samples, pixel);
+            }
+        }
+    }
+}
+
+/// A pixel from its samples.
+fn resolve(samples: &Samples, pixel: usize) -> (f32, f32, Facing) {
+    let of_pixel = pixel * SAMPLES..(pixel + 1) * SAMPLES;
+    let (mut nearest, mut light, mut normal, mut covered) = (NOTHING, 0.0, [0.0_f32; 3], 0_u16);
+    for i in of_pixel.filter(|i| samples.depth[*i] < NOTHING) {
+        nearest = nearest.min(samples.depth[i]);
+        light += samples.light[i];
+        (0..3).for_each(|k| normal[k] += samples.normal[i][k]);
+        covered += 1;
+    }
+    if covered == 0 {
+        return (NOTHING, 0.0, Facing::default());
+    }
+    let length = dot(normal, normal).sqrt();
+    // Opposite normals in one pixel cancel: it is seen from the front then.
+    let unit = if length > 0.0 { normal.map(|c| c / length) } else { [0.0, 0.0, 1.0] };
+    #[expect(clippy::cast_possible_truncation, reason = "components of a unit vector")]
+    let normal = unit.map(|c| (c * UNIT + 0.5_f32.copysign(c)) as i16);
+    (nearest, light / f32::from(covered), Facing { normal, covered })
+}

@@ -1,0 +1,20 @@
+"""Says what Pillow reads in PNG files: a path a line in, a line of JSON out."""
+
+import json
+import sys
+
+from PIL import Image
+
+for path in sys.stdin.read().splitlines():
+    with Image.open(path) as image:
+        image.load()
+        flat = image.convert("RGBA").tobytes()
+        pixels = [list(flat[at : at + 4]) for at in range(0, len(flat), 4)]
+        said = {
+            "width": image.size[0],
+            "height": image.size[1],
+            "mode": image.mode,
+            "srgb": "srgb" in image.info,
+            "pixels": pixels,
+        }
+    print(json.dumps(said))
