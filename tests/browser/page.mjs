@@ -283,6 +283,7 @@ await run({
     // It begins by itself, and ends by itself: what is noted does not go away.
     const other = await start(chromium, {
       reducedMotion: "no-preference",
+      viewport: { width: 500, height: 500 },
       before: (p) => p.addInitScript(() => new MutationObserver(() => (window.turned ||= !!document.querySelector('#turn[aria-pressed="true"]'))).observe(document, { subtree: true, childList: true, attributes: true })),
     });
     await other.waitForFunction(() => window.turned);
