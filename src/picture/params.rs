@@ -247,7 +247,7 @@ mod tests {
     #[test]
     fn canonical_texts_differ_where_pictures_do() {
         let plain = PictureParams::default();
-        let mut all = vec![
+        let mut all = [
             plain,
             PictureParams { width: 100, ..plain },
             PictureParams { height: 100, ..plain },
