@@ -71,7 +71,7 @@ await run({
     assert.deepEqual(await controls(other), names(api).sort());
     assert.ok((await other.locator("#p-kernel option").allTextContents()).includes("cubic"));
     // The service does not know it, and says so; the page offers to take it back.
-    await other.locator("details.more summary").click();
+    await other.locator("#parameters details.more summary").click();
     await slide(other, "wobble", 800);
     await other.locator("#problem strong").waitFor();
     assert.ok(surfaces(other).at(-1).includes("wobble=0.8"), surfaces(other).at(-1));
@@ -170,7 +170,7 @@ await run({
     const structure = /\/v1\/structures\/[0-9a-f]+/.exec(surfaces(page).at(-1))[0];
     const formats = await page.locator("#formats button").evaluateAll((nodes) => nodes.map((n) => n.dataset.format));
     const can = JSON.parse((await fetched("/v1/capabilities")).bytes);
-    assert.deepEqual(formats, can.formats.map((f) => f.name).filter((name) => name !== "png"));
+    assert.deepEqual(formats, can.formats.map((f) => f.name));
     for (const format of formats) {
       const [download] = await Promise.all([page.waitForEvent("download"), page.locator(`#formats button[data-format="${format}"]`).click()]);
       assert.equal(download.suggestedFilename(), `4PTI.${format}`);
@@ -180,6 +180,19 @@ await run({
       const other = await fetched(`${structure}/surface.${format}?resolution=0.9`);
       assert.ok(!other.bytes.equals(direct.bytes), "two meshes are the same");
     }
+    // What goes with a picture alone changes neither the mesh nor the other files.
+    const before = await shown(page);
+    await page.locator("details.more", { has: page.locator("#picture-fields") }).locator("summary").click();
+    await page.locator("#p-width").fill("300");
+    await page.locator("#p-width").press("Enter");
+    const [download] = await Promise.all([page.waitForEvent("download"), page.locator('#formats button[data-format="png"]').click()]);
+    const png = readFileSync(await download.path());
+    assert.deepEqual([png.readUInt32BE(16), png.readUInt32BE(20)], [300, 512]);
+    assert.ok(!(await page.locator("#curl").textContent()).includes("width"));
+    await page.locator("#format").selectOption("png");
+    assert.match(await page.locator("#curl").textContent(), /width=300/);
+    await page.locator("#format").selectOption("glb");
+    assert.equal(await shown(page), before);
     await remeshed(page, () => page.locator("#reset-all").click());
   },
 
@@ -197,7 +210,7 @@ await run({
     await remeshed(page, () => page.locator("#reset-all").click());
     // A spacing and a level of detail exclude each other: the later one stands.
     await remeshed(page, () => slide(page, "resolution", 700));
-    await page.locator("details.more").evaluate((node) => (node.open = true));
+    await page.locator("#parameters details.more").evaluate((node) => (node.open = true));
     await remeshed(page, () => slide(page, "detail", 2));
     assert.ok(/detail=2/.test(surfaces(page).at(-1)) && !/resolution=/.test(surfaces(page).at(-1)), surfaces(page).at(-1));
     await remeshed(page, () => page.locator("#reset-all").click());
@@ -304,7 +317,7 @@ await run({
   "it fits a phone": async () => {
     const phone = await start(chromium, { viewport: { width: 375, height: 812 }, hasTouch: true, isMobile: true });
     assert.ok((await phone.evaluate(() => document.documentElement.scrollWidth)) <= 375);
-    await phone.locator("details.more summary").tap();
+    await phone.locator("#parameters details.more summary").tap();
     assert.ok((await phone.evaluate(() => document.documentElement.scrollWidth)) <= 375);
     assert.deepEqual(await axe(phone), []);
     assert.ok(silhouette(await picture(phone)).share > 0.1);

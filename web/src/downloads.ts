@@ -10,7 +10,7 @@ export class Downloads {
   constructor(
     private readonly client: Client,
     formats: string[],
-    private readonly wanted: () => { source: Source; choices: Choices } | null,
+    private readonly wanted: (format: string) => { source: Source; choices: Choices } | null,
     private readonly failed: (error: unknown) => void,
   ) {
     const buttons = formats.map((format) => {
@@ -22,7 +22,7 @@ export class Downloads {
   }
 
   private async save(format: string, button: HTMLButtonElement): Promise<void> {
-    const wanted = this.wanted();
+    const wanted = this.wanted(format);
     if (!wanted) return;
     const said = $("saved");
     button.disabled = true;

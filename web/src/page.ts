@@ -52,10 +52,10 @@ export class Page {
 
   /** Builds what the description asks for, and opens what the address names, else the sample. */
   async start(parameters: Parameter[], formats: string[]): Promise<void> {
-    this.form = new Form($("parameters"), parameters, (_, live) => this.changed(live));
+    this.form = new Form($("parameters"), $("picture-fields"), parameters, (mesh, live) => (mesh ? this.changed(live) : this.commands()));
     const asked = readAddress(this.form.names);
     this.form.fill(asked.choices);
-    new Downloads(this.client, formats, () => this.source && { source: this.source, choices: this.choices }, (error) => this.problem(error, () => undefined));
+    new Downloads(this.client, formats, (format) => this.source && { source: this.source, choices: this.choicesOf(format) }, (error) => this.problem(error, () => undefined));
     $("format").replaceChildren(...formats.map((format) => el("option", { value: format }, format)));
     if (asked.pdb) return this.open(() => Promise.resolve(entry(asked.pdb)));
     if (asked.structure) return this.open((signal) => this.known(asked.structure, signal));
@@ -88,6 +88,10 @@ export class Page {
     return this.form?.choices ?? new Map<string, string>();
   }
 
+  private choicesOf(format: string) {
+    return this.form?.of(format) ?? new Map<string, string>();
+  }
+
   private listen(): void {
     const file = $<HTMLInputElement>("file");
     const take = (chosen: File) => void this.open((signal) => upload(this.client, chosen, chosen.name, signal));
@@ -115,7 +119,7 @@ export class Page {
     $("format").addEventListener("change", () => this.commands());
     const copied = (id: string, text: () => string) => $(id).addEventListener("click", () => void copy(text()).then(() => this.say("Copied"), (error: unknown) => this.problem(error, () => undefined)));
     copied("copy-curl", () => $("curl").textContent ?? "");
-    copied("copy-url", () => (this.source ? location.origin + surface(this.source, $<HTMLSelectElement>("format").value, this.choices) : ""));
+    copied("copy-url", () => (this.source ? location.origin + surface(this.source, $<HTMLSelectElement>("format").value, this.choicesOf($<HTMLSelectElement>("format").value)) : ""));
   }
 
   private sample(): Promise<void> {
@@ -156,7 +160,6 @@ export class Page {
   /** Something was set: the mesh follows. */
   private changed(live: boolean, since = performance.now()): void {
     const { source, choices } = this;
-    show($("reset-all"), choices.size > 0);
     if (!source) return;
     this.commands();
     const known = this.shown?.source === source ? this.shown : null;
@@ -169,9 +172,12 @@ export class Page {
   }
 
   private commands(): void {
+    const all = this.form?.all ?? new Map<string, string>();
+    show($("reset-all"), all.size > 0);
     if (!this.source) return;
-    writeAddress(this.source, this.choices);
-    $("curl").textContent = curl(this.source, $<HTMLSelectElement>("format").value || "glb", this.choices, location.origin, this.client.key !== "");
+    writeAddress(this.source, all);
+    const format = $<HTMLSelectElement>("format").value || "glb";
+    $("curl").textContent = curl(this.source, format, this.choicesOf(format), location.origin, this.client.key !== "");
   }
 
   private begin(wish: Wish): void {
@@ -206,7 +212,7 @@ export class Page {
     if (!source) return;
     const fresh = this.shown?.source !== source;
     const first = this.shown === null;
-    const { loaded, drawn: time } = await this.stage.show(bytes, source, this.choices, fresh);
+    const { loaded, drawn: time } = await this.stage.show(bytes, source, this.choicesOf("png"), fresh);
     // What web/measure.mjs reads.
     const parts = { answered: answered - wish.since, received: received - answered, drawn: time - received };
     performance.measure("molmesh:remesh", { start: wish.since, end: time, detail: { preview: wish.preview ?? null, triangles: loaded.extras["triangles"], ...parts } });

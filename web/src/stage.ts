@@ -27,7 +27,7 @@ export class Stage {
     if (!this.viewer) this.explain(ABSENT);
   }
 
-  /** Shows a file. Resolves with what it holds, and with the time in the frame after it was drawn. */
+  /** Shows a file; `choices` are those of its picture. Resolves with what it holds, and with the time in the frame after it was drawn. */
   async show(bytes: ArrayBuffer, source: Source, choices: Choices, fresh: boolean): Promise<{ loaded: Loaded; drawn: number }> {
     this.asked = { source, choices };
     const loaded = await load(bytes);
@@ -69,7 +69,7 @@ export class Stage {
     const { clientWidth, clientHeight } = $("view-home");
     const pixels = Math.min(2, devicePixelRatio);
     const size = (side: number) => String(Math.max(64, Math.min(2048, Math.round(side * pixels))));
-    const path = surface(source, "png", pictured(choices), { width: size(clientWidth), height: size(clientHeight) });
+    const path = surface(source, "png", choices, { width: size(clientWidth), height: size(clientHeight) });
     try {
       const reply = await this.client.ask(path, { signal: abort.signal, headers: { accept: "image/png" } });
       const type = reply.headers.get("content-type") ?? "";
@@ -89,9 +89,4 @@ export class Stage {
       if (!this.notice.querySelector(".hint")) this.notice.append(el("p", { class: "hint" }, words));
     }
   }
-}
-
-/** How a file's vertices are stored means nothing to a picture. */
-function pictured(choices: Choices): Choices {
-  return new Map([...choices].filter(([name]) => !["compress", "normals", "units", "atom_ids"].includes(name)));
 }

@@ -20,6 +20,8 @@ export interface Parameter {
   values: string[];
   /** What is expected, in words. */
   expected: string;
+  /** The only format that it goes with, such as a picture's; empty: it is the mesh's. */
+  format: string;
   /** Parameters that cannot be given beside it. */
   insteadOf: string[];
 }
@@ -56,13 +58,12 @@ function described(api: OpenApi): Described[] {
   return (mesh?.parameters ?? []).filter((parameter) => parameter.in === "query");
 }
 
-/** Every parameter that changes the mesh, in the order of the description; those of pictures go with no mesh. */
+/** Every parameter, in the order of the description. */
 export function parametersOf(api: OpenApi): Parameter[] {
-  const mesh = (parameter: Described) => !ELSEWHERE.includes(parameter.name) && !parameter.schema?.["x-control"]?.format;
-  return described(api).filter(mesh).map(parameterOf);
+  return described(api).filter((parameter) => !ELSEWHERE.includes(parameter.name)).map(parameterOf);
 }
 
-/** The formats that a mesh can be had in, by their files' extensions. */
+/** The formats that a surface can be had in, by their files' extensions. */
 export function formatsOf(api: OpenApi): string[] {
   return described(api).find((parameter) => parameter.name === "format")?.schema?.enum ?? ["glb"];
 }
@@ -78,7 +79,7 @@ function parameterOf(parameter: Described): Parameter {
   const schema = parameter.schema ?? {};
   const min = schema.minimum ?? Number.NEGATIVE_INFINITY;
   const max = schema.maximum ?? Number.POSITIVE_INFINITY;
-  const { usual: span, unit, instead_of: insteadOf } = schema["x-control"] ?? {};
+  const { usual: span, unit, instead_of: insteadOf, format } = schema["x-control"] ?? {};
   const value = schema.default;
   const words = /Default: (.*)\.$/s.exec(schema.description ?? "")?.[1];
   return {
@@ -93,6 +94,7 @@ function parameterOf(parameter: Described): Parameter {
     fallbackWords: words ?? (value === undefined ? "absent" : String(value)),
     values: schema.enum ?? schema.items?.enum ?? [],
     expected: schema.title ?? "",
+    format: format ?? "",
     insteadOf: insteadOf ?? [],
   };
 }

@@ -1,9 +1,12 @@
-/** All parameters: the ones that most people turn first, the others behind a fold. */
+/** All parameters: the ones that most people turn first, the others behind a fold, and those of pictures beside the download. */
 
 import type { Parameter } from "../api/schema";
 import type { Choices } from "../request";
 import { el } from "./dom";
 import { field, type Field } from "./field";
+
+/** How a mesh file is stored means nothing to a picture. */
+const STORAGE = ["compress", "normals", "units", "atom_ids"];
 
 /** What stands on top. A parameter that is not named here is there as well, below. */
 const FIRST = ["preset", "kernel", "resolution", "isovalue", "smoothness", "select", "chains"];
@@ -11,19 +14,41 @@ const FIRST = ["preset", "kernel", "resolution", "isovalue", "smoothness", "sele
 export class Form {
   private readonly fields = new Map<string, Field>();
 
-  /** Fills `home`; `changed` is told after every change, and whether a slider is still being dragged. */
-  constructor(private readonly home: HTMLElement, parameters: Parameter[], private readonly changed: (name: string, live: boolean) => void) {
+  /**
+   * Fills `home`, and `pictures` with what goes with one format alone; `changed` is told after every change, whether it changes
+   * the mesh, and whether a slider is still being dragged.
+   */
+  constructor(private readonly home: HTMLElement, pictures: HTMLElement, parameters: Parameter[], private readonly changed: (mesh: boolean, live: boolean) => void) {
     const first = parameters.filter((p) => FIRST.includes(p.name)).sort((a, b) => FIRST.indexOf(a.name) - FIRST.indexOf(b.name));
-    const others = parameters.filter((p) => !FIRST.includes(p.name));
+    const others = parameters.filter((p) => !FIRST.includes(p.name) && !p.format);
+    const apart = parameters.filter((p) => p.format);
     for (const parameter of parameters) this.fields.set(parameter.name, field(parameter, (name, value, live) => this.set(name, value, live)));
     const elements = (list: Parameter[]) => list.map((p) => this.fields.get(p.name)?.element).filter((e) => e !== undefined);
     home.replaceChildren(...elements(first));
+    pictures.replaceChildren(...elements(apart));
+    if (pictures.parentElement) pictures.parentElement.hidden = apart.length === 0;
     if (others.length) home.append(el("details", { class: "more" }, el("summary", {}, `More parameters (${others.length})`), ...elements(others)));
   }
 
   /** What is set, in the order of the description. */
+  get all(): Choices {
+    return this.chosen(() => true);
+  }
+
+  /** What of it is the mesh's. */
   get choices(): Choices {
-    return new Map([...this.fields].filter(([, f]) => f.value !== undefined).map(([name, f]) => [name, f.value as string]));
+    return this.chosen((parameter) => parameter.format === "");
+  }
+
+  /** What of it goes with a file of `format`. */
+  of(format: string): Choices {
+    const isApart = [...this.fields.values()].some(({ parameter }) => parameter.format === format);
+    return this.chosen(({ name, format: only }) => (only === "" && !(isApart && STORAGE.includes(name))) || only === format);
+  }
+
+  private chosen(which: (parameter: Parameter) => boolean): Choices {
+    const set = [...this.fields].filter(([, f]) => f.value !== undefined && which(f.parameter));
+    return new Map(set.map(([name, f]) => [name, f.value as string]));
   }
 
   get names(): ReadonlySet<string> {
@@ -34,16 +59,17 @@ export class Form {
   set(name: string, value: string | undefined, live = false): void {
     const field = this.fields.get(name);
     if (!field) return;
-    if (field.value === value && !live) return this.changed(name, live);
+    const mesh = field.parameter.format === "";
+    if (field.value === value && !live) return this.changed(mesh, live);
     field.value = value;
     if (value !== undefined) for (const other of field.parameter.insteadOf) this.put(other, undefined);
-    this.changed(name, live);
+    this.changed(mesh, live);
   }
 
   /** Sets values without telling. */
   fill(choices: Choices): void {
     for (const [name] of this.fields) this.put(name, choices.get(name));
-    if ([...choices.keys()].some((name) => this.names.has(name) && !FIRST.includes(name))) this.home.querySelector("details")?.setAttribute("open", "");
+    if ([...choices.keys()].some((name) => this.fields.get(name)?.parameter.format === "" && !FIRST.includes(name))) this.home.querySelector("details")?.setAttribute("open", "");
   }
 
   /** What the service took for what is not set, from a report. */
