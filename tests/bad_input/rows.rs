@@ -434,7 +434,14 @@ fn http() -> Vec<Row> {
             bytes("nothing that could be made", 406, "not-acceptable").header("accept", "text/html"),
             vec![(
                 "available",
-                Is::Equal(json!(["model/gltf-binary", "model/gltf+json", "application/ply", "model/stl", "model/obj"])),
+                Is::Equal(json!([
+                    "model/gltf-binary",
+                    "model/gltf+json",
+                    "application/ply",
+                    "model/stl",
+                    "model/obj",
+                    "image/png"
+                ])),
             )],
         ),
         with(formed("a form without a file", form("resolution", "1")), says("expected", "file")),
@@ -469,7 +476,14 @@ fn http() -> Vec<Row> {
             request("an extension that is not there", "GET", "/v1/pdb/1bad/surface.exe", 404, "not-found"),
             vec![(
                 "available",
-                Is::Equal(json!(["surface.glb", "surface.gltf", "surface.ply", "surface.stl", "surface.obj"])),
+                Is::Equal(json!([
+                    "surface.glb",
+                    "surface.gltf",
+                    "surface.ply",
+                    "surface.stl",
+                    "surface.obj",
+                    "surface.png"
+                ])),
             )],
         ),
     ]
