@@ -56,7 +56,7 @@ fn contents(format: Format, bytes: &[u8]) -> Contents {
             let corners = read_stl(bytes).into_iter().flat_map(|[_, a, b, c]| [a, b, c]).collect();
             Contents { positions: corners, ..Contents::default() }
         }
-        Format::Png => panic!("a picture has no vertices to read back"),
+        Format::Png => unreachable!("a picture has no vertices to read back"),
     }
 }
 

@@ -573,7 +573,7 @@ fn packed_files_are_unpacked_for_those_who_take_them_plain() {
         let packed = send(SERVER.addr, "GET", path, &[("accept-encoding", "gzip")], b"");
         assert_eq!((plain.status, packed.status), (200, 200), "{path}");
         assert_eq!(plain.header("content-encoding"), None, "{path}");
-        let named = path.contains("-") && path.starts_with("/assets/");
+        let named = path.contains('-') && path.starts_with("/assets/");
         assert_eq!(plain.header("cache-control").unwrap().contains("immutable"), named, "{path}");
         if packed.header("content-encoding").is_some() {
             let mut unpacked = Vec::new();

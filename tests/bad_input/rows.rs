@@ -404,6 +404,11 @@ fn parameters() -> Vec<Row> {
 }
 
 /// What only HTTP can get wrong.
+/// What meshes and pictures of them can be had as.
+const MEDIA_TYPES: [&str; 6] =
+    ["model/gltf-binary", "model/gltf+json", "application/ply", "model/stl", "model/obj", "image/png"];
+const FILES: [&str; 6] = ["surface.glb", "surface.gltf", "surface.ply", "surface.stl", "surface.obj", "surface.png"];
+
 fn http() -> Vec<Row> {
     let with = |row: Row, named: Vec<(&'static str, Is)>| Row { named, ..row };
     let bytes = |name, status, slug| upload(name, ATOM, status, slug, 0);
@@ -432,17 +437,7 @@ fn http() -> Vec<Row> {
         ),
         with(
             bytes("nothing that could be made", 406, "not-acceptable").header("accept", "text/html"),
-            vec![(
-                "available",
-                Is::Equal(json!([
-                    "model/gltf-binary",
-                    "model/gltf+json",
-                    "application/ply",
-                    "model/stl",
-                    "model/obj",
-                    "image/png"
-                ])),
-            )],
+            vec![("available", Is::Equal(json!(MEDIA_TYPES)))],
         ),
         with(formed("a form without a file", form("resolution", "1")), says("expected", "file")),
         with(formed("a form that breaks off", form("file", ATOM).replace("--XX--", "")), says("detail", "form")),
@@ -474,17 +469,7 @@ fn http() -> Vec<Row> {
         with(surface("an entry that is noise", "1bad", 422, "unreadable-structure"), says("found", "`noise`")),
         with(
             request("an extension that is not there", "GET", "/v1/pdb/1bad/surface.exe", 404, "not-found"),
-            vec![(
-                "available",
-                Is::Equal(json!([
-                    "surface.glb",
-                    "surface.gltf",
-                    "surface.ply",
-                    "surface.stl",
-                    "surface.obj",
-                    "surface.png"
-                ])),
-            )],
+            vec![("available", Is::Equal(json!(FILES)))],
         ),
     ]
 }

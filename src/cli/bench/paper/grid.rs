@@ -46,7 +46,7 @@ mod tests {
 
     #[test]
     fn a_spacing_is_found_where_there_is_one() {
-        let cells = |side: f64, h: f64| (1_u64..).take_while(|n| *n as f64 * h < side).count() as u64;
+        let cells = |side: f64, h: f64| (1..u64::MAX).take_while(|n| *n as f64 * h < side).count() as u64;
         let boxed = |h: f64| Ok(cells(30.0, h) * cells(34.1, h) * cells(41.7, h));
         for cubes in [100_000, 346_580, 7_229_120] {
             let grid = for_cubes(cubes, &boxed).unwrap();

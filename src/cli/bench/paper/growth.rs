@@ -20,7 +20,9 @@ pub(super) fn tiled(sample: &Spheres, n: usize) -> Result<Spheres, String> {
     let copies = n.div_ceil(sample.len());
     let edge = (1..=copies).find(|e| e.pow(3) >= copies).unwrap_or(1);
     let (mut columns, mut radii) = ([const { Vec::new() }; 3], Vec::with_capacity(n));
-    columns.iter_mut().for_each(|column| column.reserve_exact(n));
+    for column in &mut columns {
+        column.reserve_exact(n);
+    }
     for i in 0..n {
         let (copy, atom) = (i / sample.len(), i % sample.len());
         let at = [copy % edge, copy / edge % edge, copy / edge / edge];

@@ -17,9 +17,12 @@ const WARM_UP: usize = 2;
 /// A run of the reference that takes longer, s, is done once.
 const SHORT: f64 = 2.0;
 
-/// The programs, ready to run, or why they do not.
+/// A program that is ready to run, or why it does not.
+type Opened = Result<Box<dyn Runner>, String>;
+
+/// The programs.
 pub(super) struct Programs {
-    runners: Vec<(Program, Result<Box<dyn Runner>, String>)>,
+    runners: Vec<(Program, Opened)>,
 }
 
 impl Programs {

@@ -83,7 +83,8 @@ mod tests {
 
     /// Cubes of the paper's grid over a box of centres.
     fn cubes(sides: [f64; 3]) -> u64 {
-        let whole = |side: f64| (1_u32..).take_while(|n| f64::from(*n) * CUBE <= side + 2.0 * AROUND).count() as u64;
+        let whole =
+            |side: f64| (1..u32::MAX).take_while(|n| f64::from(*n) * CUBE <= side + 2.0 * AROUND).count() as u64;
         sides.map(whole).iter().product()
     }
 

@@ -55,7 +55,7 @@ pub(super) fn stages(documents: &[&Document], program: &str) -> Option<String> {
 }
 
 /// What each stage reaches of the rate that bounds it, for the last structure of the results.
-pub(super) fn roofline(document: &&Document) -> Option<String> {
+pub(super) fn roofline(document: &Document) -> Option<String> {
     let roofline = document.roofline.last()?;
     // Of memory and of arithmetic.
     let reached = |s: &StageFacts| {

@@ -30,7 +30,8 @@ pub(super) fn all(documents: &[Document]) -> Vec<(&'static str, String)> {
     let charts = charts.into_iter().filter_map(|(name, chart)| Some((name, chart.draw()?)));
     let stages = [("stages-cpu.svg", "cpu"), ("stages-gpu.svg", "gpu")];
     let stages = stages.into_iter().filter_map(|(name, program)| Some((name, bars::stages(documents, program)?)));
-    let roofline = documents.iter().rev().find_map(bars::roofline).map(|svg| ("roofline.svg", svg));
+    let roofline =
+        documents.iter().rev().find_map(|document| bars::roofline(document)).map(|svg| ("roofline.svg", svg));
     charts.chain(stages).chain(roofline).collect()
 }
 
@@ -162,7 +163,7 @@ mod tests {
         let (mut open, mut rest) = (Vec::new(), text);
         while let Some((before, tag)) = rest.split_once('<') {
             let bare =
-                before.split('&').skip(1).any(|part| !part.split_once(';').is_some_and(|(name, _)| name.len() < 8));
+                before.split('&').skip(1).any(|part| part.split_once(';').is_none_or(|(name, _)| name.len() >= 8));
             if bare || before.contains('>') {
                 return Some(format!("text {before:?}"));
             }
