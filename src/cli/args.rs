@@ -39,6 +39,8 @@ pub(crate) struct Args {
 
 /// What to do.
 #[derive(Debug, Subcommand)]
+// The flags of the command at hand are described, not those of the others: that took longer than reading a small structure.
+#[command(defer = true)]
 pub(crate) enum Command {
     /// Mesh the surface of one structure
     Mesh(Box<MeshArgs>),

@@ -14,6 +14,7 @@ use super::args::ServeArgs;
 use super::backend::{self, Asked, Picked};
 use super::banner::{self, Facts};
 use super::error::CliError;
+use super::heap;
 use super::style::Style;
 
 /// How much nicer threads that compute are than those that answer: their share of a busy core is a third.
@@ -58,6 +59,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
             error => CliError::Service(error.to_string()),
         },
     )?;
+    heap::tend().map_err(|e| CliError::Service(format!("cannot start a thread: {e}")))?;
     let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
     // The service runs whether or not somebody reads its banner.
     drop(io::stderr().write_all(text.as_bytes()));

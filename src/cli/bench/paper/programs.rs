@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use clap::ValueEnum;
 use molmesh::gpu::bench::{self, Opened};
-use molmesh::gpu::{Engine, Executor, GpuJob, Look, Paper, Prepared, discover};
+use molmesh::gpu::{Engine, Executor, Finished, GpuJob, Look, Paper, Prepared, discover};
 use molmesh::pipeline::StageClock;
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
@@ -162,13 +162,17 @@ fn job(spheres: &Spheres, params: &SurfaceParams) -> Result<GpuJob, String> {
     Ok(GpuJob { prepared: Arc::new(prepared), cancel: CancelToken::default(), deadline: None })
 }
 
+/// From spheres to a mesh on a device, and the seconds that it took.
+fn whole(device: &mut impl Executor, spheres: &Spheres, params: &SurfaceParams) -> Result<(Finished, f64), String> {
+    let start = Instant::now();
+    let job = job(spheres, params)?;
+    let finished = device.run(std::slice::from_ref(&job)).pop().ok_or("no answer")?.map_err(|e| e.to_string())?;
+    Ok((finished, start.elapsed().as_secs_f64()))
+}
+
 impl Runner for Engine {
     fn once(&mut self, spheres: &Spheres, params: &SurfaceParams) -> Result<Sample, String> {
-        let start = Instant::now();
-        let job = job(spheres, params)?;
-        let finished =
-            Executor::run(self, std::slice::from_ref(&job)).pop().ok_or("no answer")?.map_err(|e| e.to_string())?;
-        let seconds = start.elapsed().as_secs_f64();
+        let (finished, seconds) = whole(self, spheres, params)?;
         let stages = finished.stages.iter().map(|(stage, ns)| (stage.name(), *ns as f64 * 1e-9)).collect();
         Ok(Sample { seconds, on_device: true, stages, triangles: finished.meshed.mesh.n_triangles() })
     }
@@ -180,11 +184,7 @@ impl Runner for Engine {
 
 impl Runner for Paper {
     fn once(&mut self, spheres: &Spheres, params: &SurfaceParams) -> Result<Sample, String> {
-        let start = Instant::now();
-        let job = job(spheres, params)?;
-        let finished =
-            Executor::run(self, std::slice::from_ref(&job)).pop().ok_or("no answer")?.map_err(|e| e.to_string())?;
-        let seconds = start.elapsed().as_secs_f64();
+        let (finished, seconds) = whole(self, spheres, params)?;
         // Zeros where the device has no clock.
         let times = self.times().map(|(stage, ns)| (stage, ns as f64 * 1e-9));
         let stages = if finished.stages.is_empty() { Vec::new() } else { times.to_vec() };
