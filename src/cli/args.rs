@@ -40,6 +40,7 @@ pub(crate) struct Args {
 /// What to do.
 #[derive(Debug, Subcommand)]
 // The flags of the command at hand are described, not those of the others: that took longer than reading a small structure.
+// What a command is for is said here alone, then: a docstring of the type of its flags, or of a part of them, would replace it.
 #[command(defer = true)]
 pub(crate) enum Command {
     /// Mesh the surface of one structure
@@ -101,7 +102,7 @@ pub(crate) enum LogStyle {
     Json,
 }
 
-/// `molmesh mesh`.
+// `molmesh mesh`.
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{MESH_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct MeshArgs {
@@ -127,7 +128,7 @@ pub(crate) struct MeshArgs {
     pub(crate) job: JobArgs,
 }
 
-/// What every job has, whatever becomes of its mesh.
+// What every job has, whatever becomes of its mesh.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct JobArgs {
     /// What runs the meshing
@@ -158,7 +159,7 @@ pub(crate) struct JobArgs {
     pub(crate) limits: LimitArgs,
 }
 
-/// Which devices.
+// Which devices.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct DeviceArgs {
     /// Which devices may be used: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software; `molmesh
@@ -176,7 +177,7 @@ pub(crate) enum DoctorStyle {
     Json,
 }
 
-/// `molmesh doctor`.
+// `molmesh doctor`.
 #[derive(Debug, ClapArgs)]
 #[command(after_help = DOCTOR_CODES)]
 pub(crate) struct DoctorArgs {
@@ -190,7 +191,7 @@ pub(crate) struct DoctorArgs {
     pub(crate) serve: ServeArgs,
 }
 
-/// `molmesh config`.
+// `molmesh config`.
 #[derive(Debug, Subcommand)]
 pub(crate) enum ConfigCommand {
     /// Print the effective configuration, each value with its source; secrets are not shown
@@ -218,7 +219,7 @@ pub(crate) struct PrintArgs {
     pub(crate) serve: ServeArgs,
 }
 
-/// Which surface.
+// Which surface.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Surface")]
 pub(crate) struct SurfaceArgs {
@@ -266,7 +267,7 @@ pub(crate) struct SurfaceArgs {
     pub(crate) atom_ids: bool,
 }
 
-/// Which atoms.
+// Which atoms.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
 pub(crate) struct SelectionArgs {
@@ -293,7 +294,7 @@ pub(crate) struct SelectionArgs {
     pub(crate) altloc: Option<String>,
 }
 
-/// What is too much.
+// What is too much.
 #[expect(clippy::struct_field_names, reason = "the fields are named like their flags")]
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Limits")]
@@ -312,7 +313,7 @@ pub(crate) struct LimitArgs {
     pub(crate) max_mesh_bytes: Option<u64>,
 }
 
-/// `molmesh serve`.
+// `molmesh serve`.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct ServeArgs {
     /// Address of the service; port 0 takes a free one [default: 127.0.0.1:8080]
@@ -344,7 +345,7 @@ pub(crate) struct ServeArgs {
     pub(crate) log: Option<LogStyle>,
 }
 
-/// `molmesh healthcheck`.
+// `molmesh healthcheck`.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct HealthcheckArgs {
     /// What to ask

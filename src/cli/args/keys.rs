@@ -14,7 +14,7 @@ Examples:
   export MOLMESH__ACCESS__SIGNING_SECRET=$(molmesh key signing --id 2030a)
   molmesh sign 'https://meshes.example/v1/pdb/4pti/surface.glb?resolution=1' --expires 1h";
 
-/// `molmesh key`.
+// `molmesh key`.
 #[derive(Debug, Subcommand)]
 pub(crate) enum KeyCommand {
     /// Make a key: the lines for the file of keys go to stdout, the key itself, once, to stderr
@@ -61,7 +61,7 @@ pub(crate) struct SigningKeyArgs {
     pub(crate) id: String,
 }
 
-/// `molmesh sign`.
+// `molmesh sign`.
 #[derive(Debug, ClapArgs)]
 #[command(after_help = SIGN_EXAMPLES)]
 pub(crate) struct SignArgs {

@@ -12,7 +12,7 @@ Examples:
   molmesh render 1gbt.cif.gz -o - --width 256 --height 256 --background white > thumbnail.png
   molmesh render 4pti.pdb -o 4pti.png --kernel soft-object --style gouraud --view front --azimuth 30";
 
-/// `molmesh render`.
+// `molmesh render`.
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{RENDER_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct RenderArgs {
@@ -27,7 +27,7 @@ pub(crate) struct RenderArgs {
     pub(crate) job: JobArgs,
 }
 
-/// What the picture is to look like.
+// What the picture is to look like.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Picture")]
 pub(crate) struct PictureArgs {

@@ -23,7 +23,7 @@ use super::error::CliError;
 use cases::Case;
 use measure::Row;
 
-/// What to measure.
+// What to measure.
 #[derive(Debug, Subcommand)]
 pub(crate) enum Bench {
     /// Time the stages on a GPU, beside the floor that the device's own rates give
