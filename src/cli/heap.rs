@@ -90,11 +90,14 @@ mod tests {
         assert!(after < before + 30, "{freed} to {after} MiB");
         drop(last);
 
-        // Large enough for a mapping of its own, which would end with the vector.
-        let before = resident();
-        keep();
-        drop(used(8 << 20));
-        let after = resident();
+        // In a thread with a heap of its own: this one's has room. Large enough for a mapping, which would end with the vector.
+        let kept = std::thread::spawn(move || {
+            let before = resident();
+            keep();
+            drop(used(8 << 20));
+            (before, resident())
+        });
+        let (before, after) = kept.join().unwrap();
         assert!(after > before + 6, "{before} to {after} MiB");
     }
 }
