@@ -45,6 +45,26 @@ fn small_jobs_share_a_submission() {
 }
 
 #[test]
+fn a_device_without_work_lets_go_what_it_keeps() {
+    let rig = Rig::new(&[Serve]);
+    let pool_at = |rest| pool(std::slice::from_ref(&rig), PoolSettings { rest, ..SETTINGS });
+    let rests = || rig.rests.load(Ordering::SeqCst);
+    // The control: one that waits for ever keeps it.
+    let busy = pool_at(Duration::MAX);
+    busy.run(&job(1)).unwrap();
+    std::thread::sleep(Duration::from_millis(50));
+    assert_eq!((rests(), busy.status()[0].held_bytes), (0, 4096));
+    drop(busy);
+    let idle = pool_at(Duration::from_millis(5));
+    wait_for("a rest", || rests() > 0);
+    wait_for("its memory to be booked", || idle.status()[0].held_bytes == 1024);
+    // It works as before, and rests again.
+    assert_eq!(idle.run(&job(1)).unwrap().1, "fake 0");
+    let before = rests();
+    wait_for("another rest", || rests() > before);
+}
+
+#[test]
 fn a_large_job_runs_alone_and_keeps_its_place() {
     let rig = Rig::new(&[Hold, Serve]);
     let pool = pool(std::slice::from_ref(&rig), SETTINGS);

@@ -19,7 +19,8 @@ use molmesh::surface::{
 };
 
 /// Every job is spread that can be.
-const SETTINGS: PoolSettings = PoolSettings { queue: 64, batch: 16, pause: Duration::ZERO, spread_bricks: Some(1) };
+const SETTINGS: PoolSettings =
+    PoolSettings { queue: 64, batch: 16, pause: Duration::ZERO, rest: Duration::from_secs(5), spread_bricks: Some(1) };
 
 /// A pool of `n` devices of the software adapter, each within what `change` makes of its budget.
 fn pool(n: usize, change: fn(&mut Budget), settings: PoolSettings) -> DevicePool {

@@ -299,6 +299,10 @@ impl Executor for Engine {
         self.make_part(job, share)
     }
 
+    fn rest(&mut self) {
+        self.landings.rest();
+    }
+
     fn held_bytes(&self) -> u64 {
         self.workspaces.iter().map(Workspace::bytes).sum::<u64>() + self.landings.held() + self.cases.size()
     }

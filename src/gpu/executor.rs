@@ -44,6 +44,9 @@ pub trait Executor: Send {
         Err(GpuError::Failed("this program makes meshes whole".to_owned()))
     }
 
+    /// Lets go what is kept for the next job alone and is large: there has been none for a while.
+    fn rest(&mut self) {}
+
     /// Bytes of device memory that it holds now: in use and pooled.
     fn held_bytes(&self) -> u64;
 }

@@ -8,8 +8,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use wgpu::{Buffer, BufferUsages, BufferView, Device};
 
-/// Idle buffers are kept up to this many bytes in all: enough for the largest meshes to find one again.
-const MOST_IDLE: u64 = 2 << 30;
+/// Idle buffers are kept up to this many bytes in all between jobs that follow each other: the largest meshes find theirs
+/// again. Getting as much takes the system and the driver ten times as long as filling it.
+const MOST_IDLE: u64 = 8 << 30;
+/// And up to this many once the device has had nothing to do for a while.
+const MOST_AT_REST: u64 = 2 << 30;
 
 /// Idle buffers.
 #[derive(Debug, Clone, Default)]
@@ -29,6 +32,16 @@ pub(super) struct Landing {
     buffer: Option<Buffer>,
     view: Option<BufferView>,
     pool: Landings,
+}
+
+impl Idle {
+    /// Lets the oldest buffers go until the others are `most` bytes at most.
+    fn shrink(&mut self, most: u64) {
+        let sizes: Vec<u64> = self.buffers.iter().map(Buffer::size).collect();
+        let n = surplus(&sizes, most);
+        self.held -= sizes[..n].iter().sum::<u64>();
+        self.buffers.drain(..n);
+    }
 }
 
 impl Landings {
@@ -64,10 +77,12 @@ impl Landings {
             return;
         }
         idle.buffers.push(buffer);
-        let sizes: Vec<u64> = idle.buffers.iter().map(Buffer::size).collect();
-        let n = surplus(&sizes, MOST_IDLE);
-        idle.held -= sizes[..n].iter().sum::<u64>();
-        idle.buffers.drain(..n);
+        idle.shrink(MOST_IDLE);
+    }
+
+    /// Lets go what is not worth its memory while nothing is done.
+    pub(super) fn rest(&self) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).shrink(MOST_AT_REST);
     }
 }
 

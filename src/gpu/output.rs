@@ -1,5 +1,5 @@
-//! A job's output: in pieces that a binding holds, and landings that the host can read. The next submission is made while
-//! the one before is on its way.
+//! A job's output: in pieces that a binding holds, each in a landing that the host can read. The next one is made while the
+//! one before is on its way.
 
 use wgpu::Buffer;
 
@@ -9,13 +9,12 @@ use super::flight::{Arrived, Piece, Places, TALLY_AT, TRIANGLE_BYTES, VertexByte
 use super::progress::{Counted, Progress, Sent};
 use super::record::{Dispatch, Recording};
 use super::run::FRONT;
-use super::submit::Flight;
 use super::workspace::{Needs, OutputRows, Workspace};
 use crate::surface::Stage;
 use crate::surface::layout::{Params, Tally};
 
-/// Rows of parameters: the chunk's, and those of the pieces of a submission.
-pub(super) const PARAM_ROWS: usize = 64;
+/// Rows of parameters: the chunk's and a piece's.
+pub(super) const PARAM_ROWS: u64 = 2;
 /// Output is made before it is counted where the buffers hold the estimate for a small job over this: a ball of 60,000
 /// atoms at 0.5 Å needs a sixth of the estimate, and what is less solid needs more.
 const LIKELY: u64 = 8;
@@ -50,19 +49,19 @@ pub(super) fn copy_rows(recording: &mut Recording<'_>, from: &Buffer, target: &B
     }
 }
 
-/// Copies the vertices in the workspace to their columns, `skip` rows in.
+/// Copies the first `n` vertices in the workspace to their columns.
 pub(super) fn copy_vertices(
     recording: &mut Recording<'_>,
     loaded: &Loaded<'_>,
     target: &Buffer,
     places: &Places,
-    rows: [u64; 2],
+    n: u64,
 ) {
-    let ([skip, n], workspace) = (rows, &loaded.workspace);
+    let workspace = &loaded.workspace;
     let VertexBytes { positions, normals, sources } = loaded.vertex;
-    copy_rows(recording, workspace.buffer("positions"), target, places.positions + positions * skip, positions * n);
-    copy_rows(recording, workspace.buffer("normals"), target, places.normals + normals * skip, normals * n);
-    copy_rows(recording, workspace.buffer("sources"), target, places.sources + sources * skip, sources * n);
+    copy_rows(recording, workspace.buffer("positions"), target, places.positions, positions * n);
+    copy_rows(recording, workspace.buffer("normals"), target, places.normals, normals * n);
+    copy_rows(recording, workspace.buffer("sources"), target, places.sources, sources * n);
 }
 
 impl Loaded<'_> {
@@ -114,8 +113,8 @@ impl Engine {
         self.grow(loaded, &needs)
     }
 
-    /// Makes the vertices, the triangles or both of some pieces, in as few submissions as landings allow. Each is sent
-    /// before the one before it has landed; the last is left on its way.
+    /// Makes the vertices, the triangles or both of some pieces. Each is sent before the one before it has landed; the last
+    /// is left on its way.
     pub(super) fn send_pieces(
         &self,
         progress: &mut Progress<'_>,
@@ -123,30 +122,11 @@ impl Engine {
         pieces: &[Piece],
         columns: [bool; 2],
     ) -> Result<(), GpuError> {
-        let [vertices, triangles] = columns;
-        let vertex = progress.loaded.vertex;
-        let mut rest = pieces;
-        while !rest.is_empty() {
+        for piece in pieces {
             check(progress.loaded.job)?;
-            // As many pieces as a landing holds, one at least.
-            let (mut n, mut rows) = (0, [0, 0]);
-            let mut places = Places::new(0, 0, vertex);
-            for piece in rest.iter().take(PARAM_ROWS - 1) {
-                let more = [
-                    rows[0] + piece.n_vertices * u64::from(vertices),
-                    rows[1] + piece.n_triangles * u64::from(triangles),
-                ];
-                let larger = Places::new(more[0], more[1], vertex);
-                if n > 0 && larger.end > self.budget.landing_bytes {
-                    break;
-                }
-                (n, rows, places) = (n + 1, more, larger);
-            }
-            let (now, later) = rest.split_at(n);
-            let flight = self.send_some(&progress.loaded, chunk, now, columns, &places)?;
+            let flight = self.send_piece(&progress.loaded, chunk, piece, columns)?;
             self.settle(progress)?;
-            progress.sent = Some(Sent { flight, places, rows, columns });
-            rest = later;
+            progress.sent = Some(flight);
         }
         Ok(())
     }
@@ -166,48 +146,44 @@ impl Engine {
         Ok(())
     }
 
-    fn send_some(
+    /// A submission of its own for each piece: stages have one time a submission, which holds no copies then.
+    fn send_piece(
         &self,
         loaded: &Loaded<'_>,
         chunk: usize,
-        pieces: &[Piece],
-        [vertices, triangles]: [bool; 2],
-        places: &Places,
-    ) -> Result<Flight, GpuError> {
+        piece: &Piece,
+        columns: [bool; 2],
+    ) -> Result<Sent, GpuError> {
+        let [vertices, triangles] = columns;
+        let rows = [piece.n_vertices * u64::from(vertices), piece.n_triangles * u64::from(triangles)];
+        let places = Places::new(rows[0], rows[1], loaded.vertex);
         let landing = self.landings.get(&self.device, places.end);
         let target = landing.buffer().map_err(failed)?;
-        let base = loaded.chunks[chunk].params(&loaded.params);
-        for (row, piece) in (1..).zip(pieces) {
-            let params = Params {
-                piece_brick: piece.brick,
-                piece_bricks: piece.n_bricks,
-                piece_vertex: narrow(piece.vertex)?,
-                piece_triangle: narrow(piece.triangle & u64::from(u32::MAX))?,
-                vertex_capacity: narrow(piece.n_vertices)?,
-                triangle_capacity: narrow(piece.n_triangles)?,
-                ..base
-            };
-            self.write_params(&loaded.workspace, row, &params);
-        }
+        let params = Params {
+            piece_brick: piece.brick,
+            piece_bricks: piece.n_bricks,
+            piece_vertex: narrow(piece.vertex)?,
+            piece_triangle: narrow(piece.triangle & u64::from(u32::MAX))?,
+            vertex_capacity: narrow(piece.n_vertices)?,
+            triangle_capacity: narrow(piece.n_triangles)?,
+            ..loaded.chunks[chunk].params(&loaded.params)
+        };
+        self.write_params(&loaded.workspace, 1, &params);
         let mut recording = self.recording();
-        let ends = |i: usize| [i == 0, i + 1 == pieces.len()];
-        let (mut n_vertices, mut n_triangles) = (0, 0);
-        for (i, piece) in pieces.iter().enumerate().filter(|_| vertices) {
-            let [first, last] = ends(i);
-            recording.part(Stage::Interpolate, &[loaded.dispatch(i as u64 + 1, piece.n_bricks)], first, last);
-            copy_vertices(&mut recording, loaded, target, places, [n_vertices, piece.n_vertices]);
-            n_vertices += piece.n_vertices;
+        let dispatch = [loaded.dispatch(1, piece.n_bricks)];
+        if vertices {
+            recording.stage(Stage::Interpolate, &dispatch);
+            copy_vertices(&mut recording, loaded, target, &places, rows[0]);
         }
-        for (i, piece) in pieces.iter().enumerate().filter(|_| triangles) {
-            let [first, last] = ends(i);
-            recording.part(Stage::Emit, &[loaded.dispatch(i as u64 + 1, piece.n_bricks)], first, last);
-            let (at, bytes) = (places.triangles + TRIANGLE_BYTES * n_triangles, TRIANGLE_BYTES * piece.n_triangles);
-            copy_rows(&mut recording, loaded.workspace.buffer("triangles"), target, at, bytes);
-            n_triangles += piece.n_triangles;
+        if triangles {
+            recording.stage(Stage::Emit, &dispatch);
+            let buffer = loaded.workspace.buffer("triangles");
+            copy_rows(&mut recording, buffer, target, places.triangles, TRIANGLE_BYTES * rows[1]);
         }
         recording.read_clock(target);
         copy_counts(&mut recording, &loaded.workspace, target, None);
-        self.launch(recording, vec![(landing, places.end)])
+        let flight = self.launch(recording, vec![(landing, places.end)])?;
+        Ok(Sent { flight, places, rows, columns })
     }
 
     /// Submits the whole output of a job's only chunk before it is counted, into the buffers as they are. Returns the
@@ -257,7 +233,7 @@ impl Engine {
         let landing = self.landings.get(&self.device, places.end);
         let target = landing.buffer().map_err(failed)?;
         let mut recording = self.recording();
-        copy_vertices(&mut recording, loaded, target, &places, [0, rows[0]]);
+        copy_vertices(&mut recording, loaded, target, &places, rows[0]);
         copy_rows(
             &mut recording,
             loaded.workspace.buffer("triangles"),

@@ -15,7 +15,7 @@ use super::error::GpuError;
 use super::executor::{Finished, GpuJob};
 use super::queue::{Answer, NotPlaced, Place, Queues};
 use super::spread::Spread;
-use super::worker::{self, Build};
+use super::worker::{self, Build, Times};
 use crate::surface::devices::SPREAD_BRICKS;
 use crate::surface::{DeviceStatus, Stage, SurfaceError};
 
@@ -43,15 +43,19 @@ pub struct PoolSettings {
     pub batch: usize,
     /// Pause after a failed rebuild, doubled each time.
     pub pause: Duration,
+    /// How long a device has nothing to do before it lets go what it keeps for the next large job.
+    pub rest: Duration,
     /// Bricks that each device gets at least of a job that is spread over several; none: no job is.
     pub spread_bricks: Option<u64>,
 }
 
 impl Default for PoolSettings {
     /// 64 jobs wait, so that a caller never does before memory runs short; 16 share a submission, after which another
-    /// one costs less than waiting for a longer batch; a driver that restarts takes about half a second.
+    /// one costs less than waiting for a longer batch; a driver that restarts takes about half a second; five seconds are
+    /// longer than a caller takes to come with the next of several large jobs.
     fn default() -> Self {
-        Self { queue: 64, batch: 16, pause: Duration::from_millis(200), spread_bricks: Some(SPREAD_BRICKS) }
+        let (pause, rest) = (Duration::from_millis(200), Duration::from_secs(5));
+        Self { queue: 64, batch: 16, pause, rest, spread_bricks: Some(SPREAD_BRICKS) }
     }
 }
 
@@ -111,9 +115,9 @@ impl DevicePool {
         let mut pool =
             Self { queues, threads: Vec::with_capacity(devices.len()), names, spread_bricks: settings.spread_bricks };
         for (n, device) in devices.into_iter().enumerate() {
-            let (queues, pause) = (Arc::clone(&pool.queues), settings.pause);
+            let (queues, times) = (Arc::clone(&pool.queues), Times { pause: settings.pause, rest: settings.rest });
             let thread = std::thread::Builder::new().name(format!("molmesh-gpu-{}", device.number));
-            let started = thread.spawn(move || worker::work(&queues, n, &device.build, pause));
+            let started = thread.spawn(move || worker::work(&queues, n, &device.build, times));
             let failed = |e: io::Error| GpuError::Failed(format!("a device's thread cannot be started: {e}"));
             pool.threads.push(started.map_err(failed)?);
         }

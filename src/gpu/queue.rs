@@ -142,10 +142,11 @@ impl Queues {
         drop(left);
     }
 
-    /// What device `n` runs next: one job, or several small ones. Blocks until there is work; `None` once the device is
-    /// down or the queues are closed.
-    pub(super) fn next(&self, n: usize) -> Option<Vec<Entry>> {
+    /// What device `n` runs next: one job, or several small ones; nothing where none came for `rest`. `None` once the device
+    /// is down or the queues are closed.
+    pub(super) fn next(&self, n: usize, rest: Duration) -> Option<Vec<Entry>> {
         let mut state = self.lock();
+        let mut rested = false;
         loop {
             let closed = state.closed;
             let lane = &mut state.lanes[n];
@@ -173,8 +174,17 @@ impl Queues {
                 self.moved.notify_all();
                 return Some(taken);
             }
-            state = self.filled[n].wait(state).unwrap_or_else(PoisonError::into_inner);
+            if rested {
+                return Some(taken);
+            }
+            let waited = self.filled[n].wait_timeout(state, rest).unwrap_or_else(PoisonError::into_inner);
+            (state, rested) = (waited.0, waited.1.timed_out());
         }
+    }
+
+    /// Device `n` holds so much memory.
+    pub(super) fn holds(&self, n: usize, bytes: u64) {
+        self.lock().lanes[n].held_bytes = bytes;
     }
 
     /// Moves small jobs from `waiting` to `taken`, wherever in the queue they stand: a large one before them keeps its

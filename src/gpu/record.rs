@@ -76,23 +76,16 @@ impl<'a> Recording<'a> {
         self.timed.extend(stages);
     }
 
-    /// One stage for several jobs, or for several pieces of one with `after` recorded behind each. Dispatches without
-    /// anything between them overlap on the device as far as their buffers allow.
+    /// One stage, for one job or for several: dispatches without anything between them overlap on the device as far as
+    /// their buffers allow. It has one time in a submission.
     pub(super) fn stage(&mut self, stage: Stage, dispatches: &[Dispatch<'_>]) {
-        self.part(stage, dispatches, true, true);
-    }
-
-    /// A part of a stage; the first begins its time and the last ends it.
-    pub(super) fn part(&mut self, stage: Stage, dispatches: &[Dispatch<'_>], first: bool, last: bool) {
         let at = 2 * u32::try_from(number(stage)).unwrap_or_default();
-        let timestamp_writes = self.clock.filter(|_| first || last).map(|clock| wgpu::ComputePassTimestampWrites {
+        let timestamp_writes = self.clock.map(|clock| wgpu::ComputePassTimestampWrites {
             query_set: &clock.queries,
-            beginning_of_pass_write_index: first.then_some(at),
-            end_of_pass_write_index: last.then_some(at + 1),
+            beginning_of_pass_write_index: Some(at),
+            end_of_pass_write_index: Some(at + 1),
         });
-        if last {
-            self.timed.push(stage);
-        }
+        self.timed.push(stage);
         let mut pass = self
             .encoder
             .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage.name()), timestamp_writes });

@@ -35,12 +35,12 @@ impl Engine {
         let largest = (vertex.positions * vertices).max(TRIANGLE_BYTES * triangles);
         let fits = largest <= self.budget.piece_bytes && bytes <= self.budget.landing_bytes;
         let small = chunks.len() == 1 && bytes <= self.budget.small_bytes && fits;
-        small.then_some(OutputRows { vertices, triangles, params: PARAM_ROWS as u64 })
+        small.then_some(OutputRows { vertices, triangles, params: PARAM_ROWS })
     }
 
     /// The rows that a job's buffers hold before its output is counted.
     pub(super) fn no_rows() -> OutputRows {
-        OutputRows { vertices: 0, triangles: 0, params: PARAM_ROWS as u64 }
+        OutputRows { vertices: 0, triangles: 0, params: PARAM_ROWS }
     }
 
     /// Runs small jobs in one submission. Answers each with its number.
@@ -94,7 +94,7 @@ impl Engine {
             let target = landing.buffer().map_err(failed)?;
             recording.read_clock(target);
             copy_counts(&mut recording, &loaded.workspace, target, Some((places.end, groups)));
-            copy_vertices(&mut recording, loaded, target, &places, [0, rows.vertices]);
+            copy_vertices(&mut recording, loaded, target, &places, rows.vertices);
             let triangles = loaded.workspace.buffer("triangles");
             copy_rows(&mut recording, triangles, target, places.triangles, TRIANGLE_BYTES * rows.triangles);
             landings.push((landing, places.end + groups));

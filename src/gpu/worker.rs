@@ -16,22 +16,36 @@ pub type Build = Box<dyn Fn() -> Result<Box<dyn Executor>, GpuError> + Send + Sy
 /// second attempt, and a job that kills devices must not keep one busy for ever.
 pub const MOST_REBUILDS: usize = 3;
 
+/// How long a device's thread waits.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Times {
+    /// After a failed rebuild.
+    pub(super) pause: Duration,
+    /// For work, before the device lets go what it keeps for it.
+    pub(super) rest: Duration,
+}
+
 /// Runs jobs on device `n` until the queues are closed or it is given up.
-pub(super) fn work(queues: &Queues, n: usize, build: &Build, pause: Duration) {
+pub(super) fn work(queues: &Queues, n: usize, build: &Build, times: Times) {
     // Nothing outside the executor should panic; if it does, nobody may wait for this thread in vain.
-    let ended = catch_unwind(AssertUnwindSafe(|| run(queues, n, build, pause)));
+    let ended = catch_unwind(AssertUnwindSafe(|| run(queues, n, build, times)));
     if let Err(payload) = ended {
         queues.down(n, &format!("its thread panicked: {}", words(&*payload)));
     }
 }
 
-fn run(queues: &Queues, n: usize, build: &Build, pause: Duration) {
+fn run(queues: &Queues, n: usize, build: &Build, times: Times) {
     let mut executor = match built(build) {
         Ok(executor) => executor,
         Err(error) => return queues.down(n, &error.to_string()),
     };
     queues.up(n);
-    while let Some(entries) = queues.next(n) {
+    while let Some(entries) = queues.next(n, times.rest) {
+        if entries.is_empty() {
+            executor.rest();
+            queues.holds(n, executor.held_bytes());
+            continue;
+        }
         let begun = Instant::now();
         let answers = attempt(executor.as_mut(), &entries);
         let (time, held_bytes) = (begun.elapsed(), executor.held_bytes());
@@ -47,7 +61,7 @@ fn run(queues: &Queues, n: usize, build: &Build, pause: Duration) {
         if hopeless {
             return;
         }
-        match rebuilt(queues, n, build, pause, why) {
+        match rebuilt(queues, n, build, times.pause, why) {
             Ok(new) => executor = new,
             Err(why) => return queues.down(n, &given_up(&why)),
         }

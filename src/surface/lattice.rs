@@ -14,6 +14,7 @@ use super::params::SurfaceParams;
 use super::simd::dispatched;
 use super::sort::sorted;
 use super::spheres::Spheres;
+use super::split::{each, few};
 
 /// Samples along a brick's edge.
 pub const BRICK: i32 = 8;
@@ -154,26 +155,33 @@ impl Placing<'_> {
     /// `bounds`: lowest and highest coordinates.
     fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
         let n = self.spheres.len();
+        let few = few(n);
         // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
         let rank =
             TileRanks::new(bounds.map(|c| tile_of(self.cell(c))), n, |i| tile_of(self.cell(self.spheres.centre(i))));
         let mut atoms = Column::scratch(n);
         if rank.end() <= u64::from(u32::MAX) >> PLACE_BITS && u32::try_from(n).is_ok() {
             let order = sorted(n, |first, keys| write_short_keys(self, &rank, first, keys));
-            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
-            parts.for_each(|(atoms, order)| place_by_short_keys(self, order, atoms));
+            let parts: Vec<_> = atoms.chunks_mut(PART).zip(order.chunks(PART)).collect();
+            each(few, parts, |(atoms, order)| place_by_short_keys(self, order, atoms));
         } else {
             let order = sorted(n, |first, keys| write_keys(self, &rank, first, keys));
-            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
-            parts.for_each(|(atoms, order)| place_by_keys(self, order, atoms));
+            let parts: Vec<_> = atoms.chunks_mut(PART).zip(order.chunks(PART)).collect();
+            each(few, parts, |(atoms, order)| place_by_keys(self, order, atoms));
         }
-        atoms.par_chunk_by_mut(|a, b| a.cell == b.cell).filter(|same| same.len() > 1).for_each(|same| {
+        let same = |a: &LatticeAtom, b: &LatticeAtom| a.cell == b.cell;
+        let order = |same: &mut [LatticeAtom]| {
             same.sort_unstable_by(|a, b| {
                 let axis = |k: usize| a.frac[k].total_cmp(&b.frac[k]);
                 let size = a.inv_length2.total_cmp(&b.inv_length2);
                 axis(2).then(axis(1)).then(axis(0)).then(size).then(a.source.cmp(&b.source))
             });
-        });
+        };
+        if few {
+            atoms.chunk_by_mut(same).filter(|same| same.len() > 1).for_each(order);
+        } else {
+            atoms.par_chunk_by_mut(same).filter(|same| same.len() > 1).for_each(order);
+        }
         atoms
     }
 }

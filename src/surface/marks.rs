@@ -7,6 +7,7 @@ use rustc_hash::FxHashMap;
 
 use super::lattice::{BRICK, LatticeAtom, TILE, tile_of, tile_order, to_i32, to_u32};
 use super::layout::NONE;
+use super::split::{few, map};
 
 /// Atoms that one piece of parallel work marks the bricks of.
 const RUN: usize = 1024;
@@ -188,8 +189,9 @@ pub(super) fn starts(atoms: &[LatticeAtom]) -> Vec<usize> {
     };
     // A piece begins within a tile, as a rule.
     let begins = |&at: &usize| at == 0 || tile(at - 1) != tile(at);
-    let pieces = (0..atoms.len().div_ceil(RUN)).into_par_iter().map(|piece| piece * RUN);
-    pieces.flat_map_iter(in_piece).filter(begins).collect()
+    let pieces: Vec<usize> = (0..atoms.len()).step_by(RUN).collect();
+    let found = map(few(atoms.len()), pieces, |piece| in_piece(piece).filter(begins).collect::<Vec<_>>());
+    found.into_iter().flatten().collect()
 }
 
 /// The atoms of each tile, which `starts` tells, cut into runs.

@@ -29,6 +29,7 @@ mod simd;
 pub mod sink;
 mod sort;
 pub mod spheres;
+pub(crate) mod split;
 mod sums;
 pub mod topology;
 

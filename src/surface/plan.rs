@@ -5,8 +5,6 @@
 //! of a run of bricks are one range. A brick exists where an atom reaches one of its samples, or the gap up to its
 //! neighbours' first samples: cells live there too.
 
-use rayon::prelude::*;
-
 use super::column::Column;
 use super::control::Control;
 use super::cpu::{self, Constants, SlopeConstants};
@@ -16,6 +14,7 @@ use super::layout::{NONE, Params, Tile, halves};
 use super::marks::{Bits, Marked, local_of, mark_run, merge, runs, starts};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
+use super::split::{each, few, map};
 
 /// More tiles than this in all runs together, and the grid is looked at before it is built.
 const MANY_TILES: f64 = 1e6;
@@ -65,16 +64,16 @@ impl Plan {
             reaches.iter_mut().zip(atoms).for_each(|(reach, atom)| *reach = reach_of(lattice, atom));
             reaches.iter().copied().fold(0.0, f32::max)
         };
-        let longest = reaches.par_chunks_mut(4096).zip(atoms.par_chunks(4096)).map(part).reduce(|| 0.0, f32::max);
+        let few = few(atoms.len());
+        let parts: Vec<_> = reaches.chunks_mut(4096).zip(atoms.chunks(4096)).collect();
+        let longest = map(few, parts, part).into_iter().fold(0.0, f32::max);
         refuse_early(lattice, runs.len(), longest, limits)?;
         control.check()?;
-        let marks: Vec<Vec<Marked>> = runs
-            .par_iter()
-            .map(|&(start, end)| {
-                control.check()?;
-                Ok(mark_run(&atoms[start..end], &reaches[start..end], longest))
-            })
-            .collect::<Result<_, SurfaceError>>()?;
+        let marked_by = |&(start, end): &(usize, usize)| {
+            control.check()?;
+            Ok(mark_run(&atoms[start..end], &reaches[start..end], longest))
+        };
+        let marks: Vec<Vec<Marked>> = map(few, &runs, marked_by).into_iter().collect::<Result<_, SurfaceError>>()?;
         let marked = merge(&marks);
         control.check()?;
         let occupied = marked.iter().map(|m| ones(&m.reached)).sum::<u64>();
@@ -89,13 +88,13 @@ impl Plan {
             pairs: marked.iter().map(|m| m.pairs).sum(),
             ..Self::default()
         };
-        plan.number(&marked).ok_or_else(|| cpu::grid_too_large(lattice, u64::from(u32::MAX) * 512, limits))?;
-        plan.place(&marked, atoms, &starts);
+        plan.number(&marked, few).ok_or_else(|| cpu::grid_too_large(lattice, u64::from(u32::MAX) * 512, limits))?;
+        plan.place(&marked, atoms, &starts, few);
         Ok(plan)
     }
 
     /// Numbers tiles and bricks. `None` where 32 bits do not.
-    fn number(&mut self, marked: &[Marked]) -> Option<()> {
+    fn number(&mut self, marked: &[Marked], few: bool) -> Option<()> {
         if marked.len() >= 1 << 23 {
             return None;
         }
@@ -105,38 +104,35 @@ impl Plan {
             bases.push(base);
             base = base.checked_add(u32::try_from(ones(&m.closed)).ok()?)?;
         }
-        self.tiles = marked
-            .par_iter()
-            .zip(&bases)
-            .map(|(m, &base)| {
-                let mut tile = Tile { coord: m.tile, base, bricks: [[0; 2]; 8], before: [0; 8], around: [NONE; 28] };
-                let mut before = 0;
-                for (z, word) in m.closed.iter().enumerate() {
-                    tile.bricks[z] = halves(*word);
-                    tile.before[z] = before;
-                    before += word.count_ones();
-                }
-                for (row, entries) in (0_i32..9).zip(tile.around.chunks_exact_mut(3)) {
-                    // The three tiles of a row follow each other, as far as they exist.
-                    let first = [m.tile[0] - 1, m.tile[1] + row % 3 - 1, m.tile[2] + row / 3 - 1];
-                    let at = marked.partition_point(|m| tile_order(m.tile) < tile_order(first));
-                    for (t, there) in (at..).zip(marked[at..].iter().take(3)) {
-                        let step = there.tile[0].abs_diff(first[0]) as usize;
-                        if there.tile[1..] == first[1..] && step < 3 {
-                            entries[step] = to_u32(t);
-                        }
+        let tile = |(m, &base): (&Marked, &u32)| {
+            let mut tile = Tile { coord: m.tile, base, bricks: [[0; 2]; 8], before: [0; 8], around: [NONE; 28] };
+            let mut before = 0;
+            for (z, word) in m.closed.iter().enumerate() {
+                tile.bricks[z] = halves(*word);
+                tile.before[z] = before;
+                before += word.count_ones();
+            }
+            for (row, entries) in (0_i32..9).zip(tile.around.chunks_exact_mut(3)) {
+                // The three tiles of a row follow each other, as far as they exist.
+                let first = [m.tile[0] - 1, m.tile[1] + row % 3 - 1, m.tile[2] + row / 3 - 1];
+                let at = marked.partition_point(|m| tile_order(m.tile) < tile_order(first));
+                for (t, there) in (at..).zip(marked[at..].iter().take(3)) {
+                    let step = there.tile[0].abs_diff(first[0]) as usize;
+                    if there.tile[1..] == first[1..] && step < 3 {
+                        entries[step] = to_u32(t);
                     }
                 }
-                tile
-            })
-            .collect();
+            }
+            tile
+        };
+        self.tiles = map(few, marked.iter().zip(&bases).collect::<Vec<_>>(), tile);
         self.bricks = Column::scratch(base as usize);
         self.first_atoms = Column::scratch(base as usize + 1);
         Some(())
     }
 
     /// Lists the bricks and finds their first atoms; `starts` tells where each tile's atoms begin.
-    fn place(&mut self, marked: &[Marked], atoms: &[LatticeAtom], starts: &[usize]) {
+    fn place(&mut self, marked: &[Marked], atoms: &[LatticeAtom], starts: &[usize], few: bool) {
         let mut parts = Vec::with_capacity(marked.len());
         let (mut bricks, mut firsts) = (&mut self.bricks[..], &mut self.first_atoms[..]);
         for (t, m) in (0_u32..).zip(marked) {
@@ -146,7 +142,7 @@ impl Plan {
             (bricks, firsts) = (more, rest);
         }
         firsts.fill(to_u32(atoms.len()));
-        parts.into_par_iter().for_each(|(t, m, own, firsts)| {
+        each(few, parts, |(t, m, own, firsts)| {
             let before = |&start: &usize| tile_order(tile_of(atoms[start].cell)) < tile_order(m.tile);
             let tile = starts.partition_point(before);
             let [mut at, next] = [tile, tile + 1].map(|t| starts.get(t).copied().unwrap_or(atoms.len()));

@@ -5,6 +5,7 @@ use bytemuck::Pod;
 use rayon::prelude::*;
 
 use super::column::Column;
+use super::split::few;
 
 /// Most keys of a piece, and about as many of a range: they are sorted within the second-level cache.
 const LARGEST: usize = 1 << 13;
@@ -25,19 +26,22 @@ fn piece_of(n: usize) -> usize {
 
 /// `n` different keys in ascending order; `make(first, piece)` writes those from number `first` on.
 pub(super) fn sorted<K: Key>(n: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
-    sorted_by_pieces(n, piece_of(n), make)
+    let size = if few(n) { n.next_multiple_of(EVERY) } else { piece_of(n) };
+    sorted_by_pieces(n, size, make)
 }
 
 /// [`sorted`], with `size` keys a piece, a multiple of [`EVERY`]; the result does not depend on it.
 fn sorted_by_pieces<K: Key>(n: usize, size: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
     let mut keys = Column::scratch(n);
-    keys.par_chunks_mut(size).enumerate().for_each(|(p, piece)| {
+    let piece = |p: usize, piece: &mut [K]| {
         make(p * size, piece);
         piece.sort_unstable();
-    });
+    };
     if n <= size {
+        piece(0, &mut keys);
         return keys;
     }
+    keys.par_chunks_mut(size).enumerate().for_each(|(p, keys)| piece(p, keys));
     let mut samples: Vec<K> =
         keys.par_chunks(size).flat_map_iter(|piece| piece.iter().step_by(EVERY)).copied().collect();
     samples.par_sort_unstable();

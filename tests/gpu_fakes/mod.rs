@@ -40,6 +40,7 @@ pub struct Rig {
     changed: Condvar,
     pub builds: AtomicUsize,
     pub drops: AtomicUsize,
+    pub rests: AtomicUsize,
     /// Builds that succeed; none: all.
     pub good_builds: Option<usize>,
 }
@@ -123,13 +124,18 @@ impl Executor for Fake {
         jobs[..n].iter().map(answer).collect()
     }
 
+    fn rest(&mut self) {
+        self.0.rests.fetch_add(1, Ordering::SeqCst);
+    }
+
     fn held_bytes(&self) -> u64 {
-        4096
+        if self.0.rests.load(Ordering::SeqCst) == 0 { 4096 } else { 1024 }
     }
 }
 
-/// No pause between rebuilds, so that tests need not wait for it.
-pub const SETTINGS: PoolSettings = PoolSettings { queue: 64, batch: 16, pause: Duration::ZERO, spread_bricks: None };
+/// No pause between rebuilds, so that tests need not wait for it, and no rest.
+pub const SETTINGS: PoolSettings =
+    PoolSettings { queue: 64, batch: 16, pause: Duration::ZERO, rest: Duration::MAX, spread_bricks: None };
 
 /// The rigs as devices of a pool.
 pub fn devices(rigs: &[Arc<Rig>]) -> Vec<PoolDevice> {

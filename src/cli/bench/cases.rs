@@ -54,6 +54,7 @@ pub(super) fn all(atoms: usize) -> Vec<Case> {
         file("7cgo-0.5", "7cgo", "polymer", [1, 1], Spacing::Is(0.5)),
         file("7cgo-1.0", "7cgo", "polymer", [1, 1], Spacing::Is(1.0)),
         file("7cgo-x9-1.0", "7cgo", "polymer", [3, 3], Spacing::Is(1.0)),
+        file("7cgo-x9-0.5", "7cgo", "polymer", [3, 3], Spacing::Is(0.5)),
     ]
 }
 

@@ -67,6 +67,9 @@ pub(crate) struct GpuArgs {
     /// Time so many jobs of 600 atoms, and some large ones, through the pool on 1, 2, … devices instead
     #[arg(long, value_name = "N", conflicts_with_all = ["jobs", "device"])]
     pub(crate) pool: Option<usize>,
+    /// Callers of `--pool` for each device: none of them should wait for another to prepare its job
+    #[arg(long, value_name = "N", requires = "pool", default_value_t = 8)]
+    pub(crate) callers: usize,
     /// Time each case on 1, 2, 4, … devices together instead, every device with at least so many bricks
     #[arg(long, value_name = "BRICKS", conflicts_with_all = ["jobs", "device", "pool", "check"],
         num_args = 0..=1, default_missing_value = "32768")]
@@ -90,11 +93,11 @@ pub(super) fn run(bench: &Bench) -> Result<(), CliError> {
 }
 
 fn gpu(args: &GpuArgs) -> Result<(), CliError> {
-    if args.runs == 0 || args.atoms == 0 || args.jobs == Some(0) || args.pool == Some(0) {
-        return Err(CliError::usage("nothing is measured with 0 runs, atoms or jobs"));
+    if args.runs == 0 || args.atoms == 0 || args.jobs == Some(0) || args.pool == Some(0) || args.callers == 0 {
+        return Err(CliError::usage("nothing is measured with 0 runs, atoms, jobs or callers"));
     }
     if let Some(n) = args.pool {
-        let rates = pool::run(&args.devices, n)?;
+        let rates = pool::run(&args.devices, n, args.callers)?;
         super::say(&pool::table(&rates))?;
         return save(args, &json!({ "pool": rates }));
     }

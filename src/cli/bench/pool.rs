@@ -13,13 +13,9 @@ use serde::Serialize;
 use super::super::error::CliError;
 use super::cases::ball;
 
-/// Atoms of a small job and of a large one.
-const ATOMS: [usize; 2] = [600, 60_000];
-/// Large jobs for each hundred small ones: they take about as long.
-const LARGE_PER_SMALL: usize = 20;
-/// Callers at once for each device: enough that none waits for one of them to prepare its job.
-const CALLERS: usize = 8;
-
+/// Atoms of a small job, of a usual one and of a large one, and how many of them are made for each hundred small ones: they
+/// take about as long.
+const SIZES: [(usize, usize); 3] = [(600, 100), (6000, 50), (60_000, 20)];
 /// Jobs of one size on so many devices.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct PoolRate {
@@ -29,12 +25,15 @@ pub(super) struct PoolRate {
     callers: usize,
     seconds: f64,
     jobs_per_second: f64,
+    /// Processor time of the whole process for each job, ms: callers, device threads, driver. None where nobody tells.
+    cpu_ms: Option<f64>,
     /// Submissions that several jobs shared.
     shared: u64,
 }
 
-/// Runs `n` small jobs and a share of large ones on 1, 2, … devices of those that `choice` takes.
-pub(super) fn run(choice: &DeviceChoice, n: usize) -> Result<Vec<PoolRate>, CliError> {
+/// Runs `n` small jobs and a share of larger ones on 1, 2, … devices of those that `choice` takes, from so many callers for
+/// each device.
+pub(super) fn run(choice: &DeviceChoice, n: usize, callers: usize) -> Result<Vec<PoolRate>, CliError> {
     let failed = |e: &dyn std::fmt::Display| CliError::Service(e.to_string());
     let found = discover(choice, Look::Thorough);
     if let Some(why) = found.why_none() {
@@ -48,20 +47,34 @@ pub(super) fn run(choice: &DeviceChoice, n: usize) -> Result<Vec<PoolRate>, CliE
             GpuBackend::start(&discover(&some, Look::Thorough), Program::Stages, &PoolSettings::default(), None)
                 .map_err(|e| failed(&e))?;
         backend.warm().map_err(|e| failed(&e))?;
-        for (atoms, jobs) in [(ATOMS[0], n), (ATOMS[1], n.div_ceil(100) * LARGE_PER_SMALL)] {
+        for (atoms, share) in SIZES {
+            let jobs = n.div_ceil(100) * share;
             // Once without the clock: buffers are made.
-            let callers = CALLERS * devices;
+            let callers = callers * devices;
             flood(&backend, atoms, 2 * callers, callers).map_err(|e| failed(&e))?;
             let shared = |backend: &GpuBackend| backend.devices().iter().map(|d| d.shared).sum::<u64>();
-            let (before, start) = (shared(&backend), Instant::now());
+            let (before, cpu, start) = (shared(&backend), processor_seconds(), Instant::now());
             flood(&backend, atoms, jobs, callers).map_err(|e| failed(&e))?;
             let seconds = start.elapsed().as_secs_f64();
             let jobs_per_second = jobs as f64 / seconds;
+            let cpu_ms = processor_seconds().zip(cpu).map(|(now, then)| (now - then) * 1e3 / jobs as f64);
             let shared = shared(&backend) - before;
-            rates.push(PoolRate { devices, atoms, jobs, callers, seconds, jobs_per_second, shared });
+            rates.push(PoolRate { devices, atoms, jobs, callers, seconds, jobs_per_second, cpu_ms, shared });
         }
     }
     Ok(rates)
+}
+
+/// Processor time of this process so far, s.
+fn processor_seconds() -> Option<f64> {
+    #[cfg(target_os = "linux")]
+    let seconds = {
+        let time = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+        Some(time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9)
+    };
+    #[cfg(not(target_os = "linux"))]
+    let seconds = None;
+    seconds
 }
 
 /// Runs `jobs` jobs from so many callers, each of which prepares its own.
@@ -86,13 +99,14 @@ pub(super) fn table(rates: &[PoolRate]) -> String {
     // A string takes everything.
     _ = writeln!(
         text,
-        "  {:>8}{:>8}{:>8}{:>9}{:>10}{:>10}{:>8}",
-        "devices", "atoms", "jobs", "callers", "s", "jobs/s", "shared"
+        "  {:>8}{:>8}{:>8}{:>9}{:>10}{:>10}{:>12}{:>8}",
+        "devices", "atoms", "jobs", "callers", "s", "jobs/s", "CPU ms/job", "shared"
     );
     for r in rates {
+        let cpu = r.cpu_ms.map_or_else(|| "–".to_owned(), |ms| format!("{ms:.3}"));
         _ = writeln!(
             text,
-            "  {:>8}{:>8}{:>8}{:>9}{:>10.3}{:>10.0}{:>8}",
+            "  {:>8}{:>8}{:>8}{:>9}{:>10.3}{:>10.0}{cpu:>12}{:>8}",
             r.devices, r.atoms, r.jobs, r.callers, r.seconds, r.jobs_per_second, r.shared
         );
     }
