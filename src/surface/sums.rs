@@ -99,7 +99,7 @@ pub(super) fn sum(positions: Positions<'_>, triangles: &[[u32; 3]], first: u32, 
 
 /// Sum in double precision, in eight strands: one would wait for every addition.
 #[inline(always)]
-pub(super) fn sum_lanes(lanes: &[f32; LANES]) -> f64 {
+pub(super) fn sum_lanes<const N: usize>(lanes: &[f32; N]) -> f64 {
     let mut strands = [0.0_f64; 8];
     for row in lanes.as_chunks::<8>().0 {
         for (strand, value) in strands.iter_mut().zip(row) {

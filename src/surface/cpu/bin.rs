@@ -10,6 +10,7 @@ use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32, to_u64};
 use crate::surface::params::{MAX_RESOLUTION, SurfaceLimits};
+use crate::surface::simd::dispatched;
 
 /// Bricks along a tile's edge with the layer beyond.
 pub(super) const SIDE: usize = 9;
@@ -217,6 +218,7 @@ struct AxisReach {
 }
 
 impl AxisReach {
+    #[inline(always)]
     fn new(local: f32, reach: f32) -> Self {
         let mut axis = Self { first: SIDE, last: 0, samples: [0.0; SIDE], closed: [0.0; SIDE] };
         for b in 0..SIDE {
@@ -236,6 +238,11 @@ impl AxisReach {
 impl Bricks {
     /// Finds the candidates of every brick of a tile.
     pub(super) fn fill(&mut self, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
+        fill(self, lattice, tile, atoms);
+    }
+
+    #[inline(always)]
+    fn find(&mut self, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
         self.starts.iter_mut().for_each(|n| *n = 0);
         self.reaching.iter_mut().for_each(|n| *n = 0);
         self.hits.clear();
@@ -289,7 +296,15 @@ impl Bricks {
     }
 }
 
+dispatched! {
+/// [`Bricks::fill`].
+fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
+    bricks.find(lattice, tile, atoms);
+}
+}
+
 /// A slot's brick index within the tile, 0 to 8 per axis.
+#[inline(always)]
 pub(super) fn slot_brick(slot: usize) -> [usize; 3] {
     [slot % SIDE, slot / SIDE % SIDE, slot / (SIDE * SIDE)]
 }

@@ -194,6 +194,7 @@ impl<'a> Near<'a> {
 
     /// The neighbour `n` (bits: 0 x, 1 y, 2 z; 0 is the brick itself) of the brick in `slot`, if it has surface: its
     /// tile, its place among the tile's bricks, and the brick.
+    #[inline(always)]
     pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, Numbered<'a>)> {
         let (slot, beyond) = emit::neighbour_slot(slot, n);
         let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;

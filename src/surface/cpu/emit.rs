@@ -150,6 +150,7 @@ fn shared_words(n: usize, mut each: impl FnMut(usize, usize, u64)) {
 }
 
 /// Whether the neighbour `n` holds a vertex that a brick's cells use.
+#[inline(always)]
 pub(super) fn shares_vertices(near: &SurfaceBrick, n: usize) -> bool {
     let mut words = 0;
     shared_words(n, |z, axis, mask| words |= near.crossing[3 * z + axis] & mask);
@@ -365,6 +366,7 @@ pub(super) fn emit(
 
 /// The slot of the neighbour `n` (bits: 0 x, 1 y, 2 z) of the brick in `slot`, and whether it lies beyond the
 /// tile, per axis.
+#[inline(always)]
 pub(super) fn neighbour_slot(slot: usize, n: usize) -> (usize, [usize; 3]) {
     let brick = super::bin::slot_brick(slot);
     let moved: [usize; 3] = std::array::from_fn(|k| brick[k] + (n >> k & 1));

@@ -7,13 +7,14 @@ use super::tally::{Sheet, Tally};
 use super::{PIECE_BRICKS, Piece, Scanned, threads};
 use crate::surface::lattice::to_u32;
 use crate::surface::measure::{Component, Measures};
+use crate::surface::simd::dispatched;
 
 /// Fewer pieces are not worth waking a thread for.
 const FEW: usize = 64;
 
 /// The measures of the mesh that the pieces make up; `None` if it is not closed, which the tallies cannot explain.
 pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measures> {
-    let Scanned { lattice, tiles, done, totals, pieces, .. } = scanned;
+    let Scanned { lattice, totals, pieces, .. } = scanned;
     let tallies: Vec<&Tally> = written.iter().map(|part| &part.tally).collect();
     let checksum = tallies.iter().fold(0_u64, |sum, tally| sum.wrapping_add(tally.checksum));
     if checksum != 0 || tallies.iter().any(|tally| tally.degenerate) {
@@ -29,21 +30,7 @@ pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measure
             first
         })
         .collect();
-    let pairs_of = |p: usize| {
-        let Piece { tile, bricks } = &pieces[p];
-        let near = Near::new(tiles, done, done[*tile].coord);
-        let mut pairs = Vec::new();
-        let neighbour = |brick: usize, n: usize| {
-            let slot = done[*tile].found.bricks[bricks.start + brick].slot;
-            let (other, ix, numbered) = near.of(usize::from(slot), n)?;
-            let piece = done[other].first_piece + ix / PIECE_BRICKS;
-            Some((numbered, tallies[piece], (piece, ix % PIECE_BRICKS)))
-        };
-        tallies[p].pairs(neighbour, |own, (other, sheet)| {
-            pairs.push([to_u32(first[p]) + own, to_u32(first[other]) + sheet]);
-        });
-        Ok(pairs)
-    };
+    let pairs_of = |p: usize| Ok(pairs_of(scanned, &tallies, &first, p));
     let pairs = if pieces.len() < FEW {
         (0..pieces.len()).map(pairs_of).collect::<Result<Vec<_>, Infallible>>()
     } else {
@@ -63,6 +50,26 @@ pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measure
         sheet.add_to(&mut components[of as usize], sheets[of as usize], lattice.spacing);
     }
     Some(Measures::balanced(components, totals.vertices as u64, totals.triangles as u64))
+}
+
+dispatched! {
+/// The pairs of sheets that the bricks of piece `p` share with their neighbours; `first` is each piece's first sheet.
+fn pairs_of(scanned: &Scanned, tallies: &[&Tally], first: &[usize], p: usize) -> Vec<[u32; 2]> {
+    let Scanned { tiles, done, pieces, .. } = scanned;
+    let Piece { tile, bricks } = &pieces[p];
+    let near = Near::new(tiles, done, done[*tile].coord);
+    let mut pairs = Vec::new();
+    let neighbour = |brick: usize, n: usize| {
+        let slot = done[*tile].found.bricks[bricks.start + brick].slot;
+        let (other, ix, numbered) = near.of(usize::from(slot), n)?;
+        let piece = done[other].first_piece + ix / PIECE_BRICKS;
+        Some((numbered, tallies[piece], (piece, ix % PIECE_BRICKS)))
+    };
+    tallies[p].pairs(neighbour, |own, (other, sheet)| {
+        pairs.push([to_u32(first[p]) + own, to_u32(first[other]) + sheet]);
+    });
+    pairs
+}
 }
 
 /// Makes two labels equal to the lower one's root.

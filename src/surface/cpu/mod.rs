@@ -284,6 +284,7 @@ impl Tile {
     }
 
     /// The surface brick in `slot`: its place among the tile's, and itself with its first vertex's global id.
+    #[inline(always)]
     fn numbered(&self, slot: usize) -> Option<(usize, Numbered<'_>)> {
         let [x, y, z] = slot_brick(slot);
         let ix = usize::from(self.bricks[(z * 8 + y) * 8 + x]);

@@ -12,7 +12,7 @@ use crate::surface::simd::dispatched;
 use crate::surface::sums::{edge_shares, sum_lanes};
 
 /// Triangles whose areas are computed together.
-const LANES: usize = 128;
+const LANES: usize = 32;
 
 /// The sheets of a brick as its piece numbers them.
 #[derive(Debug, Clone, Copy)]
@@ -101,34 +101,15 @@ impl Tally {
             self.sheets.push(Sheet { origin, vertices: n_own as u64, ..sum(table, corners) });
             return;
         }
-        let on = |edge: u16| sheets.of(table.sheet(edge));
-        let mut sums = vec![Sheet { origin, ..Sheet::default() }; usize::from(n)];
-        for run in corners.chunk_by(|a, b| on(a[0]) == on(b[0])) {
-            let (of, part) = (&mut sums[usize::from(on(run[0][0]))], sum(table, run));
-            of.triangles += part.triangles;
-            of.area += part.area;
-            of.product += part.product;
-            (0..3).for_each(|k| of.vector[k] += part.vector[k]);
-        }
-        let brick = to_u32(self.bricks.len() - 1);
-        for (neighbour, near) in (0_u8..).zip(around) {
-            let Some(near) = near else { continue };
-            shared_vertices(near, usize::from(neighbour), |rank, edge| {
-                let sheet = on(u16::try_from(edge).unwrap_or_default());
-                if neighbour == 0 {
-                    sums[usize::from(sheet)].vertices += 1;
-                    self.of_vertices.push(sheet);
-                } else {
-                    self.far.push(Far { brick, neighbour, rank, sheet: first + u32::from(sheet) });
-                }
-            });
-        }
-        self.sheets.append(&mut sums);
+        self.sheets.resize(self.sheets.len() + usize::from(n), Sheet { origin, ..Sheet::default() });
+        sum_by_sheet(table, sheets, &mut self.sheets[first as usize..]);
+        note_vertices(self, table, sheets, around, first);
     }
 
     /// The pairs of sheets that neighbouring bricks share. `near(brick, neighbour)` gives a brick's neighbour, the tally
     /// of its piece, and its piece with its place in that; `pair` gets the sheet of this piece, and the other's piece
     /// and sheet.
+    #[inline(always)]
     pub(super) fn pairs<'a>(
         &self,
         near: impl Fn(usize, usize) -> Option<(Numbered<'a>, &'a Self, (usize, usize))>,
@@ -168,6 +149,7 @@ impl Tally {
     }
 
     /// The sheet of a brick's vertex.
+    #[inline(always)]
     fn sheet_of(&self, brick: usize, rank: u32) -> u32 {
         let brick = &self.bricks[brick];
         if brick.n == 1 {
@@ -181,6 +163,59 @@ dispatched! {
 /// The checksum of triangles, and whether one of them has a corner twice.
 fn check(triangles: &[[u32; 3]]) -> (u64, bool) {
     edge_shares(triangles)
+}
+}
+
+dispatched! {
+/// Notes which sheet, from number `first` on, every vertex is on that a brick of several uses: its own by their ranks, and
+/// those of its neighbours for who joins the bricks.
+fn note_vertices(
+    tally: &mut Tally,
+    table: &BrickTable,
+    sheets: &Sheets,
+    around: &[Option<Numbered<'_>>; 8],
+    first: u32,
+) {
+    let Tally { sheets: sums, bricks, of_vertices, far, .. } = tally;
+    let brick = to_u32(bricks.len() - 1);
+    let on = |edge: usize| sheets.of(table.sheet(u16::try_from(edge).unwrap_or_default()));
+    for (neighbour, near) in (0_u8..).zip(around) {
+        let Some(near) = near else { continue };
+        shared_vertices(near, usize::from(neighbour), |rank, edge| {
+            let sheet = on(edge);
+            if neighbour == 0 {
+                sums[first as usize + usize::from(sheet)].vertices += 1;
+                of_vertices.push(sheet);
+            } else {
+                far.push(Far { brick, neighbour, rank, sheet: first + u32::from(sheet) });
+            }
+        });
+    }
+}
+}
+
+dispatched! {
+/// As [`sum`], for a brick of several sheets, whose triangles come in no order of sheets: adds each to its own.
+fn sum_by_sheet(table: &BrickTable, sheets: &Sheets, sums: &mut [Sheet]) {
+    let mut parts = [(Vec3A::ZERO, Vec3A::ZERO); LANES];
+    for batch in table.corners().chunks(LANES) {
+        let mut area = [0.0_f32; LANES];
+        for ((normal, product), edges) in parts.iter_mut().zip(batch) {
+            let [a, b, c] = edges.map(|edge| table.position(edge));
+            let n = (b - a).cross(c - a);
+            (*normal, *product) = (n, a * n);
+        }
+        for (area, (normal, _)) in area.iter_mut().zip(&parts[..batch.len()]) {
+            *area = normal.length();
+        }
+        for ((edges, (normal, product)), area) in batch.iter().zip(&parts).zip(area) {
+            let sum = &mut sums[usize::from(sheets.of(table.sheet(edges[0])))];
+            sum.triangles += 1;
+            sum.area += f64::from(area);
+            (0..3).for_each(|k| sum.vector[k] += f64::from(normal[k]));
+            sum.product += f64::from(product.element_sum());
+        }
+    }
 }
 }
 
