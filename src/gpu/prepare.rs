@@ -29,7 +29,7 @@ impl Prepared {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
-        let _caller = Caller::new();
+        let _caller = Caller::default();
         control.check()?;
         let lattice = Lattice::new(spheres, params)?;
         control.check()?;

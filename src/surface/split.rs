@@ -14,16 +14,20 @@ pub(super) const FEW: usize = 5120;
 /// Callers that prepare a job at present.
 static CALLERS: AtomicUsize = AtomicUsize::new(0);
 
-/// A caller that prepares a job, for as long as this lives.
+/// A caller that prepares a job, for as long as this lives: the more there are, the larger the jobs that stay on their
+/// callers' threads.
 #[derive(Debug)]
-pub(crate) struct Caller(&'static AtomicUsize);
+#[must_use = "it counts while it lives"]
+pub struct Caller(&'static AtomicUsize);
 
-impl Caller {
+impl Default for Caller {
     /// One more.
-    pub(crate) fn new() -> Self {
+    fn default() -> Self {
         Self::among(&CALLERS)
     }
+}
 
+impl Caller {
     fn among(callers: &'static AtomicUsize) -> Self {
         callers.fetch_add(1, Ordering::Relaxed);
         Self(callers)
