@@ -283,12 +283,15 @@ impl TileRanks {
 }
 
 /// The tile that a sample belongs to.
+// Written out, here and below: `map` is a call where it is not inlined, and these are looked at for every atom.
+#[inline(always)]
 #[must_use]
-pub fn tile_of(cell: [i32; 3]) -> [i32; 3] {
-    cell.map(|c| c.div_euclid(TILE))
+pub fn tile_of([x, y, z]: [i32; 3]) -> [i32; 3] {
+    [x.div_euclid(TILE), y.div_euclid(TILE), z.div_euclid(TILE)]
 }
 
 /// Tiles are ordered by z, then y, then x.
+#[inline(always)]
 #[must_use]
 pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
     [tile[2], tile[1], tile[0]]

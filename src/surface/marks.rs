@@ -233,7 +233,9 @@ fn merged(marks: &[Vec<Marked>]) -> Vec<Marked> {
 }
 
 /// An atom's brick within its tile.
+#[inline(always)]
 pub(super) fn local_of(atom: &LatticeAtom) -> u32 {
-    let [x, y, z] = atom.cell.map(|c| c.rem_euclid(TILE).unsigned_abs() / BRICK.unsigned_abs());
-    z << 6 | y << 3 | x
+    let [x, y, z] = atom.cell;
+    let brick = |c: i32| c.rem_euclid(TILE).unsigned_abs() / BRICK.unsigned_abs();
+    brick(z) << 6 | brick(y) << 3 | brick(x)
 }
