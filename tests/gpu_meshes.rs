@@ -172,6 +172,31 @@ fn jobs_with_vertices_of_either_kind_share_a_submission() {
 }
 
 #[test]
+fn landings_are_kept_between_jobs_and_let_go_at_rest() {
+    let spheres = sample("1crn.cif");
+    let wanted = params(KERNELS[0], 0.4);
+    let held = |idle_bytes| {
+        let mut engine = engine_with(|b| (b.small_bytes, b.idle_bytes) = (0, idle_bytes));
+        let mesh = mesh_of(&mut engine, &spheres, &wanted).mesh;
+        let (bytes, in_use) = (mesh.bytes(), engine.held_bytes());
+        drop(mesh);
+        let between = engine.held_bytes();
+        engine.rest();
+        let after = engine.held_bytes();
+        assert!(mesh_of(&mut engine, &spheres, &wanted).mesh.n_triangles() > 0, "it works after a rest");
+        (bytes, [in_use, between, after])
+    };
+    let (bytes, [in_use, between, after]) = held([1 << 30, 0]);
+    assert_eq!(between, in_use, "kept for the next job");
+    assert!(after + bytes <= between, "{after} {bytes} {between}");
+    // The controls: what may stay stays, and what may not goes at once.
+    let (_, [in_use, between, after]) = held([1 << 30, 1 << 30]);
+    assert_eq!([between, after], [in_use; 2]);
+    let (bytes, [in_use, between, _]) = held([0, 0]);
+    assert!(between + bytes <= in_use, "{between} {bytes} {in_use}");
+}
+
+#[test]
 fn a_rounded_mesh_takes_less_of_the_host_and_of_a_limit() {
     let spheres = sample("1crn.cif");
     let plain = params(KERNELS[0], 0.4);

@@ -39,6 +39,10 @@ pub struct Budget {
     pub piece_bytes: u64,
     /// Bytes of the largest landing.
     pub landing_bytes: u64,
+    /// Bytes of landings that are kept for later jobs: between jobs that follow each other, where the largest meshes should
+    /// find theirs again, as getting as much takes the system and the driver ten times as long as filling it; and once there
+    /// has been nothing to do for a while.
+    pub idle_bytes: [u64; 2],
     /// Jobs whose output is estimated at no more than this many bytes take one submission, together with others.
     pub small_bytes: u64,
     /// Vertices and triangles that a small job's buffers hold per brick. A surface crosses a brick of 8 × 8 × 8 cells with
@@ -56,6 +60,7 @@ impl Budget {
             chunk_bricks: binding / (4 * layout::SAMPLES),
             piece_bytes: binding,
             landing_bytes: limits.max_buffer_size.min(8 << 30),
+            idle_bytes: [8 << 30, 2 << 30],
             small_bytes: 16 << 20,
             rows_per_brick: [128, 256],
         }
@@ -127,7 +132,7 @@ impl Engine {
         let engine = Self {
             binding: largest_binding(&limits),
             workspaces: Vec::new(),
-            landings: Landings::default(),
+            landings: Landings::keeping(budget.idle_bytes),
             device,
             queue,
             budget,

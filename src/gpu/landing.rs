@@ -8,18 +8,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use wgpu::{Buffer, BufferUsages, BufferView, Device};
 
-/// Idle buffers are kept up to this many bytes in all between jobs that follow each other: the largest meshes find theirs
-/// again. Getting as much takes the system and the driver ten times as long as filling it.
-const MOST_IDLE: u64 = 8 << 30;
-/// And up to this many once the device has had nothing to do for a while.
-const MOST_AT_REST: u64 = 2 << 30;
-
 /// Idle buffers.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub(super) struct Landings(Arc<Mutex<Idle>>);
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Idle {
+    /// Bytes of idle buffers at most: between jobs that follow each other, and after a rest.
+    most: [u64; 2],
     /// The one that has been idle longest first.
     buffers: Vec<Buffer>,
     /// Bytes of all buffers, idle and in use.
@@ -45,6 +41,11 @@ impl Idle {
 }
 
 impl Landings {
+    /// None yet; so many bytes of them are kept between jobs, and after a rest.
+    pub(super) fn keeping(most: [u64; 2]) -> Self {
+        Self(Arc::new(Mutex::new(Idle { most, buffers: Vec::new(), held: 0 })))
+    }
+
     /// A buffer of at least `bytes` bytes: the smallest idle one that is not much too large, or a new one.
     pub(super) fn get(&self, device: &Device, bytes: u64) -> Landing {
         let wanted = size_class(bytes);
@@ -72,17 +73,20 @@ impl Landings {
 
     fn put(&self, buffer: Buffer) {
         let mut idle = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if buffer.size() > MOST_IDLE {
+        let [most, _] = idle.most;
+        if buffer.size() > most {
             idle.held -= buffer.size();
             return;
         }
         idle.buffers.push(buffer);
-        idle.shrink(MOST_IDLE);
+        idle.shrink(most);
     }
 
     /// Lets go what is not worth its memory while nothing is done.
     pub(super) fn rest(&self) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).shrink(MOST_AT_REST);
+        let mut idle = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let [_, most] = idle.most;
+        idle.shrink(most);
     }
 }
 

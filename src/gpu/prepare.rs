@@ -2,7 +2,6 @@
 
 use crate::surface::lattice::Lattice;
 use crate::surface::plan::Plan;
-use crate::surface::split::Caller;
 use crate::surface::{Control, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// A job, ready for any device.
@@ -29,7 +28,6 @@ impl Prepared {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
-        let _caller = Caller::default();
         control.check()?;
         let lattice = Lattice::new(spheres, params)?;
         control.check()?;

@@ -69,7 +69,7 @@ pub fn rates(engine: &Engine, effort: Effort) -> Result<Option<Rates>, GpuError>
     let copy = engine.best_time(0, &source, &goal, groups)?;
     let fma = engine.best_time(1, &source, &goal, effort.workgroups)?;
     // Not the engine's: what is measured with must not lie about when jobs are.
-    let landings = Landings::default();
+    let landings = Landings::keeping(engine.budget.idle_bytes);
     let (mut to_host, mut round_trip) = (f64::MAX, f64::MAX);
     for _ in 0..REPEATS {
         to_host = to_host.min(engine.fetch(&landings, &source, bytes)?);

@@ -14,7 +14,7 @@ use super::params::SurfaceParams;
 use super::simd::dispatched;
 use super::sort::sorted;
 use super::spheres::Spheres;
-use super::split::{each, few};
+use super::split::{Caller, each};
 
 /// Samples along a brick's edge.
 pub const BRICK: i32 = 8;
@@ -78,7 +78,9 @@ impl Lattice {
         let (smallest, largest) = spheres.radius_range();
         params.check_radius(smallest)?;
         let largest = effective(largest, params);
-        let atoms = Placing { spheres, params, profile: &profile }.in_canonical_order([lo, hi]);
+        let caller = Caller::new();
+        let few = caller.few(spheres.len());
+        let atoms = Placing { spheres, params, profile: &profile }.in_canonical_order([lo, hi], few);
         let margin = 2.0 * profile.reach(profile.length(largest));
         let box_cells = (0..3).map(|k| ((hi[k] - lo[k] + margin) / spacing).ceil()).product::<f64>();
         Ok(Self {
@@ -152,20 +154,19 @@ impl Placing<'_> {
     }
 
     /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order last.
-    /// `bounds`: lowest and highest coordinates.
-    fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
+    /// `bounds`: lowest and highest coordinates; `few`: on this thread.
+    fn in_canonical_order(&self, bounds: [[f64; 3]; 2], few: bool) -> Column<LatticeAtom> {
         let n = self.spheres.len();
-        let few = few(n);
         // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
         let rank =
             TileRanks::new(bounds.map(|c| tile_of(self.cell(c))), n, |i| tile_of(self.cell(self.spheres.centre(i))));
         let mut atoms = Column::scratch(n);
         if rank.end() <= u64::from(u32::MAX) >> PLACE_BITS && u32::try_from(n).is_ok() {
-            let order = sorted(n, |first, keys| write_short_keys(self, &rank, first, keys));
+            let order = sorted(few, n, |first, keys| write_short_keys(self, &rank, first, keys));
             let parts: Vec<_> = atoms.chunks_mut(PART).zip(order.chunks(PART)).collect();
             each(few, parts, |(atoms, order)| place_by_short_keys(self, order, atoms));
         } else {
-            let order = sorted(n, |first, keys| write_keys(self, &rank, first, keys));
+            let order = sorted(few, n, |first, keys| write_keys(self, &rank, first, keys));
             let parts: Vec<_> = atoms.chunks_mut(PART).zip(order.chunks(PART)).collect();
             each(few, parts, |(atoms, order)| place_by_keys(self, order, atoms));
         }

@@ -7,7 +7,7 @@ use rustc_hash::FxHashMap;
 
 use super::lattice::{BRICK, LatticeAtom, TILE, tile_of, tile_order, to_i32, to_u32};
 use super::layout::NONE;
-use super::split::{few, map};
+use super::split::map;
 
 /// Atoms that one piece of parallel work marks the bricks of.
 const RUN: usize = 1024;
@@ -179,8 +179,8 @@ fn tile_step(local: f32) -> i32 {
     (local * (1.0 / TILE as f32) + OFFSET as f32) as i32 - OFFSET
 }
 
-/// Where each tile's atoms begin.
-pub(super) fn starts(atoms: &[LatticeAtom]) -> Vec<usize> {
+/// Where each tile's atoms begin. `few`: looked for on this thread.
+pub(super) fn starts(atoms: &[LatticeAtom], few: bool) -> Vec<usize> {
     let tile = |i: usize| tile_of(atoms[i].cell);
     let in_piece = |piece: usize| {
         let end = (piece + RUN).min(atoms.len());
@@ -190,7 +190,7 @@ pub(super) fn starts(atoms: &[LatticeAtom]) -> Vec<usize> {
     // A piece begins within a tile, as a rule.
     let begins = |&at: &usize| at == 0 || tile(at - 1) != tile(at);
     let pieces: Vec<usize> = (0..atoms.len()).step_by(RUN).collect();
-    let found = map(few(atoms.len()), pieces, |piece| in_piece(piece).filter(begins).collect::<Vec<_>>());
+    let found = map(few, pieces, |piece| in_piece(piece).filter(begins).collect::<Vec<_>>());
     found.into_iter().flatten().collect()
 }
 

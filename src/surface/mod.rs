@@ -29,7 +29,7 @@ mod simd;
 pub mod sink;
 mod sort;
 pub mod spheres;
-pub mod split;
+mod split;
 mod sums;
 pub mod topology;
 

@@ -14,7 +14,7 @@ use super::layout::{NONE, Params, Tile, halves};
 use super::marks::{Bits, Marked, local_of, mark_run, merge, runs, starts};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
-use super::split::{each, few, map};
+use super::split::{Caller, each, map};
 
 /// More tiles than this in all runs together, and the grid is looked at before it is built.
 const MANY_TILES: f64 = 1e6;
@@ -57,14 +57,15 @@ impl Plan {
         if atoms.len() > cpu::MAX_ATOMS {
             return Err(cpu::too_many_atoms(atoms.len()));
         }
-        let starts = starts(atoms);
+        let caller = Caller::new();
+        let few = caller.few(atoms.len());
+        let starts = starts(atoms, few);
         let runs = runs(&starts, atoms.len());
         let mut reaches = Column::scratch(atoms.len());
         let part = |(reaches, atoms): (&mut [f32], &[LatticeAtom])| {
             reaches.iter_mut().zip(atoms).for_each(|(reach, atom)| *reach = reach_of(lattice, atom));
             reaches.iter().copied().fold(0.0, f32::max)
         };
-        let few = few(atoms.len());
         let parts: Vec<_> = reaches.chunks_mut(4096).zip(atoms.chunks(4096)).collect();
         let longest = map(few, parts, part).into_iter().fold(0.0, f32::max);
         refuse_early(lattice, runs.len(), longest, limits)?;

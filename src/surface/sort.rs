@@ -5,7 +5,6 @@ use bytemuck::Pod;
 use rayon::prelude::*;
 
 use super::column::Column;
-use super::split::few;
 
 /// Most keys of a piece, and about as many of a range: they are sorted within the second-level cache.
 const LARGEST: usize = 1 << 13;
@@ -24,9 +23,9 @@ fn piece_of(n: usize) -> usize {
     (n / (4 * rayon::current_num_threads())).clamp(SMALLEST, LARGEST).next_multiple_of(EVERY)
 }
 
-/// `n` different keys in ascending order; `make(first, piece)` writes those from number `first` on.
-pub(super) fn sorted<K: Key>(n: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
-    let size = if few(n) { n.next_multiple_of(EVERY) } else { piece_of(n) };
+/// `n` different keys in ascending order; `make(first, piece)` writes those from number `first` on. `few`: on this thread.
+pub(super) fn sorted<K: Key>(few: bool, n: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
+    let size = if few { n.next_multiple_of(EVERY) } else { piece_of(n) };
     sorted_by_pieces(n, size, make)
 }
 

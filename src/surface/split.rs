@@ -8,29 +8,32 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use rayon::prelude::*;
 
-/// Atoms of the largest job whose host work stays on its caller's thread in any case: less than a millisecond of work.
-pub(super) const FEW: usize = 5120;
+/// Atoms of the largest job whose host work stays on its caller's thread in any case: half a millisecond of work, or one.
+const FEW: usize = 2048;
 
-/// Callers that prepare a job at present.
+/// Callers that place atoms or plan bricks at present.
 static CALLERS: AtomicUsize = AtomicUsize::new(0);
 
-/// A caller that prepares a job, for as long as this lives: the more there are, the larger the jobs that stay on their
-/// callers' threads.
+/// One of them, for as long as this lives.
 #[derive(Debug)]
-#[must_use = "it counts while it lives"]
-pub struct Caller(&'static AtomicUsize);
-
-impl Default for Caller {
-    /// One more.
-    fn default() -> Self {
-        Self::among(&CALLERS)
-    }
-}
+pub(super) struct Caller(&'static AtomicUsize);
 
 impl Caller {
+    /// One more.
+    pub(super) fn new() -> Self {
+        Self::among(&CALLERS)
+    }
+
     fn among(callers: &'static AtomicUsize) -> Self {
         callers.fetch_add(1, Ordering::Relaxed);
         Self(callers)
+    }
+
+    /// Whether its work on `n` atoms stays on its thread, by how many callers there are. From four on, one thread each keeps up
+    /// with a device that sends its meshes to the host; jobs of 60,000 atoms from eight callers, spread over 64 threads, kept
+    /// all of them busy with looking for work. The result of the work does not depend on it.
+    pub(super) fn few(&self, n: usize) -> bool {
+        n <= FEW.saturating_mul(self.0.load(Ordering::Relaxed).saturating_pow(3))
     }
 }
 
@@ -38,17 +41,6 @@ impl Drop for Caller {
     fn drop(&mut self) {
         self.0.fetch_sub(1, Ordering::Relaxed);
     }
-}
-
-/// Whether work on `n` atoms stays on its thread, by how many callers there are. From four on, one thread each keeps up with a
-/// device that sends its meshes to the host; eight callers of jobs of 60,000 atoms, spread over 64 threads, had all of them
-/// busy with looking for work, at half the rate. The result of the work does not depend on it.
-pub(super) fn few(n: usize) -> bool {
-    few_among(n, CALLERS.load(Ordering::Relaxed))
-}
-
-fn few_among(n: usize, callers: usize) -> bool {
-    n <= FEW.saturating_mul(callers.max(1).saturating_pow(2))
 }
 
 /// What can be gone through by one thread or by all.
@@ -93,21 +85,17 @@ mod tests {
 
     #[test]
     fn the_more_callers_the_larger_the_jobs_that_stay() {
-        assert_eq!([0, 1, 2, 100].map(|callers| few_among(FEW, callers)), [true; 4]);
-        assert_eq!([0, 1, 2, 100].map(|callers| few_among(2 * FEW, callers)), [false, false, true, true]);
-        assert_eq!([2, 3, 4].map(|callers| few_among(60_000, callers)), [false, false, true]);
-    }
-
-    #[test]
-    fn callers_are_counted_while_they_are_there() {
         static HERE: AtomicUsize = AtomicUsize::new(0);
-        let now = || HERE.load(Ordering::Relaxed);
-        let one = Caller::among(&HERE);
-        let two = Caller::among(&HERE);
-        assert_eq!(now(), 2);
-        drop(one);
-        assert_eq!(now(), 1);
-        drop(two);
-        assert_eq!(now(), 0);
+        let mut callers = Vec::new();
+        let mut stays = |n_callers: usize| {
+            callers.truncate(n_callers);
+            callers.resize_with(n_callers, || Caller::among(&HERE));
+            [FEW, FEW + 1, 60_000, usize::MAX].map(|n| callers[0].few(n))
+        };
+        assert_eq!(stays(1), [true, false, false, false]);
+        assert_eq!(stays(2), [true, true, false, false]);
+        assert_eq!(stays(4), [true, true, true, false]);
+        // Those that have left do not count any more.
+        assert_eq!(stays(1), [true, false, false, false]);
     }
 }

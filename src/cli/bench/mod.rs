@@ -48,7 +48,7 @@ pub(crate) struct GpuArgs {
     /// Folder with 2hhb, 1aon and 7cgo, as PDB or mmCIF, plain or compressed
     #[arg(long, value_name = "DIR")]
     pub(crate) data: Option<PathBuf>,
-    /// Only the cases whose name contains this
+    /// Only the cases whose name contains this; one of gigabytes, 7cgo-x9-0.5, by its whole name alone
     #[arg(long, value_name = "NAME")]
     pub(crate) only: Option<String>,
     /// Atoms of the made-up case, which needs no file
@@ -127,9 +127,8 @@ fn save(args: &GpuArgs, result: &serde_json::Value) -> Result<(), CliError> {
 }
 
 /// The cases that are asked for.
-fn chosen(args: &GpuArgs) -> impl Iterator<Item = Case> {
-    let only = args.only.clone().unwrap_or_default();
-    cases::all(args.atoms).into_iter().filter(move |case| case.name.contains(only.as_str()))
+fn chosen(args: &GpuArgs) -> Vec<Case> {
+    cases::chosen(args.atoms, args.only.as_deref().unwrap_or_default())
 }
 
 /// A case's spheres and its surface, with the vertices that are asked for.

@@ -48,7 +48,7 @@ pub(super) fn run(choice: &DeviceChoice, n: usize, callers: usize) -> Result<Vec
                 .map_err(|e| failed(&e))?;
         backend.warm().map_err(|e| failed(&e))?;
         for (atoms, share) in SIZES {
-            let jobs = n.div_ceil(100) * share;
+            let jobs = (n * share).div_ceil(100);
             // Once without the clock: buffers are made.
             let callers = callers * devices;
             flood(&backend, atoms, 2 * callers, callers).map_err(|e| failed(&e))?;

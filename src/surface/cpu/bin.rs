@@ -236,60 +236,6 @@ impl AxisReach {
 }
 
 impl Bricks {
-    /// Finds the candidates of every brick of a tile.
-    pub(super) fn fill(&mut self, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
-        fill(self, lattice, tile, atoms);
-    }
-
-    #[inline(always)]
-    fn find(&mut self, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
-        self.starts.iter_mut().for_each(|n| *n = 0);
-        self.reaching.iter_mut().for_each(|n| *n = 0);
-        self.hits.clear();
-        let origin = tile.map(|t| t * TILE);
-        for &ix in atoms {
-            let atom = &lattice.atoms[ix as usize];
-            // A little more than the support: rounding must not lose a pair, and a pair too many adds zero.
-            let reach = to_f32(lattice.reach(atom) * (1.0 + 1e-5)) + 1e-3;
-            let local = |k: usize| (atom.cell[k] - origin[k]) as f32 + atom.frac[k];
-            let [x, y, z] = std::array::from_fn(|k| AxisReach::new(local(k), reach));
-            let reach2 = reach * reach;
-            for bz in z.first..z.last {
-                for by in y.first..y.last {
-                    let closed = y.closed[by] + z.closed[bz];
-                    let samples = y.samples[by] + z.samples[bz];
-                    let row = (bz * SIDE + by) * SIDE;
-                    // The layer beyond feeds no vertex of this tile: only its samples matter.
-                    let beyond = bz == SIDE - 1 || by == SIDE - 1;
-                    for bx in x.first..x.last {
-                        if closed + x.closed[bx] > reach2 {
-                            continue;
-                        }
-                        let reaches = samples + x.samples[bx] <= reach2;
-                        if !reaches && (beyond || bx == SIDE - 1) {
-                            continue;
-                        }
-                        let slot = row + bx;
-                        self.starts[slot + 1] += 1;
-                        self.reaching[slot] += u32::from(reaches);
-                        self.hits.push((to_u32(slot), if reaches { ix } else { ix | NORMAL_ONLY }));
-                    }
-                }
-            }
-        }
-        for slot in 0..SLOTS {
-            self.starts[slot + 1] += self.starts[slot];
-        }
-        self.candidates.clear();
-        self.candidates.resize(self.hits.len(), 0);
-        let mut cursor: [u32; SLOTS] = std::array::from_fn(|slot| self.starts[slot]);
-        for &(slot, candidate) in &self.hits {
-            let at = &mut cursor[slot as usize];
-            self.candidates[*at as usize] = candidate;
-            *at += 1;
-        }
-    }
-
     /// The candidates of a slot.
     pub(super) fn of(&self, slot: usize) -> &[u32] {
         &self.candidates[self.starts[slot] as usize..self.starts[slot + 1] as usize]
@@ -297,9 +243,53 @@ impl Bricks {
 }
 
 dispatched! {
-/// [`Bricks::fill`].
-fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
-    bricks.find(lattice, tile, atoms);
+/// Finds the candidates of every brick of a tile.
+pub(super) fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
+    bricks.starts.iter_mut().for_each(|n| *n = 0);
+    bricks.reaching.iter_mut().for_each(|n| *n = 0);
+    bricks.hits.clear();
+    let origin = tile.map(|t| t * TILE);
+    for &ix in atoms {
+        let atom = &lattice.atoms[ix as usize];
+        // A little more than the support: rounding must not lose a pair, and a pair too many adds zero.
+        let reach = to_f32(lattice.reach(atom) * (1.0 + 1e-5)) + 1e-3;
+        let local = |k: usize| (atom.cell[k] - origin[k]) as f32 + atom.frac[k];
+        let [x, y, z] = std::array::from_fn(|k| AxisReach::new(local(k), reach));
+        let reach2 = reach * reach;
+        for bz in z.first..z.last {
+            for by in y.first..y.last {
+                let closed = y.closed[by] + z.closed[bz];
+                let samples = y.samples[by] + z.samples[bz];
+                let row = (bz * SIDE + by) * SIDE;
+                // The layer beyond feeds no vertex of this tile: only its samples matter.
+                let beyond = bz == SIDE - 1 || by == SIDE - 1;
+                for bx in x.first..x.last {
+                    if closed + x.closed[bx] > reach2 {
+                        continue;
+                    }
+                    let reaches = samples + x.samples[bx] <= reach2;
+                    if !reaches && (beyond || bx == SIDE - 1) {
+                        continue;
+                    }
+                    let slot = row + bx;
+                    bricks.starts[slot + 1] += 1;
+                    bricks.reaching[slot] += u32::from(reaches);
+                    bricks.hits.push((to_u32(slot), if reaches { ix } else { ix | NORMAL_ONLY }));
+                }
+            }
+        }
+    }
+    for slot in 0..SLOTS {
+        bricks.starts[slot + 1] += bricks.starts[slot];
+    }
+    bricks.candidates.clear();
+    bricks.candidates.resize(bricks.hits.len(), 0);
+    let mut cursor: [u32; SLOTS] = std::array::from_fn(|slot| bricks.starts[slot]);
+    for &(slot, candidate) in &bricks.hits {
+        let at = &mut cursor[slot as usize];
+        bricks.candidates[*at as usize] = candidate;
+        *at += 1;
+    }
 }
 }
 

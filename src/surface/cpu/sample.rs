@@ -94,7 +94,7 @@ impl Pass<'_> {
 
     fn sample_into(&self, t: usize, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
         let (coord, tally) = (self.tiles.coords[t], &self.tally);
-        self.control.span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, self.tiles.atoms(t)));
+        self.control.span(Stage::Bin, || bin::fill(&mut scratch.bricks, self.lattice, coord, self.tiles.atoms(t)));
         let occupied = count_occupied(&scratch.bricks, tally) * BRICK_SAMPLES as u64;
         let samples = tally.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
         if samples > self.limits.max_samples {

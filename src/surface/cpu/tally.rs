@@ -194,21 +194,32 @@ fn note_vertices(
 }
 }
 
+/// A triangle's normal, of twice its area, and its product with the first corner, component by component.
+#[inline(always)]
+fn normal_and_product(table: &BrickTable, edges: [u16; 3]) -> (Vec3A, Vec3A) {
+    let [a, b, c] = edges.map(|edge| table.position(edge));
+    let n = (b - a).cross(c - a);
+    (n, a * n)
+}
+
+/// Lengths of normals, zeros behind them: together, as a root alone takes as long as a vector of them.
+#[inline(always)]
+fn lengths(normals: &[Vec3A]) -> [f32; LANES] {
+    let mut lengths = [0.0; LANES];
+    lengths.iter_mut().zip(normals).for_each(|(length, n)| *length = n.length());
+    lengths
+}
+
 dispatched! {
 /// As [`sum`], for a brick of several sheets, whose triangles come in no order of sheets: adds each to its own.
 fn sum_by_sheet(table: &BrickTable, sheets: &Sheets, sums: &mut [Sheet]) {
-    let mut parts = [(Vec3A::ZERO, Vec3A::ZERO); LANES];
+    let (mut normals, mut products) = ([Vec3A::ZERO; LANES], [Vec3A::ZERO; LANES]);
     for batch in table.corners().chunks(LANES) {
-        let mut area = [0.0_f32; LANES];
-        for ((normal, product), edges) in parts.iter_mut().zip(batch) {
-            let [a, b, c] = edges.map(|edge| table.position(edge));
-            let n = (b - a).cross(c - a);
-            (*normal, *product) = (n, a * n);
+        for ((normal, product), edges) in normals.iter_mut().zip(&mut products).zip(batch) {
+            (*normal, *product) = normal_and_product(table, *edges);
         }
-        for (area, (normal, _)) in area.iter_mut().zip(&parts[..batch.len()]) {
-            *area = normal.length();
-        }
-        for ((edges, (normal, product)), area) in batch.iter().zip(&parts).zip(area) {
+        let area = lengths(&normals[..batch.len()]);
+        for (((edges, normal), product), area) in batch.iter().zip(&normals).zip(&products).zip(area) {
             let sum = &mut sums[usize::from(sheets.of(table.sheet(edges[0])))];
             sum.triangles += 1;
             sum.area += f64::from(area);
@@ -228,17 +239,12 @@ fn sum(table: &BrickTable, corners: &[[u16; 3]]) -> Sheet {
     for batch in corners.chunks(LANES) {
         let (mut vector, mut product) = (Vec3A::ZERO, Vec3A::ZERO);
         for (normal, edges) in normals.iter_mut().zip(batch) {
-            let [a, b, c] = edges.map(|edge| table.position(edge));
-            let n = (b - a).cross(c - a);
+            let (n, p) = normal_and_product(table, *edges);
             *normal = n;
             vector += n;
-            product += a * n;
+            product += p;
         }
-        let mut area = [0.0_f32; LANES];
-        for (area, n) in area.iter_mut().zip(&normals[..batch.len()]) {
-            *area = n.length();
-        }
-        all.area += sum_lanes(&area);
+        all.area += sum_lanes(&lengths(&normals[..batch.len()]));
         (0..3).for_each(|k| all.vector[k] += f64::from(vector[k]));
         all.product += f64::from(product.element_sum());
     }
