@@ -7,7 +7,7 @@ mod http_support;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use http_support::{Fake, Mode, Running, SAMPLE, carbons, sample, send, start, wait_for};
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, sample, send, start, wait_for};
 use molmesh::surface::CpuBackend;
 
 fn real(change: impl FnOnce(&mut molmesh::config::Config)) -> Running {
@@ -52,6 +52,24 @@ fn a_synchronous_result_is_found_at_its_content_location() {
         format!("{other}/report.json"),
     ] {
         server.get(&format!("/v1/results/{missing}")).problem(404, "not-found");
+    }
+}
+
+#[test]
+fn a_result_is_kept_once_however_many_ask_for_it() {
+    let server = start(Fake::new(Mode::Octahedra), |c| c.jobs.keepers = 1);
+    for round in 0..20 {
+        let input = carbons(2_000 + round);
+        let replies: Vec<Reply> = std::thread::scope(|scope| {
+            let ask = || scope.spawn(|| server.post("/v1/meshes?format=stl", &[], &input));
+            [(); 6].map(|()| ask()).map(|reply| reply.join().unwrap()).into()
+        });
+        // One place is enough for six answers, and is free when the result is found.
+        for reply in &replies {
+            let location = reply.header("content-location");
+            assert!(location.is_some() && location == replies[0].header("content-location"), "{location:?}");
+        }
+        assert!(server.get(replies[0].header("content-location").unwrap()).body == replies[0].body);
     }
 }
 

@@ -12,6 +12,7 @@ use axum::http::{HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use metrics::counter;
 use serde_json::Value;
+use tokio::sync::OwnedSemaphorePermit;
 use tracing::Instrument as _;
 
 use super::kinds::Kind;
@@ -177,14 +178,17 @@ async fn head(app: &App, key: &ContentKey, format: Format) -> Result<Option<Arc<
 }
 
 /// Keeps the result of a synchronous request, beside the answer. False if too many are being kept already: then it is made
-/// again when somebody asks for it.
+/// again when somebody asks for it. What is being kept at this moment is not kept twice.
 pub(super) fn keep_later(app: &Shared, finished: &Arc<Finished>, format: Format, key: &ContentKey) -> bool {
-    let Ok(place) = Arc::clone(&app.keepers).try_acquire_owned() else {
-        counter!(RESULTS_NOT_KEPT, "reason" => "busy").increment(1);
-        return false;
+    let keeping = match app.begin_keeping(key) {
+        Begun::Yes(keeping) => keeping,
+        Begun::Already => return true,
+        Begun::NoPlace => {
+            counter!(RESULTS_NOT_KEPT, "reason" => "busy").increment(1);
+            return false;
+        }
     };
     let (app, finished, key) = (Arc::clone(app), Arc::clone(finished), *key);
-    let keeping = app.begin_keeping(&key);
     let scope = Scope::open(&Scope::current_origin(), Instant::now());
     let keep = async move {
         let limit = app.config.limits.output_bytes;
@@ -193,7 +197,7 @@ pub(super) fn keep_later(app: &Shared, finished: &Arc<Finished>, format: Format,
             tracing::warn!(%error, "a result cannot be kept");
         }
         scope.close(|| Closing::of("keep"));
-        drop((keeping, place));
+        drop(keeping);
     };
     tokio::spawn(keep.in_current_span());
     true
@@ -216,22 +220,37 @@ impl App {
         drop(self.keepers.acquire_many(places).await);
     }
 
-    fn begin_keeping(self: &Arc<Self>, key: &ContentKey) -> Keeping {
+    fn begin_keeping(self: &Arc<Self>, key: &ContentKey) -> Begun {
+        let mut kept = self.keeping.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if kept.contains_key(key) {
+            return Begun::Already;
+        }
+        let Ok(place) = Arc::clone(&self.keepers).try_acquire_owned() else { return Begun::NoPlace };
         let (done, waiting) = tokio::sync::watch::channel(());
-        self.keeping.lock().unwrap_or_else(std::sync::PoisonError::into_inner).insert(*key, waiting);
-        Keeping { app: Arc::clone(self), key: *key, _done: done }
+        kept.insert(*key, waiting);
+        Begun::Yes(Keeping { app: Arc::clone(self), key: *key, place: Some(place), _done: done })
     }
+}
+
+/// Whether a result is kept from now on.
+enum Begun {
+    Yes(Keeping),
+    Already,
+    NoPlace,
 }
 
 /// A result that is being kept, as long as this lives.
 struct Keeping {
     app: Shared,
     key: ContentKey,
+    place: Option<OwnedSemaphorePermit>,
     _done: tokio::sync::watch::Sender<()>,
 }
 
 impl Drop for Keeping {
     fn drop(&mut self) {
+        // Whoever hears that it is kept finds its place free.
+        drop(self.place.take());
         self.app.keeping.lock().unwrap_or_else(std::sync::PoisonError::into_inner).remove(&self.key);
     }
 }
