@@ -105,6 +105,13 @@ impl Inner {
         self.store.put(&Name::job(record.id.as_str())?, Bytes::from(bytes)).await
     }
 
+    /// Writes down how a promise stands. Those who do so for one promise take turns: what is written last is what was so
+    /// last, and a job that was dismissed while it began does not come back with the next start.
+    pub(super) async fn keep_up(&self, promise: &Promise) -> Result<(), StoreError> {
+        let _turn = promise.writing.lock().await;
+        self.keep(&promise.record()).await
+    }
+
     /// Keeps a promise in mind, unless there is one with this id; then that one counts.
     fn enter(&self, id: &JobId, promise: &Arc<Promise>) -> Arc<Promise> {
         let mut promises = self.lock();
@@ -246,7 +253,7 @@ impl Ledger {
         let Some(promise) = promise else { return self.view(id).await };
         if promise.end(Status::Dismissed, |_| {}) {
             promise.dismiss();
-            self.0.keep(&promise.record()).await?;
+            self.0.keep_up(&promise).await?;
         }
         Ok(Some(promise.view()))
     }
@@ -305,8 +312,9 @@ impl Ledger {
             if kept.is_some_and(|kept| kept.recv().is_err()) {
                 return;
             }
-            promise.begin();
-            if let Err(error) = runtime.block_on(ledger.0.keep(&promise.record())) {
+            if promise.begin()
+                && let Err(error) = runtime.block_on(ledger.0.keep_up(&promise))
+            {
                 tracing::error!(job_id = %promise.id(), %error, "a job's attempt cannot be recorded");
             }
         })
@@ -332,8 +340,8 @@ impl Ledger {
         if !changed {
             return;
         }
-        let (id, record) = (promise.id(), promise.record());
-        let keep = || self.0.keep(&record);
+        let id = promise.id();
+        let keep = || self.0.keep_up(promise);
         // Without the record a restart would do the job again: a waste, but nothing is lost.
         if let Err(error) = insist(&id, self.0.settings.patience, StoreError::may_pass, keep).await {
             tracing::error!(job_id = %promise.id(), %error, "a job's ending cannot be recorded");

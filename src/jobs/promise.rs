@@ -31,13 +31,15 @@ pub(super) struct Promise {
     view: watch::Sender<View>,
     progress: Mutex<Option<Arc<Progress>>>,
     dismissed: Notify,
+    /// Held while the record is written.
+    pub(super) writing: tokio::sync::Mutex<()>,
 }
 
 impl Promise {
     pub(super) fn new(record: Record) -> Self {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
         let (view, _) = watch::channel(View { record, stage: None, fraction, version: 1, written: Arc::default() });
-        Self { view, progress: Mutex::default(), dismissed: Notify::new() }
+        Self { view, progress: Mutex::default(), dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
     }
 
     pub(super) fn id(&self) -> JobId {
@@ -62,14 +64,18 @@ impl Promise {
         view.record.finished_ms.map(|ms| (ms, view.record.id.clone()))
     }
 
-    /// The work begins.
-    pub(super) fn begin(&self) {
-        self.view.send_modify(|view| {
+    /// The work begins. False if the job was dismissed meanwhile: then it stays so.
+    pub(super) fn begin(&self) -> bool {
+        self.view.send_if_modified(|view| {
+            if view.record.status.is_final() {
+                return false;
+            }
             view.record.attempts += 1;
             view.record.status = Status::Running;
             view.record.started_ms = Some(now_ms());
             view.changed();
-        });
+            true
+        })
     }
 
     /// The work is left for the next start: the attempt, if there was one, does not count. True if that changed the record.
@@ -212,7 +218,7 @@ impl<P> Runner<P> {
                 Attempt::Left => {
                     // Stopping a service is not the job's fault, however often it happens.
                     if promise.leave(tried)
-                        && let Err(error) = ledger.0.keep(&promise.record()).await
+                        && let Err(error) = ledger.0.keep_up(&promise).await
                     {
                         tracing::warn!(job_id = %promise.id(), %error, "a job that is left counts an attempt too many");
                     }
@@ -284,9 +290,8 @@ async fn submit(ledger: &Ledger, promise: &Arc<Promise>, record: &Record, digest
         // It was accepted once: it waits until there is room.
         Refusal::QueueFull { .. } | Refusal::TooLate { .. } => Attempt::Again,
     })?;
-    if ticket.came_late() {
-        promise.begin();
-        ledger.0.keep(&promise.record()).await.map_err(silent)?;
+    if ticket.came_late() && promise.begin() {
+        ledger.0.keep_up(promise).await.map_err(silent)?;
     }
     Ok(ticket)
 }

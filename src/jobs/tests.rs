@@ -11,6 +11,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 use tokio::sync::watch;
 
+use super::promise::Promise;
 use super::rank::{Client, Rank, USUAL_URGENCY};
 use super::{
     Budget, EndError, JobId, Ledger, LedgerSettings, Order, Pool, PromiseError, Record, Requester, Settings, Status,
@@ -222,4 +223,40 @@ async fn nothing_is_promised_that_is_not_on_record() {
     house.faults.silence(None);
     assert_eq!((house.store.usage(Folder::Jobs).objects, house.ledger.recover().await.unwrap()), (0, 0));
     house.promise().await.unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_job_that_was_dismissed_does_not_begin() {
+    let house = House::new(1, PATIENT).await;
+    let id = house.inherit().await;
+    let promise = Arc::new(Promise::new(house.on_record(&id).await));
+    let claim = house.ledger.claim(&promise, None);
+    assert!(promise.end(Status::Dismissed, |_| {}));
+    house.ledger.0.keep_up(&promise).await.unwrap();
+    // The worker had it in hand already.
+    tokio::task::spawn_blocking(claim).await.unwrap();
+    for record in [promise.record(), house.on_record(&id).await] {
+        assert_eq!((record.status, record.attempts), (Status::Dismissed, 0), "{record:?}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_is_on_record_last_is_what_was_so_last() {
+    let house = House::new(1, PATIENT).await;
+    let id = house.inherit().await;
+    house.faults.slow.store(true, Ordering::SeqCst);
+    assert_eq!(house.ledger.recover().await.unwrap(), 1);
+    // The worker is writing down that it begins when the job is dismissed.
+    until("the beginning", || async { !house.faults.slow.load(Ordering::SeqCst) }).await;
+    let ledger = house.ledger.clone();
+    let mut dismissed = tokio::spawn({
+        let id = id.clone();
+        async move { ledger.dismiss(&id).await.unwrap().unwrap() }
+    });
+    let waits = tokio::time::timeout(Duration::from_millis(200), &mut dismissed).await.is_err();
+    assert!(waits, "two wrote at once");
+    house.faults.go_on();
+    assert_eq!(dismissed.await.unwrap().record.status, Status::Dismissed);
+    house.ledger.settled().await;
+    assert_eq!(house.on_record(&id).await.status, Status::Dismissed);
 }
