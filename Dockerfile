@@ -7,7 +7,7 @@
 # `deploy/container/build.sh` builds both with whatever builder is at hand, also without a registry, and `check.sh`
 # beside it runs what was built.
 
-# Debian trixie: the stable release, so that libc, libgcc and the Vulkan loader get their security updates. The driver is
+# Debian trixie: the stable release, so that libc, the Vulkan loader and what drivers need get their security updates. The driver is
 # mounted from the host and needs no newer libc than this (glibc 2.41; NVIDIA's libraries ask for 2.10); a binary built on
 # bookworm runs here as well. Pin by digest for releases: `debian:trixie-slim@sha256:…`.
 ARG BASE_IMAGE=docker.io/library/debian:trixie-slim

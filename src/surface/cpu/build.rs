@@ -6,10 +6,12 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use super::bin::{Tiles, slot_origin};
-use super::emit::{self, BrickTable, Numbered, Rounding};
+use super::emit;
 use super::interpolate::{self, Batch, Rows, SlopeConstants, Source, Target, take};
 use super::join;
+use super::near::{self, Numbered};
 use super::sheets::Sheets;
+use super::table::{BrickTable, Rounding};
 use super::tally::Tally;
 use super::{Scanned, Tile, threads};
 use crate::surface::column::Column;
@@ -138,7 +140,8 @@ impl TilePart<'_> {
                 rows: self.rows.slice(rows.clone()),
                 atom_ids: self.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
             };
-            let source = Source { tile: self.tile.coord, candidates, t: &found.t[all] };
+            let (t, edges) = (&found.t[all.clone()], &found.edges[all]);
+            let source = Source { tile: self.tile.coord, candidates, t, edges };
             flat += interpolate::interpolate(lattice, slope, brick, &source, batch, target);
         }
         flat
@@ -196,7 +199,7 @@ impl<'a> Near<'a> {
     /// tile, its place among the tile's bricks, and the brick.
     #[inline(always)]
     pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, Numbered<'a>)> {
-        let (slot, beyond) = emit::neighbour_slot(slot, n);
+        let (slot, beyond) = near::neighbour_slot(slot, n);
         let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
         let (ix, numbered) = tile.numbered(slot)?;
         Some((t, ix, numbered))

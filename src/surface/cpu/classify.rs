@@ -5,6 +5,7 @@
 use std::num::NonZeroU16;
 use std::sync::LazyLock;
 
+use super::edge::Edge;
 use super::field::Samples;
 use crate::surface::cases::CASES;
 use crate::surface::lattice::{BRICK_SAMPLES, EDGE_MARGIN, to_u32};
@@ -46,6 +47,8 @@ pub(super) struct Found {
     pub(super) bricks: Vec<SurfaceBrick>,
     /// Parameter of each vertex along its edge, from the owning sample, in vertex order.
     pub(super) t: Vec<f32>,
+    /// Edge of each vertex, likewise.
+    pub(super) edges: Vec<Edge>,
     /// Case of each active cell, in cell order.
     pub(super) cases: Vec<u8>,
     /// Vertices so far.
@@ -80,17 +83,18 @@ pub(super) struct Around<'a> {
 dispatched! {
 /// Inside bits of a brick.
 pub(super) fn inside_bits(samples: &Samples, iso: f32) -> Inside {
-    std::array::from_fn(|z| {
-        let mut word = 0;
+    // Loops, as a closure is not always compiled for the same instructions.
+    let mut inside = [0; 8];
+    for (z, word) in inside.iter_mut().enumerate() {
         for y in 0..8 {
             let mut row = 0_u64;
             for x in 0..8 {
                 row |= u64::from(samples[z * 64 + y * 8 + x] >= iso) << x;
             }
-            word |= row << (8 * y);
+            *word |= row << (8 * y);
         }
-        word
-    })
+    }
+    inside
 }
 }
 
@@ -114,6 +118,7 @@ impl Found {
     pub(super) fn clear(&mut self) {
         self.bricks.clear();
         self.t.clear();
+        self.edges.clear();
         self.cases.clear();
         self.candidates.clear();
         self.sheets.clear();
@@ -125,6 +130,7 @@ impl Found {
         Self {
             bricks: self.bricks.clone(),
             t: self.t.clone(),
+            edges: self.edges.clone(),
             cases: self.cases.clone(),
             candidates: self.candidates.clone(),
             sheets: self.sheets.clone(),
@@ -179,7 +185,7 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
         (*crossing, *before) = (layer[0] ^ layer[1 << (w % 3)], n);
         n += ones(*crossing);
     }
-    edge_parameters(&brick.crossing, n, &around.samples, iso, &mut found.t, &mut found.drop);
+    edge_parameters(&brick.crossing, n, &around.samples, iso, found);
     let cases = &*CELLS;
     let mut torn = false;
     for (layer, &cells) in corners.iter().zip(&active) {
@@ -284,36 +290,31 @@ fn ones(word: u64) -> u16 {
     u16::try_from(word.count_ones()).unwrap_or_default()
 }
 
-/// Where along each crossing edge the density is `iso`, by linear interpolation.
+/// The crossing edges, and where along each the density is `iso`, by linear interpolation.
 #[inline(always)]
-fn edge_parameters(
-    crossing: &[u64; 24],
-    n: u16,
-    samples: &[&Samples; 8],
-    iso: f32,
-    t: &mut Vec<f32>,
-    drop: &mut Vec<f32>,
-) {
+fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut Found) {
     const STEP: [usize; 3] = [1, 8, 64];
+    let Found { t, edges, drop, .. } = found;
     let first = t.len();
     // Densities at both ends first, one division per vector afterwards: `t` holds F(owner) − iso meanwhile.
     t.resize(first + usize::from(n), 0.0);
+    edges.resize(first + usize::from(n), Edge::default());
     if drop.len() < usize::from(n) {
         drop.resize(3 * BRICK_SAMPLES, 0.0);
     }
-    let mut ends = t[first..].iter_mut().zip(drop.iter_mut());
+    let mut ends = t[first..].iter_mut().zip(drop.iter_mut()).zip(&mut edges[first..]);
     for (w, &word) in crossing.iter().enumerate() {
         let (z, axis) = (w / 3, w % 3);
-        let mut edges = word;
-        while edges != 0 {
-            let bit = edges.trailing_zeros() as usize;
-            edges &= edges - 1;
+        let mut left = word;
+        while left != 0 {
+            let bit = left.trailing_zeros() as usize;
+            left &= left - 1;
             let at = z * 64 + bit;
             let coordinate = [bit & 7, bit >> 3, z][axis];
             let (far, next) = if coordinate == 7 { (1 << axis, at - 7 * STEP[axis]) } else { (0, at + STEP[axis]) };
             let (f0, f1) = (samples[0][at & 511], samples[far][next & 511]);
-            if let Some((above, drop)) = ends.next() {
-                (*above, *drop) = (f0 - iso, f0 - f1);
+            if let Some(((above, drop), edge)) = ends.next() {
+                (*above, *drop, *edge) = (f0 - iso, f0 - f1, Edge::new(z, bit, axis));
             }
         }
     }

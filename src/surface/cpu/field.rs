@@ -69,15 +69,51 @@ pub(super) struct Need {
     pub(super) z_layers: usize,
 }
 
-/// Lanes for the three axes of a brick in one batch: 8 for x, 8 for y, 8 for z, 8 idle. Whole vectors.
-const AXES: usize = 32;
+/// Numbers along the three axes of a brick, a vector of sixteen each.
+#[derive(Clone, Copy)]
+struct Axes {
+    /// Along x, twice: rows come in pairs.
+    x: [f32; 16],
+    /// Along y, then along z.
+    yz: [f32; 16],
+}
+
+impl Axes {
+    #[inline(always)]
+    fn map(&self, f: impl Fn(f32) -> f32) -> Self {
+        let (mut x, mut yz) = ([0.0; 16], [0.0; 16]);
+        for i in 0..16 {
+            x[i] = f(self.x[i]);
+            yz[i] = f(self.yz[i]);
+        }
+        Self { x, yz }
+    }
+
+    /// Of layer z.
+    #[inline(always)]
+    fn z(&self, z: usize) -> f32 {
+        self.yz[8 + (z & 7)]
+    }
+
+    /// Combined along x and y into the brick's 8 × 8 plane, as 4 pairs of rows.
+    #[inline(always)]
+    fn plane(&self, combine: impl Fn(f32, f32) -> f32) -> [[f32; 16]; 4] {
+        let mut xy = [[0.0; 16]; 4];
+        for (row, y) in xy.iter_mut().zip(self.yz.as_chunks::<2>().0) {
+            for (i, (value, x)) in row.iter_mut().zip(self.x).enumerate() {
+                *value = combine(x, y[i / 8]);
+            }
+        }
+        xy
+    }
+}
 
 /// One atom as a brick sees it: the range of rows in reach, and u along each axis.
 struct Seen {
     z: [usize; 2],
     /// Pairs of rows.
     y: [usize; 2],
-    u: [f32; AXES],
+    u: Axes,
 }
 
 #[inline(always)]
@@ -89,16 +125,13 @@ fn see(atom: &LatticeAtom, origin: [i32; 3], support: f32, need: Need) -> Seen {
         [to_row((c - reach).ceil(), n), to_row((c + reach).floor() + 1.0, n)]
     };
     let [y0, y1] = range(1, 8);
-    let mut u = [0.0; AXES];
-    for k in 0..3 {
-        for i in 0..8 {
-            // Whole numbers are exact in f32 here, so this rounds once and depends on sample and atom only.
-            u[8 * k + i] = (base[k] + i as f32) - atom.frac[k];
-        }
+    // Whole numbers are exact in f32 here, so this rounds once and depends on sample and atom only.
+    let away = |k: usize, i: usize| (base[k] + i as f32) - atom.frac[k];
+    let mut d = Axes { x: [0.0; 16], yz: [0.0; 16] };
+    for i in 0..8 {
+        (d.x[i], d.x[8 + i], d.yz[i], d.yz[8 + i]) = (away(0, i), away(0, i), away(1, i), away(2, i));
     }
-    for u in &mut u {
-        *u = *u * *u * atom.inv_length2;
-    }
+    let u = d.map(|d| d * d * atom.inv_length2);
     let y = [(y0 / 2).min(need.y_pairs), y1.div_ceil(2).min(need.y_pairs)];
     Seen { z: range(2, need.z_layers), y, u }
 }
@@ -110,21 +143,9 @@ fn to_row(v: f32, n: usize) -> usize {
     v.clamp(0.0, n as f32) as usize
 }
 
-/// Values along x and y combined into the brick's 8 × 8 plane, as 4 pairs of rows.
+/// `FULL`: all pairs of rows are needed, not only the first.
 #[inline(always)]
-fn plane(axes: &[f32; AXES], combine: impl Fn(f32, f32) -> f32) -> [[f32; 16]; 4] {
-    let mut xy = [[0.0; 16]; 4];
-    for (pair, row) in xy.iter_mut().enumerate() {
-        for i in 0..8 {
-            row[i] = combine(axes[i], axes[8 + 2 * pair]);
-            row[8 + i] = combine(axes[i], axes[9 + 2 * pair]);
-        }
-    }
-    xy
-}
-
-#[inline(always)]
-fn gaussian<const FMA: bool>(
+fn gaussian<const FMA: bool, const FULL: bool>(
     c: &Constants,
     atoms: &[LatticeAtom],
     candidates: &[u32],
@@ -138,17 +159,18 @@ fn gaussian<const FMA: bool>(
         }
         let atom = &atoms[candidate as usize];
         let seen = see(atom, origin, c.support, need);
-        let (mut e, mut w) = ([0.0_f32; AXES], [0.0_f32; AXES]);
-        for i in 0..AXES {
-            let exponent = fma::<FMA>(-c.rate, seen.u[i], c.share);
+        let e = seen.u.map(|u| {
+            let exponent = fma::<FMA>(-c.rate, u, c.share);
             // A plain comparison: `f32::max` minds NaN and costs the vector.
-            e[i] = exp2::<FMA>(if exponent > MIN_EXPONENT { exponent } else { MIN_EXPONENT });
-            w[i] = fma::<FMA>(c.tail_rate, seen.u[i], c.tail_share);
-        }
-        let (exy, wxy) = (plane(&e, |x, y| x * y), plane(&w, |x, y| x + y));
+            exp2::<FMA>(if exponent > MIN_EXPONENT { exponent } else { MIN_EXPONENT })
+        });
+        let w = seen.u.map(|u| fma::<FMA>(c.tail_rate, u, c.tail_share));
+        let (exy, wxy) = (e.plane(|x, y| x * y), w.plane(|x, y| x + y));
         for z in seen.z[0]..seen.z[1] {
-            let (ez, wz) = (e[16 + (z & 7)], w[16 + (z & 7)]);
-            for pair in seen.y[0]..seen.y[1] {
+            let (ez, wz) = (e.z(z), w.z(z));
+            // All rows of the layer: where those in reach end is harder to foresee than adding zeros to the others takes.
+            let pairs = if FULL { [0, 4] } else { [0, 1] };
+            for pair in pairs[0]..pairs[1] {
                 let (exy, wxy) = (&exy[pair & 3], &wxy[pair & 3]);
                 let at = (z * 4 + pair) * 16;
                 let Some(row) = out.get_mut(at..at + 16) else { continue };
@@ -178,9 +200,9 @@ fn compact<const FMA: bool, const INVERSE: bool>(
         let atom = &atoms[candidate as usize];
         let seen = see(atom, origin, c.support, need);
         let u_min = c.u_min * atom.inv_length2;
-        let uxy = plane(&seen.u, |x, y| x + y);
+        let uxy = seen.u.plane(|x, y| x + y);
         for z in seen.z[0]..seen.z[1] {
-            let uz = seen.u[16 + (z & 7)];
+            let uz = seen.u.z(z);
             for pair in seen.y[0]..seen.y[1] {
                 let uxy = &uxy[pair & 3];
                 let at = (z * 4 + pair) * 16;
@@ -213,13 +235,15 @@ pub(super) fn evaluate(
 
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
         match c.kernel {
-            Kernel::Gaussian => gaussian::<true>(c, atoms, candidates, origin, need, out),
+            Kernel::Gaussian if need.y_pairs == 4 => gaussian::<true, true>(c, atoms, candidates, origin, need, out),
+            Kernel::Gaussian => gaussian::<true, false>(c, atoms, candidates, origin, need, out),
             Kernel::SoftObject => compact::<true, false>(c, atoms, candidates, origin, need, out),
             Kernel::InverseSquare => compact::<true, true>(c, atoms, candidates, origin, need, out),
         }
     } else {
         match c.kernel {
-            Kernel::Gaussian => gaussian::<false>(c, atoms, candidates, origin, need, out),
+            Kernel::Gaussian if need.y_pairs == 4 => gaussian::<false, true>(c, atoms, candidates, origin, need, out),
+            Kernel::Gaussian => gaussian::<false, false>(c, atoms, candidates, origin, need, out),
             Kernel::SoftObject => compact::<false, false>(c, atoms, candidates, origin, need, out),
             Kernel::InverseSquare => compact::<false, true>(c, atoms, candidates, origin, need, out),
         }

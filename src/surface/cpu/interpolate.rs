@@ -4,15 +4,14 @@ use std::ops::Range;
 
 use super::bin::{NORMAL_ONLY, slot_origin};
 use super::classify::SurfaceBrick;
+use super::edge::Edge;
+use super::reach::{Around, LANES, extent};
 use crate::surface::kernel::{MIN_DISTANCE2, Profile};
 use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
 use crate::surface::mesh::{Quantized, normal_row, position_row};
 use crate::surface::params::Kernel;
 use crate::surface::quantize::Step;
 use crate::surface::simd::{dispatched, exp2, fma};
-
-/// Vertices are shaded in batches of this many: one AVX-512 vector, two AVX ones.
-const LANES: usize = 16;
 
 /// Constants of the slope −dF/du of a kernel.
 #[derive(Debug, Clone, Copy)]
@@ -43,47 +42,40 @@ impl SlopeConstants {
     }
 }
 
-/// Vertices of one brick in its own coordinates, spacings from its first sample.
-#[derive(Debug)]
+/// Vertices of one brick in its own coordinates, spacings from its first sample, and the atoms around them.
+#[derive(Debug, Default)]
 pub(super) struct Batch {
     p: [Vec<f32>; 3],
     n: [Vec<f32>; 3],
-}
-
-impl Default for Batch {
-    fn default() -> Self {
-        Self { p: std::array::from_fn(|_| Vec::new()), n: std::array::from_fn(|_| Vec::new()) }
-    }
+    atoms: Around,
 }
 
 impl Batch {
     /// Lays out a brick's vertices in order; rounds the count up to whole vectors by repeating the last one.
-    fn place(&mut self, brick: &SurfaceBrick, t: &[f32]) {
+    fn place(&mut self, edges: &[Edge], t: &[f32]) {
         let padded = t.len().next_multiple_of(LANES);
         for column in self.p.iter_mut().chain(&mut self.n) {
             column.resize(padded, 0.0);
         }
-        let [px, py, pz] = &mut self.p;
-        let mut rows = px.iter_mut().zip(py).zip(pz).zip(t);
-        for (w, &word) in brick.crossing.iter().enumerate() {
-            let (z, axis) = (w / 3, w % 3);
-            let along = [axis == 0, axis == 1, axis == 2].map(|is| if is { 1.0 } else { 0.0 });
-            let mut edges = word;
-            while edges != 0 {
-                let bit = edges.trailing_zeros();
-                edges &= edges - 1;
-                if let Some((((x, y), row_z), t)) = rows.next() {
-                    *x = (bit & 7) as f32 + along[0] * t;
-                    *y = (bit >> 3) as f32 + along[1] * t;
-                    *row_z = z as f32 + along[2] * t;
-                }
-            }
-        }
+        places(edges, t, &mut self.p);
         for column in &mut self.p {
             let last = column[t.len() - 1];
             column[t.len()..].fill(last);
         }
     }
+}
+
+dispatched! {
+/// Places of vertices on their edges, in spacings from the brick's first sample.
+fn places(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
+    let [x, y, z] = p;
+    for (((x, y), z), (edge, t)) in x.iter_mut().zip(y).zip(z).zip(edges.iter().zip(t)) {
+        let along = |axis: u16| if edge.axis() == axis { *t } else { 0.0 };
+        *x = f32::from(edge.x()) + along(0);
+        *y = f32::from(edge.y()) + along(1);
+        *z = f32::from(edge.z()) + along(2);
+    }
+}
 }
 
 /// What a brick's vertices are made from.
@@ -94,6 +86,8 @@ pub(super) struct Source<'a> {
     pub(super) candidates: &'a [u32],
     /// Parameter of each vertex along its edge.
     pub(super) t: &'a [f32],
+    /// Those edges.
+    pub(super) edges: &'a [Edge],
 }
 
 /// Rows of a mesh's vertices. Normals are zero where the gradient vanishes, to be filled from the triangles.
@@ -161,8 +155,9 @@ pub(super) fn interpolate(
     target: Target<'_>,
 ) -> usize {
     let (origin, candidates) = (slot_origin(source.tile, usize::from(brick.slot)), source.candidates);
-    batch.place(brick, source.t);
-    gradients(slope, &lattice.atoms, candidates, origin, &batch.p, &mut batch.n);
+    batch.place(source.edges, source.t);
+    batch.atoms.fill(&lattice.atoms, candidates, origin);
+    gradients(slope, &mut batch.atoms, &batch.p, &mut batch.n);
     if let Some(ids) = target.atom_ids {
         nearest_atoms(&lattice.atoms, candidates, origin, &batch.p, ids);
     }
@@ -236,26 +231,17 @@ fn round(
 
 /// Sum of −∇F over the candidates at each vertex, up to a common factor.
 #[inline(always)]
-fn sum_gradients<const FMA: bool>(
-    c: &SlopeConstants,
-    atoms: &[LatticeAtom],
-    candidates: &[u32],
-    origin: [i32; 3],
-    p: &[Vec<f32>; 3],
-    n: &mut [Vec<f32>; 3],
-) {
+fn sum_gradients<const FMA: bool>(c: &SlopeConstants, around: &mut Around, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     let [px, py, pz] = p;
     let [nx, ny, nz] = n;
     let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
     let outs = nx.chunks_exact_mut(LANES).zip(ny.chunks_exact_mut(LANES)).zip(nz.chunks_exact_mut(LANES));
     for (((px, py), pz), ((nx, ny), nz)) in lanes.zip(outs) {
         let mut sum = [[0.0_f32; LANES]; 3];
-        for &candidate in candidates {
-            let atom = &atoms[(candidate & !NORMAL_ONLY) as usize];
-            let a: [f32; 3] = std::array::from_fn(|k| (atom.cell[k] - origin[k]) as f32 + atom.frac[k]);
-            let (inv, u_min) = (atom.inv_length2, c.u_min * atom.inv_length2);
+        for &[x, y, z, inv] in around.reach(c.support, [extent(px), extent(py), extent(pz)]) {
+            let u_min = c.u_min * inv;
             for i in 0..LANES {
-                let (dx, dy, dz) = (px[i] - a[0], py[i] - a[1], pz[i] - a[2]);
+                let (dx, dy, dz) = (px[i] - x, py[i] - y, pz[i] - z);
                 let u = fma::<FMA>(dx, dx, fma::<FMA>(dy, dy, dz * dz)) * inv;
                 let slope = match c.kernel {
                     Kernel::Gaussian => {
@@ -281,24 +267,17 @@ fn sum_gradients<const FMA: bool>(
 }
 
 dispatched! {
-fn gradients(
-    c: &SlopeConstants,
-    atoms: &[LatticeAtom],
-    candidates: &[u32],
-    origin: [i32; 3],
-    p: &[Vec<f32>; 3],
-    n: &mut [Vec<f32>; 3],
-) {
+fn gradients(c: &SlopeConstants, around: &mut Around, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
         match c.kernel {
-            Kernel::Gaussian => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::Gaussian, ..*c }, atoms, candidates, origin, p, n),
-            Kernel::SoftObject => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::SoftObject, ..*c }, atoms, candidates, origin, p, n),
+            Kernel::Gaussian => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::Gaussian, ..*c }, around, p, n),
+            Kernel::SoftObject => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::SoftObject, ..*c }, around, p, n),
             Kernel::InverseSquare => {
-                sum_gradients::<true>(&SlopeConstants { kernel: Kernel::InverseSquare, ..*c }, atoms, candidates, origin, p, n);
+                sum_gradients::<true>(&SlopeConstants { kernel: Kernel::InverseSquare, ..*c }, around, p, n);
             }
         }
     } else {
-        sum_gradients::<false>(c, atoms, candidates, origin, p, n);
+        sum_gradients::<false>(c, around, p, n);
     }
 }
 }

@@ -10,16 +10,20 @@
 mod bin;
 mod build;
 mod classify;
+mod edge;
 mod emit;
 mod field;
 mod interpolate;
 mod join;
+mod near;
 mod pour;
 #[doc(hidden)]
 pub mod probe;
+mod reach;
 mod sample;
 mod scan;
 mod sheets;
+mod table;
 mod tally;
 mod threads;
 
@@ -36,7 +40,7 @@ pub(super) use self::scan::too_large as mesh_too_large;
 
 use self::bin::{Tiles, slot_brick};
 use self::classify::{Before, Found};
-use self::emit::Numbered;
+use self::near::Numbered;
 use self::sample::Pass;
 use self::scan::Totals;
 use super::backend::{Backend, GridStats, Meshed};
@@ -290,8 +294,9 @@ impl Tile {
         let ix = usize::from(self.bricks[(z * 8 + y) * 8 + x]);
         let brick = self.found.bricks.get(ix)?;
         let end = self.found.bricks.get(ix + 1).map_or(self.found.vertices, |next| next.vertex);
-        let t = &self.found.t[brick.vertex as usize..end as usize];
+        let own = brick.vertex as usize..end as usize;
+        let (t, edges) = (&self.found.t[own.clone()], &self.found.edges[own]);
         // `scan` made sure that ids fit 32 bits.
-        Some((ix, Numbered { brick, first: to_u32(self.first_vertex) + brick.vertex, t }))
+        Some((ix, Numbered { brick, first: to_u32(self.first_vertex) + brick.vertex, t, edges }))
     }
 }

@@ -9,6 +9,7 @@ use super::{Piece, Scanned, build, join, threads};
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::measure::{Measures, Proof};
+use crate::surface::simd::dispatched;
 use crate::surface::sink::{MeshPart, MeshSink, Poured, SinkFailed, Vertices};
 
 /// What one thread keeps from tile to tile.
@@ -128,13 +129,31 @@ fn first<T: Clone + Default>(rows: &mut Vec<T>, n: usize) -> &mut [T] {
 
 /// Lowest and highest position, Å.
 fn bounds_of(vertices: &Vertices<'_>) -> Bounds {
-    let of = |bounds, p| join_bounds(bounds, [p, p]);
     match vertices {
-        Vertices::Single { positions, .. } => positions.iter().fold(NOWHERE, |bounds, p| of(bounds, *p)),
-        Vertices::Quantized { step, positions, .. } => {
-            positions.iter().fold(NOWHERE, |bounds, [x, y, z, _]| of(bounds, step.decoded([*x, *y, *z])))
+        Vertices::Single { positions, .. } => bounds(positions),
+        Vertices::Quantized { step, positions, .. } => positions.iter().fold(NOWHERE, |bounds, [x, y, z, _]| {
+            let p = step.decoded([*x, *y, *z]);
+            join_bounds(bounds, [p, p])
+        }),
+    }
+}
+
+dispatched! {
+/// The same, sixteen positions at a time.
+fn bounds(positions: &[[f32; 3]]) -> Bounds {
+    const LANES: usize = 16;
+    let (batches, rest) = positions.as_chunks::<LANES>();
+    let (mut low, mut high) = ([[f32::INFINITY; 3]; LANES], [[f32::NEG_INFINITY; 3]; LANES]);
+    for batch in batches {
+        let rows = low.as_flattened_mut().iter_mut().zip(high.as_flattened_mut()).zip(batch.as_flattened());
+        for ((low, high), v) in rows {
+            *low = if *v < *low { *v } else { *low };
+            *high = if *v > *high { *v } else { *high };
         }
     }
+    let lanes = low.into_iter().zip(high).map(|(low, high)| [low, high]);
+    lanes.chain(rest.iter().map(|p| [*p, *p])).fold(NOWHERE, join_bounds)
+}
 }
 
 /// The bounds of both.

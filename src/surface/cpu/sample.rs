@@ -15,20 +15,27 @@ use crate::surface::params::{SurfaceLimits, SurfaceParams};
 /// What one thread keeps from tile to tile.
 struct Scratch {
     bricks: Bricks,
-    fields: Vec<Samples>,
-    inside: Vec<Inside>,
-    /// Index into `fields` per slot, or `NO_BRICK`.
+    /// Of two layers of bricks, those with even and those with odd z: no more is needed at a time, and what is not touched
+    /// need not be got from the system.
+    layers: [Layer; 2],
+    /// Index into its layer per slot, or `NO_BRICK`.
     slots: Vec<u16>,
     /// What `classify` appends to; a tile takes a copy of the right size with it.
     found: Found,
+}
+
+/// Densities and inside bits of the bricks of a layer that some atom reaches.
+#[derive(Default)]
+struct Layer {
+    fields: Vec<Samples>,
+    inside: Vec<Inside>,
 }
 
 impl Default for Scratch {
     fn default() -> Self {
         Self {
             bricks: Bricks::default(),
-            fields: Vec::new(),
-            inside: Vec::new(),
+            layers: Default::default(),
             slots: vec![NO_BRICK; SLOTS],
             found: Found::default(),
         }
@@ -40,12 +47,21 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-/// Fields of a tile of a small structure: more would cost a small structure more than it saves a large one.
-const WARM_FIELDS: usize = 192;
+/// Fields of a layer of a small structure: more would cost a small structure more than it saves a large one.
+const WARM_FIELDS: usize = 36;
 
 /// Makes the calling thread's scratch.
 pub(super) fn warm() {
-    SCRATCH.with_borrow_mut(|scratch| scratch.fields.resize(WARM_FIELDS, [0.0; BRICK_SAMPLES]));
+    SCRATCH.with_borrow_mut(|scratch| scratch.layers.iter_mut().for_each(|layer| layer.grow(WARM_FIELDS)));
+}
+
+impl Layer {
+    /// Makes room for this many bricks.
+    fn grow(&mut self, n: usize) {
+        if self.fields.len() < n {
+            self.fields.resize(n, [0.0; BRICK_SAMPLES]);
+        }
+    }
 }
 
 /// Counters that the tiles add to.
@@ -100,8 +116,13 @@ impl Pass<'_> {
         if samples > self.limits.max_samples {
             return Err(bin::too_large(self.lattice, tally.all_tiles(samples, self.tiles.len()), self.limits));
         }
-        self.control.span(Stage::Field, || scratch.evaluate(self, coord));
-        let (found, bricks) = self.control.span(Stage::Classify, || scratch.classify(self.iso));
+        let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
+        scratch.found.clear();
+        for z in 0..SIDE {
+            self.control.span(Stage::Field, || scratch.evaluate(self, coord, z));
+            self.control.span(Stage::Classify, || scratch.classify(self.iso, z, &mut bricks));
+        }
+        let found = self.control.span(Stage::Classify, || scratch.found.take());
         let bytes = self.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
         let so_far = tally.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         if so_far > self.limits.max_mesh_bytes {
@@ -113,39 +134,46 @@ impl Pass<'_> {
 }
 
 impl Scratch {
-    /// The densities of every brick of the tile, and of the layer beyond, that some atom reaches.
-    fn evaluate(&mut self, pass: &Pass<'_>, tile: [i32; 3]) {
-        let Self { bricks, fields, slots, .. } = self;
-        fields.resize(bricks.reaching.iter().filter(|&&n| n > 0).count(), [0.0; BRICK_SAMPLES]);
-        slots.fill(NO_BRICK);
-        let occupied = slots.iter_mut().enumerate().filter(|(slot, _)| bricks.reaching[*slot] > 0);
-        for ((n, field), (slot, index)) in (0..).zip(fields).zip(occupied) {
-            *index = n;
-            let [_, y, z] = slot_brick(slot);
-            let layers = |k: usize, all: usize| if k == SIDE - 1 { 1 } else { all };
-            let need = Need { y_pairs: layers(y, 4), z_layers: layers(z, 8) };
-            let origin = slot_origin(tile, slot);
+    /// The densities of every brick of layer z that some atom reaches; z up to the layer beyond the tile.
+    fn evaluate(&mut self, pass: &Pass<'_>, tile: [i32; 3], z: usize) {
+        let Self { bricks, layers, slots, .. } = self;
+        let layer = &mut layers[z % 2];
+        let mut n = 0;
+        for (slot, index) in slots.iter_mut().enumerate().skip(z * SIDE * SIDE).take(SIDE * SIDE) {
+            *index = NO_BRICK;
+            if bricks.reaching[slot] == 0 {
+                continue;
+            }
+            layer.grow(n + 1);
+            let field = &mut layer.fields[n];
+            let [_, y, _] = slot_brick(slot);
+            let rows = |k: usize, all: usize| if k == SIDE - 1 { 1 } else { all };
+            let need = Need { y_pairs: rows(y, 4), z_layers: rows(z, 8) };
             field.fill(0.0);
-            field::evaluate(&pass.constants, &pass.lattice.atoms, bricks.of(slot), origin, need, field);
+            let (atoms, origin) = (&pass.lattice.atoms, slot_origin(tile, slot));
+            field::evaluate(&pass.constants, atoms, bricks.of(slot), origin, need, field);
+            // A layer has 81 bricks.
+            *index = u16::try_from(n).unwrap_or(NO_BRICK);
+            n += 1;
         }
+        layer.inside.clear();
+        layer.inside.extend(layer.fields[..n].iter().map(|field| classify::inside_bits(field, pass.iso)));
     }
 
-    /// Classifies every brick of the tile that has, or borders on, samples in reach of an atom. Also tells where each
-    /// local brick's record is, or `NO_BRICK`.
-    fn classify(&mut self, iso: f32) -> (Found, Vec<u16>) {
+    /// Classifies every brick of the layer below z that has, or borders on, samples in reach of an atom. Enters into `local`
+    /// where each local brick's record is.
+    fn classify(&mut self, iso: f32, z: usize, local: &mut [u16]) {
         const NOWHERE: Inside = [0; 8];
         const NOTHING: Samples = [0.0; BRICK_SAMPLES];
-        let Self { bricks, fields, inside, slots, found } = self;
-        inside.clear();
-        inside.extend(fields.iter().map(|field| classify::inside_bits(field, iso)));
-        found.clear();
-        let mut local = vec![NO_BRICK; BRICK_SAMPLES];
-        for (at, entry) in local.iter_mut().enumerate() {
-            let slot = (at / 64 * SIDE + at / 8 % 8) * SIDE + at % 8;
-            let near: [usize; 8] = std::array::from_fn(|n| usize::from(slots[slot + NEIGHBOUR[n]]));
+        let Self { bricks, layers, slots, found } = self;
+        let Some(below) = z.checked_sub(1) else { return };
+        for (at, entry) in local.iter_mut().enumerate().skip(64 * below).take(64) {
+            let slot = (below * SIDE + at / 8 % 8) * SIDE + at % 8;
+            let near: [(usize, &Layer); 8] =
+                std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(below + (n >> 2)) % 2]));
             let around = Around {
-                inside: near.map(|i| inside.get(i).unwrap_or(&NOWHERE)),
-                samples: near.map(|i| fields.get(i).unwrap_or(&NOTHING)),
+                inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NOWHERE)),
+                samples: near.map(|(i, layer)| layer.fields.get(i).unwrap_or(&NOTHING)),
             };
             if around.inside.iter().all(|bits| **bits == NOWHERE) {
                 continue;
@@ -154,7 +182,6 @@ impl Scratch {
                 *entry = record;
             }
         }
-        (found.take(), local)
     }
 }
 

@@ -1,6 +1,6 @@
 //! The sheets of surface within a brick: which of its vertices hang together by its own triangles.
 
-use super::emit::{EDGE, EDGES};
+use super::edge::EDGES;
 
 /// The mark of a vertex that no triangle has met yet.
 pub(super) const NONE: u16 = u16::MAX;
@@ -82,14 +82,4 @@ impl Sheets {
     pub(super) fn of(&self, on: u16) -> u16 {
         self.equal[usize::from(on)]
     }
-}
-
-/// The sheet of the vertex on a grid edge, going by the cells of each sheet. An edge beyond the brick belongs to the
-/// brick's last cell before it.
-#[inline(always)]
-pub(super) fn of_cell(sheets: &[[u64; 8]], edge: usize) -> u16 {
-    let sample = edge / 3;
-    let [x, y, z] = [sample % EDGE, sample / EDGE % EDGE, sample / (EDGE * EDGE)].map(|c| c.min(7));
-    let on = sheets.iter().position(|cells| cells[z] >> (8 * y + x) & 1 == 1);
-    on.and_then(|on| u16::try_from(on).ok()).unwrap_or_default()
 }

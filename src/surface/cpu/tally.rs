@@ -4,8 +4,9 @@
 
 use glam::Vec3A;
 
-use super::emit::{BrickTable, Numbered, shared_vertices, shares_vertices};
+use super::near::{Numbered, Shared, shared_vertices};
 use super::sheets::Sheets;
+use super::table::BrickTable;
 use crate::surface::lattice::to_u32;
 use crate::surface::measure::Component;
 use crate::surface::simd::dispatched;
@@ -21,6 +22,8 @@ pub(super) struct BrickSheets {
     pub(super) first: u32,
     /// How many it has.
     n: u16,
+    /// The neighbours (bit n for neighbour n) that hold vertices of them.
+    shared: u8,
     /// Where the sheets of its vertices begin in `of_vertices`, if it has several.
     detail: u32,
 }
@@ -95,7 +98,7 @@ impl Tally {
         let n_own = around[0].map_or(0, |own| own.t.len());
         let n = sheets.resolve();
         let (first, detail) = (to_u32(self.sheets.len()), to_u32(self.of_vertices.len()));
-        self.bricks.push(BrickSheets { first, n, detail });
+        self.bricks.push(BrickSheets { first, n, shared: table.shared(), detail });
         let corners = table.corners();
         if n == 1 {
             self.sheets.push(Sheet { origin, vertices: n_own as u64, ..sum(table, corners) });
@@ -129,16 +132,14 @@ impl Tally {
                 }
                 continue;
             }
-            for neighbour in 1..8 {
+            for neighbour in (1..8).filter(|n| brick.shared >> n & 1 == 1) {
                 let Some((of, tally, (piece, other))) = near(ix, neighbour) else { continue };
                 if tally.bricks[other].n == 1 {
-                    if shares_vertices(of.brick, neighbour) {
-                        pair(brick.first, (piece, tally.bricks[other].first));
-                    }
+                    pair(brick.first, (piece, tally.bricks[other].first));
                     continue;
                 }
                 let mut last = None;
-                shared_vertices(&of, neighbour, |rank, _| {
+                shared_vertices(&of, neighbour, |Shared { rank, .. }| {
                     let sheet = tally.sheet_of(other, rank);
                     if last.replace(sheet) != Some(sheet) {
                         pair(brick.first, (piece, sheet));
@@ -181,14 +182,16 @@ fn note_vertices(
     let on = |edge: usize| sheets.of(table.sheet(u16::try_from(edge).unwrap_or_default()));
     for (neighbour, near) in (0_u8..).zip(around) {
         let Some(near) = near else { continue };
-        shared_vertices(near, usize::from(neighbour), |rank, edge| {
-            let sheet = on(edge);
-            if neighbour == 0 {
+        if neighbour == 0 {
+            of_vertices.extend(near.edges.iter().map(|edge| {
+                let sheet = on(edge.index());
                 sums[first as usize + usize::from(sheet)].vertices += 1;
-                of_vertices.push(sheet);
-            } else {
-                far.push(Far { brick, neighbour, rank, sheet: first + u32::from(sheet) });
-            }
+                sheet
+            }));
+            continue;
+        }
+        shared_vertices(near, usize::from(neighbour), |Shared { rank, index, .. }| {
+            far.push(Far { brick, neighbour, rank, sheet: first + u32::from(on(index)) });
         });
     }
 }

@@ -1,0 +1,101 @@
+//! Where a vertex lies within its brick: on which edge of the grid.
+
+/// Samples along a brick's side with the neighbours' first layer.
+const N: u16 = 9;
+const SIDE: usize = N as usize;
+/// Grid edges of a brick with those layers, three per sample, `3·((z·9 + y)·9 + x) + axis`, and idle room behind them: a
+/// power of two, so that a mask bounds an index.
+pub(super) const EDGES: usize = (3 * SIDE * SIDE * SIDE).next_power_of_two();
+
+/// An edge of a brick's own: `z << 8 | (8·y + x) << 2 | axis` of the sample that it starts from.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Edge(u16);
+
+impl Edge {
+    /// The edge along `axis` from the sample at `bit` of layer z.
+    #[inline(always)]
+    pub(super) fn new(z: usize, bit: usize, axis: usize) -> Self {
+        // Eleven bits.
+        Self(u16::try_from((z & 7) << 8 | (bit & 63) << 2 | axis & 3).unwrap_or_default())
+    }
+
+    /// 0 x, 1 y, 2 z.
+    #[inline(always)]
+    pub(super) fn axis(self) -> u16 {
+        self.0 & 3
+    }
+
+    /// Of its sample, likewise.
+    #[inline(always)]
+    pub(super) fn x(self) -> u16 {
+        self.0 >> 2 & 7
+    }
+
+    /// Of its sample, likewise.
+    #[inline(always)]
+    pub(super) fn y(self) -> u16 {
+        self.0 >> 5 & 7
+    }
+
+    /// Of its sample, likewise.
+    #[inline(always)]
+    pub(super) fn z(self) -> u16 {
+        self.0 >> 8 & 7
+    }
+
+    /// Among the brick's samples, and so among its cells: `(z·8 + y)·8 + x`.
+    #[inline(always)]
+    pub(super) fn sample(self) -> usize {
+        usize::from(self.0 >> 2 & 511)
+    }
+
+    /// Among the grid edges of the brick and its neighbours' first layers.
+    #[inline(always)]
+    pub(super) fn index(self) -> usize {
+        let sample = self.z() * 81 + self.y() * 9 + self.x();
+        usize::from(3 * sample + self.axis()) % EDGES
+    }
+}
+
+/// Among the same, of the edge at `bit` of layer z of a brick that lies `far` (0 or 8 per axis) away.
+#[inline(always)]
+pub(super) fn index_beyond(bit: usize, z: usize, axis: usize, far: [usize; 3]) -> usize {
+    let (x, y) = (bit & 7, bit >> 3);
+    (3 * (((z + far[2]) * SIDE + far[1] + y) * SIDE + far[0] + x) + axis) % EDGES
+}
+
+/// By grid edge the cell that it starts from; one beyond the brick belongs to the brick's last cell before it.
+pub(super) static CELL_OF: [u16; EDGES] = {
+    let mut cells = [0; EDGES];
+    let mut sample = 0;
+    while sample < N * N * N {
+        let at = [sample % N, sample / N % N, sample / (N * N)];
+        let (mut cell, mut k) = (0, 3);
+        while k > 0 {
+            k -= 1;
+            cell = 8 * cell + if at[k] < 8 { at[k] } else { 7 };
+        }
+        let edge = 3 * sample as usize;
+        (cells[edge], cells[edge + 1], cells[edge + 2]) = (cell, cell, cell);
+        sample += 1;
+    }
+    cells
+};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_edge_is_where_it_was_made() {
+        for (z, y, x, axis) in (0..8 * 8 * 8 * 3).map(|i| (i / 192, i / 24 % 8, i / 3 % 8, i % 3)) {
+            let edge = Edge::new(z, 8 * y + x, axis);
+            assert_eq!([edge.x(), edge.y(), edge.z(), edge.axis()].map(usize::from), [x, y, z, axis]);
+            assert_eq!((edge.sample(), edge.index()), ((z * 8 + y) * 8 + x, 3 * ((z * 9 + y) * 9 + x) + axis));
+            assert_eq!(index_beyond(8 * y + x, z, axis, [0; 3]), edge.index());
+            assert_eq!(usize::from(CELL_OF[edge.index()]), edge.sample());
+        }
+        assert_eq!(CELL_OF[index_beyond(8 * 3, 1, 1, [8, 0, 0])], (8 + 3) * 8 + 7, "beyond x");
+        assert_eq!(CELL_OF[index_beyond(0, 0, 2, [0, 8, 8])], (7 * 8 + 7) * 8, "beyond y and z");
+    }
+}
