@@ -244,19 +244,16 @@ async fn a_job_that_was_dismissed_does_not_begin() {
 async fn what_is_on_record_last_is_what_was_so_last() {
     let house = House::new(1, PATIENT).await;
     let id = house.inherit().await;
-    house.faults.slow.store(true, Ordering::SeqCst);
-    assert_eq!(house.ledger.recover().await.unwrap(), 1);
-    // The worker is writing down that it begins when the job is dismissed.
-    until("the beginning", || async { !house.faults.slow.load(Ordering::SeqCst) }).await;
-    let ledger = house.ledger.clone();
-    let mut dismissed = tokio::spawn({
-        let id = id.clone();
-        async move { ledger.dismiss(&id).await.unwrap().unwrap() }
-    });
-    let waits = tokio::time::timeout(Duration::from_millis(200), &mut dismissed).await.is_err();
+    let promise = Arc::new(Promise::new(house.on_record(&id).await));
+    assert!(promise.begin());
+    // Somebody else is writing the record when the worker wants to write that it begins.
+    let turn = promise.writing.lock().await;
+    let (ledger, begun) = (house.ledger.clone(), Arc::clone(&promise));
+    let mut writes = tokio::spawn(async move { ledger.0.keep_up(&begun).await.unwrap() });
+    let waits = tokio::time::timeout(Duration::from_millis(200), &mut writes).await.is_err();
     assert!(waits, "two wrote at once");
-    house.faults.go_on();
-    assert_eq!(dismissed.await.unwrap().record.status, Status::Dismissed);
-    house.ledger.settled().await;
+    assert!(promise.end(Status::Dismissed, |_| {}));
+    drop(turn);
+    writes.await.unwrap();
     assert_eq!(house.on_record(&id).await.status, Status::Dismissed);
 }

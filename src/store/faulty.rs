@@ -15,7 +15,6 @@ use object_store::{
     PutOptions, PutPayload, PutResult, Result, UploadPart,
 };
 use tempfile::TempDir;
-use tokio::sync::Notify;
 
 use super::backend::Backend;
 use super::{Folder, Store};
@@ -32,9 +31,6 @@ pub(crate) struct Faults {
     silent: Mutex<Option<(Folder, bool)>>,
     /// Questions about it that were not answered.
     pub(crate) unanswered: AtomicUsize,
-    /// The next file that is written takes until [`Faults::go_on`].
-    pub(crate) slow: AtomicBool,
-    go_on: Notify,
 }
 
 pub(crate) fn error(kind: io::ErrorKind) -> object_store::Error {
@@ -52,11 +48,6 @@ impl Faults {
     pub(crate) fn seal(&self, folder: Folder) {
         self.unanswered.store(0, Ordering::SeqCst);
         *self.silent.lock().unwrap() = Some((folder, false));
-    }
-
-    /// Lets the slow file be written.
-    pub(crate) fn go_on(&self) {
-        self.go_on.notify_one();
     }
 
     fn answers(&self, at: &Path, reading: bool) -> Result<()> {
@@ -114,9 +105,6 @@ impl ObjectStore for Faulty {
     async fn put_opts(&self, at: &Path, payload: PutPayload, options: PutOptions) -> Result<PutResult> {
         self.faults.answers(at, false)?;
         self.faults.room()?;
-        if self.faults.slow.swap(false, Ordering::SeqCst) {
-            self.faults.go_on.notified().await;
-        }
         self.files.put_opts(at, payload, options).await
     }
 
