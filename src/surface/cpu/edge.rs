@@ -52,16 +52,16 @@ impl Edge {
     /// Among the grid edges of the brick and its neighbours' first layers.
     #[inline(always)]
     pub(super) fn index(self) -> usize {
-        let sample = self.z() * 81 + self.y() * 9 + self.x();
-        usize::from(3 * sample + self.axis()) % EDGES
+        self.index_from([0; 3])
     }
-}
 
-/// Among the same, of the edge at `bit` of layer z of a brick that lies `far` (0 or 8 per axis) away.
-#[inline(always)]
-pub(super) fn index_beyond(bit: usize, z: usize, axis: usize, far: [usize; 3]) -> usize {
-    let (x, y) = (bit & 7, bit >> 3);
-    (3 * (((z + far[2]) * SIDE + far[1] + y) * SIDE + far[0] + x) + axis) % EDGES
+    /// The same, among those of a brick from which this one lies `far` (0 or 8 per axis) away.
+    #[inline(always)]
+    pub(super) fn index_from(self, far: [usize; 3]) -> usize {
+        let [x, y, z] = [self.x(), self.y(), self.z()].map(usize::from);
+        let sample = ((z + far[2]) * SIDE + y + far[1]) * SIDE + x + far[0];
+        (3 * sample + usize::from(self.axis())) % EDGES
+    }
 }
 
 /// By grid edge the cell that it starts from; one beyond the brick belongs to the brick's last cell before it.
@@ -92,10 +92,9 @@ mod tests {
             let edge = Edge::new(z, 8 * y + x, axis);
             assert_eq!([edge.x(), edge.y(), edge.z(), edge.axis()].map(usize::from), [x, y, z, axis]);
             assert_eq!((edge.sample(), edge.index()), ((z * 8 + y) * 8 + x, 3 * ((z * 9 + y) * 9 + x) + axis));
-            assert_eq!(index_beyond(8 * y + x, z, axis, [0; 3]), edge.index());
             assert_eq!(usize::from(CELL_OF[edge.index()]), edge.sample());
         }
-        assert_eq!(CELL_OF[index_beyond(8 * 3, 1, 1, [8, 0, 0])], (8 + 3) * 8 + 7, "beyond x");
-        assert_eq!(CELL_OF[index_beyond(0, 0, 2, [0, 8, 8])], (7 * 8 + 7) * 8, "beyond y and z");
+        assert_eq!(CELL_OF[Edge::new(1, 8 * 3, 1).index_from([8, 0, 0])], (8 + 3) * 8 + 7, "beyond x");
+        assert_eq!(CELL_OF[Edge::new(0, 0, 2).index_from([0, 8, 8])], (7 * 8 + 7) * 8, "beyond y and z");
     }
 }

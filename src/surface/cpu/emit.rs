@@ -5,7 +5,7 @@
 
 use std::sync::LazyLock;
 
-use super::edge::{EDGES, index_beyond};
+use super::edge::{EDGES, Edge};
 use super::near::Numbered;
 use super::sheets::Sheets;
 use super::table::{BrickTable, ROW, Rounding};
@@ -93,7 +93,7 @@ impl BrickTable {
                 cells &= cells - 1;
                 let Some(&case) = cases.next() else { return };
                 let row = &rows[usize::from(case)];
-                let cell = u16::try_from(index_beyond(bit as usize, z, 0, [0; 3])).unwrap_or_default();
+                let cell = u16::try_from(Edge::new(z, bit as usize, 0).index()).unwrap_or_default();
                 if let Some(corners) = self.corners.get_mut(3 * self.triangles..3 * self.triangles + ROW) {
                     for (corner, offset) in corners.iter_mut().zip(row.corners) {
                         *corner = cell + offset;

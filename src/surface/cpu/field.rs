@@ -169,8 +169,7 @@ fn gaussian<const FMA: bool, const FULL: bool>(
         for z in seen.z[0]..seen.z[1] {
             let (ez, wz) = (e.z(z), w.z(z));
             // All rows of the layer: where those in reach end is harder to foresee than adding zeros to the others takes.
-            let pairs = if FULL { [0, 4] } else { [0, 1] };
-            for pair in pairs[0]..pairs[1] {
+            for pair in 0..if FULL { 4 } else { 1 } {
                 let (exy, wxy) = (&exy[pair & 3], &wxy[pair & 3]);
                 let at = (z * 4 + pair) * 16;
                 let Some(row) = out.get_mut(at..at + 16) else { continue };

@@ -2,7 +2,7 @@
 
 use super::bin::{SIDE, slot_brick};
 use super::classify::SurfaceBrick;
-use super::edge::{Edge, index_beyond};
+use super::edge::Edge;
 
 /// A surface brick whose vertices have their global ids.
 #[derive(Clone, Copy)]
@@ -73,7 +73,7 @@ pub(super) struct Shared {
     pub(super) rank: u32,
     /// Its edge in the neighbour.
     pub(super) edge: Edge,
-    /// The same by [index](Edge::index) among the grid edges of the brick itself.
+    /// Where that is among the grid edges of the brick itself.
     pub(super) index: usize,
 }
 
@@ -86,7 +86,8 @@ pub(super) fn shared_vertices(of: &Numbered<'_>, n: usize, mut each: impl FnMut(
         let w = 3 * z + axis;
         let below = crossing[w] & !(u64::MAX << (bit & 63));
         let rank = u32::from(before[w]) + below.count_ones();
-        each(Shared { rank, edge: Edge::new(z, bit, axis), index: index_beyond(bit, z, axis, far) });
+        let edge = Edge::new(z, bit, axis);
+        each(Shared { rank, edge, index: edge.index_from(far) });
     });
 }
 

@@ -47,7 +47,7 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-/// Fields of a layer of a small structure: more would cost a small structure more than it saves a large one.
+/// Fields of a layer of a small structure, which a thread is to have before there is work.
 const WARM_FIELDS: usize = 36;
 
 /// Makes the calling thread's scratch.
