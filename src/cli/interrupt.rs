@@ -6,6 +6,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use molmesh::surface::CancelToken;
 
+use super::error::CliError;
+
 /// The file that must not outlive a command that did not finish. The lock is held while it gets its final name,
 /// so an interrupt either finds it unfinished and removes it, or finds it done.
 static STAGED: Mutex<Option<PathBuf>> = Mutex::new(None);
@@ -43,13 +45,16 @@ pub(crate) fn discard() {
 /// From now on SIGINT and SIGTERM cancel `token`. A job that does not notice within half a second (it may be
 /// waiting for stdin) is ended, as it is by a second signal; the staged file is removed in any case.
 #[cfg(unix)]
-pub(crate) fn watch(token: &CancelToken) -> std::io::Result<()> {
+///
+/// # Errors
+/// [`CliError::Internal`] where the system does not let the process watch.
+pub(crate) fn watch(token: &CancelToken) -> Result<(), CliError> {
     use std::time::Duration;
 
     use signal_hook::consts::{SIGINT, SIGTERM};
     use signal_hook::iterator::Signals;
 
-    use super::error::{CliError, code};
+    use super::error::code;
     use super::style::Style;
 
     fn give_up() -> ! {
@@ -58,7 +63,7 @@ pub(crate) fn watch(token: &CancelToken) -> std::io::Result<()> {
         super::leave(code::INTERRUPTED)
     }
 
-    let mut signals = Signals::new([SIGINT, SIGTERM])?;
+    let mut signals = Signals::new([SIGINT, SIGTERM]).map_err(|e| unwatched(&e))?;
     let token = token.clone();
     let watch = move || {
         let mut signals = signals.forever();
@@ -74,11 +79,32 @@ pub(crate) fn watch(token: &CancelToken) -> std::io::Result<()> {
             drop(grace);
         }
     };
-    std::thread::Builder::new().name("interrupt".to_owned()).spawn(watch).map(drop)
+    let start = move || {
+        let thread = std::thread::Builder::new().name("interrupt".to_owned()).spawn(watch);
+        thread.map(drop).map_err(|e| unwatched(&e))
+    };
+    if rayon::current_thread_index().is_none() || rayon::current_num_threads() < 2 {
+        return start();
+    }
+    // To start a thread takes as long as to read a small structure: another thread of the pool has nothing to do yet.
+    rayon::spawn(move || {
+        if let Err(error) = start() {
+            discard();
+            error.print(Style::stderr());
+            super::leave(error.code())
+        }
+    });
+    Ok(())
+}
+
+/// What it means that signals cannot be watched.
+#[cfg(unix)]
+fn unwatched(error: &std::io::Error) -> CliError {
+    CliError::Internal(format!("cannot watch for signals: {error}"))
 }
 
 /// Without signals nothing is watched: the system ends the process, and may leave the staged file behind.
 #[cfg(not(unix))]
-pub(crate) fn watch(_token: &CancelToken) -> std::io::Result<()> {
+pub(crate) fn watch(_token: &CancelToken) -> Result<(), CliError> {
     Ok(())
 }

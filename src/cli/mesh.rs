@@ -41,7 +41,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let asked = Asked::once(args);
     let picked = backend::pick(&asked, &backend::Use::Once)?;
     let cancel = CancelToken::default();
-    interrupt::watch(&cancel).map_err(|e| CliError::Internal(format!("cannot watch for signals: {e}")))?;
+    interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = read(input_path, limits.read.max_inflated_bytes)?;
 

@@ -26,7 +26,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     let limits = request::limits(&args.limits);
     let picked = backend::pick(&Asked::once(args), &Use::Picture)?;
     let cancel = CancelToken::default();
-    interrupt::watch(&cancel).map_err(|e| CliError::Internal(format!("cannot watch for signals: {e}")))?;
+    interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = mesh::read(input_path, limits.read.max_inflated_bytes)?;
 

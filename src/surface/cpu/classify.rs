@@ -63,6 +63,9 @@ pub(super) struct Found {
     drop: Vec<f32>,
 }
 
+/// Vertices, and active cells, that a brick in reach of an atom seldom has more of on average.
+const USUAL: usize = 96;
+
 /// How much of a tile comes before a brick.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Before {
@@ -114,29 +117,32 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
 }
 
 impl Found {
-    /// Forgets everything but the memory.
-    pub(super) fn clear(&mut self) {
-        self.bricks.clear();
-        self.t.clear();
-        self.edges.clear();
-        self.cases.clear();
-        self.candidates.clear();
-        self.sheets.clear();
-        (self.vertices, self.triangles) = (0, 0);
+    /// Nothing yet, and room for what is found in `bricks` bricks with `candidates` candidates, more than there mostly is:
+    /// growing would copy, and what is not touched costs nothing.
+    pub(super) fn begin(&mut self, bricks: usize, candidates: usize) {
+        *self = Self {
+            bricks: Vec::with_capacity(bricks),
+            t: Vec::with_capacity(USUAL * bricks),
+            edges: Vec::with_capacity(USUAL * bricks),
+            cases: Vec::with_capacity(USUAL * bricks),
+            candidates: Vec::with_capacity(candidates),
+            drop: std::mem::take(&mut self.drop),
+            ..Self::default()
+        };
     }
 
-    /// A copy in memory of just the right size.
-    pub(super) fn take(&self) -> Self {
-        Self {
-            bricks: self.bricks.clone(),
-            t: self.t.clone(),
-            edges: self.edges.clone(),
-            cases: self.cases.clone(),
-            candidates: self.candidates.clone(),
-            sheets: self.sheets.clone(),
-            drop: Vec::new(),
-            ..*self
-        }
+    /// What was found, in memory of just the right size; what is left has nothing.
+    pub(super) fn take(&mut self) -> Self {
+        let drop = std::mem::take(&mut self.drop);
+        let mut found = std::mem::replace(self, Self { drop, ..Self::default() });
+        // The rest goes back to the allocator, for the next tile.
+        found.bricks.shrink_to_fit();
+        found.t.shrink_to_fit();
+        found.edges.shrink_to_fit();
+        found.cases.shrink_to_fit();
+        found.candidates.shrink_to_fit();
+        found.sheets.shrink_to_fit();
+        found
     }
 
     /// Vertices, triangles and cases of the tile before brick `i`; all of them where `i` is their number.

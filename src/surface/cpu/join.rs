@@ -38,6 +38,15 @@ pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measure
     };
     let Ok(pairs) = pairs;
     let mut equal: Vec<u32> = (0..to_u32(n)).collect();
+    let mut label = Vec::with_capacity(pieces.iter().map(|piece| piece.bricks.len()).sum());
+    for (tally, first) in tallies.iter().zip(&first) {
+        label.extend(tally.bricks.iter().map(|brick| to_u32(*first) + brick.first));
+    }
+    for (tally, first) in tallies.iter().zip(&first) {
+        for [sheet, brick] in &tally.lone {
+            unite(&mut equal, to_u32(*first) + sheet, label[*brick as usize]);
+        }
+    }
     for [a, b] in pairs.into_iter().flatten() {
         unite(&mut equal, a, b);
     }

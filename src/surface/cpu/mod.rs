@@ -74,25 +74,27 @@ impl CpuBackend {
     /// whose threads compete with it for the processors between the stages.
     ///
     /// # Errors
-    /// The pool's, in words, where it exists already or its threads cannot be started.
+    /// The pool's, in words, where this thread is in one already or others cannot be started.
     pub fn on_this_thread(threads: Option<usize>) -> Result<Self, String> {
         // Counted before this thread is held in one place, which would count as one processor.
         let n = threads.or_else(|| std::thread::available_parallelism().ok().map(NonZero::get)).unwrap_or(1);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n).use_current_thread();
         let homes = threads::Homes::hold().map(Arc::new);
-        let built = match homes.clone() {
-            Some(homes) => pool.start_handler(move |index| homes.spread(index)).build_global(),
-            None => pool.build_global(),
+        let pool = match homes.clone() {
+            Some(homes) => pool.start_handler(move |index| begin(&homes, index)).build(),
+            None => pool.build(),
         };
         if let Some(homes) = homes {
+            // The others begin on this processor and leave it at once; they are not waited for.
+            std::thread::yield_now();
             homes.free();
         }
-        built.map_err(|e| e.to_string())?;
+        let pool = pool.map_err(|e| e.to_string())?;
         // The other threads get their memory while this one reads the file, and are awake when there is work.
-        for _ in 1..rayon::current_num_threads() {
-            rayon::spawn(warm);
+        for _ in 1..pool.current_num_threads() {
+            pool.spawn(warm);
         }
-        Ok(Self { pool: None })
+        Ok(Self { pool: Some(pool) })
     }
 
     /// Threads that a run uses.
@@ -141,6 +143,14 @@ impl Backend for CpuBackend {
     }
 }
 
+/// What a thread of a pool does first.
+fn begin(homes: &threads::Homes, index: usize) {
+    homes.spread(index);
+    // The processor is asked for its extensions once a process: in a virtual machine that takes longer than reading a small
+    // structure does.
+    let _known = simd::extension();
+}
+
 /// Makes what a thread keeps from tile to tile, and the tables that all share.
 fn warm() {
     sample::warm();
@@ -157,6 +167,7 @@ struct Tile {
     bricks: Vec<u16>,
     first_vertex: usize,
     first_triangle: usize,
+    first_brick: usize,
     first_piece: usize,
 }
 
@@ -186,10 +197,11 @@ const PIECE_BRICKS: usize = 32;
 
 /// Cuts the tiles into pieces, in order.
 fn pieces(done: &mut [Tile]) -> Vec<Piece> {
-    let mut pieces = Vec::new();
+    let (mut pieces, mut bricks) = (Vec::new(), 0);
     for (t, tile) in done.iter_mut().enumerate() {
-        tile.first_piece = pieces.len();
         let n = tile.found.bricks.len();
+        (tile.first_piece, tile.first_brick) = (pieces.len(), bricks);
+        bricks += n;
         let starts = (0..n).step_by(PIECE_BRICKS);
         pieces.extend(starts.map(|first| Piece { tile: t, bricks: first..n.min(first + PIECE_BRICKS) }));
     }
@@ -296,7 +308,8 @@ impl Tile {
         let end = self.found.bricks.get(ix + 1).map_or(self.found.vertices, |next| next.vertex);
         let own = brick.vertex as usize..end as usize;
         let (t, edges) = (&self.found.t[own.clone()], &self.found.edges[own]);
-        // `scan` made sure that ids fit 32 bits.
-        Some((ix, Numbered { brick, first: to_u32(self.first_vertex) + brick.vertex, t, edges }))
+        // `scan` made sure that ids fit 32 bits; there are fewer bricks than vertices.
+        let (id, first) = (to_u32(self.first_brick + ix), to_u32(self.first_vertex) + brick.vertex);
+        Some((ix, Numbered { brick, id, first, t, edges }))
     }
 }

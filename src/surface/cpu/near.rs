@@ -4,11 +4,13 @@ use super::bin::{SIDE, slot_brick};
 use super::classify::SurfaceBrick;
 use super::edge::Edge;
 
-/// A surface brick whose vertices have their global ids.
+/// A surface brick that has its number, as its vertices have theirs.
 #[derive(Clone, Copy)]
 pub(super) struct Numbered<'a> {
     /// The brick.
     pub(super) brick: &'a SurfaceBrick,
+    /// Its place among all surface bricks.
+    pub(super) id: u32,
     /// Global id of its first vertex.
     pub(super) first: u32,
     /// Parameters of its vertices along their edges.

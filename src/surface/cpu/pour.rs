@@ -29,9 +29,9 @@ thread_local! {
 /// Makes the calling thread's scratch.
 pub(super) fn warm() {
     SCRATCH.with_borrow_mut(|scratch| {
-        scratch.positions.resize(4096, [0.0; 3]);
-        scratch.normals.resize(4096, [0.0; 3]);
-        scratch.triangles.resize(8192, [0; 3]);
+        first(&mut scratch.positions, USUAL);
+        first(&mut scratch.normals, USUAL);
+        first(&mut scratch.triangles, 2 * USUAL);
     });
 }
 
@@ -121,9 +121,16 @@ impl Scratch {
     }
 }
 
+/// Vertices of a piece, which few exceed; it has twice as many triangles.
+const USUAL: usize = 3072;
+
 /// The first `n` rows of a scratch, which grows for them.
 fn first<T: Clone + Default>(rows: &mut Vec<T>, n: usize) -> &mut [T] {
-    rows.resize(rows.len().max(n), T::default());
+    if rows.len() < n {
+        // Room for most pieces, once: growing would copy, and what is not touched costs nothing.
+        rows.reserve(n.max(3 * USUAL) - rows.len());
+        rows.resize(n, T::default());
+    }
     &mut rows[..n]
 }
 

@@ -20,7 +20,7 @@ struct Scratch {
     layers: [Layer; 2],
     /// Index into its layer per slot, or `NO_BRICK`.
     slots: Vec<u16>,
-    /// What `classify` appends to; a tile takes a copy of the right size with it.
+    /// What `classify` appends to; a tile takes it with it.
     found: Found,
 }
 
@@ -29,6 +29,8 @@ struct Scratch {
 struct Layer {
     fields: Vec<Samples>,
     inside: Vec<Inside>,
+    /// The bricks with samples inside: row y, bit x.
+    rows: [u16; SIDE],
 }
 
 impl Default for Scratch {
@@ -56,9 +58,11 @@ pub(super) fn warm() {
 }
 
 impl Layer {
-    /// Makes room for this many bricks.
+    /// Makes this many bricks.
     fn grow(&mut self, n: usize) {
         if self.fields.len() < n {
+            // Room for all that there can be, once: growing would copy, and what is not touched costs nothing.
+            self.fields.reserve_exact(SIDE * SIDE - self.fields.len());
             self.fields.resize(n, [0.0; BRICK_SAMPLES]);
         }
     }
@@ -111,13 +115,14 @@ impl Pass<'_> {
     fn sample_into(&self, t: usize, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
         let (coord, tally) = (self.tiles.coords[t], &self.tally);
         self.control.span(Stage::Bin, || bin::fill(&mut scratch.bricks, self.lattice, coord, self.tiles.atoms(t)));
-        let occupied = count_occupied(&scratch.bricks, tally) * BRICK_SAMPLES as u64;
+        let reached = count_occupied(&scratch.bricks, tally);
+        let occupied = reached as u64 * BRICK_SAMPLES as u64;
         let samples = tally.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
         if samples > self.limits.max_samples {
             return Err(bin::too_large(self.lattice, tally.all_tiles(samples, self.tiles.len()), self.limits));
         }
         let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
-        scratch.found.clear();
+        scratch.found.begin(reached, scratch.bricks.candidates.len());
         for z in 0..SIDE {
             self.control.span(Stage::Field, || scratch.evaluate(self, coord, z));
             self.control.span(Stage::Classify, || scratch.classify(self.iso, z, &mut bricks));
@@ -129,7 +134,7 @@ impl Pass<'_> {
             let all = tally.all_tiles(so_far, self.tiles.len());
             return Err(scan::too_large(all, self.lattice.spacing, self.limits.max_mesh_bytes));
         }
-        Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_piece: 0 })
+        Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_brick: 0, first_piece: 0 })
     }
 }
 
@@ -158,46 +163,55 @@ impl Scratch {
         }
         layer.inside.clear();
         layer.inside.extend(layer.fields[..n].iter().map(|field| classify::inside_bits(field, pass.iso)));
+        for (row, slots) in layer.rows.iter_mut().zip(slots[z * SIDE * SIDE..].chunks(SIDE)) {
+            let inside = |slot: &u16| layer.inside.get(usize::from(*slot)).is_some_and(|bits| *bits != NOWHERE);
+            *row = slots.iter().rev().fold(0, |row, slot| row << 1 | u16::from(inside(slot)));
+        }
     }
 
-    /// Classifies every brick of the layer below z that has, or borders on, samples in reach of an atom. Enters into `local`
-    /// where each local brick's record is.
+    /// Classifies every brick of the layer below z that has, or borders on, samples inside. Enters into `local` where each
+    /// local brick's record is.
     fn classify(&mut self, iso: f32, z: usize, local: &mut [u16]) {
-        const NOWHERE: Inside = [0; 8];
         const NOTHING: Samples = [0.0; BRICK_SAMPLES];
         let Self { bricks, layers, slots, found } = self;
         let Some(below) = z.checked_sub(1) else { return };
-        for (at, entry) in local.iter_mut().enumerate().skip(64 * below).take(64) {
-            let slot = (below * SIDE + at / 8 % 8) * SIDE + at % 8;
-            let near: [(usize, &Layer); 8] =
-                std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(below + (n >> 2)) % 2]));
-            let around = Around {
-                inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NOWHERE)),
-                samples: near.map(|(i, layer)| layer.fields.get(i).unwrap_or(&NOTHING)),
-            };
-            if around.inside.iter().all(|bits| **bits == NOWHERE) {
-                continue;
-            }
-            if let Some(record) = found.add(slot, &around, iso, bricks.of(slot)) {
-                *entry = record;
+        for y in 0..SIDE - 1 {
+            let rows = layers.iter().fold(0, |rows, layer| rows | layer.rows[y] | layer.rows[y + 1]);
+            let mut left = (rows | rows >> 1) & ((1 << (SIDE - 1)) - 1);
+            while left != 0 {
+                let x = left.trailing_zeros() as usize;
+                left &= left - 1;
+                let slot = (below * SIDE + y) * SIDE + x;
+                let near: [(usize, &Layer); 8] =
+                    std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(below + (n >> 2)) % 2]));
+                let around = Around {
+                    inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NOWHERE)),
+                    samples: near.map(|(i, layer)| layer.fields.get(i).unwrap_or(&NOTHING)),
+                };
+                if let Some(record) = found.add(slot, &around, iso, bricks.of(slot)) {
+                    local[(below * 8 + y) * 8 + x] = record;
+                }
             }
         }
     }
 }
+
+/// Of a brick without samples inside.
+const NOWHERE: Inside = [0; 8];
 
 /// Distance in slots to the neighbour towards +x (bit 0), +y (bit 1), +z (bit 2).
 const NEIGHBOUR: [usize; 8] =
     [0, 1, SIDE, SIDE + 1, SIDE * SIDE, SIDE * SIDE + 1, SIDE * SIDE + SIDE, SIDE * SIDE + SIDE + 1];
 
 /// Counts the tile's own bricks that some atom reaches.
-fn count_occupied(bricks: &Bricks, tally: &Tally) -> u64 {
+fn count_occupied(bricks: &Bricks, tally: &Tally) -> usize {
     let own = (0..SLOTS).filter(|&slot| slot_brick(slot).iter().all(|&b| b < SIDE - 1));
     let (mut occupied, mut pairs) = (0, 0);
     for slot in own {
-        occupied += u64::from(bricks.reaching[slot] > 0);
+        occupied += usize::from(bricks.reaching[slot] > 0);
         pairs += u64::from(bricks.reaching[slot]);
     }
-    tally.bricks.fetch_add(occupied, Ordering::Relaxed);
+    tally.bricks.fetch_add(occupied as u64, Ordering::Relaxed);
     tally.candidates.fetch_add(pairs, Ordering::Relaxed);
     occupied
 }

@@ -2,6 +2,8 @@
 //!
 //! What [`Measures::of`](crate::surface::Measures::of) finds in a finished mesh.
 
+use std::num::NonZeroU16;
+
 use glam::Vec3A;
 
 use super::near::{Numbered, Shared, shared_vertices};
@@ -22,13 +24,13 @@ pub(super) struct BrickSheets {
     pub(super) first: u32,
     /// How many it has.
     n: u16,
-    /// The neighbours (bit n for neighbour n) that hold vertices of them.
-    shared: u8,
+    /// The neighbours (bit n for neighbour n) that hold vertices of a lone sheet and may have several themselves.
+    unsettled: u8,
     /// Where the sheets of its vertices begin in `of_vertices`, if it has several.
     detail: u32,
 }
 
-/// A vertex of a neighbour on a sheet of a brick that has several.
+/// A vertex on a sheet of a brick that has several, of a neighbour that may have several too.
 #[derive(Debug, Clone, Copy)]
 struct Far {
     brick: u32,
@@ -49,6 +51,8 @@ pub(super) struct Tally {
     pub(super) sheets: Vec<Sheet>,
     /// Per brick of the piece.
     pub(super) bricks: Vec<BrickSheets>,
+    /// A sheet of the piece and the number of a brick that shares vertices with it and has one sheet.
+    pub(super) lone: Vec<[u32; 2]>,
     of_vertices: Vec<u16>,
     far: Vec<Far>,
 }
@@ -83,6 +87,13 @@ impl Sheet {
 }
 
 impl Tally {
+    /// Makes room for what most pieces of this many bricks add up.
+    pub(super) fn expect(&mut self, bricks: usize) {
+        self.bricks.reserve_exact(bricks);
+        self.sheets.reserve_exact(2 * bricks);
+        self.lone.reserve_exact(4 * bricks);
+    }
+
     /// Adds the brick that `emit` has just written.
     pub(super) fn add(
         &mut self,
@@ -98,7 +109,8 @@ impl Tally {
         let n_own = around[0].map_or(0, |own| own.t.len());
         let n = sheets.resolve();
         let (first, detail) = (to_u32(self.sheets.len()), to_u32(self.of_vertices.len()));
-        self.bricks.push(BrickSheets { first, n, shared: table.shared(), detail });
+        let unsettled = if n == 1 { self.settle(first, table.shared(), around) } else { 0 };
+        self.bricks.push(BrickSheets { first, n, unsettled, detail });
         let corners = table.corners();
         if n == 1 {
             self.sheets.push(Sheet { origin, vertices: n_own as u64, ..sum(table, corners) });
@@ -109,9 +121,23 @@ impl Tally {
         note_vertices(self, table, sheets, around, first);
     }
 
-    /// The pairs of sheets that neighbouring bricks share. `near(brick, neighbour)` gives a brick's neighbour, the tally
-    /// of its piece, and its piece with its place in that; `pair` gets the sheet of this piece, and the other's piece
-    /// and sheet.
+    /// Notes those of the neighbours `shared` that are known to have one sheet, as the brick has, which is `sheet`. Returns
+    /// the others.
+    #[inline(always)]
+    fn settle(&mut self, sheet: u32, shared: u8, around: &[Option<Numbered<'_>>; 8]) -> u8 {
+        let mut unsettled = 0;
+        for (n, near) in around.iter().enumerate().filter(|(n, _)| shared >> n & 1 == 1) {
+            match near {
+                Some(near) if has_one_sheet(near) => self.lone.push([sheet, near.id]),
+                _ => unsettled |= 1 << n,
+            }
+        }
+        unsettled
+    }
+
+    /// The pairs of sheets that neighbouring bricks share, beyond those of `lone`. `near(brick, neighbour)` gives a brick's
+    /// neighbour, the tally of its piece, and its piece with its place in that; `pair` gets the sheet of this piece, and
+    /// the other's piece and sheet.
     #[inline(always)]
     pub(super) fn pairs<'a>(
         &self,
@@ -120,19 +146,19 @@ impl Tally {
     ) {
         let mut far = self.far.iter().peekable();
         for (ix, brick) in self.bricks.iter().enumerate() {
-            if brick.n != 1 {
+            // Nothing but those of the brick, where it has several sheets; neighbour by neighbour.
+            while let Some(Far { neighbour, .. }) = far.peek().filter(|f| f.brick as usize == ix) {
+                let met = near(ix, usize::from(*neighbour));
                 let mut last = None;
-                while let Some(at) = far.next_if(|f| f.brick as usize == ix) {
-                    let Some((_, tally, (piece, other))) = near(ix, usize::from(at.neighbour)) else { continue };
-                    let met = (at.sheet, (piece, tally.sheet_of(other, at.rank)));
-                    if last != Some(met) {
-                        pair(met.0, met.1);
-                        last = Some(met);
+                while let Some(at) = far.next_if(|f| f.brick as usize == ix && f.neighbour == *neighbour) {
+                    let Some((_, tally, (piece, other))) = met else { continue };
+                    let sheets = (at.sheet, tally.sheet_of(other, at.rank));
+                    if last.replace(sheets) != Some(sheets) {
+                        pair(at.sheet, (piece, sheets.1));
                     }
                 }
-                continue;
             }
-            for neighbour in (1..8).filter(|n| brick.shared >> n & 1 == 1) {
+            for neighbour in (1..8).filter(|n| brick.unsettled >> n & 1 == 1) {
                 let Some((of, tally, (piece, other))) = near(ix, neighbour) else { continue };
                 if tally.bricks[other].n == 1 {
                     pair(brick.first, (piece, tally.bricks[other].first));
@@ -177,7 +203,7 @@ fn note_vertices(
     around: &[Option<Numbered<'_>>; 8],
     first: u32,
 ) {
-    let Tally { sheets: sums, bricks, of_vertices, far, .. } = tally;
+    let Tally { sheets: sums, bricks, of_vertices, far, lone, .. } = tally;
     let brick = to_u32(bricks.len() - 1);
     let on = |edge: usize| sheets.of(table.sheet(u16::try_from(edge).unwrap_or_default()));
     for (neighbour, near) in (0_u8..).zip(around) {
@@ -190,11 +216,23 @@ fn note_vertices(
             }));
             continue;
         }
+        let (known, mut last) = (has_one_sheet(near), None);
         shared_vertices(near, usize::from(neighbour), |Shared { rank, index, .. }| {
-            far.push(Far { brick, neighbour, rank, sheet: first + u32::from(on(index)) });
+            let sheet = first + u32::from(on(index));
+            if !known {
+                far.push(Far { brick, neighbour, rank, sheet });
+            } else if last.replace(sheet) != Some(sheet) {
+                lone.push([sheet, near.id]);
+            }
         });
     }
 }
+}
+
+/// Whether a brick is known to have one sheet before its triangles are there.
+#[inline(always)]
+fn has_one_sheet(of: &Numbered<'_>) -> bool {
+    of.brick.n_sheets == Some(NonZeroU16::MIN)
 }
 
 /// A triangle's normal, of twice its area, and its product with the first corner, component by component.
