@@ -1,11 +1,14 @@
-"""Structure file to surface file, molmesh against splashsurf, in turn, on a RAM disk.
+"""Structure file to surface file, molmesh against splashsurf, in turn, on a RAM disk, both on the CPU.
 
     python3 benches/peers/splashsurf.py FILE [FILE ...] [--runs 7] [--resolution 0.5]
 
 Needs `cargo build --release`, `cargo install splashsurf` and the Python package gemmi. splashsurf has no reader of
 structures: it is given the heavy atoms of the same selection as 32-bit coordinates, written beforehand, so its time
-lacks reading the structure. Prints one row a file: medians of the wall time, peak memory of the process, triangles,
-and the ratios, per triangle too.
+lacks reading the structure. For a machine without gemmi, `--points` only writes those coordinates beside each file, as
+FILE.xyz; where they lie there they are taken. Both programs are copied first, as an installation does: a file that a
+linker has just written lies in the system's cache in small pieces, which costs a short run up to a sixth. Prints one
+row a file: medians of the wall time, peak memory of the process, triangles, and the ratios, per triangle too; last the
+time of a program that does nothing, `true`, which is in all of them.
 """
 
 import argparse
@@ -19,8 +22,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-
-import gemmi
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -39,6 +40,8 @@ def run(command):
 
 def heavy_atoms(path):
     """Coordinates of what molmesh meshes by default: first model, ATOM records, no hydrogens, one alternative."""
+    import gemmi  # Not needed where coordinates lie beside the structures.
+
     model = gemmi.read_structure(str(path))[0]
     for residue in (residue for chain in model for residue in chain if residue.het_flag == "A"):
         for atom in residue:
@@ -55,28 +58,43 @@ def triangles(path):
     return 0
 
 
+def coordinates(file, structure):
+    """The same as bytes, from beside `file` where they lie there."""
+    beside = file.with_name(file.name + ".xyz")
+    if beside.exists():
+        return beside.read_bytes()
+    return b"".join(struct.pack("<3f", *p) for p in heavy_atoms(structure))
+
+
 def main():
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("files", nargs="+", type=Path)
     arguments.add_argument("--runs", type=int, default=7)
     arguments.add_argument("--resolution", type=float, default=0.5)
+    arguments.add_argument("--molmesh", default=ROOT / "target/release/molmesh")
+    arguments.add_argument("--points", action="store_true", help="only write the coordinates beside the files")
     options = arguments.parse_args()
-    molmesh = ROOT / "target/release/molmesh"
+    if options.points:
+        for file in options.files:
+            file.with_name(file.name + ".xyz").write_bytes(coordinates(file, file))
+        return
     splashsurf = shutil.which("splashsurf") or sys.exit("splashsurf is not installed: cargo install splashsurf")
     ram = "/dev/shm" if os.path.isdir("/dev/shm") else None
     print("| structure | atoms | molmesh s | splashsurf s | times faster | per triangle | molmesh MB | splashsurf MB |"
           " memory | molmesh triangles | splashsurf triangles |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
-    with tempfile.TemporaryDirectory(dir=ram) as folder:
+    with tempfile.TemporaryDirectory(dir=ram) as folder, tempfile.TemporaryDirectory() as installed:
         folder = Path(folder)
+        molmesh, splashsurf = (shutil.copy(program, installed) for program in (options.molmesh, splashsurf))
         for file in options.files:
             data = gzip.open(file).read() if file.suffix == ".gz" else file.read_bytes()
             structure = folder / file.name.removesuffix(".gz")
             structure.write_bytes(data)
-            atoms = list(heavy_atoms(structure))
             points, ours, theirs = folder / "points.xyz", folder / "ours.glb", folder / "theirs.ply"
-            points.write_bytes(b"".join(struct.pack("<3f", *p) for p in atoms))
-            mesh = [str(molmesh), "mesh", str(structure), "--resolution", str(options.resolution), "--quiet", "-o"]
+            points.write_bytes(coordinates(file, structure))
+            atoms = points.stat().st_size // 12
+            mesh = [molmesh, "mesh", str(structure), "--resolution", str(options.resolution), "--backend", "cpu",
+                    "--quiet", "-o"]
             peer = [splashsurf, "reconstruct", str(points), "-r", "1", "-l", "1.7", "-c", str(options.resolution),
                     "-t", "0.15", "--normals=on", "-q", "-o", str(theirs)]
             rows = []
@@ -86,11 +104,13 @@ def main():
             run(mesh + [str(folder / "ours.ply")])
             counts = triangles(folder / "ours.ply"), triangles(theirs)
             ratio = statistics.median(row[2] / row[0] for row in rows[1:])
-            print(f"| {structure.name} | {len(atoms)} | {walls[0]:.4f} | {walls[2]:.4f} | {ratio:.2f} |"
+            print(f"| {structure.name} | {atoms} | {walls[0]:.4f} | {walls[2]:.4f} | {ratio:.2f} |"
                   f" {ratio * counts[0] / counts[1]:.2f} | {walls[1]:.0f} | {walls[3]:.0f} |"
                   f" {walls[1] / walls[3]:.2f} | {counts[0]} | {counts[1]} |", flush=True)
             for path in folder.iterdir():
                 path.unlink()
+    nothing = statistics.median(run(["true"])[0] for _ in range(51))
+    print(f"\nA program that does nothing takes {nothing:.4f} s.")
 
 
 if __name__ == "__main__":

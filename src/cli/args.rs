@@ -136,7 +136,7 @@ pub(crate) struct JobArgs {
     pub(crate) backend: BackendName,
     #[command(flatten)]
     pub(crate) devices: DeviceArgs,
-    /// Threads of the CPU backend; every core by default
+    /// Threads of the CPU backend; every core by default, 8 at most for a mesh of a file below 1 MiB
     #[arg(long, value_name = "N")]
     pub(crate) threads: Option<usize>,
     /// How the report is written

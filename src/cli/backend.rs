@@ -23,12 +23,14 @@ pub(crate) struct Asked<'a> {
     pub(crate) devices: &'a DeviceChoice,
     /// Threads of the CPU backend.
     pub(crate) threads: Option<usize>,
+    /// Threads that are enough where no number is asked for.
+    pub(crate) enough: usize,
 }
 
 impl<'a> Asked<'a> {
     /// What the flags of a single job ask for.
     pub(crate) fn once(args: &'a JobArgs) -> Self {
-        Self { backend: args.backend, devices: &args.devices.devices, threads: args.threads }
+        Self { backend: args.backend, devices: &args.devices.devices, threads: args.threads, enough: usize::MAX }
     }
 }
 
@@ -94,7 +96,7 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
         no_gpu: Some("not looked for, as another backend was asked for".to_owned()),
     };
     match asked.backend {
-        BackendName::Cpu => Ok(unasked(cpu(asked.threads, use_)?)),
+        BackendName::Cpu => Ok(unasked(cpu(asked, use_)?)),
         BackendName::Reference => Ok(unasked(Box::new(ReferenceBackend))),
         BackendName::Auto | BackendName::Gpu | BackendName::Paper => gpu_or_cpu(asked, use_),
     }
@@ -122,7 +124,7 @@ fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
         _ => format!("auto: no GPU, as {why}"),
     };
     let drawer = Drawer::cpu(&reason);
-    Ok(Picked { backend: cpu(asked.threads, use_)?, reason, drawer, devices, no_gpu: Some(why) })
+    Ok(Picked { backend: cpu(asked, use_)?, reason, drawer, devices, no_gpu: Some(why) })
 }
 
 /// A backend's name and what it runs on.
@@ -152,10 +154,10 @@ pub(crate) fn survey(picked: &Picked) -> Vec<Candidate> {
     survey
 }
 
-fn cpu(threads: Option<usize>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
+fn cpu(asked: &Asked<'_>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
     let backend = match use_ {
-        Use::Once | Use::Picture => CpuBackend::on_this_thread(threads),
-        Use::Service(_) => CpuBackend::new(threads),
+        Use::Once | Use::Picture => CpuBackend::on_this_thread(asked.threads, asked.enough),
+        Use::Service(_) => CpuBackend::new(asked.threads),
     };
     let backend = backend.map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
     Ok(Box::new(backend))

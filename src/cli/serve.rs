@@ -31,7 +31,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         tracing::warn!("{warning}");
     }
     referee::quiet_panics();
-    let asked = Asked { backend: args.backend, devices: &config.devices.choice, threads: None };
+    let asked = Asked { backend: args.backend, devices: &config.devices.choice, threads: None, enough: usize::MAX };
     let picked = backend::pick(&asked, &backend::Use::Service(config.devices.clone()))?;
     let others = backend::survey(&picked);
     let Picked { backend, reason, drawer, devices, .. } = picked;

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use super::layout::{AtomType, IndexType, Layout};
-use crate::formats::block::{convert_words, write_bytes, write_floats, write_integers, write_shorts};
+use crate::formats::block::{convert_words, extend_words, write_bytes, write_floats, write_integers, write_shorts};
 use crate::formats::{Packing, quantize};
 use crate::surface::Mesh;
 
@@ -64,13 +64,28 @@ pub(super) fn write_normals(out: &mut dyn Write, packing: Packing, rows: &[[f32;
 /// Writes indices as the layout has them.
 pub(super) fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32]) -> io::Result<()> {
     match index_type {
-        IndexType::U8 => convert_words(out, indices, |i| [i.to_le_bytes()[0]]),
-        IndexType::U16 => convert_words(out, indices, |i| {
-            let [low, high, ..] = i.to_le_bytes();
-            [low, high]
-        }),
+        IndexType::U8 => convert_words(out, indices, one_byte),
+        IndexType::U16 => convert_words(out, indices, two_bytes),
         IndexType::U32 => write_integers(out, indices),
     }
+}
+
+/// The same, to the end of what is in memory.
+pub(super) fn extend_indices(bytes: &mut Vec<u8>, index_type: IndexType, indices: &[u32]) {
+    match index_type {
+        IndexType::U8 => extend_words(bytes, indices, one_byte),
+        IndexType::U16 => extend_words(bytes, indices, two_bytes),
+        IndexType::U32 => extend_words(bytes, indices, u32::to_le_bytes),
+    }
+}
+
+fn one_byte(index: u32) -> [u8; 1] {
+    [index.to_le_bytes()[0]]
+}
+
+fn two_bytes(index: u32) -> [u8; 2] {
+    let [low, high, ..] = index.to_le_bytes();
+    [low, high]
 }
 
 #[expect(clippy::cast_precision_loss, reason = "the layout takes floats only where they are exact")]

@@ -8,9 +8,9 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use thiserror::Error;
 
-use super::buffer::{write_indices, write_normals, write_positions};
+use super::buffer::{extend_indices, write_indices, write_normals, write_positions};
 use super::glb::{GlbPlan, HEAD_BYTES, LARGE_BUFFER_BYTES};
-use super::layout::Layout;
+use super::layout::{IndexType, Layout};
 use crate::formats::block::{write_bytes, write_shorts};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
@@ -42,8 +42,10 @@ pub enum PlaceError {
     },
 }
 
-/// Blocks that may wait for the file: some 100 KiB each.
+/// Blocks that may wait for the file.
 const MOST_WAITING: usize = 48;
+/// Room in a block: what a part has of one column is mostly less.
+const BLOCK_BYTES: usize = 96 << 10;
 
 /// A GLB that is being written into `out`.
 pub struct GlbSink<'a> {
@@ -138,12 +140,7 @@ impl<'a> GlbSink<'a> {
         let (position, normal) = (packing.position_bytes() * row, packing.normal_bytes() * row);
         let (index_type, indices) = layout.indices;
         let first = 3 * part.first_triangle as u64 * index_type.bytes();
-        let lane = match self.lane.try_lock() {
-            Ok(lane) => Some(lane),
-            // Too much is waiting: now it is right to sleep.
-            Err(_) if lock(&self.waiting).len() > MOST_WAITING => Some(lock(&self.lane)),
-            Err(_) => None,
-        };
+        let lane = self.lane();
         if lane.is_some() {
             // Rows that wait are older than these, which may be the same rows once more.
             self.drain()?;
@@ -166,12 +163,39 @@ impl<'a> GlbSink<'a> {
             }
             Vertices::Quantized { step, .. } => return Err(FormatError::OtherPacking { step: step.length() }.into()),
         }
-        write_indices(&mut at(indices.offset + first), index_type, part.triangles.as_flattened())?;
-        if lane.is_some() { self.drain() } else { Ok(()) }
+        let (mut to, triangles) = (at(indices.offset + first), part.triangles.as_flattened());
+        if index_type == IndexType::U32 {
+            write_indices(&mut to, index_type, triangles)?;
+        } else {
+            let mut block = self.block();
+            extend_indices(&mut block, index_type, triangles);
+            to.hand(block)?;
+        }
+        if lane.is_some() {
+            self.drain()?;
+        }
+        Ok(())
+    }
+
+    /// Leave to write into the file; `None` if others are writing and it is better to leave the bytes to them.
+    fn lane(&self) -> Option<MutexGuard<'_, ()>> {
+        match self.lane.try_lock() {
+            Ok(lane) => Some(lane),
+            // Too much is waiting: now it is right to sleep.
+            Err(_) if lock(&self.waiting).len() > MOST_WAITING => Some(lock(&self.lane)),
+            Err(_) => None,
+        }
+    }
+
+    /// An empty block.
+    fn block(&self) -> Vec<u8> {
+        let mut block = lock(&self.spare).pop().unwrap_or_else(|| Vec::with_capacity(BLOCK_BYTES));
+        block.clear();
+        block
     }
 
     /// Writes what is waiting. The caller holds the lane, or is the last.
-    fn drain(&self) -> Result<(), PlaceError> {
+    fn drain(&self) -> io::Result<()> {
         loop {
             let Some((offset, bytes)) = lock(&self.waiting).pop() else { return Ok(()) };
             self.out.place(offset, &bytes)?;
@@ -206,24 +230,40 @@ struct At<'a> {
     now: bool,
 }
 
-impl Write for At<'_> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+impl At<'_> {
+    /// Puts `bytes` where they belong if that is possible now; says whether it was.
+    fn put(&self, bytes: &[u8]) -> io::Result<bool> {
         let mut small = lock(&self.sink.small);
-        if small.is_empty() {
-            drop(small);
-            let place = HEAD_BYTES + self.offset;
-            if self.now {
-                self.sink.out.place(place, bytes)?;
-            } else {
-                let mut block = lock(&self.sink.spare).pop().unwrap_or_default();
-                block.clear();
-                block.extend_from_slice(bytes);
-                lock(&self.sink.waiting).push((place, block));
-            }
-        } else {
+        if !small.is_empty() {
             let start = usize::try_from(self.offset).unwrap_or(usize::MAX);
             let place = small.get_mut(start..).and_then(|rest| rest.get_mut(..bytes.len()));
             place.ok_or(io::ErrorKind::InvalidInput)?.copy_from_slice(bytes);
+            return Ok(true);
+        }
+        drop(small);
+        if self.now {
+            self.sink.out.place(HEAD_BYTES + self.offset, bytes)?;
+        }
+        Ok(self.now)
+    }
+
+    /// Puts a block there, or leaves it to who is writing.
+    fn hand(&self, block: Vec<u8>) -> io::Result<()> {
+        if self.put(&block)? {
+            lock(&self.sink.spare).push(block);
+        } else {
+            lock(&self.sink.waiting).push((HEAD_BYTES + self.offset, block));
+        }
+        Ok(())
+    }
+}
+
+impl Write for At<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if !self.put(bytes)? {
+            let mut block = self.sink.block();
+            block.extend_from_slice(bytes);
+            lock(&self.sink.waiting).push((HEAD_BYTES + self.offset, block));
         }
         self.offset += bytes.len() as u64;
         Ok(bytes.len())

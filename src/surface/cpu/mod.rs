@@ -71,13 +71,15 @@ impl CpuBackend {
     }
 
     /// A backend for a process that meshes once and ends: the calling thread works too, instead of waiting for a pool
-    /// whose threads compete with it for the processors between the stages.
+    /// whose threads compete with it for the processors between the stages. It has `threads`, or as many as there are
+    /// processors but not more than are `enough`.
     ///
     /// # Errors
     /// The pool's, in words, where this thread is in one already or others cannot be started.
-    pub fn on_this_thread(threads: Option<usize>) -> Result<Self, String> {
+    pub fn on_this_thread(threads: Option<usize>, enough: usize) -> Result<Self, String> {
         // Counted before this thread is held in one place, which would count as one processor.
-        let n = threads.or_else(|| std::thread::available_parallelism().ok().map(NonZero::get)).unwrap_or(1);
+        let processors = || std::thread::available_parallelism().map_or(1, NonZero::get);
+        let n = threads.unwrap_or_else(|| processors().min(enough));
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n).use_current_thread();
         let homes = threads::Homes::hold().map(Arc::new);
         let pool = match homes.clone() {

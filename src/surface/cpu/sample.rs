@@ -24,10 +24,15 @@ struct Scratch {
     found: Found,
 }
 
+/// Densities of a brick from the start of a line of the cache on, as vectors that cross lines take twice as long.
+#[derive(Clone, Copy)]
+#[repr(align(64))]
+struct Lines(Samples);
+
 /// Densities and inside bits of the bricks of a layer that some atom reaches.
 #[derive(Default)]
 struct Layer {
-    fields: Vec<Samples>,
+    fields: Vec<Lines>,
     inside: Vec<Inside>,
     /// The bricks with samples inside: row y, bit x.
     rows: [u16; SIDE],
@@ -63,7 +68,7 @@ impl Layer {
         if self.fields.len() < n {
             // Room for all that there can be, once: growing would copy, and what is not touched costs nothing.
             self.fields.reserve_exact(SIDE * SIDE - self.fields.len());
-            self.fields.resize(n, [0.0; BRICK_SAMPLES]);
+            self.fields.resize(n, Lines([0.0; BRICK_SAMPLES]));
         }
     }
 }
@@ -150,7 +155,7 @@ impl Scratch {
                 continue;
             }
             layer.grow(n + 1);
-            let field = &mut layer.fields[n];
+            let Lines(field) = &mut layer.fields[n];
             let [_, y, _] = slot_brick(slot);
             let rows = |k: usize, all: usize| if k == SIDE - 1 { 1 } else { all };
             let need = Need { y_pairs: rows(y, 4), z_layers: rows(z, 8) };
@@ -162,7 +167,7 @@ impl Scratch {
             n += 1;
         }
         layer.inside.clear();
-        layer.inside.extend(layer.fields[..n].iter().map(|field| classify::inside_bits(field, pass.iso)));
+        layer.inside.extend(layer.fields[..n].iter().map(|Lines(field)| classify::inside_bits(field, pass.iso)));
         for (row, slots) in layer.rows.iter_mut().zip(slots[z * SIDE * SIDE..].chunks(SIDE)) {
             let inside = |slot: &u16| layer.inside.get(usize::from(*slot)).is_some_and(|bits| *bits != NOWHERE);
             *row = slots.iter().rev().fold(0, |row, slot| row << 1 | u16::from(inside(slot)));
@@ -186,7 +191,7 @@ impl Scratch {
                     std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(below + (n >> 2)) % 2]));
                 let around = Around {
                     inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NOWHERE)),
-                    samples: near.map(|(i, layer)| layer.fields.get(i).unwrap_or(&NOTHING)),
+                    samples: near.map(|(i, layer)| layer.fields.get(i).map_or(&NOTHING, |Lines(field)| field)),
                 };
                 if let Some(record) = found.add(slot, &around, iso, bricks.of(slot)) {
                     local[(below * 8 + y) * 8 + x] = record;
