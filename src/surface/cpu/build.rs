@@ -120,7 +120,7 @@ impl TilePart<'_> {
         written: &mut Written,
     ) {
         let Shading { batch, table, sheets } = shading;
-        written.tally.expect(self.bricks.len());
+        written.tally.make_room(self.bricks.len());
         written.flat += control.span(Stage::Interpolate, || self.interpolate(&scanned.lattice, slope, batch));
         control.span(Stage::Emit, || self.emit(scanned, table, sheets, &mut written.tally));
     }

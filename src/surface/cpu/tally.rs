@@ -88,7 +88,7 @@ impl Sheet {
 
 impl Tally {
     /// Makes room for what most pieces of this many bricks add up.
-    pub(super) fn expect(&mut self, bricks: usize) {
+    pub(super) fn make_room(&mut self, bricks: usize) {
         self.bricks.reserve_exact(bricks);
         self.sheets.reserve_exact(2 * bricks);
         self.lone.reserve_exact(4 * bricks);
