@@ -223,7 +223,8 @@ fn failures_of_devices_are_problems_of_their_own() {
     let answer = post();
     assert!(answer.header("retry-after").is_some());
     let problem = answer.problem(503, "device-failed");
-    assert!(!problem.to_string().contains("5512"), "drivers' words are for the log: {problem}");
+    // Not by the number: an id may hold that.
+    assert!(!problem.to_string().contains("burned"), "drivers' words are for the log: {problem}");
     assert_eq!(log_lines("queue family 5512").len(), 1);
     *backend.error.lock().unwrap() = Some(SurfaceError::Deadline);
     post().problem(504, "deadline");
