@@ -6,8 +6,7 @@ Needs `cargo build --release`, `cargo install splashsurf` and the Python package
 structures: it is given the heavy atoms of the same selection as 32-bit coordinates, written beforehand, so its time
 lacks reading the structure. For a machine without gemmi, `--points` only writes those coordinates beside each file, as
 FILE.xyz; where they lie there they are taken. Both programs are copied first, as an installation does: a file that a
-linker has just written lies in the system's cache in small pieces, which costs a short run up to a sixth. Prints one
-row a file: medians of the wall time, peak memory of the process, triangles, and the ratios, per triangle too; last the
+linker had just written took up to a sixth longer for a short run than a fresh copy of it. Prints one row a file: medians of the wall time, peak memory of the process, triangles, and the ratios, per triangle too; last the
 time of a program that does nothing, `true`, which is in all of them.
 """
 

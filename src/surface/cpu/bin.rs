@@ -4,8 +4,6 @@
 //! its upper faces (index 8), of which it needs the face samples only: they belong to the next tile, which
 //! computes the same bits.
 
-use std::ops::Range;
-
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use crate::surface::control::Control;
@@ -210,48 +208,31 @@ impl Default for Bricks {
     }
 }
 
-/// Lanes of a row of bricks: a power of two, so that a row is compared as a whole.
-const LANES: usize = SIDE.next_power_of_two();
-
 /// Squared distances along one axis from an atom to the samples of each of the 9 brick layers, and to the closed
-/// box that also holds the next brick's first sample. The layer beyond the tile has its first sample only; what lies
-/// beyond that is out of reach.
+/// box that also holds the next brick's first sample. The layer beyond the tile has its first sample only.
 struct AxisReach {
-    samples: [f32; LANES],
-    closed: [f32; LANES],
+    first: usize,
+    last: usize,
+    samples: [f32; SIDE],
+    closed: [f32; SIDE],
 }
 
 impl AxisReach {
     #[inline(always)]
-    fn new(local: f32) -> Self {
-        let mut axis = Self { samples: [f32::INFINITY; LANES], closed: [f32::INFINITY; LANES] };
+    fn new(local: f32, reach: f32) -> Self {
+        let mut axis = Self { first: SIDE, last: 0, samples: [0.0; SIDE], closed: [0.0; SIDE] };
         for b in 0..SIDE {
             let lo = (b * 8) as f32;
             let beyond = b == SIDE - 1;
             let gap = |hi: f32| (lo - local).max(local - hi).max(0.0);
             let (samples, closed) = if beyond { (gap(lo), gap(lo)) } else { (gap(lo + 7.0), gap(lo + 8.0)) };
             (axis.samples[b], axis.closed[b]) = (samples * samples, closed * closed);
+            if closed <= reach {
+                (axis.first, axis.last) = (axis.first.min(b), b + 1);
+            }
         }
         axis
     }
-
-    /// The layers in reach, which follow each other.
-    #[inline(always)]
-    fn range(&self, reach2: f32) -> Range<usize> {
-        let near = within(&self.closed, 0.0, reach2);
-        near.trailing_zeros() as usize..(u32::BITS - near.leading_zeros()) as usize
-    }
-}
-
-/// The lanes (bit by bit) whose squared distance, with `more` across the axis, is `reach2` at most.
-#[inline(always)]
-fn within(distances: &[f32; LANES], more: f32, reach2: f32) -> u32 {
-    // A loop, which becomes one comparison of a vector.
-    let mut lanes = 0;
-    for (lane, distance) in distances.iter().enumerate() {
-        lanes |= u32::from(more + distance <= reach2) << lane;
-    }
-    lanes
 }
 
 impl Bricks {
@@ -273,24 +254,27 @@ pub(super) fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], atoms
         // A little more than the support: rounding must not lose a pair, and a pair too many adds zero.
         let reach = to_f32(lattice.reach(atom) * (1.0 + 1e-5)) + 1e-3;
         let local = |k: usize| (atom.cell[k] - origin[k]) as f32 + atom.frac[k];
-        let [x, y, z] = std::array::from_fn(|k| AxisReach::new(local(k)));
+        let [x, y, z] = std::array::from_fn(|k| AxisReach::new(local(k), reach));
         let reach2 = reach * reach;
-        let rows = y.range(reach2);
-        for bz in z.range(reach2) {
-            for by in rows.clone() {
-                let reaching = within(&x.samples, y.samples[by] + z.samples[bz], reach2);
-                let near = within(&x.closed, y.closed[by] + z.closed[bz], reach2);
+        for bz in z.first..z.last {
+            for by in y.first..y.last {
+                let closed = y.closed[by] + z.closed[bz];
+                let samples = y.samples[by] + z.samples[bz];
+                let row = (bz * SIDE + by) * SIDE;
                 // The layer beyond feeds no vertex of this tile: only its samples matter.
-                let own = if bz == SIDE - 1 || by == SIDE - 1 { 0 } else { (1 << (SIDE - 1)) - 1 };
-                let mut left = reaching | near & own;
-                while left != 0 {
-                    let bx = left.trailing_zeros();
-                    left &= left - 1;
-                    let reaches = reaching >> bx & 1;
-                    let slot = (bz * SIDE + by) * SIDE + bx as usize;
+                let beyond = bz == SIDE - 1 || by == SIDE - 1;
+                for bx in x.first..x.last {
+                    if closed + x.closed[bx] > reach2 {
+                        continue;
+                    }
+                    let reaches = samples + x.samples[bx] <= reach2;
+                    if !reaches && (beyond || bx == SIDE - 1) {
+                        continue;
+                    }
+                    let slot = row + bx;
                     bricks.starts[slot + 1] += 1;
-                    bricks.reaching[slot] += reaches;
-                    bricks.hits.push((to_u32(slot), if reaches == 1 { ix } else { ix | NORMAL_ONLY }));
+                    bricks.reaching[slot] += u32::from(reaches);
+                    bricks.hits.push((to_u32(slot), if reaches { ix } else { ix | NORMAL_ONLY }));
                 }
             }
         }

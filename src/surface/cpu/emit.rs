@@ -133,10 +133,7 @@ pub(super) fn emit(
     out: &mut [[u32; 3]],
 ) {
     let Some(own) = around[0] else { return };
-    match own.brick.n_sheets {
-        None => table.fill::<true>(around),
-        Some(_) => table.fill::<false>(around),
-    }
+    table.fill(around);
     if let Some(rounding) = &rounding {
         for (n, near) in around.iter().enumerate() {
             let Some(near) = near else { continue };

@@ -315,3 +315,21 @@ impl Tile {
         Some((ix, Numbered { brick, id, first, t, edges }))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_more_threads_than_are_enough_unless_they_are_asked_for() {
+        // Each in a thread of its own, as a thread is in one pool.
+        let threads = |asked, enough| {
+            let made = std::thread::spawn(move || CpuBackend::on_this_thread(asked, enough).unwrap().threads());
+            made.join().unwrap()
+        };
+        let processors = std::thread::available_parallelism().unwrap().get();
+        assert_eq!(threads(None, usize::MAX), processors);
+        assert_eq!(threads(None, 1), 1);
+        assert_eq!(threads(Some(processors + 1), 1), processors + 1);
+    }
+}

@@ -24,7 +24,7 @@ struct Scratch {
     found: Found,
 }
 
-/// Densities of a brick from the start of a line of the cache on, as vectors that cross lines take twice as long.
+/// Densities of a brick from the start of a line of the cache on, so that no vector of them crosses one.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 struct Lines(Samples);

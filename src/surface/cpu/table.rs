@@ -100,21 +100,19 @@ fn along(edge: Edge, t: f32) -> Vec3A {
 impl BrickTable {
     /// Enters a vertex.
     #[inline(always)]
-    fn put<const JOIN: bool>(&mut self, index: usize, id: u32, at: Vec3A) {
+    fn put(&mut self, index: usize, id: u32, at: Vec3A) {
         let index = index % EDGES;
         self.ids[index] = id;
         self.at[index] = at;
-        if JOIN {
-            self.sheet[index] = NONE;
-        }
+        self.sheet[index] = NONE;
     }
 
-    /// Enters all vertices that the brick's cells use; if `JOIN`, on no sheet yet.
+    /// Enters all vertices that the brick's cells use.
     #[inline(always)]
-    pub(super) fn fill<const JOIN: bool>(&mut self, around: &[Option<Numbered<'_>>; 8]) {
+    pub(super) fn fill(&mut self, around: &[Option<Numbered<'_>>; 8]) {
         if let Some(own) = &around[0] {
             for ((edge, t), id) in own.edges.iter().zip(own.t).zip(own.first..) {
-                self.put::<JOIN>(edge.index(), id, place(*edge, *t));
+                self.put(edge.index(), id, place(*edge, *t));
             }
         }
         self.shared = 0;
@@ -123,7 +121,7 @@ impl BrickTable {
             let beyond = Vec3A::from_array(far(n).map(|k| k as f32));
             shared_vertices(near, n, |Shared { rank, edge, index }| {
                 let t = near.t.get(rank as usize).copied().unwrap_or_default();
-                self.put::<JOIN>(index, near.first + rank, (corner(edge) + beyond) + along(edge, t));
+                self.put(index, near.first + rank, (corner(edge) + beyond) + along(edge, t));
                 self.shared |= 1 << n;
             });
         }
