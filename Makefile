@@ -8,7 +8,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test tools web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run test tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## This list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -16,7 +16,7 @@ help: ## This list
 run: web-if-possible ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
 	$(CARGO) run --release --bin molmesh -- serve $(ARGS)
 
-test: tools web fmt-check lint deny-if-installed matrix tests ## Everything that must hold; installs what it needs
+test: tools web fmt-check lint deny-if-installed matrix static-if-possible tests ## Everything that must hold; installs what it needs
 
 tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan, Chromium)
 	@if [ -f tests/tools/setup.sh ]; then bash tests/tools/setup.sh; fi
@@ -42,6 +42,8 @@ matrix: ## Clippy on every combination of features that is supported
 	$(CARGO) clippy --locked --lib --no-default-features -- -D warnings
 	$(CARGO) clippy --locked --lib --no-default-features --features gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --no-default-features --features server -- -D warnings
+	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli -- -D warnings
+	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
 	$(CARGO) clippy --locked --lib --bins -- -D warnings
 
@@ -81,6 +83,13 @@ figures: ## The tables of docs/paper.md and its figures, from docs/results/paper
 
 release: web-if-possible ## The optimised binary: target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh
+
+static: ## The command line alone as one static file for any Linux, CPU only: dist/molmesh; installs what it needs
+	deploy/static.sh
+
+# Elsewhere than on Linux, or without the network, its tests say that they are skipped.
+static-if-possible:
+	@deploy/static.sh || echo "without the static executable" >&2
 
 clean: ## Remove everything that was built
 	$(CARGO) clean

@@ -3,6 +3,7 @@
 #[cfg(feature = "gpu")]
 use std::sync::Arc;
 
+#[cfg(feature = "server")]
 use molmesh::config::DevicesConfig;
 #[cfg(feature = "gpu")]
 use molmesh::picture::CpuRenderer;
@@ -43,24 +44,11 @@ pub(crate) struct Picked {
     /// What draws pictures, and why it was taken; the CPU where no pictures are wanted.
     pub(crate) drawer: Drawer,
     /// Every device that was found on the way, taken or not.
+    #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) devices: Vec<FoundDevice>,
     /// Why no GPU runs, if none does.
+    #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) no_gpu: Option<String>,
-}
-
-/// A backend that could be asked for, or a device of one, as `doctor` and the banner show it.
-pub(crate) struct Candidate {
-    /// What `--backend` calls it; a device has its number behind that.
-    pub(crate) name: String,
-    /// What it would run on, or why it is not there.
-    pub(crate) state: Result<String, String>,
-}
-
-impl Candidate {
-    /// Whether this is a device of a backend.
-    pub(crate) fn is_device(&self) -> bool {
-        self.name.contains(' ')
-    }
 }
 
 /// What a backend is picked for.
@@ -71,6 +59,7 @@ pub(crate) enum Use {
     /// One mesh and its picture, likewise.
     Picture,
     /// Many, by the threads of a service.
+    #[cfg(feature = "server")]
     Service(DevicesConfig),
 }
 
@@ -127,36 +116,10 @@ fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     Ok(Picked { backend: cpu(asked, use_)?, reason, drawer, devices, no_gpu: Some(why) })
 }
 
-/// A backend's name and what it runs on.
-pub(crate) fn describe(backend: &dyn Backend) -> String {
-    format!("{}: {}", backend.name(), backend.describe())
-}
-
-/// Every backend and its state, and the devices that are not taken.
-pub(crate) fn survey(picked: &Picked) -> Vec<Candidate> {
-    let candidate = |name: &str, state| Candidate { name: name.to_owned(), state };
-    let gpu = picked.no_gpu.clone().map_or_else(|| Ok(picked.backend.describe()), Err);
-    let mut survey = vec![
-        candidate("cpu", CpuBackend::new(None).map(|cpu| cpu.describe())),
-        candidate("reference", Ok(ReferenceBackend.describe())),
-    ];
-    // The devices' own reasons follow, one a line.
-    let gpu = gpu.map_err(|why| if picked.devices.is_empty() { why } else { "no device is taken".to_owned() });
-    survey.push(candidate("gpu", gpu));
-    let left = picked.devices.iter().filter(|device| !device.taken);
-    survey
-        .extend(left.map(|d| candidate(&format!("gpu {}", d.number), Err(format!("{}: {}", d.facts.name, d.reason)))));
-    let paper = match &picked.no_gpu {
-        None => Ok("the program of 2010, on the same devices, to compare with".to_owned()),
-        Some(_) => Err("the program of 2010 runs on a GPU".to_owned()),
-    };
-    survey.push(candidate("paper", paper));
-    survey
-}
-
 fn cpu(asked: &Asked<'_>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
     let backend = match use_ {
         Use::Once | Use::Picture => CpuBackend::on_this_thread(asked.threads, asked.enough),
+        #[cfg(feature = "server")]
         Use::Service(_) => CpuBackend::new(asked.threads),
     };
     let backend = backend.map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
@@ -196,6 +159,7 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
     }
     let settings = match use_ {
         Use::Once | Use::Picture => PoolSettings::default(),
+        #[cfg(feature = "server")]
         Use::Service(config) => PoolSettings {
             queue: config.jobs,
             batch: config.batch,

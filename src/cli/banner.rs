@@ -2,9 +2,9 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
-use super::backend::Candidate;
 use super::page::Page;
 use super::style::Style;
+use super::survey::Candidate;
 
 /// What the banner knows of the machine.
 pub(crate) struct Facts {

@@ -46,6 +46,9 @@ Exit codes:
     7  the output cannot be written
   130  interrupted; no partial file is left";
 
+/// Where a hint about backends ends.
+const DOCTOR: &str = if cfg!(feature = "server") { ", and `molmesh doctor` for what there is" } else { "" };
+
 /// Why a command failed.
 #[derive(Debug, Error)]
 pub(crate) enum CliError {
@@ -116,9 +119,11 @@ pub(crate) enum CliError {
     #[error("interrupted; nothing was written")]
     Interrupted,
     /// The service could not start, or is not healthy.
+    #[cfg(feature = "server")]
     #[error("{0}")]
     Service(String),
     /// A service would not start, or not be ready.
+    #[cfg(feature = "server")]
     #[error("a service would not start or not be ready: {}", failed.join(", "))]
     Unfit {
         /// The checks that failed.
@@ -161,10 +166,14 @@ impl CliError {
             Self::Job { source: JobError::Picture(error), .. } => picture_code(error),
             Self::Strict { .. } => code::STRUCTURE,
             Self::Format(error) => format_code(error),
-            Self::NoBackend { .. } | Self::Unfit { backend: true, .. } => code::BACKEND,
+            Self::NoBackend { .. } => code::BACKEND,
+            #[cfg(feature = "server")]
+            Self::Unfit { backend: true, .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
             Self::Interrupted => code::INTERRUPTED,
-            Self::Service(_) | Self::Unfit { .. } | Self::Internal(_) => code::INTERNAL,
+            #[cfg(feature = "server")]
+            Self::Service(_) | Self::Unfit { .. } => code::INTERNAL,
+            Self::Internal(_) => code::INTERNAL,
         }
     }
 
@@ -180,7 +189,7 @@ impl CliError {
                 StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
                 _ => opinion.clone(),
             },
-            Self::NoBackend { .. } => Some("try --backend auto, and `molmesh doctor` for what there is".to_owned()),
+            Self::NoBackend { .. } => Some(format!("try --backend auto{DOCTOR}")),
             Self::Output { source, .. } if source.kind() == io::ErrorKind::NotFound => {
                 Some("the directory must exist".to_owned())
             }
@@ -261,7 +270,7 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::DeviceMemory { suggested_resolution, .. } => {
             Some(format!("try --resolution {suggested_resolution}, or --backend cpu"))
         }
-        SurfaceError::Device { .. } => Some("try --backend cpu, and `molmesh doctor` for what there is".to_owned()),
+        SurfaceError::Device { .. } => Some(format!("try --backend cpu{DOCTOR}")),
         SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
         _ => None,
     }

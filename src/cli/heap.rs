@@ -1,8 +1,10 @@
 //! What the C library's allocator does with memory that is free. The one place with unsafe code.
 
+#[cfg(feature = "server")]
 use std::time::Duration;
 
 /// How often a service gives back what is free.
+#[cfg(feature = "server")]
 const PAUSE: Duration = Duration::from_secs(30);
 
 /// For a process that meshes once and ends: memory is got in large steps and never given back. Each step is a system call
@@ -16,6 +18,7 @@ pub(super) fn keep() {
 ///
 /// # Errors
 /// The system's, where it starts no thread.
+#[cfg(feature = "server")]
 pub(super) fn tend() -> std::io::Result<()> {
     let tend = || loop {
         std::thread::sleep(PAUSE);
@@ -41,6 +44,7 @@ mod glibc {
         }
     }
 
+    #[cfg(feature = "server")]
     #[expect(unsafe_code, reason = "there is no safe wrapper of these two functions")]
     pub(super) fn give_back() {
         // SAFETY: it touches nothing but memory that is free, under the allocator's own locks; any thread may call it.
@@ -53,6 +57,7 @@ mod glibc {
 mod glibc {
     pub(super) fn keep() {}
 
+    #[cfg(feature = "server")]
     pub(super) fn give_back() {}
 }
 

@@ -4,15 +4,20 @@
 
 mod args;
 mod backend;
+#[cfg(feature = "server")]
 mod banner;
-#[cfg(feature = "gpu")]
+#[cfg(all(feature = "gpu", feature = "server"))]
 mod bench;
+#[cfg(feature = "server")]
 mod config;
+#[cfg(feature = "server")]
 mod doctor;
 mod error;
+#[cfg(feature = "server")]
 mod healthcheck;
 mod heap;
 mod interrupt;
+#[cfg(feature = "server")]
 mod key;
 mod mesh;
 mod output;
@@ -21,10 +26,14 @@ mod panics;
 mod progress;
 mod render;
 mod request;
+#[cfg(feature = "server")]
 mod serve;
+#[cfg(feature = "server")]
 mod sign;
 mod style;
 mod summary;
+#[cfg(feature = "server")]
+mod survey;
 
 use std::io::{self, Write};
 
@@ -50,13 +59,19 @@ fn run() -> i32 {
     let result = match args.command {
         Command::Mesh(args) => once(|| mesh::run(&args)),
         Command::Render(args) => once(|| render::run(&args)),
+        #[cfg(feature = "server")]
         Command::Serve(args) => serve::run(&args),
+        #[cfg(feature = "server")]
         Command::Doctor(args) => doctor::run(&args),
+        #[cfg(feature = "server")]
         Command::Config(command) => config::run(&command),
+        #[cfg(feature = "server")]
         Command::Healthcheck(args) => healthcheck::run(&args),
+        #[cfg(feature = "server")]
         Command::Key(command) => key::run(&command),
+        #[cfg(feature = "server")]
         Command::Sign(args) => sign::run(&args),
-        #[cfg(feature = "gpu")]
+        #[cfg(all(feature = "gpu", feature = "server"))]
         Command::Bench(bench) => bench::run(&bench),
         Command::Version => version(),
     };
@@ -85,15 +100,23 @@ pub(crate) fn leave(status: i32) -> ! {
     std::process::exit(status);
 }
 
+/// What may help where a command is not known.
+const NO_SERVICE: &str = if cfg!(feature = "server") {
+    ""
+} else {
+    "\nThis build is the command line alone; `serve`, `doctor` and what else belongs to the service are in one with the feature `server`.\n"
+};
+
 /// Prints what clap has to say: help is an answer, anything else is a mistake of the caller.
 fn usage(error: &clap::Error) -> i32 {
     let text = error.render().to_string();
     let (written, code) = match error.kind() {
         ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => (io::stdout().write_all(text.as_bytes()), code::OK),
         ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => (io::stderr().write_all(text.as_bytes()), code::USAGE),
-        _ => {
+        kind => {
             let text = text.strip_prefix("error: ").unwrap_or(&text);
-            (write!(io::stderr(), "molmesh: {text}"), code::USAGE)
+            let hint = if kind == ErrorKind::InvalidSubcommand { NO_SERVICE } else { "" };
+            (write!(io::stderr(), "molmesh: {text}{hint}"), code::USAGE)
         }
     };
     // Whoever closed the stream does not want to read it.
@@ -108,7 +131,7 @@ fn version() -> Result<(), CliError> {
 
 /// The features of this build.
 fn features() -> Vec<&'static str> {
-    let features = [("cli", true), ("server", true), ("gpu", cfg!(feature = "gpu"))];
+    let features = [("cli", true), ("server", cfg!(feature = "server")), ("gpu", cfg!(feature = "gpu"))];
     features.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
 }
 

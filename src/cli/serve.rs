@@ -16,6 +16,7 @@ use super::banner::{self, Facts};
 use super::error::CliError;
 use super::heap;
 use super::style::Style;
+use super::survey;
 
 /// How much nicer threads that compute are than those that answer: their share of a busy core is a third.
 #[cfg(target_os = "linux")]
@@ -33,12 +34,12 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     referee::quiet_panics();
     let asked = Asked { backend: args.backend, devices: &config.devices.choice, threads: None, enough: usize::MAX };
     let picked = backend::pick(&asked, &backend::Use::Service(config.devices.clone()))?;
-    let others = backend::survey(&picked);
+    let others = survey::survey(&picked);
     let Picked { backend, reason, drawer, devices, .. } = picked;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();
     let facts = Facts {
-        device: backend::describe(backend.as_ref()),
+        device: survey::describe(backend.as_ref()),
         reason: reason.clone(),
         others,
         keys,

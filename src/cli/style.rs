@@ -19,6 +19,7 @@ impl Style {
     }
 
     /// For text on stdout.
+    #[cfg(feature = "server")]
     pub(crate) fn stdout() -> Self {
         Self { coloured: std::io::stdout().is_terminal() && wanted() }
     }

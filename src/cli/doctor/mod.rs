@@ -13,9 +13,10 @@ use molmesh::surface::FoundDevice;
 use serde_json::{Value, json};
 
 use super::args::{DoctorArgs, DoctorStyle};
-use super::backend::{self, Asked, Candidate, Picked, Use};
+use super::backend::{self, Asked, Picked, Use};
 use super::error::CliError;
 use super::style::Style;
+use super::survey::{self, Candidate};
 use checks::{Check, State};
 use machine::Machine;
 
@@ -57,7 +58,7 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
     match backend::pick(&asked, &Use::Service(config.devices.clone())) {
         Ok(picked) => {
-            backends = backend::survey(&picked);
+            backends = survey::survey(&picked);
             let Picked { backend, reason, devices: found, .. } = picked;
             checks.push(checks::first_mesh(backend.as_ref()));
             let workers = config.jobs.workers.max(config.devices.jobs * backend.devices().len());
