@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 """Writes the licences of everything that the binary holds to standard output.
 
-Crates are those that cargo links into `molmesh` (normal dependencies on the target, all default features), with every
-licence and notice file that they bring; the standard library; the parts of the web page that others wrote. A crate without
+Crates are those that cargo links into `molmesh` (normal dependencies on the target, the default features or those that are
+named), with every licence and notice file that they bring; the standard library, with musl where that is the target's; with
+the service, the parts of the web page that others wrote. A crate without
 a licence file gets the text of a licence that it names: Apache-2.0's, which is the same for everybody, or MIT's with its
 authors. Where neither is allowed, the command fails and names the crate.
 
-Usage: deploy/notices.py [--target TRIPLE]
+Usage: deploy/notices.py [--target TRIPLE] [--features cli,server,gpu]
 """
 
 import argparse
@@ -75,14 +76,19 @@ def stand_in(package):
     if re.search(r"\bApache-2\.0\b", allowed):
         return "Apache License 2.0", (ROOT / "LICENSE-APACHE").read_text()
     if re.search(r"\bMIT\b", allowed):
-        terms = (ROOT / "LICENSE-MIT").read_text()
-        at = terms.index("Permission is hereby granted")
         authors = ", ".join(re.sub(r"\s*<[^>]*>", "", a) for a in package["authors"]) or f"the {package['name']} authors"
-        return "MIT", f"MIT License\n\nCopyright (c) {authors}\n\n{terms[at:]}"
+        return "MIT", mit(authors)
     return None
 
 
-def texts(packages):
+def mit(authors):
+    """The text of the licence."""
+    terms = (ROOT / "LICENSE-MIT").read_text()
+    at = terms.index("Permission is hereby granted")
+    return f"MIT License\n\nCopyright (c) {authors}\n\n{terms[at:]}"
+
+
+def texts(packages, page, musl):
     """Text to the crates that it belongs to: equal texts are one."""
     of = collections.OrderedDict()
 
@@ -104,11 +110,14 @@ def texts(packages):
                 missing.append(f"{who}: {package['license']}")
             else:
                 add(text[1], f"{who} (brings no text; {text[0]} of {package['license']})")
-    web = ROOT / "web" / "swagger"
-    for name in ("LICENSE", "NOTICE", "swagger-ui-bundle.js.LICENSE.txt"):
-        add((web / name).read_text(encoding="utf-8"), f"Swagger UI ({name})")
-    for name, file in VIEWER:
-        add((ROOT / "web" / "licences" / file).read_text(encoding="utf-8"), f"{name} (in the page at /)")
+    if page:
+        web = ROOT / "web" / "swagger"
+        for name in ("LICENSE", "NOTICE", "swagger-ui-bundle.js.LICENSE.txt"):
+            add((web / name).read_text(encoding="utf-8"), f"Swagger UI ({name})")
+        for name, file in VIEWER:
+            add((ROOT / "web" / "licences" / file).read_text(encoding="utf-8"), f"{name} (in the page at /)")
+    if musl:
+        add(mit("2005-2020 Rich Felker, et al."), "musl libc (MIT)")
     std = "the Rust standard library (MIT OR Apache-2.0)"
     add((ROOT / "LICENSE-APACHE").read_text(), std)
     if missing:
@@ -119,19 +128,26 @@ def texts(packages):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--target", default=host())
-    target = parser.parse_args().target
-    metadata = json.loads(cargo("metadata", "--format-version=1", "--locked", f"--filter-platform={target}"))
+    parser.add_argument("--features")
+    options = parser.parse_args()
+    target, musl = options.target, options.target.endswith("-musl")
+    chosen = ["--no-default-features", f"--features={options.features}"] if options.features else []
+    page = not chosen or "server" in options.features.split(",")
+    metadata = json.loads(cargo("metadata", "--format-version=1", "--locked", f"--filter-platform={target}", *chosen))
     packages = linked(metadata)
     line = "-" * 100
     print("molmesh is licensed under MIT OR Apache-2.0, at your option. It holds the work of others, listed here with their")
     print(f"licences ({target}).\n")
     for package in packages:
         print(f"  {package['name']} {package['version']}: {package['license'] or 'see its text'}")
-    print("  Swagger UI, in the page at /docs: Apache-2.0")
-    for name, _ in VIEWER:
-        print(f"  {name}, in the page at /: MIT")
+    if page:
+        print("  Swagger UI, in the page at /docs: Apache-2.0")
+        for name, _ in VIEWER:
+            print(f"  {name}, in the page at /: MIT")
+    if musl:
+        print("  musl libc: MIT")
     print("  the Rust standard library: MIT OR Apache-2.0")
-    for text, who in texts(packages).items():
+    for text, who in texts(packages, page, musl).items():
         print(f"\n{line}\n" + "\n".join(who) + f"\n{line}\n\n{text}")
 
 

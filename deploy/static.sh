@@ -26,3 +26,5 @@ mkdir -p dist
 # Symbols stay, so that backtraces have names. Under another name first: whoever runs the old one keeps it.
 strip --strip-debug -o dist/molmesh.new "target/$target/release/molmesh"
 mv dist/molmesh.new dist/molmesh
+# What has to go with it where it is handed on.
+python3 deploy/notices.py --target "$target" --features cli >dist/molmesh.THIRD-PARTY.txt

@@ -1,7 +1,6 @@
 //! Our reader on every real structure at hand: against the list of what they hold, against gemmi, against pdbtbx.
 //!
-//! gemmi is called through `tests/tools/gemmi_dump.py` by the Python in `MOLMESH_PYTHON`, or `python3`. What is absent is
-//! skipped, loudly.
+//! gemmi is called through `tests/tools/gemmi_dump.py`. What is absent is skipped, loudly.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
@@ -9,6 +8,8 @@
     clippy::print_stderr,
     reason = "tests fail by panicking and say aloud what they skip"
 )]
+
+mod tools;
 
 use std::collections::BTreeMap;
 use std::io::{BufReader, Read};
@@ -29,8 +30,15 @@ fn sources() -> Vec<(String, Option<usize>, Option<usize>)> {
     rows.map(|row| (row[0].to_owned(), row[3].parse().ok(), row[4].parse().ok())).collect()
 }
 
+/// What is always there.
+const SAMPLES: [&str; 2] = ["samples/4pti.pdb", "samples/1crn.cif"];
+
+fn path(file: &str) -> PathBuf {
+    if SAMPLES.contains(&file) { file.into() } else { Path::new(FOLDER).join(file) }
+}
+
 fn bytes(file: &str) -> Vec<u8> {
-    std::fs::read(Path::new(FOLDER).join(file)).expect("a file of the list")
+    std::fs::read(path(file)).expect("a file of the list")
 }
 
 fn structure(file: &str) -> Structure {
@@ -163,15 +171,6 @@ fn memory_is_sixty_bytes_per_atom() {
 
 // ---- gemmi ----
 
-fn python() -> Option<String> {
-    let python = std::env::var("MOLMESH_PYTHON").unwrap_or_else(|_| "python3".to_owned());
-    let works = Command::new(&python).args(["-c", "import gemmi"]).output().is_ok_and(|o| o.status.success());
-    if !works {
-        eprintln!("SKIPPED: `{python} -c 'import gemmi'` fails; set MOLMESH_PYTHON to a Python that has gemmi");
-    }
-    works.then_some(python)
-}
-
 /// Files that gemmi 0.7.5 refuses, with its words.
 const GEMMI_REFUSES: [(&str, &str); 2] = [
     // Columns 79-80 of files from before 1996 hold a line number.
@@ -249,13 +248,12 @@ fn gemmis(output: &str) -> (Vec<usize>, Rows) {
 
 #[test]
 fn gemmi_agrees_but_where_the_table_says() {
-    let Some(python) = python() else { return };
+    let Some(python) = tools::python_interpreter().or_else(|| tools::missing("gemmi")) else { return };
     let mut found: Vec<(String, &str, usize)> = Vec::new();
-    for (file, _, _) in
-        sources().into_iter().filter(|(file, ..)| ![&REFUSED[..], &OURS_ALONE].concat().contains(&file.as_str()))
-    {
-        let path: PathBuf = Path::new(FOLDER).join(&file);
-        let output = Command::new(&python).arg("tests/tools/gemmi_dump.py").arg(&path).output().unwrap();
+    let not_for_it = [&REFUSED[..], &OURS_ALONE].concat();
+    let listed = sources().into_iter().map(|(file, ..)| file).filter(|file| !not_for_it.contains(&file.as_str()));
+    for file in listed.chain(SAMPLES.map(str::to_owned)) {
+        let output = Command::new(&python).arg("tests/tools/gemmi_dump.py").arg(path(&file)).output().unwrap();
         if let Some((_, words)) = GEMMI_REFUSES.iter().find(|(f, _)| *f == file) {
             let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
             assert!(!output.status.success() && stderr.contains(words), "{file}: gemmi reads it now: {stderr}");

@@ -1,13 +1,14 @@
 """Structure file to surface file, molmesh against splashsurf, in turn, on a RAM disk, both on the CPU.
 
-    python3 benches/peers/splashsurf.py FILE [FILE ...] [--runs 7] [--resolution 0.5]
+    python3 benches/peers/splashsurf.py FILE [FILE ...] [--runs 7] [--resolution 0.5] [--molmesh PROGRAM ...]
 
-Needs `cargo build --release`, `cargo install splashsurf` and the Python package gemmi. splashsurf has no reader of
-structures: it is given the heavy atoms of the same selection as 32-bit coordinates, written beforehand, so its time
-lacks reading the structure. For a machine without gemmi, `--points` only writes those coordinates beside each file, as
-FILE.xyz; where they lie there they are taken. Both programs are copied first, as an installation does: a file that a
-linker had just written took up to a sixth longer for a short run than a fresh copy of it. Prints one row a file: medians of the wall time, peak memory of the process, triangles, and the ratios, per triangle too; last the
-time of a program that does nothing, `true`, which is in all of them.
+Needs `make static` or `make release` (what is there of the two takes part, in turn), `cargo install splashsurf` and the
+Python package gemmi. splashsurf has no reader of structures: it is given the heavy atoms of the same selection as 32-bit
+coordinates, written beforehand, so its time lacks reading the structure. For a machine without gemmi, `--points` only
+writes those coordinates beside each file, as FILE.xyz; where they lie there they are taken. All programs are copied
+first, as an installation does: a file that a linker had just written took up to a sixth longer for a short run than a
+fresh copy of it. Prints one row a file and program: medians of the wall time, peak memory of the process, triangles, and
+the ratios, per triangle too; last the time of a program that does nothing, `true`, which is in all of them.
 """
 
 import argparse
@@ -57,6 +58,11 @@ def triangles(path):
     return 0
 
 
+def named(program):
+    """A program's path, from the repository's root where it lies below that."""
+    return program.relative_to(ROOT) if program.is_relative_to(ROOT) else program
+
+
 def coordinates(file, structure):
     """The same as bytes, from beside `file` where they lie there."""
     beside = file.with_name(file.name + ".xyz")
@@ -70,7 +76,7 @@ def main():
     arguments.add_argument("files", nargs="+", type=Path)
     arguments.add_argument("--runs", type=int, default=7)
     arguments.add_argument("--resolution", type=float, default=0.5)
-    arguments.add_argument("--molmesh", default=ROOT / "target/release/molmesh")
+    arguments.add_argument("--molmesh", nargs="+", type=Path)
     arguments.add_argument("--points", action="store_true", help="only write the coordinates beside the files")
     options = arguments.parse_args()
     if options.points:
@@ -78,34 +84,40 @@ def main():
             file.with_name(file.name + ".xyz").write_bytes(coordinates(file, file))
         return
     splashsurf = shutil.which("splashsurf") or sys.exit("splashsurf is not installed: cargo install splashsurf")
+    usual = [path for path in (ROOT / "dist/molmesh", ROOT / "target/release/molmesh") if path.exists()]
+    programs = options.molmesh or usual or sys.exit("molmesh is not built: make static, or make release")
     ram = "/dev/shm" if os.path.isdir("/dev/shm") else None
-    print("| structure | atoms | molmesh s | splashsurf s | times faster | per triangle | molmesh MB | splashsurf MB |"
+    print("| structure | atoms | program | molmesh s | splashsurf s | times faster | per triangle | molmesh MB | splashsurf MB |"
           " memory | molmesh triangles | splashsurf triangles |")
-    print("|---|---|---|---|---|---|---|---|---|---|---|")
+    print("|---" * 12 + "|")
     with tempfile.TemporaryDirectory(dir=ram) as folder, tempfile.TemporaryDirectory() as installed:
         folder = Path(folder)
-        molmesh, splashsurf = (shutil.copy(program, installed) for program in (options.molmesh, splashsurf))
+        splashsurf = shutil.copy(splashsurf, installed)
+        # By the folder that each lies in, as all may have one name.
+        ours = {program: shutil.copy(program, Path(installed) / str(i)) for i, program in enumerate(programs)}
         for file in options.files:
             data = gzip.open(file).read() if file.suffix == ".gz" else file.read_bytes()
             structure = folder / file.name.removesuffix(".gz")
             structure.write_bytes(data)
-            points, ours, theirs = folder / "points.xyz", folder / "ours.glb", folder / "theirs.ply"
+            points, glb, theirs = folder / "points.xyz", folder / "ours.glb", folder / "theirs.ply"
             points.write_bytes(coordinates(file, structure))
             atoms = points.stat().st_size // 12
-            mesh = [molmesh, "mesh", str(structure), "--resolution", str(options.resolution), "--backend", "cpu",
-                    "--quiet", "-o"]
+            mesh = ["mesh", str(structure), "--resolution", str(options.resolution), "--backend", "cpu", "--quiet", "-o"]
             peer = [splashsurf, "reconstruct", str(points), "-r", "1", "-l", "1.7", "-c", str(options.resolution),
                     "-t", "0.15", "--normals=on", "-q", "-o", str(theirs)]
-            rows = []
+            rows = {program: [] for program in programs}
             for _ in range(options.runs + 1):
-                rows.append(run(mesh + [str(ours)]) + run(peer))
-            walls = [statistics.median(column) for column in zip(*rows[1:])]
-            run(mesh + [str(folder / "ours.ply")])
-            counts = triangles(folder / "ours.ply"), triangles(theirs)
-            ratio = statistics.median(row[2] / row[0] for row in rows[1:])
-            print(f"| {structure.name} | {atoms} | {walls[0]:.4f} | {walls[2]:.4f} | {ratio:.2f} |"
-                  f" {ratio * counts[0] / counts[1]:.2f} | {walls[1]:.0f} | {walls[3]:.0f} |"
-                  f" {walls[1] / walls[3]:.2f} | {counts[0]} | {counts[1]} |", flush=True)
+                for program, copy in ours.items():
+                    rows[program].append(run([copy, *mesh, str(glb)]) + run(peer))
+            for program, copy in ours.items():
+                timed = rows[program][1:]
+                walls = [statistics.median(column) for column in zip(*timed)]
+                run([copy, *mesh, str(folder / "ours.ply")])
+                counts = triangles(folder / "ours.ply"), triangles(theirs)
+                ratio = statistics.median(row[2] / row[0] for row in timed)
+                print(f"| {structure.name} | {atoms} | {named(program)} | {walls[0]:.4f} | {walls[2]:.4f} | {ratio:.2f} |"
+                      f" {ratio * counts[0] / counts[1]:.2f} | {walls[1]:.0f} | {walls[3]:.0f} |"
+                      f" {walls[1] / walls[3]:.2f} | {counts[0]} | {counts[1]} |", flush=True)
             for path in folder.iterdir():
                 path.unlink()
     nothing = statistics.median(run(["true"])[0] for _ in range(51))

@@ -4,6 +4,8 @@
 //! its upper faces (index 8), of which it needs the face samples only: they belong to the next tile, which
 //! computes the same bits.
 
+use std::ops::Range;
+
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use crate::surface::control::Control;
@@ -243,8 +245,8 @@ impl Bricks {
 }
 
 dispatched! {
-/// Finds the candidates of every brick of a tile.
-pub(super) fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], atoms: &[u32]) {
+/// Finds the candidates of every brick in these layers of a tile, and in the layer beyond.
+pub(super) fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], layers: &Range<usize>, atoms: &[u32]) {
     bricks.starts.iter_mut().for_each(|n| *n = 0);
     bricks.reaching.iter_mut().for_each(|n| *n = 0);
     bricks.hits.clear();
@@ -256,13 +258,13 @@ pub(super) fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], atoms
         let local = |k: usize| (atom.cell[k] - origin[k]) as f32 + atom.frac[k];
         let [x, y, z] = std::array::from_fn(|k| AxisReach::new(local(k), reach));
         let reach2 = reach * reach;
-        for bz in z.first..z.last {
+        for bz in z.first.max(layers.start)..z.last.min(layers.end + 1) {
             for by in y.first..y.last {
                 let closed = y.closed[by] + z.closed[bz];
                 let samples = y.samples[by] + z.samples[bz];
                 let row = (bz * SIDE + by) * SIDE;
-                // The layer beyond feeds no vertex of this tile: only its samples matter.
-                let beyond = bz == SIDE - 1 || by == SIDE - 1;
+                // The layer beyond feeds no vertex of these: only its samples matter.
+                let beyond = bz == layers.end || by == SIDE - 1;
                 for bx in x.first..x.last {
                     if closed + x.closed[bx] > reach2 {
                         continue;

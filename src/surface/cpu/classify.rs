@@ -145,6 +145,41 @@ impl Found {
         found
     }
 
+    /// Nothing yet, and room for all of these, which are to be appended.
+    pub(super) fn with_room_for(parts: &[&Self]) -> Self {
+        let sum = |len: fn(&Self) -> usize| parts.iter().map(|part| len(part)).sum();
+        Self {
+            bricks: Vec::with_capacity(sum(|part| part.bricks.len())),
+            t: Vec::with_capacity(sum(|part| part.t.len())),
+            edges: Vec::with_capacity(sum(|part| part.edges.len())),
+            cases: Vec::with_capacity(sum(|part| part.cases.len())),
+            candidates: Vec::with_capacity(sum(|part| part.candidates.len())),
+            sheets: Vec::with_capacity(sum(|part| part.sheets.len())),
+            ..Self::default()
+        }
+    }
+
+    /// Adds what was found in bricks that come after these.
+    pub(super) fn append(&mut self, next: &Self) {
+        let (vertex, triangle) = (self.vertices, self.triangles);
+        let [case, candidate, sheet] = [self.cases.len(), self.candidates.len(), self.sheets.len()].map(to_u32);
+        self.bricks.extend(next.bricks.iter().map(|brick| SurfaceBrick {
+            vertex: brick.vertex + vertex,
+            triangle: brick.triangle + triangle,
+            case: brick.case + case,
+            candidates: brick.candidates.map(|at| at + candidate),
+            sheets: brick.sheets + sheet,
+            ..*brick
+        }));
+        self.t.extend_from_slice(&next.t);
+        self.edges.extend_from_slice(&next.edges);
+        self.cases.extend_from_slice(&next.cases);
+        self.candidates.extend_from_slice(&next.candidates);
+        self.sheets.extend_from_slice(&next.sheets);
+        self.vertices += next.vertices;
+        self.triangles += next.triangles;
+    }
+
     /// Vertices, triangles and cases of the tile before brick `i`; all of them where `i` is their number.
     pub(super) fn before(&self, i: usize) -> Before {
         let all =

@@ -1,8 +1,8 @@
 //! The native CPU backend: the six stages over occupied bricks, parallel over tiles, SIMD inside.
 //!
-//! Order of work: `bin` assigns atoms to tiles. Then each tile, in parallel, finds its bricks' candidates, computes
-//! `field` into a scratch that fits the core's cache, and `classify` keeps what the surface needs: crossing bits,
-//! edge parameters, cases. The field is never stored beyond a tile. `scan` numbers the tiles, `interpolate` and
+//! Order of work: `bin` assigns atoms to tiles. Then each tile (or a slab of it), in parallel, finds its bricks'
+//! candidates, computes `field` into a scratch that fits the core's cache, and `classify` keeps what the surface needs:
+//! crossing bits, edge parameters, cases. The field is never stored beyond a tile. `scan` numbers the tiles, `interpolate` and
 //! `emit` write vertices and triangles straight to their final place.
 //!
 //! The same input gives the same bytes whatever the thread count: no result depends on which thread ran what.
@@ -23,11 +23,11 @@ mod reach;
 mod sample;
 mod scan;
 mod sheets;
+mod slabs;
 mod table;
 mod tally;
 mod threads;
 
-use std::cmp::Reverse;
 use std::num::NonZero;
 use std::ops::Range;
 use std::sync::Arc;
@@ -238,9 +238,12 @@ fn scan_lattice(
     });
     let tiles = tiles?;
     control.check()?;
+    let slabs = slabs::cut(&tiles, rayon::current_num_threads());
     let pass = Pass {
         lattice: &lattice,
         tiles: &tiles,
+        slabs: &slabs,
+        unfinished: slabs::Unfinished::default(),
         constants: Constants::new(&lattice.profile, lattice.spacing),
         iso: to_f32(params.isovalue),
         params,
@@ -248,11 +251,10 @@ fn scan_lattice(
         tally: sample::Tally::default(),
         control,
     };
-    // The largest first, so that none is left over at the end for one thread alone.
-    let mut order: Vec<usize> = (0..tiles.len()).collect();
-    order.sort_by_key(|&t| Reverse(tiles.atoms(t).len()));
-    let sampled = threads::each(tiles.len(), |i| pass.sample(order[i]))?;
-    let mut done: Vec<(usize, Tile)> = order.into_iter().zip(sampled).collect();
+    let sampled = threads::each(slabs.len(), |i| pass.sample(i))?;
+    let tally = pass.tally;
+    let mut done: Vec<(usize, Tile)> =
+        slabs.iter().zip(sampled).filter_map(|(slab, tile)| Some((slab.tile, tile?))).collect();
     done.sort_unstable_by_key(|(t, _)| *t);
     let mut done: Vec<Tile> = done.into_iter().map(|(_, tile)| tile).collect();
     control.check()?;
@@ -260,7 +262,6 @@ fn scan_lattice(
     if totals.triangles == 0 {
         return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
     }
-    let tally = pass.tally;
     let surface_bricks = done.iter().map(|tile| tile.found.bricks.len() as u64).sum();
     let grid = GridStats {
         bricks: tally.bricks.into_inner(),

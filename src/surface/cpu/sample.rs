@@ -1,11 +1,14 @@
-//! The first pass over a tile: its bricks' candidates, the `field` in a scratch, and what `classify` keeps of it.
+//! The first pass over a tile, or a slab of it: its bricks' candidates, the `field` in a scratch, and what `classify` keeps
+//! of it.
 
 use std::cell::RefCell;
+use std::ops::Range;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use super::bin::{self, Bricks, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, Around, Found, Inside};
 use super::field::{self, Constants, Need, Samples};
+use super::slabs::{Slab, Unfinished};
 use super::{NO_BRICK, Tile, scan};
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
@@ -80,13 +83,13 @@ pub(super) struct Tally {
     pub(super) samples: AtomicU64,
     pub(super) candidates: AtomicU64,
     mesh_bytes: AtomicU64,
-    tiles_done: AtomicUsize,
+    slabs_done: AtomicUsize,
 }
 
 impl Tally {
-    /// What all `n` tiles will have, going by what the finished ones have.
-    fn all_tiles(&self, so_far: u64, n: usize) -> u64 {
-        let done = self.tiles_done.load(Ordering::Relaxed) + 1;
+    /// What all `n` slabs will have, going by what the finished ones have.
+    fn all_slabs(&self, so_far: u64, n: usize) -> u64 {
+        let done = self.slabs_done.load(Ordering::Relaxed) + 1;
         so_far / done as u64 * n as u64
     }
 }
@@ -95,6 +98,8 @@ impl Tally {
 pub(super) struct Pass<'a> {
     pub(super) lattice: &'a Lattice,
     pub(super) tiles: &'a Tiles,
+    pub(super) slabs: &'a [Slab],
+    pub(super) unfinished: Unfinished,
     pub(super) constants: Constants,
     pub(super) iso: f32,
     pub(super) params: &'a SurfaceParams,
@@ -104,39 +109,44 @@ pub(super) struct Pass<'a> {
 }
 
 impl Pass<'_> {
-    /// `bin` within tile `t`, `field` and `classify`.
+    /// `bin` within the `i`th slab, `field` and `classify`. Returns its tile, if that has no further slabs.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`], [`SurfaceError::MeshTooLarge`] as soon as the tiles so far exceed a limit, and
+    /// [`SurfaceError::GridTooLarge`], [`SurfaceError::MeshTooLarge`] as soon as the slabs so far exceed a limit, and
     /// [`SurfaceError::Cancelled`].
-    pub(super) fn sample(&self, t: usize) -> Result<Tile, SurfaceError> {
+    pub(super) fn sample(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
         self.control.check()?;
-        let tile = SCRATCH.with_borrow_mut(|scratch| self.sample_into(t, scratch))?;
-        let n = self.tally.tiles_done.fetch_add(1, Ordering::Relaxed) + 1;
-        self.control.observer.progress(Stage::Field, n, self.tiles.len());
+        let slab = &self.slabs[i];
+        let tile = SCRATCH.with_borrow_mut(|scratch| self.sample_into(slab, scratch))?;
+        let tile = self.control.span(Stage::Classify, || self.unfinished.add(slab, tile));
+        let n = self.tally.slabs_done.fetch_add(1, Ordering::Relaxed) + 1;
+        self.control.observer.progress(Stage::Field, n, self.slabs.len());
         Ok(tile)
     }
 
-    fn sample_into(&self, t: usize, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
-        let (coord, tally) = (self.tiles.coords[t], &self.tally);
-        self.control.span(Stage::Bin, || bin::fill(&mut scratch.bricks, self.lattice, coord, self.tiles.atoms(t)));
-        let reached = count_occupied(&scratch.bricks, tally);
+    fn sample_into(&self, slab: &Slab, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
+        let (coord, tally, layers) = (self.tiles.coords[slab.tile], &self.tally, &slab.layers);
+        let atoms = self.tiles.atoms(slab.tile);
+        self.control.span(Stage::Bin, || bin::fill(&mut scratch.bricks, self.lattice, coord, layers, atoms));
+        let reached = count_occupied(&scratch.bricks, layers, tally);
         let occupied = reached as u64 * BRICK_SAMPLES as u64;
         let samples = tally.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
         if samples > self.limits.max_samples {
-            return Err(bin::too_large(self.lattice, tally.all_tiles(samples, self.tiles.len()), self.limits));
+            return Err(bin::too_large(self.lattice, tally.all_slabs(samples, self.slabs.len()), self.limits));
         }
         let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
         scratch.found.begin(reached, scratch.bricks.candidates.len());
-        for z in 0..SIDE {
-            self.control.span(Stage::Field, || scratch.evaluate(self, coord, z));
-            self.control.span(Stage::Classify, || scratch.classify(self.iso, z, &mut bricks));
+        for z in layers.start..=layers.end {
+            self.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z));
+            if z > layers.start {
+                self.control.span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut bricks));
+            }
         }
         let found = self.control.span(Stage::Classify, || scratch.found.take());
         let bytes = self.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
         let so_far = tally.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         if so_far > self.limits.max_mesh_bytes {
-            let all = tally.all_tiles(so_far, self.tiles.len());
+            let all = tally.all_slabs(so_far, self.slabs.len());
             return Err(scan::too_large(all, self.lattice.spacing, self.limits.max_mesh_bytes));
         }
         Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_brick: 0, first_piece: 0 })
@@ -144,8 +154,9 @@ impl Pass<'_> {
 }
 
 impl Scratch {
-    /// The densities of every brick of layer z that some atom reaches; z up to the layer beyond the tile.
-    fn evaluate(&mut self, pass: &Pass<'_>, tile: [i32; 3], z: usize) {
+    /// The densities of every brick of layer z that some atom reaches; z up to the layer beyond the slab's `own`, of which
+    /// the first samples are needed.
+    fn evaluate(&mut self, pass: &Pass<'_>, tile: [i32; 3], own: &Range<usize>, z: usize) {
         let Self { bricks, layers, slots, .. } = self;
         let layer = &mut layers[z % 2];
         let mut n = 0;
@@ -157,8 +168,8 @@ impl Scratch {
             layer.grow(n + 1);
             let Lines(field) = &mut layer.fields[n];
             let [_, y, _] = slot_brick(slot);
-            let rows = |k: usize, all: usize| if k == SIDE - 1 { 1 } else { all };
-            let need = Need { y_pairs: rows(y, 4), z_layers: rows(z, 8) };
+            let rows = |beyond: bool, all: usize| if beyond { 1 } else { all };
+            let need = Need { y_pairs: rows(y == SIDE - 1, 4), z_layers: rows(z == own.end, 8) };
             field.fill(0.0);
             let (atoms, origin) = (&pass.lattice.atoms, slot_origin(tile, slot));
             field::evaluate(&pass.constants, atoms, bricks.of(slot), origin, need, field);
@@ -174,27 +185,26 @@ impl Scratch {
         }
     }
 
-    /// Classifies every brick of the layer below z that has, or borders on, samples inside. Enters into `local` where each
-    /// local brick's record is.
+    /// Classifies every brick of layer z that has, or borders on, samples inside; the layer above it was evaluated last.
+    /// Enters into `local` where each local brick's record is.
     fn classify(&mut self, iso: f32, z: usize, local: &mut [u16]) {
         const NOTHING: Samples = [0.0; BRICK_SAMPLES];
         let Self { bricks, layers, slots, found } = self;
-        let Some(below) = z.checked_sub(1) else { return };
         for y in 0..SIDE - 1 {
             let rows = layers.iter().fold(0, |rows, layer| rows | layer.rows[y] | layer.rows[y + 1]);
             let mut left = (rows | rows >> 1) & ((1 << (SIDE - 1)) - 1);
             while left != 0 {
                 let x = left.trailing_zeros() as usize;
                 left &= left - 1;
-                let slot = (below * SIDE + y) * SIDE + x;
+                let slot = (z * SIDE + y) * SIDE + x;
                 let near: [(usize, &Layer); 8] =
-                    std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(below + (n >> 2)) % 2]));
+                    std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(z + (n >> 2)) % 2]));
                 let around = Around {
                     inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NOWHERE)),
                     samples: near.map(|(i, layer)| layer.fields.get(i).map_or(&NOTHING, |Lines(field)| field)),
                 };
                 if let Some(record) = found.add(slot, &around, iso, bricks.of(slot)) {
-                    local[(below * 8 + y) * 8 + x] = record;
+                    local[(z * 8 + y) * 8 + x] = record;
                 }
             }
         }
@@ -208,9 +218,10 @@ const NOWHERE: Inside = [0; 8];
 const NEIGHBOUR: [usize; 8] =
     [0, 1, SIDE, SIDE + 1, SIDE * SIDE, SIDE * SIDE + 1, SIDE * SIDE + SIDE, SIDE * SIDE + SIDE + 1];
 
-/// Counts the tile's own bricks that some atom reaches.
-fn count_occupied(bricks: &Bricks, tally: &Tally) -> usize {
-    let own = (0..SLOTS).filter(|&slot| slot_brick(slot).iter().all(|&b| b < SIDE - 1));
+/// Counts the slab's own bricks that some atom reaches.
+fn count_occupied(bricks: &Bricks, layers: &Range<usize>, tally: &Tally) -> usize {
+    let slots = layers.start * SIDE * SIDE..layers.end * SIDE * SIDE;
+    let own = slots.filter(|&slot| slot_brick(slot)[..2].iter().all(|&b| b < SIDE - 1));
     let (mut occupied, mut pairs) = (0, 0);
     for slot in own {
         occupied += usize::from(bricks.reaching[slot] > 0);
