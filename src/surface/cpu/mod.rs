@@ -60,6 +60,16 @@ pub struct CpuBackend {
     pool: Option<rayon::ThreadPool>,
 }
 
+/// What a run is given beside its input.
+#[derive(Clone, Copy)]
+struct Means<'a> {
+    params: &'a SurfaceParams,
+    limits: &'a SurfaceLimits,
+    control: &'a Control<'a>,
+    /// Threads that have nothing else to do: one where several runs share the process's.
+    free_threads: usize,
+}
+
 impl CpuBackend {
     /// A backend on `threads` threads, or on as many as there are processors.
     ///
@@ -104,6 +114,14 @@ impl CpuBackend {
     pub fn threads(&self) -> usize {
         self.pool.as_ref().map_or_else(rayon::current_num_threads, rayon::ThreadPool::current_num_threads)
     }
+
+    /// Runs `work` on its threads. Says how many of them have nothing else to do.
+    fn install<T: Send>(&self, work: impl FnOnce(usize) -> T + Send) -> T {
+        match &self.pool {
+            Some(pool) => pool.install(|| work(pool.current_num_threads())),
+            None => work(1),
+        }
+    }
 }
 
 impl Backend for CpuBackend {
@@ -124,10 +142,7 @@ impl Backend for CpuBackend {
         limits: &SurfaceLimits,
         control: &Control<'_>,
     ) -> Result<Meshed, SurfaceError> {
-        match &self.pool {
-            Some(pool) => pool.install(|| run(spheres, params, limits, control)),
-            None => run(spheres, params, limits, control),
-        }
+        self.install(|free_threads| run(spheres, Means { params, limits, control, free_threads }))
     }
 
     fn pour(
@@ -138,10 +153,7 @@ impl Backend for CpuBackend {
         control: &Control<'_>,
         sink: &dyn MeshSink,
     ) -> Result<Poured, SurfaceError> {
-        match &self.pool {
-            Some(pool) => pool.install(|| pour(spheres, params, limits, control, sink)),
-            None => pour(spheres, params, limits, control, sink),
-        }
+        self.install(|free_threads| pour(spheres, Means { params, limits, control, free_threads }, sink))
     }
 }
 
@@ -210,27 +222,18 @@ fn pieces(done: &mut [Tile]) -> Vec<Piece> {
     pieces
 }
 
-fn scan(
-    spheres: &Spheres,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
-    control: &Control<'_>,
-) -> Result<Scanned, SurfaceError> {
-    let lattice = control.span(Stage::Bin, || {
+fn scan(spheres: &Spheres, means: Means<'_>) -> Result<Scanned, SurfaceError> {
+    let lattice = means.control.span(Stage::Bin, || {
         if spheres.len() > bin::MAX_ATOMS {
             return Err(bin::too_many_atoms(spheres.len()));
         }
-        Lattice::new(spheres, params)
+        Lattice::new(spheres, means.params)
     });
-    scan_lattice(lattice?, params, limits, control)
+    scan_lattice(lattice?, means)
 }
 
-fn scan_lattice(
-    lattice: Lattice,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
-    control: &Control<'_>,
-) -> Result<Scanned, SurfaceError> {
+fn scan_lattice(lattice: Lattice, means: Means<'_>) -> Result<Scanned, SurfaceError> {
+    let Means { params, limits, control, free_threads } = means;
     let tiles = control.span(Stage::Bin, || {
         let tiles = Tiles::new(&lattice, limits, control)?;
         bin::refuse_early(&lattice, &tiles, limits)?;
@@ -238,7 +241,7 @@ fn scan_lattice(
     });
     let tiles = tiles?;
     control.check()?;
-    let slabs = slabs::cut(&tiles, rayon::current_num_threads());
+    let slabs = slabs::cut(&tiles, free_threads);
     let pass = Pass {
         lattice: &lattice,
         tiles: &tiles,
@@ -274,26 +277,15 @@ fn scan_lattice(
     Ok(Scanned { lattice, tiles, done, totals, grid, pieces, quantize: params.quantize })
 }
 
-fn run(
-    spheres: &Spheres,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
-    control: &Control<'_>,
-) -> Result<Meshed, SurfaceError> {
-    let scanned = scan(spheres, params, limits, control)?;
-    let (mesh, measures) = build::build(&scanned, params.atom_ids, control)?;
+fn run(spheres: &Spheres, means: Means<'_>) -> Result<Meshed, SurfaceError> {
+    let scanned = scan(spheres, means)?;
+    let (mesh, measures) = build::build(&scanned, means.params.atom_ids, means.control)?;
     Ok(Meshed { measures, ..Meshed::new(mesh, scanned.grid) })
 }
 
-fn pour(
-    spheres: &Spheres,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
-    control: &Control<'_>,
-    sink: &dyn MeshSink,
-) -> Result<Poured, SurfaceError> {
-    let scanned = scan(spheres, params, limits, control)?;
-    pour::pour(&scanned, control, sink)
+fn pour(spheres: &Spheres, means: Means<'_>, sink: &dyn MeshSink) -> Result<Poured, SurfaceError> {
+    let scanned = scan(spheres, means)?;
+    pour::pour(&scanned, means.control, sink)
 }
 
 impl Tile {

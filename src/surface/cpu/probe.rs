@@ -4,7 +4,7 @@
 use super::bin::{self, Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
 use super::field::{self, Constants, Need, Samples};
-use super::{Tile, build};
+use super::{Means, Tile, build};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK, BRICK_SAMPLES, Lattice, to_f32};
@@ -80,7 +80,7 @@ pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) 
             });
         }
     }
-    let scanned = super::scan_lattice(lattice.clone(), params, limits, &control)?;
+    let scanned = super::scan_lattice(lattice.clone(), Means { params, limits, control: &control, free_threads: 1 })?;
     let (mesh, _) = build::build(&scanned, params.atom_ids, &control)?;
     Ok(Probe { bricks, surface: scanned.done.iter().flat_map(surface_of).collect(), mesh })
 }
