@@ -166,8 +166,9 @@ struct Line<'a> {
 }
 
 impl Line<'_> {
+    #[inline(always)]
     fn put(&mut self, text: &[u8]) {
-        self.bytes[self.used..self.used + text.len()].copy_from_slice(text);
+        copy_short(&mut self.bytes[self.used..self.used + text.len()], text);
         self.used += text.len();
     }
 
@@ -226,6 +227,31 @@ impl Line<'_> {
     }
 }
 
+/// Copies a word of a line. In pieces of a known length that may overlap: to call the system's `memcpy` for a few bytes
+/// takes longer than to write the rest of a line (musl's above all).
+#[inline(always)]
+fn copy_short(to: &mut [u8], from: &[u8]) {
+    if !(copy_ends::<8>(to, from) || copy_ends::<4>(to, from) || copy_ends::<2>(to, from) || copy_ends::<1>(to, from)) {
+        to.copy_from_slice(from);
+    }
+}
+
+/// Copies the first and the last `N` bytes if there is nothing else; says whether that was so.
+#[inline(always)]
+fn copy_ends<const N: usize>(to: &mut [u8], from: &[u8]) -> bool {
+    let (Some(first), Some(last)) = (from.first_chunk::<N>(), from.last_chunk::<N>()) else { return false };
+    if from.len() > 2 * N || to.len() != from.len() {
+        return false;
+    }
+    if let Some(start) = to.first_chunk_mut::<N>() {
+        *start = *first;
+    }
+    if let Some(end) = to.last_chunk_mut::<N>() {
+        *end = *last;
+    }
+    true
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -240,6 +266,16 @@ mod tests {
         line.fixed(value, decimals);
         let used = line.used;
         String::from_utf8(bytes[..used].to_vec()).unwrap()
+    }
+
+    #[test]
+    fn words_of_every_length_are_copied_whole() {
+        let from: Vec<u8> = (1..=40).collect();
+        for n in 0..=from.len() {
+            let mut to = vec![0; n];
+            copy_short(&mut to, &from[..n]);
+            assert_eq!(to, from[..n], "{n} bytes");
+        }
     }
 
     #[test]
