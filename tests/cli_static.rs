@@ -76,6 +76,8 @@ fn it_writes_the_same_bytes() {
             ("glb", &["--compress", "quantize", "--ligands", "--waters"]),
             ("ply", &["--kernel", "inverse-square", "--atom-ids", "--resolution", "1"]),
             ("stl", &["--proof", "exact"]),
+            ("obj", &["--normals", "none"]),
+            ("obj", &["--units", "nanometer"]),
         ] {
             let input = Path::new(ROOT).join("samples").join(sample);
             let mut flags = vec!["--backend", "cpu", "--quiet", "--format", format];
