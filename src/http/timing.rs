@@ -66,14 +66,18 @@ impl Timing {
     /// The header's value for an answer whose head took `total`: what no entry accounts for is `other`.
     fn value(&self, total: Duration) -> String {
         let mut text = String::new();
-        let mut left = microseconds(ms(total));
+        let (mut sum, mut total) = (0.0, microseconds(ms(total)));
         for (name, ms) in &self.entries {
             let us = microseconds(*ms);
-            left -= us;
+            sum += us;
             // Writing to a string does not fail.
             _ = write!(text, "{name};dur={:.3}, ", us / 1e3);
         }
-        _ = write!(text, "other;dur={:.3}, {}", left.max(0.0) / 1e3, total_entry(total));
+        // Parts that were rounded up may be a little more than the whole.
+        if sum > total && sum - total <= self.entries.len() as f64 {
+            total = sum;
+        }
+        _ = write!(text, "other;dur={:.3}, {}", (total - sum).max(0.0) / 1e3, total_entry(total));
         text
     }
 }
@@ -87,8 +91,8 @@ fn microseconds(ms: f64) -> f64 {
     (ms * 1e3).round()
 }
 
-fn total_entry(total: Duration) -> String {
-    format!("total;dur={:.3}", microseconds(ms(total)) / 1e3)
+fn total_entry(microseconds: f64) -> String {
+    format!("total;dur={:.3}", microseconds / 1e3)
 }
 
 /// Writes the header of an answer whose head took `total` and that says, or may say, where time went.
@@ -96,7 +100,7 @@ pub(super) fn tell(response: &mut Response, total: Duration) {
     let value = match response.extensions_mut().remove::<Timing>() {
         Some(timing) => timing.value(total),
         None => match response.headers().get(&SERVER_TIMING).and_then(|value| value.to_str().ok()) {
-            Some(known) => format!("{known}, {}", total_entry(total)),
+            Some(known) => format!("{known}, {}", total_entry(microseconds(ms(total)))),
             None => return,
         },
     };
@@ -132,6 +136,21 @@ mod tests {
         // The control: without an entry they do not.
         let without = value.split(", ").filter(|entry| !entry.starts_with("receive")).collect::<Vec<_>>().join(", ");
         assert!(sums(&without).0 < total * 0.95, "{without}");
+    }
+
+    #[test]
+    fn parts_that_were_rounded_up_add_up_as_well() {
+        let mut timing = Timing::start();
+        for name in ["receive", "lookup", "encode"] {
+            timing.add(name, 0.0006);
+        }
+        assert_eq!(
+            timing.value(Duration::from_nanos(1800)),
+            "receive;dur=0.001, lookup;dur=0.001, encode;dur=0.001, other;dur=0.000, total;dur=0.003"
+        );
+        // More than rounding is no reason to say that it took longer.
+        timing.add("mesh", 1.0);
+        assert!(timing.value(Duration::from_nanos(1800)).ends_with("other;dur=0.000, total;dur=0.002"));
     }
 
     #[test]
