@@ -156,12 +156,19 @@ pub(crate) struct JobArgs {
     pub(crate) limits: LimitArgs,
 }
 
+/// Builds without the service have no `doctor`.
+fn devices_help() -> String {
+    let doctor = if cfg!(feature = "server") { "; `molmesh doctor` numbers them" } else { "" };
+    format!(
+        "Which devices may be used: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software{doctor}"
+    )
+}
+
 // Which devices.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct DeviceArgs {
-    /// Which devices may be used: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software; `molmesh
-    /// doctor` numbers them
-    #[arg(long, value_name = "WHICH", default_value = "auto", env = "MOLMESH__DEVICES__USE", hide_env_values = true)]
+    /// Which devices may be used
+    #[arg(long, help = devices_help(), value_name = "WHICH", default_value = "auto", env = "MOLMESH__DEVICES__USE", hide_env_values = true)]
     pub(crate) devices: DeviceChoice,
 }
 
