@@ -98,9 +98,9 @@ fn proof(report: &Report, style: Style) -> String {
 fn parts(report: &Report) -> String {
     let of = |n: u64, one: &str, more: &str| format!("{} {}", grouped(n), if n == 1 { one } else { more });
     let components = of(report.components, "component", "components");
-    match report.cavities {
-        0 => format!("{components}, no cavities"),
-        n => format!("{components}, of which {}", of(n, "cavity", "cavities")),
+    match report.voids {
+        0 => format!("{components}, no voids"),
+        n => format!("{components}, of which {}", of(n, "void", "voids")),
     }
 }
 
@@ -215,7 +215,8 @@ mod tests {
             proof: "checksum",
             euler: 2,
             components: 2,
-            cavities: 1,
+            voids: 1,
+            void_list: Vec::new(),
             component_list: Vec::new(),
             area: 3200.04,
             volume: 7100.0,
@@ -259,7 +260,7 @@ mod tests {
             "steps of 0.0009765625 Å",
             "39,996 triangles",
             "closed, oriented, NOT manifold, Euler number 2",
-            "2 components, of which 1 cavity",
+            "2 components, of which 1 void",
             "3,200.0 Å²",
             "7,100.0 Å³",
             "cpu: 2 threads (asked for)",

@@ -20,7 +20,7 @@ pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;
 pub use progress::Tracker;
-pub use report::{PictureReport, Quantization, Report, maker};
+pub use report::{ComponentReport, PictureReport, Quantization, Report, VoidReport, maker};
 pub use spacing::Spacing;
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
@@ -203,7 +203,8 @@ pub fn run(
     };
     let Meshed { mesh, grid, served, .. } = meshed;
     let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
-    let counts = Counts { resolution: params.resolution, tries, grid, n_vertices, n_triangles, served, storage };
+    let (resolution, centre) = (params.resolution, mesh.centre);
+    let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, served, storage };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     Ok(Product { mesh, storage, report, picture: None })
 }
@@ -238,6 +239,7 @@ pub fn pour(
     let poured = clock.pass(|| choice.backend.pour(&spheres, &params, &limits.surface, &control, sink))?;
     let counts = Counts {
         resolution: params.resolution,
+        centre: poured.centre,
         tries: None,
         grid: poured.grid,
         n_vertices: poured.n_vertices,

@@ -7,7 +7,7 @@ use super::{Choice, Job};
 use crate::formats::{Storage, Units};
 use crate::picture::{Drawer, PictureParams, Rendered};
 use crate::structure::{Selected, Structure, radii};
-use crate::surface::{GridStats, Measures, Served};
+use crate::surface::{Component, GridStats, Measures, Served};
 
 /// One connected component.
 #[derive(Debug, Clone, Serialize)]
@@ -19,8 +19,29 @@ pub struct ComponentReport {
     pub vertices: u64,
     /// Å².
     pub area: f64,
-    /// Å³, negative for a cavity.
+    /// Å³, negative for a void.
     pub volume: f64,
+}
+
+/// A void: a closed surface whose inside is outside the molecule. No probe has tested whether a solvent molecule fits: most
+/// are gaps between atoms.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct VoidReport {
+    /// Centroid of its volume in the coordinates of the structure, Å.
+    pub center: [f64; 3],
+    /// Å³.
+    pub volume: f64,
+    /// Å².
+    pub area: f64,
+}
+
+impl VoidReport {
+    /// `centre`: that of the mesh in the coordinates of the structure, Å.
+    fn new(void: &Component, centre: [f64; 3]) -> Self {
+        let centroid = void.centroid();
+        Self { center: std::array::from_fn(|k| centre[k] + centroid[k]), volume: -void.volume, area: void.area }
+    }
 }
 
 /// How coarse the file's vertices are.
@@ -156,9 +177,12 @@ pub struct Report {
     pub euler: i64,
     /// Number of connected components.
     pub components: u64,
-    /// Components with negative volume.
-    pub cavities: u64,
-    /// The largest components, at most 100.
+    /// Number of voids: components with negative volume. No probe has tested them, and most are gaps between atoms, so
+    /// their number changes with the grid spacing.
+    pub voids: u64,
+    /// The voids of largest volume, at most 100.
+    pub void_list: Vec<VoidReport>,
+    /// The components of largest area, at most 100.
     pub component_list: Vec<ComponentReport>,
     /// Å².
     pub area: f64,
@@ -193,6 +217,8 @@ pub struct Report {
 /// What a report counts, and who made it.
 pub(super) struct Counts {
     pub(super) resolution: f64,
+    /// The mesh's centre in the coordinates of the structure, Å.
+    pub(super) centre: [f64; 3],
     pub(super) tries: Option<u32>,
     pub(super) grid: GridStats,
     pub(super) n_vertices: usize,
@@ -219,6 +245,8 @@ impl Report {
             instead: None,
         });
         let list = measures.components.iter().take(100);
+        let mut voids: Vec<&Component> = measures.components.iter().filter(|c| c.volume < 0.0).collect();
+        voids.sort_by(|a, b| a.volume.total_cmp(&b.volume));
         Self {
             id: structure.id.clone(),
             title: structure.title.clone(),
@@ -248,7 +276,8 @@ impl Report {
             proof: measures.proof.name(),
             euler: measures.euler,
             components: measures.components.len() as u64,
-            cavities: measures.components.iter().filter(|c| c.volume < 0.0).count() as u64,
+            voids: voids.len() as u64,
+            void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
             component_list: list
                 .map(|c| ComponentReport {
                     triangles: c.triangles,

@@ -44,8 +44,18 @@ pub struct Component {
     pub vertices: u64,
     /// Area, Å².
     pub area: f64,
-    /// Signed volume, Å³: positive for an outer shell, negative for a cavity.
+    /// Signed volume, Å³: positive for an outer shell, negative for a void.
     pub volume: f64,
+    /// First moment of the enclosed volume about the mesh's centre, Å⁴; signed like the volume.
+    pub moment: [f64; 3],
+}
+
+impl Component {
+    /// Centroid of the enclosed volume, relative to the mesh's centre, Å. Not finite if the volume is 0.
+    #[must_use]
+    pub fn centroid(&self) -> [f64; 3] {
+        self.moment.map(|moment| moment / self.volume)
+    }
 }
 
 /// Measures of a mesh.
@@ -151,6 +161,7 @@ impl Totals {
             component.triangles += part.triangles;
             component.area += part.area;
             component.volume += part.volume;
+            component.moment.iter_mut().zip(part.moment).for_each(|(sum, part)| *sum += part);
         };
         let (mut checksum, mut degenerate) = (0_u64, false);
         for (sums, label) in sums.iter().flat_map(|s| s.by_label.iter()).zip(0..) {
@@ -188,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn a_tetrahedron_and_a_cavity() {
+    fn a_tetrahedron_and_a_void() {
         let mut mesh = Mesh::default();
         tetrahedron(&mut mesh, [10.0, -3.0, 7.0], false);
         tetrahedron(&mut mesh, [0.0; 3], true);
@@ -200,6 +211,12 @@ mod tests {
             let volumes: Vec<f64> = m.components.iter().map(|c| (c.volume * 6.0).round()).collect();
             assert!(volumes.contains(&1.0) && volumes.contains(&-1.0), "{m:?}");
             assert!(m.components.iter().all(|c| c.vertices == 4 && c.triangles == 4));
+            for component in &m.components {
+                // A tetrahedron's centroid is the mean of its corners.
+                let at = if component.volume > 0.0 { [10.25, -2.75, 7.25] } else { [0.25; 3] };
+                let off = (0..3).map(|k| (component.centroid()[k] - at[k]).abs()).fold(0.0, f64::max);
+                assert!(off < 1e-4, "{component:?}");
+            }
         }
     }
 

@@ -23,10 +23,11 @@ pub(super) struct Sums {
 }
 
 impl Component {
-    fn add(&mut self, triangles: u64, area: f64, volume: f64) {
+    fn add(&mut self, triangles: u64, [area, volume, x, y, z]: [f64; 5]) {
         self.triangles += triangles;
         self.area += area;
         self.volume += volume;
+        self.moment.iter_mut().zip([x, y, z]).for_each(|(sum, part)| *sum += part);
     }
 }
 
@@ -64,8 +65,8 @@ impl<'a> From<&'a Mesh> for Positions<'a> {
 /// buffer when it is read back as vectors.
 const LANES: usize = 128;
 
-/// Area and volume of up to [`LANES`] triangles, each. Missing ones are zero.
-type Lanes = [[f32; LANES]; 2];
+/// Area, volume, and first moment of the volume along x, y and z of up to [`LANES`] triangles. Missing ones are zero.
+type Lanes = [[f32; LANES]; 5];
 
 dispatched! {
 /// Sums `triangles` by the label of their vertices. `labels` are those of the vertices from `first` on; the label of a
@@ -76,20 +77,24 @@ pub(super) fn sum(positions: Positions<'_>, triangles: &[[u32; 3]], first: u32, 
         let (shares, degenerate) = edge_shares(batch);
         sums.checksum = sums.checksum.wrapping_add(shares);
         sums.degenerate |= degenerate;
-        let [area, volume] = geometry(positions, batch);
+        let parts = geometry(positions, batch);
         let label = |t: &[u32; 3]| {
             t.iter().find_map(|v| labels.get(v.wrapping_sub(first) as usize)).copied().unwrap_or(NONE)
         };
         let common = label(&batch[0]);
         if common != NONE && batch.iter().all(|t| label(t) == common) {
-            sums.by_label[common as usize].add(batch.len() as u64, sum_lanes(&area), sum_lanes(&volume));
+            sums.by_label[common as usize].add(batch.len() as u64, parts.each_ref().map(sum_lanes));
             continue;
         }
-        for (t, (&area, &volume)) in batch.iter().zip(area.iter().zip(&volume)) {
-            let (area, volume) = (f64::from(area), f64::from(volume));
+        for (lane, t) in batch.iter().enumerate() {
+            let part = parts.each_ref().map(|lanes| f64::from(lanes[lane]));
             match sums.by_label.get_mut(label(t) as usize) {
-                Some(component) => component.add(1, area, volume),
-                None => sums.unlabelled.push((t[0], Component { triangles: 1, vertices: 0, area, volume })),
+                Some(component) => component.add(1, part),
+                None => {
+                    let mut alone = Component::default();
+                    alone.add(1, part);
+                    sums.unlabelled.push((t[0], alone));
+                }
             }
         }
     }
@@ -146,7 +151,8 @@ fn gather(batch: &[[u32; 3]], at: impl Fn(usize) -> [f32; 3]) -> [[f32; LANES]; 
     p
 }
 
-/// Areas and signed volumes against the mesh's centre. Single precision inside a triangle: differences of close
+/// Areas, signed volumes and their moments about the mesh's centre. By the divergence theorem, a triangle's part of the
+/// volume's moment along an axis is the integral of half the squared coordinate times the normal. Single precision inside a triangle: differences of close
 /// positions are nearly exact, and the sums over triangles are double.
 #[inline(always)]
 fn geometry(positions: Positions<'_>, batch: &[[u32; 3]]) -> Lanes {
@@ -159,13 +165,18 @@ fn geometry(positions: Positions<'_>, batch: &[[u32; 3]]) -> Lanes {
         }),
     };
     let [ax, ay, az, bx, by, bz, cx, cy, cz] = corners;
-    let (mut area, mut volume) = ([0.0; LANES], [0.0; LANES]);
+    // Sum over all pairs of corners, each with itself and with the others: 6 times the mean square over a triangle.
+    let squares = |a: f32, b: f32, c: f32| a * (a + b + c) + b * (b + c) + c * c;
+    let [mut area, mut volume, mut mx, mut my, mut mz] = [[0.0; LANES]; 5];
     for i in 0..LANES {
         let (ux, uy, uz) = (bx[i] - ax[i], by[i] - ay[i], bz[i] - az[i]);
         let (vx, vy, vz) = (cx[i] - ax[i], cy[i] - ay[i], cz[i] - az[i]);
         let (nx, ny, nz) = (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx);
         area[i] = 0.5 * (nx * nx + ny * ny + nz * nz).sqrt();
         volume[i] = (ax[i] * nx + ay[i] * ny + az[i] * nz) * (1.0 / 6.0);
+        mx[i] = nx * squares(ax[i], bx[i], cx[i]) * (1.0 / 24.0);
+        my[i] = ny * squares(ay[i], by[i], cy[i]) * (1.0 / 24.0);
+        mz[i] = nz * squares(az[i], bz[i], cz[i]) * (1.0 / 24.0);
     }
-    [area, volume]
+    [area, volume, mx, my, mz]
 }

@@ -58,6 +58,9 @@ pub(super) fn measures(scanned: &Scanned, written: &[Written]) -> Option<Measure
         equal[label] = of;
         sheet.add_to(&mut components[of as usize], sheets[of as usize], lattice.spacing);
     }
+    for (component, sheet) in components.iter_mut().zip(&sheets) {
+        sheet.refer_moment(component, lattice.centre, lattice.spacing);
+    }
     Some(Measures::balanced(components, totals.vertices as u64, totals.triangles as u64))
 }
 

@@ -66,23 +66,46 @@ pub(super) struct Sheet {
     vertices: u64,
     /// Twice the area.
     area: f64,
-    /// Twice the area vectors summed.
+    /// Sum of the normals n, which have the length of twice the area.
     vector: [f64; 3],
-    /// The first corners' products with them: six times the volume, for a closed surface.
-    product: f64,
+    /// Sum of n (a + b + c) over the corners, per axis: six times the volume, for a closed surface.
+    product: [f64; 3],
+    /// Sum of n (a² + b² + c² + ab + bc + ca), per axis: 24 times the volume's first moment, for a closed surface.
+    moment: [f64; 3],
 }
 
 impl Sheet {
+    #[inline(always)]
+    fn add(&mut self, [vector, product, moment]: [Vec3A; 3]) {
+        for k in 0..3 {
+            self.vector[k] += f64::from(vector[k]);
+            self.product[k] += f64::from(product[k]);
+            self.moment[k] += f64::from(moment[k]);
+        }
+    }
+
     /// Adds the sheet to its component, of which `first` is one too. Volumes are taken against that one's origin: against
     /// one that is far away, small errors of the area vectors would weigh as much as a molecule.
     pub(super) fn add_to(&self, component: &mut Component, first: &Self, spacing: f64) {
         let h2 = spacing * spacing;
-        // Moving the origin adds the offset's product with the area vector.
-        let moved: f64 = (0..3).map(|k| f64::from(self.origin[k] - first.origin[k]) * self.vector[k]).sum();
         component.triangles += self.triangles;
         component.vertices += self.vertices;
         component.area += 0.5 * self.area * h2;
-        component.volume += (self.product + moved) / 6.0 * h2 * spacing;
+        for k in 0..3 {
+            // The sums as they are with the corners moved by the offset.
+            let offset = f64::from(self.origin[k] - first.origin[k]);
+            let product = self.product[k] + 3.0 * offset * self.vector[k];
+            let moment = self.moment[k] + offset * (4.0 * self.product[k] + 6.0 * offset * self.vector[k]);
+            component.volume += product / 18.0 * h2 * spacing;
+            component.moment[k] += moment / 24.0 * h2 * h2;
+        }
+    }
+
+    /// Refers a finished component's moment, which is about the sheet's origin, to the sample `centre`.
+    pub(super) fn refer_moment(&self, component: &mut Component, centre: [i32; 3], spacing: f64) {
+        for k in 0..3 {
+            component.moment[k] += component.volume * f64::from(self.origin[k] - centre[k]) * spacing;
+        }
     }
 }
 
@@ -235,12 +258,13 @@ fn has_one_sheet(of: &Numbered<'_>) -> bool {
     of.brick.n_sheets == Some(NonZeroU16::MIN)
 }
 
-/// A triangle's normal, of twice its area, and its product with the first corner, component by component.
+/// A triangle's terms of the sums of a [`Sheet`]: normal, product and moment.
 #[inline(always)]
-fn normal_and_product(table: &BrickTable, edges: [u16; 3]) -> (Vec3A, Vec3A) {
+fn terms(table: &BrickTable, edges: [u16; 3]) -> [Vec3A; 3] {
     let [a, b, c] = edges.map(|edge| table.position(edge));
     let n = (b - a).cross(c - a);
-    (n, a * n)
+    let sum = a + b + c;
+    [n, n * sum, n * (a * sum + b * (b + c) + c * c)]
 }
 
 /// Lengths of normals, zeros behind them: together, as a root alone takes as long as a vector of them.
@@ -254,18 +278,18 @@ fn lengths(normals: &[Vec3A]) -> [f32; LANES] {
 dispatched! {
 /// As [`sum`], for a brick of several sheets, whose triangles come in no order of sheets: adds each to its own.
 fn sum_by_sheet(table: &BrickTable, sheets: &Sheets, sums: &mut [Sheet]) {
-    let (mut normals, mut products) = ([Vec3A::ZERO; LANES], [Vec3A::ZERO; LANES]);
+    let (mut normals, mut others) = ([Vec3A::ZERO; LANES], [[Vec3A::ZERO; 2]; LANES]);
     for batch in table.corners().chunks(LANES) {
-        for ((normal, product), edges) in normals.iter_mut().zip(&mut products).zip(batch) {
-            (*normal, *product) = normal_and_product(table, *edges);
+        for ((normal, others), edges) in normals.iter_mut().zip(&mut others).zip(batch) {
+            let [n, product, moment] = terms(table, *edges);
+            (*normal, *others) = (n, [product, moment]);
         }
         let area = lengths(&normals[..batch.len()]);
-        for (((edges, normal), product), area) in batch.iter().zip(&normals).zip(&products).zip(area) {
+        for (((edges, normal), [product, moment]), area) in batch.iter().zip(&normals).zip(&others).zip(area) {
             let sum = &mut sums[usize::from(sheets.of(table.sheet(edges[0])))];
             sum.triangles += 1;
             sum.area += f64::from(area);
-            (0..3).for_each(|k| sum.vector[k] += f64::from(normal[k]));
-            sum.product += f64::from(product.element_sum());
+            sum.add([*normal, *product, *moment]);
         }
     }
 }
@@ -278,16 +302,14 @@ fn sum(table: &BrickTable, corners: &[[u16; 3]]) -> Sheet {
     let mut all = Sheet { triangles: corners.len() as u64, ..Sheet::default() };
     let mut normals = [Vec3A::ZERO; LANES];
     for batch in corners.chunks(LANES) {
-        let (mut vector, mut product) = (Vec3A::ZERO, Vec3A::ZERO);
+        let mut sums = [Vec3A::ZERO; 3];
         for (normal, edges) in normals.iter_mut().zip(batch) {
-            let (n, p) = normal_and_product(table, *edges);
-            *normal = n;
-            vector += n;
-            product += p;
+            let terms = terms(table, *edges);
+            *normal = terms[0];
+            sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
         }
         all.area += sum_lanes(&lengths(&normals[..batch.len()]));
-        (0..3).for_each(|k| all.vector[k] += f64::from(vector[k]));
-        all.product += f64::from(product.element_sum());
+        all.add(sums);
     }
     all
 }
