@@ -1,5 +1,6 @@
 //! The only place that picks a backend, and gives the reason in words.
 
+use std::num::NonZero;
 #[cfg(feature = "gpu")]
 use std::sync::Arc;
 
@@ -14,6 +15,7 @@ use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
 
 use super::args::{BackendName, JobArgs};
 use super::error::CliError;
+use super::estimate::Estimate;
 
 /// What was asked for.
 #[derive(Debug)]
@@ -26,12 +28,21 @@ pub(crate) struct Asked<'a> {
     pub(crate) threads: Option<usize>,
     /// Threads that are enough where no number is asked for.
     pub(crate) enough: usize,
+    /// Estimated work of a command's only job; `None` for a service.
+    pub(crate) work: Option<f64>,
 }
 
 impl<'a> Asked<'a> {
-    /// What the flags of a single job ask for.
-    pub(crate) fn once(args: &'a JobArgs) -> Self {
-        Self { backend: args.backend, devices: &args.devices.devices, threads: args.threads, enough: usize::MAX }
+    /// What the flags of a single job of `work` units ask for.
+    pub(crate) fn once(args: &'a JobArgs, work: f64) -> Self {
+        let (backend, devices, threads) = (args.backend, &args.devices.devices, args.threads);
+        Self { backend, devices, threads, enough: usize::MAX, work: Some(work) }
+    }
+
+    /// Threads that the CPU backend gets.
+    fn n_threads(&self) -> usize {
+        let processors = || std::thread::available_parallelism().map_or(1, NonZero::get);
+        self.threads.unwrap_or_else(|| processors().min(self.enough))
     }
 }
 
@@ -91,13 +102,29 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     }
 }
 
+/// The estimate of a command whose backend and devices are left to this program.
+fn estimate(asked: &Asked<'_>) -> Option<Estimate> {
+    let free = asked.backend == BackendName::Auto && *asked.devices == DeviceChoice::Auto;
+    asked.work.filter(|_| free).map(|work| Estimate::new(work, asked.n_threads()))
+}
+
 /// A GPU, or the CPU where any backend will do.
 fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
+    let estimate = estimate(asked);
+    if let Some(estimate) = estimate.filter(|estimate| !estimate.favours_gpu()) {
+        let why = format!("no GPU was looked for ({estimate})");
+        let reason = format!("auto: {why}");
+        let drawer = Drawer::cpu(&reason);
+        return Ok(Picked { backend: cpu(asked, use_)?, reason, drawer, devices: Vec::new(), no_gpu: Some(why) });
+    }
     let Gpu { backend, drawer, devices, mut state } = gpu(asked, use_);
     if let (Some(backend), Some(drawer), Ok(reason)) = (backend, drawer, &state) {
         let reason = match (asked.backend, asked.devices) {
             (_, DeviceChoice::These(_)) => format!("--devices {}", asked.devices),
-            (BackendName::Auto, _) => format!("auto: {reason}"),
+            (BackendName::Auto, _) => match estimate {
+                Some(estimate) => format!("auto: {reason}, {estimate}"),
+                None => format!("auto: {reason}"),
+            },
             _ => "asked for".to_owned(),
         };
         return Ok(Picked { backend, reason, drawer, devices, no_gpu: None });

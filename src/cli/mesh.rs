@@ -1,6 +1,6 @@
 //! `molmesh mesh`: one structure to one mesh file.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::Path;
 use std::str::FromStr;
@@ -25,7 +25,7 @@ use super::style::Style;
 use super::summary::{self, Written};
 use super::{interrupt, request};
 
-/// Runs the command. The order is that of cost: flags, backend, output, input, mesh.
+/// Runs the command. The order is that of cost: flags, output, input, backend, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let Request { mut job, format: asked, strict, .. } = request::of_mesh(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
@@ -38,12 +38,13 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     request::settle(&mut job, format)?;
     let (output_path, input_path, args) = (&args.output, &args.input, &args.job);
     let limits = request::limits(&args.limits);
-    let asked = Asked { enough: enough(input_path, job.params.resolution), ..Asked::once(args) };
-    let picked = backend::pick(&asked, &backend::Use::Once)?;
     let cancel = CancelToken::default();
     interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = read(input_path, limits.read.max_inflated_bytes)?;
+    let asked =
+        Asked { enough: enough(&input, job.params.resolution), ..Asked::once(args, pipeline::work(&input, &job)) };
+    let picked = backend::pick(&asked, &backend::Use::Once)?;
 
     let progress = Progress::new(!args.quiet);
     let findings = if strict { Some(check(input_path, &input, &limits)?) } else { None };
@@ -78,9 +79,8 @@ const SMALL: f64 = (1 << 20) as f64;
 const FEW_THREADS: usize = 8;
 
 /// Threads that are enough for a file. What there is to do grows with its bytes and the inverse square of the spacing.
-fn enough(input: &Path, resolution: f64) -> usize {
-    let bytes = fs::metadata(input).ok().filter(fs::Metadata::is_file).map(|meta| meta.len());
-    let small = bytes.is_some_and(|bytes| bytes as f64 * (0.5 / resolution).powi(2) < SMALL);
+fn enough(input: &[u8], resolution: f64) -> usize {
+    let small = input.len() as f64 * (0.5 / resolution).powi(2) < SMALL;
     if small { FEW_THREADS } else { usize::MAX }
 }
 
@@ -298,19 +298,10 @@ mod tests {
 
     #[test]
     fn small_files_get_few_threads_and_all_others_every_processor() {
-        let dir = tempfile::tempdir().unwrap();
-        let file = |bytes: u64| {
-            let path = dir.path().join(format!("{bytes}.pdb"));
-            File::create(&path).unwrap().set_len(bytes).unwrap();
-            path
-        };
-        let (small, large) = (file((1 << 20) - 1), file(1 << 20));
+        let (small, large) = (vec![b' '; (1 << 20) - 1], vec![b' '; 1 << 20]);
         assert_eq!(enough(&small, 0.5), FEW_THREADS);
         assert_eq!(enough(&large, 0.5), usize::MAX);
         assert_eq!(enough(&large, 1.0), FEW_THREADS, "a quarter of the work");
         assert_eq!(enough(&small, 0.25), usize::MAX, "four times the work");
-        // What cannot be known is not guessed.
-        assert_eq!(enough(Path::new("-"), 0.5), usize::MAX);
-        assert_eq!(enough(dir.path(), 0.5), usize::MAX);
     }
 }

@@ -13,6 +13,7 @@ mod config;
 #[cfg(feature = "server")]
 mod doctor;
 mod error;
+mod estimate;
 #[cfg(feature = "server")]
 mod healthcheck;
 mod heap;

@@ -8,9 +8,9 @@ use metrics::counter;
 
 use super::devices::Watch;
 use super::queue::Queue;
-use super::{Budget, Claim, Client, Refusal, Task, Ticket, cost, worker};
+use super::{Budget, Claim, Client, Refusal, Task, Ticket, worker};
 use crate::picture::Drawer;
-use crate::pipeline::{Job, JobLimits, maker};
+use crate::pipeline::{self, Job, JobLimits, maker};
 use crate::surface::Backend;
 use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 
@@ -104,7 +104,7 @@ impl Pool {
     /// Expected time of a job on this machine, s, once it runs.
     #[must_use]
     pub fn expected(&self, input: &[u8], job: &Job) -> f64 {
-        self.shared.queue.expected(cost::units(input, job))
+        self.shared.queue.expected(pipeline::work(input, job))
     }
 
     /// How long a job that is accepted now would wait.

@@ -6,11 +6,12 @@ use std::time::{Duration, Instant};
 use metrics::gauge;
 use tokio::sync::{Notify, oneshot};
 
-use super::cost::{self, Rate};
+use super::cost::Rate;
 use super::flight::{Claim, Entry, Flight, Progress, Waiter, WorkKey};
 use super::rank::{self, Shares};
 use super::returns::Returns;
 use super::{Outcome, Refusal, Task};
+use crate::pipeline;
 use crate::surface::CancelToken;
 use crate::telemetry::{Closing, QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, Scope};
 
@@ -111,7 +112,7 @@ impl Queue {
             return Ok(Place { flight: waiter, waiter, outcome, progress, scope, shared: false, begun: false });
         }
         let now = Instant::now();
-        let units = cost::units(&task.input, &task.job);
+        let units = pipeline::work(&task.input, &task.job);
         // A free worker's job counts as running, not as waiting, even before the worker has woken up. Places are held for those
         // who were told to come back, but not so many that workers could run out of work if they do not. Whoever comes back
         // on time finds as many places again: times are told in whole seconds, so they come in bursts.

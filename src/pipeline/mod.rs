@@ -10,6 +10,7 @@ pub mod params;
 mod progress;
 mod report;
 pub mod spacing;
+mod work;
 
 use std::time::Instant;
 
@@ -22,6 +23,7 @@ pub use file::File;
 pub use progress::Tracker;
 pub use report::{ComponentReport, PictureReport, Quantization, Report, VoidReport, maker};
 pub use spacing::Spacing;
+pub use work::work;
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureLimits, PictureParams};
