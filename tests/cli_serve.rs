@@ -4,6 +4,8 @@
 mod cli_support;
 
 use std::process::Command;
+#[cfg(target_os = "linux")]
+use std::time::{Duration, Instant};
 
 use cli_support::{Folder, Service, assert_code, run, stderr};
 
@@ -108,4 +110,50 @@ fn what_cannot_start_says_why() {
     }
     assert_code(&run(["serve", "--listen", "127.0.0.1:0", "--backend", "gpu", "--devices", "77"]), 6);
     assert_code(&run(["serve", "--config", "/no/such/file.toml"]), 2);
+}
+
+/// The document that `curl` gets for these arguments.
+#[cfg(target_os = "linux")]
+fn curl(args: &[&str]) -> serde_json::Value {
+    let answer = Command::new("curl").arg("-sS").args(args).output().unwrap();
+    serde_json::from_slice(&answer.stdout).unwrap_or_else(|e| panic!("{e}: {}", stderr(&answer)))
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn identical_atoms_are_refused_before_they_take_memory() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 300_000]));
+    let body = format!("@{}", input.display());
+    let url = format!("http://{}/v1/meshes?radius_scale=10", service.addr);
+    let problem = curl(&["--data-binary", &body, &url]);
+    assert_eq!(problem["type"], "/problems/too-many-candidates", "{problem}");
+    assert!(problem["actual"].as_u64() > problem["limit"].as_u64(), "{problem}");
+    assert!(service.memory("VmHWM") < 300, "{} MiB", service.memory("VmHWM"));
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn memory_of_a_cancelled_job_goes_back_to_the_system() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let before = service.memory("VmRSS");
+    // Most of their candidate lists are long enough to be freed when their tile is finished.
+    let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 80_000]));
+    let body = format!("@{}", input.display());
+    let url = format!("http://{}/v1/meshes?radius_scale=10", service.addr);
+    let job = curl(&["-H", "Prefer: respond-async", "--data-binary", &body, &url]);
+    let job = format!("http://{}/v1/jobs/{}", service.addr, job["jobID"].as_str().unwrap());
+    let wait = |what: &str, limit: Duration, done: &dyn Fn() -> bool| {
+        let end = Instant::now() + limit;
+        while !done() {
+            assert!(Instant::now() < end, "{what}: {} MiB, {before} before", service.memory("VmRSS"));
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    };
+    wait("it takes memory", Duration::from_mins(1), &|| service.memory("VmRSS") > before + 60);
+    assert_eq!(curl(&["-X", "DELETE", &job])["status"], "dismissed");
+    // 10 s on an idle machine.
+    wait("its memory goes back", Duration::from_secs(20), &|| service.memory("VmRSS") < before + 35);
 }

@@ -32,6 +32,11 @@ const ROWS: &[Row] = &[
     ("limits.atoms", "too-many-atoms", "http_limits::atoms_are_limited"),
     ("limits.labels", "too-many-atoms", "http_limits::atoms_that_are_listed_are_limited"),
     ("limits.grid_samples", "grid-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
+    (
+        "limits.candidate_pairs",
+        "too-many-candidates",
+        "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits",
+    ),
     ("limits.mesh_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
     ("limits.output_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
     ("limits.memory_bytes", "memory-full", "http_limits::memory_is_shared_and_limited"),

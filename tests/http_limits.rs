@@ -112,6 +112,7 @@ fn atoms_that_are_listed_are_limited() {
 fn grids_and_meshes_are_limited_and_what_would_fit_fits() {
     for (slug, change) in [
         ("grid-too-large", Box::new(|c: &mut Config| c.limits.grid_samples = 60_000) as Box<dyn FnOnce(&mut Config)>),
+        ("too-many-candidates", Box::new(|c: &mut Config| c.limits.candidate_pairs = 10_000)),
         ("mesh-too-large", Box::new(|c: &mut Config| c.limits.mesh_bytes = 300_000)),
         ("mesh-too-large", Box::new(|c: &mut Config| c.limits.output_bytes = 300_000)),
     ] {

@@ -78,7 +78,7 @@ pub(crate) enum Command {
 /// Which backend runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum BackendName {
-    /// The GPU if there is one that we can use, else the CPU
+    /// A service takes the GPU if one can be used, else the CPU; a single command takes whichever is estimated to finish first
     Auto,
     /// Every core, with the widest vectors that the processor has
     Cpu,
@@ -261,6 +261,9 @@ pub(crate) struct LimitArgs {
     /// Grid samples in occupied bricks [default: 4294967296]
     #[arg(long, value_name = "N")]
     pub(crate) max_samples: Option<u64>,
+    /// Pairs of an atom and a grid brick within its reach [default: 1073741824]
+    #[arg(long, value_name = "N")]
+    pub(crate) max_candidates: Option<u64>,
     /// Bytes of vertices and triangles [default: 8 GiB]
     #[arg(long, value_name = "BYTES")]
     pub(crate) max_mesh_bytes: Option<u64>,

@@ -219,6 +219,7 @@ fn surface_code(error: &SurfaceError) -> i32 {
         // An isovalue that the density never reaches is the caller's parameter.
         SurfaceError::BadParameter { .. } | SurfaceError::NoSurface { .. } => code::USAGE,
         SurfaceError::GridTooLarge { .. }
+        | SurfaceError::TooManyCandidates { .. }
         | SurfaceError::MeshTooLarge { .. }
         | SurfaceError::TooManyTriangles { .. }
         | SurfaceError::DeviceMemory { .. }
@@ -266,6 +267,10 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::MeshTooLarge { suggested_resolution, .. } => {
             Some(format!("try --resolution {suggested_resolution}, or raise --max-mesh-bytes"))
         }
+        SurfaceError::TooManyCandidates { suggested_resolution: Some(resolution), .. } => {
+            Some(format!("try --resolution {resolution}, or raise --max-candidates"))
+        }
+        SurfaceError::TooManyCandidates { .. } => Some("try smaller radii, or raise --max-candidates".to_owned()),
         SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
         SurfaceError::DeviceMemory { suggested_resolution, .. } => {
             Some(format!("try --resolution {suggested_resolution}, or --backend cpu"))

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 /// How often a service gives back what is free.
 #[cfg(feature = "server")]
-const PAUSE: Duration = Duration::from_secs(30);
+const PAUSE: Duration = Duration::from_secs(5);
 
 /// For a process that meshes once and ends: memory is got in large steps and never given back. Each step is a system call
 /// that the other threads' memory waits for, and what is given back is got again, page by page.

@@ -27,13 +27,18 @@ pub struct LimitsConfig {
     /// Grid samples in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; as 32-bit numbers
     /// they take 4 GiB.
     pub grid_samples: u64,
+    /// Pairs of an atom and a grid brick (8³ samples) within its reach. Default 268,435,456: 128 atoms for each brick of
+    /// `grid_samples`, several times as many as ordinary structures have. Bounds time, some 16 s of one core, and the
+    /// memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
+    pub candidate_pairs: u64,
     /// Bytes of a mesh in memory (24 a vertex, 12 a triangle). Default 2 GiB: 85 million triangles.
     pub mesh_bytes: u64,
     /// Bytes of a mesh file. Default 3 GiB: below the 4 GiB that a GLB can say, and text formats take more than
     /// the mesh in memory.
     pub output_bytes: u64,
     /// Bytes of uploads and finished meshes that all requests together hold in memory. Default 8 GiB. A new
-    /// upload or job is refused while it is used up; running jobs may overshoot it by `mesh_bytes` each.
+    /// upload or job is refused while it is used up; running jobs may overshoot it by
+    /// `mesh_bytes` and the candidate lists of `candidate_pairs` each.
     pub memory_bytes: u64,
     /// Pixels of a picture's width and of its height. Default 4,096: at 40 bytes a pixel the working memory of the largest is
     /// 640 MiB, and drawing it takes seconds.
@@ -48,6 +53,7 @@ impl Default for LimitsConfig {
             atoms: 10_000_000,
             labels: 1_000_000,
             grid_samples: 1 << 30,
+            candidate_pairs: 1 << 28,
             mesh_bytes: 2 << 30,
             output_bytes: 3 << 30,
             memory_bytes: 8 << 30,
@@ -62,7 +68,11 @@ impl LimitsConfig {
     pub fn job(&self) -> JobLimits {
         JobLimits {
             read: ReadLimits { max_inflated_bytes: self.inflated_bytes, max_atoms: self.atoms },
-            surface: SurfaceLimits { max_samples: self.grid_samples, max_mesh_bytes: self.mesh_bytes },
+            surface: SurfaceLimits {
+                max_samples: self.grid_samples,
+                max_mesh_bytes: self.mesh_bytes,
+                max_candidates: self.candidate_pairs,
+            },
             picture: PictureLimits { max_side: self.picture_side },
             deadline: None,
         }

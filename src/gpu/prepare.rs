@@ -1,5 +1,6 @@
 //! A job before it meets a device: the lattice and everything that follows from it without a device.
 
+use crate::surface::candidates;
 use crate::surface::lattice::Lattice;
 use crate::surface::plan::Plan;
 use crate::surface::{Control, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
@@ -29,6 +30,7 @@ impl Prepared {
         control: &Control<'_>,
     ) -> Result<Self, SurfaceError> {
         control.check()?;
+        candidates::check(spheres, params, limits)?;
         let lattice = Lattice::new(spheres, params)?;
         control.check()?;
         let plan = Plan::new(&lattice, limits, control)?;

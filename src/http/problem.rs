@@ -363,6 +363,16 @@ impl From<SurfaceError> for Problem {
                     .with("resolution", resolution)
                     .with("suggested_resolution", suggested_resolution)
             }
+            E::TooManyCandidates { candidates, limit, resolution, suggested_resolution } => {
+                let problem = Self::new(Kind::TooManyCandidates, detail)
+                    .with("limit", limit)
+                    .with("actual", candidates)
+                    .with("resolution", resolution);
+                match suggested_resolution {
+                    Some(suggested) => problem.with("suggested_resolution", suggested),
+                    None => problem,
+                }
+            }
             E::MeshTooLarge { bytes, limit, suggested_resolution } => Self::new(Kind::MeshTooLarge, detail)
                 .with("limit", limit)
                 .with("actual", bytes)

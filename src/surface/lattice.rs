@@ -77,7 +77,7 @@ impl Lattice {
         let profile = Profile::new(params);
         let (smallest, largest) = spheres.radius_range();
         params.check_radius(smallest)?;
-        let largest = effective(largest, params);
+        let largest = effective_radius(largest, params);
         let caller = Caller::new();
         let few = caller.few(spheres.len());
         let atoms = Placing { spheres, params, profile: &profile }.in_canonical_order([lo, hi], few);
@@ -114,15 +114,15 @@ pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
     let profile = Profile::new(params);
     let largest = spheres.radii().iter().copied().fold(0.0, f32::max);
-    let reach = profile.reach(profile.length(effective(largest, params)));
+    let reach = profile.reach(profile.length(effective_radius(largest, params)));
     let half = (0..3).map(|k| 0.5 * (hi[k] - lo[k])).fold(0.0, f64::max);
     // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within reach.
     // Half a spacing more is far above every rounding.
     half + reach + 2.0 * params.resolution
 }
 
-/// The radius that counts of a sphere of radius `r`, Å.
-fn effective(r: f32, params: &SurfaceParams) -> f64 {
+/// Radius of a sphere after scale and offset, Å.
+pub(super) fn effective_radius(r: f32, params: &SurfaceParams) -> f64 {
     f64::from(r) * params.radius_scale + params.radius_offset
 }
 
@@ -137,7 +137,7 @@ impl Placing<'_> {
     #[inline(always)]
     fn atom(&self, i: usize) -> LatticeAtom {
         let spacing = self.params.resolution;
-        let length = self.profile.length(effective(self.spheres.radius(i), self.params)) / spacing;
+        let length = self.profile.length(effective_radius(self.spheres.radius(i), self.params)) / spacing;
         let scaled = self.spheres.centre(i).map(|c| c / spacing);
         let cell = scaled.map(f64::round);
         LatticeAtom {

@@ -5,6 +5,7 @@
 //! triangles wind counter-clockwise seen from outside and normals point outwards.
 
 pub mod backend;
+pub(crate) mod candidates;
 pub mod cases;
 pub mod chunks;
 pub mod column;

@@ -174,11 +174,14 @@ pub struct SurfaceLimits {
     pub max_samples: u64,
     /// Bytes of vertices and triangles.
     pub max_mesh_bytes: u64,
+    /// Candidate pairs: pairs of a sphere and a brick of the grid that its density can reach. Values above 2³¹ count as
+    /// 2³¹.
+    pub max_candidates: u64,
 }
 
 impl Default for SurfaceLimits {
     fn default() -> Self {
-        Self { max_samples: 4 << 30, max_mesh_bytes: 8 << 30 }
+        Self { max_samples: 4 << 30, max_mesh_bytes: 8 << 30, max_candidates: 1 << 30 }
     }
 }
 

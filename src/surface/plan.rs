@@ -5,6 +5,7 @@
 //! of a run of bricks are one range. A brick exists where an atom reaches one of its samples, or the gap up to its
 //! neighbours' first samples: cells live there too.
 
+use super::candidates;
 use super::column::Column;
 use super::control::Control;
 use super::cpu::{self, Constants, SlopeConstants};
@@ -50,8 +51,8 @@ impl Plan {
     /// Finds the bricks of `lattice`.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`] before memory is allocated beyond what the limit allows,
-    /// [`SurfaceError::BadParameter`] for more atoms than 31 bits number, and [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond what the
+    /// limits allow, [`SurfaceError::BadParameter`] for more atoms than 31 bits number, and [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let atoms = &lattice.atoms;
         if atoms.len() > cpu::MAX_ATOMS {
@@ -80,6 +81,10 @@ impl Plan {
         let occupied = marked.iter().map(|m| ones(&m.reached)).sum::<u64>();
         if occupied.saturating_mul(512) > limits.max_samples {
             return Err(cpu::grid_too_large(lattice, occupied * 512, limits));
+        }
+        let candidates = marked.iter().map(|m| m.candidates).sum();
+        if candidates > candidates::limit(limits) {
+            return Err(candidates::exceeded(lattice, candidates, limits));
         }
         let mut plan = Self {
             reach: longest,

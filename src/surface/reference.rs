@@ -121,7 +121,7 @@ impl Grid {
 /// # Errors
 /// [`SurfaceError::NoSpheres`].
 pub fn cells(spheres: &Spheres, params: &SurfaceParams) -> Result<[u64; 3], SurfaceError> {
-    let unlimited = SurfaceLimits { max_samples: u64::MAX, max_mesh_bytes: u64::MAX };
+    let unlimited = SurfaceLimits { max_samples: u64::MAX, max_mesh_bytes: u64::MAX, max_candidates: u64::MAX };
     let grid = Grid::new(spheres, &Density::new(spheres, params), params.resolution, &unlimited)?;
     Ok(grid.n.map(|n| n as u64 - 1))
 }

@@ -170,6 +170,14 @@ impl Service {
         run(["healthcheck", "--url", &format!("http://{}/readyz", self.addr)]).status.success()
     }
 
+    /// A field of its `/proc/<pid>/status`, such as `VmRSS` or `VmHWM`, MiB.
+    #[cfg(target_os = "linux")]
+    pub fn memory(&self, field: &str) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix(field)?.strip_prefix(':')).unwrap();
+        line.split_whitespace().next().unwrap().parse::<u64>().unwrap() >> 10
+    }
+
     /// Sends it a signal; returns its exit code and its log.
     pub fn stop(self, signal: &str) -> (Option<i32>, String) {
         self.signal(signal);

@@ -15,7 +15,8 @@ use serde::{Deserialize, Serialize};
 use super::floor::Work;
 
 /// A benchmark's machine is its own.
-pub(super) const LIMITS: SurfaceLimits = SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30 };
+pub(super) const LIMITS: SurfaceLimits =
+    SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30, max_candidates: 1 << 31 };
 /// Runs before the measured ones.
 pub(super) const WARM_UP: usize = 3;
 

@@ -8,6 +8,7 @@ use std::ops::Range;
 
 use rustc_hash::{FxHashMap, FxHashSet};
 
+use crate::surface::candidates;
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_order, to_f32, to_i32, to_u32, to_u64};
@@ -21,6 +22,12 @@ pub(super) const SLOTS: usize = SIDE * SIDE * SIDE;
 /// Marks a candidate that reaches no sample of the brick, only the space up to its neighbours' first samples: it
 /// matters to normals, not to the field.
 pub(super) const NORMAL_ONLY: u32 = 1 << 31;
+/// Pairs of an atom and a tile between two looks at the cancellation flag.
+const PAIRS_PER_CHECK: u64 = 1 << 16;
+/// Atoms whose candidate pairs are counted and checked against the limit together: 190,000 pairs at most.
+const ATOMS_PER_CHECK: usize = 256;
+/// Candidates that a list keeps memory for between tiles; longer lists are freed.
+const KEPT_CAPACITY: usize = 4096;
 /// Atoms are indexed with 31 bits.
 pub(in crate::surface) const MAX_ATOMS: usize = (1 << 31) - 1;
 
@@ -55,15 +62,15 @@ impl Tiles {
     /// Assigns atoms to tiles.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`] before memory is allocated beyond what the limit allows, and
-    /// [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond what the
+    /// limits allow, and [`SurfaceError::Cancelled`].
     pub(super) fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let mut index: FxHashMap<[i32; 3], u32> = FxHashMap::default();
-        let mut pairs = 0_u64;
-        // Every tile in reach holds at least one occupied brick, and no grid within the limit has more pairs of
-        // atoms and tiles than this: both bound what is allocated below.
+        let (mut pairs, mut unchecked) = (0_u64, 0_u64);
+        // Every tile in reach holds at least one occupied brick. A tile in reach of an atom holds at least one of its
+        // candidate pairs, except where the atom reaches a corner alone. Both bound what is allocated below.
         let max_tiles = limits.max_samples / 512 + 1;
-        let max_pairs = limits.max_samples.saturating_mul(4).max(1 << 16);
+        let max_pairs = candidates::limit(limits).max(8 * lattice.atoms.len() as u64);
         // Tiles in the order in which they were first met, and every pair of an atom and such a tile.
         let mut hits: Vec<(u32, u32)> = Vec::with_capacity(2 * lattice.atoms.len());
         // The last tile of each parity: a run of neighbouring atoms asks for the same eight again and again.
@@ -72,9 +79,16 @@ impl Tiles {
             let range = tile_range(atom, lattice.reach(atom));
             let n: u64 = range.iter().map(|[lo, hi]| u64::from(lo.abs_diff(*hi)) + 1).product();
             pairs += n;
-            if n > max_tiles || pairs > max_pairs || index.len() as u64 > max_tiles {
-                let samples = n.max(index.len() as u64).saturating_mul(512).max(pairs / 4);
-                return Err(too_large(lattice, samples, limits));
+            unchecked += n;
+            if unchecked > PAIRS_PER_CHECK {
+                control.check()?;
+                unchecked = 0;
+            }
+            if n > max_tiles || index.len() as u64 > max_tiles {
+                return Err(too_large(lattice, n.max(index.len() as u64).saturating_mul(512), limits));
+            }
+            if pairs > max_pairs {
+                return Err(candidates::exceeded(lattice, pairs, limits));
             }
             for tile in boxed(range) {
                 let parity = tile.iter().fold(0, |p, c| p << 1 | usize::from(c & 1 == 1));
@@ -84,9 +98,6 @@ impl Tiles {
                     (*cached, *id) = (tile, *index.entry(tile).or_insert(next));
                 }
                 hits.push((*id, i));
-            }
-            if i % 65_536 == 0 {
-                control.check()?;
             }
         }
         let mut met: Vec<([i32; 3], u32)> = index.iter().map(|(tile, id)| (*tile, *id)).collect();
@@ -195,18 +206,15 @@ fn samples_at_most(lattice: &Lattice, spacing: f64) -> f64 {
 /// A tile's bricks and their candidate atoms. Kept and refilled from tile to tile.
 #[derive(Debug)]
 pub(super) struct Bricks {
-    /// Where each slot's candidates begin in `candidates`; one more entry than slots.
-    pub(super) starts: Vec<u32>,
-    /// Atom indices, ascending within a slot, some marked [`NORMAL_ONLY`].
-    pub(super) candidates: Vec<u32>,
+    /// Per slot its candidates: atom indices, ascending, some marked [`NORMAL_ONLY`].
+    lists: Vec<Vec<u32>>,
     /// Per slot the number of candidates that reach a sample.
     pub(super) reaching: Vec<u32>,
-    hits: Vec<(u32, u32)>,
 }
 
 impl Default for Bricks {
     fn default() -> Self {
-        Self { starts: vec![0; SLOTS + 1], candidates: Vec::new(), reaching: vec![0; SLOTS], hits: Vec::new() }
+        Self { lists: vec![Vec::new(); SLOTS], reaching: vec![0; SLOTS] }
     }
 }
 
@@ -240,17 +248,39 @@ impl AxisReach {
 impl Bricks {
     /// The candidates of a slot.
     pub(super) fn of(&self, slot: usize) -> &[u32] {
-        &self.candidates[self.starts[slot] as usize..self.starts[slot + 1] as usize]
+        &self.lists[slot]
+    }
+
+    /// Finds the candidates of every brick in these layers of a tile, and in the layer beyond. `count` takes the number of
+    /// candidate pairs of the layers' own bricks, some at a time, and ends the search by an error.
+    ///
+    /// # Errors
+    /// Those of `count`.
+    pub(super) fn fill(
+        &mut self,
+        lattice: &Lattice,
+        tile: [i32; 3],
+        layers: &Range<usize>,
+        atoms: &[u32],
+        mut count: impl FnMut(u64) -> Result<(), SurfaceError>,
+    ) -> Result<(), SurfaceError> {
+        self.lists.iter_mut().for_each(Vec::clear);
+        self.reaching.iter_mut().for_each(|n| *n = 0);
+        atoms.chunks(ATOMS_PER_CHECK).try_for_each(|atoms| count(find(self, lattice, tile, layers, atoms)))
+    }
+
+    /// Frees the lists that are much longer than those of an ordinary structure.
+    pub(super) fn free_long_lists(&mut self) {
+        self.lists.iter_mut().filter(|list| list.capacity() > KEPT_CAPACITY).for_each(|list| *list = Vec::new());
     }
 }
 
 dispatched! {
-/// Finds the candidates of every brick in these layers of a tile, and in the layer beyond.
-pub(super) fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], layers: &Range<usize>, atoms: &[u32]) {
-    bricks.starts.iter_mut().for_each(|n| *n = 0);
-    bricks.reaching.iter_mut().for_each(|n| *n = 0);
-    bricks.hits.clear();
+/// Appends the candidates among `atoms`, which follow those that were appended before. Returns the number of candidate
+/// pairs of the layers' own bricks.
+fn find(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], layers: &Range<usize>, atoms: &[u32]) -> u64 {
     let origin = tile.map(|t| t * TILE);
+    let mut own = 0;
     for &ix in atoms {
         let atom = &lattice.atoms[ix as usize];
         // A little more than the support: rounding must not lose a pair, and a pair too many adds zero.
@@ -263,35 +293,25 @@ pub(super) fn fill(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], layer
                 let closed = y.closed[by] + z.closed[bz];
                 let samples = y.samples[by] + z.samples[bz];
                 let row = (bz * SIDE + by) * SIDE;
-                // The layer beyond feeds no vertex of these: only its samples matter.
-                let beyond = bz == layers.end || by == SIDE - 1;
                 for bx in x.first..x.last {
                     if closed + x.closed[bx] > reach2 {
                         continue;
                     }
+                    // A brick in the layer beyond feeds no vertex of these: only its samples matter.
+                    let beyond = bz == layers.end || by == SIDE - 1 || bx == SIDE - 1;
+                    own += u64::from(!beyond);
                     let reaches = samples + x.samples[bx] <= reach2;
-                    if !reaches && (beyond || bx == SIDE - 1) {
+                    if !reaches && beyond {
                         continue;
                     }
                     let slot = row + bx;
-                    bricks.starts[slot + 1] += 1;
                     bricks.reaching[slot] += u32::from(reaches);
-                    bricks.hits.push((to_u32(slot), if reaches { ix } else { ix | NORMAL_ONLY }));
+                    bricks.lists[slot].push(if reaches { ix } else { ix | NORMAL_ONLY });
                 }
             }
         }
     }
-    for slot in 0..SLOTS {
-        bricks.starts[slot + 1] += bricks.starts[slot];
-    }
-    bricks.candidates.clear();
-    bricks.candidates.resize(bricks.hits.len(), 0);
-    let mut cursor: [u32; SLOTS] = std::array::from_fn(|slot| bricks.starts[slot]);
-    for &(slot, candidate) in &bricks.hits {
-        let at = &mut cursor[slot as usize];
-        bricks.candidates[*at as usize] = candidate;
-        *at += 1;
-    }
+    own
 }
 }
 

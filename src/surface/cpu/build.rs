@@ -86,7 +86,7 @@ pub(super) fn build(
         let mut written = Written::default();
         // Nobody else locks it: the lock only hands the slices over.
         let mut part = work[i].lock().unwrap_or_else(PoisonError::into_inner);
-        SHADING.with_borrow_mut(|shading| part.write(scanned, &slope, shading, control, &mut written));
+        SHADING.with_borrow_mut(|shading| part.write(scanned, &slope, shading, control, &mut written))?;
         let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
         control.observer.progress(Stage::Emit, n, pieces.len());
         Ok(written)
@@ -111,6 +111,9 @@ pub(super) struct TilePart<'a> {
 
 impl TilePart<'_> {
     /// Writes the vertices and triangles of the part's bricks, and adds what they add up to.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
     pub(super) fn write(
         &mut self,
         scanned: &Scanned,
@@ -118,15 +121,23 @@ impl TilePart<'_> {
         shading: &mut Shading,
         control: &Control<'_>,
         written: &mut Written,
-    ) {
+    ) -> Result<(), SurfaceError> {
         let Shading { batch, table, sheets } = shading;
         written.tally.make_room(self.bricks.len());
-        written.flat += control.span(Stage::Interpolate, || self.interpolate(&scanned.lattice, slope, batch));
+        written.flat +=
+            control.span(Stage::Interpolate, || self.interpolate(&scanned.lattice, slope, batch, control))?;
         control.span(Stage::Emit, || self.emit(scanned, table, sheets, &mut written.tally));
+        Ok(())
     }
 
     /// Vertices of the bricks. Returns how many have no gradient.
-    fn interpolate(&mut self, lattice: &Lattice, slope: &SlopeConstants, batch: &mut Batch) -> usize {
+    fn interpolate(
+        &mut self,
+        lattice: &Lattice,
+        slope: &SlopeConstants,
+        batch: &mut Batch,
+        control: &Control<'_>,
+    ) -> Result<usize, SurfaceError> {
         let found = &self.tile.found;
         let base = found.before(self.bricks.start).vertices;
         let mut flat = 0;
@@ -143,9 +154,9 @@ impl TilePart<'_> {
             };
             let (t, edges) = (&found.t[all.clone()], &found.edges[all]);
             let source = Source { tile: self.tile.coord, candidates, t, edges };
-            flat += interpolate::interpolate(lattice, slope, brick, &source, batch, target);
+            flat += interpolate::interpolate(lattice, slope, brick, &source, batch, target, control)?;
         }
-        flat
+        Ok(flat)
     }
 
     /// Triangles of the bricks, and what they add up to.

@@ -117,15 +117,15 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
 }
 
 impl Found {
-    /// Nothing yet, and room for what is found in `bricks` bricks with `candidates` candidates, more than there mostly is:
-    /// growing would copy, and what is not touched costs nothing.
-    pub(super) fn begin(&mut self, bricks: usize, candidates: usize) {
+    /// Nothing yet, and room for what is found in `bricks` bricks, more than there mostly is: growing would copy, and what
+    /// is not touched costs nothing.
+    pub(super) fn begin(&mut self, bricks: usize) {
         *self = Self {
             bricks: Vec::with_capacity(bricks),
             t: Vec::with_capacity(USUAL * bricks),
             edges: Vec::with_capacity(USUAL * bricks),
             cases: Vec::with_capacity(USUAL * bricks),
-            candidates: Vec::with_capacity(candidates),
+            candidates: Vec::with_capacity(USUAL * bricks),
             drop: std::mem::take(&mut self.drop),
             ..Self::default()
         };

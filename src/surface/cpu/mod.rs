@@ -44,6 +44,7 @@ use self::near::Numbered;
 use self::sample::Pass;
 use self::scan::Totals;
 use super::backend::{Backend, GridStats, Meshed};
+use super::candidates;
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::lattice::{Lattice, to_f32, to_u32};
@@ -224,6 +225,7 @@ fn pieces(done: &mut [Tile]) -> Vec<Piece> {
 
 fn scan(spheres: &Spheres, means: Means<'_>) -> Result<Scanned, SurfaceError> {
     let lattice = means.control.span(Stage::Bin, || {
+        candidates::check(spheres, means.params, means.limits)?;
         if spheres.len() > bin::MAX_ATOMS {
             return Err(bin::too_many_atoms(spheres.len()));
         }

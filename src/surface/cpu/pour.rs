@@ -103,7 +103,7 @@ impl Scratch {
         let mut written = Written::default();
         let triangles = first(triangles, m);
         let mut part = TilePart { tile, bricks: piece.bricks.clone(), rows, triangles, atom_ids: None };
-        part.write(scanned, slope, shading, control, &mut written);
+        part.write(scanned, slope, shading, control, &mut written)?;
         let TilePart { rows, triangles, .. } = part;
         let vertices = match rows {
             Rows::Single { positions, normals } => Vertices::Single { positions, normals },

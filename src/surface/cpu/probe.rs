@@ -1,7 +1,7 @@
 //! What the stages of this backend hold between each other, brick by brick: what a device's stages are compared with and
 //! fed. For tests; a mesh is made without it.
 
-use super::bin::{self, Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
+use super::bin::{Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
 use super::field::{self, Constants, Need, Samples};
 use super::{Means, Tile, build};
@@ -64,7 +64,7 @@ pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) 
     let mut bricks = Vec::new();
     for t in 0..tiles.len() {
         let mut tile = Bricks::default();
-        bin::fill(&mut tile, lattice, tiles.coords[t], &(0..SIDE - 1), tiles.atoms(t));
+        tile.fill(lattice, tiles.coords[t], &(0..SIDE - 1), tiles.atoms(t), |_| Ok(()))?;
         for slot in (0..SLOTS).filter(|&slot| slot_brick(slot).iter().all(|&b| b < 8) && !tile.of(slot).is_empty()) {
             let origin = slot_origin(tiles.coords[t], slot);
             let mut samples = [0.0; BRICK_SAMPLES];

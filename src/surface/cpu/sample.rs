@@ -10,6 +10,7 @@ use super::classify::{self, Around, Found, Inside};
 use super::field::{self, Constants, Need, Samples};
 use super::slabs::{Slab, Unfinished};
 use super::{NO_BRICK, Tile, scan};
+use crate::surface::candidates;
 use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK_SAMPLES, Lattice};
@@ -52,6 +53,9 @@ impl Default for Scratch {
     }
 }
 
+/// Candidates of a brick between two looks at the cancellation flag: a fraction of a millisecond.
+const CANDIDATES_PER_CHECK: usize = 4096;
+
 thread_local! {
     // Rayon hands out work in pieces and would make a scratch for each; fresh memory costs more than filling it.
     static SCRATCH: RefCell<Scratch> = RefCell::default();
@@ -82,6 +86,7 @@ pub(super) struct Tally {
     pub(super) bricks: AtomicU64,
     pub(super) samples: AtomicU64,
     pub(super) candidates: AtomicU64,
+    candidate_pairs: AtomicU64,
     mesh_bytes: AtomicU64,
     slabs_done: AtomicUsize,
 }
@@ -112,22 +117,36 @@ impl Pass<'_> {
     /// `bin` within the `i`th slab, `field` and `classify`. Returns its tile, if that has no further slabs.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`], [`SurfaceError::MeshTooLarge`] as soon as the slabs so far exceed a limit, and
-    /// [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`], [`SurfaceError::MeshTooLarge`] as soon as the
+    /// slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
     pub(super) fn sample(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
         self.control.check()?;
         let slab = &self.slabs[i];
-        let tile = SCRATCH.with_borrow_mut(|scratch| self.sample_into(slab, scratch))?;
+        let tile = SCRATCH.with_borrow_mut(|scratch| {
+            let tile = self.sample_into(slab, scratch);
+            scratch.bricks.free_long_lists();
+            tile
+        })?;
         let tile = self.control.span(Stage::Classify, || self.unfinished.add(slab, tile));
         let n = self.tally.slabs_done.fetch_add(1, Ordering::Relaxed) + 1;
         self.control.observer.progress(Stage::Field, n, self.slabs.len());
         Ok(tile)
     }
 
+    /// Counts `n` more candidate pairs.
+    fn count(&self, n: u64) -> Result<(), SurfaceError> {
+        self.control.check()?;
+        let all = self.tally.candidate_pairs.fetch_add(n, Ordering::Relaxed) + n;
+        if all > candidates::limit(self.limits) {
+            return Err(candidates::exceeded(self.lattice, all, self.limits));
+        }
+        Ok(())
+    }
+
     fn sample_into(&self, slab: &Slab, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
         let (coord, tally, layers) = (self.tiles.coords[slab.tile], &self.tally, &slab.layers);
         let atoms = self.tiles.atoms(slab.tile);
-        self.control.span(Stage::Bin, || bin::fill(&mut scratch.bricks, self.lattice, coord, layers, atoms));
+        self.control.span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, layers, atoms, |n| self.count(n)))?;
         let reached = count_occupied(&scratch.bricks, layers, tally);
         let occupied = reached as u64 * BRICK_SAMPLES as u64;
         let samples = tally.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
@@ -135,9 +154,9 @@ impl Pass<'_> {
             return Err(bin::too_large(self.lattice, tally.all_slabs(samples, self.slabs.len()), self.limits));
         }
         let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
-        scratch.found.begin(reached, scratch.bricks.candidates.len());
+        scratch.found.begin(reached);
         for z in layers.start..=layers.end {
-            self.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z));
+            self.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z))?;
             if z > layers.start {
                 self.control.span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut bricks));
             }
@@ -156,7 +175,10 @@ impl Pass<'_> {
 impl Scratch {
     /// The densities of every brick of layer z that some atom reaches; z up to the layer beyond the slab's `own`, of which
     /// the first samples are needed.
-    fn evaluate(&mut self, pass: &Pass<'_>, tile: [i32; 3], own: &Range<usize>, z: usize) {
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
+    fn evaluate(&mut self, pass: &Pass<'_>, tile: [i32; 3], own: &Range<usize>, z: usize) -> Result<(), SurfaceError> {
         let Self { bricks, layers, slots, .. } = self;
         let layer = &mut layers[z % 2];
         let mut n = 0;
@@ -172,7 +194,10 @@ impl Scratch {
             let need = Need { y_pairs: rows(y == SIDE - 1, 4), z_layers: rows(z == own.end, 8) };
             field.fill(0.0);
             let (atoms, origin) = (&pass.lattice.atoms, slot_origin(tile, slot));
-            field::evaluate(&pass.constants, atoms, bricks.of(slot), origin, need, field);
+            for candidates in bricks.of(slot).chunks(CANDIDATES_PER_CHECK) {
+                pass.control.check()?;
+                field::evaluate(&pass.constants, atoms, candidates, origin, need, field);
+            }
             // A layer has 81 bricks.
             *index = u16::try_from(n).unwrap_or(NO_BRICK);
             n += 1;
@@ -183,6 +208,7 @@ impl Scratch {
             let inside = |slot: &u16| layer.inside.get(usize::from(*slot)).is_some_and(|bits| *bits != NOWHERE);
             *row = slots.iter().rev().fold(0, |row, slot| row << 1 | u16::from(inside(slot)));
         }
+        Ok(())
     }
 
     /// Classifies every brick of layer z that has, or borders on, samples inside; the layer above it was evaluated last.
