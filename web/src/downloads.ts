@@ -1,4 +1,4 @@
-/** The surface as a file, in every format: made with what is set now, byte for byte what the address gives. */
+/** Downloads of the surface on the stage, in every format, byte for byte what its address gives. */
 
 import type { Client } from "./api/client";
 import { fetchFile } from "./api/jobs";
@@ -11,7 +11,7 @@ export class Downloads {
     private readonly client: Client,
     formats: string[],
     private readonly wanted: (format: string) => { source: Source; choices: Choices } | null,
-    private readonly failed: (error: unknown) => void,
+    private readonly failed: (error: unknown, source: Source) => void,
   ) {
     const buttons = formats.map((format) => {
       const button = el("button", { type: "button", "data-format": format, "aria-label": `Download as ${format.toUpperCase()}` }, format);
@@ -42,7 +42,7 @@ export class Downloads {
       said.textContent = `${name}, ${bytes(blob.size)}`;
     } catch (error) {
       said.textContent = "";
-      this.failed(error);
+      this.failed(error, wanted.source);
     } finally {
       button.disabled = false;
     }

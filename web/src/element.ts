@@ -1,37 +1,58 @@
 /** `<molmesh-viewer src="…/surface.glb">`: a surface in any page. */
 
 import { bytesOf } from "./api/bytes";
+import { Client } from "./api/client";
+import { fetchFile } from "./api/jobs";
+import { asProblem, Problem } from "./api/problem";
 import { load } from "./scene/load";
 import { contextOf, Viewer } from "./scene/viewer";
 
 const ATTRIBUTES = ["src", "color", "background", "turn", "alt"] as const;
 
+const STYLE = `
+:host { display: block; position: relative; min-height: 12rem }
+[hidden] { display: none }
+canvas { position: absolute; inset: 0; width: 100%; height: 100%; display: block; touch-action: none }
+canvas:focus-visible { outline: 2px solid Highlight; outline-offset: -2px }
+p { margin: 0; padding: 1rem; overflow-wrap: anywhere }
+`;
+
 export class MolmeshViewer extends HTMLElement {
   static readonly observedAttributes: readonly string[] = ATTRIBUTES;
+  private readonly client = new Client();
   private viewer: Viewer | null = null;
   private abort: AbortController | null = null;
   private readonly canvas = document.createElement("canvas");
+  /** What stands between the tags, shown instead of a surface. */
+  private readonly fallback = document.createElement("slot");
+  /** Says why there is no surface, where nothing stands between the tags. */
+  private readonly reason = document.createElement("p");
+  /** Why the surface of `src` is not shown; null: it is, or will be when it has been loaded. */
+  private failure: string | null = null;
+  private isLost = false;
 
-  connectedCallback(): void {
-    const root = this.shadowRoot ?? this.attachShadow({ mode: "open" });
+  constructor() {
+    super();
+    const root = this.attachShadow({ mode: "open" });
     // Styles are set through the document's objects, which no content security policy forbids.
     const sheet = new CSSStyleSheet();
-    sheet.replaceSync(":host{display:block;position:relative;min-height:12rem}canvas{position:absolute;inset:0;width:100%;height:100%;display:block;touch-action:none}canvas:focus-visible{outline:2px solid Highlight;outline-offset:-2px}");
+    sheet.replaceSync(STYLE);
     root.adoptedStyleSheets = [sheet];
-    root.replaceChildren(this.canvas);
     this.canvas.tabIndex = 0;
     this.canvas.setAttribute("role", "img");
-    const gl = contextOf(this.canvas, true);
-    if (!gl) {
-      // What the page has put between the tags stands in, such as a picture.
-      root.replaceChildren(document.createElement("slot"));
-      return this.fail(new Error("this browser has no WebGL 2"));
-    }
-    this.viewer ??= new Viewer(this.canvas, gl, { transparent: true, onLost: (lost) => this.tell(lost ? "contextlost" : "contextrestored", {}) });
     this.canvas.addEventListener("click", (event) => this.clicked(event));
     this.canvas.addEventListener("keydown", (event) => this.pressed(event));
+    this.reason.setAttribute("role", "alert");
+    root.append(this.canvas, this.fallback, this.reason);
+    this.arrange();
+  }
+
+  connectedCallback(): void {
+    const gl = contextOf(this.canvas, true);
+    if (!gl) return this.fail(new Error("this browser has no WebGL 2"));
+    this.viewer ??= new Viewer(this.canvas, gl, { transparent: true, onLost: (lost) => this.lost(lost) });
     this.dress();
-    if (this.src) void this.load(this.src);
+    void this.load(this.src);
   }
 
   disconnectedCallback(): void {
@@ -54,22 +75,41 @@ export class MolmeshViewer extends HTMLElement {
     this.setAttribute("src", value);
   }
 
-  /** Loads another file. What was on its way is cancelled: the latest one wins. */
+  /** Loads another file, and follows the job where the service makes it one. The former file is cancelled: the latest one wins. */
   private async load(src: string): Promise<void> {
     this.abort?.abort();
-    const abort = (this.abort = new AbortController());
-    if (!src) return;
+    const { signal } = (this.abort = new AbortController());
+    if (!src) return this.arrange("");
     try {
-      const reply = await fetch(src, { signal: abort.signal });
-      if (reply.status !== 200) throw new Error(`${src}: ${reply.status} ${reply.statusText}`);
+      const reply = await fetchFile(this.client, src, signal, ({ status, stage, fraction }) => this.tell("progress", { status, stage, fraction }), {});
       const loaded = await load(await bytesOf(reply));
-      if (abort.signal.aborted) return;
+      signal.throwIfAborted();
+      // The canvas has a size only while it is visible.
+      this.arrange();
       await this.viewer?.show(loaded, true);
+      signal.throwIfAborted();
       if (this.hasAttribute("turn")) this.viewer?.turn(true);
       this.tell("load", { report: loaded.extras });
     } catch (error) {
-      if (!abort.signal.aborted) this.fail(error as Error);
+      if (!signal.aborted) this.fail(error);
     }
+  }
+
+  /** Shows the canvas, or the fallback where there is no surface, for a reason in words. */
+  private arrange(failure: string | null = null): void {
+    this.failure = failure;
+    const reason = failure ?? (this.isLost ? "the graphics device was lost" : null);
+    this.canvas.hidden = reason !== null;
+    this.fallback.hidden = reason === null;
+    const isEmpty = this.childElementCount === 0 && !this.textContent?.trim();
+    this.reason.textContent = reason;
+    this.reason.hidden = !reason || !isEmpty;
+  }
+
+  private lost(lost: boolean): void {
+    this.isLost = lost;
+    this.arrange(this.failure);
+    this.tell(lost ? "contextlost" : "contextrestored", {});
   }
 
   private clicked(event: MouseEvent): void {
@@ -97,8 +137,12 @@ export class MolmeshViewer extends HTMLElement {
     this.viewer?.theme(this.getAttribute("background") ?? "#ffffff", this.getAttribute("color") ?? "#58ad9d");
   }
 
-  private fail(error: Error): void {
-    this.tell("error", { message: error.message });
+  private fail(error: unknown): void {
+    const { document } = asProblem(error);
+    const words = [document.title, document.detail].filter(Boolean).join(": ");
+    const message = this.src ? `${this.src}: ${words}` : words;
+    this.arrange(message);
+    this.tell("error", { message, problem: error instanceof Problem ? document : null });
   }
 
   private tell(name: string, detail: unknown): void {

@@ -10,7 +10,7 @@ import { drops } from "./drop";
 import { keyboard } from "./keyboard";
 import { Picker } from "./picker";
 import { type Delivery, Remesher, type Wish } from "./remesh";
-import { curl, drawn, readAddress, SAMPLE, surface, writeAddress } from "./request";
+import { addressOf, type Choices, coarser, curl, currentAddress, drawn, readAddress, SAMPLE, surface, writeAddress } from "./request";
 import { Stage } from "./stage";
 import { $, copy, el, number, show } from "./ui/dom";
 import { Form } from "./ui/form";
@@ -25,9 +25,13 @@ export class Page {
   private readonly remesher: Remesher;
   private readonly picker: Picker | null;
   private form: Form | null = null;
-  private source: Source | null = null;
-  private shown: { source: Source; resolution: number; took: number } | null = null;
+  /** The surface on the stage and what it was made from. Caption, address, command line, report and downloads describe this alone. */
+  private shown: { source: Source; choices: Choices; resolution: number; took: number } | null = null;
+  /** The structure that the next mesh is made of. After a failure it is the one that is shown, if there is one. */
+  private target: Source | null = null;
   private opening: AbortController | null = null;
+  /** Structures that were shown, by their paths: going back to one needs no second upload. */
+  private readonly visited = new Map<string, Source>();
   private labelling: AbortController | null = null;
   private facts = 0;
   private busy = 0;
@@ -50,16 +54,23 @@ export class Page {
     this.listen();
   }
 
-  /** Builds what the description asks for, and opens what the address names, else the sample. */
+  /** Builds what the description asks for, and opens what the address names. */
   async start(parameters: Parameter[], formats: string[]): Promise<void> {
-    this.form = new Form($("parameters"), $("picture-fields"), parameters, (mesh, live) => (mesh ? this.changed(live) : this.commands()));
-    const asked = readAddress(this.form.names);
-    this.form.fill(asked.choices);
-    new Downloads(this.client, formats, (format) => this.source && { source: this.source, choices: this.choicesOf(format) }, (error) => this.problem(error, () => undefined));
+    const form = new Form($("parameters"), $("picture-fields"), parameters, (mesh, live) => (mesh ? this.changed(live) : this.pictured()));
+    this.form = form;
+    const wanted = (format: string) => this.shown && { source: this.shown.source, choices: form.of(format, this.shown.choices) };
+    new Downloads(this.client, formats, wanted, (error, source) => this.problem(error, () => undefined, source.name));
     $("format").replaceChildren(...formats.map((format) => el("option", { value: format }, format)));
-    if (asked.pdb) return this.open(() => Promise.resolve(entry(asked.pdb)));
-    if (asked.structure) return this.open((signal) => this.known(asked.structure, signal));
-    await this.sample();
+    await this.visit();
+  }
+
+  /** Opens what the address names, else the sample, with the parameters that stand there. */
+  private async visit(): Promise<void> {
+    if (!this.form) return;
+    const { choices, pdb, structure } = readAddress(this.form.names);
+    if (pdb) return this.open(pdb.toUpperCase(), () => Promise.resolve(entry(pdb)), choices);
+    if (structure) return this.open(`Structure ${structure.slice(0, 8)}`, (signal) => this.known(structure, signal), choices);
+    await this.sample(choices);
   }
 
   /** Words where there is no surface. */
@@ -68,15 +79,23 @@ export class Page {
     $("structure-title").textContent = title;
   }
 
-  /** Shows a failure. */
-  problem(error: unknown, again: () => void): void {
+  /** Shows a failure, and the structure `name` that it concerns. If a mesh failed, the remedies change its `wish` instead of what is shown. */
+  problem(error: unknown, again: () => void, name = "", wish?: Wish): void {
     const found = asProblem(error);
-    showProblem($("problem"), found, {
-      takeResolution: (resolution) => this.form?.set("resolution", String(resolution)),
-      reset: (parameter) => this.form?.set(parameter, undefined),
+    const set = (parameter: string, value: string | undefined) => {
+      if (wish) this.take(wish);
+      this.form?.set(parameter, value);
+    };
+    const shown = this.shown?.source.name;
+    let kept = "";
+    if (name && shown && name !== shown) kept = `The surface shown is still that of ${shown}.`;
+    else if (shown && wish) kept = "The surface and its parameters are as they were before.";
+    showProblem($("problem"), found, { name, kept }, {
+      takeResolution: (resolution) => set("resolution", String(resolution)),
+      reset: (parameter) => set(parameter, undefined),
       again,
     });
-    this.say(`${found.document.title}. ${found.document.detail ?? ""}`);
+    this.say(`${name ? `${name}: ` : ""}${found.document.title}. ${found.document.detail ?? ""} ${kept}`.trim());
   }
 
   /** Takes failures away. */
@@ -84,17 +103,9 @@ export class Page {
     show($("problem"), false);
   }
 
-  private get choices() {
-    return this.form?.choices ?? new Map<string, string>();
-  }
-
-  private choicesOf(format: string) {
-    return this.form?.of(format) ?? new Map<string, string>();
-  }
-
   private listen(): void {
     const file = $<HTMLInputElement>("file");
-    const take = (chosen: File) => void this.open((signal) => upload(this.client, chosen, chosen.name, signal));
+    const take = (chosen: File) => void this.open(chosen.name, (signal) => upload(this.client, chosen, chosen.name, signal));
     file.addEventListener("change", () => {
       const chosen = file.files?.[0];
       if (chosen) take(chosen);
@@ -104,80 +115,130 @@ export class Page {
     $("pdb-form").addEventListener("submit", (event) => {
       event.preventDefault();
       const id = $<HTMLInputElement>("pdb").value.trim();
-      if (id) void this.open(() => Promise.resolve(entry(id)));
+      if (id) void this.open(id.toUpperCase(), () => Promise.resolve(entry(id)));
     });
     $("sample").addEventListener("click", () => void this.sample());
     $("cancel").addEventListener("click", () => {
       this.opening?.abort();
+      this.opening = null;
       this.remesher.cancel();
-      this.say("Cancelled");
+      this.restore();
+      this.say(this.shown ? `Cancelled. The surface shown is that of ${this.shown.source.name}.` : "Cancelled");
     });
     $("reset-all").addEventListener("click", () => {
       this.form?.fill(new Map());
       this.changed(false);
     });
     $("format").addEventListener("change", () => this.commands());
+    window.addEventListener("popstate", () => {
+      // A step to another fragment of the same address opens nothing.
+      if (this.shown && addressOf(this.shown.source, this.shown.choices) === currentAddress()) return;
+      void this.visit();
+    });
     const copied = (id: string, text: () => string) => $(id).addEventListener("click", () => void copy(text()).then(() => this.say("Copied"), (error: unknown) => this.problem(error, () => undefined)));
     copied("copy-curl", () => $("curl").textContent ?? "");
-    copied("copy-url", () => (this.source ? location.origin + surface(this.source, $<HTMLSelectElement>("format").value, this.choicesOf($<HTMLSelectElement>("format").value)) : ""));
+    copied("copy-url", () => {
+      const format = $<HTMLSelectElement>("format").value;
+      return this.shown && this.form ? location.origin + surface(this.shown.source, format, this.form.of(format, this.shown.choices)) : "";
+    });
   }
 
-  private sample(): Promise<void> {
-    return this.open(async (signal) => {
+  private sample(choices: Choices | null = null): Promise<void> {
+    return this.open("The sample", async (signal) => {
       const blob = await (await this.client.ask(`/${SAMPLE}`, { signal })).blob();
-      return upload(this.client, blob, SAMPLE, signal);
-    });
+      return { ...(await upload(this.client, blob, SAMPLE, signal)), isSample: true };
+    }, choices);
   }
 
   /** A structure that was uploaded before. */
   private async known(digest: string, signal: AbortSignal): Promise<Source> {
+    const visited = this.visited.get(`/v1/structures/${digest}`);
+    if (visited) return visited;
     const summary = await this.client.json<Summary>(`/v1/structures/${encodeURIComponent(digest)}`, { signal });
     return { path: `/v1/structures/${summary.digest}`, name: summary.id ?? "structure", file: `${(summary.id ?? "structure").toLowerCase()}.cif`, summary };
   }
 
-  /** Opens another structure. */
-  private async open(find: (signal: AbortSignal) => Promise<Source>): Promise<void> {
+  /**
+   * Opens another structure: `find` finds it, and `choices` are set for it. Without them what is set stays, except what names parts of
+   * the former structure. The page goes on describing the former one until the mesh is there.
+   */
+  private async open(name: string, find: (signal: AbortSignal) => Promise<Source>, choices: Choices | null = null): Promise<void> {
     this.opening?.abort();
     this.remesher.cancel();
     this.clear();
     const abort = (this.opening = new AbortController());
-    this.wait("Reading the structure…", null);
+    this.wait(`Reading ${name}…`, null);
     try {
       const source = await find(abort.signal);
       if (abort.signal.aborted) return;
-      this.source = source;
-      this.greet(source.name, source.summary?.title ?? "");
-      const chains = source.summary?.chains.map((c) => c.name || "_").slice(0, 12).join(",");
-      this.form?.hint("chains", chains ? `all: ${chains}` : "all");
+      this.opening = null;
+      if (choices) this.form?.fill(choices);
+      else if (source.path !== this.target?.path) this.form?.forget();
+      this.target = source;
       this.changed(false);
     } catch (error) {
       if (abort.signal.aborted) return;
-      this.idle();
-      this.problem(error, () => void this.open(find));
+      this.opening = null;
+      this.restore();
+      this.problem(error, () => void this.open(name, find, choices), name);
     }
   }
 
-  /** Something was set: the mesh follows. */
+  /** Something was set: the mesh follows. A structure that is being opened takes what is set by then. */
   private changed(live: boolean, since = performance.now()): void {
-    const { source, choices } = this;
-    if (!source) return;
-    this.commands();
-    const known = this.shown?.source === source ? this.shown : null;
+    const { form, target: source } = this;
+    if (!form) return;
+    this.resettable();
+    if (!source || this.opening) return;
+    const choices = form.all;
+    const known = this.shown?.source.path === source.path ? this.shown : null;
     if (live && known && known.took > PREVIEW_FROM) {
       const set = Number(choices.get("resolution"));
-      const resolution = Number((2 * (set > 0 ? set : known.resolution)).toPrecision(3));
-      return this.remesher.want({ path: drawn(source, choices, resolution), preview: resolution, live, since });
+      const preview = Number((2 * (set > 0 ? set : known.resolution)).toPrecision(3));
+      return this.remesher.want({ source, choices, path: drawn(source, form.mesh(coarser(choices, preview))), preview, live, since });
     }
-    this.remesher.want({ path: drawn(source, choices), live, since });
+    this.remesher.want({ source, choices, path: drawn(source, form.mesh(choices)), live, since });
   }
 
-  private commands(): void {
-    const all = this.form?.all ?? new Map<string, string>();
-    show($("reset-all"), all.size > 0);
-    if (!this.source) return;
-    writeAddress(this.source, all);
+  /** Something was set that goes with pictures alone: the surface stays, downloads and command line follow. */
+  private pictured(): void {
+    const { form, shown } = this;
+    this.resettable();
+    if (!form || !shown) return;
+    shown.choices = new Map([...form.mesh(shown.choices), ...form.apart(form.all)]);
+    this.commands();
+  }
+
+  /** Sets what a wish has set, for its structure. */
+  private take(wish: Wish): void {
+    this.target = wish.source;
+    this.form?.fill(wish.choices);
+  }
+
+  /** Goes back to what is shown after a request that came to nothing: parameters, address, and the surface that a preview has replaced. */
+  private restore(): void {
+    this.idle();
+    const { shown } = this;
+    if (!shown) return this.greet("No surface", "");
+    this.target = shown.source;
+    this.form?.fill(shown.choices);
+    this.resettable();
+    this.stage.restore();
+    show($("preview"), false);
+    this.commands();
+  }
+
+  private resettable(): void {
+    show($("reset-all"), (this.form?.all.size ?? 0) > 0);
+  }
+
+  /** The address and the command line of what is shown; `push` makes the address a new entry of the history. */
+  private commands(push = false): void {
+    const { shown, form } = this;
+    if (!shown || !form) return;
+    writeAddress(addressOf(shown.source, shown.choices), push);
     const format = $<HTMLSelectElement>("format").value || "glb";
-    $("curl").textContent = curl(this.source, format, this.choicesOf(format), location.origin, this.client.key !== "");
+    $("curl").textContent = curl(shown.source, format, form.of(format, shown.choices), location.origin, this.client.key !== "");
   }
 
   private begin(wish: Wish): void {
@@ -202,34 +263,59 @@ export class Page {
   }
 
   private idle(): void {
+    if (this.opening) return;
     clearTimeout(this.busy);
     show($("busy"), false);
     $("stage").removeAttribute("aria-busy");
   }
 
-  private async show({ wish, answered, received, bytes, headers }: Delivery): Promise<void> {
-    const source = this.source;
-    if (!source) return;
-    const fresh = this.shown?.source !== source;
-    const first = this.shown === null;
-    const { loaded, drawn: time } = await this.stage.show(bytes, source, this.choicesOf("png"), fresh);
+  /** Shows a mesh that has arrived. Nothing changes before all of it is ready, and then everything does in one step. */
+  private async show({ wish, answered, received, bytes, headers, signal }: Delivery): Promise<void> {
+    const { form } = this;
+    if (!form) return;
+    const { source, preview } = wish;
+    const taken = preview === undefined ? wish.choices : coarser(wish.choices, preview);
+    const scene = await this.stage.prepare(bytes, source, form.of("png", taken), signal);
+    signal.throwIfAborted();
+    const { extras } = scene.loaded;
+    const drawing = this.stage.show(scene, this.shown?.source.path !== source.path, preview !== undefined);
+    show($("preview"), preview !== undefined);
+    $("preview").textContent = preview === undefined ? "" : `preview at ${number(preview, 2)} Å`;
+    if (preview === undefined) this.commit(wish, extras, headers);
+    const { shown } = this;
+    const time = await drawing;
     // What web/measure.mjs reads.
     const parts = { answered: answered - wish.since, received: received - answered, drawn: time - received };
-    performance.measure("molmesh:remesh", { start: wish.since, end: time, detail: { preview: wish.preview ?? null, triangles: loaded.extras["triangles"], ...parts } });
-    const preview = $("preview");
-    show(preview, wish.preview !== undefined);
-    preview.textContent = wish.preview === undefined ? "" : `preview at ${number(wish.preview, 2)} Å`;
-    if (wish.preview !== undefined) return;
-    const took = time - wish.since;
-    this.shown = { source, resolution: Number(loaded.extras["resolution"] ?? 0.5), took };
-    if (fresh) this.label(source);
-    if (first) this.stage.viewer?.turn(true);
-    if (!source.summary) this.greet(source.name, String(loaded.extras["title"] ?? ""));
-    this.form?.tell(loaded.extras);
-    report($("report"), loaded.extras, timingsOf(headers));
-    const { triangles } = loaded.extras;
-    $("now").textContent = `${Number(triangles).toLocaleString("en")} triangles, ${number(took, 3)} ms from wish to screen`;
-    this.later(() => this.complete(source, loaded.extras, headers));
+    performance.measure("molmesh:remesh", { start: wish.since, end: time, detail: { preview: preview ?? null, triangles: extras["triangles"], ...parts } });
+    if (preview !== undefined || !shown || this.shown !== shown) return;
+    shown.took = time - wish.since;
+    $("now").textContent += `, ${number(shown.took, 3)} ms from input to frame`;
+  }
+
+  /** Makes everything on the page describe the mesh of `wish`, which is on the stage. */
+  private commit({ source, choices }: Wish, extras: Record<string, unknown>, headers: Headers): void {
+    const { form, shown: former } = this;
+    if (!form) return;
+    const isOther = former?.source.path !== source.path;
+    // After a step through the history the address is there already.
+    const push = isOther && former !== null && addressOf(former.source, former.choices) === currentAddress();
+    const all = new Map([...form.mesh(choices), ...form.apart(form.all)]);
+    this.shown = { source, choices: all, resolution: Number(extras["resolution"] ?? 0.5), took: former?.took ?? 0 };
+    source.resent = false;
+    this.visited.set(source.path, source);
+    this.greet(source.name, source.summary?.title ?? String(extras["title"] ?? ""));
+    document.title = `${source.name} · molmesh`;
+    if (isOther) {
+      const chains = source.summary?.chains.map((c) => c.name || "_").slice(0, 12).join(",");
+      form.hint("chains", chains ? `all: ${chains}` : "all");
+      this.label(source);
+    }
+    form.tell(extras);
+    report($("report"), extras, timingsOf(headers));
+    $("now").textContent = `${Number(extras["triangles"]).toLocaleString("en")} triangles`;
+    this.commands(push);
+    if (!former) this.stage.viewer?.turn(true);
+    this.later(() => this.complete(source, extras, headers));
   }
 
   /** What differs from run to run, and words for those who hear the page: not while something else follows at once. */
@@ -265,14 +351,19 @@ export class Page {
   }
 
   private failed(error: unknown, wish: Wish): void {
-    const { source } = this;
+    const { source } = wish;
+    const { blob } = source;
     // The service keeps structures for some time only; this page has the bytes.
-    if (error instanceof Problem && error.is("no-such-structure") && source?.blob) {
-      void this.open((signal) => upload(this.client, source.blob as Blob, source.file, signal));
+    if (error instanceof Problem && error.is("no-such-structure") && blob && !source.resent) {
+      void this.open(source.name, async (signal) => ({ ...source, ...(await upload(this.client, blob, source.file, signal)), resent: true }));
       return;
     }
-    show($("preview"), false);
-    this.problem(error, () => this.remesher.want({ ...wish, since: performance.now() }));
+    this.restore();
+    const again = () => {
+      this.take(wish);
+      this.changed(false);
+    };
+    this.problem(error, again, source.name, wish);
   }
 
   private say(words: string): void {

@@ -3,8 +3,13 @@
 import { bytesOf } from "./api/bytes";
 import type { Client } from "./api/client";
 import { fetchFile, type Progress } from "./api/jobs";
+import type { Source } from "./api/structures";
+import type { Choices } from "./request";
 
 export interface Wish {
+  source: Source;
+  /** Everything that was set when it was asked for; a preview replaces the spacing. */
+  choices: Choices;
   /** The address of the mesh. */
   path: string;
   /** The spacing of a preview, Å; none: it is what was asked for. */
@@ -22,6 +27,8 @@ export interface Delivery {
   received: number;
   bytes: ArrayBuffer;
   headers: Headers;
+  /** Aborted once a later wish supersedes this one: nothing of it may be shown then. */
+  signal: AbortSignal;
 }
 
 export interface Listener {
@@ -96,9 +103,10 @@ export class Remesher {
       const answered = performance.now();
       const bytes = await bytesOf(reply);
       const received = performance.now();
-      if (isLatest()) await this.listener.show({ wish, answered, received, bytes, headers: reply.headers });
+      if (isLatest()) await this.listener.show({ wish, answered, received, bytes, headers: reply.headers, signal: abort.signal });
     } catch (error) {
-      if (isLatest()) this.listener.failed(error, wish);
+      // With a later wish waiting for its turn, this one has been superseded already.
+      if (isLatest() && !this.next) this.listener.failed(error, wish);
     }
     if (!isLatest()) return;
     this.current = null;

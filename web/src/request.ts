@@ -16,12 +16,15 @@ export function surface(source: Source, extension: string, choices: Choices, mor
   return `${source.path}/surface.${extension}${query(choices, more)}`;
 }
 
-/** What is drawn: every vertex with its atom, so that the pointer finds out whose it is. */
-export function drawn(source: Source, choices: Choices, resolution?: number): string {
-  if (resolution === undefined) return surface(source, "glb", choices, { atom_ids: "true" });
-  // A preview sets the spacing in its own way.
-  const rest = new Map([...choices].filter(([name]) => !["resolution", "detail", "max_triangles"].includes(name)));
-  return surface(source, "glb", rest, { atom_ids: "true", resolution: String(resolution) });
+/** The address of a mesh to show: every vertex with its atom, so that the pointer finds out whose it is. */
+export function drawn(source: Source, choices: Choices): string {
+  return surface(source, "glb", choices, { atom_ids: "true" });
+}
+
+/** Choices of a preview, which sets the spacing in its own way. */
+export function coarser(choices: Choices, resolution: number): Choices {
+  const rest = [...choices].filter(([name]) => !["resolution", "detail", "max_triangles"].includes(name));
+  return new Map([...rest, ["resolution", String(resolution)]]);
 }
 
 const quoted = (text: string) => (/^[\w./:=-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
@@ -32,7 +35,7 @@ export function curl(source: Source, format: string, choices: Choices, origin: s
   const out = `-o ${quoted(`${stem(source)}.${format}`)}`;
   if (source.path.startsWith("/v1/pdb/")) return `curl -sS${header} ${quoted(origin + surface(source, format, choices))} ${out}`;
   const address = quoted(`${origin}/v1/meshes${query(choices, format === "glb" ? {} : { format })}`);
-  const sample = source.file === SAMPLE ? `curl -sS ${origin}/${SAMPLE} -o ${SAMPLE}\n` : "";
+  const sample = source.isSample ? `curl -sS ${origin}/${SAMPLE} -o ${SAMPLE}\n` : "";
   return `${sample}curl -sS${header} --data-binary @${quoted(source.file || "structure.cif")} ${address} ${out}`;
 }
 
@@ -51,9 +54,20 @@ export function readAddress(known: ReadonlySet<string>): { choices: Map<string, 
   return { choices, pdb: pairs.get("pdb") ?? "", structure: pairs.get("structure") ?? "" };
 }
 
-export function writeAddress(source: Source | null, choices: Choices): void {
+/** The page's own address for a structure and what is set. */
+export function addressOf(source: Source, choices: Choices): string {
   const name: Record<string, string> = {};
-  if (source?.path.startsWith("/v1/pdb/")) name["pdb"] = decodeURIComponent(source.path.slice("/v1/pdb/".length));
-  else if (source && source.file !== SAMPLE) name["structure"] = source.path.slice("/v1/structures/".length);
-  history.replaceState(null, "", location.pathname + query(new Map(Object.entries(name)), Object.fromEntries(choices)));
+  if (source.path.startsWith("/v1/pdb/")) name["pdb"] = decodeURIComponent(source.path.slice("/v1/pdb/".length));
+  else if (!source.isSample) name["structure"] = source.path.slice("/v1/structures/".length);
+  return location.pathname + query(new Map(Object.entries(name)), Object.fromEntries(choices));
+}
+
+/** The address that the page has now, in the form of `addressOf`. */
+export const currentAddress = () => location.pathname + location.search;
+
+/** Gives the page another address: `push` as a new entry of the history, otherwise in place of the present one. */
+export function writeAddress(address: string, push: boolean): void {
+  if (address === currentAddress()) return;
+  if (push) history.pushState(null, "", address);
+  else history.replaceState(null, "", address);
 }

@@ -1,6 +1,7 @@
 /** The place of the surface: the viewer, or a picture by the service where the browser has no WebGL or has lost it. */
 
 import type { Client } from "./api/client";
+import { fetchFile } from "./api/jobs";
 import { asProblem } from "./api/problem";
 import { type Choices, surface } from "./request";
 import type { Source } from "./api/structures";
@@ -12,13 +13,27 @@ import { color } from "./ui/theme";
 const ABSENT = "This browser shows no WebGL 2, so the surface cannot be turned here. It is shown as a picture that the server draws; report and downloads are as always.";
 const LOST = "The graphics device was lost, for a moment or for good. Until it is back the surface is shown as a picture that the server draws.";
 
+/** A surface that is ready to be shown. */
+export interface Scene {
+  source: Source;
+  /** The choices of its picture. */
+  choices: Choices;
+  loaded: Loaded;
+  /** Its picture, or why there is none, in words; null: the viewer draws it. */
+  picture: Blob | string | null;
+}
+
 export class Stage {
   readonly viewer: Viewer | null;
   private readonly canvas = $<HTMLCanvasElement>("view");
   private readonly image = $<HTMLImageElement>("picture");
   private readonly notice = $("no-webgl");
+  private readonly hint = el("p", { class: "hint" });
   private lost = false;
-  private asked: { source: Source; choices: Choices } | null = null;
+  /** On the stage now. */
+  private scene: Scene | null = null;
+  /** The last one that was no preview. */
+  private kept: Scene | null = null;
   private fetching: AbortController | null = null;
 
   constructor(private readonly client: Client, onTurn: (turning: boolean) => void) {
@@ -27,19 +42,36 @@ export class Stage {
     if (!this.viewer) this.explain(ABSENT);
   }
 
-  /** Shows a file; `choices` are those of its picture. Resolves with what it holds, and with the time in the frame after it was drawn. */
-  async show(bytes: ArrayBuffer, source: Source, choices: Choices, fresh: boolean): Promise<{ loaded: Loaded; drawn: number }> {
-    this.asked = { source, choices };
+  /** Reads a file, and fetches the picture that stands in for the viewer. The stage does not change; `choices` are those of the picture. */
+  async prepare(bytes: ArrayBuffer, source: Source, choices: Choices, signal: AbortSignal): Promise<Scene> {
     const loaded = await load(bytes);
-    if (!this.viewer || this.lost) void this.picture();
-    const drawn = this.viewer ? await this.viewer.show(loaded, fresh) : performance.now();
-    return { loaded, drawn };
+    return { source, choices, loaded, picture: this.draws ? null : await this.picture(source, choices, signal) };
+  }
+
+  /** Puts a surface on the stage at once, and resolves with the time in the frame after it was drawn. */
+  show(scene: Scene, fresh: boolean, preview: boolean): Promise<number> {
+    this.scene = scene;
+    if (!preview) this.kept = scene;
+    this.fetching?.abort();
+    const drawn = this.viewer?.show(scene.loaded, fresh) ?? Promise.resolve(performance.now());
+    if (!this.draws) this.hang(scene);
+    return drawn;
+  }
+
+  /** Takes a preview off the stage. */
+  restore(): void {
+    if (this.kept && this.scene !== this.kept) void this.show(this.kept, false, false);
   }
 
   /** Takes the colours of the page. */
   theme(): void {
     this.viewer?.theme(color("--stage"), color("--plain"));
-    if (!this.image.hidden) void this.picture();
+    if (!this.image.hidden) void this.redraw();
+  }
+
+  /** Whether the viewer draws: otherwise pictures of the service are shown. */
+  private get draws(): boolean {
+    return this.viewer !== null && !this.lost;
   }
 
   private onLost(lost: boolean): void {
@@ -47,7 +79,7 @@ export class Stage {
     this.canvas.style.visibility = lost ? "hidden" : "";
     if (lost) {
       this.explain(LOST);
-      void this.picture();
+      void this.redraw();
     } else {
       show(this.notice, false);
       show(this.image, false);
@@ -56,37 +88,62 @@ export class Stage {
   }
 
   private explain(words: string): void {
-    this.notice.replaceChildren(el("p", {}, words));
+    this.notice.replaceChildren(el("p", {}, words), this.hint);
     show(this.notice, true);
   }
 
-  /** Asks for the picture of what would be shown. It is fetched, as an image's own address would carry no key. */
-  private async picture(): Promise<void> {
-    if (!this.asked) return;
+  /** Fetches the picture of the surface on the stage anew. */
+  private async redraw(): Promise<void> {
+    const { scene } = this;
+    if (!scene) return;
     this.fetching?.abort();
     const abort = (this.fetching = new AbortController());
-    const { source, choices } = this.asked;
+    try {
+      scene.picture = await this.picture(scene.source, scene.choices, abort.signal);
+    } catch {
+      // Another surface is on the stage, or the viewer draws again.
+      return;
+    }
+    this.hang(scene);
+  }
+
+  /** Shows the picture of a scene, or says why there is none. */
+  private hang(scene: Scene): void {
+    const { picture, source } = scene;
+    if (picture === null) {
+      // The viewer has stopped drawing since the scene was prepared.
+      show(this.image, false);
+      return void this.redraw();
+    }
+    if (this.image.src) URL.revokeObjectURL(this.image.src);
+    this.image.removeAttribute("src");
+    if (picture instanceof Blob) {
+      this.image.src = URL.createObjectURL(picture);
+      this.image.alt = `A picture of the surface of ${source.name}`;
+    }
+    this.hint.textContent = picture instanceof Blob ? "" : picture;
+    show(this.hint, !(picture instanceof Blob));
+    show(this.image, picture instanceof Blob);
+  }
+
+  /**
+   * Fetches a picture, or words that say why there is none. It is fetched, as an image's own address would carry no key.
+   * Throws only when `signal` is aborted.
+   */
+  private async picture(source: Source, choices: Choices, signal: AbortSignal): Promise<Blob | string> {
     const { clientWidth, clientHeight } = $("view-home");
     const pixels = Math.min(2, devicePixelRatio);
     const size = (side: number) => String(Math.max(64, Math.min(2048, Math.round(side * pixels))));
     const path = surface(source, "png", choices, { width: size(clientWidth), height: size(clientHeight) });
     try {
-      const reply = await this.client.ask(path, { signal: abort.signal, headers: { accept: "image/png" } });
-      const type = reply.headers.get("content-type") ?? "";
-      if (reply.status !== 200 || !type.startsWith("image/")) throw new Error("the server sent no picture");
-      const blob = await reply.blob();
-      if (abort.signal.aborted) return;
-      if (this.image.src) URL.revokeObjectURL(this.image.src);
-      this.image.src = URL.createObjectURL(blob);
-      this.image.alt = `A picture of the surface of ${source.name}`;
-      show(this.image, true);
+      const reply = await fetchFile(this.client, path, signal, () => undefined);
+      if (!(reply.headers.get("content-type") ?? "").startsWith("image/")) throw new Error("the server sent no picture");
+      return await reply.blob();
     } catch (error) {
-      if (abort.signal.aborted) return;
-      show(this.image, false);
+      signal.throwIfAborted();
       const { document } = asProblem(error);
       const none = document.status === 404 || document.status === 406;
-      const words = none ? "This server draws no pictures either; report and downloads work as always." : `The picture could not be had: ${document.detail ?? document.title}`;
-      if (!this.notice.querySelector(".hint")) this.notice.append(el("p", { class: "hint" }, words));
+      return none ? "This server draws no pictures either; report and downloads work as always." : `The picture could not be had: ${document.detail ?? document.title}`;
     }
   }
 }

@@ -6,13 +6,11 @@ export class Client {
   /** A key lives as long as the page does: it is written down nowhere. */
   key = "";
 
-  constructor(readonly base = "") {}
-
-  /** Asks; whatever is not a success is thrown as a Problem. */
+  /** Sends a request to a path of this service or to a full address; every status but a success is thrown as a Problem. */
   async ask(path: string, options: RequestInit = {}): Promise<Response> {
     const headers = new Headers(options.headers);
     if (this.key) headers.set("authorization", `Bearer ${this.key}`);
-    const reply = await fetch(this.base + path, { ...options, headers });
+    const reply = await fetch(path, { ...options, headers });
     if (!reply.ok) throw await problemOf(reply);
     return reply;
   }

@@ -1,4 +1,7 @@
-/** Files that may take long: whoever is promised a job instead of the file follows its events, and cancels it on leaving. */
+/**
+ * Files that may take long. If the service answers with a job (202), the job is followed to its result, and cancelled when the
+ * caller no longer wants it. Used by the page and by `<molmesh-viewer>`.
+ */
 
 import type { Client } from "./client";
 import { Problem, type ProblemDocument } from "./problem";
@@ -11,55 +14,86 @@ export interface Job {
   problem: ProblemDocument | null;
 }
 
-/** Called with how far a promised job is. */
+/** Called with the state of a job that is being followed. */
 export type Progress = (job: Job) => void;
 
+/** Longest wait for a job's end in one poll, s. */
+const POLL_S = 5;
+/** Bounds of the pause between two polls, s, whatever `Retry-After` says. */
+const PAUSE_S = { least: 0.5, most: 30 };
+
+/** Meshes are large and made in milliseconds: not worth the browser's disk. */
+const UNCACHED: RequestInit = { cache: "no-store" };
+
 /**
- * The file at `path`. If a job is promised instead (202), its events are followed and its result is fetched. When `signal`
- * is aborted, the request is cancelled, and so is the job.
+ * Fetches the file at `path`. A job is followed through its `Location` to the result; a failed job is thrown as its Problem.
+ * When `signal` is aborted, the request is cancelled, and so is the job.
  */
-export async function fetchFile(client: Client, path: string, signal: AbortSignal, progress: Progress, headers: HeadersInit = {}): Promise<Response> {
-  // Meshes are large and made in milliseconds: not worth the browser's disk.
-  const reply = await client.ask(path, { signal, headers, cache: "no-store" });
-  if (reply.status !== 202) return reply;
-  const job = (await reply.json()) as Job;
-  const dismiss = () => void client.ask(`/v1/jobs/${job.jobID}`, { method: "DELETE", keepalive: true }).catch(() => undefined);
-  // It may have been aborted while the answer was read.
-  if (signal.aborted) dismiss();
-  signal.addEventListener("abort", dismiss, { once: true });
+export async function fetchFile(client: Client, path: string, signal: AbortSignal, progress: Progress, options: RequestInit = UNCACHED): Promise<Response> {
+  const reply = await client.ask(path, { ...options, signal });
+  return reply.status === 202 ? follow(client, reply, signal, progress) : complete(reply);
+}
+
+/** Follows the job that `reply` announces. */
+async function follow(client: Client, reply: Response, signal: AbortSignal, progress: Progress): Promise<Response> {
+  const location = reply.headers.get("location");
+  if (!location) throw new Error("the server accepted a job but sent no Location header for it");
+  const address = new URL(location, reply.url).href;
+  const cancel = () => void client.ask(address, { method: "DELETE", keepalive: true }).catch(() => undefined);
+  // The signal may have been aborted while the answer arrived.
+  if (signal.aborted) cancel();
+  signal.addEventListener("abort", cancel, { once: true });
   try {
-    progress(job);
-    await ended(client, job, signal, progress);
+    const { problem } = await ended(client, address, signal, progress);
+    if (problem) throw new Problem(problem);
   } finally {
-    signal.removeEventListener("abort", dismiss);
+    signal.removeEventListener("abort", cancel);
   }
-  return client.ask(`/v1/jobs/${job.jobID}/result`, { signal, cache: "no-store" });
+  return complete(await client.ask(`${address}/result`, { ...UNCACHED, signal }));
 }
 
-/** Waits for a job's end. The browser's own EventSource sends no key, so events are read from a plain answer. */
-async function ended(client: Client, job: Job, signal: AbortSignal, progress: Progress): Promise<void> {
-  let last = "";
+/** Rejects successes without a file, such as a 204. */
+function complete(reply: Response): Response {
+  if (reply.status !== 200) throw new Error(`the server answered ${reply.status} ${reply.statusText} instead of a file`);
+  return reply;
+}
+
+/** Resolves with a job that has ended. It is watched by its events, and polled where the stream breaks off or cannot be had. */
+async function ended(client: Client, address: string, signal: AbortSignal, progress: Progress): Promise<Job> {
   for (;;) {
-    const headers: Record<string, string> = { accept: "text/event-stream" };
-    if (last) headers["last-event-id"] = last;
-    const reply = await client.ask(`/v1/jobs/${job.jobID}/events`, { signal, headers, cache: "no-store" });
-    if (reply.status === 204 || !reply.body) return;
-    for await (const { id, data } of events(reply.body)) {
-      if (id) last = id;
-      if (!data) continue;
-      const now = JSON.parse(data) as Job;
-      progress(now);
-      if (now.status === "successful") return;
-      // The result says why there is none.
-      if (now.status === "failed" && now.problem) throw new Problem(now.problem);
-      if (now.status === "failed" || now.status === "dismissed") return;
-    }
-    // The stream was cut, by a proxy or a restart: it is taken up after the last event that was seen.
-    await new Promise((resolve) => setTimeout(resolve, 500));
+    const last = await endedInEvents(client, address, signal, progress);
+    if (last) return last;
+    const reply = await client.ask(`${address}?wait=${POLL_S}`, { ...UNCACHED, signal });
+    const job = (await reply.json()) as Job;
+    progress(job);
+    if (isOver(job)) return job;
+    const pause = Math.min(PAUSE_S.most, Math.max(PAUSE_S.least, Number(reply.headers.get("retry-after")) || 0));
+    await new Promise((resolve) => setTimeout(resolve, 1000 * pause));
+    signal.throwIfAborted();
   }
 }
 
-async function* events(body: ReadableStream<Uint8Array>): AsyncGenerator<{ id: string; data: string }> {
+/** Reads a job's events to its end; null if they stop before. The browser's own EventSource sends no key, so the answer is read as text. */
+async function endedInEvents(client: Client, address: string, signal: AbortSignal, progress: Progress): Promise<Job | null> {
+  try {
+    const reply = await client.ask(`${address}/events`, { ...UNCACHED, signal, headers: { accept: "text/event-stream" } });
+    if (!reply.body) return null;
+    for await (const data of events(reply.body)) {
+      const job = JSON.parse(data) as Job;
+      progress(job);
+      if (isOver(job)) return job;
+    }
+  } catch {
+    // The poll that follows reports what keeps failing. An abort ends here.
+    signal.throwIfAborted();
+  }
+  return null;
+}
+
+const isOver = ({ status }: Job) => ["successful", "failed", "dismissed"].includes(status);
+
+/** The data of server-sent events. Each event of a job is its whole state, so a stream that breaks off needs no resumption. */
+async function* events(body: ReadableStream<Uint8Array>): AsyncGenerator<string> {
   const reader = body.pipeThrough(new TextDecoderStream() as ReadableWritablePair<string, Uint8Array>).getReader();
   let text = "";
   for (;;) {
@@ -67,10 +101,10 @@ async function* events(body: ReadableStream<Uint8Array>): AsyncGenerator<{ id: s
     if (done) return;
     text += value;
     for (let end = text.indexOf("\n\n"); end >= 0; end = text.indexOf("\n\n")) {
-      const fields = text.slice(0, end).split("\n").map((line) => /^(\w+): ?(.*)$/.exec(line));
+      const fields = text.slice(0, end).split("\n").map((line) => /^data: ?(.*)$/.exec(line)?.[1]);
       text = text.slice(end + 2);
-      const field = (name: string) => fields.filter((f) => f?.[1] === name).map((f) => f?.[2]).join("\n");
-      yield { id: field("id"), data: field("data") };
+      const data = fields.filter((field) => field !== undefined).join("\n");
+      if (data) yield data;
     }
   }
 }

@@ -12,6 +12,10 @@ export interface Source {
   file: string;
   /** The bytes, to be sent again when the service has forgotten them. */
   blob?: Blob;
+  /** The bytes were sent again and have not been meshed since. */
+  resent?: boolean;
+  /** The bundled structure, which the page opens where its address names no other. */
+  isSample?: boolean;
   summary?: Summary;
 }
 

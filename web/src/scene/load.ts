@@ -16,7 +16,7 @@ const loader = new GLTFLoader();
 
 /** Reads a GLB. Fails where it is none, or holds no triangles. */
 export async function load(bytes: ArrayBuffer): Promise<Loaded> {
-  if (new DataView(bytes).getUint32(0, true) !== 0x46546c67) throw new Error("the file is no GLB");
+  if (bytes.byteLength < 20 || new DataView(bytes).getUint32(0, true) !== 0x46546c67) throw new Error("the file is no GLB");
   if (usesMeshopt(bytes)) {
     // Only such files need WebAssembly: on pages that forbid it, all others are shown nevertheless.
     const { MeshoptDecoder } = await import("three/examples/jsm/libs/meshopt_decoder.module.js");

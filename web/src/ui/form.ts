@@ -8,6 +8,9 @@ import { field, type Field } from "./field";
 /** How a mesh file is stored means nothing to a picture. */
 const STORAGE = ["compress", "normals", "units", "atom_ids"];
 
+/** Parameters whose values name parts of one structure, and mean nothing in another. */
+const PARTS = ["model", "chains", "altloc"];
+
 /** What stands on top. A parameter that is not named here is there as well, below. */
 const FIRST = ["preset", "kernel", "resolution", "isovalue", "smoothness", "select", "chains"];
 
@@ -32,23 +35,30 @@ export class Form {
 
   /** What is set, in the order of the description. */
   get all(): Choices {
-    return this.chosen(() => true);
+    return new Map([...this.fields].flatMap(([name, { value }]) => (value === undefined ? [] : [[name, value]])));
   }
 
-  /** What of it is the mesh's. */
-  get choices(): Choices {
-    return this.chosen((parameter) => parameter.format === "");
+  /** Those of `choices` that shape the mesh. */
+  mesh(choices: Choices): Choices {
+    return this.chosen(choices, (parameter) => parameter.format === "");
   }
 
-  /** What of it goes with a file of `format`. */
-  of(format: string): Choices {
+  /** Those of `choices` that go with one format alone. */
+  apart(choices: Choices): Choices {
+    return this.chosen(choices, (parameter) => parameter.format !== "");
+  }
+
+  /** Those of `choices` that go with a file of `format`. */
+  of(format: string, choices: Choices): Choices {
     const isApart = [...this.fields.values()].some(({ parameter }) => parameter.format === format);
-    return this.chosen(({ name, format: only }) => (only === "" && !(isApart && STORAGE.includes(name))) || only === format);
+    return this.chosen(choices, ({ name, format: only }) => (only === "" && !(isApart && STORAGE.includes(name))) || only === format);
   }
 
-  private chosen(which: (parameter: Parameter) => boolean): Choices {
-    const set = [...this.fields].filter(([, f]) => f.value !== undefined && which(f.parameter));
-    return new Map(set.map(([name, f]) => [name, f.value as string]));
+  private chosen(choices: Choices, which: (parameter: Parameter) => boolean): Choices {
+    return new Map([...choices].filter(([name]) => {
+      const field = this.fields.get(name);
+      return field !== undefined && which(field.parameter);
+    }));
   }
 
   get names(): ReadonlySet<string> {
@@ -70,6 +80,11 @@ export class Form {
   fill(choices: Choices): void {
     for (const [name] of this.fields) this.put(name, choices.get(name));
     if ([...choices.keys()].some((name) => this.fields.get(name)?.parameter.format === "" && !FIRST.includes(name))) this.home.querySelector("details")?.setAttribute("open", "");
+  }
+
+  /** Takes back what names parts of the former structure, without telling. */
+  forget(): void {
+    for (const name of PARTS) this.put(name, undefined);
   }
 
   /** What the service took for what is not set, from a report. */

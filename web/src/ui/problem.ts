@@ -12,7 +12,16 @@ export interface Remedies {
   again(): void;
 }
 
-export function problem(home: HTMLElement, { document, numbers }: Problem, remedies: Remedies): void {
+/** What a problem is about. */
+export interface About {
+  /** The structure whose request failed; empty: none is concerned. */
+  name: string;
+  /** What the page shows in spite of it, in words. */
+  kept: string;
+}
+
+/** Shows a problem in `home`. */
+export function problem(home: HTMLElement, { document, numbers }: Problem, about: About, remedies: Remedies): void {
   const act = (words: string, action: () => void, primary = false) => {
     const button = el("button", { type: "button", class: primary ? "primary" : "" }, words);
     button.addEventListener("click", () => {
@@ -30,8 +39,9 @@ export function problem(home: HTMLElement, { document, numbers }: Problem, remed
   actions.push(act("Close", () => undefined));
   const list = numbers.filter(([name]) => name !== "suggested resolution").flatMap(([name, value]) => [el("dt", {}, name), el("dd", {}, value)]);
   home.replaceChildren(
-    el("strong", {}, document.title),
+    el("strong", {}, about.name ? `${about.name}: ${document.title}` : document.title),
     ...(document.detail ? [el("p", {}, document.detail)] : []),
+    ...(about.kept ? [el("p", { class: "kept" }, about.kept)] : []),
     ...(list.length ? [el("dl", {}, ...list)] : []),
     el("div", { class: "row" }, ...actions),
   );
