@@ -72,6 +72,16 @@ export const slide = (page, name, value) =>
     [name, value],
   );
 
+/** Drops a file on the page. */
+export async function drop(page, name, bytes) {
+  const data = await page.evaluateHandle(([name, text]) => {
+    const transfer = new DataTransfer();
+    transfer.items.add(new File([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))], name));
+    return transfer;
+  }, [name, bytes.toString("base64")]);
+  for (const type of ["dragover", "drop"]) await page.dispatchEvent("body", type, { dataTransfer: data });
+}
+
 /** A number of the report that is shown. */
 export async function reported(page, row) {
   const text = await page.locator(`#report tr[data-row="${row}"] td`).textContent();
@@ -106,7 +116,7 @@ export async function run(scenarios) {
 export async function picture(page, selector = "#view-home") {
   const words = (visibility) =>
     page.evaluate((visibility) => {
-      for (const node of document.querySelectorAll(".caption, .tools, .now, .tip, .badge")) node.style.visibility = visibility;
+      for (const node of document.querySelectorAll(".caption, .tools, .now, .tip, .badge, .busy, .problem")) node.style.visibility = visibility;
     }, visibility);
   await words("hidden");
   await settled(page);
@@ -133,6 +143,17 @@ export const settled = (page) =>
     await new Promise((resolve) => setTimeout(resolve, 400));
     for (let i = 0; i < 3; i += 1) await new Promise((resolve) => requestAnimationFrame(resolve));
   });
+
+/** Waits until two pictures are the same, and returns them: what was begun before may still have to be drawn. */
+export async function still(page) {
+  const end = performance.now() + PATIENCE;
+  for (let last = await picture(page); ; ) {
+    const next = await picture(page);
+    if (next.data.equals(last.data)) return next;
+    assert.ok(performance.now() < end, "it goes on moving");
+    last = next;
+  }
+}
 
 const luminance = (data, i) => (0.2126 * data[i] + 0.7152 * data[i + 1] + 0.0722 * data[i + 2]) / 255;
 

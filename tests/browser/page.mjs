@@ -1,7 +1,7 @@
 // The page at `/`: what people see and do.
 import { readFileSync } from "node:fs";
 import {
-  assert, axe, browser, clean, emptied, fetched, inverted, looksWrong, open, picture, plainColor, remeshed, reported, run, sample, settled, shown, silhouette, slide, start, PATIENCE, URL_OF_SERVICE,
+  assert, axe, browser, clean, drop, emptied, fetched, inverted, looksWrong, open, picture, plainColor, remeshed, reported, run, sample, settled, shown, silhouette, slide, start, still, PATIENCE, URL_OF_SERVICE,
 } from "./lib.mjs";
 
 const chromium = await browser();
@@ -11,25 +11,6 @@ const path = (line) => line.slice(line.indexOf("/v1/"));
 const meshOf = async (p) => (await fetched(path(surfaces(p).at(-1)))).bytes;
 const atomsOf = (file) => readFileSync(sample(file), "utf8").split("\n").filter((l) => /^(ATOM|HETATM)/.test(l));
 const pinned = (p) => p.locator("#picked").textContent();
-const drop = async (p, name, bytes) => {
-  const data = await p.evaluateHandle(([name, text]) => {
-    const transfer = new DataTransfer();
-    transfer.items.add(new File([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))], name));
-    return transfer;
-  }, [name, bytes.toString("base64")]);
-  for (const type of ["dragover", "drop"]) await p.dispatchEvent("body", type, { dataTransfer: data });
-};
-
-/** Waits until two pictures are the same: what was begun before may still have to be drawn. */
-const still = async (p) => {
-  const end = performance.now() + PATIENCE;
-  for (let last = await picture(p); ; ) {
-    const next = await picture(p);
-    if (next.data.equals(last.data)) return;
-    assert.ok(performance.now() < end, "it goes on moving");
-    last = next;
-  }
-};
 
 await run({
   "the sample is there at once, with its report": async () => {
