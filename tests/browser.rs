@@ -59,6 +59,16 @@ fn the_page_does_what_it_promises() {
 }
 
 #[test]
+fn a_failed_request_leaves_the_former_surface_and_its_description() {
+    drive("former.mjs", &[], &[]);
+}
+
+#[test]
+fn the_component_follows_jobs_and_shows_its_fallback() {
+    drive("component.mjs", &[], &[]);
+}
+
+#[test]
 fn long_meshes_are_followed_as_jobs() {
     drive("jobs.mjs", &["--set", "jobs.sync_wait_ms=1"], &[]);
 }

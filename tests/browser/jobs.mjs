@@ -1,5 +1,6 @@
 // A service that promises what takes longer than an instant: progress is shown, and what is superseded is dismissed.
-import { assert, browser, clean, open, reported, run, shown, PATIENCE } from "./lib.mjs";
+import http from "node:http";
+import { assert, browser, clean, fetched, open, reported, run, shown, PATIENCE, URL_OF_SERVICE } from "./lib.mjs";
 
 const chromium = await browser();
 const page = await open(chromium);
@@ -17,7 +18,7 @@ await run({
   },
 
   "progress is shown, and a superseded job is dismissed": async () => {
-    // Its events are held back: to the page it goes on and on.
+    // Its events and its state are held back: to the page it goes on and on.
     const document = { status: "running", fraction: 0.4, stage: "field", problem: null };
     let first;
     await page.route("**/events", (route) => {
@@ -25,6 +26,10 @@ await run({
       first ??= id;
       if (id !== first) return route.continue();
       return route.fulfill({ contentType: "text/event-stream", body: `id: 1\nevent: running\ndata: ${JSON.stringify({ ...document, jobID: id })}\n\n` });
+    });
+    await page.route(/\/v1\/jobs\/[0-9a-f]+\?wait=/, (route) => {
+      const id = /jobs\/([0-9a-f]+)\?/.exec(route.request().url())[1];
+      return id === first ? route.fulfill({ json: { ...document, jobID: id } }) : route.continue();
     });
     await page.locator("#p-resolution").fill("0.22");
     await page.locator("#p-resolution").press("Enter");
@@ -38,6 +43,29 @@ await run({
     assert.equal(await reported(page, "resolution"), 0.6);
     assert.ok(jobs().some((line) => line.startsWith("DELETE") && line.includes(first)), `${jobs()}`);
     assert.ok(await page.locator("#busy").isHidden());
+  },
+
+  "the component follows a job of another origin, and cancels it when it leaves": async () => {
+    const element = '<!doctype html><html lang="en"><title>component</title><molmesh-viewer style="height: 200px"></molmesh-viewer>';
+    const server = http.createServer((_, reply) => reply.writeHead(200, { "content-type": "text/html" }).end(`${element}<script type="module" src="${URL_OF_SERVICE}/molmesh-viewer.js"></script>`));
+    await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
+    const other = await open(chromium, { url: `http://127.0.0.1:${server.address().port}/` });
+    const load = (resolution, event) =>
+      other.evaluate(([src, event]) => new Promise((resolve) => {
+        const viewer = document.querySelector("molmesh-viewer");
+        for (const name of [event, "molmesh-error"]) viewer.addEventListener(name, ({ detail }) => resolve(detail), { once: true });
+        viewer.src = src;
+      }), [`${URL_OF_SERVICE}/v1/pdb/1crn/surface.glb?resolution=${resolution}`, event]);
+    assert.equal((await load("0.17", "molmesh-load")).report?.resolution, 0.17);
+    assert.ok(other.asked.some((line) => line.includes("/v1/jobs/") && line.endsWith("/result")), `${other.asked}`);
+    assert.equal((await load("0.16", "molmesh-progress")).message, undefined);
+    await other.evaluate(() => document.querySelector("molmesh-viewer").remove());
+    const id = other.asked.map((line) => /jobs\/([0-9a-f]+)/.exec(line)?.[1]).filter(Boolean).at(-1);
+    const state = await fetched(`/v1/jobs/${id}?wait=55`);
+    assert.equal(JSON.parse(state.bytes).status, "dismissed");
+    // The browser notes that reading the events was broken off.
+    assert.deepEqual(other.wrong.filter((line) => !/ERR_ABORTED/.test(line)), []);
+    await other.context().close();
   },
 
   "nothing went wrong": async () => {

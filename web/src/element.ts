@@ -50,7 +50,11 @@ export class MolmeshViewer extends HTMLElement {
   connectedCallback(): void {
     const gl = contextOf(this.canvas, true);
     if (!gl) return this.fail(new Error("this browser has no WebGL 2"));
-    this.viewer ??= new Viewer(this.canvas, gl, { transparent: true, onLost: (lost) => this.lost(lost) });
+    try {
+      this.viewer ??= new Viewer(this.canvas, gl, { transparent: true, onLost: (lost) => this.lost(lost) });
+    } catch (error) {
+      return this.fail(error);
+    }
     this.dress();
     void this.load(this.src);
   }
