@@ -2,7 +2,7 @@
 
 import { bytesOf } from "./api/bytes";
 import { Client } from "./api/client";
-import { fetchFile } from "./api/jobs";
+import { fetchFile, type Job } from "./api/jobs";
 import { asProblem, Problem } from "./api/problem";
 import { load } from "./scene/load";
 import { contextOf, Viewer } from "./scene/viewer";
@@ -23,7 +23,7 @@ export class MolmeshViewer extends HTMLElement {
   private viewer: Viewer | null = null;
   private abort: AbortController | null = null;
   private readonly canvas = document.createElement("canvas");
-  /** What stands between the tags, shown instead of a surface. */
+  /** The content between the tags, shown instead of a surface. */
   private readonly fallback = document.createElement("slot");
   /** Says why there is no surface, where nothing stands between the tags. */
   private readonly reason = document.createElement("p");
@@ -79,13 +79,14 @@ export class MolmeshViewer extends HTMLElement {
     this.setAttribute("src", value);
   }
 
-  /** Loads another file, and follows the job where the service makes it one. The former file is cancelled: the latest one wins. */
+  /** Loads another file, through a job if the service makes it one. Cancels the former request: the latest one wins. */
   private async load(src: string): Promise<void> {
     this.abort?.abort();
     const { signal } = (this.abort = new AbortController());
     if (!src) return this.arrange("");
     try {
-      const reply = await fetchFile(this.client, src, signal, ({ status, stage, fraction }) => this.tell("progress", { status, stage, fraction }), {});
+      const progress = ({ status, stage, fraction }: Job) => this.tell("progress", { status, stage, fraction });
+      const reply = await fetchFile(this.client, src, signal, progress, {});
       const loaded = await load(await bytesOf(reply));
       signal.throwIfAborted();
       // The canvas has a size only while it is visible.

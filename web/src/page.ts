@@ -25,7 +25,10 @@ export class Page {
   private readonly remesher: Remesher;
   private readonly picker: Picker | null;
   private form: Form | null = null;
-  /** The surface on the stage and what it was made from. Caption, address, command line, report and downloads describe this alone. */
+  /**
+   * The surface on the stage and what it was made from. Caption, address, command line, report and downloads describe
+   * it and nothing else.
+   */
   private shown: { source: Source; choices: Choices; resolution: number; took: number } | null = null;
   /** The structure that the next mesh is made of. After a failure it is the one that is shown, if there is one. */
   private target: Source | null = null;
@@ -79,7 +82,10 @@ export class Page {
     $("structure-title").textContent = title;
   }
 
-  /** Shows a failure, and the structure `name` that it concerns. If a mesh failed, the remedies change its `wish` instead of what is shown. */
+  /**
+   * Shows a failure, and the structure `name` that it concerns. If a mesh failed, the remedies change its `wish`
+   * instead of the parameters of the surface shown.
+   */
   problem(error: unknown, again: () => void, name = "", wish?: Wish): void {
     const found = asProblem(error);
     const set = (parameter: string, value: string | undefined) => {
@@ -159,8 +165,8 @@ export class Page {
   }
 
   /**
-   * Opens another structure: `find` finds it, and `choices` are set for it. Without them what is set stays, except what names parts of
-   * the former structure. The page goes on describing the former one until the mesh is there.
+   * Opens another structure, which `find` resolves with, and sets `choices` for it. Without them the parameters stay,
+   * except those that name parts of the former structure. The page describes the former one until the mesh has arrived.
    */
   private async open(name: string, find: (signal: AbortSignal) => Promise<Source>, choices: Choices | null = null): Promise<void> {
     this.opening?.abort();
@@ -184,7 +190,7 @@ export class Page {
     }
   }
 
-  /** Something was set: the mesh follows. A structure that is being opened takes what is set by then. */
+  /** Requests a mesh after a parameter was set. A structure that is being opened takes the parameters set by then. */
   private changed(live: boolean, since = performance.now()): void {
     const { form, target: source } = this;
     if (!form) return;
@@ -195,12 +201,13 @@ export class Page {
     if (live && known && known.took > PREVIEW_FROM) {
       const set = Number(choices.get("resolution"));
       const preview = Number((2 * (set > 0 ? set : known.resolution)).toPrecision(3));
-      return this.remesher.want({ source, choices, path: drawn(source, form.mesh(coarser(choices, preview))), preview, live, since });
+      const path = drawn(source, form.mesh(coarser(choices, preview)));
+      return this.remesher.want({ source, choices, path, preview, live, since });
     }
     this.remesher.want({ source, choices, path: drawn(source, form.mesh(choices)), live, since });
   }
 
-  /** Something was set that goes with pictures alone: the surface stays, downloads and command line follow. */
+  /** Updates downloads and command line after a parameter of pictures was set. The surface stays. */
   private pictured(): void {
     const { form, shown } = this;
     this.resettable();
@@ -209,13 +216,16 @@ export class Page {
     this.commands();
   }
 
-  /** Sets what a wish has set, for its structure. */
+  /** Takes structure and parameters of a wish as the next ones to mesh. */
   private take(wish: Wish): void {
     this.target = wish.source;
     this.form?.fill(wish.choices);
   }
 
-  /** Goes back to what is shown after a request that came to nothing: parameters, address, and the surface that a preview has replaced. */
+  /**
+   * Returns to the surface shown after a request failed or was cancelled: parameters, address, and the full mesh in
+   * place of a preview.
+   */
   private restore(): void {
     this.idle();
     const { shown } = this;
@@ -238,7 +248,8 @@ export class Page {
     if (!shown || !form) return;
     writeAddress(addressOf(shown.source, shown.choices), push);
     const format = $<HTMLSelectElement>("format").value || "glb";
-    $("curl").textContent = curl(shown.source, format, form.of(format, shown.choices), location.origin, this.client.key !== "");
+    const choices = form.of(format, shown.choices);
+    $("curl").textContent = curl(shown.source, format, choices, location.origin, this.client.key !== "");
   }
 
   private begin(wish: Wish): void {
@@ -269,7 +280,7 @@ export class Page {
     $("stage").removeAttribute("aria-busy");
   }
 
-  /** Shows a mesh that has arrived. Nothing changes before all of it is ready, and then everything does in one step. */
+  /** Shows a mesh that has arrived. The page changes in one step, and not before all of it is ready. */
   private async show({ wish, answered, received, bytes, headers, signal }: Delivery): Promise<void> {
     const { form } = this;
     if (!form) return;

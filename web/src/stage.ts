@@ -42,7 +42,7 @@ export class Stage {
     if (!this.viewer) this.explain(ABSENT);
   }
 
-  /** Reads a file, and fetches the picture that stands in for the viewer. The stage does not change; `choices` are those of the picture. */
+  /** Reads a file, and fetches its picture with `choices` where the viewer does not draw. The stage does not change. */
   async prepare(bytes: ArrayBuffer, source: Source, choices: Choices, signal: AbortSignal): Promise<Scene> {
     const loaded = await load(bytes);
     return { source, choices, loaded, picture: this.draws ? null : await this.picture(source, choices, signal) };
@@ -51,9 +51,9 @@ export class Stage {
   /** Puts a surface on the stage at once, and resolves with the time in the frame after it was drawn. */
   show(scene: Scene, fresh: boolean, preview: boolean): Promise<number> {
     this.scene = scene;
-    if (!preview) this.kept = scene;
     this.fetching?.abort();
     const drawn = this.viewer?.show(scene.loaded, fresh) ?? Promise.resolve(performance.now());
+    if (!preview) this.kept = scene;
     if (!this.draws) this.hang(scene);
     return drawn;
   }
@@ -127,8 +127,8 @@ export class Stage {
   }
 
   /**
-   * Fetches a picture, or words that say why there is none. It is fetched, as an image's own address would carry no key.
-   * Throws only when `signal` is aborted.
+   * Fetches a picture, or words that say why there is none. An image's own address would carry no key. Throws only
+   * when `signal` is aborted.
    */
   private async picture(source: Source, choices: Choices, signal: AbortSignal): Promise<Blob | string> {
     const { clientWidth, clientHeight } = $("view-home");
@@ -143,7 +143,9 @@ export class Stage {
       signal.throwIfAborted();
       const { document } = asProblem(error);
       const none = document.status === 404 || document.status === 406;
-      return none ? "This server draws no pictures either; report and downloads work as always." : `The picture could not be had: ${document.detail ?? document.title}`;
+      return none
+        ? "This server draws no pictures either; report and downloads work as always."
+        : `The picture could not be had: ${document.detail ?? document.title}`;
     }
   }
 }

@@ -6,7 +6,7 @@ export class Client {
   /** A key lives as long as the page does: it is written down nowhere. */
   key = "";
 
-  /** Sends a request to a path of this service or to a full address; every status but a success is thrown as a Problem. */
+  /** Sends a request to a path of this service or to a full address. Throws every status but a success as a Problem. */
   async ask(path: string, options: RequestInit = {}): Promise<Response> {
     const headers = new Headers(options.headers);
     if (this.key) headers.set("authorization", `Bearer ${this.key}`);

@@ -1,6 +1,6 @@
 /**
- * Files that may take long. If the service answers with a job (202), the job is followed to its result, and cancelled when the
- * caller no longer wants it. Used by the page and by `<molmesh-viewer>`.
+ * Files that may take long. If the service answers with a job (202), the job is followed to its result, and cancelled
+ * when the caller no longer wants it. Used by the page and by `<molmesh-viewer>`.
  */
 
 import type { Client } from "./client";
@@ -26,10 +26,12 @@ const PAUSE_S = { least: 0.5, most: 30 };
 const UNCACHED: RequestInit = { cache: "no-store" };
 
 /**
- * Fetches the file at `path`. A job is followed through its `Location` to the result; a failed job is thrown as its Problem.
- * When `signal` is aborted, the request is cancelled, and so is the job.
+ * Fetches the file at `path`. A job is followed through its `Location` to the result; a failed job is thrown as its
+ * Problem. Aborting `signal` cancels the request and the job.
  */
-export async function fetchFile(client: Client, path: string, signal: AbortSignal, progress: Progress, options: RequestInit = UNCACHED): Promise<Response> {
+export async function fetchFile(
+  client: Client, path: string, signal: AbortSignal, progress: Progress, options: RequestInit = UNCACHED,
+): Promise<Response> {
   const reply = await client.ask(path, { ...options, signal });
   return reply.status === 202 ? follow(client, reply, signal, progress) : complete(reply);
 }
@@ -58,7 +60,7 @@ function complete(reply: Response): Response {
   return reply;
 }
 
-/** Resolves with a job that has ended. It is watched by its events, and polled where the stream breaks off or cannot be had. */
+/** Resolves with a job that has ended. Follows its events, and polls if their stream breaks off or is unavailable. */
 async function ended(client: Client, address: string, signal: AbortSignal, progress: Progress): Promise<Job> {
   for (;;) {
     const last = await endedInEvents(client, address, signal, progress);
@@ -73,10 +75,16 @@ async function ended(client: Client, address: string, signal: AbortSignal, progr
   }
 }
 
-/** Reads a job's events to its end; null if they stop before. The browser's own EventSource sends no key, so the answer is read as text. */
-async function endedInEvents(client: Client, address: string, signal: AbortSignal, progress: Progress): Promise<Job | null> {
+/**
+ * Reads a job's events to its end; null if they stop before. The browser's own EventSource sends no key, so the answer
+ * is read as text.
+ */
+async function endedInEvents(
+  client: Client, address: string, signal: AbortSignal, progress: Progress,
+): Promise<Job | null> {
   try {
-    const reply = await client.ask(`${address}/events`, { ...UNCACHED, signal, headers: { accept: "text/event-stream" } });
+    const headers = { accept: "text/event-stream" };
+    const reply = await client.ask(`${address}/events`, { ...UNCACHED, signal, headers });
     if (!reply.body) return null;
     for await (const data of events(reply.body)) {
       const job = JSON.parse(data) as Job;
@@ -92,7 +100,7 @@ async function endedInEvents(client: Client, address: string, signal: AbortSigna
 
 const isOver = ({ status }: Job) => ["successful", "failed", "dismissed"].includes(status);
 
-/** The data of server-sent events. Each event of a job is its whole state, so a stream that breaks off needs no resumption. */
+/** The data of server-sent events. Each event of a job is its whole state, so a broken stream needs no resumption. */
 async function* events(body: ReadableStream<Uint8Array>): AsyncGenerator<string> {
   const reader = body.pipeThrough(new TextDecoderStream() as ReadableWritablePair<string, Uint8Array>).getReader();
   let text = "";
