@@ -219,6 +219,25 @@ await run({
     assert.equal((await described(page)).name, "1CRN");
   },
 
+  "a structure that the service forgets is sent again, once": async () => {
+    const forgotten = { status: 404, contentType: "application/problem+json", body: JSON.stringify({ type: "/problems/no-such-structure", title: "There is no such structure", status: 404 }) };
+    await remeshed(page, () => drop(page, "1crn.cif", readFileSync(sample("1crn.cif"))));
+    const sent = () => page.asked.filter((line) => line.startsWith("POST")).length;
+    const before = sent();
+    let times = Infinity;
+    await page.route(/\/v1\/structures\/[0-9a-f]+\/surface\.glb/, (route) => (times-- > 0 ? route.fulfill(forgotten) : route.continue()));
+    await unchanged(page, async () => {
+      await set(page, "isovalue", "0.9");
+      await problem.locator("strong", { hasText: "1CRN: There is no such structure" }).waitFor();
+    });
+    assert.equal(sent(), before + 1);
+    times = 1;
+    await remeshed(page, () => set(page, "chains", "A"));
+    assert.equal(sent(), before + 2);
+    assert.deepEqual((await described(page)).set, ["chains"]);
+    await page.unroute(/\/v1\/structures\/[0-9a-f]+\/surface\.glb/);
+  },
+
   "without a former surface a refusal can be put right": async () => {
     const other = await open(chromium, { viewport, url: `${URL_OF_SERVICE}/?pdb=1crn&resolution=0.05` });
     const refused = other.locator("#problem");
