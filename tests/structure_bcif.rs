@@ -6,7 +6,7 @@ mod bcif_support;
 
 use bcif_support::Pack::{Array, Bytes, Int, Map, Nil, Real};
 use bcif_support::*;
-use molmesh::structure::{ReadLimits, SourceFormat, Structure, StructureError, read, referee};
+use molmesh::structure::{Kind, ReadLimits, SourceFormat, Structure, StructureError, read, referee};
 
 fn bcif(bytes: &[u8]) -> Structure {
     read(bytes, &ReadLimits::default()).unwrap_or_else(|e| panic!("{e}"))
@@ -272,7 +272,6 @@ fn what_text_refuses_is_refused_with_the_same_words() {
         "20.25", "2", "?",
     ];
     let bad = [
-        ("group_PDB", "ATM", "ATOM or HETATM"),
         ("label_alt_id", "AB", "an alternative location of one character, ? or ."),
         ("pdbx_PDB_ins_code", "XYZ", "an insertion code of one character, ? or ."),
         ("Cartn_y", "?", "Cartn_y in Å, within ±100000"),
@@ -296,15 +295,55 @@ fn what_text_refuses_is_refused_with_the_same_words() {
         (texts("pdbx_PDB_model_num", &["1", ""]), "pdbx_PDB_model_num, row 2: found nothing, expected a model number"),
         (reals("Cartn_x", &[0.0, f64::NAN]), "Cartn_x, row 2: found NaN, expected Cartn_x in Å"),
         (reals("Cartn_x", &[f64::INFINITY, f64::NAN]), "Cartn_x, row 1: found inf, expected Cartn_x in Å"),
-        (reals("occupancy", &[1.0, f64::NAN]), "occupancy, row 2: found NaN, expected an occupancy"),
-        (
-            column("B_iso_or_equiv", i32s(&[1, 2]), vec![fixed_point(1e-320), byte_array(3)]),
-            "B_iso_or_equiv, row 1: found inf",
-        ),
     ] {
         let said = refusal(&atoms(2, vec![column]));
         assert!(said.starts_with(&format!("BinaryCIF, atom_site, {place}")), "{place}: {said}");
     }
+}
+
+#[test]
+fn values_that_do_not_matter_for_a_mesh_are_warnings() {
+    let warnings = |column: Pack| bcif(&atoms(2, vec![column])).warnings.join("\n");
+    for (column, said) in [
+        (reals("occupancy", &[1.0, f64::NAN]), "occupancy, row 2: found NaN, expected an occupancy, ? or .; read as 1"),
+        (
+            column("B_iso_or_equiv", i32s(&[0, 2]), vec![fixed_point(1e-320), byte_array(3)]),
+            "B_iso_or_equiv, row 2: found inf, expected a B-factor, ? or .; read as 0",
+        ),
+        (texts("group_PDB", &["ATM", "ATOM"]), "group_PDB, row 1: found `ATM`, expected ATOM or HETATM; read as ATOM"),
+    ] {
+        assert_eq!(warnings(column), format!("BinaryCIF, atom_site, {said}"));
+    }
+    assert_eq!(warnings(texts("group_PDB", &["ATOM", "HETATM"])), "");
+}
+
+#[test]
+fn entities_or_sequence_numbers_tell_which_hetatm_records_are_polymer() {
+    let site = |numbers: Pack| {
+        let group = texts("group_PDB", &["HETATM", "HETATM"]);
+        let names = texts("auth_comp_id", &["MSE", "LIG"]);
+        let chains = texts("label_asym_id", &["A", "B"]);
+        category("_atom_site", 2, [places(2), vec![group, names, chains, numbers]].concat())
+    };
+    let numbered = || masked(ints("label_seq_id", &[7, 0]), &[0, 1]);
+    let entity = |types: &[&str]| category("_entity", 2, vec![ints("id", &[1, 2]), texts("type", types)]);
+    let asym = |n| category("_struct_asym", n, vec![texts("id", &["A", "B"]), texts("entity_id", &["1", "2"])]);
+    let kinds = |categories: Vec<Pack>| {
+        let s = bcif(&file(vec![block("a", categories)]));
+        (s.kind, s.warnings.join("\n"))
+    };
+    let (first, second) = (vec![Kind::Polymer, Kind::Ligand], vec![Kind::Ligand, Kind::Polymer]);
+    let none = String::new();
+    assert_eq!(kinds(vec![site(numbered())]), (first.clone(), none.clone()));
+    assert_eq!(kinds(vec![site(ints("label_seq_id", &[7, 8]))]), (vec![Kind::Ligand; 2], none.clone()), "all are numbered");
+    // The entities decide, wherever they stand.
+    let known = [site(numbered()), entity(&["water", "polymer"]), asym(2)];
+    assert_eq!(kinds(known.to_vec()), (second.clone(), none.clone()));
+    assert_eq!(kinds(known.into_iter().rev().collect()), (second, none));
+    // Entities that cannot be read do not cost the atoms.
+    let (found, warning) = kinds(vec![site(numbered()), entity(&["water", "polymer"]), asym(3)]);
+    assert_eq!(found, first);
+    assert!(warning.starts_with("BinaryCIF, struct_asym, id") && warning.ends_with("entities are unknown"), "{warning}");
 }
 
 #[test]

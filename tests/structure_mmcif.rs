@@ -178,8 +178,6 @@ fn values_are_refused_by_place() {
         bad("0.500 ", "-100000.5 "),
         "line 24, column 46: found `-100000.5`, expected Cartn_z in Å, within ±100000"
     );
-    assert_eq!(bad("HETATM", "ATOMS"), "line 24, column 1: found `ATOMS`, expected ATOM or HETATM");
-    assert_eq!(bad("0.50 ", "x "), "line 24, column 52: found `x`, expected an occupancy, ? or .");
     assert_eq!(
         bad("-3 Bb", "1.5 Bb"),
         "line 24, column 63: found `1.5`, expected a residue number (a whole number), ? or ."
@@ -212,6 +210,39 @@ fn values_are_refused_by_place() {
         refusal("data_x\nloop_ _atom_site.Cartn_x _atom_site.cartn_x 1 2"),
         "line 2, column 26: found `_atom_site.cartn_x`, expected every tag once in its category"
     );
+}
+
+#[test]
+fn values_that_do_not_matter_for_a_mesh_are_warnings() {
+    let read = |from: &str, to: &str| cif(file(&format!("{ROW}{}", ROW.replace(from, to))));
+    let s = read("HETATM", "ATOMS");
+    assert_eq!((s.hetero.as_slice(), s.len()), (&[true, false][..], 2));
+    assert_eq!(s.warnings, ["line 24, column 1: found `ATOMS`, expected ATOM or HETATM; read as ATOM"]);
+    for bad in ["x", "inf", "NaN", "1e39", "-1e400"] {
+        let s = read("0.50 ", &format!("{bad} "));
+        assert_eq!(s.occupancy, [0.5, 1.0]);
+        assert_eq!(
+            s.warnings,
+            [format!("line 24, column 52: found `{bad}`, expected an occupancy, ? or .; read as 1")]
+        );
+    }
+    let s = read("20.25", "nan");
+    assert_eq!(s.b_factor, [20.25, 0.0]);
+    assert_eq!(s.warnings, ["line 24, column 57: found `nan`, expected a B-factor, ? or .; read as 0"]);
+    assert_eq!(cif(file(ROW)).warnings, Vec::<String>::new());
+}
+
+#[test]
+fn warnings_are_the_same_on_any_number_of_threads() {
+    let pool = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    let bad = ROW.replace("0.50 20.25", "inf 20.25");
+    let text = file(&format!("{}{bad}{}{}", ROW.repeat(30_000), ROW.repeat(30_000), bad.repeat(12)));
+    let reads = [1, 3].map(|n| pool(n).install(|| cif(&text)));
+    assert_eq!(reads[0], reads[1]);
+    let warnings = &reads[0].warnings;
+    assert!(warnings[0].starts_with("line 30023, column 52: found `inf`"), "{warnings:?}");
+    assert!(warnings[1].starts_with("line 60024, column 52: found `inf`"), "{warnings:?}");
+    assert_eq!((warnings.len(), warnings[10].as_str()), (11, "3 more values that could not be read"));
 }
 
 #[test]

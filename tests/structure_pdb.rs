@@ -222,17 +222,33 @@ fn numbers_are_refused_by_place() {
     assert_eq!(bad("  11.104", "        "), format!("line 2, column 31: found blanks, {x}"));
     assert!(bad("  -6.134", "  -6.13x").starts_with("line 2, column 39: found `  -6.13x`, expected the y"));
     assert!(bad("   0.500", " 0 . 500").starts_with("line 2, column 47: found ` 0 . 500`, expected the z"));
-    assert!(
-        bad("  0.50 ", "  x.50 ")
-            .starts_with("line 2, column 55: found `  x.50`, expected an occupancy in columns 55 to 60")
-    );
-    assert!(
-        bad(" 20.25", "   NaN")
-            .starts_with("line 2, column 61: found `   NaN`, expected a B-factor in columns 61 to 66")
-    );
     assert_eq!(pdb(CA.replace("  11.104", "1.104   ")).x[0], 1.104);
     assert_eq!(pdb(CA.replace("  11.104", "  -1e2  ")).x[0], -100.0);
     assert_eq!(pdb(CA.replace("  11.104", "100000.0")).x[0], 100_000.0);
+}
+
+#[test]
+fn occupancies_and_b_factors_that_are_none_are_warnings() {
+    let read = |from: &str, to: &str| {
+        let s = pdb(format!("REMARK\n{}", CA.replace(from, to)));
+        (s.occupancy[0], s.b_factor[0], s.warnings.join("\n"))
+    };
+    assert_eq!(read("", ""), (0.5, 20.25, String::new()));
+    let occupancy = "expected an occupancy in columns 55 to 60, or blanks; read as 1";
+    for bad in ["  x.50", "   inf", "   NaN", "******", " 1e39 "] {
+        assert_eq!(read("  0.50", bad), (1.0, 20.25, format!("line 2, column 55: found `{bad}`, {occupancy}")));
+    }
+    let b_factor = "expected a B-factor in columns 61 to 66, or blanks; read as 0";
+    for bad in ["   NaN", "******", "-  inf"] {
+        assert_eq!(read(" 20.25", bad), (0.5, 0.0, format!("line 2, column 61: found `{bad}`, {b_factor}")));
+    }
+    // A tab stands for the eight columns from 49 to 56.
+    let tabbed = pdb(CA.replace("   0.500  0.50", "  0.5\t  x0 "));
+    assert_eq!(tabbed.warnings.len(), 1, "{:?}", tabbed.warnings);
+    let many = pdb(CA.replace("  0.50", "  x.50").repeat(1000));
+    assert_eq!((many.len(), many.warnings.len()), (1000, 11));
+    assert_eq!(many.warnings[9], format!("line 10, column 55: found `  x.50`, {occupancy}"));
+    assert_eq!(many.warnings[10], "990 more values that could not be read");
 }
 
 #[test]

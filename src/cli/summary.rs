@@ -1,6 +1,6 @@
 //! The report of a mesh on one screen, for people. Pure: a report in, text out.
 
-use molmesh::pipeline::{PictureReport, Report};
+use molmesh::pipeline::{LeftOutReport, PictureReport, Report};
 
 use super::page::Page;
 use super::style::Style;
@@ -23,6 +23,12 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
     page.row("atoms", &format!("{atoms} of {in_file} in the file ({}, model {})", report.source_format, report.model));
+    if report.left_out.total > 0 {
+        page.row("left out", &left_out(&report.left_out));
+    }
+    for warning in &report.warnings {
+        page.row("warning", warning);
+    }
     page.row("surface", &surface(report));
     let [bricks, with_surface, samples, dense] =
         [report.bricks, report.surface_bricks, report.samples, report.box_cells].map(grouped);
@@ -73,6 +79,21 @@ fn surface(report: &Report) -> String {
         (None, None) => String::new(),
     };
     format!("{}, {} Å{from}, isovalue {}{smoothness}{preset}", report.kernel, report.resolution, report.isovalue)
+}
+
+/// The atoms that were not meshed, by residue name and reason.
+fn left_out(left_out: &LeftOutReport) -> String {
+    let LeftOutReport { total, other_chains, virtual_sites, residues, other_residues, hydrogens, alternatives } = left_out;
+    let named = residues.iter().map(|residue| format!("{} {}", residue.name, grouped(residue.atoms)));
+    let counted = [
+        ("other residues", other_residues),
+        ("hydrogens", hydrogens),
+        ("alternative locations", alternatives),
+        ("virtual sites", virtual_sites),
+        ("other chains", other_chains),
+    ];
+    let counted = counted.into_iter().filter(|(_, n)| **n > 0).map(|(what, n)| format!("{what} {}", grouped(*n)));
+    format!("{} atoms: {}", grouped(*total), named.chain(counted).collect::<Vec<_>>().join(", "))
 }
 
 fn drawn(picture: &PictureReport) -> String {
@@ -167,7 +188,7 @@ fn decimal(value: f64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use molmesh::pipeline::Quantization;
+    use molmesh::pipeline::{Quantization, ResidueCount};
 
     use super::*;
 
@@ -193,6 +214,14 @@ mod tests {
             atoms: 454,
             atoms_in_file: 514,
             model: 1,
+            left_out: LeftOutReport {
+                total: 60,
+                virtual_sites: 2,
+                residues: vec![ResidueCount { name: "HOH".into(), atoms: 53 }],
+                hydrogens: 5,
+                ..LeftOutReport::default()
+            },
+            warnings: vec!["line 9, column 55: found `   inf`; read as 1".into()],
             radii: "table",
             kernel: "gaussian",
             preset: "default",
@@ -252,6 +281,8 @@ mod tests {
         for part in [
             "4PTI TRYPSIN INHIBITOR",
             "454 of 514",
+            "60 atoms: HOH 53, hydrogens 5, virtual sites 2",
+            "warning    line 9, column 55: found `   inf`; read as 1",
             "300 bricks",
             "153,600 samples",
             "0.5 Å (for 40,000 triangles at most, 2 tries)",

@@ -63,7 +63,7 @@ struct ResidueColumns {
     chain: Vec<String>,
     /// Its model.
     model: Vec<i32>,
-    /// What its first atom is: `polymer`, `ligand` or `water`.
+    /// What its first atom is: `polymer`, `ligand`, `water` or `virtual` (a site that is not an atom).
     kind: Vec<&'static str>,
 }
 
@@ -196,7 +196,6 @@ fn document(structure: &Structure) -> AtomsDocument {
     let mut element_at = [u8::MAX; 1 + element::SYMBOLS.len()];
     let mut atoms = AtomColumns { name: structure.name.ids().to_vec(), element: Vec::with_capacity(count) };
     let mut residues = ResidueColumns::default();
-    let water = structure.water_residues();
     for i in 0..count {
         let number = usize::from(structure.element[i]);
         if element_at[number] == u8::MAX {
@@ -214,7 +213,7 @@ fn document(structure: &Structure) -> AtomsDocument {
         residues.insertion_code.push(if code == 0 { String::new() } else { char::from(code).to_string() });
         residues.chain.push(structure.chain.get(i).to_owned());
         residues.model.push(structure.model[i]);
-        residues.kind.push(structure.kind(i, &water).name());
+        residues.kind.push(structure.kind[i].name());
     }
     AtomsDocument { count, names: structure.name.texts().map(str::to_owned).collect(), elements, atoms, residues }
 }

@@ -76,6 +76,8 @@ pub(super) struct StructureDocument {
     alternatives: u64,
     /// Atoms of unknown elements.
     unknown_elements: u64,
+    /// Values that could not be read and do not matter for a mesh, at most 12.
+    warnings: Vec<String>,
     /// Chains.
     chain_count: usize,
     /// The first thousand of them.
@@ -101,12 +103,14 @@ struct KindCounts {
     ligand: u64,
     water: u64,
     hydrogens: u64,
+    /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
+    virtual_sites: u64,
 }
 
 impl From<&Counts> for KindCounts {
     fn from(counts: &Counts) -> Self {
-        let Counts { polymer, ligand, water, hydrogens } = *counts;
-        Self { polymer, ligand, water, hydrogens }
+        let Counts { polymer, ligand, water, hydrogens, virtual_sites } = *counts;
+        Self { polymer, ligand, water, hydrogens, virtual_sites }
     }
 }
 
@@ -253,6 +257,7 @@ fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDoc
         atoms_in_model: (&contents.counts).into(),
         alternatives: contents.alternatives,
         unknown_elements: contents.unknown_elements,
+        warnings: structure.warnings.clone(),
         chain_count: contents.chains.len(),
         chains: chains.collect(),
         surface: format!("/v1/structures/{digest}/surface.glb"),

@@ -6,7 +6,7 @@ use serde_json::{Map, Value};
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
 use crate::picture::{Drawer, PictureParams, Rendered};
-use crate::structure::{Selected, Structure, radii};
+use crate::structure::{LeftOut, Selected, Structure, radii};
 use crate::surface::{Component, GridStats, Measures, Served};
 
 /// One connected component.
@@ -41,6 +41,51 @@ impl VoidReport {
     fn new(void: &Component, centre: [f64; 3]) -> Self {
         let centroid = void.centroid();
         Self { center: std::array::from_fn(|k| centre[k] + centroid[k]), volume: -void.volume, area: void.area }
+    }
+}
+
+/// Atoms under one residue name.
+#[derive(Debug, Clone, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct ResidueCount {
+    /// Name of the residue.
+    pub name: String,
+    /// Number of atoms.
+    pub atoms: u64,
+}
+
+/// Atoms of the model that are not meshed, each counted under the first reason that applies, in the order of the fields.
+#[derive(Debug, Clone, Default, Serialize)]
+#[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
+pub struct LeftOutReport {
+    /// Sum of all counts below.
+    pub total: u64,
+    /// Atoms of chains that were not asked for.
+    pub other_chains: u64,
+    /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
+    pub virtual_sites: u64,
+    /// Atoms of kinds that were not asked for, by residue name; the ten most frequent names.
+    pub residues: Vec<ResidueCount>,
+    /// Atoms of kinds that were not asked for, under all other residue names.
+    pub other_residues: u64,
+    /// Hydrogen atoms of residues that are meshed.
+    pub hydrogens: u64,
+    /// Other alternative locations of residues that are meshed.
+    pub alternatives: u64,
+}
+
+impl LeftOutReport {
+    fn new(left_out: &LeftOut) -> Self {
+        let residues = left_out.residues.iter();
+        Self {
+            total: left_out.total(),
+            other_chains: left_out.other_chains,
+            virtual_sites: left_out.virtual_sites,
+            residues: residues.map(|(name, atoms)| ResidueCount { name: name.clone(), atoms: *atoms }).collect(),
+            other_residues: left_out.other_residues,
+            hydrogens: left_out.hydrogens,
+            alternatives: left_out.alternatives,
+        }
     }
 }
 
@@ -129,6 +174,12 @@ pub struct Report {
     pub atoms_in_file: u64,
     /// The model that was taken.
     pub model: i32,
+    /// Atoms of the model that are not meshed.
+    pub left_out: LeftOutReport,
+    /// Values of the file that could not be read and do not matter for the mesh, at most 12; absent if there are none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[cfg_attr(feature = "server", schema(required = false))]
+    pub warnings: Vec<String>,
     /// The table of radii.
     pub radii: &'static str,
     /// Kernel function.
@@ -254,6 +305,8 @@ impl Report {
             atoms: selected.atoms.len() as u64,
             atoms_in_file: structure.len() as u64,
             model: selected.model,
+            left_out: LeftOutReport::new(&selected.left_out),
+            warnings: structure.warnings.clone(),
             radii: radii::TABLE,
             kernel: params.kernel.name(),
             preset: params.preset.name(),
@@ -320,12 +373,12 @@ impl Report {
     }
 
     /// The report as a mesh file's extras: without what differs from run to run, so that the same input gives
-    /// the same bytes.
+    /// the same bytes, and without what describes the input rather than the mesh.
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
-        for run_dependent in ["timings_ms", "device", "backend_reason", "fallback"] {
-            map.remove(run_dependent);
+        for field in ["timings_ms", "device", "backend_reason", "fallback", "left_out", "warnings"] {
+            map.remove(field);
         }
         map
     }

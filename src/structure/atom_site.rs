@@ -4,11 +4,13 @@
 use std::collections::HashMap;
 
 use super::atoms::{Atom, Tables};
+use super::contents::Kind;
 use super::element::{self, Name, atomic_number};
 use super::error::StructureError;
 use super::number::{self, single};
 use super::read::MAX_COORDINATE;
 use super::text;
+use super::warnings::Warnings;
 
 /// Longest name of an atom, a residue or a chain, bytes: the dictionary's have five.
 const MAX_NAME: usize = 255;
@@ -27,6 +29,7 @@ pub(super) struct Layout {
     residue: [usize; 2],
     chain: [usize; 2],
     number: [usize; 2],
+    sequence_number: usize,
     insertion_code: usize,
     altloc: usize,
     position: [usize; 3],
@@ -55,6 +58,7 @@ impl Layout {
             residue: pair("auth_comp_id", "label_comp_id"),
             chain: pair("auth_asym_id", "label_asym_id"),
             number: pair("auth_seq_id", "label_seq_id"),
+            sequence_number: column("label_seq_id"),
             insertion_code: column("pdbx_PDB_ins_code"),
             altloc: column("label_alt_id"),
             position: POSITION.map(column),
@@ -83,11 +87,16 @@ impl Layout {
     }
 
     /// Columns of numbers, likewise.
-    pub(super) fn numbers(&self) -> [[usize; 2]; 7] {
+    pub(super) fn numbers(&self) -> [[usize; 2]; 8] {
         let [x, y, z] = self.position;
-        let alone = |column| [column, NONE];
-        let [x, y, z, occupancy, b_factor, model] = [x, y, z, self.occupancy, self.b_factor, self.model].map(alone);
-        [self.number, x, y, z, occupancy, b_factor, model]
+        let others = [x, y, z, self.occupancy, self.b_factor, self.model, self.sequence_number];
+        let [x, y, z, occupancy, b_factor, model, sequence] = others.map(|column| [column, NONE]);
+        [self.number, x, y, z, occupancy, b_factor, model, sequence]
+    }
+
+    /// Does without `label_seq_id`, except where it stands in for the author's number.
+    pub(super) fn without_sequence_numbers(self) -> Self {
+        Self { sequence_number: NONE, ..self }
     }
 }
 
@@ -155,20 +164,21 @@ pub(super) trait Row {
 
 /// Turns rows into atoms.
 #[derive(Debug)]
-pub(super) struct AtomSite {
+pub(super) struct AtomSite<F> {
     pub(super) layout: Layout,
     pub(super) tables: Tables,
+    pub(super) warnings: Warnings<F>,
     /// Guessed elements by name and residue.
     guesses: HashMap<(u32, u32), u8>,
 }
 
-impl AtomSite {
+impl<F> AtomSite<F> {
     pub(super) fn new(layout: Layout) -> Self {
-        Self { layout, tables: Tables::default(), guesses: HashMap::new() }
+        Self { layout, tables: Tables::default(), warnings: Warnings::default(), guesses: HashMap::new() }
     }
 
     #[inline]
-    pub(super) fn atom<R: Row>(&mut self, row: &R) -> Result<Atom, R::Fault> {
+    pub(super) fn atom<R: Row<Fault = F>>(&mut self, row: &R) -> Result<Atom, F> {
         let layout = self.layout;
         let position = [coordinate(row, &layout, 0)?, coordinate(row, &layout, 1)?, coordinate(row, &layout, 2)?];
         let span = name(row, layout.name)?;
@@ -183,6 +193,9 @@ impl AtomSite {
             let span = name(row, [layout.label_chain, NONE])?;
             self.tables.label_chain.intern(span.text, span.start, span.end)
         };
+        let hetero = self.hetero(row);
+        // Sequence numbers only matter for HETATM records, of which there are few.
+        let in_sequence = !hetero || matches!(row.integer(layout.sequence_number), Ok(Some(_)));
         Ok(Atom {
             position,
             element: self.element(row, name_id, residue),
@@ -193,11 +206,38 @@ impl AtomSite {
             residue_number: whole(row, layout.number, 0, "a residue number")?,
             insertion_code: character(row, layout.insertion_code, "an insertion code")?,
             altloc: character(row, layout.altloc, "an alternative location")?,
-            occupancy: optional(row, layout.occupancy, 1.0, "an occupancy")?,
-            b_factor: optional(row, layout.b_factor, 0.0, "a B-factor")?,
+            occupancy: self.optional(row, layout.occupancy, (1.0, "1"), "an occupancy"),
+            b_factor: self.optional(row, layout.b_factor, (0.0, "0"), "a B-factor"),
             model: whole(row, [layout.model, NONE], 1, "a model number")?,
-            hetero: hetero(row, layout.group)?,
+            hetero,
+            kind: if in_sequence { Kind::Polymer } else { Kind::Ligand },
         })
+    }
+
+    /// A number that may be left out. One that cannot be read is replaced by the default, with a warning.
+    #[inline]
+    fn optional<R: Row<Fault = F>>(&mut self, row: &R, column: usize, default: (f32, &'static str), what: &str) -> f32 {
+        match row.real(column) {
+            Ok(None) => return default.0,
+            Ok(Some(value)) if single(value).is_finite() => return single(value),
+            _ => {}
+        }
+        self.warnings.add(default.1, || row.fault(column, format!("{what}, ? or .")));
+        default.0
+    }
+
+    /// Whether the record is HETATM. An unknown one is read as ATOM, with a warning.
+    #[inline]
+    fn hetero<R: Row<Fault = F>>(&mut self, row: &R) -> bool {
+        let column = self.layout.group;
+        match row.text(column).map(|span| span.bytes()) {
+            Some(b"HETATM") => true,
+            None | Some(b"ATOM") => false,
+            Some(_) => {
+                self.warnings.add("ATOM", || row.fault(column, "ATOM or HETATM".to_owned()));
+                false
+            }
+        }
     }
 
     #[inline]
@@ -238,14 +278,6 @@ fn name<R: Row>(row: &R, columns: [usize; 2]) -> Result<Span<'_>, R::Fault> {
 }
 
 #[inline]
-fn optional<R: Row>(row: &R, column: usize, default: f32, what: &str) -> Result<f32, R::Fault> {
-    match row.real(column) {
-        Ok(value) => Ok(value.map_or(default, single)),
-        Err(Wrong) => Err(row.fault(column, format!("{what}, ? or ."))),
-    }
-}
-
-#[inline]
 fn whole<R: Row>(row: &R, columns: [usize; 2], default: i32, what: &str) -> Result<i32, R::Fault> {
     let value = match row.integer(columns[0]) {
         Ok(None) => row.integer(columns[1]),
@@ -265,16 +297,6 @@ fn character<R: Row>(row: &R, column: usize, what: &str) -> Result<u8, R::Fault>
         // An empty or blank quoted value is another way to say that there is none.
         Some(span) if span.bytes().iter().all(|&b| b == b' ') => Ok(0),
         Some(_) => Err(row.fault(column, format!("{what} of one character, ? or ."))),
-    }
-}
-
-#[inline]
-fn hetero<R: Row>(row: &R, column: usize) -> Result<bool, R::Fault> {
-    let Some(span) = row.text(column) else { return Ok(false) };
-    match span.bytes() {
-        b"ATOM" => Ok(false),
-        b"HETATM" => Ok(true),
-        _ => Err(row.fault(column, "ATOM or HETATM".to_owned())),
     }
 }
 

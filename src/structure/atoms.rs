@@ -1,7 +1,7 @@
 //! Atoms of a structure file as a structure of arrays.
 
 use super::contents::Kind;
-use super::residue;
+use super::kinds::{self, Sequence};
 use super::texts::{Interner, TextColumn};
 
 /// The file format that a structure was read from.
@@ -28,7 +28,7 @@ impl SourceFormat {
 }
 
 /// Atoms of every model of a file, in file order. All columns have the same length, `label_chain` excepted.
-/// An atom takes 60 bytes.
+/// An atom takes 61 bytes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
     /// Where it came from.
@@ -67,6 +67,10 @@ pub struct Structure {
     pub model: Vec<i32>,
     /// Whether the record was HETATM.
     pub hetero: Vec<bool>,
+    /// What each atom belongs to.
+    pub kind: Vec<Kind>,
+    /// Values that could not be read and were replaced by a default, in words; a bounded number.
+    pub warnings: Vec<String>,
 }
 
 impl Structure {
@@ -80,24 +84,6 @@ impl Structure {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.element.is_empty()
-    }
-
-    /// What each residue name is, by [`TextColumn::id`] in the `residue` column: whether it is water.
-    #[must_use]
-    pub fn water_residues(&self) -> Vec<bool> {
-        self.residue.texts().map(residue::is_water).collect()
-    }
-
-    /// The kind of atom `i`; `water` comes from [`Self::water_residues`].
-    #[must_use]
-    pub fn kind(&self, i: usize, water: &[bool]) -> Kind {
-        if water[self.residue.id(i) as usize] {
-            Kind::Water
-        } else if self.hetero[i] {
-            Kind::Ligand
-        } else {
-            Kind::Polymer
-        }
     }
 
     /// Whether atom `i` is hydrogen or deuterium.
@@ -123,6 +109,18 @@ pub(super) struct Atom {
     pub(super) b_factor: f32,
     pub(super) model: i32,
     pub(super) hetero: bool,
+    /// Polymer or ligand; [`kinds::assign`] decides when all atoms are known.
+    pub(super) kind: Kind,
+}
+
+/// What a file says apart from its atoms.
+#[derive(Debug)]
+pub(super) struct Source {
+    pub(super) format: SourceFormat,
+    pub(super) id: Option<String>,
+    pub(super) title: Option<String>,
+    pub(super) sequence: Sequence,
+    pub(super) warnings: Vec<String>,
 }
 
 /// The texts that atoms refer to while they are read.
@@ -211,6 +209,7 @@ columns! {
     b_factor: f32 = |a: &Atom| a.b_factor,
     model: i32 = |a: &Atom| a.model,
     hetero: bool = |a: &Atom| a.hetero,
+    kind: Kind = |a: &Atom| a.kind,
 }
 
 impl Slices<'_> {
@@ -234,21 +233,16 @@ impl Columns {
     }
 
     /// The finished structure.
-    pub(super) fn finish(
-        mut self,
-        tables: Tables,
-        format: SourceFormat,
-        id: Option<String>,
-        title: Option<String>,
-    ) -> Structure {
+    pub(super) fn finish(mut self, tables: Tables, source: Source) -> Structure {
+        kinds::assign(&mut self, &tables, &source.sequence);
         if tables.label_chain.is_empty() {
             self.label_chain = Vec::new();
         }
         self.shrink();
         Structure {
-            format,
-            id,
-            title,
+            format: source.format,
+            id: source.id,
+            title: source.title,
             x: self.x,
             y: self.y,
             z: self.z,
@@ -264,6 +258,8 @@ impl Columns {
             b_factor: self.b_factor,
             model: self.model,
             hetero: self.hetero,
+            kind: self.kind,
+            warnings: source.warnings,
         }
     }
 }

@@ -6,24 +6,28 @@ use super::atoms::Structure;
 use super::text::list;
 
 /// What an atom belongs to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum Kind {
-    /// ATOM records that are not water: chains of amino acids and nucleotides.
+    /// Chains of amino acids and nucleotides: ATOM records, and the HETATM residues of a chain.
+    #[default]
     Polymer,
-    /// HETATM records that are not water: ligands, ions, modified residues.
+    /// Other HETATM records, and single ions in any record.
     Ligand,
-    /// Water, whatever its record.
+    /// Water in any record.
     Water,
+    /// Sites of a force field that are no atoms, such as the charge site of TIP4P water. They are never selected.
+    VirtualSite,
 }
 
 impl Kind {
-    /// `polymer`, `ligand` or `water`.
+    /// `polymer`, `ligand`, `water` or `virtual`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::Polymer => "polymer",
             Self::Ligand => "ligand",
             Self::Water => "water",
+            Self::VirtualSite => "virtual",
         }
     }
 }
@@ -31,25 +35,28 @@ impl Kind {
 /// Atoms by kind; hydrogens and deuterium are counted by themselves.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// ATOM records that are neither water nor hydrogen.
+    /// Polymer without its hydrogens.
     pub polymer: u64,
-    /// HETATM records that are neither water nor hydrogen.
+    /// Ligands and ions without their hydrogens.
     pub ligand: u64,
     /// Water without its hydrogens.
     pub water: u64,
     /// Hydrogen and deuterium of all kinds.
     pub hydrogens: u64,
+    /// Sites that are no atoms.
+    pub virtual_sites: u64,
 }
 
 impl Counts {
-    /// Atoms of all kinds.
+    /// Atoms and virtual sites of all kinds.
     #[must_use]
     pub fn total(&self) -> u64 {
-        self.polymer + self.ligand + self.water + self.hydrogens
+        self.polymer + self.ligand + self.water + self.hydrogens + self.virtual_sites
     }
 
     fn add(&mut self, kind: Kind, hydrogen: bool) {
         let slot = match (hydrogen, kind) {
+            (_, Kind::VirtualSite) => &mut self.virtual_sites,
             (true, _) => &mut self.hydrogens,
             (_, Kind::Polymer) => &mut self.polymer,
             (_, Kind::Ligand) => &mut self.ligand,
@@ -61,8 +68,9 @@ impl Counts {
 
 impl fmt::Display for Counts {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { polymer, ligand, water, hydrogens } = self;
-        write!(f, "{polymer} polymer, {ligand} ligand, {water} water and {hydrogens} hydrogen atoms")
+        let Self { polymer, ligand, water, hydrogens, virtual_sites } = self;
+        write!(f, "{polymer} polymer, {ligand} ligand, {water} water and {hydrogens} hydrogen atoms")?;
+        if *virtual_sites > 0 { write!(f, " and {virtual_sites} virtual sites") } else { Ok(()) }
     }
 }
 
@@ -109,11 +117,10 @@ impl Contents {
             unknown_elements: 0,
             chains: Vec::new(),
         };
-        let water = structure.water_residues();
         // Where each of the chain column's texts stands among the chains of this model.
         let mut chain_at = vec![usize::MAX; structure.chain.texts().len()];
         for i in (0..structure.len()).filter(|&i| structure.model[i] == model) {
-            let (kind, hydrogen) = (structure.kind(i, &water), structure.is_hydrogen(i));
+            let (kind, hydrogen) = (structure.kind[i], structure.is_hydrogen(i));
             contents.counts.add(kind, hydrogen);
             contents.alternatives += u64::from(structure.altloc[i] != 0);
             contents.unknown_elements += u64::from(structure.element[i] == 0);

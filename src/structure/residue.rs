@@ -18,7 +18,7 @@ const POLYMER: &[&str] = &[
 /// Water under the names of the component dictionary and of the simulation packages.
 const WATER: &[&str] = &[
     "HOH", "WAT", "H2O", "DOD", "D2O", "TIP", "TIP3", "TIP4", "TIP5", "TIP2", "TIP3P", "TIP4P", "TIP5P", "TP3", "TP3M",
-    "TP4", "TP5", "T3P", "T4P", "T5P", "T3H", "SOL", "SPC", "SPCE", "OHH", "HHO", "WTR", "OPC", "OPC3",
+    "TP4", "TP5", "T3P", "T4P", "T5P", "T3H", "SOL", "SPC", "SPCE", "OHH", "HHO", "WTR", "OPC", "OPC3", "SWM4", "SWM6",
 ];
 
 /// CHARMM's names of ions that do not begin with the element's symbol, or begin with that of another one.
@@ -34,11 +34,22 @@ const IONS: &[(&str, u8)] = &[
     ("BAR", 56),
 ];
 
-/// Residue names of four letters whose first three are a name of their own; such a name next to a chain letter is no
-/// name of three letters next to a chain of two.
+/// Single ions that may stand in ATOM records: the names of the component dictionary and of simulation packages, without
+/// digits and signs.
+const SINGLE_IONS: &[&str] = &[
+    "NA", "K", "CL", "MG", "CA", "ZN", "LI", "RB", "CS", "BR", "CD", "BA", "MN", "FE", "CU", "CO", "NI", "SR", "IOD",
+];
+
+/// The twenty amino acids and the nucleotides that sequences are made of.
+const STANDARD: &[&str] = &[
+    "ALA", "ARG", "ASN", "ASP", "CYS", "GLN", "GLU", "GLY", "HIS", "ILE", "LEU", "LYS", "MET", "PHE", "PRO", "SER",
+    "THR", "TRP", "TYR", "VAL", "A", "C", "G", "U", "T", "I", "DA", "DC", "DG", "DT", "DU", "DI",
+];
+
+/// Residue names of four letters whose first three are a name of their own: GROMOS, and AMBER's chain ends.
 const FOUR_LETTERS: &[&str] = &[
     "TIP2", "TIP3", "TIP4", "TIP5", "SPCE", "HISA", "HISB", "HISD", "HISE", "HISH", "CYS2", "CYSH", "ASPH", "GLUH",
-    "LYSH", "ARGN", "ALAD",
+    "LYSH", "ARGN", "ALAD", "NMET", "CMET", "NLEU",
 ];
 
 pub(super) fn is_polymer(residue: &str) -> bool {
@@ -54,12 +65,18 @@ pub(super) fn charmm_ion(residue: &str) -> Option<u8> {
     IONS.iter().find(|(name, _)| *name == residue).map(|&(_, z)| z)
 }
 
-/// Whether columns 18-21 hold a residue name of three columns and the first letter of a chain of two, and not a name of
-/// four letters: names of less than three letters leave a blank, and known names are not longer than they are.
-pub(super) fn splits_from_chain(four: [u8; 4]) -> bool {
-    if four[..3].contains(&b' ') {
-        return true;
-    }
-    let (Ok(four), Ok(three)) = (std::str::from_utf8(&four), std::str::from_utf8(&four[..3])) else { return false };
-    !FOUR_LETTERS.contains(&four) && (is_polymer(three) || is_water(three))
+/// Whether a residue is a single ion.
+pub(super) fn is_ion(residue: &str) -> bool {
+    let bare = residue.trim_end_matches(|c: char| c.is_ascii_digit() || c == '+' || c == '-');
+    charmm_ion(residue).is_some() || SINGLE_IONS.iter().any(|ion| ion.eq_ignore_ascii_case(bare))
+}
+
+/// Whether a residue is one of the usual ones of sequences.
+pub(super) fn is_standard(residue: &str) -> bool {
+    STANDARD.contains(&residue)
+}
+
+/// Whether a name is one of four letters whose first three are a name of their own.
+pub(super) fn is_four_letters(residue: &str) -> bool {
+    FOUR_LETTERS.contains(&residue)
 }

@@ -12,7 +12,7 @@ use super::radii;
 use super::text::list;
 use crate::surface::{Spheres, SurfaceError};
 
-/// What to take. The default: first model, polymer (ATOM records), no hydrogens, best alternative location.
+/// What to take. The default: first model, polymer, no hydrogens, best alternative location.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[expect(clippy::struct_excessive_bools, reason = "each is a flag of its own, given by name")]
 pub struct Selection {
@@ -20,11 +20,11 @@ pub struct Selection {
     pub model: Option<i32>,
     /// Chains by author name; all by default. The empty name and `_` are a blank one.
     pub chains: Option<Vec<String>>,
-    /// ATOM records that are not water.
+    /// Chains of amino acids and nucleotides, modified residues included.
     pub polymer: bool,
-    /// HETATM records that are not water.
+    /// Ligands and ions.
     pub ligands: bool,
-    /// Water, whatever its record.
+    /// Water.
     pub waters: bool,
     /// Hydrogen and deuterium of whatever else is taken.
     pub hydrogens: bool,
@@ -91,6 +91,7 @@ impl Selection {
             Kind::Polymer => self.polymer,
             Kind::Ligand => self.ligands,
             Kind::Water => self.waters,
+            Kind::VirtualSite => false,
         }
     }
 }
@@ -102,6 +103,47 @@ pub struct Selected {
     pub atoms: Vec<u32>,
     /// The model that was taken.
     pub model: i32,
+    /// The other atoms of that model.
+    pub left_out: LeftOut,
+}
+
+/// Residue names that are counted on their own.
+const MAX_NAMES: usize = 10;
+
+/// Atoms of the model that were not taken, each counted under the first reason that applies, in this order.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct LeftOut {
+    /// Atoms of chains that were not asked for.
+    pub other_chains: u64,
+    /// Sites that are no atoms: charge sites of water models, lone pairs, Drude particles.
+    pub virtual_sites: u64,
+    /// Atoms of kinds that were not asked for, by residue name, the most frequent names first; a bounded number.
+    pub residues: Vec<(String, u64)>,
+    /// The same under all further residue names.
+    pub other_residues: u64,
+    /// Hydrogen and deuterium of residues that were taken.
+    pub hydrogens: u64,
+    /// Other alternative locations of residues that were taken.
+    pub alternatives: u64,
+}
+
+impl LeftOut {
+    /// All atoms and sites that were not taken.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        let named: u64 = self.residues.iter().map(|(_, n)| n).sum();
+        named + self.other_chains + self.virtual_sites + self.other_residues + self.hydrogens + self.alternatives
+    }
+
+    /// Sets the counts of residue names from counts by their number.
+    fn name_residues(&mut self, structure: &Structure, counts: &[u64]) {
+        let counted = structure.residue.texts().zip(counts).filter(|(_, n)| **n > 0);
+        let mut names: Vec<(&str, u64)> = counted.map(|(name, n)| (name, *n)).collect();
+        names.sort_unstable_by(|(a, m), (b, n)| n.cmp(m).then(a.cmp(b)));
+        let shown = names.len().min(MAX_NAMES);
+        self.other_residues = names[shown..].iter().map(|(_, n)| n).sum();
+        self.residues = names[..shown].iter().map(|(name, n)| ((*name).to_owned(), *n)).collect();
+    }
 }
 
 /// Selects atoms.
@@ -114,20 +156,31 @@ pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, 
     let chains = chains(structure, selection)?;
     let wanted = alternative(structure, selection, model)?;
     let alternatives = Alternatives::choose(structure, model, wanted);
-    let water = structure.water_residues();
-    let taken = |i: usize| {
-        structure.model[i] == model
-            && (selection.hydrogens || !structure.is_hydrogen(i))
-            && selection.takes(structure.kind(i, &water))
-            && chains.as_ref().is_none_or(|chains| chains[structure.chain.id(i) as usize])
-            && alternatives.keeps(structure, i)
-    };
+    let mut left_out = LeftOut::default();
+    let mut by_residue = vec![0; structure.residue.texts().len()];
+    let mut atoms: Vec<u32> = Vec::new();
     // The reader refuses more atoms than 32 bits count.
-    let atoms: Vec<u32> = (0..structure.len()).filter(|&i| taken(i)).filter_map(|i| u32::try_from(i).ok()).collect();
+    for (i, index) in (0..structure.len()).zip(0_u32..).filter(|&(i, _)| structure.model[i] == model) {
+        let kind = structure.kind[i];
+        if chains.as_ref().is_some_and(|chains| !chains[structure.chain.id(i) as usize]) {
+            left_out.other_chains += 1;
+        } else if kind == Kind::VirtualSite {
+            left_out.virtual_sites += 1;
+        } else if !selection.takes(kind) {
+            by_residue[structure.residue.id(i) as usize] += 1;
+        } else if !selection.hydrogens && structure.is_hydrogen(i) {
+            left_out.hydrogens += 1;
+        } else if !alternatives.keeps(structure, i) {
+            left_out.alternatives += 1;
+        } else {
+            atoms.push(index);
+        }
+    }
     if atoms.is_empty() {
         return Err(StructureError::EmptySelection { holds: holds(structure, selection, model) });
     }
-    Ok(Selected { atoms, model })
+    left_out.name_residues(structure, &by_residue);
+    Ok(Selected { atoms, model, left_out })
 }
 
 fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureError> {

@@ -108,6 +108,11 @@ impl Interner {
         self.texts.get(id as usize)
     }
 
+    /// The distinct texts, by number.
+    pub(super) fn texts(&self) -> impl ExactSizeIterator<Item = &str> {
+        self.texts.iter()
+    }
+
     /// The number of `text[start..end]`.
     #[inline]
     pub(super) fn intern(&mut self, text: &[u8], start: usize, end: usize) -> u32 {

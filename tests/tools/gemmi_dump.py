@@ -2,7 +2,8 @@
 
 Usage: gemmi_dump.py FILE. First line: `models N N N…` (atoms of each model). Then one line per atom of the first model:
 chain, residue number, insertion code, residue, atom name, altloc, atomic number, x, y, z, occupancy, B, hetero, selected.
-`selected` applies the documented default selection, written here a second time.
+`selected` applies the documented default selection, written here a second time; gemmi decides which HETATM residues
+belong to a polymer.
 """
 
 import sys
@@ -10,6 +11,7 @@ import sys
 import gemmi
 
 WATER = {"HOH", "WAT", "H2O", "DOD", "TIP", "TIP3", "SOL"}
+IONS = {"SOD", "CLA", "POT", "NA", "CL", "K", "MG", "ZN"}
 
 
 def read(path):
@@ -44,6 +46,7 @@ def altlocs(model):
 
 def main():
     structure = read(sys.argv[1])
+    structure.setup_entities()
     print("models", *(model.count_atom_sites() for model in structure))
     model = structure[0]
     best = altlocs(model)
@@ -51,8 +54,9 @@ def main():
     for chain, residue, atom in atoms(model):
         hetero = residue.het_flag == "H"
         key = (chain.name, str(residue.seqid))
+        polymer = residue.entity_type == gemmi.EntityType.Polymer if hetero else residue.name not in IONS
         selected = (
-            not hetero
+            polymer
             and not atom.is_hydrogen()
             and residue.name not in WATER
             and (not atom.has_altloc() or atom.altloc == best[key])

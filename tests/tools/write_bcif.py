@@ -10,7 +10,7 @@ Usage: write_bcif.py VARIANT INPUT.cif[.gz] OUTPUT.bcif. Variants:
 * texts: every column a StringArray, numbers too
 * compressed: what biotite finds smallest
 
-`entry`, `struct` and `atom_site` are written. For every file one line of JSON: {"atoms": N, "encodings": [names]}.
+`entry`, `struct`, `entity`, `struct_asym` and `atom_site` are written. For every file one line of JSON: {"atoms": N, "encodings": [names]}.
 Without arguments, lines of VARIANT, INPUT and OUTPUT separated by tabs are read from standard input.
 """
 
@@ -99,7 +99,7 @@ def write(variant, source, target):
     with opener(source, "rt") as file:
         block = pdbx.CIFFile.read(io.StringIO(file.read())).block
     out = pdbx.BinaryCIFBlock()
-    for name in ("entry", "struct", "atom_site"):
+    for name in ("entry", "struct", "entity", "struct_asym", "atom_site"):
         if name in block:
             columns = {key: column(variant, name, key, value) for key, value in block[name].items()}
             out[name] = pdbx.BinaryCIFCategory(columns)

@@ -19,8 +19,10 @@ use self::column::{Bounds, Cells, Raw};
 use self::fault::Fault;
 use self::msgpack::Cursor;
 use super::atom_site::{Layout, Passed};
-use super::atoms::{Columns, SourceFormat, Structure, Tables};
+use super::atoms::{Source, SourceFormat, Structure};
+use super::entities::{self, Entities};
 use super::error::StructureError;
+use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
 use super::read::ReadLimits;
 use super::text::{decode, tidy};
@@ -118,6 +120,20 @@ impl<'a> Category<'a> {
         Ok(range.and_then(|(start, end)| tidy(&texts.joined[start..end], max)))
     }
 
+    /// The values of an item, empty texts where there are none; nothing without the item.
+    fn values(&self, item: &str, most: usize) -> Result<Vec<String>, Box<Fault>> {
+        let columns = self.columns()?;
+        let named = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item.as_bytes()));
+        let Some(raw) = named else { return Ok(Vec::new()) };
+        let Some(rows) = usize::try_from(self.rows).ok().filter(|&n| n <= most) else {
+            return Err(Fault::new(format!("{} rows", self.rows), format!("at most {most}")).within("rowCount"));
+        };
+        let column = raw.load(Bounds { rows, texts: most }, true)?;
+        let Cells::Text(texts) = &column.cells else { return Ok(Vec::new()) };
+        let text = |row| texts.range(row).filter(|_| !column.is_null(row)).map(|(from, to)| &texts.joined[from..to]);
+        Ok((0..rows).map(|row| decode(text(row).unwrap_or_default()).into_owned()).collect())
+    }
+
     /// What may be decoded; `None` if there are more rows than atoms are allowed.
     fn bounds(&self, limits: &ReadLimits) -> Option<Bounds> {
         let rows = usize::try_from(self.rows).ok().filter(|&n| n <= limits.max_rows())?;
@@ -133,6 +149,9 @@ struct Block<'a> {
     atom_site: Option<Category<'a>>,
     entry: Option<Category<'a>>,
     title: Option<Category<'a>>,
+    entity: Option<Category<'a>>,
+    entity_poly: Option<Category<'a>>,
+    struct_asym: Option<Category<'a>>,
 }
 
 impl<'a> Block<'a> {
@@ -166,6 +185,9 @@ impl<'a> Block<'a> {
             () if is(b"atom_site") => &mut self.atom_site,
             () if is(b"entry") => &mut self.entry,
             () if is(b"struct") => &mut self.title,
+            () if is(b"entity") => &mut self.entity,
+            () if is(b"entity_poly") => &mut self.entity_poly,
+            () if is(b"struct_asym") => &mut self.struct_asym,
             () => return,
         };
         if place.is_none() {
@@ -175,19 +197,55 @@ impl<'a> Block<'a> {
 
     /// The structure, if the block has atoms with coordinates.
     fn structure(&self, limits: &ReadLimits, passed: &mut Passed) -> Result<Option<Structure>, StructureError> {
-        let Some((columns, tables)) = self.atoms(limits, passed)? else { return Ok(None) };
+        let (entities, unread) = self.entities();
+        let Some((columns, tables, warnings)) = self.atoms(entities.are_known(), limits, passed)? else {
+            return Ok(None);
+        };
         let value = |category: &Option<Category<'_>>, item, max| -> Result<Option<String>, StructureError> {
             let Some(category) = category else { return Ok(None) };
             Ok(category.value(item, max, limits).map_err(|f| f.within(category.place()))?)
         };
         let entry = value(&self.entry, b"id", 80)?;
         let title = value(&self.title, b"title", MAX_TITLE)?;
-        let id = entry.or_else(|| self.name.clone());
-        Ok(Some(columns.finish(tables, SourceFormat::BinaryCif, id, title)))
+        let place = self.atom_site.as_ref().map(Category::place).unwrap_or_default();
+        let source = Source {
+            format: SourceFormat::BinaryCif,
+            id: entry.or_else(|| self.name.clone()),
+            title,
+            sequence: Sequence { polymer_chains: entities.polymer_chains(), ..Sequence::default() },
+            warnings: warnings.messages(|fault| fault.within(&place).into()).into_iter().chain(unread).collect(),
+        };
+        Ok(Some(columns.finish(tables, source)))
+    }
+
+    /// What the block says about its entities, and a warning if that cannot be read.
+    fn entities(&self) -> (Entities, Option<String>) {
+        let mut known = Entities::default();
+        for (place, (name, item)) in entities::ITEMS.into_iter().enumerate() {
+            let category = match name {
+                "entity" => &self.entity,
+                "entity_poly" => &self.entity_poly,
+                _ => &self.struct_asym,
+            };
+            let Some(category) = category else { continue };
+            match category.values(item, entities::MAX_VALUES) {
+                Ok(values) => values.into_iter().for_each(|value| known.add(place, value)),
+                Err(fault) => {
+                    let error = StructureError::from(fault.within(category.place()));
+                    return (Entities::default(), Some(format!("{error}; entities are unknown")));
+                }
+            }
+        }
+        (known, None)
     }
 
     /// The atoms, if the block has some with coordinates.
-    fn atoms(&self, limits: &ReadLimits, passed: &mut Passed) -> Result<Option<(Columns, Tables)>, StructureError> {
+    fn atoms(
+        &self,
+        entities: bool,
+        limits: &ReadLimits,
+        passed: &mut Passed,
+    ) -> Result<Option<rows::Atoms>, StructureError> {
         let Some(category) = self.atom_site.as_ref().filter(|category| category.rows > 0) else { return Ok(None) };
         let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
         let within = |fault: Box<Fault>| fault.within(category.place());
@@ -197,6 +255,8 @@ impl<'a> Block<'a> {
             passed.lacking(missing);
             return Ok(None);
         }
+        // Where entities are known, the column is not needed.
+        let layout = if entities { layout.without_sequence_numbers() } else { layout };
         // What is decoded counts as inflated: runs may say in a few bytes what takes many.
         if rows::decoded_bytes(&layout, bounds.rows) > limits.max_inflated_bytes {
             return Err(StructureError::InflatedTooLarge { limit: limits.max_inflated_bytes });

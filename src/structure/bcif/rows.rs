@@ -5,6 +5,7 @@ use rayon::prelude::*;
 use super::super::atom_site::{self, AtomSite, Layout, Span, Wrong};
 use super::super::atoms::{Columns, Tables};
 use super::super::text::{decode, quote};
+use super::super::warnings::Warnings;
 use super::column::{Bounds, Cells, Column, Raw};
 use super::fault::Fault;
 
@@ -92,8 +93,11 @@ pub(super) fn decoded_bytes(layout: &Layout, rows: usize) -> u64 {
     row as u64 * rows as u64
 }
 
+/// Atoms, the texts they refer to, and values that were replaced.
+pub(super) type Atoms = (Columns, Tables, Warnings<Box<Fault>>);
+
 /// Decodes the columns that the layout needs, and makes atoms of their rows.
-pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<(Columns, Tables), Box<Fault>> {
+pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<Atoms, Box<Fault>> {
     let table = Table { raw, columns: load(raw, &layout, bounds)? };
     let mut columns = Columns::zeroed(bounds.rows);
     let mut rest = columns.slices();
@@ -115,11 +119,12 @@ pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<(C
         .collect();
     // The first fault of the file, whichever thread was first.
     done.into_iter().collect::<Result<(), _>>()?;
-    let mut tables = Tables::default();
+    let (mut tables, mut warnings) = (Tables::default(), Warnings::default());
     for (_, mut slices, site) in parts {
         slices.adopt(&site.tables, &mut tables);
+        warnings.append(site.warnings);
     }
-    Ok((columns, tables))
+    Ok((columns, tables, warnings))
 }
 
 /// A column and the one that stands in for it, as far as they are needed.

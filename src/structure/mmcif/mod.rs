@@ -1,4 +1,4 @@
-//! PDBx/mmCIF: the `atom_site` category of the first data block that has one, and the entry's id and title.
+//! PDBx/mmCIF: the `atom_site` category of the first data block that has one, the entry's id and title, and the entities.
 //!
 //! Dictionary: PDBx/mmCIF, category `atom_site`. Author names and numbers (`auth_*`) go before the dictionary's own
 //! (`label_*`), which stand in where the author's are missing.
@@ -9,9 +9,11 @@ mod rows;
 use self::row::PREFIX;
 use self::rows::Rows;
 use super::atom_site::{Layout, Passed};
-use super::atoms::{SourceFormat, Structure};
+use super::atoms::{Source, SourceFormat, Structure};
 use super::cif::{self, Kind, Token, Tokenizer};
+use super::entities::Entities;
 use super::error::StructureError;
+use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
 use super::read::ReadLimits;
 use super::text::{Fault, decode, tidy};
@@ -54,6 +56,7 @@ struct Reader<'a> {
     block: Option<String>,
     entry: Option<String>,
     title: Option<String>,
+    entities: Entities,
     in_frame: bool,
     rows: Option<Rows<'a>>,
     /// `atom_site` given item by item, as files with one atom may: item names, and their values as offsets.
@@ -70,6 +73,7 @@ impl<'a> Reader<'a> {
             block: None,
             entry: None,
             title: None,
+            entities: Entities::default(),
             in_frame: false,
             rows: None,
             single: SingleRow::default(),
@@ -113,6 +117,7 @@ impl<'a> Reader<'a> {
         self.block = tidy(name, 80);
         self.entry = None;
         self.title = None;
+        self.entities = Entities::default();
         self.in_frame = false;
         self.passed.block();
     }
@@ -134,8 +139,25 @@ impl<'a> Reader<'a> {
             self.single.values.push((value.start, value.end));
         } else {
             self.note_value(name, &value);
+            if let Some(place) = self.entity_item(tag) {
+                self.note_entity(place, &value);
+            }
         }
         Ok(())
+    }
+
+    /// The place of an item that describes entities.
+    fn entity_item(&self, tag: &Token) -> Option<usize> {
+        if self.in_frame {
+            return None;
+        }
+        Entities::find(&self.text[tag.start + 1..tag.end])
+    }
+
+    /// Keeps a value that describes entities.
+    fn note_entity(&mut self, place: usize, value: &Token) {
+        let (start, end, _) = cif::unquote(self.text, value.start, value.end);
+        self.entities.add(place, decode(&self.text[start..end]).into_owned());
     }
 
     /// The id and the title of the entry.
@@ -180,11 +202,16 @@ impl<'a> Reader<'a> {
                 return Ok(self.tokens.next()?);
             }
         }
+        let places: Vec<Option<usize>> = tags.iter().map(|tag| self.entity_item(tag)).collect();
+        let of_entities = places.iter().any(Option::is_some);
         let mut i = 0;
         while token.kind == Kind::Value {
             // Of a loop over entries or titles the first row is meant.
             if let Some(tag) = tags.get(i) {
                 self.note_value(&self.text[tag.start..tag.end], &token);
+            }
+            if of_entities && let Some(place) = places[i % places.len()] {
+                self.note_entity(place, &token);
             }
             i += 1;
             token = self.tokens.next()?;
@@ -216,9 +243,12 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// Looks for a title behind the atoms. These are complete: what is wrong from here on harms nobody.
+    /// Looks for a title behind the atoms, and for entities if HETATM records need them. The atoms are complete, so errors
+    /// from here on do not matter.
     fn rest_of_block(&mut self, mut token: Token) {
-        while self.title.is_none() && !matches!(token.kind, Kind::End | Kind::Data) {
+        let hetero = self.rows.as_ref().is_some_and(Rows::has_hetero);
+        let wanted = |reader: &Self| reader.title.is_none() || (hetero && !reader.entities.are_known());
+        while wanted(self) && !matches!(token.kind, Kind::End | Kind::Data) {
             let next = match token.kind {
                 Kind::Tag => self.item(&token).and_then(|()| Ok(self.tokens.next()?)),
                 Kind::Loop => self.category(),
@@ -244,11 +274,20 @@ impl<'a> Reader<'a> {
     }
 
     fn finish(self) -> Result<Structure, StructureError> {
-        let (columns, tables) = self.rows.map(Rows::into_parts).unwrap_or_default();
+        let (columns, tables, warnings) = self.rows.map(Rows::into_parts).unwrap_or_default();
         if columns.len() == 0 {
             return Err(self.passed.no_atoms("mmCIF", self.block));
         }
-        Ok(columns.finish(tables, SourceFormat::Mmcif, self.entry.or(self.block), self.title))
+        let too_many = self.entities.warning();
+        let warnings = warnings.messages(|fault| fault.locate(self.text));
+        let source = Source {
+            format: SourceFormat::Mmcif,
+            id: self.entry.or(self.block),
+            title: self.title,
+            sequence: Sequence { polymer_chains: self.entities.polymer_chains(), ..Sequence::default() },
+            warnings: warnings.into_iter().chain(too_many).collect(),
+        };
+        Ok(columns.finish(tables, source))
     }
 }
 

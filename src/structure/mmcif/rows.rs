@@ -14,6 +14,7 @@ use super::super::atoms::{Atom, Columns, Slices, Tables};
 use super::super::cif::{Kind, Tokenizer, bare_kind};
 use super::super::scan::Edges;
 use super::super::text::Fault;
+use super::super::warnings::Warnings;
 use super::Stop;
 use super::row::Row;
 
@@ -26,7 +27,7 @@ const CHUNK_BYTES: usize = 512 << 10;
 
 pub(super) struct Rows<'a> {
     text: &'a [u8],
-    site: AtomSite,
+    site: AtomSite<Box<Fault>>,
     columns: Columns,
     limit: usize,
 }
@@ -64,8 +65,13 @@ impl<'a> Rows<'a> {
         Self { text, site: AtomSite::new(layout), columns: Columns::default(), limit: max_rows }
     }
 
-    pub(super) fn into_parts(self) -> (Columns, Tables) {
-        (self.columns, self.site.tables)
+    pub(super) fn into_parts(self) -> (Columns, Tables, Warnings<Box<Fault>>) {
+        (self.columns, self.site.tables, self.site.warnings)
+    }
+
+    /// Whether some row is a HETATM record.
+    pub(super) fn has_hetero(&self) -> bool {
+        self.columns.hetero.contains(&true)
     }
 
     /// Reads rows from the first value on; returns where the loop ends.
@@ -158,12 +164,14 @@ impl<'a> Rows<'a> {
         if failed.into_inner() {
             return None;
         }
-        let mut tables = Tables::default();
+        let (mut tables, mut warnings) = (Tables::default(), Warnings::default());
         for (_, mut slices, site) in parts {
             slices.adopt(&site.tables, &mut tables);
+            warnings.append(site.warnings);
         }
         self.columns = columns;
         self.site.tables = tables;
+        self.site.warnings = warnings;
         Some(end)
     }
 }
@@ -261,7 +269,7 @@ impl<'a> Scanner<'a> {
     /// whole, or not there.
     fn rows(
         &mut self,
-        site: &mut AtomSite,
+        site: &mut AtomSite<Box<Fault>>,
         sink: &mut impl Sink,
         mut at: usize,
         end: usize,

@@ -6,21 +6,28 @@
 //! coordinates, hybrid-36 and five-digit residue numbers, residue names of four letters, chains of two, no element
 //! columns, entry and line number in their place (before 1996), tabs, any line ending.
 
+mod card;
+mod chains;
+mod lines;
+mod sequence;
+
 use std::collections::{HashMap, HashSet};
 
-use super::atoms::{Atom, Columns, SourceFormat, Structure, Tables};
+use self::card::{Card, card, coordinate, expand_tabs, number, numbered_line, residue_number};
+use self::chains::TwoLetterChains;
+use self::lines::Lines;
+use super::atoms::{Atom, Columns, Source, SourceFormat, Structure, Tables};
+use super::contents::Kind;
 use super::element::{self, Name, atomic_number};
 use super::error::StructureError;
-use super::number::{hybrid36, real, single};
-use super::read::{MAX_COORDINATE, ReadLimits};
-use super::residue;
-use super::scan::run_length;
+use super::kinds::{Listed, Sequence};
+use super::number::single;
+use super::read::ReadLimits;
 use super::text::{self, Fault, tidy, trimmed};
+use super::warnings::Warnings;
 
 /// Longest title that is kept, characters.
 pub(super) const MAX_TITLE: usize = 1000;
-
-type Card = [u8; 80];
 
 pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
     let mut reader = Reader::new(text, limits);
@@ -35,48 +42,14 @@ pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, Struct
     if reader.columns.len() == 0 {
         return Err(StructureError::NoAtoms { found: describe(text) });
     }
-    let title = tidy(&reader.title, MAX_TITLE);
-    Ok(reader.columns.finish(reader.tables, SourceFormat::Pdb, reader.id, title))
-}
-
-/// Lines that are not empty, as offsets, without their ends.
-struct Lines<'a> {
-    text: &'a [u8],
-    at: usize,
-    carriage_returns: bool,
-}
-
-impl<'a> Lines<'a> {
-    fn new(text: &'a [u8]) -> Self {
-        Self { text, at: 0, carriage_returns: memchr::memchr(b'\r', text).is_some() }
-    }
-}
-
-impl Iterator for Lines<'_> {
-    type Item = (usize, usize);
-
-    #[inline]
-    fn next(&mut self) -> Option<(usize, usize)> {
-        let rest = self.text.get(self.at..).unwrap_or_default();
-        let one_end = match rest {
-            [b'\n', ..] => 1,
-            [b'\r', b'\n', ..] => 2,
-            _ => 0,
-        };
-        // Usually the next line begins right there.
-        let next = if rest.get(one_end).is_some_and(|&b| b > b' ') { one_end } else { empty_lines(rest) };
-        let start = self.at + next;
-        let rest = self.text.get(start..).filter(|rest| !rest.is_empty())?;
-        let len = if self.carriage_returns { memchr::memchr2(b'\n', b'\r', rest) } else { memchr::memchr(b'\n', rest) };
-        self.at = start + len.unwrap_or(rest.len());
-        Some((start, self.at))
-    }
-}
-
-/// Length of the line ends and blank lines that `text` begins with.
-fn empty_lines(text: &[u8]) -> usize {
-    let blanks = &text[..run_length(text, false)];
-    memchr::memrchr2(b'\n', b'\r', blanks).map_or(0, |i| i + 1)
+    let source = Source {
+        format: SourceFormat::Pdb,
+        id: reader.id,
+        title: tidy(&reader.title, MAX_TITLE),
+        sequence: Sequence { listed: reader.listed, ..Sequence::default() },
+        warnings: reader.warnings.messages(|fault| fault.locate(text)),
+    };
+    Ok(reader.columns.finish(reader.tables, source))
 }
 
 /// Which model an atom belongs to. A number that comes back, and atoms after the end of a model, begin a new one.
@@ -112,8 +85,11 @@ struct Reader<'a> {
     left_justified: bool,
     /// Guessed elements by name columns and residue.
     guesses: HashMap<(u32, u32), u8>,
-    /// Columns 18-21 of the latest residue name that reaches into column 21, and whether that belongs to the chain.
-    four_letters: ([u8; 4], bool),
+    /// Chains of two letters; found when column 21 is in use for the first time.
+    two_letters: Option<TwoLetterChains>,
+    /// Chains and residue names of SEQRES and MODRES records.
+    listed: HashSet<Listed>,
+    warnings: Warnings<Box<Fault>>,
 }
 
 impl<'a> Reader<'a> {
@@ -130,7 +106,9 @@ impl<'a> Reader<'a> {
             title: Vec::new(),
             left_justified: false,
             guesses: HashMap::new(),
-            four_letters: ([0; 4], false),
+            two_letters: None,
+            listed: HashSet::new(),
+            warnings: Warnings::default(),
         }
     }
 
@@ -142,7 +120,7 @@ impl<'a> Reader<'a> {
                 self.atom(start, end, false)
             }
             [b'H', b'E', b'T', b'A', b'T', b'M', ..] => self.atom(start, end, true),
-            [b'M' | b'E' | b'H' | b'T', ..] => self.other(start, line),
+            [b'M' | b'E' | b'H' | b'T' | b'S', ..] => self.other(start, line),
             _ => Ok(()),
         }
     }
@@ -152,6 +130,8 @@ impl<'a> Reader<'a> {
         match word.trim_ascii_end() {
             b"MODEL" => self.model(start, line)?,
             b"ENDMDL" | b"END" => self.models.current = None,
+            b"SEQRES" => sequence::of_chain(line, &mut self.listed),
+            b"MODRES" => sequence::of_residue(line, &mut self.listed),
             b"HEADER" if self.id.is_none() => {
                 let id = line.get(62..66).unwrap_or_default();
                 if id.first().is_some_and(u8::is_ascii_digit) && id.iter().all(u8::is_ascii_alphanumeric) {
@@ -186,31 +166,40 @@ impl<'a> Reader<'a> {
     #[inline]
     fn atom(&mut self, start: usize, end: usize, hetero: bool) -> Result<(), Box<Fault>> {
         let line = &self.text[start..end];
+        let n_warnings = self.warnings.len();
         if self.tabs && line.contains(&b'\t') {
             let (expanded, origin) = expand_tabs(line);
-            return self.columns_of(&expanded, hetero).map_err(|mut fault| {
-                fault.at = start + origin.get(fault.at).copied().unwrap_or(line.len());
+            let place = |at: usize| start + origin.get(at).copied().unwrap_or(line.len());
+            let read = self.columns_of(&expanded, hetero);
+            self.warnings.after(n_warnings).iter_mut().for_each(|w| w.fault.at = place(w.fault.at));
+            return read.map_err(|mut fault| {
+                fault.at = place(fault.at);
                 fault
             });
         }
-        self.columns_of(line, hetero).map_err(|mut fault| {
+        let read = self.columns_of(line, hetero);
+        self.warnings.after(n_warnings).iter_mut().for_each(|w| w.fault.at += start);
+        read.map_err(|mut fault| {
             fault.at += start;
             fault
         })
     }
 
-    /// Reads the columns of one line; faults are relative to it.
+    /// Reads the columns of one line; places of faults and warnings are relative to it.
     #[inline]
     fn columns_of(&mut self, line: &[u8], hetero: bool) -> Result<(), Box<Fault>> {
         if line.len() < 54 {
             let found = format!("a line of {} columns", line.len());
             return Err(Fault::words(line.len(), found, "coordinates in columns 31 to 54"));
         }
-        let mut padded = [b' '; 80];
-        let card: &Card = line.first_chunk().unwrap_or_else(|| {
-            padded[..line.len()].copy_from_slice(line);
-            &padded
-        });
+        let padded;
+        let card: &Card = match line.first_chunk() {
+            Some(card) => card,
+            None => {
+                padded = card(line);
+                &padded
+            }
+        };
         if self.columns.len() >= self.max_rows {
             self.full = true;
             return Ok(());
@@ -231,13 +220,14 @@ impl<'a> Reader<'a> {
             residue_number,
             insertion_code,
             altloc: if card[16] > b' ' { card[16] } else { 0 },
-            occupancy: optional(card, 54, 60, 1.0, "an occupancy")?,
-            b_factor: optional(card, 60, 66, 0.0, "a B-factor")?,
+            occupancy: self.optional(card, (54, 60), (1.0, "1"), "an occupancy"),
+            b_factor: self.optional(card, (60, 66), (0.0, "0"), "a B-factor"),
             model: match self.models.current {
                 Some(model) => model,
                 None => self.models.begin(None),
             },
             hetero,
+            kind: if hetero { Kind::Ligand } else { Kind::Polymer },
         };
         if self.columns.len() == 0 {
             // Were all lines as long as this one, so many atoms would fit.
@@ -254,11 +244,23 @@ impl<'a> Reader<'a> {
         if card[20] <= b' ' {
             return (20, 21);
         }
-        let four = [card[17], card[18], card[19], card[20]];
-        if self.four_letters.0 != four {
-            self.four_letters = (four, residue::splits_from_chain(four));
+        let chains = self.two_letters.get_or_insert_with(|| TwoLetterChains::find(self.text));
+        if chains.has(card) { (20, 20) } else { (21, 21) }
+    }
+
+    /// A number that may be left out. One that cannot be read is replaced by the default, with a warning.
+    #[inline]
+    fn optional(&mut self, card: &Card, at: (usize, usize), default: (f32, &'static str), what: &str) -> f32 {
+        let (from, to) = at;
+        match number(card, from, to) {
+            Some(value) if single(value).is_finite() => return single(value),
+            None if trimmed(&card[from..to]).1 == 0 => return default.0,
+            _ => {}
         }
-        if self.four_letters.1 && card[21] > b' ' { (20, 20) } else { (21, 21) }
+        self.warnings.add(default.1, || {
+            Fault::token(card, from, to, format!("{what} in columns {} to {to}, or blanks", from + 1))
+        });
+        default.0
     }
 
     #[inline]
@@ -294,71 +296,6 @@ impl<'a> Reader<'a> {
         self.guesses.insert((u32::from_le_bytes(columns), residue), z);
         z
     }
-}
-
-/// Whether columns 73-80 hold the entry's id and a line number, as before 1996: `4PTI  88`, `2HHBA 206`.
-fn numbered_line(card: &Card) -> bool {
-    card[72].is_ascii_digit()
-        && card[73..76].iter().all(u8::is_ascii_alphanumeric)
-        && card[79].is_ascii_digit()
-        && (card[78].is_ascii_digit() || card[78] == b' ')
-}
-
-#[inline]
-fn coordinate(card: &Card, from: usize, axis: &str) -> Result<f64, Box<Fault>> {
-    match number(card, from, from + 8) {
-        Some(value) if value.abs() <= MAX_COORDINATE => Ok(value),
-        _ => Err(Fault::token(card, from, from + 8, format!("the {axis} coordinate in Å, within ±{MAX_COORDINATE}"))),
-    }
-}
-
-/// A number that may be left out.
-#[inline]
-fn optional(card: &Card, from: usize, to: usize, default: f32, what: &str) -> Result<f32, Box<Fault>> {
-    match number(card, from, to) {
-        Some(value) => Ok(single(value)),
-        None if trimmed(&card[from..to]).1 == 0 => Ok(default),
-        None => Err(Fault::token(card, from, to, format!("{what} in columns {} to {to}, or blanks", from + 1))),
-    }
-}
-
-/// The number in `card[from..to]`, with blanks around it.
-#[inline]
-fn number(card: &Card, from: usize, to: usize) -> Option<f64> {
-    let mut start = from;
-    while start < to && card[start] == b' ' {
-        start += 1;
-    }
-    real(card, start, to).or_else(|| {
-        let (a, b) = trimmed(&card[from..to]);
-        real(card, from + a, from + b)
-    })
-}
-
-/// Columns 23-26 and the insertion code in column 27, which is the fifth digit of numbers that need one.
-#[inline]
-fn residue_number(card: &Card) -> Result<(i32, u8), Box<Fault>> {
-    let code = card[26];
-    if code.is_ascii_digit() && card[22..26].iter().all(|b| b.is_ascii_digit() || *b == b'-') {
-        let number = super::number::integer(&card[22..27]);
-        return number.map(|n| (n, 0)).ok_or_else(|| Fault::token(card, 22, 27, "a residue number"));
-    }
-    let (from, to) = trimmed(&card[22..26]);
-    let number = if from == to { Some(0) } else { hybrid36(&card[22 + from..22 + to]) };
-    let number = number.ok_or_else(|| Fault::token(card, 22, 26, "a residue number, decimal or hybrid-36"))?;
-    Ok((number, if code > b' ' { code } else { 0 }))
-}
-
-/// A line with tab stops every eight columns, and where each of its bytes came from.
-fn expand_tabs(line: &[u8]) -> (Vec<u8>, Vec<usize>) {
-    let (mut out, mut origin) = (Vec::with_capacity(96), Vec::with_capacity(96));
-    // What lies beyond column 80 is not read; a tab is eight columns at most.
-    for (i, &b) in line.iter().enumerate().take(96) {
-        let columns = if b == b'\t' { 8 - out.len() % 8 } else { 1 };
-        out.extend(std::iter::repeat_n(if b == b'\t' { b' ' } else { b }, columns));
-        origin.extend(std::iter::repeat_n(i, columns));
-    }
-    (out, origin)
 }
 
 /// What a file without atoms holds.

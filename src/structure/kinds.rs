@@ -1,0 +1,220 @@
+//! The kind of every atom: polymer, ligand, water, or a virtual site.
+//!
+//! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file says so: by the
+//! entity of its chain or its `label_seq_id` (mmCIF), by a SEQRES or MODRES record (PDB). Where the file says nothing,
+//! it is polymer if a backbone bond joins it to a polymer residue beside it in the file, directly or through residues of
+//! its own sort.
+
+use std::collections::{HashMap, HashSet};
+
+use super::atoms::{Columns, Tables};
+use super::contents::Kind;
+use super::{residue, sites};
+
+/// What a file says about the sequence of its chains.
+#[derive(Debug, Default)]
+pub(super) struct Sequence {
+    /// Chains and residue names of SEQRES and MODRES records, standard residues excepted.
+    pub(super) listed: HashSet<Listed>,
+    /// For chains by `label_asym_id`, whether their entity is a polymer.
+    pub(super) polymer_chains: HashMap<String, bool>,
+}
+
+/// Columns of a chain (two) and a residue name (three), right-aligned.
+pub(super) type Listed = [u8; 5];
+
+/// The columns of a chain and a residue name, if these are as short as in a PDB file.
+pub(super) fn listed(chain: &[u8], residue: &[u8]) -> Option<Listed> {
+    let mut columns = [b' '; 5];
+    columns[..2].get_mut(2_usize.checked_sub(chain.len())?..)?.copy_from_slice(chain);
+    columns[2..].get_mut(3_usize.checked_sub(residue.len())?..)?.copy_from_slice(residue);
+    Some(columns)
+}
+
+/// Longest bond between the carbon and the nitrogen of a peptide, Å; 1.33 Å is usual, and no contact is this short.
+const PEPTIDE_BOND: f64 = 2.0;
+/// Longest bond between O3' and the next phosphorus, Å; 1.6 Å is usual.
+const PHOSPHATE_BOND: f64 = 2.2;
+
+/// Sets the kinds of all atoms. The reader has made ATOM records and rows with a `label_seq_id` polymer, and other HETATM
+/// records ligands.
+pub(super) fn assign(columns: &mut Columns, tables: &Tables, sequence: &Sequence) {
+    let solvent = Solvent::new(tables);
+    if columns.hetero.contains(&true) {
+        let decided = sequenced(columns, tables, sequence, &solvent);
+        solvent.mark(columns);
+        bonded(columns, tables, &decided);
+    } else {
+        solvent.mark(columns);
+    }
+    sites::mark(columns, tables);
+}
+
+/// Residue names of water and single ions.
+struct Solvent {
+    /// By number of the residue name: the kind, `None` for other residues.
+    kinds: Vec<Option<Kind>>,
+    any: bool,
+}
+
+impl Solvent {
+    fn new(tables: &Tables) -> Self {
+        let kind = |name| match name {
+            name if residue::is_water(name) => Some(Kind::Water),
+            name if residue::is_ion(name) => Some(Kind::Ligand),
+            _ => None,
+        };
+        let kinds: Vec<Option<Kind>> = tables.residue.texts().map(kind).collect();
+        let any = kinds.iter().any(Option::is_some);
+        Self { kinds, any }
+    }
+
+    fn has(&self, residue: u32) -> bool {
+        self.kinds[residue as usize].is_some()
+    }
+
+    fn mark(&self, columns: &mut Columns) {
+        if !self.any {
+            return;
+        }
+        for (kind, &residue) in columns.kind.iter_mut().zip(&columns.residue) {
+            if let Some(solvent) = self.kinds[residue as usize] {
+                *kind = solvent;
+            }
+        }
+    }
+}
+
+/// Sets the kinds of HETATM residues that the file decides, and returns which `label_chain` numbers it decides.
+fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solvent: &Solvent) -> Vec<bool> {
+    let chains: Vec<Option<bool>> =
+        tables.label_chain.texts().map(|chain| sequence.polymer_chains.get(chain).copied()).collect();
+    let numbered = has_sequence_numbers(columns, solvent);
+    let is_listed = |chain: u32, residue: u32| {
+        let (chain, residue) = (tables.chain.text(chain), tables.residue.text(residue));
+        listed(chain.as_bytes(), residue.as_bytes()).is_some_and(|pair| sequence.listed.contains(&pair))
+    };
+    for i in 0..columns.len() {
+        if !columns.hetero[i] {
+            continue;
+        }
+        let of_entity = chains.get(columns.label_chain[i] as usize).copied().flatten();
+        let polymer = of_entity.unwrap_or_else(|| {
+            (numbered && columns.kind[i] == Kind::Polymer)
+                || (!sequence.listed.is_empty() && is_listed(columns.chain[i], columns.residue[i]))
+        });
+        columns.kind[i] = if polymer { Kind::Polymer } else { Kind::Ligand };
+    }
+    chains.iter().map(Option::is_some).collect()
+}
+
+/// Whether `label_seq_id` tells polymers from other residues. Some programs write it for every atom, water included.
+fn has_sequence_numbers(columns: &Columns, solvent: &Solvent) -> bool {
+    let mut without = false;
+    for i in (0..columns.len()).filter(|&i| columns.hetero[i]) {
+        if columns.kind[i] != Kind::Polymer {
+            without = true;
+        } else if solvent.has(columns.residue[i]) {
+            return false;
+        }
+    }
+    without
+}
+
+/// Atoms at which residues of a chain are joined.
+#[derive(Debug, Clone, Copy)]
+enum Joint {
+    /// Carbon of a peptide bond.
+    C,
+    /// Nitrogen of a peptide bond.
+    N,
+    /// Oxygen before the phosphorus of the next nucleotide.
+    O3,
+    /// Phosphorus.
+    P,
+}
+
+impl Joint {
+    fn of(name: &str) -> Option<Self> {
+        match name {
+            "C" => Some(Self::C),
+            "N" => Some(Self::N),
+            "O3'" | "O3*" => Some(Self::O3),
+            "P" => Some(Self::P),
+            _ => None,
+        }
+    }
+}
+
+/// The first atom of each [`Joint`] in a residue.
+#[derive(Debug, Clone, Copy, Default)]
+struct Joints([Option<[f64; 3]>; 4]);
+
+impl Joints {
+    /// Whether a bond leads from this residue to the `next` one.
+    fn lead_to(&self, next: &Self) -> bool {
+        let near = |a: Joint, b: Joint, limit: f64| match (self.0[a as usize], next.0[b as usize]) {
+            (Some(a), Some(b)) => a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>() <= limit * limit,
+            _ => false,
+        };
+        near(Joint::C, Joint::N, PEPTIDE_BOND) || near(Joint::O3, Joint::P, PHOSPHATE_BOND)
+    }
+}
+
+/// Makes HETATM residues polymer that backbone bonds join to a polymer residue. Chains that are `decided` stay as they are.
+fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
+    let joints: Vec<Option<Joint>> = tables.name.texts().map(Joint::of).collect();
+    let open = |columns: &Columns, i: usize| {
+        columns.kind[i] == Kind::Ligand
+            && columns.hetero[i]
+            && !decided.get(columns.label_chain[i] as usize).is_some_and(|&decided| decided)
+    };
+    if !(0..columns.len()).any(|i| open(columns, i) && joints[columns.name[i] as usize].is_some()) {
+        return;
+    }
+    // A group is a run of residues that bonds join.
+    let (mut group, mut has_polymer, mut has_open) = (0, false, false);
+    let (mut before, mut first) = (Joints::default(), 0);
+    loop {
+        let (end, here) = residue_from(columns, first, &joints);
+        let at_end = first == columns.len();
+        if at_end || !(first > 0 && same_chain(columns, first - 1, first) && before.lead_to(&here)) {
+            if has_polymer && has_open {
+                for i in group..first {
+                    if open(columns, i) {
+                        columns.kind[i] = Kind::Polymer;
+                    }
+                }
+            }
+            (group, has_polymer, has_open) = (first, false, false);
+        }
+        if at_end {
+            return;
+        }
+        has_polymer |= columns.kind[first] == Kind::Polymer;
+        has_open |= open(columns, first);
+        (before, first) = (here, end);
+    }
+}
+
+fn same_chain(columns: &Columns, a: usize, b: usize) -> bool {
+    columns.chain[a] == columns.chain[b] && columns.model[a] == columns.model[b]
+}
+
+/// The end of the residue that begins with atom `first`, and its joints.
+fn residue_from(columns: &Columns, first: usize, joints: &[Option<Joint>]) -> (usize, Joints) {
+    let mut found = Joints::default();
+    let mut i = first;
+    while i < columns.len()
+        && columns.residue_number[i] == columns.residue_number[first]
+        && columns.residue[i] == columns.residue[first]
+        && columns.insertion_code[i] == columns.insertion_code[first]
+        && same_chain(columns, i, first)
+    {
+        if let Some(joint) = joints[columns.name[i] as usize] {
+            found.0[joint as usize].get_or_insert([columns.x[i], columns.y[i], columns.z[i]]);
+        }
+        i += 1;
+    }
+    (i, found)
+}

@@ -1,0 +1,71 @@
+//! The fixed columns of an ATOM record.
+
+use super::super::number::{self, hybrid36, real};
+use super::super::read::MAX_COORDINATE;
+use super::super::text::{Fault, trimmed};
+
+/// A line, cut or padded to 80 columns.
+pub(super) type Card = [u8; 80];
+
+/// The columns of a line.
+pub(super) fn card(line: &[u8]) -> Card {
+    let mut padded = [b' '; 80];
+    let len = line.len().min(80);
+    padded[..len].copy_from_slice(&line[..len]);
+    padded
+}
+
+/// Whether columns 73-80 hold the entry's id and a line number, as before 1996: `4PTI  88`, `2HHBA 206`.
+pub(super) fn numbered_line(card: &Card) -> bool {
+    card[72].is_ascii_digit()
+        && card[73..76].iter().all(u8::is_ascii_alphanumeric)
+        && card[79].is_ascii_digit()
+        && (card[78].is_ascii_digit() || card[78] == b' ')
+}
+
+#[inline]
+pub(super) fn coordinate(card: &Card, from: usize, axis: &str) -> Result<f64, Box<Fault>> {
+    match number(card, from, from + 8) {
+        Some(value) if value.abs() <= MAX_COORDINATE => Ok(value),
+        _ => Err(Fault::token(card, from, from + 8, format!("the {axis} coordinate in Å, within ±{MAX_COORDINATE}"))),
+    }
+}
+
+/// The number in `card[from..to]`, with blanks around it.
+#[inline]
+pub(super) fn number(card: &Card, from: usize, to: usize) -> Option<f64> {
+    let mut start = from;
+    while start < to && card[start] == b' ' {
+        start += 1;
+    }
+    real(card, start, to).or_else(|| {
+        let (a, b) = trimmed(&card[from..to]);
+        real(card, from + a, from + b)
+    })
+}
+
+/// Columns 23-26 and the insertion code in column 27, which is the fifth digit of numbers that need one.
+#[inline]
+pub(super) fn residue_number(card: &Card) -> Result<(i32, u8), Box<Fault>> {
+    let code = card[26];
+    if code.is_ascii_digit() && card[22..26].iter().all(|b| b.is_ascii_digit() || *b == b'-') {
+        let number = number::integer(&card[22..27]);
+        return number.map(|n| (n, 0)).ok_or_else(|| Fault::token(card, 22, 27, "a residue number"));
+    }
+    let (from, to) = trimmed(&card[22..26]);
+    let number = if from == to { Some(0) } else { hybrid36(&card[22 + from..22 + to]) };
+    let number = number.ok_or_else(|| Fault::token(card, 22, 26, "a residue number, decimal or hybrid-36"))?;
+    Ok((number, if code > b' ' { code } else { 0 }))
+}
+
+/// A line with tab stops every eight columns, and where each of its bytes came from.
+pub(super) fn expand_tabs(line: &[u8]) -> (Vec<u8>, Vec<usize>) {
+    let (mut out, mut origin) = (Vec::with_capacity(96), Vec::with_capacity(96));
+    // What lies beyond column 80 is not read; a tab is eight columns at most.
+    for (i, &b) in line.iter().enumerate().take(96) {
+        let columns = if b == b'\t' { 8 - out.len() % 8 } else { 1 };
+        out.extend(std::iter::repeat_n(if b == b'\t' { b' ' } else { b }, columns));
+        origin.extend(std::iter::repeat_n(i, columns));
+    }
+    (out, origin)
+}

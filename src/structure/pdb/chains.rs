@@ -1,0 +1,167 @@
+//! Column 21 of ATOM records: the fourth letter of a residue name, or the first one of a chain.
+//!
+//! Programs that write many chains put names of two letters into columns 21 and 22; programs that simulate write residue
+//! names of four letters into columns 18 to 21. `HISA` of chain `A` and `HIS` of chain `AA` are the same columns. One row
+//! does not tell, but the file does: residues of one chain follow each other with the same letter in column 21, and
+//! residue names of four letters change that letter, or leave it blank, within a chain.
+
+use std::collections::{HashMap, HashSet};
+
+use super::super::residue::{is_four_letters, is_polymer, is_water};
+use super::card::{Card, card, expand_tabs, residue_number};
+use super::lines::Lines;
+
+/// Columns 21 and 22.
+type Pair = [u8; 2];
+
+/// Which pairs of letters in columns 21 and 22 are chains.
+#[derive(Debug, Default)]
+pub(super) struct TwoLetterChains {
+    /// Pairs for which the file has evidence, and whether they are chains.
+    verdicts: HashMap<Pair, bool>,
+    /// Whether the evidence is for chains in every case, and there is some.
+    only_chains: bool,
+    /// Columns 18-22 that were asked for last, and the answer.
+    latest: ([u8; 5], bool),
+}
+
+impl TwoLetterChains {
+    /// Reads the evidence in a whole file.
+    pub(super) fn find(text: &[u8]) -> Self {
+        let mut evidence = Evidence::default();
+        Lines::new(text).for_each(|(start, end)| evidence.line(&text[start..end]));
+        let verdicts = evidence.verdicts();
+        let only_chains = !verdicts.is_empty() && verdicts.values().all(|chain| *chain);
+        Self { verdicts, only_chains, latest: ([0; 5], false) }
+    }
+
+    /// Whether column 21 of an ATOM record, which is not blank, belongs to the chain.
+    #[inline]
+    pub(super) fn has(&mut self, card: &Card) -> bool {
+        let columns = [card[17], card[18], card[19], card[20], card[21]];
+        if self.latest.0 != columns {
+            self.latest = (columns, self.decide(columns));
+        }
+        self.latest.1
+    }
+
+    fn decide(&self, columns: [u8; 5]) -> bool {
+        let [a, b, c, first, second] = columns;
+        if second <= b' ' {
+            return false;
+        }
+        if let Some(&chain) = self.verdicts.get(&[first, second]) {
+            return chain;
+        }
+        // Without evidence for this pair, the name decides. Short names are right-aligned in columns 18 to 20.
+        let (three, four) = (Name::of(&[a, b, c]), Name::of(&columns[..4]));
+        if [a, b, c].contains(&b' ') {
+            true
+        } else if four.four_letters {
+            three.polymer && self.only_chains
+        } else {
+            three.polymer || three.water || self.only_chains
+        }
+    }
+}
+
+/// What a residue name is known as.
+#[derive(Debug, Clone, Copy, Default)]
+struct Name {
+    polymer: bool,
+    water: bool,
+    four_letters: bool,
+}
+
+impl Name {
+    fn of(columns: &[u8]) -> Self {
+        let Ok(name) = std::str::from_utf8(columns.trim_ascii()) else { return Self::default() };
+        Self { polymer: is_polymer(name), water: is_water(name), four_letters: is_four_letters(name) }
+    }
+}
+
+/// Columns 18-27 of a residue: its name, its chain, its number.
+type Residue = [u8; 10];
+
+/// What the residues of a file say about pairs of letters.
+#[derive(Debug, Default)]
+struct Evidence {
+    /// For each pair, how often it stays and how often it changes from one residue of a chain to the next.
+    counts: HashMap<Pair, [u64; 2]>,
+    /// Pairs that SEQRES records name.
+    listed: HashSet<Pair>,
+    /// The residue of the ATOM record before; `None` where a chain may end.
+    before: Option<Residue>,
+}
+
+impl Evidence {
+    fn line(&mut self, line: &[u8]) {
+        if line.starts_with(b"ATOM") && line.len() >= 54 {
+            if line.contains(&b'\t') {
+                self.atom(&card(&expand_tabs(line).0));
+            } else if let Some(card) = line.first_chunk() {
+                self.atom(card);
+            } else {
+                self.atom(&card(line));
+            }
+            return;
+        }
+        match line {
+            [b'S', b'E', b'Q', b'R', b'E', b'S', _, _, _, _, first, second, ..]
+                if first.is_ascii_alphanumeric() && second.is_ascii_alphanumeric() =>
+            {
+                self.listed.insert([*first, *second]);
+            }
+            [b'T', b'E', b'R', ..] | [b'E', b'N', b'D', ..] | [b'M', b'O', b'D', b'E', b'L', ..] => self.before = None,
+            [b'H', b'E', b'T', b'A', b'T', b'M', ..] => self.before = None,
+            _ => {}
+        }
+    }
+
+    #[inline]
+    fn atom(&mut self, card: &Card) {
+        let mut here = Residue::default();
+        here.copy_from_slice(&card[17..27]);
+        if self.before != Some(here) {
+            if let Some(before) = self.before {
+                self.step(before, here);
+            }
+            self.before = Some(here);
+        }
+    }
+
+    /// Counts a step from one residue to the next, if the number says that they are neighbours in a chain.
+    fn step(&mut self, before: Residue, here: Residue) {
+        let (Some(m), Some(n)) = (number(before), number(here)) else { return };
+        let letters = [before[3], here[3]].map(|b| if b <= b' ' { b' ' } else { b });
+        if n != m + 1 || before[4] != here[4] || letters == [b' '; 2] {
+            return;
+        }
+        let names = [before, here].map(|residue| Name::of(&residue[..3]));
+        if names.iter().any(|name| name.water) {
+            return;
+        }
+        if letters[0] == letters[1] {
+            // Lipids follow each other as POPC and DOPC do, and LYSH may follow GLUH.
+            let four = [before, here].map(|residue| Name::of(&residue[..4]).four_letters);
+            if before[..3] != here[..3] && names.iter().all(|name| name.polymer) && four != [true; 2] {
+                self.counts.entry([letters[0], here[4]]).or_default()[0] += 1;
+            }
+        } else {
+            for letter in letters.into_iter().filter(|&letter| letter != b' ') {
+                self.counts.entry([letter, here[4]]).or_default()[1] += 1;
+            }
+        }
+    }
+
+    fn verdicts(self) -> HashMap<Pair, bool> {
+        let counted = self.counts.into_iter().map(|(pair, [stays, changes])| (pair, stays > changes));
+        counted.chain(self.listed.into_iter().map(|pair| (pair, true))).collect()
+    }
+}
+
+fn number(residue: Residue) -> Option<i64> {
+    let mut card = [b' '; 80];
+    card[17..27].copy_from_slice(&residue);
+    residue_number(&card).ok().map(|(number, _)| number.into())
+}

@@ -1,0 +1,87 @@
+//! Sites of force fields that are no atoms: charge sites of water models, lone pairs, mass centres, Drude particles.
+
+use std::collections::HashMap;
+
+use super::atoms::{Columns, Tables};
+use super::contents::Kind;
+use super::residue;
+
+/// Largest distance of a Drude particle from its atom, Å. No two atoms are this close.
+const DRUDE_DISTANCE: f64 = 0.4;
+
+/// Makes virtual sites of the atoms that are none: by name where the element is unknown, Drude particles by their place.
+pub(super) fn mark(columns: &mut Columns, tables: &Tables) {
+    by_name(columns, tables);
+    drude(columns, tables);
+}
+
+/// The residues in which an atom of this name and of no known element is a virtual site.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Site {
+    /// All: TIP4P's `MW` and `EPW`, lone pairs such as `LP1`.
+    Anywhere,
+    /// Amino acids and nucleotides: mass centres such as `MCB1`, lone pairs such as `LG1`.
+    InPolymer,
+    /// None but water, in which every site of no element is virtual.
+    InWater,
+}
+
+impl Site {
+    fn of(name: &str) -> Self {
+        let begins = |prefix: &str| name.get(..prefix.len()).is_some_and(|n| n.eq_ignore_ascii_case(prefix));
+        if ["EP", "LP", "MW"].into_iter().any(begins) {
+            Self::Anywhere
+        } else if ["L", "M"].into_iter().any(begins) {
+            Self::InPolymer
+        } else {
+            Self::InWater
+        }
+    }
+}
+
+/// CHARMM's name for the charge site of four-site water models, whose first letter is an oxygen's.
+const OXYGEN_LIKE: &str = "OM";
+
+fn by_name(columns: &mut Columns, tables: &Tables) {
+    let oxygen_like = tables.name.texts().any(|name| name == OXYGEN_LIKE);
+    if !oxygen_like && !columns.element.contains(&0) {
+        return;
+    }
+    let sites: Vec<Site> = tables.name.texts().map(Site::of).collect();
+    let water: Vec<bool> = tables.residue.texts().map(residue::is_water).collect();
+    let polymer: Vec<bool> = tables.residue.texts().map(residue::is_polymer).collect();
+    for i in 0..columns.len() {
+        let (name, residue) = (columns.name[i], columns.residue[i] as usize);
+        let site = if columns.element[i] == 0 {
+            match sites[name as usize] {
+                Site::Anywhere => true,
+                Site::InPolymer => polymer[residue] || water[residue],
+                Site::InWater => water[residue],
+            }
+        } else {
+            oxygen_like && water[residue] && tables.name.text(name) == OXYGEN_LIKE
+        };
+        if site {
+            columns.kind[i] = Kind::VirtualSite;
+        }
+    }
+}
+
+/// Drude particles follow their atom, bear its name behind a `D`, and are within [`DRUDE_DISTANCE`].
+fn drude(columns: &mut Columns, tables: &Tables) {
+    if !tables.name.texts().any(|name| name.len() > 1 && name.starts_with('D')) {
+        return;
+    }
+    let ids: HashMap<&str, u32> = tables.name.texts().zip(0..).collect();
+    let parents: Vec<Option<u32>> =
+        tables.name.texts().map(|name| name.strip_prefix('D').and_then(|parent| ids.get(parent).copied())).collect();
+    for i in 1..columns.len() {
+        if parents[columns.name[i] as usize] != Some(columns.name[i - 1]) {
+            continue;
+        }
+        let step = [&columns.x, &columns.y, &columns.z].map(|axis| axis[i] - axis[i - 1]);
+        if step.iter().map(|d| d * d).sum::<f64>() <= DRUDE_DISTANCE * DRUDE_DISTANCE {
+            columns.kind[i] = Kind::VirtualSite;
+        }
+    }
+}
