@@ -335,7 +335,11 @@ fn entities_or_sequence_numbers_tell_which_hetatm_records_are_polymer() {
     let (first, second) = (vec![Kind::Polymer, Kind::Ligand], vec![Kind::Ligand, Kind::Polymer]);
     let none = String::new();
     assert_eq!(kinds(vec![site(numbered())]), (first.clone(), none.clone()));
-    assert_eq!(kinds(vec![site(ints("label_seq_id", &[7, 8]))]), (vec![Kind::Ligand; 2], none.clone()), "all are numbered");
+    assert_eq!(
+        kinds(vec![site(ints("label_seq_id", &[7, 8]))]),
+        (vec![Kind::Ligand; 2], none.clone()),
+        "all are numbered"
+    );
     // The entities decide, wherever they stand.
     let known = [site(numbered()), entity(&["water", "polymer"]), asym(2)];
     assert_eq!(kinds(known.to_vec()), (second.clone(), none.clone()));
@@ -343,7 +347,10 @@ fn entities_or_sequence_numbers_tell_which_hetatm_records_are_polymer() {
     // Entities that cannot be read do not cost the atoms.
     let (found, warning) = kinds(vec![site(numbered()), entity(&["water", "polymer"]), asym(3)]);
     assert_eq!(found, first);
-    assert!(warning.starts_with("BinaryCIF, struct_asym, id") && warning.ends_with("entities are unknown"), "{warning}");
+    assert!(
+        warning.starts_with("BinaryCIF, struct_asym, id") && warning.ends_with("entities are unknown"),
+        "{warning}"
+    );
 }
 
 #[test]

@@ -236,7 +236,10 @@ fn occupancies_and_b_factors_that_are_none_are_warnings() {
     assert_eq!(read("", ""), (0.5, 20.25, String::new()));
     let occupancy = "expected an occupancy in columns 55 to 60, or blanks; read as 1";
     for bad in ["  x.50", "   inf", "   NaN", "******", " 1e39 "] {
-        assert_eq!(read("  0.50", bad), (1.0, 20.25, format!("line 2, column 55: found `{bad}`, {occupancy}")));
+        assert_eq!(
+            read("  0.50 20", &format!("{bad} 20")),
+            (1.0, 20.25, format!("line 2, column 55: found `{bad}`, {occupancy}"))
+        );
     }
     let b_factor = "expected a B-factor in columns 61 to 66, or blanks; read as 0";
     for bad in ["   NaN", "******", "-  inf"] {
@@ -245,7 +248,7 @@ fn occupancies_and_b_factors_that_are_none_are_warnings() {
     // A tab stands for the eight columns from 49 to 56.
     let tabbed = pdb(CA.replace("   0.500  0.50", "  0.5\t  x0 "));
     assert_eq!(tabbed.warnings.len(), 1, "{:?}", tabbed.warnings);
-    let many = pdb(CA.replace("  0.50", "  x.50").repeat(1000));
+    let many = pdb(CA.replace("  0.50 20", "  x.50 20").repeat(1000));
     assert_eq!((many.len(), many.warnings.len()), (1000, 11));
     assert_eq!(many.warnings[9], format!("line 10, column 55: found `  x.50`, {occupancy}"));
     assert_eq!(many.warnings[10], "990 more values that could not be read");

@@ -83,7 +83,8 @@ fn surface(report: &Report) -> String {
 
 /// The atoms that were not meshed, by residue name and reason.
 fn left_out(left_out: &LeftOutReport) -> String {
-    let LeftOutReport { total, other_chains, virtual_sites, residues, other_residues, hydrogens, alternatives } = left_out;
+    let LeftOutReport { total, other_chains, virtual_sites, residues, other_residues, hydrogens, alternatives } =
+        left_out;
     let named = residues.iter().map(|residue| format!("{} {}", residue.name, grouped(residue.atoms)));
     let counted = [
         ("other residues", other_residues),

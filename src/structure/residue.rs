@@ -36,9 +36,8 @@ const IONS: &[(&str, u8)] = &[
 
 /// Single ions that may stand in ATOM records: the names of the component dictionary and of simulation packages, without
 /// digits and signs.
-const SINGLE_IONS: &[&str] = &[
-    "NA", "K", "CL", "MG", "CA", "ZN", "LI", "RB", "CS", "BR", "CD", "BA", "MN", "FE", "CU", "CO", "NI", "SR", "IOD",
-];
+const SINGLE_IONS: &[&str] =
+    &["NA", "K", "CL", "MG", "CA", "ZN", "LI", "RB", "CS", "BR", "CD", "BA", "MN", "FE", "CU", "CO", "NI", "SR", "IOD"];
 
 /// The twenty amino acids and the nucleotides that sequences are made of.
 const STANDARD: &[&str] = &[

@@ -19,8 +19,8 @@ type Pair = [u8; 2];
 pub(super) struct TwoLetterChains {
     /// Pairs for which the file has evidence, and whether they are chains.
     verdicts: HashMap<Pair, bool>,
-    /// Whether the evidence is for chains in every case, and there is some.
-    only_chains: bool,
+    /// Whether pairs are chains in this file, if the evidence says the same for all of them.
+    all: Option<bool>,
     /// Columns 18-22 that were asked for last, and the answer.
     latest: ([u8; 5], bool),
 }
@@ -31,8 +31,9 @@ impl TwoLetterChains {
         let mut evidence = Evidence::default();
         Lines::new(text).for_each(|(start, end)| evidence.line(&text[start..end]));
         let verdicts = evidence.verdicts();
-        let only_chains = !verdicts.is_empty() && verdicts.values().all(|chain| *chain);
-        Self { verdicts, only_chains, latest: ([0; 5], false) }
+        let first = verdicts.values().next().copied();
+        let all = first.filter(|first| verdicts.values().all(|chain| chain == first));
+        Self { verdicts, all, latest: ([0; 5], false) }
     }
 
     /// Whether column 21 of an ATOM record, which is not blank, belongs to the chain.
@@ -56,11 +57,11 @@ impl TwoLetterChains {
         // Without evidence for this pair, the name decides. Short names are right-aligned in columns 18 to 20.
         let (three, four) = (Name::of(&[a, b, c]), Name::of(&columns[..4]));
         if [a, b, c].contains(&b' ') {
-            true
+            self.all != Some(false)
         } else if four.four_letters {
-            three.polymer && self.only_chains
+            three.polymer && self.all == Some(true)
         } else {
-            three.polymer || three.water || self.only_chains
+            three.polymer || three.water || self.all == Some(true)
         }
     }
 }

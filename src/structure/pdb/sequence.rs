@@ -37,7 +37,7 @@ mod tests {
     fn names_are_listed_by_chain() {
         let mut listed = HashSet::new();
         of_chain(b"SEQRES   1 A   15  ACE MSE ALA  DG SEP NH2", &mut listed);
-        of_chain(b"SEQRES   1 AB  15  GLY MVA", &mut listed);
+        of_chain(b"SEQRES   1AB   15  GLY MVA", &mut listed);
         of_chain(b"SEQRES   1", &mut listed);
         of_residue(b"MODRES 1ABC TPO C  160  THR  PHOSPHOTHREONINE", &mut listed);
         of_residue(b"MODRES 1ABC ASN C  161  ASN  GLYCOSYLATION SITE", &mut listed);
