@@ -226,7 +226,7 @@ impl<F> AtomSite<F> {
         default.0
     }
 
-    /// Whether the record is HETATM. An unknown one is read as ATOM, with a warning.
+    /// Returns true for a HETATM record. An unknown record is read as ATOM, with a warning.
     #[inline]
     fn hetero<R: Row<Fault = F>>(&mut self, row: &R) -> bool {
         let column = self.layout.group;

@@ -67,7 +67,7 @@ pub struct Structure {
     pub model: Vec<i32>,
     /// Whether the record was HETATM.
     pub hetero: Vec<bool>,
-    /// What each atom belongs to.
+    /// Kinds of atoms.
     pub kind: Vec<Kind>,
     /// Values that could not be read and were replaced by a default, in words; a bounded number.
     pub warnings: Vec<String>,
@@ -113,7 +113,7 @@ pub(super) struct Atom {
     pub(super) kind: Kind,
 }
 
-/// What a file says apart from its atoms.
+/// Parts of a structure that are not columns.
 #[derive(Debug)]
 pub(super) struct Source {
     pub(super) format: SourceFormat,

@@ -42,7 +42,7 @@ impl Entities {
         }
     }
 
-    /// Whether types of entities and the entities of chains are known.
+    /// Returns true if types of entities and the entities of chains are known.
     pub(super) fn are_known(&self) -> bool {
         let [_, types, polymers, _, of_chains] = &self.values;
         !(types.is_empty() && polymers.is_empty()) && !of_chains.is_empty()
@@ -53,7 +53,7 @@ impl Entities {
         self.full.then(|| format!("more than {MAX_VALUES} entities or chains; the rest are treated as unknown"))
     }
 
-    /// For each chain whose entity has a known type, whether it is a polymer.
+    /// Chains whose entity has a known type; true for polymers.
     pub(super) fn polymer_chains(self) -> HashMap<String, bool> {
         let [ids, types, listed, chains, of_chains] = self.values;
         let listed: HashSet<String> = listed.into_iter().collect();

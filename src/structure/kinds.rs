@@ -2,8 +2,8 @@
 //!
 //! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file says so: by the
 //! entity of its chain or its `label_seq_id` (mmCIF), by a SEQRES or MODRES record (PDB). Where the file says nothing,
-//! it is polymer if a backbone bond joins it to a polymer residue beside it in the file, directly or through residues of
-//! its own sort.
+//! it is polymer if a backbone bond joins it to a polymer residue beside it in the file, directly or through other
+//! HETATM residues.
 
 use std::collections::{HashMap, HashSet};
 
@@ -11,12 +11,12 @@ use super::atoms::{Columns, Tables};
 use super::contents::Kind;
 use super::{residue, sites};
 
-/// What a file says about the sequence of its chains.
+/// Sequence information of a file, by chain.
 #[derive(Debug, Default)]
 pub(super) struct Sequence {
     /// Chains and residue names of SEQRES and MODRES records, standard residues excepted.
     pub(super) listed: HashSet<Listed>,
-    /// For chains by `label_asym_id`, whether their entity is a polymer.
+    /// Chains (`label_asym_id`) with a known entity; true if that is a polymer.
     pub(super) polymer_chains: HashMap<String, bool>,
 }
 
@@ -85,7 +85,7 @@ impl Solvent {
     }
 }
 
-/// Sets the kinds of HETATM residues that the file decides, and returns which `label_chain` numbers it decides.
+/// Sets the kinds of HETATM residues that the file decides, and returns a flag for each number of `label_chain`: its entity decided.
 fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solvent: &Solvent) -> Vec<bool> {
     let chains: Vec<Option<bool>> =
         tables.label_chain.texts().map(|chain| sequence.polymer_chains.get(chain).copied()).collect();
@@ -108,7 +108,7 @@ fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solven
     chains.iter().map(Option::is_some).collect()
 }
 
-/// Whether `label_seq_id` tells polymers from other residues. Some programs write it for every atom, water included.
+/// Returns true if `label_seq_id` tells polymers from other residues. Some programs write it for every atom, even of water.
 fn has_sequence_numbers(columns: &Columns, solvent: &Solvent) -> bool {
     let mut without = false;
     for i in (0..columns.len()).filter(|&i| columns.hetero[i]) {
@@ -151,7 +151,7 @@ impl Joint {
 struct Joints([Option<[f64; 3]>; 4]);
 
 impl Joints {
-    /// Whether a bond leads from this residue to the `next` one.
+    /// Returns true if a bond joins this residue to the `next` one.
     fn lead_to(&self, next: &Self) -> bool {
         let near = |a: Joint, b: Joint, limit: f64| match (self.0[a as usize], next.0[b as usize]) {
             (Some(a), Some(b)) => a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>() <= limit * limit,

@@ -64,18 +64,18 @@ pub(super) fn charmm_ion(residue: &str) -> Option<u8> {
     IONS.iter().find(|(name, _)| *name == residue).map(|&(_, z)| z)
 }
 
-/// Whether a residue is a single ion.
+/// Returns true for a residue that is a single ion.
 pub(super) fn is_ion(residue: &str) -> bool {
     let bare = residue.trim_end_matches(|c: char| c.is_ascii_digit() || c == '+' || c == '-');
     charmm_ion(residue).is_some() || SINGLE_IONS.iter().any(|ion| ion.eq_ignore_ascii_case(bare))
 }
 
-/// Whether a residue is one of the usual ones of sequences.
+/// Returns true for a standard amino acid or nucleotide.
 pub(super) fn is_standard(residue: &str) -> bool {
     STANDARD.contains(&residue)
 }
 
-/// Whether a name is one of four letters whose first three are a name of their own.
+/// Returns true for a name of four letters whose first three are a name of their own.
 pub(super) fn is_four_letters(residue: &str) -> bool {
     FOUR_LETTERS.contains(&residue)
 }

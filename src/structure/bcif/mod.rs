@@ -218,7 +218,7 @@ impl<'a> Block<'a> {
         Ok(Some(columns.finish(tables, source)))
     }
 
-    /// What the block says about its entities, and a warning if that cannot be read.
+    /// Returns the entities of the block, and a warning if they cannot be read.
     fn entities(&self) -> (Entities, Option<String>) {
         let mut known = Entities::default();
         for (place, (name, item)) in entities::ITEMS.into_iter().enumerate() {

@@ -69,7 +69,7 @@ impl<'a> Rows<'a> {
         (self.columns, self.site.tables, self.site.warnings)
     }
 
-    /// Whether some row is a HETATM record.
+    /// Returns true if some row is a HETATM record.
     pub(super) fn has_hetero(&self) -> bool {
         self.columns.hetero.contains(&true)
     }

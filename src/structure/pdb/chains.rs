@@ -14,12 +14,12 @@ use super::lines::Lines;
 /// Columns 21 and 22.
 type Pair = [u8; 2];
 
-/// Which pairs of letters in columns 21 and 22 are chains.
+/// Chains of two letters, in columns 21 and 22.
 #[derive(Debug, Default)]
 pub(super) struct TwoLetterChains {
-    /// Pairs for which the file has evidence, and whether they are chains.
+    /// Pairs for which the file has evidence; true for chains.
     verdicts: HashMap<Pair, bool>,
-    /// Whether pairs are chains in this file, if the evidence says the same for all of them.
+    /// The verdict on all pairs, if it is the same.
     all: Option<bool>,
     /// Columns 18-22 that were asked for last, and the answer.
     latest: ([u8; 5], bool),
@@ -36,7 +36,7 @@ impl TwoLetterChains {
         Self { verdicts, all, latest: ([0; 5], false) }
     }
 
-    /// Whether column 21 of an ATOM record, which is not blank, belongs to the chain.
+    /// Returns true if column 21 of an ATOM record, which is not blank, belongs to the chain.
     #[inline]
     pub(super) fn has(&mut self, card: &Card) -> bool {
         let columns = [card[17], card[18], card[19], card[20], card[21]];
@@ -66,7 +66,7 @@ impl TwoLetterChains {
     }
 }
 
-/// What a residue name is known as.
+/// Lists that hold a residue name.
 #[derive(Debug, Clone, Copy, Default)]
 struct Name {
     polymer: bool,
@@ -84,7 +84,7 @@ impl Name {
 /// Columns 18-27 of a residue: its name, its chain, its number.
 type Residue = [u8; 10];
 
-/// What the residues of a file say about pairs of letters.
+/// Evidence on pairs of letters, from the residues and SEQRES records of a file.
 #[derive(Debug, Default)]
 struct Evidence {
     /// For each pair, how often it stays and how often it changes from one residue of a chain to the next.
