@@ -45,7 +45,7 @@ impl Entities {
     /// Returns true if types of entities and the entities of chains are known.
     pub(super) fn are_known(&self) -> bool {
         let [_, types, polymers, _, of_chains] = &self.values;
-        !(types.is_empty() && polymers.is_empty()) && !of_chains.is_empty()
+        !(of_chains.is_empty() || types.is_empty() && polymers.is_empty())
     }
 
     /// A warning if there were more values than are kept.

@@ -113,8 +113,9 @@ impl Evidence {
             {
                 self.listed.insert([*first, *second]);
             }
-            [b'T', b'E', b'R', ..] | [b'E', b'N', b'D', ..] | [b'M', b'O', b'D', b'E', b'L', ..] => self.before = None,
-            [b'H', b'E', b'T', b'A', b'T', b'M', ..] => self.before = None,
+            _ if [&b"TER"[..], b"END", b"MODEL", b"HETATM"].iter().any(|record| line.starts_with(record)) => {
+                self.before = None;
+            }
             _ => {}
         }
     }

@@ -192,14 +192,11 @@ impl<'a> Reader<'a> {
             let found = format!("a line of {} columns", line.len());
             return Err(Fault::words(line.len(), found, "coordinates in columns 31 to 54"));
         }
-        let padded;
-        let card: &Card = match line.first_chunk() {
-            Some(card) => card,
-            None => {
-                padded = card(line);
-                &padded
-            }
-        };
+        let mut padded = [b' '; 80];
+        let card: &Card = line.first_chunk().unwrap_or_else(|| {
+            padded = card(line);
+            &padded
+        });
         if self.columns.len() >= self.max_rows {
             self.full = true;
             return Ok(());
