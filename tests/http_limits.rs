@@ -70,6 +70,118 @@ fn bodies_are_limited_whether_announced_or_not() {
 }
 
 #[test]
+fn json_bodies_are_limited_before_they_are_read() {
+    let server = fake(|_| {});
+    let json = ("content-type", "application/json");
+    let before = rejected(&server, "body-too-large");
+    let list = |items: usize| format!("{{\"pdb_id\":\"4pti\",\"chains\":[{}0]}}", "0,".repeat(items)).into_bytes();
+    for path in ["/v1/meshes", "/v1/estimate"] {
+        let problem = server.post(path, &[json], &list(10_000_000)).problem(413, "body-too-large");
+        assert_eq!(problem["limit"], 65_536);
+        assert!(problem["detail"].as_str().unwrap().contains("limits.json_bytes"), "{problem}");
+    }
+    // Without a length it is refused once it is longer.
+    let mut stream = connect(server.addr);
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-type: application/json\r\n\
+                transfer-encoding: chunked\r\n\r\n10001\r\n";
+    stream.write_all(&[head.as_bytes(), &[b' '; 0x10001]].concat()).unwrap();
+    assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 65_536);
+    assert!(rejected(&server, "body-too-large") >= before + 3.0);
+    // What fits is looked at.
+    server.post("/v1/meshes", &[json], &list(30_000)).problem(422, "bad-parameter");
+}
+
+/// Begins a form in a chunked body.
+fn begin_form(server: &Running) -> std::net::TcpStream {
+    let mut stream = connect(server.addr);
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\
+                content-type: multipart/form-data; boundary=XX\r\n\r\n";
+    stream.write_all(head.as_bytes()).unwrap();
+    stream
+}
+
+fn send_chunk(stream: &mut std::net::TcpStream, bytes: &[u8]) -> std::io::Result<()> {
+    stream.write_all(&[format!("{:x}\r\n", bytes.len()).as_bytes(), bytes, b"\r\n"].concat())
+}
+
+#[test]
+fn heads_of_parts_are_limited_wherever_they_are_and_however_slowly_they_come() {
+    let server = fake(|c| c.limits.part_head_bytes = 2000);
+    let part = |head: &str, content: &str| format!("--XX\r\n{head}\r\n\r\n{content}\r\n");
+    let named = |name: &str| format!("content-disposition: form-data; name=\"{name}\"");
+    let sample = part(&named("file"), std::str::from_utf8(SAMPLE).unwrap());
+    let long = format!("{}\r\nx: {}", named("resolution"), "y".repeat(2000));
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    let before = rejected(&server, "body-too-large");
+    for (what, form) in [
+        ("a preamble", format!("{}{sample}--XX--", "p".repeat(2000))),
+        ("a preamble without end", "p".repeat(1_000_000)),
+        ("a first head", format!("{}{sample}--XX--", part(&long, "1"))),
+        ("a later head", format!("{sample}{}--XX--", part(&long, "1"))),
+        ("a name", format!("{sample}{}--XX--", part(&named(&"n".repeat(2000)), "1"))),
+        ("a head without end", format!("{sample}--XX\r\na: {}", "y".repeat(1_000_000))),
+        ("an epilogue", format!("{sample}--XX--{}", "e".repeat(1_000_000))),
+    ] {
+        let problem = server.post("/v1/meshes", &[kind], form.as_bytes()).problem(413, "body-too-large");
+        assert_eq!(problem["limit"], 2000, "{what}");
+        assert!(problem["detail"].as_str().unwrap().contains("limits.part_head_bytes"), "{what}: {problem}");
+    }
+    // A byte at a time, where the end is never more than a byte away.
+    let mut stream = begin_form(&server);
+    send_chunk(&mut stream, b"--XX\r\na: ").unwrap();
+    for _ in 0..3000 {
+        if send_chunk(&mut stream, b"b").is_err() {
+            break;
+        }
+    }
+    assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 2000);
+    assert!(rejected(&server, "body-too-large") >= before + 8.0);
+    // Heads that fit do, with a preamble, an epilogue, and content that comes in small pieces.
+    let form = format!("hello\r\n{}{sample}--XX--\r\nbye", part(&named("resolution"), "1.5"));
+    let mut stream = begin_form(&server);
+    for piece in form.as_bytes().chunks(777) {
+        send_chunk(&mut stream, piece).unwrap();
+    }
+    stream.write_all(b"0\r\n\r\n").unwrap();
+    assert_eq!(read_reply(&mut stream, false).status, 200);
+    let wide = ("content-type", format!("multipart/form-data; boundary={}", "b".repeat(71)));
+    assert_eq!(server.post("/v1/meshes", &[(wide.0, &wide.1)], b"x").problem(400, "bad-request")["limit"], 70);
+}
+
+#[test]
+fn an_endless_head_of_a_part_takes_no_memory_and_little_time() {
+    let server = fake(|_| {});
+    let mut stream = begin_form(&server);
+    let start = Instant::now();
+    send_chunk(&mut stream, b"--XX\r\nA: ").unwrap();
+    let mut sent = 0;
+    while sent < 60_000_000 && send_chunk(&mut stream, &[b'a'; 64 << 10]).is_ok() {
+        sent += 64 << 10;
+    }
+    assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 16_384);
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+    // The parser's buffer is charged: without room for it a form is refused, and a file is not.
+    let server = fake(|c| c.limits.memory_bytes = 60_000);
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    server.post("/v1/meshes", &[kind], b"--XX\r\n").problem(503, "memory-full");
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(10)).status, 200);
+}
+
+#[test]
+fn parts_of_forms_are_limited() {
+    let server = fake(|c| c.limits.parts = 3);
+    let form = |parts: usize| {
+        let fields = "--XX\r\ncontent-disposition: form-data; name=\"unknown\"\r\n\r\n\r\n".repeat(parts);
+        server.post("/v1/meshes", &[("content-type", "multipart/form-data; boundary=XX")], (fields + "--XX--").as_bytes())
+    };
+    let problem = form(4).problem(413, "body-too-large");
+    assert_eq!(problem["limit"], 3);
+    assert!(problem["detail"].as_str().unwrap().contains("limits.parts"), "{problem}");
+    form(3).problem(400, "bad-request");
+    form(100_000).problem(413, "body-too-large");
+}
+
+#[test]
 fn compression_bombs_stop_at_the_inflated_limit() {
     let server = fake(|c| c.limits.inflated_bytes = 1_000_000);
     let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());

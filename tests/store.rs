@@ -166,12 +166,18 @@ async fn parts_are_read_and_bad_ranges_refused(place: Place) {
     assert_eq!(part(&store, &input(2), None).await, Some((0, Vec::new())));
     assert_eq!(part(&store, &input(3), None).await, None);
     assert_eq!(part(&store, &input(3), Some(0..1)).await, None);
-    // What is open stays readable.
-    store.put(&input(4), noise(MIB, 4).into()).await.unwrap();
+    // An object that is being read is not tidied away; one that is deleted ends its streams with an error.
     if place.is_local() {
+        let old = SystemTime::now() + Duration::from_hours(24 * 365);
+        store.put(&input(4), noise(MIB, 4).into()).await.unwrap();
+        let (_, stream) = store.read(&input(4), None).await.unwrap().unwrap();
+        store.sweep(old).await;
+        assert!(stream.try_collect::<Vec<_>>().await.unwrap().concat() == noise(MIB, 4));
         let (_, stream) = store.read(&input(4), None).await.unwrap().unwrap();
         store.delete(&input(4)).await.unwrap();
-        assert!(stream.try_collect::<Vec<_>>().await.unwrap().concat() == noise(MIB, 4));
+        assert!(matches!(stream.try_collect::<Vec<_>>().await, Err(StoreError::Failed { .. })));
+        store.put(&input(4), noise(MIB, 4).into()).await.unwrap();
+        assert_eq!(store.sweep(old).await.expired, 1, "the control: nothing is read");
     }
 }
 

@@ -46,6 +46,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         keys,
         viewer: has_viewer(),
     };
+    raise_open_files();
     let failed = |e: io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(RUNTIME_THREADS)
@@ -71,6 +72,18 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     // What still reads a file or computes after the drain timeout is not waited for.
     runtime.shutdown_timeout(Duration::from_millis(100));
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
+}
+
+/// Raises the limit of open files to the most that this process may set itself.
+fn raise_open_files() {
+    #[cfg(target_os = "linux")]
+    {
+        use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+        let maximum = getrlimit(Resource::Nofile).maximum;
+        if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum }) {
+            tracing::warn!(%error, "the limit of open files stays as it was");
+        }
+    }
 }
 
 /// Lets computing give way to answering: a refusal, a cached mesh and a probe are due in milliseconds also while every

@@ -15,6 +15,13 @@ pub struct LimitsConfig {
     /// Bytes of a request body as sent. Default 256 MiB: the largest entries of the archive are about 100 MB
     /// compressed.
     pub body_bytes: u64,
+    /// Bytes of a JSON request body. Default 64 KiB: a document names a structure and has some forty parameters.
+    pub json_bytes: u64,
+    /// Bytes ahead of the content of a form's part: its headers, and the preamble in front of the first one. Default
+    /// 16 KiB: browsers send a few hundred.
+    pub part_head_bytes: u64,
+    /// Parts of a form. Default 128: one file and every parameter once are fewer than half.
+    pub parts: usize,
     /// Bytes of a structure after decompression. Default 2 GiB: the largest entries inflate to about 1 GB; a
     /// compression bomb stops here.
     pub inflated_bytes: u64,
@@ -49,6 +56,9 @@ impl Default for LimitsConfig {
     fn default() -> Self {
         Self {
             body_bytes: 256 << 20,
+            json_bytes: 64 << 10,
+            part_head_bytes: 16 << 10,
+            parts: 128,
             inflated_bytes: 2 << 30,
             atoms: 10_000_000,
             labels: 1_000_000,

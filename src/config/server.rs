@@ -22,8 +22,8 @@ pub struct ServerConfig {
     /// Folder of everything that the service keeps; the archive is looked for in it. Default `molmesh-data` in the working
     /// folder: it can be written where the service can be started.
     pub data_dir: PathBuf,
-    /// Connections at once. Default 1,024: the usual limit of open files leaves no room for more. One more is
-    /// answered with 503 and closed.
+    /// Connections at once. Default 1,024. One more is answered with 503 and closed. The hard limit of open files
+    /// should be a few hundred higher; `molmesh doctor` compares them.
     pub connections: usize,
     /// Time for the head of a request, ms, from the connection or the answer before it: also how long an idle
     /// HTTP/1.1 connection is kept. Default 15,000: clients on slow lines need seconds, a minute serves only those
@@ -31,9 +31,12 @@ pub struct ServerConfig {
     pub header_timeout_ms: u64,
     /// Time for the whole body of a request, ms. Default 60,000: 256 MiB at 36 Mbit/s.
     pub body_timeout_ms: u64,
-    /// Time in which a client must take some bytes of an answer, ms. Default 30,000: a mesh is kept in memory
-    /// until it is sent.
+    /// Time in which a client must take `write_bytes` of a response body, or all that is left of it, ms. Default 30,000:
+    /// buffers and places are held until a body is sent. Event streams may be as slow as they like.
     pub write_timeout_ms: u64,
+    /// Bytes of a response body that a client must take within `write_timeout_ms`. Default 16 KiB: half a kilobyte a
+    /// second, so that a line of 8 KiB/s carries a dozen bodies at once; one byte now and then does not count.
+    pub write_bytes: u64,
     /// Bytes of the head of a request: its line and its headers, 8 KiB at least. Default 64 KiB: browsers and proxies send a
     /// few; 431 beyond.
     pub head_bytes: u32,
@@ -69,6 +72,7 @@ impl Default for ServerConfig {
             header_timeout_ms: 15_000,
             body_timeout_ms: 60_000,
             write_timeout_ms: 30_000,
+            write_bytes: 16 << 10,
             head_bytes: 64 << 10,
             streams: 64,
             heartbeat_ms: 15_000,
@@ -94,7 +98,7 @@ impl ServerConfig {
         Duration::from_millis(self.body_timeout_ms)
     }
 
-    /// Time in which a client must take some bytes of an answer.
+    /// Time in which a client must take `write_bytes` of a response body.
     #[must_use]
     pub fn write_timeout(&self) -> Duration {
         Duration::from_millis(self.write_timeout_ms)

@@ -14,12 +14,12 @@ use axum::http::{Request, Response, Version};
 use futures_util::FutureExt as _;
 use hyper::body::Incoming;
 use hyper::service::service_fn;
-use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
+use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
 use metrics::{counter, gauge};
 use tokio::io::AsyncWriteExt as _;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore, watch};
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tower::ServiceExt as _;
@@ -27,6 +27,7 @@ use tower::ServiceExt as _;
 use super::guard::Peer;
 use super::io::Guarded;
 use super::kinds::Kind;
+use super::pace::{self, Pace, Rate, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::stop::{self, Stop};
 use crate::config::ServerConfig;
@@ -41,6 +42,12 @@ const MAX_REFUSALS: usize = 64;
 /// What an HTTP/2 client may send before it is read, per request and per connection: enough for full speed over
 /// long distances.
 const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
+/// Bytes of a stream that HTTP/2 buffers while the connection is busy with others.
+const SEND_BUFFER: usize = 64 << 10;
+/// Bytes of a connection that the system buffers before they are on their way: few enough that a slow client's progress is
+/// seen every few seconds.
+#[cfg(target_os = "linux")]
+const UNSENT: u32 = 128 << 10;
 /// How often an HTTP/2 client is asked whether it is still there.
 const PING: Duration = Duration::from_secs(20);
 
@@ -90,8 +97,7 @@ pub(super) async fn serve(
             }
             continue;
         };
-        // Answers are written in pieces that are large already; waiting for more only delays them.
-        if let Err(error) = stream.set_nodelay(true) {
+        if let Err(error) = set_up(&stream) {
             tracing::debug!(%error, "the client left at once");
             continue;
         }
@@ -106,6 +112,14 @@ pub(super) async fn serve(
     };
     connections.shutdown().await;
     drained
+}
+
+/// Sets a fresh socket up.
+fn set_up(stream: &TcpStream) -> io::Result<()> {
+    #[cfg(target_os = "linux")]
+    socket2::SockRef::from(stream).set_tcp_notsent_lowat(UNSENT)?;
+    // Answers are written in pieces that are large already; waiting for more only delays them.
+    stream.set_nodelay(true)
 }
 
 /// A connection's place among those that there may be.
@@ -179,26 +193,28 @@ async fn connection(
 ) {
     let activity = Arc::new(Activity::default());
     let phase = stop.clone();
+    let rate = Rate::new(&config);
+    let (pace, broken) = (Pace::new(rate), Arc::new(Notify::new()));
     let service = service_fn(|request: Request<Incoming>| {
         let working = Working::on(&activity);
-        let (phase, version) = (phase.clone(), request.version());
+        let (phase, pace, version) = (phase.clone(), Arc::clone(&pace), request.version());
         let mut request = request.map(Body::new);
         request.extensions_mut().insert(peer);
         let answer = router.clone().oneshot(request);
         async move {
-            let mut answer: Result<Response<Body>, Infallible> = answer.await;
+            let mut answer: Response<Body> = match answer.await {
+                Ok(answer) => answer,
+                Err(never) => match never {},
+            };
             drop(working);
             // So that clients turn elsewhere for their next request, before connections are closed on them.
-            if let Ok(answer) = &mut answer
-                && *phase.borrow() >= Stop::Notice
-                && version < Version::HTTP_2
-            {
+            if *phase.borrow() >= Stop::Notice && version < Version::HTTP_2 {
                 answer.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
             }
-            answer
+            Ok::<_, Infallible>(Pace::watch(answer, &pace, version))
         }
     });
-    let builder = builder(&config);
+    let builder = builder(&config, Streams::new(rate, &broken));
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     tokio::pin!(connection);
     let (mut stopping, mut patient) = (false, false);
@@ -211,6 +227,11 @@ async fn connection(
                 }
                 return;
             }
+            () = pace.stalled() => {
+                pace::cut_off();
+                return;
+            }
+            () = broken.notified() => return,
             () = stop::reached(&mut stop, Stop::Drain), if !stopping => {
                 stopping = true;
                 if activity.begun.load(Ordering::Relaxed) {
@@ -240,8 +261,8 @@ async fn connection(
     }
 }
 
-fn builder(config: &ServerConfig) -> auto::Builder<TokioExecutor> {
-    let mut builder = auto::Builder::new(TokioExecutor::new());
+fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
+    let mut builder = auto::Builder::new(streams);
     builder
         .http1()
         .timer(TokioTimer::new())
@@ -255,6 +276,7 @@ fn builder(config: &ServerConfig) -> auto::Builder<TokioExecutor> {
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
         .max_concurrent_streams(config.streams)
+        .max_send_buf_size(SEND_BUFFER)
         .max_header_list_size(config.head_bytes);
     builder
 }

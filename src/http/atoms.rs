@@ -19,7 +19,7 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::{conditional, pdb, structures};
-use crate::jobs::{Failure, Lease};
+use crate::jobs::Failure;
 use crate::store::{Digest, Name};
 use crate::structure::{self, Structure, StructureError, element};
 
@@ -146,23 +146,11 @@ async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
         let structure = structure::read(&input.bytes, &limits)?;
         lease.grow(BYTES_PER_ATOM * structure.len() as u64).map_err(Failed::Memory)?;
         let text = serde_json::to_vec(&document(&structure)).map_err(Failed::Writing)?;
-        Ok(Bytes::from_owner(Leased { text, _lease: lease }))
+        Ok(lease.attach(text))
     });
     let listed: Result<Bytes, Failed> = listing.await.map_err(Problem::internal)?;
     let text = listed.map_err(Problem::from)?;
     Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
-}
-
-/// A text, and the memory that it is charged to.
-struct Leased {
-    text: Vec<u8>,
-    _lease: Lease,
-}
-
-impl AsRef<[u8]> for Leased {
-    fn as_ref(&self) -> &[u8] {
-        &self.text
-    }
 }
 
 /// Why atoms cannot be listed.

@@ -125,7 +125,7 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::ResultGone, "result-gone", S::GONE, false, "The result is gone",
         "The job was successful, but its result was kept for some time only. Ask for the mesh again."),
     row(Kind::BodyTooLarge, "body-too-large", S::PAYLOAD_TOO_LARGE, true, "The body is too large",
-        "The request's body has more than `limit` bytes. Compress it with gzip or zstd, or ask the operator to raise limits.body_bytes."),
+        "The request's body has more than `limit` bytes, or `detail` names what of it is too large. Compress a structure with gzip or zstd, or ask the operator to raise the limit that `detail` names."),
     row(Kind::InflatedTooLarge, "inflated-too-large", S::PAYLOAD_TOO_LARGE, true, "The structure inflates to too much",
         "After decompression the structure has more than `limit` bytes."),
     row(Kind::EntryTooLarge, "entry-too-large", S::PAYLOAD_TOO_LARGE, true, "The entry is too large",

@@ -8,7 +8,6 @@ use axum::extract::{Query, State};
 use axum::http::header::{self, HeaderMap};
 use axum::http::{Extensions, HeaderValue, Method};
 use axum::response::Response;
-use serde_json::Value;
 
 use super::ask::{self, Ask, Input};
 use super::declared::Declared;
@@ -23,7 +22,7 @@ use super::state::{App, Shared};
 use super::timing::Timing;
 use super::upload::{self, Upload};
 use super::wish::Wish;
-use super::{negotiate, pdb, structures};
+use super::{document, negotiate, pdb, structures};
 use crate::formats::Format;
 use crate::pipeline::params::{self, Request};
 use crate::store::Digest;
@@ -102,11 +101,17 @@ pub(super) async fn take(app: &Shared, query: Pairs, headers: &HeaderMap, body: 
     let mut pairs = pairs(query)?;
     // A request that will be refused is refused before its body is received.
     let mut request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
-    let late = upload::is_multipart(headers) || upload::is_json(headers);
+    let is_json = upload::is_json(headers);
+    let late = is_json || upload::is_multipart(headers);
     let early = if late { None } else { Some(settled(app, &mut request, headers)?) };
-    let Upload { bytes, lease, fields, declared } = upload::receive(app, headers, body).await?;
-    let (source, fields) = if upload::is_json(headers) {
-        document(&bytes)?
+    let received = if is_json {
+        upload::receive_json(app, headers, body).await
+    } else {
+        upload::receive(app, headers, body).await
+    };
+    let Upload { bytes, lease, fields, declared } = received?;
+    let (source, fields) = if is_json {
+        named(&bytes)?
     } else {
         let digest = ask::digest(&bytes).await?;
         (Source::Sent(Input { bytes, digest, lease: Arc::new(lease) }), fields)
@@ -159,20 +164,9 @@ impl Source {
 }
 
 /// Reads `{"pdb_id": …}` or `{"structure": …}` with parameters beside it.
-fn document(bytes: &[u8]) -> Result<(Source, Vec<(String, String)>), Problem> {
-    let bad = |detail: String| Problem::new(Kind::BadRequest, detail).with("expected", "{\"pdb_id\": \"4pti\", …}");
-    let value: Value = serde_json::from_slice(bytes)
-        .map_err(|e| bad(format!("the JSON cannot be read: {e}")).with("line", e.line()).with("column", e.column()))?;
-    let Value::Object(members) = value else { return Err(bad("the JSON is no object".to_owned())) };
+fn named(bytes: &[u8]) -> Result<(Source, Vec<(String, String)>), Problem> {
     let (mut source, mut fields) = (None, Vec::new());
-    for (name, value) in members {
-        let text = plain(&value).ok_or_else(|| {
-            Problem::new(
-                Kind::BadParameter,
-                format!("member `{name}` is neither text, number, true or false, nor a list of them"),
-            )
-            .with("parameter", name.as_str())
-        })?;
+    for (name, text) in document::members(bytes)? {
         let found = match name.as_str() {
             "pdb_id" => Source::Entry(text.parse().map_err(|error| pdb::of_folder(&error))?),
             "structure" => Source::Structure(structures::digest_of(&text)?),
@@ -182,26 +176,12 @@ fn document(bytes: &[u8]) -> Result<(Source, Vec<(String, String)>), Problem> {
             }
         };
         if source.replace(found).is_some() {
-            return Err(bad("the JSON names more than one structure".to_owned()));
+            return Err(document::bad("it names more than one structure"));
         }
     }
     let source =
-        source.ok_or_else(|| bad("the JSON names no structure: it has no `pdb_id` and no `structure`".to_owned()))?;
+        source.ok_or_else(|| document::bad("it names no structure: it has no `pdb_id` and no `structure`"))?;
     Ok((source, fields))
-}
-
-/// A value as it would stand in a query.
-fn plain(value: &Value) -> Option<String> {
-    match value {
-        Value::String(text) => Some(text.clone()),
-        Value::Number(number) => Some(number.to_string()),
-        Value::Bool(flag) => Some(flag.to_string()),
-        Value::Array(items) if !items.is_empty() => {
-            let items: Option<Vec<String>> = items.iter().filter(|i| !i.is_array()).map(plain).collect();
-            items.filter(|found| !found.is_empty()).map(|items| items.join(","))
-        }
-        _ => None,
-    }
 }
 
 #[cfg(test)]
@@ -211,7 +191,7 @@ mod tests {
     #[test]
     fn json_members_become_parameters() {
         let (source, fields) =
-            document(br#"{"pdb_id": "4PTI", "resolution": 0.5, "chains": ["A", "B"], "atom_ids": true}"#).ok().unwrap();
+            named(br#"{"pdb_id": "4PTI", "resolution": 0.5, "chains": ["A", "B"], "atom_ids": true}"#).ok().unwrap();
         assert!(matches!(source, Source::Entry(id) if id.as_str() == "4pti"));
         let expected = [("resolution", "0.5"), ("chains", "A,B"), ("atom_ids", "true")];
         assert_eq!(fields, expected.map(|(n, v)| (n.to_owned(), v.to_owned())));
@@ -226,7 +206,7 @@ mod tests {
             "{\"structure\": \"xyz\"}",
             "{\"pdb_id\": \"4pti\", \"chains\": []}",
         ] {
-            assert!(document(bad.as_bytes()).is_err(), "{bad}");
+            assert!(named(bad.as_bytes()).is_err(), "{bad}");
         }
     }
 }

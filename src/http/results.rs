@@ -10,6 +10,7 @@ use axum::extract::{Path, State};
 use axum::http::header::{self, HeaderMap};
 use axum::http::{HeaderValue, Method, StatusCode};
 use axum::response::{IntoResponse, Response};
+use futures_util::TryStreamExt as _;
 use metrics::counter;
 use serde_json::Value;
 use tokio::sync::OwnedSemaphorePermit;
@@ -39,7 +40,9 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
     format!("/v1/results/{key}.{extension}")
 }
 
-refusals!(ShowRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::RangeNotSatisfiable, Kind::StoreFailed]]);
+refusals!(ShowRefusals: [[
+    Kind::BadRequest, Kind::NotFound, Kind::RangeNotSatisfiable, Kind::MemoryFull, Kind::StoreFailed,
+]]);
 refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
 
 /// A mesh that was made before.
@@ -125,6 +128,7 @@ pub(super) async fn stored(
     headers: &HeaderMap,
 ) -> Result<Option<Response>, Problem> {
     let name = key.name(format.extension())?;
+    app.pool.budget().check()?;
     let Some((meta, mut body)) = app.store.read(&name, None).await? else { return Ok(None) };
     let Some(head) = head(app, key, format).await? else { return Ok(None) };
     let mut out = head.headers.clone();
@@ -154,7 +158,14 @@ pub(super) async fn stored(
         let Some((_, part)) = app.store.read(&name, Some(part)).await? else { return Ok(None) };
         body = part;
     }
-    Ok(Some((status, out, Body::from_stream(body)).into_response()))
+    // Pieces of bodies that have begun are held in any case; new bodies wait until there is room.
+    let budget = app.pool.budget().clone();
+    let charged = body.map_ok(move |piece| {
+        let mut lease = budget.lease();
+        lease.force(piece.len() as u64);
+        lease.attach(piece)
+    });
+    Ok(Some((status, out, Body::from_stream(charged)).into_response()))
 }
 
 /// The headers of a result, from its report.

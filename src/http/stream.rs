@@ -16,7 +16,7 @@ use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 use super::problem::Problem;
 use super::unfit;
 use crate::formats::Format;
-use crate::jobs::Finished;
+use crate::jobs::{Budget, Finished};
 use crate::telemetry::{STAGE_DURATION, Scope};
 
 /// Bytes of a piece: few wake-ups for large meshes, small enough to be in a cache while it is sent.
@@ -36,10 +36,12 @@ pub(super) async fn start(
     finished: Arc<Finished>,
     format: Format,
     limit: u64,
+    budget: Budget,
     place: OwnedSemaphorePermit,
 ) -> Result<(Option<u64>, Body), Problem> {
     let (head, answer) = oneshot::channel();
-    let (pieces, receiver) = mpsc::channel(PIECES);
+    let (sender, receiver) = mpsc::channel(PIECES);
+    let pieces = Pieces { pieces: sender, buffer: BytesMut::new(), budget };
     let (span, scope) = (tracing::Span::current(), Scope::current());
     tokio::task::spawn_blocking(move || {
         span.in_scope(|| write(&finished, format, limit, head, pieces, scope.as_ref()));
@@ -56,7 +58,7 @@ fn write(
     format: Format,
     limit: u64,
     head: oneshot::Sender<Result<Option<u64>, Problem>>,
-    pieces: mpsc::Sender<Piece>,
+    mut writer: Pieces,
     scope: Option<&Scope>,
 ) {
     let start = Instant::now();
@@ -74,7 +76,6 @@ fn write(
     // Without a receiver the client is gone; the first piece would find out as well.
     let gone = head.send(length).is_err();
     let Some(file) = file.filter(|_| !gone) else { return };
-    let mut writer = Pieces { pieces, buffer: BytesMut::new() };
     match file.write(&mut writer).and_then(|()| writer.finish()) {
         Ok(()) => {
             let time = start.elapsed();
@@ -93,6 +94,8 @@ fn write(
 struct Pieces {
     pieces: mpsc::Sender<Piece>,
     buffer: BytesMut,
+    /// Charged with every piece until it is sent.
+    budget: Budget,
 }
 
 impl Pieces {
@@ -100,10 +103,16 @@ impl Pieces {
         self.pieces.blocking_send(piece).map_err(|_gone| io::ErrorKind::BrokenPipe.into())
     }
 
+    fn send_buffer(&mut self) -> io::Result<()> {
+        let data = std::mem::take(&mut self.buffer).freeze();
+        let mut lease = self.budget.lease();
+        lease.force(data.len() as u64);
+        self.send(Piece::Data(lease.attach(data)))
+    }
+
     fn finish(&mut self) -> io::Result<()> {
         if !self.buffer.is_empty() {
-            let data = self.buffer.split().freeze();
-            self.send(Piece::Data(data))?;
+            self.send_buffer()?;
         }
         // Whoever knows the length hangs up after the last byte and does not wait for the end.
         self.send(Piece::End).or(Ok(()))
@@ -118,8 +127,7 @@ impl Write for Pieces {
         let n = data.len().min(self.buffer.capacity() - self.buffer.len());
         self.buffer.put_slice(&data[..n]);
         if self.buffer.len() == self.buffer.capacity() {
-            let data = std::mem::take(&mut self.buffer).freeze();
-            self.send(Piece::Data(data))?;
+            self.send_buffer()?;
         }
         Ok(n)
     }

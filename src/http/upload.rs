@@ -4,17 +4,15 @@ use axum::body::Body;
 use axum::http::HeaderMap;
 use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE};
 use bytes::{Bytes, BytesMut};
-use futures_util::{StreamExt as _, TryStreamExt as _};
-use multer::{Constraints, Multipart, SizeLimit};
+use futures_util::StreamExt as _;
 
 use super::declared::Declared;
+use super::form;
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::state::App;
 use crate::jobs::Lease;
 
-/// Bytes of a form field that is a parameter.
-const MAX_FIELD_BYTES: usize = 4096;
 /// Most that is set aside before anything has come: what a length header promises costs its sender nothing.
 const MAX_RESERVED_BYTES: u64 = 1 << 20;
 
@@ -38,12 +36,40 @@ pub(super) fn is_json(headers: &HeaderMap) -> bool {
     essence.trim().eq_ignore_ascii_case("application/json")
 }
 
-/// Receives the body.
+/// A limit, and the key of the configuration that sets it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Limit {
+    pub(super) key: &'static str,
+    pub(super) most: u64,
+}
+
+impl Limit {
+    /// The problem of a body that is too large.
+    pub(super) fn exceeded_by_body(self) -> Problem {
+        self.exceeded("the body has", "bytes")
+    }
+
+    /// The problem of something that has more than the limit; `what` begins the sentence.
+    pub(super) fn exceeded(self, what: &str, unit: &str) -> Problem {
+        let Self { key, most } = self;
+        Problem::new(Kind::BodyTooLarge, format!("{what} more than {most} {unit} ({key})")).with("limit", most)
+    }
+}
+
+/// Receives a structure: a file, or a form around one.
 pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Result<Upload, Problem> {
-    let limit = app.config.limits.body_bytes;
+    receive_within(app, headers, body, Limit { key: "limits.body_bytes", most: app.config.limits.body_bytes }).await
+}
+
+/// Receives a JSON document.
+pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> Result<Upload, Problem> {
+    receive_within(app, headers, body, Limit { key: "limits.json_bytes", most: app.config.limits.json_bytes }).await
+}
+
+async fn receive_within(app: &App, headers: &HeaderMap, body: Body, limit: Limit) -> Result<Upload, Problem> {
     let announced = text(headers, &CONTENT_LENGTH).and_then(|length| length.parse::<u64>().ok());
-    if let Some(length) = announced.filter(|length| *length > limit) {
-        return Err(too_large(limit).with("actual", length));
+    if let Some(length) = announced.filter(|length| *length > limit.most) {
+        return Err(limit.exceeded_by_body().with("actual", length));
     }
     let coding = content_encoding(headers)?;
     let receive = async {
@@ -51,7 +77,8 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
             if coding.is_some() {
                 return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
             }
-            form(app, text(headers, &CONTENT_TYPE).unwrap_or_default(), body, limit).await
+            let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
+            form::read(&app.config.limits, limit, content_type, body, app.pool.budget().lease()).await
         } else {
             let mut lease = app.pool.budget().lease();
             let bytes = collect(body, announced.unwrap_or(0), limit, &mut lease).await?;
@@ -75,24 +102,20 @@ fn text<'a>(headers: &'a HeaderMap, name: &axum::http::HeaderName) -> Option<&'a
     headers.get(name)?.to_str().ok()
 }
 
-fn too_large(limit: u64) -> Problem {
-    Problem::new(Kind::BodyTooLarge, format!("the body has more than {limit} bytes")).with("limit", limit)
-}
-
 /// A body that ends early; its sender is most likely gone.
 fn broken(error: &dyn std::fmt::Display) -> Problem {
     Problem::new(Kind::BadRequest, format!("the body cannot be read: {error}"))
 }
 
 /// Reads a body into one piece; a body of one frame is not copied.
-async fn collect(body: Body, announced: u64, limit: u64, lease: &mut Lease) -> Result<Bytes, Problem> {
+async fn collect(body: Body, announced: u64, limit: Limit, lease: &mut Lease) -> Result<Bytes, Problem> {
     let mut stream = body.into_data_stream();
     let (mut first, mut all, mut length) = (Bytes::new(), BytesMut::new(), 0u64);
     while let Some(data) = stream.next().await {
         let data = data.map_err(|e| broken(&e))?;
         length += data.len() as u64;
-        if length > limit {
-            return Err(too_large(limit));
+        if length > limit.most {
+            return Err(limit.exceeded_by_body());
         }
         lease.grow(data.len() as u64)?;
         if first.is_empty() && all.is_empty() {
@@ -106,49 +129,6 @@ async fn collect(body: Body, announced: u64, limit: u64, lease: &mut Lease) -> R
         all.extend_from_slice(&data);
     }
     Ok(if all.is_empty() { first } else { all.freeze() })
-}
-
-/// Reads a form: one file in `file` or `structure`, parameters in the other fields.
-async fn form(app: &App, content_type: &str, body: Body, limit: u64) -> Result<Upload, Problem> {
-    let bad = |error: multer::Error| match error {
-        multer::Error::StreamSizeExceeded { limit } => too_large(limit),
-        other => Problem::new(Kind::BadRequest, format!("the form cannot be read: {other}")),
-    };
-    let boundary = multer::parse_boundary(content_type).map_err(bad)?;
-    let constraints = Constraints::new().size_limit(SizeLimit::new().whole_stream(limit));
-    let stream = body.into_data_stream().map_err(|e| std::io::Error::other(e.to_string()));
-    let mut form = Multipart::with_constraints(stream, boundary, constraints);
-    let mut lease = app.pool.budget().lease();
-    let (mut file, mut fields) = (None, Vec::new());
-    while let Some(mut field) = form.next_field().await.map_err(bad)? {
-        let name = field.name().unwrap_or_default().to_owned();
-        let is_file = matches!(name.as_str(), "file" | "structure");
-        if is_file && file.is_some() {
-            return Err(Problem::new(Kind::BadRequest, "the form has more than one file").with("parameter", name));
-        }
-        let declared = Declared::new(field.content_type().map_or("", |mime| mime.as_ref()));
-        let mut content = BytesMut::new();
-        while let Some(chunk) = field.chunk().await.map_err(bad)? {
-            lease.grow(chunk.len() as u64)?;
-            content.extend_from_slice(&chunk);
-            if !is_file && content.len() > MAX_FIELD_BYTES {
-                let detail = format!("the form field `{name}` has more than {MAX_FIELD_BYTES} bytes");
-                return Err(Problem::new(Kind::BadParameter, detail)
-                    .with("parameter", name)
-                    .with("limit", MAX_FIELD_BYTES));
-            }
-        }
-        if is_file {
-            file = Some((content.freeze(), declared));
-        } else {
-            fields.push((name, String::from_utf8_lossy(&content).into_owned()));
-        }
-    }
-    let Some((bytes, declared)) = file else {
-        let detail = "the form has no file; put it into a field named `file` or `structure`";
-        return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
-    };
-    Ok(Upload { bytes, lease, fields, declared })
 }
 
 /// A content coding that the reader undoes.

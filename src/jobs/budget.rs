@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use bytes::Bytes;
 use metrics::gauge;
 use thiserror::Error;
 
@@ -75,6 +76,23 @@ impl Lease {
         self.bytes += bytes;
         publish(bytes, 1.0);
     }
+
+    /// Returns `memory` as bytes that hold this lease until the last reference to them is dropped.
+    pub fn attach(self, memory: impl AsRef<[u8]> + Send + 'static) -> Bytes {
+        Bytes::from_owner(Leased { memory, _lease: self })
+    }
+}
+
+/// Memory together with its lease.
+struct Leased<T> {
+    memory: T,
+    _lease: Lease,
+}
+
+impl<T: AsRef<[u8]>> AsRef<[u8]> for Leased<T> {
+    fn as_ref(&self) -> &[u8] {
+        self.memory.as_ref()
+    }
 }
 
 impl Drop for Lease {
@@ -107,5 +125,18 @@ mod tests {
         budget.check().unwrap();
         drop(a);
         budget.lease().grow(100).unwrap();
+    }
+
+    #[test]
+    fn attached_bytes_hold_their_lease_to_the_last_reference() {
+        let budget = Budget::new(10);
+        let mut lease = budget.lease();
+        lease.force(11);
+        let mut bytes = lease.attach(vec![7; 11]);
+        let tail = bytes.split_off(10);
+        drop(bytes);
+        assert_eq!((&tail[..], budget.check().unwrap_err().held), (&[7][..], 11));
+        drop(tail);
+        budget.check().unwrap();
     }
 }

@@ -132,6 +132,16 @@ impl Backend {
         Ok(Some((meta, bytes)))
     }
 
+    /// Bytes of an object. The file is open for that long only.
+    pub(super) async fn piece(&self, name: &Name, range: std::ops::Range<u64>) -> Result<Bytes, StoreError> {
+        let length = range.end - range.start;
+        let parts = self.objects.get_ranges(&name.path(), &[range]).await.map_err(self.fail_at("read", name))?;
+        match parts.into_iter().next() {
+            Some(bytes) if bytes.len() as u64 == length => Ok(bytes),
+            _ => Err(self.fail("read", &name.to_string(), &std::io::Error::other("the object has become shorter"))),
+        }
+    }
+
     pub(super) async fn head(&self, name: &Name) -> Result<Option<Meta>, StoreError> {
         let found = found(self.objects.head(&name.path()).await).map_err(self.fail_at("head", name))?;
         Ok(found.as_ref().map(Meta::from))

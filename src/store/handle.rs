@@ -154,16 +154,38 @@ impl Store {
         Ok(Some(Stored { bytes, meta }))
     }
 
-    /// An object in pieces, or the bytes of `range` of it, whose end may lie behind the object's. What was opened can be
-    /// read to its end, even if it is removed meanwhile.
+    /// An object in pieces, or the bytes of `range` of it, whose end may lie behind the object's. For objects named after
+    /// their content: each piece is read when it is asked for. The object is pinned until the stream is dropped.
     ///
     /// # Errors
-    /// [`StoreError::Range`] if the range is empty or begins behind the end; others as they come.
+    /// [`StoreError::Range`] if the range is empty or begins behind the end; others as they come. The stream fails if the
+    /// object is deleted while it is read.
     pub async fn read(&self, name: &Name, range: Option<Range<u64>>) -> Result<Option<(Meta, ByteStream)>, StoreError> {
-        if let Some((meta, bytes)) = self.recall(name) {
-            let range = range.map(|range| within(range, meta.size)).transpose()?.unwrap_or(0..meta.size);
-            return Ok(Some((meta, stream::of(&bytes, range))));
+        let pin = self.pin(name);
+        let known = self.recall(name).map(|(meta, _)| meta);
+        if known.is_none() && !self.0.backend.is_local() {
+            return self.read_remote(name, range).await;
         }
+        let meta = match known {
+            Some(meta) => meta,
+            None => {
+                let Some(seen) = self.begin_read(name) else { return Ok(None) };
+                let meta = self.0.backend.head(name).await?;
+                self.end_read(name, seen, meta);
+                let Some(meta) = meta else { return Ok(None) };
+                meta
+            }
+        };
+        let range = range.map(|range| within(range, meta.size)).transpose()?.unwrap_or(0..meta.size);
+        Ok(Some((meta, stream::pieces(pin, meta, range))))
+    }
+
+    /// [`read`](Self::read) from a service: one request for all pieces.
+    async fn read_remote(
+        &self,
+        name: &Name,
+        range: Option<Range<u64>>,
+    ) -> Result<Option<(Meta, ByteStream)>, StoreError> {
         let Some(seen) = self.begin_read(name) else { return Ok(None) };
         let range = match range {
             Some(range) => {
@@ -177,7 +199,16 @@ impl Store {
         };
         let read = self.0.backend.get(name, range).await?;
         self.end_read(name, seen, read.as_ref().map(|read| Meta::from(&read.meta)));
-        Ok(read.map(|read| (Meta::from(&read.meta), stream::read(self.clone(), name.clone(), read))))
+        Ok(read.map(|read| (Meta::from(&read.meta), stream::remote(self.clone(), name.clone(), read))))
+    }
+
+    /// Bytes of the object that `meta` describes. A copy where it is in memory, so that the bytes hold only themselves.
+    pub(super) async fn piece(&self, name: &Name, meta: Meta, range: Range<u64>) -> Result<Bytes, StoreError> {
+        if let Some((_, bytes)) = self.0.memory.get(name).filter(|(now, _)| now.size == meta.size) {
+            let at = |offset: u64| usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
+            return Ok(Bytes::copy_from_slice(&bytes[at(range.start)..at(range.end)]));
+        }
+        self.0.backend.piece(name, range).await
     }
 
     /// What is known of an object; this is no use of it.

@@ -1,5 +1,6 @@
 //! What the store hands out.
 
+use std::ops::Range;
 use std::time::SystemTime;
 
 use bytes::Bytes;
@@ -58,6 +59,11 @@ impl Pin {
     /// For a name that the index has noted.
     pub(super) fn new(store: Store, name: Name) -> Self {
         Self { store, name }
+    }
+
+    /// Bytes of the pinned object, which must still be the one that `meta` describes.
+    pub(super) async fn piece(&self, meta: Meta, range: Range<u64>) -> Result<Bytes, StoreError> {
+        self.store.piece(&self.name, meta, range).await
     }
 }
 

@@ -41,6 +41,8 @@ metrics! {
     CONNECTIONS = "molmesh_connections", Gauge;
     /// Requests refused by a limit, by the slug of the problem's type, or by the timeout that has none.
     REJECTED = "molmesh_requests_rejected_total", Counter, reason: "slugs of problem types, `header-timeout`, `write-timeout`";
+    /// Response bodies that are being sent.
+    BODIES_OPEN = "molmesh_response_bodies_open", Gauge;
     /// Clients whose quotas are counted one by one.
     QUOTA_CLIENTS = "molmesh_quota_clients", Gauge;
     /// Jobs accepted, by mode and by whether they took part in work that was in the house.

@@ -119,9 +119,34 @@ pub(super) fn memory(machine: &Machine, config: &Config, workers: usize) -> Chec
     }
 }
 
+/// Files that a service opens beside its connections: libraries, devices, the store, requests to an archive.
+const OTHER_FILES: u64 = 128;
+
+/// Whether the limit of open files allows the configured connections.
+pub(super) fn files(machine: &Machine, config: &Config) -> Option<Check> {
+    let [_, most] = machine.files?;
+    let needed = (config.server.connections as u64).saturating_add(OTHER_FILES);
+    let sum = format!("{needed} ({} server.connections, {OTHER_FILES} others), of {most}", config.server.connections);
+    Some(if needed > most {
+        let detail = format!("{sum}: connections will fail under load; raise the limit or lower server.connections");
+        Check::new("open files", State::Warning, detail)
+    } else {
+        Check::new("open files", State::Ok, sum)
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn connections_need_open_files() {
+        let mut config = Config::default();
+        config.server.connections = 1000;
+        let state = |most| files(&Machine { files: Some([10, most]), ..Machine::default() }, &config).unwrap().state;
+        assert_eq!((state(1128), state(1127)), (State::Ok, State::Warning));
+        assert_eq!(files(&Machine::default(), &config), None);
+    }
 
     #[test]
     fn budgets_that_do_not_fit_are_a_warning() {

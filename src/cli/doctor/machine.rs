@@ -19,6 +19,8 @@ pub(super) struct Machine {
     pub(super) bytes: Option<u64>,
     /// Bytes that this process may take, and by whose word, where there is a limit.
     pub(super) limit: Option<(u64, &'static str)>,
+    /// Files that may be open: now, and at most, to which a service raises it.
+    pub(super) files: Option<[u64; 2]>,
     /// What announces itself as a Vulkan driver, whether or not it starts; a sentence where nothing does.
     pub(super) drivers: Vec<String>,
 }
@@ -30,6 +32,7 @@ impl Machine {
             cores: std::thread::available_parallelism().ok().map(std::num::NonZero::get),
             bytes: fs::read_to_string("/proc/meminfo").ok().and_then(|text| total(&text)),
             limit: limit(Path::new("/")).map(|bytes| (bytes, "this control group")),
+            files: files(),
             drivers: drivers(),
         }
     }
@@ -46,6 +49,7 @@ impl Machine {
         json!({
             "os": std::env::consts::OS, "arch": std::env::consts::ARCH, "cores": self.cores, "vectors": vectors,
             "memory_bytes": self.bytes, "memory_limit_bytes": self.limit.map(|(bytes, _)| bytes),
+            "open_files": self.files.map(|[now, _]| now), "open_files_limit": self.files.map(|[_, most]| most),
             "drivers": self.drivers,
         })
     }
@@ -68,6 +72,18 @@ fn drivers() -> Vec<String> {
 #[cfg(not(feature = "gpu"))]
 fn drivers() -> Vec<String> {
     Vec::new()
+}
+
+/// The soft and the hard limit of open files.
+#[cfg(target_os = "linux")]
+fn files() -> Option<[u64; 2]> {
+    let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile);
+    Some([limit.current, limit.maximum].map(|files| files.unwrap_or(u64::MAX)))
+}
+
+#[cfg(not(target_os = "linux"))]
+fn files() -> Option<[u64; 2]> {
+    None
 }
 
 /// The total of `/proc/meminfo`, bytes.

@@ -76,6 +76,7 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
         }
         Err(error) => return Err(error),
     }
+    checks.extend(checks::files(&machine, &config));
     checks.extend(places::listeners(&config));
     let failed = |e: std::io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().map_err(failed)?;

@@ -28,6 +28,9 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
         .limit
         .map_or("no limit of a control group".to_owned(), |(bytes, whose)| format!("{} for {whose}", size(bytes)));
     page.row("memory", &format!("{memory}, {limit}"));
+    if let Some([now, most]) = machine.files {
+        page.row("open files", &format!("{now}, raised to {most} by a service"));
+    }
     for candidate in findings.backends.iter().filter(|candidate| !candidate.is_device()) {
         let said = match &candidate.state {
             Ok(device) => format!("{} {device}", style.green("yes")),

@@ -1,0 +1,183 @@
+//! Forms: one file and parameters as `multipart/form-data`, every part of it bounded before it is buffered.
+
+use std::pin::Pin;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::task::{Context, Poll, ready};
+
+use axum::body::{Body, BodyDataStream};
+use axum::http::HeaderMap;
+use bytes::{Bytes, BytesMut};
+use futures_util::{Stream, StreamExt as _};
+use multer::{Constraints, Multipart, SizeLimit};
+use thiserror::Error;
+
+use super::declared::Declared;
+use super::kinds::Kind;
+use super::problem::Problem;
+use super::upload::{Limit, Upload};
+use crate::config::LimitsConfig;
+use crate::jobs::Lease;
+
+/// Bytes of a form field that is a parameter.
+const MAX_FIELD_BYTES: usize = 4096;
+/// Characters of a boundary (RFC 2046, 5.1.1).
+const MAX_BOUNDARY: usize = 70;
+/// Bytes that the parser gets at once. It searches all that it has buffered whenever it gets more.
+const PIECE: usize = 64 << 10;
+
+/// Why the parser gets nothing more.
+#[derive(Debug, Error)]
+enum FeedError {
+    #[error("the head of a part is too long")]
+    HeadTooLong,
+    #[error(transparent)]
+    Body(#[from] axum::Error),
+}
+
+/// Hands a body to the parser in pieces, and no more than `allowance` bytes: the parser buffers the preamble and the head
+/// of a part until it has seen their end.
+struct Feed<'a> {
+    body: BodyDataStream,
+    rest: Bytes,
+    allowance: &'a AtomicUsize,
+    /// The parser has to look at the last piece before it gets another one.
+    paused: bool,
+}
+
+impl Stream for Feed<'_> {
+    type Item = Result<Bytes, FeedError>;
+
+    fn poll_next(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Self::Item>> {
+        if std::mem::take(&mut self.paused) {
+            cx.waker().wake_by_ref();
+            return Poll::Pending;
+        }
+        while self.rest.is_empty() {
+            match ready!(self.body.poll_next_unpin(cx)) {
+                Some(data) => self.rest = data?,
+                None => return Poll::Ready(None),
+            }
+        }
+        let allowance = self.allowance.load(Ordering::Relaxed);
+        let length = self.rest.len().min(allowance).min(PIECE);
+        if length == 0 {
+            return Poll::Ready(Some(Err(FeedError::HeadTooLong)));
+        }
+        if allowance != UNBOUNDED {
+            self.allowance.store(allowance - length, Ordering::Relaxed);
+        }
+        self.paused = true;
+        Poll::Ready(Some(Ok(self.rest.split_to(length))))
+    }
+}
+
+/// The allowance while a part's content is read: content is handed on as it comes.
+const UNBOUNDED: usize = usize::MAX;
+
+/// What a form is checked against.
+struct Bounds {
+    body: Limit,
+    head: Limit,
+    parts: Limit,
+}
+
+impl Bounds {
+    fn new(limits: &LimitsConfig, body: Limit) -> Self {
+        let head = Limit { key: "limits.part_head_bytes", most: limits.part_head_bytes };
+        Self { body, head, parts: Limit { key: "limits.parts", most: limits.parts as u64 } }
+    }
+
+    fn head_too_long(&self) -> Problem {
+        self.head.exceeded("the preamble or the headers of a part have", "bytes")
+    }
+
+    fn problem(&self, error: &multer::Error) -> Problem {
+        match error {
+            multer::Error::StreamSizeExceeded { .. } => self.body.exceeded_by_body(),
+            multer::Error::StreamReadFailed(cause)
+                if matches!(cause.downcast_ref::<FeedError>(), Some(FeedError::HeadTooLong)) =>
+            {
+                self.head_too_long()
+            }
+            other => Problem::new(Kind::BadRequest, format!("the form cannot be read: {other}")),
+        }
+    }
+}
+
+/// Reads a form: one file in `file` or `structure`, parameters in the other fields.
+pub(super) async fn read(
+    limits: &LimitsConfig,
+    within: Limit,
+    content_type: &str,
+    body: Body,
+    mut lease: Lease,
+) -> Result<Upload, Problem> {
+    let bounds = Bounds::new(limits, within);
+    let boundary = multer::parse_boundary(content_type).map_err(|e| bounds.problem(&e))?;
+    if boundary.len() > MAX_BOUNDARY {
+        let detail = format!("the form's boundary has more than {MAX_BOUNDARY} characters");
+        return Err(Problem::new(Kind::BadRequest, detail).with("limit", MAX_BOUNDARY));
+    }
+    // What the parser buffers at most.
+    lease.grow(bounds.head.most.saturating_add(PIECE as u64))?;
+    let allowance = AtomicUsize::new(0);
+    let mut feed = Feed { body: body.into_data_stream(), rest: Bytes::new(), allowance: &allowance, paused: false };
+    let constraints = Constraints::new().size_limit(SizeLimit::new().whole_stream(bounds.body.most));
+    let mut form = Multipart::with_constraints(&mut feed, boundary, constraints);
+    let (mut file, mut fields) = (None, Vec::new());
+    let head = usize::try_from(bounds.head.most).unwrap_or(UNBOUNDED);
+    loop {
+        allowance.store(head, Ordering::Relaxed);
+        let Some(mut field) = form.next_field().await.map_err(|e| bounds.problem(&e))? else { break };
+        allowance.store(UNBOUNDED, Ordering::Relaxed);
+        // The beginning of the head may have come with the content before it.
+        if head_bytes(field.headers()) > head {
+            return Err(bounds.head_too_long());
+        }
+        if fields.len() + usize::from(file.is_some()) >= limits.parts {
+            return Err(bounds.parts.exceeded("the form has", "parts"));
+        }
+        let name = field.name().unwrap_or_default().to_owned();
+        lease.grow(name.len() as u64)?;
+        let is_file = matches!(name.as_str(), "file" | "structure");
+        if is_file && file.is_some() {
+            return Err(Problem::new(Kind::BadRequest, "the form has more than one file").with("parameter", name));
+        }
+        let declared = Declared::new(field.content_type().map_or("", |mime| mime.as_ref()));
+        let mut content = BytesMut::new();
+        while let Some(chunk) = field.chunk().await.map_err(|e| bounds.problem(&e))? {
+            lease.grow(chunk.len() as u64)?;
+            content.extend_from_slice(&chunk);
+            if !is_file && content.len() > MAX_FIELD_BYTES {
+                return Err(field_too_long(name));
+            }
+        }
+        if is_file {
+            file = Some((content.freeze(), declared));
+        } else {
+            fields.push((name, String::from_utf8_lossy(&content).into_owned()));
+        }
+    }
+    drop(form);
+    // An epilogue means nothing, but a body that is not read to its end costs the client its connection.
+    allowance.store(head, Ordering::Relaxed);
+    while let Some(piece) = feed.next().await {
+        piece.map_err(|e| bounds.problem(&multer::Error::StreamReadFailed(e.into())))?;
+    }
+    let Some((bytes, declared)) = file else {
+        let detail = "the form has no file; put it into a field named `file` or `structure`";
+        return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
+    };
+    Ok(Upload { bytes, lease, fields, declared })
+}
+
+/// Bytes of a part's headers as they are sent.
+fn head_bytes(headers: &HeaderMap) -> usize {
+    headers.iter().map(|(name, value)| name.as_str().len() + ": \r\n".len() + value.len()).sum()
+}
+
+fn field_too_long(name: String) -> Problem {
+    let shown: String = name.chars().take(80).collect();
+    let detail = format!("the form field `{shown}` has more than {MAX_FIELD_BYTES} bytes");
+    Problem::new(Kind::BadParameter, detail).with("parameter", shown).with("limit", MAX_FIELD_BYTES)
+}

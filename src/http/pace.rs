@@ -1,0 +1,278 @@
+//! Minimum pace of response bodies: a client that takes too little of a body for too long loses it.
+//!
+//! hyper polls a body ahead of the client and does not poll it again while the client takes nothing, so a body cannot watch
+//! itself. Instead [`Paced`] counts each slice until hyper has written it and dropped it, and whoever runs the exchange waits
+//! for [`Pace::stalled`] beside it: for HTTP/1.1 the connection, for HTTP/2 the stream's own task ([`Streams`]).
+
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Context, Poll, Waker, ready};
+use std::time::Duration;
+
+use axum::body::Body;
+use axum::http::header::CONTENT_TYPE;
+use axum::http::{Response, Version};
+use bytes::Bytes;
+use hyper::body::{Body as HttpBody, Frame, SizeHint};
+use hyper::rt::Executor;
+use metrics::{counter, gauge};
+use tokio::sync::Notify;
+use tokio::time::Instant;
+
+use crate::config::ServerConfig;
+use crate::telemetry::{BODIES_OPEN, REJECTED};
+
+/// Bytes of a slice: at 8 KiB/s one is taken in four seconds.
+const SLICE: usize = 32 << 10;
+/// Bytes of a body that is sent without being watched: too few to hold anything back with.
+const SMALL: u64 = 1 << 10;
+
+tokio::task_local! {
+    /// The pace of the HTTP/2 stream that this task serves.
+    static STREAM: Arc<Pace>;
+}
+
+/// Bytes that a client must take within a time.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Rate {
+    bytes: u64,
+    within: Duration,
+}
+
+impl Rate {
+    pub(super) fn new(config: &ServerConfig) -> Self {
+        Self { bytes: config.write_bytes, within: config.write_timeout() }
+    }
+}
+
+/// The pace at which one client takes one body after another.
+#[derive(Debug)]
+pub(super) struct Pace {
+    rate: Rate,
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    /// Bytes that hyper has and the client has not taken.
+    offered: u64,
+    /// Bytes taken since `since`, fewer than the rate asks for.
+    taken: u64,
+    since: Instant,
+    /// Waits until everything is taken.
+    waker: Option<Waker>,
+}
+
+impl Pace {
+    pub(super) fn new(rate: Rate) -> Arc<Self> {
+        let state = State { offered: 0, taken: 0, since: Instant::now(), waker: None };
+        Arc::new(Self { rate, state: Mutex::new(state) })
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Counts a slice until the last reference to it is dropped.
+    fn offer(self: &Arc<Self>, bytes: Bytes) -> Bytes {
+        let mut state = self.state();
+        if state.offered == 0 {
+            (state.taken, state.since) = (0, Instant::now());
+        }
+        state.offered += bytes.len() as u64;
+        drop(state);
+        Bytes::from_owner(Slice { bytes, pace: Arc::clone(self) })
+    }
+
+    fn took(&self, bytes: u64) {
+        let mut state = self.state();
+        state.offered -= bytes;
+        state.taken += bytes;
+        if state.taken >= self.rate.bytes {
+            (state.taken, state.since) = (0, Instant::now());
+        }
+        let waker = if state.offered == 0 { state.waker.take() } else { None };
+        drop(state);
+        if let Some(waker) = waker {
+            waker.wake();
+        }
+    }
+
+    fn poll_taken(&self, cx: &Context<'_>) -> Poll<()> {
+        let mut state = self.state();
+        if state.offered == 0 {
+            return Poll::Ready(());
+        }
+        state.waker = Some(cx.waker().clone());
+        Poll::Pending
+    }
+
+    /// Waits until everything that was offered is taken.
+    async fn taken(&self) {
+        std::future::poll_fn(|cx| self.poll_taken(cx)).await;
+    }
+
+    /// Waits until the client has been slower than the rate for the rate's whole time.
+    pub(super) async fn stalled(&self) {
+        loop {
+            let now = Instant::now();
+            let due = {
+                let state = self.state();
+                // What is offered later is due later.
+                if state.offered == 0 { now } else { state.since }
+            } + self.rate.within;
+            if due <= now {
+                return;
+            }
+            tokio::time::sleep_until(due).await;
+        }
+    }
+
+    /// Watches the body of an answer: at the pace of its stream for HTTP/2, else at `connection`'s. Event streams are as
+    /// slow as their events, and hold no more than one.
+    pub(super) fn watch(answer: Response<Body>, connection: &Arc<Self>, version: Version) -> Response<Body> {
+        let is_small = answer.body().size_hint().upper().is_some_and(|bytes| bytes <= SMALL);
+        let is_events = answer.headers().get(CONTENT_TYPE).is_some_and(|t| t.as_bytes().starts_with(b"text/event-stream"));
+        if is_small || is_events {
+            return answer;
+        }
+        let stream = if version == Version::HTTP_2 { STREAM.try_with(Arc::clone).ok() } else { None };
+        let stays = stream.is_some();
+        let pace = stream.unwrap_or_else(|| Arc::clone(connection));
+        answer.map(|body| Body::new(Paced { body, rest: Bytes::new(), ended: false, stays, pace, _open: Open::new() }))
+    }
+}
+
+/// Counts a body that was cut off.
+pub(super) fn cut_off() {
+    counter!(REJECTED, "reason" => "write-timeout").increment(1);
+    tracing::debug!("a client took too little of a body");
+}
+
+/// Bytes on their way to the client.
+struct Slice {
+    bytes: Bytes,
+    pace: Arc<Pace>,
+}
+
+impl AsRef<[u8]> for Slice {
+    fn as_ref(&self) -> &[u8] {
+        &self.bytes
+    }
+}
+
+impl Drop for Slice {
+    fn drop(&mut self) {
+        self.pace.took(self.bytes.len() as u64);
+    }
+}
+
+/// Counts an open body while it lives.
+struct Open;
+
+impl Open {
+    fn new() -> Self {
+        gauge!(BODIES_OPEN).increment(1.0);
+        Self
+    }
+}
+
+impl Drop for Open {
+    fn drop(&mut self) {
+        gauge!(BODIES_OPEN).decrement(1.0);
+    }
+}
+
+/// A body in slices that are counted until they are sent.
+struct Paced {
+    body: Body,
+    /// What is left of the frame at hand.
+    rest: Bytes,
+    /// The body has nothing more.
+    ended: bool,
+    /// The end is held back until everything is taken: HTTP/2 gives a stream's task up at the end of its body, and then
+    /// nobody could take back what is still buffered.
+    stays: bool,
+    pace: Arc<Pace>,
+    _open: Open,
+}
+
+impl HttpBody for Paced {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        while self.rest.is_empty() && !self.ended {
+            match ready!(Pin::new(&mut self.body).poll_frame(cx)) {
+                Some(Ok(frame)) => match frame.into_data() {
+                    Ok(data) => self.rest = data,
+                    Err(trailers) => return Poll::Ready(Some(Ok(trailers))),
+                },
+                Some(Err(error)) => return Poll::Ready(Some(Err(error))),
+                None => self.ended = true,
+            }
+            self.ended = self.ended || self.body.is_end_stream();
+        }
+        if self.rest.is_empty() {
+            if self.stays {
+                ready!(self.pace.poll_taken(cx));
+            }
+            return Poll::Ready(None);
+        }
+        let length = self.rest.len().min(SLICE);
+        let slice = self.rest.split_to(length);
+        Poll::Ready(Some(Ok(Frame::data(self.pace.offer(slice)))))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        let ended = self.rest.is_empty() && (self.ended || self.body.is_end_stream());
+        ended && (!self.stays || self.pace.state().offered == 0)
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        let (rest, hint) = (self.rest.len() as u64, self.body.size_hint());
+        let mut all = SizeHint::new();
+        all.set_lower(hint.lower() + rest);
+        if let Some(upper) = hint.upper() {
+            all.set_upper(upper + rest);
+        }
+        all
+    }
+}
+
+/// Runs the streams of an HTTP/2 connection, each until its client is too slow. A stream that is cut off is reset, and its
+/// buffers are freed; where the connection does not even take that, `broken` is told.
+#[derive(Clone)]
+pub(super) struct Streams {
+    rate: Rate,
+    broken: Arc<Notify>,
+}
+
+impl Streams {
+    pub(super) fn new(rate: Rate, broken: &Arc<Notify>) -> Self {
+        Self { rate, broken: Arc::clone(broken) }
+    }
+}
+
+impl<F> Executor<F> for Streams
+where
+    F: Future + Send + 'static,
+    F::Output: Send,
+{
+    fn execute(&self, stream: F) {
+        let (pace, broken) = (Pace::new(self.rate), Arc::clone(&self.broken));
+        tokio::spawn(async move {
+            let stalled = tokio::select! {
+                _ = STREAM.scope(Arc::clone(&pace), stream) => false,
+                () = pace.stalled() => true,
+            };
+            if stalled {
+                cut_off();
+                if tokio::time::timeout(pace.rate.within, pace.taken()).await.is_err() {
+                    broken.notify_one();
+                }
+            }
+        });
+    }
+}
