@@ -172,7 +172,11 @@ fn parts_of_forms_are_limited() {
     let server = fake(|c| c.limits.parts = 3);
     let form = |parts: usize| {
         let fields = "--XX\r\ncontent-disposition: form-data; name=\"unknown\"\r\n\r\n\r\n".repeat(parts);
-        server.post("/v1/meshes", &[("content-type", "multipart/form-data; boundary=XX")], (fields + "--XX--").as_bytes())
+        server.post(
+            "/v1/meshes",
+            &[("content-type", "multipart/form-data; boundary=XX")],
+            (fields + "--XX--").as_bytes(),
+        )
     };
     let problem = form(4).problem(413, "body-too-large");
     assert_eq!(problem["limit"], 3);

@@ -43,9 +43,9 @@ pub struct LimitsConfig {
     /// Bytes of a mesh file. Default 3 GiB: below the 4 GiB that a GLB can say, and text formats take more than
     /// the mesh in memory.
     pub output_bytes: u64,
-    /// Bytes of uploads and finished meshes that all requests together hold in memory. Default 8 GiB. A new
-    /// upload or job is refused while it is used up; running jobs may overshoot it by
-    /// `mesh_bytes` and the candidate lists of `candidate_pairs` each.
+    /// Bytes of uploads, finished meshes and responses on their way that all requests together hold in memory. Default
+    /// 8 GiB. A new upload, job or stored result is refused while it is used up; running jobs may overshoot it by
+    /// `mesh_bytes` and the candidate lists of `candidate_pairs` each, responses by their next piece.
     pub memory_bytes: u64,
     /// Pixels of a picture's width and of its height. Default 4,096: at 40 bytes a pixel the working memory of the largest is
     /// 640 MiB, and drawing it takes seconds.

@@ -47,7 +47,7 @@ const SEND_BUFFER: usize = 64 << 10;
 /// Bytes of a connection that the system buffers before they are on their way: few enough that a slow client's progress is
 /// seen every few seconds.
 #[cfg(target_os = "linux")]
-const UNSENT: u32 = 128 << 10;
+const UNSENT: u32 = 256 << 10;
 /// How often an HTTP/2 client is asked whether it is still there.
 const PING: Duration = Duration::from_secs(20);
 
@@ -202,10 +202,7 @@ async fn connection(
         request.extensions_mut().insert(peer);
         let answer = router.clone().oneshot(request);
         async move {
-            let mut answer: Response<Body> = match answer.await {
-                Ok(answer) => answer,
-                Err(never) => match never {},
-            };
+            let Ok(mut answer): Result<Response<Body>, Infallible> = answer.await;
             drop(working);
             // So that clients turn elsewhere for their next request, before connections are closed on them.
             if *phase.borrow() >= Stop::Notice && version < Version::HTTP_2 {

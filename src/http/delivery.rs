@@ -73,7 +73,8 @@ pub(super) async fn mesh(
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
     headers.insert(header::ETAG, etag(key));
-    let (length, body) = stream::start(finished, format, app.config.limits.output_bytes, app.pool.budget().clone(), place).await?;
+    let (length, body) =
+        stream::start(finished, format, app.config.limits.output_bytes, app.pool.budget().clone(), place).await?;
     if let Some(length) = length {
         headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     }

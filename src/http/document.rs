@@ -10,8 +10,8 @@ use super::problem::Problem;
 
 /// The members of an object, in order, each as it would stand in a query.
 pub(super) fn members(bytes: &[u8]) -> Result<Vec<(String, String)>, Problem> {
-    let Members(members) =
-        serde_json::from_slice(bytes).map_err(|e| bad(&e.to_string()).with("line", e.line()).with("column", e.column()))?;
+    let Members(members) = serde_json::from_slice(bytes)
+        .map_err(|e| bad(&e.to_string()).with("line", e.line()).with("column", e.column()))?;
     let text = |(name, Member(text)): (String, Member)| match text {
         Some(text) => Ok((name, text)),
         None => Err(unfit(&name)),

@@ -179,8 +179,7 @@ fn named(bytes: &[u8]) -> Result<(Source, Vec<(String, String)>), Problem> {
             return Err(document::bad("it names more than one structure"));
         }
     }
-    let source =
-        source.ok_or_else(|| document::bad("it names no structure: it has no `pdb_id` and no `structure`"))?;
+    let source = source.ok_or_else(|| document::bad("it names no structure: it has no `pdb_id` and no `structure`"))?;
     Ok((source, fields))
 }
 

@@ -23,8 +23,10 @@ use tokio::time::Instant;
 use crate::config::ServerConfig;
 use crate::telemetry::{BODIES_OPEN, REJECTED};
 
-/// Bytes of a slice: at 8 KiB/s one is taken in four seconds.
-const SLICE: usize = 32 << 10;
+/// Bytes of a slice over HTTP/1.1: at 8 KiB/s one is taken in eight seconds.
+const SLICE: usize = 64 << 10;
+/// Bytes of a slice over HTTP/2: a frame, so that the progress of many bodies on one line is seen.
+const STREAM_SLICE: usize = 16 << 10;
 /// Bytes of a body that is sent without being watched: too few to hold anything back with.
 const SMALL: u64 = 1 << 10;
 
@@ -133,7 +135,8 @@ impl Pace {
     /// slow as their events, and hold no more than one.
     pub(super) fn watch(answer: Response<Body>, connection: &Arc<Self>, version: Version) -> Response<Body> {
         let is_small = answer.body().size_hint().upper().is_some_and(|bytes| bytes <= SMALL);
-        let is_events = answer.headers().get(CONTENT_TYPE).is_some_and(|t| t.as_bytes().starts_with(b"text/event-stream"));
+        let is_events =
+            answer.headers().get(CONTENT_TYPE).is_some_and(|t| t.as_bytes().starts_with(b"text/event-stream"));
         if is_small || is_events {
             return answer;
         }
@@ -220,7 +223,7 @@ impl HttpBody for Paced {
             }
             return Poll::Ready(None);
         }
-        let length = self.rest.len().min(SLICE);
+        let length = self.rest.len().min(if self.stays { STREAM_SLICE } else { SLICE });
         let slice = self.rest.split_to(length);
         Poll::Ready(Some(Ok(Frame::data(self.pace.offer(slice)))))
     }

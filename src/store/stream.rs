@@ -12,7 +12,7 @@ use super::object::{ByteStream, Meta, Pin};
 /// Bytes of the first piece: all that a reader holds who asks for an object and takes nothing of it.
 const FIRST: u64 = 16 << 10;
 /// Bytes of a later piece, at most: each wakes a thread and opens the file.
-const PIECE: u64 = 128 << 10;
+const PIECE: u64 = 256 << 10;
 
 /// The bytes of `range`, read piece by piece as they are asked for. Between two pieces nothing is held but the pin: no
 /// memory, no open file. A piece is as large as all before it together, from [`FIRST`] to [`PIECE`].
