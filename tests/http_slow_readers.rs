@@ -155,7 +155,7 @@ fn thin(addr: SocketAddr) -> TcpStream {
 #[test]
 fn stalled_readers_lose_their_streams_and_nothing_else() {
     let _alone = alone();
-    let server = serve(|c| c.server.write_timeout_ms = 3000);
+    let server = serve(|c| (c.server.write_timeout_ms, c.server.write_bytes) = (3000, 8 << 10));
     // From a file, from memory, and one that fits into the send buffer together with its end.
     let paths = [result(&server, 20_000), result(&server, 2000), result(&server, 50)];
     let (files, before) = (open_files(), cut_off(&server));

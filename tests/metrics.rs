@@ -11,11 +11,12 @@ mod trace_support;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
+use std::io::Write as _;
 use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use http_support::{Fake, Mode, Running, SAMPLE, sample, start};
+use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, sample, start};
 use metrics_support::{Devices, Held, Scrape, check, queries, until};
 use molmesh::surface::CpuBackend;
 use molmesh::telemetry::{self as t, Kind, METRICS, Metric, recorder};
@@ -33,6 +34,7 @@ const ROWS: &[Row] = &[
     (t::HTTP_RESPONSE_SIZE, &["method=\"POST\"", "route=\"/v1/meshes\"", "status=\"200\""], meshes),
     (t::CONNECTIONS, &[], held),
     (t::REJECTED, &["reason=\"body-too-large\""], refusals),
+    (t::BODIES_OPEN, &[], unread),
     (t::QUOTA_CLIENTS, &[], quotas),
     (t::JOBS_SUBMITTED, &["mode=\"sync\"", "dedup=\"no\""], meshes),
     (t::JOBS_FINISHED, &["outcome=\"successful\""], meshes),
@@ -103,6 +105,15 @@ fn held(look: &dyn Fn()) {
         backend.let_go();
         assert_eq!(running.join().unwrap().status, 200);
     });
+}
+
+/// A client that does not read its mesh.
+fn unread(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |_| {});
+    let (mut client, body) = (connect(server.addr), carbons(60_000));
+    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    client.write_all(&[head.as_bytes(), &body].concat()).unwrap();
+    look();
 }
 
 fn refusals(look: &dyn Fn()) {
