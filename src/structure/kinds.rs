@@ -191,6 +191,15 @@ fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
         if at_end {
             return;
         }
+        if !has_open {
+            // Only the residue before the next open one matters.
+            let Some(next) = (first..columns.len()).find(|&i| open(columns, i)) else { return };
+            let near = residue_start(columns, next.saturating_sub(1).max(first));
+            if near > first {
+                (before, first, group, has_polymer) = (Joints::default(), near, near, false);
+                continue;
+            }
+        }
         has_polymer |= columns.kind[first] == Kind::Polymer;
         has_open |= open(columns, first);
         (before, first) = (here, end);
@@ -201,16 +210,23 @@ fn same_chain(columns: &Columns, a: usize, b: usize) -> bool {
     columns.chain[a] == columns.chain[b] && columns.model[a] == columns.model[b]
 }
 
+/// The first atom of the residue of atom `i`.
+fn residue_start(columns: &Columns, i: usize) -> usize {
+    (0..i).rev().find(|&before| !same_residue(columns, before, i)).map_or(0, |before| before + 1)
+}
+
+fn same_residue(columns: &Columns, a: usize, b: usize) -> bool {
+    columns.residue_number[a] == columns.residue_number[b]
+        && columns.residue[a] == columns.residue[b]
+        && columns.insertion_code[a] == columns.insertion_code[b]
+        && same_chain(columns, a, b)
+}
+
 /// The end of the residue that begins with atom `first`, and its joints.
 fn residue_from(columns: &Columns, first: usize, joints: &[Option<Joint>]) -> (usize, Joints) {
     let mut found = Joints::default();
     let mut i = first;
-    while i < columns.len()
-        && columns.residue_number[i] == columns.residue_number[first]
-        && columns.residue[i] == columns.residue[first]
-        && columns.insertion_code[i] == columns.insertion_code[first]
-        && same_chain(columns, i, first)
-    {
+    while i < columns.len() && same_residue(columns, i, first) {
         if let Some(joint) = joints[columns.name[i] as usize] {
             found.0[joint as usize].get_or_insert([columns.x[i], columns.y[i], columns.z[i]]);
         }

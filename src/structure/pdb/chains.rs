@@ -134,9 +134,12 @@ impl Evidence {
 
     /// Counts a step from one residue to the next, if the number says that they are neighbours in a chain.
     fn step(&mut self, before: Residue, here: Residue) {
-        let (Some(m), Some(n)) = (number(before), number(here)) else { return };
         let letters = [before[3], here[3]].map(|b| if b <= b' ' { b' ' } else { b });
-        if n != m + 1 || before[4] != here[4] || letters == [b' '; 2] {
+        if before[4] != here[4] || letters == [b' '; 2] || before[..4] == here[..4] {
+            return;
+        }
+        let (Some(m), Some(n)) = (number(before), number(here)) else { return };
+        if n != m + 1 {
             return;
         }
         let names = [before, here].map(|residue| Name::of(&residue[..3]));
@@ -146,7 +149,7 @@ impl Evidence {
         if letters[0] == letters[1] {
             // Lipids follow each other as POPC and DOPC do, and LYSH may follow GLUH.
             let four = [before, here].map(|residue| Name::of(&residue[..4]).four_letters);
-            if before[..3] != here[..3] && names.iter().all(|name| name.polymer) && four != [true; 2] {
+            if names.iter().all(|name| name.polymer) && four != [true; 2] {
                 self.counts.entry([letters[0], here[4]]).or_default()[0] += 1;
             }
         } else {
