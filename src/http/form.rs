@@ -149,7 +149,7 @@ pub(super) async fn read(
             lease.grow(chunk.len() as u64)?;
             content.extend_from_slice(&chunk);
             if !is_file && content.len() > MAX_FIELD_BYTES {
-                return Err(field_too_long(name));
+                return Err(field_too_long(&name));
             }
         }
         if is_file {
@@ -176,7 +176,7 @@ fn head_bytes(headers: &HeaderMap) -> usize {
     headers.iter().map(|(name, value)| name.as_str().len() + ": \r\n".len() + value.len()).sum()
 }
 
-fn field_too_long(name: String) -> Problem {
+fn field_too_long(name: &str) -> Problem {
     let shown: String = name.chars().take(80).collect();
     let detail = format!("the form field `{shown}` has more than {MAX_FIELD_BYTES} bytes");
     Problem::new(Kind::BadParameter, detail).with("parameter", shown).with("limit", MAX_FIELD_BYTES)

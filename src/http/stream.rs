@@ -41,7 +41,7 @@ pub(super) async fn start(
 ) -> Result<(Option<u64>, Body), Problem> {
     let (head, answer) = oneshot::channel();
     let (sender, receiver) = mpsc::channel(PIECES);
-    let pieces = Pieces { pieces: sender, buffer: BytesMut::new(), budget };
+    let pieces = Pieces { sender, buffer: BytesMut::new(), budget };
     let (span, scope) = (tracing::Span::current(), Scope::current());
     tokio::task::spawn_blocking(move || {
         span.in_scope(|| write(&finished, format, limit, head, pieces, scope.as_ref()));
@@ -92,7 +92,7 @@ fn write(
 
 /// Collects what is written into pieces. Blocks while the client is slow.
 struct Pieces {
-    pieces: mpsc::Sender<Piece>,
+    sender: mpsc::Sender<Piece>,
     buffer: BytesMut,
     /// Charged with every piece until it is sent.
     budget: Budget,
@@ -100,7 +100,7 @@ struct Pieces {
 
 impl Pieces {
     fn send(&self, piece: Piece) -> io::Result<()> {
-        self.pieces.blocking_send(piece).map_err(|_gone| io::ErrorKind::BrokenPipe.into())
+        self.sender.blocking_send(piece).map_err(|_gone| io::ErrorKind::BrokenPipe.into())
     }
 
     fn send_buffer(&mut self) -> io::Result<()> {

@@ -166,15 +166,14 @@ impl Store {
         if known.is_none() && !self.0.backend.is_local() {
             return self.read_remote(name, range).await;
         }
-        let meta = match known {
-            Some(meta) => meta,
-            None => {
-                let Some(seen) = self.begin_read(name) else { return Ok(None) };
-                let meta = self.0.backend.head(name).await?;
-                self.end_read(name, seen, meta);
-                let Some(meta) = meta else { return Ok(None) };
-                meta
-            }
+        let meta = if let Some(meta) = known {
+            meta
+        } else {
+            let Some(seen) = self.begin_read(name) else { return Ok(None) };
+            let meta = self.0.backend.head(name).await?;
+            self.end_read(name, seen, meta);
+            let Some(meta) = meta else { return Ok(None) };
+            meta
         };
         let range = range.map(|range| within(range, meta.size)).transpose()?.unwrap_or(0..meta.size);
         Ok(Some((meta, stream::pieces(pin, meta, range))))

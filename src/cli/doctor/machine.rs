@@ -74,11 +74,11 @@ fn drivers() -> Vec<String> {
     Vec::new()
 }
 
-/// The soft and the hard limit of open files.
+/// The soft and the hard limit of open files, where there are both.
 #[cfg(target_os = "linux")]
 fn files() -> Option<[u64; 2]> {
     let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile);
-    Some([limit.current, limit.maximum].map(|files| files.unwrap_or(u64::MAX)))
+    Some([limit.current?, limit.maximum?])
 }
 
 #[cfg(not(target_os = "linux"))]
