@@ -142,7 +142,7 @@ fn what_does_not_go_with_a_picture_is_refused_and_what_goes_with_it_alone() {
         ("format=png&normals=none", "normals"),
         ("format=png&units=nanometer", "units"),
         ("width=100", "width"),
-        ("width=512", "width"),
+        ("width=512&height=30", "height"),
         ("format=stl&view=top", "view"),
         ("report=json&style=gouraud", "style"),
     ] {

@@ -170,8 +170,10 @@ mod tests {
 
     #[test]
     fn a_bad_value_is_bad_usage() {
-        let both = request(&["--detail", "3", "--resolution", "0.5"]).unwrap_err();
+        let both = request(&["--detail", "3", "--resolution", "0.6"]).unwrap_err();
         let said = both.to_string();
+        let default = request(&["--detail", "3", "--resolution", "0.5"]).unwrap();
+        assert_eq!(params::canonical(&default.job), params::canonical(&request(&["--detail", "3"]).unwrap().job));
         assert!(both.code() == 2 && said.contains("`detail`") && said.contains("`resolution`"), "{said}");
         for flags in [["--detail", "7"], ["--max-triangles", "7"], ["--normals", "flat"], ["--units", "inch"]] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");

@@ -10,6 +10,7 @@ use std::str::FromStr;
 
 use thiserror::Error;
 
+use table::flag;
 pub use table::{Domain, Parameter, TABLE, usual};
 
 use super::nearest::nearest;
@@ -82,6 +83,10 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         if std::mem::replace(&mut seen[index], true) {
             return Err(ParamError::Repeated { name: parameter.name });
         }
+        // A default conflicts with nothing, since clients may send every default. An explicit format still overrides `Accept`.
+        if parameter.name != "format" && parameter.is_default(value) {
+            continue;
+        }
         if PICTURES.contains(&parameter.name) {
             set_picture(parameter, value, &mut picture)?;
             request.job.picture = Some(picture);
@@ -144,13 +149,13 @@ pub fn settle(job: &mut Job, format: Format) -> Result<(), ParamError> {
         job.picture.get_or_insert_default();
         return Ok(());
     }
-    let Some(picture) = &job.picture else { return Ok(()) };
-    // The first that is not as it would be anyway; all of them may be.
+    let Some(picture) = job.picture.take() else { return Ok(()) };
+    // The first parameter that differs from its default; a mesh ignores the defaults.
     let (given, plain) = (picture.canonical(), PictureParams::default().canonical());
-    let pairs = given.split('&').zip(plain.split('&')).find(|(given, plain)| given != plain);
-    let (name, value) = pairs.map_or(("width", "512"), |(given, _)| given.split_once('=').unwrap_or_default());
-    let name = PICTURES.into_iter().find(|known| *known == name).unwrap_or("width");
-    refuse(name, value, "nothing", &|f| f.is_picture())
+    let differs = given.split('&').zip(plain.split('&')).find(|(given, plain)| given != plain);
+    let Some((name, value)) = differs.and_then(|(given, _)| given.split_once('=')) else { return Ok(()) };
+    let name = PICTURES.into_iter().find(|known| *known == name).unwrap_or("format");
+    refuse(name, value, "the default", &|f| f.is_picture())
 }
 
 /// The refusal of an unknown name.
@@ -251,14 +256,6 @@ fn set_picture(parameter: &Parameter, text: &str, picture: &mut PictureParams) -
         _ => return Err(unknown(parameter.name)),
     }
     Ok(())
-}
-
-fn flag(text: &str) -> Option<bool> {
-    match text {
-        "true" | "1" => Some(true),
-        "false" | "0" => Some(false),
-        _ => None,
-    }
 }
 
 const PROOFS: [Proof; 2] = [Proof::Checksum, Proof::Exact];
