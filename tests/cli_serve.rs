@@ -98,6 +98,32 @@ fn flags_reach_the_service() {
 }
 
 #[test]
+fn a_data_folder_has_one_service_at_a_time() {
+    let folder = Folder::new();
+    let first = Service::start(&folder, &[]);
+    let data = folder.path("data");
+    let before = std::fs::read(data.join("lock")).unwrap();
+    let serve = ["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir"];
+    let refused = run(serve.iter().copied().chain([data.to_str().unwrap()]));
+    assert_code(&refused, 8);
+    let said = stderr(&refused);
+    for part in [data.to_str().unwrap(), "server.data_dir", &format!("pid {}", first.pid()), &first.addr, "--data-dir"]
+    {
+        assert!(said.contains(part), "no `{part}` in {said}");
+    }
+    assert_eq!(std::fs::read(data.join("lock")).unwrap(), before, "the second changes nothing");
+    let doctor = run(["doctor", "--report", "json", "--listen", "127.0.0.1:0", "--data-dir", data.to_str().unwrap()]);
+    assert!(cli_support::stdout(&doctor).contains(&format!("pid {}", first.pid())), "{}", stderr(&doctor));
+    // Another folder is another matter.
+    drop(Service::start(&Folder::new(), &[]));
+    // The lock ends with the process, however it ends.
+    assert_eq!(first.stop("KILL").0, None);
+    let third = Service::start(&folder, &[]);
+    assert_eq!(third.stop("TERM").0, Some(0));
+    assert_eq!(Service::start(&folder, &[]).stop("TERM").0, Some(0));
+}
+
+#[test]
 fn what_cannot_start_says_why() {
     let folder = Folder::new();
     let service = Service::start(&folder, &[]);

@@ -198,6 +198,34 @@ fn a_job_that_ends_the_process_again_and_again_is_given_up() {
 }
 
 #[test]
+fn a_repeated_key_is_the_same_job_after_a_restart_and_cannot_be_guessed() {
+    let folder = tempfile::tempdir().unwrap();
+    let keep = |c: &mut molmesh::config::Config| folder.path().clone_into(&mut c.server.data_dir);
+    let headers = [("prefer", "respond-async"), ("idempotency-key", "upload-1")];
+    let promise = |server: &http_support::Running| {
+        let reply = server.post("/v1/meshes?format=stl", &headers, SAMPLE);
+        assert_eq!(reply.status, 202);
+        reply.header("location").unwrap().to_owned()
+    };
+    let backend = Fake::new(Mode::Octahedra);
+    let server = start(Arc::clone(&backend) as _, keep);
+    // Requests that race are one job.
+    let jobs: Vec<String> = std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..6).map(|_| scope.spawn(|| promise(&server))).collect();
+        clients.into_iter().map(|client| client.join().unwrap()).collect()
+    });
+    assert!(jobs.iter().all(|job| *job == jobs[0]), "{jobs:?}");
+    assert_eq!(server.get(&format!("{}?wait=20", jobs[0])).json()["status"], "successful");
+    assert!(server.join());
+    let server = start(Arc::clone(&backend) as _, keep);
+    assert_eq!(promise(&server), jobs[0]);
+    assert_eq!(server.get(&jobs[0]).json()["attempts"], 1);
+    // Client and key alone do not say the id: on another store it is another one.
+    let elsewhere = start(backend as _, |_| {});
+    assert_ne!(promise(&elsewhere), jobs[0]);
+}
+
+#[test]
 fn a_restart_takes_up_what_waits_and_leaves_what_has_ended() {
     let folder = tempfile::tempdir().unwrap();
     let keep = |c: &mut molmesh::config::Config| {

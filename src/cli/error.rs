@@ -29,6 +29,9 @@ pub(crate) mod code {
     pub(crate) const BACKEND: i32 = 6;
     /// The output cannot be written.
     pub(crate) const OUTPUT: i32 = 7;
+    /// Another service uses the data folder.
+    #[cfg(feature = "server")]
+    pub(crate) const IN_USE: i32 = 8;
     /// Interrupted (Ctrl-C).
     pub(crate) const INTERRUPTED: i32 = 130;
 }
@@ -44,6 +47,7 @@ Exit codes:
     5  a limit is exceeded: input, atoms, grid, mesh
     6  no such backend or device on this machine
     7  the output cannot be written
+    8  another service uses the data folder
   130  interrupted; no partial file is left";
 
 /// Where a hint about backends ends.
@@ -122,6 +126,10 @@ pub(crate) enum CliError {
     #[cfg(feature = "server")]
     #[error("{0}")]
     Service(String),
+    /// Another service uses the data folder.
+    #[cfg(feature = "server")]
+    #[error("{0}")]
+    InUse(String),
     /// A service would not start, or not be ready.
     #[cfg(feature = "server")]
     #[error("a service would not start or not be ready: {}", failed.join(", "))]
@@ -170,6 +178,8 @@ impl CliError {
             #[cfg(feature = "server")]
             Self::Unfit { backend: true, .. } => code::BACKEND,
             Self::Output { .. } => code::OUTPUT,
+            #[cfg(feature = "server")]
+            Self::InUse(_) => code::IN_USE,
             Self::Interrupted => code::INTERRUPTED,
             #[cfg(feature = "server")]
             Self::Service(_) | Self::Unfit { .. } => code::INTERNAL,
@@ -190,6 +200,8 @@ impl CliError {
                 _ => opinion.clone(),
             },
             Self::NoBackend { .. } => Some(format!("try --backend auto{DOCTOR}")),
+            #[cfg(feature = "server")]
+            Self::InUse(_) => Some("stop that service, or choose another folder with --data-dir".to_owned()),
             Self::Output { source, .. } if source.kind() == io::ErrorKind::NotFound => {
                 Some("the directory must exist".to_owned())
             }
@@ -289,7 +301,7 @@ mod tests {
     fn every_kind_of_failure_has_its_code() {
         let job = |source: JobError| CliError::Job { name: "x".into(), source, opinion: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
-        let cases: [(CliError, i32); 18] = [
+        let cases: [(CliError, i32); 19] = [
             (CliError::Internal(String::new()), 1),
             (CliError::Unfit { failed: vec!["store"], backend: false }, 1),
             (CliError::usage("x"), 2),
@@ -305,6 +317,7 @@ mod tests {
             (job(SurfaceError::Device { why: String::new() }.into()), 6),
             (FormatError::GlbTooLarge { bytes: 2, limit: 1 }.into(), 5),
             (CliError::NoBackend { asked: "gpu", why: String::new() }, 6),
+            (CliError::InUse(String::new()), 8),
             (CliError::Output { name: "x".into(), source: missing() }, 7),
             (job(SurfaceError::Cancelled.into()), 130),
             (CliError::Interrupted, 130),

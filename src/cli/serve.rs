@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use molmesh::config::Loaded;
 use molmesh::http::{Chosen, ServeError, Server, has_viewer, shutdown_signals};
+use molmesh::store::LockError;
 use molmesh::structure::referee;
 use molmesh::surface::Backend;
 use molmesh::telemetry;
@@ -59,6 +60,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         |error| match error {
             // Keys and secrets are the caller's, as the rest of the configuration is.
             ServeError::Access(error) => CliError::usage(error.to_string()),
+            ServeError::Lock(error @ LockError::Held { .. }) => CliError::InUse(error.to_string()),
             error => CliError::Service(error.to_string()),
         },
     )?;

@@ -21,7 +21,7 @@ use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
 use crate::picture::Drawer;
-use crate::store::{Store, StoreError};
+use crate::store::{FolderLock, LockError, Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, Exporter, TelemetryError};
 
@@ -55,6 +55,9 @@ pub enum ServeError {
     /// Keys, signatures or quotas cannot be set up.
     #[error(transparent)]
     Access(#[from] AccessError),
+    /// The data folder is in use, or cannot be locked.
+    #[error(transparent)]
+    Lock(#[from] LockError),
     /// What the service keeps cannot be kept.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -84,6 +87,8 @@ pub struct Server {
     metrics_addr: Option<SocketAddr>,
     stop: watch::Sender<Stop>,
     exporter: Option<Exporter>,
+    /// Held until the service has ended.
+    data: FolderLock,
 }
 
 fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
@@ -97,7 +102,7 @@ fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAdd
 }
 
 impl Server {
-    /// Binds the listeners, opens the store and starts the workers. Must be called on the runtime that [`Self::run`] is.
+    /// Binds the listeners, locks the data folder, opens the store and starts the workers. Must be called on the runtime that [`Self::run`] is.
     ///
     /// # Errors
     /// [`ServeError`].
@@ -107,6 +112,7 @@ impl Server {
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
         let (metrics_listener, metrics_addr) = metrics.unzip();
+        let data = FolderLock::acquire(&config.server.data_dir, addr)?;
         // Before anything is counted; what nobody can read is not.
         if metrics_listener.is_some() {
             telemetry::recorder()?;
@@ -123,6 +129,7 @@ impl Server {
             tracer: tracer.clone(),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
+        let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
         let promises = LedgerSettings {
             allowed: config.jobs.batch_deadline(),
@@ -131,7 +138,7 @@ impl Server {
             patience: config.jobs.store_patience(),
         };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
-        let ledger = Ledger::new(store.clone(), Arc::clone(&pool), promises, describe);
+        let ledger = Ledger::new(store.clone(), Arc::clone(&pool), promises, secret, describe);
         let archive = Archive::new(&config, Arc::new(pdb::Fetching(pool.budget().clone())));
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
@@ -156,7 +163,7 @@ impl Server {
             found,
             capabilities,
         });
-        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop, exporter })
+        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop, exporter, data })
     }
 
     /// Address of the service.
@@ -232,6 +239,7 @@ impl Server {
         if let Some(exporter) = self.exporter {
             exporter.finish().await;
         }
+        drop(self.data);
         Ok(requests)
     }
 }

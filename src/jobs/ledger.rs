@@ -17,7 +17,7 @@ use super::promise::{Promise, Runner};
 use super::record::{JobId, Record, Requester, Status, now_ms};
 use super::{Claim, ContentKey, EndError, Pool, PromiseError, Task, Ticket};
 use crate::formats::Format;
-use crate::store::{Digest, Folder, Name, Pin, Store, StoreError};
+use crate::store::{Digest, Folder, Name, Pin, Secret, Store, StoreError};
 use crate::telemetry::JOBS_RECOVERED;
 
 /// Ended jobs that are kept in mind; older ones are read from the store.
@@ -84,6 +84,8 @@ pub(super) struct Inner {
     pub(super) pool: Arc<Pool>,
     pub(super) settings: LedgerSettings,
     pub(super) describe: Describe,
+    /// Turns idempotency keys into ids.
+    secret: Secret,
     promises: Mutex<HashMap<JobId, Arc<Promise>>>,
     /// Jobs that are seen through at this moment.
     pub(super) open: watch::Sender<usize>,
@@ -128,10 +130,24 @@ impl Inner {
 }
 
 impl Ledger {
-    /// A ledger over `store`, whose jobs run on `pool`.
+    /// A ledger over `store`, whose jobs run on `pool`. `secret` is that of the store.
     #[must_use]
-    pub fn new(store: Store, pool: Arc<Pool>, settings: LedgerSettings, describe: Describe) -> Self {
-        Self(Arc::new(Inner { store, pool, settings, describe, promises: Mutex::default(), open: watch::channel(0).0 }))
+    pub(crate) fn new(
+        store: Store,
+        pool: Arc<Pool>,
+        settings: LedgerSettings,
+        secret: Secret,
+        describe: Describe,
+    ) -> Self {
+        Self(Arc::new(Inner {
+            store,
+            pool,
+            settings,
+            describe,
+            secret,
+            promises: Mutex::default(),
+            open: watch::channel(0).0,
+        }))
     }
 
     /// Promises a job: when this returns, it survives the process. `ticket` is that of a job that waits or runs already.
@@ -142,7 +158,7 @@ impl Ledger {
         let inner = &self.0;
         let client = order.task.rank.client.number();
         let id = match &order.idempotency {
-            Some(key) => JobId::of_key(client, key),
+            Some(key) => JobId::of_key(&inner.secret, client, key),
             None => JobId::random().map_err(PromiseError::Random)?,
         };
         let record = Record {

@@ -4,11 +4,13 @@ use std::fmt;
 use std::str::FromStr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use hmac::{Hmac, KeyInit as _, Mac as _};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use sha2::Sha256;
 use thiserror::Error;
 
-use crate::store::Digest;
+use crate::store::Secret;
 use crate::telemetry::{Origin, TraceContext, Tracer};
 
 /// Not a job's id: 32 hexadecimal digits in lower case are.
@@ -32,11 +34,18 @@ impl JobId {
         Ok(Self(format!("{:032x}", u128::from_be_bytes(bytes))))
     }
 
-    /// The id that belongs to an idempotency key: the same for the same key of the same client.
+    /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart. HMAC-SHA-256
+    /// under `secret`, so that nobody who knows client and key can compute it.
     #[must_use]
-    pub fn of_key(client: u64, key: &str) -> Self {
-        let digest = Digest::of(format!("idempotency\n{client:x}\n{key}").as_bytes()).to_string();
-        Self(digest[..32].to_owned())
+    pub(super) fn of_key(secret: &Secret, client: u64, key: &str) -> Self {
+        // HMAC pads a key to the block length with zeros.
+        let mut block = [0; 64];
+        block[..secret.len()].copy_from_slice(secret);
+        let mut mac = Hmac::<Sha256>::new(&block.into());
+        mac.update(format!("idempotency\n{client:x}\n{key}").as_bytes());
+        let bytes = mac.finalize().into_bytes();
+        let id = bytes.iter().take(16).fold(0_u128, |id, byte| id << 8 | u128::from(*byte));
+        Self(format!("{id:032x}"))
     }
 
     /// The id.
@@ -208,15 +217,21 @@ const MAX_MS: u64 = 253_402_300_799_000;
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::store::Digest;
 
     #[test]
     fn ids_are_random_or_follow_their_key() {
         let (a, b) = (JobId::random().unwrap(), JobId::random().unwrap());
         assert_ne!(a, b);
         assert_eq!(a.as_str().parse(), Ok(a.clone()));
-        assert_eq!(JobId::of_key(1, "x"), JobId::of_key(1, "x"));
-        assert_ne!(JobId::of_key(1, "x"), JobId::of_key(2, "x"));
-        assert_ne!(JobId::of_key(1, "x"), JobId::of_key(1, "y"));
+        let of = |secret: u8, client, key| JobId::of_key(&[secret; 32], client, key);
+        assert_eq!(of(0, 1, "x"), of(0, 1, "x"));
+        assert_eq!(of(0, 1, "x").as_str().parse(), Ok(of(0, 1, "x")));
+        for other in [of(1, 1, "x"), of(0, 2, "x"), of(0, 1, "y")] {
+            assert_ne!(of(0, 1, "x"), other);
+        }
+        // HMAC-SHA-256, computed elsewhere.
+        assert_eq!(of(7, 255, "upload-1").as_str(), "0a0f88f773ba0077f73431b46274a47a");
         for bad in ["", "..", &"A".repeat(32), &"a".repeat(31), &"a".repeat(33), "../../../../etc/passwd0123456789"] {
             assert_eq!(bad.parse::<JobId>(), Err(BadJobId), "{bad}");
         }
@@ -225,7 +240,7 @@ mod tests {
     #[test]
     fn records_come_back_as_they_were() {
         let record = Record {
-            id: JobId::of_key(0, "k"),
+            id: JobId::random().unwrap(),
             input: Digest::of(b"x").to_string(),
             parameters: vec![("resolution".to_owned(), "0.5".to_owned())],
             format: "glb".to_owned(),

@@ -52,7 +52,7 @@ impl House {
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test says so".to_owned()).unwrap());
         let settings = LedgerSettings { allowed: PATIENT, attempts, output_bytes: 1 << 30, patience };
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
-        Self { faults, ledger: Ledger::new(store.clone(), pool, settings, describe), store, _dir: dir }
+        Self { faults, ledger: Ledger::new(store.clone(), pool, settings, [0; 32], describe), store, _dir: dir }
     }
 
     async fn promise(&self) -> Result<View, PromiseError> {
@@ -189,6 +189,7 @@ async fn a_result_that_the_store_never_takes_is_made_as_often_as_may_be() {
         house.store.clone(),
         Arc::clone(&house.ledger.0.pool),
         LedgerSettings { output_bytes: 100, ..house.ledger.0.settings },
+        [0; 32],
         house.ledger.0.describe,
     );
     let id = house.promise().await.unwrap().record.id;

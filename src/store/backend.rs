@@ -17,6 +17,7 @@ use super::error::StoreError;
 use super::name::{Folder, Name};
 use super::object::Meta;
 use super::s3::{self, Bucket};
+use super::secret::{self, Secret};
 use super::stale;
 use crate::config::StoreConfig;
 use crate::telemetry::STORE_ERRORS;
@@ -178,6 +179,21 @@ impl Backend {
             return Ok(());
         }
         Err(self.fail("probe", path.as_ref(), &std::io::Error::other("what was read is not what was written")))
+    }
+
+    /// Reads the secret of the store, or creates it.
+    pub(super) async fn secret(&self) -> Result<Secret, StoreError> {
+        let outcome = match &self.kind {
+            Kind::Local(root) => {
+                let root = root.clone();
+                let read = spawn_blocking(move || secret::in_folder(&root)).await;
+                read.unwrap_or_else(|e| Err(e.into())).map_err(|e| self.fail("secret", "secret", &e))
+            }
+            Kind::S3(_) => {
+                secret::in_bucket(self.objects.as_ref()).await.map_err(|e| self.fail("secret", "secret", &e))
+            }
+        };
+        outcome.map_err(|error| self.refuse(&error))
     }
 
     /// Removes what crashed processes left: staged files, unfinished uploads, probes. Returns how many.

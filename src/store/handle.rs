@@ -20,6 +20,7 @@ use super::index::{Index, Seen};
 use super::memory::Memory;
 use super::name::{Folder, Name};
 use super::object::{ByteStream, Meta, Pin, Stored, Usage};
+use super::secret::Secret;
 use super::{stream, upload};
 use crate::config::StoreConfig;
 use crate::telemetry::CACHE_REQUESTS;
@@ -261,6 +262,14 @@ impl Store {
     /// [`StoreError`].
     pub async fn probe(&self) -> Result<(), StoreError> {
         self.0.backend.probe().await
+    }
+
+    /// Returns the secret of the store, which names what must not be guessed. Creates it on first use.
+    ///
+    /// # Errors
+    /// [`StoreError::Open`] where it cannot be read or created.
+    pub(crate) async fn secret(&self) -> Result<Secret, StoreError> {
+        self.0.backend.secret().await
     }
 
     /// What a folder holds.

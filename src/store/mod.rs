@@ -1,7 +1,8 @@
 //! What the service keeps, by the names of contents: in a folder or on S3, bounded, and swept.
 //!
 //! [`Store`] is the whole interface. `backend.rs` knows where bytes lie, `index.rs` what there is and what goes first,
-//! `memory.rs` keeps small results at hand, `tidy.rs` makes room, `writer.rs` takes what threads write.
+//! `memory.rs` keeps small results at hand, `tidy.rs` makes room, `writer.rs` takes what threads write. `lock.rs` keeps a second
+//! service from the data folder.
 //!
 //! Who writes or removes a name holds its lock (`Store::stripe`), after room has been made for it: so nobody waits for
 //! room with a lock in hand. Readers hold none; what they bring back enters index and memory only if the name has not
@@ -14,10 +15,12 @@ mod error;
 pub(crate) mod faulty;
 mod handle;
 mod index;
+mod lock;
 mod memory;
 mod name;
 mod object;
 mod s3;
+mod secret;
 mod stale;
 mod stream;
 #[cfg(test)]
@@ -29,7 +32,9 @@ mod writer;
 pub use digest::{BadDigest, Digest};
 pub use error::StoreError;
 pub use handle::Store;
+pub use lock::{FolderLock, LockError};
 pub use name::{BadName, Folder, Name};
 pub use object::{ByteStream, Meta, Pin, Stored, Usage};
+pub(crate) use secret::Secret;
 pub use tidy::Swept;
 pub use writer::Writer;

@@ -178,6 +178,11 @@ impl Service {
         line.split_whitespace().next().unwrap().parse::<u64>().unwrap() >> 10
     }
 
+    /// Its process id.
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Sends it a signal; returns its exit code and its log.
     pub fn stop(self, signal: &str) -> (Option<i32>, String) {
         self.signal(signal);

@@ -78,6 +78,7 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     }
     checks.extend(checks::files(&machine, &config));
     checks.extend(places::listeners(&config));
+    checks.extend(places::data_dir(&config));
     let failed = |e: std::io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().map_err(failed)?;
     checks.push(runtime.block_on(places::store(&config, limit)));

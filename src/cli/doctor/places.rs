@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use molmesh::archive::{Archive, Uncounted};
 use molmesh::config::Config;
-use molmesh::store::{Folder, Store};
+use molmesh::store::{Folder, FolderLock, Store};
 use molmesh::structure::{self, EntryId};
 
 use super::checks::{Check, State};
@@ -32,6 +32,12 @@ pub(super) fn listeners(config: &Config) -> Vec<Check> {
     let service = check("listen", config.server.listen);
     let metrics = config.server.metrics_listen.map(|addr| check("metrics_listen", addr));
     [service].into_iter().chain(metrics).collect()
+}
+
+/// Whether another service uses the data folder; no check if none does.
+pub(super) fn data_dir(config: &Config) -> Option<Check> {
+    let error = FolderLock::check(&config.server.data_dir).err()?;
+    Some(Check::new("data_dir", State::Failed, error.to_string()))
 }
 
 /// Whether the store can be opened, written, read and listed, and what it holds.

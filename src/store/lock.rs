@@ -1,0 +1,157 @@
+//! The lock of a data folder: one service at a time writes to it.
+//!
+//! The operating system holds the lock for the open file and releases it when the process ends, however it ends. The text in
+//! the file only says who holds it.
+
+use std::fmt;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{self, Read as _, Write as _};
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use serde::{Deserialize, Serialize};
+use thiserror::Error;
+
+/// Name of the lock file in a data folder.
+const FILE: &str = "lock";
+/// Largest description of a holder that is read, bytes.
+const MAX_HOLDER_BYTES: u64 = 4096;
+
+/// Errors of locking a data folder.
+#[derive(Debug, Error)]
+pub enum LockError {
+    /// Another service holds the lock.
+    #[error("the data folder {} (server.data_dir) is in use by {holder}", folder.display())]
+    Held {
+        /// The data folder.
+        folder: PathBuf,
+        /// Description of the other service.
+        holder: String,
+    },
+    /// The folder cannot be created, or its lock file cannot be opened or locked.
+    #[error("cannot lock the data folder {} (server.data_dir): {error}", folder.display())]
+    Io {
+        /// The data folder.
+        folder: PathBuf,
+        /// The operating system's error.
+        error: io::Error,
+    },
+}
+
+/// The service that holds a lock, as the lock file describes it.
+#[derive(Debug, Serialize, Deserialize)]
+struct Holder {
+    pid: u32,
+    /// Absent where the operating system does not say.
+    host: Option<String>,
+    address: SocketAddr,
+    /// Start time, RFC 3339.
+    started: String,
+}
+
+impl fmt::Display for Holder {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { pid, host, address, started } = self;
+        write!(f, "another molmesh service: pid {pid}")?;
+        if let Some(host) = host {
+            write!(f, " on host {host}")?;
+        }
+        write!(f, ", listening on {address}, started {started}")
+    }
+}
+
+/// Exclusive use of a data folder, until it is dropped.
+#[derive(Debug)]
+pub struct FolderLock {
+    _file: File,
+}
+
+impl FolderLock {
+    /// Locks `folder`, creating it if necessary, and records this process and `address` in the lock file.
+    ///
+    /// # Errors
+    /// [`LockError::Held`] if another service uses the folder.
+    pub fn acquire(folder: &Path, address: SocketAddr) -> Result<Self, LockError> {
+        let failed = |error| LockError::Io { folder: folder.to_owned(), error };
+        std::fs::create_dir_all(folder).map_err(failed)?;
+        let open = OpenOptions::new().read(true).write(true).create(true).truncate(false).open(folder.join(FILE));
+        let mut file = open.map_err(failed)?;
+        lock(&mut file, folder)?;
+        let started = humantime::format_rfc3339_seconds(SystemTime::now()).to_string();
+        let holder = Holder { pid: std::process::id(), host: host(), address, started };
+        let text = serde_json::to_vec(&holder).map_err(|error| failed(error.into()))?;
+        file.set_len(0).and_then(|()| file.write_all(&text)).map_err(failed)?;
+        Ok(Self { _file: file })
+    }
+
+    /// Checks that nobody holds the lock of `folder`, without creating anything.
+    ///
+    /// # Errors
+    /// [`LockError::Held`] if a service uses the folder.
+    pub fn check(folder: &Path) -> Result<(), LockError> {
+        match File::open(folder.join(FILE)) {
+            Ok(mut file) => lock(&mut file, folder),
+            // A folder that cannot be opened is reported by whoever opens the store in it.
+            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => Ok(()),
+            Err(error) => Err(LockError::Io { folder: folder.to_owned(), error }),
+        }
+    }
+}
+
+/// Locks an open lock file, or says who holds it.
+fn lock(file: &mut File, folder: &Path) -> Result<(), LockError> {
+    match file.try_lock() {
+        Ok(()) => Ok(()),
+        Err(TryLockError::WouldBlock) => {
+            let mut text = String::new();
+            let read = file.take(MAX_HOLDER_BYTES).read_to_string(&mut text);
+            let holder: Option<Holder> = read.ok().and_then(|_bytes| serde_json::from_str(&text).ok());
+            // The other service may not have written its description yet.
+            let holder = holder.map_or_else(|| "another process".to_owned(), |holder| holder.to_string());
+            Err(LockError::Held { folder: folder.to_owned(), holder })
+        }
+        Err(TryLockError::Error(error)) => Err(LockError::Io { folder: folder.to_owned(), error }),
+    }
+}
+
+/// Name of this host, where Linux says it.
+fn host() -> Option<String> {
+    let name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok()?;
+    Some(name.trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_has_one_holder_at_a_time() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("data");
+        let address = "127.0.0.1:8080".parse().unwrap();
+        FolderLock::check(&folder).unwrap();
+        assert!(!folder.exists(), "a check creates nothing");
+        let lock = FolderLock::acquire(&folder, address).unwrap();
+        let held = [FolderLock::acquire(&folder, address).map(drop), FolderLock::check(&folder)];
+        for refused in held {
+            let message = refused.unwrap_err().to_string();
+            let pid = format!("pid {}", std::process::id());
+            for part in [folder.to_str().unwrap(), "server.data_dir", &pid, "127.0.0.1:8080", "started 20"] {
+                assert!(message.contains(part), "no `{part}` in {message}");
+            }
+        }
+        drop(lock);
+        FolderLock::check(&folder).unwrap();
+        drop(FolderLock::acquire(&folder, address).unwrap());
+    }
+
+    #[test]
+    fn a_lock_file_without_a_description_still_locks() {
+        let dir = tempfile::tempdir().unwrap();
+        let file = File::create(dir.path().join(FILE)).unwrap();
+        file.lock().unwrap();
+        let refused = FolderLock::acquire(dir.path(), "127.0.0.1:1".parse().unwrap()).unwrap_err();
+        assert!(refused.to_string().ends_with("in use by another process"), "{refused}");
+    }
+}
