@@ -29,9 +29,11 @@ fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<Meshed, SurfaceEr
 #[test]
 fn the_device_that_served_is_named() {
     let backend = over(&[Rig::new(&[]), Rig::new(&[])], true);
-    let names: Vec<String> =
-        (0..2).map(|_| run(&backend, &Control::default()).unwrap().served.unwrap().device).collect();
-    assert_eq!(names, ["fake 0", "fake 1"]);
+    let served: Vec<_> = (0..2).map(|_| run(&backend, &Control::default()).unwrap().served.unwrap()).collect();
+    assert_eq!([&served[0].device, &served[1].device], ["fake 0", "fake 1"]);
+    // Results of different devices have different keys; one that is looked for is the first device's.
+    assert_eq!(served[0].arithmetic, backend.arithmetic());
+    assert_ne!(served[0].arithmetic, served[1].arithmetic);
     assert_eq!((backend.name(), backend.describe().as_str()), ("gpu", "2 devices: fake 0, fake 1"));
 }
 
@@ -46,7 +48,9 @@ fn the_cpu_stands_in_and_says_so() {
         assert_eq!(meshed.mesh, cpu.mesh);
         let served = meshed.served.unwrap();
         let why = served.instead.unwrap();
-        assert_eq!(served.backend, "cpu");
+        assert_eq!((served.backend, &served.arithmetic), ("cpu", &CpuBackend::new(None).unwrap().arithmetic()));
+        // As long as the device is up it is expected to serve; once it is given up, the CPU is.
+        assert_eq!(backend.arithmetic() == served.arithmetic, backend.devices()[0].down.is_some(), "{n}");
         assert!(
             served.device.contains("native CPU") && why.contains("the GPU failed") && why.contains("as told"),
             "{why}"

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use http_support::{Fake, Mode, SAMPLE, log_lines, start_on, wait_for};
+use http_support::{Fake, Mode, SAMPLE, log_lines, send, start_on, wait_for};
 use molmesh::surface::{
     Backend, Control, DeviceFacts, DeviceKind, DeviceStatus, FoundDevice, Meshed, Served, Spheres, SurfaceError,
     SurfaceLimits, SurfaceParams,
@@ -19,6 +19,9 @@ struct Devices {
     fake: Arc<Fake>,
     /// Serves by another backend, and why.
     instead: Mutex<Option<&'static str>>,
+    /// The arithmetic of the first device, and of the one that serves if that is another.
+    arithmetic: Mutex<&'static str>,
+    served: Mutex<Option<&'static str>>,
     error: Mutex<Option<SurfaceError>>,
     second_is_down: AtomicBool,
     /// The warm-up has to wait for this.
@@ -30,6 +33,8 @@ impl Devices {
         Arc::new(Self {
             fake: Fake::new(Mode::Octahedra),
             instead: Mutex::default(),
+            arithmetic: Mutex::new("card 1, driver 1"),
+            served: Mutex::default(),
             error: Mutex::default(),
             second_is_down: AtomicBool::new(false),
             warm: AtomicBool::new(true),
@@ -40,6 +45,10 @@ impl Devices {
 impl Backend for Devices {
     fn name(&self) -> &'static str {
         "gpu"
+    }
+
+    fn arithmetic(&self) -> String {
+        self.arithmetic.lock().unwrap().to_owned()
     }
 
     fn describe(&self) -> String {
@@ -58,7 +67,11 @@ impl Backend for Devices {
         }
         let instead = self.instead.lock().unwrap().map(str::to_owned);
         let (backend, device) = if instead.is_some() { ("cpu", "the processor") } else { ("gpu", "card 1") };
-        let served = Some(Served { backend, device: device.to_owned(), instead });
+        let arithmetic = match &instead {
+            Some(_) => "cpu".to_owned(),
+            None => self.served.lock().unwrap().map_or_else(|| self.arithmetic(), str::to_owned),
+        };
+        let served = Some(Served { backend, arithmetic, device: device.to_owned(), instead });
         Ok(Meshed { served, ..self.fake.run(spheres, params, limits, control)? })
     }
 
@@ -180,6 +193,42 @@ fn what_stands_in_is_said_in_answer_report_log_and_metrics() {
     assert_eq!(report["device"], "the processor");
     assert_eq!(log_lines("on fire 7431").len(), 2);
     assert!((server.metric("molmesh_jobs_fallback_total", &[]) - before - 2.0).abs() < 0.5);
+}
+
+#[test]
+fn a_tag_belongs_to_the_device_and_the_driver_that_made_the_bytes() {
+    let backend = Devices::new();
+    let server = start_on(Arc::clone(&backend) as _, found(), |_| {});
+    wait_for("ready", || server.get("/readyz").status == 200);
+    let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let path = format!("{structure}/surface.glb");
+    let tag = |reply: &http_support::Reply| reply.header("etag").unwrap().to_owned();
+    // The result is kept before its own address answers.
+    let ask = || {
+        let reply = server.get(&path);
+        assert_eq!(server.get(reply.header("content-location").unwrap()).status, 200);
+        tag(&reply)
+    };
+    let predicted = tag(&send(server.addr, "HEAD", &path, &[], b""));
+    // Another device than the first one serves: its bytes are kept under its own key.
+    *backend.served.lock().unwrap() = Some("card 2, driver 1");
+    let second = ask();
+    assert_ne!(second, predicted);
+    let later = [("prefer", "respond-async")];
+    let job = server.post("/v1/meshes?format=ply", &later, SAMPLE).json()["jobID"].as_str().unwrap().to_owned();
+    assert_eq!(server.get(&format!("/v1/jobs/{job}?wait=20")).json()["status"], "successful");
+    let of_job = server.get(&format!("/v1/jobs/{job}/result")).header("location").unwrap().to_owned();
+    *backend.served.lock().unwrap() = None;
+    assert_eq!(ask(), predicted);
+    let first = server.post("/v1/meshes?format=ply", &[], SAMPLE);
+    assert_ne!(first.header("content-location").unwrap(), of_job);
+    // A new driver makes other bytes: what the old one made is no answer any more, and its tag does not hold.
+    *backend.arithmetic.lock().unwrap() = "card 1, driver 2";
+    let again = send(server.addr, "GET", &path, &[("if-none-match", &predicted)], b"");
+    assert_eq!(again.status, 200);
+    assert!(![predicted, second].contains(&tag(&again)));
+    let unchanged = send(server.addr, "GET", &path, &[("if-none-match", &tag(&again))], b"");
+    assert_eq!(unchanged.status, 304);
 }
 
 #[test]

@@ -42,9 +42,12 @@ impl GpuBackend {
             let build = Box::new(move || device::build(&adapter, program));
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
-        // The program of 2010 knows no parts.
-        let spread_bricks = settings.spread_bricks.filter(|_| program == Program::Stages);
-        let pool = DevicePool::start(devices.collect(), &PoolSettings { spread_bricks, ..*settings })?;
+        let devices: Vec<_> = devices.collect();
+        // The program of 2010 knows no parts. Devices of different models or drivers would make a mesh whose bytes depend on
+        // which of them were free.
+        let alike = devices.windows(2).all(|pair| pair[0].name == pair[1].name);
+        let spread_bricks = settings.spread_bricks.filter(|_| program == Program::Stages && alike);
+        let pool = DevicePool::start(devices, &PoolSettings { spread_bricks, ..*settings })?;
         Ok(Self { name: program.name(), ..Self::over(pool, fallback) })
     }
 
@@ -81,8 +84,13 @@ impl GpuBackend {
     }
 }
 
-/// A device for people.
-fn describe(facts: &DeviceFacts) -> String {
+/// Name of the arithmetic of a device: model and driver, and the processor's, which prepares jobs and measures meshes.
+pub(super) fn arithmetic(name: &str, device: &str) -> String {
+    format!("{name} {device} {}", crate::surface::arithmetic())
+}
+
+/// A device for people, with its driver.
+pub(super) fn describe(facts: &DeviceFacts) -> String {
     let DeviceFacts { name, kind, api, driver, .. } = facts;
     let driver = if driver.is_empty() { String::new() } else { format!(", {driver}") };
     format!("{name} ({}, {api}{driver})", kind.name())
@@ -91,6 +99,16 @@ fn describe(facts: &DeviceFacts) -> String {
 impl Backend for GpuBackend {
     fn name(&self) -> &'static str {
         self.name
+    }
+
+    fn arithmetic(&self) -> String {
+        let status = self.pool.status();
+        let up = status.iter().find(|device| device.down.is_none());
+        match (up, &self.fallback) {
+            (Some(device), _) => arithmetic(self.name, &device.name),
+            (None, Some(fallback)) => fallback.arithmetic(),
+            (None, None) => arithmetic(self.name, "no device"),
+        }
     }
 
     fn describe(&self) -> String {
@@ -108,11 +126,14 @@ impl Backend for GpuBackend {
     ) -> Result<Meshed, SurfaceError> {
         control.check()?;
         let job = Self::job(spheres, params, limits, control)?;
-        let error = match self.pool.run(&job) {
-            Ok((finished, device)) => {
-                finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));
-                let served = Served { backend: self.name(), device, instead: None };
-                return Ok(Meshed { served: Some(served), ..finished.meshed });
+        let error = match self.pool.ran(&job) {
+            Ok(ran) => {
+                ran.finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));
+                // Several devices make one job only if they are alike.
+                let device = ran.by.first().map_or("", |work| work.device.as_str());
+                let arithmetic = arithmetic(self.name, device);
+                let served = Served { backend: self.name(), arithmetic, device: ran.device(), instead: None };
+                return Ok(Meshed { served: Some(served), ..ran.finished.meshed });
             }
             Err(error) => error,
         };
@@ -129,6 +150,7 @@ impl Backend for GpuBackend {
                 let meshed = fallback.run(spheres, params, limits, control)?;
                 let served = Served {
                     backend: fallback.name(),
+                    arithmetic: fallback.arithmetic(),
                     device: fallback.describe(),
                     instead: Some(one_line(&format!("the GPU failed: {error}"))),
                 };
@@ -158,5 +180,34 @@ impl Backend for GpuBackend {
 
     fn devices(&self) -> Vec<DeviceStatus> {
         self.pool.status()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::DeviceKind;
+
+    #[test]
+    fn model_and_driver_are_part_of_the_arithmetic() {
+        let facts = |name: &str, driver: &str| DeviceFacts {
+            name: name.to_owned(),
+            kind: DeviceKind::Discrete,
+            api: "vulkan",
+            driver: driver.to_owned(),
+            bus: String::new(),
+            binding_bytes: 0,
+            buffer_bytes: 0,
+            workgroup_bytes: 0,
+            workgroup_size: 0,
+            storage_buffers: 0,
+            timestamps: false,
+            subgroups: None,
+        };
+        let of = |name, driver| arithmetic("gpu", &describe(&facts(name, driver)));
+        assert_eq!(of("card", "driver 1"), of("card", "driver 1"));
+        assert_ne!(of("card", "driver 1"), of("card", "driver 2"));
+        assert_ne!(of("card", "driver 1"), of("other card", "driver 1"));
+        assert!(of("card", "driver 1").ends_with(&crate::surface::arithmetic()), "the processor takes part");
     }
 }

@@ -5,6 +5,7 @@ use std::sync::{Mutex, PoisonError};
 
 use wgpu::Adapter;
 
+use super::backend::{arithmetic, describe};
 use super::device;
 use super::discover::Discovery;
 use super::error::GpuError;
@@ -18,6 +19,8 @@ use crate::surface::{Control, Mesh, Served, Vertices};
 pub struct GpuRenderer {
     adapter: Adapter,
     name: String,
+    /// The device with its driver.
+    device: String,
     /// None once the device was lost; the next picture opens it again.
     painter: Mutex<Option<Painter>>,
     fallback: Option<CpuRenderer>,
@@ -35,8 +38,9 @@ impl GpuRenderer {
             return Err(GpuError::NoDevice(discovery.why_none().unwrap_or_default()));
         };
         let name = format!("{} ({}, {})", found.facts.name, found.facts.kind.name(), found.facts.api);
+        let device = describe(&found.facts);
         let painter = Mutex::new(Some(open(adapter)?));
-        Ok(Self { adapter: adapter.clone(), name, painter, fallback })
+        Ok(Self { adapter: adapter.clone(), name, device, painter, fallback })
     }
 
     fn paint(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<(Image, f64), Why> {
@@ -84,6 +88,10 @@ impl Renderer for GpuRenderer {
         "gpu"
     }
 
+    fn arithmetic(&self) -> String {
+        arithmetic(self.name(), &self.device)
+    }
+
     fn describe(&self) -> String {
         self.name.clone()
     }
@@ -95,7 +103,8 @@ impl Renderer for GpuRenderer {
             (Err(Why::Device(why)), None) => Err(PictureError::Device { why }),
             (Err(Why::Device(why)), Some(cpu)) => {
                 let instead = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
-                let served = Served { backend: cpu.name(), device: cpu.describe(), instead };
+                let served =
+                    Served { backend: cpu.name(), arithmetic: cpu.arithmetic(), device: cpu.describe(), instead };
                 Ok(Rendered { served: Some(served), ..cpu.render(mesh, params, control)? })
             }
         }

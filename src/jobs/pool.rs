@@ -131,11 +131,11 @@ impl Pool {
         &self.shared.drawer
     }
 
-    /// Who makes a job's file, if nothing stands in for the backend and for what draws.
+    /// Arithmetic behind a job's file, if nothing stands in for the backend and for what draws.
     #[must_use]
     pub fn maker(&self, job: &Job) -> String {
-        let renderer = job.picture.map(|_| self.shared.drawer.renderer.name());
-        maker(self.shared.backend.name(), renderer)
+        let renderer = job.picture.map(|_| self.shared.drawer.renderer.arithmetic());
+        maker(&self.shared.backend.arithmetic(), renderer.as_deref())
     }
 
     /// Jobs that run at once.

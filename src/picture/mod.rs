@@ -22,7 +22,7 @@ use std::sync::Arc;
 
 use thiserror::Error;
 
-use crate::surface::{Control, Mesh, Served, SurfaceError};
+use crate::surface::{Control, Mesh, Served, SurfaceError, arithmetic};
 pub use cpu::CpuRenderer;
 pub use params::{Background, DEFAULT_SIDE, MOST_SIDE, PictureLimits, PictureParams, Style, View};
 
@@ -100,6 +100,11 @@ pub struct Rendered {
 pub trait Renderer: Send + Sync {
     /// Short stable name: `cpu` or `gpu`.
     fn name(&self) -> &'static str;
+
+    /// Name of the arithmetic behind the pixels: equal names, equal pixels of equal meshes.
+    fn arithmetic(&self) -> String {
+        format!("{} {}", self.name(), arithmetic())
+    }
 
     /// What it runs on, for people.
     fn describe(&self) -> String;

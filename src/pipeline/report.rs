@@ -119,6 +119,9 @@ pub struct PictureReport {
     pub pixel: f64,
     /// What drew it: `cpu` or `gpu`.
     pub renderer: &'static str,
+    /// Its arithmetic, for the key of the file.
+    #[serde(skip)]
+    pub arithmetic: String,
     /// What that ran on.
     pub device: String,
     /// Why it was taken.
@@ -132,6 +135,7 @@ impl PictureReport {
     pub(super) fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
         let served = drawn.served.clone().unwrap_or_else(|| Served {
             backend: drawer.renderer.name(),
+            arithmetic: drawer.renderer.arithmetic(),
             device: drawer.renderer.describe(),
             instead: None,
         });
@@ -145,6 +149,7 @@ impl PictureReport {
             style: params.style.name(),
             pixel: drawn.pixel,
             renderer: served.backend,
+            arithmetic: served.arithmetic,
             device: served.device,
             reason: match &served.instead {
                 Some(why) => format!("{}; but {why}", drawer.reason),
@@ -250,6 +255,9 @@ pub struct Report {
     pub quantization: Option<Quantization>,
     /// The backend that ran.
     pub backend: &'static str,
+    /// Its arithmetic, for the key of the file.
+    #[serde(skip)]
+    pub arithmetic: String,
     /// What it ran on.
     pub device: String,
     /// Why it was taken.
@@ -292,6 +300,7 @@ impl Report {
         let gaussian = params.kernel == crate::surface::Kernel::Gaussian && params.paper.is_none();
         let served = counts.served.clone().unwrap_or_else(|| Served {
             backend: choice.backend.name(),
+            arithmetic: choice.backend.arithmetic(),
             device: choice.backend.describe(),
             instead: None,
         });
@@ -346,6 +355,7 @@ impl Report {
             normals: counts.storage.normals.name(),
             quantization: counts.storage.packing.step().map(|step| Quantization { step: step.length() }),
             backend: served.backend,
+            arithmetic: served.arithmetic,
             device: served.device,
             backend_reason: match &served.instead {
                 Some(why) => format!("{}; but {why}", choice.reason),
@@ -366,10 +376,10 @@ impl Report {
         self.timings_ms.insert(stage.to_owned(), Value::from(((before + ms) * 1e3).round() / 1e3));
     }
 
-    /// Who made the file, as its key says: the backend, and behind it what drew a picture.
+    /// Arithmetic behind the file, as its key has it: that of the mesh, and behind it that of a picture.
     #[must_use]
     pub fn maker(&self) -> String {
-        maker(self.backend, self.picture.as_ref().map(|picture| picture.renderer))
+        maker(&self.arithmetic, self.picture.as_ref().map(|picture| picture.arithmetic.as_str()))
     }
 
     /// The report as a mesh file's extras: without what differs from run to run, so that the same input gives
@@ -384,8 +394,8 @@ impl Report {
     }
 }
 
-/// Who makes a file: a backend, and whatever draws its mesh.
+/// Arithmetic behind a file: that of its mesh, and that of a picture of it.
 #[must_use]
-pub fn maker(backend: &str, renderer: Option<&str>) -> String {
-    renderer.map_or_else(|| backend.to_owned(), |renderer| format!("{backend}+{renderer}"))
+pub fn maker(mesh: &str, picture: Option<&str>) -> String {
+    picture.map_or_else(|| mesh.to_owned(), |picture| format!("{mesh}+{picture}"))
 }

@@ -6,6 +6,7 @@ use super::error::SurfaceError;
 use super::measure::{Measures, Proof};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
+use super::simd;
 use super::sink::{MeshPart, MeshSink, Poured, SinkFailed};
 use super::spheres::Spheres;
 
@@ -52,6 +53,8 @@ impl Meshed {
 pub struct Served {
     /// The name of the backend that did, as [`Backend::name`] gives it.
     pub backend: &'static str,
+    /// Its arithmetic, as [`Backend::arithmetic`] gives it.
+    pub arithmetic: String,
     /// What it ran on, for people.
     pub device: String,
     /// Why this one stood in for the backend that was asked; none where none had to.
@@ -62,6 +65,12 @@ pub struct Served {
 pub trait Backend: Send + Sync {
     /// Short stable name: `cpu`, `reference`, `gpu`.
     fn name(&self) -> &'static str;
+
+    /// Name of the arithmetic behind the bytes that it makes: equal names, equal bytes for equal input. Of several devices, that
+    /// of the first one that takes jobs. A part of the key of results.
+    fn arithmetic(&self) -> String {
+        format!("{} {}", self.name(), simd::arithmetic())
+    }
 
     /// What it runs on, for people: threads and vector extension, or the adapter's name.
     fn describe(&self) -> String;

@@ -45,5 +45,6 @@ pub use mesh::{Mesh, Quantized};
 pub use params::{Kernel, PaperParams, Preset, SurfaceLimits, SurfaceOptions, SurfaceParams};
 pub use quantize::Step;
 pub use reference::ReferenceBackend;
+pub use simd::arithmetic;
 pub use sink::{MeshPart, MeshSink, Poured, SinkFailed, Vertices};
 pub use spheres::Spheres;

@@ -35,6 +35,21 @@ pub(super) fn exp2<const FMA: bool>(x: f32) -> f32 {
     f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
 }
 
+dispatched! {
+    /// Whether the dispatched functions fuse products and sums here. They use the same condition.
+    fn is_fused() -> bool {
+        multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"))
+    }
+}
+
+/// Returns the name of the arithmetic that decides the last bits of results on this processor: fused or not, and the system
+/// and architecture, whose mathematical functions differ. The width of vectors does not matter.
+#[must_use]
+pub fn arithmetic() -> String {
+    let fused = if is_fused() { "fma" } else { "no-fma" };
+    format!("{} {} {fused}", std::env::consts::OS, std::env::consts::ARCH)
+}
+
 /// The vector extension that the dispatched functions use here, for people.
 #[must_use]
 pub(super) fn extension() -> &'static str {
@@ -61,6 +76,13 @@ pub(super) fn extension() -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_arithmetic_is_that_of_the_dispatch() {
+        // Both vector extensions have fused multiply-add; plain x86-64 has not.
+        assert_eq!(is_fused(), ["AVX-512", "AVX2", "NEON"].contains(&extension()));
+        assert!(arithmetic().ends_with(if is_fused() { " fma" } else { " no-fma" }), "{}", arithmetic());
+    }
 
     #[test]
     fn exp2_is_within_three_parts_in_ten_million() {

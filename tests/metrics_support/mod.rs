@@ -213,7 +213,8 @@ impl Backend for Devices {
         control: &Control<'_>,
     ) -> Result<Meshed, SurfaceError> {
         let instead = Some("as told".to_owned());
-        let served = Some(Served { backend: "cpu", device: "the processor".to_owned(), instead });
+        let served =
+            Some(Served { backend: "cpu", arithmetic: "cpu".to_owned(), device: "the processor".to_owned(), instead });
         Ok(Meshed { served, ..self.0.run(spheres, params, limits, control)? })
     }
 
