@@ -179,7 +179,9 @@ pub(crate) struct SurfaceArgs {
     /// Density of an atom: gaussian, soft-object or inverse-square [default: gaussian]
     #[arg(long, value_name = "KERNEL")]
     pub(crate) kernel: Option<String>,
-    /// Values for what is not given: default, ses-like, vdw-like, molstar, blinn or quicksurf
+    /// Values for what is not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like` approximates the
+    /// solvent-excluded surface: -6.5 to +6.0 % off in area and -0.6 to +5.1 % in volume over eight proteins, worse for small
+    /// structures (area +13.5 % for a DNA dodecamer)
     #[arg(long, value_name = "PRESET")]
     pub(crate) preset: Option<String>,
     /// Grid spacing in Å [default: 0.5]

@@ -54,7 +54,13 @@ fn mesh(doc: &str) -> ResponseBuilder {
     let response = ResponseBuilder::new()
         .description(doc)
         .header("Content-Disposition", text("A file name."))
-        .header("ETag", text("The strong validator of the file: the same key, the same bytes."))
+        .header(
+            "ETag",
+            text(
+                "The strong validator of the file: SHA-256 over input, parameters, format, arithmetic (instruction set, or \
+                 GPU and driver) and version. Equal tags, equal bytes.",
+            ),
+        )
         .header(
             "Server-Timing",
             text(
