@@ -368,10 +368,7 @@ impl From<SurfaceError> for Problem {
                     .with("limit", limit)
                     .with("actual", candidates)
                     .with("resolution", resolution);
-                match suggested_resolution {
-                    Some(suggested) => problem.with("suggested_resolution", suggested),
-                    None => problem,
-                }
+                suggested_resolution.into_iter().fold(problem, |p, h| p.with("suggested_resolution", h))
             }
             E::MeshTooLarge { bytes, limit, suggested_resolution } => Self::new(Kind::MeshTooLarge, detail)
                 .with("limit", limit)

@@ -21,7 +21,9 @@ pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;
 pub use progress::Tracker;
-pub use report::{ComponentReport, LeftOutReport, PictureReport, Quantization, Report, ResidueCount, VoidReport, maker};
+pub use report::{
+    ComponentReport, LeftOutReport, PictureReport, Quantization, Report, ResidueCount, VoidReport, maker,
+};
 pub use spacing::Spacing;
 pub use work::work;
 

@@ -23,6 +23,12 @@ pub struct ComponentReport {
     pub volume: f64,
 }
 
+impl ComponentReport {
+    fn new(&Component { triangles, vertices, area, volume, .. }: &Component) -> Self {
+        Self { triangles, vertices, area, volume }
+    }
+}
+
 /// A void: a closed surface whose inside is outside the molecule. No probe has tested whether a solvent molecule fits: most
 /// are gaps between atoms.
 #[derive(Debug, Clone, Serialize)]
@@ -304,7 +310,6 @@ impl Report {
             device: choice.backend.describe(),
             instead: None,
         });
-        let list = measures.components.iter().take(100);
         let mut voids: Vec<&Component> = measures.components.iter().filter(|c| c.volume < 0.0).collect();
         voids.sort_by(|a, b| a.volume.total_cmp(&b.volume));
         Self {
@@ -340,14 +345,7 @@ impl Report {
             components: measures.components.len() as u64,
             voids: voids.len() as u64,
             void_list: voids.iter().take(100).map(|void| VoidReport::new(void, counts.centre)).collect(),
-            component_list: list
-                .map(|c| ComponentReport {
-                    triangles: c.triangles,
-                    vertices: c.vertices,
-                    area: c.area,
-                    volume: c.volume,
-                })
-                .collect(),
+            component_list: measures.components.iter().take(100).map(ComponentReport::new).collect(),
             area: measures.area,
             volume: measures.volume,
             report_units: Units::Angstrom.name(),
