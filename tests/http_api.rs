@@ -245,7 +245,7 @@ fn bad_parameters_are_named_with_what_was_expected() {
         ("preset=nice", "preset", None),
         ("preset=blinn&kernel=soft-object", "preset", None),
         ("smoothness=1&kernel=inverse-square", "smoothness", None),
-        ("paper_a=1", "paper_b", None),
+        ("paper_a=1", "paper_a", None),
         ("kernel=inverse-square&paper_c=2&paper_b=5", "paper_c", None),
         ("atom_ids=maybe", "atom_ids", None),
         ("model=first", "model", None),

@@ -344,7 +344,8 @@ fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
     // It goes away for good: nothing new is begun on it.
     let place = service.config("away");
     let access = service.access.clone();
-    let mut starting = command(&service, "away", server.dir.path());
+    let elsewhere = tempfile::tempdir().unwrap();
+    let mut starting = command(&service, "away", elsewhere.path());
     drop(service);
     send(addr, "POST", "/v1/meshes?format=stl", &[LATER], &sample(6)).problem(503, "store-failed");
     let refused = starting.output().unwrap();

@@ -28,15 +28,15 @@ pub(crate) struct Asked<'a> {
     pub(crate) threads: Option<usize>,
     /// Threads that are enough where no number is asked for.
     pub(crate) enough: usize,
-    /// Estimated work of a command's only job; `None` for a service.
+    /// Estimated work of a command's only job, if there is one and its input is known.
     pub(crate) work: Option<f64>,
 }
 
 impl<'a> Asked<'a> {
-    /// What the flags of a single job of `work` units ask for.
-    pub(crate) fn once(args: &'a JobArgs, work: f64) -> Self {
+    /// Flags of a command with a single job, whose work is not known yet.
+    pub(crate) fn once(args: &'a JobArgs) -> Self {
         let (backend, devices, threads) = (args.backend, &args.devices.devices, args.threads);
-        Self { backend, devices, threads, enough: usize::MAX, work: Some(work) }
+        Self { backend, devices, threads, enough: usize::MAX, work: None }
     }
 
     /// Threads that the CPU backend gets.
@@ -74,11 +74,11 @@ pub(crate) enum Use {
     Service(DevicesConfig),
 }
 
-/// Picks a backend.
+/// Rejects flags that contradict each other.
 ///
 /// # Errors
-/// [`CliError::NoBackend`] says why the one that was asked for is not there.
-pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
+/// [`CliError::Usage`].
+pub(crate) fn check(asked: &Asked<'_>) -> Result<(), CliError> {
     if asked.threads == Some(0) {
         return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
     }
@@ -88,6 +88,16 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
             "parameter `devices`: cpu is not allowed with --backend gpu and paper; expected a GPU",
         ));
     }
+    Ok(())
+}
+
+/// Picks a backend.
+///
+/// # Errors
+/// [`CliError::Usage`] for flags that contradict each other; [`CliError::NoBackend`] says why the backend that was asked
+/// for is not there.
+pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
+    check(asked)?;
     let unasked = |backend: Box<dyn Backend>| Picked {
         backend,
         reason: "asked for".to_owned(),

@@ -38,12 +38,13 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     request::settle(&mut job, format)?;
     let (output_path, input_path, args) = (&args.output, &args.input, &args.job);
     let limits = request::limits(&args.limits);
+    backend::check(&Asked::once(args))?;
     let cancel = CancelToken::default();
     interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = read(input_path, limits.read.max_inflated_bytes)?;
-    let asked =
-        Asked { enough: enough(&input, job.params.resolution), ..Asked::once(args, pipeline::work(&input, &job)) };
+    let (enough, work) = (enough(&input, job.params.resolution), Some(pipeline::work(&input, &job)));
+    let asked = Asked { enough, work, ..Asked::once(args) };
     let picked = backend::pick(&asked, &backend::Use::Once)?;
 
     let progress = Progress::new(!args.quiet);

@@ -24,11 +24,13 @@ pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     of_name(&args.output)?;
     let (output_path, input_path, args) = (&args.output, &args.input, &args.job);
     let limits = request::limits(&args.limits);
+    backend::check(&Asked::once(args))?;
     let cancel = CancelToken::default();
     interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = mesh::read(input_path, limits.read.max_inflated_bytes)?;
-    let picked = backend::pick(&Asked::once(args, pipeline::work(&input, &job)), &Use::Picture)?;
+    let asked = Asked { work: Some(pipeline::work(&input, &job)), ..Asked::once(args) };
+    let picked = backend::pick(&asked, &Use::Picture)?;
 
     let progress = Progress::new(!args.quiet);
     let findings = if strict { Some(mesh::check(input_path, &input, &limits)?) } else { None };

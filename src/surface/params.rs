@@ -295,12 +295,17 @@ impl SurfaceParams {
 /// The paper's raw parameters, if any of them is given.
 fn paper_params(kernel: Kernel, options: &SurfaceOptions) -> Result<Option<PaperParams>, SurfaceError> {
     let (a, b, c) = (options.paper_a, options.paper_b, options.paper_c);
-    if a.is_none() && b.is_none() && c.is_none() {
+    let all = [("paper_a", a), ("paper_b", b), ("paper_c", c)];
+    let Some((given, given_value)) = all.into_iter().find_map(|(name, value)| Some((name, value?))) else {
         return Ok(None);
-    }
+    };
+    // An error names a parameter that was given, not the one that is missing.
     let need = |name: &'static str, value: Option<f64>, lo: f64, hi: f64| match value {
         Some(value) => within(name, value, lo, hi),
-        None => Err(bad(name, "nothing", format!("a number, as the paper's {kernel} kernel needs it"))),
+        None => {
+            let expected = format!("`{name}` beside it: the paper's {kernel} kernel needs both");
+            Err(bad(given, given_value, expected))
+        }
     };
     let refuse = |name: &'static str, value: Option<f64>| match value {
         Some(value) => Err(bad(name, value, format!("no value: the paper's {kernel} kernel has no such parameter"))),
