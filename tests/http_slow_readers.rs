@@ -1,5 +1,5 @@
-//! Clients that take a response body slowly or not at all, over raw HTTP/2 frames and small socket buffers: who is cut off,
-//! who is not, and what it costs meanwhile.
+//! Clients that take a response body slowly or not at all, over raw HTTP/2 frames and small socket buffers: who is cut
+//! off, who is not, and what it costs meanwhile.
 #![cfg(all(feature = "server", target_os = "linux"))]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
@@ -58,7 +58,7 @@ fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
     [&length[1..], &[kind, flags], &stream.to_be_bytes(), payload].concat()
 }
 
-/// What became of a stream.
+/// State of a stream.
 #[derive(Debug, Default, Clone)]
 struct Seen {
     bytes: usize,
@@ -66,7 +66,7 @@ struct Seen {
     reset: bool,
 }
 
-/// An HTTP/2 connection by hand.
+/// An HTTP/2 connection in raw frames.
 struct H2 {
     socket: TcpStream,
     unread: Vec<u8>,
@@ -197,7 +197,7 @@ fn stalled_readers_lose_their_streams_and_nothing_else() {
 }
 
 #[test]
-fn slow_but_honest_readers_get_everything() {
+fn readers_above_the_minimum_rate_get_everything() {
     let _alone = alone();
     let server = serve(|_| {});
     let path = result(&server, 2000);

@@ -166,7 +166,7 @@ async fn parts_are_read_and_bad_ranges_refused(place: Place) {
     assert_eq!(part(&store, &input(2), None).await, Some((0, Vec::new())));
     assert_eq!(part(&store, &input(3), None).await, None);
     assert_eq!(part(&store, &input(3), Some(0..1)).await, None);
-    // An object that is being read is not tidied away; one that is deleted ends its streams with an error.
+    // An object that is being read is not removed by a sweep; deleting one ends its streams with an error.
     if place.is_local() {
         let old = SystemTime::now() + Duration::from_hours(24 * 365);
         store.put(&input(4), noise(MIB, 4).into()).await.unwrap();

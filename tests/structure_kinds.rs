@@ -58,7 +58,8 @@ fn names(s: &Structure) -> Vec<(String, String)> {
     (0..s.len()).map(|i| (s.chain.get(i).to_owned(), s.residue.get(i).to_owned())).collect()
 }
 
-/// What gemmi reads: chain, residue name and selection of each atom of the first model, in the order of the file.
+/// Atoms as gemmi reads them: chain, residue name and selection of each atom of the first model, in the order of the
+/// file.
 fn gemmi(text: &str, extension: &str) -> Option<Vec<(String, String, bool)>> {
     let python = tools::python_interpreter().or_else(|| tools::missing("gemmi"))?;
     let dir = tempfile::tempdir().unwrap();
@@ -440,7 +441,7 @@ fn drude_particles_are_told_by_place_and_name() {
 }
 
 #[test]
-fn all_formats_agree_on_sites_and_warnings_are_apart() {
+fn virtual_sites_of_mmcif_are_counted_apart() {
     let rows =
         "ATOM O OW SOL 1 0.0\nATOM H HW1 SOL 1 1.0\nATOM H HW2 SOL 1 -1.0\nATOM ? MW SOL 1 0.1\nATOM C CA ALA 2 9.0\n";
     let rows: String = rows.lines().map(|row| format!("{row} 0.0 0.0\n")).collect();

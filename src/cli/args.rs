@@ -78,7 +78,7 @@ pub(crate) enum Command {
 /// Which backend runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum BackendName {
-    /// A service takes the GPU if one can be used, else the CPU; a single command takes whichever is estimated to finish first
+    /// A service takes a GPU if one can be used, else the CPU; a command takes the one estimated to finish first
     Auto,
     /// Every core, with the widest vectors that the processor has
     Cpu,
@@ -179,9 +179,9 @@ pub(crate) struct SurfaceArgs {
     /// Density of an atom: gaussian, soft-object or inverse-square [default: gaussian]
     #[arg(long, value_name = "KERNEL")]
     pub(crate) kernel: Option<String>,
-    /// Values for what is not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like` approximates the
-    /// solvent-excluded surface: -6.5 to +6.0 % off in area and -0.6 to +5.1 % in volume over eight proteins, worse for small
-    /// structures (area +13.5 % for a DNA dodecamer)
+    /// Values for what is not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like` approximates
+    /// the solvent-excluded surface: -6.5 to +6.0 % off in area and -0.6 to +5.1 % in volume over eight proteins, worse
+    /// for small structures (area +13.5 % for a DNA dodecamer)
     #[arg(long, value_name = "PRESET")]
     pub(crate) preset: Option<String>,
     /// Grid spacing in Å [default: 0.5]

@@ -1,4 +1,5 @@
-//! Estimated time of one command on the CPU and on a GPU that has not been started: decides what `--backend auto` takes.
+//! Estimated time of one command on the CPU and on a GPU that has not been started: decides what `--backend auto`
+//! takes.
 //!
 //! The constants are medians of one host with an H200 and 16 processors, and of one with two processors.
 

@@ -76,7 +76,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
 }
 
-/// Raises the limit of open files to the most that this process may set itself.
+/// Raises the limit of open files to the hard limit.
 fn raise_open_files() {
     #[cfg(target_os = "linux")]
     {

@@ -15,7 +15,7 @@ pub struct LimitsConfig {
     /// Bytes of a request body as sent. Default 256 MiB: the largest entries of the archive are about 100 MB
     /// compressed.
     pub body_bytes: u64,
-    /// Bytes of a JSON request body. Default 64 KiB: a document names a structure and has some forty parameters.
+    /// Bytes of a JSON request body. Default 64 KiB: a document names a structure and has about thirty parameters.
     pub json_bytes: u64,
     /// Bytes ahead of the content of a form's part: its headers, and the preamble in front of the first one. Default
     /// 16 KiB: browsers send a few hundred.
@@ -34,16 +34,16 @@ pub struct LimitsConfig {
     /// Grid samples in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; as 32-bit numbers
     /// they take 4 GiB.
     pub grid_samples: u64,
-    /// Pairs of an atom and a grid brick (8³ samples) within its reach. Default 268,435,456: 128 atoms for each brick of
-    /// `grid_samples`, several times as many as ordinary structures have. Bounds time, some 16 s of one core, and the
-    /// memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
+    /// Pairs of an atom and a grid brick (8³ samples) within its reach. Default 268,435,456: 128 atoms for each brick
+    /// of `grid_samples`, several times as many as ordinary structures have. Bounds time, some 16 s of one core, and
+    /// the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
     pub candidate_pairs: u64,
     /// Bytes of a mesh in memory (24 a vertex, 12 a triangle). Default 2 GiB: 85 million triangles.
     pub mesh_bytes: u64,
     /// Bytes of a mesh file. Default 3 GiB: below the 4 GiB that a GLB can say, and text formats take more than
     /// the mesh in memory.
     pub output_bytes: u64,
-    /// Bytes of uploads, finished meshes and responses on their way that all requests together hold in memory. Default
+    /// Bytes of uploads, finished meshes and responses being sent that all requests together hold in memory. Default
     /// 8 GiB. A new upload, job or stored result is refused while it is used up; running jobs may overshoot it by
     /// `mesh_bytes` and the candidate lists of `candidate_pairs` each, responses by their next piece.
     pub memory_bytes: u64,

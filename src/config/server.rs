@@ -31,11 +31,11 @@ pub struct ServerConfig {
     pub header_timeout_ms: u64,
     /// Time for the whole body of a request, ms. Default 60,000: 256 MiB at 36 Mbit/s.
     pub body_timeout_ms: u64,
-    /// Time in which a client must take `write_bytes` of a response body, or all that is left of it, ms. Default 30,000:
-    /// buffers and places are held until a body is sent. Event streams may be as slow as they like.
+    /// Time in which a client must take `write_bytes` of a response body, or all that is left of it, ms. Default
+    /// 30,000: buffers and delivery slots are held until a body is sent. Event streams are exempt.
     pub write_timeout_ms: u64,
     /// Bytes of a response body that a client must take within `write_timeout_ms`. Default 16 KiB: half a kilobyte a
-    /// second, so that a line of 8 KiB/s carries a dozen bodies at once; one byte now and then does not count.
+    /// second, so that a line of 8 KiB/s carries a dozen bodies at once.
     pub write_bytes: u64,
     /// Bytes of the head of a request: its line and its headers, 8 KiB at least. Default 64 KiB: browsers and proxies send a
     /// few; 431 beyond.

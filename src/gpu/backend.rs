@@ -43,8 +43,8 @@ impl GpuBackend {
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
         let devices: Vec<_> = devices.collect();
-        // The program of 2010 knows no parts. Devices of different models or drivers would make a mesh whose bytes depend on
-        // which of them were free.
+        // The program of 2010 knows no parts. Devices of different models or drivers would make a mesh whose bytes
+        // depend on which of them were free.
         let alike = devices.windows(2).all(|pair| pair[0].name == pair[1].name);
         let spread_bricks = settings.spread_bricks.filter(|_| program == Program::Stages && alike);
         let pool = DevicePool::start(devices, &PoolSettings { spread_bricks, ..*settings })?;

@@ -44,8 +44,7 @@ const MAX_REFUSALS: usize = 64;
 const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
 /// Bytes of a stream that HTTP/2 buffers while the connection is busy with others.
 const SEND_BUFFER: usize = 64 << 10;
-/// Bytes of a connection that the system buffers before they are on their way: few enough that a slow client's progress is
-/// seen every few seconds.
+/// Unsent bytes that the system buffers for a connection: few enough to see a slow client's progress every few seconds.
 #[cfg(target_os = "linux")]
 const UNSENT: u32 = 256 << 10;
 /// How often an HTTP/2 client is asked whether it is still there.
@@ -114,7 +113,7 @@ pub(super) async fn serve(
     drained
 }
 
-/// Sets a fresh socket up.
+/// Sets the options of a new connection.
 fn set_up(stream: &TcpStream) -> io::Result<()> {
     #[cfg(target_os = "linux")]
     socket2::SockRef::from(stream).set_tcp_notsent_lowat(UNSENT)?;

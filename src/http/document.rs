@@ -1,4 +1,4 @@
-//! JSON bodies: an object that names a structure, with parameters beside it. Read into names and texts, never into a tree:
+//! JSON bodies: an object that names a structure, and parameters. Parsed into names and texts, never into a tree:
 //! a body within `limits.json_bytes` takes less than a millisecond.
 
 use std::fmt;
@@ -8,7 +8,7 @@ use serde::de::{Deserialize, Deserializer, Error, IgnoredAny, MapAccess, SeqAcce
 use super::kinds::Kind;
 use super::problem::Problem;
 
-/// The members of an object, in order, each as it would stand in a query.
+/// Returns the members of an object, in order, each as written in a query.
 pub(super) fn members(bytes: &[u8]) -> Result<Vec<(String, String)>, Problem> {
     let Members(members) = serde_json::from_slice(bytes)
         .map_err(|e| bad(&e.to_string()).with("line", e.line()).with("column", e.column()))?;
@@ -19,7 +19,7 @@ pub(super) fn members(bytes: &[u8]) -> Result<Vec<(String, String)>, Problem> {
     members.into_iter().map(text).collect()
 }
 
-/// The problem of a body that is no such document.
+/// Returns the problem for a body that is not such a document.
 pub(super) fn bad(detail: &str) -> Problem {
     Problem::new(Kind::BadRequest, format!("the JSON cannot be read: {detail}"))
         .with("expected", "{\"pdb_id\": \"4pti\", …}")
@@ -64,7 +64,7 @@ impl<'de> Deserialize<'de> for Member {
     }
 }
 
-/// Reads a value as text; within a list there are no lists.
+/// Reads a value as text. Lists in lists are not accepted.
 #[derive(Clone, Copy)]
 struct Scalars {
     is_item: bool,

@@ -25,7 +25,7 @@ const MAX_BOUNDARY: usize = 70;
 /// Bytes that the parser gets at once. It searches all that it has buffered whenever it gets more.
 const PIECE: usize = 64 << 10;
 
-/// Why the parser gets nothing more.
+/// Errors that end the parser's input.
 #[derive(Debug, Error)]
 enum FeedError {
     #[error("the head of a part is too long")]
@@ -34,13 +34,13 @@ enum FeedError {
     Body(#[from] axum::Error),
 }
 
-/// Hands a body to the parser in pieces, and no more than `allowance` bytes: the parser buffers the preamble and the head
-/// of a part until it has seen their end.
+/// Hands a body to the parser in pieces, and no more than `allowance` bytes: the parser buffers the preamble and the
+/// head of a part until it has seen their end.
 struct Feed<'a> {
     body: BodyDataStream,
     rest: Bytes,
     allowance: &'a AtomicUsize,
-    /// The parser has to look at the last piece before it gets another one.
+    /// Set after each piece: the parser must process it before it gets the next one.
     paused: bool,
 }
 
@@ -71,10 +71,10 @@ impl Stream for Feed<'_> {
     }
 }
 
-/// The allowance while a part's content is read: content is handed on as it comes.
+/// The allowance while a part's content is read: content is passed on as it arrives.
 const UNBOUNDED: usize = usize::MAX;
 
-/// What a form is checked against.
+/// Limits that a form is checked against.
 struct Bounds {
     body: Limit,
     head: Limit,
@@ -118,7 +118,7 @@ pub(super) async fn read(
         let detail = format!("the form's boundary has more than {MAX_BOUNDARY} characters");
         return Err(Problem::new(Kind::BadRequest, detail).with("limit", MAX_BOUNDARY));
     }
-    // What the parser buffers at most.
+    // The most that the parser buffers.
     lease.grow(bounds.head.most.saturating_add(PIECE as u64))?;
     let allowance = AtomicUsize::new(0);
     let mut feed = Feed { body: body.into_data_stream(), rest: Bytes::new(), allowance: &allowance, paused: false };
@@ -159,7 +159,7 @@ pub(super) async fn read(
         }
     }
     drop(form);
-    // An epilogue means nothing, but a body that is not read to its end costs the client its connection.
+    // The epilogue has no meaning, but a connection is closed if its request body is not read to the end.
     allowance.store(head, Ordering::Relaxed);
     while let Some(piece) = feed.next().await {
         piece.map_err(|e| bounds.problem(&multer::Error::StreamReadFailed(e.into())))?;

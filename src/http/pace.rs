@@ -1,8 +1,9 @@
-//! Minimum pace of response bodies: a client that takes too little of a body for too long loses it.
+//! Minimum pace of response bodies: a client that takes too little of a body for too long is cut off.
 //!
-//! hyper polls a body ahead of the client and does not poll it again while the client takes nothing, so a body cannot watch
-//! itself. Instead [`Paced`] counts each slice until hyper has written it and dropped it, and whoever runs the exchange waits
-//! for [`Pace::stalled`] beside it: for HTTP/1.1 the connection, for HTTP/2 the stream's own task ([`Streams`]).
+//! hyper polls a body ahead of the client and does not poll it again while the client takes nothing, so a body cannot
+//! watch itself. Instead [`Paced`] counts each slice until hyper has written it and dropped it, and the task that runs
+//! the exchange also waits for [`Pace::stalled`]: for HTTP/1.1 the connection, for HTTP/2 the stream's own task
+//! ([`Streams`]).
 
 use std::future::Future;
 use std::pin::Pin;
@@ -27,7 +28,7 @@ use crate::telemetry::{BODIES_OPEN, REJECTED};
 const SLICE: usize = 64 << 10;
 /// Bytes of a slice over HTTP/2: a frame, so that the progress of many bodies on one line is seen.
 const STREAM_SLICE: usize = 16 << 10;
-/// Bytes of a body that is sent without being watched: too few to hold anything back with.
+/// Bytes of a body that is sent without being watched: too few to hold resources with.
 const SMALL: u64 = 1 << 10;
 
 tokio::task_local! {
@@ -121,7 +122,7 @@ impl Pace {
             let now = Instant::now();
             let due = {
                 let state = self.state();
-                // What is offered later is due later.
+                // Bytes offered later are due later.
                 if state.offered == 0 { now } else { state.since }
             } + self.rate.within;
             if due <= now {
@@ -131,8 +132,8 @@ impl Pace {
         }
     }
 
-    /// Watches the body of an answer: at the pace of its stream for HTTP/2, else at `connection`'s. Event streams are as
-    /// slow as their events, and hold no more than one.
+    /// Watches the body of an answer: at the pace of its stream for HTTP/2, else at `connection`'s. Event streams are
+    /// as slow as their events, and hold no more than one.
     pub(super) fn watch(answer: Response<Body>, connection: &Arc<Self>, version: Version) -> Response<Body> {
         let is_small = answer.body().size_hint().upper().is_some_and(|bytes| bytes <= SMALL);
         let is_events =
@@ -190,12 +191,12 @@ impl Drop for Open {
 /// A body in slices that are counted until they are sent.
 struct Paced {
     body: Body,
-    /// What is left of the frame at hand.
+    /// The rest of the current frame.
     rest: Bytes,
     /// The body has nothing more.
     ended: bool,
-    /// The end is held back until everything is taken: HTTP/2 gives a stream's task up at the end of its body, and then
-    /// nobody could take back what is still buffered.
+    /// Holds the end back until everything is taken: hyper ends an HTTP/2 stream's task with the body, and the rest of
+    /// the buffer could not be freed after that.
     stays: bool,
     pace: Arc<Pace>,
     _open: Open,
@@ -244,8 +245,8 @@ impl HttpBody for Paced {
     }
 }
 
-/// Runs the streams of an HTTP/2 connection, each until its client is too slow. A stream that is cut off is reset, and its
-/// buffers are freed; where the connection does not even take that, `broken` is told.
+/// Runs the streams of an HTTP/2 connection, each until its client is too slow. A stream that is cut off is reset, and
+/// its buffers are freed; if the reset is not sent either, `broken` is notified.
 #[derive(Clone)]
 pub(super) struct Streams {
     rate: Rate,

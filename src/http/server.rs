@@ -55,7 +55,7 @@ pub enum ServeError {
     /// Keys, signatures or quotas cannot be set up.
     #[error(transparent)]
     Access(#[from] AccessError),
-    /// The data folder is in use, or cannot be locked.
+    /// The data folder is in use or cannot be locked.
     #[error(transparent)]
     Lock(#[from] LockError),
     /// What the service keeps cannot be kept.
@@ -102,7 +102,8 @@ fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAdd
 }
 
 impl Server {
-    /// Binds the listeners, locks the data folder, opens the store and starts the workers. Must be called on the runtime that [`Self::run`] is.
+    /// Binds the listeners, locks the data folder, opens the store and starts the workers. Must be called on the
+    /// runtime that [`Self::run`] is.
     ///
     /// # Errors
     /// [`ServeError`].

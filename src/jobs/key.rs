@@ -12,8 +12,8 @@ use crate::store::{BadDigest, Digest, Name, StoreError};
 pub struct ContentKey(Digest);
 
 impl ContentKey {
-    /// The key of what `maker` makes of an input: the arithmetic of a backend, and behind it that of what draws a picture. The
-    /// version is part of it, as any release may move a bit.
+    /// The key of what `maker` makes of an input: the arithmetic of a backend, followed by that of a picture's
+    /// renderer. The version is part of it, as any release may move a bit.
     #[must_use]
     pub fn new(input: &Digest, job: &Job, format: Format, maker: &str) -> Self {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));

@@ -131,7 +131,7 @@ impl Pool {
         &self.shared.drawer
     }
 
-    /// Arithmetic behind a job's file, if nothing stands in for the backend and for what draws.
+    /// Arithmetic of a job's file, if neither the backend nor the renderer falls back to another.
     #[must_use]
     pub fn maker(&self, job: &Job) -> String {
         let renderer = job.picture.map(|_| self.shared.drawer.renderer.arithmetic());

@@ -34,8 +34,8 @@ impl JobId {
         Ok(Self(format!("{:032x}", u128::from_be_bytes(bytes))))
     }
 
-    /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart. HMAC-SHA-256
-    /// under `secret`, so that nobody who knows client and key can compute it.
+    /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart.
+    /// HMAC-SHA-256 under `secret`, so that client and key alone do not reveal it.
     #[must_use]
     pub(super) fn of_key(secret: &Secret, client: u64, key: &str) -> Self {
         // HMAC pads a key to the block length with zeros.

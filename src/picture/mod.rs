@@ -101,7 +101,7 @@ pub trait Renderer: Send + Sync {
     /// Short stable name: `cpu` or `gpu`.
     fn name(&self) -> &'static str;
 
-    /// Name of the arithmetic behind the pixels: equal names, equal pixels of equal meshes.
+    /// Name of the arithmetic: equal names give equal pixels for equal meshes.
     fn arithmetic(&self) -> String {
         format!("{} {}", self.name(), arithmetic())
     }

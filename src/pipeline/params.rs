@@ -83,7 +83,8 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         if std::mem::replace(&mut seen[index], true) {
             return Err(ParamError::Repeated { name: parameter.name });
         }
-        // A default conflicts with nothing, since clients may send every default. An explicit format still overrides `Accept`.
+        // A default conflicts with nothing, since clients may send every default. An explicit format still overrides
+        // `Accept`.
         if parameter.name != "format" && parameter.is_default(value) {
             continue;
         }

@@ -29,8 +29,8 @@ impl ComponentReport {
     }
 }
 
-/// A void: a closed surface whose inside is outside the molecule. No probe has tested whether a solvent molecule fits: most
-/// are gaps between atoms.
+/// A void: a closed surface whose inside is outside the molecule. No probe has tested whether a solvent molecule fits:
+/// most are gaps between atoms.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct VoidReport {
@@ -60,7 +60,8 @@ pub struct ResidueCount {
     pub atoms: u64,
 }
 
-/// Atoms of the model that are not meshed, each counted under the first reason that applies, in the order of the fields.
+/// Atoms of the model that are not meshed, each counted under the first reason that applies, in the order of the
+/// fields.
 #[derive(Debug, Clone, Default, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct LeftOutReport {
@@ -374,7 +375,7 @@ impl Report {
         self.timings_ms.insert(stage.to_owned(), Value::from(((before + ms) * 1e3).round() / 1e3));
     }
 
-    /// Arithmetic behind the file, as its key has it: that of the mesh, and behind it that of a picture.
+    /// Arithmetic of the file, as in its key: that of the mesh, followed by that of the picture.
     #[must_use]
     pub fn maker(&self) -> String {
         maker(&self.arithmetic, self.picture.as_ref().map(|picture| picture.arithmetic.as_str()))
@@ -392,7 +393,7 @@ impl Report {
     }
 }
 
-/// Arithmetic behind a file: that of its mesh, and that of a picture of it.
+/// Arithmetic of a file: that of its mesh, followed by that of its picture.
 #[must_use]
 pub fn maker(mesh: &str, picture: Option<&str>) -> String {
     picture.map_or_else(|| mesh.to_owned(), |picture| format!("{mesh}+{picture}"))

@@ -4,18 +4,18 @@ use super::Job;
 
 /// Bytes of text per atom, about: a line of a PDB file has 81, one of an mmCIF file 90 to 110.
 const BYTES_PER_ATOM: f64 = 90.0;
-/// How much smaller compressed structure files are, about.
+/// Approximate compression ratio of structure files.
 const COMPRESSION: f64 = 4.0;
-/// How much smaller atoms are in BinaryCIF than in text, about. Compressed it cannot be told without inflating it; the two
-/// differ less then.
+/// Approximate size ratio of atoms in text and in BinaryCIF. Not applied to compressed input, whose format is only known
+/// after inflating; compressed, the two differ less.
 const BINARY: f64 = 5.0;
 /// Bytes of an archive's BinaryCIF that describe the columns of all its categories, about: as many for a small entry as
 /// for a large one.
 const DESCRIPTION: f64 = 150e3;
 /// Work of the smallest job, in atoms.
 const LEAST: f64 = 2_000.0;
-/// Time of a mesh whose spacing is searched for, in times of the one that is found: a coarse one goes before it, and now and
-/// then there is a third.
+/// Time of a mesh whose spacing is searched for, relative to the final one: a coarse mesh precedes it, and sometimes a
+/// third is needed.
 const TRIES: f64 = 1.5;
 /// Work of a picture's pixel, in atoms: 100 ns of one core, on a machine whose atoms take 4 µs of two.
 const PIXEL: f64 = 0.0125;

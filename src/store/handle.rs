@@ -155,12 +155,12 @@ impl Store {
         Ok(Some(Stored { bytes, meta }))
     }
 
-    /// An object in pieces, or the bytes of `range` of it, whose end may lie behind the object's. For objects named after
-    /// their content: each piece is read when it is asked for. The object is pinned until the stream is dropped.
+    /// An object in pieces, or the bytes of `range` of it, whose end may lie behind the object's. For objects named
+    /// after their content: each piece is read when it is asked for. The object is pinned until the stream is dropped.
     ///
     /// # Errors
-    /// [`StoreError::Range`] if the range is empty or begins behind the end; others as they come. The stream fails if the
-    /// object is deleted while it is read.
+    /// [`StoreError::Range`] if the range is empty or begins behind the end; others as they come. The stream fails if
+    /// the object is deleted while it is read.
     pub async fn read(&self, name: &Name, range: Option<Range<u64>>) -> Result<Option<(Meta, ByteStream)>, StoreError> {
         let pin = self.pin(name);
         let known = self.recall(name).map(|(meta, _)| meta);
@@ -264,10 +264,10 @@ impl Store {
         self.0.backend.probe().await
     }
 
-    /// Returns the secret of the store, which names what must not be guessed. Creates it on first use.
+    /// Returns the secret of the store, from which unguessable ids are derived. Creates it on first use.
     ///
     /// # Errors
-    /// [`StoreError::Open`] where it cannot be read or created.
+    /// [`StoreError::Open`] if it cannot be read or created.
     pub(crate) async fn secret(&self) -> Result<Secret, StoreError> {
         self.0.backend.secret().await
     }

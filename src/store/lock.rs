@@ -1,7 +1,7 @@
 //! The lock of a data folder: one service at a time writes to it.
 //!
-//! The operating system holds the lock for the open file and releases it when the process ends, however it ends. The text in
-//! the file only says who holds it.
+//! The operating system holds the lock for the open file and releases it when the process ends, however it ends. The
+//! text in the file only says who holds it.
 
 use std::fmt;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -85,21 +85,21 @@ impl FolderLock {
         Ok(Self { _file: file })
     }
 
-    /// Checks that nobody holds the lock of `folder`, without creating anything.
+    /// Checks that the lock of `folder` is free, without creating anything.
     ///
     /// # Errors
     /// [`LockError::Held`] if a service uses the folder.
     pub fn check(folder: &Path) -> Result<(), LockError> {
         match File::open(folder.join(FILE)) {
             Ok(mut file) => lock(&mut file, folder),
-            // A folder that cannot be opened is reported by whoever opens the store in it.
+            // A folder that cannot be opened is reported when the store in it is opened.
             Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => Ok(()),
             Err(error) => Err(LockError::Io { folder: folder.to_owned(), error }),
         }
     }
 }
 
-/// Locks an open lock file, or says who holds it.
+/// Locks an open lock file, or returns its holder in the error.
 fn lock(file: &mut File, folder: &Path) -> Result<(), LockError> {
     match file.try_lock() {
         Ok(()) => Ok(()),
@@ -115,7 +115,7 @@ fn lock(file: &mut File, folder: &Path) -> Result<(), LockError> {
     }
 }
 
-/// Name of this host, where Linux says it.
+/// Name of this host; `None` on other systems than Linux.
 fn host() -> Option<String> {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok()?;
     Some(name.trim().to_owned())

@@ -1,8 +1,8 @@
 //! What the service keeps, by the names of contents: in a folder or on S3, bounded, and swept.
 //!
 //! [`Store`] is the whole interface. `backend.rs` knows where bytes lie, `index.rs` what there is and what goes first,
-//! `memory.rs` keeps small results at hand, `tidy.rs` makes room, `writer.rs` takes what threads write. `lock.rs` keeps a second
-//! service from the data folder.
+//! `memory.rs` keeps small results at hand, `tidy.rs` makes room, `writer.rs` takes what threads write. `lock.rs` locks
+//! the data folder against a second service.
 //!
 //! Who writes or removes a name holds its lock (`Store::stripe`), after room has been made for it: so nobody waits for
 //! room with a lock in hand. Readers hold none; what they bring back enters index and memory only if the name has not

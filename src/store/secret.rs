@@ -8,7 +8,7 @@ use bytes::Bytes;
 use object_store::path::Path;
 use object_store::{ObjectStore, ObjectStoreExt as _, PutMode};
 
-/// Name of the secret in the root of the store, beside the folders that are tidied.
+/// Name of the secret in the root of the store, outside the folders that are cleaned up.
 const NAME: &str = "secret";
 /// Bytes of a secret.
 const BYTES: usize = 32;

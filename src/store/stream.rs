@@ -9,7 +9,7 @@ use super::handle::Store;
 use super::name::Name;
 use super::object::{ByteStream, Meta, Pin};
 
-/// Bytes of the first piece: all that a reader holds who asks for an object and takes nothing of it.
+/// Bytes of the first piece: all that is held for a reader that takes nothing.
 const FIRST: u64 = 16 << 10;
 /// Bytes of a later piece, at most: each wakes a thread and opens the file.
 const PIECE: u64 = 256 << 10;

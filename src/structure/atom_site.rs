@@ -94,7 +94,7 @@ impl Layout {
         [self.number, x, y, z, occupancy, b_factor, model, sequence]
     }
 
-    /// Does without `label_seq_id`, except where it stands in for the author's number.
+    /// Leaves out `label_seq_id`, except as a fallback for the author's number.
     pub(super) fn without_sequence_numbers(self) -> Self {
         Self { sequence_number: NONE, ..self }
     }

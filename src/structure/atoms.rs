@@ -69,7 +69,7 @@ pub struct Structure {
     pub hetero: Vec<bool>,
     /// Kinds of atoms.
     pub kind: Vec<Kind>,
-    /// Values that could not be read and were replaced by a default, in words; a bounded number.
+    /// Messages about values that could not be read and were replaced by a default; a bounded number.
     pub warnings: Vec<String>,
 }
 

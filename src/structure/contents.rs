@@ -15,7 +15,7 @@ pub enum Kind {
     Ligand,
     /// Water in any record.
     Water,
-    /// Sites of a force field that are no atoms, such as the charge site of TIP4P water. They are never selected.
+    /// Sites of a force field that are not atoms, such as the charge site of TIP4P water. They are never selected.
     VirtualSite,
 }
 
@@ -43,7 +43,7 @@ pub struct Counts {
     pub water: u64,
     /// Hydrogen and deuterium of all kinds.
     pub hydrogens: u64,
-    /// Sites that are no atoms.
+    /// Sites that are not atoms.
     pub virtual_sites: u64,
 }
 

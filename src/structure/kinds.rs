@@ -1,7 +1,7 @@
 //! The kind of every atom: polymer, ligand, water, or a virtual site.
 //!
 //! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file says so: by the
-//! entity of its chain or its `label_seq_id` (mmCIF), by a SEQRES or MODRES record (PDB). Where the file says nothing,
+//! entity of its chain or its `label_seq_id` (mmCIF), by a SEQRES or MODRES record (PDB). Otherwise
 //! it is polymer if a backbone bond joins it to a polymer residue beside it in the file, directly or through other
 //! HETATM residues.
 
@@ -36,8 +36,8 @@ const PEPTIDE_BOND: f64 = 2.0;
 /// Longest bond between O3' and the next phosphorus, Å; 1.6 Å is usual.
 const PHOSPHATE_BOND: f64 = 2.2;
 
-/// Sets the kinds of all atoms. The reader has made ATOM records and rows with a `label_seq_id` polymer, and other HETATM
-/// records ligands.
+/// Sets the kinds of all atoms. The reader has made ATOM records and rows with a `label_seq_id` polymer, and other
+/// HETATM records ligands.
 pub(super) fn assign(columns: &mut Columns, tables: &Tables, sequence: &Sequence) {
     let solvent = Solvent::new(tables);
     if columns.hetero.contains(&true) {
@@ -85,7 +85,8 @@ impl Solvent {
     }
 }
 
-/// Sets the kinds of HETATM residues that the file decides, and returns a flag for each number of `label_chain`: its entity decided.
+/// Sets the kinds of HETATM residues that the file decides, and returns for each number of `label_chain` whether its
+/// entity decided.
 fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solvent: &Solvent) -> Vec<bool> {
     let chains: Vec<Option<bool>> =
         tables.label_chain.texts().map(|chain| sequence.polymer_chains.get(chain).copied()).collect();
@@ -108,7 +109,8 @@ fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solven
     chains.iter().map(Option::is_some).collect()
 }
 
-/// Returns true if `label_seq_id` tells polymers from other residues. Some programs write it for every atom, even of water.
+/// Returns true if `label_seq_id` tells polymers from other residues. Some programs write it for every atom, even of
+/// water.
 fn has_sequence_numbers(columns: &Columns, solvent: &Solvent) -> bool {
     let mut without = false;
     for i in (0..columns.len()).filter(|&i| columns.hetero[i]) {
@@ -161,7 +163,8 @@ impl Joints {
     }
 }
 
-/// Makes HETATM residues polymer that backbone bonds join to a polymer residue. Chains that are `decided` stay as they are.
+/// Makes HETATM residues polymer that backbone bonds join to a polymer residue. Chains that are `decided` stay as they
+/// are.
 fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
     let joints: Vec<Option<Joint>> = tables.name.texts().map(Joint::of).collect();
     let open = |columns: &Columns, i: usize| {

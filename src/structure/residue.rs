@@ -34,8 +34,8 @@ const IONS: &[(&str, u8)] = &[
     ("BAR", 56),
 ];
 
-/// Single ions that may stand in ATOM records: the names of the component dictionary and of simulation packages, without
-/// digits and signs.
+/// Single ions that may stand in ATOM records: the names of the component dictionary and of simulation packages,
+/// without digits and signs.
 const SINGLE_IONS: &[&str] =
     &["NA", "K", "CL", "MG", "CA", "ZN", "LI", "RB", "CS", "BR", "CD", "BA", "MN", "FE", "CU", "CO", "NI", "SR", "IOD"];
 
@@ -75,7 +75,7 @@ pub(super) fn is_standard(residue: &str) -> bool {
     STANDARD.contains(&residue)
 }
 
-/// Returns true for a name of four letters whose first three are a name of their own.
+/// Returns true for a known residue name of four letters whose first three letters are a residue name as well.
 pub(super) fn is_four_letters(residue: &str) -> bool {
     FOUR_LETTERS.contains(&residue)
 }

@@ -12,7 +12,7 @@ use super::radii;
 use super::text::list;
 use crate::surface::{Spheres, SurfaceError};
 
-/// What to take. The default: first model, polymer, no hydrogens, best alternative location.
+/// Selection of atoms. The default: first model, polymer, no hydrogens, best alternative location.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[expect(clippy::struct_excessive_bools, reason = "each is a flag of its own, given by name")]
 pub struct Selection {
@@ -115,11 +115,11 @@ const MAX_NAMES: usize = 10;
 pub struct LeftOut {
     /// Atoms of chains that were not asked for.
     pub other_chains: u64,
-    /// Sites that are no atoms: charge sites of water models, lone pairs, Drude particles.
+    /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
     pub virtual_sites: u64,
     /// Atoms of kinds that were not asked for, by residue name, the most frequent names first; a bounded number.
     pub residues: Vec<(String, u64)>,
-    /// The same under all further residue names.
+    /// Atoms of kinds that were not asked for, under all other residue names.
     pub other_residues: u64,
     /// Hydrogen and deuterium of residues that were taken.
     pub hydrogens: u64,

@@ -1,4 +1,4 @@
-//! Sites of force fields that are no atoms: charge sites of water models, lone pairs, mass centres, Drude particles.
+//! Sites of force fields that are not atoms: charge sites of water models, lone pairs, mass centres, Drude particles.
 
 use std::collections::HashMap;
 
@@ -9,7 +9,7 @@ use super::residue;
 /// Largest distance of a Drude particle from its atom, Å. No two atoms are this close.
 const DRUDE_DISTANCE: f64 = 0.4;
 
-/// Makes virtual sites of the atoms that are none: by name where the element is unknown, Drude particles by their place.
+/// Marks virtual sites: by name if the element is unknown, Drude particles by name and distance.
 pub(super) fn mark(columns: &mut Columns, tables: &Tables) {
     by_name(columns, tables);
     drude(columns, tables);
@@ -22,7 +22,7 @@ enum Site {
     Anywhere,
     /// Amino acids and nucleotides: mass centres such as `MCB1`, lone pairs such as `LG1`.
     InPolymer,
-    /// None but water, in which every site of no element is virtual.
+    /// Water only: there, every site without an element is virtual.
     InWater,
 }
 

@@ -66,8 +66,8 @@ pub trait Backend: Send + Sync {
     /// Short stable name: `cpu`, `reference`, `gpu`.
     fn name(&self) -> &'static str;
 
-    /// Name of the arithmetic behind the bytes that it makes: equal names, equal bytes for equal input. Of several devices, that
-    /// of the first one that takes jobs. A part of the key of results.
+    /// Name of the arithmetic: equal names give equal bytes for equal input. Of several devices, that of the first one
+    /// that takes jobs. Part of the keys of results.
     fn arithmetic(&self) -> String {
         format!("{} {}", self.name(), simd::arithmetic())
     }

@@ -1,7 +1,8 @@
 //! Limit on candidate pairs: pairs of a sphere and a brick that its density can reach.
 //!
-//! Their number bounds the time of a run, since each pair costs up to 512 evaluations of the kernel, and the memory of the
-//! candidate lists. Neither the number of spheres nor the number of grid samples bounds it: overlapping spheres share bricks.
+//! Their number bounds the time of a run, since each pair costs up to 512 evaluations of the kernel, and the memory of
+//! the candidate lists. Neither the number of spheres nor the number of grid samples bounds it: overlapping spheres
+//! share bricks.
 
 use std::f64::consts::PI;
 
@@ -11,8 +12,8 @@ use super::lattice::{BRICK, Lattice, effective_radius, to_u64};
 use super::params::{MAX_RESOLUTION, SurfaceLimits, SurfaceParams};
 use super::spheres::Spheres;
 
-/// Highest limit that takes effect: offsets into candidate lists have 32 bits, and a tile's lists also hold the candidates
-/// of the bricks around it.
+/// Highest limit that takes effect: offsets into candidate lists have 32 bits, and a tile's lists also hold the
+/// candidates of the bricks around it.
 const MAX_LIMIT: u64 = 1 << 31;
 
 /// The limit that takes effect.

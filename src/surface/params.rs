@@ -34,9 +34,9 @@ pub enum Preset {
     /// Smoothness 1.25 at isovalue 1: close to the solvent-excluded surface in volume.
     #[default]
     Default,
-    /// Smoothness 0.75 at isovalue 1.9: an approximation of the solvent-excluded surface (1.4 Å probe), without a probe. Over
-    /// eight proteins its area was −6.5 to +6.0 % off and its volume −0.6 to +5.1 %. Small structures are worse: the area of a
-    /// DNA dodecamer was +13.5 % off.
+    /// Smoothness 0.75 at isovalue 1.9: an approximation of the solvent-excluded surface (1.4 Å probe), without a
+    /// probe. Over eight proteins its area was −6.5 to +6.0 % off and its volume −0.6 to +5.1 %. Small structures are
+    /// worse: the area of a DNA dodecamer was +13.5 % off.
     SesLike,
     /// Smoothness 5 at isovalue 1.06: close to the union of van der Waals spheres.
     VdwLike,

@@ -51,8 +51,9 @@ impl Plan {
     /// Finds the bricks of `lattice`.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond what the
-    /// limits allow, [`SurfaceError::BadParameter`] for more atoms than 31 bits number, and [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond what
+    /// the limits allow, [`SurfaceError::BadParameter`] for more atoms than 31 bits number, and
+    /// [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let atoms = &lattice.atoms;
         if atoms.len() > cpu::MAX_ATOMS {

@@ -36,14 +36,14 @@ pub(super) fn exp2<const FMA: bool>(x: f32) -> f32 {
 }
 
 dispatched! {
-    /// Whether the dispatched functions fuse products and sums here. They use the same condition.
+    /// Returns true if the dispatched functions fuse products and sums on this processor. They use the same condition.
     fn is_fused() -> bool {
         multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"))
     }
 }
 
-/// Returns the name of the arithmetic that decides the last bits of results on this processor: fused or not, and the system
-/// and architecture, whose mathematical functions differ. The width of vectors does not matter.
+/// Returns the name of the arithmetic that decides the last bits of results on this processor: fused or not, and the
+/// system and architecture, whose mathematical functions differ. The width of vectors does not matter.
 #[must_use]
 pub fn arithmetic() -> String {
     let fused = if is_fused() { "fma" } else { "no-fma" };

@@ -152,8 +152,8 @@ fn gather(batch: &[[u32; 3]], at: impl Fn(usize) -> [f32; 3]) -> [[f32; LANES]; 
 }
 
 /// Areas, signed volumes and their moments about the mesh's centre. By the divergence theorem, a triangle's part of the
-/// volume's moment along an axis is the integral of half the squared coordinate times the normal. Single precision inside a triangle: differences of close
-/// positions are nearly exact, and the sums over triangles are double.
+/// volume's moment along an axis is the integral of half the squared coordinate times the normal. Single precision
+/// inside a triangle: differences of close positions are nearly exact, and the sums over triangles are double.
 #[inline(always)]
 fn geometry(positions: Positions<'_>, batch: &[[u32; 3]]) -> Lanes {
     let corners = match positions {

@@ -54,7 +54,7 @@ const asked = (job) => (jobs[job] ?? []).map(({ what }) => what);
 const until = async (condition, what) => {
   const end = performance.now() + PATIENCE;
   while (!condition()) {
-    assert.ok(performance.now() < end, `waited in vain: ${what}`);
+    assert.ok(performance.now() < end, `timed out: ${what}`);
     await new Promise((resolve) => setTimeout(resolve, 20));
   }
 };
@@ -70,19 +70,19 @@ await run({
     assert.equal(await instead(page), false);
   },
 
-  "a job whose events are cut or cannot be had is polled, no more often than it says": async () => {
-    for (const [job, watched] of [["cut", 2], ["polled", 2]]) {
+  "a job whose events are cut or unavailable is polled, no more often than Retry-After allows": async () => {
+    for (const job of ["cut", "polled"]) {
       await load(`/meshes/${job}`);
       await told("load");
       const polls = asked(job).filter((what) => /^GET jobs\?wait=\d+$/.test(what));
       assert.equal(polls.length, 2, `${asked(job)}`);
-      assert.equal(asked(job).filter((what) => what === "GET events").length, watched);
+      assert.equal(asked(job).filter((what) => what === "GET events").length, 2);
       const [first, second] = jobs[job].filter(({ what }) => what.startsWith("GET jobs"));
       assert.ok(second.at - first.at >= 990, `${second.at - first.at} ms`);
     }
   },
 
-  "a failure is told, and what stands between the tags is shown until a mesh is there": async () => {
+  "a failure is reported, and the content between the tags is shown until a mesh arrives": async () => {
     for (const [src, words, status] of [
       ["/meshes/failed", /\/meshes\/failed: The grid would be too large: 9 samples/, 422],
       ["/nothing.glb", /404/, 404],
@@ -100,7 +100,7 @@ await run({
       assert.equal(await instead(page), false);
       assert.ok(silhouette(await picture(page, "#viewer")).share > 0.1, "the canvas is back");
     }
-    // Without anything between the tags the reason stands there.
+    // Without content between the tags, the reason is shown.
     await page.evaluate(() => document.querySelector("#instead").remove());
     await load("/meshes/failed");
     await told("error");
@@ -130,7 +130,7 @@ await run({
     assert.equal(await page.evaluate(() => window.picks), 1);
   },
 
-  "without WebGL what stands between the tags is shown": async () => {
+  "without WebGL the content between the tags is shown": async () => {
     const flat = await browser("--disable-3d-apis");
     const other = await open(flat, { url: `${origin}/page/quick` });
     await other.waitForFunction(() => window.told.length > 0, null, { timeout: PATIENCE });

@@ -36,7 +36,7 @@ const fetchEntry = async (p, id) => {
   await p.locator("#pdb").press("Enter");
 };
 
-/** Does something that must come to nothing, and compares the page and the surface on it with those before. */
+/** Runs `act`, which must change nothing, and compares page and surface before and after. */
 async function unchanged(p, act) {
   await p.mouse.move(1, 1);
   const before = { ...(await described(p)), surfaces: await shown(p) };
@@ -64,7 +64,7 @@ async function hold(p, pattern) {
 }
 
 await run({
-  "a structure that cannot be had leaves the former one": async () => {
+  "a structure that cannot be loaded leaves the former one": async () => {
     await remeshed(page, () => set(page, "chains", "A"));
     assert.match((await described(page)).address, /chains=A/);
     await unchanged(page, async () => {
@@ -77,7 +77,7 @@ await run({
       await problem.locator("strong", { hasText: "poem.txt" }).waitFor();
       assert.match(await problem.textContent(), /The structure cannot be read.*still that of 4PTI/s);
     });
-    // A refusal in the name of the service, and an answer that is no mesh.
+    // A refusal by the service, and a response that is not a mesh.
     for (const [answer, words] of [[refusal, /^1CRN: The queue is full/], [{ status: 200, contentType: "model/gltf-binary", body: "glTF?" }, /^1CRN: .*no GLB/]]) {
       await page.route(entry, (route) => route.fulfill(answer));
       await unchanged(page, async () => {
@@ -144,7 +144,7 @@ await run({
       await problem.locator("strong", { hasText: "1CRN" }).waitFor();
     });
     await page.unroute(entry);
-    // It is kept how the failed structure is asked for.
+    // The request of the failed structure is kept.
     await remeshed(page, () => page.getByRole("button", { name: "Try again" }).click());
     assert.deepEqual((({ name, address }) => [name, address])(await described(page)), ["1CRN", "/?pdb=1crn&isovalue=0.6"]);
     await remeshed(page, () => page.locator("#reset-all").click());

@@ -25,7 +25,7 @@ export class MolmeshViewer extends HTMLElement {
   private readonly canvas = document.createElement("canvas");
   /** The content between the tags, shown instead of a surface. */
   private readonly fallback = document.createElement("slot");
-  /** Says why there is no surface, where nothing stands between the tags. */
+  /** The reason why there is no surface, shown if there is no content between the tags. */
   private readonly reason = document.createElement("p");
   /** Why the surface of `src` is not shown; null: it is, or will be when it has been loaded. */
   private failure: string | null = null;
@@ -100,7 +100,7 @@ export class MolmeshViewer extends HTMLElement {
     }
   }
 
-  /** Shows the canvas, or the fallback where there is no surface, for a reason in words. */
+  /** Shows the canvas, or, with the reason `failure`, the fallback. */
   private arrange(failure: string | null = null): void {
     this.failure = failure;
     const reason = failure ?? (this.isLost ? "the graphics device was lost" : null);

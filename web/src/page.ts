@@ -216,7 +216,7 @@ export class Page {
     this.commands();
   }
 
-  /** Takes structure and parameters of a wish as the next ones to mesh. */
+  /** Sets structure and parameters of `wish` as the next ones to mesh. */
   private take(wish: Wish): void {
     this.target = wish.source;
     this.form?.fill(wish.choices);

@@ -27,7 +27,7 @@ export interface Delivery {
   received: number;
   bytes: ArrayBuffer;
   headers: Headers;
-  /** Aborted once a later wish supersedes this one: nothing of it may be shown then. */
+  /** Aborted once a later request supersedes this one, which must not be shown then. */
   signal: AbortSignal;
 }
 
@@ -105,7 +105,7 @@ export class Remesher {
       const received = performance.now();
       if (isLatest()) await this.listener.show({ wish, answered, received, bytes, headers: reply.headers, signal: abort.signal });
     } catch (error) {
-      // With a later wish waiting for its turn, this one has been superseded already.
+      // A later request is waiting, so this one is superseded already.
       if (isLatest() && !this.next) this.listener.failed(error, wish);
     }
     if (!isLatest()) return;

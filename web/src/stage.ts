@@ -19,7 +19,7 @@ export interface Scene {
   /** The choices of its picture. */
   choices: Choices;
   loaded: Loaded;
-  /** Its picture, or why there is none, in words; null: the viewer draws it. */
+  /** Its picture, or a message why there is none; null if the viewer draws it. */
   picture: Blob | string | null;
 }
 
@@ -54,7 +54,7 @@ export class Stage {
     this.fetching?.abort();
     const drawn = this.viewer?.show(scene.loaded, fresh) ?? Promise.resolve(performance.now());
     if (!preview) this.kept = scene;
-    if (!this.draws) this.hang(scene);
+    if (!this.draws) this.showPicture(scene);
     return drawn;
   }
 
@@ -69,7 +69,7 @@ export class Stage {
     if (!this.image.hidden) void this.redraw();
   }
 
-  /** Whether the viewer draws: otherwise pictures of the service are shown. */
+  /** True if the viewer draws; otherwise pictures of the service are shown. */
   private get draws(): boolean {
     return this.viewer !== null && !this.lost;
   }
@@ -92,7 +92,7 @@ export class Stage {
     show(this.notice, true);
   }
 
-  /** Fetches the picture of the surface on the stage anew. */
+  /** Fetches the picture of the surface on the stage again. */
   private async redraw(): Promise<void> {
     const { scene } = this;
     if (!scene) return;
@@ -104,11 +104,11 @@ export class Stage {
       // Another surface is on the stage, or the viewer draws again.
       return;
     }
-    this.hang(scene);
+    this.showPicture(scene);
   }
 
   /** Shows the picture of a scene, or says why there is none. */
-  private hang(scene: Scene): void {
+  private showPicture(scene: Scene): void {
     const { picture, source } = scene;
     if (picture === null) {
       // The viewer has stopped drawing since the scene was prepared.
@@ -127,7 +127,7 @@ export class Stage {
   }
 
   /**
-   * Fetches a picture, or words that say why there is none. An image's own address would carry no key. Throws only
+   * Fetches a picture, or a message why there is none. An image's own address would carry no key. Throws only
    * when `signal` is aborted.
    */
   private async picture(source: Source, choices: Choices, signal: AbortSignal): Promise<Blob | string> {
@@ -145,7 +145,7 @@ export class Stage {
       const none = document.status === 404 || document.status === 406;
       return none
         ? "This server draws no pictures either; report and downloads work as always."
-        : `The picture could not be had: ${document.detail ?? document.title}`;
+        : `The picture could not be loaded: ${document.detail ?? document.title}`;
     }
   }
 }

@@ -119,10 +119,10 @@ pub(super) fn memory(machine: &Machine, config: &Config, workers: usize) -> Chec
     }
 }
 
-/// Files that a service opens beside its connections: libraries, devices, the store, requests to an archive.
+/// Files that a service opens in addition to its connections: libraries, devices, the store, requests to an archive.
 const OTHER_FILES: u64 = 128;
 
-/// Whether the limit of open files allows the configured connections.
+/// Checks that the limit of open files allows the configured connections.
 pub(super) fn files(machine: &Machine, config: &Config) -> Option<Check> {
     let [_, most] = machine.files?;
     let needed = (config.server.connections as u64).saturating_add(OTHER_FILES);

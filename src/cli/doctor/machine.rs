@@ -19,7 +19,7 @@ pub(super) struct Machine {
     pub(super) bytes: Option<u64>,
     /// Bytes that this process may take, and by whose word, where there is a limit.
     pub(super) limit: Option<(u64, &'static str)>,
-    /// Files that may be open: now, and at most, to which a service raises it.
+    /// Limits of open files: the current one, and the hard limit to which a service raises it.
     pub(super) files: Option<[u64; 2]>,
     /// What announces itself as a Vulkan driver, whether or not it starts; a sentence where nothing does.
     pub(super) drivers: Vec<String>,
@@ -74,7 +74,7 @@ fn drivers() -> Vec<String> {
     Vec::new()
 }
 
-/// The soft and the hard limit of open files, where there are both.
+/// Reads the soft and the hard limit of open files; `None` if either is unlimited.
 #[cfg(target_os = "linux")]
 fn files() -> Option<[u64; 2]> {
     let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile);

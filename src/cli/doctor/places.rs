@@ -34,7 +34,7 @@ pub(super) fn listeners(config: &Config) -> Vec<Check> {
     [service].into_iter().chain(metrics).collect()
 }
 
-/// Whether another service uses the data folder; no check if none does.
+/// Reports another service that uses the data folder; `None` if there is none.
 pub(super) fn data_dir(config: &Config) -> Option<Check> {
     let error = FolderLock::check(&config.server.data_dir).err()?;
     Some(Check::new("data_dir", State::Failed, error.to_string()))

@@ -58,7 +58,7 @@ fn mesh(doc: &str) -> ResponseBuilder {
             "ETag",
             text(
                 "The strong validator of the file: SHA-256 over input, parameters, format, arithmetic (instruction set, or \
-                 GPU and driver) and version. Equal tags, equal bytes.",
+                 GPU and driver) and version. Equal tags mean equal bytes.",
             ),
         )
         .header(

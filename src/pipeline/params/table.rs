@@ -71,8 +71,8 @@ pub struct Parameter {
 }
 
 impl Parameter {
-    /// Whether `text` is the default that the interface declares. Defaults in words, such as `the first of the file`, are not
-    /// values, so nothing equals them.
+    /// Returns true if `text` equals the declared default. Defaults in words, such as `the first of the file`, are not
+    /// values and equal nothing.
     #[must_use]
     pub fn is_default(&self, text: &str) -> bool {
         match self.domain {

@@ -1,4 +1,5 @@
-//! PDBx/mmCIF: the `atom_site` category of the first data block that has one, the entry's id and title, and the entities.
+//! PDBx/mmCIF: the `atom_site` category of the first data block that has one, the entry's id and title, and the
+//! entities.
 //!
 //! Dictionary: PDBx/mmCIF, category `atom_site`. Author names and numbers (`auth_*`) go before the dictionary's own
 //! (`label_*`), which stand in where the author's are missing.
@@ -243,8 +244,8 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// Looks for a title behind the atoms, and for entities if HETATM records need them. The atoms are complete, so errors
-    /// from here on do not matter.
+    /// Looks for a title behind the atoms, and for entities if HETATM records need them. The atoms are complete, so
+    /// errors from here on do not matter.
     fn rest_of_block(&mut self, mut token: Token) {
         let hetero = self.rows.as_ref().is_some_and(Rows::has_hetero);
         let wanted = |reader: &Self| reader.title.is_none() || (hetero && !reader.entities.are_known());

@@ -15,7 +15,7 @@ pub(super) fn card(line: &[u8]) -> Card {
     padded
 }
 
-/// Whether columns 73-80 hold the entry's id and a line number, as before 1996: `4PTI  88`, `2HHBA 206`.
+/// Returns true if columns 73-80 hold the entry's id and a line number, as before 1996: `4PTI  88`, `2HHBA 206`.
 pub(super) fn numbered_line(card: &Card) -> bool {
     card[72].is_ascii_digit()
         && card[73..76].iter().all(u8::is_ascii_alphanumeric)

@@ -1,9 +1,9 @@
 //! Column 21 of ATOM records: the fourth letter of a residue name, or the first one of a chain.
 //!
-//! Programs that write many chains put names of two letters into columns 21 and 22; programs that simulate write residue
-//! names of four letters into columns 18 to 21. `HISA` of chain `A` and `HIS` of chain `AA` are the same columns. One row
-//! does not tell, but the file does: residues of one chain follow each other with the same letter in column 21, and
-//! residue names of four letters change that letter, or leave it blank, within a chain.
+//! Programs that write many chains put names of two letters into columns 21 and 22; programs that simulate write
+//! residue names of four letters into columns 18 to 21. `HISA` of chain `A` and `HIS` of chain `AA` are the same
+//! columns. One row does not tell, but the file does: residues of one chain follow each other with the same letter in
+//! column 21, and residue names of four letters change that letter, or leave it blank, within a chain.
 
 use std::collections::{HashMap, HashSet};
 

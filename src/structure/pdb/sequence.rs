@@ -1,14 +1,15 @@
 //! Residue names that SEQRES and MODRES records list for chains.
 //!
-//! A HETATM residue under a listed name is part of its chain. Standard names are not kept: an amino acid in a HETATM record
-//! may be a ligand of a chain that holds the same amino acid.
+//! A HETATM residue under a listed name is part of its chain. Standard names are not kept: an amino acid in a HETATM
+//! record may be a ligand of a chain that holds the same amino acid.
 
 use std::collections::HashSet;
 
 use super::super::kinds::{self, Listed};
 use super::super::residue;
 
-/// Adds the names of a SEQRES record: chain in column 12, or 11 and 12, thirteen names of three columns from column 20 on.
+/// Adds the names of a SEQRES record: chain in column 12, or 11 and 12, thirteen names of three columns from column 20
+/// on.
 pub(super) fn of_chain(line: &[u8], listed: &mut HashSet<Listed>) {
     for name in line.get(19..).unwrap_or_default().chunks(4).take(13) {
         add(line.get(10..12), name.get(..3), listed);

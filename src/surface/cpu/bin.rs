@@ -22,7 +22,7 @@ pub(super) const SLOTS: usize = SIDE * SIDE * SIDE;
 /// Marks a candidate that reaches no sample of the brick, only the space up to its neighbours' first samples: it
 /// matters to normals, not to the field.
 pub(super) const NORMAL_ONLY: u32 = 1 << 31;
-/// Pairs of an atom and a tile between two looks at the cancellation flag.
+/// Pairs of an atom and a tile between two checks of the cancellation flag.
 const PAIRS_PER_CHECK: u64 = 1 << 16;
 /// Atoms whose candidate pairs are counted and checked against the limit together: 190,000 pairs at most.
 const ATOMS_PER_CHECK: usize = 256;
@@ -62,8 +62,8 @@ impl Tiles {
     /// Assigns atoms to tiles.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond what the
-    /// limits allow, and [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond what
+    /// the limits allow, and [`SurfaceError::Cancelled`].
     pub(super) fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let mut index: FxHashMap<[i32; 3], u32> = FxHashMap::default();
         let (mut pairs, mut unchecked) = (0_u64, 0_u64);
@@ -251,8 +251,8 @@ impl Bricks {
         &self.lists[slot]
     }
 
-    /// Finds the candidates of every brick in these layers of a tile, and in the layer beyond. `count` takes the number of
-    /// candidate pairs of the layers' own bricks, some at a time, and ends the search by an error.
+    /// Finds the candidates of every brick in these layers of a tile, and in the layer beyond. `count` takes the number
+    /// of candidate pairs of the layers' own bricks, some at a time, and ends the search by an error.
     ///
     /// # Errors
     /// Those of `count`.

@@ -117,8 +117,8 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
 }
 
 impl Found {
-    /// Nothing yet, and room for what is found in `bricks` bricks, more than there mostly is: growing would copy, and what
-    /// is not touched costs nothing.
+    /// Clears the lists and reserves room for `bricks` bricks, usually more than needed: growing would copy, and untouched
+    /// memory costs nothing.
     pub(super) fn begin(&mut self, bricks: usize) {
         *self = Self {
             bricks: Vec::with_capacity(bricks),

@@ -53,7 +53,7 @@ impl Default for Scratch {
     }
 }
 
-/// Candidates of a brick between two looks at the cancellation flag: a fraction of a millisecond.
+/// Candidates of a brick between two checks of the cancellation flag: a fraction of a millisecond.
 const CANDIDATES_PER_CHECK: usize = 4096;
 
 thread_local! {
@@ -117,8 +117,8 @@ impl Pass<'_> {
     /// `bin` within the `i`th slab, `field` and `classify`. Returns its tile, if that has no further slabs.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`], [`SurfaceError::MeshTooLarge`] as soon as the
-    /// slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
+    /// [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`], [`SurfaceError::MeshTooLarge`] as soon as
+    /// the slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
     pub(super) fn sample(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
         self.control.check()?;
         let slab = &self.slabs[i];

@@ -82,7 +82,7 @@ export class Form {
     if ([...choices.keys()].some((name) => this.fields.get(name)?.parameter.format === "" && !FIRST.includes(name))) this.home.querySelector("details")?.setAttribute("open", "");
   }
 
-  /** Takes back what names parts of the former structure, without telling. */
+  /** Resets parameters that name parts of the former structure, without an event. */
   forget(): void {
     for (const name of PARTS) this.put(name, undefined);
   }

@@ -12,11 +12,11 @@ export interface Remedies {
   again(): void;
 }
 
-/** What a problem is about. */
+/** Context of a problem. */
 export interface About {
-  /** The structure whose request failed; empty: none is concerned. */
+  /** The structure whose request failed; empty: none. */
   name: string;
-  /** What the page shows in spite of it, in words. */
+  /** Sentence on what the page still shows; empty: none. */
   kept: string;
 }
 
