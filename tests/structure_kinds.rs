@@ -336,7 +336,7 @@ fn entities_decide_for_mmcif_wherever_they_stand() {
     let (head, tail): (Vec<&str>, Vec<&str>) =
         text.lines().partition(|l| !(l.starts_with("_entity.") || l.starts_with("_struct_asym.")));
     let behind = format!("{}\n{}\n", head.join("\n"), tail.join("\n"));
-    assert_eq!(selected(&structure(behind.replace("non-polymer", "polymer"))), selected(&sample));
+    assert_eq!(selected(&structure(&behind)), selected(&sample));
     let behind = behind.replace("_entity.type                       polymer", "_entity.type non-polymer");
     assert_eq!(
         selected(&structure(behind.replace("_entity_poly.entity_id", "_entity_poly.other_id"))).len(),
