@@ -7,7 +7,7 @@ mod cli_support;
 use std::fs;
 use std::path::Path;
 
-use cli_support::{Folder, assert_code, mesh, piped, rod, run, stderr, stdout};
+use cli_support::{Folder, assert_code, mesh, pdb, piped, rod, run, stderr, stdout};
 use serde_json::Value;
 
 /// How the files of a format begin.
@@ -348,5 +348,23 @@ fn version_and_doctor_answer_on_stdout() {
     let text = stdout(&doctor);
     for part in ["cpu", "reference", "gpu", "paper", "auto", "limits", "cores", "vectors"] {
         assert!(text.contains(part), "no `{part}` in\n{text}");
+    }
+}
+
+#[test]
+fn a_mesh_with_many_voids_is_written_while_it_is_made() {
+    // A lattice of atoms with a void in each of its 6³ cells: as many entries as the report lists, and more.
+    let at = |i: usize| [i % 7, i / 7 % 7, i / 49].map(|c| 3.2 * f64::from(u32::try_from(c).unwrap()));
+    let folder = Folder::new();
+    let input = folder.file("lattice.pdb", pdb(&(0..343).map(at).collect::<Vec<_>>()));
+    let done = mesh(&input, &folder.path("lattice.glb"), &["--report", "json", "--resolution", "0.3"]);
+    assert_code(&done, 0);
+    let report = json(&stdout(&done));
+    assert!(report["voids"].as_u64().unwrap() > 100, "{}", report["voids"]);
+    assert_eq!(report["void_list"].as_array().unwrap().len(), 100);
+    for void in report["void_list"].as_array().unwrap() {
+        assert!(void["volume"].as_f64().unwrap() > 0.0 && void["area"].as_f64().unwrap() > 0.0, "{void}");
+        let center = void["center"].as_array().unwrap();
+        assert!(center.iter().all(|c| (0.0..20.0).contains(&c.as_f64().unwrap())), "{void}");
     }
 }

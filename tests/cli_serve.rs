@@ -1,5 +1,6 @@
 //! `molmesh serve` as a process: its banner, its addresses, its end.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
 mod cli_support;
 

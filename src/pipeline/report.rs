@@ -386,7 +386,7 @@ impl Report {
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
-        for field in ["timings_ms", "device", "backend_reason", "fallback", "left_out", "warnings"] {
+        for field in ["timings_ms", "device", "backend_reason", "fallback", "left_out", "warnings", "void_list"] {
             map.remove(field);
         }
         map

@@ -170,6 +170,7 @@ pub struct SurfaceParams {
 }
 
 /// Limits of a run, checked before memory is allocated.
+#[expect(clippy::struct_field_names, reason = "each is the highest value that is allowed")]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SurfaceLimits {
     /// Grid samples in occupied bricks.
@@ -300,12 +301,9 @@ fn paper_params(kernel: Kernel, options: &SurfaceOptions) -> Result<Option<Paper
         return Ok(None);
     };
     // An error names a parameter that was given, not the one that is missing.
-    let need = |name: &'static str, value: Option<f64>, lo: f64, hi: f64| match value {
-        Some(value) => within(name, value, lo, hi),
-        None => {
-            let expected = format!("`{name}` beside it: the paper's {kernel} kernel needs both");
-            Err(bad(given, given_value, expected))
-        }
+    let need = |name: &'static str, value: Option<f64>, lo: f64, hi: f64| {
+        let missing = || format!("`{name}` beside it: the paper's {kernel} kernel needs both");
+        value.map_or_else(|| Err(bad(given, given_value, missing())), |value| within(name, value, lo, hi))
     };
     let refuse = |name: &'static str, value: Option<f64>| match value {
         Some(value) => Err(bad(name, value, format!("no value: the paper's {kernel} kernel has no such parameter"))),

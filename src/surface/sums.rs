@@ -88,13 +88,12 @@ pub(super) fn sum(positions: Positions<'_>, triangles: &[[u32; 3]], first: u32, 
         }
         for (lane, t) in batch.iter().enumerate() {
             let part = parts.each_ref().map(|lanes| f64::from(lanes[lane]));
-            match sums.by_label.get_mut(label(t) as usize) {
-                Some(component) => component.add(1, part),
-                None => {
-                    let mut alone = Component::default();
-                    alone.add(1, part);
-                    sums.unlabelled.push((t[0], alone));
-                }
+            if let Some(component) = sums.by_label.get_mut(label(t) as usize) {
+                component.add(1, part);
+            } else {
+                let mut alone = Component::default();
+                alone.add(1, part);
+                sums.unlabelled.push((t[0], alone));
             }
         }
     }

@@ -103,8 +103,8 @@ impl Sheet {
 
     /// Refers a finished component's moment, which is about the sheet's origin, to the sample `centre`.
     pub(super) fn refer_moment(&self, component: &mut Component, centre: [i32; 3], spacing: f64) {
-        for k in 0..3 {
-            component.moment[k] += component.volume * f64::from(self.origin[k] - centre[k]) * spacing;
+        for ((moment, origin), centre) in component.moment.iter_mut().zip(self.origin).zip(centre) {
+            *moment += component.volume * f64::from(origin - centre) * spacing;
         }
     }
 }
