@@ -251,6 +251,7 @@ fn a_byte_now_and_then_is_no_progress_over_http1_either() {
         std::thread::sleep(Duration::from_millis(50));
     }
     assert!(start.elapsed() > Duration::from_millis(900), "{:?}", start.elapsed());
+    wait_for("it is cut off", || cut_off(&server) >= before + 1.0);
     wait_for("all is freed", || server.metric("molmesh_memory_held_bytes", &[]) < 1.0);
 }
 

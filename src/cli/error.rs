@@ -282,7 +282,9 @@ fn surface_hint(error: &SurfaceError) -> Option<String> {
         SurfaceError::TooManyCandidates { suggested_resolution: Some(resolution), .. } => {
             Some(format!("try --resolution {resolution}, or raise --max-candidates"))
         }
-        SurfaceError::TooManyCandidates { .. } => Some("try smaller radii, or raise --max-candidates".to_owned()),
+        SurfaceError::TooManyCandidates { .. } => {
+            Some("try a coarser --resolution or smaller radii, or raise --max-candidates".to_owned())
+        }
         SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
         SurfaceError::DeviceMemory { suggested_resolution, .. } => {
             Some(format!("try --resolution {suggested_resolution}, or --backend cpu"))

@@ -32,7 +32,8 @@ pub struct ServerConfig {
     /// Time for the whole body of a request, ms. Default 60,000: 256 MiB at 36 Mbit/s.
     pub body_timeout_ms: u64,
     /// Time in which a client must take `write_bytes` of a response body, or all that is left of it, ms. Default
-    /// 30,000: buffers and delivery slots are held until a body is sent. Event streams are exempt.
+    /// 30,000: buffers and delivery slots are held until a body is sent. A client that has taken more may pause for longer,
+    /// one second for each 16 KiB, four times this value at most. Event streams are exempt.
     pub write_timeout_ms: u64,
     /// Bytes of a response body that a client must take within `write_timeout_ms`. Default 16 KiB: half a kilobyte a
     /// second, so that a line of 8 KiB/s carries a dozen bodies at once.

@@ -120,6 +120,9 @@ enum DomainDocument {
 #[derive(Debug, Serialize, ToSchema)]
 struct Limits {
     body_bytes: u64,
+    json_bytes: u64,
+    part_head_bytes: u64,
+    parts: usize,
     inflated_bytes: u64,
     atoms: u64,
     labels: u64,
@@ -139,6 +142,7 @@ struct Limits {
     body_timeout_ms: u64,
     header_timeout_ms: u64,
     write_timeout_ms: u64,
+    write_bytes: u64,
     connections: usize,
 }
 
@@ -290,6 +294,9 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
     let (limits, server, jobs) = (&config.limits, &config.server, &config.jobs);
     Limits {
         body_bytes: limits.body_bytes,
+        json_bytes: limits.json_bytes,
+        part_head_bytes: limits.part_head_bytes,
+        parts: limits.parts,
         inflated_bytes: limits.inflated_bytes,
         atoms: limits.atoms,
         labels: limits.labels,
@@ -309,6 +316,7 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         body_timeout_ms: server.body_timeout_ms,
         header_timeout_ms: server.header_timeout_ms,
         write_timeout_ms: server.write_timeout_ms,
+        write_bytes: server.write_bytes,
         connections: server.connections,
     }
 }

@@ -43,7 +43,19 @@ pub(super) struct Rate {
     within: Duration,
 }
 
+/// Bytes that let a client pause for one second longer.
+const BYTES_PER_SECOND: u64 = 16 << 10;
+/// Longest time between two signs of progress, as a multiple of the rate's time.
+const MAX_PATIENCE: u32 = 4;
+
 impl Rate {
+    /// Time for the next bytes of a client that has taken `total` bytes. A client that reads slowly over a fast line takes
+    /// what its system buffers, then nothing until a part of these megabytes is read.
+    fn patience(&self, total: u64) -> Duration {
+        let more = Duration::from_secs(total / BYTES_PER_SECOND);
+        self.within.saturating_add(more).min(MAX_PATIENCE * self.within)
+    }
+
     pub(super) fn new(config: &ServerConfig) -> Self {
         Self { bytes: config.write_bytes, within: config.write_timeout() }
     }
@@ -63,13 +75,15 @@ struct State {
     /// Bytes taken since `since`, fewer than the rate asks for.
     taken: u64,
     since: Instant,
+    /// Bytes taken in all.
+    total: u64,
     /// Waits until everything is taken.
     waker: Option<Waker>,
 }
 
 impl Pace {
     pub(super) fn new(rate: Rate) -> Arc<Self> {
-        let state = State { offered: 0, taken: 0, since: Instant::now(), waker: None };
+        let state = State { offered: 0, taken: 0, since: Instant::now(), total: 0, waker: None };
         Arc::new(Self { rate, state: Mutex::new(state) })
     }
 
@@ -92,6 +106,7 @@ impl Pace {
         let mut state = self.state();
         state.offered -= bytes;
         state.taken += bytes;
+        state.total += bytes;
         if state.taken >= self.rate.bytes {
             (state.taken, state.since) = (0, Instant::now());
         }
@@ -123,8 +138,9 @@ impl Pace {
             let due = {
                 let state = self.state();
                 // Bytes offered later are due later.
-                if state.offered == 0 { now } else { state.since }
-            } + self.rate.within;
+                let since = if state.offered == 0 { now } else { state.since };
+                since + self.rate.patience(state.total)
+            };
             if due <= now {
                 return;
             }

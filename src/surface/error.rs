@@ -45,8 +45,11 @@ pub enum SurfaceError {
         suggested_resolution: f64,
     },
     /// The spheres would reach more grid bricks than allowed, all spheres together: they overlap each other too often.
-    #[error("the spheres would reach {candidates} grid bricks in total at {resolution} Å, the limit is {limit}; {}",
-        suggested_resolution.map_or_else(|| "smaller radii are needed".to_owned(), |h| format!("{h} Å would fit")))]
+    #[error(
+        "the spheres would reach at least {candidates} grid bricks in total at {resolution} Å, the limit is {limit}; {}",
+        suggested_resolution
+            .map_or_else(|| "a coarser grid or smaller radii reach fewer".to_owned(), |h| format!("{h} Å would fit"))
+    )]
     TooManyCandidates {
         /// Pairs of a sphere and a brick (a lower bound: counting stops soon after the limit).
         candidates: u64,
@@ -54,7 +57,7 @@ pub enum SurfaceError {
         limit: u64,
         /// The spacing asked for, in Å.
         resolution: f64,
-        /// A spacing that would fit, in Å, if there is one.
+        /// A spacing that is certain to fit, in Å, if one is.
         suggested_resolution: Option<f64>,
     },
     /// The mesh would take more bytes than allowed.
