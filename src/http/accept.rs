@@ -27,7 +27,7 @@ use tower::ServiceExt as _;
 use super::guard::Peer;
 use super::io::Guarded;
 use super::kinds::Kind;
-use super::pace::{self, Pace, Rate, Streams};
+use super::pace::{self, MAX_PATIENCE, Pace, Rate, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::stop::{self, Stop};
 use crate::config::ServerConfig;
@@ -44,7 +44,7 @@ const MAX_REFUSALS: usize = 64;
 const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
 /// Bytes of a stream that HTTP/2 buffers while the connection is busy with others.
 const SEND_BUFFER: usize = 64 << 10;
-/// Send buffer that the system keeps for a connection. It takes more from us only when a third of the buffer is free. The
+/// Send buffer that the system keeps for a connection. It accepts more only when a third of the buffer is free. The
 /// megabytes of the default make a steady but slow client look stalled for a minute.
 const SOCKET_BUFFER: usize = 256 << 10;
 /// Unsent bytes that the system buffers for a connection: few enough to see a slow client's progress every few seconds.
@@ -103,7 +103,7 @@ pub(super) async fn serve(
             tracing::debug!(%error, "the client left at once");
             continue;
         }
-        let stream = Guarded::new(stream, Place::new(place), config.write_timeout());
+        let stream = Guarded::new(stream, Place::new(place), MAX_PATIENCE * config.write_timeout());
         connections.spawn(connection(stream, Peer(peer.ip()), router.clone(), Arc::clone(&config), stop.clone()));
     }
     drop(listener);
@@ -273,7 +273,8 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
         .http2()
         .timer(TokioTimer::new())
         .keep_alive_interval(PING)
-        .keep_alive_timeout(PING)
+        // A slow reader answers a ping when it has read what lies before it.
+        .keep_alive_timeout(MAX_PATIENCE * config.write_timeout())
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
         .max_concurrent_streams(config.streams)

@@ -46,7 +46,7 @@ pub(super) struct Rate {
 /// Bytes that let a client pause for one second longer.
 const BYTES_PER_SECOND: u64 = 16 << 10;
 /// Longest time between two signs of progress, as a multiple of the rate's time.
-const MAX_PATIENCE: u32 = 4;
+pub(super) const MAX_PATIENCE: u32 = 4;
 
 impl Rate {
     /// Time for the next bytes of a client that has taken `total` bytes. A client that reads slowly over a fast line takes
