@@ -380,7 +380,7 @@ fn parameters() -> Vec<Row> {
         parameter("a smoothness below zero", "smoothness=-2", "smoothness", "-2"),
         parameter("radii below zero", "radius_offset=-5", "radius_offset", "-5"),
         parameter("an unknown kernel", "kernel=sphere", "kernel", "sphere"),
-        parameter("half of the paper's parameters", "paper_a=1", "paper_b", "nothing"),
+        parameter("half of the paper's parameters", "paper_a=1", "paper_a", "1"),
         parameter("a chain without a name", "chains=,", "chains", ","),
         parameter("a model beyond 32 bits", "model=99999999999", "model", "99999999999"),
         parameter("an altloc of two letters", "altloc=AB", "altloc", "AB"),
