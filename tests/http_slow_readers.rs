@@ -170,7 +170,7 @@ fn stalled_readers_lose_their_streams_and_nothing_else() {
             attacker.grant(1, false);
             attacker.read(Duration::from_millis(20));
         }
-        // What they hold is charged, little, and no files. Their sockets count twice here.
+        // Their memory is charged and small, and they hold no files. Their sockets count twice here.
         let held = server.metric("molmesh_memory_held_bytes", &[]);
         let pieces = held / f64::from(4 * STREAMS) / 16_384.0;
         assert!(pieces < 2.5, "{held} bytes");

@@ -255,7 +255,7 @@ impl<'a> Block<'a> {
             passed.lacking(missing);
             return Ok(None);
         }
-        // Where entities are known, the column is not needed.
+        // The column is not needed if entities are known.
         let layout = if entities { layout.without_sequence_numbers() } else { layout };
         // What is decoded counts as inflated: runs may say in a few bytes what takes many.
         if rows::decoded_bytes(&layout, bounds.rows) > limits.max_inflated_bytes {

@@ -61,7 +61,7 @@ pub(super) fn residue_number(card: &Card) -> Result<(i32, u8), Box<Fault>> {
 /// A line with tab stops every eight columns, and where each of its bytes came from.
 pub(super) fn expand_tabs(line: &[u8]) -> (Vec<u8>, Vec<usize>) {
     let (mut out, mut origin) = (Vec::with_capacity(96), Vec::with_capacity(96));
-    // What lies beyond column 80 is not read; a tab is eight columns at most.
+    // Columns beyond 80 are not read; a tab is eight columns at most.
     for (i, &b) in line.iter().enumerate().take(96) {
         let columns = if b == b'\t' { 8 - out.len() % 8 } else { 1 };
         out.extend(std::iter::repeat_n(if b == b'\t' { b' ' } else { b }, columns));
