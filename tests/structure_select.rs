@@ -95,11 +95,11 @@ fn a_list_of_kinds_that_means_nothing_is_refused() {
     let refused = |list: &str| Selection::default().set_kinds(list).unwrap_err().to_string();
     assert_eq!(
         refused("protein"),
-        "`protein` is no kind of atoms; expected a list of polymer, ligand, water, hydrogens, all"
+        "`protein` is not a kind of atoms; expected a list of polymer, ligand, water, hydrogens, all"
     );
     assert_eq!(
         refused("polymer,,water"),
-        "`` is no kind of atoms; expected a list of polymer, ligand, water, hydrogens, all"
+        "`` is not a kind of atoms; expected a list of polymer, ligand, water, hydrogens, all"
     );
     assert!(refused("").contains("expected a list of"));
     assert!(refused("hydrogens").contains("expected polymer, ligand or water beside it"));

@@ -1,7 +1,8 @@
-//! One alternative location for each residue.
+//! Chooses one alternative location for each residue.
 //!
-//! A residue is a chain, a number and an insertion code: where two residue names share these (microheterogeneity), they
-//! are alternatives of one residue. One letter is taken for the whole residue, so that no bond joins two alternatives.
+//! Chain, number and insertion code identify a residue. Two residue names with the same three values
+//! (microheterogeneity) are alternatives of one residue. The same letter applies to the whole residue, so that bonded
+//! atoms always come from one alternative.
 
 use std::collections::HashMap;
 
@@ -9,7 +10,7 @@ use super::atoms::Structure;
 
 type Residue = (u32, i32, u8);
 
-/// The letter of each residue that has alternatives.
+/// The chosen letter of each residue that has alternatives.
 #[derive(Debug, Default)]
 pub(super) struct Alternatives {
     chosen: HashMap<Residue, u8>,
@@ -23,11 +24,8 @@ struct Letter {
 }
 
 impl Letter {
-    /// Mean occupancy in ten thousandths: files give two or three digits, and a tie must be one.
-    #[expect(
-        clippy::cast_possible_truncation,
-        reason = "an occupancy times ten thousand fits, and saturates otherwise"
-    )]
+    /// Mean occupancy in units of 10⁻⁴. Files give two or three digits, and equal occupancies must compare as equal.
+    #[expect(clippy::cast_possible_truncation, reason = "an occupancy times ten thousand fits; other values saturate")]
     fn rank(&self) -> i64 {
         (self.occupancy / f64::from(self.atoms) * 1e4).round() as i64
     }
@@ -38,8 +36,8 @@ fn residue(structure: &Structure, i: usize) -> Residue {
 }
 
 impl Alternatives {
-    /// Chooses among the atoms of `model`: `wanted` where a residue has it, otherwise the alternative with the highest
-    /// mean occupancy, otherwise the lowest letter.
+    /// Chooses an alternative for each residue of `model`: `wanted` if the residue has it, otherwise the one with the
+    /// highest mean occupancy. The lowest letter wins a tie.
     pub(super) fn choose(structure: &Structure, model: i32, wanted: Option<u8>) -> Self {
         let mut letters: HashMap<Residue, Vec<Letter>> = HashMap::new();
         for i in (0..structure.len()).filter(|&i| structure.altloc[i] != 0 && structure.model[i] == model) {
@@ -61,7 +59,7 @@ impl Alternatives {
         Self { chosen: letters.into_iter().map(|(residue, letters)| (residue, best(letters))).collect() }
     }
 
-    /// Whether atom `i` is common to all alternatives or belongs to the chosen one.
+    /// Returns true if atom `i` is common to all alternatives or belongs to the chosen one.
     pub(super) fn keeps(&self, structure: &Structure, i: usize) -> bool {
         structure.altloc[i] == 0 || self.chosen.get(&residue(structure, i)) == Some(&structure.altloc[i])
     }

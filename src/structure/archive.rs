@@ -1,9 +1,9 @@
-//! A local folder of structure files: entry id in, bytes out.
+//! Local folder of structure files: entry id in, bytes out.
 //!
-//! Layouts: flat (`1abc.cif`, `1abc.pdb`, `pdb1abc.ent`, `1abc.bcif`), and that of the wwPDB's mirrors, divided by the two middle
-//! characters (`ab/1abc.cif.gz`, `ab/pdb1abc.ent.gz`, also under `divided/mmCIF` and `divided/pdb`); every file with
-//! `.gz` or without, mmCIF first, BinaryCIF last. Only a validated id ever becomes part of a path, and a file whose real place is not
-//! in the folder (a link that leads out) does not exist here. Errors name ids, never paths.
+//! Supported layouts: flat (`1abc.cif`, `1abc.pdb`, `pdb1abc.ent`, `1abc.bcif`), and that of wwPDB mirrors, divided by
+//! the two middle characters (`ab/1abc.cif.gz`, `ab/pdb1abc.ent.gz`, also under `divided/mmCIF` and `divided/pdb`).
+//! Every file may have the suffix `.gz`. mmCIF is preferred, BinaryCIF comes last. Only a validated id becomes part of
+//! a path. A symbolic link that points outside the folder is treated as absent. Errors name ids, never paths.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -13,13 +13,13 @@ use std::time::SystemTime;
 
 use thiserror::Error;
 
-/// Why an entry cannot be had.
+/// Errors of fetching an entry.
 #[derive(Debug, Error)]
 pub enum ArchiveError {
-    /// Not an entry's id.
-    #[error("`{id}` is no PDB id; expected four characters such as 4pti, or pdb_ and eight such as pdb_00004pti")]
+    /// The text is not an entry id.
+    #[error("`{id}` is not a PDB id; expected four characters such as 4pti, or pdb_ and eight such as pdb_00004pti")]
     BadId {
-        /// What was given.
+        /// The text that was given.
         id: String,
     },
     /// The folder has no such entry.
@@ -43,18 +43,18 @@ pub enum ArchiveError {
     Io(#[from] io::Error),
 }
 
-/// A valid id of a PDB entry, in lower case: `4pti`, or `pdb_00004pti` where four characters do not say it.
+/// A valid PDB entry id in lower case: `4pti`, or the extended form `pdb_1abc2def` if there is no short one.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct EntryId(String);
 
 impl EntryId {
-    /// The id.
+    /// Returns the id.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
 
-    /// The two characters by which mirrors divide: those before the last one, for ids of four the middle ones.
+    /// Returns the two characters before the last one, by which mirrors divide their folders.
     #[must_use]
     pub fn middle(&self) -> &str {
         &self.0[self.0.len() - 3..self.0.len() - 1]
@@ -70,7 +70,7 @@ impl std::fmt::Display for EntryId {
 impl FromStr for EntryId {
     type Err = ArchiveError;
 
-    /// Accepts `^(?:[0-9][a-z0-9]{3}|pdb_[a-z0-9]{8})$` in any case. `pdb_00001abc` is `1abc`.
+    /// Accepts `^(?:[0-9][a-z0-9]{3}|pdb_[a-z0-9]{8})$` in any case. `pdb_00001abc` becomes `1abc`.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let id = if text.len() <= 12 { text.to_ascii_lowercase() } else { String::new() };
         let plain = |s: &str| s.bytes().all(|b| b.is_ascii_digit() || b.is_ascii_lowercase());
@@ -95,32 +95,32 @@ pub struct Archive {
     max_bytes: u64,
 }
 
-/// Largest file that is read if nothing else is said: the largest entries are below 1 GiB as text.
+/// Default limit of file sizes. The largest entries are below 1 GiB as text.
 pub const MAX_BYTES: u64 = 4 << 30;
 
 impl Archive {
-    /// The folder `dir`, which may appear, vanish or change at any time.
+    /// Creates an archive over the folder `dir`, which may appear, vanish or change at any time.
     #[must_use]
     pub fn new(dir: impl Into<PathBuf>) -> Self {
         Self { dir: dir.into(), max_bytes: MAX_BYTES }
     }
 
-    /// Refuses files of more than `bytes`, as they are on disk.
+    /// Sets the largest accepted file size on disk, bytes.
     #[must_use]
     pub fn with_max_bytes(self, bytes: u64) -> Self {
         Self { max_bytes: bytes, ..self }
     }
 
-    /// The bytes of an entry's file as they are on disk, compressed or not. Blocks.
+    /// Reads the file of an entry, without decompressing it. Blocks.
     ///
     /// # Errors
-    /// Any [`ArchiveError`].
+    /// Returns any [`ArchiveError`].
     pub fn fetch(&self, id: &EntryId) -> Result<Vec<u8>, ArchiveError> {
         let (file, stamp) = self.open(id)?;
         self.read(file, stamp.bytes, id)
     }
 
-    /// The bytes of an entry's file and its stamp; none if the folder, or the entry in it, is not there. Blocks.
+    /// Reads the file of an entry and its stamp. Returns `None` if the folder or the entry does not exist. Blocks.
     ///
     /// # Errors
     /// [`ArchiveError::TooLarge`] and [`ArchiveError::Io`].
@@ -129,7 +129,7 @@ impl Archive {
         Ok(Some((self.read(file, stamp.bytes, id)?, stamp)))
     }
 
-    /// Which file is an entry's now, and how it looks, without reading it; none if it is not there. Blocks.
+    /// Returns the stamp of an entry's file without reading it, or `None` if it does not exist. Blocks.
     ///
     /// # Errors
     /// [`ArchiveError::Io`].
@@ -155,7 +155,7 @@ impl Archive {
             return Err(too_large(bytes));
         }
         let mut out = Vec::with_capacity(usize::try_from(bytes).unwrap_or(0));
-        // The file may grow while it is read.
+        // The file may grow during the read.
         file.take(self.max_bytes.saturating_add(1)).read_to_end(&mut out)?;
         if out.len() as u64 > self.max_bytes {
             return Err(too_large(out.len() as u64));
@@ -164,8 +164,8 @@ impl Archive {
     }
 }
 
-/// Which file an entry's bytes came from, and how it looked: its place, length and time of change. While that stays
-/// the same, so do the bytes, for all that the system says.
+/// Identity of an entry's file: path, length and modification time. The content is assumed to be unchanged while the
+/// stamp is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Stamp {
     path: PathBuf,
@@ -173,7 +173,7 @@ pub struct Stamp {
     modified: Option<SystemTime>,
 }
 
-/// None in place of the errors that say no more than that nothing is there.
+/// Turns errors for absent entries into `None`.
 fn present<T>(found: Result<T, ArchiveError>) -> Result<Option<T>, ArchiveError> {
     match found {
         Ok(found) => Ok(Some(found)),
@@ -183,14 +183,14 @@ fn present<T>(found: Result<T, ArchiveError>) -> Result<Option<T>, ArchiveError>
     }
 }
 
-/// Places where an entry's file may be, relative to the folder, in order of preference.
+/// Returns candidate paths of an entry's file, relative to the folder, in order of preference.
 fn candidates(id: &EntryId) -> Vec<PathBuf> {
     let (id, middle) = (id.as_str(), id.middle());
     let long = id.strip_prefix("pdb_");
     let mut names = vec![(format!("{id}.cif"), "mmCIF")];
     if long.is_none() {
         names.push((format!("pdb_0000{id}.cif"), "mmCIF"));
-        // Extended ids have no file in the PDB format.
+        // Entries with an extended id have no file in PDB format.
         names.push((format!("{id}.pdb"), "pdb"));
         names.push((format!("pdb{id}.ent"), "pdb"));
     }
@@ -210,7 +210,7 @@ fn candidates(id: &EntryId) -> Vec<PathBuf> {
     out
 }
 
-/// Opens `root/candidate` if it is a file whose real place is inside `root`.
+/// Opens `root/candidate` if it is a regular file whose canonical path is inside `root`.
 fn open_inside(root: &Path, candidate: &Path) -> io::Result<Option<File>> {
     let real = match root.join(candidate).canonicalize() {
         Ok(real) => real,
@@ -220,7 +220,7 @@ fn open_inside(root: &Path, candidate: &Path) -> io::Result<Option<File>> {
     if !real.starts_with(root) {
         return Ok(None);
     }
-    // Asked before it is opened: opening a pipe waits for its other end.
+    // Checked before opening, because opening a named pipe blocks.
     match std::fs::metadata(&real).and_then(|data| if data.is_file() { File::open(&real).map(Some) } else { Ok(None) })
     {
         Err(e) if is_absent(&e) => Ok(None),
@@ -228,7 +228,7 @@ fn open_inside(root: &Path, candidate: &Path) -> io::Result<Option<File>> {
     }
 }
 
-/// A missing file, a file where a folder would have to be, a link that leads nowhere.
+/// Returns true for errors that mean "not found": a missing file, a file in place of a folder, a dangling link.
 fn is_absent(e: &io::Error) -> bool {
     matches!(e.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory)
 }

@@ -1,5 +1,5 @@
-//! One row of `atom_site` to one atom, whether the row is text or binary: what its items mean, which stand in for others,
-//! and what is said where they are missing or wrong.
+//! Converts rows of the mmCIF category `atom_site` to atoms, for text and binary files alike. Defines the meaning of
+//! every item, the fallback for missing items, and the errors for invalid ones.
 
 use std::collections::HashMap;
 
@@ -12,16 +12,16 @@ use super::read::MAX_COORDINATE;
 use super::text;
 use super::warnings::Warnings;
 
-/// Longest name of an atom, a residue or a chain, bytes: the dictionary's have five.
+/// Longest name of an atom, residue or chain, bytes. Names in the dictionary have up to five characters.
 const MAX_NAME: usize = 255;
 
-/// No such column.
+/// Marks a column that does not exist.
 pub(super) const NONE: usize = usize::MAX;
 
-/// Where the items stand in a row; an item that is not there stands at [`NONE`].
+/// Column index of each item in a row; [`NONE`] for missing items.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Layout {
-    /// Items of a row.
+    /// Number of items in a row.
     pub(super) width: usize,
     group: usize,
     element: usize,
@@ -42,10 +42,10 @@ pub(super) struct Layout {
 const POSITION: [&str; 3] = ["Cartn_x", "Cartn_y", "Cartn_z"];
 
 impl Layout {
-    /// The layout of rows of `width` items, of which `find` gives the place by name.
+    /// Returns the layout of rows of `width` items. `find` returns the index of an item by name.
     pub(super) fn new(width: usize, find: impl Fn(&str) -> Option<usize>) -> Self {
         let column = |item: &str| find(item).unwrap_or(NONE);
-        // The author's item, then the dictionary's.
+        // The author's item comes first, the dictionary's item is the fallback.
         let pair = |auth: &str, label: &str| match (column(auth), column(label)) {
             (NONE, label) => [label, NONE],
             (auth, label) => [auth, label],
@@ -69,14 +69,14 @@ impl Layout {
         }
     }
 
-    /// The coordinates that are missing, for [`Passed::lacking`]; `None` if all are there.
+    /// Describes missing coordinate items for [`Passed::lacking`]. Returns `None` if all exist.
     pub(super) fn missing(&self) -> Option<String> {
         let missing: Vec<&str> =
             POSITION.iter().zip(self.position).filter(|(_, column)| *column == NONE).map(|(item, _)| *item).collect();
         (!missing.is_empty()).then(|| format!("atom_site without {}", missing.join(", ")))
     }
 
-    /// Columns of texts. The second of a pair stands in where the first says nothing.
+    /// Returns the text columns. The second of a pair is the fallback for rows where the first has no value.
     pub(super) fn texts(&self) -> [[usize; 2]; 8] {
         let alone = |column| [column, NONE];
         let (names, others) = ([self.name, self.residue, self.chain], [self.group, self.element]);
@@ -86,7 +86,7 @@ impl Layout {
         [group, element, name, residue, chain, code, altloc, label]
     }
 
-    /// Columns of numbers, likewise.
+    /// Returns the number columns, in the same form.
     pub(super) fn numbers(&self) -> [[usize; 2]; 8] {
         let [x, y, z] = self.position;
         let others = [x, y, z, self.occupancy, self.b_factor, self.model, self.sequence_number];
@@ -94,13 +94,13 @@ impl Layout {
         [self.number, x, y, z, occupancy, b_factor, model, sequence]
     }
 
-    /// Leaves out `label_seq_id`, except as a fallback for the author's number.
+    /// Removes `label_seq_id`, except as a fallback for the author's number.
     pub(super) fn without_sequence_numbers(self) -> Self {
         Self { sequence_number: NONE, ..self }
     }
 }
 
-/// `text[start..end]`, with what stands around it.
+/// A range of a text: `text[start..end]`. Fast number parsing may read beyond it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Span<'a> {
     pub(super) text: &'a [u8],
@@ -121,48 +121,48 @@ impl<'a> Span<'a> {
         self.end - self.start
     }
 
-    /// The number that the text writes.
+    /// Parses a real number.
     #[inline]
     pub(super) fn real(self) -> Result<f64, Wrong> {
         number::real(self.text, self.start, self.end).ok_or(Wrong)
     }
 
-    /// The whole number that the text writes.
+    /// Parses an integer.
     #[inline]
     pub(super) fn integer(self) -> Result<i32, Wrong> {
         number::integer(self.bytes()).ok_or(Wrong)
     }
 }
 
-/// A value is there, but is no number, or none that fits.
+/// Error for a value that is not a number or is out of range.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Wrong;
 
-/// A row, wherever its values come from. Nothing stands at [`NONE`].
+/// A row of text or binary data. Column [`NONE`] never has a value.
 pub(super) trait Row {
-    /// What is said of a value that is wrong.
+    /// Error type for invalid values.
     type Fault;
 
-    /// The text at a column; `None` if nothing stands there.
+    /// Returns the text in a column, or `None` if there is no value.
     fn text(&self, column: usize) -> Option<Span<'_>>;
 
-    /// The number at a column.
+    /// Returns the real number in a column.
     #[inline]
     fn real(&self, column: usize) -> Result<Option<f64>, Wrong> {
         self.text(column).map(Span::real).transpose()
     }
 
-    /// The whole number at a column.
+    /// Returns the integer in a column.
     #[inline]
     fn integer(&self, column: usize) -> Result<Option<i32>, Wrong> {
         self.text(column).map(Span::integer).transpose()
     }
 
-    /// The error for what stands at a column.
+    /// Returns the error for an invalid value in a column.
     fn fault(&self, column: usize, expected: String) -> Self::Fault;
 }
 
-/// Turns rows into atoms.
+/// Converts rows to atoms.
 #[derive(Debug)]
 pub(super) struct AtomSite<F> {
     pub(super) layout: Layout,
@@ -194,7 +194,7 @@ impl<F> AtomSite<F> {
             self.tables.label_chain.intern(span.text, span.start, span.end)
         };
         let hetero = self.hetero(row);
-        // Sequence numbers only matter for HETATM records, of which there are few.
+        // Sequence numbers matter only for HETATM records, which are few.
         let in_sequence = !hetero || matches!(row.integer(layout.sequence_number), Ok(Some(_)));
         Ok(Atom {
             position,
@@ -214,7 +214,7 @@ impl<F> AtomSite<F> {
         })
     }
 
-    /// A number that may be left out. One that cannot be read is replaced by the default, with a warning.
+    /// Reads an optional number. An unreadable one is replaced by the default, with a warning.
     #[inline]
     fn optional<R: Row<Fault = F>>(&mut self, row: &R, column: usize, default: (f32, &'static str), what: &str) -> f32 {
         match row.real(column) {
@@ -267,7 +267,7 @@ fn coordinate<R: Row>(row: &R, layout: &Layout, axis: usize) -> Result<f64, R::F
     Err(row.fault(column, format!("{} in Å, within ±{MAX_COORDINATE}", POSITION[axis])))
 }
 
-/// A name, empty where there is none.
+/// Returns a name, which is empty if there is none.
 #[inline]
 fn name<R: Row>(row: &R, columns: [usize; 2]) -> Result<Span<'_>, R::Fault> {
     match row.text(columns[0]).or_else(|| row.text(columns[1])) {
@@ -294,13 +294,13 @@ fn character<R: Row>(row: &R, column: usize, what: &str) -> Result<u8, R::Fault>
     match row.text(column) {
         None => Ok(0),
         Some(span) if span.len() == 1 => Ok(span.text[span.start]),
-        // An empty or blank quoted value is another way to say that there is none.
+        // An empty or blank quoted value counts as missing.
         Some(span) if span.bytes().iter().all(|&b| b == b' ') => Ok(0),
         Some(_) => Err(row.fault(column, format!("{what} of one character, ? or ."))),
     }
 }
 
-/// What was passed on the way to the atoms, for the message when there are none.
+/// Blocks and categories that the reader passed, for the error message of a file without atoms.
 #[derive(Debug, Default)]
 pub(super) struct Passed {
     categories: Vec<String>,
@@ -308,31 +308,31 @@ pub(super) struct Passed {
 }
 
 impl Passed {
-    /// So many categories are named.
+    /// Largest number of categories in the message.
     const KEPT: usize = 10;
 
     pub(super) fn block(&mut self) {
         self.blocks += 1;
     }
 
-    /// Whether more categories would not be named.
+    /// Returns true if the message has no place for more categories.
     pub(super) fn is_full(&self) -> bool {
         self.categories.len() >= Self::KEPT
     }
 
-    /// A category without coordinates, as [`Layout::missing`] names it: named whatever else was passed.
+    /// Notes an `atom_site` without coordinates, described by [`Layout::missing`]. It is always part of the message.
     pub(super) fn lacking(&mut self, missing: String) {
         self.categories.push(missing);
     }
 
-    /// A category, by name without underscore.
+    /// Notes a category, by its name without underscore.
     pub(super) fn category(&mut self, name: impl AsRef<str> + Into<String>) {
         if !self.is_full() && !self.categories.iter().any(|c| c == name.as_ref()) {
             self.categories.push(name.into());
         }
     }
 
-    /// The error of a file in this `format` that has come to its end, in this block, without atoms.
+    /// Returns the error for a file of this `format` that ends, in this block, without atoms.
     pub(super) fn no_atoms(self, format: &str, block: Option<String>) -> StructureError {
         let block = block.map_or_else(|| "no named data block".to_owned(), |b| format!("data block {b}"));
         let more = if self.blocks > 1 { format!(" (the last of {})", self.blocks) } else { String::new() };

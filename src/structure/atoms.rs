@@ -1,4 +1,4 @@
-//! Atoms of a structure file as a structure of arrays.
+//! Atoms of a structure file, stored as a structure of arrays.
 
 use super::contents::Kind;
 use super::kinds::{self, Sequence};
@@ -16,7 +16,7 @@ pub enum SourceFormat {
 }
 
 impl SourceFormat {
-    /// `pdb`, `mmcif` or `bcif`.
+    /// Returns `pdb`, `mmcif` or `bcif`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -27,15 +27,15 @@ impl SourceFormat {
     }
 }
 
-/// Atoms of every model of a file, in file order. All columns have the same length, `label_chain` excepted.
-/// An atom takes 61 bytes.
+/// Atoms of all models of a file, in file order. All columns have the same length, except that `label_chain` may be
+/// empty. An atom takes 61 bytes.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Structure {
-    /// Where it came from.
+    /// Format of the source file.
     pub format: SourceFormat,
-    /// PDB id or data block name, if the file says one.
+    /// PDB id or data block name, if the file has one.
     pub id: Option<String>,
-    /// Title, if the file says one.
+    /// Title, if the file has one.
     pub title: Option<String>,
     /// Coordinates, Å.
     pub x: Vec<f64>,
@@ -45,55 +45,55 @@ pub struct Structure {
     pub z: Vec<f64>,
     /// Atomic numbers; 0 where the element is unknown, 1 for deuterium.
     pub element: Vec<u8>,
-    /// Atom names without padding: `CA`, `O5'`; the author's where the file has two.
+    /// Atom names without padding, such as `CA` and `O5'`. Author names (`auth_*`) take precedence.
     pub name: TextColumn,
-    /// Residue names: `ALA`, `HOH`; the author's where the file has two.
+    /// Residue names, such as `ALA` and `HOH`. Author names (`auth_*`) take precedence.
     pub residue: TextColumn,
-    /// Chains by author name; a PDB file's blank chain is the empty text.
+    /// Author names of chains. The blank chain of a PDB file is the empty string.
     pub chain: TextColumn,
-    /// Chains as mmCIF numbers them (`label_asym_id`); empty for PDB files and where there is no such column.
+    /// mmCIF chain ids (`label_asym_id`). Empty for PDB files and for files without this column.
     pub label_chain: TextColumn,
-    /// Residue numbers as the author gives them; 0 where the file leaves them blank.
+    /// Author residue numbers; 0 if the file has none.
     pub residue_number: Vec<i32>,
-    /// Insertion codes as Latin-1 characters; 0 where there is none.
+    /// Insertion codes as Latin-1 characters; 0 if there is none.
     pub insertion_code: Vec<u8>,
-    /// Alternative locations as Latin-1 characters; 0 where there is none.
+    /// Alternative locations as Latin-1 characters; 0 if there is none.
     pub altloc: Vec<u8>,
-    /// Occupancies; 1 where the file gives none.
+    /// Occupancies; 1 if the file has none.
     pub occupancy: Vec<f32>,
-    /// Isotropic displacement (B-factor), Å²; 0 where the file gives none.
+    /// Isotropic displacement parameters (B-factors), Å²; 0 if the file has none.
     pub b_factor: Vec<f32>,
     /// Model numbers.
     pub model: Vec<i32>,
-    /// Whether the record was HETATM.
+    /// True for HETATM records.
     pub hetero: Vec<bool>,
-    /// Kinds of atoms.
+    /// Kinds: polymer, ligand, water or virtual site.
     pub kind: Vec<Kind>,
-    /// Messages about values that could not be read and were replaced by a default; a bounded number.
+    /// Messages about unreadable values that were replaced by a default. Their number is bounded.
     pub warnings: Vec<String>,
 }
 
 impl Structure {
-    /// Number of atoms in all models.
+    /// Returns the number of atoms in all models.
     #[must_use]
     pub fn len(&self) -> usize {
         self.element.len()
     }
 
-    /// Whether the file holds no atom.
+    /// Returns true if there is no atom.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.element.is_empty()
     }
 
-    /// Whether atom `i` is hydrogen or deuterium.
+    /// Returns true if atom `i` is hydrogen or deuterium.
     #[must_use]
     pub fn is_hydrogen(&self, i: usize) -> bool {
         self.element[i] == 1
     }
 }
 
-/// One atom on its way into the columns; texts are ids of the [`Tables`].
+/// One row of the columns. Texts are ids into the [`Tables`].
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Atom {
     pub(super) position: [f64; 3],
@@ -109,11 +109,11 @@ pub(super) struct Atom {
     pub(super) b_factor: f32,
     pub(super) model: i32,
     pub(super) hetero: bool,
-    /// Polymer or ligand; [`kinds::assign`] decides when all atoms are known.
+    /// Polymer or ligand. [`kinds::assign`] makes the final decision when all atoms have been read.
     pub(super) kind: Kind,
 }
 
-/// Parts of a structure that are not columns.
+/// Fields of a structure that are not columns.
 #[derive(Debug)]
 pub(super) struct Source {
     pub(super) format: SourceFormat,
@@ -123,7 +123,7 @@ pub(super) struct Source {
     pub(super) warnings: Vec<String>,
 }
 
-/// The texts that atoms refer to while they are read.
+/// String tables that atoms refer to while a file is read.
 #[derive(Debug, Default)]
 pub(super) struct Tables {
     pub(super) name: Interner,
@@ -134,12 +134,12 @@ pub(super) struct Tables {
 
 macro_rules! columns {
     ($($field:ident: $type:ty = $from:expr),+ $(,)?) => {
-        /// Columns while they are read.
+        /// Columns that are being filled.
         #[derive(Debug, Default)]
         pub(super) struct Columns { $(pub(super) $field: Vec<$type>),+ }
 
         impl Columns {
-            /// Room for exactly `n` more atoms.
+            /// Reserves memory for exactly `n` more atoms.
             pub(super) fn reserve(&mut self, n: usize) {
                 $(self.$field.reserve_exact(n);)+
             }
@@ -149,17 +149,17 @@ macro_rules! columns {
                 $(self.$field.push($from(atom));)+
             }
 
-            /// `n` atoms of zeros, to be filled through [`Self::slices`].
+            /// Returns `n` zeroed atoms, to be filled through [`Self::slices`].
             pub(super) fn zeroed(n: usize) -> Self {
                 Self { $($field: vec![<$type>::default(); n]),+ }
             }
 
-            /// All columns, to be split and filled by several threads.
+            /// Returns mutable slices of all columns, which can be split among threads.
             pub(super) fn slices(&mut self) -> Slices<'_> {
                 Slices { next: 0, $($field: &mut self.$field),+ }
             }
 
-            /// Gives back room that was reserved and not used, unless it is little.
+            /// Releases unused capacity if it is large.
             fn shrink(&mut self) {
                 $(if self.$field.capacity() > self.$field.len() + self.$field.len() / 8 + 1024 {
                     self.$field.shrink_to_fit();
@@ -167,18 +167,18 @@ macro_rules! columns {
             }
         }
 
-        /// A range of rows of the columns, filled from its beginning.
+        /// A range of rows, filled from its beginning.
         #[derive(Debug)]
         pub(super) struct Slices<'a> { next: usize, $(pub(super) $field: &'a mut [$type]),+ }
 
         impl<'a> Slices<'a> {
-            /// The first `n` rows, and the others.
+            /// Splits off the first `n` rows.
             pub(super) fn split(self, n: usize) -> (Self, Self) {
                 $(let $field = self.$field.split_at_mut(n);)+
                 (Slices { next: 0, $($field: $field.0),+ }, Slices { next: 0, $($field: $field.1),+ })
             }
 
-            /// Fills the next row; `false` if there is none left.
+            /// Fills the next row. Returns false if none is left.
             #[inline]
             pub(super) fn put(&mut self, atom: &Atom) -> bool {
                 let i = self.next;
@@ -213,12 +213,12 @@ columns! {
 }
 
 impl Slices<'_> {
-    /// Whether every row was filled.
+    /// Returns true if every row has been filled.
     pub(super) fn is_full(&self) -> bool {
         self.next == self.element.len()
     }
 
-    /// Replaces ids of another reader's tables by ids of `tables`, which learn the texts they lack.
+    /// Translates ids of the tables `from` into ids of `tables`, which receive the missing texts.
     pub(super) fn adopt(&mut self, from: &Tables, tables: &mut Tables) {
         tables.name.adopt(&from.name, self.name);
         tables.residue.adopt(&from.residue, self.residue);
@@ -232,7 +232,7 @@ impl Columns {
         self.element.len()
     }
 
-    /// The finished structure.
+    /// Returns the finished structure.
     pub(super) fn finish(mut self, tables: Tables, source: Source) -> Structure {
         kinds::assign(&mut self, &tables, &source.sequence);
         if tables.label_chain.is_empty() {

@@ -1,13 +1,13 @@
-//! The CIF 1.1 grammar as a stream of tokens: S. R. Hall, J. D. Westbrook et al., *Specification of the Crystallographic
-//! Information File*, International Tables for Crystallography G, chapter 2.2.
+//! Tokenizer for the CIF 1.1 grammar. Source: S. R. Hall, J. D. Westbrook et al., *Specification of the
+//! Crystallographic Information File*, International Tables for Crystallography G, chapter 2.2.
 //!
-//! Every byte up to a blank counts as white space, and `[`, `]` and `$` begin plain values like any other character:
-//! files that do so have one meaning only.
+//! Two relaxations, neither of which is ambiguous: every byte up to the space character counts as white space, and `[`,
+//! `]` and `$` may begin a plain value.
 
 use super::scan::run_length;
 use super::text::Fault;
 
-/// What a token is.
+/// Kind of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     /// `data_NAME`.
@@ -16,7 +16,7 @@ pub(super) enum Kind {
     Save,
     /// `loop_`.
     Loop,
-    /// `stop_` or `global_`: reserved words without a meaning here.
+    /// `stop_` or `global_`: reserved words that the reader does not use.
     Reserved,
     /// `_category.item`.
     Tag,
@@ -26,7 +26,7 @@ pub(super) enum Kind {
     End,
 }
 
-/// A token and where it stands.
+/// A token and its byte range.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Token {
     pub(super) kind: Kind,
@@ -46,7 +46,7 @@ impl<'a> Tokenizer<'a> {
         Self { text, at: 0 }
     }
 
-    /// The next token; [`Kind::End`] again and again at the end.
+    /// Returns the next token. At the end, every call returns [`Kind::End`].
     pub(super) fn next(&mut self) -> Result<Token, Box<Fault>> {
         self.skip_blanks();
         let text = self.text;
@@ -64,18 +64,18 @@ impl<'a> Tokenizer<'a> {
         }
     }
 
-    /// White space and comments.
+    /// Skips white space and comments.
     fn skip_blanks(&mut self) {
         let mut comment = false;
         let blanks = self.text[self.at..].iter().position(|&b| {
-            // Neither is searched for with vectors: both are short, unless somebody wants to be slow.
+            // Both are short in real files, so a vectorized search does not pay.
             comment = if comment { b != b'\n' && b != b'\r' } else { b == b'#' };
             !comment && b > b' '
         });
         self.at = blanks.map_or(self.text.len(), |n| self.at + n);
     }
 
-    /// A quote ends a value only where white space follows it, and not beyond its line.
+    /// Reads a quoted value. A quote ends it only if white space follows, and on the same line.
     fn quoted(&mut self, quote: u8) -> Result<Token, Box<Fault>> {
         let start = self.at;
         let mut before = 0;
@@ -85,7 +85,7 @@ impl<'a> Tokenizer<'a> {
             ends
         });
         let end = blank.map_or(self.text.len(), |n| start + 1 + n);
-        // The opening quote is no closing one, even if nothing stands between it and a blank.
+        // The opening quote is not a closing one, even if a space follows it directly.
         if end > start + 1 && self.text[end - 1] == quote {
             self.at = end;
             return Ok(Token { kind: Kind::Value, start, end });
@@ -93,7 +93,7 @@ impl<'a> Tokenizer<'a> {
         Err(Fault::token(self.text, start, end, format!("a closing {} on the same line", char::from(quote))))
     }
 
-    /// A text field reaches from a semicolon at the start of a line to the next one.
+    /// Reads a text field, which reaches from a semicolon at the start of a line to the next such semicolon.
     fn text_field(&mut self) -> Result<Token, Box<Fault>> {
         let start = self.at;
         match line_beginning_with_semicolon(self.text, start + 1) {
@@ -106,20 +106,20 @@ impl<'a> Tokenizer<'a> {
     }
 }
 
-/// Most tokens are shorter than what it takes to look at many bytes at once.
+/// Returns the length of the token. A plain loop, because most tokens are too short for a vectorized search.
 fn token_length(text: &[u8]) -> usize {
     let short = text.iter().take(32).position(|&b| b <= b' ');
     short.unwrap_or_else(|| run_length(text, true))
 }
 
-/// The first semicolon from `at` on that begins a line.
+/// Returns the first semicolon at or after `at` that begins a line.
 fn line_beginning_with_semicolon(text: &[u8], mut at: usize) -> Option<usize> {
     loop {
         at += memchr::memchr(b';', &text[at..])?;
         if at_line_start(text, at) {
             return Some(at);
         }
-        // No other one on this line can be the first.
+        // No other semicolon on this line can begin a line.
         at += memchr::memchr2(b'\n', b'\r', &text[at..])?;
     }
 }
@@ -128,7 +128,7 @@ fn at_line_start(text: &[u8], at: usize) -> bool {
     at == 0 || matches!(text[at - 1], b'\n' | b'\r')
 }
 
-/// What a token without quotes is.
+/// Returns the kind of an unquoted token.
 pub(super) fn bare_kind(token: &[u8]) -> Kind {
     if token[0] == b'_' {
         return Kind::Tag;
@@ -150,7 +150,7 @@ pub(super) fn bare_kind(token: &[u8]) -> Kind {
     }
 }
 
-/// A value's own text, without quotes or the semicolons of a text field, and whether it had some.
+/// Returns the range of a value without quotes or text field semicolons, and true if it had any.
 #[inline]
 pub(super) fn unquote(text: &[u8], start: usize, end: usize) -> (usize, usize, bool) {
     match text[start] {
@@ -165,7 +165,7 @@ fn unquote_slow(text: &[u8], start: usize, end: usize) -> (usize, usize, bool) {
     if first != b';' {
         return (start + 1, end - 1, true);
     }
-    // A semicolon elsewhere than at a line's start is a character like any other.
+    // A semicolon that does not begin a line is an ordinary character.
     if !at_line_start(text, start) || end < start + 3 {
         return (start, end, false);
     }

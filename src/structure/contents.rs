@@ -1,11 +1,11 @@
-//! What a structure holds, for people who wonder what to select.
+//! Summary of a structure: models, chains and counts of atoms by kind.
 
 use std::fmt;
 
 use super::atoms::Structure;
 use super::text::list;
 
-/// What an atom belongs to.
+/// Kind of molecule that an atom belongs to.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum Kind {
     /// Chains of amino acids and nucleotides: ATOM records, and the HETATM residues of a chain.
@@ -20,7 +20,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// `polymer`, `ligand`, `water` or `virtual`.
+    /// Returns `polymer`, `ligand`, `water` or `virtual`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -32,23 +32,23 @@ impl Kind {
     }
 }
 
-/// Atoms by kind; hydrogens and deuterium are counted by themselves.
+/// Numbers of atoms by kind. Hydrogen and deuterium are counted separately.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// Polymer without its hydrogens.
+    /// Polymer atoms without hydrogens.
     pub polymer: u64,
-    /// Ligands and ions without their hydrogens.
+    /// Ligand and ion atoms without hydrogens.
     pub ligand: u64,
-    /// Water without its hydrogens.
+    /// Water atoms without hydrogens.
     pub water: u64,
     /// Hydrogen and deuterium of all kinds.
     pub hydrogens: u64,
-    /// Sites that are not atoms.
+    /// Virtual sites.
     pub virtual_sites: u64,
 }
 
 impl Counts {
-    /// Atoms and virtual sites of all kinds.
+    /// Returns the total number of atoms and virtual sites.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.polymer + self.ligand + self.water + self.hydrogens + self.virtual_sites
@@ -77,33 +77,33 @@ impl fmt::Display for Counts {
 /// One chain of a model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ChainContents {
-    /// Author name; empty where the file leaves it blank.
+    /// Author name; empty if blank in the file.
     pub name: String,
-    /// Its atoms.
+    /// Numbers of its atoms by kind.
     pub counts: Counts,
 }
 
-/// What a structure holds.
+/// Contents of a structure.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Contents {
-    /// Atoms in all models.
+    /// Number of atoms in all models.
     pub atoms: u64,
     /// Model numbers, in order of first appearance.
     pub models: Vec<i32>,
     /// The model that the counts below describe.
     pub model: i32,
-    /// Atoms of that model, every alternative location.
+    /// Numbers of atoms of that model, including all alternative locations.
     pub counts: Counts,
-    /// Atoms of that model that have an alternative location.
+    /// Number of atoms of that model that have an alternative location.
     pub alternatives: u64,
-    /// Atoms of that model whose element is unknown.
+    /// Number of atoms of that model whose element is unknown.
     pub unknown_elements: u64,
     /// Chains of that model, in order of first appearance.
     pub chains: Vec<ChainContents>,
 }
 
 impl Contents {
-    /// Counts what `model` holds, the first of the file by default; a model that is not there holds nothing.
+    /// Summarizes `model`, by default the first one of the file. A model that does not exist has no atoms.
     #[must_use]
     pub fn of(structure: &Structure, model: Option<i32>) -> Self {
         let models = models(structure);
@@ -117,7 +117,7 @@ impl Contents {
             unknown_elements: 0,
             chains: Vec::new(),
         };
-        // Where each of the chain column's texts stands among the chains of this model.
+        // Index of each text of the chain column among the chains of this model.
         let mut chain_at = vec![usize::MAX; structure.chain.texts().len()];
         for i in (0..structure.len()).filter(|&i| structure.model[i] == model) {
             let (kind, hydrogen) = (structure.kind[i], structure.is_hydrogen(i));
@@ -136,14 +136,14 @@ impl Contents {
         contents
     }
 
-    /// Chains for a message.
+    /// Lists chains for a message.
     #[must_use]
     pub(super) fn chain_list(&self) -> String {
         let names = self.chains.iter().map(|c| shown(&c.name));
         format!("{} {}", plural(self.chains.len(), "chain"), list(names, self.chains.len()))
     }
 
-    /// Models for a message.
+    /// Lists models for a message.
     #[must_use]
     pub(super) fn model_list(&self) -> String {
         format!(
@@ -162,7 +162,7 @@ fn shown(chain: &str) -> String {
     if chain.is_empty() { "(blank)".to_owned() } else { chain.to_owned() }
 }
 
-/// Distinct model numbers, in order of first appearance.
+/// Returns the distinct model numbers, in order of first appearance.
 fn models(structure: &Structure) -> Vec<i32> {
     let mut seen = std::collections::HashSet::new();
     let mut models = Vec::new();

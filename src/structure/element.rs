@@ -1,8 +1,8 @@
-//! Elements: symbols to atomic numbers, and a guess where a file leaves the element out.
+//! Converts element symbols to atomic numbers, and guesses the element if a file does not give it.
 //!
-//! An atom name such as `CA` is a carbon or a calcium. PDB files right-align the symbol in the name's first two
-//! columns, so ` CA ` is a carbon and `CA  ` a calcium; what the residue is outweighs that, because files with
-//! carelessly placed names are common and calcium inside an alanine is not.
+//! An atom name such as `CA` is a carbon or a calcium. PDB files right-align the symbol in the first two columns of the
+//! name, so ` CA ` is a carbon and `CA  ` a calcium. The residue takes precedence over the alignment, because files
+//! with misaligned names are common and calcium inside an alanine is not.
 
 use super::residue;
 
@@ -33,7 +33,8 @@ const BY_LETTERS: [u8; 1024] = {
     table
 };
 
-/// Atomic number of a symbol in any case, `D` being 1; 0 if it is none. A charge behind it (`FE3+`, `O1-`) is ignored.
+/// Returns the atomic number of a symbol in any case, or 0 if there is no such element. `D` is 1. A charge after the
+/// symbol (`FE3+`, `O1-`) is ignored.
 #[inline]
 #[must_use]
 pub fn atomic_number(symbol: &[u8]) -> u8 {
@@ -47,23 +48,23 @@ pub fn atomic_number(symbol: &[u8]) -> u8 {
     }
 }
 
-/// Two-letter elements that are believed from a name alone, as in `CL1`, `FE`, `BR12`: those whose letters are no carbon,
-/// nitrogen, oxygen, sulphur, phosphorus or hydrogen with a Greek remoteness letter behind it.
+/// Two-letter elements that an atom name alone identifies, as in `CL1`, `FE`, `BR12`. Their letters cannot be read as
+/// carbon, nitrogen, oxygen, sulphur, phosphorus or hydrogen followed by a remoteness letter.
 const SURE: &[&[u8; 2]] = &[
     b"CL", b"BR", b"FE", b"ZN", b"MG", b"MN", b"CU", b"NI", b"NA", b"LI", b"AL", b"SI", b"SE", b"AS", b"RU", b"RH",
     b"PT", b"AU", b"AG", b"IR", b"MO", b"SR", b"RB", b"TI", b"ZR", b"GA", b"XE", b"KR", b"YB", b"GD", b"LA", b"TL",
 ];
 
-/// An atom name as a file gives it.
+/// An atom name as the file writes it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Name<'a> {
     /// Without padding.
     pub(super) text: &'a [u8],
-    /// The four columns of a PDB file, where their alignment can be trusted.
+    /// The four name columns of a PDB file, if their alignment can be trusted.
     pub(super) columns: Option<[u8; 4]>,
 }
 
-/// The element that an atom's name and residue suggest; 0 if they suggest none.
+/// Guesses the atomic number from the names of atom and residue. Returns 0 if they suggest none.
 pub(super) fn guess(name: Name<'_>, residue: &str) -> u8 {
     let upper = name.text.to_ascii_uppercase();
     let letters_at = upper.iter().position(u8::is_ascii_alphabetic).unwrap_or(upper.len());
@@ -78,19 +79,19 @@ pub(super) fn guess(name: Name<'_>, residue: &str) -> u8 {
     if residue::is_polymer(residue) || residue::is_water(residue) {
         return if letters.starts_with(b"SE") && matches!(residue, "MSE" | "SEC") { 34 } else { single };
     }
-    // A digit first is a hydrogen's or a carbon's number, never a metal's.
+    // A leading digit numbers a hydrogen or a carbon, never a metal.
     let two = if letters_at == 0 { letters.get(..2) } else { None };
     match (two, name.columns) {
-        // ` CL1`: a symbol of one letter, by its place. `1HB `: a number first.
+        // ` CL1`: a symbol of one letter, by its alignment. `1HB `: a leading number.
         (_, Some([b' ', ..])) | (None, _) => single,
-        // `HG11`, `CA12`, `NB1A`: all columns used, so the place says nothing; hydrogens and carbons are likelier.
+        // `HG11`, `CA12`, `NB1A`: all columns are used, so there is no alignment. Hydrogen and carbon are likelier.
         (Some(two), Some([_, _, _, last])) if last != b' ' => sure(two, n_letters).unwrap_or(single),
         (Some(two), Some(_)) => aligned_left(two, residue).unwrap_or(single),
         (Some(two), None) => sure(two, n_letters).unwrap_or(single),
     }
 }
 
-/// A residue of one atom that bears its name: `CA` in `CA`, `CL` in `CL-`, `NA` in `Na+`, `SOD` in `SOD`.
+/// Returns the element of a monatomic residue named like its atom: `CA` in `CA`, `CL` in `CL-`, `SOD` in `SOD`.
 fn single_ion(letters: &[u8], residue: &str) -> Option<u8> {
     let bare: Vec<u8> = residue.bytes().filter(u8::is_ascii_alphabetic).map(|b| b.to_ascii_uppercase()).collect();
     if bare != letters {
@@ -103,10 +104,10 @@ fn sure(two: &[u8], n_letters: usize) -> Option<u8> {
     (n_letters == 2 && SURE.iter().any(|s| s.as_slice() == two)).then(|| atomic_number(two))
 }
 
-/// A symbol of two letters in the first two columns, as the format wants it.
+/// Returns the element of a two-letter symbol in the first two columns, where the format puts it.
 fn aligned_left(two: &[u8], residue: &str) -> Option<u8> {
-    // Left-justified hydrogens (`HO1 `, `HE  `) are commoner than helium, holmium, hafnium and hassium, and deuterium than
-    // dysprosium: the residue has to name these.
+    // Left-justified hydrogens (`HO1 `, `HE  `) are commoner than helium, holmium, hafnium and hassium, and deuterium
+    // is commoner than dysprosium. These elements are accepted only if the residue names them.
     let rare = matches!(two, b"HE" | b"HO" | b"HF" | b"HS" | b"DY" | b"DB" | b"DS");
     let named = residue.as_bytes().get(..2).is_some_and(|r| r.eq_ignore_ascii_case(two));
     (!rare || named).then(|| atomic_number(two)).filter(|&z| z != 0)

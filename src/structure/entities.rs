@@ -4,7 +4,7 @@
 
 use std::collections::{HashMap, HashSet};
 
-/// The items that are read, by category and name.
+/// Items to read, by category and name.
 pub(super) const ITEMS: [(&str, &str); 5] = [
     ("entity", "id"),
     ("entity", "type"),
@@ -13,7 +13,7 @@ pub(super) const ITEMS: [(&str, &str); 5] = [
     ("struct_asym", "entity_id"),
 ];
 
-/// Most values of an item. The archive's largest entries have some ten thousand chains.
+/// Largest number of values of an item. The largest entries of the PDB have about ten thousand chains.
 pub(super) const MAX_VALUES: usize = 1 << 18;
 
 /// Values of the [`ITEMS`], in file order.
@@ -24,7 +24,7 @@ pub(super) struct Entities {
 }
 
 impl Entities {
-    /// The place among [`ITEMS`] of an item, given as `category.item` in any case.
+    /// Returns the index in [`ITEMS`] of an item, given as `category.item` in any case.
     pub(super) fn find(tag: &[u8]) -> Option<usize> {
         let mut parts = tag.splitn(2, |&b| b == b'.');
         let (category, item) = (parts.next()?, parts.next()?);
@@ -32,7 +32,7 @@ impl Entities {
         ITEMS.iter().position(|(c, i)| is(c, category) && is(i, item))
     }
 
-    /// Adds a value of the item at `place`.
+    /// Adds a value of the item with index `place`.
     pub(super) fn add(&mut self, place: usize, value: String) {
         let values = &mut self.values[place];
         if values.len() < MAX_VALUES {
@@ -42,18 +42,18 @@ impl Entities {
         }
     }
 
-    /// Returns true if types of entities and the entities of chains are known.
+    /// Returns true if the types of entities and the entities of chains are known.
     pub(super) fn are_known(&self) -> bool {
         let [_, types, polymers, _, of_chains] = &self.values;
         !(of_chains.is_empty() || types.is_empty() && polymers.is_empty())
     }
 
-    /// A warning if there were more values than are kept.
+    /// Returns a warning if there were too many values.
     pub(super) fn warning(&self) -> Option<String> {
         self.full.then(|| format!("more than {MAX_VALUES} entities or chains; the rest are treated as unknown"))
     }
 
-    /// Chains whose entity has a known type; true for polymers.
+    /// Maps each chain whose entity has a known type to true for polymers.
     pub(super) fn polymer_chains(self) -> HashMap<String, bool> {
         let [ids, types, listed, chains, of_chains] = self.values;
         let listed: HashSet<String> = listed.into_iter().collect();

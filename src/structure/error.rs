@@ -1,16 +1,16 @@
-//! Why a structure could not be read or selected from. Messages name the place and what was expected.
+//! Errors of reading structures and selecting atoms. Messages name the location and the expected content.
 
 use thiserror::Error;
 
 /// Errors of reading and selecting.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum StructureError {
-    /// The bytes are no structure file that is read here.
+    /// The bytes are not in a supported format.
     #[error(
         "unknown structure format: {found}; expected PDB, mmCIF or BinaryCIF, plain or compressed with gzip or zstd"
     )]
     UnknownFormat {
-        /// What the first bytes look like.
+        /// Description of the first bytes.
         found: String,
     },
     /// A line could not be read.
@@ -20,19 +20,19 @@ pub enum StructureError {
         line: u64,
         /// Column, from 1.
         column: u64,
-        /// What stands there.
+        /// The content found there.
         found: String,
-        /// What was expected.
+        /// The expected content.
         expected: String,
     },
     /// A binary file could not be read.
     #[error("{place}: found {found}, expected {expected}")]
     Malformed {
-        /// Where, from the outside in: format, category, column, then encoding, row (from 1) or byte (from 0).
+        /// Location, from the outside in: format, category, column, then encoding, row (from 1) or byte (from 0).
         place: String,
-        /// What stands there.
+        /// The content found there.
         found: String,
-        /// What was expected.
+        /// The expected content.
         expected: String,
     },
     /// Compressed data is broken.
@@ -40,41 +40,41 @@ pub enum StructureError {
     Decompress {
         /// `gzip` or `zstd`.
         encoding: &'static str,
-        /// The decoder's words.
+        /// Message of the decoder.
         reason: String,
     },
-    /// The input inflates to more bytes than allowed.
+    /// The input decompresses to more bytes than allowed.
     #[error("the structure inflates to more than {limit} bytes")]
     InflatedTooLarge {
-        /// Bytes allowed.
+        /// Limit, bytes.
         limit: u64,
     },
     /// More atoms than allowed.
     #[error("the structure holds more than {limit} atoms")]
     TooManyAtoms {
-        /// Atoms allowed.
+        /// Limit, number of atoms.
         limit: u64,
     },
     /// The file holds no atoms.
     #[error("no atoms: {found}")]
     NoAtoms {
-        /// What was there instead.
+        /// Description of the content.
         found: String,
     },
-    /// The selection is empty; the message says what the file holds and which flag takes it.
+    /// The selection is empty. The message lists the contents of the file and the parameters that select them.
     #[error("the selection holds no atoms: {holds}")]
     EmptySelection {
-        /// What the file holds and how to select it.
+        /// Contents of the file and the parameters that select them.
         holds: String,
     },
-    /// A model or chain was asked for that the file does not have.
+    /// The requested model, chain or alternative location does not exist.
     #[error("{what} {asked} is not in the file; it has {available}")]
     NotFound {
         /// `model` or `chain`.
         what: &'static str,
-        /// What was asked for.
+        /// The requested value.
         asked: String,
-        /// What there is.
+        /// The available values.
         available: String,
     },
 }

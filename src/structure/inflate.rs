@@ -1,7 +1,7 @@
-//! gzip and zstd by magic bytes, every member and frame, bounded while inflating.
+//! Decompresses gzip (all members) and zstd (all frames), detected by their magic numbers.
 //!
-//! Nothing is believed about sizes: the output grows by at most its own length (or a megabyte) at a time, never
-//! beyond one byte over the limit.
+//! Declared sizes are not trusted. The output buffer at most doubles (or grows by 1 MiB) at a time, and never exceeds
+//! the limit by more than one byte.
 
 use std::borrow::Cow;
 use std::io::{self, Read};
@@ -10,11 +10,11 @@ use super::error::StructureError;
 
 const GZIP: &[u8] = b"\x1f\x8b";
 const ZSTD: &[u8] = b"\x28\xb5\x2f\xfd";
-/// A decoder's window is memory that the sender chooses: 32 MiB covers every level of the usual tools but the
-/// `--ultra --long` ones.
+/// Largest accepted zstd window. The sender chooses the window, so it must be bounded. 32 MiB covers all levels of the
+/// usual tools except `--ultra --long`.
 const MAX_ZSTD_WINDOW: u64 = 32 << 20;
 
-/// Whether the bytes begin with a magic number that is inflated here, and its name.
+/// Returns the name of the compression whose magic number the bytes begin with, if it is supported.
 pub(super) fn encoding(bytes: &[u8]) -> Option<&'static str> {
     if bytes.starts_with(GZIP) {
         Some("gzip")
@@ -25,7 +25,7 @@ pub(super) fn encoding(bytes: &[u8]) -> Option<&'static str> {
     }
 }
 
-/// The plain bytes; borrowed where nothing is compressed.
+/// Returns the decompressed bytes, or the input itself if it is not compressed.
 pub(super) fn inflate(bytes: &[u8], limit: u64) -> Result<Cow<'_, [u8]>, StructureError> {
     let plain = match encoding(bytes) {
         None if bytes.len() as u64 > limit => return Err(StructureError::InflatedTooLarge { limit }),
@@ -41,11 +41,11 @@ fn gzip(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
     let mut out = Vec::new();
     while !rest.is_empty() {
         if !rest.starts_with(GZIP) {
-            // Tapes and block devices pad with zeros, which gzip itself ignores.
+            // Tapes and block devices pad with zeros, which the gzip tool ignores too.
             if rest.iter().all(|&b| b == 0) {
                 break;
             }
-            let reason = format!("{} bytes after the last member are no gzip data", rest.len());
+            let reason = format!("{} bytes after the last member are not gzip data", rest.len());
             return Err(StructureError::Decompress { encoding: "gzip", reason });
         }
         let mut decoder = flate2::bufread::GzDecoder::new(rest);
@@ -67,19 +67,19 @@ fn zstd(mut rest: &[u8], limit: u64) -> Result<Vec<u8>, StructureError> {
         let mut decoder = ruzstd::decoding::StreamingDecoder::new_with_max_window_size(rest, MAX_ZSTD_WINDOW)
             .map_err(|e| broken(e.to_string()))?;
         append(&mut decoder, &mut out, limit, |e| broken(e.to_string()))?;
-        // The frame may end in a checksum of what was inflated.
+        // The frame may end with a checksum of the decompressed data.
         let frame = &decoder.decoder;
         if let (Some(said), Some(computed)) = (frame.get_checksum_from_data(), frame.get_calculated_checksum())
             && said != computed
         {
-            return Err(broken(format!("checksum {computed:08x}, the frame says {said:08x}")));
+            return Err(broken(format!("checksum {computed:08x}, but the frame declares {said:08x}")));
         }
         rest = decoder.into_inner();
     }
     Ok(out)
 }
 
-/// Reads all of `decoder`, in steps that double.
+/// Reads `decoder` to its end into a buffer that doubles.
 fn append(
     decoder: &mut dyn Read,
     out: &mut Vec<u8>,
@@ -104,7 +104,7 @@ fn append(
     }
 }
 
-/// zstd lets tools put frames of their own between those with data.
+/// Returns true for a skippable frame, which zstd allows between data frames.
 fn skippable_frame(bytes: &[u8]) -> bool {
     matches!(bytes, [0x50..=0x5F, 0x2A, 0x4D, 0x18, ..])
 }

@@ -1,9 +1,9 @@
-//! The kind of every atom: polymer, ligand, water, or a virtual site.
+//! Assigns a kind to every atom: polymer, ligand, water or virtual site.
 //!
-//! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file says so: by the
-//! entity of its chain or its `label_seq_id` (mmCIF), by a SEQRES or MODRES record (PDB). Otherwise
-//! it is polymer if a backbone bond joins it to a polymer residue beside it in the file, directly or through other
-//! HETATM residues.
+//! ATOM records are polymer, except for water and single ions. A HETATM residue is polymer if the file declares it to
+//! be: by the entity of its chain or its `label_seq_id` (mmCIF), or by a SEQRES or MODRES record (PDB). Otherwise it is
+//! polymer if a backbone bond joins it to an adjacent polymer residue of the file, directly or through other HETATM
+//! residues.
 
 use std::collections::{HashMap, HashSet};
 
@@ -23,7 +23,7 @@ pub(super) struct Sequence {
 /// Columns of a chain (two) and a residue name (three), right-aligned.
 pub(super) type Listed = [u8; 5];
 
-/// The columns of a chain and a residue name, if these are as short as in a PDB file.
+/// Returns the columns of a chain and a residue name, if both fit into the columns of a PDB file.
 pub(super) fn listed(chain: &[u8], residue: &[u8]) -> Option<Listed> {
     let mut columns = [b' '; 5];
     columns[..2].get_mut(2_usize.checked_sub(chain.len())?..)?.copy_from_slice(chain);
@@ -31,9 +31,10 @@ pub(super) fn listed(chain: &[u8], residue: &[u8]) -> Option<Listed> {
     Some(columns)
 }
 
-/// Longest bond between the carbon and the nitrogen of a peptide, Å; 1.33 Å is usual, and no contact is this short.
+/// Longest bond between carbon and nitrogen of a peptide, Å. The usual length is 1.33 Å; non-bonded contacts are
+/// longer.
 const PEPTIDE_BOND: f64 = 2.0;
-/// Longest bond between O3' and the next phosphorus, Å; 1.6 Å is usual.
+/// Longest bond between O3' and the next phosphorus, Å. The usual length is 1.6 Å.
 const PHOSPHATE_BOND: f64 = 2.2;
 
 /// Sets the kinds of all atoms. The reader has made ATOM records and rows with a `label_seq_id` polymer, and other
@@ -52,7 +53,7 @@ pub(super) fn assign(columns: &mut Columns, tables: &Tables, sequence: &Sequence
 
 /// Residue names of water and single ions.
 struct Solvent {
-    /// By number of the residue name: the kind, `None` for other residues.
+    /// Kind by residue name id; `None` for other residues.
     kinds: Vec<Option<Kind>>,
     any: bool,
 }
@@ -85,8 +86,8 @@ impl Solvent {
     }
 }
 
-/// Sets the kinds of HETATM residues that the file decides, and returns for each number of `label_chain` whether its
-/// entity decided.
+/// Sets the kinds of HETATM residues that the file declares. Returns, for each `label_chain` id, true if the entity of
+/// the chain decided.
 fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solvent: &Solvent) -> Vec<bool> {
     let chains: Vec<Option<bool>> =
         tables.label_chain.texts().map(|chain| sequence.polymer_chains.get(chain).copied()).collect();
@@ -109,8 +110,8 @@ fn sequenced(columns: &mut Columns, tables: &Tables, sequence: &Sequence, solven
     chains.iter().map(Option::is_some).collect()
 }
 
-/// Returns true if `label_seq_id` tells polymers from other residues. Some programs write it for every atom, even of
-/// water.
+/// Returns true if `label_seq_id` distinguishes polymers from other residues. Some programs write it for every atom,
+/// even for water.
 fn has_sequence_numbers(columns: &Columns, solvent: &Solvent) -> bool {
     let mut without = false;
     for i in (0..columns.len()).filter(|&i| columns.hetero[i]) {
@@ -123,7 +124,7 @@ fn has_sequence_numbers(columns: &Columns, solvent: &Solvent) -> bool {
     without
 }
 
-/// Atoms at which residues of a chain are joined.
+/// Backbone atoms that join the residues of a chain.
 #[derive(Debug, Clone, Copy)]
 enum Joint {
     /// Carbon of a peptide bond.
@@ -163,8 +164,7 @@ impl Joints {
     }
 }
 
-/// Makes HETATM residues polymer that backbone bonds join to a polymer residue. Chains that are `decided` stay as they
-/// are.
+/// Turns HETATM residues that backbone bonds join to a polymer residue into polymer. Chains in `decided` do not change.
 fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
     let joints: Vec<Option<Joint>> = tables.name.texts().map(Joint::of).collect();
     let open = |columns: &Columns, i: usize| {
@@ -175,7 +175,7 @@ fn bonded(columns: &mut Columns, tables: &Tables, decided: &[bool]) {
     if !(0..columns.len()).any(|i| open(columns, i) && joints[columns.name[i] as usize].is_some()) {
         return;
     }
-    // A group is a run of residues that bonds join.
+    // A group is a sequence of residues joined by bonds.
     let (mut group, mut has_polymer, mut has_open) = (0, false, false);
     let (mut before, mut first) = (Joints::default(), 0);
     loop {
@@ -213,7 +213,7 @@ fn same_chain(columns: &Columns, a: usize, b: usize) -> bool {
     columns.chain[a] == columns.chain[b] && columns.model[a] == columns.model[b]
 }
 
-/// The first atom of the residue of atom `i`.
+/// Returns the index of the first atom in the residue of atom `i`.
 fn residue_start(columns: &Columns, i: usize) -> usize {
     (0..i).rev().find(|&before| !same_residue(columns, before, i)).map_or(0, |before| before + 1)
 }
@@ -225,7 +225,7 @@ fn same_residue(columns: &Columns, a: usize, b: usize) -> bool {
         && same_chain(columns, a, b)
 }
 
-/// The end of the residue that begins with atom `first`, and its joints.
+/// Returns the end of the residue that begins with atom `first`, and its joints.
 fn residue_from(columns: &Columns, first: usize, joints: &[Option<Joint>]) -> (usize, Joints) {
     let mut found = Joints::default();
     let mut i = first;

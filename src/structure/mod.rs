@@ -1,9 +1,10 @@
-//! Structure files to atoms to spheres: PDB, mmCIF and BinaryCIF bytes in, [`crate::surface::Spheres`] out.
+//! Reads structure files: PDB, mmCIF and BinaryCIF bytes in, [`crate::surface::Spheres`] out. Positions are in Å.
 //!
-//! It knows nothing of grids, meshes, HTTP or paths (the archive folder excepted). Positions are Å.
+//! The module does not depend on grids, meshes or HTTP. Only [`archive`] reads files from disk.
 //!
-//! [`read()`] goes straight from bytes to columns; [`Selection`] says which atoms are meshed, [`Contents`] what there
-//! is to select; [`radii`] gives every element a radius; [`referee`] asks a second, strict reader for its opinion.
+//! [`read()`] parses bytes into columns. [`Selection`] chooses the atoms to mesh, and [`Contents`] lists what can be
+//! selected. [`radii`] assigns a van der Waals radius to every element. [`referee`] checks a file with a second, strict
+//! reader.
 
 mod altloc;
 pub mod archive;

@@ -1,8 +1,8 @@
-//! Numbers as structure files write them, eight digits at a time.
+//! Fast parser for the numbers in structure files, eight digits at a time.
 //!
-//! The usual `-?ddd.ddd` of at most eight digits is an integer below 10⁸ divided by a power of ten: both are
-//! exact in an `f64`, so the quotient is the nearest `f64`, the same as the general parser's. Anything else goes to
-//! that parser.
+//! A number of the usual form `-?ddd.ddd` with at most eight digits is an integer below 10⁸ divided by a power of ten.
+//! Both are exact in an `f64`, so the quotient is correctly rounded and equals the result of the general parser. All
+//! other numbers go to the general parser.
 
 const ONES: u64 = 0x0101_0101_0101_0101;
 const ZEROS: u64 = 0x3030_3030_3030_3030;
@@ -10,7 +10,7 @@ const HIGH: u64 = 0x8080_8080_8080_8080;
 const TWO_52: f64 = 4_503_599_627_370_496.0;
 const POWERS: [f64; 9] = [1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8];
 
-/// The low `n` bytes set, `n` from 0 to 8.
+/// Masks with the low `n` bytes set, `n` from 0 to 8.
 const LOW: [u64; 9] = {
     let mut masks = [0; 9];
     let mut n = 1;
@@ -21,8 +21,8 @@ const LOW: [u64; 9] = {
     masks
 };
 
-/// A number in `text[start..end]`; `None` if it is none, or not finite. A standard uncertainty in parentheses
-/// (`1.234(5)`) is ignored.
+/// Parses `text[start..end]`. Returns `None` if it is not a finite number. Ignores a standard uncertainty in
+/// parentheses (`1.234(5)`).
 #[inline]
 pub(super) fn real(text: &[u8], start: usize, end: usize) -> Option<f64> {
     match short_decimal(text, start, end) {
@@ -31,15 +31,15 @@ pub(super) fn real(text: &[u8], start: usize, end: usize) -> Option<f64> {
     }
 }
 
-/// An occupancy or a B-factor: a few digits, which an `f32` holds but for the last bits.
-#[expect(clippy::cast_possible_truncation, reason = "rounding is meant; what is too large becomes infinite")]
+/// Rounds an occupancy or a B-factor to single precision.
+#[expect(clippy::cast_possible_truncation, reason = "rounding is intended; values that are too large become infinite")]
 pub(super) fn single(value: f64) -> f32 {
     value as f32
 }
 
 #[inline]
 fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
-    // Eleven bytes hold a sign, eight digits, a point and one more.
+    // Eleven bytes hold a sign, eight digits, a point and one more byte.
     let window = text.get(start..)?.first_chunk::<11>()?;
     let negative = usize::from(window[0] == b'-');
     let len = (end - start).wrapping_sub(negative);
@@ -54,11 +54,11 @@ fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
     let point = (points.wrapping_sub(ONES) & !points & HIGH).trailing_zeros() as usize / 8;
     let integer_digits = point.min(len);
     let digits = len - usize::from(point < len);
-    // A point in the ninth place is out of sight.
+    // The window does not show a point in the ninth position.
     if digits == 0 || digits > 8 || (point == 8 && len > 8) {
         return None;
     }
-    // Digits before the point from `head`, those after it from `tail`, which is one byte further.
+    // Digits before the point come from `head`, those after it from `tail`, which starts one byte later.
     let joined = (head & LOW[integer_digits]) | (tail & !LOW[integer_digits]);
     let shift = 8 * (8 - digits);
     // Right-aligned, with leading zeros.
@@ -70,7 +70,8 @@ fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
     let pairs = (values.wrapping_mul(10).wrapping_add(values >> 8)) & 0x00FF_00FF_00FF_00FF;
     let fours = (pairs.wrapping_mul(100).wrapping_add(pairs >> 16)) & 0x0000_FFFF_0000_FFFF;
     let eights = (fours.wrapping_mul(10_000).wrapping_add(fours >> 32)) & 0xFFFF_FFFF;
-    // An integer below 2⁵² as the low bits of 2⁵² plus itself: no conversion instruction has to wait for the number before.
+    // Sets the low bits of 2⁵² to the integer. Unlike a conversion instruction, this does not depend on earlier
+    // results.
     let whole = f64::from_bits(TWO_52.to_bits() | eights) - TWO_52;
     let magnitude = whole / POWERS[digits - integer_digits];
     Some(f64::from_bits(magnitude.to_bits() | (negative as u64) << 63))
@@ -78,7 +79,7 @@ fn short_decimal(text: &[u8], start: usize, end: usize) -> Option<f64> {
 
 #[cold]
 fn general(raw: &[u8]) -> Option<f64> {
-    // Nobody writes a coordinate with so many digits, but somebody may send one with millions.
+    // Real coordinates are shorter; hostile input may have millions of digits.
     if raw.len() > 64 {
         return None;
     }
@@ -89,7 +90,7 @@ fn general(raw: &[u8]) -> Option<f64> {
         Some(_) => return None,
         None => raw,
     };
-    // The general parser also knows words: nan, inf, infinity.
+    // The general parser also accepts the words nan, inf and infinity.
     if digits.iter().any(|b| b.is_ascii_alphabetic() && !matches!(b, b'e' | b'E')) {
         return None;
     }
@@ -97,7 +98,7 @@ fn general(raw: &[u8]) -> Option<f64> {
     value.is_finite().then_some(value)
 }
 
-/// A decimal integer that fits.
+/// Parses a decimal integer. Returns `None` if it does not fit.
 #[inline]
 pub(super) fn integer(raw: &[u8]) -> Option<i32> {
     let (negative, digits) = match raw {
@@ -118,7 +119,7 @@ pub(super) fn integer(raw: &[u8]) -> Option<i32> {
     i32::try_from(if negative { -value } else { value }).ok()
 }
 
-/// A residue number of four columns: decimal, or hybrid-36 (`A000` is 10000, `a000` follows `ZZZZ`).
+/// Parses a residue number of four columns: decimal, or hybrid-36 (`A000` is 10000, `a000` follows `ZZZZ`).
 pub(super) fn hybrid36(raw: &[u8]) -> Option<i32> {
     let [first, rest @ ..] = raw else { return None };
     if !first.is_ascii_alphabetic() || raw.len() != 4 {
@@ -147,7 +148,7 @@ mod tests {
     fn parse(text: &str) -> Option<f64> {
         let padded = [text.as_bytes(), b" 7.7 5555555555"].concat();
         let fast = real(&padded, 0, text.len());
-        // At the end of the text there is no room for the fast path.
+        // The fast path cannot read beyond the end of the text.
         assert_eq!(fast.map(f64::to_bits), real(text.as_bytes(), 0, text.len()).map(f64::to_bits), "{text}");
         fast
     }

@@ -1,18 +1,18 @@
 //! Van der Waals radii of all elements.
 //!
-//! A. Bondi, *van der Waals Volumes and Radii*, J. Phys. Chem. 68, 441 (1964), as completed for the main groups by
-//! M. Mantina, A. C. Chamberlin, R. Valero, C. J. Cramer, D. G. Truhlar, *Consistent van der Waals Radii for the Whole Main
-//! Group*, J. Phys. Chem. A 113, 5806 (2009), table 12: Bondi's values where these authors keep them (hydrogen is 1.10 Å
-//! there, after Rowland and Taylor 1996), theirs for the main-group elements that Bondi lacks. Transition metals that
-//! Bondi gives keep his values. The rest, for which neither has a value, take [`FALLBACK`]. Hydrogens are atoms of their
-//! own: no radius is enlarged to stand for hydrogens that a file leaves out (no united atoms).
+//! A. Bondi, *van der Waals Volumes and Radii*, J. Phys. Chem. 68, 441 (1964), as completed for the main groups by M.
+//! Mantina, A. C. Chamberlin, R. Valero, C. J. Cramer, D. G. Truhlar, *Consistent van der Waals Radii for the Whole
+//! Main Group*, J. Phys. Chem. A 113, 5806 (2009), table 12: Bondi's values where these authors keep them (hydrogen is
+//! 1.10 Å there, after Rowland and Taylor 1996), theirs for the main-group elements that Bondi lacks. Transition metals
+//! that Bondi lists keep his values. All other elements have the radius [`FALLBACK`]. There are no united atoms: radii
+//! do not account for hydrogens that a file leaves out.
 
 use super::element::SYMBOLS;
 
-/// Names the table, for reports.
+/// Name of the table, for reports.
 pub const TABLE: &str = "Bondi 1964, completed by Mantina et al. 2009; 2.0 Å elsewhere";
 
-/// Radius of elements without a value in the two sources, and of unknown ones, Å.
+/// Radius of elements without a value in either source, and of unknown elements, Å.
 pub const FALLBACK: f32 = 2.0;
 
 /// Hydrogen to krypton without the transition metals, then by period: Mantina et al. 2009, table 12.
@@ -92,7 +92,7 @@ const RADII: [f32; SYMBOLS.len() + 1] = {
     radii
 };
 
-/// Van der Waals radius of an element by atomic number (0: unknown), Å.
+/// Returns the van der Waals radius (Å) of an element by atomic number (0: unknown).
 #[must_use]
 pub fn vdw_radius(atomic_number: u8) -> f32 {
     RADII.get(usize::from(atomic_number)).copied().unwrap_or(FALLBACK)

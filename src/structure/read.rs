@@ -1,4 +1,4 @@
-//! Bytes to atoms.
+//! Entry point of the readers: bytes to atoms.
 
 use super::atoms::{SourceFormat, Structure};
 use super::error::StructureError;
@@ -26,15 +26,14 @@ impl ReadLimits {
     }
 }
 
-/// Coordinates beyond this distance from the origin (Å, per axis) are refused, as no structure file's columns reach
-/// that far: [`crate::surface::spheres::MAX_COORDINATE`].
+/// Largest accepted coordinate (Å, absolute value per axis). No structure file format has columns for larger values.
 pub(super) use crate::surface::spheres::MAX_COORDINATE;
 
-/// Reads a structure: sniffs compression and format, never trusts a name. Lines, columns and bytes of errors are
-/// those of the inflated text.
+/// Reads a structure. Compression and format are detected from the content, not from a file name. Lines, columns and
+/// byte offsets in errors refer to the decompressed text.
 ///
 /// # Errors
-/// Any [`StructureError`] of reading. No input panics.
+/// Returns any [`StructureError`] of reading. Never panics, whatever the input.
 pub fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
     let plain = inflate::inflate(bytes, limits.max_inflated_bytes)?;
     let text = without_mark(&plain);
@@ -45,7 +44,7 @@ pub fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureErr
     }
 }
 
-/// Without the byte order mark that some editors put before UTF-8.
+/// Strips the byte order mark that some editors write before UTF-8 text.
 pub(super) fn without_mark(text: &[u8]) -> &[u8] {
     text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text)
 }

@@ -1,14 +1,13 @@
-//! A second opinion: what pdbtbx, a strict validating reader, says of a file.
+//! Strict validation of a structure file by pdbtbx.
 //!
-//! Our reader takes what it needs and refuses the rest with one message; the referee checks the whole file against the
-//! format and lists everything it does not like. It decides nothing: its findings go with a refusal, or answer a strict
-//! check. It is slow (quadratic in the residues of a chain) and panics on hostile input, hence:
+//! The reader of this crate parses only what it needs and stops at the first error. This module checks the whole file
+//! against the format and lists all findings. They accompany a read error, or answer a strict check. pdbtbx is slow
+//! (quadratic in the residues of a chain) and panics on hostile input. Therefore:
 //!
-//! * call it on a thread that may block, with at most [`MAX_BYTES`] of text;
-//! * panics are caught and become a diagnostic. The panic hook is one for the whole process, so a library cannot replace
-//!   it without a race against everybody else who does. [`quiet_panics`] therefore is for `main`, before there are
-//!   threads: it wraps the hook once, and only panics of a thread that is inside [`check`] are kept from it. Without that
-//!   call everything works the same, and a caught panic also shows on standard error.
+//! * Call it on a thread that may block, with at most [`MAX_BYTES`] of text.
+//! * Panics are caught and become a diagnostic. The panic hook is shared by the whole process, so a library cannot
+//!   replace it without races. Call [`quiet_panics`] from `main` before starting threads: it wraps the hook once and
+//!   silences panics of threads inside [`check`]. Without that call, a caught panic also prints to standard error.
 
 use std::cell::Cell;
 use std::io::BufReader;
@@ -22,28 +21,28 @@ use super::read::{ReadLimits, without_mark};
 use super::text::decode;
 use super::{inflate, sniff};
 
-/// Largest text that the referee reads: a few seconds in the worst case.
+/// Largest text that is checked. Takes a few seconds in the worst case.
 pub const MAX_BYTES: u64 = 8 << 20;
 
-/// Most diagnostics that are returned; a damaged file has one per line.
+/// Largest number of returned diagnostics. A damaged file has one per line.
 pub const MAX_DIAGNOSTICS: usize = 100;
 
-/// Longest message, characters.
+/// Longest message in characters.
 const MAX_MESSAGE: usize = 400;
 
-/// How bad a finding is.
+/// Severity of a finding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Level {
-    /// Worth knowing.
+    /// Information.
     Note,
-    /// Against the format's description, but readable.
+    /// Violates the format description, but is readable.
     Warning,
-    /// Not readable by the description.
+    /// Not readable according to the format description.
     Error,
 }
 
 impl Level {
-    /// `note`, `warning` or `error`.
+    /// Returns `note`, `warning` or `error`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -57,11 +56,11 @@ impl Level {
 /// One finding.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Diagnostic {
-    /// How bad it is.
+    /// Severity.
     pub level: Level,
-    /// What it is, in words.
+    /// Message.
     pub message: String,
-    /// The line of the inflated text, from 1, where one is to blame.
+    /// Line of the decompressed text, from 1, if known.
     pub line: Option<u64>,
 }
 
@@ -75,8 +74,8 @@ thread_local! {
     static INSIDE: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Keeps the referee's caught panics from the process's panic hook. For `main`, once, before it starts threads and after it
-/// has set any hook of its own.
+/// Hides caught panics of [`check`] from the panic hook of the process. Call it once from `main`, after setting other
+/// hooks and before starting threads.
 pub fn quiet_panics() {
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |info| {
@@ -86,10 +85,10 @@ pub fn quiet_panics() {
     }));
 }
 
-/// Checks a file, compressed or not. Blocks for up to seconds; never panics.
+/// Checks a file, compressed or not. Blocks for up to several seconds. Never panics.
 ///
 /// # Errors
-/// Those of inflating and of sniffing: what is no structure file is not checked.
+/// Returns errors of decompression and format detection.
 pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, StructureError> {
     let limit = limits.max_inflated_bytes.min(MAX_BYTES);
     let too_large = || vec![Diagnostic::note(format!("not checked: the text is larger than {limit} bytes"))];
@@ -98,12 +97,12 @@ pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, Struc
         plain => plain?,
     };
     let text = without_mark(&plain);
-    // pdbtbx does not read BinaryCIF, so there is no second opinion on it.
+    // pdbtbx does not read BinaryCIF.
     let format = match sniff::sniff(text)? {
         SourceFormat::Pdb => Format::Pdb,
         SourceFormat::Mmcif => Format::Mmcif,
         SourceFormat::BinaryCif => {
-            return Ok(vec![Diagnostic::note("not checked: the strict reader does not read BinaryCIF".to_owned())]);
+            return Ok(vec![Diagnostic::note("not checked: the strict validator does not read BinaryCIF".to_owned())]);
         }
     };
     INSIDE.set(true);
@@ -111,7 +110,7 @@ pub fn check(bytes: &[u8], limits: &ReadLimits) -> Result<Vec<Diagnostic>, Struc
     INSIDE.set(false);
     Ok(outcome.unwrap_or_else(|panic| {
         let words = panic.downcast_ref::<String>().map(String::as_str).or(panic.downcast_ref::<&str>().copied());
-        let message = format!("the checker gave up on this file: {}", words.unwrap_or("it does not say why"));
+        let message = format!("the strict validator failed on this file: {}", words.unwrap_or("no reason given"));
         vec![Diagnostic { level: Level::Error, message: short(&message), line: None }]
     }))
 }
@@ -143,7 +142,7 @@ fn diagnostic(error: &PDBError) -> Diagnostic {
     Diagnostic { level, message, line: line.filter(|&n| n > 0) }
 }
 
-/// A message that is safe to print, on one line, and not endless.
+/// Returns a message of bounded length that is safe to print on one line.
 fn short(message: &str) -> String {
     let line = message.split_whitespace().collect::<Vec<_>>().join(" ");
     decode(line.as_bytes()).chars().take(MAX_MESSAGE).collect()

@@ -1,7 +1,7 @@
-//! What residue names mean: polymers, water, and single ions under the names of simulation packages.
+//! Residue names of polymers, water and single ions, including those of simulation packages.
 
-/// Amino acids, nucleotides and their common variants and modifications, whose atoms C*, N*, O*, H* are never metals.
-/// Names: the chemical component dictionary; AMBER, CHARMM and GROMOS for protonation states and old nucleic acids.
+/// Amino acids, nucleotides and their common variants and modifications. Their atoms C*, N*, O*, H* are never metals.
+/// Sources: chemical component dictionary; AMBER, CHARMM and GROMOS for protonation states and old nucleic acid names.
 const POLYMER: &[&str] = &[
     "ALA", "ARG", "ASN", "ASP", "CYS", "GLN", "GLU", "GLY", "HIS", "ILE", "LEU", "LYS", "MET", "PHE", "PRO", "SER",
     "THR", "TRP", "TYR", "VAL", "ASX", "GLX", "UNK", "XLE", "MSE", "SEC", "PYL", "HID", "HIE", "HIP", "HSD", "HSE",
@@ -15,13 +15,13 @@ const POLYMER: &[&str] = &[
     "7MG", "H2U", "OMC", "OMG", "OMU", "4SU", "M2G", "YYG", "+A", "+C", "+G", "+U", "+T", "+I",
 ];
 
-/// Water under the names of the component dictionary and of the simulation packages.
+/// Water, by names of the component dictionary and of simulation packages.
 const WATER: &[&str] = &[
     "HOH", "WAT", "H2O", "DOD", "D2O", "TIP", "TIP3", "TIP4", "TIP5", "TIP2", "TIP3P", "TIP4P", "TIP5P", "TP3", "TP3M",
     "TP4", "TP5", "T3P", "T4P", "T5P", "T3H", "SOL", "SPC", "SPCE", "OHH", "HHO", "WTR", "OPC", "OPC3", "SWM4", "SWM6",
 ];
 
-/// CHARMM's names of ions that do not begin with the element's symbol, or begin with that of another one.
+/// CHARMM ion names that do not begin with the symbol of the element, or begin with the symbol of another element.
 const IONS: &[(&str, u8)] = &[
     ("SOD", 11),
     ("POT", 19),
@@ -34,18 +34,18 @@ const IONS: &[(&str, u8)] = &[
     ("BAR", 56),
 ];
 
-/// Single ions that may stand in ATOM records: the names of the component dictionary and of simulation packages,
-/// without digits and signs.
+/// Single ions that may occur in ATOM records: names of the component dictionary and of simulation packages, without
+/// digits and signs.
 const SINGLE_IONS: &[&str] =
     &["NA", "K", "CL", "MG", "CA", "ZN", "LI", "RB", "CS", "BR", "CD", "BA", "MN", "FE", "CU", "CO", "NI", "SR", "IOD"];
 
-/// The twenty amino acids and the nucleotides that sequences are made of.
+/// The twenty standard amino acids and the standard nucleotides.
 const STANDARD: &[&str] = &[
     "ALA", "ARG", "ASN", "ASP", "CYS", "GLN", "GLU", "GLY", "HIS", "ILE", "LEU", "LYS", "MET", "PHE", "PRO", "SER",
     "THR", "TRP", "TYR", "VAL", "A", "C", "G", "U", "T", "I", "DA", "DC", "DG", "DT", "DU", "DI",
 ];
 
-/// Residue names of four letters whose first three are a name of their own: GROMOS, and AMBER's chain ends.
+/// Four-letter residue names whose first three letters are a residue name too: GROMOS names and AMBER chain ends.
 const FOUR_LETTERS: &[&str] = &[
     "TIP2", "TIP3", "TIP4", "TIP5", "SPCE", "HISA", "HISB", "HISD", "HISE", "HISH", "CYS2", "CYSH", "ASPH", "GLUH",
     "LYSH", "ARGN", "ALAD", "NMET", "CMET", "NLEU",
@@ -59,7 +59,7 @@ pub(super) fn is_water(residue: &str) -> bool {
     WATER.contains(&residue)
 }
 
-/// The element of an ion under one of CHARMM's names.
+/// Returns the atomic number of an ion by its CHARMM name.
 pub(super) fn charmm_ion(residue: &str) -> Option<u8> {
     IONS.iter().find(|(name, _)| *name == residue).map(|&(_, z)| z)
 }
@@ -75,7 +75,7 @@ pub(super) fn is_standard(residue: &str) -> bool {
     STANDARD.contains(&residue)
 }
 
-/// Returns true for a known residue name of four letters whose first three letters are a residue name as well.
+/// Returns true for a known four-letter residue name whose first three letters are a residue name too.
 pub(super) fn is_four_letters(residue: &str) -> bool {
     FOUR_LETTERS.contains(&residue)
 }

@@ -1,8 +1,8 @@
-//! Finds the boundaries of white-space separated tokens, 64 bytes at a time.
+//! Finds the boundaries of tokens separated by white space, 64 bytes at a time.
 //!
-//! Bytes are compared many at once, their verdicts gathered into a bit mask, and the places where the mask changes are
-//! the starts and ends of tokens. Quotes, comments and text fields are the caller's business:
-//! [`Edges`] only knows white space (any byte up to a blank).
+//! Vector comparisons yield one bit per byte. Changes between adjacent bits are the starts and ends of tokens. Only
+//! white space (any byte up to the space character) separates tokens here; the caller handles quotes, comments and text
+//! fields.
 
 /// Starts and ends of tokens, alternating, as offsets from the beginning of the window that was scanned.
 #[derive(Debug, Default)]
@@ -11,13 +11,13 @@ pub(super) struct Edges {
     len: usize,
 }
 
-/// Bytes that are looked at together, and edges that they can hold.
+/// Bytes per block, which is also the largest number of edges in a block.
 const BLOCK: usize = 64;
 const STEP: u32 = 64;
 
 impl Edges {
-    /// Scans `window`, which begins outside of any token and is below 4 GiB. A token that the window may have cut off
-    /// is left out, unless `last` says that the text ends with the window.
+    /// Scans `window`, which must begin outside a token and be smaller than 4 GiB. Leaves out a token that the end of
+    /// the window may have cut, unless `last` is true (the text ends with the window).
     pub(super) fn scan(&mut self, window: &[u8], last: bool) {
         let room = window.len() + 2 * BLOCK;
         if self.offsets.len() < room {
@@ -30,13 +30,13 @@ impl Edges {
         }
     }
 
-    /// The edges that were found: `[start, end, start, end, …]`.
+    /// Returns the edges: `[start, end, start, end, …]`.
     pub(super) fn offsets(&self) -> &[u32] {
         &self.offsets[..self.len]
     }
 }
 
-/// How many bytes `text` begins with that are `solid` (above a blank), or that are not.
+/// Returns the number of leading bytes of `text` that are non-blank (`solid`) or blank.
 pub(super) fn run_length(text: &[u8], solid: bool) -> usize {
     let (blocks, rest) = text.as_chunks::<BLOCK>();
     for (i, block) in blocks.iter().enumerate() {
@@ -49,7 +49,7 @@ pub(super) fn run_length(text: &[u8], solid: bool) -> usize {
     blocks.len() * BLOCK + rest.iter().position(|&b| (b > b' ') != solid).unwrap_or(rest.len())
 }
 
-/// Writes the edges of `window` to `out`, which is a little longer, and returns how many there are: an even number.
+/// Writes the edges of `window` to `out`, which must be slightly longer, and returns their number, which is even.
 #[multiversion::multiversion(targets(
     "x86_64+avx512f+avx512bw+avx512dq+avx512vl+bmi1+bmi2+popcnt+lzcnt",
     "x86_64+avx2+bmi1+bmi2+popcnt+lzcnt"
@@ -75,16 +75,17 @@ fn edges(window: &[u8], out: &mut [u32]) -> usize {
     len
 }
 
-/// Adds the edges of one block to the `len` that `out` has; `open` is 1 where a token goes on from the block before.
-#[expect(clippy::inline_always, reason = "so that it is compiled for each of the caller's instruction sets")]
+/// Appends the edges of one block to the first `len` of `out`. `open` is 1 if a token continues from the previous
+/// block.
+#[expect(clippy::inline_always, reason = "must be compiled for each instruction set of the caller")]
 #[inline(always)]
 fn block_edges(block: &[u8; BLOCK], base: u32, open: u64, out: &mut [u32], len: usize) -> (usize, u64) {
     let solid = solid_mask(block);
     let mut edges = solid ^ ((solid << 1) | open);
     let total = len + edges.count_ones() as usize;
     let mut at = len;
-    // Sixteen at a time without asking whether there are sixteen: what is too much is written over later. Blocks of
-    // atoms have 17 to 32 edges, so the number of turns can be foreseen.
+    // Writes sixteen at a time without checking the count; surplus entries are overwritten later. Blocks of atom rows
+    // have 17 to 32 edges, so the number of iterations is predictable.
     while at < total {
         if let Some(out) = out.get_mut(at..).and_then(|o| o.first_chunk_mut::<16>()) {
             for slot in out {
@@ -97,7 +98,7 @@ fn block_edges(block: &[u8; BLOCK], base: u32, open: u64, out: &mut [u32], len: 
     (total, solid >> 63)
 }
 
-/// Bit `i` is set where byte `i` is above a blank.
+/// Returns a mask whose bit `i` is set if byte `i` is non-blank.
 #[inline]
 fn solid_mask(block: &[u8; BLOCK]) -> u64 {
     const LOW_BITS: u64 = 0x7F7F_7F7F_7F7F_7F7F;
@@ -106,9 +107,9 @@ fn solid_mask(block: &[u8; BLOCK]) -> u64 {
     let (words, _) = block.as_chunks::<8>();
     for (i, word) in words.iter().enumerate() {
         let bytes = u64::from_le_bytes(*word);
-        // The high bit of each byte: its low seven bits exceed 0x20, or it is above ASCII.
+        // Sets the high bit of each byte whose low seven bits exceed 0x20, or which is not ASCII.
         let verdicts = (((bytes & LOW_BITS) + ABOVE_BLANK) | bytes) & !LOW_BITS;
-        // The product gathers the eight bits in its highest byte, in order.
+        // The multiplication gathers the eight bits, in order, in the highest byte.
         let gathered = (verdicts >> 7).wrapping_mul(0x0102_0408_1020_4080) >> 56;
         mask |= gathered << (8 * i);
     }
@@ -172,7 +173,7 @@ mod tests {
             last: bool,
         ) {
             let mut edges = Edges::default();
-            // Scanned twice: nothing of an earlier window may show.
+            // Scans twice: the second result must not depend on the first.
             edges.scan(&[b'x'; 200], true);
             edges.scan(&bytes, last);
             proptest::prop_assert_eq!(edges.offsets(), naive(&bytes, last));

@@ -1,4 +1,4 @@
-//! Which atoms of a structure are meshed.
+//! Selection of the atoms to mesh.
 
 use std::collections::HashSet;
 
@@ -12,13 +12,13 @@ use super::radii;
 use super::text::list;
 use crate::surface::{Spheres, SurfaceError};
 
-/// Selection of atoms. The default: first model, polymer, no hydrogens, best alternative location.
+/// Selection of atoms. Default: first model, polymer, no hydrogens, alternative locations with the highest occupancy.
 #[derive(Debug, Clone, PartialEq, Eq)]
-#[expect(clippy::struct_excessive_bools, reason = "each is a flag of its own, given by name")]
+#[expect(clippy::struct_excessive_bools, reason = "independent options, set by name")]
 pub struct Selection {
-    /// Model number as the file gives it; the file's first by default.
+    /// Model number in the file; the first model by default.
     pub model: Option<i32>,
-    /// Chains by author name; all by default. The empty name and `_` are a blank one.
+    /// Author names of chains; all by default. The empty string and `_` select the blank chain.
     pub chains: Option<Vec<String>>,
     /// Chains of amino acids and nucleotides, modified residues included.
     pub polymer: bool,
@@ -26,9 +26,9 @@ pub struct Selection {
     pub ligands: bool,
     /// Water.
     pub waters: bool,
-    /// Hydrogen and deuterium of whatever else is taken.
+    /// Hydrogen and deuterium of the selected residues.
     pub hydrogens: bool,
-    /// This alternative location of the residues that have it, instead of the best occupied one.
+    /// Preferred alternative location, for residues that have it.
     pub altloc: Option<char>,
 }
 
@@ -41,18 +41,18 @@ impl Default for Selection {
 /// Names of kinds in the list form, in documentation order.
 pub const KIND_NAMES: [&str; 5] = ["polymer", "ligand", "water", "hydrogens", "all"];
 
-/// A list of kinds that says nothing sensible.
+/// Error for an invalid list of kinds.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("`{value}` is no kind of atoms; expected {expected}")]
+#[error("`{value}` is not a kind of atoms; expected {expected}")]
 pub struct BadKinds {
-    /// What was asked for.
+    /// The invalid value.
     pub value: String,
-    /// What was expected, in words.
+    /// Description of valid values.
     pub expected: String,
 }
 
 impl Selection {
-    /// Takes the kinds of a list such as `polymer,ligand,hydrogens`, and no others.
+    /// Selects exactly the kinds in a list such as `polymer,ligand,hydrogens`.
     ///
     /// # Errors
     /// [`BadKinds`] for a name that is not in [`KIND_NAMES`], an empty list, and `hydrogens` alone.
@@ -70,14 +70,15 @@ impl Selection {
         }
         let [polymer, ligands, waters, hydrogens] = taken;
         if !(polymer || ligands || waters) {
-            let expected = "polymer, ligand or water beside it: hydrogens are those of other atoms taken".to_owned();
+            let expected =
+                "polymer, ligand or water as well: hydrogens are added to the atoms of other kinds".to_owned();
             return Err(BadKinds { value: "hydrogens".to_owned(), expected });
         }
         *self = Self { polymer, ligands, waters, hydrogens, ..std::mem::take(self) };
         Ok(())
     }
 
-    /// The kinds as a list that [`Self::set_kinds`] reads.
+    /// Returns the kinds as a list that [`Self::set_kinds`] accepts.
     #[must_use]
     pub fn kinds(&self) -> String {
         let flags = [self.polymer, self.ligands, self.waters, self.hydrogens];
@@ -96,46 +97,46 @@ impl Selection {
     }
 }
 
-/// Atoms taken, as indices into the structure's columns, ascending.
+/// Result of a selection.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Selected {
-    /// Indices into the structure's columns.
+    /// Indices of the selected atoms in the columns of the structure, ascending.
     pub atoms: Vec<u32>,
-    /// The model that was taken.
+    /// The selected model.
     pub model: i32,
-    /// The other atoms of that model.
+    /// Counts of the other atoms of that model.
     pub left_out: LeftOut,
 }
 
-/// Residue names that are counted on their own.
+/// Largest number of residue names that are counted separately.
 const MAX_NAMES: usize = 10;
 
-/// Atoms of the model that were not taken, each counted under the first reason that applies, in this order.
+/// Atoms of the model that were not selected. Each is counted under the first reason that applies, in field order.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct LeftOut {
-    /// Atoms of chains that were not asked for.
+    /// Atoms of other chains.
     pub other_chains: u64,
     /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
     pub virtual_sites: u64,
-    /// Atoms of kinds that were not asked for, by residue name, the most frequent names first; a bounded number.
+    /// Atoms of other kinds, by residue name, most frequent first. At most ten names.
     pub residues: Vec<(String, u64)>,
-    /// Atoms of kinds that were not asked for, under all other residue names.
+    /// Atoms of other kinds, with any other residue name.
     pub other_residues: u64,
-    /// Hydrogen and deuterium of residues that were taken.
+    /// Hydrogen and deuterium of selected residues.
     pub hydrogens: u64,
-    /// Other alternative locations of residues that were taken.
+    /// Other alternative locations of selected residues.
     pub alternatives: u64,
 }
 
 impl LeftOut {
-    /// All atoms and sites that were not taken.
+    /// Returns the number of atoms and sites that were not selected.
     #[must_use]
     pub fn total(&self) -> u64 {
         let named: u64 = self.residues.iter().map(|(_, n)| n).sum();
         named + self.other_chains + self.virtual_sites + self.other_residues + self.hydrogens + self.alternatives
     }
 
-    /// Sets the counts of residue names from counts by their number.
+    /// Sets the counts of residue names from counts by residue name id.
     fn name_residues(&mut self, structure: &Structure, counts: &[u64]) {
         let counted = structure.residue.texts().zip(counts).filter(|(_, n)| **n > 0);
         let mut names: Vec<(&str, u64)> = counted.map(|(name, n)| (name, *n)).collect();
@@ -149,8 +150,8 @@ impl LeftOut {
 /// Selects atoms.
 ///
 /// # Errors
-/// [`StructureError::EmptySelection`] says what the file holds and what takes it; [`StructureError::NotFound`] for a model,
-/// chain or alternative location that the file does not have.
+/// Returns [`StructureError::EmptySelection`] if no atom is selected, and [`StructureError::NotFound`] for a model,
+/// chain or alternative location that does not exist.
 pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, StructureError> {
     let model = model(structure, selection)?;
     let chains = chains(structure, selection)?;
@@ -159,7 +160,7 @@ pub fn select(structure: &Structure, selection: &Selection) -> Result<Selected, 
     let mut left_out = LeftOut::default();
     let mut by_residue = vec![0; structure.residue.texts().len()];
     let mut atoms: Vec<u32> = Vec::new();
-    // The reader refuses more atoms than 32 bits count.
+    // The reader limits the number of atoms to 32 bits.
     for (i, index) in (0..structure.len()).zip(0_u32..).filter(|&(i, _)| structure.model[i] == model) {
         let kind = structure.kind[i];
         if chains.as_ref().is_some_and(|chains| !chains[structure.chain.id(i) as usize]) {
@@ -195,7 +196,7 @@ fn model(structure: &Structure, selection: &Selection) -> Result<i32, StructureE
     }
 }
 
-/// For each text of the chain column, whether it was asked for.
+/// Returns, for each text of the chain column, true if it is selected.
 fn chains(structure: &Structure, selection: &Selection) -> Result<Option<Vec<bool>>, StructureError> {
     let Some(asked) = &selection.chains else { return Ok(None) };
     let known: HashSet<&str> = structure.chain.texts().collect();
@@ -232,7 +233,7 @@ fn alternative(structure: &Structure, selection: &Selection, model: i32) -> Resu
     }
 }
 
-/// What the file holds and what takes it.
+/// Describes the contents of the file and the parameters that select them.
 fn holds(structure: &Structure, selection: &Selection, model: i32) -> String {
     let contents = Contents::of(structure, Some(model));
     let counts = contents.counts;
@@ -260,10 +261,10 @@ fn holds(structure: &Structure, selection: &Selection, model: i32) -> String {
 }
 
 impl Selected {
-    /// The selected atoms as spheres with van der Waals radii.
+    /// Returns the selected atoms as spheres with van der Waals radii.
     ///
     /// # Errors
-    /// [`SurfaceError::BadSphere`] if a coordinate is out of range.
+    /// Returns [`SurfaceError::BadSphere`] if a coordinate is out of range.
     pub fn spheres(&self, structure: &Structure) -> Result<Spheres, SurfaceError> {
         let column = |c: &[f64]| self.atoms.iter().map(|&i| c[i as usize]).collect();
         let r = self.atoms.iter().map(|&i| radii::vdw_radius(structure.element[i as usize])).collect();

@@ -1,4 +1,4 @@
-//! Sites of force fields that are not atoms: charge sites of water models, lone pairs, mass centres, Drude particles.
+//! Marks virtual sites of force fields: charge sites of water models, lone pairs, mass centres, Drude particles.
 
 use std::collections::HashMap;
 
@@ -15,14 +15,14 @@ pub(super) fn mark(columns: &mut Columns, tables: &Tables) {
     drude(columns, tables);
 }
 
-/// The residues in which an atom of this name and of no known element is a virtual site.
+/// Residues in which an atom of a given name, without a known element, is a virtual site.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Site {
     /// All: TIP4P's `MW` and `EPW`, lone pairs such as `LP1`.
     Anywhere,
     /// Amino acids and nucleotides: mass centres such as `MCB1`, lone pairs such as `LG1`.
     InPolymer,
-    /// Water only: there, every site without an element is virtual.
+    /// Water only, where every site without an element is virtual.
     InWater,
 }
 
@@ -39,7 +39,7 @@ impl Site {
     }
 }
 
-/// CHARMM's name for the charge site of four-site water models, whose first letter is an oxygen's.
+/// CHARMM name for the charge site of four-site water models. Its first letter suggests an oxygen.
 const OXYGEN_LIKE: &str = "OM";
 
 fn by_name(columns: &mut Columns, tables: &Tables) {
@@ -67,7 +67,7 @@ fn by_name(columns: &mut Columns, tables: &Tables) {
     }
 }
 
-/// Drude particles follow their atom, bear its name behind a `D`, and are within [`DRUDE_DISTANCE`].
+/// Marks Drude particles, which follow their atom, have its name prefixed with `D`, and lie within [`DRUDE_DISTANCE`].
 fn drude(columns: &mut Columns, tables: &Tables) {
     if !tables.name.texts().any(|name| name.len() > 1 && name.starts_with('D')) {
         return;

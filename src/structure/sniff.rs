@@ -1,10 +1,10 @@
-//! What kind of file some plain (inflated) bytes are, by content alone.
+//! Detects the file format of decompressed bytes from their content.
 
 use super::atoms::SourceFormat;
 use super::error::StructureError;
 use super::text::quote;
 
-/// Records that begin lines of PDB files. `END` and `TER` are common words: they do not decide.
+/// Record names that identify a PDB file. `END` and `TER` are common words and do not count.
 const PDB_RECORDS: [&[u8]; 33] = [
     b"ATOM", b"HETATM", b"HEADER", b"TITLE", b"REMARK", b"COMPND", b"SOURCE", b"CRYST1", b"MODEL", b"ENDMDL",
     b"OBSLTE", b"SPLIT", b"CAVEAT", b"KEYWDS", b"EXPDTA", b"NUMMDL", b"MDLTYP", b"AUTHOR", b"REVDAT", b"SPRSDE",
@@ -12,10 +12,10 @@ const PDB_RECORDS: [&[u8]; 33] = [
     b"CONECT", b"MASTER",
 ];
 
-/// Only so much is looked at before a text is called unknown.
+/// Bytes examined before a text is reported as unknown.
 const LOOKED_AT: usize = 256 << 10;
 
-/// The format of `text`, which begins after any byte order mark.
+/// Returns the format of `text`, which must not begin with a byte order mark.
 pub(super) fn sniff(text: &[u8]) -> Result<SourceFormat, StructureError> {
     let unknown = |found: String| Err(StructureError::UnknownFormat { found });
     if is_binary_cif(text) {
@@ -37,7 +37,7 @@ pub(super) fn sniff(text: &[u8]) -> Result<SourceFormat, StructureError> {
     unknown(words(head))
 }
 
-/// mmCIF begins, after comments, with a data block; bare categories are taken for one without a name.
+/// Returns true if the first token after comments is a data block. Categories without a data block are accepted too.
 fn is_cif(head: &[u8]) -> bool {
     let mut rest = head;
     loop {
@@ -59,12 +59,12 @@ fn is_pdb_record(line: &[u8]) -> bool {
     PDB_RECORDS.contains(&&word[..end]) || (word.starts_with(b"ATOM ") && word.len() == 6)
 }
 
-/// Whether the bytes are a MessagePack map.
+/// Returns true if the bytes begin with a MessagePack map.
 fn is_map(bytes: &[u8]) -> bool {
     matches!(bytes.first(), Some(0x80..=0x8F | 0xDE | 0xDF))
 }
 
-/// Whether one of the keys stands near the beginning.
+/// Returns true if one of the keys occurs near the beginning.
 fn has_key(bytes: &[u8], keys: [&[u8]; 2]) -> bool {
     let head = &bytes[..bytes.len().min(4096)];
     keys.iter().any(|key| memchr::memmem::find(head, key).is_some())
@@ -74,12 +74,12 @@ fn is_mmtf(bytes: &[u8]) -> bool {
     is_map(bytes) && has_key(bytes, [b"mmtfVersion", b"mmtfProducer"])
 }
 
-/// BinaryCIF is a MessagePack map of encoder, version and data blocks, in any order.
+/// Returns true for BinaryCIF: a MessagePack map of encoder, version and data blocks, in any order.
 fn is_binary_cif(bytes: &[u8]) -> bool {
     is_map(bytes) && !is_mmtf(bytes) && has_key(bytes, [b"dataBlocks", b"encoder"])
 }
 
-/// Names binary formats that are not read by their first bytes.
+/// Names unsupported binary formats, recognised by their first bytes.
 fn binary(bytes: &[u8]) -> Option<String> {
     let head = &bytes[..bytes.len().min(4096)];
     if is_mmtf(bytes) {
@@ -111,7 +111,7 @@ fn binary(bytes: &[u8]) -> Option<String> {
     (odd * 10 > head.len()).then(|| format!("binary data beginning with {}", hex(head)))
 }
 
-/// Names text formats by tell-tale words.
+/// Names unsupported text formats, recognised by typical words.
 fn words(head: &[u8]) -> String {
     let trimmed = head.trim_ascii_start();
     let has = |word: &[u8]| memchr::memmem::find(&head[..head.len().min(4096)], word).is_some();

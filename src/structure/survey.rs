@@ -1,4 +1,4 @@
-//! What a folder of structure files holds, by the names of its files.
+//! Counts the entries in a folder of structure files, by file names.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -6,21 +6,21 @@ use std::path::{Path, PathBuf};
 
 use super::archive::EntryId;
 
-/// What a folder holds.
+/// Entries of a folder.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Survey {
-    /// Entries with at least one file.
+    /// Number of entries with at least one file.
     pub entries: usize,
-    /// Counting stopped there: there may be more.
+    /// True if counting stopped at the limit, so there may be more.
     pub more: bool,
-    /// The first of them, in the order of ids.
+    /// First entry in the order of ids.
     pub first: Option<EntryId>,
 }
 
-/// Counts the entries of a folder in any of the layouts that are looked at, `most` at most. Only names are read. Blocks.
+/// Counts the entries of a folder in any supported layout, at most `most`. Reads only file names. Blocks.
 ///
 /// # Errors
-/// That of the system, for the first folder that cannot be listed, with its path.
+/// Returns the path of the first folder that cannot be listed, and the system error.
 pub fn survey(dir: &Path, most: usize) -> Result<Survey, (PathBuf, io::Error)> {
     let mut found = BTreeSet::new();
     let mut folders = files(dir, &mut found, most)?;
@@ -37,7 +37,7 @@ pub fn survey(dir: &Path, most: usize) -> Result<Survey, (PathBuf, io::Error)> {
     Ok(Survey { entries: found.len(), more: found.len() >= most, first: found.into_iter().next() })
 }
 
-/// Notes the entries whose files lie in `dir`; the folders of two characters in it come back.
+/// Adds the entries whose files are in `dir`. Returns the subfolders with names of two characters.
 fn files(dir: &Path, found: &mut BTreeSet<EntryId>, most: usize) -> Result<Vec<PathBuf>, (PathBuf, io::Error)> {
     let fail = |e| (dir.to_owned(), e);
     let mut folders = Vec::new();
@@ -56,7 +56,7 @@ fn files(dir: &Path, found: &mut BTreeSet<EntryId>, most: usize) -> Result<Vec<P
     Ok(folders)
 }
 
-/// The entry whose file has this name.
+/// Returns the entry id of a file name.
 fn entry_of(name: &str) -> Option<EntryId> {
     let plain = name.strip_suffix(".gz").unwrap_or(name);
     let old = |id: &str| (id.len() == 4).then(|| id.parse().ok()).flatten();
@@ -66,7 +66,7 @@ fn entry_of(name: &str) -> Option<EntryId> {
         (rest, "ent") => old(rest.strip_prefix("pdb")?),
         _ => None,
     }?;
-    // Files are looked for in lower case only.
+    // The archive looks up only lower-case names.
     (!plain.bytes().any(|b| b.is_ascii_uppercase())).then_some(id)
 }
 

@@ -1,48 +1,48 @@
-//! Bytes of a text file: places as line and column, excerpts for messages, decoding.
+//! Text helpers: line and column of a byte offset, excerpts for messages, decoding.
 
 use std::borrow::Cow;
 
 use super::error::StructureError;
 
-/// Something wrong at a byte of the text.
+/// A syntax error at a byte offset.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fault {
     /// Byte offset.
     pub(super) at: usize,
-    /// What stands there.
+    /// The text found there.
     pub(super) found: String,
-    /// What was expected.
+    /// The expected content.
     pub(super) expected: String,
 }
 
 impl Fault {
-    /// `found` is an excerpt of `text[start..end]`.
+    /// Creates a fault whose `found` is an excerpt of `text[start..end]`.
     #[cold]
     #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
     pub(super) fn token(text: &[u8], start: usize, end: usize, expected: impl Into<String>) -> Box<Self> {
         Box::new(Self { at: start, found: quote(&text[start..end]), expected: expected.into() })
     }
 
-    /// `found` in words.
+    /// Creates a fault with a description of what was found.
     #[cold]
     #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
     pub(super) fn words(at: usize, found: impl Into<String>, expected: impl Into<String>) -> Box<Self> {
         Box::new(Self { at, found: found.into(), expected: expected.into() })
     }
 
-    /// The error of reading, with line and column.
+    /// Converts the fault to an error with line and column.
     pub(super) fn locate(self, text: &[u8]) -> StructureError {
         let (line, column) = line_and_column(text, self.at);
         StructureError::Syntax { line, column, found: self.found, expected: self.expected }
     }
 }
 
-/// Line and column of a byte, both from 1. Lines end with LF, CR LF or a lone CR; columns are bytes.
+/// Returns line and column of a byte, both from 1. Lines end with LF, CR LF or a lone CR. Columns count bytes.
 pub(super) fn line_and_column(text: &[u8], at: usize) -> (u64, u64) {
     let before = &text[..at.min(text.len())];
     let lf = memchr::memchr_iter(b'\n', before).count();
     let cr = memchr::memchr_iter(b'\r', before).count();
-    // The line feed of the last pair may stand at `at` itself.
+    // The line feed of the last CR LF pair may be at `at` itself.
     let pairs = if lf == 0 || cr == 0 {
         usize::from(before.last() == Some(&b'\r') && text.get(at) == Some(&b'\n'))
     } else {
@@ -53,10 +53,10 @@ pub(super) fn line_and_column(text: &[u8], at: usize) -> (u64, u64) {
     ((lf + lone_cr) as u64 + 1, (before.len() - start) as u64 + 1)
 }
 
-/// Bytes as text: UTF-8 where they are, Latin-1 otherwise; control characters become U+FFFD, so that a name
-/// is safe to print.
+/// Decodes bytes as UTF-8 if valid, as Latin-1 otherwise. Replaces control characters with U+FFFD, so that the text is
+/// safe to print.
 pub(super) fn decode(raw: &[u8]) -> Cow<'_, str> {
-    // Almost every text is plain.
+    // Almost all texts have no control characters.
     let text = match std::str::from_utf8(raw) {
         Ok(text) if raw.iter().all(|b| (b' '..=b'~').contains(b)) => return Cow::Borrowed(text),
         Ok(text) => Cow::Borrowed(text),
@@ -69,7 +69,7 @@ pub(super) fn decode(raw: &[u8]) -> Cow<'_, str> {
     }
 }
 
-/// An excerpt for a message.
+/// Returns a quoted excerpt for a message.
 pub(super) fn quote(raw: &[u8]) -> String {
     const SHOWN: usize = 40;
     if raw.is_empty() {
@@ -82,9 +82,10 @@ pub(super) fn quote(raw: &[u8]) -> String {
     if raw.len() > SHOWN { format!("`{text}…` ({} bytes)", raw.len()) } else { format!("`{text}`") }
 }
 
-/// A title or id: white space collapsed, at most `max` characters; `None` if nothing is left.
+/// Normalizes a title or id: collapses white space and keeps at most `max` characters. Returns `None` if nothing is
+/// left.
 pub(super) fn tidy(raw: &[u8], max: usize) -> Option<String> {
-    // Enough bytes for `max` characters and generous padding: a title of 50 MB must not be copied.
+    // Bounds the copy: a hostile title may have 50 MB.
     let raw = &raw[..raw.len().min(8 * max)];
     let spaced: Vec<u8> = raw.iter().map(|&b| if b <= b' ' { b' ' } else { b }).collect();
     let text = decode(&spaced);
@@ -93,14 +94,14 @@ pub(super) fn tidy(raw: &[u8], max: usize) -> Option<String> {
     (!short.is_empty()).then_some(short)
 }
 
-/// `raw` without blanks and control characters at both ends, as offsets into it.
+/// Returns the range of `raw` without leading and trailing blanks and control characters.
 pub(super) fn trimmed(raw: &[u8]) -> (usize, usize) {
     let Some(start) = raw.iter().position(|&b| b > b' ') else { return (0, 0) };
     let end = raw.iter().rposition(|&b| b > b' ').map_or(start, |i| i + 1);
     (start, end)
 }
 
-/// `items` with commas, at most twenty of `total`.
+/// Joins `items` with commas, at most twenty of `total`.
 pub(super) fn list<I: IntoIterator<Item = String>>(items: I, total: usize) -> String {
     const SHOWN: usize = 20;
     let shown: Vec<String> = items.into_iter().take(SHOWN).collect();

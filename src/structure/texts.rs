@@ -1,13 +1,13 @@
-//! Columns of short texts (names of atoms, residues and chains) stored once each and referred to by number.
+//! Interned strings: columns of names of atoms, residues and chains, which store each distinct text once.
 //!
-//! Real files repeat a few hundred names millions of times. A small cache answers almost every look-up with one
-//! comparison; what it does not know goes to a hash table with a random seed, so that no choice of names is slow.
+//! Real files repeat a few hundred names millions of times. A small cache answers almost every lookup with one
+//! comparison. Misses go to a hash table with a random seed, which resists hostile choices of names.
 
 use std::hash::{BuildHasher, RandomState};
 
 use super::text;
 
-/// Distinct texts, one behind the other, by number.
+/// Distinct texts, concatenated, by id.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 struct Texts {
     joined: String,
@@ -29,7 +29,7 @@ impl Texts {
     }
 }
 
-/// Texts of a column: `get(i)` is the text of row `i`.
+/// Column of texts: `get(i)` returns the text of row `i`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TextColumn {
     ids: Vec<u32>,
@@ -37,37 +37,37 @@ pub struct TextColumn {
 }
 
 impl TextColumn {
-    /// The text of row `i`.
+    /// Returns the text of row `i`.
     #[must_use]
     pub fn get(&self, i: usize) -> &str {
         self.texts.get(self.ids[i] as usize)
     }
 
-    /// The number of the text of row `i`: equal numbers are equal texts, counted in order of first appearance.
+    /// Returns the id of the text of row `i`. Equal ids are equal texts. Ids count from 0 in order of first appearance.
     #[must_use]
     pub fn id(&self, i: usize) -> u32 {
         self.ids[i]
     }
 
-    /// The numbers of all rows.
+    /// Returns the ids of all rows.
     #[must_use]
     pub fn ids(&self) -> &[u32] {
         &self.ids
     }
 
-    /// The distinct texts, by number.
+    /// Returns the distinct texts by id.
     #[must_use]
     pub fn texts(&self) -> impl ExactSizeIterator<Item = &str> {
         self.texts.iter()
     }
 
-    /// Number of rows.
+    /// Returns the number of rows.
     #[must_use]
     pub fn len(&self) -> usize {
         self.ids.len()
     }
 
-    /// Whether there is no row.
+    /// Returns true if there is no row.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.ids.is_empty()
@@ -76,19 +76,19 @@ impl TextColumn {
 
 const CACHE_BITS: u32 = 8;
 
-/// The length of a text that a cache entry holds, 1 to 8.
+/// Converts the length of a cacheable text, 1 to 8.
 fn short(len: usize) -> u32 {
     u32::try_from(len).unwrap_or(0)
 }
 
-/// Gives numbers to texts.
+/// Assigns ids to texts.
 #[derive(Debug)]
 pub(super) struct Interner {
     texts: Texts,
     seed: RandomState,
-    /// Hash and number plus one of each text, open addressing; a power of two, at most half full.
+    /// Hash and id plus one of each text. Open addressing; the size is a power of two, at most half full.
     table: Vec<(u32, u32)>,
-    /// Up to eight bytes of a text, their count, and the text's number; direct mapped, vacant where the count is 0.
+    /// Up to eight bytes of a text, their count, and its id. Direct mapped; an entry with count 0 is vacant.
     cache: Box<[(u64, u32, u32); 1 << CACHE_BITS]>,
 }
 
@@ -113,7 +113,7 @@ impl Interner {
         self.texts.iter()
     }
 
-    /// The number of `text[start..end]`.
+    /// Returns the id of `text[start..end]`.
     #[inline]
     pub(super) fn intern(&mut self, text: &[u8], start: usize, end: usize) -> u32 {
         let len = end - start;
@@ -123,7 +123,7 @@ impl Interner {
         if len > 8 || len == 0 {
             return self.intern_slow(&text[start..end]);
         }
-        // The first byte of the text is the lowest of the word; what follows the text is shifted out.
+        // The first byte of the text is the lowest byte of the word. The shift removes bytes after the text.
         let key = u64::from_le_bytes(word) << (64 - 8 * len);
         let slot = (key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> (64 - CACHE_BITS)) as usize;
         let (cached, cached_len, id) = self.cache[slot];
@@ -135,7 +135,7 @@ impl Interner {
         id
     }
 
-    /// The number of the text in fixed columns, without the blanks around it.
+    /// Returns the id of the text in fixed columns, without surrounding blanks.
     #[inline]
     pub(super) fn intern_field(&mut self, card: &[u8; 80], from: usize, to: usize) -> u32 {
         let (mut start, mut end) = (from, to);
@@ -153,7 +153,7 @@ impl Interner {
         self.number(&text::decode(raw))
     }
 
-    /// The number of `text`, which is added if it is new.
+    /// Returns the id of `text`, and adds it if it is new.
     fn number(&mut self, text: &str) -> u32 {
         let hash = self.hash(text);
         let mut slot = self.slot(hash);
@@ -164,7 +164,7 @@ impl Interner {
                 _ => slot = (slot + 1) % self.table.len(),
             }
         }
-        // As many distinct texts as 32 bits count need as many rows, which the reader's limit refuses.
+        // The atom limit of the reader keeps the number of distinct texts below 2³².
         let id = u32::try_from(self.texts.len()).unwrap_or(u32::MAX - 1);
         self.texts.joined.push_str(text);
         self.texts.ends.push(self.texts.joined.len());
@@ -188,7 +188,7 @@ impl Interner {
     }
 
     fn hash(&self, text: &str) -> u32 {
-        // The upper half of the hash; the table never needs more bits.
+        // The upper half of the hash has enough bits for the table.
         u32::try_from(self.seed.hash_one(text) >> 32).unwrap_or(0)
     }
 
@@ -196,7 +196,7 @@ impl Interner {
         hash as usize % self.table.len()
     }
 
-    /// Learns the texts of `other` and rewrites `ids` accordingly.
+    /// Adds the texts of `other` and translates `ids` to the new ids.
     pub(super) fn adopt(&mut self, other: &Self, ids: &mut [u32]) {
         let map: Vec<u32> = other.texts.iter().map(|text| self.number(text)).collect();
         if map.iter().enumerate().any(|(i, &id)| i != id as usize) {
@@ -227,7 +227,7 @@ mod tests {
         let texts = ["A", "", "AA", "CA", "A", "a longer text than a word", "AA", "", "a longer text than a word"];
         let ids: Vec<u32> = texts.iter().map(|t| id(&mut interner, t)).collect();
         assert_eq!(ids, [0, 1, 2, 3, 0, 4, 2, 1, 4]);
-        // At the end of the bytes, where no word can be loaded, too.
+        // At the end of the input, where a whole word cannot be loaded.
         assert_eq!(interner.intern(b"xCA", 1, 3), 3);
         assert_eq!(interner.text(3), "CA");
     }

@@ -1,18 +1,18 @@
-//! Values that could not be read and do not matter for the mesh: a default is used, and the report says so.
+//! Warnings about unreadable values that do not affect the mesh. A default replaces the value, and the report lists it.
 
 use super::error::StructureError;
 
-/// Most warnings with a message of their own; a damaged file may have one a line.
+/// Largest number of warnings with their own message. A damaged file may have one per line.
 const KEPT: usize = 10;
 
-/// A fault, and the value that is used instead.
+/// A fault and the default used in place of the value.
 #[derive(Debug, Clone)]
 pub(super) struct Warning<F> {
     pub(super) fault: F,
     used: &'static str,
 }
 
-/// Warnings in file order: the first ones, and the number of all.
+/// The first warnings in file order, and the total number.
 #[derive(Debug, Clone)]
 pub(super) struct Warnings<F> {
     kept: Vec<Warning<F>>,
@@ -26,7 +26,7 @@ impl<F> Default for Warnings<F> {
 }
 
 impl<F> Warnings<F> {
-    /// Adds a warning; the fault is only made if its message is kept.
+    /// Adds a warning. Calls `fault` only if the message is kept.
     #[cold]
     pub(super) fn add(&mut self, used: &'static str, fault: impl FnOnce() -> F) {
         self.total += 1;
@@ -35,12 +35,12 @@ impl<F> Warnings<F> {
         }
     }
 
-    /// Number of warnings with a message.
+    /// Returns the number of warnings with a message.
     pub(super) fn len(&self) -> usize {
         self.kept.len()
     }
 
-    /// The warnings kept after the first `n`.
+    /// Returns the kept warnings after the first `n`.
     pub(super) fn after(&mut self, n: usize) -> &mut [Warning<F>] {
         &mut self.kept[n..]
     }
@@ -52,7 +52,7 @@ impl<F> Warnings<F> {
         self.kept.append(&mut later.kept);
     }
 
-    /// Messages for a report, at most one more than [`KEPT`].
+    /// Returns messages for a report, at most [`KEPT`] and a summary.
     pub(super) fn messages(self, locate: impl Fn(F) -> StructureError) -> Vec<String> {
         let more = self.total - self.kept.len() as u64;
         let kept = self.kept.into_iter();

@@ -1,4 +1,4 @@
-//! A column of a category: its values, and the rows in which it has none.
+//! Columns of a category: values, and the rows without a value.
 
 use std::borrow::Cow;
 
@@ -8,7 +8,7 @@ use super::encoding::{Chain, Strings};
 use super::fault::Fault;
 use super::msgpack::{Cursor, Token};
 
-/// A column as it lies in the file.
+/// An undecoded column.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Raw<'a> {
     pub(super) name: &'a [u8],
@@ -20,14 +20,14 @@ pub(super) struct Raw<'a> {
 #[derive(Debug)]
 pub(super) struct Texts<'a> {
     pub(super) joined: Cow<'a, [u8]>,
-    /// Where each text begins and, behind it, the next one: one more than there are texts, all within `joined`.
+    /// Start of each text in `joined`, followed by the end of the last one.
     offsets: Vec<u32>,
-    /// Numbers of texts; below zero where there is none.
+    /// Text id by row; negative if there is none.
     ids: Vec<i32>,
 }
 
 impl Texts<'_> {
-    /// Start and end of the text of a row in `joined`.
+    /// Returns the range in `joined` of the text of a row.
     #[inline]
     pub(super) fn range(&self, row: usize) -> Option<(usize, usize)> {
         let id = usize::try_from(self.ids[row]).ok()?;
@@ -35,7 +35,7 @@ impl Texts<'_> {
     }
 }
 
-/// What a column holds.
+/// Decoded values of a column.
 #[derive(Debug)]
 pub(super) enum Cells<'a> {
     Int(Vec<i32>),
@@ -43,11 +43,11 @@ pub(super) enum Cells<'a> {
     Text(Texts<'a>),
 }
 
-/// A column, decoded.
+/// A decoded column.
 #[derive(Debug)]
 pub(super) struct Column<'a> {
     pub(super) cells: Cells<'a>,
-    /// By row: whether nothing stands there.
+    /// By row: true if there is no value.
     mask: Option<Vec<bool>>,
 }
 
@@ -57,18 +57,18 @@ impl Column<'_> {
         self.mask.as_ref().is_some_and(|mask| mask[row])
     }
 
-    /// Whether some row has no value.
+    /// Returns true if some row has no value.
     pub(super) fn has_nulls(&self) -> bool {
         self.mask.is_some() || matches!(&self.cells, Cells::Text(texts) if texts.ids.iter().any(|&id| id < 0))
     }
 }
 
-/// Bounds for what is decoded.
+/// Limits of decoding.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Bounds {
-    /// Rows of the category.
+    /// Number of rows in the category.
     pub(super) rows: usize,
-    /// Distinct texts of a column.
+    /// Largest number of distinct texts in a column.
     pub(super) texts: usize,
 }
 
@@ -90,7 +90,7 @@ impl<'a> Raw<'a> {
         Ok(Self { name, data, mask })
     }
 
-    /// Decodes the column; whole numbers become texts if it is to have `texts`.
+    /// Decodes the column. If `texts` is true, integers are converted to texts.
     pub(super) fn load(&self, bounds: Bounds, texts: bool) -> Result<Column<'a>, Box<Fault>> {
         self.decode(bounds, texts).map_err(|fault| fault.within(decode(self.name)))
     }
@@ -114,7 +114,7 @@ impl<'a> Raw<'a> {
     }
 }
 
-/// Values that a step on the way to `n` values may have: pairs of runs are two for one.
+/// Returns the largest number of values in an intermediate step of decoding `n` values. Run-length pairs take two.
 const fn room(n: usize) -> usize {
     n.saturating_add(1).saturating_mul(2)
 }
@@ -123,7 +123,7 @@ fn whole_column(found: usize, rows: usize) -> Result<(), Box<Fault>> {
     if found == rows { Ok(()) } else { Err(Fault::new(format!("{found} values"), format!("{rows}, as rowCount says"))) }
 }
 
-/// Data and how it is encoded.
+/// Reads encoded data and its chain of encodings.
 fn encoded(mut at: Cursor<'_>) -> Result<(&[u8], Chain<'_>), Box<Fault>> {
     let (mut data, mut chain) = (None, None);
     at.map(|key, value| {
@@ -139,7 +139,7 @@ fn encoded(mut at: Cursor<'_>) -> Result<(&[u8], Chain<'_>), Box<Fault>> {
     Ok((data, Chain::read(chain)?))
 }
 
-/// The rows without a value, as a mask says: 1 is `.`, 2 is `?`. `None` if there are none.
+/// Decodes a mask of rows without a value: 1 is `.`, 2 is `?`. Returns `None` if all rows have a value.
 fn nulls(mask: Cursor<'_>, rows: usize) -> Result<Option<Vec<bool>>, Box<Fault>> {
     let (data, chain) = encoded(mask)?;
     let values = chain.decode(data, room(rows))?.ints()?;
@@ -167,8 +167,8 @@ impl<'a> Strings<'a> {
         Ok(Texts { joined: Cow::Borrowed(self.joined), offsets, ids })
     }
 
-    /// Checks that the offsets rise, and makes them count bytes: the file's count UTF-16 code units, as those do who defined
-    /// the format.
+    /// Checks that the offsets are ascending, and converts them from UTF-16 code units, which the reference
+    /// implementation writes, to bytes.
     fn byte_offsets(&self, offsets: Vec<i32>) -> Result<Vec<u32>, Box<Fault>> {
         let text = if self.joined.is_ascii() { None } else { std::str::from_utf8(self.joined).ok() };
         let mut characters = text.map(str::chars);
@@ -201,7 +201,7 @@ impl<'a> Strings<'a> {
     }
 }
 
-/// Whole numbers as texts, one for each run of equal ones.
+/// Converts integers to texts, one for each run of equal values.
 fn written_out(values: &[i32]) -> Texts<'static> {
     let (mut joined, mut offsets, mut ids) = (Vec::new(), vec![0], Vec::with_capacity(values.len()));
     let mut id = -1;

@@ -1,14 +1,14 @@
-//! The encodings of BinaryCIF, undone.
+//! Decoder of BinaryCIF encodings.
 //!
-//! A chain is listed in the order in which it was applied, so it is undone from its end: bytes become whole or real
-//! numbers, whole numbers become others, or real ones. Every length is known before memory is asked for: a value comes from
-//! at least one byte or from a run, and runs are added up first.
+//! A file lists a chain of encodings in the order of their application, so decoding starts at the end. Lengths are
+//! known before memory is allocated: every value comes from at least one byte or from a run, and the runs are summed
+//! first.
 
 use super::encoding::{Chain, Encoding, Number};
 use super::fault::Fault;
 
 impl<'a> Chain<'a> {
-    /// Undoes the encodings of `data`, of which no step may give more than `most` values.
+    /// Decodes `data`. No step may produce more than `most` values.
     pub(super) fn decode(&self, data: &'a [u8], most: usize) -> Result<Values, Box<Fault>> {
         let mut stage = None;
         for (i, encoding) in self.0.iter().enumerate().rev() {
@@ -17,10 +17,10 @@ impl<'a> Chain<'a> {
                 (&Encoding::IntegerPacking { size, number }, Some(Stage::Bytes(bytes))) => {
                     bytes.unpack(number, size, most)
                 }
-                (_, None) => Err(Fault::new("it at the end of its chain", "ByteArray there")),
+                (_, None) => Err(Fault::new("it at the end of its chain", "ByteArray at the end")),
                 (Encoding::ByteArray(_), _) => Err(Fault::new("it in the middle of its chain", "it at the end")),
                 (Encoding::IntegerPacking { .. }, _) => {
-                    Err(Fault::new("another encoding behind it", "ByteArray behind it"))
+                    Err(Fault::new("another encoding after it", "ByteArray after it"))
                 }
                 (Encoding::StringArray(_), _) => Err(Fault::new("it among others", "it alone")),
                 (encoding, Some(stage)) => stage.ints(most).and_then(|ints| encoding.undo(ints, most)),
@@ -29,14 +29,14 @@ impl<'a> Chain<'a> {
             stage = Some(undone.map_err(|fault| fault.within(place()))?);
         }
         match stage {
-            None => Err(Fault::new("no encoding", "ByteArray at least")),
+            None => Err(Fault::new("no encoding", "at least ByteArray")),
             Some(Stage::Bytes(bytes)) => bytes.values(most),
             Some(Stage::Values(values)) => Ok(values),
         }
     }
 }
 
-/// Numbers, decoded.
+/// Decoded numbers.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Values {
     Int(Vec<i32>),
@@ -59,14 +59,14 @@ impl Values {
     }
 }
 
-/// Numbers as they lie in the file.
+/// Undecoded numbers.
 #[derive(Debug, Clone, Copy)]
 struct Bytes<'a> {
     data: &'a [u8],
     number: Number,
 }
 
-/// How far a chain is undone.
+/// Intermediate result of decoding.
 #[derive(Debug)]
 enum Stage<'a> {
     Bytes(Bytes<'a>),
@@ -90,7 +90,7 @@ impl<'a> Stage<'a> {
     }
 }
 
-/// Little-endian numbers of `N` bytes.
+/// Reads little-endian numbers of `N` bytes.
 fn numbers<const N: usize, T, V: FromIterator<T>>(data: &[u8], number: impl Fn([u8; N]) -> T) -> V {
     data.as_chunks::<N>().0.iter().map(|bytes| number(*bytes)).collect()
 }
@@ -118,8 +118,7 @@ impl<'a> Bytes<'a> {
         })
     }
 
-    /// Undoes `IntegerPacking`: a value is a sum of numbers, all but the last of which are the largest or the smallest of
-    /// their type.
+    /// Decodes `IntegerPacking`: a value is a sum of numbers, all but the last of which are the limits of their type.
     fn unpack(self, number: Number, size: Option<usize>, most: usize) -> Result<Stage<'a>, Box<Fault>> {
         if self.number != number {
             let (found, expected) = (format!("{:?} in the ByteArray", self.number), format!("{number:?}"));
@@ -129,7 +128,7 @@ impl<'a> Bytes<'a> {
         let limits = match number {
             Number::Int8 => [i8::MIN.into(), i8::MAX.into()],
             Number::Int16 => [i16::MIN.into(), i16::MAX.into()],
-            // No number is below zero, and zero is one.
+            // Unsigned types have no lower limit.
             Number::Uint8 => [-1, u8::MAX.into()],
             _ => [-1, u16::MAX.into()],
         };
@@ -143,7 +142,7 @@ impl<'a> Bytes<'a> {
     }
 }
 
-/// Adds up runs of numbers that end with one that is none of the `limits`.
+/// Sums runs of numbers that end with a number other than the `limits`.
 fn sums<const N: usize>(
     data: &[u8],
     number: impl Fn([u8; N]) -> i32,
@@ -155,7 +154,7 @@ fn sums<const N: usize>(
     let goes_on = |value: i32| value == limits[0] || value == limits[1];
     let n = numbers.iter().filter(|bytes| !goes_on(number(**bytes))).count();
     if numbers.last().is_some_and(|bytes| goes_on(number(*bytes))) {
-        return Err(Fault::new("the end of the data within a value", "its last part"));
+        return Err(Fault::new("the end of the data within a value", "its last number"));
     }
     said(n, size)?;
     within(n, most)?;
@@ -175,7 +174,7 @@ fn sums<const N: usize>(
     Ok(values)
 }
 
-/// Checks a length against what the file says it is.
+/// Checks a length against the declared one.
 fn said(n: usize, size: Option<usize>) -> Result<(), Box<Fault>> {
     match size {
         Some(size) if size != n => Err(Fault::new(format!("{n} values"), format!("{size}, as srcSize says"))),
@@ -188,12 +187,12 @@ fn fits(value: i64) -> Result<i32, Box<Fault>> {
 }
 
 impl Encoding<'_> {
-    /// Undoes an encoding of whole numbers.
+    /// Decodes one encoding of integers.
     fn undo(&self, ints: Vec<i32>, most: usize) -> Result<Stage<'static>, Box<Fault>> {
         let values = match *self {
             Self::Delta { origin } => Values::Int(add_up(ints, origin)?),
             Self::RunLength { size } => Values::Int(repeat(&ints, size, most)?),
-            // A quotient is the number that was written, to the last bit; a product with the inverse is not.
+            // Division restores the original value exactly; multiplication by the inverse does not.
             Self::FixedPoint { factor } => Values::Real(ints.iter().map(|&v| f64::from(v) / factor).collect()),
             Self::IntervalQuantization { min, max, steps } => {
                 if let Some(step) = ints.iter().find(|step| !(0..steps).contains(*step)) {
@@ -208,7 +207,7 @@ impl Encoding<'_> {
     }
 }
 
-/// Undoes `Delta`: the first difference is that to the origin.
+/// Decodes `Delta`: the first difference is relative to the origin.
 fn add_up(mut ints: Vec<i32>, origin: i32) -> Result<Vec<i32>, Box<Fault>> {
     let mut sum = i64::from(origin);
     for value in &mut ints {
@@ -218,7 +217,7 @@ fn add_up(mut ints: Vec<i32>, origin: i32) -> Result<Vec<i32>, Box<Fault>> {
     Ok(ints)
 }
 
-/// Undoes `RunLength`: pairs of a value and how often it stands there.
+/// Decodes `RunLength`: pairs of a value and a count.
 fn repeat(pairs: &[i32], size: Option<usize>, most: usize) -> Result<Vec<i32>, Box<Fault>> {
     let (pairs, rest) = pairs.as_chunks::<2>();
     if !rest.is_empty() {

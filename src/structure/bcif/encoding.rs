@@ -1,4 +1,4 @@
-//! The encodings of BinaryCIF: what a file says of them. [`super::decode`] undoes them.
+//! Declarations of BinaryCIF encodings. [`super::decode`] applies them.
 //!
 //! Specification: <https://github.com/molstar/BinaryCIF/blob/master/encoding.md>.
 
@@ -6,10 +6,10 @@ use super::super::text::quote;
 use super::fault::Fault;
 use super::msgpack::Cursor;
 
-/// Most encodings of a chain; the longest that make sense have five.
+/// Longest chain of encodings. Useful chains have at most five.
 const MAX_CHAIN: usize = 8;
 
-/// Types of numbers as bytes, little endian.
+/// Little-endian number types.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Number {
     Int8,
@@ -47,8 +47,8 @@ impl Number {
     }
 }
 
-/// One encoding, with what it takes to undo it. What a file says of the types in between (`srcType`) is of no use here:
-/// whole numbers have 32 bits, real ones 64.
+/// An encoding with its parameters. Declared intermediate types (`srcType`) are ignored: integers have 32 bits, real
+/// numbers 64.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Encoding<'a> {
     ByteArray(Number),
@@ -60,8 +60,8 @@ pub(super) enum Encoding<'a> {
     StringArray(Strings<'a>),
 }
 
-/// What a `StringArray` says: texts one behind the other, where each begins, and how both that and the data, which are
-/// numbers of texts, are encoded.
+/// Parameters of a `StringArray`: concatenated texts, their encoded offsets, and the encodings of the offsets and of
+/// the data, which are text ids.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Strings<'a> {
     pub(super) joined: &'a [u8],
@@ -84,7 +84,7 @@ impl Encoding<'_> {
     }
 }
 
-/// Fields of an encoding, as far as they are there.
+/// Fields of an encoding; `None` if missing.
 #[derive(Default)]
 struct Fields<'a> {
     kind: Option<&'a [u8]>,
@@ -186,7 +186,7 @@ impl<'a> Fields<'a> {
     }
 }
 
-/// The encodings of some data, in the order in which they were applied.
+/// A chain of encodings in the order of their application.
 #[derive(Debug)]
 pub(super) struct Chain<'a>(pub(super) Vec<Encoding<'a>>);
 
@@ -204,7 +204,7 @@ impl<'a> Chain<'a> {
         Ok(Self(chain))
     }
 
-    /// The texts, if that is what the chain encodes.
+    /// Returns the texts, if the chain encodes texts.
     pub(super) fn strings(&self) -> Option<Strings<'a>> {
         match self.0[..] {
             [Encoding::StringArray(strings)] => Some(strings),

@@ -1,10 +1,10 @@
-//! What is wrong with a binary file, and where: the category, the column, the encoding, the byte.
+//! Errors in binary files, with their location: category, column, encoding, byte.
 
 use std::fmt::Display;
 
 use super::super::error::StructureError;
 
-/// Something wrong, with the place as far as it is known. Boxed, as results are to stay small where nothing is wrong.
+/// An error and its location, as far as known. Always boxed, which keeps results small.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Fault {
     place: String,
@@ -19,7 +19,7 @@ impl Fault {
         Box::new(Self { place: String::new(), found: found.into(), expected: expected.into() })
     }
 
-    /// The same, with the place around the one that is known so far.
+    /// Prepends an enclosing location.
     #[cold]
     #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
     pub(super) fn within(mut self: Box<Self>, outer: impl Display) -> Box<Self> {

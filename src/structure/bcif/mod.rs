@@ -1,10 +1,10 @@
-//! BinaryCIF: the data model of mmCIF in MessagePack, a column at a time and encoded. Read is what [`super::mmcif`] reads of
-//! a text, and it means the same ([`super::atom_site`]).
+//! Reader of BinaryCIF: the data model of mmCIF as encoded columns in MessagePack. It reads the same items as
+//! [`super::mmcif`], with the same meaning ([`super::atom_site`]).
 //!
 //! Specification: <https://github.com/molstar/BinaryCIF>, version 0.3.
 //!
-//! A file is decoded where it lies, and of it only the columns that are needed. Nothing is believed about lengths: what the
-//! file says has to agree with its bytes, with the rows of the category and with the limits before memory is asked for.
+//! Only the required columns are decoded. Declared lengths are not trusted: they must agree with the number of bytes,
+//! the rows of the category and the limits before memory is allocated.
 
 mod column;
 mod decode;
@@ -27,7 +27,7 @@ use super::pdb::MAX_TITLE;
 use super::read::ReadLimits;
 use super::text::{decode, tidy};
 
-/// Most columns of a category; the dictionary has about a hundred for `atom_site`.
+/// Largest number of columns in a category. The dictionary has about a hundred for `atom_site`.
 const MAX_COLUMNS: usize = 1000;
 
 pub(super) fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
@@ -40,7 +40,7 @@ pub(super) fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, Struc
         }
         any = true;
         value.array(|_, at| {
-            // What follows the atoms only has to be there.
+            // Data after the atoms must be well-formed, but is not used.
             if found.is_none() {
                 passed.block();
                 let block = Block::read(at, &mut passed)?;
@@ -61,7 +61,7 @@ pub(super) fn read(bytes: &[u8], limits: &ReadLimits) -> Result<Structure, Struc
 /// A table of a block.
 #[derive(Debug)]
 struct Category<'a> {
-    /// Without the underscore.
+    /// Name without the underscore.
     name: &'a [u8],
     rows: u64,
     columns: Cursor<'a>,
@@ -104,7 +104,7 @@ impl<'a> Category<'a> {
         Ok(columns)
     }
 
-    /// The first value of an item, tidy and of at most `max` characters.
+    /// Returns the first value of an item, normalized, of at most `max` characters.
     fn value(&self, item: &[u8], max: usize, limits: &ReadLimits) -> Result<Option<String>, Box<Fault>> {
         let columns = self.columns()?;
         let Some(raw) = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item)) else { return Ok(None) };
@@ -120,7 +120,7 @@ impl<'a> Category<'a> {
         Ok(range.and_then(|(start, end)| tidy(&texts.joined[start..end], max)))
     }
 
-    /// The values of an item, empty texts where there are none; nothing without the item.
+    /// Returns the values of an item, with empty texts for missing values. Returns no values without the item.
     fn values(&self, item: &str, most: usize) -> Result<Vec<String>, Box<Fault>> {
         let columns = self.columns()?;
         let named = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item.as_bytes()));
@@ -134,15 +134,15 @@ impl<'a> Category<'a> {
         Ok((0..rows).map(|row| decode(text(row).unwrap_or_default()).into_owned()).collect())
     }
 
-    /// What may be decoded; `None` if there are more rows than atoms are allowed.
+    /// Returns the limits of decoding, or `None` if there are more rows than allowed atoms.
     fn bounds(&self, limits: &ReadLimits) -> Option<Bounds> {
         let rows = usize::try_from(self.rows).ok().filter(|&n| n <= limits.max_rows())?;
-        // Texts that no row refers to are allowed, but no more than there might be rows.
+        // Unused texts are allowed, within the limit of rows.
         Some(Bounds { rows, texts: limits.max_rows() })
     }
 }
 
-/// A data block: the categories that are read.
+/// Required categories of a data block.
 #[derive(Debug, Default)]
 struct Block<'a> {
     name: Option<String>,
@@ -175,7 +175,7 @@ impl<'a> Block<'a> {
         if any { Ok(block) } else { Err(Fault::new("nothing", "`categories`")) }
     }
 
-    /// Keeps a category that is read.
+    /// Stores a category if it is required.
     fn keep(&mut self, category: Category<'a>, passed: &mut Passed) {
         if !passed.is_full() {
             passed.category(decode(category.name));
@@ -195,7 +195,7 @@ impl<'a> Block<'a> {
         }
     }
 
-    /// The structure, if the block has atoms with coordinates.
+    /// Returns the structure, if the block has atoms with coordinates.
     fn structure(&self, limits: &ReadLimits, passed: &mut Passed) -> Result<Option<Structure>, StructureError> {
         let (entities, unread) = self.entities();
         let Some((columns, tables, warnings)) = self.atoms(entities.are_known(), limits, passed)? else {
@@ -239,7 +239,7 @@ impl<'a> Block<'a> {
         (known, None)
     }
 
-    /// The atoms, if the block has some with coordinates.
+    /// Returns the atoms, if the block has some with coordinates.
     fn atoms(
         &self,
         entities: bool,
@@ -257,7 +257,7 @@ impl<'a> Block<'a> {
         }
         // The column is not needed if entities are known.
         let layout = if entities { layout.without_sequence_numbers() } else { layout };
-        // What is decoded counts as inflated: runs may say in a few bytes what takes many.
+        // Decoded data counts as decompressed data, because a few bytes of run-length encoding may expand to many.
         if rows::decoded_bytes(&layout, bounds.rows) > limits.max_inflated_bytes {
             return Err(StructureError::InflatedTooLarge { limit: limits.max_inflated_bytes });
         }

@@ -1,5 +1,5 @@
-//! MessagePack, read where it lies: nothing is copied and no tree is built, so that memory does not depend on what the
-//! bytes claim. Skipping a value counts what is still to come instead of calling itself, so depth costs nothing.
+//! In-place MessagePack reader. It neither copies nor builds a tree, so memory does not depend on declared lengths.
+//! Skipping a value is iterative, so nesting depth is harmless.
 //!
 //! Specification: <https://github.com/msgpack/msgpack/blob/master/spec.md>.
 
@@ -13,18 +13,18 @@ pub(super) enum Token<'a> {
     Bool(bool),
     Integer(i64),
     Real(f64),
-    /// Should be UTF-8, which is not looked at.
+    /// A text. UTF-8 is not checked.
     Text(&'a [u8]),
     Bytes(&'a [u8]),
-    /// So many values follow.
+    /// Number of values that follow.
     Array(u32),
-    /// So many pairs of values follow.
+    /// Number of key-value pairs that follow.
     Map(u32),
     Extension,
 }
 
 impl Token<'_> {
-    /// What it is, for a message.
+    /// Describes the token for a message.
     pub(super) fn words(&self) -> String {
         match self {
             Self::Nil => "nil".to_owned(),
@@ -40,7 +40,7 @@ impl Token<'_> {
     }
 }
 
-/// A place in the file.
+/// A position in the file.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cursor<'a> {
     bytes: &'a [u8],
@@ -52,7 +52,7 @@ impl<'a> Cursor<'a> {
         Self { bytes, at: 0 }
     }
 
-    /// The next value or head; a container's values come next.
+    /// Returns the next value or container head. The values of a container follow.
     pub(super) fn next(&mut self) -> Result<Token<'a>, Box<Fault>> {
         let start = self.at;
         let [first] = self.take()?;
@@ -100,7 +100,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// Passes a value and all that is in it.
+    /// Skips a value and everything inside it.
     pub(super) fn skip(&mut self) -> Result<(), Box<Fault>> {
         let mut pending = 1_u64;
         while pending > 0 {
@@ -114,8 +114,8 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// Calls `entry` with every key of a map and the place of its value, and passes the map. A value that `entry` does not
-    /// read is passed; one that it reads, it reads whole, so that a file is passed over once.
+    /// Reads a map and calls `entry` with each key and the position of its value. `entry` must read a value completely
+    /// or not at all; unread values are skipped.
     pub(super) fn map(
         &mut self,
         mut entry: impl FnMut(&'a [u8], &mut Self) -> Result<(), Box<Fault>>,
@@ -135,8 +135,7 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
-    /// Calls `item` with the number, from 0, and the place of every value of an array, and passes the array; as [`Self::map`]
-    /// does.
+    /// Reads an array and calls `item` with the index, from 0, and the position of each value, like [`Self::map`].
     pub(super) fn array(
         &mut self,
         mut item: impl FnMut(u32, &mut Self) -> Result<(), Box<Fault>>,
@@ -169,7 +168,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Yes or no. Languages without such values write 1 or 0.
+    /// Reads a boolean. Languages without booleans write 1 or 0.
     pub(super) fn truth(&mut self) -> Result<bool, Box<Fault>> {
         match self.next()? {
             Token::Bool(value) => Ok(value),
@@ -178,17 +177,17 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// A finite number.
+    /// Reads a finite number.
     pub(super) fn number(&mut self) -> Result<f64, Box<Fault>> {
         match self.next()? {
-            #[expect(clippy::cast_precision_loss, reason = "factors and bounds are small or were rounded before")]
+            #[expect(clippy::cast_precision_loss, reason = "factors and bounds are small or already rounded")]
             Token::Integer(value) => Ok(value as f64),
             Token::Real(value) if value.is_finite() => Ok(value),
             other => Err(Fault::new(other.words(), "a finite number")),
         }
     }
 
-    /// A whole number of the type `T`. Languages with one type of numbers may write it as a real one.
+    /// Reads an integer of type `T`. Languages with a single number type may write it as a real number.
     pub(super) fn whole<T: TryFrom<i64>>(&mut self, expected: &str) -> Result<T, Box<Fault>> {
         let token = self.next()?;
         let value = match token {
@@ -207,7 +206,7 @@ impl<'a> Cursor<'a> {
         Ok(*found)
     }
 
-    /// A big-endian number of 1, 2 or 4 bytes: two to the power `log`.
+    /// Reads a big-endian length of 2^`log` bytes: 1, 2 or 4.
     fn length(&mut self, log: u8) -> Result<u32, Box<Fault>> {
         Ok(match log {
             0 => u8::from_be_bytes(self.take()?).into(),
@@ -230,7 +229,7 @@ impl<'a> Cursor<'a> {
         Ok(Token::Extension)
     }
 
-    /// Refuses heads that announce more values than there are bytes.
+    /// Rejects container heads that declare more values than there are bytes.
     fn container(&mut self, head: Token<'a>) -> Result<Token<'a>, Box<Fault>> {
         let least = match head {
             Token::Array(n) => n as usize,
@@ -249,9 +248,9 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// What does not fit a signed number is no length and no id; it only has to be told from what does.
+/// Converts an unsigned number. Values that do not fit into `i64` are neither lengths nor ids and become real numbers.
 fn unsigned(value: u64) -> Token<'static> {
-    #[expect(clippy::cast_precision_loss, reason = "only said in messages")]
+    #[expect(clippy::cast_precision_loss, reason = "used only in messages")]
     i64::try_from(value).map_or(Token::Real(value as f64), Token::Integer)
 }
 
@@ -272,7 +271,7 @@ mod tests {
         super::super::super::error::StructureError::from(fault).to_string()
     }
 
-    /// By the table of the specification, every first byte.
+    /// Covers every first byte in the table of the specification.
     #[test]
     fn every_form_of_every_value() {
         let cases: [(&[u8], Token<'_>); 29] = [
@@ -308,7 +307,7 @@ mod tests {
         ];
         for (bytes, expected) in cases {
             assert_eq!(token(bytes), expected, "{bytes:x?}");
-            // Cut anywhere, it is no value.
+            // A truncated value is an error at every length.
             for cut in 0..bytes.len() {
                 assert!(refusal(&bytes[..cut]).contains("the end of the file"), "{bytes:x?} cut at {cut}");
             }

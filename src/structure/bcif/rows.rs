@@ -1,4 +1,4 @@
-//! Rows of decoded columns to atoms, by several threads where there are many.
+//! Converts rows of decoded columns to atoms, on several threads if there are many.
 
 use rayon::prelude::*;
 
@@ -9,10 +9,10 @@ use super::super::warnings::Warnings;
 use super::column::{Bounds, Cells, Column, Raw};
 use super::fault::Fault;
 
-/// Rows that one thread turns into atoms at a time.
+/// Rows per task.
 const CHUNK: usize = 64 << 10;
 
-/// The columns of `atom_site`, in the file's order; only those that are needed are decoded.
+/// Columns of `atom_site` in file order. Only the required ones are decoded.
 struct Table<'a> {
     raw: &'a [Raw<'a>],
     columns: Vec<Option<Column<'a>>>,
@@ -25,7 +25,7 @@ struct Row<'t> {
 }
 
 impl Row<'_> {
-    /// A column's cells, unless nothing stands there in this row.
+    /// Returns the cells of a column, or `None` if it has no value in this row.
     #[inline]
     fn cells(&self, column: usize) -> Option<&Cells<'_>> {
         let column = self.table.columns.get(column)?.as_ref()?;
@@ -78,25 +78,25 @@ impl atom_site::Row for Row<'_> {
     }
 }
 
-/// A real number that is a whole one.
+/// Converts a real number with an integral value.
 #[cold]
 fn whole(value: f64) -> Result<i32, Wrong> {
     let fits = value.fract() == 0.0 && value.abs() <= f64::from(i32::MAX);
-    #[expect(clippy::cast_possible_truncation, reason = "it is whole and fits")]
+    #[expect(clippy::cast_possible_truncation, reason = "an integral value in range")]
     if fits { Ok(value as i32) } else { Err(Wrong) }
 }
 
-/// Bytes of memory that the columns of the layout may take once they are decoded.
+/// Returns an upper bound for the memory (bytes) of the decoded columns of the layout.
 pub(super) fn decoded_bytes(layout: &Layout, rows: usize) -> u64 {
     let columns = |pairs: &[[usize; 2]]| pairs.iter().flatten().filter(|c| **c != atom_site::NONE).count();
     let row = columns(&layout.texts()) * size_of::<i32>() + columns(&layout.numbers()) * size_of::<f64>();
     row as u64 * rows as u64
 }
 
-/// Atoms, the texts they refer to, and values that were replaced.
+/// Atoms, their string tables, and warnings about replaced values.
 pub(super) type Atoms = (Columns, Tables, Warnings<Box<Fault>>);
 
-/// Decodes the columns that the layout needs, and makes atoms of their rows.
+/// Decodes the columns of the layout and converts their rows to atoms.
 pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<Atoms, Box<Fault>> {
     let table = Table { raw, columns: load(raw, &layout, bounds)? };
     let mut columns = Columns::zeroed(bounds.rows);
@@ -117,7 +117,7 @@ pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<At
             Ok(())
         })
         .collect();
-    // The first fault of the file, whichever thread was first.
+    // Reports the first fault in file order, independent of the threads.
     done.into_iter().collect::<Result<(), _>>()?;
     let (mut tables, mut warnings) = (Tables::default(), Warnings::default());
     for (_, mut slices, site) in parts {
@@ -127,10 +127,10 @@ pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<At
     Ok((columns, tables, warnings))
 }
 
-/// A column and the one that stands in for it, as far as they are needed.
+/// A column and its fallback, if required.
 type Pair<'a> = [Option<Column<'a>>; 2];
 
-/// Decodes columns. The second of a pair is needed only where the first has rows without a value.
+/// Decodes columns. The second of a pair is required only if the first has rows without a value.
 fn load<'a>(raw: &[Raw<'a>], layout: &Layout, bounds: Bounds) -> Result<Vec<Option<Column<'a>>>, Box<Fault>> {
     let texts = layout.texts().map(|pair| (pair, true));
     let numbers = layout.numbers().map(|pair| (pair, false));

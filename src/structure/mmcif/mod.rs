@@ -1,8 +1,7 @@
-//! PDBx/mmCIF: the `atom_site` category of the first data block that has one, the entry's id and title, and the
-//! entities.
+//! Reader of PDBx/mmCIF: the `atom_site` category of the first data block that has one, entry id, title and entities.
 //!
-//! Dictionary: PDBx/mmCIF, category `atom_site`. Author names and numbers (`auth_*`) go before the dictionary's own
-//! (`label_*`), which stand in where the author's are missing.
+//! Dictionary: PDBx/mmCIF, category `atom_site`. Author names and numbers (`auth_*`) take precedence. The identifiers
+//! of the dictionary (`label_*`) are the fallback.
 
 mod row;
 mod rows;
@@ -19,12 +18,12 @@ use super::pdb::MAX_TITLE;
 use super::read::ReadLimits;
 use super::text::{Fault, decode, tidy};
 
-/// Why rows stop being read.
+/// Reason to stop reading rows.
 #[derive(Debug)]
 enum Stop {
-    /// The text is wrong.
+    /// Syntax error.
     Fault(Box<Fault>),
-    /// The limit of atoms.
+    /// The atom limit was reached.
     TooMany,
 }
 
@@ -43,7 +42,7 @@ pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, Struct
     }
 }
 
-/// Tags and values, as offsets.
+/// Tags and values as byte ranges.
 #[derive(Debug, Default)]
 struct SingleRow {
     tags: Vec<(usize, usize)>,
@@ -60,7 +59,7 @@ struct Reader<'a> {
     entities: Entities,
     in_frame: bool,
     rows: Option<Rows<'a>>,
-    /// `atom_site` given item by item, as files with one atom may: item names, and their values as offsets.
+    /// `atom_site` without a loop, as in files with one atom: tags and values as byte ranges.
     single: SingleRow,
     passed: Passed,
 }
@@ -123,7 +122,7 @@ impl<'a> Reader<'a> {
         self.passed.block();
     }
 
-    /// A tag and its value.
+    /// Reads a tag and its value.
     fn item(&mut self, tag: &Token) -> Result<(), Stop> {
         let value = self.tokens.next()?;
         if value.kind != Kind::Value {
@@ -147,7 +146,7 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// The place of an item that describes entities.
+    /// Returns the index of an item that describes entities.
     fn entity_item(&self, tag: &Token) -> Option<usize> {
         if self.in_frame {
             return None;
@@ -155,13 +154,13 @@ impl<'a> Reader<'a> {
         Entities::find(&self.text[tag.start + 1..tag.end])
     }
 
-    /// Keeps a value that describes entities.
+    /// Stores a value that describes entities.
     fn note_entity(&mut self, place: usize, value: &Token) {
         let (start, end, _) = cif::unquote(self.text, value.start, value.end);
         self.entities.add(place, decode(&self.text[start..end]).into_owned());
     }
 
-    /// The id and the title of the entry.
+    /// Stores the id or title of the entry.
     fn note_value(&mut self, tag: &[u8], value: &Token) {
         if self.in_frame || !(starts_with(tag, b"_entry.id") || starts_with(tag, b"_struct.title")) {
             return;
@@ -178,7 +177,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// A loop: its tags, then its rows. Returns the token behind it.
+    /// Reads a loop: tags, then rows. Returns the token after it.
     fn category(&mut self) -> Result<Token, Stop> {
         let mut tags: Vec<Token> = Vec::new();
         let mut token = self.tokens.next()?;
@@ -207,7 +206,7 @@ impl<'a> Reader<'a> {
         let of_entities = places.iter().any(Option::is_some);
         let mut i = 0;
         while token.kind == Kind::Value {
-            // Of a loop over entries or titles the first row is meant.
+            // Uses the first row of a loop over entries or titles.
             if let Some(tag) = tags.get(i) {
                 self.note_value(&self.text[tag.start..tag.end], &token);
             }
@@ -220,7 +219,7 @@ impl<'a> Reader<'a> {
         Ok(token)
     }
 
-    /// The columns of `atom_site`; `None` if it has no coordinates.
+    /// Returns the columns of `atom_site`, or `None` if it has no coordinates.
     fn layout(&mut self, tags: &[(usize, usize)]) -> Result<Option<Layout>, Stop> {
         let layout = row::layout(self.text, tags)?;
         if let Some(missing) = layout.missing() {
@@ -230,7 +229,7 @@ impl<'a> Reader<'a> {
         Ok(Some(layout))
     }
 
-    /// `atom_site` item by item is one row.
+    /// Ends a data block. An `atom_site` without a loop is one row.
     fn end_block(&mut self) -> Result<(), Stop> {
         let SingleRow { tags, values } = std::mem::take(&mut self.single);
         if self.rows.is_some() || tags.is_empty() {
@@ -244,8 +243,8 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// Looks for a title behind the atoms, and for entities if HETATM records need them. The atoms are complete, so
-    /// errors from here on do not matter.
+    /// Reads the title and, if HETATM records need them, the entities after the atoms. Ignores errors, because the
+    /// atoms are complete.
     fn rest_of_block(&mut self, mut token: Token) {
         let hetero = self.rows.as_ref().is_some_and(Rows::has_hetero);
         let wanted = |reader: &Self| reader.title.is_none() || (hetero && !reader.entities.are_known());

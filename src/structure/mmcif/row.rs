@@ -1,4 +1,4 @@
-//! A row of `atom_site` as it stands in the text.
+//! Text rows of `atom_site`.
 
 use std::collections::HashMap;
 
@@ -6,10 +6,10 @@ use super::super::atom_site::{self, Layout, NONE, Span};
 use super::super::cif::unquote;
 use super::super::text::Fault;
 
-/// Tags of the category begin with this.
+/// Prefix of the tags of the category.
 pub(super) const PREFIX: &[u8] = b"_atom_site.";
 
-/// Finds the items among the tags of a loop, given as offsets into `text`.
+/// Returns the column indices of the items among the tags of a loop, given as ranges of `text`.
 pub(super) fn layout(text: &[u8], tags: &[(usize, usize)]) -> Result<Layout, Box<Fault>> {
     let mut found: HashMap<Vec<u8>, usize> = HashMap::with_capacity(tags.len());
     for (i, &(start, end)) in tags.iter().enumerate() {
@@ -24,18 +24,18 @@ pub(super) fn layout(text: &[u8], tags: &[(usize, usize)]) -> Result<Layout, Box
     }))
 }
 
-/// A row: where its values stand in the text. Most rows have no quotes, and are spared looking for them.
+/// A row as byte ranges of its values. `QUOTES` is false for rows without quotes, which need no unquoting.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Row<'a, const QUOTES: bool> {
     pub(super) text: &'a [u8],
-    /// Offsets count from here.
+    /// Origin of the offsets.
     pub(super) base: usize,
-    /// Start and end of each value, with its quotes.
+    /// Start and end of each value, including quotes.
     pub(super) offsets: &'a [u32],
 }
 
 impl<const QUOTES: bool> Row<'_, QUOTES> {
-    /// Start and end of a value as it stands.
+    /// Returns start and end of a value, including quotes.
     #[inline]
     fn raw(&self, column: usize) -> (usize, usize) {
         (self.base + self.offsets[2 * column] as usize, self.base + self.offsets[2 * column + 1] as usize)
@@ -45,7 +45,7 @@ impl<const QUOTES: bool> Row<'_, QUOTES> {
 impl<const QUOTES: bool> atom_site::Row for Row<'_, QUOTES> {
     type Fault = Box<Fault>;
 
-    /// A value without quotes; `?` and `.` say that there is none.
+    /// Returns a value without quotes. `?` and `.` mean that there is no value.
     #[inline]
     fn text(&self, column: usize) -> Option<Span<'_>> {
         if column == NONE {

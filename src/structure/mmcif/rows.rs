@@ -1,9 +1,9 @@
-//! The rows of the `atom_site` loop, as fast as memory allows and as slowly as the grammar needs.
+//! Reads the rows of the `atom_site` loop: a fast path for plain rows, the full grammar for all others.
 //!
-//! Almost every row is plain tokens between blanks. [`Edges`] finds these; rows that hold anything the grammar treats
-//! specially (comments, text fields, quoted blanks, a possible end of the loop) go through the tokenizer one at a time.
-//! Long loops of one line per row are read by several threads: each fills its own rows of the columns, and whenever
-//! anything is out of the ordinary the whole stretch is read again in order, so results and errors are the same.
+//! Almost all rows are plain tokens separated by blanks, which [`Edges`] finds. Rows with comments, text fields, quoted
+//! blanks or a possible end of the loop go through the tokenizer one at a time. Several threads read long loops with
+//! one line per row, each into its own rows of the columns. If a thread meets anything else, the whole range is read
+//! again in order, so that results and errors are the same.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -18,11 +18,12 @@ use super::super::warnings::Warnings;
 use super::Stop;
 use super::row::Row;
 
-/// Bytes scanned at a time: short after a special row, as what was scanned beyond it is scanned again.
+/// Bytes scanned at a time. The window is short after a special row, because the bytes after it are scanned again.
 const MIN_WINDOW: usize = 1 << 8;
 const MAX_WINDOW: usize = 16 << 10;
-/// A stretch worth sharing among threads, and the share of one.
+/// Smallest text that is divided among threads, bytes.
 const PARALLEL_BYTES: usize = 2 << 20;
+/// Bytes per thread, at least.
 const CHUNK_BYTES: usize = 512 << 10;
 
 pub(super) struct Rows<'a> {
@@ -32,7 +33,7 @@ pub(super) struct Rows<'a> {
     limit: usize,
 }
 
-/// Where atoms go; `false` if there is no room.
+/// Destination of atoms. Returns false if it is full.
 trait Sink {
     fn put(&mut self, atom: &Atom) -> bool;
 }
@@ -74,7 +75,7 @@ impl<'a> Rows<'a> {
         self.columns.hetero.contains(&true)
     }
 
-    /// Reads rows from the first value on; returns where the loop ends.
+    /// Reads rows from the first value on. Returns the end of the loop.
     pub(super) fn read(&mut self, first: usize) -> Result<usize, Stop> {
         let large = self.text.len() - first >= PARALLEL_BYTES && rayon::current_num_threads() > 1;
         let parallel = if large { self.read_parallel(first) } else { None };
@@ -93,7 +94,7 @@ impl<'a> Rows<'a> {
         }
     }
 
-    /// Reads a row of values by the full grammar; `None` at the end of the loop.
+    /// Reads a row by the full grammar. Returns `None` at the end of the loop.
     fn special_row(&mut self, at: usize) -> Result<Option<usize>, Stop> {
         let mut tokens = Tokenizer { text: self.text, at };
         let width = self.site.layout.width;
@@ -116,7 +117,7 @@ impl<'a> Rows<'a> {
         Ok(Some(tokens.at))
     }
 
-    /// One row whose values were found elsewhere.
+    /// Reads one row, given by the ranges of its values.
     pub(super) fn single(&mut self, values: &[(usize, usize)]) -> Result<(), Stop> {
         let Some(&(base, _)) = values.first() else { return Ok(()) };
         let mut offsets = Vec::with_capacity(2 * values.len());
@@ -131,8 +132,8 @@ impl<'a> Rows<'a> {
         if sink.put(&atom) { Ok(()) } else { Err(Stop::TooMany) }
     }
 
-    /// Reads rows from `first` on by several threads, and returns where they stop; `None`, with nothing changed, if what
-    /// they read is not one plain row to a line.
+    /// Reads rows from `first` on by several threads, and returns the end of what they read. Returns `None`, and
+    /// changes nothing, if the text does not have one plain row per line.
     fn read_parallel(&mut self, first: usize) -> Option<usize> {
         let text = self.text;
         let stretches = stretches(text, first)?;
@@ -176,8 +177,8 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// About as many rows as lines: what three samples suggest, and a little more. Too many cost nothing, as memory that is
-/// not touched is not there; too few make the columns grow.
+/// Estimates the number of rows from three samples of line length, with a margin. An overestimate costs nothing,
+/// because untouched memory is not allocated. An underestimate makes the columns grow.
 fn estimate(rest: &[u8]) -> usize {
     const SAMPLE: usize = 64 << 10;
     if rest.len() <= 4 * SAMPLE {
@@ -188,7 +189,7 @@ fn estimate(rest: &[u8]) -> usize {
     (lines + 1) * (rest.len() / (3 * SAMPLE) + 1) / 16 * 17
 }
 
-/// Whole lines that one thread reads.
+/// Whole lines read by one thread.
 #[derive(Debug, Clone, Copy)]
 struct Stretch {
     from: usize,
@@ -196,10 +197,10 @@ struct Stretch {
     lines: usize,
 }
 
-/// Stretches from `first` on in which no row holds an underscore, and hence no tag and no reserved word, without the
-/// comments and blank lines before that.
+/// Divides the text from `first` on into stretches, up to the first underscore. Rows without underscores contain
+/// neither tags nor reserved words. Leaves out comments and blank lines before the end.
 ///
-/// `None` where lines are as long as chunks.
+/// Returns `None` if lines are as long as chunks.
 fn stretches(text: &[u8], first: usize) -> Option<Vec<Stretch>> {
     let line_start = |at: usize| {
         if at == first || at >= text.len() {
@@ -216,7 +217,7 @@ fn stretches(text: &[u8], first: usize) -> Option<Vec<Stretch>> {
             let to = line_start(start + CHUNK_BYTES)?;
             let chunk = &text[from..to];
             let underscore = memchr::memchr(b'_', chunk);
-            // The text may end in comments, or within its last line, which then is read in order.
+            // The text may end with comments or within its last line, which the sequential path reads.
             let until = underscore.or((to == text.len()).then_some(chunk.len()));
             let to = from + until.map_or(chunk.len(), |i| whole_rows(&chunk[..i]));
             let lines = memchr::memchr_iter(b'\n', &text[from..to]).count();
@@ -230,7 +231,7 @@ fn stretches(text: &[u8], first: usize) -> Option<Vec<Stretch>> {
     Some(found.into_iter().map(|(stretch, _)| stretch).filter(|s| s.lines > 0).collect())
 }
 
-/// Length of `chunk`, which a tag or nothing follows, up to the end of the last line that is neither blank nor a comment.
+/// Returns the length of `chunk` up to the end of its last row. A tag or the end of the text must follow `chunk`.
 fn whole_rows(chunk: &[u8]) -> usize {
     let mut end = memchr::memrchr(b'\n', chunk).map_or(0, |i| i + 1);
     while end > 0 {
@@ -243,14 +244,14 @@ fn whole_rows(chunk: &[u8]) -> usize {
     end
 }
 
-/// Reads plain rows.
+/// Reader of plain rows.
 struct Scanner<'a> {
     text: &'a [u8],
     edges: Edges,
     window: usize,
 }
 
-/// What the first byte of a token says: 1 for quotes, 2 for what the tokenizer has to look at.
+/// Classes of first bytes of tokens: 1 for quotes, 2 for tokens that need the tokenizer.
 const SPECIAL: [u8; 256] = {
     let mut table = [0; 256];
     table[b'\'' as usize] = 1;
@@ -265,8 +266,8 @@ impl<'a> Scanner<'a> {
         Self { text, edges: Edges::default(), window: MAX_WINDOW }
     }
 
-    /// Reads rows from `at` to `end` into `sink`; returns the end of the last row before one that is not plain, not
-    /// whole, or not there.
+    /// Reads rows from `at` to `end` into `sink`. Stops before the first row that is incomplete or not plain, and
+    /// returns the end of the row before it.
     fn rows(
         &mut self,
         site: &mut AtomSite<Box<Fault>>,
@@ -280,7 +281,7 @@ impl<'a> Scanner<'a> {
         let result = loop {
             let to = at.saturating_add(self.window).min(end);
             let window = &self.text[at..to];
-            // Tags and reserved words have an underscore; almost no row has one.
+            // Tags and reserved words contain an underscore; almost no row does.
             let words = memchr::memchr(b'_', window).is_some();
             edges.scan(window, to == self.text.len());
             let mut done = at;
@@ -316,15 +317,15 @@ impl<'a> Scanner<'a> {
     }
 }
 
-/// What the first bytes of a row's tokens say, as in [`SPECIAL`].
+/// Returns the combined classes, as in [`SPECIAL`], of the tokens of a row.
 #[inline]
 fn special(window: &[u8], offsets: &[u32]) -> u8 {
     let (tokens, _) = offsets.as_chunks::<2>();
     tokens.iter().fold(0, |sum, token| sum | SPECIAL[usize::from(window[token[0] as usize])])
 }
 
-/// Whether every token of the row is one value by itself: quotes close where the token ends, and nothing is a tag or a
-/// reserved word, which is looked for only if the window has `words`, that is, underscores.
+/// Returns true if every token of the row is a complete value: quotes close at the end of the token, and no token is a
+/// tag or a reserved word. The latter is checked only if the window contains underscores (`words`).
 fn values_only(window: &[u8], offsets: &[u32], words: bool) -> bool {
     offsets.as_chunks::<2>().0.iter().all(|token| {
         let token = &window[token[0] as usize..token[1] as usize];
@@ -351,7 +352,7 @@ mod tests {
         super::super::row::layout(text.as_bytes(), &tags.collect::<Vec<_>>()).unwrap()
     }
 
-    /// How many rows several threads read of a text with these rows and this end, and where they stop.
+    /// Returns the number of rows that several threads read of a text with this ending, and where they stop.
     fn parallel(rows: &str, end: &str) -> Option<(usize, usize)> {
         let text = format!("{TAGS}{rows}{end}");
         let mut table = Rows::new(text.as_bytes(), layout(&text), usize::MAX);

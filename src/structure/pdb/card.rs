@@ -1,4 +1,4 @@
-//! The fixed columns of an ATOM record.
+//! Fixed columns of ATOM records.
 
 use super::super::number::{self, hybrid36, real};
 use super::super::read::MAX_COORDINATE;
@@ -7,7 +7,7 @@ use super::super::text::{Fault, trimmed};
 /// A line, cut or padded to 80 columns.
 pub(super) type Card = [u8; 80];
 
-/// The columns of a line.
+/// Cuts or pads a line to 80 columns.
 pub(super) fn card(line: &[u8]) -> Card {
     let mut padded = [b' '; 80];
     let len = line.len().min(80);
@@ -15,7 +15,8 @@ pub(super) fn card(line: &[u8]) -> Card {
     padded
 }
 
-/// Returns true if columns 73-80 hold the entry's id and a line number, as before 1996: `4PTI  88`, `2HHBA 206`.
+/// Returns true if columns 73-80 contain the entry id and a line number, as in files before 1996: `4PTI  88`, `2HHBA
+/// 206`.
 pub(super) fn numbered_line(card: &Card) -> bool {
     card[72].is_ascii_digit()
         && card[73..76].iter().all(u8::is_ascii_alphanumeric)
@@ -31,7 +32,7 @@ pub(super) fn coordinate(card: &Card, from: usize, axis: &str) -> Result<f64, Bo
     }
 }
 
-/// The number in `card[from..to]`, with blanks around it.
+/// Parses the number in `card[from..to]`, ignoring surrounding blanks.
 #[inline]
 pub(super) fn number(card: &Card, from: usize, to: usize) -> Option<f64> {
     let mut start = from;
@@ -44,7 +45,7 @@ pub(super) fn number(card: &Card, from: usize, to: usize) -> Option<f64> {
     })
 }
 
-/// Columns 23-26 and the insertion code in column 27, which is the fifth digit of numbers that need one.
+/// Parses the residue number in columns 23-26 and the insertion code in column 27. Column 27 may be a fifth digit.
 #[inline]
 pub(super) fn residue_number(card: &Card) -> Result<(i32, u8), Box<Fault>> {
     let code = card[26];
@@ -58,10 +59,10 @@ pub(super) fn residue_number(card: &Card) -> Result<(i32, u8), Box<Fault>> {
     Ok((number, if code > b' ' { code } else { 0 }))
 }
 
-/// A line with tab stops every eight columns, and where each of its bytes came from.
+/// Expands tabs to stops every eight columns. Returns the line and the source column of each byte.
 pub(super) fn expand_tabs(line: &[u8]) -> (Vec<u8>, Vec<usize>) {
     let (mut out, mut origin) = (Vec::with_capacity(96), Vec::with_capacity(96));
-    // Columns beyond 80 are not read; a tab is eight columns at most.
+    // Columns beyond 80 are not read, and a tab fills at most eight columns.
     for (i, &b) in line.iter().enumerate().take(96) {
         let columns = if b == b'\t' { 8 - out.len() % 8 } else { 1 };
         out.extend(std::iter::repeat_n(if b == b'\t' { b' ' } else { b }, columns));

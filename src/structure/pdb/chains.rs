@@ -1,9 +1,9 @@
-//! Column 21 of ATOM records: the fourth letter of a residue name, or the first one of a chain.
+//! Resolves column 21 of ATOM records: the fourth letter of a residue name, or the first letter of a chain name.
 //!
-//! Programs that write many chains put names of two letters into columns 21 and 22; programs that simulate write
-//! residue names of four letters into columns 18 to 21. `HISA` of chain `A` and `HIS` of chain `AA` are the same
-//! columns. One row does not tell, but the file does: residues of one chain follow each other with the same letter in
-//! column 21, and residue names of four letters change that letter, or leave it blank, within a chain.
+//! Programs that write many chains put two-letter names into columns 21 and 22. Simulation programs put four-letter
+//! residue names into columns 18 to 21. `HISA` of chain `A` and `HIS` of chain `AA` look the same. A single row is
+//! ambiguous, but the whole file is not: within a chain with a two-letter name, column 21 is always the same letter.
+//! Four-letter residue names change that letter, or leave it blank.
 
 use std::collections::{HashMap, HashSet};
 
@@ -17,16 +17,16 @@ type Pair = [u8; 2];
 /// Chains of two letters, in columns 21 and 22.
 #[derive(Debug, Default)]
 pub(super) struct TwoLetterChains {
-    /// Pairs for which the file has evidence; true for chains.
+    /// Pairs for which the file has evidence; true for chain names.
     verdicts: HashMap<Pair, bool>,
-    /// The verdict on all pairs, if it is the same.
+    /// The verdict on all pairs, if all are equal.
     all: Option<bool>,
-    /// Columns 18-22 that were asked for last, and the answer.
+    /// Columns 18-22 of the latest query, and its answer.
     latest: ([u8; 5], bool),
 }
 
 impl TwoLetterChains {
-    /// Reads the evidence in a whole file.
+    /// Collects the evidence in a file.
     pub(super) fn find(text: &[u8]) -> Self {
         let mut evidence = Evidence::default();
         Lines::new(text).for_each(|(start, end)| evidence.line(&text[start..end]));
@@ -36,7 +36,7 @@ impl TwoLetterChains {
         Self { verdicts, all, latest: ([0; 5], false) }
     }
 
-    /// Returns true if column 21 of an ATOM record, which is not blank, belongs to the chain.
+    /// Returns true if column 21 of an ATOM record, which must not be blank, belongs to the chain name.
     #[inline]
     pub(super) fn has(&mut self, card: &Card) -> bool {
         let columns = [card[17], card[18], card[19], card[20], card[21]];
@@ -66,7 +66,7 @@ impl TwoLetterChains {
     }
 }
 
-/// Lists that hold a residue name.
+/// Lists of residue names that contain a name.
 #[derive(Debug, Clone, Copy, Default)]
 struct Name {
     polymer: bool,
@@ -81,17 +81,17 @@ impl Name {
     }
 }
 
-/// Columns 18-27 of a residue: its name, its chain, its number.
+/// Columns 18-27 of a residue: name, chain and number.
 type Residue = [u8; 10];
 
 /// Evidence on pairs of letters, from the residues and SEQRES records of a file.
 #[derive(Debug, Default)]
 struct Evidence {
-    /// For each pair, how often it stays and how often it changes from one residue of a chain to the next.
+    /// For each pair, the numbers of consecutive residues in a chain that keep it and that change it.
     counts: HashMap<Pair, [u64; 2]>,
-    /// Pairs that SEQRES records name.
+    /// Pairs named by SEQRES records.
     listed: HashSet<Pair>,
-    /// The residue of the ATOM record before; `None` where a chain may end.
+    /// Residue of the previous ATOM record; `None` where a chain may end.
     before: Option<Residue>,
 }
 
@@ -132,7 +132,7 @@ impl Evidence {
         }
     }
 
-    /// Counts a step from one residue to the next, if the number says that they are neighbours in a chain.
+    /// Counts a pair of consecutive residues, if their numbers are consecutive too.
     fn step(&mut self, before: Residue, here: Residue) {
         let letters = [before[3], here[3]].map(|b| if b <= b' ' { b' ' } else { b });
         if before[4] != here[4] || letters == [b' '; 2] || before[..4] == here[..4] {
@@ -147,7 +147,7 @@ impl Evidence {
             return;
         }
         if letters[0] == letters[1] {
-            // Lipids follow each other as POPC and DOPC do, and LYSH may follow GLUH.
+            // Four-letter names may follow each other: lipids POPC and DOPC, residues GLUH and LYSH.
             let four = [before, here].map(|residue| Name::of(&residue[..4]).four_letters);
             if names.iter().all(|name| name.polymer) && four != [true; 2] {
                 self.counts.entry([letters[0], here[4]]).or_default()[0] += 1;

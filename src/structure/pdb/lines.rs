@@ -1,8 +1,8 @@
-//! Lines of a PDB file, with any line ending.
+//! Iterator over the lines of a PDB file, with any line ending.
 
 use super::super::scan::run_length;
 
-/// Lines that are not empty, as offsets, without their ends.
+/// Non-empty lines as byte ranges, without line endings.
 pub(super) struct Lines<'a> {
     text: &'a [u8],
     at: usize,
@@ -26,7 +26,7 @@ impl Iterator for Lines<'_> {
             [b'\r', b'\n', ..] => 2,
             _ => 0,
         };
-        // Usually the next line begins right there.
+        // Usually the next line begins directly after the line ending.
         let next = if rest.get(one_end).is_some_and(|&b| b > b' ') { one_end } else { empty_lines(rest) };
         let start = self.at + next;
         let rest = self.text.get(start..).filter(|rest| !rest.is_empty())?;
@@ -36,7 +36,7 @@ impl Iterator for Lines<'_> {
     }
 }
 
-/// Length of the line ends and blank lines that `text` begins with.
+/// Returns the length of the line endings and blank lines at the beginning of `text`.
 fn empty_lines(text: &[u8]) -> usize {
     let blanks = &text[..run_length(text, false)];
     memchr::memrchr2(b'\n', b'\r', blanks).map_or(0, |i| i + 1)

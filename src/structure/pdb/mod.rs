@@ -1,10 +1,10 @@
-//! PDB files: fixed columns, as written since 1972 and by programs that take liberties.
+//! Reader of PDB files, including common deviations from the format.
 //!
-//! Columns in this file are counted from 0 in code and from 1 in comments and messages, as the format description
-//! (wwPDB, version 3.3) does. Read are ATOM, HETATM, MODEL, ENDMDL, END, HEADER and TITLE; atom serial numbers are
-//! not, so overflowing ones are harmless. Liberties that are understood: lines without the columns after the
-//! coordinates, hybrid-36 and five-digit residue numbers, residue names of four letters, chains of two, no element
-//! columns, entry and line number in their place (before 1996), tabs, any line ending.
+//! Code counts columns from 0; comments and messages count from 1, as the format description (wwPDB, version 3.3) does.
+//! The reader uses ATOM, HETATM, MODEL, ENDMDL, END, HEADER, TITLE, SEQRES and MODRES records. It ignores atom serial
+//! numbers, so their overflow is harmless. Supported deviations: lines that end after the coordinates, hybrid-36 and
+//! five-digit residue numbers, four-letter residue names, two-letter chain names, missing element columns, entry id and
+//! line number in columns 73-80 (before 1996), tabs, any line ending.
 
 mod card;
 mod chains;
@@ -26,7 +26,7 @@ use super::read::ReadLimits;
 use super::text::{self, Fault, tidy, trimmed};
 use super::warnings::Warnings;
 
-/// Longest title that is kept, characters.
+/// Longest title, characters.
 pub(super) const MAX_TITLE: usize = 1000;
 
 pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, StructureError> {
@@ -52,7 +52,7 @@ pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, Struct
     Ok(reader.columns.finish(reader.tables, source))
 }
 
-/// Which model an atom belongs to. A number that comes back, and atoms after the end of a model, begin a new one.
+/// Assigns atoms to models. A repeated model number, or atoms after the end of a model, begin a new model.
 #[derive(Default)]
 struct Models {
     current: Option<i32>,
@@ -81,13 +81,13 @@ struct Reader<'a> {
     models: Models,
     id: Option<String>,
     title: Vec<u8>,
-    /// Whether some atom's name of one letter stood in the first of its columns: this file's alignment says nothing.
+    /// True if a one-letter atom name was found in the first name column: the alignment of this file is not reliable.
     left_justified: bool,
     /// Guessed elements by name columns and residue.
     guesses: HashMap<(u32, u32), u8>,
-    /// Chains of two letters; found when column 21 is in use for the first time.
+    /// Two-letter chain names, resolved at the first use of column 21.
     two_letters: Option<TwoLetterChains>,
-    /// Chains and residue names of SEQRES and MODRES records.
+    /// Chains and residue names in SEQRES and MODRES records.
     listed: HashSet<Listed>,
     warnings: Warnings<Box<Fault>>,
 }
@@ -185,7 +185,7 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// Reads the columns of one line; places of faults and warnings are relative to it.
+    /// Reads one line. Offsets in faults and warnings are relative to the line.
     #[inline]
     fn columns_of(&mut self, line: &[u8], hetero: bool) -> Result<(), Box<Fault>> {
         if line.len() < 54 {
@@ -227,7 +227,7 @@ impl<'a> Reader<'a> {
             kind: if hetero { Kind::Ligand } else { Kind::Polymer },
         };
         if self.columns.len() == 0 {
-            // Were all lines as long as this one, so many atoms would fit.
+            // Number of atoms if all lines were as long as this one.
             let rows = self.text.len() / (line.len() + 1) + 1;
             self.columns.reserve(rows.min(self.max_rows));
         }
@@ -235,7 +235,7 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// Where the residue name ends and the chain begins: column 21 belongs to either.
+    /// Returns the end of the residue name and the start of the chain name. Column 21 belongs to one of them.
     #[inline]
     fn residue_and_chain(&mut self, card: &Card) -> (usize, usize) {
         if card[20] <= b' ' {
@@ -245,7 +245,7 @@ impl<'a> Reader<'a> {
         if chains.has(card) { (20, 20) } else { (21, 21) }
     }
 
-    /// A number that may be left out. One that cannot be read is replaced by the default, with a warning.
+    /// Reads an optional number. An unreadable one is replaced by the default, with a warning.
     #[inline]
     fn optional(&mut self, card: &Card, at: (usize, usize), default: (f32, &'static str), what: &str) -> f32 {
         let (from, to) = at;
@@ -295,9 +295,9 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// What a file without atoms holds.
+/// Describes the content of a file without atoms.
 fn describe(text: &[u8]) -> String {
-    /// So many lines are looked at for records to name.
+    /// Number of lines searched for record names.
     const LINES: usize = 10_000;
     let mut records: Vec<String> = Vec::new();
     for (start, end) in Lines::new(text).take(LINES) {

@@ -1,22 +1,21 @@
-//! Residue names that SEQRES and MODRES records list for chains.
+//! Collects the residue names of chains in SEQRES and MODRES records.
 //!
-//! A HETATM residue under a listed name is part of its chain. Standard names are not kept: an amino acid in a HETATM
-//! record may be a ligand of a chain that holds the same amino acid.
+//! A HETATM residue with a listed name is part of the chain. Standard names are excluded: an amino acid in HETATM
+//! records may be a ligand of a chain that contains the same amino acid.
 
 use std::collections::HashSet;
 
 use super::super::kinds::{self, Listed};
 use super::super::residue;
 
-/// Adds the names of a SEQRES record: chain in column 12, or 11 and 12, thirteen names of three columns from column 20
-/// on.
+/// Adds the names of a SEQRES record. The chain is in column 12, or 11 and 12. Thirteen names start at column 20.
 pub(super) fn of_chain(line: &[u8], listed: &mut HashSet<Listed>) {
     for name in line.get(19..).unwrap_or_default().chunks(4).take(13) {
         add(line.get(10..12), name.get(..3), listed);
     }
 }
 
-/// Adds the name of a MODRES record: columns 13 to 15, chain in column 17, or 16 and 17.
+/// Adds the name of a MODRES record, in columns 13 to 15. The chain is in column 17, or 16 and 17.
 pub(super) fn of_residue(line: &[u8], listed: &mut HashSet<Listed>) {
     add(line.get(15..17), line.get(12..15), listed);
 }
