@@ -359,7 +359,7 @@ impl Ledger {
         let id = promise.id();
         let keep = || self.0.keep_up(promise);
         // Without the record a restart would do the job again: a waste, but nothing is lost.
-        if let Err(error) = insist(&id, self.0.settings.patience, StoreError::may_pass, keep).await {
+        if let Err(error) = insist(&id, self.0.settings.patience, StoreError::is_transient, keep).await {
             tracing::error!(job_id = %promise.id(), %error, "a job's ending cannot be recorded");
         }
     }

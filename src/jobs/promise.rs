@@ -252,7 +252,7 @@ async fn attempt(ledger: &Ledger, promise: &Arc<Promise>, ticket: &mut Option<Ti
             match save(ledger, &record, finished).await {
                 // The mesh is not held for ever. As long as it may be begun again, it is made anew once the store answers.
                 Err(EndError::Save { error, .. })
-                    if error.may_pass() && promise.record().attempts < ledger.0.settings.attempts =>
+                    if error.is_transient() && promise.record().attempts < ledger.0.settings.attempts =>
                 {
                     tracing::warn!(job_id = %record.id, %error, "a result was given up; it is made again");
                     Attempt::Silent
@@ -306,7 +306,7 @@ async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Resu
     let (store, settings) = (&ledger.0.store, &ledger.0.settings);
     let scope = Scope::open(&record.requester.origin(ledger.0.pool.tracer()), Instant::now());
     let keep = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
-    insist(&record.id, settings.patience, SaveError::may_pass, keep)
+    insist(&record.id, settings.patience, SaveError::is_transient, keep)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
     scope.close(|| Closing::of("keep"));

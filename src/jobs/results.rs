@@ -38,8 +38,8 @@ pub enum SaveError {
 impl SaveError {
     /// Whether the same may go well later.
     #[must_use]
-    pub fn may_pass(&self) -> bool {
-        matches!(self, Self::Store(error) if error.may_pass())
+    pub fn is_transient(&self) -> bool {
+        matches!(self, Self::Store(error) if error.is_transient())
     }
 }
 

@@ -1,4 +1,4 @@
-//! Where the bytes lie: a folder, or S3. Errors are sorted and counted here.
+//! Storage backend: a folder or S3. Classifies and counts errors.
 
 use std::path::{Path as FilePath, PathBuf};
 use std::sync::Arc;
@@ -22,9 +22,9 @@ use super::stale;
 use crate::config::StoreConfig;
 use crate::telemetry::STORE_ERRORS;
 
-/// Bytes of a part of a large object. S3 asks for 5 MiB at least and takes 10,000 parts: 80 GB.
+/// Size of a part of a large object on S3, bytes. S3 requires at least 5 MiB and accepts 10,000 parts: 80 GB.
 const S3_PART: usize = 8 << 20;
-/// Bytes that are written to a file at once: enough that a thread is not woken for nothing.
+/// Size of a write to a file, bytes: large enough to make waking a thread worthwhile.
 const FILE_PART: usize = 1 << 20;
 /// The folder of [`Backend::probe`].
 const PROBE: &str = "probe";
@@ -34,16 +34,16 @@ enum Kind {
     S3(Bucket),
 }
 
-/// A place for objects.
+/// Folder or bucket that holds the objects.
 pub(super) struct Backend {
     objects: Arc<dyn ObjectStore>,
     kind: Kind,
-    /// For messages: a folder, or a URL without credentials.
+    /// Folder, or URL without credentials, for messages.
     place: String,
 }
 
 impl Backend {
-    /// Opens what the configuration names; `data_dir` is where the folder is made otherwise.
+    /// Opens the configured store. The default is a folder in `data_dir`.
     pub(super) async fn open(config: &StoreConfig, data_dir: &FilePath) -> Result<Self, StoreError> {
         if let Some(url) = &config.url {
             let refuse = |reason| StoreError::Open { key: "store.url", place: url.clone(), reason };
@@ -64,19 +64,19 @@ impl Backend {
         Ok(Self { objects: Arc::new(opened.map_err(refuse)?), kind: Kind::Local(root), place })
     }
 
-    /// A folder with other manners, for tests.
+    /// Creates a backend over a folder with injected behaviour, for tests.
     #[cfg(test)]
     pub(super) fn over(objects: Arc<dyn ObjectStore>, root: PathBuf) -> Self {
         let place = root.display().to_string();
         Self { objects, kind: Kind::Local(root), place }
     }
 
-    /// For messages.
+    /// Returns the location, for messages.
     pub(super) fn place(&self) -> &str {
         &self.place
     }
 
-    /// An error of opening: the same words, with the key that says where the store is.
+    /// Converts an error of opening: adds the configuration key of the location.
     pub(super) fn refuse(&self, error: &StoreError) -> StoreError {
         let key = if self.is_local() { "server.data_dir" } else { "store.url" };
         StoreError::Open { key, place: self.place.clone(), reason: error.to_string() }
@@ -86,7 +86,7 @@ impl Backend {
         matches!(self.kind, Kind::Local(_))
     }
 
-    /// Bytes of a part of a large object.
+    /// Returns the size of a part of a large object, bytes.
     pub(super) fn part(&self) -> usize {
         if self.is_local() { FILE_PART } else { S3_PART }
     }
@@ -95,7 +95,7 @@ impl Backend {
         &self.objects
     }
 
-    /// Sorts and counts an error; `at` is a path from the root of the store.
+    /// Classifies and counts an error. `at` is a path relative to the root of the store.
     pub(super) fn fail(&self, op: &'static str, at: &str, error: &(dyn std::error::Error + 'static)) -> StoreError {
         counter!(STORE_ERRORS, "op" => op).increment(1);
         StoreError::sort(op, &format!("{}/{at}", self.place), error)
@@ -105,7 +105,7 @@ impl Backend {
         move |error| self.fail(op, &name.to_string(), &error)
     }
 
-    /// Writes a whole object. With `new`, false says that there was one.
+    /// Writes an object. With `new`, returns false and changes nothing if the object exists.
     pub(super) async fn put(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
         let mode = if new { PutMode::Create } else { PutMode::Overwrite };
         match self.objects.put_opts(&name.path(), bytes.into(), mode.into()).await {
@@ -115,7 +115,7 @@ impl Backend {
         }
     }
 
-    /// Begins to read an object, or a part of it that lies within.
+    /// Starts reading an object, or a range within it.
     pub(super) async fn get(
         &self,
         name: &Name,
@@ -125,7 +125,7 @@ impl Backend {
         found(self.objects.get_opts(&name.path(), options).await).map_err(self.fail_at("get", name))
     }
 
-    /// All bytes of an object.
+    /// Reads all bytes of an object.
     pub(super) async fn get_whole(&self, name: &Name) -> Result<Option<(Meta, Bytes)>, StoreError> {
         let Some(read) = self.get(name, None).await? else { return Ok(None) };
         let meta = Meta::from(&read.meta);
@@ -133,7 +133,7 @@ impl Backend {
         Ok(Some((meta, bytes)))
     }
 
-    /// Bytes of an object. The file is open for that long only.
+    /// Reads a range of an object. Keeps no file open.
     pub(super) async fn piece(&self, name: &Name, range: std::ops::Range<u64>) -> Result<Bytes, StoreError> {
         let length = range.end - range.start;
         let parts = self.objects.get_ranges(&name.path(), &[range]).await.map_err(self.fail_at("read", name))?;
@@ -148,12 +148,12 @@ impl Backend {
         Ok(found.as_ref().map(Meta::from))
     }
 
-    /// Removes an object; one that is not there is removed already.
+    /// Removes an object. Succeeds if it does not exist.
     pub(super) async fn delete(&self, name: &Name) -> Result<(), StoreError> {
         found(self.objects.delete(&name.path()).await).map_err(self.fail_at("delete", name)).map(|_| ())
     }
 
-    /// What lies in a folder under a name of ours, in the order of names.
+    /// Lists the objects of a folder in name order. Ignores files with other names.
     pub(super) async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
         let listed = self.objects.list(Some(&Path::from(folder.as_str())));
         let ours = |meta: ObjectMeta| Some((Name::at(meta.location.as_ref())?, Meta::from(&meta)));
@@ -167,7 +167,7 @@ impl Backend {
     /// Writes, reads and removes a small object.
     pub(super) async fn probe(&self) -> Result<(), StoreError> {
         static COUNT: AtomicU64 = AtomicU64::new(0);
-        // Processes that share the store do not read each other's.
+        // The name is unique per process, because processes may share a store.
         let file = format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
         let path = Path::from_iter([PROBE, &file]);
         let fail = |e: object_store::Error| self.fail("probe", path.as_ref(), &e);
@@ -196,7 +196,7 @@ impl Backend {
         outcome.map_err(|error| self.refuse(&error))
     }
 
-    /// Removes what crashed processes left: staged files, unfinished uploads, probes. Returns how many.
+    /// Removes leftovers of crashed processes: staged files, unfinished uploads, probes. Returns their number.
     pub(super) async fn clear_stale(&self, now: SystemTime) -> Result<u64, StoreError> {
         let fail = |e: object_store::Error| self.fail("clear", PROBE, &e);
         let probes: Vec<_> = self.objects.list(Some(&Path::from(PROBE))).try_collect().await.map_err(fail)?;
@@ -218,7 +218,7 @@ impl Backend {
     }
 }
 
-/// What is not there is no error.
+/// Converts a "not found" error to `None`.
 fn found<T>(answer: object_store::Result<T>) -> object_store::Result<Option<T>> {
     match answer {
         Ok(there) => Ok(Some(there)),

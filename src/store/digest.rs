@@ -1,4 +1,4 @@
-//! The name of bytes.
+//! SHA-256 digests.
 
 use std::fmt;
 use std::str::FromStr;
@@ -6,17 +6,17 @@ use std::str::FromStr;
 use sha2::{Digest as _, Sha256};
 use thiserror::Error;
 
-/// Not a digest: 64 hexadecimal digits in lower case are.
+/// Error for a text that is not a digest (64 lower-case hexadecimal digits).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("a digest has 64 hexadecimal digits in lower case")]
 pub struct BadDigest;
 
-/// SHA-256 of some bytes, such as a structure file as it came.
+/// SHA-256 digest, for example of an uploaded structure file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Digest([u8; 32]);
 
 impl Digest {
-    /// The digest of `bytes`. About a nanosecond a byte: not for the async runtime.
+    /// Computes the digest of `bytes`. Takes about 1 ns per byte, so large inputs must not run on the async runtime.
     #[must_use]
     pub fn of(bytes: &[u8]) -> Self {
         Self(Sha256::digest(bytes).into())

@@ -1,4 +1,4 @@
-//! Why something could not be kept or found.
+//! Errors of the store.
 
 use std::error::Error as StdError;
 use std::io;
@@ -7,33 +7,33 @@ use thiserror::Error;
 
 use super::name::BadName;
 
-/// Errors of the store. Each names the place that somebody has to look at.
+/// Errors of the store. Each names the location concerned.
 #[derive(Debug, Clone, Error)]
 pub enum StoreError {
-    /// The store cannot be used at all.
+    /// The store cannot be opened.
     #[error("cannot open the store at {place} ({key}): {reason}")]
     Open {
-        /// The key of the configuration that says where it is.
+        /// Configuration key of the location.
         key: &'static str,
-        /// Where it is.
+        /// Location.
         place: String,
-        /// What is wrong with it.
+        /// Cause.
         reason: String,
     },
-    /// One object is larger than everything together may be.
-    #[error("{bytes} bytes do not fit into the store, which keeps {max_bytes} at most (store.max_bytes)")]
+    /// The object is larger than the capacity of the store.
+    #[error("{bytes} bytes exceed the capacity of the store, {max_bytes} bytes (store.max_bytes)")]
     TooLarge {
-        /// Bytes of the object, as far as they are known.
+        /// Size of the object, bytes, as far as known.
         bytes: u64,
         /// The cap.
         max_bytes: u64,
     },
-    /// There is no room, and nothing that could be removed: everything is in use.
-    #[error("no room for {bytes} bytes: {held} of {max_bytes} (store.max_bytes) are held by what is in use")]
+    /// The store is full, and all its objects are in use.
+    #[error("no space for {bytes} bytes: objects in use take {held} of {max_bytes} bytes (store.max_bytes)")]
     Full {
-        /// Bytes asked for.
+        /// Requested bytes.
         bytes: u64,
-        /// Bytes that are held.
+        /// Bytes of objects in use and of reservations.
         held: u64,
         /// The cap.
         max_bytes: u64,
@@ -48,7 +48,7 @@ pub enum StoreError {
         /// The system's words.
         reason: String,
     },
-    /// The system or the service does not let us.
+    /// The system or the storage service denies access.
     #[error("not permitted at {place} ({op}): {reason}")]
     Denied {
         /// What was done.
@@ -58,50 +58,50 @@ pub enum StoreError {
         /// The system's words.
         reason: String,
     },
-    /// A range begins behind the end, or is empty.
-    #[error("bytes {start} to {end} were asked for of {size}")]
+    /// The range is empty or begins after the end.
+    #[error("requested bytes {start} to {end} of {size}")]
     Range {
         /// First byte.
         start: u64,
         /// The byte after the last one.
         end: u64,
-        /// Bytes that there are.
+        /// Size of the object, bytes.
         size: u64,
     },
-    /// A writer got more or fewer bytes than it was promised; nothing is kept.
-    #[error("{written} bytes were written where {promised} were promised")]
+    /// A writer received more or fewer bytes than declared. Nothing is stored.
+    #[error("{written} bytes were written, but {declared} were declared")]
     Length {
-        /// Bytes promised.
-        promised: u64,
-        /// Bytes written, as far as they were counted.
+        /// Declared bytes.
+        declared: u64,
+        /// Bytes written, as far as counted.
         written: u64,
     },
-    /// A writer was dropped before its end; nothing is kept.
-    #[error("the object was given up before its end")]
+    /// A writer was dropped before it finished. Nothing is stored.
+    #[error("the writer was dropped before it finished")]
     Abandoned,
-    /// Not a name.
+    /// The name is invalid.
     #[error(transparent)]
     Name(#[from] BadName),
-    /// Anything else that the disk or the service says.
+    /// Any other error of the disk or the storage service.
     #[error("the store at {place} failed ({op}): {reason}")]
     Failed {
         /// What was done.
         op: &'static str,
         /// Where.
         place: String,
-        /// The words of the system or the service.
+        /// Message of the system or the service.
         reason: String,
     },
 }
 
 impl StoreError {
-    /// Whether the same may go well later: the store answers again, lets us again, or has room again.
+    /// Returns true if a retry may succeed: the store may become reachable or permitted, or have space again.
     #[must_use]
-    pub fn may_pass(&self) -> bool {
+    pub fn is_transient(&self) -> bool {
         matches!(self, Self::Full { .. } | Self::NoSpace { .. } | Self::Denied { .. } | Self::Failed { .. })
     }
 
-    /// Sorts an error of the backend at `place` by what is to be done about it.
+    /// Classifies an error of the backend at `place`.
     pub(super) fn sort(op: &'static str, place: &str, error: &(dyn StdError + 'static)) -> Self {
         use object_store::Error as Os;
         let (place, reason) = (place.to_owned(), error.to_string());

@@ -1,4 +1,4 @@
-//! A disk that fails on command, for tests here and of whoever keeps something in the store.
+//! Disk with injected faults, for tests.
 
 use std::io;
 use std::ops::Range;
@@ -20,16 +20,16 @@ use super::backend::Backend;
 use super::{Folder, Store};
 use crate::config::StoreConfig;
 
-/// What is wrong with it at the moment.
+/// Injected faults.
 #[derive(Debug, Default)]
 pub(crate) struct Faults {
-    /// Nothing can be written.
+    /// Writes fail.
     pub(crate) full: AtomicBool,
-    /// Nothing can be removed.
+    /// Removals fail.
     pub(crate) stuck: AtomicBool,
-    /// The folder of which nothing is heard, and whether that goes for reading too.
+    /// Folder whose operations hang; true if reads hang too.
     silent: Mutex<Option<(Folder, bool)>>,
-    /// Questions about it that were not answered.
+    /// Number of operations that hang.
     pub(crate) unanswered: AtomicUsize,
 }
 
@@ -38,13 +38,13 @@ pub(crate) fn error(kind: io::ErrorKind) -> object_store::Error {
 }
 
 impl Faults {
-    /// From now on nothing is heard of this folder, and of no other one.
+    /// Makes all operations on this folder hang, and no others.
     pub(crate) fn silence(&self, folder: Option<Folder>) {
         self.unanswered.store(0, Ordering::SeqCst);
         *self.silent.lock().unwrap() = folder.map(|folder| (folder, true));
     }
 
-    /// The same for what is written there alone.
+    /// Makes only writes to this folder hang.
     pub(crate) fn seal(&self, folder: Folder) {
         self.unanswered.store(0, Ordering::SeqCst);
         *self.silent.lock().unwrap() = Some((folder, false));
@@ -59,12 +59,12 @@ impl Faults {
         Ok(())
     }
 
-    fn room(&self) -> Result<()> {
+    fn check_space(&self) -> Result<()> {
         if self.full.load(Ordering::Relaxed) { Err(error(io::ErrorKind::StorageFull)) } else { Ok(()) }
     }
 }
 
-/// A folder on such a disk.
+/// Object store on a disk with injected faults.
 #[derive(Debug)]
 struct Faulty {
     files: LocalFileSystem,
@@ -84,10 +84,10 @@ struct FaultyUpload(Box<dyn MultipartUpload>, Arc<Faults>);
 impl MultipartUpload for FaultyUpload {
     fn put_part(&mut self, data: PutPayload) -> UploadPart {
         let part = self.0.put_part(data);
-        let room = self.1.room();
+        let space = self.1.check_space();
         Box::pin(async move {
             part.await?;
-            room
+            space
         })
     }
 
@@ -104,7 +104,7 @@ impl MultipartUpload for FaultyUpload {
 impl ObjectStore for Faulty {
     async fn put_opts(&self, at: &Path, payload: PutPayload, options: PutOptions) -> Result<PutResult> {
         self.faults.answers(at, false)?;
-        self.faults.room()?;
+        self.faults.check_space()?;
         self.files.put_opts(at, payload, options).await
     }
 
@@ -142,11 +142,11 @@ impl ObjectStore for Faulty {
     }
 }
 
-/// A store on such a disk, in a folder of its own, with this much room for results and inputs, bytes.
+/// Opens a store with injected faults in a temporary folder. `max_bytes` is its capacity.
 pub(crate) async fn faulty(max_bytes: u64) -> (TempDir, Arc<Faults>, Store) {
     let dir = tempfile::tempdir().unwrap();
     let config = StoreConfig { max_bytes, memory_object_bytes: 1, ..StoreConfig::default() };
-    // Makes the folders.
+    // Creates the folders.
     drop(Store::open(&config, dir.path()).await.unwrap());
     let (root, faults) = (dir.path().join("store"), Arc::new(Faults::default()));
     let files = LocalFileSystem::new_with_prefix(&root).unwrap();

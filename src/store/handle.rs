@@ -1,4 +1,4 @@
-//! The store: bytes by name, kept whole.
+//! The store: atomic, durable objects by name.
 
 use std::collections::hash_map::DefaultHasher;
 use std::fmt;
@@ -25,12 +25,12 @@ use super::{stream, upload};
 use crate::config::StoreConfig;
 use crate::telemetry::CACHE_REQUESTS;
 
-/// Locks for writing and removing, shared by the names that fall on one.
+/// Number of locks for writing and removing. Names share them by hash.
 const STRIPES: usize = 64;
 
-/// What the service keeps, in a folder or on S3. Clones are the same store.
+/// Object store in a folder or on S3. Clones share one store.
 ///
-/// Objects appear and disappear as a whole. Futures may be dropped at any time: what was begun is finished or undone.
+/// Writes and removals are atomic. Futures may be dropped at any time: a started operation is completed or undone.
 #[derive(Clone)]
 pub struct Store(pub(super) Arc<Inner>);
 
@@ -40,8 +40,9 @@ pub(super) struct Inner {
     index: Mutex<Index>,
     memory: Memory,
     stripes: [AsyncMutex<()>; STRIPES],
-    /// Held by whoever makes room, so that two do not remove twice as much; says when staged files were last looked for.
-    pub(super) tidying: AsyncMutex<SystemTime>,
+    /// Serializes evictions, so that two do not remove twice as much. The value is the time of the last search for
+    /// staged files.
+    pub(super) last_cleanup: AsyncMutex<SystemTime>,
     pub(super) runtime: Handle,
 }
 
@@ -52,21 +53,21 @@ impl fmt::Debug for Store {
 }
 
 impl Store {
-    /// Opens the store that `config` names, by default the folder `store` in `data_dir`; tries it, removes what crashed
-    /// processes left there, and counts what it holds. Call it on the runtime that shall do the store's work.
+    /// Opens the configured store, by default the folder `store` in `data_dir`. Tests it, removes leftovers of crashed
+    /// processes, and indexes its objects. Call it on the runtime that is to run the operations of the store.
     ///
     /// # Errors
-    /// [`StoreError::Open`] where it cannot be written and read.
+    /// Returns [`StoreError::Open`] if it cannot be written and read.
     pub async fn open(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
         let backend = Backend::open(config, data_dir).await?;
         Self::over(backend, config).await
     }
 
-    /// [`open`](Self::open), with the backend at hand.
+    /// Opens a store over `backend`; see [`open`](Self::open).
     pub(super) async fn over(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
         backend.probe().await.map_err(|e| backend.refuse(&e))?;
         let now = SystemTime::now();
-        // The store works without this, and whoever may not list uploads may still use them.
+        // Not fatal: credentials may permit uploads without permitting their listing.
         let cleared = match backend.clear_stale(now).await {
             Ok(cleared) => cleared,
             Err(error) => {
@@ -88,25 +89,25 @@ impl Store {
             index: Mutex::new(index),
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
             stripes: [const { AsyncMutex::const_new(()) }; STRIPES],
-            tidying: AsyncMutex::new(now),
+            last_cleanup: AsyncMutex::new(now),
             runtime: Handle::current(),
             config: config.clone(),
         })))
     }
 
-    /// Keeps `bytes` under `name`, in place of what was there. It is durable when this returns.
+    /// Stores `bytes` under `name`, replacing any existing object. The object is durable on return.
     ///
     /// # Errors
-    /// [`StoreError`]; what was there before is still there then, unless it had to make room.
+    /// Returns a [`StoreError`]. An existing object is unchanged then, unless it was evicted.
     pub async fn put(&self, name: &Name, bytes: Bytes) -> Result<(), StoreError> {
         self.keep(name, bytes, false).await.map(|_| ())
     }
 
-    /// Keeps `bytes` under `name` unless there is something. Returns whether it was kept; for names that follow from
-    /// the content both are good news. It is durable when this returns.
+    /// Stores `bytes` under `name` unless an object exists, and returns true if it was stored. The object is durable on
+    /// return.
     ///
     /// # Errors
-    /// [`StoreError`]; nothing has changed then.
+    /// Returns a [`StoreError`]. Nothing has changed then.
     pub async fn put_new(&self, name: &Name, bytes: Bytes) -> Result<bool, StoreError> {
         if self.head(name).await?.is_some() {
             self.touch(name, SystemTime::now());
@@ -118,9 +119,9 @@ impl Store {
     async fn keep(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
         let (store, name) = (self.clone(), name.clone());
         self.finished(async move {
-            let room = store.room_for(&name, bytes.len() as u64).await?;
+            let reservation = store.reserve_for(&name, bytes.len() as u64).await?;
             let _lock = store.stripe(&name).lock().await;
-            // What a content is named after is the same in both hands; only documents have to be told apart at once.
+            // Content-addressed objects are equal anyway; only job documents need an atomic check.
             if new && name.folder() != Folder::Jobs && store.0.backend.head(&name).await?.is_some() {
                 return Ok(false);
             }
@@ -129,17 +130,17 @@ impl Store {
             if kept {
                 store.commit(&name, bytes.len() as u64, Some(&bytes));
             }
-            drop(room);
+            drop(reservation);
             Ok(kept)
         })
         .await
     }
 
-    /// All bytes of an object. A result that is in memory is answered at once: no disk, no other thread. Large objects
-    /// are better read with [`read`](Self::read).
+    /// Reads all bytes of an object. Results in memory need no disk access and no other thread. For large objects, use
+    /// [`read`](Self::read).
     ///
     /// # Errors
-    /// [`StoreError`]. An object that is not there is none: it may have been removed at any time.
+    /// Returns a [`StoreError`]. A missing object is `None`, not an error, since objects may be removed at any time.
     pub async fn get(&self, name: &Name) -> Result<Option<Stored>, StoreError> {
         if let Some((meta, bytes)) = self.recall(name) {
             return Ok(Some(Stored { bytes, meta }));
@@ -155,12 +156,12 @@ impl Store {
         Ok(Some(Stored { bytes, meta }))
     }
 
-    /// An object in pieces, or the bytes of `range` of it, whose end may lie behind the object's. For objects named
-    /// after their content: each piece is read when it is asked for. The object is pinned until the stream is dropped.
+    /// Streams an object, or a range of it whose end may exceed the size. Use it for content-addressed objects: each
+    /// piece is read on demand. The object is pinned until the stream is dropped.
     ///
     /// # Errors
-    /// [`StoreError::Range`] if the range is empty or begins behind the end; others as they come. The stream fails if
-    /// the object is deleted while it is read.
+    /// Returns [`StoreError::Range`] if the range is empty or begins after the end, or another [`StoreError`]. The
+    /// stream fails if the object is deleted during the read.
     pub async fn read(&self, name: &Name, range: Option<Range<u64>>) -> Result<Option<(Meta, ByteStream)>, StoreError> {
         let pin = self.pin(name);
         let known = self.recall(name).map(|(meta, _)| meta);
@@ -180,7 +181,7 @@ impl Store {
         Ok(Some((meta, stream::pieces(pin, meta, range))))
     }
 
-    /// [`read`](Self::read) from a service: one request for all pieces.
+    /// Reads from S3; see [`read`](Self::read). Makes one request for all pieces.
     async fn read_remote(
         &self,
         name: &Name,
@@ -202,7 +203,8 @@ impl Store {
         Ok(read.map(|read| (Meta::from(&read.meta), stream::remote(self.clone(), name.clone(), read))))
     }
 
-    /// Bytes of the object that `meta` describes. A copy where it is in memory, so that the bytes hold only themselves.
+    /// Reads a range of the object that `meta` describes. Copies from memory, so that the result does not keep the
+    /// whole object alive.
     pub(super) async fn piece(&self, name: &Name, meta: Meta, range: Range<u64>) -> Result<Bytes, StoreError> {
         if let Some((_, bytes)) = self.0.memory.get(name).filter(|(now, _)| now.size == meta.size) {
             let at = |offset: u64| usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
@@ -211,10 +213,10 @@ impl Store {
         self.0.backend.piece(name, range).await
     }
 
-    /// What is known of an object; this is no use of it.
+    /// Returns the metadata of an object. Does not count as a use.
     ///
     /// # Errors
-    /// [`StoreError`].
+    /// Returns a [`StoreError`].
     pub async fn head(&self, name: &Name) -> Result<Option<Meta>, StoreError> {
         let Some(seen) = self.index().begin_read(name) else { return Ok(None) };
         let meta = self.0.backend.head(name).await?;
@@ -222,44 +224,44 @@ impl Store {
         Ok(meta)
     }
 
-    /// Removes an object, pinned or not; one that is not there is removed already.
+    /// Removes an object, even if it is pinned. Succeeds if it does not exist.
     ///
     /// # Errors
-    /// [`StoreError`]; the object is still there then.
+    /// Returns a [`StoreError`]. The object still exists then.
     pub async fn delete(&self, name: &Name) -> Result<(), StoreError> {
         let (store, name) = (self.clone(), name.clone());
         self.finished(async move {
             let _lock = store.stripe(&name).lock().await;
-            store.index().order_removal(&name);
+            store.index().mark_removed(&name);
             store.remove(&name).await
         })
         .await
     }
 
-    /// The objects of a folder, in the order of their names, as the disk or the service has them.
+    /// Lists the objects of a folder in name order, as the disk or the service reports them.
     ///
     /// # Errors
-    /// [`StoreError`].
+    /// Returns a [`StoreError`].
     pub async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
         self.0.backend.list(folder).await
     }
 
-    /// Notes that an object is of use at `at`: its time to live begins anew.
+    /// Records a use of an object at time `at`, which restarts its time to live.
     pub fn touch(&self, name: &Name, at: SystemTime) {
         self.index().touch(name, at);
     }
 
-    /// Keeps a name from being tidied away for as long as the pin lives, whether there is an object or not.
-    /// [`delete`](Self::delete) is stronger.
+    /// Protects a name from eviction and expiry until the pin is dropped. The object need not exist yet.
+    /// [`delete`](Self::delete) ignores pins.
     pub fn pin(&self, name: &Name) -> Pin {
         self.index().pin(name);
         Pin::new(self.clone(), name.clone())
     }
 
-    /// Writes, reads and removes a small object: whether the store works.
+    /// Tests the store: writes, reads and removes a small object.
     ///
     /// # Errors
-    /// [`StoreError`].
+    /// Returns a [`StoreError`].
     pub async fn probe(&self) -> Result<(), StoreError> {
         self.0.backend.probe().await
     }
@@ -267,25 +269,25 @@ impl Store {
     /// Returns the secret of the store, from which unguessable ids are derived. Creates it on first use.
     ///
     /// # Errors
-    /// [`StoreError::Open`] if it cannot be read or created.
+    /// Returns [`StoreError::Open`] if it cannot be read or created.
     pub(crate) async fn secret(&self) -> Result<Secret, StoreError> {
         self.0.backend.secret().await
     }
 
-    /// What a folder holds.
+    /// Returns the number and total size of the objects in a folder.
     #[must_use]
     pub fn usage(&self, folder: Folder) -> Usage {
         let (bytes, objects) = self.index().total(folder);
         Usage { bytes, objects }
     }
 
-    /// Bytes of results that are in memory.
+    /// Returns the bytes of results in memory.
     #[must_use]
     pub fn memory_held(&self) -> u64 {
         self.0.memory.held()
     }
 
-    /// Where it is, for messages.
+    /// Returns the location, for messages.
     #[must_use]
     pub fn place(&self) -> &str {
         self.0.backend.place()
@@ -302,7 +304,7 @@ impl Store {
         &self.0.stripes[stripe]
     }
 
-    /// Enters what was just written under the name's lock; small results stay in memory.
+    /// Indexes an object that was just written under the lock of its name. Caches small results in memory.
     pub(super) fn commit(&self, name: &Name, size: u64, bytes: Option<&Bytes>) {
         let now = SystemTime::now();
         let mut index = self.index();
@@ -313,7 +315,7 @@ impl Store {
         }
     }
 
-    /// Removes what the index has taken out of sight, under the name's lock.
+    /// Removes an object that the index has marked as being removed, under the lock of its name.
     pub(super) async fn remove(&self, name: &Name) -> Result<(), StoreError> {
         self.0.memory.remove(name);
         let removed = self.0.backend.delete(name).await;
@@ -321,7 +323,7 @@ impl Store {
         removed
     }
 
-    /// Runs to the end what must not stop half-way, even if nobody waits for it any more.
+    /// Runs an operation to its end, even if the caller stops waiting.
     pub(super) async fn finished<T: Send + 'static>(
         &self,
         work: impl Future<Output = Result<T, StoreError>> + Send + 'static,
@@ -330,7 +332,7 @@ impl Store {
         done.unwrap_or_else(|e| Err(self.0.backend.fail("task", "", &e)))
     }
 
-    /// A result from memory.
+    /// Returns a result from memory.
     fn recall(&self, name: &Name) -> Option<(Meta, Bytes)> {
         if name.folder() != Folder::Results {
             return None;
@@ -343,7 +345,7 @@ impl Store {
         found
     }
 
-    /// Begins a read that is counted.
+    /// Starts a read and records the use.
     fn begin_read(&self, name: &Name) -> Option<Seen> {
         let seen = self.index().begin_read(name);
         if seen.is_none() && name.folder() == Folder::Results {
@@ -352,7 +354,7 @@ impl Store {
         seen
     }
 
-    /// Ends it.
+    /// Ends a read.
     fn end_read(&self, name: &Name, seen: Seen, meta: Option<Meta>) {
         if name.folder() == Folder::Results {
             count("store", meta.is_some());
@@ -363,7 +365,7 @@ impl Store {
         }
     }
 
-    /// Makes the index agree with what a read found: others may write to the store and remove from it.
+    /// Updates the index with the result of a read, because other processes may write to the store and remove from it.
     fn reconcile(&self, name: &Name, seen: Seen, meta: Option<Meta>) {
         let mut index = self.index();
         match meta {
@@ -377,12 +379,12 @@ impl Store {
     }
 }
 
-/// Counts a question for a result.
+/// Counts a lookup of a result.
 fn count(tier: &'static str, hit: bool) {
     counter!(CACHE_REQUESTS, "tier" => tier, "result" => if hit { "hit" } else { "miss" }).increment(1);
 }
 
-/// The part of a range that lies within `size` bytes.
+/// Clips a range to `size` bytes.
 fn within(range: Range<u64>, size: u64) -> Result<Range<u64>, StoreError> {
     if range.start >= range.end.min(size) {
         return Err(StoreError::Range { start: range.start, end: range.end, size });

@@ -1,4 +1,4 @@
-//! Bookkeeping, in memory: how large everything is, when it was used, who holds it. Nothing here waits or touches a disk.
+//! In-memory index of objects: sizes, times of last use, pins and reservations. Never blocks or accesses a disk.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, SystemTime};
@@ -8,52 +8,52 @@ use metrics::gauge;
 use super::name::{Folder, Name};
 use crate::telemetry::{STORE_BYTES, STORE_OBJECTS};
 
-/// Order of last use; the count tells uses within one tick of the clock apart.
+/// Order of last use. The counter orders uses within one clock tick.
 type Use = (SystemTime, u64);
 
 #[derive(Debug, Clone, Copy)]
 struct Entry {
     bytes: u64,
     used: Use,
-    /// Which writing of the name this is.
+    /// Number of writes to the name.
     version: u64,
 }
 
-/// What a read saw when it began, so that what it brings back is not taken for newer than it is.
+/// State of a name at the start of a read, which shows whether the result of the read is outdated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Seen {
     version: Option<u64>,
     removals: u64,
 }
 
-/// An object that may go: its name, and the state in which it was looked at.
+/// Object that may be evicted, and its state when it was chosen.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Victim {
+pub(super) struct EvictionCandidate {
     pub(super) name: Name,
     pub(super) bytes: u64,
     used: Use,
 }
 
-/// Why there is no room.
+/// Reason for a failed reservation.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum NoRoom {
-    /// These have to go first.
-    Remove(Vec<Victim>),
-    /// There would be none if everything went that may go.
+pub(super) enum ReserveError {
+    /// These objects must be evicted first.
+    Remove(Vec<EvictionCandidate>),
+    /// Evicting all candidates would not suffice. Bytes in use.
     Held(u64),
 }
 
-/// Sizes, uses, pins, reservations.
+/// Index of all objects.
 #[derive(Debug, Default)]
 pub(super) struct Index {
     entries: BTreeMap<Name, Entry>,
     by_use: BTreeMap<Use, Name>,
     pins: BTreeMap<Name, usize>,
-    /// On their way out: no longer to be read, still on disk.
+    /// Objects being removed: no longer readable, but still on disk.
     leaving: BTreeSet<Name>,
-    /// Bytes and objects by folder, those on their way out included.
+    /// Bytes and objects by folder, including objects being removed.
     totals: [(u64, u64); Folder::ALL.len()],
-    /// Capped bytes promised to writers.
+    /// Bytes reserved by writers, in folders that count against the capacity.
     reserved: u64,
     count: u64,
     removals: u64,
@@ -65,7 +65,7 @@ impl Index {
         self.count
     }
 
-    /// Enters an object that was written, or found at the start. Its bytes are on disk from now on.
+    /// Adds an object that was written, or found at startup.
     pub(super) fn commit(&mut self, name: &Name, bytes: u64, used: SystemTime) {
         self.forget(name);
         let (version, used) = (self.next(), (used, self.next()));
@@ -76,7 +76,7 @@ impl Index {
         self.show(name.folder());
     }
 
-    /// Strikes an object that is gone. Returns whether there was one.
+    /// Removes an object that no longer exists. Returns true if it was in the index.
     pub(super) fn forget(&mut self, name: &Name) -> bool {
         let Some(entry) = self.entries.remove(name) else { return false };
         self.by_use.remove(&entry.used);
@@ -87,7 +87,7 @@ impl Index {
         true
     }
 
-    /// Notes a use at `at`, unless a later one is known.
+    /// Records a use at time `at`, unless a later one is known.
     pub(super) fn touch(&mut self, name: &Name, at: SystemTime) {
         let count = self.next();
         let Some(entry) = self.entries.get_mut(name) else { return };
@@ -96,19 +96,19 @@ impl Index {
         self.by_use.insert(entry.used, name.clone());
     }
 
-    /// Begins a read. `None`: the object is on its way out.
+    /// Starts a read. Returns `None` if the object is being removed.
     pub(super) fn begin_read(&self, name: &Name) -> Option<Seen> {
         let version = self.entries.get(name).map(|entry| entry.version);
         (!self.leaving.contains(name)).then_some(Seen { version, removals: self.removals })
     }
 
-    /// Whether nothing was written to the name since the read began, and it is still there.
+    /// Returns true if the object exists and was not written since the read started.
     pub(super) fn is_current(&self, name: &Name, seen: Seen) -> bool {
         let version = self.entries.get(name).map(|entry| entry.version);
         version.is_some() && version == seen.version && !self.leaving.contains(name)
     }
 
-    /// Enters what a read found and the index did not know: another process wrote it.
+    /// Adds an object that a read found, because another process wrote it.
     pub(super) fn adopt(&mut self, name: &Name, seen: Seen, bytes: u64, used: SystemTime) {
         let unknown = !self.entries.contains_key(name) && !self.leaving.contains(name);
         if unknown && seen.version.is_none() && seen.removals == self.removals {
@@ -133,75 +133,75 @@ impl Index {
         !self.pins.contains_key(name) && !self.leaving.contains(name)
     }
 
-    /// What was last used longer ago than its folder allows, the longest first.
-    pub(super) fn expired(&self, now: SystemTime, ttl: impl Fn(Folder) -> Duration) -> Vec<Victim> {
+    /// Returns the objects whose time to live has expired, oldest first.
+    pub(super) fn expired(&self, now: SystemTime, ttl: impl Fn(Folder) -> Duration) -> Vec<EvictionCandidate> {
         self.by_use
             .iter()
             .filter(|((used, _), name)| now.duration_since(*used).is_ok_and(|age| age >= ttl(name.folder())))
             .filter(|(_, name)| self.may_go(name))
-            .filter_map(|(used, name)| self.victim(name, *used))
+            .filter_map(|(used, name)| self.candidate(name, *used))
             .collect()
     }
 
-    /// Promises `bytes` below `cap`, or says what has to go for that.
-    pub(super) fn reserve(&mut self, bytes: u64, cap: u64) -> Result<(), NoRoom> {
-        let (victims, missing) = self.excess(bytes, cap);
+    /// Reserves `bytes` within the capacity `cap`, or returns the objects to evict.
+    pub(super) fn reserve(&mut self, bytes: u64, cap: u64) -> Result<(), ReserveError> {
+        let (candidates, missing) = self.excess(bytes, cap);
         if missing > 0 {
-            let taken = self.taken() - victims.iter().map(|victim| victim.bytes).sum::<u64>();
-            return Err(NoRoom::Held(taken));
+            let taken = self.taken() - candidates.iter().map(|candidate| candidate.bytes).sum::<u64>();
+            return Err(ReserveError::Held(taken));
         }
-        if !victims.is_empty() {
-            return Err(NoRoom::Remove(victims));
+        if !candidates.is_empty() {
+            return Err(ReserveError::Remove(candidates));
         }
         self.reserved += bytes;
         Ok(())
     }
 
-    /// What has to go, the least recently used first, so that `bytes` more are at most `cap`; and how many bytes are
+    /// Returns the least recently used objects to evict so that `bytes` more fit into `cap`, and the bytes that are
     /// missing even then.
-    pub(super) fn excess(&self, bytes: u64, cap: u64) -> (Vec<Victim>, u64) {
+    pub(super) fn excess(&self, bytes: u64, cap: u64) -> (Vec<EvictionCandidate>, u64) {
         let mut missing = self.taken().saturating_add(bytes).saturating_sub(cap);
-        let mut victims = Vec::new();
+        let mut candidates = Vec::new();
         for (used, name) in &self.by_use {
             if missing == 0 {
                 break;
             }
             if name.folder().is_capped() && self.may_go(name) {
-                let Some(victim) = self.victim(name, *used) else { continue };
-                missing = missing.saturating_sub(victim.bytes);
-                victims.push(victim);
+                let Some(candidate) = self.candidate(name, *used) else { continue };
+                missing = missing.saturating_sub(candidate.bytes);
+                candidates.push(candidate);
             }
         }
-        (victims, missing)
+        (candidates, missing)
     }
 
-    /// Capped bytes, on disk and promised.
+    /// Returns the bytes that count against the capacity: on disk and reserved.
     fn taken(&self) -> u64 {
         let capped = Folder::ALL.into_iter().filter(|folder| folder.is_capped());
         capped.map(|folder| self.total(folder).0).sum::<u64>() + self.reserved
     }
 
-    /// Gives promised bytes back.
+    /// Releases reserved bytes.
     pub(super) fn release(&mut self, bytes: u64) {
         self.reserved -= bytes;
     }
 
-    fn victim(&self, name: &Name, used: Use) -> Option<Victim> {
-        self.entries.get(name).map(|entry| Victim { name: name.clone(), bytes: entry.bytes, used })
+    fn candidate(&self, name: &Name, used: Use) -> Option<EvictionCandidate> {
+        self.entries.get(name).map(|entry| EvictionCandidate { name: name.clone(), bytes: entry.bytes, used })
     }
 
-    /// Takes any object out of sight, on the word of whoever owns it.
-    pub(super) fn order_removal(&mut self, name: &Name) {
+    /// Marks an object as being removed, unconditionally.
+    pub(super) fn mark_removed(&mut self, name: &Name) {
         self.leaving.insert(name.clone());
     }
 
-    /// Takes a victim out of sight, unless it was used, written or pinned since it was chosen.
-    pub(super) fn begin_removal(&mut self, victim: &Victim) -> bool {
-        let unchanged = self.entries.get(&victim.name).is_some_and(|entry| entry.used == victim.used);
-        unchanged && self.may_go(&victim.name) && self.leaving.insert(victim.name.clone())
+    /// Marks a candidate as being removed, unless it was used, written or pinned since it was chosen.
+    pub(super) fn begin_removal(&mut self, candidate: &EvictionCandidate) -> bool {
+        let unchanged = self.entries.get(&candidate.name).is_some_and(|entry| entry.used == candidate.used);
+        unchanged && self.may_go(&candidate.name) && self.leaving.insert(candidate.name.clone())
     }
 
-    /// Ends a removal: the object is gone, or is back in sight.
+    /// Ends a removal. If it failed, the object becomes readable again.
     pub(super) fn end_removal(&mut self, name: &Name, gone: bool) {
         self.leaving.remove(name);
         if gone {
@@ -209,12 +209,12 @@ impl Index {
         }
     }
 
-    /// Bytes and objects of a folder.
+    /// Returns bytes and number of objects of a folder.
     pub(super) fn total(&self, folder: Folder) -> (u64, u64) {
         self.totals[folder as usize]
     }
 
-    /// Tells the metrics about a folder.
+    /// Updates the metrics of a folder.
     pub(super) fn show(&self, folder: Folder) {
         let (bytes, objects) = self.total(folder);
         gauge!(STORE_BYTES, "folder" => folder.as_str()).set(bytes as f64);
@@ -245,7 +245,7 @@ mod tests {
         index.commit(&name("a"), 5, at(3));
         assert!(!index.is_current(&name("a"), seen));
         let seen = index.begin_read(&name("a")).unwrap();
-        index.order_removal(&name("a"));
+        index.mark_removed(&name("a"));
         assert!(!index.is_current(&name("a"), seen) && index.begin_read(&name("a")).is_none());
         index.end_removal(&name("a"), false);
         assert!(index.is_current(&name("a"), seen), "it could not be removed");
@@ -269,18 +269,20 @@ mod tests {
         for (id, used) in [("a", 1), ("b", 2), ("c", 3)] {
             index.commit(&name(id), 10, at(used));
         }
-        let Err(NoRoom::Remove(victims)) = index.reserve(20, 30) else { panic!("room where there is none") };
-        assert_eq!(victims.iter().map(|v| v.name.clone()).collect::<Vec<_>>(), [name("a"), name("b")]);
+        let Err(ReserveError::Remove(candidates)) = index.reserve(20, 30) else {
+            panic!("reserved more than the capacity")
+        };
+        assert_eq!(candidates.iter().map(|v| v.name.clone()).collect::<Vec<_>>(), [name("a"), name("b")]);
         index.touch(&name("a"), at(1));
         index.pin(&name("b"));
-        assert!(!index.begin_removal(&victims[0]) && !index.begin_removal(&victims[1]));
+        assert!(!index.begin_removal(&candidates[0]) && !index.begin_removal(&candidates[1]));
         index.unpin(&name("b"));
-        assert!(index.begin_removal(&victims[1]) && !index.begin_removal(&victims[1]));
+        assert!(index.begin_removal(&candidates[1]) && !index.begin_removal(&candidates[1]));
         index.end_removal(&name("b"), true);
         assert_eq!((index.reserve(10, 30), index.total(Folder::Inputs)), (Ok(()), (20, 2)));
         index.pin(&name("a"));
         index.pin(&name("c"));
-        assert_eq!(index.reserve(1, 30), Err(NoRoom::Held(30)));
+        assert_eq!(index.reserve(1, 30), Err(ReserveError::Held(30)));
         index.release(10);
         assert_eq!(index.reserve(10, 30), Ok(()));
     }

@@ -71,7 +71,7 @@ impl FolderLock {
     /// Locks `folder`, creating it if necessary, and records this process and `address` in the lock file.
     ///
     /// # Errors
-    /// [`LockError::Held`] if another service uses the folder.
+    /// Returns [`LockError::Held`] if another service uses the folder.
     pub fn acquire(folder: &Path, address: SocketAddr) -> Result<Self, LockError> {
         let failed = |error| LockError::Io { folder: folder.to_owned(), error };
         std::fs::create_dir_all(folder).map_err(failed)?;
@@ -88,7 +88,7 @@ impl FolderLock {
     /// Checks that the lock of `folder` is free, without creating anything.
     ///
     /// # Errors
-    /// [`LockError::Held`] if a service uses the folder.
+    /// Returns [`LockError::Held`] if a service uses the folder.
     pub fn check(folder: &Path) -> Result<(), LockError> {
         match File::open(folder.join(FILE)) {
             Ok(mut file) => lock(&mut file, folder),
@@ -115,7 +115,7 @@ fn lock(file: &mut File, folder: &Path) -> Result<(), LockError> {
     }
 }
 
-/// Name of this host; `None` on other systems than Linux.
+/// Returns the name of this host; `None` on systems other than Linux.
 fn host() -> Option<String> {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok()?;
     Some(name.trim().to_owned())

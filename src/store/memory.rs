@@ -1,4 +1,4 @@
-//! Small results, kept in memory: an answer that everybody asks for costs no disk and no other thread.
+//! In-memory cache of small results.
 
 use bytes::Bytes;
 use quick_cache::Weighter;
@@ -7,7 +7,7 @@ use quick_cache::sync::Cache;
 use super::name::{Folder, Name};
 use super::object::Meta;
 
-/// What an entry takes beside its bytes: its name, its place in the cache.
+/// Memory of an entry besides its data, bytes.
 const OVERHEAD: u64 = 256;
 
 #[derive(Clone)]
@@ -19,17 +19,16 @@ impl Weighter<Name, (Meta, Bytes)> for Weight {
     }
 }
 
-/// The memory tier.
+/// Bounded cache of results.
 pub(super) struct Memory {
     cache: Cache<Name, (Meta, Bytes), Weight>,
     largest: u64,
 }
 
 impl Memory {
-    /// At most `bytes` in all, in objects of at most `largest` bytes.
+    /// Creates a cache of `bytes`, for objects of at most `largest` bytes.
     pub(super) fn new(bytes: u64, largest: u64) -> Self {
-        // The cache divides itself into shards by the number of entries expected; few large entries make few shards,
-        // so that the largest object fits into one.
+        // The expected number of entries determines the number of shards. Few, large shards hold the largest object.
         let items = usize::try_from(bytes / largest.max(1)).unwrap_or(usize::MAX).clamp(1, 1 << 16);
         Self { cache: Cache::with_weighter(items, bytes, Weight), largest }
     }
@@ -42,7 +41,7 @@ impl Memory {
         self.cache.get(name)
     }
 
-    /// Keeps a result if it is small enough; what was kept under the name is gone in any case.
+    /// Caches a result if it is small enough. Drops an existing entry in any case.
     pub(super) fn put(&self, name: &Name, meta: Meta, bytes: &Bytes) {
         if self.takes(name, bytes.len() as u64) {
             self.cache.insert(name.clone(), (meta, bytes.clone()));
@@ -55,7 +54,7 @@ impl Memory {
         let _gone = self.cache.remove(name);
     }
 
-    /// Bytes held.
+    /// Returns the cached bytes.
     pub(super) fn held(&self) -> u64 {
         self.cache.weight()
     }

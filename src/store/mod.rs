@@ -1,16 +1,16 @@
-//! What the service keeps, by the names of contents: in a folder or on S3, bounded, and swept.
+//! Bounded object store for inputs, jobs and results, in a folder or on S3.
 //!
-//! [`Store`] is the whole interface. `backend.rs` knows where bytes lie, `index.rs` what there is and what goes first,
-//! `memory.rs` keeps small results at hand, `tidy.rs` makes room, `writer.rs` takes what threads write. `lock.rs` locks
-//! the data folder against a second service.
+//! [`Store`] is the whole interface. `backend.rs` accesses folder or bucket, `index.rs` tracks objects and their use,
+//! `memory.rs` caches small results, `eviction.rs` frees space, and `writer.rs` accepts data from blocking threads.
+//! `lock.rs` protects the data folder against a second service.
 //!
-//! Who writes or removes a name holds its lock (`Store::stripe`), after room has been made for it: so nobody waits for
-//! room with a lock in hand. Readers hold none; what they bring back enters index and memory only if the name has not
-//! changed meanwhile.
+//! A write or removal reserves space first and then holds the lock of the name (`Store::stripe`), so it never waits for
+//! space under a lock. Reads take no lock. Their results enter index and cache only if the name has not changed.
 
 mod backend;
 mod digest;
 mod error;
+mod eviction;
 #[cfg(test)]
 pub(crate) mod faulty;
 mod handle;
@@ -25,16 +25,15 @@ mod stale;
 mod stream;
 #[cfg(test)]
 mod tests;
-mod tidy;
 mod upload;
 mod writer;
 
 pub use digest::{BadDigest, Digest};
 pub use error::StoreError;
+pub use eviction::Swept;
 pub use handle::Store;
 pub use lock::{FolderLock, LockError};
 pub use name::{BadName, Folder, Name};
 pub use object::{ByteStream, Meta, Pin, Stored, Usage};
 pub(crate) use secret::Secret;
-pub use tidy::Swept;
 pub use writer::Writer;

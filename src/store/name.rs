@@ -1,4 +1,4 @@
-//! Names of what is kept. There is no way from a text of a client to a path that does not lead through here.
+//! Validated object names. Every path that depends on client input is built here.
 
 use std::fmt;
 
@@ -7,27 +7,27 @@ use thiserror::Error;
 
 use super::Digest;
 
-/// Not a name: it would be too long, or have characters that names do not have.
+/// Error for a name that is too long or has invalid characters.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-#[error("not the name of anything that is kept: {0}")]
+#[error("not a valid object name: {0}")]
 pub struct BadName(&'static str);
 
-/// Where an object lies, and so how long it is kept.
+/// Folder of an object, which determines its time to live.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Folder {
-    /// Structure files as they came, by their digest.
+    /// Uploaded structure files, by digest.
     Inputs,
-    /// Documents of jobs, by the job's id.
+    /// Job documents, by job id.
     Jobs,
-    /// Mesh files and reports, by their content key.
+    /// Mesh files and reports, by content key.
     Results,
 }
 
 impl Folder {
-    /// All of them.
+    /// All folders.
     pub const ALL: [Self; 3] = [Self::Inputs, Self::Jobs, Self::Results];
 
-    /// The name of the folder, also the label of metrics.
+    /// Returns the name of the folder, which is also a metric label.
     #[must_use]
     pub fn as_str(self) -> &'static str {
         match self {
@@ -37,14 +37,14 @@ impl Folder {
         }
     }
 
-    /// Whether its bytes count against `store.max_bytes`.
+    /// Returns true if its objects count against `store.max_bytes`.
     #[must_use]
     pub fn is_capped(self) -> bool {
         self != Self::Jobs
     }
 }
 
-/// The name of an object: a folder, and a file name of lower-case letters, digits, `-` and `.`.
+/// Name of an object: a folder, and a file name of lower-case letters, digits, `-` and `.`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Name {
     folder: Folder,
@@ -52,16 +52,16 @@ pub struct Name {
 }
 
 impl Name {
-    /// A structure file as it came.
+    /// Returns the name of an uploaded structure file.
     #[must_use]
     pub fn input(digest: &Digest) -> Self {
         Self { folder: Folder::Inputs, file: digest.to_string().into() }
     }
 
-    /// The document of a job.
+    /// Returns the name of a job document.
     ///
     /// # Errors
-    /// An id has 1 to 64 characters: lower-case hexadecimal digits and dashes.
+    /// Returns [`BadName`] unless the id has 1 to 64 lower-case hexadecimal digits and dashes.
     pub fn job(id: &str) -> Result<Self, BadName> {
         let good = |c: u8| matches!(c, b'0'..=b'9' | b'a'..=b'f' | b'-');
         if id.is_empty() || id.len() > 64 || !id.bytes().all(good) {
@@ -70,10 +70,11 @@ impl Name {
         Ok(Self { folder: Folder::Jobs, file: format!("{id}.json").into() })
     }
 
-    /// A file that was computed, by its content key (64 hexadecimal digits in lower case) and its extension.
+    /// Returns the name of a result, by content key (64 lower-case hexadecimal digits) and extension.
     ///
     /// # Errors
-    /// An extension has 1 to 16 characters: lower-case letters and digits, with single dots between them.
+    /// Returns [`BadName`] unless the extension has 1 to 16 lower-case letters and digits, with single dots between
+    /// them.
     pub fn result(key: &str, extension: &str) -> Result<Self, BadName> {
         let _digest: Digest = key.parse().map_err(|_bad| BadName("a key has 64 hexadecimal digits in lower case"))?;
         let good =
@@ -84,24 +85,24 @@ impl Name {
         Ok(Self { folder: Folder::Results, file: format!("{key}.{extension}").into() })
     }
 
-    /// Where it lies.
+    /// Returns the folder.
     #[must_use]
     pub fn folder(&self) -> Folder {
         self.folder
     }
 
-    /// Without its folder.
+    /// Returns the file name without the folder.
     #[must_use]
     pub fn file(&self) -> &str {
         &self.file
     }
 
-    /// Its path from the root of the store.
+    /// Returns the path relative to the root of the store.
     pub(super) fn path(&self) -> Path {
         Path::from_iter([self.folder.as_str(), &self.file])
     }
 
-    /// The name that has this file name in this folder. `None`: nothing that we would have written.
+    /// Parses a file name in a folder. Returns `None` for files that the store does not write.
     pub(super) fn read(folder: Folder, file: &str) -> Option<Self> {
         match folder {
             Folder::Inputs => file.parse().ok().map(|digest| Self::input(&digest)),
@@ -110,7 +111,7 @@ impl Name {
         }
     }
 
-    /// The name at a path from the root of the store.
+    /// Parses a path relative to the root of the store.
     pub(super) fn at(path: &str) -> Option<Self> {
         let (folder, file) = path.split_once('/')?;
         Folder::ALL.into_iter().find(|f| f.as_str() == folder).and_then(|folder| Self::read(folder, file))

@@ -1,4 +1,4 @@
-//! What the store hands out.
+//! Objects, metadata and pins.
 
 use std::ops::Range;
 use std::time::SystemTime;
@@ -11,12 +11,12 @@ use super::error::StoreError;
 use super::handle::Store;
 use super::name::Name;
 
-/// What is known of an object.
+/// Metadata of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Meta {
-    /// Bytes.
+    /// Size, bytes.
     pub size: u64,
-    /// When it was written; S3 says it to the second.
+    /// Time of the last write. S3 has a resolution of one second.
     pub modified: SystemTime,
 }
 
@@ -26,28 +26,28 @@ impl From<&ObjectMeta> for Meta {
     }
 }
 
-/// A whole object.
+/// An object with its metadata.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Stored {
-    /// Its bytes.
+    /// Content.
     pub bytes: Bytes,
-    /// What is known of it.
+    /// Metadata.
     pub meta: Meta,
 }
 
-/// The bytes of an object or of a part of it, in pieces.
+/// Stream of the bytes of an object or of a range of it.
 pub type ByteStream = BoxStream<'static, Result<Bytes, StoreError>>;
 
-/// What a folder holds.
+/// Usage of a folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Usage {
-    /// Bytes of all objects.
+    /// Total size of its objects, bytes.
     pub bytes: u64,
-    /// Objects.
+    /// Number of objects.
     pub objects: u64,
 }
 
-/// Keeps a name from being tidied away; see [`Store::pin`].
+/// Protects an object from eviction; see [`Store::pin`].
 #[derive(Debug)]
 #[must_use = "the name is let go when the pin is dropped"]
 pub struct Pin {
@@ -56,12 +56,12 @@ pub struct Pin {
 }
 
 impl Pin {
-    /// For a name that the index has noted.
+    /// Creates a pin for a name that the index has already pinned.
     pub(super) fn new(store: Store, name: Name) -> Self {
         Self { store, name }
     }
 
-    /// Bytes of the pinned object, which must still be the one that `meta` describes.
+    /// Reads a range of the pinned object, which must still be the one that `meta` describes.
     pub(super) async fn piece(&self, meta: Meta, range: Range<u64>) -> Result<Bytes, StoreError> {
         self.store.piece(&self.name, meta, range).await
     }

@@ -1,4 +1,4 @@
-//! S3, and what speaks like it.
+//! S3 and compatible services.
 
 use std::error::Error as StdError;
 use std::sync::Arc;
@@ -16,17 +16,17 @@ use super::name::Name;
 use super::stale::is_stale;
 use crate::config::StoreConfig;
 
-/// How long a request is tried again. A probe for readiness must not take longer than whoever asks waits.
+/// Time limit for retries. Readiness probes must not exceed the timeout of their caller.
 const RETRY: Duration = Duration::from_secs(10);
 
-/// A bucket, for what [`ObjectStore`] has no word for.
+/// Bucket, for operations that [`ObjectStore`] lacks.
 pub(super) struct Bucket {
     s3: AmazonS3,
     client: HttpClient,
     prefix: Path,
 }
 
-/// `s3://bucket/prefix` as bucket and prefix.
+/// Splits `s3://bucket/prefix` into bucket and prefix.
 fn split(url: &str) -> Option<(&str, Path)> {
     let rest = url.strip_prefix("s3://")?;
     let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
@@ -35,16 +35,16 @@ fn split(url: &str) -> Option<(&str, Path)> {
     Some((bucket, Path::parse(prefix).ok()?))
 }
 
-/// The objects below the prefix, and the bucket. Nothing is sent yet.
+/// Returns the object store below the prefix, and the bucket. Sends nothing yet.
 pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn ObjectStore>, Bucket), String> {
     let (name, prefix) = split(url).ok_or("expected s3://bucket or s3://bucket/prefix")?;
     let key = AmazonS3ConfigKey::Client;
     let mut builder = AmazonS3Builder::from_env()
         .with_bucket_name(name)
         .with_virtual_hosted_style_request(!config.path_style)
-        // Deletions one by one: not every service knows the other way, and few go at once.
+        // Not every service supports bulk deletion, and few objects are deleted at once.
         .with_disable_bulk_delete(true)
-        // A body may be read as slowly as its reader likes, so the whole has no time limit, only the silence.
+        // Clients may read slowly, so only the time between two reads of a body is limited, not the total.
         .with_config(key(ClientConfigKey::Timeout), "1day")
         .with_config(key(ClientConfigKey::ReadTimeout), format!("{}ms", config.timeout_ms))
         .with_config(key(ClientConfigKey::ConnectTimeout), format!("{}ms", config.timeout_ms.min(5000)))
@@ -73,14 +73,14 @@ pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn Object
 }
 
 impl Bucket {
-    /// Gives up uploads of our names that nobody will finish: the first thousand of them, the next ones next time.
+    /// Aborts stale multipart uploads of the store. Handles one page of up to 1,000; the next call continues.
     pub(super) async fn clear_uploads(&self, now: SystemTime) -> Result<u64, Box<dyn StdError + Send + Sync>> {
         let query = SignedUrlOptions::new().with_query([("uploads", ""), ("prefix", self.prefix.as_ref())]);
-        // The type of the method is one that we have no name for.
+        // The crate does not export the type of the method.
         let url = self.s3.signed_url_opts("GET".parse()?, &Path::default(), RETRY, &query).await?;
         let mut request = HttpRequest::new(HttpRequestBody::empty());
         *request.uri_mut() = url.as_str().parse()?;
-        // The words of the client would quote the signed address.
+        // The error message of the client would contain the signed URL.
         let answer = self.client.execute(request).await.map_err(|e| format!("no answer: {:?}", e.kind()))?;
         let status = answer.status();
         let body = answer.into_body().bytes().await?;
@@ -89,7 +89,7 @@ impl Bucket {
         }
         let mut removed = 0;
         for upload in uploads(&String::from_utf8_lossy(&body)) {
-            // Others may use the bucket, with keys that we could not even say.
+            // Other applications may use the bucket, with keys that are not valid paths.
             let Ok(path) = Path::parse(&upload.key) else { continue };
             let below = path.prefix_match(&self.prefix).map(Path::from_iter);
             let ours = below.is_some_and(|path| Name::at(path.as_ref()).is_some());
@@ -109,7 +109,7 @@ struct Unfinished {
     begun: SystemTime,
 }
 
-/// The uploads of a `ListMultipartUploadsResult`. What we cannot read is not ours: our keys need no escapes.
+/// Parses a `ListMultipartUploadsResult`. Ignores keys with escapes, which the store does not write.
 fn uploads(xml: &str) -> Vec<Unfinished> {
     let one = |upload: &str| {
         let text = |tag: &str| {
@@ -121,7 +121,7 @@ fn uploads(xml: &str) -> Vec<Unfinished> {
     xml.split("<Upload>").skip(1).filter_map(one).collect()
 }
 
-/// A time such as `2026-01-31T12:00:00.000Z`, read by the type that the crate has for times of objects.
+/// Parses a time such as `2026-01-31T12:00:00.000Z`.
 fn time(text: &str) -> Option<SystemTime> {
     let mut scratch = ObjectMeta {
         location: Path::default(),

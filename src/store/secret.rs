@@ -1,4 +1,4 @@
-//! The random secret of a store: created once, kept as long as the store.
+//! Random secret of a store, created once.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write as _};
@@ -90,7 +90,7 @@ mod tests {
             let mode = std::fs::metadata(dir.path().join(NAME)).unwrap().permissions().mode();
             assert_eq!(mode & 0o777, 0o600);
         }
-        // A damaged secret is not replaced: with another one, repeated keys would begin new jobs.
+        // A damaged secret is not replaced: with a new one, repeated idempotency keys would start new jobs.
         std::fs::write(dir.path().join(NAME), b"short").unwrap();
         assert!(in_folder(dir.path()).unwrap_err().to_string().contains("has 5"));
     }

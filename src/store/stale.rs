@@ -1,19 +1,19 @@
-//! What crashed processes leave behind, and how old it must be before it counts as that.
+//! Leftovers of crashed processes.
 
 use std::io;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};
 
-/// Age at which something unfinished is nobody's: no job may take that long. Younger ones may belong to a process that
-/// shares the store, as during a rolling restart.
+/// Age at which unfinished objects are abandoned; no job takes that long. Younger ones may belong to another process,
+/// as during a rolling restart.
 pub(super) const STALE: Duration = Duration::from_hours(1);
 
-/// Whether something that was last written at `written` is nobody's at `now`.
+/// Returns true if an unfinished object last written at `written` is abandoned at `now`.
 pub(super) fn is_stale(written: SystemTime, now: SystemTime) -> bool {
     now.duration_since(written).is_ok_and(|age| age >= STALE)
 }
 
-/// Removes staged files from `folders`: they are named after their object, with `#` and a number. Blocks.
+/// Removes abandoned staged files from `folders`. Their name is that of the object, with `#` and a number. Blocks.
 pub(super) fn clear_files(folders: &[PathBuf], now: SystemTime) -> io::Result<u64> {
     let mut removed = 0;
     for folder in folders {
@@ -24,7 +24,7 @@ pub(super) fn clear_files(folders: &[PathBuf], now: SystemTime) -> io::Result<u6
             if !staged.is_some_and(|(_, count)| count.bytes().all(|c| c.is_ascii_digit())) {
                 continue;
             }
-            // Another process may have finished or removed it meanwhile.
+            // Another process may have finished or removed it.
             let Ok(written) = entry.metadata().and_then(|meta| meta.modified()) else { continue };
             if is_stale(written, now) {
                 match std::fs::remove_file(entry.path()) {

@@ -1,4 +1,4 @@
-//! Objects in pieces.
+//! Streams of objects.
 
 use std::ops::Range;
 
@@ -9,13 +9,13 @@ use super::handle::Store;
 use super::name::Name;
 use super::object::{ByteStream, Meta, Pin};
 
-/// Bytes of the first piece: all that is held for a reader that takes nothing.
+/// Size of the first piece, bytes, which is all the memory that a stalled reader holds.
 const FIRST: u64 = 16 << 10;
-/// Bytes of a later piece, at most: each wakes a thread and opens the file.
+/// Largest size of later pieces, bytes. Each piece wakes a thread and opens the file.
 const PIECE: u64 = 256 << 10;
 
-/// The bytes of `range`, read piece by piece as they are asked for. Between two pieces nothing is held but the pin: no
-/// memory, no open file. A piece is as large as all before it together, from [`FIRST`] to [`PIECE`].
+/// Streams the bytes of `range`, one piece on demand at a time. Between pieces it holds only the pin: no memory, no
+/// open file. Each piece is as large as all earlier ones together, from [`FIRST`] to [`PIECE`].
 pub(super) fn pieces(pin: Pin, meta: Meta, range: Range<u64>) -> ByteStream {
     let start = range.start;
     futures_util::stream::try_unfold((pin, range), move |(pin, rest)| async move {
@@ -30,7 +30,7 @@ pub(super) fn pieces(pin: Pin, meta: Meta, range: Range<u64>) -> ByteStream {
     .boxed()
 }
 
-/// The bytes of an object that a service sends as a stream.
+/// Streams the bytes of an object from S3.
 pub(super) fn remote(store: Store, name: Name, opened: GetResult) -> ByteStream {
     opened.into_stream().map_err(move |e| store.0.backend.fail("read", &name.to_string(), &e)).boxed()
 }

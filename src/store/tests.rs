@@ -1,4 +1,4 @@
-//! Faults that no disk shows on demand: it is full, it does not let go. And that each error is sorted as it should be.
+//! Tests with injected disk faults, and of the classification of errors.
 
 use std::io;
 use std::path::PathBuf;
@@ -46,7 +46,7 @@ async fn a_full_disk_is_named_and_nothing_is_lost() {
     }
     assert_eq!(store.get(&name(1)).await.unwrap().unwrap().bytes, body(1000));
     assert_eq!((store.usage(Folder::Results).bytes, files(&dir).len()), (1000, 1));
-    // When there is room again, all of it is: no promise was forgotten.
+    // All reservations were released: the full capacity is available again.
     faults.full.store(false, Ordering::Relaxed);
     store.put(&name(4), body(8 << 20)).await.unwrap();
     assert_eq!((store.usage(Folder::Results).bytes, files(&dir).len()), (8 << 20, 1));
@@ -81,7 +81,7 @@ fn errors_are_sorted_by_what_is_to_be_done() {
         assert!(matches!(of(&error(kind)), StoreError::Denied { .. }), "{kind}");
     }
     assert!(matches!(of(&error(io::ErrorKind::TimedOut)), StoreError::Failed { .. }));
-    // The system's own numbers: no space, not permitted, not allowed; and one that is none of these.
+    // System error numbers: ENOSPC, EPERM, EACCES, and another one.
     let code = |code| object_store::Error::Generic { store: "x", source: Box::new(io::Error::from_raw_os_error(code)) };
     assert!(matches!(of(&code(28)), StoreError::NoSpace { .. }));
     assert!([1, 13].into_iter().all(|number| matches!(of(&code(number)), StoreError::Denied { .. })));

@@ -1,4 +1,4 @@
-//! Large objects, part by part. They appear with the last one, or not at all.
+//! Multipart upload of large objects. An object becomes visible with its last part, or not at all.
 
 use bytes::Bytes;
 use object_store::{ObjectStoreExt as _, WriteMultipart};
@@ -9,10 +9,10 @@ use super::backend::Backend;
 use super::error::StoreError;
 use super::name::Name;
 
-/// Parts that are on their way at once: they fill a line with some latency, and bound what waits in memory.
+/// Concurrent parts: enough to use a connection with latency, and a bound of the memory.
 const PARTS: usize = 3;
 
-/// An object that is being written.
+/// Multipart upload in progress.
 pub(super) struct Upload<'a> {
     backend: &'a Backend,
     name: &'a Name,
@@ -20,10 +20,10 @@ pub(super) struct Upload<'a> {
 }
 
 impl<'a> Upload<'a> {
-    /// Begins one.
+    /// Starts an upload.
     pub(super) async fn begin(backend: &'a Backend, name: &'a Name) -> Result<Self, StoreError> {
         let (objects, path) = (backend.objects().clone(), name.path());
-        // A folder's backend makes the staged file right here, and not on another thread.
+        // The backend of a folder creates the staged file on the calling thread.
         let begun = if backend.is_local() {
             let runtime = Handle::current();
             let begin = move || runtime.block_on(async { objects.put_multipart(&path).await });
@@ -35,7 +35,7 @@ impl<'a> Upload<'a> {
         Ok(Self { backend, name, parts: WriteMultipart::new_with_chunk_size(begun, backend.part()) })
     }
 
-    /// Takes the next bytes, and waits while too much is on its way.
+    /// Uploads the next bytes. Waits while [`PARTS`] parts are in progress.
     pub(super) async fn push(&mut self, bytes: Bytes) -> Result<(), StoreError> {
         let sent = self.parts.wait_for_capacity(PARTS).await;
         sent.map_err(|e| self.backend.fail("put", &self.name.to_string(), &e))?;
@@ -43,13 +43,13 @@ impl<'a> Upload<'a> {
         Ok(())
     }
 
-    /// Makes the object appear, durably.
+    /// Makes the object visible and durable.
     pub(super) async fn finish(self) -> Result<(), StoreError> {
         let finished = self.parts.finish().await;
         finished.map(|_| ()).map_err(|e| self.backend.fail("put", &self.name.to_string(), &e))
     }
 
-    /// Leaves nothing behind, as far as the backend lets us.
+    /// Aborts the upload and removes its parts, as far as possible.
     pub(super) async fn abort(self) {
         if let Err(error) = self.parts.abort().await {
             let error = self.backend.fail("abort", &self.name.to_string(), &error);
@@ -58,8 +58,8 @@ impl<'a> Upload<'a> {
     }
 }
 
-/// Writes a whole object; see [`Backend::put`]. A large one goes to S3 in parts, which the service asks for from 5 GiB
-/// on and which is faster long before.
+/// Writes an object; see [`Backend::put`]. Uploads large objects to S3 in parts, which S3 requires from 5 GiB on and
+/// which is faster for much smaller ones.
 pub(super) async fn put(backend: &Backend, name: &Name, mut bytes: Bytes, new: bool) -> Result<bool, StoreError> {
     let part = backend.part();
     if backend.is_local() || new || bytes.len() <= part {

@@ -1,4 +1,4 @@
-//! Objects from threads that block: an encoder writes, the runtime stores, and little is in memory between them.
+//! Writers for blocking threads: an encoder writes, the runtime stores, with little buffering in between.
 
 use std::io;
 
@@ -10,7 +10,7 @@ use super::handle::Store;
 use super::name::Name;
 use super::upload::{self, Upload};
 
-/// Parts that wait for the runtime. With the one that is being filled and those on their way six are in memory at most.
+/// Parts that wait for the runtime. With the one being filled and those being uploaded, at most six are in memory.
 const WAITING: usize = 1;
 
 enum Message {
@@ -18,9 +18,9 @@ enum Message {
     Last(Bytes),
 }
 
-/// An object that is being written, from a thread that may block; see [`Store::writer`].
+/// Blocking writer of an object; see [`Store::writer`].
 ///
-/// Nothing is visible before [`finish`](Self::finish), and nothing is left if the writer is dropped without it.
+/// The object becomes visible with [`finish`](Self::finish). Dropping the writer earlier leaves nothing behind.
 #[derive(Debug)]
 pub struct Writer {
     filling: BytesMut,
@@ -30,17 +30,17 @@ pub struct Writer {
 }
 
 impl Store {
-    /// Begins an object whose bytes come from a thread that blocks. With `length` it must have exactly so many, and
-    /// room is made for it before the first byte; otherwise room is made while it grows. Errors come with the writing.
+    /// Starts an object that a blocking thread writes. With `length`, the object must have exactly this size, and space
+    /// is reserved before the first byte. Otherwise, space is reserved as it grows. Errors are reported by the writer.
     ///
-    /// The writer's calls block: they must not be made on the async runtime.
+    /// The calls of the writer block, so they must not be made on the async runtime.
     #[must_use]
     pub fn writer(&self, name: &Name, length: Option<u64>) -> Writer {
         let (to, from) = mpsc::channel(WAITING);
         let (done, outcome) = oneshot::channel();
         let (store, name) = (self.clone(), name.clone());
         self.0.runtime.spawn(async move {
-            // Nobody listens to the outcome of what was given up.
+            // The receiver is gone if the writer was dropped.
             let _unheard = done.send(receive(&store, &name, length, from).await);
         });
         Writer { filling: BytesMut::new(), part: self.0.backend.part(), to: Some(to), outcome: Some(outcome) }
@@ -48,18 +48,18 @@ impl Store {
 }
 
 impl Writer {
-    /// Makes the object visible, as a whole. It is durable when this returns.
+    /// Makes the object visible. It is durable on return.
     ///
     /// # Errors
-    /// [`StoreError`]; nothing is visible then.
+    /// Returns a [`StoreError`]. The object is not visible then.
     pub fn finish(mut self) -> Result<(), StoreError> {
         let last = Message::Last(self.filling.split().freeze());
-        // If nobody takes it, the outcome says why.
+        // A failed send means that the store failed; the outcome has the error.
         let _sent = self.to.take().map(|to| to.blocking_send(last));
         self.outcome()
     }
 
-    /// How it ended. The runtime ends without a word where it is shut down.
+    /// Returns the result. A shut-down runtime drops the channel without one.
     fn outcome(&mut self) -> Result<(), StoreError> {
         let outcome = self.outcome.take().and_then(|outcome| outcome.blocking_recv().ok());
         outcome.unwrap_or(Err(StoreError::Abandoned))
@@ -85,20 +85,20 @@ impl io::Write for Writer {
         Ok(taken)
     }
 
-    /// Does nothing: only [`Writer::finish`] makes anything visible.
+    /// Does nothing: only [`Writer::finish`] makes the object visible.
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
     }
 }
 
-/// Stores what comes, until the last part or until the writer is gone.
+/// Stores parts until the last one, or until the writer is dropped.
 async fn receive(
     store: &Store,
     name: &Name,
     length: Option<u64>,
     mut parts: mpsc::Receiver<Message>,
 ) -> Result<(), StoreError> {
-    let mut room = store.room_for(name, length.unwrap_or(0)).await?;
+    let mut reservation = store.reserve_for(name, length.unwrap_or(0)).await?;
     let backend = &store.0.backend;
     let mut written = 0;
     let mut upload: Option<Upload<'_>> = None;
@@ -109,16 +109,16 @@ async fn receive(
             None => break Err(StoreError::Abandoned),
         };
         written += bytes.len() as u64;
-        if let Some(promised) = length.filter(|&promised| written > promised || last && written < promised) {
-            break Err(StoreError::Length { promised, written });
+        if let Some(declared) = length.filter(|&declared| written > declared || last && written < declared) {
+            break Err(StoreError::Length { declared, written });
         }
         if length.is_none()
-            && let Err(error) = room.grow(bytes.len() as u64).await
+            && let Err(error) = reservation.grow(bytes.len() as u64).await
         {
             break Err(error);
         }
         if last && upload.is_none() {
-            // What fits into one part needs no upload, and may stay in memory.
+            // An object of one part needs no multipart upload, and may be cached.
             let _lock = store.stripe(name).lock().await;
             upload::put(backend, name, bytes.clone(), false).await?;
             store.commit(name, written, Some(&bytes));

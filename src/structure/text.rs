@@ -84,7 +84,7 @@ pub(super) fn quote(raw: &[u8]) -> String {
 
 /// Normalizes a title or id: collapses white space and keeps at most `max` characters. Returns `None` if nothing is
 /// left.
-pub(super) fn tidy(raw: &[u8], max: usize) -> Option<String> {
+pub(super) fn normalize(raw: &[u8], max: usize) -> Option<String> {
     // Bounds the copy: a hostile title may have 50 MB.
     let raw = &raw[..raw.len().min(8 * max)];
     let spaced: Vec<u8> = raw.iter().map(|&b| if b <= b' ' { b' ' } else { b }).collect();
@@ -128,7 +128,7 @@ mod tests {
         assert_eq!(decode("café".as_bytes()), "café");
         assert_eq!(decode(b"a\x1b[2J"), "a\u{fffd}[2J");
         assert_eq!(quote(b"    "), "blanks");
-        assert_eq!(tidy(b"  a \n b\t", 10), Some("a b".to_owned()));
-        assert_eq!(tidy(b" \n ", 10), None);
+        assert_eq!(normalize(b"  a \n b\t", 10), Some("a b".to_owned()));
+        assert_eq!(normalize(b" \n ", 10), None);
     }
 }

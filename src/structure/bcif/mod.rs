@@ -25,7 +25,7 @@ use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
 use super::read::ReadLimits;
-use super::text::{decode, tidy};
+use super::text::{decode, normalize};
 
 /// Largest number of columns in a category. The dictionary has about a hundred for `atom_site`.
 const MAX_COLUMNS: usize = 1000;
@@ -117,7 +117,7 @@ impl<'a> Category<'a> {
         let column = raw.load(bounds, true)?;
         let Cells::Text(texts) = &column.cells else { return Ok(None) };
         let range = texts.range(0).filter(|_| !column.is_null(0));
-        Ok(range.and_then(|(start, end)| tidy(&texts.joined[start..end], max)))
+        Ok(range.and_then(|(start, end)| normalize(&texts.joined[start..end], max)))
     }
 
     /// Returns the values of an item, with empty texts for missing values. Returns no values without the item.
@@ -160,7 +160,7 @@ impl<'a> Block<'a> {
         let mut any = false;
         at.map(|key, value| {
             match key {
-                b"header" => block.name = tidy(value.text().map_err(|f| f.within("header"))?, 80),
+                b"header" => block.name = normalize(value.text().map_err(|f| f.within("header"))?, 80),
                 b"categories" => {
                     any = true;
                     value.array(|_, at| {

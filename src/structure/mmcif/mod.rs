@@ -16,7 +16,7 @@ use super::error::StructureError;
 use super::kinds::Sequence;
 use super::pdb::MAX_TITLE;
 use super::read::ReadLimits;
-use super::text::{Fault, decode, tidy};
+use super::text::{Fault, decode, normalize};
 
 /// Reason to stop reading rows.
 #[derive(Debug)]
@@ -114,7 +114,7 @@ impl<'a> Reader<'a> {
 
     fn begin_block(&mut self, token: &Token) {
         let name = &self.text[token.start + b"data_".len()..token.end];
-        self.block = tidy(name, 80);
+        self.block = normalize(name, 80);
         self.entry = None;
         self.title = None;
         self.entities = Entities::default();
@@ -171,9 +171,9 @@ impl<'a> Reader<'a> {
             return;
         }
         if tag.eq_ignore_ascii_case(b"_entry.id") && self.entry.is_none() {
-            self.entry = tidy(raw, 80);
+            self.entry = normalize(raw, 80);
         } else if tag.eq_ignore_ascii_case(b"_struct.title") && self.title.is_none() {
-            self.title = tidy(raw, MAX_TITLE);
+            self.title = normalize(raw, MAX_TITLE);
         }
     }
 

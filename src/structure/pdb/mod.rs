@@ -23,7 +23,7 @@ use super::error::StructureError;
 use super::kinds::{Listed, Sequence};
 use super::number::single;
 use super::read::ReadLimits;
-use super::text::{self, Fault, tidy, trimmed};
+use super::text::{self, Fault, normalize, trimmed};
 use super::warnings::Warnings;
 
 /// Longest title, characters.
@@ -45,7 +45,7 @@ pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, Struct
     let source = Source {
         format: SourceFormat::Pdb,
         id: reader.id,
-        title: tidy(&reader.title, MAX_TITLE),
+        title: normalize(&reader.title, MAX_TITLE),
         sequence: Sequence { listed: reader.listed, ..Sequence::default() },
         warnings: reader.warnings.messages(|fault| fault.locate(text)),
     };
@@ -135,7 +135,7 @@ impl<'a> Reader<'a> {
             b"HEADER" if self.id.is_none() => {
                 let id = line.get(62..66).unwrap_or_default();
                 if id.first().is_some_and(u8::is_ascii_digit) && id.iter().all(u8::is_ascii_alphanumeric) {
-                    self.id = tidy(id, 4);
+                    self.id = normalize(id, 4);
                 }
             }
             b"TITLE" if self.title.len() < 8 * MAX_TITLE => {

@@ -1,4 +1,4 @@
-//! Room for what comes, at the cost of what was not used for longest.
+//! Reservations, eviction of the least recently used objects, and expiry.
 
 use std::time::{Duration, SystemTime};
 
@@ -6,38 +6,38 @@ use metrics::counter;
 
 use super::error::StoreError;
 use super::handle::Store;
-use super::index::{NoRoom, Victim};
+use super::index::{EvictionCandidate, ReserveError};
 use super::name::{Folder, Name};
 use super::stale::STALE;
 use crate::telemetry::STORE_REMOVED;
 
-/// Attempts to make room, where others use what was about to go or take the room that was made.
+/// Attempts to free space. Other requests may use the candidates or take the freed space in between.
 const ATTEMPTS: usize = 16;
 
-/// What a sweep did.
+/// Result of a sweep.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Swept {
-    /// Objects removed because their time was up.
+    /// Objects whose time to live expired.
     pub expired: u64,
-    /// Objects removed because everything together was too large.
+    /// Objects evicted because the store was over its capacity.
     pub evicted: u64,
-    /// Their bytes.
+    /// Bytes of removed objects.
     pub bytes: u64,
-    /// Unfinished objects of crashed processes that were removed.
+    /// Abandoned unfinished objects that were removed.
     pub stale: u64,
-    /// Objects that could not be removed; they are tried again next time. The errors are in the log.
+    /// Objects that could not be removed. The errors are logged, and the next sweep retries.
     pub failed: u64,
 }
 
-/// Bytes promised to a writer, until they are committed or given up.
-pub(super) struct Room {
+/// Bytes reserved by a writer, until they are committed or released.
+pub(super) struct Reservation {
     store: Store,
     bytes: u64,
     capped: bool,
 }
 
-impl Room {
-    /// Promises more bytes.
+impl Reservation {
+    /// Reserves more bytes.
     pub(super) async fn grow(&mut self, bytes: u64) -> Result<(), StoreError> {
         if self.capped {
             self.store.reserve(self.bytes, bytes).await?;
@@ -47,21 +47,21 @@ impl Room {
     }
 }
 
-impl Drop for Room {
+impl Drop for Reservation {
     fn drop(&mut self) {
         self.store.index().release(self.bytes);
     }
 }
 
 impl Store {
-    /// Removes what has been kept for long enough at `now`, then the least recently used until everything fits, and
-    /// about once an hour what crashed processes left. To be called regularly, by whoever owns the service.
+    /// Removes expired objects, then the least recently used ones until the store is within its capacity, and about
+    /// once an hour leftovers of crashed processes. The service calls it regularly.
     pub async fn sweep(&self, now: SystemTime) -> Swept {
         let mut swept = Swept::default();
-        let mut cleared = self.0.tidying.lock().await;
+        let mut cleared = self.0.last_cleanup.lock().await;
         let expired = self.index().expired(now, |folder| self.ttl(folder));
         (swept.expired, swept.bytes) = self.remove_all(&expired, "ttl", &mut swept.failed).await;
-        // The cap may have been lowered, or others may have written.
+        // The capacity may have been lowered, or other processes may have written.
         let (excess, _) = self.index().excess(0, self.0.config.max_bytes);
         let (evicted, bytes) = self.remove_all(&excess, "cap", &mut swept.failed).await;
         (swept.evicted, swept.bytes) = (evicted, swept.bytes + bytes);
@@ -86,14 +86,14 @@ impl Store {
         }
     }
 
-    /// Promises room for an object, and makes it where there is none.
-    pub(super) async fn room_for(&self, name: &Name, bytes: u64) -> Result<Room, StoreError> {
-        let mut room = Room { store: self.clone(), bytes: 0, capped: name.folder().is_capped() };
-        room.grow(bytes).await?;
-        Ok(room)
+    /// Reserves space for an object, evicting others if necessary.
+    pub(super) async fn reserve_for(&self, name: &Name, bytes: u64) -> Result<Reservation, StoreError> {
+        let mut reservation = Reservation { store: self.clone(), bytes: 0, capped: name.folder().is_capped() };
+        reservation.grow(bytes).await?;
+        Ok(reservation)
     }
 
-    /// Promises `more` bytes to whoever has `had`.
+    /// Reserves `more` bytes for a writer that has reserved `had`.
     async fn reserve(&self, had: u64, more: u64) -> Result<(), StoreError> {
         let max_bytes = self.0.config.max_bytes;
         let bytes = had.saturating_add(more);
@@ -103,16 +103,18 @@ impl Store {
         if self.index().reserve(more, max_bytes).is_ok() {
             return Ok(());
         }
-        let _one_at_a_time = self.0.tidying.lock().await;
+        let _one_at_a_time = self.0.last_cleanup.lock().await;
         let mut held = max_bytes;
         for _ in 0..ATTEMPTS {
             let outcome = self.index().reserve(more, max_bytes);
             match outcome {
                 Ok(()) => return Ok(()),
-                Err(NoRoom::Held(by_others)) => return Err(StoreError::Full { bytes, held: by_others, max_bytes }),
-                Err(NoRoom::Remove(victims)) => {
+                Err(ReserveError::Held(by_others)) => {
+                    return Err(StoreError::Full { bytes, held: by_others, max_bytes });
+                }
+                Err(ReserveError::Remove(candidates)) => {
                     let mut failed = 0;
-                    let (_, freed) = self.remove_all(&victims, "cap", &mut failed).await;
+                    let (_, freed) = self.remove_all(&candidates, "cap", &mut failed).await;
                     held = held.saturating_sub(freed);
                     if failed > 0 && freed == 0 {
                         break;
@@ -123,16 +125,17 @@ impl Store {
         Err(StoreError::Full { bytes, held, max_bytes })
     }
 
-    /// Removes what may still go. Returns how many objects and bytes went; `failed` counts those that did not let go.
-    async fn remove_all(&self, victims: &[Victim], reason: &'static str, failed: &mut u64) -> (u64, u64) {
+    /// Removes the candidates that are still unused. Returns the numbers of removed objects and bytes; adds failures to
+    /// `failed`.
+    async fn remove_all(&self, candidates: &[EvictionCandidate], reason: &'static str, failed: &mut u64) -> (u64, u64) {
         let (mut objects, mut bytes) = (0, 0);
-        for victim in victims {
-            match self.remove_victim(victim.clone()).await {
-                Ok(true) => (objects, bytes) = (objects + 1, bytes + victim.bytes),
+        for candidate in candidates {
+            match self.remove_victim(candidate.clone()).await {
+                Ok(true) => (objects, bytes) = (objects + 1, bytes + candidate.bytes),
                 Ok(false) => {}
                 Err(error) => {
                     *failed += 1;
-                    tracing::warn!(%error, name = %victim.name, "an object could not be removed");
+                    tracing::warn!(%error, name = %candidate.name, "an object could not be removed");
                 }
             }
         }
@@ -140,13 +143,13 @@ impl Store {
         (objects, bytes)
     }
 
-    async fn remove_victim(&self, victim: Victim) -> Result<bool, StoreError> {
+    async fn remove_victim(&self, candidate: EvictionCandidate) -> Result<bool, StoreError> {
         let store = self.clone();
         self.finished(async move {
-            let _lock = store.stripe(&victim.name).lock().await;
-            let goes = store.index().begin_removal(&victim);
+            let _lock = store.stripe(&candidate.name).lock().await;
+            let goes = store.index().begin_removal(&candidate);
             if goes {
-                store.remove(&victim.name).await?;
+                store.remove(&candidate.name).await?;
             }
             Ok(goes)
         })
