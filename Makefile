@@ -1,6 +1,6 @@
-# molmesh. The two that matter: `make run` and `make test`. `make help` lists the rest.
+# Main targets: `make run` and `make test`. `make help` lists all targets.
 #
-# No variable here needs to be set. PROFILE=release runs the tests optimised; ARGS passes flags to `make run`.
+# Optional variables: PROFILE=release runs optimised tests; ARGS passes flags to `make run`.
 
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
@@ -10,23 +10,23 @@ ARGS ?=
 
 .PHONY: help run test tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
-help: ## This list
+help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
 
 run: web-if-possible ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
 	$(CARGO) run --release --bin molmesh -- serve $(ARGS)
 
-test: tools web fmt-check lint deny-if-installed matrix static-if-possible tests ## Everything that must hold; installs what it needs
+test: tools web fmt-check lint deny-if-installed matrix static-if-possible tests ## Run all checks of a commit; installs the tools
 
 tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan, Chromium)
 	@if [ -f tests/tools/setup.sh ]; then bash tests/tools/setup.sh; fi
 
-web: ## Build the viewer into web/dist, which the next build of the server takes in; needs Node 20.19 or later
+web: ## Build the web page into web/dist, for the next build of the server; needs Node 20.19 or later
 	@sh web/build.sh
 
-# A service without its viewer is a service: where there is no Node, or no network for its packages, this says so and goes on.
+# The service works without its web page, so a missing Node or network is reported but is not an error.
 web-if-possible:
-	@sh web/build.sh || echo "without the viewer: the page at / will say how to get it" >&2
+	@sh web/build.sh || echo "the web page was not built: / will explain how to build it" >&2
 
 fmt: ## Format
 	$(CARGO) fmt --all
@@ -37,8 +37,8 @@ fmt-check:
 lint: ## Clippy on everything, warnings are errors
 	$(CARGO) clippy --locked --all-targets -- -D warnings
 
-# The rooms compile apart: a stray async type in the core, or a flag in the service, does not get through here.
-matrix: ## Clippy on every combination of features that is supported
+# Compiles the layers separately, so an async type in the core or a flag in the service is an error.
+matrix: ## Clippy on every supported combination of features
 	$(CARGO) clippy --locked --lib --no-default-features -- -D warnings
 	$(CARGO) clippy --locked --lib --no-default-features --features gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --no-default-features --features server -- -D warnings
@@ -55,42 +55,42 @@ deny-if-installed:
 	@if command -v cargo-deny >/dev/null; then $(MAKE) --no-print-directory deny; \
 	else echo "SKIPPED: cargo-deny is not installed; make deny installs and runs it"; fi
 
-audit: ## Known vulnerabilities of all dependencies; ADVISORY_DB=FOLDER for a copy of the database, ALLOW_SKIP=1 if none may do
+audit: ## Known vulnerabilities of dependencies; ADVISORY_DB=FOLDER names the database, ALLOW_SKIP=1 permits its absence
 	deploy/audit.sh
 
-sbom: ## The bill of materials: dist/molmesh.cdx.json
+sbom: ## Write the bill of materials, dist/molmesh.cdx.json
 	deploy/sbom.sh
 
-# BINARY=FILE takes one that is there. Images of bases are made here, so that no registry of images is needed.
-container: $(if $(BINARY),,release) ## Build the images and run them: two to four minutes and the binary; needs root on Debian, or docker
+# BINARY=FILE uses an existing binary. Base images are created here, without an image registry.
+container: $(if $(BINARY),,release) ## Build and test the images (two to four minutes plus the binary); needs root on Debian, or docker
 	deploy/container/build.sh --binary $(or $(BINARY),target/release/molmesh) --base-from-debootstrap
 	deploy/container/check.py
 	deploy/kubernetes/check.sh
 	deploy/sbom.sh cpu gpu
 
-tests: ## The tests alone
+tests: ## Run only the tests
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
 
-bench: ## The benchmarks
+bench: ## Run the benchmarks
 	$(CARGO) bench
 
-gallery: release ## Draw docs/gallery anew; DATA=FOLDER holds the structures, named by their PDB ids
+gallery: release ## Draw docs/gallery; DATA=FOLDER holds the structures, named by their PDB ids
 	docs/gallery/make.py $(if $(DATA),--data $(DATA))
 
 # The results of other machines lie in docs/results/paper too: `molmesh bench paper --out FOLDER` writes them.
 figures: ## The tables of docs/paper.md and its figures, from docs/results/paper
 	$(CARGO) run --bin molmesh -- bench figures docs/results/paper --out docs/figures --page docs/paper.md
 
-release: web-if-possible ## The optimised binary: target/release/molmesh
+release: web-if-possible ## Build the optimised binary, target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh
 
-static: ## The command line alone as one static file for any Linux, CPU only: dist/molmesh; installs what it needs
+static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs
 	deploy/static.sh
 
-# Elsewhere than on Linux, or without the network, its tests say that they are skipped. A build that fails is a failure.
+# Without Linux or network access, the tests of the static executable are skipped. A failed build is an error.
 static-if-possible:
 	@deploy/static.sh || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 
-clean: ## Remove everything that was built
+clean: ## Remove all build output
 	$(CARGO) clean
 	rm -rf dist web/dist

@@ -1,9 +1,8 @@
 #!/usr/bin/env bash
-# Holds Cargo.lock against RustSec's advisories. Installs cargo-audit into target/tools where it is absent.
+# Checks Cargo.lock against RustSec's advisories. Installs cargo-audit into target/tools if it is missing.
 #
-# ADVISORY_DB=FOLDER uses a copy of the database instead of fetching it. Without a database nothing was checked, and that is
-# a failure, unless ALLOW_SKIP=1 says that it may be. Exit codes: 0 nothing found (or skipped, allowed), 1 advisories
-# found, 3 skipped.
+# ADVISORY_DB=FOLDER uses a copy of the database instead of fetching it. A check without a database fails unless
+# ALLOW_SKIP=1 is set. Exit codes: 0 nothing found or skip permitted, 1 advisories found, 2 invalid database, 3 skipped.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -15,7 +14,7 @@ fi
 
 db=${ADVISORY_DB:-}
 if [ -z "$db" ]; then
-    # Fetched apart from the check, so that one cannot be taken for the other.
+    # A separate step, so a failed fetch cannot be mistaken for a failed check.
     db=target/advisory-db
     url=https://github.com/RustSec/advisory-db.git
     log=$(mktemp)
@@ -28,7 +27,7 @@ if [ -z "$db" ]; then
     fi
 fi
 if ! [ -d "$db/crates" ]; then
-    echo "$db holds no advisories (no folder crates in it)" >&2
+    echo "$db contains no advisories: it has no folder named crates" >&2
     exit 2
 fi
 cargo audit --no-fetch --db "$db" --deny warnings

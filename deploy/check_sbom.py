@@ -1,5 +1,5 @@
-"""Holds bills of materials against CycloneDX's schema, as another project checks it, and against cargo's own list of what is
-linked; a spoiled copy of each must be refused. Usage: python deploy/check_sbom.py FILE.cdx.json ... (in the tests' environment)
+"""Checks bills of materials against the CycloneDX schema and against cargo's list of linked crates. Invalid copies of each
+document must be rejected. Usage: python deploy/check_sbom.py FILE.cdx.json ... (in the Python environment of the tests)
 """
 
 import json
@@ -12,12 +12,12 @@ from cyclonedx.validation.json import JsonStrictValidator
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 VALIDATOR = JsonStrictValidator(SchemaVersion.V1_5)
-# What the pages hold that others wrote.
+# Third-party packages bundled in the web pages.
 PAGES = ("swagger-ui-dist", "three", "meshoptimizer")
 
 
 def linked():
-    """`name version` of every crate that cargo links into the binary, build scripts and macros aside."""
+    """Returns `name version` of every crate that cargo links into the binary, without build dependencies."""
     command = ["cargo", "tree", "--locked", "--edges", "normal", "--prefix", "none", "--format", "{p}"]
     lines = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True).stdout.splitlines()
     words = [line.split() for line in lines if line]
@@ -25,7 +25,7 @@ def linked():
 
 
 def faults(text, crates):
-    """What is wrong with a document."""
+    """Returns the faults of a document."""
     error = VALIDATOR.validate_str(text)
     if error is not None:
         return [f"against the schema: {str(error)[:300]}"]
@@ -34,18 +34,18 @@ def faults(text, crates):
     named = {f"{part['name']} {part.get('version')}" for part in parts}
     refs = [part["bom-ref"] for part in parts]
     wrong = [f"lacks the crate {crate}" for crate in sorted(crates - named)]
-    wrong += [f"{ref} comes twice" for ref in sorted(set(refs)) if refs.count(ref) > 1]
+    wrong += [f"{ref} occurs twice" for ref in sorted(set(refs)) if refs.count(ref) > 1]
     pointed = {ref for edge in bom["dependencies"] for ref in (edge["ref"], *edge.get("dependsOn", []))}
-    wrong += [f"{ref} is nothing" for ref in sorted(pointed - set(refs))]
-    wrong += [f"names this machine: {ref}" for ref in refs if "/" + "root" in ref or str(ROOT) in ref]
-    wrong += [f"lacks {name}, which is in the pages" for name in PAGES if not any(part["name"] == name for part in parts)]
+    wrong += [f"{ref} is not defined" for ref in sorted(pointed - set(refs))]
+    wrong += [f"contains a path of this machine: {ref}" for ref in refs if "/" + "root" in ref or str(ROOT) in ref]
+    wrong += [f"lacks {name}, which the web pages contain" for name in PAGES if not any(part["name"] == name for part in parts)]
     crated = [part for part in parts if part["bom-ref"].startswith("crates/")]
     wrong += [f"{part['name']} has no licence or digest" for part in crated if not (part.get("licenses") and part.get("hashes"))]
     return wrong
 
 
 def spoiled(text):
-    """Copies with one fault each."""
+    """Yields copies with one fault each."""
     for change in (
         lambda bom: bom["components"][0].update(type="librarie"),
         lambda bom: bom.pop("bomFormat"),
@@ -70,7 +70,7 @@ def main():
             sys.exit(f"{path}: " + "; ".join(wrong[:20]))
         let_through = [i for i, copy in enumerate(spoiled(text)) if not faults(copy, crates)]
         if let_through:
-            sys.exit(f"{path}: spoiled copies {let_through} were let through")
+            sys.exit(f"{path}: invalid copies {let_through} were accepted")
         print(f"{path}: CycloneDX 1.5, {len(json.loads(text)['components'])} components")
 
 

@@ -1,11 +1,10 @@
 #!/usr/bin/env python3
-"""Writes the licences of everything that the binary holds to standard output.
+"""Writes the licences of everything in the binary to standard output.
 
-Crates are those that cargo links into `molmesh` (normal dependencies on the target, the default features or those that are
-named), with every licence and notice file that they bring; the standard library, with musl where that is the target's; with
-the service, the parts of the web page that others wrote. A crate without
-a licence file gets the text of a licence that it names: Apache-2.0's, which is the same for everybody, or MIT's with its
-authors. Where neither is allowed, the command fails and names the crate.
+Covers the crates that cargo links into `molmesh` (normal dependencies for the target and features) with all their licence
+and notice files, the standard library, musl if the target uses it, and, with the service, third-party parts of the web
+pages. For a crate without a licence file, the text of a licence that it names is used: Apache-2.0, or MIT with its
+authors. If the crate permits neither, the command fails and names it.
 
 Usage: deploy/notices.py [--target TRIPLE] [--features cli,server,gpu]
 """
@@ -19,13 +18,13 @@ import subprocess
 import sys
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-# Files that carry a licence or a notice, by the beginnings of their names, and folders of such files.
+# Names of files and folders with licences or notices.
 NAMES = re.compile(r"^(licen[cs]e|copying|copyright|notice|unlicense)", re.IGNORECASE)
-# Sources are not texts; what only the crate's own tests use is not in the binary.
+# Source files are not licence texts. Files for tests and examples are not part of the binary.
 SOURCES = (".rs", ".py", ".toml", ".json", ".go", ".sh", ".c", ".h")
 UNUSED = {"tests", "test", "examples", "benches", ".github"}
 MOST_BYTES = 1 << 20
-# What the page at / bundles; the build of the page checks that the texts are theirs.
+# Packages bundled in the page at /. The build of the page checks that the texts are up to date.
 VIEWER = (("three.js", "three.txt"), ("meshoptimizer's decoder", "meshoptimizer.txt"))
 
 
@@ -40,7 +39,7 @@ def host():
 
 
 def linked(metadata):
-    """The packages that are linked into molmesh, without itself, by name and version."""
+    """Returns the packages linked into molmesh, without molmesh, sorted by name and version."""
     packages = {package["id"]: package for package in metadata["packages"]}
     nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
     root = metadata["resolve"]["root"]
@@ -56,7 +55,7 @@ def linked(metadata):
 
 
 def files(folder):
-    """Licence and notice files of a crate and of what it brings along, such as C sources."""
+    """Returns licence and notice files of a crate and of bundled code, such as C sources."""
 
     def wanted(path):
         parts = path.relative_to(folder).parts
@@ -71,7 +70,7 @@ def files(folder):
 
 
 def stand_in(package):
-    """The text of a licence that a crate without one names."""
+    """Returns name and text of a licence for a crate without a licence file."""
     allowed = package["license"] or ""
     if re.search(r"\bApache-2\.0\b", allowed):
         return "Apache License 2.0", (ROOT / "LICENSE-APACHE").read_text()
@@ -82,14 +81,14 @@ def stand_in(package):
 
 
 def mit(authors):
-    """The text of the licence."""
+    """Returns the MIT licence with `authors` as copyright holders."""
     terms = (ROOT / "LICENSE-MIT").read_text()
     at = terms.index("Permission is hereby granted")
     return f"MIT License\n\nCopyright (c) {authors}\n\n{terms[at:]}"
 
 
 def texts(packages, page, musl):
-    """Text to the crates that it belongs to: equal texts are one."""
+    """Maps each distinct licence text to the crates that it belongs to."""
     of = collections.OrderedDict()
 
     def add(text, who):
@@ -103,13 +102,13 @@ def texts(packages, page, musl):
         own = files(folder)
         for path in own:
             add(path.read_text(encoding="utf-8", errors="replace"), f"{who} ({path.relative_to(folder)})")
-        # A notice alone is no licence.
+        # A notice is not a licence.
         if not any(not path.name.lower().startswith("notice") for path in own):
             text = stand_in(package)
             if text is None:
                 missing.append(f"{who}: {package['license']}")
             else:
-                add(text[1], f"{who} (brings no text; {text[0]} of {package['license']})")
+                add(text[1], f"{who} (without a licence file; {text[0]} of {package['license']})")
     if page:
         web = ROOT / "web" / "swagger"
         for name in ("LICENSE", "NOTICE", "swagger-ui-bundle.js.LICENSE.txt"):
@@ -136,8 +135,8 @@ def main():
     metadata = json.loads(cargo("metadata", "--format-version=1", "--locked", f"--filter-platform={target}", *chosen))
     packages = linked(metadata)
     line = "-" * 100
-    print("molmesh is licensed under MIT OR Apache-2.0, at your option. It holds the work of others, listed here with their")
-    print(f"licences ({target}).\n")
+    print("molmesh is licensed under MIT OR Apache-2.0, at your option. It contains third-party software, listed here with")
+    print(f"its licences ({target}).\n")
     for package in packages:
         print(f"  {package['name']} {package['version']}: {package['license'] or 'see its text'}")
     if page:

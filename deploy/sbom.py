@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Makes a bill of materials (CycloneDX 1.5, JSON) of what is distributed, from cargo-cyclonedx's list of crates.
+"""Writes a bill of materials (CycloneDX 1.5, JSON) from cargo-cyclonedx's list of crates.
 
-Without --root it is that of the binary: the crates, and what the web page holds of others. With --root, the file that
-`docker export` writes, it is that of an image: Debian's packages as well, and what is copied in of some. The output depends on
-nothing but the input: refs name no folder of this machine, the serial number is a digest.
+Without --root, it describes the binary: crates and third-party parts of the web pages. With --root, a file from
+`docker export`, it describes an image: also Debian packages, installed or copied in part. The output depends only on the
+input: references contain no local paths, and the serial number is a digest.
 
 Usage: deploy/sbom.py CRATES.json [--root ROOT.tar --name molmesh:cpu] >OUT.cdx.json
 """
@@ -20,13 +20,13 @@ import uuid
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 APPLICATION = "molmesh"
-# Where dpkg notes what is installed; files below the second are packages of which parts were copied in.
+# dpkg's list of installed packages; files below the second path describe packages that were copied in part.
 STATUS = "var/lib/dpkg/status"
 COPIED = "var/lib/dpkg/status.d/"
 
 
 def crates(path):
-    """cargo-cyclonedx's document with refs that are the same everywhere."""
+    """Returns cargo-cyclonedx's document with references that do not depend on the machine."""
     bom = json.loads(pathlib.Path(path).read_text())
     own = bom["metadata"]["component"]
     at = own["bom-ref"]
@@ -44,7 +44,7 @@ def crates(path):
     for edge in bom["dependencies"]:
         edge["ref"] = ref(edge["ref"])
         edge["dependsOn"] = sorted({ref(text) for text in edge.get("dependsOn", [])})
-    # In 1.5 tools are components; the form of old is deprecated.
+    # CycloneDX 1.5 lists tools as components; the older form is deprecated.
     bom["metadata"]["tools"] = {
         "components": [
             {"type": "application", "group": tool.get("vendor", ""), "name": tool["name"], "version": tool["version"]}
@@ -55,7 +55,7 @@ def crates(path):
 
 
 def swagger():
-    """What others wrote of the page at /docs, as its README beside it says."""
+    """Returns the component Swagger UI of the page at /docs, as its README describes it."""
     text = (ROOT / "web/swagger/README.md").read_text()
     version = re.search(r"`swagger-ui-dist` (\S+) \(Apache-2\.0", text)[1]
     files = re.findall(r"^    ([0-9a-f]{64})  (\S+)$", text, re.MULTILINE)
@@ -77,7 +77,7 @@ def swagger():
 
 
 def viewer():
-    """What others wrote of the page at /, as its lock says: three.js, and the decoder that comes with it."""
+    """Yields the third-party packages of the page at / from its lock file: three.js and the meshopt decoder."""
     lock = json.loads((ROOT / "web/package-lock.json").read_text())["packages"]
     for name in ("three", "meshoptimizer"):
         package = lock[f"node_modules/{name}"]
@@ -96,7 +96,7 @@ def viewer():
 
 
 def packages(status, how):
-    """Debian's packages in a file of dpkg."""
+    """Yields the Debian packages in a dpkg status file."""
     for paragraph in re.split(r"\n\n+", status.strip()):
         fields = dict(line.split(": ", 1) for line in paragraph.splitlines() if re.match(r"^[A-Za-z-]+: ", line))
         if how == "installed" and not fields.get("Status", "").endswith(" installed"):
@@ -114,7 +114,7 @@ def packages(status, how):
 
 
 def image(bom, root, name):
-    """Makes the binary one part of an image."""
+    """Turns the binary's document into that of an image."""
     found = []
     with tarfile.open(root) as archive:
         for member in archive:
@@ -125,7 +125,7 @@ def image(bom, root, name):
             if path == "usr/lib/os-release":
                 release = dict(re.findall(r'^([A-Z_]+)="?([^"\n]*)"?$', archive.extractfile(member).read().decode(), re.MULTILINE))
     if len(found) < 20:
-        sys.exit(f"only {len(found)} packages in {root}: the root of an image is wanted")
+        sys.exit(f"only {len(found)} packages in {root}: expected the root of an image")
     found.sort(key=lambda component: component["bom-ref"])
     application = bom["metadata"]["component"]
     system = {"type": "operating-system", "bom-ref": "debian", "name": release["ID"], "version": release["VERSION_ID"]}

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Writes dist/molmesh.cdx.json, the bill of materials of the binary, and dist/molmesh-TARGET.cdx.json for each image that is
-# named, and checks them. Installs cargo-cyclonedx into target/tools where it is absent. Usage: deploy/sbom.sh [cpu] [gpu]
+# Writes and checks bills of materials: dist/molmesh.cdx.json for the binary and dist/molmesh-IMAGE.cdx.json for each
+# named image. Installs cargo-cyclonedx into target/tools if it is missing. Usage: deploy/sbom.sh [cpu] [gpu]
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # shellcheck source=deploy/container/engine.sh
@@ -17,7 +17,7 @@ bash tests/tools/setup.sh
 SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct 2>/dev/null || date +%s)}
 export SOURCE_DATE_EPOCH
 mkdir -p dist
-# It writes beside the manifest, whatever it is told.
+# cargo-cyclonedx always writes beside the manifest.
 trap 'rm -f molmesh.crates.json target/root.tar' EXIT
 cargo cyclonedx -qq --format json --spec-version 1.5 --target "$target" --override-filename molmesh.crates
 python3 deploy/sbom.py molmesh.crates.json >dist/molmesh.cdx.json

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Builds the command line alone (`mesh` and `render` on the CPU; no service, no GPU) as one static file, dist/molmesh, which runs on
-# any Linux of this processor's kind. Installs the standard library for musl and Debian's musl-tools where they are absent; ends
-# with 3 where they cannot be had, and with what the build ends with where that fails.
+# Builds the command line (`mesh` and `render` on the CPU, without service and GPU) as the static file dist/molmesh, which
+# runs on any Linux with the same processor architecture. Installs the standard library for musl and Debian's musl-tools
+# if they are missing. Exits with 3 if these are not available, and with the build's status if the build fails.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 # shellcheck source=deploy/container/engine.sh
@@ -12,17 +12,17 @@ impossible() {
     exit 3
 }
 
-[ "$(uname -s)" = Linux ] || impossible "a static executable is built on Linux alone"
+[ "$(uname -s)" = Linux ] || impossible "a static executable can be built on Linux only"
 target=$(uname -m)-unknown-linux-musl
 if [ ! -d "$(rustc --print sysroot)/lib/rustlib/$target/lib" ]; then
-    rustup target add "$target" || impossible "Rust's standard library for $target is not installed and cannot be got by rustup"
+    rustup target add "$target" || impossible "Rust's standard library for $target is missing and rustup cannot install it"
 fi
-# The allocator is C.
-command -v musl-gcc >/dev/null || (install_packages musl-tools) || impossible "there is no musl-gcc"
+# The allocator is written in C.
+command -v musl-gcc >/dev/null || (install_packages musl-tools) || impossible "musl-gcc is not installed"
 cargo build --release --locked --bin molmesh --no-default-features --features cli --target "$target"
 mkdir -p dist
-# Symbols stay, so that backtraces have names. Under another name first: whoever runs the old one keeps it.
+# Symbols stay for backtraces. The rename replaces the file without disturbing running processes.
 strip --strip-debug -o dist/molmesh.new "target/$target/release/molmesh"
 mv dist/molmesh.new dist/molmesh
-# What has to go with it where it is handed on.
+# Licence notices that must accompany the file.
 python3 deploy/notices.py --target "$target" --features cli >dist/molmesh.THIRD-PARTY.txt

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Meshes a structure and measures it: the service's report and trimesh say the same.
+"""Meshes a structure and compares the measures of the service with those of trimesh.
 
 Usage: measure.py FILE [SERVER]      (pip install requests trimesh)
 """

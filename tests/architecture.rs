@@ -1,6 +1,6 @@
-//! The map of `ARCHITECTURE.md`, checked: which room may name which, how long a file may be, that a stage's parts
-//! exist, and that nothing unfinished is left lying about. Every checker has a negative control: a made-up bad
-//! source that it must find fault with.
+//! Checks of the repository's structure and language: references between layers, the map in `ARCHITECTURE.md`, the
+//! index of decision records, file lengths, the parts of each stage, unfinished work, and the form of comments and
+//! prose. Every checker has a negative control with bad input that it must report.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -8,17 +8,18 @@ use std::iter::Peekable;
 use std::path::{Path, PathBuf};
 use std::str::Chars;
 
-/// A source file: its path from the repository's root, with `/`, and its text.
+/// A text file: its path relative to the repository root, separated by `/`, and its text.
 struct Source {
     path: String,
     text: String,
 }
 
-/// What a room may name of the crate: rooms, and for some of them only certain items.
-struct Room {
+/// A layer of the library and the references that it may contain.
+struct Layer {
     name: &'static str,
-    rooms: &'static [(&'static str, Items)],
-    /// External crates that it must not name.
+    /// Layers that it may reference, with the permitted items.
+    layers: &'static [(&'static str, Items)],
+    /// External crates that it must not reference.
     crates: &'static [&'static str],
 }
 
@@ -28,10 +29,10 @@ enum Items {
 }
 use Items::{Any, Only};
 
-/// What no room below the service may name.
+/// Crates that no layer below the service may reference.
 const SERVICE: &[&str] =
     &["tokio", "axum", "tower", "tower_http", "hyper", "hyper_util", "tracing", "metrics", "toml", "clap", "indicatif"];
-/// What the core may not name: that, files, and other people's molecules.
+/// Crates that the core may not reference: those of the service, serialisation, file formats and graphics APIs.
 const NOT_CORE: &[&str] = &[
     "tokio",
     "axum",
@@ -53,35 +54,35 @@ const NOT_CORE: &[&str] = &[
     "ruzstd",
 ];
 
-/// `surface ← picture ← gpu; surface ← structure, formats, picture ← pipeline ← jobs ← http`; the binary may name everything.
-const ROOMS: &[Room] = &[
-    Room { name: "surface", rooms: &[], crates: NOT_CORE },
-    Room { name: "picture", rooms: &[("surface", Any)], crates: NOT_CORE },
-    Room { name: "gpu", rooms: &[("surface", Any), ("picture", Any)], crates: SERVICE },
-    Room {
+/// The layers in order: each may reference only layers that precede it.
+const LAYERS: &[Layer] = &[
+    Layer { name: "surface", layers: &[], crates: NOT_CORE },
+    Layer { name: "picture", layers: &[("surface", Any)], crates: NOT_CORE },
+    Layer { name: "gpu", layers: &[("surface", Any), ("picture", Any)], crates: SERVICE },
+    Layer {
         name: "structure",
-        rooms: &[("surface", Only(&["Spheres", "SurfaceError", "spheres"]))],
+        layers: &[("surface", Only(&["Spheres", "SurfaceError", "spheres"]))],
         crates: &["tokio", "axum", "tower", "hyper", "tracing", "wgpu", "gltf_json", "clap"],
     },
-    Room {
+    Layer {
         name: "formats",
-        rooms: &[("surface", Only(&["Mesh", "MeshPart", "MeshSink", "SinkFailed", "Vertices", "quantize"]))],
+        layers: &[("surface", Only(&["Mesh", "MeshPart", "MeshSink", "SinkFailed", "Vertices", "quantize"]))],
         crates: &["tokio", "axum", "tower", "hyper", "tracing", "wgpu", "pdbtbx", "clap"],
     },
-    Room {
+    Layer {
         name: "pipeline",
-        rooms: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any)],
+        layers: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any)],
         crates: SERVICE,
     },
-    Room {
+    Layer {
         name: "config",
-        rooms: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any), ("pipeline", Any)],
+        layers: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any), ("pipeline", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "wgpu", "clap"],
     },
-    Room { name: "telemetry", rooms: &[("config", Any)], crates: &["axum", "tower", "hyper", "wgpu", "clap"] },
-    Room {
+    Layer { name: "telemetry", layers: &[("config", Any)], crates: &["axum", "tower", "hyper", "wgpu", "clap"] },
+    Layer {
         name: "access",
-        rooms: &[("pipeline", Only(&["nearest"])), ("config", Any)],
+        layers: &[("pipeline", Only(&["nearest"])), ("config", Any)],
         crates: &[
             "tokio",
             "axum",
@@ -96,19 +97,24 @@ const ROOMS: &[Room] = &[
             "reqwest",
         ],
     },
-    Room {
-        name: "store",
-        rooms: &[("config", Any), ("telemetry", Any)],
+    Layer {
+        name: "single_flight",
+        layers: &[],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
-    Room {
+    Layer {
+        name: "store",
+        layers: &[("config", Any), ("telemetry", Any)],
+        crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
+    },
+    Layer {
         name: "archive",
-        rooms: &[("structure", Any), ("config", Any), ("telemetry", Any), ("store", Any)],
+        layers: &[("structure", Any), ("config", Any), ("telemetry", Any), ("single_flight", Any), ("store", Any)],
         crates: &["axum", "tower", "tower_http", "wgpu", "clap"],
     },
-    Room {
+    Layer {
         name: "jobs",
-        rooms: &[
+        layers: &[
             ("surface", Any),
             ("structure", Any),
             ("formats", Any),
@@ -116,13 +122,14 @@ const ROOMS: &[Room] = &[
             ("pipeline", Any),
             ("config", Any),
             ("telemetry", Any),
+            ("single_flight", Any),
             ("store", Any),
         ],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap"],
     },
-    Room {
+    Layer {
         name: "http",
-        rooms: &[
+        layers: &[
             ("surface", Any),
             ("structure", Any),
             ("formats", Any),
@@ -130,6 +137,7 @@ const ROOMS: &[Room] = &[
             ("pipeline", Any),
             ("config", Any),
             ("telemetry", Any),
+            ("single_flight", Any),
             ("store", Any),
             ("archive", Any),
             ("jobs", Any),
@@ -139,12 +147,27 @@ const ROOMS: &[Room] = &[
     },
 ];
 
-/// The crate's root and the binary, which stand above the map.
+/// The crate root and the binary, which may reference every layer.
 const ABOVE: &[&str] = &["lib", "main", "cli"];
 
+/// Limit for the lines of `ARCHITECTURE.md`.
+const MAX_MAP_LINES: usize = 150;
+
+/// Limit for the columns of prose and comments.
+const MAX_COLUMNS: usize = 120;
+/// Folders and files with code.
+const CODE: &[&str] = &["build.rs", "src", "shaders", "tests", "bench", "benches", "examples"];
+/// Documentation comments that still begin with a question word. The aim is 0.
+const MAX_QUESTION_DOCS: usize = 990;
+/// Comment lines in Rust that are still too long. The aim is 0.
+const MAX_LONG_COMMENTS: usize = 298;
+/// Lines of Markdown prose that are still too long. The aim is 0.
+const MAX_LONG_PROSE: usize = 441;
+
 const STAGES: &[&str] = &["bin", "field", "classify", "scan", "interpolate", "emit"];
+/// Limit for the lines of a source file, without its tests.
 const MAX_LINES: usize = 400;
-/// Tables may be longer.
+/// Data tables, which may exceed [`MAX_LINES`].
 const TABLES: &[&str] = &["src/surface/cases.rs", "src/structure/radii.rs", "src/structure/residues.rs"];
 
 // ---------------------------------------------------------------------------------------------- reading sources
@@ -153,21 +176,28 @@ fn root() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR"))
 }
 
-fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
-    let Ok(entries) = fs::read_dir(folder) else { return };
+/// Collects the files below `path` (or `path` itself) with one of the `extensions`. Skips build output and packages.
+fn walk(path: &Path, extensions: &[&str], found: &mut Vec<PathBuf>) {
+    const SKIPPED: [&str; 3] = ["target", "node_modules", "dist"];
+    let Ok(entries) = fs::read_dir(path) else {
+        let matches = path.extension().is_some_and(|e| extensions.iter().any(|wanted| e == *wanted));
+        found.extend((matches && path.is_file()).then(|| path.to_owned()));
+        return;
+    };
     for entry in entries.map(|e| e.expect("a folder can be listed")) {
-        let path = entry.path();
-        if path.is_dir() {
-            walk(&path, found);
-        } else if path.extension().is_some_and(|e| e == "rs") {
-            found.push(path);
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if !name.starts_with('.') && !SKIPPED.contains(&name.as_str()) {
+            walk(&entry.path(), extensions, found);
         }
     }
 }
 
-fn sources_under(folder: &str) -> Vec<Source> {
+/// Reads the files below `places` (folders or files below the root) with one of the `extensions`, sorted by path.
+fn files(places: &[&str], extensions: &[&str]) -> Vec<Source> {
     let mut found = Vec::new();
-    walk(&root().join(folder), &mut found);
+    for place in places {
+        walk(&root().join(place), extensions, &mut found);
+    }
     found.sort();
     let relative = |p: &Path| p.strip_prefix(root()).expect("below the root").to_string_lossy().replace('\\', "/");
     found
@@ -176,7 +206,11 @@ fn sources_under(folder: &str) -> Vec<Source> {
         .collect()
 }
 
-/// The code without comments and without what stands in strings and character literals; lines keep their numbers.
+fn sources_under(folder: &str) -> Vec<Source> {
+    files(&[folder], &["rs"])
+}
+
+/// Returns the code without comments and without the content of literals. Line numbers stay the same.
 fn code(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut chars = text.chars().peekable();
@@ -194,7 +228,7 @@ fn code(text: &str) -> String {
                 }
             }
             '"' => {
-                // A raw string ends at its own number of hashes, a plain one at the first bare quote.
+                // A raw string ends at a quote with as many hashes, a plain one at the first unescaped quote.
                 let hashes = out.chars().rev().take_while(|&c| c == '#').count();
                 let raw = out.trim_end_matches('#').ends_with('r');
                 out.push('"');
@@ -225,7 +259,7 @@ fn skip_string(chars: &mut Peekable<Chars<'_>>, out: &mut String, raw: Option<us
     }
 }
 
-/// Behind a single quote: skips a character literal, leaves a lifetime alone.
+/// Called after a single quote: skips a character literal, keeps a lifetime.
 fn skip_character(chars: &mut Peekable<Chars<'_>>) {
     let mut ahead = chars.clone();
     let (first, second) = (ahead.next(), ahead.next());
@@ -237,13 +271,13 @@ fn skip_character(chars: &mut Peekable<Chars<'_>>) {
     }
 }
 
-/// The room that a source belongs to: `src/http/x.rs` and `src/http.rs` are `http`.
-fn room_of(path: &str) -> &str {
+/// Returns the layer of a source: `src/http/x.rs` and `src/http.rs` belong to `http`.
+fn layer_of(path: &str) -> &str {
     let rest = path.strip_prefix("src/").unwrap_or(path);
     rest.split('/').next().unwrap_or(rest).trim_end_matches(".rs")
 }
 
-/// How deep the file's module lies: `src/http.rs` and `src/http/mod.rs` 1, `src/http/x.rs` 2.
+/// Returns the depth of the file's module: 1 for `src/http.rs` and `src/http/mod.rs`, 2 for `src/http/x.rs`.
 fn depth_of(path: &str) -> usize {
     let rest = path.trim_start_matches("src/").trim_end_matches(".rs").trim_end_matches("/mod");
     rest.split('/').count()
@@ -253,9 +287,9 @@ fn is_ident(c: char) -> bool {
     c.is_alphanumeric() || c == '_'
 }
 
-/// What of the crate's root the code names: `(room, item)` for `crate::room::item`, also in braces, also by way of
-/// `super`. The item is empty where the room itself is named.
-fn named(source: &Source) -> BTreeSet<(String, String)> {
+/// Returns `(layer, item)` for each reference `crate::layer::item`, including use trees and paths through `super`. The
+/// item is empty for a reference to the layer itself.
+fn references(source: &Source) -> BTreeSet<(String, String)> {
     const SUPER: &str = "super::";
     let code = code(&source.text);
     let starts_a_path = |at: usize| !code[..at].chars().next_back().is_some_and(|c| is_ident(c) || c == ':');
@@ -267,7 +301,7 @@ fn named(source: &Source) -> BTreeSet<(String, String)> {
     for (at, _) in code.match_indices(SUPER).filter(|(at, _)| starts_a_path(*at)) {
         let rest = code[at..].trim_start_matches(SUPER);
         let n_supers = (code.len() - at - rest.len()) / SUPER.len();
-        // Inside the module of tests every path is one level deeper.
+        // Inside the test module every path is one level deeper.
         let in_tests = tests_from.is_some_and(|from| code[..at].matches('\n').count() >= from);
         if n_supers >= depth_of(&source.path) + usize::from(in_tests) {
             found.extend(paths(rest));
@@ -280,27 +314,27 @@ fn segment(text: &str) -> String {
     text.chars().take_while(|&c| is_ident(c)).collect()
 }
 
-/// The first two segments of every path in a use tree, or of a plain path.
+/// Returns the first two segments of every path in a use tree, or of a plain path.
 fn paths(text: &str) -> Vec<(String, String)> {
     match text.strip_prefix('{') {
-        Some(tree) => top_level(tree).iter().flat_map(|part| room_and_items(part)).collect(),
-        None => room_and_items(text),
+        Some(tree) => top_level(tree).iter().flat_map(|part| layer_and_items(part)).collect(),
+        None => layer_and_items(text),
     }
 }
 
-fn room_and_items(text: &str) -> Vec<(String, String)> {
-    let room = segment(text);
-    let items = match text[room.len()..].strip_prefix("::") {
+fn layer_and_items(text: &str) -> Vec<(String, String)> {
+    let layer = segment(text);
+    let items = match text[layer.len()..].strip_prefix("::") {
         None => vec![String::new()],
         Some(rest) => match rest.strip_prefix('{') {
             Some(tree) => top_level(tree).iter().map(|part| segment(part)).collect(),
             None => vec![segment(rest)],
         },
     };
-    items.into_iter().map(|item| (room.clone(), item)).collect()
+    items.into_iter().map(|item| (layer.clone(), item)).collect()
 }
 
-/// The comma-separated parts of a brace group whose opening brace is already gone.
+/// Splits the inside of a brace group, given without its opening brace, at its top-level commas.
 fn top_level(tree: &str) -> Vec<String> {
     let (mut depth, mut parts) = (0_u32, vec![String::new()]);
     for c in tree.chars() {
@@ -319,7 +353,7 @@ fn top_level(tree: &str) -> Vec<String> {
     parts.into_iter().map(|p| p.trim().to_owned()).filter(|p| !p.is_empty()).collect()
 }
 
-/// The line (from 0) at which the module of tests begins, which by house style ends the file.
+/// Returns the line (from 0) at which the test module begins. The test module is the last item of a file.
 fn tests_start(text: &str) -> Option<usize> {
     let lines: Vec<&str> = text.lines().collect();
     (0..lines.len()).find(|&i| {
@@ -330,16 +364,16 @@ fn tests_start(text: &str) -> Option<usize> {
 
 // --------------------------------------------------------------------------------------------------- the checkers
 
-/// Rooms and crates named that may not be named, and rooms that the map does not know.
-fn wrong_edges(sources: &[Source]) -> Vec<String> {
+/// Returns forbidden references to layers and crates, and sources that belong to no layer.
+fn forbidden_references(sources: &[Source]) -> Vec<String> {
     let mut wrong = Vec::new();
-    for source in sources.iter().filter(|s| !ABOVE.contains(&room_of(&s.path))) {
-        let (path, room) = (&source.path, room_of(&source.path));
-        let Some(rules) = ROOMS.iter().find(|r| r.name == room) else {
-            wrong.push(format!("{path}: the map has no room `{room}`"));
+    for source in sources.iter().filter(|s| !ABOVE.contains(&layer_of(&s.path))) {
+        let (path, layer) = (&source.path, layer_of(&source.path));
+        let Some(rules) = LAYERS.iter().find(|l| l.name == layer) else {
+            wrong.push(format!("{path}: there is no layer `{layer}`"));
             continue;
         };
-        for (other, item) in named(source) {
+        for (other, item) in references(source) {
             let allowed = |(name, items): &(&str, Items)| {
                 *name == other
                     && match items {
@@ -347,8 +381,8 @@ fn wrong_edges(sources: &[Source]) -> Vec<String> {
                         Only(items) => items.contains(&item.as_str()),
                     }
             };
-            if other != room && !rules.rooms.iter().any(allowed) {
-                wrong.push(format!("{path}: `{room}` must not name crate::{other}::{item}"));
+            if other != layer && !rules.layers.iter().any(allowed) {
+                wrong.push(format!("{path}: `{layer}` must not reference crate::{other}::{item}"));
             }
         }
         let code = code(&source.text);
@@ -356,7 +390,7 @@ fn wrong_edges(sources: &[Source]) -> Vec<String> {
             let start = format!("{krate}::");
             let begins = |at: usize| !code[..at].chars().next_back().is_some_and(|c| is_ident(c) || c == ':');
             if code.match_indices(&start).any(|(at, _)| begins(at)) {
-                wrong.push(format!("{path}: `{room}` must not name the crate {krate}"));
+                wrong.push(format!("{path}: `{layer}` must not reference the crate {krate}"));
             }
         }
     }
@@ -365,7 +399,7 @@ fn wrong_edges(sources: &[Source]) -> Vec<String> {
 
 type Edges = BTreeMap<String, BTreeSet<String>>;
 
-/// A cycle between rooms, if there is one.
+/// Returns a reference cycle between layers, if there is one.
 fn cycle(sources: &[Source]) -> Option<Vec<String>> {
     fn visit(at: &str, edges: &Edges, trail: &mut Vec<String>) -> bool {
         let seen = trail.iter().any(|t| t == at);
@@ -378,15 +412,15 @@ fn cycle(sources: &[Source]) -> Option<Vec<String>> {
     }
     let mut edges = Edges::new();
     for source in sources {
-        let room = room_of(&source.path);
-        if !ABOVE.contains(&room) {
-            let others = named(source).into_iter().map(|(other, _)| other).filter(|other| other != room);
-            edges.entry(room.to_owned()).or_default().extend(others);
+        let layer = layer_of(&source.path);
+        if !ABOVE.contains(&layer) {
+            let others = references(source).into_iter().map(|(other, _)| other).filter(|other| other != layer);
+            edges.entry(layer.to_owned()).or_default().extend(others);
         }
     }
-    edges.keys().find_map(|room| {
+    edges.keys().find_map(|layer| {
         let mut trail = Vec::new();
-        visit(room, &edges, &mut trail).then_some(trail)
+        visit(layer, &edges, &mut trail).then_some(trail)
     })
 }
 
@@ -401,10 +435,10 @@ fn too_long(sources: &[Source]) -> Vec<String> {
 
 fn without_doc(sources: &[Source]) -> Vec<String> {
     let bare = |s: &&Source| !s.text.starts_with("//!") && !s.text.starts_with("#!");
-    sources.iter().filter(bare).map(|s| format!("{}: begins without a module doc", s.path)).collect()
+    sources.iter().filter(bare).map(|s| format!("{}: has no module documentation", s.path)).collect()
 }
 
-/// Parts of stages that are missing. A part is asked for as soon as its folder or file exists.
+/// Returns the missing parts of stages. A part is required once its folder or file exists.
 fn missing_parts(files: &[String], stage_tests: Option<&str>) -> Vec<String> {
     let has = |path: &str| files.iter().any(|f| f == path);
     let any = |prefix: &str, suffix: &str| files.iter().any(|f| f.starts_with(prefix) && f.ends_with(suffix));
@@ -423,7 +457,7 @@ fn missing_parts(files: &[String], stage_tests: Option<&str>) -> Vec<String> {
     missing
 }
 
-/// Marks of unfinished work and bare lint switches.
+/// Returns marks of unfinished work and lint switches without a reason.
 fn unfinished(sources: &[Source]) -> Vec<String> {
     const MARKS: [&str; 6] = ["todo!", "unimplemented!", "dbg!", "#[ignore", "#[allow(", "#![allow("];
     let mut found = Vec::new();
@@ -431,7 +465,7 @@ fn unfinished(sources: &[Source]) -> Vec<String> {
         let code = code(&source.text);
         for mark in MARKS {
             for (at, _) in code.match_indices(mark) {
-                // A switch with a reason is let through: the lints ask for the reason.
+                // A switch with a reason is permitted.
                 let attribute = code[at..].split(']').next().unwrap_or_default();
                 if !(mark.contains("allow") && attribute.contains("reason =")) {
                     found.push(format!("{}:{}: {mark}", source.path, code[..at].matches('\n').count() + 1));
@@ -442,43 +476,144 @@ fn unfinished(sources: &[Source]) -> Vec<String> {
     found
 }
 
+/// Returns the folders of `src` that `map` does not show, and the length of a map that is too long.
+fn map_faults(map: &str, folders: &[String]) -> Vec<String> {
+    let mut faults: Vec<String> = folders
+        .iter()
+        .filter(|folder| !map.contains(&format!("src/{folder}/")))
+        .map(|folder| format!("ARCHITECTURE.md: src/{folder}/ is missing"))
+        .collect();
+    let n_lines = map.lines().count();
+    faults.extend((n_lines > MAX_MAP_LINES).then(|| format!("ARCHITECTURE.md: {n_lines} lines of {MAX_MAP_LINES}")));
+    faults
+}
+
+/// Returns the decision records (file names) that `index` does not link, and numbers that are missing or used twice.
+fn record_faults(index: &str, records: &[String]) -> Vec<String> {
+    let unlisted = records.iter().filter(|name| !index.contains(&format!("({name})")));
+    let mut faults: Vec<String> = unlisted.map(|name| format!("docs/adr/README.md: {name} is missing")).collect();
+    let misnumbered = records.iter().zip(1..).filter(|(name, number)| !name.starts_with(&format!("{number:04}-")));
+    faults.extend(misnumbered.map(|(name, number)| format!("docs/adr/{name}: expected the number {number:04}")));
+    faults
+}
+
+/// Returns the marker of a documentation comment and its text. WGSL has no such comments: every comment counts there.
+fn doc_line<'a>(path: &str, line: &'a str) -> Option<(&'static str, &'a str)> {
+    let line = line.trim_start();
+    let markers: &[&str] = if path.ends_with(".wgsl") { &["//"] } else { &["//!", "///"] };
+    let (marker, text) = markers.iter().find_map(|marker| Some((*marker, line.strip_prefix(marker)?)))?;
+    (!text.starts_with('/')).then_some((marker, text))
+}
+
+/// Returns documentation comments that begin with a question word instead of a verb or a noun phrase.
+fn question_docs(sources: &[Source]) -> Vec<String> {
+    const WORDS: [&str; 9] = ["What", "How", "Whether", "Where", "Who", "Whose", "When", "Which", "Why"];
+    let mut found = Vec::new();
+    for source in sources {
+        let mut previous = None;
+        for (i, line) in source.text.lines().enumerate() {
+            let doc = doc_line(&source.path, line);
+            if let Some((marker, text)) = doc
+                && previous != Some(marker)
+            {
+                let word: String =
+                    text.chars().skip_while(|c| !c.is_alphanumeric()).take_while(|c| c.is_alphabetic()).collect();
+                if WORDS.contains(&word.as_str()) {
+                    found.push(format!("{}:{}: begins with `{word}`", source.path, i + 1));
+                }
+            }
+            previous = doc.map(|(marker, _)| marker);
+        }
+    }
+    found
+}
+
+/// Returns true if a line exceeds [`MAX_COLUMNS`] and could be wrapped: a bare link, with or without a label, cannot.
+fn is_overlong(line: &str) -> bool {
+    let text = line.trim_start_matches(|c: char| c.is_whitespace() || "/!#*->".contains(c));
+    let text = text.split_once("]: ").map_or(text, |(label, link)| if label.starts_with('[') { link } else { text });
+    let bare_link = text.contains("://") && !text.trim().contains(' ');
+    line.chars().count() > MAX_COLUMNS && !bare_link
+}
+
+/// Returns comment lines of Rust sources that exceed [`MAX_COLUMNS`].
+fn long_comments(sources: &[Source]) -> Vec<String> {
+    let lines = sources.iter().flat_map(|s| s.text.lines().enumerate().map(move |(i, line)| (s, i, line)));
+    lines
+        .filter(|(_, _, line)| line.trim_start().starts_with("//") && is_overlong(line))
+        .map(|(s, i, line)| format!("{}:{}: {} columns", s.path, i + 1, line.chars().count()))
+        .collect()
+}
+
+/// Returns lines of Markdown prose that exceed [`MAX_COLUMNS`]. Tables and fenced code blocks are exempt.
+fn long_prose(documents: &[Source]) -> Vec<String> {
+    let mut found = Vec::new();
+    for document in documents {
+        let mut fence = None;
+        for (i, line) in document.text.lines().enumerate() {
+            let start = line.trim_start();
+            let marker = ["```", "~~~"].into_iter().find(|marker| start.starts_with(marker));
+            if marker.is_some() && (fence.is_none() || fence == marker) {
+                fence = if fence.is_none() { marker } else { None };
+            } else if fence.is_none() && !start.starts_with('|') && is_overlong(line) {
+                found.push(format!("{}:{}: {} columns", document.path, i + 1, line.chars().count()));
+            }
+        }
+    }
+    found
+}
+
 // ------------------------------------------------------------------------------------------------------ the tests
 
-fn nothing(found: &[String]) {
-    assert!(found.is_empty(), "{} found:\n{}", found.len(), found.join("\n"));
+fn assert_none(found: &[String]) {
+    assert_at_most(0, found);
+}
+
+fn assert_at_most(limit: usize, found: &[String]) {
+    assert!(found.len() <= limit, "{} found, {limit} permitted:\n{}", found.len(), found.join("\n"));
+}
+
+/// Returns the names in a folder for which `wanted` holds, sorted.
+fn names_in(folder: &str, wanted: impl Fn(&Path) -> bool) -> Vec<String> {
+    let entries = fs::read_dir(root().join(folder)).expect("the folder can be listed").flatten();
+    let mut names: Vec<String> = entries
+        .filter(|entry| wanted(&entry.path()))
+        .map(|entry| entry.file_name().to_string_lossy().into_owned())
+        .collect();
+    names.sort();
+    names
 }
 
 #[test]
-fn arrows_point_one_way() {
+fn layers_reference_only_permitted_layers() {
     let sources = sources_under("src");
-    assert!(sources.len() > 20, "only {} sources found: the check looks in the wrong place", sources.len());
-    nothing(&wrong_edges(&sources));
+    assert!(sources.len() > 20, "only {} sources found: wrong folder?", sources.len());
+    assert_none(&forbidden_references(&sources));
 }
 
 #[test]
-fn rooms_have_no_cycle() {
+fn layers_have_no_reference_cycle() {
     assert_eq!(cycle(&sources_under("src")), None);
 }
 
 #[test]
-fn the_map_itself_has_no_cycle() {
-    for (i, room) in ROOMS.iter().enumerate() {
-        for (other, _) in room.rooms {
-            let at = ROOMS.iter().position(|r| r.name == *other).expect("a room of the map");
-            assert!(at < i, "{} stands before {other}, which it names", room.name);
+fn layers_are_listed_in_order() {
+    for (i, layer) in LAYERS.iter().enumerate() {
+        for (other, _) in layer.layers {
+            let at = LAYERS.iter().position(|l| l.name == *other).expect("a known layer");
+            assert!(at < i, "{} precedes {other}, which it references", layer.name);
         }
     }
 }
 
 #[test]
 fn files_are_short() {
-    nothing(&too_long(&sources_under("src")));
+    assert_none(&too_long(&files(&["src", "bench/src"], &["rs"])));
 }
 
 #[test]
-fn files_say_what_they_are_for() {
-    nothing(&without_doc(&sources_under("src")));
-    nothing(&without_doc(&sources_under("tests")));
+fn files_have_module_documentation() {
+    assert_none(&without_doc(&files(&["src", "tests", "bench"], &["rs"])));
 }
 
 #[test]
@@ -488,24 +623,55 @@ fn stages_have_all_their_parts() {
         files.extend(entries.flatten().map(|e| format!("shaders/{}", e.file_name().to_string_lossy())));
     }
     let stage_tests = fs::read_to_string(root().join("tests/stages.rs")).ok();
-    nothing(&missing_parts(&files, stage_tests.as_deref()));
+    assert_none(&missing_parts(&files, stage_tests.as_deref()));
 }
 
 #[test]
-fn nothing_unfinished_is_left() {
-    for folder in ["src", "tests", "benches", "examples"] {
-        nothing(&unfinished(&sources_under(folder)));
-    }
+fn no_unfinished_work_remains() {
+    assert_none(&unfinished(&files(CODE, &["rs"])));
+}
+
+#[test]
+fn the_map_shows_every_folder() {
+    let folders = names_in("src", Path::is_dir);
+    assert!(folders.len() > 10, "only {} folders found: wrong folder?", folders.len());
+    let map = fs::read_to_string(root().join("ARCHITECTURE.md")).expect("the map is there");
+    assert_none(&map_faults(&map, &folders));
+}
+
+#[test]
+fn the_index_lists_every_decision_record() {
+    let records = names_in("docs/adr", |path| path.file_name().is_some_and(|name| name != "README.md"));
+    assert!(records.len() > 20, "only {} records found: wrong folder?", records.len());
+    let index = fs::read_to_string(root().join("docs/adr/README.md")).expect("the index is there");
+    assert_none(&record_faults(&index, &records));
+}
+
+#[test]
+fn documentation_comments_do_not_begin_with_question_words() {
+    assert_at_most(MAX_QUESTION_DOCS, &question_docs(&files(CODE, &["rs", "wgsl"])));
+}
+
+#[test]
+fn comments_fit_the_line() {
+    assert_at_most(MAX_LONG_COMMENTS, &long_comments(&files(CODE, &["rs"])));
+}
+
+#[test]
+fn prose_fits_the_line() {
+    let documents = files(&["."], &["md"]);
+    assert!(documents.len() > 10, "only {} documents found: wrong folder?", documents.len());
+    assert_at_most(MAX_LONG_PROSE, &long_prose(&documents));
 }
 
 // -------------------------------------------------------------------------------------------- negative controls
 
-fn made_up(path: &str, text: &str) -> Vec<Source> {
+fn source(path: &str, text: &str) -> Vec<Source> {
     vec![Source { path: path.to_owned(), text: text.to_owned() }]
 }
 
 #[test]
-fn control_wrong_edges_are_seen() {
+fn control_forbidden_references_are_reported() {
     let bad = [
         ("src/surface/grid.rs", "use crate::structure::Structure;"),
         ("src/surface/grid.rs", "fn f() { crate::pipeline::run() }"),
@@ -526,12 +692,12 @@ fn control_wrong_edges_are_seen() {
         ("src/attic/old.rs", "fn f() {}"),
     ];
     for (path, text) in bad {
-        assert_eq!(wrong_edges(&made_up(path, text)).len(), 1, "{path}: {text}");
+        assert_eq!(forbidden_references(&source(path, text)).len(), 1, "{path}: {text}");
     }
 }
 
 #[test]
-fn control_good_edges_are_let_through() {
+fn control_permitted_references_are_not_reported() {
     let good = [
         ("src/surface/grid.rs", "use super::mesh::Mesh; // crate::http\nlet s = \"crate::http::x\";"),
         ("src/surface/cpu/bin.rs", "use super::super::mesh::Mesh; use crate::surface::Spheres;"),
@@ -545,35 +711,35 @@ fn control_good_edges_are_let_through() {
         ("src/http/router.rs", "use crate::{jobs::Pool, surface::Kernel}; use axum::Router;"),
     ];
     for (path, text) in good {
-        assert_eq!(wrong_edges(&made_up(path, text)), Vec::<String>::new(), "{path}: {text}");
+        assert_eq!(forbidden_references(&source(path, text)), Vec::<String>::new(), "{path}: {text}");
     }
 }
 
 #[test]
-fn control_a_cycle_is_seen() {
-    let source = |path: &str, text: &str| Source { path: path.to_owned(), text: text.to_owned() };
-    let mut sources = vec![source("src/a/mod.rs", "use crate::b::X;"), source("src/b.rs", "use crate::c::Y;")];
+fn control_a_cycle_is_reported() {
+    let one = |path: &str, text: &str| source(path, text).remove(0);
+    let mut sources = vec![one("src/a/mod.rs", "use crate::b::X;"), one("src/b.rs", "use crate::c::Y;")];
     assert_eq!(cycle(&sources), None);
-    sources.push(source("src/c/deep/er.rs", "fn f() { crate::a::f() }"));
+    sources.push(one("src/c/deep/er.rs", "fn f() { crate::a::f() }"));
     assert_eq!(cycle(&sources), Some(["a", "b", "c", "a"].map(String::from).to_vec()));
 }
 
 #[test]
-fn control_a_long_file_is_seen_and_its_tests_do_not_count() {
+fn control_a_long_file_is_reported_without_its_tests() {
     let long = "//! Doc.\n".to_owned() + &"fn f() {}\n".repeat(MAX_LINES);
-    assert_eq!(too_long(&made_up("src/http/long.rs", &long)).len(), 1);
-    assert_eq!(too_long(&made_up(TABLES[0], &long)).len(), 0);
+    assert_eq!(too_long(&source("src/http/long.rs", &long)).len(), 1);
+    assert_eq!(too_long(&source(TABLES[0], &long)).len(), 0);
     let tested = "//! Doc.\n#[cfg(test)]\n#[expect(clippy::panic)]\nmod tests {\n".to_owned() + &long;
-    assert_eq!(too_long(&made_up("src/http/tested.rs", &tested)).len(), 0);
+    assert_eq!(too_long(&source("src/http/tested.rs", &tested)).len(), 0);
 }
 
 #[test]
-fn control_a_file_without_a_doc_is_seen() {
-    assert_eq!(without_doc(&made_up("src/http/x.rs", "use std::fmt;\n//! late")).len(), 1);
+fn control_a_file_without_documentation_is_reported() {
+    assert_eq!(without_doc(&source("src/http/x.rs", "use std::fmt;\n//! late")).len(), 1);
 }
 
 #[test]
-fn control_missing_parts_are_seen() {
+fn control_missing_parts_are_reported() {
     let whole = |folder: &str, suffix: &str| -> Vec<String> {
         STAGES.iter().map(|s| format!("{folder}/{s}.{suffix}")).collect()
     };
@@ -589,13 +755,77 @@ fn control_missing_parts_are_seen() {
 }
 
 #[test]
-fn control_unfinished_work_is_seen() {
+fn control_unfinished_work_is_reported() {
     let bad = ["fn f() { todo!() }", "#[ignore = \"slow\"]\nfn f() {}", "#[allow(dead_code)]\nfn f() {}", "dbg!(1);"];
     for text in bad {
-        assert_eq!(unfinished(&made_up("src/x.rs", text)).len(), 1, "{text}");
+        assert_eq!(unfinished(&source("src/x.rs", text)).len(), 1, "{text}");
         let reasoned = "#![allow(\n    dead_code,\n    reason = \"a (good) one\"\n)]\nfn f() {}";
-        assert_eq!(unfinished(&made_up("tests/x.rs", reasoned)).len(), 0);
+        assert_eq!(unfinished(&source("tests/x.rs", reasoned)).len(), 0);
         let comment = format!("// {}", text.replace('\n', "\n// "));
-        assert_eq!(unfinished(&made_up("src/x.rs", &comment)).len(), 0, "{text}");
+        assert_eq!(unfinished(&source("src/x.rs", &comment)).len(), 0, "{text}");
+    }
+}
+
+#[test]
+fn control_an_incomplete_map_is_reported() {
+    let folders = ["surface", "http"].map(String::from);
+    assert_eq!(map_faults("src/surface/ src/http/", &folders).len(), 0);
+    assert_eq!(map_faults("src/surface/", &folders), ["ARCHITECTURE.md: src/http/ is missing"]);
+    let long = "src/surface/ src/http/\n".repeat(MAX_MAP_LINES + 1);
+    assert_eq!(map_faults(&long, &folders).len(), 1);
+}
+
+#[test]
+fn control_an_incomplete_index_is_reported() {
+    let records = ["0001-a.md", "0002-b.md"].map(String::from);
+    assert_eq!(record_faults("[A](0001-a.md) [B](0002-b.md)", &records).len(), 0);
+    assert_eq!(record_faults("[A](0001-a.md)", &records), ["docs/adr/README.md: 0002-b.md is missing"]);
+    let gap = ["0001-a.md", "0003-c.md"].map(String::from);
+    assert_eq!(record_faults("(0001-a.md) (0003-c.md)", &gap), ["docs/adr/0003-c.md: expected the number 0002"]);
+}
+
+#[test]
+fn control_question_words_are_reported() {
+    let bad = [
+        ("src/x.rs", "/// What it is.\nfn f() {}"),
+        ("src/x.rs", "//! **How** it works."),
+        ("src/x.rs", "//! Layers.\n/// Which one.\nfn f() {}"),
+        ("shaders/x.wgsl", "// Where a vertex lies."),
+    ];
+    for (path, text) in bad {
+        assert_eq!(question_docs(&source(path, text)).len(), 1, "{path}: {text}");
+    }
+    let good = [
+        ("src/x.rs", "/// Returns the layer.\n/// Which one depends on the path.\nfn f() {}"),
+        ("src/x.rs", "// What follows is an ordinary comment.\n//// Why not.\nfn f() {}"),
+        ("src/x.rs", "/// Whatever.\nfn f() {}"),
+        ("shaders/x.wgsl", "fn f() {}\n// Density at one grid point.\n// What follows is the second line."),
+    ];
+    for (path, text) in good {
+        assert_eq!(question_docs(&source(path, text)), Vec::<String>::new(), "{path}: {text}");
+    }
+}
+
+#[test]
+fn control_long_lines_are_reported() {
+    let words = "å ".repeat(MAX_COLUMNS / 2);
+    let long = format!("// {words}");
+    assert_eq!(long_comments(&source("src/x.rs", &format!("{long}\n    ///! {words}"))).len(), 2);
+    assert_eq!(long_comments(&source("src/x.rs", &format!("// {}", &words[..MAX_COLUMNS]))).len(), 0);
+    assert_eq!(long_comments(&source("src/x.rs", &format!("let x = \"{words}\";"))).len(), 0);
+    let link = format!("https://example.org/{}", "x".repeat(MAX_COLUMNS));
+    assert_eq!(long_comments(&source("src/x.rs", &format!("/// {link}"))).len(), 0);
+
+    for bad in [format!("- {words}a"), format!("[a]: {link} {words}"), format!("```\n{words}a\n```\n{words}a")] {
+        assert_eq!(long_prose(&source("x.md", &bad)).len(), 1, "{bad}");
+    }
+    let exempt = [
+        format!("| {words} |"),
+        format!("```\n{words}a\n~~~\n{words}a\n```"),
+        format!("- {link}"),
+        format!("[a]: {link}"),
+    ];
+    for good in exempt {
+        assert_eq!(long_prose(&source("x.md", &good)), Vec::<String>::new(), "{good}");
     }
 }

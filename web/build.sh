@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds the viewer into web/dist. Does nothing when that is up to date, and says nothing unless it builds or fails.
+# Builds the web page into web/dist. Does nothing if that is up to date, and prints only when it builds or fails.
 set -eu
 cd "$(CDPATH='' cd -- "$(dirname -- "$0")" && pwd)"
 
@@ -9,19 +9,19 @@ fail() {
 }
 
 for command in node npm; do
-    command -v "$command" >/dev/null 2>&1 || fail "\`$command\` is not installed; the viewer needs Node 20.19 or later to be built"
+    command -v "$command" >/dev/null 2>&1 || fail "\`$command\` is not installed; building the web page needs Node 20.19 or later"
 done
 node -e 'const [a, b] = process.versions.node.split(".").map(Number); process.exit(a > 20 || (a === 20 && b >= 19) ? 0 : 1)' ||
-    fail "Node $(node --version) is too old; the viewer needs 20.19 or later to be built"
+    fail "Node $(node --version) is too old; building the web page needs Node 20.19 or later"
 
-# Two builds may start at once: the second waits for the first.
+# If two builds start at once, the second waits for the first.
 if command -v flock >/dev/null 2>&1; then
     mkdir -p node_modules
     exec 9>node_modules/.lock
     flock 9
 fi
 
-# A stamp says what something was made from; it is written last, so that what was broken off is made again.
+# A stamp is the digest of the inputs. It is written last, so an interrupted build is repeated.
 digest() {
     { node --version; for file; do echo "$file"; cat "$file"; done; } | node -e '
         const hash = require("node:crypto").createHash("sha256");
@@ -30,17 +30,17 @@ digest() {
 
 stamp=$(digest package.json package-lock.json)
 if [ "$(cat node_modules/.stamp 2>/dev/null)" != "$stamp" ]; then
-    echo "installing the packages of the viewer into web/node_modules" >&2
+    echo "installing packages into web/node_modules" >&2
     npm ci --silent --no-audit --no-fund >&2 || fail "npm could not install web/package.json"
     echo "$stamp" >node_modules/.stamp
 fi
 
-# shellcheck disable=SC2046 # names of sources have no blanks
+# shellcheck disable=SC2046 # source file names contain no blanks
 stamp=$(digest $(find src public licences index.html vite.config.js pack.mjs tsconfig.json package-lock.json -type f | LC_ALL=C sort))
 if [ "$(cat dist/.stamp 2>/dev/null)" != "$stamp" ]; then
-    echo "building the viewer into web/dist" >&2
+    echo "building the web page into web/dist" >&2
     log=$(mktemp)
-    npm run --silent build >"$log" 2>&1 || { cat "$log" >&2; rm -f "$log"; fail "the viewer does not build"; }
+    npm run --silent build >"$log" 2>&1 || { cat "$log" >&2; rm -f "$log"; fail "the build of the web page failed"; }
     rm -f "$log"
     echo "$stamp" >dist/.stamp
 fi

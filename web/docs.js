@@ -1,4 +1,4 @@
-// Shows the description of the interface. Nothing is asked of anybody but this server.
+// Shows the OpenAPI document. All requests go to this server.
 "use strict";
 SwaggerUIBundle({
   url: "/openapi.json",

@@ -1,9 +1,9 @@
-// How long it takes from a slider's move to the frame after the one that shows the new surface, in a real browser, at full
-// resolution and without previews. Needs a server and the tools of the tests (make tools):
+// Measures the time from a slider input to the frame after the one that shows the new surface, in a real browser, at full
+// resolution and without previews. Needs a running server and the test tools (make tools):
 //
 //   node web/measure.mjs FILE [SERVER] [RUNS]
 //
-// A line for each run: ms in all, to the head of the answer, to its last byte, to the frame after. Then median and worst.
+// Prints per run: total ms, ms to the response head, to its last byte, to the frame. Then median and maximum.
 import { createRequire } from "node:module";
 
 const [file, server = "http://127.0.0.1:8080", runs = "25"] = process.argv.slice(2);
@@ -31,7 +31,7 @@ for (let run = 0; run < Number(runs); run += 1) {
     const before = window.seen.length;
     const slider = document.querySelector('[data-slider="isovalue"]');
     slider.value = String(position);
-    // As a key does: the value is set and final.
+    // Like a key press: the value is set and final.
     for (const type of ["input", "change"]) slider.dispatchEvent(new Event(type, { bubbles: true }));
     return new Promise((resolve) => {
       const look = () => (window.seen.length > before ? resolve(window.seen.at(-1)) : setTimeout(look, 5));
@@ -40,7 +40,7 @@ for (let run = 0; run < Number(runs); run += 1) {
   }, position);
   all.push(seen.ms);
   console.log([seen.ms, seen.answered, seen.received, seen.drawn].map((ms) => ms.toFixed(1).padStart(7)).join(" "), seen.triangles, "triangles");
-  // What goes on after a mesh was sent (it is kept, its report is fetched) is over by then.
+  // Wait for work after the response: storing the result and fetching the report.
   await page.waitForTimeout(600);
 }
 all.sort((a, b) => a - b);

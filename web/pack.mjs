@@ -1,4 +1,4 @@
-// After the build: the licences of what is bundled beside it, and every file packed, as the server embeds and sends it.
+// Finishes the build: adds the licences of bundled packages and compresses every file with gzip for embedding.
 import { readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { gzipSync } from "node:zlib";
 
@@ -10,11 +10,11 @@ const bundled = [
 ];
 const texts = bundled.map(([name, kept, theirs]) => {
   const text = readFileSync(new URL(`licences/${kept}`, here), "utf8");
-  // The notices of the binary are made without Node, from the texts that are kept.
-  if (text !== readFileSync(new URL(theirs, here), "utf8")) throw new Error(`licences/${kept} is not ${theirs} any more: copy it`);
+  // The binary's licence notices come from these copies, since they are made without Node.
+  if (text !== readFileSync(new URL(theirs, here), "utf8")) throw new Error(`licences/${kept} differs from ${theirs}: copy it`);
   return `${name}\n${"-".repeat(100)}\n${text.trim()}\n`;
 });
-writeFileSync(new URL("assets/licences.txt", dist), `The viewer holds the work of others:\n\n${texts.join("\n\n")}`);
+writeFileSync(new URL("assets/licences.txt", dist), `The viewer contains third-party software:\n\n${texts.join("\n\n")}`);
 
 let [plain, packed] = [0, 0];
 for (const entry of readdirSync(dist, { recursive: true, withFileTypes: true })) {

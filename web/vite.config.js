@@ -1,16 +1,16 @@
-// The page and the web component: two entries that share one chunk with three.js.
+// Builds the page and the web component as two entries that share a chunk with three.js.
 import { defineConfig } from "vite";
 
-/** A running server for `npm run dev`: everything that is not the page is asked of it. */
+/** Server that `npm run dev` forwards requests of the page to. */
 const server = process.env.MOLMESH ?? "http://127.0.0.1:8080";
 const asked = ["/v1", "/openapi.json", "/openapi.yaml", "/sample.pdb", "/docs", "/version", "/problems"];
 
 export default defineConfig({
   build: {
     target: "es2022",
-    // Nothing inlined: the content security policy allows no data and no inline script.
+    // No inlining: the content security policy forbids data URLs and inline scripts.
     assetsInlineLimit: 0,
-    // Without preload helpers, chunks find each other by relative addresses: the component works on pages of other origins.
+    // Without preload helpers, chunks use relative URLs, so the component works on pages of other origins.
     modulePreload: false,
     chunkSizeWarningLimit: 900,
     rolldownOptions: {

@@ -1,15 +1,14 @@
 #!/usr/bin/env bash
-# Builds the images molmesh:cpu and molmesh:gpu from the Dockerfile, with docker or podman, whichever is at hand.
+# Builds the images molmesh:cpu and molmesh:gpu from the Dockerfile with docker or podman.
 #
-#   deploy/container/build.sh                          everything in containers, as `docker build` does it
-#   deploy/container/build.sh --binary FILE            with a binary that was built here
-#   deploy/container/build.sh --base-from-debootstrap  over a Debian made here: no registry of images is asked
-#   deploy/container/build.sh --target cpu             one image alone
+#   deploy/container/build.sh                          builds everything in containers, like `docker build`
+#   deploy/container/build.sh --binary FILE            uses a binary from this machine
+#   deploy/container/build.sh --base-from-debootstrap  creates the Debian base here, without an image registry
+#   deploy/container/build.sh --target cpu             builds one image
 #
-# The viewer is in the image that is built in containers; a binary that was built here has it if `make web` ran before it was
-# built (`make release` does so). Such a binary must not need a newer libc than the base has; the build fails if it does. Beside the
-# images, dist/molmesh-TARGET.cdx.json says what is in them. The environment may set
-# SUITE (trixie), BASE_IMAGE, RUST_IMAGE, NODE_IMAGE, and SOURCE, the address of the sources for the image's label.
+# A binary from this machine contains the web page if `make web` ran before its build, as `make release` does. It must not
+# need a newer libc than the base; otherwise the image build fails. Environment variables: SUITE (trixie), BASE_IMAGE,
+# RUST_IMAGE, NODE_IMAGE, and SOURCE (address of the sources for the image label).
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
 # shellcheck source=deploy/container/engine.sh
@@ -23,7 +22,7 @@ while [ $# -gt 0 ]; do
     --target) targets=("$2") && shift 2 ;;
     --binary) binary=$2 && shift 2 ;;
     --base-from-debootstrap) debootstrap=true && shift ;;
-    *) echo "unknown argument $1; the head of this file says what there is" >&2; exit 2 ;;
+    *) echo "unknown argument $1; see the usage at the top of this file" >&2; exit 2 ;;
     esac
 done
 
@@ -51,7 +50,7 @@ if [ -n "${BASE_IMAGE:-}" ]; then arguments+=(--build-arg "BASE_IMAGE=$BASE_IMAG
 if [ -n "${RUST_IMAGE:-}" ]; then arguments+=(--build-arg "RUST_IMAGE=$RUST_IMAGE"); fi
 if [ -n "${NODE_IMAGE:-}" ]; then arguments+=(--build-arg "NODE_IMAGE=$NODE_IMAGE"); fi
 if [ "${engine[0]}" = podman ]; then
-    # OCI's own format has no health check. The steps need the host's network, and no daemon's help to become root.
+    # The OCI format has no health check. Build steps use the host's network and need no daemon to run as root.
     arguments+=(--format docker --isolation chroot --network host)
 fi
 

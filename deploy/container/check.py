@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Runs the images molmesh:cpu and molmesh:gpu as they are meant to be run, and looks at what is in them.
+"""Checks the content and the operation of the images molmesh:cpu and molmesh:gpu.
 
-Each check is put to an image that breaks it as well (`molmesh:broken`, made here) or to an event that it must notice, and
-fails if it does not. Needs docker or podman with its daemon on this machine, and root: requests go in through the
-container's own network, which has no way out. Usage: deploy/container/check.py [cpu|gpu ...]
+Each check has a negative control: a broken image (`molmesh:broken`, made here) or an event that it must report. Needs root
+and docker or podman on this machine: requests enter through the container's own network, which has no outside access.
+Usage: deploy/container/check.py [cpu|gpu ...]
 """
 
 import io
@@ -37,13 +37,13 @@ ENGINE, RUN = [os.environ.get("ENGINE") or ("docker" if docker_answers() else "p
 if ENGINE == ["podman"]:
     if runc := shutil.which("runc"):
         ENGINE += ["--runtime", runc]
-    # A machine that lowers its own limits cannot give containers more. What is writable is said here, not guessed.
+    # Explicit limits, since containers cannot exceed those of the host. Only declared folders are writable.
     RUN = ["--ulimit", "nofile=1024:1024", "--ulimit", "nproc=4096:4096", "--read-only-tmpfs=false", "--no-healthcheck"]
 SAFE = ["--cap-drop", "ALL", "--security-opt", "no-new-privileges", "--network", "none"]
 
 
 def engine(*arguments, code=0, text=True, stdin=None):
-    """Runs the engine; `code` is the exit status that is expected, None for any."""
+    """Runs the engine and fails unless it exits with `code`; None accepts any exit status."""
     done = subprocess.run([*ENGINE, *arguments], capture_output=True, text=text, input=stdin, check=False)
     if code is not None and done.returncode != code:
         said = done.stderr if text else done.stderr.decode(errors="replace")
@@ -52,7 +52,7 @@ def engine(*arguments, code=0, text=True, stdin=None):
 
 
 class Failed(Exception):
-    """A check that did not hold."""
+    """A failed check."""
 
 
 def need(holds, why):
@@ -70,7 +70,7 @@ class Image:
         self.name, self.kind = name, kind
         [found] = json.loads(engine("image", "inspect", name).stdout)
         self.size, self.config = found["Size"], found["Config"]
-        # docker keeps the health check in the configuration, podman beside it.
+        # docker stores the health check in the configuration, podman next to it.
         self.health = (self.config.get("Healthcheck") or found.get("Healthcheck") or {}).get("Test") or []
         made = engine("create", "--no-healthcheck", name).stdout.strip()
         try:
@@ -124,12 +124,12 @@ def has_no_setuid(image):
 
 
 def belongs_to_root(image):
-    """Nothing but /data can be changed by whom it runs as."""
+    """Requires that the image's user can change only /data."""
     mine = [path for path, m in image.files.items() if USER in (m.uid, m.gid) and path != "/data"]
     need(not mine, f"belongs to {USER}: {mine}")
     sticky = (stat.S_ISVTX, stat.S_IWOTH)
     loose = [p for p, m in image.files.items() if not m.issym() and m.mode & sticky[1] and not m.mode & sticky[0]]
-    need(not loose, f"everybody may write: {loose}")
+    need(not loose, f"writable for all users: {loose}")
 
 
 def brings_licences(image):
@@ -188,7 +188,7 @@ LOOKS = [
 
 
 def broken(target):
-    """An image to which every look must object."""
+    """Builds an image that every content check must reject."""
     recipe = f"""FROM molmesh:{target}
 USER 0:0
 RUN chmod u+s /usr/bin/ldd && mkdir -m 0777 /loose && touch /usr/bin/gcc && head -c 60000000 /dev/urandom >/ballast \\
@@ -208,7 +208,7 @@ HEALTHCHECK NONE
 
 
 class Container:
-    """A running image. The volume outlives it."""
+    """A running container. Its volume remains when it is removed."""
 
     def __init__(self, image, *flags, command=(), volume=True):
         engine("rm", "--force", NAME, code=None)
@@ -230,7 +230,7 @@ class Container:
             time.sleep(0.2)
 
     def curl(self, path, *flags, port=8080):
-        """One request from inside the container's network: the status, the body."""
+        """Sends one request from the container's network and returns the status and the body."""
         inside = ["nsenter", "--target", str(self.state()["Pid"]), "--net"]
         command = ["curl", "-sS", "--max-time", "60", "-w", "\n%{http_code}", f"http://127.0.0.1:{port}{path}", *flags]
         done = subprocess.run([*inside, *command], capture_output=True, check=False)
@@ -243,14 +243,14 @@ class Container:
         return done.stdout + done.stderr
 
     def written(self):
-        """Files that were added or changed outside of volumes; folders are made for mounts."""
+        """Returns files that were added or changed outside of volumes, without folders made for mounts."""
         lines = [line.split(" ", 1) for line in engine("diff", NAME).stdout.splitlines()]
         made_for_mounts = {"/data", "/dev", "/etc", "/proc", "/run", "/run/secrets", "/sys", "/etc/mtab"}
         given = {"/etc/hosts", "/etc/hostname", "/etc/resolv.conf", "/run/.containerenv", "/.dockerenv"}
         return [path for _, path in lines if path not in made_for_mounts | given]
 
     def stop(self):
-        """SIGTERM; the exit status."""
+        """Sends SIGTERM and returns the exit status."""
         engine("stop", "-t", str(STOP_SECONDS), NAME)
         return self.state()["ExitCode"]
 
@@ -265,7 +265,7 @@ def privileges(container):
 
 
 def serves(image):
-    """The whole life of a service: ready, a mesh, a restart, the mesh again, an orderly end."""
+    """Checks the life of a service: readiness, a mesh, a restart, the stored mesh, an orderly stop."""
     engine("volume", "rm", "--force", VOLUME, code=None)
     test = image.health[1:]
     container = Container(image.name, "--read-only")
@@ -276,11 +276,11 @@ def serves(image):
     status, glb = container.curl("/v1/meshes", "--data-binary", f"@{ROOT}/samples/4pti.pdb")
     need(status == 200 and glb.startswith(b"glTF\x02\x00\x00\x00"), f"a mesh: {status} {glb[:300]!r}")
     status, job = container.curl("/v1/meshes?resolution=0.7", "--data-binary", f"@{ROOT}/samples/4pti.pdb", "-H", "Prefer: respond-async")
-    need(status == 202, f"a promise: {status} {job[:300]!r}")
+    need(status == 202, f"an asynchronous job: {status} {job[:300]!r}")
     address = json.loads(job)["jobID"]
     end = time.monotonic() + READY_SECONDS
     while json.loads(container.curl(f"/v1/jobs/{address}?wait=20")[1])["status"] != "successful":
-        need(time.monotonic() < end, "the promised mesh does not come")
+        need(time.monotonic() < end, "the asynchronous job does not end")
     status, first = container.curl(f"/v1/jobs/{address}/result", "-L")
     need(status == 200 and first.startswith(b"glTF"), f"its result: {status}")
     status, metrics = container.curl("/metrics", port=9090)
@@ -289,7 +289,7 @@ def serves(image):
     code = container.stop()
     need(code == 0 and "stopped" in container.logs(), f"SIGTERM: exit {code}: {container.logs()[-2000:]}")
 
-    # Again, where it might write: another container, the same volume.
+    # Another container with the same volume.
     container = Container(image.name)
     container.wait_until_healthy(test)
     status, again = container.curl(f"/v1/jobs/{address}/result", "-L")
@@ -314,7 +314,7 @@ def examines_itself(image):
 
 
 def notices_what_goes_wrong(image):
-    """What the checks above rest on can be seen to fail."""
+    """Negative controls of the checks above."""
     container = Container(image.name, "--user", "0:0", "--entrypoint", "sh", command=["-c", "echo x >/var/tmp/x; exit 3"])
     end = time.monotonic() + READY_SECONDS
     while container.state()["Running"]:
@@ -322,7 +322,7 @@ def notices_what_goes_wrong(image):
         time.sleep(0.1)
     need("/var/tmp/x" in container.written(), f"a file that was written is not seen: {container.written()}")
     need(container.state()["ExitCode"] == 3, "an exit status is not seen")
-    # Not to be served without a place to write to.
+    # The service must not start without a writable folder.
     flags = ["--read-only", "--tmpfs", "/data:ro,size=1m"]
     container = Container(image.name, *flags, volume=False)
     while container.state()["Running"]:
@@ -342,7 +342,7 @@ def main():
         name = check.__name__.replace("_", " ")
         try:
             check(*arguments)
-            good, why = not fails, "control: the broken image was let through" if fails else ""
+            good, why = not fails, "control: the broken image was accepted" if fails else ""
         except Failed as failed:
             good, why = fails, f"{failed}"
         except (LookupError, ValueError, OSError) as error:

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes what `debian:SUITE-slim` is, for places without a registry of images: the essential packages with the updates of
-# security, without documentation and translations. Needs root and debootstrap. Usage: debian-base.sh SUITE OUT.tar
+# Creates the equivalent of `debian:SUITE-slim` without an image registry: essential packages with security updates,
+# without documentation and translations. Needs root and debootstrap. Usage: debian-base.sh SUITE OUT.tar
 set -euo pipefail
 
 suite=$1
@@ -16,7 +16,7 @@ root=$work/root
 debootstrap --variant=minbase --force-check-gpg --keyring="$keyring" "$suite" "$root" "$mirror" >"$work/log" 2>&1 ||
     { tail -20 "$work/log" >&2; exit 1; }
 
-# As in Debian's own image: what is left out stays out when packages are added.
+# As in Debian's image: the same files are excluded from packages installed later.
 cat >"$root/etc/dpkg/dpkg.cfg.d/slim" <<'SLIM'
 path-exclude /usr/share/doc/*
 path-include /usr/share/doc/*/copyright
@@ -42,7 +42,7 @@ find "$root/usr/share/doc" -mindepth 1 -type d -empty -delete
 for folder in groff info linda lintian locale man; do rm -rf "$root/usr/share/$folder"/*; done
 rm -rf "$root"/var/lib/apt/lists/* "$root"/var/cache/apt/* "$root"/var/cache/debconf/*-old "$root"/var/lib/dpkg/*-old
 find "$root/var/log" -type f -delete
-# This machine's, not the image's.
+# Remove files of the build machine.
 rm -f "$root/etc/resolv.conf" "$root/etc/hostname" "$root/var/cache/ldconfig/aux-cache"
 : >"$root/etc/machine-id"
 

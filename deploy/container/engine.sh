@@ -1,6 +1,6 @@
-# What builds and runs images here, sourced by build.sh: sets `engine`, an array that begins a command.
-# Takes docker where its daemon answers, else podman; installs the latter where this is root on Debian. ENGINE=docker or
-# ENGINE=podman decides it.
+# Selects the container engine for the scripts that source this file. `pick_engine` sets the array `engine`, the start of
+# a command. Uses docker if its daemon answers, else podman, and installs podman as root on Debian. ENGINE=docker or
+# ENGINE=podman overrides the choice.
 
 pick_engine() {
     case ${ENGINE:-} in
@@ -15,14 +15,14 @@ pick_engine() {
         ;;
     *) echo "ENGINE=$ENGINE is not known; expected docker or podman" >&2; exit 2 ;;
     esac
-    # runc runs where cgroups are of both versions at once; crun does not.
+    # Unlike crun, runc supports hosts with both cgroup versions.
     if [ "${engine[0]}" = podman ] && command -v runc >/dev/null; then engine+=(--runtime "$(command -v runc)"); fi
 }
 
-# Installs Debian packages, quietly unless that fails.
+# Installs Debian packages. Prints the log only on failure.
 install_packages() {
     if [ "$(id -u)" -ne 0 ] || ! command -v apt-get >/dev/null; then
-        echo "not installed and cannot be installed here: $*; needs root and apt-get" >&2
+        echo "missing packages: $*; installing them needs root and apt-get" >&2
         exit 1
     fi
     echo "installing $*" >&2

@@ -1,6 +1,6 @@
 #!/bin/sh
-# Lays out what goes into the image below a folder: the binary without its debug information (symbols stay, so that
-# backtraces have names), and the licences of everything in it. Usage: deploy/container/stage.sh BINARY FOLDER
+# Arranges the image content below a folder: the binary without debug information (symbols stay for backtraces) and the
+# licences of its parts. Usage: deploy/container/stage.sh BINARY FOLDER
 set -eu
 
 binary=$1

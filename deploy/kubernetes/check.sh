@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
-# Renders the three kustomizations with kubectl and holds what comes out against the schemas of Kubernetes; a spoiled one must be
-# refused. Takes the kubectl at hand, or Debian's in a container over the base that deploy/container/build.sh has made.
+# Renders the three kustomizations with kubectl and validates the result with the schemas of Kubernetes. A negative
+# control must be rejected. Uses the installed kubectl, or Debian's in a container on the base from
+# deploy/container/build.sh.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 # shellcheck source=deploy/container/engine.sh
@@ -14,7 +15,7 @@ if ! command -v kubectl >/dev/null; then
     printf 'FROM %s\nRUN apt-get update && apt-get install -qy --no-install-recommends kubernetes-client\n' \
         "${BASE_IMAGE:-localhost/molmesh-base:trixie}" |
         "${engine[@]}" build "${options[@]}" --tag molmesh-kubectl - >/dev/null
-    # No process of the container runs: kubectl comes out with the libraries that it needs, and Debian's loader starts it.
+    # The container never runs: kubectl and its libraries are extracted and started with Debian's loader.
     root=$(mktemp -d)
     trap 'rm -rf "$root"' EXIT
     made=$("${engine[@]}" create molmesh-kubectl true)
@@ -41,4 +42,4 @@ done
 sed 's/ containerPort: 8080/ containerPort: http/' "$out/base.yaml" >"$out/spoiled.yaml"
 echo "$out/spoiled.yaml" | validate | python3 -c '
 import json, sys
-sys.exit("a spoiled manifest was let through") if not json.load(sys.stdin)["errors"] else print("spoiled refused, as it must be")'
+sys.exit("an invalid manifest was accepted") if not json.load(sys.stdin)["errors"] else print("invalid manifest rejected, as expected")'

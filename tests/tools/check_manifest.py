@@ -1,6 +1,8 @@
-"""Reads YAML files of deployments: one path per line on standard input, one line of JSON per path on standard output, with
-the file's documents and what a schema says against them: that of Compose where the file is named compose*, else that of
-Kubernetes for each document that has one there. Kustomize's own files have none; they are only read."""
+"""Reads and validates YAML files of deployments: one path per line of stdin, one line of JSON per path.
+
+The line contains the documents and their schema errors. Files named compose* use the schema of Compose, others that of
+Kubernetes for each known kind of document. Kustomize files have no schema and are only parsed.
+"""
 
 import importlib.resources
 import json

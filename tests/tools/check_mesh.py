@@ -1,4 +1,4 @@
-"""Looks at mesh files with trimesh: the second opinion on what the product writes.
+"""Reads mesh files with trimesh as an independent check of the product's output.
 
 Reads file names from the arguments, or one per line from standard input, and answers each with one line of
 JSON, at once: so it serves a batch as well as a test that keeps it running. Nothing is repaired or welded,
@@ -14,7 +14,7 @@ import trimesh
 
 
 def load(path):
-    """The file as one mesh in its own coordinates, and its vertex normals as written (None without)."""
+    """Returns the file as one mesh in its own coordinates, and its stored vertex normals or None."""
     options = {"process": False, "maintain_order": True} if path.endswith(".obj") else {"process": False}
     scene = trimesh.load_scene(path, **options)
     parts, normals = [], []
@@ -23,7 +23,7 @@ def load(path):
         part = scene.geometry[name].copy(include_cache=True)
         written = part._cache.cache.get("vertex_normals")
         if written is not None:
-            # Row vectors times the inverse are column vectors times the inverse transpose; a scale does not make them longer.
+            # Row vectors times the inverse equal column vectors times the inverse transpose. A scale must not stretch them.
             linear = transform[:3, :3] / np.cbrt(np.linalg.det(transform[:3, :3]))
             normals.append(np.array(written, dtype=np.float64) / normal_unit(path) @ np.linalg.inv(linear))
         part.apply_transform(transform)
@@ -35,7 +35,7 @@ def load(path):
 
 
 def normal_unit(path):
-    """What stands for 1 in the normals of a glTF: trimesh hands integers on as they are."""
+    """Returns the integer that represents 1 in the normals of a glTF, since trimesh returns integers unscaled."""
     if not path.endswith((".glb", ".gltf")):
         return 1.0
     with open(path, "rb") as file:
@@ -43,12 +43,12 @@ def normal_unit(path):
     document = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")] if path.endswith(".glb") else data)
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     accessor = document["accessors"][attributes["NORMAL"]]
-    # 5120 is a signed byte.
+    # 5120 is the component type of a signed byte.
     return 127.0 if accessor["componentType"] == 5120 and accessor.get("normalized") else 1.0
 
 
 def weld(mesh):
-    """Vertices with equal coordinates become one."""
+    """Merges vertices with equal coordinates."""
     vertices = np.ascontiguousarray(mesh.vertices) + 0.0  # -0 is 0
     rows = vertices.view(np.dtype((np.void, vertices.dtype.itemsize * 3))).ravel()
     _, first, inverse = np.unique(rows, return_index=True, return_inverse=True)
@@ -56,16 +56,16 @@ def weld(mesh):
 
 
 def stl_normals(path):
-    """The normals as written: trimesh throws them away where it finds better ones."""
+    """Returns the stored normals, which trimesh otherwise replaces by its own."""
     record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     return np.fromfile(path, dtype=record, offset=84)["normal"].astype(np.float64)
 
 
 def normal_report(mesh, normals):
-    """How far the written normals are from length 1, and whether they agree with the faces around them."""
+    """Returns the largest deviation of stored normals from length 1 and their agreement with the adjacent faces."""
     lengths = np.linalg.norm(normals, axis=1)
     corners = mesh.vertices[mesh.faces]
-    # The cross product is twice the area long: the sum over the faces of a vertex is weighted by area.
+    # The length of the cross product is twice the area, so the sum over the faces of a vertex is weighted by area.
     crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     mean = np.stack(
         [np.bincount(mesh.faces.ravel(), np.repeat(crosses[:, k], 3), len(mesh.vertices)) for k in range(3)], axis=1
@@ -130,7 +130,7 @@ def report(path):
 
 
 def finite(value):
-    """JSON has no NaN and no infinity: null stands for both."""
+    """Replaces NaN and infinity, which JSON lacks, by null."""
     if isinstance(value, dict):
         return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Judges JSON Schemas and documents with jsonschema: one path per line of stdin, one line of JSON per path.
+"""Validates JSON Schemas and documents with jsonschema: one path per line of stdin, one line of JSON per path.
 
 A file holds {"schema": …, "documents": [...]}. The answer says why the schema is no schema of draft 2020-12 (null if it is
 one), and for each document what the schema has against it.

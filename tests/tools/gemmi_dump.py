@@ -1,4 +1,4 @@
-"""Prints what gemmi reads from a structure file, for tests/structure_real.rs to compare with.
+"""Prints the atoms that gemmi reads from a structure file. tests/structure_real.rs compares them.
 
 Usage: gemmi_dump.py FILE. First line: `models N N N…` (atoms of each model). Then one line per atom of the first model:
 chain, residue number, insertion code, residue, atom name, altloc, atomic number, x, y, z, occupancy, B, hetero, selected.
@@ -32,7 +32,7 @@ def atoms(model):
 
 
 def altlocs(model):
-    """The letter to take for every chain and residue number: highest mean occupancy, then lowest letter."""
+    """Returns the alternative location per chain and residue number: highest mean occupancy, then lowest letter."""
     groups = {}
     for chain, residue, atom in atoms(model):
         if atom.has_altloc():

@@ -1,4 +1,4 @@
-"""The PromQL of dashboards and rules: which expressions there are, whether they parse, what they name.
+"""Extracts and parses the PromQL of dashboards and rules.
 
 Reads paths from standard input, one a line; writes one line of JSON per path. A `.json` file is a dashboard of Grafana, a
 `.yaml` file rules of Prometheus.
@@ -11,12 +11,12 @@ import sys
 import promql_parser as promql
 import yaml
 
-# What Grafana puts in place of its variables.
+# Replacements for Grafana's variables.
 VARIABLES = {"$__rate_interval": "5m", "$__interval": "1m", "$__range": "1h", "$job": "x", "$instance": "x"}
 
 
 def of_dashboard(document):
-    """Titles, expressions and texts around them, of panels, annotations and variables."""
+    """Yields title, expression and related texts of panels, annotations and variables."""
     for panel in document["panels"]:
         for target in panel.get("targets", []):
             yield f"panel {panel['title']}", target["expr"], target["legendFormat"]
@@ -46,7 +46,7 @@ def children(node):
 
 
 def selectors(node):
-    """The selectors below a node: name, matchers, and the labels that are named by what stands around them."""
+    """Returns the selectors below a node: name, matchers, and labels used by the enclosing expressions."""
     if isinstance(node, promql.VectorSelector):
         matchers = node.matchers.matchers
         yield {
@@ -57,7 +57,7 @@ def selectors(node):
         return
     around = []
     modifier = getattr(node, "modifier", None)
-    # `by`, `without`, and `on`, `ignoring` name labels; so does `group_left`.
+    # `by`, `without`, `on`, `ignoring` and `group_left` use labels.
     for part in (modifier, getattr(modifier, "matching", None)):
         around += getattr(part, "labels", None) or []
     around += getattr(modifier, "group_labels", None) or []
@@ -68,7 +68,7 @@ def selectors(node):
 
 
 def expression(place, text, words):
-    # `{{route}}` of a legend, `{{ $labels.route }}` of an annotation.
+    # `{{route}}` in a legend, `{{ $labels.route }}` in an annotation.
     shown = re.findall(r"\{\{ *(?:\$labels\.)?([a-z_]+) *\}\}", words)
     for name, value in VARIABLES.items():
         text = text.replace(name, value)

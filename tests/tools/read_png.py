@@ -1,4 +1,4 @@
-"""Says what Pillow reads in PNG files: a path a line in, a line of JSON out."""
+"""Reads PNG files with Pillow: one path per line of stdin, one line of JSON per path."""
 
 import json
 import sys

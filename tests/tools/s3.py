@@ -1,6 +1,9 @@
-"""An S3 service in memory for the tests of the store: prints one line of JSON when it is ready, ends when its standard
-input does. The bucket is `meshes`. With `--guarded`, only the printed credentials are let in. After the line `away` every
-connection is broken off without an answer, after `back` it is as before; each line is answered with itself."""
+"""Runs an in-memory S3 service for the tests of the store.
+
+Prints one line of JSON when it is ready and ends at the end of standard input. The bucket is `meshes`. With `--guarded`, it
+accepts only the printed credentials. After the line `away` it drops every connection, after `back` it answers again. Each
+line is echoed.
+"""
 
 import json
 import logging
@@ -36,11 +39,11 @@ if "--guarded" in sys.argv:
     everything = {"Version": "2012-10-17", "Statement": [{"Effect": "Allow", "Action": "*", "Resource": "*"}]}
     iam.put_user_policy(UserName="molmesh", PolicyName="all", PolicyDocument=json.dumps(everything))
     key = iam.create_access_key(UserName="molmesh")["AccessKey"]
-    settings.INITIAL_NO_AUTH_ACTION_COUNT = 0  # from now on everybody has to say who they are
+    settings.INITIAL_NO_AUTH_ACTION_COUNT = 0  # from now on, every request needs credentials
 
 
 class Gate:
-    """The service, unless it is away. Its port stays its own meanwhile, so that it can come back."""
+    """WSGI application that can be made unavailable while it keeps its port."""
 
     def __init__(self, app):
         self.app, self.away = app, False

@@ -1,5 +1,5 @@
-"""What Schemathesis cannot make up from the description: structures. Random bytes are sent as well, being what the schema
-allows; these make the requests get past the reader."""
+"""Adds valid structures to the requests of Schemathesis, so that some pass the reader. Random bytes, which the schema
+permits, are sent as well."""
 
 import gzip
 

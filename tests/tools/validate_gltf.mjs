@@ -1,19 +1,19 @@
-// Looks at .glb and .gltf files with the Khronos validator: the second opinion on what the product writes.
+// Validates .glb and .gltf files with the Khronos validator as an independent check of the product's output.
 //
 // Reads file names from the arguments, or one per line from standard input, and answers each with one line of
 // JSON: how many errors, warnings, infos and hints, their codes with a count each, and the first messages.
-// A file that the validator cannot take for a glTF at all is answered with `error`.
+// For a file that the validator does not recognise as glTF, the line contains `error`.
 import { readFileSync } from 'node:fs';
 import { createRequire } from 'node:module';
 import { createInterface } from 'node:readline';
 import { fileURLToPath } from 'node:url';
 
-// The package lies in the git-ignored target folder, away from this file.
+// The package is installed in the git-ignored target folder.
 const tools = fileURLToPath(new URL('../../target/test-tools/node/', import.meta.url));
 const validator = createRequire(tools)('gltf-validator');
 
 async function report(file) {
-  // maxIssues 0 means all: a limit could hide an error behind warnings.
+  // 0 means unlimited: a limit could hide errors behind warnings.
   const result = await validator.validateBytes(new Uint8Array(readFileSync(file)), { uri: file, maxIssues: 0 });
   const { numErrors, numWarnings, numInfos, numHints, messages } = result.issues;
   const codes = {};

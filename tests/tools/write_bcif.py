@@ -1,14 +1,14 @@
-"""Writes the atoms of an mmCIF file as BinaryCIF by biotite, for tests/bcif_oracles.rs and benches/read.rs.
+"""Writes the atoms of an mmCIF file as BinaryCIF with biotite, for tests/bcif_oracles.rs and benches/read.rs.
 
 Usage: write_bcif.py VARIANT INPUT.cif[.gz] OUTPUT.bcif. Variants:
 
-* plain: ByteArray and StringArray alone, real numbers in 64 bits
-* single: the same with real numbers in 32 bits
-* packed: FixedPoint, Delta and IntegerPacking of two bytes; texts with RunLength
-* bytes: FixedPoint, RunLength and IntegerPacking of one byte, which goes on over many; texts with Delta
-* quantized: coordinates by IntervalQuantization, of which the error is half a step of the range in 10^6
+* plain: only ByteArray and StringArray, 64-bit real numbers
+* single: the same with 32-bit real numbers
+* packed: FixedPoint, Delta and two-byte IntegerPacking; texts with RunLength
+* bytes: FixedPoint, RunLength and one-byte IntegerPacking with continued values; texts with Delta
+* quantized: coordinates with IntervalQuantization in 10^6 steps
 * texts: every column a StringArray, numbers too
-* compressed: what biotite finds smallest
+* compressed: the encodings that biotite finds smallest
 
 `entry`, `struct`, `entity`, `struct_asym` and `atom_site` are written. For every file one line of JSON: {"atoms": N, "encodings": [names]}.
 Without arguments, lines of VARIANT, INPUT and OUTPUT separated by tabs are read from standard input.
@@ -37,7 +37,7 @@ def differences(size):
 
 
 def chain(variant, name, values):
-    """Encodings of a column of numbers."""
+    """Returns the encodings of a column of numbers."""
     if name in PLACES:
         fixed = pdbx.FixedPointEncoding(10 ** PLACES[name])
         if variant == "plain":
@@ -56,7 +56,7 @@ def chain(variant, name, values):
 
 
 def texts(variant, values):
-    """The encoding of a column of texts."""
+    """Returns the encoding of a column of texts."""
     encodings = {
         "packed": (runs(2), differences(1)),
         "bytes": (differences(1), runs(1)),
@@ -87,7 +87,7 @@ def column(variant, category, name, source):
 
 
 def names(encoded):
-    """Kinds of encodings in a serialized column or file."""
+    """Returns the kinds of encodings in a serialized column or file."""
     if isinstance(encoded, dict):
         own = {encoded["kind"]} if "kind" in encoded else set()
         return own.union(*map(names, encoded.values()))

@@ -1,4 +1,4 @@
-/** Downloads of the surface on the stage, in every format, byte for byte what its address gives. */
+/** Downloads of the shown surface in every format, identical to the response of the API. */
 
 import type { Client } from "./api/client";
 import { fetchFile } from "./api/jobs";
@@ -37,7 +37,7 @@ export class Downloads {
       const url = URL.createObjectURL(blob);
       const link = el("a", { href: url, download: name });
       link.click();
-      // The browser has taken it by then.
+      // The browser has copied it by then.
       setTimeout(() => URL.revokeObjectURL(url), 60_000);
       said.textContent = `${name}, ${bytes(blob.size)}`;
     } catch (error) {

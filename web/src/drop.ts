@@ -1,4 +1,4 @@
-/** Files that are dropped anywhere on the page. */
+/** Files dropped anywhere on the page. */
 
 import { $, show } from "./ui/dom";
 

@@ -1,9 +1,9 @@
-/** The surface by keyboard. */
+/** Keyboard control of the surface. */
 
 import type { Picker } from "./picker";
 import type { Viewer } from "./scene/viewer";
 
-/** Radians a key press. */
+/** Rotation per key press, radians. */
 const STEP = Math.PI / 18;
 
 export function keyboard(home: HTMLElement, viewer: Viewer, picker: Picker): void {

@@ -1,4 +1,4 @@
-/** The page: a structure and parameters on one side, their surface in the middle, what is known of it on the other. */
+/** Entry point of the page: structure and parameters, the surface, and its report. */
 
 import { Client } from "./api/client";
 import { asProblem, Problem } from "./api/problem";
@@ -11,7 +11,7 @@ const client = new Client();
 const page = new Page(client);
 theme(() => page.stage.theme());
 
-/** Begins, or begins anew with a key. */
+/** Starts the page, again after a key was entered. */
 async function begin(): Promise<void> {
   try {
     const [api, capabilities] = await Promise.all([
@@ -26,7 +26,7 @@ async function begin(): Promise<void> {
     const asksForKey = error instanceof Problem && [401, 403].includes(problem.document.status);
     show($("key-form"), asksForKey);
     if (asksForKey && !client.key) {
-      page.greet("A key is needed", "This server's operator gives them out.");
+      page.greet("API key required", "The operator of this server provides keys.");
       $("key").focus();
     } else page.problem(problem, () => void begin());
   }

@@ -1,4 +1,4 @@
-/** What the page does with structures, parameters and meshes. */
+/** Controller of the page: structures, parameters and meshes. */
 
 import type { Client } from "./api/client";
 import type { Job } from "./api/jobs";
@@ -9,7 +9,7 @@ import { Downloads } from "./downloads";
 import { drops } from "./drop";
 import { keyboard } from "./keyboard";
 import { Picker } from "./picker";
-import { type Delivery, Remesher, type Wish } from "./remesh";
+import { type Delivery, Remesher, type MeshRequest } from "./remesh";
 import { addressOf, type Choices, coarser, curl, currentAddress, drawn, readAddress, SAMPLE, surface, writeAddress } from "./request";
 import { Stage } from "./stage";
 import { $, copy, el, number, show } from "./ui/dom";
@@ -17,7 +17,7 @@ import { Form } from "./ui/form";
 import { problem as showProblem } from "./ui/problem";
 import { report, timingsOf } from "./ui/report";
 
-/** A mesh that takes longer than this, ms from the slider to the screen, is seen coarser while the slider is dragged. */
+/** Time from input to frame, ms, above which a dragged slider shows a coarser preview. */
 const PREVIEW_FROM = 200;
 
 export class Page {
@@ -26,14 +26,14 @@ export class Page {
   private readonly picker: Picker | null;
   private form: Form | null = null;
   /**
-   * The surface on the stage and what it was made from. Caption, address, command line, report and downloads describe
-   * it and nothing else.
+   * The shown surface with its structure and parameters. Caption, address, command line, report and downloads describe
+   * only this surface.
    */
   private shown: { source: Source; choices: Choices; resolution: number; took: number } | null = null;
-  /** The structure that the next mesh is made of. After a failure it is the one that is shown, if there is one. */
+  /** Structure of the next mesh. After a failure, the structure of the shown surface, if there is one. */
   private target: Source | null = null;
   private opening: AbortController | null = null;
-  /** Structures that were shown, by their paths: going back to one needs no second upload. */
+  /** Structures shown so far, by path, so that returning to one needs no second upload. */
   private readonly visited = new Map<string, Source>();
   private labelling: AbortController | null = null;
   private facts = 0;
@@ -48,16 +48,16 @@ export class Page {
     $("turn").addEventListener("click", () => viewer?.turn(!viewer.isTurning, true));
     $("home").addEventListener("click", () => viewer?.reset());
     this.remesher = new Remesher(client, {
-      begin: (wish) => this.begin(wish),
+      begin: (request) => this.begin(request),
       progress: (job) => this.progress(job),
       show: (delivery) => this.show(delivery),
-      failed: (error, wish) => this.failed(error, wish),
+      failed: (error, request) => this.failed(error, request),
       idle: () => this.idle(),
     });
     this.listen();
   }
 
-  /** Builds what the description asks for, and opens what the address names. */
+  /** Builds the form from the OpenAPI document and opens the structure that the address names. */
   async start(parameters: Parameter[], formats: string[]): Promise<void> {
     const form = new Form($("parameters"), $("picture-fields"), parameters, (mesh, live) => (mesh ? this.changed(live) : this.pictured()));
     this.form = form;
@@ -67,7 +67,7 @@ export class Page {
     await this.visit();
   }
 
-  /** Opens what the address names, else the sample, with the parameters that stand there. */
+  /** Opens the structure that the address names, else the sample, with the parameters of the address. */
   private async visit(): Promise<void> {
     if (!this.form) return;
     const { choices, pdb, structure } = readAddress(this.form.names);
@@ -76,26 +76,26 @@ export class Page {
     await this.sample(choices);
   }
 
-  /** Words where there is no surface. */
+  /** Sets the caption. */
   greet(name: string, title: string): void {
     $("structure-name").textContent = name;
     $("structure-title").textContent = title;
   }
 
   /**
-   * Shows a failure, and the structure `name` that it concerns. If a mesh failed, the remedies change its `wish`
+   * Shows an error, and the structure `name` that it concerns. If a mesh failed, the remedies change its `request`
    * instead of the parameters of the surface shown.
    */
-  problem(error: unknown, again: () => void, name = "", wish?: Wish): void {
+  problem(error: unknown, again: () => void, name = "", request?: MeshRequest): void {
     const found = asProblem(error);
     const set = (parameter: string, value: string | undefined) => {
-      if (wish) this.take(wish);
+      if (request) this.take(request);
       this.form?.set(parameter, value);
     };
     const shown = this.shown?.source.name;
     let kept = "";
     if (name && shown && name !== shown) kept = `The surface shown is still that of ${shown}.`;
-    else if (shown && wish) kept = "The surface and its parameters are as they were before.";
+    else if (shown && request) kept = "The surface and its parameters are as they were before.";
     showProblem($("problem"), found, { name, kept }, {
       takeResolution: (resolution) => set("resolution", String(resolution)),
       reset: (parameter) => set(parameter, undefined),
@@ -104,7 +104,7 @@ export class Page {
     this.say(`${name ? `${name}: ` : ""}${found.document.title}. ${found.document.detail ?? ""} ${kept}`.trim());
   }
 
-  /** Takes failures away. */
+  /** Hides the error message. */
   clear(): void {
     show($("problem"), false);
   }
@@ -156,7 +156,7 @@ export class Page {
     }, choices);
   }
 
-  /** A structure that was uploaded before. */
+  /** Returns a structure that was uploaded before. */
   private async known(digest: string, signal: AbortSignal): Promise<Source> {
     const visited = this.visited.get(`/v1/structures/${digest}`);
     if (visited) return visited;
@@ -216,10 +216,10 @@ export class Page {
     this.commands();
   }
 
-  /** Sets structure and parameters of `wish` as the next ones to mesh. */
-  private take(wish: Wish): void {
-    this.target = wish.source;
-    this.form?.fill(wish.choices);
+  /** Sets structure and parameters of `request` as the next ones to mesh. */
+  private take(request: MeshRequest): void {
+    this.target = request.source;
+    this.form?.fill(request.choices);
   }
 
   /**
@@ -242,7 +242,7 @@ export class Page {
     show($("reset-all"), (this.form?.all.size ?? 0) > 0);
   }
 
-  /** The address and the command line of what is shown; `push` makes the address a new entry of the history. */
+  /** Updates the address and the command line; `push` adds the address to the history. */
   private commands(push = false): void {
     const { shown, form } = this;
     if (!shown || !form) return;
@@ -252,12 +252,12 @@ export class Page {
     $("curl").textContent = curl(shown.source, format, choices, location.origin, this.client.key !== "");
   }
 
-  private begin(wish: Wish): void {
+  private begin(request: MeshRequest): void {
     this.clear();
-    this.wait("Meshing…", null, wish.live ? 600 : 250);
+    this.wait("Meshing…", null, request.live ? 600 : 250);
   }
 
-  /** Says that something takes its time, but not of what is done at once. */
+  /** Shows the progress indicator after a delay of `after` ms, so that short work does not show it. */
   private wait(words: string, fraction: number | null, after = 250): void {
     clearTimeout(this.busy);
     const bar = $<HTMLProgressElement>("progress");
@@ -269,7 +269,7 @@ export class Page {
   }
 
   private progress({ status, stage, fraction }: Job): void {
-    const words = status === "accepted" ? "Waiting for its turn…" : `${stage ?? "meshing"}, ${Math.round(100 * fraction)} %`;
+    const words = status === "accepted" ? "Waiting in the queue…" : `${stage ?? "meshing"}, ${Math.round(100 * fraction)} %`;
     this.wait(words, status === "accepted" ? null : fraction, 0);
   }
 
@@ -280,35 +280,35 @@ export class Page {
     $("stage").removeAttribute("aria-busy");
   }
 
-  /** Shows a mesh that has arrived. The page changes in one step, and not before all of it is ready. */
-  private async show({ wish, answered, received, bytes, headers, signal }: Delivery): Promise<void> {
+  /** Shows a received mesh. The page changes in one step, once everything is ready. */
+  private async show({ request, answered, received, bytes, headers, signal }: Delivery): Promise<void> {
     const { form } = this;
     if (!form) return;
-    const { source, preview } = wish;
-    const taken = preview === undefined ? wish.choices : coarser(wish.choices, preview);
+    const { source, preview } = request;
+    const taken = preview === undefined ? request.choices : coarser(request.choices, preview);
     const scene = await this.stage.prepare(bytes, source, form.of("png", taken), signal);
     signal.throwIfAborted();
     const { extras } = scene.loaded;
     const drawing = this.stage.show(scene, this.shown?.source.path !== source.path, preview !== undefined);
     show($("preview"), preview !== undefined);
     $("preview").textContent = preview === undefined ? "" : `preview at ${number(preview, 2)} Å`;
-    if (preview === undefined) this.commit(wish, extras, headers);
+    if (preview === undefined) this.commit(request, extras, headers);
     const { shown } = this;
     const time = await drawing;
-    // What web/measure.mjs reads.
-    const parts = { answered: answered - wish.since, received: received - answered, drawn: time - received };
-    performance.measure("molmesh:remesh", { start: wish.since, end: time, detail: { preview: preview ?? null, triangles: extras["triangles"], ...parts } });
+    // Read by web/measure.mjs.
+    const parts = { answered: answered - request.since, received: received - answered, drawn: time - received };
+    performance.measure("molmesh:remesh", { start: request.since, end: time, detail: { preview: preview ?? null, triangles: extras["triangles"], ...parts } });
     if (preview !== undefined || !shown || this.shown !== shown) return;
-    shown.took = time - wish.since;
+    shown.took = time - request.since;
     $("now").textContent += `, ${number(shown.took, 3)} ms from input to frame`;
   }
 
-  /** Makes everything on the page describe the mesh of `wish`, which is on the stage. */
-  private commit({ source, choices }: Wish, extras: Record<string, unknown>, headers: Headers): void {
+  /** Updates the page to describe the mesh of the request, which is now shown. */
+  private commit({ source, choices }: MeshRequest, extras: Record<string, unknown>, headers: Headers): void {
     const { form, shown: former } = this;
     if (!form) return;
     const isOther = former?.source.path !== source.path;
-    // After a step through the history the address is there already.
+    // After a step through the history, the address is already set.
     const push = isOther && former !== null && addressOf(former.source, former.choices) === currentAddress();
     const all = new Map([...form.mesh(choices), ...form.apart(form.all)]);
     this.shown = { source, choices: all, resolution: Number(extras["resolution"] ?? 0.5), took: former?.took ?? 0 };
@@ -329,7 +329,7 @@ export class Page {
     this.later(() => this.complete(source, extras, headers));
   }
 
-  /** What differs from run to run, and words for those who hear the page: not while something else follows at once. */
+  /** Runs `then` after a pause without further meshes. */
   private later(then: () => void): void {
     clearTimeout(this.facts);
     this.facts = window.setTimeout(then, 300);
@@ -345,7 +345,7 @@ export class Page {
       (document) => {
         if (this.shown === shown) report($("report"), document, timingsOf(headers, document));
       },
-      // A result that is not kept has no report of its own: what the file says is there already.
+      // A result that is not stored has no report document. The page already shows the report in the file.
       () => undefined,
     );
   }
@@ -356,25 +356,25 @@ export class Page {
     this.picker?.know(null);
     labels(this.client, source, abort.signal).then(
       (found: Labels) => abort.signal.aborted || this.picker?.know(found),
-      // Without labels atoms go by their numbers.
+      // Without labels, atoms are shown by number.
       () => undefined,
     );
   }
 
-  private failed(error: unknown, wish: Wish): void {
-    const { source } = wish;
+  private failed(error: unknown, request: MeshRequest): void {
+    const { source } = request;
     const { blob } = source;
-    // The service keeps structures for some time only; this page has the bytes.
+    // The service stores structures for a limited time; this page still has the bytes.
     if (error instanceof Problem && error.is("no-such-structure") && blob && !source.resent) {
       void this.open(source.name, async (signal) => ({ ...source, ...(await upload(this.client, blob, source.file, signal)), resent: true }));
       return;
     }
     this.restore();
     const again = () => {
-      this.take(wish);
+      this.take(request);
       this.changed(false);
     };
-    this.problem(error, again, source.name, wish);
+    this.problem(error, again, source.name, request);
   }
 
   private say(words: string): void {

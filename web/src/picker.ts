@@ -1,4 +1,4 @@
-/** Whose surface it is: under the pointer while it hovers, pinned by a click, found by name. */
+/** Atom selection: under the pointer, pinned by a click, or found by name. */
 
 import { type Atom, type Labels, nameOf } from "./api/structures";
 import { chainColors, elementColors } from "./scene/colors";
@@ -6,7 +6,7 @@ import { palette } from "./scene/material";
 import type { Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
 
-/** A mesh of so many triangles is searched on a click alone: going through it would make the pointer stick. */
+/** Triangle count above which only clicks search the mesh, since a search per pointer move would be too slow. */
 const MOST_HOVERED = 1_500_000;
 
 export class Picker {
@@ -39,7 +39,7 @@ export class Picker {
     this.colour.addEventListener("change", () => this.paint());
   }
 
-  /** The labels of what is shown from now on; null: they are not there (yet). */
+  /** Sets the labels of the shown structure; null while they are not available. */
   know(labels: Labels | null): void {
     this.labels = labels;
     this.pin(null, false);
@@ -48,7 +48,7 @@ export class Picker {
     this.paint();
   }
 
-  /** Pins what is in the middle of the canvas. */
+  /** Pins the atom in the middle of the canvas. */
   pinMiddle(): void {
     this.pin(this.viewer.pick(0, 0)?.atom ?? null);
   }
@@ -61,10 +61,10 @@ export class Picker {
     const atom = this.labels?.find(text);
     if (!atom) return this.tell([el("span", {}, text.trim() ? `There is no residue “${text.trim()}”.` : "Type a residue, such as A LYS 15.")]);
     this.pin(atom.row);
-    if (!this.viewer.face(atom.first, atom.last)) $("picked").append(el("span", {}, " It has no part in the surface."));
+    if (!this.viewer.face(atom.first, atom.last)) $("picked").append(el("span", {}, " It does not contribute to the surface."));
   }
 
-  /** Hovers in the next frame: pointers move more often than that. */
+  /** Hovers in the next frame, since pointers move more often than frames are drawn. */
   private soon(place: { x: number; y: number }): void {
     if (this.viewer.triangles > MOST_HOVERED || this.viewer.isTurning) return;
     const waiting = this.pending !== null;
@@ -104,7 +104,7 @@ export class Picker {
     show($("unpin"), row !== null);
     if (row === null) {
       this.viewer.mark("pinned", null);
-      if (was !== null || !aloud) this.tell([el("span", { class: "hint" }, "Point at the surface; a click pins an atom.")]);
+      if (was !== null || !aloud) this.tell([el("span", { class: "hint" }, "Point at the surface to see the atom. Click to pin it.")]);
       return;
     }
     const atom = this.labels?.of(row) ?? null;

@@ -1,4 +1,4 @@
-/** Meshes on request, the latest one wins: what was asked for before is cancelled, here and in the service. */
+/** Queue of mesh requests. The latest request wins; earlier ones are cancelled, here and in the service. */
 
 import { bytesOf } from "./api/bytes";
 import type { Client } from "./api/client";
@@ -6,23 +6,23 @@ import { fetchFile, type Progress } from "./api/jobs";
 import type { Source } from "./api/structures";
 import type { Choices } from "./request";
 
-export interface Wish {
+export interface MeshRequest {
   source: Source;
-  /** Everything that was set when it was asked for; a preview replaces the spacing. */
+  /** All parameters at the time of the request; a preview replaces the grid spacing. */
   choices: Choices;
-  /** The address of the mesh. */
+  /** Path of the mesh. */
   path: string;
-  /** The spacing of a preview, Å; none: it is what was asked for. */
+  /** Grid spacing of a preview, Å; undefined for a full mesh. */
   preview?: number;
-  /** A slider is being dragged: more will follow. */
+  /** True while a slider is dragged and more requests will follow. */
   live: boolean;
-  /** When it was wished for, by the page's clock. */
+  /** Time of the input, by the page's clock. */
   since: number;
 }
 
 export interface Delivery {
-  wish: Wish;
-  /** When its head and its last byte had come, by the page's clock. */
+  request: MeshRequest;
+  /** Times of the response head and of the last byte, by the page's clock. */
   answered: number;
   received: number;
   bytes: ArrayBuffer;
@@ -32,45 +32,45 @@ export interface Delivery {
 }
 
 export interface Listener {
-  /** Nothing was on its way, and now something is. */
-  begin(wish: Wish): void;
+  /** Called when a request starts. */
+  begin(request: MeshRequest): void;
   progress: Progress;
-  /** A mesh is there. What comes while it is being shown waits. */
+  /** Shows a received mesh. Later requests wait until it is shown. */
   show(delivery: Delivery): Promise<void>;
-  failed(error: unknown, wish: Wish): void;
-  /** Nothing is on its way any more. */
+  failed(error: unknown, request: MeshRequest): void;
+  /** Called when no request is running. */
   idle(): void;
 }
 
-/** While a slider is dragged, a mesh on its way is given this long, ms, so that something is seen between its moves. */
+/** Time, ms, that a running request has before a dragged slider replaces it, so that intermediate meshes appear. */
 const GRACE = 250;
 
 export class Remesher {
-  private current: { wish: Wish; abort: AbortController } | null = null;
-  private next: Wish | null = null;
+  private current: { request: MeshRequest; abort: AbortController } | null = null;
+  private next: MeshRequest | null = null;
   private timer = 0;
 
   constructor(private readonly client: Client, private readonly listener: Listener) {}
 
-  want(wish: Wish): void {
+  want(request: MeshRequest): void {
     const current = this.current;
-    if (!current) return this.start(wish);
-    if (current.wish.path === wish.path && current.wish.preview === wish.preview) {
+    if (!current) return this.start(request);
+    if (current.request.path === request.path && current.request.preview === request.preview) {
       this.next = null;
       return;
     }
-    const age = performance.now() - current.wish.since;
-    if (wish.live && current.wish.live && age < GRACE) {
-      this.next = wish;
+    const age = performance.now() - current.request.since;
+    if (request.live && current.request.live && age < GRACE) {
+      this.next = request;
       clearTimeout(this.timer);
       this.timer = window.setTimeout(() => this.supersede(), GRACE - age);
       return;
     }
-    this.next = wish;
+    this.next = request;
     this.supersede();
   }
 
-  /** Cancels what is on its way. */
+  /** Cancels the running request. */
   cancel(): void {
     this.next = null;
     clearTimeout(this.timer);
@@ -81,32 +81,32 @@ export class Remesher {
 
   private supersede(): void {
     clearTimeout(this.timer);
-    const wish = this.next;
+    const request = this.next;
     this.next = null;
-    if (!wish) return;
+    if (!request) return;
     this.current?.abort.abort();
-    this.start(wish);
+    this.start(request);
   }
 
-  private start(wish: Wish): void {
-    const mine = { wish, abort: new AbortController() };
+  private start(request: MeshRequest): void {
+    const mine = { request, abort: new AbortController() };
     this.current = mine;
-    this.listener.begin(wish);
+    this.listener.begin(request);
     void this.run(mine);
   }
 
-  private async run(mine: { wish: Wish; abort: AbortController }): Promise<void> {
-    const { wish, abort } = mine;
+  private async run(mine: { request: MeshRequest; abort: AbortController }): Promise<void> {
+    const { request, abort } = mine;
     const isLatest = () => this.current === mine;
     try {
-      const reply = await fetchFile(this.client, wish.path, abort.signal, (job) => isLatest() && this.listener.progress(job));
+      const reply = await fetchFile(this.client, request.path, abort.signal, (job) => isLatest() && this.listener.progress(job));
       const answered = performance.now();
       const bytes = await bytesOf(reply);
       const received = performance.now();
-      if (isLatest()) await this.listener.show({ wish, answered, received, bytes, headers: reply.headers, signal: abort.signal });
+      if (isLatest()) await this.listener.show({ request, answered, received, bytes, headers: reply.headers, signal: abort.signal });
     } catch (error) {
       // A later request is waiting, so this one is superseded already.
-      if (isLatest() && !this.next) this.listener.failed(error, wish);
+      if (isLatest() && !this.next) this.listener.failed(error, request);
     }
     if (!isLatest()) return;
     this.current = null;

@@ -1,8 +1,8 @@
-/** What is asked for: a structure and the parameters that somebody has set, as an address and as a line for the shell. */
+/** A structure with the parameters that the user has set, as a URL and as a shell command. */
 
 import type { Source } from "./api/structures";
 
-/** Parameters that were set, by name; all others are at their defaults. */
+/** Parameters set by the user, by name; all others have their defaults. */
 export type Choices = ReadonlyMap<string, string>;
 
 export function query(choices: Choices, more: Record<string, string> = {}): string {
@@ -11,17 +11,17 @@ export function query(choices: Choices, more: Record<string, string> = {}): stri
   return text ? `?${text}` : "";
 }
 
-/** The address of a file that is made of a structure. */
+/** Returns the path of a file made from a structure. */
 export function surface(source: Source, extension: string, choices: Choices, more: Record<string, string> = {}): string {
   return `${source.path}/surface.${extension}${query(choices, more)}`;
 }
 
-/** The address of a mesh to show: every vertex with its atom, so that the pointer finds out whose it is. */
+/** Returns the path of a mesh for display, with an atom id per vertex for atom selection. */
 export function drawn(source: Source, choices: Choices): string {
   return surface(source, "glb", choices, { atom_ids: "true" });
 }
 
-/** Choices of a preview, which sets the spacing in its own way. */
+/** Returns the parameters of a preview with the given grid spacing, Å. */
 export function coarser(choices: Choices, resolution: number): Choices {
   const rest = [...choices].filter(([name]) => !["resolution", "detail", "max_triangles"].includes(name));
   return new Map([...rest, ["resolution", String(resolution)]]);
@@ -29,7 +29,7 @@ export function coarser(choices: Choices, resolution: number): Choices {
 
 const quoted = (text: string) => (/^[\w./:=-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
-/** The same from a shell, without anything that was done here before. */
+/** Returns a shell command for the same file that does not depend on earlier requests of the page. */
 export function curl(source: Source, format: string, choices: Choices, origin: string, key: boolean): string {
   const header = key ? ' -H "X-Api-Key: $MOLMESH_KEY"' : "";
   const out = `-o ${quoted(`${stem(source)}.${format}`)}`;
@@ -42,19 +42,19 @@ export function curl(source: Source, format: string, choices: Choices, origin: s
 /** The bundled structure. */
 export const SAMPLE = "sample.pdb";
 
-/** A file name without an extension. */
+/** Returns a file name without an extension. */
 export function stem(source: Source): string {
   return (source.summary?.id ?? source.name).replaceAll(/[^\w.-]+/g, "_").replace(/\.(pdb|ent|cif|mmcif|bcif)?(\.gz|\.zst)?$/i, "").toLowerCase() || "surface";
 }
 
-/** What the page's own address says: parameters, and what they are for, so that reloading and sharing keep them. */
+/** Reads structure and parameters from the page's address, which preserves them for reloading and sharing. */
 export function readAddress(known: ReadonlySet<string>): { choices: Map<string, string>; pdb: string; structure: string } {
   const pairs = new URLSearchParams(location.search);
   const choices = new Map([...pairs].filter(([name, value]) => known.has(name) && value !== ""));
   return { choices, pdb: pairs.get("pdb") ?? "", structure: pairs.get("structure") ?? "" };
 }
 
-/** The page's own address for a structure and what is set. */
+/** Returns the page's address for a structure and parameters. */
 export function addressOf(source: Source, choices: Choices): string {
   const name: Record<string, string> = {};
   if (source.path.startsWith("/v1/pdb/")) name["pdb"] = decodeURIComponent(source.path.slice("/v1/pdb/".length));
@@ -62,10 +62,10 @@ export function addressOf(source: Source, choices: Choices): string {
   return location.pathname + query(new Map(Object.entries(name)), Object.fromEntries(choices));
 }
 
-/** The address that the page has now, in the form of `addressOf`. */
+/** Returns the current address of the page, in the form of `addressOf`. */
 export const currentAddress = () => location.pathname + location.search;
 
-/** Gives the page another address: `push` as a new entry of the history, otherwise in place of the present one. */
+/** Changes the page's address: with `push` as a new history entry, otherwise in place of the current one. */
 export function writeAddress(address: string, push: boolean): void {
   if (address === currentAddress()) return;
   if (push) history.pushState(null, "", address);

@@ -1,4 +1,4 @@
-/** The place of the surface: the viewer, or a picture by the service where the browser has no WebGL or has lost it. */
+/** Display of the surface: the WebGL viewer, or a picture from the service if WebGL is missing or lost. */
 
 import type { Client } from "./api/client";
 import { fetchFile } from "./api/jobs";
@@ -10,16 +10,16 @@ import { contextOf, Viewer } from "./scene/viewer";
 import { $, el, show } from "./ui/dom";
 import { color } from "./ui/theme";
 
-const ABSENT = "This browser shows no WebGL 2, so the surface cannot be turned here. It is shown as a picture that the server draws; report and downloads are as always.";
-const LOST = "The graphics device was lost, for a moment or for good. Until it is back the surface is shown as a picture that the server draws.";
+const ABSENT = "This browser has no WebGL 2, so the surface cannot be turned. It is shown as a picture from the server. Report and downloads work as usual.";
+const LOST = "The graphics device was lost. Until it is available again, the surface is shown as a picture from the server.";
 
-/** A surface that is ready to be shown. */
+/** A surface that is ready for display. */
 export interface Scene {
   source: Source;
-  /** The choices of its picture. */
+  /** Parameters of its picture. */
   choices: Choices;
   loaded: Loaded;
-  /** Its picture, or a message why there is none; null if the viewer draws it. */
+  /** Its picture, or a message with the reason for its absence; null if the viewer draws it. */
   picture: Blob | string | null;
 }
 
@@ -30,9 +30,9 @@ export class Stage {
   private readonly notice = $("no-webgl");
   private readonly hint = el("p", { class: "hint" });
   private lost = false;
-  /** On the stage now. */
+  /** The shown surface. */
   private scene: Scene | null = null;
-  /** The last one that was no preview. */
+  /** The last surface that was not a preview. */
   private kept: Scene | null = null;
   private fetching: AbortController | null = null;
 
@@ -42,13 +42,13 @@ export class Stage {
     if (!this.viewer) this.explain(ABSENT);
   }
 
-  /** Reads a file, and fetches its picture with `choices` where the viewer does not draw. The stage does not change. */
+  /** Reads a file, and fetches its picture with `choices` if the viewer does not draw. Does not change the display. */
   async prepare(bytes: ArrayBuffer, source: Source, choices: Choices, signal: AbortSignal): Promise<Scene> {
     const loaded = await load(bytes);
     return { source, choices, loaded, picture: this.draws ? null : await this.picture(source, choices, signal) };
   }
 
-  /** Puts a surface on the stage at once, and resolves with the time in the frame after it was drawn. */
+  /** Shows a surface at once, and resolves with the time in the frame after it was drawn. */
   show(scene: Scene, fresh: boolean, preview: boolean): Promise<number> {
     this.scene = scene;
     this.fetching?.abort();
@@ -58,18 +58,18 @@ export class Stage {
     return drawn;
   }
 
-  /** Takes a preview off the stage. */
+  /** Replaces a preview by the last full surface. */
   restore(): void {
     if (this.kept && this.scene !== this.kept) void this.show(this.kept, false, false);
   }
 
-  /** Takes the colours of the page. */
+  /** Applies the colours of the page. */
   theme(): void {
     this.viewer?.theme(color("--stage"), color("--plain"));
     if (!this.image.hidden) void this.redraw();
   }
 
-  /** True if the viewer draws; otherwise pictures of the service are shown. */
+  /** True if the viewer draws; otherwise pictures from the service are shown. */
   private get draws(): boolean {
     return this.viewer !== null && !this.lost;
   }
@@ -92,7 +92,7 @@ export class Stage {
     show(this.notice, true);
   }
 
-  /** Fetches the picture of the surface on the stage again. */
+  /** Fetches the picture of the shown surface again. */
   private async redraw(): Promise<void> {
     const { scene } = this;
     if (!scene) return;
@@ -101,13 +101,13 @@ export class Stage {
     try {
       scene.picture = await this.picture(scene.source, scene.choices, abort.signal);
     } catch {
-      // Another surface is on the stage, or the viewer draws again.
+      // Another surface is shown, or the viewer draws again.
       return;
     }
     this.showPicture(scene);
   }
 
-  /** Shows the picture of a scene, or says why there is none. */
+  /** Shows the picture of a scene, or the reason for its absence. */
   private showPicture(scene: Scene): void {
     const { picture, source } = scene;
     if (picture === null) {
@@ -127,8 +127,8 @@ export class Stage {
   }
 
   /**
-   * Fetches a picture, or a message why there is none. An image's own address would carry no key. Throws only
-   * when `signal` is aborted.
+   * Fetches a picture, or returns a message with the reason for its absence. Uses fetch, since an image element would
+   * send no key. Throws only when `signal` is aborted.
    */
   private async picture(source: Source, choices: Choices, signal: AbortSignal): Promise<Blob | string> {
     const { clientWidth, clientHeight } = $("view-home");
@@ -144,7 +144,7 @@ export class Stage {
       const { document } = asProblem(error);
       const none = document.status === 404 || document.status === 406;
       return none
-        ? "This server draws no pictures either; report and downloads work as always."
+        ? "This server draws no pictures. Report and downloads work as usual."
         : `The picture could not be loaded: ${document.detail ?? document.title}`;
     }
   }

@@ -1,12 +1,12 @@
-/** Requests to the service, with the key where one was given. */
+/** Requests to the service, with the API key if there is one. */
 
 import { problemOf } from "./problem";
 
 export class Client {
-  /** A key lives as long as the page does: it is written down nowhere. */
+  /** API key, held in memory only. */
   key = "";
 
-  /** Sends a request to a path of this service or to a full address. Throws every status but a success as a Problem. */
+  /** Sends a request to a path of this service or to a full URL. Throws a Problem unless the status is a success. */
   async ask(path: string, options: RequestInit = {}): Promise<Response> {
     const headers = new Headers(options.headers);
     if (this.key) headers.set("authorization", `Bearer ${this.key}`);

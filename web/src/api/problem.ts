@@ -1,4 +1,4 @@
-/** Refusals of the service (RFC 9457), as errors that carry their document. */
+/** Problem documents of the service (RFC 9457) as errors. */
 
 export interface ProblemDocument {
   type: string;
@@ -17,12 +17,12 @@ export class Problem extends Error {
     this.name = "Problem";
   }
 
-  /** Whether the last segment of the type is `slug`. */
+  /** Returns true if the last segment of the type is one of `slugs`. */
   is(...slugs: string[]): boolean {
     return slugs.some((slug) => this.document.type.endsWith(`/${slug}`));
   }
 
-  /** Members beside the standard ones: the numbers. */
+  /** Returns the names and values of non-standard members, formatted for display. */
   get numbers(): [string, string][] {
     const standard = ["type", "title", "status", "detail", "instance", "diagnostics"];
     return Object.entries(this.document)
@@ -31,7 +31,7 @@ export class Problem extends Error {
   }
 }
 
-/** The problem in an answer, or one made of its status where the answer holds none (a proxy's page). */
+/** Returns the problem in a response, or one made from its status if it contains none, as from a proxy. */
 export async function problemOf(reply: Response): Promise<Problem> {
   const fallback: ProblemDocument = {
     type: "/problems/unknown",
@@ -44,7 +44,7 @@ export async function problemOf(reply: Response): Promise<Problem> {
   return new Problem({ ...fallback, ...document });
 }
 
-/** Any failure as a problem: what is no refusal is mostly a connection that did not come about. */
+/** Returns any failure as a problem. Failures without a document are mostly connection errors. */
 export function asProblem(error: unknown): Problem {
   if (error instanceof Problem) return error;
   const offline = error instanceof TypeError;
@@ -52,6 +52,6 @@ export function asProblem(error: unknown): Problem {
     type: "/problems/unreachable",
     title: offline ? "The server cannot be reached" : "The surface cannot be shown",
     status: 0,
-    detail: offline ? "The connection failed. Is the service running, and is the network there?" : String((error as Error).message ?? error),
+    detail: offline ? "The connection failed. Check that the service is running and the network is available." : String((error as Error).message ?? error),
   });
 }

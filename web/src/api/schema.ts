@@ -1,4 +1,4 @@
-/** The parameters of a mesh, read from the service's own description: what it learns, the page has. */
+/** Parameters of a mesh, read from the OpenAPI document of the service. */
 
 export type Kind = "number" | "integer" | "boolean" | "choice" | "set" | "text";
 
@@ -9,20 +9,20 @@ export interface Parameter {
   /** Bounds of numbers. */
   min: number;
   max: number;
-  /** The part of them that a slider spans. */
+  /** Range of the slider within the bounds. */
   usual: [number, number];
   unit: string;
-  /** The value where it is absent; undefined where it hangs on others. */
+  /** Default value; undefined if it depends on other parameters. */
   fallback: string | undefined;
-  /** The same in words. */
+  /** Default value in words. */
   fallbackWords: string;
-  /** Words of choices and sets. */
+  /** Permitted words of choices and sets. */
   values: string[];
-  /** What is expected, in words. */
+  /** Description of permitted values. */
   expected: string;
-  /** The only format that it goes with, such as a picture's; empty: it is the mesh's. */
+  /** The only format that it applies to, such as `png`; empty for parameters of the mesh. */
   format: string;
-  /** Parameters that cannot be given beside it. */
+  /** Parameters that exclude it. */
   insteadOf: string[];
 }
 
@@ -49,7 +49,7 @@ export interface OpenApi {
   paths: Record<string, Record<string, { operationId?: string; parameters?: Described[] }>>;
 }
 
-/** What is chosen elsewhere than in the form: files are asked for by their address, the report is read along. */
+/** Parameters without a control: the URL determines the format, and the file contains the report. */
 const ELSEWHERE = ["format", "report"];
 
 function described(api: OpenApi): Described[] {
@@ -58,12 +58,12 @@ function described(api: OpenApi): Described[] {
   return (mesh?.parameters ?? []).filter((parameter) => parameter.in === "query");
 }
 
-/** Every parameter, in the order of the description. */
+/** Returns every parameter, in the order of the document. */
 export function parametersOf(api: OpenApi): Parameter[] {
   return described(api).filter((parameter) => !ELSEWHERE.includes(parameter.name)).map(parameterOf);
 }
 
-/** The formats that a surface can be had in, by their files' extensions. */
+/** Returns the available formats by file extension. */
 export function formatsOf(api: OpenApi): string[] {
   return described(api).find((parameter) => parameter.name === "format")?.schema?.enum ?? ["glb"];
 }
@@ -99,7 +99,7 @@ function parameterOf(parameter: Described): Parameter {
   };
 }
 
-/** The part of the bounds that a slider spans where the description does not say it: three octaves around the default. */
+/** Returns the range of a slider if the document does not state one: three octaves around the default. */
 function usual(min: number, max: number, value: number): [number, number] {
   const wide = !Number.isFinite(min) || !Number.isFinite(max) || (min > 0 ? max / min > 100 : max - min > 1000);
   if (!wide) return [min, max];

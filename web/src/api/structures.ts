@@ -1,20 +1,20 @@
-/** Structures: where they are, what they hold, and who is behind the numbers of `_ATOM`. */
+/** Structures: their paths, summaries and atom labels. */
 
 import type { Client } from "./client";
 
-/** What is meshed: an upload, by the digest of its bytes, or an entry of the archive. */
+/** Source of a mesh: an upload, by the digest of its bytes, or an entry of the archive. */
 export interface Source {
-  /** The part of the address before `/surface.glb`. */
+  /** Path before `/surface.glb`. */
   path: string;
-  /** What people call it. */
+  /** Display name. */
   name: string;
-  /** The file's name, for the command line. */
+  /** File name, for the command line. */
   file: string;
-  /** The bytes, to be sent again when the service has forgotten them. */
+  /** The bytes, for another upload if the service has deleted them. */
   blob?: Blob;
-  /** The bytes were sent again and have not been meshed since. */
+  /** True if the bytes were uploaded again and have not been meshed since. */
   resent?: boolean;
-  /** The bundled structure, which the page opens where its address names no other. */
+  /** True for the bundled structure, which the page opens by default. */
   isSample?: boolean;
   summary?: Summary;
 }
@@ -29,7 +29,7 @@ export interface Summary {
   atoms_in_model: { polymer: number; ligand: number; water: number; hydrogens: number };
 }
 
-/** Sends a structure in, once; meshes are asked for under its address. */
+/** Uploads a structure. Its path then gives access to meshes. */
 export async function upload(client: Client, blob: Blob, file: string, signal?: AbortSignal): Promise<Source> {
   const options: RequestInit = { method: "POST", body: blob, headers: { "content-type": "application/octet-stream" } };
   if (signal) options.signal = signal;
@@ -37,13 +37,13 @@ export async function upload(client: Client, blob: Blob, file: string, signal?: 
   return { path: `/v1/structures/${summary.digest}`, name: summary.id ?? file, file, blob, summary };
 }
 
-/** An entry of the archive. */
+/** Returns an entry of the archive. */
 export function entry(id: string): Source {
   const name = id.trim();
   return { path: `/v1/pdb/${encodeURIComponent(name.toLowerCase())}`, name: name.toUpperCase(), file: "" };
 }
 
-/** `GET …/atoms`: columns whose rows are what `_ATOM` counts. */
+/** Document of `GET …/atoms`: columns; the mesh attribute `_ATOM` contains row numbers. */
 interface AtomsDocument {
   count: number;
   names: string[];
@@ -61,7 +61,7 @@ export interface Atom {
   insertion: string;
   chain: string;
   kind: string;
-  /** Rows of its residue, both included. */
+  /** First and last row of its residue, inclusive. */
   first: number;
   last: number;
 }
@@ -73,7 +73,7 @@ export class Labels {
     return this.document.count;
   }
 
-  /** Who `row` is. */
+  /** Returns the atom in `row`. */
   of(row: number): Atom | null {
     const { atoms, names, elements, residues, count } = this.document;
     if (!(row >= 0 && row < count)) return null;
@@ -97,7 +97,7 @@ export class Labels {
     };
   }
 
-  /** The first atom, preferably the alpha carbon, of a residue that people name: `15`, `LYS 15`, `A:15`, `A LYS 15`. */
+  /** Finds an atom, preferably the alpha carbon, of the residue in `text`: `15`, `LYS 15`, `A:15`, `A LYS 15`. */
   find(text: string): Atom | null {
     const words = text.trim().toUpperCase().split(/[\s:/.,]+/).filter(Boolean);
     const { residues, names, atoms } = this.document;
@@ -112,7 +112,7 @@ export class Labels {
     return this.of(first);
   }
 
-  /** A number per atom, for colours: which chain (in order of appearance) or which element. */
+  /** Returns a number per atom for colours: its chain, in order of appearance, or its element. */
   classes(by: "chain" | "element"): { of: Uint16Array; names: string[] } {
     const { residues, atoms, elements, count } = this.document;
     if (by === "element") return { of: Uint16Array.from(atoms.element), names: elements };
@@ -128,12 +128,12 @@ export class Labels {
   }
 }
 
-/** The labels of a structure's atoms. */
+/** Fetches the labels of a structure's atoms. */
 export async function labels(client: Client, source: Source, signal: AbortSignal): Promise<Labels> {
   return new Labels(await client.json<AtomsDocument>(`${source.path}/atoms`, { signal }));
 }
 
-/** How an atom is called: `LYS 15 A · CA`. */
+/** Returns the name of an atom, such as `LYS 15 A · CA`. */
 export function nameOf(atom: Atom): string {
   return `${atom.residue} ${atom.number}${atom.insertion} ${atom.chain || "(blank)"} · ${atom.atom}`;
 }

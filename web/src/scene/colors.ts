@@ -1,4 +1,4 @@
-/** Colours of chains and elements: muted, apart in hue and lightness also for those who see two hues alone. */
+/** Colours of chains and elements, distinct in hue and lightness, also with colour vision deficiency. */
 
 import { Color } from "three";
 

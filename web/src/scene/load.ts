@@ -1,24 +1,24 @@
-/** A GLB as something to draw: positions stay as they came, also as integers, and the node says what they mean. */
+/** Loads a GLB for drawing. Positions stay unchanged, also integers; the node transforms them. */
 
 import { Box3, Matrix4, Sphere, Vector3, type BufferAttribute, type BufferGeometry, type Group, type Mesh } from "three";
 import { GLTFLoader } from "three/examples/jsm/loaders/GLTFLoader.js";
 
 export interface Loaded {
   geometry: BufferGeometry;
-  /** From the file's numbers to its units. */
+  /** Transform from stored positions to file units. */
   matrix: Matrix4;
   sphere: Sphere;
-  /** What the file says about itself: parameters and report, without what differs from run to run. */
+  /** Parameters and report in the file, without values that differ between runs. */
   extras: Record<string, unknown>;
 }
 
 const loader = new GLTFLoader();
 
-/** Reads a GLB. Fails where it is none, or holds no triangles. */
+/** Reads a GLB. Throws if it is invalid or has no triangles. */
 export async function load(bytes: ArrayBuffer): Promise<Loaded> {
   if (bytes.byteLength < 20 || new DataView(bytes).getUint32(0, true) !== 0x46546c67) throw new Error("the file is no GLB");
   if (usesMeshopt(bytes)) {
-    // Only such files need WebAssembly: on pages that forbid it, all others are shown nevertheless.
+    // Only such files need WebAssembly. Pages that forbid it can show all other files.
     const { MeshoptDecoder } = await import("three/examples/jsm/libs/meshopt_decoder.module.js");
     loader.setMeshoptDecoder(MeshoptDecoder);
   }
@@ -28,7 +28,7 @@ export async function load(bytes: ArrayBuffer): Promise<Loaded> {
   gltf.scene.updateMatrixWorld(true);
   const matrix = mesh.matrixWorld.clone();
   const { geometry } = mesh;
-  // From the bounds that the file tells: no look at a million vertices. Integers are bounded as they lie.
+  // Uses the bounds in the file instead of reading all vertices. Bounds of integers are in stored units.
   const box = geometry.boundingBox ?? new Box3().setFromBufferAttribute(geometry.getAttribute("position") as BufferAttribute);
   const sphere = box.clone().applyMatrix4(matrix).getBoundingSphere(new Sphere(new Vector3(), 1));
   const extras = ((gltf.asset as { extras?: Record<string, unknown> }).extras ?? {}) as Record<string, unknown>;

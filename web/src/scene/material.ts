@@ -1,8 +1,8 @@
-/** How a surface is lit: a sky, a ground and two lights that go with the eye, darker hollows and edges, haze in the distance. */
+/** Material of the surface: hemisphere light, two camera lights, darker hollows and edges, and distance fog. */
 
 import { Color, DataTexture, FloatType, GLSL3, NearestFilter, RGBAFormat, ShaderMaterial, Vector2, type BufferGeometry } from "three";
 
-/** Atoms in a row of the palette: textures are not wider than this anywhere. */
+/** Atoms per row of the palette, a texture width that every device supports. */
 const PALETTE_WIDTH = 1024;
 
 const VERTEX = /* glsl */ `
@@ -61,7 +61,7 @@ void main() {
   light += vec3(0.62, 0.6, 0.56) * max(dot(n, KEY), 0.0);
   light += vec3(0.1, 0.11, 0.14) * max(dot(n, FILL), 0.0);
   #ifdef NORMALS
-  // How the normal turns from pixel to pixel: hollows get less light, crests a little more.
+  // Change of the normal between pixels: hollows get less light, ridges slightly more.
   float bend = (dFdx(n).x + dFdy(n).y) / max(length(dFdx(vEye)) / unit, 1e-4);
   light *= 1.0 + clamp(bend * 0.16, -0.34, 0.1);
   #endif
@@ -106,7 +106,7 @@ export class SurfaceMaterial extends ShaderMaterial {
   }
 }
 
-/** Colours by atom, as a texture that the vertices look up. */
+/** Texture with a colour per atom, read by vertices. */
 export function palette(of: Uint16Array, colors: Color[]): DataTexture {
   const height = Math.max(1, Math.ceil(of.length / PALETTE_WIDTH));
   const data = new Float32Array(PALETTE_WIDTH * height * 4);

@@ -1,4 +1,4 @@
-/** Which atom lies under a ray: the triangles are gone through as they lie in the file's buffers. */
+/** Search for the atom under a ray, directly in the buffers of the file. */
 
 import { InterleavedBufferAttribute, Matrix4, Ray, Vector3, type BufferAttribute, type BufferGeometry } from "three";
 
@@ -16,15 +16,15 @@ function column(geometry: BufferGeometry, name: string): Column | null {
 }
 
 export interface Hit {
-  /** Row of the atom; −1 where the mesh names none. */
+  /** Row of the atom; −1 if the mesh has no atom ids. */
   atom: number;
-  /** Where, in the file's units. */
+  /** Position in file units. */
   point: Vector3;
 }
 
 /**
- * The foremost triangle that faces the origin of `ray` (in the scene, where `matrix` puts the mesh), and the atom of its corner
- * that is nearest to the point.
+ * Finds the first triangle that faces the origin of `ray`, and the atom of its corner nearest to the intersection. `ray`
+ * is in scene coordinates; `matrix` transforms the mesh into them.
  */
 export function pick(geometry: BufferGeometry, matrix: Matrix4, ray: Ray): Hit | null {
   const positions = column(geometry, "position");
@@ -42,7 +42,7 @@ export function pick(geometry: BufferGeometry, matrix: Matrix4, ray: Ray): Hit |
     const ax = array[a]!, ay = array[a + 1]!, az = array[a + 2]!;
     const ex = array[b]! - ax, ey = array[b + 1]! - ay, ez = array[b + 2]! - az;
     const fx = array[c]! - ax, fy = array[c + 1]! - ay, fz = array[c + 2]! - az;
-    // Möller and Trumbore; what faces away has a determinant that is not positive.
+    // Möller–Trumbore. Back faces have a determinant that is not positive.
     const px = dy * fz - dz * fy, py = dz * fx - dx * fz, pz = dx * fy - dy * fx;
     const det = ex * px + ey * py + ez * pz;
     if (det <= 0) continue;
@@ -64,7 +64,7 @@ export function pick(geometry: BufferGeometry, matrix: Matrix4, ray: Ray): Hit |
   return { atom, point };
 }
 
-/** A place on the surface of the atoms `first` to `last`: the vertex of theirs that is nearest to the middle of all; null where they have none. */
+/** Returns the vertex of the atoms `first` to `last` that is nearest to their centre; null if they have none. */
 export function placeOf(geometry: BufferGeometry, matrix: Matrix4, first: number, last: number): Vector3 | null {
   const [positions, atoms] = [column(geometry, "position"), column(geometry, "_atom")];
   if (!positions || !atoms) return null;

@@ -1,4 +1,4 @@
-/** A surface on a canvas: drawn when something has changed, and at no other time. */
+/** Viewer of a surface on a canvas. Draws only when something has changed. */
 
 import { Color, DataTexture, Mesh, PerspectiveCamera, Raycaster, Scene, SRGBColorSpace, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
@@ -7,22 +7,22 @@ import { SurfaceMaterial } from "./material";
 import { type Hit, pick, placeOf } from "./pick";
 
 export interface ViewerOptions {
-  /** The canvas lets what is behind it shine through. */
+  /** True for a transparent background. */
   transparent?: boolean;
-  /** The context was lost (true), or is there again (false). */
+  /** Called when the context is lost (true) or restored (false). */
   onLost?: (lost: boolean) => void;
-  /** The turn has begun or ended. */
+  /** Called when the rotation starts or stops. */
   onTurn?: (turning: boolean) => void;
 }
 
-/** How long a turn lasts that nobody asked for, ms: one round. */
+/** Duration of the initial rotation, ms: one full turn. */
 const TURN = 14_000;
-/** Pixels of the screen per pixel of the page at most: more is not seen, and costs. */
+/** Maximum device pixels per CSS pixel. More is not visible. */
 const MOST_PIXELS = 2;
-/** A frame that takes longer than this makes the picture coarser while it moves, ms. */
+/** Frame time, ms, above which the resolution is reduced during motion. */
 const SLOW = 40;
 
-/** WebGL 2 on `canvas`, or null where the browser has none. */
+/** Returns a WebGL 2 context of `canvas`, or null if the browser has none. */
 export function contextOf(canvas: HTMLCanvasElement, transparent: boolean): WebGL2RenderingContext | null {
   const attributes = { antialias: true, alpha: transparent, premultipliedAlpha: true, powerPreference: "high-performance" as const, preserveDrawingBuffer: false };
   return canvas.getContext("webgl2", attributes) as WebGL2RenderingContext | null;
@@ -47,7 +47,7 @@ export class Viewer {
   private readonly size = new ResizeObserver(() => this.resize());
   private readonly calm = matchMedia("(prefers-reduced-motion: reduce)");
 
-  /** Draws on `canvas`, whose context `gl` is. */
+  /** Creates a viewer on `canvas` with the context `gl`. */
   constructor(readonly canvas: HTMLCanvasElement, gl: WebGL2RenderingContext, private readonly options: ViewerOptions = {}) {
     this.renderer = new WebGLRenderer({ canvas, context: gl, antialias: true, alpha: options.transparent ?? false });
     this.renderer.outputColorSpace = SRGBColorSpace;
@@ -57,7 +57,7 @@ export class Viewer {
     canvas.addEventListener("webglcontextlost", () => options.onLost?.(true));
     canvas.addEventListener("webglcontextrestored", () => {
       options.onLost?.(false);
-      // A new context has forgotten what it clears with; everything else is sent to it again by itself.
+      // The restored context lacks the clear colour. three.js restores everything else.
       this.clear();
       this.invalidate();
     });
@@ -65,7 +65,7 @@ export class Viewer {
     this.resize();
   }
 
-  /** Shows a surface. The view stays as it is, unless it is `fresh`: another molecule. Resolves in the frame after the one that shows it. */
+  /** Shows a surface. Resets the view if `fresh`. Resolves in the frame after the one that shows it. */
   show(loaded: Loaded, fresh: boolean): Promise<number> {
     const first = !this.loaded;
     this.mesh?.geometry.dispose();
@@ -85,13 +85,13 @@ export class Viewer {
     return this.drawn();
   }
 
-  /** Resolves in the frame after the next one that is drawn, with the time then. */
+  /** Resolves with the time in the frame after the next one that is drawn. */
   drawn(): Promise<number> {
     this.invalidate();
     return new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(() => resolve(performance.now()))));
   }
 
-  /** Looks at the whole from the front. */
+  /** Resets the view to the whole surface from the front. */
   reset(): void {
     if (!this.loaded) return;
     const { center, radius } = this.loaded.sphere;
@@ -105,7 +105,7 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Turns the molecule, or stops. Without a word from the user it turns once, and not at all for those who want no motion. */
+  /** Starts or stops the rotation. Without a user action it turns once, and not at all if reduced motion is preferred. */
   turn(on: boolean, asked = false): void {
     const now = performance.now();
     const was = this.isTurning;
@@ -120,7 +120,7 @@ export class Viewer {
     return this.turnUntil > performance.now();
   }
 
-  /** Turns by angles (radians) and comes nearer by a factor: what the keyboard does. */
+  /** Turns by angles (radians) and zooms by a factor. Used by the keyboard. */
   move(right: number, down: number, nearer = 1): void {
     this.turn(false);
     const offset = this.camera.position.clone().sub(this.controls.target);
@@ -133,7 +133,7 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** The atom under a point of the canvas, whose middle is (0, 0) and upper right corner (1, 1). */
+  /** Returns the atom under a point of the canvas, with (0, 0) in the middle and (1, 1) in the upper right corner. */
   pick(x: number, y: number): Hit | null {
     if (!this.loaded) return null;
     const caster = new Raycaster();
@@ -142,7 +142,7 @@ export class Viewer {
     return pick(this.loaded.geometry, this.loaded.matrix, caster.ray);
   }
 
-  /** Turns so that the surface of the atoms `first` to `last` faces the eye. False where they have none. */
+  /** Turns the surface of the atoms `first` to `last` to the camera. Returns false if they have none. */
   face(first: number, last: number): boolean {
     const place = this.loaded && placeOf(this.loaded.geometry, this.loaded.matrix, first, last);
     if (!place || !this.loaded) return false;
@@ -155,14 +155,14 @@ export class Viewer {
     return true;
   }
 
-  /** Where a place of the scene is on the canvas, in the coordinates of `pick`. */
+  /** Projects a point of the scene to the canvas, in the coordinates of `pick`. */
   project(place: Vector3): { x: number; y: number } {
     this.camera.updateMatrixWorld();
     const { x, y } = place.clone().project(this.camera);
     return { x, y };
   }
 
-  /** Marks atoms by their rows, both included; null marks none. */
+  /** Marks atoms by first and last row, inclusive; null marks none. */
   mark(which: "hovered" | "pinned", rows: [number, number] | null): void {
     const next = rows ?? [-2, -2];
     if (this.marked[which].every((row, i) => row === next[i])) return;
@@ -171,7 +171,7 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Colours by atom; null: one colour. */
+  /** Sets the colours per atom; null for one colour. */
   colour(texture: DataTexture | null, atoms: number): void {
     this.colors?.texture.dispose();
     this.colors = texture ? { texture, atoms } : null;
@@ -179,7 +179,7 @@ export class Viewer {
     this.invalidate();
   }
 
-  /** Colours of what is around, and of a surface without colours of its own. */
+  /** Sets the background, and the colour of a surface without atom colours. */
   theme(background: string, plain: string): void {
     this.haze = new Color(background);
     this.plain = new Color(plain);
@@ -192,12 +192,12 @@ export class Viewer {
     if (!this.options.transparent) this.renderer.setClearColor(this.haze, 1);
   }
 
-  /** Triangles that are drawn. */
+  /** Returns the number of drawn triangles. */
   get triangles(): number {
     return (this.loaded?.geometry.getIndex()?.count ?? 0) / 3;
   }
 
-  /** Waits until what was drawn is there: for measuring, as drawing goes on beside the script. */
+  /** Waits until drawing has finished, since the GPU works asynchronously. For measurements. */
   finish(): void {
     const gl = this.renderer.getContext();
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
@@ -225,7 +225,7 @@ export class Viewer {
     this.lastFrame = now;
     if (step < 500) this.slowness += 0.3 * (step - this.slowness);
     if (turning) this.controls.update(Math.min(step, 100) / 1000);
-    // Without a GPU a moving picture of fewer pixels is better than a jerking one; at rest it is sharp again.
+    // Without a GPU, a lower resolution keeps motion smooth. The full resolution returns at rest.
     const moving = step < 250;
     this.sharpen(moving && this.slowness > SLOW ? Math.max(0.5, Math.sqrt(SLOW / this.slowness)) : 1);
     this.renderer.render(this.scene, this.camera);
@@ -257,18 +257,18 @@ export class Viewer {
     const before = Math.min(1, this.camera.aspect);
     this.camera.aspect = clientWidth / clientHeight;
     this.camera.updateProjectionMatrix();
-    // A picture that becomes narrower still shows the whole.
+    // A narrower canvas still shows the whole surface.
     const nearer = before / Math.min(1, this.camera.aspect);
     if (nearer !== 1) this.camera.position.sub(this.controls.target).multiplyScalar(nearer).add(this.controls.target);
     this.clip();
-    // A canvas that has changed its size is empty until it is drawn.
+    // A resized canvas is empty until it is drawn.
     cancelAnimationFrame(this.frame);
     this.frame = 0;
     this.renderer.render(this.scene, this.camera);
     this.invalidate();
   }
 
-  /** Near and far, around what there is. */
+  /** Sets the near and far planes around the surface. */
   private clip(): void {
     if (!this.loaded) return;
     const { radius } = this.loaded.sphere;
@@ -279,7 +279,7 @@ export class Viewer {
     this.camera.updateProjectionMatrix();
   }
 
-  /** Gives the surface its colours and marks. */
+  /** Applies colours and marks to the surface. */
   private dress(): void {
     const material = this.mesh?.material as SurfaceMaterial | undefined;
     if (!material || !this.mesh) return;
@@ -298,7 +298,7 @@ export class Viewer {
   }
 }
 
-/** The radius in Å, where the file says its units. */
+/** Returns the radius in Å if the file states its units. */
 function radius(loaded: Loaded): number {
   const scale = Number(loaded.extras["unit_scale"] ?? 1);
   return loaded.sphere.radius * (Number.isFinite(scale) ? scale : 1);

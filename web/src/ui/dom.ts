@@ -1,8 +1,8 @@
-/** Elements. Text is never parsed as markup. */
+/** Helpers for elements and text. Text is never parsed as markup. */
 
 type Attributes = Record<string, string | boolean | number | undefined>;
 
-/** An element with attributes (`false` and undefined leave one out) and children. */
+/** Creates an element with children and attributes; `false` and undefined omit an attribute. */
 export function el<K extends keyof HTMLElementTagNameMap>(tag: K, attributes: Attributes = {}, ...children: (Node | string)[]): HTMLElementTagNameMap[K] {
   const node = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -12,7 +12,7 @@ export function el<K extends keyof HTMLElementTagNameMap>(tag: K, attributes: At
   return node;
 }
 
-/** The element with an id: the page has it, or is broken. */
+/** Returns the element with an id. Throws if the page lacks it. */
 export function $<T extends HTMLElement = HTMLElement>(id: string): T {
   const node = document.getElementById(id);
   if (!node) throw new Error(`the page has no #${id}`);
@@ -23,7 +23,7 @@ export function show(node: HTMLElement, visible: boolean): void {
   node.hidden = !visible;
 }
 
-/** A number for people, to `digits` significant digits. */
+/** Formats a number with at least `digits` significant digits. */
 export function number(value: number, digits = 4): string {
   return value.toLocaleString("en", { maximumSignificantDigits: Math.max(digits, Math.ceil(Math.log10(Math.abs(value) + 1))) });
 }
@@ -35,7 +35,7 @@ export function bytes(count: number): string {
   return `${count.toFixed(unit ? 1 : 0)} ${units[unit]}`;
 }
 
-/** Puts text on the clipboard, also where the page is not served over TLS. */
+/** Copies text to the clipboard, also without TLS. */
 export async function copy(text: string): Promise<void> {
   try {
     await navigator.clipboard.writeText(text);
@@ -46,6 +46,6 @@ export async function copy(text: string): Promise<void> {
     area.select();
     const done = document.execCommand("copy");
     area.remove();
-    if (!done) throw new Error("the browser does not let this page copy");
+    if (!done) throw new Error("the browser does not permit copying");
   }
 }

@@ -1,4 +1,4 @@
-/** One parameter as a control: slider, menu, switch, boxes or text, whatever its schema asks for. */
+/** Control of one parameter: slider, menu, switch, check boxes or text, depending on its schema. */
 
 import type { Parameter } from "../api/schema";
 import { el, number } from "./dom";
@@ -7,13 +7,13 @@ import { Scale } from "./scale";
 export interface Field {
   readonly parameter: Parameter;
   readonly element: HTMLElement;
-  /** The value that is set; none: the default. */
+  /** The value set by the user; undefined for the default. */
   value: string | undefined;
-  /** What the service took where nothing was set. */
+  /** Shows the value that the service used by default. */
   effective(value: string | number | undefined): void;
 }
 
-/** Called when a value is set or taken back (undefined); `live` while a slider is dragged. */
+/** Called when a value is set or reset (undefined); `live` while a slider is dragged. */
 export type Changed = (name: string, value: string | undefined, live: boolean) => void;
 
 export function field(parameter: Parameter, changed: Changed): Field {
@@ -26,10 +26,10 @@ export function field(parameter: Parameter, changed: Changed): Field {
 
 const title = (parameter: Parameter) => parameter.name.replaceAll("_", " ");
 
-/** What all have: a name, a description, a way back to the default. */
+/** Builds the common part of all controls: name, description and reset button. */
 function frame(parameter: Parameter, changed: Changed, group = false) {
   const id = `p-${parameter.name}`;
-  const reset = el("button", { type: "button", class: "reset", hidden: true, "aria-label": `Reset ${title(parameter)} to its default`, title: "Back to the default" }, "↺");
+  const reset = el("button", { type: "button", class: "reset", hidden: true, "aria-label": `Reset ${title(parameter)} to its default`, title: "Reset to default" }, "↺");
   const name = group ? el("span", { class: "name", id: `${id}-name` }, title(parameter)) : el("label", { class: "name", for: id }, title(parameter));
   const head = el("div", { class: "field-head" }, name, reset);
   const doc = el("p", { class: "doc", id: `${id}-doc` }, `${parameter.doc} Default: ${parameter.fallbackWords}.`);

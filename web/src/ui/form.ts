@@ -1,25 +1,25 @@
-/** All parameters: the ones that most people turn first, the others behind a fold, and those of pictures beside the download. */
+/** Form of all parameters: common ones first, others in a collapsed section, picture settings beside the download. */
 
 import type { Parameter } from "../api/schema";
 import type { Choices } from "../request";
 import { el } from "./dom";
 import { field, type Field } from "./field";
 
-/** How a mesh file is stored means nothing to a picture. */
+/** Storage parameters, which do not apply to pictures. */
 const STORAGE = ["compress", "normals", "units", "atom_ids"];
 
-/** Parameters whose values name parts of one structure, and mean nothing in another. */
+/** Parameters whose values name parts of one structure. */
 const PARTS = ["model", "chains", "altloc"];
 
-/** What stands on top. A parameter that is not named here is there as well, below. */
+/** Parameters at the top. Others follow below. */
 const FIRST = ["preset", "kernel", "resolution", "isovalue", "smoothness", "select", "chains"];
 
 export class Form {
   private readonly fields = new Map<string, Field>();
 
   /**
-   * Fills `home`, and `pictures` with what goes with one format alone; `changed` is told after every change, whether it changes
-   * the mesh, and whether a slider is still being dragged.
+   * Fills `home`, and `pictures` with parameters of single formats. Calls `changed` after every change and states whether
+   * it affects the mesh and whether a slider is still being dragged.
    */
   constructor(private readonly home: HTMLElement, pictures: HTMLElement, parameters: Parameter[], private readonly changed: (mesh: boolean, live: boolean) => void) {
     const first = parameters.filter((p) => FIRST.includes(p.name)).sort((a, b) => FIRST.indexOf(a.name) - FIRST.indexOf(b.name));
@@ -33,22 +33,22 @@ export class Form {
     if (others.length) home.append(el("details", { class: "more" }, el("summary", {}, `More parameters (${others.length})`), ...elements(others)));
   }
 
-  /** What is set, in the order of the description. */
+  /** Returns all set values, in the order of the document. */
   get all(): Choices {
     return new Map([...this.fields].flatMap(([name, { value }]) => (value === undefined ? [] : [[name, value]])));
   }
 
-  /** Those of `choices` that shape the mesh. */
+  /** Returns the values in `choices` that affect the mesh. */
   mesh(choices: Choices): Choices {
     return this.chosen(choices, (parameter) => parameter.format === "");
   }
 
-  /** Those of `choices` that go with one format alone. */
+  /** Returns the values in `choices` that apply to a single format. */
   apart(choices: Choices): Choices {
     return this.chosen(choices, (parameter) => parameter.format !== "");
   }
 
-  /** Those of `choices` that go with a file of `format`. */
+  /** Returns the values in `choices` that apply to a file of `format`. */
   of(format: string, choices: Choices): Choices {
     const isApart = [...this.fields.values()].some(({ parameter }) => parameter.format === format);
     return this.chosen(choices, ({ name, format: only }) => (only === "" && !(isApart && STORAGE.includes(name))) || only === format);
@@ -65,7 +65,7 @@ export class Form {
     return new Set(this.fields.keys());
   }
 
-  /** Sets a value, or takes it back. What cannot stand beside it is taken back. */
+  /** Sets or resets a value, and resets parameters that it excludes. */
   set(name: string, value: string | undefined, live = false): void {
     const field = this.fields.get(name);
     if (!field) return;
@@ -76,7 +76,7 @@ export class Form {
     this.changed(mesh, live);
   }
 
-  /** Sets values without telling. */
+  /** Sets all values without calling `changed`. */
   fill(choices: Choices): void {
     for (const [name] of this.fields) this.put(name, choices.get(name));
     if ([...choices.keys()].some((name) => this.fields.get(name)?.parameter.format === "" && !FIRST.includes(name))) this.home.querySelector("details")?.setAttribute("open", "");
@@ -87,7 +87,7 @@ export class Form {
     for (const name of PARTS) this.put(name, undefined);
   }
 
-  /** What the service took for what is not set, from a report. */
+  /** Shows the values from a report that the service used by default. */
   tell(report: Record<string, unknown>): void {
     for (const [name, { effective, parameter }] of this.fields) {
       const value = report[name];
@@ -96,7 +96,7 @@ export class Form {
     }
   }
 
-  /** What a text field stands for in this structure, such as its chains. */
+  /** Shows the meaning of an empty text field for this structure, such as its chains. */
   hint(name: string, words: string): void {
     this.fields.get(name)?.effective(words);
   }

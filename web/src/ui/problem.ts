@@ -1,12 +1,12 @@
-/** A refusal, in the words of the service, and what can be done about it. */
+/** Error message of the service with buttons for remedies. */
 
 import { type Problem } from "../api/problem";
 import { el } from "./dom";
 
 export interface Remedies {
-  /** Takes a spacing that fits. */
+  /** Applies a grid spacing that fits. */
   takeResolution(resolution: number): void;
-  /** Takes a parameter back to its default. */
+  /** Resets a parameter to its default. */
   reset(parameter: string): void;
   /** Tries again. */
   again(): void;

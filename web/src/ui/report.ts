@@ -1,4 +1,4 @@
-/** What is known of the surface that is shown: from the file itself at once, from the service's report soon after. */
+/** Report of the shown surface, first from the file, later from the service's report. */
 
 import { el, number } from "./dom";
 
@@ -24,7 +24,7 @@ export function report(home: HTMLElement, document: Report, timings: [string, nu
   const device = document["device"] ?? document["backend"];
   const parts: Node[] = [el("div", { class: "proof" }, ...proofs), el("table", {}, el("tbody", {}, ...rows))];
   if (device) parts.push(el("p", { class: "why" }, el("b", {}, String(document["backend"] ?? "")), ` ${String(document["device"] ?? "")}`, ...(document["backend_reason"] ? [` (${String(document["backend_reason"])})`] : [])));
-  if (document["fallback"]) parts.push(el("p", { class: "why" }, `Stood in: ${String(document["fallback"])}`));
+  if (document["fallback"]) parts.push(el("p", { class: "why" }, `Fallback: ${String(document["fallback"])}`));
   if (timings.length) {
     const most = Math.max(...timings.map(([, ms]) => ms), 1e-3);
     const bars = timings.map(([stage, ms]) =>
@@ -38,7 +38,7 @@ export function report(home: HTMLElement, document: Report, timings: [string, nu
   home.replaceChildren(...parts);
 }
 
-/** The stages of `Server-Timing`, or of a report. */
+/** Returns the stage times of a report, or of `Server-Timing`, ms. */
 export function timingsOf(headers: Headers, document?: Report): [string, number][] {
   const told = document?.["timings_ms"];
   if (told && typeof told === "object") return Object.entries(told as Record<string, number>);

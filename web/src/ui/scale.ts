@@ -1,4 +1,4 @@
-/** Where values stand on a slider: by their logarithm where the span is wide and positive. */
+/** Mapping between values and slider positions, logarithmic if the range is wide and positive. */
 
 export const STEPS = 1000;
 
@@ -9,7 +9,7 @@ export class Scale {
     this.logarithmic = low > 0 && high / low >= 8;
   }
 
-  /** Steps of the slider. */
+  /** Number of steps of the slider. */
   get steps(): number {
     const span = this.high - this.low;
     return this.whole && !this.logarithmic && span <= STEPS ? span : STEPS;
@@ -19,7 +19,7 @@ export class Scale {
     const t = position / this.steps;
     const raw = this.logarithmic ? this.low * (this.high / this.low) ** t : this.low + (this.high - this.low) * t;
     if (this.whole) return Math.round(raw);
-    // Three digits are what a hand can set.
+    // Dragging cannot set more than three digits.
     const digits = this.logarithmic ? Number(raw.toPrecision(3)) : Number(raw.toFixed(Math.max(0, 2 - Math.floor(Math.log10(this.high - this.low)))));
     return Math.min(this.high, Math.max(this.low, digits));
   }

@@ -1,13 +1,13 @@
-/** Light and dark: as the system has it, until the button says otherwise. */
+/** Light or dark colours: the system setting, or the choice of the user. */
 
 import { $ } from "./dom";
 
 type Choice = "system" | "light" | "dark";
 const KEY = "molmesh-theme";
 const NEXT: Record<Choice, Choice> = { system: "light", light: "dark", dark: "system" };
-const SAID: Record<Choice, [string, string]> = { system: ["◐", "as the system has them"], light: ["☀", "light"], dark: ["☾", "dark"] };
+const SAID: Record<Choice, [string, string]> = { system: ["◐", "system setting"], light: ["☀", "light"], dark: ["☾", "dark"] };
 
-/** Applies the choice; `changed` is told whenever colours change, and once now. */
+/** Applies the choice. Calls `changed` now and whenever colours change. */
 export function theme(changed: () => void): void {
   const button = $("theme");
   const dark = matchMedia("(prefers-color-scheme: dark)");
@@ -26,7 +26,7 @@ export function theme(changed: () => void): void {
     try {
       localStorage.setItem(KEY, choice);
     } catch {
-      // Without storage the choice lasts as long as the page.
+      // Without storage, the choice lasts until the page is closed.
     }
     apply();
   });
@@ -43,7 +43,7 @@ function kept(): Choice {
   }
 }
 
-/** A colour of the style sheet. */
+/** Returns a colour of the style sheet. */
 export function color(name: string): string {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
