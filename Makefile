@@ -78,8 +78,8 @@ gallery: release ## Draw docs/gallery; DATA=FOLDER holds the structures, named b
 	docs/gallery/make.py $(if $(DATA),--data $(DATA))
 
 # The results of other machines lie in docs/results/paper too: `molmesh bench paper --out FOLDER` writes them.
-figures: ## The tables of docs/paper.md and its figures, from docs/results/paper
-	$(CARGO) run --bin molmesh -- bench figures docs/results/paper --out docs/figures --page docs/paper.md
+figures: ## The tables of docs/research/paper.md and its figures, from docs/results/paper
+	$(CARGO) run --bin molmesh -- bench figures docs/results/paper --out docs/figures --page docs/research/paper.md
 
 release: web-if-possible ## Build the optimised binary, target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh

@@ -246,7 +246,7 @@ fn shown(key: &str, n: u64) -> String {
 
 #[test]
 fn the_operators_table_is_the_list() {
-    let page = read("docs/operations.md");
+    let page = read("docs/operate/limits.md");
     assert_eq!(differences(&page), Vec::<String>::new());
     // The control: another default, a row too few.
     assert_eq!(differences(&page.replace("| 1,024 |", "| 1,025 |")).len(), 1);

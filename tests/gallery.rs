@@ -20,7 +20,7 @@ fn docs() -> PathBuf {
 
 /// The pictures that a page shows.
 fn shown(page: &str) -> BTreeSet<String> {
-    let links = page.split("](gallery/").skip(1).filter_map(|rest| rest.split(')').next());
+    let links = page.split("](../gallery/").skip(1).filter_map(|rest| rest.split(')').next());
     links.map(str::to_owned).collect()
 }
 
@@ -54,20 +54,20 @@ fn pixels(path: &Path) -> (u32, u32, Vec<u8>) {
 
 #[test]
 fn the_page_shows_the_pictures_that_there_are() {
-    let page = fs::read_to_string(docs().join("gallery.md")).unwrap();
+    let page = fs::read_to_string(docs().join("research/gallery.md")).unwrap();
     assert_eq!(faults(&page), Vec::<String>::new());
     let named = shown(&page);
     assert!(named.len() >= 12, "{named:?}");
     let bytes: u64 = named.iter().map(|name| fs::metadata(docs().join("gallery").join(name)).unwrap().len()).sum();
     assert!(bytes <= MOST, "{bytes} bytes");
     // The controls: a picture that is not there, one that nobody shows, one without its command.
-    assert_eq!(faults(&page.replace("](gallery/4pti-gaussian.png)", "](gallery/none.png)")).len(), 3);
+    assert_eq!(faults(&page.replace("](../gallery/4pti-gaussian.png)", "](../gallery/none.png)")).len(), 3);
     assert_eq!(faults(&page.replace("FILE -o 4pti-gaussian.png", "FILE -o it")).len(), 1);
 }
 
 #[test]
 fn the_command_beside_a_picture_draws_it() {
-    let page = fs::read_to_string(docs().join("gallery.md")).unwrap();
+    let page = fs::read_to_string(docs().join("research/gallery.md")).unwrap();
     let folder = Folder::new();
     let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/4pti.pdb");
     let draw = |picture: &str| {

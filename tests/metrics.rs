@@ -1,4 +1,4 @@
-//! Every metric of the service, moved: a row for each says what moves it. The table of `docs/operations.md` is made of the same
+//! Every metric of the service, moved: a row for each says what moves it. The table of `docs/operate/monitoring.md` is made of the same
 //! descriptions (`MOLMESH_BLESS=1` writes it).
 #![cfg(feature = "server")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
@@ -347,7 +347,7 @@ fn table() -> String {
 #[test]
 fn the_documentation_lists_every_metric() {
     const MARKS: [&str; 2] = ["<!-- metrics -->\n", "<!-- end of metrics -->"];
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/operations.md");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/operate/monitoring.md");
     let text = std::fs::read_to_string(&path).unwrap();
     let (before, rest) = text.split_once(MARKS[0]).unwrap();
     let (listed, after) = rest.split_once(MARKS[1]).unwrap();

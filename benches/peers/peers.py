@@ -6,7 +6,7 @@
 
 Needs `cargo build --release`, Python 3.11, and what the registries of each program need (cargo, npm, apt-get); programs that
 are absent are installed into target/peers. What cannot be installed, fails or takes too long has its row with the reason.
-Every run is a whole process, from a file to a file. docs/peers.md says what is compared with what.
+Every run is a whole process, from a file to a file. docs/research/peers.md says what is compared with what.
 """
 
 import argparse
@@ -40,12 +40,12 @@ def options():
     parser.add_argument("--json", type=Path, help="write the figures there")
     parser.add_argument("--page", type=Path, help="write the tables there, between its markers")
     parser.add_argument("--note", default="", help="a sentence for the tables' header: who else used the machine, say")
-    parser.add_argument("--publish", action="store_true", help="--json docs/results/peers.json --page docs/peers.md")
+    parser.add_argument("--publish", action="store_true", help="--json docs/results/peers.json --page docs/research/peers.md")
     given = parser.parse_args()
     if given.rounds < 1 or given.limit <= 0 or given.spacing <= 0:
         parser.error("--rounds, --limit and --spacing must be positive")
     if given.publish:
-        given.json, given.page = ROOT / "docs/results/peers.json", ROOT / "docs/peers.md"
+        given.json, given.page = ROOT / "docs/results/peers.json", ROOT / "docs/research/peers.md"
     return given
 
 

@@ -139,14 +139,15 @@ def overview(result):
 def page(result):
     """All of it as Markdown, machine and versions first."""
     machine = result["machine"]
-    versions = "; ".join(version for version in dict.fromkeys(result["versions"].values()) if version)
+    versions = [version for version in dict.fromkeys(result["versions"].values()) if version]
     loads = [machine["load"], *(s["load"] for s in result["structures"] if "load" in s)]
     note = f" {result['note']}" if result.get("note") else ""
     load = f"load {loads[0]:.1f} at the start" if len(loads) == 1 else f"load between {min(loads):.1f} and {max(loads):.1f}"
     parts = [
-        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB, {machine['system']}; {load}."
-        f" {result['date']}, grid {result['spacing']:g} Å, {result['rounds']} rounds after"
-        f" one that is not timed, {result['limit']:g} s a run at most.{note} {versions}.",
+        f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']:.0f} GB, {machine['system']}; {load}.",
+        f"{result['date']}, grid {result['spacing']:g} Å, {result['rounds']} rounds after"
+        f" one that is not timed, {result['limit']:g} s a run at most.{note}",
+        "\n".join(f"- {version}" for version in versions),
         overview(result),
     ]
     for structure in result["structures"]:

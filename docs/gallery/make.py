@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws the gallery anew: docs/gallery/*.png and the table of docs/gallery.md.
+"""Draws the gallery anew: docs/gallery/*.png and the table of docs/research/gallery.md.
 
     docs/gallery/make.py --data FOLDER [--binary target/release/molmesh] [--only 4PTI]
 
@@ -16,7 +16,7 @@ import sys
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
-PAGE = HERE.parent / "gallery.md"
+PAGE = HERE.parent / "research" / "gallery.md"
 BEGIN, END = "<!-- pictures: docs/gallery/make.py writes from here -->\n", "<!-- to here -->\n"
 KERNELS = ["gaussian", "soft-object", "inverse-square"]
 VIEW = ["--width", "320", "--height", "240", "--background", "white"]
@@ -73,7 +73,7 @@ def section(pdb_id, about, reports):
     atoms = reports[0][3]["atoms"]
     lines = [f"### {pdb_id}", "", f"{about[0].upper()}{about[1:]}. {atoms:,} atoms.", ""]
     lines += ["| " + " | ".join(kernel for kernel, *_ in reports) + " |", "|" + "---|" * len(reports)]
-    lines.append("| " + " | ".join(f"![{pdb_id}, {kernel}](gallery/{p.name})" for kernel, _, p, _ in reports) + " |")
+    lines.append("| " + " | ".join(f"![{pdb_id}, {kernel}](../gallery/{p.name})" for kernel, _, p, _ in reports) + " |")
     lines += ["", "| kernel | spacing Å | triangles | area Å² | volume Å³ | Å a pixel | command |", "|---|---|---|---|---|---|---|"]
     for kernel, flags, picture, report in reports:
         cells = [
@@ -100,7 +100,7 @@ def main():
     if args.more:
         list(rows(args.binary, args.data, MORE, ROOT / "build" / "gallery", args.only))
     if len(drawn) < len(SHOWN):
-        print("docs/gallery.md is left as it is: not every entry was drawn")
+        print("docs/research/gallery.md is left as it is: not every entry was drawn")
         return
     before, rest = PAGE.read_text().split(BEGIN)
     after = rest.split(END)[1]

@@ -80,7 +80,7 @@ pub(super) fn machine(document: &Document) -> String {
         None => "GPU: not run".to_owned(),
     };
     format!(
-        "Measured with molmesh {} on {}: {cpu}, {} cores ({} threads){memory}, {}. {device}. Medians.\n",
+        "Measured with molmesh {} on {}:\n{cpu}, {} cores ({} threads){memory}, {}.\n{device}. Medians.\n",
         document.version, document.date, m.cores, m.threads, m.os
     )
 }
@@ -230,7 +230,8 @@ fn roofline(all: &[Roofline]) -> String {
     for one in all {
         _ = writeln!(
             text,
-            "{}; the device measured: {:.2} TB/s of memory, {:.2} T multiply-adds/s. Registers and workgroups in flight: the driver does not tell through wgpu.\n\n\
+            "{}.\nMeasured rates of the device: {:.2} TB/s of memory, {:.2} T multiply-adds/s.\n\
+             wgpu does not report registers and workgroups in flight.\n\n\
              | program | stage | threads a workgroup | shared memory | workgroups | time | bytes at least | multiply-adds at least | of the memory rate | of the arithmetic |\n\
              |---|---|---|---|---|---|---|---|---|---|",
             one.structure,
