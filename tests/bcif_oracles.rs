@@ -1,14 +1,13 @@
-//! BinaryCIF against others: what biotite writes with each encoding, and what an archive wrote, has to be read as the text
-//! is, and gemmi has to count the same in the text. The mesh of a binary file is that of the text, byte for byte.
+//! BinaryCIF compared with other programs. Files written by biotite with each encoding, and files of the PDB archive,
+//! must have the same content as the text. gemmi must count the same atoms, and meshes must be equal byte for byte.
 //!
-//! biotite and gemmi come from `tests/tools/setup.sh`. Where a folder of structures lies beside the repository, its files
-//! take part.
+//! `tests/tools/setup.sh` installs biotite and gemmi. The test also uses a folder of structures beside the repository.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
     clippy::print_stderr,
-    reason = "tests fail by panicking and say aloud what they skip"
+    reason = "tests fail by panicking and print what they skip"
 )]
 
 mod bcif_support;
@@ -31,12 +30,12 @@ fn structure(path: &Path) -> Structure {
     read(&bytes, &ReadLimits::default()).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The structure without what says where it came from.
+/// Returns the structure without the fields that depend on the source format.
 fn anonymous(structure: &Structure) -> Structure {
     Structure { format: SourceFormat::Pdb, ..structure.clone() }
 }
 
-/// A file of the folder beside the repository.
+/// Returns a file of the folder beside the repository.
 fn beside(name: &str) -> Option<PathBuf> {
     let path = Path::new(FOLDER).join(name);
     let there = path.is_file();
@@ -52,7 +51,7 @@ fn sources() -> Vec<PathBuf> {
     [PathBuf::from("samples/1crn.cif")].into_iter().chain(more).collect()
 }
 
-/// The file of a mesh, without what says where it came from.
+/// Returns a mesh file without the fields that depend on the source format.
 fn mesh(structure: &Structure) -> Vec<u8> {
     let spheres = select(structure, &Selection::default()).unwrap().spheres(structure).unwrap();
     let params = SurfaceParams::new(&SurfaceOptions { resolution: Some(1.0), ..SurfaceOptions::default() }).unwrap();
@@ -63,7 +62,7 @@ fn mesh(structure: &Structure) -> Vec<u8> {
     bytes
 }
 
-/// What the writer says of a file.
+/// Summary that the writer prints.
 #[derive(Debug, Deserialize)]
 struct Written {
     atoms: usize,
@@ -76,14 +75,14 @@ fn farthest(a: &Structure, b: &Structure) -> f64 {
     pairs.map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
 
-/// The structure with the real numbers of another one.
+/// Returns the structure with the real numbers of another one.
 fn with_numbers_of(a: &Structure, b: &Structure) -> Structure {
     let (x, y, z) = (b.x.clone(), b.y.clone(), b.z.clone());
     Structure { x, y, z, occupancy: b.occupancy.clone(), b_factor: b.b_factor.clone(), ..anonymous(a) }
 }
 
 #[test]
-fn what_biotite_writes_is_read_as_the_text_is() {
+fn files_of_biotite_have_the_content_of_the_text() {
     let folder = tempfile::tempdir().unwrap();
     let mut lines = Vec::new();
     let mut files = Vec::new();
@@ -114,7 +113,7 @@ fn what_biotite_writes_is_read_as_the_text_is() {
             "quantized" => {
                 let range =
                     |v: &[f64]| v.iter().fold(f64::MIN, |a, b| a.max(*b)) - v.iter().fold(f64::MAX, |a, b| a.min(*b));
-                // That writer takes the step above a value, not the nearest.
+                // biotite rounds up to the next step, not to the nearest.
                 let step = [&text.x, &text.y, &text.z].map(|v| range(v) / 1e6).into_iter().fold(0.0, f64::max);
                 let far = farthest(&text, &binary);
                 assert!(far > 0.0 && far <= step * 1.000_001, "{what}: {far} Å, a step is {step}");
@@ -127,7 +126,7 @@ fn what_biotite_writes_is_read_as_the_text_is() {
                 }
             }
         }
-        // Control: one thousandth of an ångström in one atom is seen, by the atoms and by the mesh.
+        // Control: moving one atom by 0.001 Å changes atoms and mesh.
         let mut moved = text.clone();
         let last = select(&text, &Selection::default()).unwrap().atoms.last().map_or(0, |&i| i as usize);
         moved.x[last] += 0.001;
@@ -142,7 +141,7 @@ fn what_biotite_writes_is_read_as_the_text_is() {
     assert_eq!(encodings, all.map(str::to_owned).into());
 }
 
-/// Atoms of the first model by chain and element.
+/// Counts the atoms of the first model by chain and element.
 type Counts = BTreeMap<(String, u8), usize>;
 
 fn counts(structure: &Structure) -> Counts {
@@ -153,7 +152,7 @@ fn counts(structure: &Structure) -> Counts {
     counts
 }
 
-/// What gemmi counts in a text.
+/// Counts the atoms of a text with gemmi.
 fn gemmi_counts(python: &Path, file: &Path) -> Counts {
     let output = Command::new(python).arg("tests/tools/gemmi_dump.py").arg(file).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -166,7 +165,7 @@ fn gemmi_counts(python: &Path, file: &Path) -> Counts {
 }
 
 #[test]
-fn gemmi_counts_the_same_in_the_text() {
+fn gemmi_counts_the_same_atoms() {
     let Some(python) = tools::python_interpreter() else {
         return tools::missing::<()>("gemmi").unwrap_or_default();
     };
@@ -189,7 +188,7 @@ fn the_committed_file_is_the_sample() {
     assert!(mesh(&text) == mesh(&binary));
 }
 
-/// `1gbt` as the archive distributes it, written by the tools of those who defined the format.
+/// `1gbt` as distributed by the archive, written by the reference implementation.
 #[test]
 fn an_entry_of_the_archive_is_the_same_in_both_formats() {
     let Some((text, binary)) = beside("1gbt.cif.gz").zip(beside("1gbt.bcif.gz")) else { return };

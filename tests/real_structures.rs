@@ -1,15 +1,10 @@
-//! Real structures from end to end: every kernel gives a closed, oriented manifold, by our exact check and by trimesh;
-//! the same bytes with 1, 2 and 7 threads; the same surface with the atoms permuted; clean glTF.
+//! End-to-end tests of real structures. Every kernel yields a closed, oriented manifold by the exact check and by
+//! trimesh; the same bytes with 1, 2 and 7 threads; the same surface with permuted atoms; valid glTF.
 //!
-//! The samples of the product always run. Where a folder of structures lies beside the repository, they run too: those
-//! of up to [`EVERYDAY`] atoms on every run, all of them with `MOLMESH_ALL_STRUCTURES=1`.
+//! The samples always run. Structures in a folder beside the repository run too: those of up to [`EVERYDAY`] atoms on
+//! every run, all of them with `MOLMESH_ALL_STRUCTURES=1`.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::print_stderr,
-    reason = "a test says what it expects by panicking"
-)]
+#![expect(clippy::unwrap_used, clippy::panic, clippy::print_stderr, reason = "tests fail by panicking")]
 
 mod tools;
 
@@ -21,12 +16,12 @@ use molmesh::surface::{
     Backend, Control, CpuBackend, Kernel, Measures, Mesh, Proof, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
 };
 
-/// Structures with at most this many selected atoms take part in every run.
+/// Largest number of selected atoms of structures that run every time.
 const EVERYDAY: usize = 5_000;
-/// Meshes of more triangles than this are checked by our exact check alone: trimesh takes a kilobyte for each.
+/// Largest number of triangles for trimesh, which takes 1 KiB per triangle. The exact check covers larger meshes.
 const TRIMESH_LIMIT: usize = 6_000_000;
 
-/// Files that must be refused, with the reason.
+/// Files that must be rejected, with the reason.
 const REFUSED: &[(&str, &str)] = &[("2ins_header_only.pdb.gz", "no atoms")];
 
 struct Case {
@@ -46,7 +41,7 @@ fn folders() -> Vec<PathBuf> {
     folders
 }
 
-/// Every structure at hand that has atoms to mesh, smallest first; asserts that the others are refused as expected.
+/// Returns all available structures with atoms, smallest first. Asserts that the others are rejected as expected.
 fn cases() -> Vec<Case> {
     let all = std::env::var_os("MOLMESH_ALL_STRUCTURES").is_some();
     let mut cases = Vec::new();
@@ -101,7 +96,7 @@ fn gcd(a: usize, b: usize) -> usize {
 }
 
 #[test]
-fn every_structure_and_kernel_gives_a_closed_oriented_manifold() {
+fn every_structure_and_kernel_yields_a_closed_oriented_manifold() {
     let dir = tempfile::tempdir().unwrap();
     for case in cases() {
         let mut files = Vec::new();
@@ -147,7 +142,7 @@ fn every_structure_and_kernel_gives_a_closed_oriented_manifold() {
     }
 }
 
-/// Share of vertices whose normal points to the same side as the area-weighted mean of their faces.
+/// Returns the fraction of vertices whose normal points to the same side as the area-weighted mean of their faces.
 fn outward(mesh: &Mesh) -> f64 {
     let mut mean = vec![[0.0_f64; 3]; mesh.n_vertices()];
     for t in &mesh.triangles {
@@ -182,7 +177,7 @@ fn the_same_bytes_with_1_2_and_7_threads_and_the_same_surface_permuted() {
 }
 
 #[test]
-fn every_structure_gives_clean_gltf() {
+fn every_structure_yields_valid_gltf() {
     let dir = tempfile::tempdir().unwrap();
     let mut paths = Vec::new();
     for case in cases() {

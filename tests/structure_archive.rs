@@ -1,10 +1,10 @@
-//! A folder of entries, and what must not come out of it.
+//! The local archive folder: layouts, limits, and protection against links that lead outside.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
     clippy::print_stderr,
-    reason = "tests fail by panicking and say aloud what they skip"
+    reason = "tests fail by panicking and print what they skip"
 )]
 
 use std::fs;
@@ -23,7 +23,7 @@ fn put(root: &Path, file: &str) {
 }
 
 #[test]
-fn ids_are_validated_and_lowered() {
+fn validates_ids_and_converts_them_to_lower_case() {
     for (text, canonical) in [
         ("4pti", "4pti"),
         ("4PTI", "4pti"),
@@ -67,7 +67,7 @@ fn ids_are_validated_and_lowered() {
 }
 
 #[test]
-fn every_layout_is_found_mmcif_first() {
+fn finds_every_layout_and_prefers_mmcif() {
     let files = [
         "1abc.cif",
         "ab/1abc.cif",
@@ -112,7 +112,7 @@ fn every_layout_is_found_mmcif_first() {
 }
 
 #[test]
-fn what_is_not_there_is_not_found_by_id() {
+fn reports_missing_entries_by_id() {
     let dir = tempfile::tempdir().unwrap();
     fs::create_dir(dir.path().join("1abc.cif")).unwrap();
     fs::write(dir.path().join("ab"), "a file where a folder would be").unwrap();
@@ -125,7 +125,7 @@ fn what_is_not_there_is_not_found_by_id() {
 }
 
 #[test]
-fn files_are_limited_in_size() {
+fn limits_file_sizes() {
     let dir = tempfile::tempdir().unwrap();
     put(dir.path(), "1abc.cif");
     let archive = Archive::new(dir.path());
@@ -136,7 +136,7 @@ fn files_are_limited_in_size() {
 
 #[cfg(unix)]
 #[test]
-fn links_may_not_lead_out() {
+fn ignores_links_that_lead_outside() {
     use std::os::unix::fs::symlink;
     let outside = tempfile::tempdir().unwrap();
     put(outside.path(), "secret");
@@ -160,7 +160,7 @@ fn links_may_not_lead_out() {
 
 #[cfg(unix)]
 #[test]
-fn a_pipe_is_no_file() {
+fn ignores_named_pipes() {
     let dir = tempfile::tempdir().unwrap();
     let made = std::process::Command::new("mkfifo").arg(dir.path().join("1abc.cif")).status();
     if !made.is_ok_and(|s| s.success()) {

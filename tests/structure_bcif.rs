@@ -1,5 +1,5 @@
-//! BinaryCIF: every encoding against arrays computed by hand, what the columns mean against the same values in text, and
-//! files that lie.
+//! BinaryCIF: encodings compared with arrays computed by hand, columns compared with the same values in text, and
+//! inconsistent files.
 #![allow(clippy::pedantic, clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod bcif_support;
@@ -16,18 +16,18 @@ fn refusal(bytes: &[u8]) -> String {
     read(bytes, &ReadLimits::default()).expect_err("a refusal").to_string()
 }
 
-/// The structure without what says where it came from.
+/// Returns the structure without the fields that depend on the source format.
 fn anonymous(structure: Structure) -> Structure {
     Structure { format: SourceFormat::Pdb, ..structure }
 }
 
 // ---- encodings ----
 
-/// What it shows, data, its encodings, and what they hold.
+/// Description, data, encodings, and expected values.
 type Case<T> = (&'static str, Vec<u8>, Vec<Pack>, Vec<T>);
 
 #[test]
-fn whole_numbers_by_every_chain() {
+fn decodes_integers_of_every_encoding() {
     let cases: Vec<Case<i32>> = vec![
         ("Int8", vec![0xFF, 0x80, 0x7F], vec![byte_array(1)], vec![-1, -128, 127]),
         ("Int16", i16s(&[-2, 300, -32768]), vec![byte_array(2)], vec![-2, 300, -32768]),
@@ -35,7 +35,7 @@ fn whole_numbers_by_every_chain() {
         ("Uint8", vec![0xFF, 0x80, 0], vec![byte_array(4)], vec![255, 128, 0]),
         ("Uint16", i16s(&[-1, 1, 256]), vec![byte_array(5)], vec![65_535, 1, 256]),
         ("Uint32", i32s(&[i32::MAX, 0, 9]), vec![byte_array(6)], vec![i32::MAX, 0, 9]),
-        // The specification's own examples.
+        // Examples of the specification.
         ("Delta", i32s(&[0, 3, 2, 1]), vec![delta(1000), byte_array(3)], vec![1000, 1003, 1005, 1006]),
         ("RunLength", i32s(&[1, 3, 2, 1, 3, 2]), vec![run_length(6), byte_array(3)], vec![1, 1, 1, 2, 3, 3]),
         (
@@ -44,7 +44,7 @@ fn whole_numbers_by_every_chain() {
             vec![packing(1, false, 4), byte_array(1)],
             vec![1, 2, -3, 128],
         ),
-        // Limits are followed by what is missing, be it nothing.
+        // A limit value is always followed by the remainder, even if that is 0.
         (
             "IntegerPacking, limits",
             vec![127, 0, 0x80, 0, 0x80, 0xFF, 127, 127, 5, 0x80, 0x80, 0x80, 0xFE],
@@ -80,7 +80,7 @@ fn whole_numbers_by_every_chain() {
         let n = expected.len();
         let s = bcif(&atoms(n, vec![column("auth_seq_id", data.clone(), chain.clone())]));
         assert_eq!(s.residue_number, expected, "{name}");
-        // Control: one byte more or less is another array, or none.
+        // Control: one byte more or less yields another array or an error.
         for changed in [&data[..data.len() - 1], &[&data[..], &[1]].concat()] {
             let other =
                 read(&atoms(n, vec![column("auth_seq_id", changed.to_vec(), chain.clone())]), &ReadLimits::default());
@@ -90,13 +90,13 @@ fn whole_numbers_by_every_chain() {
 }
 
 #[test]
-fn real_numbers_by_every_chain() {
+fn decodes_real_numbers_of_every_encoding() {
     let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let doubles = |values: &[f64]| values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>();
     let cases: Vec<Case<f64>> = vec![
         ("Float32", floats(&[0.1, -2.5]), vec![byte_array(32)], vec![f64::from(0.1_f32), -2.5]),
         ("Float64", doubles(&[0.1, 1e-300]), vec![byte_array(33)], vec![0.1, 1e-300]),
-        // To the last bit what the text would say.
+        // Bit-identical to the text.
         (
             "FixedPoint",
             i32s(&[120, 123, -99_999_999]),
@@ -120,7 +120,7 @@ fn real_numbers_by_every_chain() {
     ];
     for (name, data, chain, expected) in cases {
         if name == "FixedPoint" {
-            // Beyond what a coordinate may be.
+            // Outside the range of coordinates.
             let s = bcif(&atoms(3, vec![column("B_iso_or_equiv", data, chain)]));
             assert_eq!(s.b_factor, expected.iter().map(|&v| v as f32).collect::<Vec<_>>(), "{name}");
         } else {
@@ -128,32 +128,32 @@ fn real_numbers_by_every_chain() {
             assert_eq!(s.x, expected, "{name}");
         }
     }
-    // A number may be written as a text in a binary file, too.
+    // Binary files may store numbers as text.
     let s = bcif(&atoms(2, vec![texts("Cartn_x", &["1.234(5)", "-7"]), texts("auth_seq_id", &["-3", "12"])]));
     assert_eq!((s.x, s.residue_number), (vec![1.234, -7.0], vec![-3, 12]));
 }
 
 #[test]
-fn texts_by_number() {
-    // The specification's own example: a, AB, a.
+fn decodes_texts() {
+    // Example of the specification: a, AB, a.
     let chain = vec![string_array("aAB", &[0, 1, 3], vec![byte_array(4)])];
     let s = bcif(&atoms(3, vec![column("auth_asym_id", vec![0, 1, 0], chain)]));
     assert_eq!((0..3).map(|i| s.chain.get(i)).collect::<Vec<_>>(), ["a", "AB", "a"]);
-    // Numbers of texts are encoded themselves; -1 is none; what nobody refers to may be there.
+    // Text ids are encoded too. -1 means no value. Unused texts are allowed.
     let chain = vec![string_array("XYZ", &[0, 1, 2, 3], vec![run_length(5), byte_array(3)])];
     let s = bcif(&atoms(5, vec![column("label_atom_id", i32s(&[2, 2, -1, 1, 0, 2]), chain)]));
     assert_eq!((0..5).map(|i| s.name.get(i)).collect::<Vec<_>>(), ["Z", "Z", "", "X", "X"]);
     // Offsets count UTF-16 code units, not bytes.
     let s = bcif(&atoms(3, vec![texts("auth_asym_id", &["é€", "𝄞A", "B"])]));
     assert_eq!((0..3).map(|i| s.chain.get(i)).collect::<Vec<_>>(), ["é€", "𝄞A", "B"]);
-    // Whole numbers where texts are meant are written out.
+    // Integers in text columns are converted to text.
     let s = bcif(&atoms(4, vec![ints("auth_asym_id", &[7, 7, -12, 7])]));
     assert_eq!((0..4).map(|i| s.chain.get(i)).collect::<Vec<_>>(), ["7", "7", "-12", "7"]);
 }
 
 // ---- meaning ----
 
-/// A table of `atom_site` as text and as BinaryCIF; `?` and `.` become masks.
+/// Writes a table of `atom_site` as text and as BinaryCIF. `?` and `.` become masks.
 fn both(items: &[&str], rows: &[&[&str]]) -> (String, Vec<u8>) {
     let tags: String = items.iter().map(|item| format!("_atom_site.{item}\n")).collect();
     let lines: String = rows.iter().map(|row| row.join(" ") + "\n").collect();
@@ -203,7 +203,7 @@ const ITEMS: [&str; 19] = [
 ];
 
 #[test]
-fn columns_mean_what_they_mean_in_text() {
+fn columns_have_the_same_meaning_as_in_text() {
     let rows: [&[&str]; 6] = [
         &[
             "HETATM", "C", "C1", "C1'", "A", "LIG", "LIG", "AA", "Bb", "12", "-3", "C", "11.104", "-6.134", "0.5",
@@ -259,14 +259,14 @@ fn columns_mean_what_they_mean_in_text() {
         let (from_text, from_binary) = (bcif(text.as_bytes()), bcif(&binary));
         assert_eq!((from_text.format.name(), from_binary.format.name()), ("mmcif", "bcif"));
         assert_eq!(anonymous(from_text.clone()), anonymous(from_binary), "without {left_out:?}");
-        // Control: another value is seen.
+        // Control: a changed value is detected.
         let (other, _) = both(&items, &rows[1..].iter().map(Vec::as_slice).collect::<Vec<_>>());
         assert_ne!(anonymous(from_text), anonymous(bcif(other.as_bytes())));
     }
 }
 
 #[test]
-fn what_text_refuses_is_refused_with_the_same_words() {
+fn rejects_the_same_values_as_text_with_the_same_message() {
     let good = [
         "HETATM", "C", "C1", "C1'", "A", "LIG", "LIG", "AA", "Bb", "12", "-3", "C", "11.104", "-6.134", "0.5", "0.5",
         "20.25", "2", "?",
@@ -302,7 +302,7 @@ fn what_text_refuses_is_refused_with_the_same_words() {
 }
 
 #[test]
-fn values_that_do_not_matter_for_a_mesh_are_warnings() {
+fn unreadable_optional_values_are_warnings() {
     let warnings = |column: Pack| bcif(&atoms(2, vec![column])).warnings.join("\n");
     for (column, said) in [
         (reals("occupancy", &[1.0, f64::NAN]), "occupancy, row 2: found NaN, expected an occupancy, ? or .; read as 1"),
@@ -318,7 +318,7 @@ fn values_that_do_not_matter_for_a_mesh_are_warnings() {
 }
 
 #[test]
-fn entities_or_sequence_numbers_tell_which_hetatm_records_are_polymer() {
+fn entities_or_sequence_numbers_decide_which_hetatm_records_are_polymer() {
     let site = |numbers: Pack| {
         let group = texts("group_PDB", &["HETATM", "HETATM"]);
         let names = texts("auth_comp_id", &["MSE", "LIG"]);
@@ -340,11 +340,11 @@ fn entities_or_sequence_numbers_tell_which_hetatm_records_are_polymer() {
         (vec![Kind::Ligand; 2], none.clone()),
         "all are numbered"
     );
-    // The entities decide, wherever they stand.
+    // The entities decide, wherever they are in the file.
     let known = [site(numbered()), entity(&["water", "polymer"]), asym(2)];
     assert_eq!(kinds(known.to_vec()), (second.clone(), none.clone()));
     assert_eq!(kinds(known.into_iter().rev().collect()), (second, none));
-    // Entities that cannot be read do not cost the atoms.
+    // Unreadable entities do not affect the atoms.
     let (found, warning) = kinds(vec![site(numbered()), entity(&["water", "polymer"]), asym(3)]);
     assert_eq!(found, first);
     assert!(
@@ -357,13 +357,13 @@ fn entities_or_sequence_numbers_tell_which_hetatm_records_are_polymer() {
 fn blocks_categories_and_names() {
     let site = |n: usize| category("_atom_site", n as i64, places(n));
     let entry = |id: &str| category("_entry", 1, vec![texts("id", &[id])]);
-    // The first block with atoms; the block's name where there is no entry.
+    // The first block with atoms; the block name if there is no entry.
     let empty = category("_atom_site", 0, vec![]);
     let two =
         file(vec![block("a", vec![entry("X"), empty.clone()]), block("b", vec![site(3)]), block("c", vec![site(4)])]);
     let s = bcif(&two);
     assert_eq!((s.len(), s.id.as_deref(), s.title), (3, Some("b"), None));
-    // Names in any case, with or without underscore; a masked id is none.
+    // Names in any case, with or without underscore. A masked id counts as missing.
     let lower: Vec<Pack> =
         places(2).into_iter().zip(["CARTN_X", "cartn_y", "Cartn_Z"]).map(|(c, n)| c.with("name", text(n))).collect();
     let hidden = category("_entry", 1, vec![masked(texts("id", &["X"]), &[2])]);
@@ -385,20 +385,20 @@ fn blocks_categories_and_names() {
 }
 
 #[test]
-fn only_what_is_needed_is_decoded() {
-    // A column that nobody reads, a label that nothing has to stand in for, and another category may hold anything.
+fn decodes_only_required_columns() {
+    // Unused columns, unused fallback columns and other categories may contain anything.
     let broken = |name: &str| column(name, vec![1, 2, 3], vec![text("nonsense")]);
     let site = atoms(2, vec![texts("auth_atom_id", &["A", "B"]), broken("label_atom_id"), broken("Cartn_x_esd")]);
     assert_eq!(bcif(&site).len(), 2);
-    // Control: where something has to stand in, it is read.
+    // Control: a required fallback is read.
     let hole = masked(texts("auth_atom_id", &["A", "B"]), &[0, 2]);
     let said = refusal(&atoms(2, vec![hole, broken("label_atom_id")]));
     assert_eq!(said, "BinaryCIF, atom_site, label_atom_id, encoding 1: found the text `nonsense`, expected a map");
 }
 
-// ---- files that lie ----
+// ---- inconsistent files ----
 
-/// What is said of a column of two values, behind the category.
+/// Returns the error for a column of two values, without the category.
 fn of_column(column: Pack) -> String {
     let said = refusal(&atoms(2, vec![column]));
     let behind = said.strip_prefix("BinaryCIF, atom_site").unwrap_or_else(|| panic!("{said}"));
@@ -406,7 +406,7 @@ fn of_column(column: Pack) -> String {
 }
 
 #[test]
-fn encodings_that_lie() {
+fn rejects_inconsistent_encodings() {
     let number = |data: &[u8], chain: Vec<Pack>| column("auth_seq_id", data.to_vec(), chain);
     let two = i32s(&[1, 2]);
     let strings = |ids: &[i32], offsets: &[i32]| {
@@ -549,14 +549,14 @@ fn encodings_that_lie() {
         (ints("CARTN_X", &[1, 2]), "found two columns CARTN_X, expected every column once"),
     ];
     for (column, expected) in cases {
-        // Names are matched without regard to case, so `atoms` leaves both.
+        // Names are case-insensitive, so `atoms` leaves both.
         let said = of_column(column).replace("BinaryCIF, ", "");
         assert!(said.starts_with(expected), "`{said}` is not `{expected}`");
     }
 }
 
 #[test]
-fn the_frame_that_lies() {
+fn rejects_inconsistent_frames() {
     let site = |rows: Pack| category("_atom_site", 0, places(2)).with("rowCount", rows);
     let one = |category: Pack| file(vec![block("x", vec![category])]);
     let top = |entries: Vec<(&'static str, Pack)>| {
@@ -587,13 +587,13 @@ fn the_frame_that_lies() {
         let said = refusal(&bytes);
         assert!(said.starts_with(expected), "`{said}` is not `{expected}`");
     }
-    // A whole row count written as a real number is one.
+    // An integral row count may be written as a real number.
     assert_eq!(bcif(&one(site(Real(2.0)))).len(), 2);
 }
 
 #[test]
-fn limits_come_before_memory() {
-    // A few hundred bytes that would be 2³¹ atoms.
+fn checks_limits_before_allocation() {
+    // A few hundred bytes that declare 2³¹ atoms.
     let n = i64::from(i32::MAX);
     let runs = |name| column(name, i32s(&[0, i32::MAX]), vec![run_length(n), byte_array(3)]);
     let bomb = |rows: i64| {
@@ -605,13 +605,13 @@ fn limits_come_before_memory() {
     assert_eq!(read(&bomb(n), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
     assert_eq!(read(&bomb(i64::MAX), &limits), Err(StructureError::TooManyAtoms { limit: 10_000 }));
     assert_eq!(read(&bomb(i64::MAX), &ReadLimits::default()), Err(StructureError::TooManyAtoms { limit: 20_000_000 }));
-    // Rows that are allowed, runs that are not.
+    // The number of rows is allowed, the number of runs is not.
     let said = read(&bomb(10_000), &limits).unwrap_err().to_string();
     assert_eq!(
         said,
         "BinaryCIF, atom_site, auth_seq_id, RunLength (encoding 1 of 2): found 2147483647 values, expected at most 20002"
     );
-    // What is decoded counts as inflated: 32 bytes a row here.
+    // Decoded data counts as decompressed data: 32 bytes per row here.
     let whole = |name| column(name, i32s(&[0, 10_000]), vec![run_length(10_000), byte_array(3)]);
     let all = ["Cartn_x", "Cartn_y", "Cartn_z", "auth_seq_id"].map(whole).to_vec();
     let good = file(vec![block("x", vec![category("_atom_site", 10_000, all)])]);
@@ -619,7 +619,7 @@ fn limits_come_before_memory() {
     let tight = |bytes| ReadLimits { max_inflated_bytes: bytes, ..limits };
     assert_eq!(read(&good, &tight(320_000)).unwrap().len(), 10_000);
     assert_eq!(read(&good, &tight(319_999)), Err(StructureError::InflatedTooLarge { limit: 319_999 }));
-    // Texts that no row refers to, more than there may be atoms.
+    // More unused texts than allowed atoms.
     let offsets = column(
         "auth_asym_id",
         i32s(&[0, 1]),
@@ -633,17 +633,17 @@ fn limits_come_before_memory() {
         said.contains("auth_asym_id, StringArray, offsets, RunLength (encoding 1 of 2): found 2147483647 values"),
         "{said}"
     );
-    // More columns than anybody has.
+    // Too many columns.
     let said = read(&atoms(1, vec![ints("x", &[1]); 1000]), &limits).unwrap_err().to_string();
     assert_eq!(said, "BinaryCIF, atom_site: found more columns, expected at most 1000");
-    // An entry with more rows than atoms are allowed.
+    // An entry with more rows than allowed atoms.
     let long = category("_entry", 10_001, vec![texts("id", &["x"])]);
     let said = read(&file(vec![block("x", vec![category("_atom_site", 2, places(2)), long])]), &limits).unwrap_err();
     assert_eq!(said.to_string(), "BinaryCIF, entry, rowCount: found 10001 rows, expected at most 10000");
 }
 
 #[test]
-fn truncated_and_changed_everywhere() {
+fn never_panics_on_truncated_or_changed_files() {
     let limits = ReadLimits { max_inflated_bytes: 1 << 20, max_atoms: 1_000 };
     let whole = CRAMBIN;
     assert_eq!(read(whole, &limits).unwrap().len(), 327);
@@ -651,7 +651,7 @@ fn truncated_and_changed_everywhere() {
         let error = read(&whole[..cut], &limits).expect_err("a part of a file");
         assert!(error.to_string().len() < 1000, "{cut}: {error}");
     }
-    // Every byte changed in some ways: it reads, or it is refused; it never panics.
+    // Changes every byte in several ways. The result is a structure or an error, never a panic.
     let mut read_still = 0;
     let mut changed = whole.to_vec();
     for at in 0..whole.len() {
@@ -665,13 +665,13 @@ fn truncated_and_changed_everywhere() {
         }
     }
     assert!(read_still > 1000, "{read_still}");
-    // Nothing but heads of maps and arrays, two million deep.
+    // Nested map and array heads, two million deep.
     let deep = [b"\x81\xaadataBlocks".as_slice(), &[0x91; 2_000_000], &[0xC0]].concat();
     assert_eq!(refusal(&deep), "BinaryCIF: found an array of 1, expected a map");
 }
 
 #[test]
-fn the_referee_says_that_it_does_not_read_it() {
+fn strict_validator_reports_that_it_does_not_read_binary_cif() {
     let findings = referee::check(CRAMBIN, &ReadLimits::default()).unwrap();
     assert_eq!(findings.len(), 1);
     assert_eq!((findings[0].level, findings[0].line), (referee::Level::Note, None));
@@ -679,8 +679,8 @@ fn the_referee_says_that_it_does_not_read_it() {
 }
 
 #[test]
-fn many_rows_are_read_by_many_threads_alike() {
-    // More than one thread takes at a time, with names that come in another order in every part.
+fn results_do_not_depend_on_the_number_of_threads() {
+    // More rows than one task reads. Names appear in a different order in every part.
     let n = 200_000;
     let ids: Vec<i32> = (0..n).map(|i| (i * 7919) % 31).collect();
     let letters: String = (0..31).map(|i| char::from(b'A' + i as u8 % 26)).collect();
@@ -699,7 +699,7 @@ fn many_rows_are_read_by_many_threads_alike() {
         assert_eq!(one.chain.get(i), &letters[id..=id]);
     }
     assert!(one == with(2) && one == with(7));
-    // The first fault of the file, whoever was there first.
+    // The first fault in file order, independent of the threads.
     let mut x = vec![0.0; n as usize];
     (x[70_000], x[190_000]) = (f64::NAN, f64::NAN);
     let said = refusal(&atoms(n as usize, vec![reals("Cartn_x", &x)]));

@@ -1,10 +1,10 @@
-//! Hostile and broken input: a typed answer, in time, and never a panic; with ours and with the referee.
+//! Hostile and broken input: a typed error in bounded time and never a panic, from the reader and the strict validator.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
     clippy::print_stderr,
-    reason = "tests fail by panicking and say aloud what they skip"
+    reason = "tests fail by panicking and print what they skip"
 )]
 
 use std::io::Write;
@@ -15,7 +15,7 @@ use molmesh::structure::{Contents, ReadLimits, Selection, StructureError, read, 
 
 const ATOM: &str = "ATOM      2  CA  ALA A  12      11.104  -6.134   0.500  1.00 20.25           C  \n";
 
-/// A release build has to answer in this time; an unoptimised one on a busy machine gets more.
+/// Time limit for a release build. An unoptimised build on a busy machine has a larger one.
 const IN_TIME: Duration = Duration::from_millis(if cfg!(debug_assertions) { 2000 } else { 100 });
 
 fn gzip(data: &[u8]) -> Vec<u8> {
@@ -28,17 +28,17 @@ fn limits() -> ReadLimits {
     ReadLimits { max_inflated_bytes: 64 << 20, max_atoms: 2_000_000 }
 }
 
-/// Tests run side by side; those that look at the clock take turns.
+/// Serializes the tests that measure time.
 static CLOCK: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
-/// Reads in time. What a busy machine does once it does not do five times.
+/// Reads within the time limit, in at least one of five attempts, since the machine may be busy.
 fn timed(name: &str, input: &[u8]) -> Result<molmesh::structure::Structure, StructureError> {
     let _turn = CLOCK.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
     let mut fastest = Duration::MAX;
     let mut result = None;
     for _ in 0..5 {
-        // What an earlier turn read is given back before the clock starts.
+        // Frees the result of the previous attempt before measuring.
         drop(result.take());
         pool.install(|| {
             let start = (Instant::now(), processor_time());
@@ -54,7 +54,7 @@ fn timed(name: &str, input: &[u8]) -> Result<molmesh::structure::Structure, Stru
     result.unwrap()
 }
 
-/// What this thread has spent on a processor, where Linux says so: other programs do not count.
+/// Returns the CPU time of this thread, if Linux reports it.
 fn processor_time() -> Option<Duration> {
     let stat = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
     Some(Duration::from_nanos(stat.split(' ').next()?.parse().ok()?))
@@ -81,7 +81,7 @@ fn cif(rows: &str) -> String {
 }
 
 #[test]
-fn nothing_and_noise() {
+fn rejects_empty_and_random_input() {
     refused("empty", "", "nothing (0 bytes)");
     refused("white space", " \n\n\t", "only white space");
     refused("binary", (0..=255).cycle().take(100_000).collect::<Vec<u8>>(), "binary data");
@@ -98,8 +98,8 @@ fn nothing_and_noise() {
 }
 
 #[test]
-fn truncated_everywhere() {
-    // Whatever is cut off, the rest either reads or is refused; never more atoms than there are.
+fn never_panics_on_truncated_files() {
+    // A truncated file is read or rejected. It never has more atoms than the whole file.
     for text in [ATOM.repeat(3), cif("A . 1 1.0 2.0 3.0\nA . 1 4.0 5.0 6.0\n")] {
         for cut in 0..text.len() {
             if let Ok(s) = read(&text.as_bytes()[..cut], &limits()) {
@@ -115,7 +115,7 @@ fn truncated_everywhere() {
 }
 
 #[test]
-fn numbers_that_are_none() {
+fn rejects_invalid_numbers() {
     for bad in [
         "     NaN", "     nan", "     inf", "    -inf", "infinity", "    1e30", "   1e400", "     1e9", "        ",
         "********",
@@ -146,7 +146,7 @@ fn numbers_that_are_none() {
 }
 
 #[test]
-fn what_makes_pdbtbx_panic_reads_or_is_refused() {
+fn handles_files_that_make_pdbtbx_panic() {
     reads(
         "a bad space group",
         format!("CRYST1   28.070   28.070   53.350  90.00  90.00  90.00 Q 99 99 9   8\n{ATOM}"),
@@ -161,7 +161,7 @@ fn what_makes_pdbtbx_panic_reads_or_is_refused() {
 }
 
 #[test]
-fn bombs_stop_at_the_limit() {
+fn compression_bombs_stop_at_the_limit() {
     let bomb = gzip(&vec![b' '; 512 << 20]);
     let start = Instant::now();
     assert_eq!(
@@ -178,7 +178,7 @@ fn bombs_stop_at_the_limit() {
 }
 
 #[test]
-fn a_hundred_thousand_of_everything() {
+fn reads_a_hundred_thousand_of_everything() {
     const N: usize = 100_000;
     let rows = |row: &dyn Fn(usize) -> String| cif(&(0..N).map(row).collect::<String>());
     let chains = rows(&|i| format!("c{i} . 1 1 2 {}\n", i % 1000));
@@ -210,7 +210,7 @@ fn a_hundred_thousand_of_everything() {
         + &"1 ".repeat(3 * (N + 3));
     reads("100,000 columns, three rows", wide, 3);
 
-    // What is done with these afterwards has to be quick as well.
+    // Later steps must be fast too.
     for (name, text) in [("chains", &chains), ("models", &models), ("altlocs", &altlocs)] {
         let s = read(text.as_bytes(), &limits()).unwrap();
         let start = Instant::now();
@@ -237,7 +237,7 @@ fn a_hundred_thousand_of_everything() {
 }
 
 #[test]
-fn endless_lines_and_tokens() {
+fn handles_very_long_lines_and_tokens() {
     const LONG: usize = 50 << 20;
     let long = |byte: u8| vec![byte; LONG];
     refused("50 MB of one letter", long(b'x'), "text beginning with");
@@ -263,16 +263,16 @@ fn endless_lines_and_tokens() {
 }
 
 #[test]
-fn ambiguous_atoms_are_counted_before_memory_is_taken() {
+fn counts_ambiguous_atoms_before_allocation() {
     let text = ATOM.repeat(1000);
     let tight = ReadLimits { max_atoms: 999, ..limits() };
     assert_eq!(read(text.as_bytes(), &tight), Err(StructureError::TooManyAtoms { limit: 999 }));
 }
 
-// ---- the referee ----
+// ---- strict validator ----
 
 #[test]
-fn the_referee_reports_and_never_panics() {
+fn strict_validator_reports_and_never_panics() {
     referee::quiet_panics();
     let sound = std::fs::read("samples/4pti.pdb").unwrap();
     let findings = referee::check(&sound, &limits()).unwrap();
@@ -281,7 +281,7 @@ fn the_referee_reports_and_never_panics() {
     let short = referee::check(&ATOM.as_bytes()[..60], &limits()).unwrap();
     assert!(short.iter().any(|d| d.level == Level::Error && d.line == Some(1)), "{short:?}");
 
-    // A space group that it panics at.
+    // pdbtbx panics on this space group.
     let panics = format!("CRYST1   28.070   28.070   53.350  90.00  90.00  90.00 Q 99 99 9   8\n{ATOM}");
     let findings = referee::check(panics.as_bytes(), &limits()).unwrap();
     assert_eq!(findings.len(), 1);

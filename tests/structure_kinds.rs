@@ -1,12 +1,12 @@
-//! Which atoms belong to a polymer: chains of two letters, modified residues, virtual sites; and what is left out.
+//! Kinds of atoms: two-letter chains, modified residues, ions, virtual sites; and counts of atoms that are left out.
 //!
-//! Inputs are the samples, rewritten. gemmi reads the same files where it is installed.
+//! Inputs are modified samples. If gemmi is installed, its results are compared.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
     clippy::print_stderr,
-    reason = "tests fail by panicking and say aloud what they skip"
+    reason = "tests fail by panicking and print what they skip"
 )]
 
 mod tools;
@@ -35,12 +35,12 @@ fn left_out(s: &Structure) -> LeftOut {
     select(s, &Selection::default()).unwrap().left_out
 }
 
-/// The lines of the PDB sample that are atoms.
+/// Returns the atom lines of the PDB sample.
 fn atoms() -> impl Iterator<Item = String> {
     PDB.lines().filter(|l| l.starts_with("ATOM") || l.starts_with("HETATM")).map(str::to_owned)
 }
 
-/// Columns 18 to 22 of every atom and TER record, rewritten from residue name and number.
+/// Rewrites columns 18 to 22 of every atom and TER record by residue name and number.
 fn rewritten(columns: impl Fn(&str, i32) -> String) -> String {
     let lines = PDB.lines().map(|line| {
         if !["ATOM", "HETATM", "TER"].iter().any(|record| line.starts_with(record)) || line.len() < 27 {
@@ -53,13 +53,12 @@ fn rewritten(columns: impl Fn(&str, i32) -> String) -> String {
     lines.collect()
 }
 
-/// Chains and residue names, in the order of the file.
+/// Returns chains and residue names in file order.
 fn names(s: &Structure) -> Vec<(String, String)> {
     (0..s.len()).map(|i| (s.chain.get(i).to_owned(), s.residue.get(i).to_owned())).collect()
 }
 
-/// Atoms as gemmi reads them: chain, residue name and selection of each atom of the first model, in the order of the
-/// file.
+/// Reads a file with gemmi. Returns chain, residue name and selection of each atom of the first model, in file order.
 fn gemmi(text: &str, extension: &str) -> Option<Vec<(String, String, bool)>> {
     let python = tools::python_interpreter().or_else(|| tools::missing("gemmi"))?;
     let dir = tempfile::tempdir().unwrap();
@@ -81,7 +80,7 @@ fn ours(s: &Structure) -> Vec<(String, String, bool)> {
     names(s).into_iter().zip(flags).map(|((chain, residue), taken)| (chain, residue, taken)).collect()
 }
 
-/// Compares with gemmi without regard to order, since gemmi moves water to the end of its chain.
+/// Compares with gemmi, ignoring the order, since gemmi moves water to the end of its chain.
 fn agrees_with_gemmi(text: &str, extension: &str) -> Option<bool> {
     let mut theirs = gemmi(text, extension)?;
     let mut ours = ours(&structure(text));
@@ -98,7 +97,7 @@ fn with_histidine(name: &str) -> &str {
 }
 
 #[test]
-fn chains_of_two_letters_keep_every_residue_whatever_the_letters_spell() {
+fn two_letter_chains_keep_every_residue() {
     // With these first letters HIS, LYS, ASP, GLU, CYS, ARG, ALA and MET spell a residue name of four letters.
     for chain in ["AA", "HA", "2A", "DA", "EA", "BA", "NA", "TA", "Az", "1x"] {
         let text = rewritten(|name, _| format!("{:>3}{chain}", with_histidine(name)));
@@ -115,7 +114,7 @@ fn chains_of_two_letters_keep_every_residue_whatever_the_letters_spell() {
 }
 
 #[test]
-fn many_chains_with_and_without_a_second_letter() {
+fn mixes_one_and_two_letter_chains() {
     let text: String = [" A", "AA", "HA", "BA", " B", "HB"]
         .map(|chain| rewritten(|name, _| format!("{:>3}{chain}", with_histidine(name))).replace("END", "REMARK"))
         .concat();
@@ -129,15 +128,15 @@ fn many_chains_with_and_without_a_second_letter() {
 }
 
 #[test]
-fn residue_names_of_four_letters_stay_whole() {
-    // GROMOS names of charged and bound residues.
+fn keeps_four_letter_residue_names() {
+    // GROMOS names of charged and bonded residues.
     let gromos = |name: &str| match name {
         "LYS" | "ASP" | "GLU" | "CYS" => format!("{name}HA"),
         "ARG" => "ARGNA".to_owned(),
         "ALA" => "HISAA".to_owned(),
         name => format!("{name:>3} A"),
     };
-    // AMBER's names of chain ends.
+    // AMBER names of chain ends.
     let amber = |name: &str, number: i32| match number {
         1 => "NMETA".to_owned(),
         58 => "CALAA".to_owned(),
@@ -170,7 +169,7 @@ fn residue_names_of_four_letters_stay_whole() {
 }
 
 #[test]
-fn lipids_and_water_of_simulations_keep_their_names() {
+fn keeps_names_of_lipids_and_water_of_simulations() {
     let line = |residue: &str, number: i32, x: f64| {
         format!("ATOM      1  P   {residue}{number:>4}    {x:8.3}   0.000   0.000  1.00  0.00\n")
     };
@@ -185,7 +184,7 @@ fn lipids_and_water_of_simulations_keep_their_names() {
 }
 
 #[test]
-fn a_chain_of_one_residue_name_is_told_by_seqres() {
+fn seqres_identifies_a_chain_with_one_residue_name() {
     let atoms: String = (1..=9)
         .map(|i| format!("ATOM  {i:>5}  CA  HISHA{i:>4}    {i:8.3}   0.000   0.000  1.00  0.00           C\n"))
         .collect();
@@ -195,7 +194,7 @@ fn a_chain_of_one_residue_name_is_told_by_seqres() {
 }
 
 #[test]
-fn ligands_of_a_file_with_chains_of_two_letters_have_them_too() {
+fn ligands_have_two_letter_chains_too() {
     let protein = rewritten(|name, _| format!("{name:>3}AA"));
     let ligand = "HETATM    1  C1  LIGBA 900     100.000   0.000   0.000  1.00  0.00           C\n";
     assert_eq!(names(&structure(protein + ligand)).last().unwrap(), &("BA".to_owned(), "LIG".to_owned()));
@@ -218,7 +217,7 @@ fn modified(name: &str, remarks: &str, shift: f64) -> String {
 }
 
 #[test]
-fn a_residue_with_peptide_bonds_belongs_to_its_chain() {
+fn a_residue_with_peptide_bonds_is_polymer() {
     for name in ["MSE", "SME", "XYZ"] {
         let text = modified(name, "", 0.0);
         let s = structure(&text);
@@ -234,13 +233,13 @@ fn a_residue_with_peptide_bonds_belongs_to_its_chain() {
         let other_chain = listed.replace(" A   5", " B   5");
         assert_eq!(selected(&structure(modified("MSE", &other_chain, 10.0))).len(), POLYMER - 8, "{other_chain}");
     }
-    // A standard amino acid may be a ligand of a protein that holds it.
+    // A standard amino acid may be a ligand of a protein that contains it.
     let free = modified("MET", "SEQRES   5 A   58  ARG MET CYS GLY GLY ALA\n", 10.0);
     assert_eq!(selected(&structure(free)).len(), POLYMER - 8);
 }
 
 #[test]
-fn gemmi_takes_the_same_modified_residues() {
+fn gemmi_selects_the_same_modified_residues() {
     for name in ["MSE", "SEP"] {
         if let Some(agrees) = agrees_with_gemmi(&modified(name, "", 0.0), "pdb") {
             assert!(agrees, "{name}");
@@ -248,13 +247,13 @@ fn gemmi_takes_the_same_modified_residues() {
     }
     if let Some(agrees) = agrees_with_gemmi(CIF, "cif") {
         assert!(agrees && agrees_with_gemmi(&modified_cif("LIG"), "cif") == Some(true));
-        // Control: gemmi goes by the chain's end, we go by the bonds.
+        // Control: gemmi decides by the end of the chain, molmesh by bonds.
         assert_eq!(agrees_with_gemmi(&modified("MSE", "", 10.0), "pdb"), Some(false));
     }
 }
 
 #[test]
-fn bonds_reach_through_several_modified_residues_and_stop_at_ligands() {
+fn bonds_connect_several_modified_residues_but_not_ligands() {
     let line = |record: &str, name: &str, residue: &str, number: i32, x: f64| {
         format!(
             "{record:<6}    1  {name:<3} {residue} A{number:>4}    {x:8.3}   0.000   0.000  1.00  0.00           {}\n",
@@ -276,12 +275,12 @@ fn bonds_reach_through_several_modified_residues_and_stop_at_ligands() {
     let taken = |text: &str| select(&structure(text), &Selection::default()).map(|s| s.atoms.len()).unwrap_or(0);
     assert_eq!(taken(&chain(["ATOM", "HETATM", "HETATM", "HETATM"])), 8);
     assert_eq!(taken(&chain(["HETATM", "HETATM", "HETATM", "ATOM"])), 8);
-    // A peptide without any polymer residue is a ligand, as it is without bonds.
+    // A peptide without any polymer residue is a ligand.
     assert_eq!(taken(&chain(["HETATM"; 4])), 0);
     let broken =
         chain(["ATOM", "HETATM", "HETATM", "HETATM"]).replace("DVA A   3      13.900", "DVA A   3      19.900");
     assert_eq!(taken(&broken), 6, "the last one is bonded to none");
-    // Another chain or model does not bond.
+    // There are no bonds between chains or models.
     assert_eq!(taken(&chain(["ATOM", "HETATM", "HETATM", "HETATM"]).replace("AIB A", "AIB B")), 2);
     let nucleotides = line("ATOM", "P", " DA", 1, 0.0)
         + &line("ATOM", "O3'", " DA", 1, 4.0)
@@ -303,7 +302,7 @@ fn modified_cif(name: &str) -> String {
     rows.collect()
 }
 
-/// The sample with other values of an item of `atom_site`, given the old value.
+/// Returns the sample with new values of an item of `atom_site`, computed from the old ones.
 fn with_item(text: &str, item: &str, value: impl Fn(&str, bool) -> String) -> String {
     let place =
         text.lines().filter(|l| l.starts_with("_atom_site.")).position(|l| l.trim() == format!("_atom_site.{item}"));
@@ -320,7 +319,7 @@ fn with_item(text: &str, item: &str, value: impl Fn(&str, bool) -> String) -> St
 }
 
 #[test]
-fn entities_decide_for_mmcif_wherever_they_stand() {
+fn entities_decide_wherever_they_are_in_the_file() {
     let sample = structure(CIF);
     let text = modified_cif("LIG");
     let s = structure(&text);
@@ -332,7 +331,7 @@ fn entities_decide_for_mmcif_wherever_they_stand() {
     let ligand = ligand.replace("_entity_poly.entity_id", "_entity_poly.other_id");
     assert_ne!(ligand, text);
     assert_eq!(selected(&structure(&ligand)).len(), sample.len() - 7);
-    // Behind the atoms, as in files sorted by name.
+    // After the atoms, as in files sorted by name.
     let (head, tail): (Vec<&str>, Vec<&str>) =
         text.lines().partition(|l| !(l.starts_with("_entity.") || l.starts_with("_struct_asym.")));
     let behind = format!("{}\n{}\n", head.join("\n"), tail.join("\n"));
@@ -345,7 +344,7 @@ fn entities_decide_for_mmcif_wherever_they_stand() {
 }
 
 #[test]
-fn sequence_numbers_and_bonds_decide_where_entities_are_unknown() {
+fn sequence_numbers_and_bonds_decide_without_entities() {
     let sample = structure(CIF);
     let unknown = modified_cif("LIG").replace("_struct_asym.entity_id", "_struct_asym.other_id");
     assert_eq!(selected(&structure(&unknown)), selected(&sample), "bonds");
@@ -360,7 +359,7 @@ fn sequence_numbers_and_bonds_decide_where_entities_are_unknown() {
     };
     let with = |number: &str| far.replacen("HETATM", &format!("{}\nHETATM", row(number)), 1);
     assert_eq!(selected(&structure(with("."))).len(), sample.len());
-    // ... and means nothing where water is numbered as well.
+    // ... and means nothing if water is numbered too.
     assert_eq!(selected(&structure(with("7"))).len(), sample.len() - 7);
 }
 
@@ -389,7 +388,7 @@ fn single_ions_are_ligands_in_any_record() {
 }
 
 #[test]
-fn virtual_sites_are_no_atoms() {
+fn virtual_sites_are_not_atoms() {
     let sites = [
         (" MW ", "SOL"),
         (" M  ", "WAT"),
@@ -431,7 +430,7 @@ fn virtual_sites_are_no_atoms() {
 }
 
 #[test]
-fn drude_particles_are_told_by_place_and_name() {
+fn identifies_drude_particles_by_position_and_name() {
     let pair = |name: &str, shift: f64| {
         structure(line("ATOM", " C1 ", "LIG", 1, 0.0, "") + &line("ATOM", name, "LIG", 1, shift, "")).kind[1]
     };
@@ -441,7 +440,7 @@ fn drude_particles_are_told_by_place_and_name() {
 }
 
 #[test]
-fn virtual_sites_of_mmcif_are_counted_apart() {
+fn counts_virtual_sites_of_mmcif_separately() {
     let rows =
         "ATOM O OW SOL 1 0.0\nATOM H HW1 SOL 1 1.0\nATOM H HW2 SOL 1 -1.0\nATOM ? MW SOL 1 0.1\nATOM C CA ALA 2 9.0\n";
     let rows: String = rows.lines().map(|row| format!("{row} 0.0 0.0\n")).collect();
@@ -459,7 +458,7 @@ fn virtual_sites_of_mmcif_are_counted_apart() {
 // ---- what is left out ----
 
 #[test]
-fn what_is_left_out_is_counted_once_and_names_are_bounded() {
+fn counts_atoms_left_out_once_and_bounds_the_names() {
     let mut text = PDB.replace("END", "REMARK");
     for i in 0..15 {
         let ligand = format!("L{i:02}");

@@ -1,10 +1,10 @@
-//! mmCIF: the grammar, the order of things, the items that stand in for others.
+//! mmCIF: grammar, order of columns and categories, fallback items.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
     clippy::print_stderr,
-    reason = "tests fail by panicking and say aloud what they skip"
+    reason = "tests fail by panicking and print what they skip"
 )]
 
 use molmesh::structure::{ReadLimits, Structure, StructureError, read};
@@ -43,7 +43,7 @@ fn file(rows: &str) -> String {
 }
 
 #[test]
-fn every_item_is_read() {
+fn reads_every_item() {
     let s = cif(file(ROW));
     assert_eq!((s.id.as_deref(), s.title.as_deref()), (Some("1abc"), Some("A title")));
     assert_eq!((s.x[0], s.y[0], s.z[0]), (11.104, -6.134, 0.5));
@@ -53,7 +53,7 @@ fn every_item_is_read() {
 }
 
 #[test]
-fn plain_and_special_rows_read_the_same() {
+fn plain_and_special_rows_have_the_same_result() {
     let plain = cif(file(&ROW.repeat(3)));
     let row = ROW.trim_end();
     let forms = [
@@ -75,7 +75,7 @@ fn plain_and_special_rows_read_the_same() {
 }
 
 #[test]
-fn quotes_end_before_blanks_only() {
+fn quotes_end_only_before_white_space() {
     let name = |value: &str| cif(file(&ROW.replace("\"C1'\"", value))).name.get(0).to_owned();
     assert_eq!(name("'a dog's name'"), "a dog's name");
     assert_eq!(name("\"O5\"'\""), "O5\"'");
@@ -111,7 +111,7 @@ fn columns_and_categories_in_any_order() {
 }
 
 #[test]
-fn author_items_come_first_and_dictionary_items_stand_in() {
+fn author_items_take_precedence_over_dictionary_items() {
     let text = |auth: &str| {
         format!(
             "data_x loop_ _atom_site.Cartn_x _atom_site.Cartn_y _atom_site.Cartn_z
@@ -132,7 +132,7 @@ _atom_site.label_asym_id _atom_site.auth_asym_id _atom_site.label_seq_id _atom_s
 }
 
 #[test]
-fn one_atom_item_by_item() {
+fn reads_one_atom_without_a_loop() {
     let text = "data_x\n_atom_site.id 1\n_atom_site.Cartn_x 1\n_atom_site.Cartn_y 2\n_atom_site.Cartn_z 3\n_atom_site.label_atom_id \"O5'\"\n";
     let s = cif(text);
     assert_eq!((s.len(), s.x[0], s.y[0], s.z[0], s.name.get(0), s.element[0]), (1, 1.0, 2.0, 3.0, "O5'", 8));
@@ -140,13 +140,13 @@ fn one_atom_item_by_item() {
 }
 
 #[test]
-fn the_first_block_with_atoms_is_read() {
+fn reads_the_first_block_with_atoms() {
     let other = "data_first\n_entry.id WRONG\n_struct.title wrong\n_cell.length_a 1\n";
     let second = file(&ROW.repeat(2));
     let third = "data_third\nloop_ _atom_site.Cartn_x 1 2 3";
     let s = cif(format!("{other}{second}{third}"));
     assert_eq!((s.len(), s.id.as_deref(), s.title.as_deref()), (2, Some("1abc"), Some("A title")));
-    // Frames are not the block's own.
+    // Items of save frames do not belong to the block.
     let framed = format!("data_x save_frame _entry.id y {TAGS}{ROW} save_ {TAGS}{ROW}{ROW}");
     assert_eq!(cif(framed).len(), 2);
 }
@@ -169,7 +169,7 @@ fn elements_are_read_or_guessed() {
 }
 
 #[test]
-fn values_are_refused_by_place() {
+fn errors_name_line_and_column() {
     let bad = |from: &str, to: &str| refusal(file(&format!("{ROW}{}", ROW.replace(from, to))));
     assert_eq!(bad("11.104", "nan"), "line 24, column 32: found `nan`, expected Cartn_x in Å, within ±100000");
     assert_eq!(bad("11.104", "1e400"), "line 24, column 32: found `1e400`, expected Cartn_x in Å, within ±100000");
@@ -213,7 +213,7 @@ fn values_are_refused_by_place() {
 }
 
 #[test]
-fn values_that_do_not_matter_for_a_mesh_are_warnings() {
+fn unreadable_optional_values_are_warnings() {
     let read = |from: &str, to: &str| cif(file(&format!("{ROW}{}", ROW.replace(from, to))));
     let s = read("HETATM", "ATOMS");
     assert_eq!((s.hetero.as_slice(), s.len()), (&[true, false][..], 2));
@@ -246,7 +246,7 @@ fn warnings_are_the_same_on_any_number_of_threads() {
 }
 
 #[test]
-fn a_file_without_coordinates_says_what_it_has() {
+fn a_file_without_coordinates_is_described() {
     assert_eq!(refusal("data_x\n"), "no atoms: mmCIF with data block x and nothing in it");
     assert_eq!(
         refusal("data_ligand\nloop_\n_chem_comp_atom.atom_id\n_chem_comp_atom.x\nC1 0\n_cell.length_a 1\n"),
@@ -259,8 +259,8 @@ fn a_file_without_coordinates_says_what_it_has() {
 }
 
 #[test]
-fn limits_of_atoms() {
-    // Large enough to be shared among threads.
+fn limits_atoms() {
+    // Large enough for several threads.
     for n in [10, 60_000] {
         let text = file(&ROW.repeat(n));
         let with = |max_atoms| read(text.as_bytes(), &ReadLimits { max_atoms, ..ReadLimits::default() });
@@ -270,7 +270,7 @@ fn limits_of_atoms() {
 }
 
 #[test]
-fn large_files_read_the_same_whatever_is_in_them() {
+fn large_files_have_the_same_result_on_every_path() {
     let pool = |threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
     let rows = |special: &str| format!("{}{special}{}", ROW.repeat(50_000), ROW.replace("Bb", "Q").repeat(20_000));
     let row = ROW.trim_end();

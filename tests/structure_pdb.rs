@@ -1,10 +1,10 @@
-//! PDB files and the liberties that programs take with them.
+//! PDB files and common deviations from the format.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
     clippy::print_stderr,
-    reason = "tests fail by panicking and say aloud what they skip"
+    reason = "tests fail by panicking and print what they skip"
 )]
 
 use molmesh::structure::{ReadLimits, Structure, StructureError, read};
@@ -17,7 +17,7 @@ fn refusal(text: impl AsRef<[u8]>) -> String {
     read(text.as_ref(), &ReadLimits::default()).expect_err("a refusal").to_string()
 }
 
-/// A line of 80 columns.
+/// Pads a line to 80 columns.
 const CA: &str = "ATOM      2  CA AALA B -12C     11.104  -6.134   0.500  0.50 20.25           C  \n";
 
 fn symbols(s: &Structure) -> Vec<u8> {
@@ -25,7 +25,7 @@ fn symbols(s: &Structure) -> Vec<u8> {
 }
 
 #[test]
-fn every_column_is_read() {
+fn reads_every_column() {
     let s = pdb([
         "HEADER    HYDROLASE                               02-MAR-00   1ABC              \n",
         "TITLE     A TITLE  OF\nTITLE    2 TWO LINES \n",
@@ -41,7 +41,7 @@ fn every_column_is_read() {
 }
 
 #[test]
-fn any_line_ending_reads_the_same() {
+fn accepts_any_line_ending() {
     let text = format!("\n\nREMARK   1\n{CA}{CA}TER\nEND\n");
     let plain = pdb(&text);
     assert_eq!(plain.len(), 2);
@@ -53,7 +53,7 @@ fn any_line_ending_reads_the_same() {
 }
 
 #[test]
-fn short_lines_read_down_to_the_coordinates() {
+fn accepts_lines_that_end_after_the_coordinates() {
     let full = pdb(CA);
     for columns in [79, 78, 66, 60, 54] {
         let s = pdb(format!("{}\n", &CA[..columns]));
@@ -124,7 +124,7 @@ fn four_letter_residues_and_two_letter_chains() {
 }
 
 #[test]
-fn blank_element_columns_are_guessed_from_name_and_residue() {
+fn guesses_blank_elements_from_name_and_residue() {
     let element = |name: &str, residue: &str| {
         let line = format!("HETATM    1 {name} {residue:<3} A   1      11.104   6.134  -6.504\n");
         pdb(line).element[0]
@@ -152,14 +152,14 @@ fn blank_element_columns_are_guessed_from_name_and_residue() {
     for (name, residue, z) in cases {
         assert_eq!(element(name, residue), z, "{name} in {residue}");
     }
-    // A file whose names are all left-justified says nothing by alignment: N and C in the first column give it away.
+    // If all names are left-justified, the alignment is meaningless. N and C in the first column reveal it.
     let lines = ["N    ALA", "CA   ALA", "C    LIG", "CD   LIG", "CD    CD"]
         .map(|n| format!("ATOM      1 {n} A   1      11.104   6.134  -6.504\n"));
     assert_eq!(symbols(&pdb(lines.concat())), [7, 6, 6, 6, 48]);
 }
 
 #[test]
-fn element_columns_are_believed_when_they_hold_an_element() {
+fn uses_element_columns_that_contain_an_element() {
     let element = |columns: &str| {
         assert_eq!(columns.len(), 8);
         pdb(format!("{}{columns}\n", &CA[..72])).element[0]
@@ -169,11 +169,11 @@ fn element_columns_are_believed_when_they_hold_an_element() {
     assert_eq!(element("    zn  "), 30);
     assert_eq!(element("    D   "), 1);
     assert_eq!(element("     D1+"), 1);
-    // No symbols: the name decides.
+    // Not element symbols: the name decides.
     assert_eq!(element("    XX  "), 6);
     assert_eq!(element("    12  "), 6);
     assert_eq!(element("PROA    "), 6);
-    // Entry and line number, as before 1996; the revision letter of such a line is no nitrogen.
+    // Entry id and line number, as before 1996. The revision letter of such a line is not nitrogen.
     assert_eq!(element("4PTI 104"), 6);
     assert_eq!(element("4PTIN104"), 6);
     assert_eq!(element("4PTIE  1"), 6);
@@ -211,7 +211,7 @@ fn latin_1_reads() {
 }
 
 #[test]
-fn numbers_are_refused_by_place() {
+fn errors_name_line_and_column() {
     let bad = |from: &str, to: &str| refusal(format!("REMARK\n{}", CA.replace(from, to)));
     let x = "expected the x coordinate in Å, within ±100000";
     assert_eq!(bad("  11.104", "     NaN"), format!("line 2, column 31: found `     NaN`, {x}"));
@@ -228,7 +228,7 @@ fn numbers_are_refused_by_place() {
 }
 
 #[test]
-fn occupancies_and_b_factors_that_are_none_are_warnings() {
+fn unreadable_occupancies_and_b_factors_are_warnings() {
     let read = |from: &str, to: &str| {
         let s = pdb(format!("REMARK\n{}", CA.replace(from, to)));
         (s.occupancy[0], s.b_factor[0], s.warnings.join("\n"))
@@ -245,7 +245,7 @@ fn occupancies_and_b_factors_that_are_none_are_warnings() {
     for bad in ["   NaN", "******", "-  inf"] {
         assert_eq!(read(" 20.25", bad), (0.5, 0.0, format!("line 2, column 61: found `{bad}`, {b_factor}")));
     }
-    // A tab stands for the eight columns from 49 to 56.
+    // A tab replaces columns 49 to 56.
     let tabbed = pdb(CA.replace("   0.500  0.50", "  0.5\t  x0 "));
     assert_eq!(tabbed.warnings.len(), 1, "{:?}", tabbed.warnings);
     let many = pdb(CA.replace("  0.50 20", "  x.50 20").repeat(1000));
@@ -255,7 +255,7 @@ fn occupancies_and_b_factors_that_are_none_are_warnings() {
 }
 
 #[test]
-fn limits_of_atoms() {
+fn limits_atoms() {
     let text = CA.repeat(10);
     let with = |max_atoms| read(text.as_bytes(), &ReadLimits { max_atoms, ..ReadLimits::default() });
     assert_eq!(with(9), Err(StructureError::TooManyAtoms { limit: 9 }));
@@ -264,7 +264,7 @@ fn limits_of_atoms() {
 }
 
 #[test]
-fn a_file_without_atoms_says_what_it_has() {
+fn a_file_without_atoms_is_described() {
     let message = refusal("HEADER    X\nREMARK   2\nREMARK   2\nEND\n");
     assert_eq!(message, "no atoms: a PDB file of 4 lines without ATOM and HETATM; it has HEADER, REMARK, END");
 }

@@ -1,12 +1,12 @@
-//! Our reader on every real structure at hand: against the list of what they hold, against gemmi, against pdbtbx.
+//! The reader on all available real structures, compared with a list of their contents, gemmi and pdbtbx.
 //!
-//! gemmi is called through `tests/tools/gemmi_dump.py`. What is absent is skipped, loudly.
+//! gemmi runs through `tests/tools/gemmi_dump.py`. Missing files and tools are reported as skipped.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
     clippy::print_stderr,
-    reason = "tests fail by panicking and say aloud what they skip"
+    reason = "tests fail by panicking and print what they skip"
 )]
 
 mod tools;
@@ -30,7 +30,7 @@ fn sources() -> Vec<(String, Option<usize>, Option<usize>)> {
     rows.map(|row| (row[0].to_owned(), row[3].parse().ok(), row[4].parse().ok())).collect()
 }
 
-/// What is always there.
+/// The samples, which always exist.
 const SAMPLES: [&str; 2] = ["samples/4pti.pdb", "samples/1crn.cif"];
 
 fn path(file: &str) -> PathBuf {
@@ -38,24 +38,24 @@ fn path(file: &str) -> PathBuf {
 }
 
 fn bytes(file: &str) -> Vec<u8> {
-    std::fs::read(path(file)).expect("a file of the list")
+    std::fs::read(path(file)).expect("a listed file is readable")
 }
 
 fn structure(file: &str) -> Structure {
     read(&bytes(file), &ReadLimits::default()).unwrap_or_else(|e| panic!("{file}: {e}"))
 }
 
-/// Files that hold no atoms.
+/// Files without atoms.
 const REFUSED: [&str; 1] = ["2ins_header_only.pdb.gz"];
 
 /// BinaryCIF, which neither gemmi nor pdbtbx reads; `tests/bcif_oracles.rs` compares it with the text.
 const OURS_ALONE: [&str; 1] = ["1gbt.bcif.gz"];
 
-/// Models that SOURCES.tsv counts differently, with ours: what follows an ENDMDL without a MODEL of its own is one.
+/// Files whose number of models differs from SOURCES.tsv. Here, atoms after an ENDMDL without a MODEL are a model.
 const MODELS: [(&str, usize); 1] = [("odd_a_structure.pdb.gz", 2)];
 
 #[test]
-fn every_file_holds_what_the_list_says() {
+fn every_file_matches_the_list() {
     for (file, atoms, models) in sources() {
         if REFUSED.contains(&file.as_str()) || OURS_ALONE.contains(&file.as_str()) {
             continue;
@@ -71,7 +71,7 @@ fn every_file_holds_what_the_list_says() {
 }
 
 #[test]
-fn files_without_atoms_are_refused_by_name() {
+fn errors_name_files_without_atoms() {
     if sources().is_empty() {
         return;
     }
@@ -85,7 +85,7 @@ fn files_without_atoms_are_refused_by_name() {
 }
 
 #[test]
-fn the_papers_atoms_are_the_default_selection() {
+fn the_default_selection_has_the_atoms_of_the_paper() {
     if sources().is_empty() {
         return;
     }
@@ -129,7 +129,7 @@ fn old_and_new_files_of_one_entry_agree() {
         return;
     }
     let (new, old) = (structure("4pti.pdb.gz"), structure("4pti_1996.ent.gz"));
-    // Names and elements; the remediated file moved atoms by a few thousandths where it moved them at all.
+    // Compares names and elements. The remediated file moved some atoms by a few thousandths of an ångström.
     assert_eq!(new.element, old.element);
     for i in 0..new.len() {
         assert_eq!((new.name.get(i), new.residue_number[i]), (old.name.get(i), old.residue_number[i]));
@@ -137,7 +137,7 @@ fn old_and_new_files_of_one_entry_agree() {
 }
 
 #[test]
-fn one_thread_and_many_read_the_same() {
+fn results_do_not_depend_on_the_number_of_threads() {
     for (file, atoms, _) in sources().into_iter().filter(|(_, atoms, _)| atoms.is_some_and(|n| n > 15_000)) {
         let text = bytes(&file);
         let with = |threads: usize| {
@@ -153,7 +153,7 @@ fn one_thread_and_many_read_the_same() {
 }
 
 #[test]
-fn memory_is_sixty_one_bytes_per_atom() {
+fn an_atom_takes_61_bytes() {
     if sources().is_empty() {
         return;
     }
@@ -162,7 +162,7 @@ fn memory_is_sixty_one_bytes_per_atom() {
         let columns = 8 * (s.x.capacity() + s.y.capacity() + s.z.capacity())
             + 4 * (s.residue_number.capacity() + s.occupancy.capacity() + s.b_factor.capacity() + s.model.capacity())
             + s.element.capacity() + s.insertion_code.capacity() + s.altloc.capacity() + s.hetero.capacity() + s.kind.capacity()
-            // The ids of four columns of texts.
+            // Ids of four text columns.
             + 4 * 4 * s.len();
         let per_atom = columns as f64 / s.len() as f64;
         assert!(per_atom <= 71.0, "{file}: {per_atom} bytes per atom");
@@ -171,14 +171,14 @@ fn memory_is_sixty_one_bytes_per_atom() {
 
 // ---- gemmi ----
 
-/// Files that gemmi 0.7.5 refuses, with its words.
+/// Files that gemmi 0.7.5 rejects, with its message.
 const GEMMI_REFUSES: [(&str, &str); 2] = [
-    // Columns 79-80 of files from before 1996 hold a line number.
+    // Columns 79-80 of files from before 1996 contain a line number.
     ("4pti_1996.ent.gz", "Wrong format for charge"),
     ("2hhb.ent.gz", "Wrong format for charge"),
 ];
 
-/// Where gemmi 0.7.5 reads something else: file, field, atoms, why.
+/// Differences to gemmi 0.7.5: file, field, number of atoms, reason.
 const DISAGREEMENTS: &[(&str, &str, usize, &str)] = &[
     ("md_1tw7_charmm.pdb.gz", "chain", 47_175, "TIP3 ends in column 21, where gemmi begins a chain of two letters"),
     ("md_1tw7_charmm.pdb.gz", "number", 17_178, "14669 ends in column 27, where gemmi reads an insertion code 9"),
@@ -200,13 +200,13 @@ const DISAGREEMENTS: &[(&str, &str, usize, &str)] = &[
     ("odd_occupancy.pdb.gz", "b", 1, "a B-factor that is left out is 0 here and 20 in gemmi"),
 ];
 
-/// The fields of an atom that are compared, by name, apart from its place.
+/// Compared fields of an atom by name, except the position.
 const FIELDS: [&str; 11] =
     ["chain", "number", "code", "residue", "name", "altloc", "element", "occupancy", "b", "hetero", "selected"];
 
 type Rows = Vec<([i64; 3], Vec<String>)>;
 
-/// Ten thousandths of an ångström, so that rounding to five digits does not matter.
+/// Rounds to 10⁻⁴ Å, so that the rounding of the other program does not matter.
 fn place(x: f64, y: f64, z: f64) -> [i64; 3] {
     [x, y, z].map(|v| (v * 1e4).round() as i64)
 }
@@ -253,7 +253,7 @@ fn gemmis(output: &str) -> (Vec<usize>, Rows) {
 }
 
 #[test]
-fn gemmi_agrees_but_where_the_table_says() {
+fn agrees_with_gemmi_except_for_listed_differences() {
     let Some(python) = tools::python_interpreter().or_else(|| tools::missing("gemmi")) else { return };
     let mut found: Vec<(String, &str, usize)> = Vec::new();
     let not_for_it = [&REFUSED[..], &OURS_ALONE].concat();
@@ -285,7 +285,7 @@ fn gemmi_agrees_but_where_the_table_says() {
         }
         assert!(ours.iter().zip(&theirs).all(|(a, b)| a.0 == b.0), "{file}: positions");
     }
-    // The table speaks of files that may not be there at all.
+    // The table lists files that may be missing.
     let read: Vec<String> = sources().into_iter().map(|(file, ..)| file).collect();
     let explained = DISAGREEMENTS.iter().filter(|(f, ..)| read.iter().any(|file| file == f));
     let expected: Vec<_> = explained.map(|(f, name, n, _)| ((*f).to_owned(), *name, *n)).collect();
@@ -294,23 +294,23 @@ fn gemmi_agrees_but_where_the_table_says() {
 
 // ---- pdbtbx ----
 
-/// Files on which pdbtbx 0.12 (strictness `Loose`) is wrong or says nothing, and why.
+/// Files that pdbtbx 0.12 (strictness `Loose`) reads incorrectly or not at all, with the reason.
 const PDBTBX_FAILS: &[(&str, &str)] = &[
-    // Entry and line number in columns 73-80, where it looks for other things.
+    // Entry id and line number in columns 73-80, which it reads as other fields.
     ("4pti_1996.ent.gz", "refuses"),
     ("110d.pdb.gz", "refuses"),
     // A DBREF line of 67 columns.
     ("odd_1crn_10a.pdb.gz", "refuses"),
-    // Two residue names for one number, where SEQRES has one.
+    // Two residue names for one number; SEQRES has one.
     ("1ejg.pdb.gz", "refuses"),
     // A MODRES line of 28 columns.
     ("133d.pdb.gz", "panics"),
-    // Atoms without alternatives are repeated for every alternative of their residue.
+    // It repeats atoms without alternatives for every alternative of their residue.
     ("4cup.cif.gz", "1111 atoms, ours 1107"),
     ("1pfe.cif.gz", "370 atoms, ours 342"),
     // SEQADV of a deleted residue, which has no number.
     ("1a0q.pdb.gz", "refuses"),
-    // Space groups under names that it does not know.
+    // Unknown names of space groups.
     ("2hhb.ent.gz", "panics"),
     ("1zni.pdb1.gz", "panics"),
     // SEQADV again.
@@ -329,18 +329,18 @@ const PDBTBX_FAILS: &[(&str, &str)] = &[
 ];
 
 #[test]
-fn pdbtbx_agrees_where_it_is_right() {
+fn agrees_with_pdbtbx_except_for_listed_files() {
     use pdbtbx::{Format, ReadOptions, StrictnessLevel};
     let mut wrong: Vec<String> = Vec::new();
     let hook = std::panic::take_hook();
     let here = std::thread::current().id();
     std::panic::set_hook(Box::new(move |info| {
-        // pdbtbx's panics are expected here, those of other tests are not.
+        // Panics of pdbtbx are expected here; other panics are not.
         if std::thread::current().id() != here {
             hook(info);
         }
     }));
-    // Large files take it seconds, and teach nothing that small ones do not.
+    // Large files take seconds and cover nothing more.
     for (file, _, _) in sources().into_iter().filter(|(_, atoms, _)| atoms.is_some_and(|n| (1..60_000).contains(&n))) {
         if REFUSED.contains(&file.as_str()) || OURS_ALONE.contains(&file.as_str()) {
             continue;

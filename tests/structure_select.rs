@@ -1,10 +1,10 @@
-//! Which atoms are taken, and what is said when there are none.
+//! Selection of atoms, and errors of empty selections.
 #![allow(
     clippy::pedantic,
     clippy::unwrap_used,
     clippy::panic,
     clippy::print_stderr,
-    reason = "tests fail by panicking and say aloud what they skip"
+    reason = "tests fail by panicking and print what they skip"
 )]
 
 use molmesh::structure::{Contents, ReadLimits, Selection, Structure, StructureError, read, select};
@@ -40,7 +40,7 @@ fn structure() -> Structure {
     read(FILE.as_bytes(), &ReadLimits::default()).unwrap()
 }
 
-/// The x coordinates of what is taken: they number the atoms.
+/// Returns the x coordinates of the selected atoms, which number them.
 fn taken(selection: &Selection) -> Vec<u32> {
     let s = structure();
     select(&s, selection).unwrap().atoms.iter().map(|&i| s.x[i as usize] as u32).collect()
@@ -61,8 +61,8 @@ fn chains(names: &[&str]) -> Option<Vec<String>> {
 }
 
 #[test]
-fn by_default_polymer_without_hydrogens() {
-    // Residue 1 takes B (0.6), 2 takes A (a tie, although its other name has fewer atoms), 2A takes C.
+fn selects_polymer_without_hydrogens_by_default() {
+    // Residue 1 uses B (0.6), residue 2 uses A (a tie, although its other name has fewer atoms), residue 2A uses C.
     assert_eq!(taken(&Selection::default()), [1, 3, 5, 6, 9, 11]);
     let s = structure();
     let selected = select(&s, &Selection::default()).unwrap();
@@ -72,7 +72,7 @@ fn by_default_polymer_without_hydrogens() {
 }
 
 #[test]
-fn kinds_are_taken_by_name() {
+fn selects_kinds_by_name() {
     assert_eq!(taken(&kinds("polymer")), taken(&Selection::default()));
     assert_eq!(taken(&kinds("polymer,hydrogens")), [1, 3, 4, 5, 6, 9, 11]);
     assert_eq!(taken(&kinds("ligand")), [12, 13]);
@@ -91,7 +91,7 @@ fn kinds_are_taken_by_name() {
 }
 
 #[test]
-fn a_list_of_kinds_that_means_nothing_is_refused() {
+fn rejects_invalid_lists_of_kinds() {
     let refused = |list: &str| Selection::default().set_kinds(list).unwrap_err().to_string();
     assert_eq!(
         refused("protein"),
@@ -112,7 +112,7 @@ fn models_chains_and_alternatives() {
     assert_eq!(taken(&Selection { chains: chains(&["B"]), ..Selection::default() }), [9, 11]);
     assert_eq!(taken(&Selection { chains: chains(&["B", "A"]), ..Selection::default() }), [1, 3, 5, 6, 9, 11]);
     assert_eq!(taken(&Selection { altloc: Some('A'), ..Selection::default() }), [1, 2, 5, 6, 8, 10]);
-    // Residues without the letter keep their best.
+    // Residues without the letter keep their best alternative.
     assert_eq!(taken(&Selection { altloc: Some('C'), ..Selection::default() }), [1, 3, 5, 6, 9, 11]);
     assert_eq!(taken(&Selection { altloc: Some('B'), ..Selection::default() }), [1, 3, 7, 9, 11]);
     for blank in ["", "_"] {
@@ -121,7 +121,7 @@ fn models_chains_and_alternatives() {
 }
 
 #[test]
-fn what_is_not_there_is_answered_with_what_is() {
+fn errors_list_the_available_values() {
     assert_eq!(
         refusal(&Selection { model: Some(2), ..Selection::default() }),
         "model 2 is not in the file; it has 2 models 1, 5"
@@ -155,7 +155,7 @@ fn what_is_not_there_is_answered_with_what_is() {
 }
 
 #[test]
-fn contents_count_everything_once() {
+fn contents_count_every_atom_once() {
     let s = structure();
     let contents = Contents::of(&s, None);
     assert_eq!((contents.atoms, contents.model, &contents.models[..]), (19, 1, &[1, 5][..]));
@@ -170,7 +170,7 @@ fn contents_count_everything_once() {
 }
 
 #[test]
-fn interleaved_and_repeated_models_of_mmcif_are_told_by_number() {
+fn identifies_interleaved_models_of_mmcif_by_number() {
     let text = "data_x loop_ _atom_site.pdbx_PDB_model_num _atom_site.Cartn_x _atom_site.Cartn_y _atom_site.Cartn_z
 2 1 0 0 1 2 0 0 2 3 0 0 1 4 0 0";
     let s = read(text.as_bytes(), &ReadLimits::default()).unwrap();

@@ -1,7 +1,7 @@
-//! A writer of BinaryCIF that writes whatever it is told, wrong files too. `1crn.bcif` is `samples/1crn.cif` by
+//! Writer of BinaryCIF files for tests, including invalid ones. `1crn.bcif` was made from `samples/1crn.cif` by
 //! `tests/tools/write_bcif.py compressed`.
-#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
-#![allow(clippy::unwrap_used, unreachable_pub, reason = "tests say what they expect by panicking")]
+#![allow(dead_code, reason = "each test binary uses only a part of this file")]
+#![allow(clippy::unwrap_used, unreachable_pub, reason = "tests fail by panicking")]
 
 /// Crambin as biotite wrote it.
 pub const CRAMBIN: &[u8] = include_bytes!("1crn.bcif");
@@ -27,7 +27,7 @@ fn length(out: &mut Vec<u8>, head: u8, n: usize) {
 }
 
 impl Pack {
-    /// Its bytes, in forms of 32 or 64 bits.
+    /// Encodes the value, in forms of 32 or 64 bits.
     pub fn write(&self, out: &mut Vec<u8>) {
         match self {
             Nil => out.push(0xC0),
@@ -64,7 +64,7 @@ impl Pack {
         }
     }
 
-    /// The map with another value of a key, or with one more.
+    /// Returns the map with a key added or replaced.
     pub fn with(self, key: &'static str, value: Pack) -> Self {
         let Map(mut entries) = self else { return self };
         entries.retain(|(k, _)| *k != key);
@@ -72,14 +72,14 @@ impl Pack {
         Map(entries)
     }
 
-    /// The map without a key.
+    /// Returns the map without a key.
     pub fn without(self, key: &str) -> Self {
         let Map(mut entries) = self else { return self };
         entries.retain(|(k, _)| *k != key);
         Map(entries)
     }
 
-    /// A column, not its file's bytes, by name.
+    /// Returns a column of the file by name.
     pub fn is_named(&self, name: &str) -> bool {
         matches!(self, Map(entries) if entries.iter().any(|(k, v)| *k == "name" && matches!(v, Text(t) if t == name)))
     }
@@ -93,7 +93,7 @@ fn encoding(kind: &str, fields: Vec<(&'static str, Pack)>) -> Pack {
     Map([vec![("kind", text(kind))], fields].concat())
 }
 
-/// Types: 1, 2, 3 signed and 4, 5, 6 unsigned whole numbers of 8, 16, 32 bits; 32 and 33 real ones.
+/// Types: 1, 2, 3 signed and 4, 5, 6 unsigned integers of 8, 16, 32 bits; 32 and 33 real numbers.
 pub fn byte_array(code: i64) -> Pack {
     encoding("ByteArray", vec![("type", Int(code))])
 }
@@ -194,7 +194,7 @@ pub fn places(n: usize) -> Vec<Pack> {
     vec![reals("Cartn_x", &along(1.5)), reals("Cartn_y", &along(0.0)), reals("Cartn_z", &along(-0.25))]
 }
 
-/// A file with these columns of `n` atoms; those with a name that [`places`] has replace these.
+/// Returns a file with these columns of `n` atoms. They replace columns of [`places`] with the same name.
 pub fn atoms(n: usize, columns: Vec<Pack>) -> Vec<u8> {
     let mut all = places(n);
     for name in ["Cartn_x", "Cartn_y", "Cartn_z"] {
