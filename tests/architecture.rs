@@ -472,12 +472,16 @@ fn the_map_itself_has_no_cycle() {
 
 #[test]
 fn files_are_short() {
-    nothing(&too_long(&sources_under("src")));
+    for folder in ["src", "bench/src"] {
+        nothing(&too_long(&sources_under(folder)));
+    }
 }
 
 #[test]
 fn files_say_what_they_are_for() {
-    nothing(&without_doc(&sources_under("src")));
+    for folder in ["src", "bench/src"] {
+        nothing(&without_doc(&sources_under(folder)));
+    }
     nothing(&without_doc(&sources_under("tests")));
 }
 
@@ -493,7 +497,7 @@ fn stages_have_all_their_parts() {
 
 #[test]
 fn nothing_unfinished_is_left() {
-    for folder in ["src", "tests", "benches", "examples"] {
+    for folder in ["src", "tests", "benches", "examples", "bench"] {
         nothing(&unfinished(&sources_under(folder)));
     }
 }
