@@ -35,7 +35,7 @@ fmt-check:
 	$(CARGO) fmt --all -- --check
 
 lint: ## Clippy on everything, warnings are errors
-	$(CARGO) clippy --locked --all-targets -- -D warnings
+	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
 
 # Compiles the layers separately, so an async type in the core or a flag in the service is an error.
 matrix: ## Clippy on every supported combination of features
@@ -49,7 +49,7 @@ matrix: ## Clippy on every supported combination of features
 
 deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (three minutes) when absent
 	@command -v cargo-deny >/dev/null || $(CARGO) install cargo-deny --locked
-	$(CARGO) deny check licenses bans sources
+	$(CARGO) deny --workspace check licenses bans sources
 
 deny-if-installed:
 	@if command -v cargo-deny >/dev/null; then $(MAKE) --no-print-directory deny; \
@@ -77,9 +77,9 @@ bench: ## Run the benchmarks
 gallery: release ## Draw docs/gallery; DATA=FOLDER holds the structures, named by their PDB ids
 	docs/gallery/make.py $(if $(DATA),--data $(DATA))
 
-# The results of other machines lie in docs/results/paper too: `molmesh bench paper --out FOLDER` writes them.
-figures: ## The tables of docs/research/paper.md and its figures, from docs/results/paper
-	$(CARGO) run --bin molmesh -- bench figures docs/results/paper --out docs/figures --page docs/research/paper.md
+# `molmesh-bench paper --out FOLDER` writes such results.
+figures: ## Update the tables of docs/research/paper.md and its figures from docs/results/paper
+	$(CARGO) run --package molmesh-bench -- figures docs/results/paper --out docs/figures --page docs/research/paper.md
 
 release: web-if-possible ## Build the optimised binary, target/release/molmesh
 	$(CARGO) build --release --locked --bin molmesh

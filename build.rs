@@ -94,11 +94,9 @@ mod shaders {
 
     /// What is generated of a folder of shaders: the table's name, its layouts' name, the folder, and the shaders in the
     /// order in which they run.
-    const TABLES: [(&str, &str, &str, &[&str]); 4] = [
+    const TABLES: [(&str, &str, &str, &[&str]); 2] = [
         ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit"]),
-        ("PAPER", "PAPER_LAYOUTS", "paper/", &["field", "classify", "scan", "add", "map", "vertices", "normals"]),
         ("PICTURE", "PICTURE_LAYOUTS", "picture/", &["vertex", "fragment", "resolve", "finish"]),
-        ("YARDSTICKS", "YARDSTICK_LAYOUTS", "bench/", &["copy", "fma"]),
     ];
 
     pub(super) fn build() {
@@ -118,8 +116,7 @@ mod shaders {
                         let bindings = bindings(&module);
                         writeln!(
                             generated,
-                            "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}], {} }},",
-                            workgroup(&module)
+                            "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}] }},"
                         )
                         .expect("a string takes it");
                         layouts.extend(structs(&module));
@@ -169,14 +166,6 @@ mod shaders {
             [entry] if entry.name == "main" => Ok(module),
             others => Err(format!("{} entry points; one named main is wanted", others.len())),
         }
-    }
-
-    /// The threads of a workgroup, and the bytes that they share.
-    fn workgroup(module: &Module) -> String {
-        let threads: u32 = module.entry_points.iter().map(|entry| entry.workgroup_size.iter().product::<u32>()).sum();
-        let shared = module.global_variables.iter().filter(|(_, global)| global.space == AddressSpace::WorkGroup);
-        let bytes: u32 = shared.map(|(_, global)| module.types[global.ty].inner.size(module.to_ctx())).sum();
-        format!("workgroup_size: {threads}, workgroup_bytes: {bytes}")
     }
 
     fn bindings(module: &Module) -> String {

@@ -38,20 +38,14 @@ def host():
     return next(line.split()[1] for line in lines if line.startswith("host:"))
 
 
-def linked(metadata):
+def linked(metadata, target, chosen):
     """Returns the packages linked into molmesh, without molmesh, sorted by name and version."""
-    packages = {package["id"]: package for package in metadata["packages"]}
-    nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
-    root = metadata["resolve"]["root"]
-    seen, todo = {root}, [root]
-    while todo:
-        for dep in nodes[todo.pop()]["deps"]:
-            normal = any(kind["kind"] is None for kind in dep["dep_kinds"])
-            if normal and dep["pkg"] not in seen:
-                seen.add(dep["pkg"])
-                todo.append(dep["pkg"])
-    seen.discard(root)
-    return sorted((packages[i] for i in seen), key=lambda p: (p["name"], p["version"]))
+    # `cargo metadata` joins the features of all members of the workspace; `cargo tree` takes those of one package.
+    tree = ["tree", "--locked", "--package=molmesh", "--edges=normal", "--prefix=none", "--format={p}", f"--target={target}"]
+    lines = cargo(*tree, *chosen).decode().splitlines()
+    crates = {tuple(line.split()[:2]) for line in lines if line and not line.startswith("molmesh ")}
+    packages = [p for p in metadata["packages"] if (p["name"], f"v{p['version']}") in crates]
+    return sorted(packages, key=lambda p: (p["name"], p["version"]))
 
 
 def files(folder):
@@ -132,8 +126,8 @@ def main():
     target, musl = options.target, options.target.endswith("-musl")
     chosen = ["--no-default-features", f"--features={options.features}"] if options.features else []
     page = not chosen or "server" in options.features.split(",")
-    metadata = json.loads(cargo("metadata", "--format-version=1", "--locked", f"--filter-platform={target}", *chosen))
-    packages = linked(metadata)
+    metadata = json.loads(cargo("metadata", "--format-version=1", "--locked", f"--filter-platform={target}"))
+    packages = linked(metadata, target, chosen)
     line = "-" * 100
     print("molmesh is licensed under MIT OR Apache-2.0, at your option. It contains third-party software, listed here with")
     print(f"its licences ({target}).\n")

@@ -98,24 +98,3 @@ fn a_service_says_which_devices_it_found() {
     assert!(service.banner.contains("cpu: ") && service.banner.contains("(--devices cpu)"), "{}", service.banner);
     assert!(service.banner.contains("not gpu: "), "{}", service.banner);
 }
-
-#[test]
-fn the_program_of_2010_makes_the_same_triangles_unshared() {
-    let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/1crn.cif");
-    let folder = Folder::new();
-    let meshed = |backend: &str| {
-        let output = folder.path("out.glb");
-        let flags = ["--backend", backend, "--devices", "software", "--resolution", "1.0", "--report", "json"];
-        let done = mesh(sample.as_ref(), &output, &flags);
-        assert_code(&done, 0);
-        serde_json::from_str::<serde_json::Value>(&stdout(&done)).unwrap()
-    };
-    let [ours, paper] = ["gpu", "paper"].map(meshed);
-    assert_eq!((&ours["backend"], &paper["backend"]), (&"gpu".into(), &"paper".into()));
-    assert_eq!(ours["triangles"], paper["triangles"]);
-    assert_eq!(paper["vertices"].as_u64().unwrap(), 3 * paper["triangles"].as_u64().unwrap());
-    // Soup has no shared edges, and the report does not claim otherwise.
-    assert_eq!((&ours["closed"], &paper["closed"]), (&true.into(), &false.into()));
-    let area = |report: &serde_json::Value| report["area"].as_f64().unwrap();
-    assert!((area(&ours) / area(&paper) - 1.0).abs() < 1e-3, "{} {}", area(&ours), area(&paper));
-}

@@ -346,7 +346,7 @@ fn version_and_doctor_answer_on_stdout() {
     let doctor = cli_support::doctor(&[]);
     assert_code(&doctor, 0);
     let text = stdout(&doctor);
-    for part in ["cpu", "reference", "gpu", "paper", "auto", "limits", "cores", "vectors"] {
+    for part in ["cpu", "reference", "gpu", "auto", "limits", "cores", "vectors"] {
         assert!(text.contains(part), "no `{part}` in\n{text}");
     }
 }

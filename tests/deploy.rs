@@ -109,8 +109,17 @@ fn the_build_sees_every_file_that_it_reads() {
     let ignore = read(".dockerignore");
     let mut files = read_by_the_build();
     assert!(files.len() > 100, "only {} files are said to be read", files.len());
-    let more =
-        ["Cargo.toml", "Cargo.lock", "build.rs", "LICENSE-MIT", "LICENSE-APACHE", "web/swagger/NOTICE", "web/build.sh"];
+    let more = [
+        "Cargo.toml",
+        "Cargo.lock",
+        "build.rs",
+        "LICENSE-MIT",
+        "LICENSE-APACHE",
+        "web/swagger/NOTICE",
+        "web/build.sh",
+        "bench/Cargo.toml",
+        "bench/src/main.rs",
+    ];
     files.extend(more.into_iter().chain([CONFIGURATIONS[0], "deploy/notices.py"]).map(PathBuf::from));
     let left_out: Vec<_> = files.iter().filter(|path| !deploy_support::sent(&ignore, path)).collect();
     assert!(left_out.is_empty(), "left out of the build: {left_out:?}");
@@ -118,6 +127,7 @@ fn the_build_sees_every_file_that_it_reads() {
         ".git/config",
         "target/release/molmesh",
         "tests/deploy.rs",
+        "bench/src/device.rs",
         "web/node_modules/x/y.js",
         "web/dist/index.html.gz",
     ] {

@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use gpu_fakes::Step::{Hold, Lose, OutOfMemory, Serve};
 use gpu_fakes::{Rig, SETTINGS, devices, spheres};
-use molmesh::gpu::{DevicePool, GpuBackend, GpuError, Look, Program, discover};
+use molmesh::gpu::{DevicePool, GpuBackend, GpuError, Look, discover};
 use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, Meshed, Observer, Stage, Step, SurfaceError,
     SurfaceLimits, SurfaceParams,
@@ -203,9 +203,7 @@ fn what_is_not_there_is_missing_and_nothing_can_be_started_on_it() {
     let choice: DeviceChoice = "77".parse().unwrap();
     let found = discover(&choice, Look::Quick);
     assert_eq!(found.missing(&choice), ["there is no device 77"]);
-    let Err(GpuError::NoDevice(why)) = GpuBackend::start(&found, Program::Stages, &SETTINGS, None) else {
-        panic!("it started")
-    };
+    let Err(GpuError::NoDevice(why)) = GpuBackend::start(&found, &SETTINGS, None) else { panic!("it started") };
     assert!(!why.is_empty());
     let quick = discover(&DeviceChoice::Cpu, Look::Quick);
     assert_eq!((quick.devices.len(), quick.why_none().as_deref()), (0, Some("the CPU was asked for")));

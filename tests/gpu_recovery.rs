@@ -7,9 +7,7 @@ mod gpu_support;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use molmesh::gpu::{
-    DevicePool, Engine, Executor, GpuBackend, GpuError, Look, PoolDevice, PoolSettings, Program, discover,
-};
+use molmesh::gpu::{DevicePool, Engine, Executor, GpuBackend, GpuError, Look, PoolDevice, PoolSettings, discover};
 use molmesh::surface::{Backend, Control, CpuBackend, Meshed, SurfaceError, SurfaceLimits, SurfaceParams};
 
 fn run(backend: &dyn Backend) -> Result<Meshed, SurfaceError> {
@@ -20,8 +18,7 @@ fn run(backend: &dyn Backend) -> Result<Meshed, SurfaceError> {
 #[test]
 fn a_device_that_was_found_meshes_as_the_cpu_does() {
     let choice = "software".parse().unwrap();
-    let backend =
-        GpuBackend::start(&discover(&choice, Look::Thorough), Program::Stages, &PoolSettings::default(), None).unwrap();
+    let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
     backend.warm().unwrap();
     let (cpu, gpu) = (run(&CpuBackend::new(None).unwrap()).unwrap(), run(&backend).unwrap());
     assert_eq!(gpu.mesh.n_triangles(), cpu.mesh.n_triangles());
@@ -36,8 +33,7 @@ fn a_device_that_was_found_meshes_as_the_cpu_does() {
 #[test]
 fn callers_share_submissions_and_get_what_they_would_get_alone() {
     let choice = "software".parse().unwrap();
-    let backend =
-        GpuBackend::start(&discover(&choice, Look::Thorough), Program::Stages, &PoolSettings::default(), None).unwrap();
+    let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
     let alone = run(&backend).unwrap().mesh;
     std::thread::scope(|scope| {
         for _ in 0..12 {

@@ -3,7 +3,7 @@
     python3 gpu_field.py ATOMS.npz … --spacing 0.5 1.0 --runs 30 > baselines.json
 
 ATOMS.npz is made by gpu_atoms.py. Every baseline samples our density on our lattice, from atoms that lie on the device, and
-its triangles are ours but for rounding; `molmesh bench gpu` times the same work. The baselines:
+its triangles are ours but for rounding; `molmesh-bench gpu` times the same work. The baselines:
 
 * `torch`: whole-array operations (gpu_arrays.py), pairs of atom and sample added by index;
 * `torch.compile`: the same with that step compiled into one kernel, marching cubes as above;

@@ -67,10 +67,6 @@ pub(crate) enum Command {
     /// Sign an address of the service, so that it opens without a key until it expires
     #[cfg(feature = "server")]
     Sign(SignArgs),
-    /// Time what this machine has
-    #[cfg(all(feature = "gpu", feature = "server"))]
-    #[command(subcommand)]
-    Bench(super::bench::Bench),
     /// Print the version
     Version,
 }
@@ -86,8 +82,6 @@ pub(crate) enum BackendName {
     Reference,
     /// The GPU or nothing
     Gpu,
-    /// The program of Dias, Bora and Gomes (2010), on the GPU
-    Paper,
 }
 
 /// How the report is written.

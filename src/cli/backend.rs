@@ -82,11 +82,8 @@ pub(crate) fn check(asked: &Asked<'_>) -> Result<(), CliError> {
     if asked.threads == Some(0) {
         return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
     }
-    let of_gpu = |name| matches!(name, BackendName::Gpu | BackendName::Paper);
-    if of_gpu(asked.backend) && *asked.devices == DeviceChoice::Cpu {
-        return Err(CliError::usage(
-            "parameter `devices`: cpu is not allowed with --backend gpu and paper; expected a GPU",
-        ));
+    if asked.backend == BackendName::Gpu && *asked.devices == DeviceChoice::Cpu {
+        return Err(CliError::usage("parameter `devices`: cpu is not allowed with --backend gpu; expected a GPU"));
     }
     Ok(())
 }
@@ -108,7 +105,7 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     match asked.backend {
         BackendName::Cpu => Ok(unasked(cpu(asked, use_)?)),
         BackendName::Reference => Ok(unasked(Box::new(ReferenceBackend))),
-        BackendName::Auto | BackendName::Gpu | BackendName::Paper => gpu_or_cpu(asked, use_),
+        BackendName::Auto | BackendName::Gpu => gpu_or_cpu(asked, use_),
     }
 }
 
@@ -142,8 +139,7 @@ fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
     // Whoever asks for a device by name does not want to learn from a report that it was not used.
     if asked.backend != BackendName::Auto || matches!(asked.devices, DeviceChoice::These(_)) {
-        let asked = if asked.backend == BackendName::Paper { "paper" } else { "gpu" };
-        return Err(CliError::NoBackend { asked, why: format!("no GPU can be used: {why}") });
+        return Err(CliError::NoBackend { asked: "gpu", why: format!("no GPU can be used: {why}") });
     }
     let reason = match asked.devices {
         DeviceChoice::Cpu => "--devices cpu".to_owned(),
@@ -179,7 +175,7 @@ fn gpu(_asked: &Asked<'_>, _use: &Use) -> Gpu {
 
 #[cfg(feature = "gpu")]
 fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
-    use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, Program, discover};
+    use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, discover};
 
     // One mesh is not worth asking drivers that have nothing to drive; who asks for a GPU wants to know of all.
     let once = matches!(use_, Use::Once | Use::Picture);
@@ -209,8 +205,7 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
         BackendName::Auto => CpuBackend::new(asked.threads).ok().map(|cpu| Box::new(cpu) as Box<dyn Backend>),
         _ => None,
     };
-    let program = if asked.backend == BackendName::Paper { Program::Paper } else { Program::Stages };
-    let started = GpuBackend::start(&discovery, program, &settings, fallback);
+    let started = GpuBackend::start(&discovery, &settings, fallback);
     let drawer = match drawer(asked, use_, &discovery) {
         Ok(drawer) => drawer,
         Err(why) => return none(discovery.devices, why),

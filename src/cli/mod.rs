@@ -6,8 +6,6 @@ mod args;
 mod backend;
 #[cfg(feature = "server")]
 mod banner;
-#[cfg(all(feature = "gpu", feature = "server"))]
-mod bench;
 #[cfg(feature = "server")]
 mod config;
 #[cfg(feature = "server")]
@@ -72,8 +70,6 @@ fn run() -> i32 {
         Command::Key(command) => key::run(&command),
         #[cfg(feature = "server")]
         Command::Sign(args) => sign::run(&args),
-        #[cfg(all(feature = "gpu", feature = "server"))]
-        Command::Bench(bench) => bench::run(&bench),
         Command::Version => version(),
     };
     match result {

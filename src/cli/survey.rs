@@ -40,10 +40,5 @@ pub(crate) fn survey(picked: &Picked) -> Vec<Candidate> {
     let left = picked.devices.iter().filter(|device| !device.taken);
     survey
         .extend(left.map(|d| candidate(&format!("gpu {}", d.number), Err(format!("{}: {}", d.facts.name, d.reason)))));
-    let paper = match &picked.no_gpu {
-        None => Ok("the program of 2010, on the same devices, to compare with".to_owned()),
-        Some(_) => Err("the program of 2010 runs on a GPU".to_owned()),
-    };
-    survey.push(candidate("paper", paper));
     survey
 }

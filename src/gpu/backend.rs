@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use super::device::{self, Program};
+use super::device;
 use super::discover::Discovery;
 use super::error::GpuError;
-use super::executor::GpuJob;
+use super::executor::{Executor, GpuJob};
 use super::lane::one_line;
 use super::pool::{self, DevicePool, PoolDevice, PoolSettings};
 use super::prepare::Prepared;
@@ -17,19 +17,17 @@ use crate::surface::{
 /// Meshes on devices.
 pub struct GpuBackend {
     pool: DevicePool,
-    name: &'static str,
     /// Serves what no device could, and says so in [`Meshed::served`].
     fallback: Option<Box<dyn Backend>>,
 }
 
 impl GpuBackend {
-    /// Builds `program` on every device that `discovery` takes.
+    /// Compiles the stages on every device that `discovery` takes.
     ///
     /// # Errors
     /// [`GpuError::NoDevice`] with every device's reason if none is taken or none could be built.
     pub fn start(
         discovery: &Discovery,
-        program: Program,
         settings: &PoolSettings,
         fallback: Option<Box<dyn Backend>>,
     ) -> Result<Self, GpuError> {
@@ -39,22 +37,21 @@ impl GpuBackend {
         let taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(device, _)| device.taken);
         let devices = taken.map(|(device, adapter)| {
             let adapter = adapter.clone();
-            let build = Box::new(move || device::build(&adapter, program));
+            let build = Box::new(move || device::engine(&adapter).map(|engine| Box::new(engine) as Box<dyn Executor>));
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
         let devices: Vec<_> = devices.collect();
-        // The program of 2010 knows no parts. Devices of different models or drivers would make a mesh whose bytes
-        // depend on which of them were free.
+        // With devices of different models or drivers, the bytes of a mesh would depend on which of them were free.
         let alike = devices.windows(2).all(|pair| pair[0].name == pair[1].name);
-        let spread_bricks = settings.spread_bricks.filter(|_| program == Program::Stages && alike);
+        let spread_bricks = settings.spread_bricks.filter(|_| alike);
         let pool = DevicePool::start(devices, &PoolSettings { spread_bricks, ..*settings })?;
-        Ok(Self { name: program.name(), ..Self::over(pool, fallback) })
+        Ok(Self::over(pool, fallback))
     }
 
     /// The backend over a pool that runs already.
     #[must_use]
     pub fn over(pool: DevicePool, fallback: Option<Box<dyn Backend>>) -> Self {
-        Self { pool, name: Program::Stages.name(), fallback }
+        Self { pool, fallback }
     }
 
     /// The pool of its devices.
@@ -98,16 +95,16 @@ pub(super) fn describe(facts: &DeviceFacts) -> String {
 
 impl Backend for GpuBackend {
     fn name(&self) -> &'static str {
-        self.name
+        "gpu"
     }
 
     fn arithmetic(&self) -> String {
         let status = self.pool.status();
         let up = status.iter().find(|device| device.down.is_none());
         match (up, &self.fallback) {
-            (Some(device), _) => arithmetic(self.name, &device.name),
+            (Some(device), _) => arithmetic(self.name(), &device.name),
             (None, Some(fallback)) => fallback.arithmetic(),
-            (None, None) => arithmetic(self.name, "no device"),
+            (None, None) => arithmetic(self.name(), "no device"),
         }
     }
 
@@ -131,7 +128,7 @@ impl Backend for GpuBackend {
                 ran.finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));
                 // Several devices make one job only if they are alike.
                 let device = ran.by.first().map_or("", |work| work.device.as_str());
-                let arithmetic = arithmetic(self.name, device);
+                let arithmetic = arithmetic(self.name(), device);
                 let served = Served { backend: self.name(), arithmetic, device: ran.device(), instead: None };
                 return Ok(Meshed { served: Some(served), ..ran.finished.meshed });
             }

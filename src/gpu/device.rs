@@ -1,59 +1,26 @@
-//! From an adapter to what runs jobs on it.
+//! Opens devices, and compiles the stages on them.
 
 use wgpu::{Adapter, Device, DeviceDescriptor, ExperimentalFeatures, Features, MemoryHints, Queue, Trace};
 
 use super::engine::Engine;
 use super::error::GpuError;
-use super::executor::Executor;
-use super::paper::Paper;
 
-/// Features that are used where a device has them.
+/// Optional features, requested if the device has them.
 const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 
-/// Which program runs on a device.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Program {
-    /// Ours.
-    Stages,
-    /// The one of 2010, to compare with.
-    Paper,
-}
-
-impl Program {
-    /// The name of the backend that runs it.
-    pub(super) const fn name(self) -> &'static str {
-        match self {
-            Self::Stages => "gpu",
-            Self::Paper => "paper",
-        }
-    }
-}
-
-/// Opens `adapter` and builds the stages on it: the one place where a device meets them.
+/// Opens `adapter` and compiles the stages on it.
 ///
 /// # Errors
-/// [`GpuError::Failed`] where the driver refuses, and those of the stages.
+/// [`GpuError::Failed`] if the driver refuses the device, and the errors of [`Engine::new`].
 pub(super) fn engine(adapter: &Adapter) -> Result<Engine, GpuError> {
     let (device, queue) = open(adapter)?;
     Engine::new(device, queue)
 }
 
-/// Likewise, with a program on top.
+/// Opens `adapter` with the adapter's own limits.
 ///
 /// # Errors
-/// As [`engine`], and those of the program.
-pub(super) fn build(adapter: &Adapter, program: Program) -> Result<Box<dyn Executor>, GpuError> {
-    let engine = engine(adapter)?;
-    Ok(match program {
-        Program::Stages => Box::new(engine),
-        Program::Paper => Box::new(Paper::new(engine)?),
-    })
-}
-
-/// Opens `adapter` with all that its limits allow.
-///
-/// # Errors
-/// [`GpuError::Failed`] where the driver refuses.
+/// [`GpuError::Failed`] if the driver refuses.
 pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
     let descriptor = DeviceDescriptor {
         label: Some("molmesh"),

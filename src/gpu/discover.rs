@@ -4,7 +4,8 @@ use std::panic::catch_unwind;
 
 use wgpu::{Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags};
 
-use super::{choose, hardware};
+use super::error::GpuError;
+use super::{choose, device, hardware};
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, FoundDevice};
 
 /// How thoroughly to look.
@@ -35,6 +36,18 @@ impl Discovery {
     /// The devices that are taken.
     pub fn taken(&self) -> impl Iterator<Item = &FoundDevice> {
         self.devices.iter().filter(|device| device.taken)
+    }
+
+    /// Opens the taken device with this number, with all that its limits allow and timestamps where it has them.
+    ///
+    /// # Errors
+    /// [`GpuError::NoDevice`] if no taken device has the number; [`GpuError::Failed`] if the driver refuses.
+    pub fn open(&self, number: usize) -> Result<(wgpu::Device, wgpu::Queue), GpuError> {
+        let mut all = self.devices.iter().zip(&self.adapters);
+        match all.find(|(device, _)| device.taken && device.number == number) {
+            Some((_, adapter)) => device::open(adapter),
+            None => Err(GpuError::NoDevice(format!("no usable device has number {number}"))),
+        }
     }
 
     /// Why no device is taken, on one line; `None` if one is.

@@ -4,6 +4,7 @@
 //! counted first, and their output is then made in buffers of just the right size: the round trip between is nothing
 //! against their transfer. What does not fit at once goes in chunks of tiles.
 
+use std::cell::Cell;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -14,7 +15,6 @@ use super::executor::{Executor, Finished, GpuJob};
 use super::flight::VertexBytes;
 use super::health::{Complaint, Health};
 use super::landing::Landings;
-use super::meter::Meter;
 use super::pipelines::{N_STAGES, Pipelines, Variant};
 use super::record::Clock;
 use super::share::Share;
@@ -82,7 +82,7 @@ pub struct Engine {
     pub(super) workspaces: Vec<Workspace>,
     pub(super) landings: Landings,
     health: Arc<Health>,
-    pub(super) meter: Meter,
+    pub(super) submissions: Cell<u64>,
 }
 
 /// A job on its way: its buffers are filled.
@@ -140,21 +140,16 @@ impl Engine {
             clock,
             cases,
             health,
-            meter: Meter::default(),
+            submissions: Cell::new(0),
         };
         engine.healthy()?;
         Ok(engine)
     }
 
-    /// Whether it tells the stages' times.
+    /// Returns the number of submissions so far.
     #[must_use]
-    pub const fn has_clock(&self) -> bool {
-        self.clock.is_some()
-    }
-
-    /// Bytes of the largest binding.
-    pub(super) const fn binding_bytes(&self) -> u64 {
-        self.binding
+    pub const fn submissions(&self) -> u64 {
+        self.submissions.get()
     }
 
     /// What was complained about since the last look, but for memory.

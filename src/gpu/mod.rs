@@ -8,7 +8,6 @@
 
 mod assemble;
 pub mod backend;
-pub mod bench;
 mod choose;
 mod device;
 pub mod discover;
@@ -21,10 +20,7 @@ mod health;
 mod landing;
 mod lane;
 pub mod manifests;
-pub mod meter;
 mod output;
-pub mod paper;
-mod paper_pipelines;
 mod part;
 pub mod picture;
 mod picture_targets;
@@ -44,18 +40,16 @@ mod spread;
 mod submit;
 mod worker;
 mod workspace;
-pub mod yardstick;
 
 pub use backend::GpuBackend;
-pub use device::Program;
 pub use discover::{Discovery, Look, discover};
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
 pub use executor::{Executor, Finished, GpuJob};
 pub use manifests::{Manifest, manifests};
-pub use paper::Paper;
 pub use picture::GpuRenderer;
 pub use pool::{DevicePool, PoolDevice, PoolSettings, Ran, Work};
 pub use prepare::Prepared;
+pub use shaders::stage_shaders;
 pub use share::Share;
 pub use worker::{Build, MOST_REBUILDS};

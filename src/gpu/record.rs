@@ -64,13 +64,6 @@ impl<'a> Recording<'a> {
         Self { encoder, pipelines, clock, timed: Vec::new() }
     }
 
-    /// The stages with times so far: from the first to behind the last; all between have some.
-    pub(super) fn timed(&self) -> Option<std::ops::Range<usize>> {
-        let of = |stage: &Stage| number(*stage);
-        self.clock?;
-        Some(self.timed.iter().map(of).min()?..self.timed.iter().map(of).max()? + 1)
-    }
-
     /// Has the times of `stages` read here that ran in the submission before.
     pub(super) fn timed_before(&mut self, stages: &[Stage]) {
         self.timed.extend(stages);

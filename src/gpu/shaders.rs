@@ -29,10 +29,6 @@ pub(super) struct Shader {
     /// Its text, fragments included.
     pub(super) source: &'static str,
     pub(super) bindings: &'static [Binding],
-    /// Threads of a workgroup.
-    pub(super) workgroup_size: u32,
-    /// Bytes that they share.
-    pub(super) workgroup_bytes: u32,
 }
 
 /// A struct that lies in a buffer, as a shader declares it.
@@ -46,6 +42,11 @@ pub(super) struct Layout {
 }
 
 include!(concat!(env!("OUT_DIR"), "/shaders.rs"));
+
+/// Returns the complete WGSL source of every mesh stage, by stage name and in execution order.
+pub fn stage_shaders() -> impl Iterator<Item = (&'static str, &'static str)> {
+    SHADERS.iter().map(|shader| (shader.stage, shader.source))
+}
 
 impl Binding {
     /// The binding as a layout declares it. Parameters are one of several rows of their buffer.
@@ -158,18 +159,6 @@ mod tests {
     fn structs_are_laid_out_alike_on_both_sides() {
         assert_eq!(LAYOUTS.len(), host().len(), "every struct in a buffer is compared");
         assert_eq!(differences(LAYOUTS, &host()), Vec::<String>::new());
-    }
-
-    #[test]
-    fn the_papers_structs_are_laid_out_alike_on_both_sides() {
-        use crate::gpu::paper::Box;
-        let mut all = host();
-        all.retain(|(name, ..)| PAPER_LAYOUTS.iter().any(|layout| layout.name == *name));
-        all.push(host!("Box", Box, origin, n_atoms, n, n_samples, scale, n_active, n_triangles, pad));
-        assert_eq!(all.len(), PAPER_LAYOUTS.len(), "Atom, Params and Box");
-        assert_eq!(differences(PAPER_LAYOUTS, &all), Vec::<String>::new());
-        all[2].1 += 4;
-        assert!(!differences(PAPER_LAYOUTS, &all).is_empty());
     }
 
     #[test]

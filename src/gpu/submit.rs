@@ -14,24 +14,22 @@ use super::record::Recording;
 pub(super) struct Flight {
     index: wgpu::SubmissionIndex,
     landings: Vec<(Landing, u64)>,
-    timed: Option<std::ops::Range<usize>>,
 }
 
 impl Engine {
     /// Submits, and asks for the landings' first bytes.
     pub(super) fn launch(&self, recording: Recording<'_>, landings: Vec<(Landing, u64)>) -> Result<Flight, GpuError> {
-        let timed = recording.timed();
         let index = self.queue.submit([recording.encoder.finish()]);
         for (landing, bytes) in &landings {
             landing.request(*bytes).map_err(GpuError::Failed)?;
         }
-        self.meter.count_submission();
-        Ok(Flight { index, landings, timed })
+        self.submissions.update(|n| n + 1);
+        Ok(Flight { index, landings })
     }
 
     /// Waits for a submission and all before it, and returns the landings' first bytes.
     pub(super) fn land(&self, flight: Flight) -> Result<Vec<Arc<Landing>>, GpuError> {
-        let Flight { index, landings, timed } = flight;
+        let Flight { index, landings } = flight;
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });
         if waited.is_err() {
             // A loss is told by a callback, which a device that cannot wait any more has not run yet.
@@ -39,15 +37,7 @@ impl Engine {
         }
         self.healthy()?;
         waited.map_err(|e| GpuError::Failed(e.to_string()))?;
-        let landed: Vec<_> = landings
-            .into_iter()
-            .map(|(landing, bytes)| landing.look(bytes).map_err(GpuError::Failed))
-            .collect::<Result<_, _>>()?;
-        if let (Some(clock), Some(landing), Some(stages)) = (&self.clock, landed.first(), timed) {
-            let ticks: &[u64] = values((**landing).as_ref(), 0, 2 * N_STAGES as u64).map_err(GpuError::Failed)?;
-            self.meter.add_span(&ticks[2 * stages.start..2 * stages.end], f64::from(clock.period));
-        }
-        Ok(landed)
+        landings.into_iter().map(|(landing, bytes)| landing.look(bytes).map_err(GpuError::Failed)).collect()
     }
 
     /// Submits, waits, and returns the landings' first bytes.

@@ -1,0 +1,59 @@
+//! The least time that a stage can take on a device: the bytes that it must move at the rate of memory, or its arithmetic at
+//! the rate of multiply-adds, whichever takes longer.
+//!
+//! Every byte counts once, as if caches were perfect. Arithmetic counts only the necessary pairs of grid point and atom:
+//! those in bricks that the atom reaches.
+//!
+//! | stage | reads | writes | arithmetic |
+//! |---|---|---|---|
+//! | bin | 36 B per atom, 212 B per tile, 8 B per brick | 4 B per list entry, 16 B per brick | – |
+//! | field | the lists, 32 B per atom | 2 KiB per brick | 2 multiply-adds per pair of grid point and atom |
+//! | classify | 2 KiB per brick | 292 B per brick | – |
+//! | scan | 4 B per brick | 8 B per brick | – |
+//! | interpolate | 2 KiB, 248 B and the lists of a brick with surface, 32 B per atom | 24 B per vertex, quantised 12 B | 10 per vertex and atom that reaches the vertex's brick |
+//! | emit | 300 B per brick with surface | 12 B per triangle | – |
+
+use molmesh::gpu::Prepared;
+use molmesh::surface::{Meshed, Stage};
+
+use crate::rates::Rates;
+
+/// The least work of a stage.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Work {
+    pub(crate) bytes: f64,
+    /// Multiply-adds.
+    pub(crate) fmas: f64,
+}
+
+impl Work {
+    /// The work of `stage` in a finished job.
+    pub(crate) fn of(stage: Stage, job: &Prepared, meshed: &Meshed) -> Self {
+        let atoms = job.lattice.atoms.len() as f64;
+        let (bricks, tiles) = (job.plan.bricks.len() as f64, job.plan.tiles.len() as f64);
+        let entries = job.plan.candidates.iter().sum::<u64>() as f64;
+        let surface = meshed.grid.surface_bricks as f64;
+        let pairs = job.plan.pairs as f64;
+        let (vertices, triangles) = (meshed.mesh.n_vertices() as f64, meshed.mesh.n_triangles() as f64);
+        let (bytes, fmas) = match stage {
+            Stage::Bin => (36.0 * atoms + 212.0 * tiles + 24.0 * bricks + 4.0 * entries, 0.0),
+            Stage::Field => (4.0 * entries + 32.0 * atoms + 2048.0 * bricks, 2.0 * 512.0 * pairs),
+            Stage::Classify => ((2048.0 + 292.0) * bricks, 0.0),
+            Stage::Scan => (12.0 * bricks, 0.0),
+            Stage::Interpolate => {
+                let lists = 4.0 * entries * surface / bricks.max(1.0);
+                let each = if meshed.mesh.quantized.is_some() { 12.0 } else { 24.0 };
+                let reach = pairs / job.plan.occupied.max(1) as f64;
+                ((2048.0 + 248.0) * surface + lists + 32.0 * atoms + each * vertices, 10.0 * vertices * reach)
+            }
+            Stage::Emit => (300.0 * surface + 12.0 * triangles, 0.0),
+            Stage::Write | Stage::Measure => (0.0, 0.0),
+        };
+        Self { bytes, fmas }
+    }
+
+    /// The least time, s.
+    pub(crate) fn seconds(self, rates: &Rates) -> f64 {
+        (self.bytes / rates.memory).max(self.fmas / rates.fma)
+    }
+}

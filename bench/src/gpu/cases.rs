@@ -1,0 +1,110 @@
+//! The cases: structures at grid spacings.
+
+use std::path::Path;
+
+use molmesh::surface::lattice::Lattice;
+use molmesh::surface::{Spheres, SurfaceOptions, SurfaceParams};
+
+use crate::error::{Error, Result};
+use crate::{grid, structures};
+
+/// Cubes of the 2010 paper's largest structure, 1BIJ, which 2HHB replaces.
+const PAPER_CUBES: u64 = 7_267_456;
+
+/// A source of atoms.
+#[derive(Debug, Clone, Copy)]
+enum Source {
+    /// The atoms of these kinds of an entry, repeated `copies` times along x and y.
+    File { id: &'static str, kinds: &'static str, copies: usize },
+    /// A ball of this many generated atoms.
+    Ball(usize),
+}
+
+/// A grid spacing.
+#[derive(Debug, Clone, Copy)]
+enum Spacing {
+    /// Å.
+    Is(f64),
+    /// The spacing at which the box has this many cells.
+    Cells(u64),
+}
+
+/// A structure at a spacing.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Case {
+    /// Its name, for `--only`.
+    pub(super) name: &'static str,
+    source: Source,
+    spacing: Spacing,
+}
+
+/// Makes gigabytes of mesh.
+const HUGE: &str = "7cgo-x9-0.5";
+
+/// Returns the cases whose names contain `only`, [`HUGE`] only by its whole name; the generated case has `atoms` atoms.
+pub(super) fn selected(atoms: usize, only: &str) -> Vec<Case> {
+    let file = |name, id, kinds, copies, spacing| Case { name, source: Source::File { id, kinds, copies }, spacing };
+    let all = [
+        Case { name: "ball-0.5", source: Source::Ball(atoms), spacing: Spacing::Is(0.5) },
+        file("2hhb-7.27M", "2hhb", "polymer", 1, Spacing::Cells(PAPER_CUBES)),
+        file("1aon-0.5", "1aon", "polymer,ligand", 1, Spacing::Is(0.5)),
+        file("7cgo-0.5", "7cgo", "polymer", 1, Spacing::Is(0.5)),
+        file("7cgo-1.0", "7cgo", "polymer", 1, Spacing::Is(1.0)),
+        file("7cgo-x9-1.0", "7cgo", "polymer", 3, Spacing::Is(1.0)),
+        file(HUGE, "7cgo", "polymer", 3, Spacing::Is(0.5)),
+    ];
+    let wanted = |case: &Case| if case.name == HUGE { only == HUGE } else { case.name.contains(only) };
+    all.into_iter().filter(wanted).collect()
+}
+
+impl Case {
+    /// Loads the spheres, and the default surface at the case's spacing.
+    ///
+    /// # Errors
+    /// [`Error`] if the file is missing or holds no structure.
+    pub(super) fn load(&self, folder: Option<&Path>) -> Result<(Spheres, SurfaceParams)> {
+        let spheres = match self.source {
+            Source::Ball(n) => structures::ball(n, 1)?,
+            Source::File { id, kinds, copies } => {
+                let folder = folder.ok_or_else(|| Error::Failed(format!("--data must name a folder with {id}")))?;
+                let path = structures::find(folder, id)?
+                    .ok_or_else(|| Error::Failed(format!("no file {id} in {}", folder.display())))?;
+                let one = structures::read(&path, Some(kinds))?;
+                structures::tiled(&one, one.len() * copies * copies, [copies; 2])?
+            }
+        };
+        let params = |spacing| {
+            let options = SurfaceOptions { resolution: Some(spacing), ..SurfaceOptions::default() };
+            SurfaceParams::new(&options).map_err(Error::failed)
+        };
+        let cells =
+            |spacing| Lattice::new(&spheres, &params(spacing)?).map(|lattice| lattice.box_cells).map_err(Error::failed);
+        let spacing = match self.spacing {
+            Spacing::Is(spacing) => spacing,
+            Spacing::Cells(n) => grid::for_cubes(n, &cells)?.spacing,
+        };
+        let params = params(spacing)?;
+        Ok((spheres, params))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gigabytes_are_measured_only_by_name() {
+        let names = |only| selected(1, only).iter().map(|case| case.name).collect::<Vec<_>>();
+        assert_eq!(names("x9"), ["7cgo-x9-1.0"]);
+        assert_eq!(names(HUGE), [HUGE]);
+        assert_eq!(names("").len(), 6);
+    }
+
+    #[test]
+    fn a_missing_file_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let [case] = selected(1, "2hhb")[..] else { panic!("one case") };
+        assert!(case.load(Some(folder.path())).unwrap_err().to_string().contains("no file 2hhb"));
+        assert!(case.load(None).unwrap_err().to_string().contains("--data"));
+    }
+}

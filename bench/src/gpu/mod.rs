@@ -1,0 +1,169 @@
+//! `molmesh-bench gpu`: the stages on GPUs, small jobs, many callers, and several devices.
+
+mod cases;
+mod jobs;
+mod measure;
+mod pool;
+mod several;
+
+use std::path::PathBuf;
+
+use molmesh::formats::Compress;
+use molmesh::gpu::{GpuBackend, GpuJob, Look, PoolSettings, Prepared, discover};
+use molmesh::surface::devices::DeviceName;
+use molmesh::surface::{
+    Backend as _, CancelToken, Control, DeviceChoice, Spheres, Step, SurfaceLimits, SurfaceParams, lattice,
+};
+use serde_json::{Value, json};
+
+use crate::device::Selected;
+use crate::error::{Error, Result};
+use crate::{rates, say};
+use cases::Case;
+
+/// Limits of the benchmarks, which have the machine to themselves.
+pub(crate) const LIMITS: SurfaceLimits =
+    SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30, max_candidates: 1 << 31 };
+/// Runs before the measured ones.
+const WARM_UP: usize = 3;
+
+/// Arguments of `molmesh-bench gpu`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct GpuArgs {
+    /// The device: auto, software, or a number that `molmesh doctor` prints; hardware comes first
+    #[arg(long, value_name = "WHICH", default_value = "0")]
+    device: DeviceChoice,
+    /// Measured runs of each case, after three unmeasured ones
+    #[arg(long, value_name = "N", default_value_t = 20)]
+    runs: usize,
+    /// Folder with 2hhb, 1aon and 7cgo, as PDB or mmCIF, plain or compressed
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    /// Only the cases whose name contains this; 7cgo-x9-0.5, which makes gigabytes, only by its whole name
+    #[arg(long, value_name = "NAME")]
+    only: Option<String>,
+    /// Atoms of the generated case, which needs no file
+    #[arg(long, value_name = "N", default_value_t = 60_000)]
+    atoms: usize,
+    /// How vertices are stored: none (single precision, 24 bytes each), or quantize (12 bytes)
+    #[arg(long, value_name = "HOW", default_value = Compress::None.name(), conflicts_with_all = ["jobs", "pool"],
+        value_parser = [Compress::None.name(), Compress::Quantize.name()])]
+    compress: String,
+    /// Compare each mesh with the CPU's
+    #[arg(long)]
+    check: bool,
+    /// Measure this many jobs of 600 atoms instead, one by one and in batches
+    #[arg(long, value_name = "N")]
+    jobs: Option<usize>,
+    /// Measure this many jobs of 600 atoms, and fewer large ones, on 1, 2, … devices from many callers instead
+    #[arg(long, value_name = "N", conflicts_with_all = ["jobs", "device"])]
+    pool: Option<usize>,
+    /// Callers of --pool per device
+    #[arg(long, value_name = "N", requires = "pool", default_value_t = 8)]
+    callers: usize,
+    /// Measure each case on 1, 2, 4, … devices together instead, each with at least this many bricks
+    #[arg(long, value_name = "BRICKS", conflicts_with_all = ["jobs", "device", "pool", "check"],
+        num_args = 0..=1, default_missing_value = "32768")]
+    spread: Option<u64>,
+    /// Devices of --pool and --spread: all, software, or numbers
+    #[arg(long, value_name = "WHICH", default_value = "all", conflicts_with = "device")]
+    devices: DeviceChoice,
+    /// Write the results to this file too, as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Runs the command.
+pub(crate) fn run(args: &GpuArgs) -> Result<()> {
+    if args.runs == 0 || args.atoms == 0 || args.jobs == Some(0) || args.pool == Some(0) || args.callers == 0 {
+        return Err(Error::Usage("--runs, --atoms, --jobs, --pool and --callers must be at least 1".to_owned()));
+    }
+    let results = if let Some(n) = args.pool {
+        pool::run(&args.devices, n, args.callers)?
+    } else if let Some(min_bricks) = args.spread {
+        several::run(&args.devices, min_bricks, &loaded(args)?, args.runs)?
+    } else {
+        let selected = Selected::new(&args.device)?;
+        say(&format!("{}, {}\n", selected.name, selected.driver))?;
+        match args.jobs {
+            Some(n) => jobs::run(&mut selected.engine()?, n)?,
+            None => stages(args, &selected)?,
+        }
+    };
+    let Some(path) = &args.json else { return Ok(()) };
+    std::fs::write(path, format!("{results:#}\n")).map_err(Error::file(path))
+}
+
+/// Loads the selected cases. Prints which of them cannot be measured.
+fn loaded(args: &GpuArgs) -> Result<Vec<(Case, Spheres, SurfaceParams)>> {
+    let mut loaded = Vec::new();
+    for case in cases::selected(args.atoms, args.only.as_deref().unwrap_or_default()) {
+        match case.load(args.data.as_deref()) {
+            Ok((spheres, params)) => {
+                let quantized = args.compress == Compress::Quantize.name();
+                let quantize = quantized.then(|| Step::covering(lattice::extent(&spheres, &params)));
+                loaded.push((case, spheres, SurfaceParams { quantize, ..params }));
+            }
+            Err(why) => say(&format!("{}: not measured: {why}\n", case.name))?,
+        }
+    }
+    Ok(loaded)
+}
+
+/// Measures the stages of every case. Each has an engine of its own, with empty buffers.
+fn stages(args: &GpuArgs, selected: &Selected) -> Result<Value> {
+    let rates = rates::measure(&selected.gpu()?, selected.software)?;
+    say(&match &rates {
+        Some(r) => format!(
+            "measured: memory {:.3} TB/s (read + written), {:.2} T multiply-adds/s, to the host {:.1} GB/s, round trip {:.0} µs\n\n",
+            r.memory * 1e-12,
+            r.fma * 1e-12,
+            r.to_host * 1e-9,
+            r.round_trip * 1e6,
+        ),
+        None => "no timestamps on this device: no times of stages\n\n".to_owned(),
+    })?;
+    let mut rows = Vec::new();
+    for (case, spheres, params) in loaded(args)? {
+        let row = measure::measure(&mut selected.engine()?, &spheres, &params, args.runs, rates.as_ref(), args.check);
+        rows.push(match row {
+            Ok(row) => {
+                say(&measure::table(case.name, &row))?;
+                json!({ "case": case.name, "measured": row })
+            }
+            Err(why) => {
+                say(&format!("{}: not measured: {why}\n", case.name))?;
+                json!({ "case": case.name, "not_measured": why.to_string() })
+            }
+        });
+    }
+    let Selected { name, driver, .. } = selected;
+    Ok(json!({ "device": name, "driver": driver, "rates": rates, "runs": args.runs, "cases": rows }))
+}
+
+/// Prepares a job.
+fn prepare(spheres: &Spheres, params: &SurfaceParams) -> Result<GpuJob> {
+    let prepared = Prepared::new(spheres, params, &LIMITS, &Control::default()).map_err(Error::failed)?;
+    Ok(GpuJob { prepared: prepared.into(), cancel: CancelToken::default(), deadline: None })
+}
+
+/// Starts backends on the first, the first two, four, … and all devices of `choice`, and calls `measure` with each and its
+/// number of devices.
+fn on_more_devices(
+    choice: &DeviceChoice,
+    settings: &PoolSettings,
+    mut measure: impl FnMut(&GpuBackend, usize) -> Result<()>,
+) -> Result<()> {
+    let found = discover(choice, Look::Thorough);
+    if let Some(why) = found.why_none() {
+        return Err(Error::NoDevice(why));
+    }
+    let numbers: Vec<DeviceName> = found.taken().map(|device| DeviceName::Number(device.number)).collect();
+    for n in (1..=numbers.len()).filter(|n| n.is_power_of_two() || *n == numbers.len()) {
+        let some = discover(&DeviceChoice::These(numbers[..n].to_vec()), Look::Thorough);
+        let backend = GpuBackend::start(&some, settings, None).map_err(Error::failed)?;
+        backend.warm().map_err(Error::failed)?;
+        measure(&backend, n)?;
+    }
+    Ok(())
+}

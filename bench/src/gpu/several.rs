@@ -1,0 +1,148 @@
+//! One structure at a time on several devices together.
+
+use std::fmt::Write as _;
+use std::time::Instant;
+
+use molmesh::gpu::{GpuBackend, PoolSettings, Ran};
+use molmesh::surface::{DeviceChoice, Spheres, Step, SurfaceParams};
+use serde::Serialize;
+use serde_json::{Value, json};
+use sha2::{Digest as _, Sha256};
+
+use super::cases::Case;
+use super::measure::byte_columns;
+use super::{WARM_UP, on_more_devices, prepare};
+use crate::error::{Error, Result};
+use crate::say;
+use crate::stats::Summary;
+
+/// A case on several devices. Times are in ms.
+#[derive(Debug, Serialize)]
+struct Row {
+    case: &'static str,
+    devices: usize,
+    atoms: usize,
+    bricks: usize,
+    triangles: usize,
+    /// Quantisation step of the vertices, Å.
+    step: Option<f32>,
+    /// Bytes of the mesh.
+    bytes: u64,
+    /// On the host, before the devices: lattice and plan.
+    prepare_ms: Summary,
+    /// From spheres to a mesh in host memory.
+    ready_ms: Summary,
+    /// The part of each device.
+    by: Vec<Part>,
+    /// Whether the mesh has the same bytes as on a single device.
+    same: bool,
+}
+
+/// The part of one device.
+#[derive(Debug, Serialize)]
+struct Part {
+    device: String,
+    /// Device time by stage, ms.
+    stages: Vec<(&'static str, Summary)>,
+    stages_ms: Summary,
+}
+
+/// Measures `cases` on 1, 2, 4, … devices of `choice`, with at least `min_bricks` bricks per device.
+pub(super) fn run(
+    choice: &DeviceChoice,
+    min_bricks: u64,
+    cases: &[(Case, Spheres, SurfaceParams)],
+    runs: usize,
+) -> Result<Value> {
+    say("one structure at a time; ms, medians (minima)\n")?;
+    let (mut rows, mut digests) = (Vec::new(), vec![None; cases.len()]);
+    let settings = PoolSettings { spread_bricks: Some(min_bricks), ..PoolSettings::default() };
+    on_more_devices(choice, &settings, |backend, devices| {
+        for ((case, spheres, params), first) in cases.iter().zip(&mut digests) {
+            let (row, digest) = measure(backend, spheres, params, runs)?;
+            let same = *first.get_or_insert_with(|| digest.clone()) == digest;
+            let row = Row { case: case.name, devices, same, ..row };
+            say(&text(&row))?;
+            rows.push(row);
+        }
+        Ok(())
+    })?;
+    Ok(json!({ "spread": rows, "runs": runs }))
+}
+
+/// Measures a case on the devices of `backend`. The SHA-256 of its mesh comes back too.
+fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs: usize) -> Result<(Row, Vec<u8>)> {
+    let [mut prepare_ms, mut ready_ms] = [const { Vec::new() }; 2];
+    let mut all: Vec<Ran> = Vec::with_capacity(runs);
+    let mut last = None;
+    for run in 0..WARM_UP + runs {
+        // The previous mesh goes first: its memory is reused.
+        drop(last.take());
+        let start = Instant::now();
+        let job = prepare(spheres, params)?;
+        let prepared_at = start.elapsed().as_secs_f64() * 1e3;
+        let mut ran = backend.pool().ran(&job).map_err(Error::failed)?;
+        let ready_at = start.elapsed().as_secs_f64() * 1e3;
+        let mesh = std::mem::take(&mut ran.finished.meshed.mesh);
+        if run >= WARM_UP {
+            prepare_ms.push(prepared_at);
+            ready_ms.push(ready_at);
+            all.push(ran);
+        }
+        last = Some((job, mesh));
+    }
+    let (job, mesh) = last.ok_or_else(|| Error::failed("no run"))?;
+    let row = Row {
+        case: "",
+        devices: 0,
+        atoms: spheres.len(),
+        bricks: job.prepared.plan.bricks.len(),
+        triangles: mesh.n_triangles(),
+        step: params.quantize.map(Step::length),
+        bytes: mesh.bytes(),
+        prepare_ms: Summary::of(prepare_ms),
+        ready_ms: Summary::of(ready_ms),
+        by: parts(&all),
+        same: false,
+    };
+    let digest = byte_columns(&mesh).into_iter().fold(Sha256::new(), Sha256::chain_update);
+    Ok((row, digest.finalize().to_vec()))
+}
+
+/// Summarises each part over all runs: parts are the same in every run, and idle devices take them in turn.
+fn parts(all: &[Ran]) -> Vec<Part> {
+    let n = all.iter().map(|ran| ran.by.len()).min().unwrap_or_default();
+    let part = |k: usize| {
+        let ms = |ns: u64| ns as f64 * 1e-6;
+        let first = &all[0].by[k];
+        let stage = |i: usize| all.iter().filter_map(move |ran| ran.by[k].stages.get(i)).map(move |(_, ns)| ms(*ns));
+        Part {
+            device: first.device.clone(),
+            stages: (0..first.stages.len()).map(|i| (first.stages[i].0.name(), Summary::of(stage(i)))).collect(),
+            stages_ms: Summary::of(all.iter().map(|ran| ran.by[k].stages.iter().map(|(_, ns)| ms(*ns)).sum())),
+        }
+    };
+    (0..n).map(part).collect()
+}
+
+fn text(r: &Row) -> String {
+    let mut text = format!(
+        "{} on {}: {} atoms, {} bricks, {} triangles, {:.1} MB: prepare {:.1}, ready {:.1} ({:.1}); {}\n",
+        r.case,
+        r.devices,
+        r.atoms,
+        r.bricks,
+        r.triangles,
+        r.bytes as f64 * 1e-6,
+        r.prepare_ms.median,
+        r.ready_ms.median,
+        r.ready_ms.min,
+        if r.same { "the same bytes as on one device" } else { "OTHER BYTES THAN ON ONE DEVICE" },
+    );
+    for (k, part) in r.by.iter().enumerate() {
+        let stages: Vec<String> = part.stages.iter().map(|(stage, ms)| format!("{stage} {:.3}", ms.median)).collect();
+        // Writing to a string does not fail.
+        _ = writeln!(text, "  part {k}, {}: {}; sum {:.3}", part.device, stages.join(", "), part.stages_ms.median);
+    }
+    text
+}

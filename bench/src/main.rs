@@ -1,0 +1,67 @@
+//! `molmesh-bench`: benchmarks of molmesh on GPUs, and the tables and figures of the 2010 paper on today's hardware.
+
+mod device;
+mod error;
+mod floor;
+mod gpu;
+mod grid;
+mod machine;
+mod paper;
+mod program_2010;
+mod rates;
+mod stand_in;
+mod stats;
+mod structures;
+
+use std::io::Write as _;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use error::{Error, Result};
+
+#[derive(Debug, Parser)]
+#[command(version, about = "Benchmarks of molmesh")]
+struct Args {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Time the stages on GPUs, and compare them with the least time that each device needs
+    Gpu(Box<gpu::GpuArgs>),
+    /// Measure the tables of Dias, Bora and Gomes (HPDC 2010) on this machine
+    Paper(Box<paper::PaperArgs>),
+    /// Download the structures of the 2010 paper
+    Fetch(paper::fetch::FetchArgs),
+    /// Draw the figures of the 2010 paper, and update the tables of a Markdown page, from stored results
+    Figures(paper::redraw::FiguresArgs),
+}
+
+fn main() -> ExitCode {
+    let done = match Args::parse().command {
+        Command::Gpu(args) => gpu::run(&args),
+        Command::Paper(args) => paper::run(&args),
+        Command::Fetch(args) => paper::fetch::run(&args),
+        Command::Figures(args) => paper::redraw::run(&args),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            note(&format!("molmesh-bench: {error}"));
+            ExitCode::from(error.code())
+        }
+    }
+}
+
+/// Writes `text` to standard output.
+fn say(text: &str) -> Result<()> {
+    let mut out = std::io::stdout().lock();
+    out.write_all(text.as_bytes()).and_then(|()| out.flush()).map_err(Error::file("standard output"))
+}
+
+/// Writes a line to standard error: progress and errors. Nobody is left to tell if that fails.
+fn note(line: &str) {
+    drop(writeln!(std::io::stderr().lock(), "{line}"));
+}
