@@ -57,15 +57,15 @@ pub struct StageShape {
 /// The shapes of our stages, then of the 2010 program's, in the order in which they run.
 #[must_use]
 pub fn shapes() -> Vec<StageShape> {
-    let shape = |paper| {
-        move |shader: &Shader| StageShape {
+    fn shape<B>(paper: bool, shader: &Shader<B>) -> StageShape {
+        StageShape {
             paper,
             stage: shader.stage,
             workgroup_size: shader.workgroup_size,
             workgroup_bytes: shader.workgroup_bytes,
         }
-    };
-    SHADERS.iter().map(shape(false)).chain(PAPER.iter().map(shape(true))).collect()
+    }
+    SHADERS.iter().map(|s| shape(false, s)).chain(PAPER.iter().map(|s| shape(true, s))).collect()
 }
 
 impl Engine {
@@ -87,9 +87,10 @@ mod tests {
         assert_eq!((of(true, "field").workgroup_size, of(true, "field").workgroup_bytes), (64, 0));
         assert_eq!(of(true, "classify").workgroup_size, 256);
         assert!(of(false, "field").workgroup_bytes > 0 && of(true, "scan").workgroup_bytes > 0);
-        for (shape, shader) in shapes.iter().zip(SHADERS.iter().chain(&PAPER)) {
+        let sources = SHADERS.iter().map(|s| s.source).chain(PAPER.iter().map(|s| s.source));
+        for (shape, source) in shapes.iter().zip(sources) {
             // Sizes that are written as numbers.
-            if let Some((_, rest)) = shader.source.split_once("@workgroup_size(")
+            if let Some((_, rest)) = source.split_once("@workgroup_size(")
                 && let Some(size) = rest.split(')').next().and_then(|n| n.trim_end_matches('u').parse::<u32>().ok())
             {
                 assert_eq!(shape.workgroup_size, size, "{}", shape.stage);

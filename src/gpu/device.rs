@@ -1,4 +1,4 @@
-//! From an adapter to what runs jobs on it.
+//! Opens adapters and builds the executors on them.
 
 use wgpu::{Adapter, Device, DeviceDescriptor, ExperimentalFeatures, Features, MemoryHints, Queue, Trace};
 
@@ -7,20 +7,20 @@ use super::error::GpuError;
 use super::executor::Executor;
 use super::paper::Paper;
 
-/// Features that are used where a device has them.
+/// Features that are used if the device has them.
 const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 
-/// Which program runs on a device.
+/// Program that runs on a device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Program {
-    /// Ours.
+    /// The stages of this crate.
     Stages,
-    /// The one of 2010, to compare with.
+    /// The 2010 program, for comparison.
     Paper,
 }
 
 impl Program {
-    /// The name of the backend that runs it.
+    /// Name of the backend that runs the program.
     pub(super) const fn name(self) -> &'static str {
         match self {
             Self::Stages => "gpu",
@@ -29,19 +29,19 @@ impl Program {
     }
 }
 
-/// Opens `adapter` and builds the stages on it: the one place where a device meets them.
+/// Opens `adapter` and builds the engine on it.
 ///
 /// # Errors
-/// [`GpuError::Failed`] where the driver refuses, and those of the stages.
+/// [`GpuError::Failed`] if the driver rejects the request; those of [`Engine::new`].
 pub(super) fn engine(adapter: &Adapter) -> Result<Engine, GpuError> {
     let (device, queue) = open(adapter)?;
     Engine::new(device, queue)
 }
 
-/// Likewise, with a program on top.
+/// Opens `adapter` and builds the executor of `program` on it.
 ///
 /// # Errors
-/// As [`engine`], and those of the program.
+/// Those of [`engine`] and of the program.
 pub(super) fn build(adapter: &Adapter, program: Program) -> Result<Box<dyn Executor>, GpuError> {
     let engine = engine(adapter)?;
     Ok(match program {
@@ -50,10 +50,10 @@ pub(super) fn build(adapter: &Adapter, program: Program) -> Result<Box<dyn Execu
     })
 }
 
-/// Opens `adapter` with all that its limits allow.
+/// Opens `adapter` with its own limits.
 ///
 /// # Errors
-/// [`GpuError::Failed`] where the driver refuses.
+/// [`GpuError::Failed`] if the driver rejects the request.
 pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
     let descriptor = DeviceDescriptor {
         label: Some("molmesh"),

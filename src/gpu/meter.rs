@@ -28,7 +28,7 @@ impl Meter {
         let (first, last) = (ticks.iter().min(), ticks.iter().max());
         let span = first.zip(last).map_or(0, |(first, last)| last - first);
         let was = self.0.get();
-        self.0.set(Metered { device_ns: was.device_ns + super::engine::scaled(span, period), ..was });
+        self.0.set(Metered { device_ns: was.device_ns + super::recording::ticks_to_ns(span, period), ..was });
     }
 
     pub(super) fn take(&self) -> Metered {

@@ -1,205 +1,182 @@
-//! A job's output: in pieces that a binding holds, each in a landing that the host can read. The next one is made while the
-//! one before is on its way.
+//! Second half of a job: its output, in pieces that fit a binding, each in a readback buffer. A piece is submitted
+//! before the previous one is collected.
 
-use wgpu::Buffer;
-
-use super::engine::{Engine, Loaded, check};
+use super::buffers::BufferId;
+use super::count::{N_COUNT_STAGES, narrow};
+use super::engine::Engine;
 use super::error::GpuError;
-use super::flight::{Arrived, Piece, Places, TALLY_AT, TRIANGLE_BYTES, VertexBytes, pieces};
-use super::progress::{Counted, Progress, Sent};
-use super::record::{Dispatch, Recording};
-use super::run::FRONT;
-use super::workspace::{Needs, OutputRows, Workspace};
+use super::job_state::{ChunkCounts, JobState, PendingOutput};
+use super::output_layout::{OutputPiece, ReadbackLayout, ReadbackRows, TRIANGLE_BYTES, VertexBytes, pieces};
+use super::plan::layout::Params;
+use super::workspace::{BufferSizes, OutputCapacity};
 use crate::surface::Stage;
-use crate::surface::layout::{Params, Tally};
 
-/// Rows of parameters: the chunk's and a piece's.
+/// Rows of parameters: one for the chunk and one for the output piece.
 pub(super) const PARAM_ROWS: u64 = 2;
-/// Output is made before it is counted where the buffers hold the estimate for a small job over this: a ball of 60,000
-/// atoms at 0.5 Å needs a sixth of the estimate, and what is less solid needs more.
-const LIKELY: u64 = 8;
-
-pub(super) fn failed(why: String) -> GpuError {
-    GpuError::Failed(why)
-}
-
-/// `n` rows as 32 bits; buffers are smaller than that.
-pub(super) fn narrow(n: u64) -> Result<u32, GpuError> {
-    u32::try_from(n).map_err(|e| failed(format!("{n} rows: {e}")))
-}
-
-/// Copies counters, and the groups to where they shall lie.
-pub(super) fn copy_counts(
-    recording: &mut Recording<'_>,
-    workspace: &Workspace,
-    target: &Buffer,
-    groups: Option<(u64, u64)>,
-) {
-    let encoder = &mut recording.encoder;
-    encoder.copy_buffer_to_buffer(workspace.buffer("tally"), 0, target, TALLY_AT, size_of::<Tally>() as u64);
-    if let Some((at, bytes)) = groups {
-        encoder.copy_buffer_to_buffer(workspace.buffer("groups"), 0, target, at, bytes);
-    }
-}
-
-/// Copies the first `bytes` bytes of a buffer.
-pub(super) fn copy_rows(recording: &mut Recording<'_>, from: &Buffer, target: &Buffer, at: u64, bytes: u64) {
-    if bytes > 0 {
-        recording.encoder.copy_buffer_to_buffer(from, 0, target, at, bytes);
-    }
-}
-
-/// Copies the first `n` vertices in the workspace to their columns.
-pub(super) fn copy_vertices(
-    recording: &mut Recording<'_>,
-    loaded: &Loaded<'_>,
-    target: &Buffer,
-    places: &Places,
-    n: u64,
-) {
-    let workspace = &loaded.workspace;
-    let VertexBytes { positions, normals, sources } = loaded.vertex;
-    copy_rows(recording, workspace.buffer("positions"), target, places.positions, positions * n);
-    copy_rows(recording, workspace.buffer("normals"), target, places.normals, normals * n);
-    copy_rows(recording, workspace.buffer("sources"), target, places.sources, sources * n);
-}
-
-impl Loaded<'_> {
-    pub(super) fn dispatch(&self, row: u64, workgroups: u32) -> Dispatch<'_> {
-        Dispatch { workspace: &self.workspace, row, workgroups, variant: self.variant }
-    }
-}
+/// Output is submitted before the counts are known if the buffers hold at least 1/8 of the small-job estimate. A ball
+/// of 60,000 atoms at 0.5 Å needs 1/6, and less compact structures need more. This hides one round trip to the host,
+/// 0.14 ms on an H200.
+const SPECULATION_DIVISOR: u64 = 8;
+/// Capacity of the buffers before the output is counted.
+pub(super) const NO_OUTPUT: OutputCapacity = OutputCapacity { vertices: 0, triangles: 0, params: PARAM_ROWS };
 
 impl Engine {
-    /// Vertices, triangles or both of all chunks; vertices of one only, the first.
+    /// Counts every chunk and submits its vertices, because its samples are overwritten by the next chunk; triangles
+    /// need the vertex numbers of all chunks. `accept` is called with the index of each counted chunk and returns
+    /// whether to make its vertices.
+    pub(super) fn count_chunks(
+        &mut self,
+        state: &mut JobState<'_>,
+        mut accept: impl FnMut(&Self, &JobState<'_>, usize) -> Result<bool, GpuError>,
+    ) -> Result<Vec<ChunkCounts>, GpuError> {
+        let n_chunks = state.loaded.chunks.len();
+        let mut all = Vec::with_capacity(n_chunks);
+        for chunk in 0..n_chunks {
+            state.loaded.job.check()?;
+            // The vertices of the previous chunk are read back meanwhile.
+            let submission = self.submit_count(state, chunk)?;
+            self.collect_output(state)?;
+            let counts = self.wait_for_counts(state, chunk, submission)?;
+            if accept(self, state, chunk)? {
+                let pieces = self.pieces(state, &[(chunk, &counts)]);
+                self.ensure_capacity(state, &pieces)?;
+                self.submit_pieces(state, chunk, &pieces, [true, false])?;
+            }
+            all.push(counts);
+        }
+        Ok(all)
+    }
+
+    /// Makes the vertices, the triangles or both of all chunks; vertices only if there is a single chunk.
     pub(super) fn output(
         &mut self,
-        progress: &mut Progress<'_>,
-        counted: &[Counted],
+        state: &mut JobState<'_>,
+        counts: &[ChunkCounts],
         columns: [bool; 2],
     ) -> Result<(), GpuError> {
-        let all: Vec<_> = counted.iter().enumerate().collect();
-        let pieces = self.pieces(progress, &all);
-        self.make_room(progress, &pieces)?;
-        self.send_pieces(progress, 0, &pieces, columns)?;
-        self.settle(progress)
+        let all: Vec<_> = counts.iter().enumerate().collect();
+        let pieces = self.pieces(state, &all);
+        self.ensure_capacity(state, &pieces)?;
+        self.submit_pieces(state, 0, &pieces, columns)?;
+        self.collect_output(state)
     }
 
-    /// Pieces of output of some chunks, each small enough for a binding.
-    pub(super) fn pieces(&self, progress: &Progress<'_>, counted: &[(usize, &Counted)]) -> Vec<Piece> {
-        let most = self.most_rows(progress.loaded.vertex);
-        let cut = |&(chunk, counted): &(usize, &Counted)| {
-            let own = &progress.loaded.chunks[chunk];
-            pieces([own.first_brick, own.n_own], &counted.groups, counted.first, most)
+    /// Cuts the output of chunks into pieces that fit a binding.
+    fn pieces(&self, state: &JobState<'_>, counts: &[(usize, &ChunkCounts)]) -> Vec<OutputPiece> {
+        let max = self.max_rows(state.loaded.vertex);
+        let cut = |&(chunk, counts): &(usize, &ChunkCounts)| {
+            let own = &state.loaded.chunks[chunk];
+            pieces([own.first_brick, own.n_own], &counts.groups, counts.first, max)
         };
-        counted.iter().flat_map(cut).collect()
+        counts.iter().flat_map(cut).collect()
     }
 
-    /// Vertices and triangles of the largest piece of output.
-    fn most_rows(&self, vertex: VertexBytes) -> [u64; 2] {
-        let most = self.budget.piece_bytes.min(self.budget.landing_bytes / 4);
-        [most / vertex.positions, most / TRIANGLE_BYTES]
+    /// Maximum number of vertices and triangles of a piece.
+    fn max_rows(&self, vertex: VertexBytes) -> [u64; 2] {
+        let bytes = self.budget.piece_bytes.min(self.budget.readback_bytes / 4);
+        [bytes / vertex.positions, bytes / TRIANGLE_BYTES]
     }
 
-    /// Output buffers for the largest of some pieces.
-    pub(super) fn make_room(&mut self, progress: &mut Progress<'_>, pieces: &[Piece]) -> Result<(), GpuError> {
-        let rows = OutputRows {
+    /// Grows the output buffers to the largest of `pieces`.
+    fn ensure_capacity(&mut self, state: &mut JobState<'_>, pieces: &[OutputPiece]) -> Result<(), GpuError> {
+        let capacity = OutputCapacity {
             vertices: pieces.iter().map(|p| p.n_vertices).max().unwrap_or_default(),
             triangles: pieces.iter().map(|p| p.n_triangles).max().unwrap_or_default(),
-            ..Self::no_rows()
+            ..NO_OUTPUT
         };
-        let loaded = &mut progress.loaded;
-        let needs = Needs::new(&loaded.job.prepared.plan, &loaded.chunks, loaded.vertex, rows);
-        self.grow(loaded, &needs)
+        let loaded = &mut state.loaded;
+        let sizes = BufferSizes::new(&loaded.job.prepared.plan, &loaded.chunks, loaded.vertex, capacity);
+        self.grow(loaded, &sizes)
     }
 
-    /// Makes the vertices, the triangles or both of some pieces. Each is sent before the one before it has landed; the last
-    /// is left on its way.
-    pub(super) fn send_pieces(
+    /// Submits the vertices, the triangles or both of `pieces`, and collects all but the last.
+    fn submit_pieces(
         &self,
-        progress: &mut Progress<'_>,
+        state: &mut JobState<'_>,
         chunk: usize,
-        pieces: &[Piece],
+        pieces: &[OutputPiece],
         columns: [bool; 2],
     ) -> Result<(), GpuError> {
         for piece in pieces {
-            check(progress.loaded.job)?;
-            let flight = self.send_piece(&progress.loaded, chunk, piece, columns)?;
-            self.settle(progress)?;
-            progress.sent = Some(flight);
+            state.loaded.job.check()?;
+            let params = Params {
+                piece_brick: piece.brick,
+                piece_bricks: piece.n_bricks,
+                piece_vertex: narrow(piece.vertex)?,
+                piece_triangle: narrow(piece.triangle & u64::from(u32::MAX))?,
+                vertex_capacity: narrow(piece.n_vertices)?,
+                triangle_capacity: narrow(piece.n_triangles)?,
+                ..state.loaded.chunks[chunk].params(&state.loaded.params)
+            };
+            let rows = [piece.n_vertices * u64::from(columns[0]), piece.n_triangles * u64::from(columns[1])];
+            let pending = self.submit_output(state, Some(&params), rows, columns)?;
+            self.collect_output(state)?;
+            state.pending = Some(pending);
         }
         Ok(())
     }
 
-    /// Takes the output that is on its way, if any is.
-    pub(super) fn settle(&self, progress: &mut Progress<'_>) -> Result<(), GpuError> {
-        let Some(Sent { flight, places, rows, columns: [vertices, triangles] }) = progress.sent.take() else {
+    /// Submits the stages of an output piece with `params`, or none if they ran before, and the copies of its `rows`.
+    /// Each piece is a submission of its own, because a stage has one time per submission.
+    fn submit_output(
+        &self,
+        state: &JobState<'_>,
+        params: Option<&Params>,
+        rows: [u64; 2],
+        columns: [bool; 2],
+    ) -> Result<PendingOutput, GpuError> {
+        let loaded = &state.loaded;
+        let layout = ReadbackLayout::new(rows, loaded.vertex);
+        let readback = self.readback.acquire(&self.device, layout.end);
+        let target = readback.buffer().map_err(GpuError::Failed)?;
+        let mut recording = self.recording();
+        if let Some(params) = params {
+            self.write_params(&loaded.workspace, 1, params);
+        }
+        for (stage, _) in [Stage::Interpolate, Stage::Emit].into_iter().zip(columns).filter(|(_, wanted)| *wanted) {
+            match params {
+                Some(params) => recording.stage(stage, &[loaded.dispatch(1, params.piece_bricks)]),
+                None => recording.include_time(stage),
+            }
+        }
+        recording.copy_output(&loaded.workspace, loaded.vertex, rows, target, &layout);
+        recording.copy_timestamps(target);
+        recording.copy_counters(&loaded.workspace, target);
+        let submission = self.submit(recording, vec![(readback, layout.end)])?;
+        Ok(PendingOutput { submission, layout, rows, columns })
+    }
+
+    /// Waits for the pending output, if any, and adds it to the job.
+    pub(super) fn collect_output(&self, state: &mut JobState<'_>) -> Result<(), GpuError> {
+        let Some(PendingOutput { submission, layout, rows, columns: [vertices, triangles] }) = state.pending.take()
+        else {
             return Ok(());
         };
-        let landing = self.land(flight)?.pop().ok_or_else(|| failed("a submission without its landing".to_owned()))?;
-        progress.note_flat(&landing)?;
-        let first = if vertices { FRONT } else { FRONT + 1 };
-        self.add_times(progress, &landing, first..FRONT + 1 + usize::from(triangles))?;
-        let arrived = Arrived { landing, places, n_vertices: rows[0], n_triangles: rows[1] };
-        progress.vertices.extend(vertices.then(|| arrived.clone()));
-        progress.triangles.extend(triangles.then_some(arrived));
+        let readback = self.wait_one(submission)?;
+        state.note_flat_vertices(&readback)?;
+        let first = if vertices { N_COUNT_STAGES } else { N_COUNT_STAGES + 1 };
+        let end = N_COUNT_STAGES + 1 + usize::from(triangles);
+        self.add_times(&mut state.times, &readback, first..end)?;
+        let rows = ReadbackRows { readback, layout, n_vertices: rows[0], n_triangles: rows[1] };
+        state.vertices.extend(vertices.then(|| rows.clone()));
+        state.triangles.extend(triangles.then_some(rows));
         Ok(())
     }
 
-    /// A submission of its own for each piece: stages have one time a submission, which holds no copies then.
-    fn send_piece(
-        &self,
-        loaded: &Loaded<'_>,
-        chunk: usize,
-        piece: &Piece,
-        columns: [bool; 2],
-    ) -> Result<Sent, GpuError> {
-        let [vertices, triangles] = columns;
-        let rows = [piece.n_vertices * u64::from(vertices), piece.n_triangles * u64::from(triangles)];
-        let places = Places::new(rows[0], rows[1], loaded.vertex);
-        let landing = self.landings.get(&self.device, places.end);
-        let target = landing.buffer().map_err(failed)?;
-        let params = Params {
-            piece_brick: piece.brick,
-            piece_bricks: piece.n_bricks,
-            piece_vertex: narrow(piece.vertex)?,
-            piece_triangle: narrow(piece.triangle & u64::from(u32::MAX))?,
-            vertex_capacity: narrow(piece.n_vertices)?,
-            triangle_capacity: narrow(piece.n_triangles)?,
-            ..loaded.chunks[chunk].params(&loaded.params)
-        };
-        self.write_params(&loaded.workspace, 1, &params);
-        let mut recording = self.recording();
-        let dispatch = [loaded.dispatch(1, piece.n_bricks)];
-        if vertices {
-            recording.stage(Stage::Interpolate, &dispatch);
-            copy_vertices(&mut recording, loaded, target, &places, rows[0]);
-        }
-        if triangles {
-            recording.stage(Stage::Emit, &dispatch);
-            let buffer = loaded.workspace.buffer("triangles");
-            copy_rows(&mut recording, buffer, target, places.triangles, TRIANGLE_BYTES * rows[1]);
-        }
-        recording.read_clock(target);
-        copy_counts(&mut recording, &loaded.workspace, target, None);
-        let flight = self.launch(recording, vec![(landing, places.end)])?;
-        Ok(Sent { flight, places, rows, columns })
-    }
-
-    /// Submits the whole output of a job's only chunk before it is counted, into the buffers as they are. Returns the
-    /// vertices and triangles that they hold: what is more than that is not written. None where they are so small that
-    /// it would be.
-    pub(super) fn tail_ahead(&self, progress: &Progress<'_>) -> Result<Option<[u64; 2]>, GpuError> {
-        let loaded = &progress.loaded;
-        let [most_vertices, most_triangles] = self.most_rows(loaded.vertex);
-        let hold = |name: &str, each: u64| loaded.workspace.buffer(name).size().checked_div(each).unwrap_or(u64::MAX);
+    /// Submits the output of a job's only chunk into the buffers as they are, before it is counted. Returns the number
+    /// of vertices and triangles that the buffers hold (the stages write no more), or `None` without a submission if
+    /// the buffers are probably too small; see [`SPECULATION_DIVISOR`].
+    pub(super) fn submit_speculative_output(&self, state: &JobState<'_>) -> Result<Option<[u64; 2]>, GpuError> {
+        let loaded = &state.loaded;
+        let [max_vertices, max_triangles] = self.max_rows(loaded.vertex);
+        let rows = |id: BufferId, each: u64| loaded.workspace.buffer(id).size().checked_div(each).unwrap_or(u64::MAX);
         let VertexBytes { positions, normals, sources } = loaded.vertex;
-        let columns = [hold("positions", positions), hold("normals", normals), hold("sources", sources)];
-        let vertices = columns.into_iter().fold(most_vertices, u64::min);
-        let triangles = hold("triangles", TRIANGLE_BYTES).min(most_triangles);
+        let columns = [(BufferId::Positions, positions), (BufferId::Normals, normals), (BufferId::Sources, sources)];
+        let vertices = columns.into_iter().map(|(id, each)| rows(id, each)).fold(max_vertices, u64::min);
+        let triangles = rows(BufferId::Triangles, TRIANGLE_BYTES).min(max_triangles);
         let n_bricks = u64::from(loaded.params.n_bricks);
-        let few = self.budget.rows_per_brick.map(|each| each * n_bricks / LIKELY);
-        if vertices < few[0] || triangles < few[1] {
+        let likely = self.budget.rows_per_brick.map(|each| each * n_bricks / SPECULATION_DIVISOR);
+        if vertices < likely[0] || triangles < likely[1] {
             return Ok(None);
         }
         let params = Params {
@@ -210,43 +187,27 @@ impl Engine {
         };
         self.write_params(&loaded.workspace, 1, &params);
         let mut recording = self.recording();
-        let tail = [loaded.dispatch(1, params.n_bricks)];
-        recording.stage(Stage::Interpolate, &tail);
-        recording.stage(Stage::Emit, &tail);
-        self.launch(recording, Vec::new())?;
+        for stage in [Stage::Interpolate, Stage::Emit] {
+            recording.stage(stage, &[loaded.dispatch(1, params.piece_bricks)]);
+        }
+        self.submit(recording, Vec::new())?;
         Ok(Some([vertices, triangles]))
     }
 
-    /// Copies the output that was submitted ahead, if the buffers had room for it and a landing has. Whether they had.
-    pub(super) fn copy_tail(
+    /// Reads back the speculative output if it fits `capacity` and a readback buffer. Returns whether it did.
+    pub(super) fn collect_speculative_output(
         &self,
-        progress: &mut Progress<'_>,
-        counted: &Counted,
-        room: Option<[u64; 2]>,
+        state: &mut JobState<'_>,
+        counts: &ChunkCounts,
+        capacity: Option<[u64; 2]>,
     ) -> Result<bool, GpuError> {
-        let (rows, loaded) = ([counted.n_vertices, counted.n_triangles], &progress.loaded);
-        let places = Places::new(rows[0], rows[1], loaded.vertex);
-        let fits = room.is_some_and(|room| rows[0] <= room[0] && rows[1] <= room[1]);
-        if !fits || places.end > self.budget.landing_bytes {
+        let rows = [counts.n_vertices, counts.n_triangles];
+        let fits = capacity.is_some_and(|capacity| rows[0] <= capacity[0] && rows[1] <= capacity[1]);
+        if !fits || ReadbackLayout::new(rows, state.loaded.vertex).end > self.budget.readback_bytes {
             return Ok(false);
         }
-        let landing = self.landings.get(&self.device, places.end);
-        let target = landing.buffer().map_err(failed)?;
-        let mut recording = self.recording();
-        copy_vertices(&mut recording, loaded, target, &places, rows[0]);
-        copy_rows(
-            &mut recording,
-            loaded.workspace.buffer("triangles"),
-            target,
-            places.triangles,
-            TRIANGLE_BYTES * rows[1],
-        );
-        recording.timed_before(&[Stage::Interpolate, Stage::Emit]);
-        recording.read_clock(target);
-        copy_counts(&mut recording, &loaded.workspace, target, None);
-        let flight = self.launch(recording, vec![(landing, places.end)])?;
-        progress.sent = Some(Sent { flight, places, rows, columns: [true, true] });
-        self.settle(progress)?;
+        state.pending = Some(self.submit_output(state, None, rows, [true, true])?);
+        self.collect_output(state)?;
         Ok(true)
     }
 }

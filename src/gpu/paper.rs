@@ -15,17 +15,17 @@ use std::sync::Arc;
 use bytemuck::{Pod, Zeroable};
 use wgpu::{Buffer, BufferUsages};
 
-use super::engine::{Engine, check, scaled};
+use super::engine::Engine;
 use super::error::GpuError;
-use super::executor::{Executor, Finished, GpuJob};
-use super::flight::values;
-use super::landing::Landing;
+use super::executor::Executor;
+use super::job::{Finished, GpuJob, Prepared};
+use super::output_layout::values;
 use super::paper_pipelines::{Bound, PaperPipelines};
-use super::prepare::Prepared;
-use super::record::Recording;
+use super::plan::check_totals;
+use super::plan::layout::{self, Params};
+use super::readback::ReadbackBuffer;
+use super::recording::{Recording, ticks_to_ns};
 use crate::surface::lattice::Lattice;
-use crate::surface::layout::Params;
-use crate::surface::plan::check_totals;
 use crate::surface::{Column, GridStats, Kernel, Mesh, Meshed, Stage, SurfaceError, SurfaceParams};
 
 /// Fixed-point units of the isovalue, as the shaders have it. Rounding a term moves a density by less than 3·10⁻⁷ of the
@@ -141,7 +141,7 @@ impl Paper {
     pub fn new(engine: Engine) -> Result<Self, GpuError> {
         let pipelines = PaperPipelines::new(&engine.device);
         let paper = Self { engine, pipelines, buffers: Vec::new(), times: [0; STAGES.len()] };
-        paper.engine.healthy()?;
+        paper.engine.check_errors()?;
         Ok(paper)
     }
 
@@ -170,14 +170,14 @@ impl Paper {
     }
 
     fn one(&mut self, job: &GpuJob) -> Result<Finished, GpuError> {
-        check(job)?;
+        job.check()?;
         let prepared = &*job.prepared;
         if prepared.params.atom_ids {
             let expected = "no nearest atoms with the 2010 program".to_owned();
             return Err(SurfaceError::BadParameter { name: "atom_ids", value: "true".to_owned(), expected }.into());
         }
         // Two words a sample are bound at once.
-        let mut dense = box_of(prepared, self.engine.binding_bytes() / 8)?;
+        let mut dense = box_of(prepared, self.engine.max_binding_bytes() / 8)?;
         let params = prepared.plan.params(&prepared.lattice, &prepared.params);
         self.times = [0; STAGES.len()];
         let n = u64::from(dense.n_samples);
@@ -188,7 +188,7 @@ impl Paper {
         // Its vertices are single-precision numbers, whatever was asked for.
         let single = SurfaceParams { quantize: None, ..prepared.params.clone() };
         check_totals(lattice, &single, limits, n_vertices, n_triangles.into())?;
-        let most = self.engine.binding_bytes();
+        let most = self.engine.max_binding_bytes();
         if 12 * n_vertices > most {
             let excess = (12 * n_vertices) as f64 / most as f64;
             let suggested_resolution = (lattice.spacing * excess.sqrt() * 105.0).ceil() / 100.0;
@@ -196,7 +196,7 @@ impl Paper {
             let limit = Mesh::bytes_for(most / 12, most / 36);
             return Err(SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution }.into());
         }
-        check(job)?;
+        job.check()?;
         dense = Box { n_active, n_triangles, ..dense };
         let landing = self.output(&dense)?;
         let column = |at: u64| {
@@ -223,7 +223,7 @@ impl Paper {
             (Stage::Scan, scan + map),
             (Stage::Interpolate, vertices + normals),
         ];
-        let stages = if self.engine.has_clock() { all.to_vec() } else { Vec::new() };
+        let stages = if self.engine.has_timestamps() { all.to_vec() } else { Vec::new() };
         Ok(Finished { meshed: Meshed::new(mesh, grid), stages })
     }
 
@@ -231,7 +231,7 @@ impl Paper {
     fn count(&mut self, job: &GpuJob, params: &Params, dense: &Box) -> Result<[u32; 2], GpuError> {
         let atoms = &job.prepared.lattice.atoms;
         let n = u64::from(dense.n_samples);
-        let table = crate::surface::layout::case_table();
+        let table = layout::case_table();
         let bound = [
             self.room("params", size_of::<Params>() as u64),
             self.room("box", size_of::<Box>() as u64),
@@ -278,7 +278,7 @@ impl Paper {
             let blocks = threads(pair[0].bytes / 8, 256);
             pipelines.pass(device, &mut recording, "add", 0, &both, blocks, (i == 0).then_some([u32::MAX, 5]));
         }
-        let landing = self.engine.landings.get(&self.engine.device, BODY_AT);
+        let landing = self.engine.readback.acquire(&self.engine.device, BODY_AT);
         let target = landing.buffer().map_err(failed)?;
         self.pipelines.read_clock(&mut recording, 0..6, target);
         if let Some(total) = levels.last() {
@@ -296,13 +296,13 @@ impl Paper {
     }
 
     /// The last three stages.
-    fn output(&mut self, dense: &Box) -> Result<Arc<Landing>, GpuError> {
+    fn output(&mut self, dense: &Box) -> Result<Arc<ReadbackBuffer>, GpuError> {
         let n = u64::from(dense.n_samples);
         let column = 36 * u64::from(dense.n_triangles);
         let bound = [
             self.room("params", size_of::<Params>() as u64),
             self.room("box", size_of::<Box>() as u64),
-            self.room("cases", 4 * crate::surface::layout::CASE_WORDS as u64),
+            self.room("cases", 4 * layout::CASE_WORDS as u64),
             self.room("field", 4 * n),
             self.room("flags", 4 * n),
             self.room("counts", 8 * n),
@@ -319,7 +319,7 @@ impl Paper {
         pipelines.pass(device, &mut recording, "vertices", 0, &bound, active, Some([8, 9]));
         pipelines.pass(device, &mut recording, "normals", 0, &bound, active, Some([10, 11]));
         let bytes = (BODY_AT + 2 * column).next_multiple_of(8);
-        let landing = self.engine.landings.get(&self.engine.device, bytes);
+        let landing = self.engine.readback.acquire(&self.engine.device, bytes);
         let target = landing.buffer().map_err(failed)?;
         self.pipelines.read_clock(&mut recording, 6..12, target);
         recording.encoder.copy_buffer_to_buffer(&bound[7].buffer, 0, target, BODY_AT, column);
@@ -330,18 +330,17 @@ impl Paper {
     }
 
     /// Submits and waits.
-    fn fly(&self, recording: Recording<'_>, landing: (Landing, u64)) -> Result<Arc<Landing>, GpuError> {
-        let mut landed = self.engine.fly(recording, vec![landing])?;
-        landed.pop().ok_or_else(|| failed("a submission without its landing"))
+    fn fly(&self, recording: Recording<'_>, landing: (ReadbackBuffer, u64)) -> Result<Arc<ReadbackBuffer>, GpuError> {
+        self.engine.submit_and_wait(recording, landing)
     }
 
     /// Takes the times of some stages from a landing.
-    fn note_times(&mut self, landing: &Landing, stages: std::ops::Range<usize>) -> Result<(), GpuError> {
-        if self.engine.has_clock() {
+    fn note_times(&mut self, landing: &ReadbackBuffer, stages: std::ops::Range<usize>) -> Result<(), GpuError> {
+        if self.engine.has_timestamps() {
             let ticks: &[u64] = values(landing.as_ref(), 0, 2 * STAGES.len() as u64).map_err(failed)?;
             let period = f64::from(self.engine.queue.get_timestamp_period());
             for s in stages {
-                self.times[s] = scaled(ticks[2 * s + 1].saturating_sub(ticks[2 * s]), period);
+                self.times[s] = ticks_to_ns(ticks[2 * s + 1].saturating_sub(ticks[2 * s]), period);
             }
         }
         Ok(())

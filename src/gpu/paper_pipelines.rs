@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use wgpu::{Buffer, BufferUsages, ComputePipeline, Device, QuerySet};
 
-use super::record::Recording;
+use super::recording::Recording;
 use super::shaders::{PAPER, Shader};
 
 /// Workgroups along a dispatch's first dimension: the most that every device takes.
@@ -75,7 +75,7 @@ impl PaperPipelines {
             .bindings
             .iter()
             .filter_map(|binding| {
-                let found = bound.iter().find(|b| b.name == binding.name)?;
+                let found = bound.iter().find(|b| b.name == binding.buffer)?;
                 let resource = wgpu::BindingResource::Buffer(wgpu::BufferBinding {
                     buffer: &found.buffer,
                     offset: 0,

@@ -4,10 +4,11 @@ use std::time::Instant;
 
 use wgpu::{Buffer, BufferUsages};
 
-use super::engine::{Engine, scaled};
+use super::engine::Engine;
 use super::error::GpuError;
-use super::flight::values;
-use super::landing::Landings;
+use super::output_layout::values;
+use super::readback::ReadbackPool;
+use super::recording::ticks_to_ns;
 use super::shaders::YARDSTICKS;
 
 /// Rates of a device.
@@ -49,7 +50,7 @@ const REPEATS: usize = 8;
 /// # Errors
 /// [`GpuError`] as the device reports it.
 pub fn rates(engine: &Engine, effort: Effort) -> Result<Option<Rates>, GpuError> {
-    if !engine.has_clock() {
+    if !engine.has_timestamps() {
         return Ok(None);
     }
     let bytes = effort.bytes.min(engine.budget.piece_bytes) & !255;
@@ -69,7 +70,7 @@ pub fn rates(engine: &Engine, effort: Effort) -> Result<Option<Rates>, GpuError>
     let copy = engine.best_time(0, &source, &goal, groups)?;
     let fma = engine.best_time(1, &source, &goal, effort.workgroups)?;
     // Not the engine's: what is measured with must not lie about when jobs are.
-    let landings = Landings::keeping(engine.budget.idle_bytes);
+    let landings = ReadbackPool::new(engine.budget.idle_bytes);
     let (mut to_host, mut round_trip) = (f64::MAX, f64::MAX);
     for _ in 0..REPEATS {
         to_host = to_host.min(engine.fetch(&landings, &source, bytes)?);
@@ -134,26 +135,23 @@ impl Engine {
             pass.dispatch_workgroups(workgroups.min(1 << 15), workgroups.div_ceil(1 << 15), 1);
             drop(pass);
             recording.encoder.resolve_query_set(&queries, 0..2, &resolved, 0);
-            let landing = self.landings.get(&self.device, 16);
+            let landing = self.readback.acquire(&self.device, 16);
             recording.encoder.copy_buffer_to_buffer(&resolved, 0, landing.buffer().map_err(GpuError::Failed)?, 0, 16);
-            let landed = self.fly(recording, vec![(landing, 16)])?;
-            let ticks: &[u64] = match landed.first() {
-                Some(landed) => values((**landed).as_ref(), 0, 2).map_err(GpuError::Failed)?,
-                None => &[],
-            };
+            let landed = self.submit_and_wait(recording, (landing, 16))?;
+            let ticks: &[u64] = values((*landed).as_ref(), 0, 2).map_err(GpuError::Failed)?;
             let [begin, end] = ticks else { return Err(GpuError::Failed("no timestamps came back".to_owned())) };
-            best = best.min(scaled(end.saturating_sub(*begin), period) as f64 * 1e-9);
+            best = best.min(ticks_to_ns(end.saturating_sub(*begin), period) as f64 * 1e-9);
         }
         Ok(best.max(1e-9))
     }
 
     /// Seconds to bring `bytes` bytes to the host.
-    fn fetch(&self, landings: &Landings, from: &Buffer, bytes: u64) -> Result<f64, GpuError> {
-        let landing = landings.get(&self.device, bytes);
+    fn fetch(&self, landings: &ReadbackPool, from: &Buffer, bytes: u64) -> Result<f64, GpuError> {
+        let landing = landings.acquire(&self.device, bytes);
         let start = Instant::now();
         let mut recording = self.recording();
         recording.encoder.copy_buffer_to_buffer(from, 0, landing.buffer().map_err(GpuError::Failed)?, 0, bytes);
-        let landed = self.fly(recording, vec![(landing, bytes)])?;
+        let landed = self.submit_and_wait(recording, (landing, bytes))?;
         let seconds = start.elapsed().as_secs_f64();
         drop(landed);
         Ok(seconds)

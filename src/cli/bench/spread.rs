@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 use std::time::Instant;
 
-use molmesh::gpu::{GpuBackend, GpuJob, Look, PoolSettings, Prepared, Program, Ran, discover};
+use molmesh::gpu::{CompletedJob, GpuBackend, GpuJob, Look, PoolSettings, Prepared, Program, discover};
 use molmesh::surface::devices::DeviceName;
 use molmesh::surface::{Backend, CancelToken, Control, DeviceChoice, Mesh, Spheres, Step, SurfaceParams};
 use serde::Serialize;
@@ -64,7 +64,7 @@ pub(super) fn run(
     let mut alone: Vec<Option<Vec<u8>>> = cases.iter().map(|_| None).collect();
     for devices in (1..=taken.len()).filter(|n| n.is_power_of_two() || *n == taken.len()) {
         let some = DeviceChoice::These(taken[..devices].iter().map(|&n| DeviceName::Number(n)).collect());
-        let settings = PoolSettings { spread_bricks: Some(least), ..PoolSettings::default() };
+        let settings = PoolSettings { min_partition_bricks: Some(least), ..PoolSettings::default() };
         let backend = GpuBackend::start(&discover(&some, Look::Thorough), Program::Stages, &settings, None)
             .map_err(|e| failed(&e))?;
         backend.warm().map_err(|e| failed(&e))?;
@@ -85,7 +85,7 @@ fn measure(
     runs: usize,
 ) -> Result<(SpreadRow, Vec<u8>), String> {
     let [mut prepare, mut ready, mut read] = [const { Vec::new() }; 3];
-    let mut all: Vec<Ran> = Vec::with_capacity(runs);
+    let mut all: Vec<CompletedJob> = Vec::with_capacity(runs);
     let mut last: Option<(Arc<Prepared>, Mesh)> = None;
     for run in 0..WARM_UP + runs {
         // The mesh before goes first: its memory is what this one lands in.
@@ -96,7 +96,7 @@ fn measure(
             Arc::new(Prepared::new(spheres, params, &LIMITS, &Control::default()).map_err(|e| e.to_string())?);
         let prepared_at = elapsed();
         let job = GpuJob { prepared: Arc::clone(&prepared), cancel: CancelToken::default(), deadline: None };
-        let mut ran = backend.pool().ran(&job).map_err(|e| e.to_string())?;
+        let mut ran = backend.pool().run(&job).map_err(|e| e.to_string())?;
         let ready_at = elapsed();
         let mesh = std::mem::take(&mut ran.finished.meshed.mesh);
         std::hint::black_box(sum_of_bytes(&mesh));
@@ -128,10 +128,10 @@ fn measure(
 }
 
 /// Medians of what each device did: the parts are the same in every run, and idle devices take them in turn.
-fn by_device(all: &[Ran]) -> Vec<DeviceRow> {
-    let n = all.iter().map(|ran| ran.by.len()).min().unwrap_or_default();
+fn by_device(all: &[CompletedJob]) -> Vec<DeviceRow> {
+    let n = all.iter().map(|ran| ran.devices.len()).min().unwrap_or_default();
     let part = |k: usize| {
-        let works = || all.iter().map(move |ran| &ran.by[k]);
+        let works = || all.iter().map(move |ran| &ran.devices[k]);
         let ms = |ns: u64| ns as f64 * 1e-6;
         let first = works().next().map(|work| &work.stages[..]).unwrap_or_default();
         let stage = |(i, (stage, _)): (usize, &(molmesh::surface::Stage, u64))| {
