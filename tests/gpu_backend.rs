@@ -17,7 +17,7 @@ use molmesh::surface::{
     SurfaceLimits, SurfaceParams,
 };
 
-fn backend(fakes: &[Arc<FakeDevice>], fallback: bool) -> GpuBackend {
+fn backend_with(fakes: &[Arc<FakeDevice>], fallback: bool) -> GpuBackend {
     let fallback = fallback.then(|| Box::new(CpuBackend::new(None).unwrap()) as Box<dyn Backend>);
     GpuBackend::with_pool(DevicePool::start(devices(fakes), &SETTINGS).unwrap(), fallback)
 }
@@ -28,7 +28,7 @@ fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<Meshed, SurfaceEr
 
 #[test]
 fn the_device_of_a_job_is_reported() {
-    let backend = backend(&[FakeDevice::new(&[]), FakeDevice::new(&[])], true);
+    let backend = backend_with(&[FakeDevice::new(&[]), FakeDevice::new(&[])], true);
     let served: Vec<_> = (0..2).map(|_| run(&backend, &Control::default()).unwrap().served.unwrap()).collect();
     assert_eq!([&served[0].device, &served[1].device], ["fake 0", "fake 1"]);
     // Results of different devices have different keys. A look-up uses the key of the first device.
@@ -40,7 +40,7 @@ fn the_device_of_a_job_is_reported() {
 #[test]
 fn the_cpu_is_the_fallback_and_is_reported() {
     let fake = FakeDevice::new(&[Lose]);
-    let backend = backend(std::slice::from_ref(&fake), true);
+    let backend = backend_with(std::slice::from_ref(&fake), true);
     let cpu = run(&CpuBackend::new(None).unwrap(), &Control::default()).unwrap();
     // The device fails the first two jobs; then it is given up.
     for n in 0..4 {
@@ -63,27 +63,27 @@ fn the_cpu_is_the_fallback_and_is_reported() {
     let fallback = backend.run(&spheres(2), &small, &SurfaceLimits::default(), &Control::default()).unwrap();
     assert!(fallback.mesh.quantized.is_some() && fallback.measures.is_some());
     // Negative control: a device that works.
-    let working = run(&backend(&[FakeDevice::new(&[])], true), &Control::default()).unwrap().served.unwrap();
+    let working = run(&backend_with(&[FakeDevice::new(&[])], true), &Control::default()).unwrap().served.unwrap();
     assert_eq!((working.backend, working.instead), ("gpu", None));
 }
 
 #[test]
 fn without_a_fallback_the_failure_is_an_error() {
-    let error = run(&backend(&[FakeDevice::new(&[Lose])], false), &Control::default()).unwrap_err();
+    let error = run(&backend_with(&[FakeDevice::new(&[Lose])], false), &Control::default()).unwrap_err();
     let SurfaceError::Device { why } = error else { panic!("{error}") };
     assert!(why.contains("scripted"), "{why}");
 }
 
 #[test]
 fn a_lack_of_memory_is_an_error_with_numbers_and_without_fallback() {
-    let error = run(&backend(&[FakeDevice::new(&[OutOfMemory])], true), &Control::default()).unwrap_err();
+    let error = run(&backend_with(&[FakeDevice::new(&[OutOfMemory])], true), &Control::default()).unwrap_err();
     assert_eq!(error, SurfaceError::DeviceMemory { needed: 9, available: 5, suggested_resolution: 1.5 });
 }
 
 #[test]
 fn deadline_and_cancellation_reach_the_device() {
     let fake = FakeDevice::new(&[Block]);
-    let backend = backend(std::slice::from_ref(&fake), true);
+    let backend = backend_with(std::slice::from_ref(&fake), true);
     let deadline = Some(Instant::now() + std::time::Duration::from_millis(30));
     assert_eq!(
         run(&backend, &Control { deadline, ..Control::default() }).map(|_| ()).unwrap_err(),
@@ -122,7 +122,7 @@ fn the_observer_receives_stage_times() {
         }
     }
     let watch = Watch::default();
-    run(&backend(&[FakeDevice::new(&[])], true), &Control { observer: &watch, ..Control::default() }).unwrap();
+    run(&backend_with(&[FakeDevice::new(&[])], true), &Control { observer: &watch, ..Control::default() }).unwrap();
     assert_eq!(*watch.told.lock().unwrap(), [(Stage::Field, 2_000), (Stage::Emit, 1_000)]);
     assert!(watch.binned.into_inner());
 }
@@ -130,21 +130,21 @@ fn the_observer_receives_stage_times() {
 #[test]
 fn warm_runs_every_device_and_gives_up_those_that_fail() {
     let fakes = [FakeDevice::new(&[Finish]), FakeDevice::new(&[Lose]), FakeDevice::new(&[Finish])];
-    let backend = backend(&fakes, true);
+    let backend = backend_with(&fakes, true);
     backend.warm().unwrap();
     assert_eq!(fakes.each_ref().map(|fake| fake.calls().len()), [1, 2, 1]);
     let down: Vec<bool> = backend.devices().iter().map(|device| device.down.is_some()).collect();
     assert_eq!(down, [false, true, false]);
     assert!(backend.devices()[1].down.as_deref().unwrap().contains("first mesh failed"));
     // Without a device the fallback must work; without a fallback warming up fails.
-    backend(&[FakeDevice::new(&[Lose])], true).warm().unwrap();
-    assert!(matches!(backend(&[FakeDevice::new(&[Lose])], false).warm(), Err(SurfaceError::Device { .. })));
+    backend_with(&[FakeDevice::new(&[Lose])], true).warm().unwrap();
+    assert!(matches!(backend_with(&[FakeDevice::new(&[Lose])], false).warm(), Err(SurfaceError::Device { .. })));
 }
 
 #[test]
 fn many_callers_share_one_device() {
     let fake = FakeDevice::new(&[]);
-    let backend = backend(std::slice::from_ref(&fake), false);
+    let backend = backend_with(std::slice::from_ref(&fake), false);
     let (done, samples) = (AtomicUsize::new(0), AtomicU64::new(0));
     std::thread::scope(|scope| {
         for _ in 0..16 {

@@ -386,34 +386,6 @@ fn chunks_pieces_and_readback_buffers_change_no_byte() {
 }
 
 #[test]
-fn speculative_output_is_the_same_or_made_again() {
-    let crowd = |n: usize| spheres(&Random(21).cloud(n, 40.0));
-    let ids = SurfaceOptions { resolution: Some(0.6), atom_ids: true, ..SurfaceOptions::default() };
-    let (plain, ids) = (params(KERNELS[0], 0.6), SurfaceParams::new(&ids).unwrap());
-    let mut engine = engine_with(|b| b.small_bytes = 0);
-    // Three submissions with speculation, else two: the first job has no buffers; jobs with as many or fewer rows reuse
-    // them; more rows, or the first nearest atoms, need new buffers.
-    let jobs = [
-        (400, &plain, 2),
-        (400, &plain, 3),
-        (380, &plain, 3),
-        (700, &plain, 3),
-        (700, &plain, 3),
-        (400, &ids, 2),
-        (400, &ids, 3),
-    ];
-    for (i, (n, params, submissions)) in jobs.into_iter().enumerate() {
-        let spheres = crowd(n);
-        engine.metered();
-        let meshed = mesh_of(&mut engine, &spheres, params);
-        let whole = mesh_of(&mut self::engine(), &spheres, params);
-        assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{i}");
-        assert_eq!(meshed.mesh.atom_ids, whole.mesh.atom_ids, "{i}");
-        assert_eq!(engine.metered().submissions, submissions, "{i}");
-    }
-}
-
-#[test]
 fn dispatches_may_exceed_one_dimension() {
     // Isolated atoms: each has a few dozen bricks and little to compute.
     let rows: Vec<[f64; 4]> = (0..8000)

@@ -186,3 +186,40 @@ pub(super) fn reject(jobs: VecDeque<QueuedJob>, why: &str) {
         job.reply(Err(GpuError::NoDevice(why.to_owned())));
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::sync::mpsc::sync_channel;
+
+    use super::*;
+    use crate::gpu::job::{Finished, Prepared};
+    use crate::gpu::plan::Partition;
+    use crate::surface::backend::one_atom;
+    use crate::surface::{CancelToken, Control, GridStats, Mesh, Meshed, SurfaceError, SurfaceLimits, SurfaceParams};
+
+    /// Two partitions; the first is queued.
+    fn queued() -> (QueuedJob, PartitionHandle) {
+        let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
+        let prepared = Prepared::new(&one_atom().unwrap(), &params, &limits, &Control::default()).unwrap();
+        let job = GpuJob { prepared: Arc::new(prepared), cancel: CancelToken::default(), deadline: None };
+        let mut handles = PartitionHandle::for_partitions(vec![Partition::default(); 2]);
+        let (other, partition) = (handles.pop().unwrap(), handles.pop());
+        (QueuedJob { id: 0, job, partition, retry: false, reply: sync_channel(1).0 }, other)
+    }
+
+    #[test]
+    fn a_partition_that_does_not_succeed_aborts_the_others() {
+        let cancelled = Err(GpuError::Surface(SurfaceError::Cancelled));
+        let (job, other) = queued();
+        assert_eq!(other.check(), Ok(()));
+        drop(job);
+        assert_eq!(other.check(), cancelled, "dropped without a result");
+        let (job, other) = queued();
+        job.reply(Err(GpuError::Deadline));
+        assert_eq!(other.check(), cancelled, "failed");
+        let (job, other) = queued();
+        job.reply(Ok(Finished { meshed: Meshed::new(Mesh::default(), GridStats::default()), stages: Vec::new() }));
+        assert_eq!(other.check(), Ok(()), "succeeded");
+    }
+}

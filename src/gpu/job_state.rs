@@ -12,7 +12,7 @@ use super::plan::check_totals;
 use super::plan::layout::{self, Counters, GROUP};
 use super::readback::ReadbackBuffer;
 use super::submit::{PendingSubmission, StageTimes};
-use crate::surface::{Column, GridStats, Mesh, Meshed, Quantized};
+use crate::surface::{Column, GridStats, Mesh, Meshed, Quantized, Stage};
 
 /// Counts of a chunk.
 #[derive(Debug, Default)]
@@ -29,10 +29,10 @@ pub(super) struct ChunkCounts {
 pub(super) struct PendingOutput {
     pub(super) submission: PendingSubmission,
     pub(super) layout: ReadbackLayout,
-    /// Number of vertices and triangles.
+    /// Number of vertices and triangles, one of which is 0.
     pub(super) rows: [u64; 2],
-    /// True if the piece has vertices, and true if it has triangles.
-    pub(super) columns: [bool; 2],
+    /// Stage that makes the piece: `interpolate` or `emit`.
+    pub(super) stage: Stage,
 }
 
 /// State of a job.

@@ -4,7 +4,7 @@
 //! device; each thread runs them by an [`Executor`], normally the [`Engine`]. [`GpuBackend`] is the pool behind the
 //! `Backend` trait, [`GpuRenderer`] draws pictures.
 //!
-//! A module names only modules of earlier lines:
+//! A module names only modules of earlier lines; the measuring modules may name any:
 //!
 //! ```text
 //! error, buffers, plan, describe, readback, hardware, manifests, choose, picture_targets
@@ -13,7 +13,8 @@
 //! executor, output_layout, device_queue
 //! workspace, scheduler
 //! recording, worker
-//! engine, pool
+//! meter, pool
+//! engine
 //! submit, device
 //! job_state, probe, backend, picture
 //! count

@@ -1,22 +1,18 @@
 //! Second half of a job: its output, in pieces that fit a binding, each in a readback buffer. A piece is submitted
 //! before the previous one is collected.
 
-use super::buffers::BufferId;
-use super::count::{N_COUNT_STAGES, narrow};
+use super::count::narrow;
 use super::engine::Engine;
 use super::error::GpuError;
 use super::job_state::{ChunkCounts, JobState, PendingOutput};
 use super::output_layout::{OutputPiece, ReadbackLayout, ReadbackRows, TRIANGLE_BYTES, VertexBytes, pieces};
+use super::pipelines::stage_index;
 use super::plan::layout::Params;
 use super::workspace::{BufferSizes, OutputCapacity};
 use crate::surface::Stage;
 
 /// Rows of parameters: one for the chunk and one for the output piece.
 pub(super) const PARAM_ROWS: u64 = 2;
-/// Output is submitted before the counts are known if the buffers hold at least 1/8 of the small-job estimate. A ball
-/// of 60,000 atoms at 0.5 Å needs 1/6, and less compact structures need more. This hides one round trip to the host,
-/// 0.14 ms on an H200.
-const SPECULATION_DIVISOR: u64 = 8;
 /// Capacity of the buffers before the output is counted.
 pub(super) const NO_OUTPUT: OutputCapacity = OutputCapacity { vertices: 0, triangles: 0, params: PARAM_ROWS };
 
@@ -38,27 +34,38 @@ impl Engine {
             self.collect_output(state)?;
             let counts = self.wait_for_counts(state, chunk, submission)?;
             if accept(self, state, chunk)? {
-                let pieces = self.pieces(state, &[(chunk, &counts)]);
-                self.ensure_capacity(state, &pieces)?;
-                self.submit_pieces(state, chunk, &pieces, [true, false])?;
+                self.make_output(state, &[(chunk, &counts)], Stage::Interpolate)?;
             }
             all.push(counts);
         }
         Ok(all)
     }
 
-    /// Makes the vertices, the triangles or both of all chunks; vertices only if there is a single chunk.
-    pub(super) fn output(
+    /// Makes the triangles of all chunks.
+    pub(super) fn make_triangles(&mut self, state: &mut JobState<'_>, counts: &[ChunkCounts]) -> Result<(), GpuError> {
+        let all: Vec<_> = counts.iter().enumerate().collect();
+        self.make_output(state, &all, Stage::Emit)?;
+        self.collect_output(state)
+    }
+
+    /// Submits the output of `stage` for chunks, given with their indices, and collects all pieces but the last. The
+    /// samples of the first chunk must be present for vertices.
+    pub(super) fn make_output(
         &mut self,
         state: &mut JobState<'_>,
-        counts: &[ChunkCounts],
-        columns: [bool; 2],
+        counts: &[(usize, &ChunkCounts)],
+        stage: Stage,
     ) -> Result<(), GpuError> {
-        let all: Vec<_> = counts.iter().enumerate().collect();
-        let pieces = self.pieces(state, &all);
+        let pieces = self.pieces(state, counts);
         self.ensure_capacity(state, &pieces)?;
-        self.submit_pieces(state, 0, &pieces, columns)?;
-        self.collect_output(state)
+        let chunk = counts.first().map_or(0, |(chunk, _)| *chunk);
+        for piece in &pieces {
+            state.loaded.job.check()?;
+            let pending = self.submit_piece(state, chunk, piece, stage)?;
+            self.collect_output(state)?;
+            state.pending = Some(pending);
+        }
+        Ok(())
     }
 
     /// Cuts the output of chunks into pieces that fit a binding.
@@ -89,125 +96,47 @@ impl Engine {
         self.grow(loaded, &sizes)
     }
 
-    /// Submits the vertices, the triangles or both of `pieces`, and collects all but the last.
-    fn submit_pieces(
-        &self,
-        state: &mut JobState<'_>,
-        chunk: usize,
-        pieces: &[OutputPiece],
-        columns: [bool; 2],
-    ) -> Result<(), GpuError> {
-        for piece in pieces {
-            state.loaded.job.check()?;
-            let params = Params {
-                piece_brick: piece.brick,
-                piece_bricks: piece.n_bricks,
-                piece_vertex: narrow(piece.vertex)?,
-                piece_triangle: narrow(piece.triangle & u64::from(u32::MAX))?,
-                vertex_capacity: narrow(piece.n_vertices)?,
-                triangle_capacity: narrow(piece.n_triangles)?,
-                ..state.loaded.chunks[chunk].params(&state.loaded.params)
-            };
-            let rows = [piece.n_vertices * u64::from(columns[0]), piece.n_triangles * u64::from(columns[1])];
-            let pending = self.submit_output(state, Some(&params), rows, columns)?;
-            self.collect_output(state)?;
-            state.pending = Some(pending);
-        }
-        Ok(())
-    }
-
-    /// Submits the stages of an output piece with `params`, or none if they ran before, and the copies of its `rows`.
-    /// Each piece is a submission of its own, because a stage has one time per submission.
-    fn submit_output(
+    /// Submits `stage` for a piece and the copies of its output.
+    fn submit_piece(
         &self,
         state: &JobState<'_>,
-        params: Option<&Params>,
-        rows: [u64; 2],
-        columns: [bool; 2],
+        chunk: usize,
+        piece: &OutputPiece,
+        stage: Stage,
     ) -> Result<PendingOutput, GpuError> {
         let loaded = &state.loaded;
+        let rows = if stage == Stage::Emit { [0, piece.n_triangles] } else { [piece.n_vertices, 0] };
+        let params = Params {
+            piece_brick: piece.brick,
+            piece_bricks: piece.n_bricks,
+            piece_vertex: narrow(piece.vertex)?,
+            piece_triangle: narrow(piece.triangle & u64::from(u32::MAX))?,
+            vertex_capacity: narrow(piece.n_vertices)?,
+            triangle_capacity: narrow(piece.n_triangles)?,
+            ..loaded.chunks[chunk].params(&loaded.params)
+        };
+        self.write_params(&loaded.workspace, 1, &params);
         let layout = ReadbackLayout::new(rows, loaded.vertex);
         let readback = self.readback.acquire(&self.device, layout.end);
         let target = readback.buffer().map_err(GpuError::Failed)?;
         let mut recording = self.recording();
-        if let Some(params) = params {
-            self.write_params(&loaded.workspace, 1, params);
-        }
-        for (stage, _) in [Stage::Interpolate, Stage::Emit].into_iter().zip(columns).filter(|(_, wanted)| *wanted) {
-            match params {
-                Some(params) => recording.stage(stage, &[loaded.dispatch(1, params.piece_bricks)]),
-                None => recording.include_time(stage),
-            }
-        }
+        recording.stage(stage, &[loaded.dispatch(1, piece.n_bricks)]);
         recording.copy_output(&loaded.workspace, loaded.vertex, rows, target, &layout);
         recording.copy_timestamps(target);
         recording.copy_counters(&loaded.workspace, target);
         let submission = self.submit(recording, vec![(readback, layout.end)])?;
-        Ok(PendingOutput { submission, layout, rows, columns })
+        Ok(PendingOutput { submission, layout, rows, stage })
     }
 
     /// Waits for the pending output, if any, and adds it to the job.
     pub(super) fn collect_output(&self, state: &mut JobState<'_>) -> Result<(), GpuError> {
-        let Some(PendingOutput { submission, layout, rows, columns: [vertices, triangles] }) = state.pending.take()
-        else {
-            return Ok(());
-        };
+        let Some(PendingOutput { submission, layout, rows, stage }) = state.pending.take() else { return Ok(()) };
         let readback = self.wait_one(submission)?;
         state.note_flat_vertices(&readback)?;
-        let first = if vertices { N_COUNT_STAGES } else { N_COUNT_STAGES + 1 };
-        let end = N_COUNT_STAGES + 1 + usize::from(triangles);
-        self.add_times(&mut state.times, &readback, first..end)?;
-        let rows = ReadbackRows { readback, layout, n_vertices: rows[0], n_triangles: rows[1] };
-        state.vertices.extend(vertices.then(|| rows.clone()));
-        state.triangles.extend(triangles.then_some(rows));
+        self.add_times(&mut state.times, &readback, stage_index(stage)..stage_index(stage) + 1)?;
+        let [n_vertices, n_triangles] = rows;
+        let columns = if stage == Stage::Emit { &mut state.triangles } else { &mut state.vertices };
+        columns.push(ReadbackRows { readback, layout, n_vertices, n_triangles });
         Ok(())
-    }
-
-    /// Submits the output of a job's only chunk into the buffers as they are, before it is counted. Returns the number
-    /// of vertices and triangles that the buffers hold (the stages write no more), or `None` without a submission if
-    /// the buffers are probably too small; see [`SPECULATION_DIVISOR`].
-    pub(super) fn submit_speculative_output(&self, state: &JobState<'_>) -> Result<Option<[u64; 2]>, GpuError> {
-        let loaded = &state.loaded;
-        let [max_vertices, max_triangles] = self.max_rows(loaded.vertex);
-        let rows = |id: BufferId, each: u64| loaded.workspace.buffer(id).size().checked_div(each).unwrap_or(u64::MAX);
-        let VertexBytes { positions, normals, sources } = loaded.vertex;
-        let columns = [(BufferId::Positions, positions), (BufferId::Normals, normals), (BufferId::Sources, sources)];
-        let vertices = columns.into_iter().map(|(id, each)| rows(id, each)).fold(max_vertices, u64::min);
-        let triangles = rows(BufferId::Triangles, TRIANGLE_BYTES).min(max_triangles);
-        let n_bricks = u64::from(loaded.params.n_bricks);
-        let likely = self.budget.rows_per_brick.map(|each| each * n_bricks / SPECULATION_DIVISOR);
-        if vertices < likely[0] || triangles < likely[1] {
-            return Ok(None);
-        }
-        let params = Params {
-            piece_bricks: loaded.params.n_bricks,
-            vertex_capacity: narrow(vertices)?,
-            triangle_capacity: narrow(triangles)?,
-            ..loaded.chunks[0].params(&loaded.params)
-        };
-        self.write_params(&loaded.workspace, 1, &params);
-        let mut recording = self.recording();
-        for stage in [Stage::Interpolate, Stage::Emit] {
-            recording.stage(stage, &[loaded.dispatch(1, params.piece_bricks)]);
-        }
-        self.submit(recording, Vec::new())?;
-        Ok(Some([vertices, triangles]))
-    }
-
-    /// Reads back the speculative output if it fits `capacity` and a readback buffer. Returns whether it did.
-    pub(super) fn collect_speculative_output(
-        &self,
-        state: &mut JobState<'_>,
-        counts: &ChunkCounts,
-        capacity: Option<[u64; 2]>,
-    ) -> Result<bool, GpuError> {
-        let rows = [counts.n_vertices, counts.n_triangles];
-        let fits = capacity.is_some_and(|capacity| rows[0] <= capacity[0] && rows[1] <= capacity[1]);
-        if !fits || ReadbackLayout::new(rows, state.loaded.vertex).end > self.budget.readback_bytes {
-            return Ok(false);
-        }
-        state.pending = Some(self.submit_output(state, None, rows, [true, true])?);
-        self.collect_output(state)?;
-        Ok(true)
     }
 }

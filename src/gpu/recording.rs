@@ -69,7 +69,7 @@ pub(super) struct Recording<'a> {
     pub(super) encoder: CommandEncoder,
     pipelines: &'a Pipelines,
     timer: Option<&'a StageTimer>,
-    /// Range of the stages whose times the submission reads.
+    /// Range of the recorded stages.
     timed: Option<Range<usize>>,
 }
 
@@ -79,28 +79,23 @@ impl<'a> Recording<'a> {
         Self { encoder, pipelines, timer, timed: None }
     }
 
-    /// Range of the stages whose times the submission reads; `None` without timestamps.
+    /// Range of the recorded stages; `None` without timestamps.
     pub(super) fn timed(&self) -> Option<Range<usize>> {
         self.timer.and(self.timed.clone())
-    }
-
-    /// Includes the time of `stage`, which ran here or in the submission before, in those that the submission reads.
-    pub(super) fn include_time(&mut self, stage: Stage) {
-        let index = stage_index(stage);
-        let timed = self.timed.get_or_insert(index..index + 1);
-        *timed = timed.start.min(index)..timed.end.max(index + 1);
     }
 
     /// Records a stage of one or several jobs. Dispatches without dependencies may overlap on the device; together they
     /// have one time in the submission.
     pub(super) fn stage(&mut self, stage: Stage, dispatches: &[Dispatch<'_>]) {
-        let query = 2 * query_number(stage_index(stage));
+        let index = stage_index(stage);
+        let query = 2 * query_number(index);
         let timestamp_writes = self.timer.map(|timer| wgpu::ComputePassTimestampWrites {
             query_set: &timer.queries,
             beginning_of_pass_write_index: Some(query),
             end_of_pass_write_index: Some(query + 1),
         });
-        self.include_time(stage);
+        let timed = self.timed.get_or_insert(index..index + 1);
+        *timed = timed.start.min(index)..timed.end.max(index + 1);
         let mut pass = self
             .encoder
             .begin_compute_pass(&wgpu::ComputePassDescriptor { label: Some(stage.name()), timestamp_writes });
@@ -130,7 +125,7 @@ impl<'a> Recording<'a> {
         }
     }
 
-    /// Copies the timestamps of the timed stages to the start of `target`.
+    /// Copies the timestamps of the recorded stages to the start of `target`.
     pub(super) fn copy_timestamps(&mut self, target: &Buffer) {
         let (Some(timer), Some(timed)) = (self.timer, self.timed.clone()) else { return };
         let bytes = |stages: usize| 16 * stages as u64;

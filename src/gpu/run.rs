@@ -143,7 +143,8 @@ impl Engine {
         state.times = times.map(|ns| portion(ns, share));
         let (n_vertices, n_triangles) = (counts.n_vertices, counts.n_triangles);
         if n_vertices > capacity.vertices || n_triangles > capacity.triangles {
-            self.output(state, &[counts], [true, true])?;
+            self.make_output(state, &[(0, &counts)], Stage::Interpolate)?;
+            self.make_triangles(state, &[counts])?;
         } else {
             state.note_flat_vertices(readback)?;
             let rows = ReadbackRows { readback: readback.clone(), layout, n_vertices, n_triangles };
@@ -156,35 +157,16 @@ impl Engine {
     /// Runs one job of any size.
     fn run_large(&mut self, loaded: LoadedJob<'_>) -> JobResult {
         let mut state = JobState::new(loaded);
-        let made = if state.loaded.chunks.len() == 1 {
-            self.run_single_chunk(&mut state)
-        } else {
-            self.run_chunks(&mut state)
-        };
-        let result = made.and_then(|()| state.finish());
+        let result = self.run_chunks(&mut state);
         self.workspaces.push(state.loaded.workspace);
         result
     }
 
-    fn run_chunks(&mut self, state: &mut JobState<'_>) -> Result<(), GpuError> {
+    fn run_chunks(&mut self, state: &mut JobState<'_>) -> JobResult {
         let counts = self.count_chunks(state, |_, state, _| state.check_limits().map(|()| true))?;
         state.check_complete()?;
-        self.output(state, &counts, [false, true])
-    }
-
-    /// Runs a job of one chunk. The device makes the output while the host reads the counts, if the buffers of an
-    /// earlier job are large enough.
-    fn run_single_chunk(&mut self, state: &mut JobState<'_>) -> Result<(), GpuError> {
-        state.loaded.job.check()?;
-        let submission = self.submit_count(state, 0)?;
-        let capacity = self.submit_speculative_output(state)?;
-        let counts = self.wait_for_counts(state, 0, submission)?;
-        state.check_complete()?;
-        state.loaded.job.check()?;
-        if !self.collect_speculative_output(state, &counts, capacity)? {
-            self.output(state, &[counts], [true, true])?;
-        }
-        Ok(())
+        self.make_triangles(state, &counts)?;
+        state.finish()
     }
 }
 

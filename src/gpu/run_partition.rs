@@ -64,7 +64,7 @@ impl Engine {
             self.write_import(&state.loaded, import, base)?;
         }
         state.loaded.params.base_vertex = base;
-        self.output(state, &counts, [false, true])?;
+        self.make_triangles(state, &counts)?;
         if state.has_flat_vertices {
             handle.set_flat_vertices();
         }
