@@ -25,9 +25,9 @@ fn built_by() {
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
 }
 
-/// Links the unwinder in where Linux has it as an archive, which compilers there bring with them. As a library of its own it
-/// has to be found, mapped and bound by every process, and asks the processor for its features once more: 0.13 ms of
-/// each start on a virtual machine. A linker script stands in for the library that the standard library names.
+/// Links the unwinder in where Linux has it as an archive, which compilers there bring with them. As a library of its
+/// own it has to be found, mapped and bound by every process, and asks the processor for its features once more: 0.13
+/// ms of each start on a virtual machine. A linker script stands in for the library that the standard library names.
 fn unwinder() {
     let [target, host] = ["TARGET", "HOST"].map(|name| std::env::var(name).unwrap_or_default());
     if target != host || !target.ends_with("-linux-gnu") {
@@ -92,8 +92,8 @@ mod shaders {
     use naga::valid::{Capabilities, ValidationFlags, Validator};
     use naga::{AddressSpace, Module, StorageAccess, TypeInner};
 
-    /// What is generated of a folder of shaders: the table's name, its layouts' name, the folder, and the shaders in the
-    /// order in which they run.
+    /// What is generated of a folder of shaders: the table's name, its layouts' name, the folder, and the shaders in
+    /// the order in which they run.
     const TABLES: [(&str, &str, &str, &[&str]); 2] = [
         ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit"]),
         ("PICTURE", "PICTURE_LAYOUTS", "picture/", &["vertex", "fragment", "resolve", "finish"]),
@@ -105,7 +105,11 @@ mod shaders {
         for (table, layouts_table, folder, names) in TABLES {
             n += names.len();
             let mut layouts = BTreeSet::new();
-            writeln!(generated, "pub(super) static {table}: [Shader; {}] = [", names.len()).expect("a string takes it");
+            // The meshing stages address their buffers by enum.
+            let by_enum = table == "SHADERS";
+            let buffer = if by_enum { "BufferId" } else { "&str" };
+            writeln!(generated, "pub(super) static {table}: [Shader<{buffer}>; {}] = [", names.len())
+                .expect("a string takes it");
             for name in names {
                 match assemble(Path::new("shaders"), &format!("{folder}{name}.wgsl"), &mut BTreeSet::new())
                     .and_then(|source| checked(&source).map(|module| (source, module)))
@@ -113,7 +117,7 @@ mod shaders {
                     Ok((source, module)) => {
                         let file = format!("{}{name}.wgsl", folder.replace('/', "_"));
                         fs::write(out.join(&file), &source).expect("OUT_DIR can be written");
-                        let bindings = bindings(&module);
+                        let bindings = bindings(&module, by_enum);
                         writeln!(
                             generated,
                             "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}] }},"
@@ -168,7 +172,8 @@ mod shaders {
         }
     }
 
-    fn bindings(module: &Module) -> String {
+    /// Bindings by number. The buffer is the variable's name, or with `by_enum` the variant of `BufferId` of that name.
+    fn bindings(module: &Module, by_enum: bool) -> String {
         let mut rows: Vec<(u32, String)> = module
             .global_variables
             .iter()
@@ -180,14 +185,21 @@ mod shaders {
                     _ => "Read",
                 };
                 let name = global.name.as_deref().unwrap_or_default();
+                let buffer = if by_enum { format!("BufferId::{}", camel_case(name)) } else { format!("{name:?}") };
                 Some((
                     at.binding,
-                    format!("Binding {{ name: {name:?}, number: {}, access: Access::{access} }}", at.binding),
+                    format!("Binding {{ buffer: {buffer}, number: {}, access: Access::{access} }}", at.binding),
                 ))
             })
             .collect();
         rows.sort();
         rows.into_iter().map(|(_, row)| row).collect::<Vec<_>>().join(", ")
+    }
+
+    /// `first_atoms` as `FirstAtoms`.
+    fn camel_case(name: &str) -> String {
+        let capitalized = |word: &str| word[..1].to_uppercase() + &word[1..];
+        name.split('_').map(capitalized).collect()
     }
 
     /// The structs of the buffers' types.

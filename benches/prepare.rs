@@ -6,8 +6,8 @@
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use molmesh::gpu::plan::Plan;
 use molmesh::surface::lattice::Lattice;
-use molmesh::surface::plan::Plan;
 use molmesh::surface::{Control, Spheres, SurfaceLimits, SurfaceParams};
 
 /// Side of a domain, Å, and its atoms other than hydrogen: 20 Å³ an atom.

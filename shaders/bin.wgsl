@@ -1,19 +1,19 @@
-// Stage `bin`: the candidate atoms of every brick, in canonical order. One workgroup a brick.
+// Stage `bin`: candidate atoms of every brick, in canonical order. One workgroup per brick.
 //
-// Atoms are sorted by tile and brick, so the atoms of a run of bricks along x within a tile are one range. A lane
-// looks up a range; then the lanes share out the atoms of 64 ranges evenly and keep those in reach, in order.
+// Atoms are sorted by tile and brick, so the atoms of a run of bricks along x within a tile are one range. Each lane
+// looks up one range. Then the lanes divide the atoms of 64 ranges evenly and keep those in reach, in order.
 #include shared/params.wgsl
 #include shared/atom.wgsl
 #include shared/bits.wgsl
 #include shared/tiles.wgsl
 #include shared/chunk.wgsl
 
-struct Tally {
-    // Entries of the lists; counts on beyond the capacity.
+struct Counters {
+    // Number of list entries, including those beyond the capacity.
     list_end: atomic<u32>,
     vertices: u32,
     triangles: u32,
-    // Vertices without a gradient.
+    // Number of vertices without a gradient.
     flat: u32,
 }
 
@@ -26,23 +26,23 @@ struct Tally {
 @group(0) @binding(6) var<storage, read> halo: array<u32>;
 @group(0) @binding(7) var<storage, read_write> lists: array<u32>;
 @group(0) @binding(8) var<storage, read_write> heads: array<vec4<u32>>;
-@group(0) @binding(9) var<storage, read_write> tally: Tally;
+@group(0) @binding(9) var<storage, read_write> counters: Counters;
 
 const LANES: u32 = 64u;
-// Lists up to this long are staged; longer ones, of fine grids, are gathered twice.
+// Maximum length of a list in workgroup memory. Longer lists, of fine grids, take a second pass.
 const STAGED: u32 = 256u;
 
-// Where the ranges begin, and how many atoms they and those before them hold.
+// First atom of each range, and inclusive sums of their lengths; the second pair of arrays alternates during the scan.
 var<workgroup> range_start: array<u32, 64>;
 var<workgroup> range_end: array<u32, 64>;
 var<workgroup> range_sum: array<u32, 64>;
-// Lanes with an atom that reaches a sample (0, 1) or only the gap behind the samples (2, 3), for three steps.
+// Bits of the lanes whose atom reaches a sample (0, 1) or only the gap behind the samples (2, 3), for three steps.
 var<workgroup> hits: array<atomic<u32>, 12>;
 var<workgroup> staged: array<u32, 256>;
 var<workgroup> list_start: u32;
 
-// `v` as it was rounded: the compiler cannot see through the zero, so it cannot fuse the product into a sum. The
-// comparison below must come out as on the host.
+// Returns `v`. The compiler does not know that `zero` is 0, so it cannot fuse the product `v` into a sum. The
+// comparison below must have the same result as on the host.
 fn rounded(v: f32) -> f32 {
     return bitcast<f32>(bitcast<u32>(v) | params.zero);
 }
@@ -52,7 +52,7 @@ fn square(v: vec3<f32>) -> vec3<f32> {
     return vec3<f32>(rounded(s.x), rounded(s.y), rounded(s.z));
 }
 
-// A tile by its coordinates: next to tile `from` at a glance, further away by search.
+// Index of the tile at `coord`: by table if it is adjacent to tile `tile_from`, else by binary search.
 fn tile_at(tile_from: u32, coord: vec3<i32>) -> u32 {
     let step = coord - tiles[tile_from].coord;
     if (all(abs(step) <= vec3<i32>(1))) {
@@ -72,19 +72,19 @@ fn tile_at(tile_from: u32, coord: vec3<i32>) -> u32 {
     return NONE;
 }
 
-// Part of [lo, hi] that lies in tile coordinate t, as first and count.
+// Intersection of [lo, hi] with tile coordinate t, as first and count.
 fn part(lo: i32, hi: i32, t: i32) -> vec2<i32> {
     let first = max(lo, 8 * t);
     return vec2<i32>(first, min(hi, 8 * t + 7) - first + 1);
 }
 
-// Gap along one axis, in spacings, between a brick and an atom of another brick `step` bricks away.
+// Minimum gap along one axis, in spacings, between a brick and the atoms of a brick `step` bricks away.
 fn brick_gap(step: i32) -> f32 {
     return max(max(f32(8 * step) - 8.5, f32(-8 * step) - 7.5), 0.0);
 }
 
-// Range number `index` of those that can hold candidates of `brick`: first atom and number of atoms. Ranges come in
-// the order of the atoms: by tile, and by row within a tile.
+// Range `index` of those that may hold candidates of `brick`: first atom and number of atoms. Ranges are in the order
+// of the atoms: by tile, and by row within a tile.
 fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
     let lo = brick - vec3<i32>(i32(params.back));
     let hi = brick + vec3<i32>(i32(params.ahead));
@@ -108,7 +108,7 @@ fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
     t.x += left / (z.y * y.y);
     left = left % (z.y * y.y);
     let row = vec2<i32>(y.x + left % y.y, z.x + left / y.y);
-    // How far along x the longest reach gets in this row.
+    // Maximum extent of the reach along x in this row.
     let gap = vec2<f32>(brick_gap(row.x - brick.y), brick_gap(row.y - brick.z));
     let rest = params.reach * params.reach - dot(gap, gap);
     if (rest < 0.0) {
@@ -131,7 +131,8 @@ fn range_at(tile: u32, brick: vec3<i32>, index: u32) -> vec2<u32> {
     return vec2<u32>(start, end - start);
 }
 
-// Whether the atom reaches a sample of the brick (1), or only the gap up to its neighbours' first samples (2).
+// Returns 1 if the atom reaches a sample of the brick, 2 if it reaches only the gap up to the first samples of the
+// neighbours, else 0.
 fn reach_of(atom: u32, tile_origin: vec3<i32>, lo: vec3<f32>) -> u32 {
     let local = vec3<f32>(atoms[atom].cell - tile_origin) + atoms[atom].frac;
     let reach = reaches[atom];
@@ -168,10 +169,10 @@ fn main(
     if (lane < 12u) {
         atomicStore(&hits[lane], 0u);
     }
-    // Atoms that reach a sample, and those that reach the gap only.
+    // Number of atoms that reach a sample, and number of those that reach the gap only.
     var n = vec2<u32>(0u);
     var start = 0u;
-    // Which of the hits is used; the second pass goes on where the first one ended.
+    // Index of the current hits; the second pass continues with the index at which the first ended.
     var phase = 0u;
     for (var pass_number = 0u; pass_number < 2u; pass_number++) {
         var kept = vec2<u32>(0u);
@@ -183,7 +184,7 @@ fn main(
             workgroupBarrier();
             range_start[lane] = range.x;
             range_end[lane] = range.y;
-            // A scan from one array into the other and back: six steps end where they began.
+            // Inclusive scan between two arrays. After six steps the result is in the first.
             var end = range.y;
             workgroupBarrier();
             end += select(0u, range_end[(lane - 1u) & 63u], lane >= 1u);
@@ -209,7 +210,7 @@ fn main(
                 var reaches_it = 0u;
                 var atom = 0u;
                 if (index < total) {
-                    // The first range that ends behind the index.
+                    // First range that ends behind the index.
                     var r = select(0u, 32u, range_end[31] <= index);
                     r += select(0u, 16u, range_end[r + 15u] <= index);
                     r += select(0u, 8u, range_end[r + 7u] <= index);
@@ -223,7 +224,7 @@ fn main(
                 let hit = 4u * phase;
                 phase = select(phase + 1u, 0u, phase == 2u);
                 if (lane < 4u) {
-                    // Used in the next step; last read two steps ago.
+                    // Cleared for the next step; last read two steps ago.
                     atomicStore(&hits[4u * phase + lane], 0u);
                 }
                 let half = lane >> 5u;
@@ -257,10 +258,10 @@ fn main(
         n = kept;
         let entries = n.x + n.y;
         if (lane == 0u) {
-            list_start = atomicAdd(&tally.list_end, entries);
+            list_start = atomicAdd(&counters.list_end, entries);
         }
         start = workgroupUniformLoad(&list_start);
-        // What does not fit is not written; the host sees the counter.
+        // A list that does not fit is not written. The host detects it by the counter.
         if (start + entries > params.list_capacity) {
             n = vec2<u32>(0u);
         }

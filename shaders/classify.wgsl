@@ -1,5 +1,5 @@
-// Stage `classify`: crossing edges, and how many vertices and triangles a brick has. Four bricks a workgroup, sixteen
-// lanes a brick: one for each half layer of 32 samples.
+// Stage `classify`: crossing edges, and the numbers of vertices and triangles of every brick. A workgroup has four
+// bricks and sixteen lanes per brick, one for each half layer of 32 samples.
 #include shared/params.wgsl
 #include shared/bits.wgsl
 #include shared/tiles.wgsl
@@ -12,13 +12,13 @@
 @group(0) @binding(3) var<storage, read> inside: array<u32>;
 @group(0) @binding(4) var<storage, read> cases: array<u32>;
 @group(0) @binding(5) var<storage, read_write> records: array<Record>;
-// Vertices, and triangles shifted by 16.
+// Number of vertices, and number of triangles shifted by 16.
 @group(0) @binding(6) var<storage, read_write> counts: array<u32>;
-// Vertices, triangles and bricks with any of 1024 bricks each; a fourth word is unused.
+// Per group of 1024 bricks: number of vertices, triangles and bricks with triangles; the fourth word is unused.
 @group(0) @binding(7) var<storage, read_write> groups: array<atomic<u32>>;
 
-var<workgroup> near: array<u32, 32>;
-// Crossing edges of a half layer by axis, ten bits each; and triangles.
+var<workgroup> neighbours: array<u32, 32>;
+// Per half layer: number of crossing edges by axis, ten bits each, and number of triangles.
 var<workgroup> edges: array<u32, 64>;
 var<workgroup> triangles: array<u32, 64>;
 var<workgroup> totals: array<vec2<u32>, 4>;
@@ -44,17 +44,17 @@ fn main(
         if (exists) {
             brick = neighbour(bricks[id] >> 9u, bricks[id] & 511u, part);
         }
-        near[8u * owner + part] = brick;
+        neighbours[8u * owner + part] = brick;
         if (exists) {
-            records[id].near[part] = brick;
+            records[id].neighbours[part] = brick;
         }
     }
     workgroupBarrier();
     let z = part >> 1u;
     let half = part & 1u;
     let b = 8u * owner;
-    let here = vec4<u32>(near[b], near[b + 1u], near[b + 2u], near[b + 3u]);
-    let above = vec4<u32>(near[b + 4u], near[b + 5u], near[b + 6u], near[b + 7u]);
+    let here = vec4<u32>(neighbours[b], neighbours[b + 1u], neighbours[b + 2u], neighbours[b + 3u]);
+    let above = vec4<u32>(neighbours[b + 4u], neighbours[b + 5u], neighbours[b + 6u], neighbours[b + 7u]);
     let c = corners_of(here, above, z, half);
     let crossing = vec3<u32>(c.low.x) ^ vec3<u32>(c.low.y, c.low.z, c.high.x);
     let n = countOneBits(crossing);
@@ -67,7 +67,8 @@ fn main(
     workgroupBarrier();
     if (exists) {
         for (var axis = 0u; axis < 3u; axis++) {
-            records[id].crossing[2u * (3u * z + axis) + half] = select(select(crossing.z, crossing.y, axis == 1u), crossing.x, axis == 0u);
+            let word = select(select(crossing.z, crossing.y, axis == 1u), crossing.x, axis == 0u);
+            records[id].crossing[2u * (3u * z + axis) + half] = word;
         }
         if (half == 0u) {
             var before = 0u;
@@ -89,7 +90,7 @@ fn main(
         }
     }
     workgroupBarrier();
-    // A group's bricks are a multiple of a workgroup's.
+    // All bricks of a workgroup belong to one group.
     if (lane == 0u && exists) {
         let total = totals[0] + totals[1] + totals[2] + totals[3];
         let group = 4u * (first >> 10u);

@@ -1,9 +1,9 @@
-// Stage `emit`: triangle indices. One workgroup a brick; a lane lists the triangles of a row of eight cells, then the
-// lanes write single indices, so that what is written together lies together.
+// Stage `emit`: triangle indices. One workgroup per brick. A lane lists the triangles of a row of eight cells; then
+// each lane writes single indices, so that memory accesses are contiguous.
 //
-// A cell's edge belongs to one of the samples around it, in the brick or in one of its seven neighbours towards +x, +y,
-// +z; the vertex's number is the rank of the edge among its brick's crossing edges. Bricks and neighbours are put down
-// as one block of 9 × 9 × 9 samples, so that no index asks whose edge it is.
+// Each edge of a cell is owned by a sample of the brick or of one of its seven neighbours towards +x, +y and +z. The
+// index of a vertex is the rank of its edge among the crossing edges of the owner's brick. The brick and its neighbours
+// are combined into one block of 9 × 9 × 9 samples, so that look-ups need not distinguish owners.
 #include shared/params.wgsl
 #include shared/bits.wgsl
 #include shared/record.wgsl
@@ -18,32 +18,32 @@
 
 const LANES: u32 = 64u;
 const NONE: u32 = 0xffffffffu;
-// Triangles listed at once.
+// Number of triangles listed at once.
 const WINDOW: u32 = 256u;
-// In the case table, by pairs of words: eight cases' numbers of triangles a word and then the edges of a cell; the
-// corners of the cases' triangles, four bits each.
+// Offsets in the case table, in pairs of words: triangle counts with eight cases per word, followed by the edges of a
+// cell; triangle corners of the cases, four bits each.
 const PACKED_COUNTS: u32 = 128u;
 const CORNERS: u32 = 152u;
 
-// Inside bits of the rows of samples along x, nine of nine each: row 9·z + y.
+// Inside bits of the rows of nine samples along x: row 9·z + y.
 var<workgroup> rows: array<u32, 81>;
-// Crossing edges of the block, as words of 4 rows, each with the number of its first vertex: by axis, z, every fourth
-// y; first those of samples with x < 8.
+// Crossing edges of the block as words of 4 rows, each with the index of its first vertex: by axis, z and every fourth
+// y; samples with x < 8 first.
 var<workgroup> edges: array<vec2<u32>, 162>;
-// Numbers of triangles of eight cases each; from 32 on the edges of a cell, as steps from its sample to their own.
+// Triangle counts of eight cases per word; from 32 on, the edges of a cell as offsets from the cell's sample.
 var<workgroup> packed_counts: array<u32, 48>;
-// Triangles: their cell, and from bit 12 on their corners. Before that, sums of rows.
+// Triangles: cell, and corners from bit 12 on. Used for the sums of rows before.
 var<workgroup> listed: array<u32, 256>;
 
 // Inside bits of row (y, z) of the block of brick `id`.
 fn row_at(id: u32, y: u32, z: u32) -> u32 {
     let n = (y >> 3u) << 1u | (z >> 3u) << 2u;
-    let brick = records[id].near[n];
-    let next = records[id].near[n + 1u];
+    let brick = records[id].neighbours[n];
+    let next = records[id].neighbours[n + 1u];
     let at = 2u * (z & 7u) + (y >> 2u & 1u);
     let shift = 8u * (y & 3u);
     var row = 0u;
-    // A brick that does not exist is out of every atom's reach: nothing of it is inside.
+    // A brick that does not exist is out of reach of all atoms, so no sample of it is inside.
     if (brick != NONE) {
         row = inside[brick * 16u + at] >> shift & 255u;
     }
@@ -53,18 +53,18 @@ fn row_at(id: u32, y: u32, z: u32) -> u32 {
     return row;
 }
 
-// Four bits to four bytes.
-fn spread(bits: u32) -> u32 {
+// Moves four bits to four bytes.
+fn bits_to_bytes(bits: u32) -> u32 {
     return ((bits & 15u) * 0x00204081u) & 0x01010101u;
 }
 
-// Triangles of the case in byte `i` of `quad`.
+// Number of triangles of the case in byte `i` of `quad`.
 fn triangles_of(quad: u32, i: u32) -> u32 {
     let case_ = quad >> (8u * i);
     return packed_counts[case_ >> 3u & 31u] >> (4u * (case_ & 7u)) & 7u;
 }
 
-// Lists a cell's `n` triangles from `at` on; what is not in the window is another's.
+// Lists the `n` triangles of a cell from `at` on, as far as they lie in the window.
 fn list_cell(at: u32, cell: u32, quad: u32, i: u32, n: u32) {
     if (n == 0u) {
         return;
@@ -77,10 +77,10 @@ fn list_cell(at: u32, cell: u32, quad: u32, i: u32, n: u32) {
     if (n > 4u && at + 4u < WINDOW) { listed[at + 4u] = cell | row.y >> 16u << 12u; }
 }
 
-// Number of the vertex at corner `k` of a listed triangle.
+// Index of the vertex at corner `k` of a listed triangle.
 fn vertex_at(triangle: u32, k: u32) -> u32 {
     let code = listed[triangle];
-    // The sum of a cell and a step is a sample, x from bit 0, y from bit 4 on: every fourth y counts as a word.
+    // The sum of a cell and an offset is a sample: x from bit 0 on, y from bit 4 on, and one word per four rows.
     let edge = (code & 0xfffu) + packed_counts[32u + (code >> (12u + 4u * k) & 15u)];
     let word = edges[(edge >> 6u) + 81u * (edge >> 3u & 1u)];
     let bit = (edge >> 1u & 24u) | (edge & 7u);
@@ -110,16 +110,16 @@ fn main(
     let z = lane >> 3u;
     rows[9u * z + y] = row_at(id, y, z);
     if (lane >= 47u) {
-        // Nine rows behind along y, eight along z.
+        // Nine rows of the neighbours along z, and eight of those along y.
         let i = lane - 47u;
         let at = select(vec2<u32>(i - 9u, 8u), vec2<u32>(8u, i), i < 9u);
         rows[9u * at.y + at.x] = row_at(id, at.x, at.y);
     }
     if (lane < 36u) {
-        // A layer of the brick or of a neighbour in its own layer of bricks; the lowest one of a neighbour above.
+        // A layer of the brick or of a neighbour at the same z; the lowest layer of a neighbour above.
         let which = select(lane - 28u, lane >> 3u, lane < 32u);
         let layer = select(0u, lane & 7u, lane < 32u);
-        let brick = records[id].near[which];
+        let brick = records[id].neighbours[which];
         if (brick != NONE) {
             var before = params.base_vertex + offsets[brick].x + (records[brick].layers[layer] & 0xffffu);
             let at = 81u * (which & 1u) + 3u * (layer + (which >> 2u) * 8u) + (which & 2u);
@@ -129,7 +129,7 @@ fn main(
             let y_high = records[brick].crossing[6u * layer + 3u];
             let z_low = records[brick].crossing[6u * layer + 4u];
             let z_high = records[brick].crossing[6u * layer + 5u];
-            // Of a brick behind along y the lowest rows are needed only, and there is no room for more.
+            // Of a neighbour along y, only the lowest rows are needed, and there is space for no others.
             let whole = (which & 2u) == 0u;
             edges[at] = vec2<u32>(x_low, before);
             before += countOneBits(x_low);
@@ -148,13 +148,14 @@ fn main(
     if (n == 0u || first + n > params.triangle_capacity) {
         return;
     }
-    // The corners of eight cells: four rows, their bits interleaved to a byte a cell.
+    // Corners of eight cells: the bits of four rows, interleaved to one byte per cell.
     let r0 = rows[9u * z + y];
     let r1 = rows[9u * z + y + 1u];
     let r2 = rows[9u * z + y + 9u];
     let r3 = rows[9u * z + y + 10u];
-    let near_x = spread(r0) | spread(r1) << 2u | spread(r2) << 4u | spread(r3) << 6u;
-    let far_x = spread(r0 >> 4u) | spread(r1 >> 4u) << 2u | spread(r2 >> 4u) << 4u | spread(r3 >> 4u) << 6u;
+    let near_x = bits_to_bytes(r0) | bits_to_bytes(r1) << 2u | bits_to_bytes(r2) << 4u | bits_to_bytes(r3) << 6u;
+    let far_x = bits_to_bytes(r0 >> 4u) | bits_to_bytes(r1 >> 4u) << 2u
+        | bits_to_bytes(r2 >> 4u) << 4u | bits_to_bytes(r3 >> 4u) << 6u;
     let last_x = r0 >> 8u | r1 >> 8u << 2u | r2 >> 8u << 4u | r3 >> 8u << 6u;
     let low = near_x | (near_x >> 8u | far_x << 24u) << 1u;
     let high = far_x | (far_x >> 8u | last_x << 24u) << 1u;
@@ -167,7 +168,7 @@ fn main(
     let n6 = triangles_of(high, 2u);
     let n7 = triangles_of(high, 3u);
     let own = n0 + n1 + n2 + n3 + n4 + n5 + n6 + n7;
-    // Rows come in the order of cells.
+    // Rows are in the order of cells.
     var sum = own;
     var side = 0u;
     listed[lane] = sum;
@@ -210,7 +211,7 @@ fn main(
         workgroupBarrier();
         let words = 3u * min(WINDOW, n - window);
         let base = 3u * (first + window);
-        // Three times 64 indices are 64 triangles: a lane writes the same corners of every 64th.
+        // 192 indices are 64 triangles, so a lane writes the same corners of every 64th triangle.
         var i = lane;
         for (var at = 0u; i < words; at += LANES) {
             triangles[base + i] = vertex_at(at + t0, k0);

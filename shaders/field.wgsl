@@ -1,9 +1,9 @@
-// Stage `field`: the density at the 8 × 8 × 8 samples of a brick, and which of them are inside. One workgroup a brick,
-// one lane a column of samples along z.
+// Stage `field`: density at the 8 × 8 × 8 samples of every brick, and the bits of the samples inside the surface. One
+// workgroup per brick, one lane per column of samples along z.
 //
-// Each sample is computed once, by the brick that owns it (a borrowed brick by the same instructions from the same
-// list), so neighbours never disagree on a sign. Candidates are staged in pieces: what depends on z is computed once
-// for all 64 columns.
+// Each sample has one owner. A halo brick is computed by the same instructions from the same list, so neighbours always
+// agree on a sign. Candidates are staged in workgroup memory in pieces; terms that depend on z are computed once for
+// all 64 columns.
 #include shared/params.wgsl
 #include shared/atom.wgsl
 #include shared/bits.wgsl
@@ -19,15 +19,16 @@
 @group(0) @binding(6) var<storage, read_write> field: array<f32>;
 @group(0) @binding(7) var<storage, read_write> inside: array<u32>;
 
-// Candidates staged at once: two lanes stage one. More would take workgroup memory that more workgroups put to better use.
+// Number of candidates staged at once, by two lanes each. A larger number would reduce the number of concurrent
+// workgroups.
 const PIECE: u32 = 24u;
 
 struct Staged {
-    // Whole cells from the atom's to the brick's first sample, and the atom's fraction: x, y.
+    // Whole cells from the atom to the first sample of the brick, and fraction of the atom: x, y.
     whole: vec2<f32>,
     frac: vec2<f32>,
     inv_length2: f32,
-    // Least u along z in the lower and the upper half of the brick.
+    // Minimum u along z in the lower and the upper half of the brick.
     nearest: vec2<f32>,
 }
 
@@ -37,7 +38,7 @@ var<workgroup> z_w: array<vec4<f32>, 48>;
 // Inside bits of four columns each.
 var<workgroup> columns: array<vec4<u32>, 16>;
 
-// Those of layer z.
+// Inside bits of four columns in layer z.
 fn four_bits(at: u32, z: u32) -> u32 {
     let bits = columns[at] >> vec4<u32>(z) & vec4<u32>(1u);
     return bits.x | bits.y << 1u | bits.z << 2u | bits.w << 3u;
@@ -68,7 +69,7 @@ fn main(
         workgroupBarrier();
         if (mine < n) {
             let atom = atoms[lists[head.x + first + mine]];
-            // Whole numbers are exact, so a distance is rounded once.
+            // Whole numbers are exact, so each distance is rounded once.
             let whole = vec3<f32>(origin - atom.cell);
             let start = whole.z + f32(4u * half);
             let d = (vec4<f32>(start) + vec4<f32>(0.0, 1.0, 2.0, 3.0)) - atom.frac.z;
@@ -95,7 +96,7 @@ fn main(
             if (u + min(a.nearest.x, a.nearest.y) < params.support) {
                 let c = column(u);
                 let u_min = params.u_min * a.inv_length2;
-                // Most candidates reach one half of the brick only; beyond their reach they would add zeros.
+                // Most candidates reach only one half of the brick.
                 if (u + a.nearest.x < params.support) {
                     low += density(c, Axis(z_e[2u * i], z_w[2u * i]), u_min);
                 }

@@ -1,5 +1,5 @@
-// Stage `interpolate`: vertex positions on crossing edges, analytic normals, and nearest atoms on request. One workgroup
-// a brick; a lane finds its vertex by rank among the crossing edges.
+// Stage `interpolate`: vertex positions on crossing edges, analytic normals, and nearest atoms if requested. One
+// workgroup per brick; a lane finds the edge of its vertex by rank among the crossing edges.
 #include shared/params.wgsl
 #include shared/atom.wgsl
 #include shared/bits.wgsl
@@ -9,10 +9,10 @@
 #include shared/record.wgsl
 #include shared/quantize.wgsl
 
-// Whether to find the nearest atom of each vertex.
+// Computes the nearest atom of each vertex if true.
 override NEAREST: bool = false;
 
-struct Tally {
+struct Counters {
     list_end: u32,
     vertices: u32,
     triangles: u32,
@@ -30,33 +30,33 @@ struct Tally {
 @group(0) @binding(8) var<storage, read> records: array<Record>;
 @group(0) @binding(9) var<storage, read> counts: array<u32>;
 @group(0) @binding(10) var<storage, read> offsets: array<vec2<u32>>;
-// Words of the vertex layout that is asked for: three of either, or two of a position and one of a normal.
+// Words of the requested vertex layout: three per position and normal, or two per position and one per normal.
 @group(0) @binding(11) var<storage, read_write> positions: array<u32>;
 @group(0) @binding(12) var<storage, read_write> normals: array<u32>;
 @group(0) @binding(13) var<storage, read_write> sources: array<u32>;
-@group(0) @binding(14) var<storage, read_write> tally: Tally;
+@group(0) @binding(14) var<storage, read_write> counters: Counters;
 
 const LANES: u32 = 128u;
-// Candidates staged at once.
+// Number of candidates staged at once.
 const PIECE: u32 = 128u;
-// As `EDGE_MARGIN` of every backend.
+// Same value as `EDGE_MARGIN` in `surface/lattice.rs`.
 const EDGE_MARGIN: f32 = 1.0 / 1024.0;
 
 var<workgroup> crossing: array<u32, 48>;
 var<workgroup> layers: array<u32, 8>;
-// The brick's slot and those of its neighbours towards +x, +y, +z.
+// Slots of the brick and of its neighbours towards +x, +y and +z.
 var<workgroup> slots: array<u32, 4>;
-// Centre from the brick's first sample, and 1/ρ².
+// Centre relative to the first sample of the brick, and 1/ρ².
 var<workgroup> staged: array<vec4<f32>, 128>;
 
-// What a candidate adds to the gradient at p, counted from the brick's first sample.
-fn pull(p: vec3<f32>, atom: vec4<f32>) -> vec3<f32> {
+// Contribution of an atom to the gradient at p, which is relative to the first sample of the brick.
+fn gradient_of(p: vec3<f32>, atom: vec4<f32>) -> vec3<f32> {
     let d = p - atom.xyz;
     let u = dot(d, d) * atom.w;
     return select(0.0, slope(u, params.u_min * atom.w) * atom.w, u < params.support) * d;
 }
 
-// A crossing edge: its owner's bit, layer and axis.
+// Crossing edge: bit and layer of its owner, and axis.
 struct Edge {
     bit: u32,
     z: u32,
@@ -80,7 +80,7 @@ fn edge_of(vertex: u32) -> Edge {
     return Edge(32u + select_bit(crossing[word + 1u], rank - n_low), z, axis);
 }
 
-// Density at the far end of an edge.
+// Density at the second sample of an edge.
 fn density_beyond(edge: Edge) -> f32 {
     let at = vec3<u32>(edge.bit & 7u, edge.bit >> 3u, edge.z);
     let along = vec3<u32>(vec3<u32>(0u, 1u, 2u) == vec3<u32>(edge.axis));
@@ -88,14 +88,14 @@ fn density_beyond(edge: Edge) -> f32 {
     let beyond = (next.x | next.y | next.z) > 7u;
     let slot = slots[select(0u, edge.axis + 1u, beyond)];
     if (slot == NONE) {
-        // A brick out of every atom's reach.
+        // A brick out of reach of all atoms.
         return 0.0;
     }
     let sample = next & vec3<u32>(7u);
     return field[slot * 512u + sample.z * 64u + sample.y * 8u + sample.x];
 }
 
-// Stages the candidates from `start` on: a multiple of four, and what is too much is far away.
+// Stages the candidates from `start` on, padded to a multiple of four by distant atoms.
 fn stage_piece(lane: u32, head: vec4<u32>, start: u32, origin: vec3<i32>) {
     let n = min(PIECE, head.z - start);
     for (var i = lane; i < ((n + 3u) & ~3u); i += LANES) {
@@ -130,13 +130,13 @@ fn main(
     } else if (lane < 56u) {
         layers[lane - 48u] = records[id].layers[lane - 48u];
     } else if (lane < 59u) {
-        slots[lane - 55u] = slot_of(records[id].near[1u << (lane - 56u)]);
+        slots[lane - 55u] = slot_of(records[id].neighbours[1u << (lane - 56u)]);
     } else if (lane == 59u) {
         slots[0] = id - params.first_brick;
     }
     stage_piece(lane, head, 0u, origin);
     workgroupBarrier();
-    // Where the estimate was too small nothing is written; the host sees the totals.
+    // A brick beyond the capacity is not written. The host detects it by the totals.
     if (n == 0u || first + n > params.vertex_capacity) {
         return;
     }
@@ -154,7 +154,7 @@ fn main(
                 stage_piece(lane, head, start, origin);
                 workgroupBarrier();
             }
-            // No barrier from here on: lanes without a vertex rest.
+            // No barriers follow, so lanes without a vertex may skip the rest.
             if (mine && start == 0u) {
                 let edge = edge_of(vertex);
                 let inner = field[slots[0] * 512u + edge.z * 64u + edge.bit];
@@ -165,10 +165,10 @@ fn main(
             }
             if (mine) {
                 for (var i = 0u; i < in_piece; i += 4u) {
-                    gradient += pull(p, staged[i]);
-                    gradient += pull(p, staged[i + 1u]);
-                    gradient += pull(p, staged[i + 2u]);
-                    gradient += pull(p, staged[i + 3u]);
+                    gradient += gradient_of(p, staged[i]);
+                    gradient += gradient_of(p, staged[i + 1u]);
+                    gradient += gradient_of(p, staged[i + 2u]);
+                    gradient += gradient_of(p, staged[i + 3u]);
                 }
                 if (NEAREST) {
                     for (var i = 0u; i < in_piece; i++) {
@@ -183,17 +183,17 @@ fn main(
             }
         }
         if (mine) {
-            // Below this, single precision has no direction left.
+            // A shorter gradient has no significant direction in single precision.
             let length2 = dot(gradient, gradient);
             let usable = length2 > 1e-14;
             let normal = gradient * select(0.0, inverseSqrt(length2), usable);
             if (!usable) {
-                atomicAdd(&tally.flat, 1u);
+                atomicAdd(&counters.flat, 1u);
             }
             if (NEAREST) {
                 sources[first + vertex] = atoms[lists[head.x + source]].source;
             }
-            // Whole steps are exact; the fraction is added before the one multiplication.
+            // Whole cells are exact; the fraction is added before the only multiplication.
             let position = (vec3<f32>(origin - params.centre) + p) * params.spacing;
             if (params.steps_per_angstrom > 0.0) {
                 let at = first + vertex;

@@ -1,8 +1,8 @@
-// Stage `scan`: the exclusive scan over bricks that tells each where its vertices and triangles go. One workgroup for
-// 1024 bricks; `classify` has added up the groups, so that nobody waits for anybody.
+// Stage `scan`: exclusive scan over bricks, which gives the first vertex and the first triangle of each. One workgroup
+// per group of 1024 bricks. `classify` has added up the groups, so workgroups do not depend on each other.
 #include shared/params.wgsl
 
-struct Tally {
+struct Counters {
     list_end: u32,
     vertices: u32,
     triangles: u32,
@@ -13,7 +13,7 @@ struct Tally {
 @group(0) @binding(1) var<storage, read> counts: array<u32>;
 @group(0) @binding(2) var<storage, read> groups: array<vec4<u32>>;
 @group(0) @binding(3) var<storage, read_write> offsets: array<vec2<u32>>;
-@group(0) @binding(4) var<storage, read_write> tally: Tally;
+@group(0) @binding(4) var<storage, read_write> counters: Counters;
 
 const LANES: u32 = 256u;
 
@@ -23,7 +23,7 @@ fn split(count: u32) -> vec2<u32> {
     return vec2<u32>(count & 0xffffu, count >> 16u);
 }
 
-// Makes `sums` inclusive.
+// Replaces `sums` by inclusive sums.
 fn scan_sums(lane: u32) {
     for (var step = 1u; step < LANES; step = step << 1u) {
         workgroupBarrier();
@@ -44,7 +44,7 @@ fn main(
     if (group * 1024u >= params.n_own) {
         return;
     }
-    // What the groups before hold.
+    // Sum of the groups before.
     var sum = vec2<u32>(0u);
     for (var i = lane; i < group; i += LANES) {
         sum += groups[i].xy;
@@ -67,8 +67,8 @@ fn main(
     store(first + 3u, start + c0 + c1 + c2);
     if ((group + 1u) * 1024u >= params.n_own && lane == 0u) {
         let end = before + sums[LANES - 1u];
-        tally.vertices = end.x;
-        tally.triangles = end.y;
+        counters.vertices = end.x;
+        counters.triangles = end.y;
     }
 }
 

@@ -401,13 +401,17 @@ type Edges = BTreeMap<String, BTreeSet<String>>;
 
 /// Returns a reference cycle between layers, if there is one.
 fn cycle(sources: &[Source]) -> Option<Vec<String>> {
-    fn visit(at: &str, edges: &Edges, trail: &mut Vec<String>) -> bool {
+    fn visit(at: &str, edges: &Edges, trail: &mut Vec<String>, done: &mut BTreeSet<String>) -> bool {
+        if done.contains(at) {
+            return false;
+        }
         let seen = trail.iter().any(|t| t == at);
         trail.push(at.to_owned());
-        if seen || edges.get(at).is_some_and(|next| next.iter().any(|n| visit(n, edges, trail))) {
+        if seen || edges.get(at).is_some_and(|next| next.iter().any(|n| visit(n, edges, trail, done))) {
             return true;
         }
         trail.pop();
+        done.insert(at.to_owned());
         false
     }
     let mut edges = Edges::new();
@@ -418,10 +422,38 @@ fn cycle(sources: &[Source]) -> Option<Vec<String>> {
             edges.entry(layer.to_owned()).or_default().extend(others);
         }
     }
+    let mut done = BTreeSet::new();
     edges.keys().find_map(|layer| {
         let mut trail = Vec::new();
-        visit(layer, &edges, &mut trail).then_some(trail)
+        visit(layer, &edges, &mut trail, &mut done).then_some(trail)
     })
+}
+
+/// Returns the modules of a layer without their tests, as if the layer were the root of the crate. [`cycle`] then finds
+/// cycles between modules.
+fn modules_of(sources: &[Source], layer: &str) -> Vec<Source> {
+    let (folder, path) = (format!("src/{layer}/"), format!("crate::{layer}::"));
+    let modules = sources.iter().filter(|s| s.path.starts_with(&folder) && s.path != format!("{folder}mod.rs"));
+    modules
+        .map(|s| {
+            let lines = s.text.lines().take(tests_start(&s.text).unwrap_or(usize::MAX));
+            let text = lines.collect::<Vec<_>>().join("\n").replace(&path, "crate::");
+            Source { path: s.path.replacen(&folder, "src/", 1), text }
+        })
+        .collect()
+}
+
+/// Modules of `room` without their tests, as if `room` were the root of the crate: [`cycle`] then finds cycles between them.
+fn modules_of(sources: &[Source], room: &str) -> Vec<Source> {
+    let (folder, path) = (format!("src/{room}/"), format!("crate::{room}::"));
+    let modules = sources.iter().filter(|s| s.path.starts_with(&folder) && s.path != format!("{folder}mod.rs"));
+    modules
+        .map(|s| {
+            let lines = s.text.lines().take(tests_start(&s.text).unwrap_or(usize::MAX));
+            let text = lines.collect::<Vec<_>>().join("\n").replace(&path, "crate::");
+            Source { path: s.path.replacen(&folder, "src/", 1), text }
+        })
+        .collect()
 }
 
 fn too_long(sources: &[Source]) -> Vec<String> {
@@ -597,6 +629,13 @@ fn layers_have_no_reference_cycle() {
 }
 
 #[test]
+fn modules_of_a_layer_have_no_reference_cycle() {
+    for layer in ["gpu", "http"] {
+        assert_eq!(cycle(&modules_of(&sources_under("src"), layer)), None);
+    }
+}
+
+#[test]
 fn layers_are_listed_in_order() {
     for (i, layer) in LAYERS.iter().enumerate() {
         for (other, _) in layer.layers {
@@ -722,6 +761,20 @@ fn control_a_cycle_is_reported() {
     assert_eq!(cycle(&sources), None);
     sources.push(one("src/c/deep/er.rs", "fn f() { crate::a::f() }"));
     assert_eq!(cycle(&sources), Some(["a", "b", "c", "a"].map(String::from).to_vec()));
+}
+
+#[test]
+fn control_a_cycle_of_modules_is_reported() {
+    let one = |path: &str, text: &str| source(path, text).remove(0);
+    let mut sources = vec![
+        one("src/gpu/mod.rs", "mod a; use a::X;"),
+        one("src/gpu/a.rs", "use super::b::X;\n#[cfg(test)]\nmod tests {\n    use crate::gpu::c::Y;\n}"),
+        one("src/gpu/b/deep.rs", "use super::super::c::Y;"),
+        one("src/gpu/c.rs", "use crate::surface::Mesh;"),
+    ];
+    assert_eq!(cycle(&modules_of(&sources, "gpu")), None);
+    sources.push(one("src/gpu/c/other.rs", "use crate::gpu::a::Z;"));
+    assert_eq!(cycle(&modules_of(&sources, "gpu")), Some(["a", "b", "c", "a"].map(String::from).to_vec()));
 }
 
 #[test]

@@ -87,7 +87,7 @@ fn doctor_lists_every_device_with_its_reason() {
     }
     let cpu = doctor(&["--devices", "cpu"]);
     for line in stdout(&cpu).lines().filter(|line| line.trim_start().starts_with("device ")) {
-        assert!(line.contains("the CPU was asked for"), "{line}");
+        assert!(line.contains("the CPU was requested"), "{line}");
     }
 }
 

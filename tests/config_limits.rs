@@ -73,9 +73,9 @@ const ROWS: &[Row] = &[
     ("devices.jobs", "molmesh_device_jobs", "http_devices::devices_are_listed_with_their_reasons"),
     ("devices.batch", "molmesh_device_shared_submissions_total", "gpu_pool::small_jobs_share_a_submission"),
     (
-        "devices.spread_bricks",
-        "molmesh_device_spread_jobs_total",
-        "gpu_spread::callers_at_once_neither_wait_for_each_other_for_ever_nor_mix_their_parts",
+        "devices.min_partition_bricks",
+        "molmesh_device_partitions_total",
+        "gpu_multi_device::concurrent_callers_neither_deadlock_nor_mix_partitions",
     ),
     ("archive.check_ms", "", "archive_http::digests_are_known_without_reading"),
     (

@@ -1,16 +1,16 @@
-//! Whole meshes of the engine against the CPU backend's, on the software device.
+//! Meshes of the engine compared with those of the CPU backend, on software Vulkan.
 #![cfg(feature = "gpu")]
-#![expect(clippy::unwrap_used, clippy::float_cmp, reason = "a test may panic, and means equality where it asks for it")]
+#![expect(clippy::unwrap_used, clippy::float_cmp, reason = "tests may panic and compare exactly")]
 
 mod gpu_support;
 
 use std::sync::Arc;
 
 use gpu_support::{
-    KERNELS, Random, engine, engine_with, job, measures, mesh_of, params, rounded, run, sample, spheres,
+    KERNELS, Random, engine, engine_with, job, measures, mesh_of, params, quantized, run, sample, spheres,
 };
+use molmesh::gpu::plan::ChunkLimits;
 use molmesh::gpu::{Budget, Engine, Executor, GpuError, GpuJob, Prepared};
-use molmesh::surface::chunks::ChunkLimits;
 use molmesh::surface::quantize::BEYOND;
 use molmesh::surface::{
     Backend, Control, CpuBackend, Mesh, Meshed, Quantized, Spheres, SurfaceError, SurfaceLimits, SurfaceOptions,
@@ -21,7 +21,7 @@ fn cpu(spheres: &Spheres, params: &SurfaceParams) -> Meshed {
     CpuBackend::new(Some(2)).unwrap().run(spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap()
 }
 
-/// What is wrong with `mesh`, going by `expected`; bounds in Å.
+/// Returns the first difference of `mesh` from `expected`, with bounds in Å.
 fn difference(mesh: &Mesh, expected: &Mesh) -> Option<String> {
     if mesh.centre != expected.centre {
         return Some("centre".to_owned());
@@ -55,7 +55,7 @@ fn assert_equal(gpu: &Meshed, spheres: &Spheres, params: &SurfaceParams, what: &
 }
 
 #[test]
-fn structures_are_as_on_the_cpu_with_every_kernel() {
+fn structures_are_equal_to_the_cpu_with_every_kernel() {
     for name in ["4pti.pdb", "1crn.cif"] {
         let spheres = sample(name);
         for kernel in KERNELS {
@@ -66,12 +66,12 @@ fn structures_are_as_on_the_cpu_with_every_kernel() {
     }
 }
 
-/// Asserts that the engine's rounded vertices are its own single-precision ones rounded by the host, bit for bit, and that
-/// everything else is as it was. Returns the rounded mesh.
+/// Asserts that the engine's quantized vertices equal its single-precision vertices quantized by the host, bit by bit,
+/// and that the rest of the mesh is unchanged. Returns the quantized mesh.
 #[track_caller]
-fn assert_rounded(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams, what: &str) -> Meshed {
+fn assert_quantized(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams, what: &str) -> Meshed {
     let single = mesh_of(engine, spheres, params).mesh;
-    let small = rounded(spheres, params);
+    let small = quantized(spheres, params);
     let meshed = mesh_of(engine, spheres, &small);
     let mut expected = single.clone();
     assert!(expected.quantize(small.quantize.unwrap()));
@@ -80,7 +80,7 @@ fn assert_rounded(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams
     assert_eq!(single.bytes() - meshed.mesh.bytes(), 12 * single.n_vertices() as u64, "{what}");
     let quantized = meshed.mesh.quantized.as_ref().unwrap();
     assert!(quantized.positions.iter().all(|row| row[3] == 0 && !row.contains(&BEYOND)), "{what}");
-    // Control: a vertex that is off by one, and a normal.
+    // Negative controls: a vertex and a normal that are off by one.
     let changed = |change: &dyn Fn(&mut Quantized)| {
         let mut mesh = meshed.mesh.clone();
         change(mesh.quantized.as_mut().unwrap());
@@ -91,13 +91,13 @@ fn assert_rounded(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams
 }
 
 #[test]
-fn rounded_vertices_are_those_in_single_precision_rounded_with_every_kernel() {
+fn quantized_vertices_equal_those_of_the_host_with_every_kernel() {
     for name in ["4pti.pdb", "1crn.cif"] {
         let spheres = sample(name);
         for kernel in KERNELS {
             let params = params(kernel, 0.5);
-            let meshed = assert_rounded(&mut engine(), &spheres, &params, &format!("{name} {kernel}"));
-            let (found, cpu) = (measures(&meshed), measures(&cpu(&spheres, &rounded(&spheres, &params))));
+            let meshed = assert_quantized(&mut engine(), &spheres, &params, &format!("{name} {kernel}"));
+            let (found, cpu) = (measures(&meshed), measures(&cpu(&spheres, &quantized(&spheres, &params))));
             assert!(found.closed && found.oriented && found.manifold, "{name} {kernel}: {found:?}");
             assert_eq!((found.euler, found.components.len()), (cpu.euler, cpu.components.len()));
             assert!((found.area / cpu.area - 1.0).abs() < 1e-5 && (found.volume / cpu.volume - 1.0).abs() < 1e-5);
@@ -106,37 +106,37 @@ fn rounded_vertices_are_those_in_single_precision_rounded_with_every_kernel() {
 }
 
 #[test]
-fn hard_cases_are_rounded_alike() {
-    for (name, rows, resolution) in hard_cases() {
+fn edge_cases_are_quantized_like_on_the_host() {
+    for (name, rows, resolution) in edge_cases() {
         let spheres = spheres(&rows);
         for kernel in KERNELS {
             let params = params(kernel, resolution);
             if run(&mut engine(), &job(&spheres, &params)).is_ok() {
-                assert_rounded(&mut engine(), &spheres, &params, &format!("{name} {kernel}"));
+                assert_quantized(&mut engine(), &spheres, &params, &format!("{name} {kernel}"));
             }
         }
     }
 }
 
 #[test]
-fn rounded_vertices_in_chunks_pieces_and_landings_are_the_same_bytes() {
+fn quantized_vertices_in_chunks_pieces_and_readback_buffers_have_the_same_bytes() {
     let cloud: Vec<[f64; 4]> =
         Random(11).cloud(1500, 70.0).iter().map(|[x, y, z, r]| [x - 20.0, y + 3.0, z - 40.0, *r]).collect();
     let crowd = spheres(&cloud);
     let ids = SurfaceOptions { resolution: Some(0.5), atom_ids: true, ..SurfaceOptions::default() };
     let ids = SurfaceParams::new(&ids).unwrap();
-    let whole = assert_rounded(&mut engine(), &crowd, &ids, "whole");
-    let small = rounded(&crowd, &ids);
+    let whole = assert_quantized(&mut engine(), &crowd, &ids, "whole");
+    let small = quantized(&crowd, &ids);
     let cut: [(&str, Change); 5] = [
         ("chunks", |b| b.chunk_bricks = 900),
         ("pieces", |b| (b.small_bytes, b.piece_bytes) = (0, 1 << 20)),
-        ("landings", |b| (b.small_bytes, b.landing_bytes) = (0, 2 << 20)),
-        ("all three", |b| (b.chunk_bricks, b.piece_bytes, b.landing_bytes) = (1200, 1 << 20, 2 << 20)),
+        ("readback buffers", |b| (b.small_bytes, b.readback_bytes) = (0, 2 << 20)),
+        ("all three", |b| (b.chunk_bricks, b.piece_bytes, b.readback_bytes) = (1200, 1 << 20, 2 << 20)),
         ("counted first", |b| b.small_bytes = 0),
     ];
     for (what, change) in cut {
         let mut engine = engine_with(change);
-        // After a job with vertices of the other kind, whose buffers are found again, and after itself.
+        // Reuses buffers of a job with the other vertex layout, and its own.
         for params in [&small, &ids, &small, &small] {
             let meshed = mesh_of(&mut engine, &crowd, params);
             assert_eq!(meshed.mesh.quantized.is_some(), params.quantize.is_some());
@@ -148,12 +148,12 @@ fn rounded_vertices_in_chunks_pieces_and_landings_are_the_same_bytes() {
 }
 
 #[test]
-fn jobs_with_vertices_of_either_kind_share_a_submission() {
+fn jobs_with_both_vertex_layouts_share_a_submission() {
     let mut random = Random(5);
     let clouds: Vec<Spheres> = (2..=7).map(|n| spheres(&random.cloud(n * n * 7, 6.0 * n as f64))).collect();
     let wanted = |(i, cloud): (usize, &Spheres)| {
         let plain = params(KERNELS[i % 3], 0.5);
-        job(cloud, &if i % 2 == 0 { plain } else { rounded(cloud, &plain) })
+        job(cloud, &if i % 2 == 0 { plain } else { quantized(cloud, &plain) })
     };
     let jobs: Vec<_> = clouds.iter().enumerate().map(wanted).collect();
     let mut engine = engine_with(|_| ());
@@ -164,14 +164,14 @@ fn jobs_with_vertices_of_either_kind_share_a_submission() {
         assert_eq!(together.mesh.quantized.is_some(), i % 2 == 1);
         assert!(together.mesh == alone.mesh, "{i}");
     }
-    // An estimate that is too low costs a second round and nothing else.
+    // If the estimate is too low, the output is made again.
     let mut engine = engine_with(|b| b.rows_per_brick = [20, 20]);
     let again = mesh_of(&mut engine, &clouds[1], &jobs[1].prepared.params);
     assert!(again.mesh == run(&mut engine_with(|_| ()), &jobs[1]).unwrap().meshed.mesh);
 }
 
 #[test]
-fn landings_are_kept_between_jobs_and_let_go_at_rest() {
+fn idle_readback_buffers_are_kept_between_jobs_and_released_on_request() {
     let spheres = sample("1crn.cif");
     let wanted = params(KERNELS[0], 0.4);
     let held = |idle_bytes| {
@@ -180,15 +180,15 @@ fn landings_are_kept_between_jobs_and_let_go_at_rest() {
         let (bytes, in_use) = (mesh.bytes(), engine.held_bytes());
         drop(mesh);
         let between = engine.held_bytes();
-        engine.rest();
+        engine.release_idle_memory();
         let after = engine.held_bytes();
-        assert!(mesh_of(&mut engine, &spheres, &wanted).mesh.n_triangles() > 0, "it works after a rest");
+        assert!(mesh_of(&mut engine, &spheres, &wanted).mesh.n_triangles() > 0, "it works afterwards");
         (bytes, [in_use, between, after])
     };
     let (bytes, [in_use, between, after]) = held([1 << 30, 0]);
     assert_eq!(between, in_use, "kept for the next job");
     assert!(after + bytes <= between, "{after} {bytes} {between}");
-    // The controls: what may stay stays, and what may not goes at once.
+    // Negative controls: a higher limit keeps the buffers, and a limit of 0 frees them at once.
     let (_, [in_use, between, after]) = held([1 << 30, 1 << 30]);
     assert_eq!([between, after], [in_use; 2]);
     let (bytes, [in_use, between, _]) = held([0, 0]);
@@ -196,17 +196,17 @@ fn landings_are_kept_between_jobs_and_let_go_at_rest() {
 }
 
 #[test]
-fn a_rounded_mesh_takes_less_of_the_host_and_of_a_limit() {
+fn a_quantized_mesh_takes_less_memory_and_less_of_a_limit() {
     let spheres = sample("1crn.cif");
     let plain = params(KERNELS[0], 0.4);
-    let small = rounded(&spheres, &plain);
+    let small = quantized(&spheres, &plain);
     let held = |params: &SurfaceParams| {
         let mut engine = engine_with(|b| b.small_bytes = 0);
         let meshed = mesh_of(&mut engine, &spheres, params);
         (engine.held_bytes(), meshed.mesh.n_vertices() as u64)
     };
     let ((much, n), (less, _)) = (held(&plain), held(&small));
-    // Twelve bytes a vertex on the device, and as many in the landing; sizes come in steps.
+    // Twelve bytes per vertex less on the device and in the readback buffer; sizes are rounded.
     assert!(much > less + 14 * n, "{much} {less} {n}");
     let bytes = mesh_of(&mut engine(), &spheres, &small).mesh.bytes();
     let within = |params: &SurfaceParams, max_mesh_bytes| {
@@ -220,18 +220,18 @@ fn a_rounded_mesh_takes_less_of_the_host_and_of_a_limit() {
     }
 }
 
-/// A spacing so wide that vertices lie where no atom reaches: their normals come from the triangles around them.
+/// With a very wide spacing vertices lie out of reach of all atoms. Their normals come from the adjacent triangles.
 #[test]
-fn rounded_vertices_without_a_gradient_have_normals() {
+fn quantized_vertices_without_a_gradient_have_normals() {
     let (spheres, params) = (spheres(&[[0.0, 0.0, 0.0, 1.7]]), params(KERNELS[0], 8.0));
-    let small = rounded(&spheres, &params);
+    let small = quantized(&spheres, &params);
     for small_bytes in [0, 16 << 20] {
         let mut engine = engine_with(|b| b.small_bytes = small_bytes);
         let (single, meshed) = (mesh_of(&mut engine, &spheres, &params), mesh_of(&mut engine, &spheres, &small));
         let normals = &meshed.mesh.quantized.as_ref().unwrap().normals;
         assert_eq!((normals.len(), single.mesh.normals.len()), (6, 6));
         for (found, unit) in normals.iter().zip(&single.mesh.normals) {
-            // Of the triangles as they are delivered, so off by what rounding turns them.
+            // Computed from the quantized triangles, so they differ slightly.
             let off = (0..3).map(|k| (f32::from(found[k]) - 127.0 * unit[k]).abs()).fold(0.0, f32::max);
             assert!(off < 1.5 && *found != [0; 4], "{found:?} {unit:?}");
         }
@@ -239,7 +239,7 @@ fn rounded_vertices_without_a_gradient_have_normals() {
 }
 
 #[test]
-fn the_comparison_finds_fault() {
+fn control_the_comparison_finds_differences() {
     let spheres = sample("1crn.cif");
     let good = cpu(&spheres, &params(KERNELS[0], 1.0)).mesh;
     assert_eq!(difference(&good, &good), None);
@@ -256,8 +256,8 @@ fn the_comparison_finds_fault() {
     assert!(changed(&|m| m.centre[0] += 0.5).is_some());
 }
 
-/// Small cases that a grid's seams and limits make hard.
-fn hard_cases() -> Vec<(&'static str, Vec<[f64; 4]>, f64)> {
+/// Small cases at boundaries of the grid and of parameters.
+fn edge_cases() -> Vec<(&'static str, Vec<[f64; 4]>, f64)> {
     let mut random = Random(7);
     let ring = |n: u32| {
         (0..n).map(move |i| {
@@ -282,15 +282,15 @@ fn hard_cases() -> Vec<(&'static str, Vec<[f64; 4]>, f64)> {
 }
 
 #[test]
-fn hard_cases_are_as_on_the_cpu() {
-    for (name, rows, resolution) in hard_cases() {
+fn edge_cases_are_equal_to_the_cpu() {
+    for (name, rows, resolution) in edge_cases() {
         let spheres = spheres(&rows);
         for kernel in KERNELS {
             let params = params(kernel, resolution);
             let meshed = match run(&mut engine(), &job(&spheres, &params)) {
                 Ok(finished) => finished.meshed,
                 Err(e) => {
-                    // Where the CPU finds no surface either.
+                    // The CPU finds no surface either.
                     let cpu = CpuBackend::new(Some(2)).unwrap();
                     let same = cpu.run(&spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap_err();
                     assert_eq!(e, GpuError::Surface(same), "{name} {kernel}");
@@ -303,7 +303,7 @@ fn hard_cases_are_as_on_the_cpu() {
 }
 
 #[test]
-fn parameters_of_the_paper_and_presets_are_as_on_the_cpu() {
+fn parameters_of_the_paper_and_presets_are_equal_to_the_cpu() {
     use molmesh::surface::{Kernel, Preset};
     let spheres = sample("1crn.cif");
     let all = [
@@ -335,7 +335,7 @@ fn parameters_of_the_paper_and_presets_are_as_on_the_cpu() {
         let expected = cpu(&spheres, &params).mesh.atom_ids;
         assert_eq!(meshed.mesh.atom_ids.is_some(), expected.is_some());
         if let (Some(ids), Some(expected)) = (meshed.mesh.atom_ids, expected) {
-            // Two atoms at the same distance to the last bit may change places.
+            // Two atoms at the same distance may be exchanged.
             let other = ids.iter().zip(&expected).filter(|(a, b)| a != b).count();
             assert!(other * 1000 <= ids.len(), "{options:?}: {other} of {} nearest atoms differ", ids.len());
         }
@@ -351,7 +351,7 @@ fn bytes(mesh: &Mesh) -> (Vec<u8>, Vec<u8>, Vec<u8>) {
 type Change = fn(&mut Budget);
 
 #[test]
-fn chunks_pieces_and_landings_change_no_byte() {
+fn chunks_pieces_and_readback_buffers_change_no_byte() {
     let mut random = Random(11);
     let cloud: Vec<[f64; 4]> =
         random.cloud(1500, 70.0).iter().map(|[x, y, z, r]| [x - 20.0, y + 3.0, z - 40.0, *r]).collect();
@@ -359,9 +359,9 @@ fn chunks_pieces_and_landings_change_no_byte() {
     let params = params(KERNELS[0], 0.5);
     let whole = mesh_of(&mut engine(), &crowd, &params);
     assert_equal(&whole, &crowd, &params, "whole");
-    // Small enough to be cut below, large enough that it will be.
+    // Large enough to be cut by every budget below.
     let plan = job(&crowd, &params).prepared;
-    let chunks = plan.plan.chunks(ChunkLimits { bricks: 900, candidates: 1 << 30 }).unwrap();
+    let chunks = plan.plan.chunks(0..plan.plan.tiles.len(), ChunkLimits { bricks: 900, candidates: 1 << 30 }).unwrap();
     assert!(chunks.len() > 4 && chunks.iter().all(|c| c.n_slots() <= 900), "{} chunks", chunks.len());
     assert!(whole.mesh.n_triangles() * 12 > 5 << 20, "{} triangles", whole.mesh.n_triangles());
     let again = mesh_of(&mut engine(), &crowd, &params);
@@ -369,15 +369,15 @@ fn chunks_pieces_and_landings_change_no_byte() {
     let cut: [(&str, Change); 4] = [
         ("chunks", |b| b.chunk_bricks = 900),
         ("pieces", |b| (b.small_bytes, b.piece_bytes) = (0, 2 << 20)),
-        ("landings", |b| (b.small_bytes, b.landing_bytes) = (0, 3 << 20)),
-        ("all three", |b| (b.chunk_bricks, b.piece_bytes, b.landing_bytes) = (1200, 2 << 20, 3 << 20)),
+        ("readback buffers", |b| (b.small_bytes, b.readback_bytes) = (0, 3 << 20)),
+        ("all three", |b| (b.chunk_bricks, b.piece_bytes, b.readback_bytes) = (1200, 2 << 20, 3 << 20)),
     ];
     for (what, change) in cut {
         let mut engine = engine_with(change);
         let meshed = mesh_of(&mut engine, &crowd, &params);
         assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{what}");
         assert_eq!(meshed.grid, whole.grid, "{what}");
-        // In another order, and with buffers that still hold the last job.
+        // Atoms in reverse order, with reused buffers.
         let backwards: Vec<[f64; 4]> = cloud.iter().rev().copied().collect();
         let other = mesh_of(&mut engine, &spheres(&backwards), &params);
         assert_eq!(bytes(&other.mesh), bytes(&whole.mesh), "{what}, other order");
@@ -385,36 +385,8 @@ fn chunks_pieces_and_landings_change_no_byte() {
 }
 
 #[test]
-fn output_that_is_made_before_it_is_counted_is_the_same_or_made_again() {
-    let crowd = |n: usize| spheres(&Random(21).cloud(n, 40.0));
-    let ids = SurfaceOptions { resolution: Some(0.6), atom_ids: true, ..SurfaceOptions::default() };
-    let (plain, ids) = (params(KERNELS[0], 0.6), SurfaceParams::new(&ids).unwrap());
-    let mut engine = engine_with(|b| b.small_bytes = 0);
-    // The first has no buffers to be made in. The second finds them; so do those with fewer rows. One with more rows, or
-    // with atoms by vertex for the first time, does not; then its like does.
-    let jobs = [
-        (400, &plain, 2),
-        (400, &plain, 3),
-        (380, &plain, 3),
-        (700, &plain, 3),
-        (700, &plain, 3),
-        (400, &ids, 2),
-        (400, &ids, 3),
-    ];
-    for (i, (n, params, submissions)) in jobs.into_iter().enumerate() {
-        let spheres = crowd(n);
-        let before = engine.submissions();
-        let meshed = mesh_of(&mut engine, &spheres, params);
-        let whole = mesh_of(&mut self::engine(), &spheres, params);
-        assert_eq!(bytes(&meshed.mesh), bytes(&whole.mesh), "{i}");
-        assert_eq!(meshed.mesh.atom_ids, whole.mesh.atom_ids, "{i}");
-        assert_eq!(engine.submissions() - before, submissions, "{i}");
-    }
-}
-
-#[test]
-fn more_workgroups_than_one_dimension_has() {
-    // Lone atoms on a grid of their own: each has a few dozen bricks and little to compute.
+fn dispatches_may_exceed_one_dimension() {
+    // Isolated atoms: each has a few dozen bricks and little to compute.
     let rows: Vec<[f64; 4]> = (0..8000)
         .map(|i| [i % 20, i / 20 % 20, i / 400].map(|k| 41.3 * f64::from(k) - 300.0))
         .map(|[x, y, z]| [x, y, z, 1.4])
@@ -427,7 +399,7 @@ fn more_workgroups_than_one_dimension_has() {
 }
 
 #[test]
-fn an_estimate_that_is_too_low_costs_a_second_round_and_nothing_else() {
+fn output_is_made_again_if_the_estimate_is_too_low() {
     let spheres = sample("1crn.cif");
     let params = params(KERNELS[0], 0.5);
     let whole = mesh_of(&mut engine(), &spheres, &params);
@@ -439,12 +411,12 @@ fn an_estimate_that_is_too_low_costs_a_second_round_and_nothing_else() {
 }
 
 #[test]
-fn several_jobs_share_a_submission_and_none_sees_another() {
+fn jobs_that_share_a_submission_are_independent() {
     let mut random = Random(5);
     let clouds: Vec<Spheres> = (1..=9).map(|n| spheres(&random.cloud(n * n * 7, 6.0 * n as f64))).collect();
     let mut jobs: Vec<_> =
         clouds.iter().zip(KERNELS.iter().cycle()).map(|(cloud, &kernel)| job(cloud, &params(kernel, 0.5))).collect();
-    // One that has no surface, one that nobody wants any more, one whose time is over.
+    // A job without a surface, a cancelled one, and a late one.
     let high = SurfaceOptions { isovalue: Some(1e6), ..SurfaceOptions::default() };
     jobs.push(job(&clouds[2], &SurfaceParams::new(&high).unwrap()));
     jobs.push(job(&clouds[3], &params(KERNELS[0], 0.5)));
@@ -466,10 +438,10 @@ fn several_jobs_share_a_submission_and_none_sees_another() {
 }
 
 #[test]
-fn meshes_outlive_the_engine_and_give_their_memory_back() {
+fn meshes_outlive_the_engine_and_return_their_memory() {
     let params = params(KERNELS[0], 1.0);
     let spheres = sample("1crn.cif");
-    // In one submission, and counted first.
+    // As a small job, and counted first.
     let ways: [Change; 2] = [|_| (), |b| b.small_bytes = 0];
     for way in ways {
         let mut engine = engine_with(way);
@@ -479,8 +451,8 @@ fn meshes_outlive_the_engine_and_give_their_memory_back() {
             let _second = mesh_of(&mut engine, &spheres, &params);
             engine.held_bytes()
         };
-        assert!(while_kept > with_one, "two meshes at once have two landings");
-        // A third finds the second's landing again, and every buffer of the workspace.
+        assert!(while_kept > with_one, "two meshes have two readback buffers");
+        // A third job reuses the readback buffer of the second, and the workspace.
         let third = mesh_of(&mut engine, &spheres, &params);
         assert_eq!(engine.held_bytes(), while_kept);
         drop(third);
@@ -490,7 +462,7 @@ fn meshes_outlive_the_engine_and_give_their_memory_back() {
 }
 
 #[test]
-fn what_a_device_cannot_hold_is_refused_with_numbers() {
+fn a_job_beyond_the_memory_is_rejected_with_numbers() {
     let spheres = sample("1crn.cif");
     let params = params(KERNELS[0], 0.3);
     let mut engine = engine_with(|b| b.memory = 1 << 20);
@@ -506,7 +478,7 @@ fn what_a_device_cannot_hold_is_refused_with_numbers() {
 }
 
 #[test]
-fn stages_tell_their_times_where_the_device_has_a_clock() {
+fn stage_times_are_reported_if_the_device_has_timestamps() {
     let (spheres, params) = (sample("1crn.cif"), params(KERNELS[0], 0.7));
     let has_timestamps = gpu_support::device().0.features().contains(wgpu::Features::TIMESTAMP_QUERY);
     for small_bytes in [0, 16 << 20] {
@@ -524,7 +496,7 @@ fn stages_tell_their_times_where_the_device_has_a_clock() {
 }
 
 #[test]
-fn a_lost_device_is_an_error_and_no_panic() {
+fn a_lost_device_is_an_error_without_panic() {
     let (spheres, params) = (sample("1crn.cif"), params(KERNELS[0], 0.7));
     for small in [0, 16 << 20] {
         let (device, queue) = gpu_support::device();
@@ -537,7 +509,7 @@ fn a_lost_device_is_an_error_and_no_panic() {
             let error = run(&mut engine, &job(&spheres, &params)).unwrap_err();
             assert!(matches!(error, GpuError::Lost(_)), "{error}");
         }
-        // What was read before stays readable.
+        // Earlier meshes stay readable.
         assert_eq!(measures(&before).euler, measures(&cpu(&spheres, &params)).euler);
     }
 }

@@ -1,4 +1,4 @@
-//! The pool over a real engine on software Vulkan: found, started, shared, lost and rebuilt.
+//! Device pool with real engines on software Vulkan: discovery, shared submissions, loss and rebuilding.
 #![cfg(feature = "gpu")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
@@ -16,7 +16,7 @@ fn run(backend: &dyn Backend) -> Result<Meshed, SurfaceError> {
 }
 
 #[test]
-fn a_device_that_was_found_meshes_as_the_cpu_does() {
+fn a_discovered_device_gives_the_mesh_of_the_cpu() {
     let choice = "software".parse().unwrap();
     let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
     backend.warm().unwrap();
@@ -31,7 +31,7 @@ fn a_device_that_was_found_meshes_as_the_cpu_does() {
 }
 
 #[test]
-fn callers_share_submissions_and_get_what_they_would_get_alone() {
+fn callers_share_submissions_and_get_the_mesh_of_a_single_job() {
     let choice = "software".parse().unwrap();
     let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
     let alone = run(&backend).unwrap().mesh;
@@ -45,11 +45,11 @@ fn callers_share_submissions_and_get_what_they_would_get_alone() {
     assert!(status.shared > 0, "{status:?}");
 }
 
-/// Starts a backend whose device is destroyed, as a driver might, before the first `n_losses` jobs.
+/// Starts a backend whose device is destroyed before each of the first `n_losses` jobs.
 fn losing(n_losses: usize, fallback: Option<Box<dyn Backend>>) -> GpuBackend {
-    /// An engine whose device is destroyed when it is given work.
-    struct Doomed(Engine, Mutex<Option<wgpu::Device>>);
-    impl Executor for Doomed {
+    /// Engine whose device is destroyed before its next job.
+    struct LosingEngine(Engine, Mutex<Option<wgpu::Device>>);
+    impl Executor for LosingEngine {
         fn run(&mut self, jobs: &[molmesh::gpu::GpuJob]) -> Vec<Result<molmesh::gpu::Finished, GpuError>> {
             if let Some(device) = self.1.lock().unwrap().take() {
                 device.destroy();
@@ -62,20 +62,20 @@ fn losing(n_losses: usize, fallback: Option<Box<dyn Backend>>) -> GpuBackend {
     }
     let builds = AtomicUsize::new(0);
     let build = move || {
-        let doomed = builds.fetch_add(1, Ordering::SeqCst) < n_losses;
+        let loses = builds.fetch_add(1, Ordering::SeqCst) < n_losses;
         let (device, queue) = gpu_support::device();
         let engine = Engine::new(device.clone(), queue)?;
-        Ok(Box::new(Doomed(engine, Mutex::new(doomed.then_some(device)))) as Box<dyn Executor>)
+        Ok(Box::new(LosingEngine(engine, Mutex::new(loses.then_some(device)))) as Box<dyn Executor>)
     };
-    let device = PoolDevice { number: 0, name: "doomed".to_owned(), build: Box::new(build) };
-    GpuBackend::over(DevicePool::start(vec![device], &PoolSettings::default()).unwrap(), fallback)
+    let device = PoolDevice { number: 0, name: "losing".to_owned(), build: Box::new(build) };
+    GpuBackend::with_pool(DevicePool::start(vec![device], &PoolSettings::default()).unwrap(), fallback)
 }
 
 #[test]
 fn a_lost_device_is_rebuilt_and_gives_the_same_mesh() {
-    let undisturbed = losing(0, None);
-    let expected = run(&undisturbed).unwrap().mesh;
-    assert_eq!(undisturbed.devices()[0].rebuilds, 0);
+    let working = losing(0, None);
+    let expected = run(&working).unwrap().mesh;
+    assert_eq!(working.devices()[0].rebuilds, 0);
     let backend = losing(1, None);
     assert!(run(&backend).unwrap().mesh == expected, "another mesh");
     let status = backend.devices().remove(0);
@@ -83,7 +83,7 @@ fn a_lost_device_is_rebuilt_and_gives_the_same_mesh() {
 }
 
 #[test]
-fn the_cpu_serves_what_a_device_that_is_lost_for_good_does_not() {
+fn the_cpu_replaces_a_device_that_is_lost_permanently() {
     let cpu = run(&CpuBackend::new(None).unwrap()).unwrap().mesh;
     let backend = losing(usize::MAX, Some(Box::new(CpuBackend::new(None).unwrap())));
     for _ in 0..3 {

@@ -102,7 +102,7 @@ fn bad_values_name_the_key_the_value_and_what_was_expected() {
         ("jobs.workers", "-1"),
         ("jobs.queue", "5MiB"),
         ("jobs.queue", "none"),
-        ("devices.spread_bricks", "0"),
+        ("devices.min_partition_bricks", "0"),
         ("limits.body_bytes", "5 MB"),
         ("limits.body_bytes", "99999999999GiB"),
         ("server.listen", "localhost"),
@@ -134,10 +134,13 @@ fn bad_values_name_the_key_the_value_and_what_was_expected() {
 
 #[test]
 fn a_number_that_may_be_absent_is_cleared_by_none_and_set_again() {
-    let spread = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().devices.spread_bricks;
-    assert_eq!(spread(&[]), Some(molmesh::surface::devices::SPREAD_BRICKS));
-    assert_eq!(spread(&[("devices.spread_bricks", "none")]), None);
-    assert_eq!(spread(&[("devices.spread_bricks", "none"), ("devices.spread_bricks", "5_000")]), Some(5000));
+    let spread = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().devices.min_partition_bricks;
+    assert_eq!(spread(&[]), Some(molmesh::surface::devices::MIN_PARTITION_BRICKS));
+    assert_eq!(spread(&[("devices.min_partition_bricks", "none")]), None);
+    assert_eq!(
+        spread(&[("devices.min_partition_bricks", "none"), ("devices.min_partition_bricks", "5_000")]),
+        Some(5000)
+    );
 }
 
 #[test]

@@ -95,7 +95,7 @@ impl Backend for Devices {
             finished: 11,
             failed: 2,
             shared: 4,
-            spread: 3,
+            partitions: 3,
             held_bytes: 1 << 20,
         };
         vec![device(0, None), device(1, down)]
@@ -248,7 +248,7 @@ fn devices_are_counted_and_their_end_is_logged_once() {
         ("molmesh_device_jobs_total", &["device=\"0\"", "outcome=\"finished\""][..], 11.0),
         ("molmesh_device_jobs_total", &["device=\"1\"", "outcome=\"failed\""], 2.0),
         ("molmesh_device_shared_submissions_total", &["device=\"0\""], 4.0),
-        ("molmesh_device_spread_jobs_total", &["device=\"1\""], 3.0),
+        ("molmesh_device_partitions_total", &["device=\"1\""], 3.0),
         ("molmesh_device_memory_bytes", &["device=\"1\""], f64::from(1 << 20)),
     ] {
         assert!((value(name, labels) - expected).abs() < 0.5, "{name}: {}", value(name, labels));

@@ -135,7 +135,7 @@ impl Backend for OneDevice {
             lost: 0,
             rebuilds: 0,
             shared: 0,
-            spread: 0,
+            partitions: 0,
             held_bytes: 0,
         }]
     }

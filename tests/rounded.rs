@@ -39,8 +39,8 @@ fn devices(n: usize) -> GpuBackend {
         let build = || Ok(Box::new(gpu_support::engine_with(|_| ())) as Box<dyn Executor>);
         PoolDevice { number, name: format!("device {number}"), build: Box::new(build) }
     };
-    let settings = PoolSettings { spread_bricks: Some(1), ..PoolSettings::default() };
-    GpuBackend::over(DevicePool::start((0..n).map(device).collect(), &settings).unwrap(), None)
+    let settings = PoolSettings { min_partition_bricks: Some(1), ..PoolSettings::default() };
+    GpuBackend::with_pool(DevicePool::start((0..n).map(device).collect(), &settings).unwrap(), None)
 }
 
 fn made(backend: &dyn Backend, job: &Job) -> Product {

@@ -43,7 +43,7 @@ impl Work {
             Stage::Interpolate => {
                 let lists = 4.0 * entries * surface / bricks.max(1.0);
                 let each = if meshed.mesh.quantized.is_some() { 12.0 } else { 24.0 };
-                let reach = pairs / job.plan.occupied.max(1) as f64;
+                let reach = pairs / job.plan.n_reached.max(1) as f64;
                 ((2048.0 + 248.0) * surface + lists + 32.0 * atoms + each * vertices, 10.0 * vertices * reach)
             }
             Stage::Emit => (300.0 * surface + 12.0 * triangles, 0.0),

@@ -1,4 +1,4 @@
-// One sample of one pixel: what was interpolated is kept as it is.
+// Writes the interpolated values of a sample.
 
 struct Sample {
     @location(0) shade: vec4<f32>,

@@ -1,19 +1,19 @@
-// A pixel from its four samples: the nearest depth, the mean light and normal, how much is covered.
+// Resolves four samples to a pixel: minimum depth, mean light and normal, and coverage.
 
 const SAMPLES: i32 = 4;
 
 #include shared/picture.wgsl
 
-@group(0) @binding(0) var<uniform> numbers: Numbers;
+@group(0) @binding(0) var<uniform> params: FinishParams;
 @group(0) @binding(1) var shades: texture_2d_array<f32>;
 @group(0) @binding(2) var depths: texture_2d_array<f32>;
-// Depth, light, the covered share.
+// Depth, light, coverage.
 @group(0) @binding(3) var<storage, read_write> seen: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> normals: array<vec4<f32>>;
 
 @compute @workgroup_size(8, 8)
 fn main(@builtin(global_invocation_id) id: vec3<u32>) {
-    if id.x >= numbers.size.x || id.y >= numbers.size.y {
+    if id.x >= params.size.x || id.y >= params.size.y {
         return;
     }
     var depth = NOTHING;
@@ -29,7 +29,7 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let length = sqrt(dot(sum.xyz, sum.xyz));
     let normal = select(vec3(0.0, 0.0, 1.0), sum.xyz / max(length, 1e-20), length > 0.0);
-    let i = id.y * numbers.size.x + id.x;
+    let i = id.y * params.size.x + id.x;
     seen[i] = vec4(depth, sum.w / max(covered, 1.0), covered / f32(SAMPLES), 0.0);
     normals[i] = vec4(normal, 0.0);
 }

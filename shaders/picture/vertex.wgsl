@@ -1,16 +1,16 @@
-// A corner of the mesh: where it lies on the screen, how deep, which way it faces, how bright it is.
+// Transforms a vertex: screen position, depth, normal in view space, and light.
 
 struct View {
-    // Right, up, towards the viewer; behind each what is added to a projection.
+    // Axes of the view: right, up, towards the viewer. The fourth component is the offset of the projection.
     right: vec4<f32>,
     up: vec4<f32>,
     toward: vec4<f32>,
-    // Where the light comes from, as the viewer sees it; behind it the light from everywhere.
+    // Direction of the light in view space; the fourth component is the ambient light.
     light: vec4<f32>,
-    // Pixels of the picture, and where in a pixel the sample lies.
+    // Size of the picture in pixels, and position of the sample within a pixel.
     size: vec2<f32>,
     offset: vec2<f32>,
-    // Pixels per Å, the farthest depth, and light that comes from somewhere.
+    // Pixels per Å, maximum depth, and diffuse light.
     scale: f32,
     reach: f32,
     diffuse: f32,
@@ -19,7 +19,7 @@ struct View {
 
 struct Corner {
     @builtin(position) position: vec4<f32>,
-    // The normal as the viewer sees it, and light.
+    // Normal in view space, and light.
     @location(0) @interpolate(linear) shade: vec4<f32>,
     @location(1) @interpolate(linear) depth: f32,
 }
@@ -31,12 +31,12 @@ fn main(@location(0) position: vec3<f32>, @location(1) normal: vec3<f32>) -> Cor
     let right = dot(view.right.xyz, position) + view.right.w;
     let up = dot(view.up.xyz, position) + view.up.w;
     let depth = view.toward.w - dot(view.toward.xyz, position);
-    // The sample, not the middle of the pixel, is what the device looks at.
+    // The device samples pixel centres, so the position is shifted by the offset of the sample.
     let pixel = vec2(right, -up) * view.scale + 0.5 * view.size + (vec2(0.5, 0.5) - view.offset);
     let clip = vec2(pixel.x / view.size.x, 1.0 - pixel.y / view.size.y) * 2.0 - 1.0;
     let seen = vec3(dot(view.right.xyz, normal), dot(view.up.xyz, normal), dot(view.toward.xyz, normal));
     let light = view.light.w + view.diffuse * max(dot(seen, view.light.xyz), 0.0);
-    // Rounding must not push the nearest and the farthest point out of the range that is drawn.
+    // The margin keeps rounding from clipping the nearest and the farthest point.
     let z = 0.0005 + 0.999 * depth / max(view.reach, 1e-6);
     return Corner(vec4(clip, z, 1.0), vec4(seen, light), depth);
 }

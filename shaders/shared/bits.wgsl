@@ -1,11 +1,12 @@
-// 64 (x, y) bits of a layer are two halves of 32: bit 8·y + x, the upper half from y = 4 on.
+// The 64 (x, y) bits of a layer are two words of 32: bit 8·y + x, the second word from y = 4 on.
 
-// The bits below `bit`, which is at most 31.
+// Mask of the bits below `bit`, which is at most 31.
 fn below(bit: u32) -> u32 {
     return (1u << bit) - 1u;
 }
 
-// Position of the set bit that has `rank` set bits below it. Written out, as the device's compiler does not unroll.
+// Position of the set bit that has `rank` set bits below it. Unrolled by hand, because
+// shader compilers do not unroll the loop.
 fn select_bit(word: u32, rank: u32) -> u32 {
     var rest = word;
     var left = rank;

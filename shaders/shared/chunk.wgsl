@@ -1,6 +1,6 @@
-// The bricks of a chunk. Needs `params`, `halo` and shared/tiles.
+// Bricks of a chunk. Requires `params`, `halo` and shared/tiles.
 
-// The brick in slot `slot` of the chunk: its own ones come first, then the borrowed ones.
+// Brick in slot `slot` of the chunk: own bricks first, then the halo.
 fn brick_in(slot: u32) -> u32 {
     if (slot < params.n_own) {
         return params.first_brick + slot;
@@ -8,7 +8,7 @@ fn brick_in(slot: u32) -> u32 {
     return halo[slot - params.n_own];
 }
 
-// The slot of a brick in the chunk, or NONE. Borrowed bricks come after the chunk's own in the order of all.
+// Slot of a brick in the chunk, or NONE. Halo bricks have higher numbers than own bricks.
 fn slot_of(brick: u32) -> u32 {
     let own = brick - params.first_brick;
     if (brick == NONE || own < params.n_own) {

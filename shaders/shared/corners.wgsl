@@ -1,6 +1,6 @@
-// Inside bits at the eight corners of 32 cells. Needs `inside`.
+// Inside bits at the eight corners of 32 cells. Requires `inside`.
 
-// The halves at corner c of the cells: bit 0 of c is x, 1 y, 2 z.
+// Words of the bits at corner c of the cells: bit 0 of c is x, bit 1 is y, bit 2 is z.
 struct Corners {
     low: vec4<u32>,
     high: vec4<u32>,
@@ -9,14 +9,14 @@ struct Corners {
 const FIRST_COLUMN: u32 = 0x01010101u;
 
 fn half_word(brick: u32, at: u32) -> u32 {
-    // NONE is a brick out of every atom's reach: nothing of it is inside.
+    // NONE is a brick out of reach of all atoms, so no sample of it is inside.
     if (brick == 0xffffffffu) {
         return 0u;
     }
     return inside[brick * 16u + at];
 }
 
-// Shifted by one sample along x, y and both.
+// Words shifted by one sample along x, along y and along both.
 fn plane_corners(own: u32, next: u32, x_own: u32, x_next: u32) -> vec4<u32> {
     let up = own >> 8u | next << 24u;
     let x_up = x_own >> 8u | x_next << 24u;
@@ -25,13 +25,15 @@ fn plane_corners(own: u32, next: u32, x_own: u32, x_next: u32) -> vec4<u32> {
     return vec4<u32>(own, along, up, both);
 }
 
-// `near`: the brick and its neighbours towards +x, +y, +z, first those of the same layer of bricks.
+// Corners in layer z. `near` holds the brick and its neighbours towards +x, +y and both.
 fn plane_of(near: vec4<u32>, z: u32, half: u32) -> vec4<u32> {
     let at = 2u * z + half;
     let above = select(near.z, near.x, half == 0u);
     let x_above = select(near.w, near.y, half == 0u);
     let next = 2u * z + (1u - half);
-    return plane_corners(half_word(near.x, at), half_word(above, next), half_word(near.y, at), half_word(x_above, next));
+    let own = half_word(near.x, at);
+    let x_own = half_word(near.y, at);
+    return plane_corners(own, half_word(above, next), x_own, half_word(x_above, next));
 }
 
 fn corners_of(near: vec4<u32>, near_above: vec4<u32>, z: u32, half: u32) -> Corners {
@@ -42,7 +44,7 @@ fn corners_of(near: vec4<u32>, near_above: vec4<u32>, z: u32, half: u32) -> Corn
     return Corners(low, plane_of(near, z + 1u, half));
 }
 
-// Cells that the surface passes through.
+// Mask of the cells that the surface crosses.
 fn active_cells(c: Corners) -> u32 {
     let some = c.low | c.high;
     let every = c.low & c.high;

@@ -1,12 +1,12 @@
-// The three densities along u = d²/ρ². Needs `params`.
+// Densities of the three kernels as functions of u = d²/ρ². Requires `params`.
 override KERNEL: u32 = 0u;
 
 const GAUSSIAN: u32 = 0u;
 const SOFT_OBJECT: u32 = 1u;
 const INVERSE_SQUARE: u32 = 2u;
 
-// What of the density belongs to one axis, for four distances: the exponential and the cut-off's linear term for the
-// Gaussian, u for the others.
+// Terms of the density along one axis, for four distances: the exponential and the linear term of the cut-off for the
+// Gaussian, u for the other kernels.
 struct Axis {
     e: vec4<f32>,
     w: vec4<f32>,
@@ -19,8 +19,7 @@ fn z_axis(u: vec4<f32>) -> Axis {
     return Axis(vec4<f32>(0.0), u);
 }
 
-// Density of four samples of a column, from u of the column and what belongs to z. Beyond the support exactly 0, so
-// that it does not matter who else is among the candidates.
+// Terms of the density of a column of samples.
 struct Column {
     e: f32,
     w: f32,
@@ -33,6 +32,7 @@ fn column(u: f32) -> Column {
     return Column(0.0, u);
 }
 
+// Density at four samples of a column. Exactly 0 beyond the support, so additional candidates do not change the sum.
 fn density(c: Column, z: Axis, u_min: f32) -> vec4<f32> {
     if (KERNEL == GAUSSIAN) {
         let tail = c.w + z.w;
@@ -47,7 +47,7 @@ fn density(c: Column, z: Axis, u_min: f32) -> vec4<f32> {
     return t2 / max(u, vec4<f32>(u_min));
 }
 
-// -dF/du up to a factor that all atoms share.
+// -dF/du up to a factor that all atoms have in common.
 fn slope(u: f32, u_min: f32) -> f32 {
     if (KERNEL == GAUSSIAN) {
         return exp2(params.slope_offset - params.rate * u) - params.slope_tail;

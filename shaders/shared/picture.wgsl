@@ -1,20 +1,20 @@
-// The numbers that a picture is finished with.
+// Parameters of shading; see `Finish` in `picture/finish.rs`.
 
-// Deeper than anything: nothing is seen.
+// Depth of pixels without a surface.
 const NOTHING: f32 = 3.0e38;
 
-struct Numbers {
+struct FinishParams {
     color: vec4<f32>,
-    behind: vec4<f32>,
+    background: vec4<f32>,
     size: vec2<u32>,
     n_taps: u32,
-    line: i32,
+    line_width: i32,
     falloff: f32,
     bias: f32,
     strength: f32,
-    darkest: f32,
-    step_from: f32,
-    step_to: f32,
-    ink: f32,
+    min_light: f32,
+    step_min: f32,
+    step_max: f32,
+    line_strength: f32,
     pad: f32,
 }

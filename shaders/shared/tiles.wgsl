@@ -1,19 +1,19 @@
-// A tile: 8 × 8 × 8 bricks, of which those with a set bit exist. Needs `tiles` and shared/bits.
+// Tile: 8 × 8 × 8 bricks, with a bit set for each that exists. Requires `tiles` and shared/bits.
 struct Tile {
     coord: vec3<i32>,
-    // Bricks of the tiles before.
+    // Number of bricks in all tiles before.
     base: u32,
     // Word z, bit 8·y + x.
     bricks: array<vec2<u32>, 8>,
-    // Bricks of the tile before each word.
+    // Number of bricks of the tile before each word.
     before: array<u32, 8>,
-    // The tiles around: 9·(z + 1) + 3·(y + 1) + (x + 1), the last one unused.
+    // Adjacent tiles, or NONE: entry 9·(z + 1) + 3·(y + 1) + (x + 1), the last is unused.
     around: array<u32, 28>,
 }
 
 const NONE: u32 = 0xffffffffu;
 
-// Bricks before position `local` (9 bits: z, y, x) of a tile, in the whole job.
+// Number of bricks of the job before position `local` (9 bits: z, y, x) of a tile.
 fn bricks_before(tile: u32, local: u32) -> u32 {
     let z = local >> 6u;
     let word = tiles[tile].bricks[z];
@@ -23,14 +23,14 @@ fn bricks_before(tile: u32, local: u32) -> u32 {
     return tiles[tile].base + tiles[tile].before[z] + countOneBits(low) + countOneBits(high);
 }
 
-// Whether the brick at `local` exists.
+// Returns true if the brick at `local` exists.
 fn brick_exists(tile: u32, local: u32) -> bool {
     let word = tiles[tile].bricks[local >> 6u];
     let bit = local & 63u;
     return (select(word.y, word.x, bit < 32u) >> (bit & 31u) & 1u) == 1u;
 }
 
-// The neighbour `n` (bits: 0 x, 1 y, 2 z) of the brick at `local`, or NONE.
+// Neighbour `n` (bit 0: x, bit 1: y, bit 2: z) of the brick at `local`, or NONE.
 fn neighbour(tile: u32, local: u32, n: u32) -> u32 {
     let x = (local & 7u) + (n & 1u);
     let y = (local >> 3u & 7u) + (n >> 1u & 1u);
@@ -43,7 +43,7 @@ fn neighbour(tile: u32, local: u32, n: u32) -> u32 {
     return bricks_before(at, there);
 }
 
-// Coordinates within the tile.
+// Coordinates of a brick within its tile.
 fn local_brick(local: u32) -> vec3<i32> {
     return vec3<i32>(vec3<u32>(local, local >> 3u, local >> 6u) & vec3<u32>(7u));
 }

@@ -196,7 +196,7 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
         Use::Service(config) => PoolSettings {
             queue: config.jobs,
             batch: config.batch,
-            spread_bricks: config.spread_bricks,
+            min_partition_bricks: config.min_partition_bricks,
             ..PoolSettings::default()
         },
     };

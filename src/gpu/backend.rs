@@ -1,31 +1,32 @@
-//! The backend: devices that share the work, and the one that stands in for them when they fail.
+//! GPU backend: a device pool, and a fallback backend for jobs that no device could run.
 
 use std::sync::Arc;
 
+use super::describe::{arithmetic, describe};
 use super::device;
+use super::device_queue::single_line;
 use super::discover::Discovery;
 use super::error::GpuError;
-use super::executor::{Executor, GpuJob};
-use super::lane::one_line;
+use super::executor::Executor;
+use super::job::{GpuJob, Prepared};
 use super::pool::{self, DevicePool, PoolDevice, PoolSettings};
-use super::prepare::Prepared;
 use crate::surface::{
-    Backend, Control, DeviceFacts, DeviceStatus, Meshed, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
-    SurfaceParams, backend::one_atom,
+    Backend, Control, DeviceStatus, Meshed, Served, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
+    backend::one_atom,
 };
 
-/// Meshes on devices.
+/// Backend that meshes on devices.
 pub struct GpuBackend {
     pool: DevicePool,
-    /// Serves what no device could, and says so in [`Meshed::served`].
+    /// Backend for jobs that no device could run; reported in [`Meshed::served`].
     fallback: Option<Box<dyn Backend>>,
 }
 
 impl GpuBackend {
-    /// Compiles the stages on every device that `discovery` takes.
+    /// Builds an engine on every device that `discovery` selected.
     ///
     /// # Errors
-    /// [`GpuError::NoDevice`] with every device's reason if none is taken or none could be built.
+    /// [`GpuError::NoDevice`] with the reasons of all devices if none is selected or none could be built.
     pub fn start(
         discovery: &Discovery,
         settings: &PoolSettings,
@@ -41,20 +42,20 @@ impl GpuBackend {
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
         let devices: Vec<_> = devices.collect();
-        // With devices of different models or drivers, the bytes of a mesh would depend on which of them were free.
-        let alike = devices.windows(2).all(|pair| pair[0].name == pair[1].name);
-        let spread_bricks = settings.spread_bricks.filter(|_| alike);
-        let pool = DevicePool::start(devices, &PoolSettings { spread_bricks, ..*settings })?;
-        Ok(Self::over(pool, fallback))
+        // On devices of different models or drivers, the bytes of a mesh would depend on which of them were idle.
+        let identical = devices.windows(2).all(|pair| pair[0].name == pair[1].name);
+        let min_partition_bricks = settings.min_partition_bricks.filter(|_| identical);
+        let pool = DevicePool::start(devices, &PoolSettings { min_partition_bricks, ..*settings })?;
+        Ok(Self::with_pool(pool, fallback))
     }
 
-    /// The backend over a pool that runs already.
+    /// Creates a backend with a running pool.
     #[must_use]
-    pub fn over(pool: DevicePool, fallback: Option<Box<dyn Backend>>) -> Self {
+    pub fn with_pool(pool: DevicePool, fallback: Option<Box<dyn Backend>>) -> Self {
         Self { pool, fallback }
     }
 
-    /// The pool of its devices.
+    /// Returns the device pool.
     #[must_use]
     pub const fn pool(&self) -> &DevicePool {
         &self.pool
@@ -70,27 +71,15 @@ impl GpuBackend {
         Ok(GpuJob { prepared: Arc::new(prepared), cancel: control.cancel.clone(), deadline: control.deadline })
     }
 
-    /// Makes one atom's surface on device `n`, which is given up if it cannot.
+    /// Meshes one atom on device `n`, which is given up if that fails.
     fn warm_device(&self, n: usize) -> Result<(), SurfaceError> {
         let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
         let job = Self::job(&one_atom()?, &params, &limits, &Control::default())?;
-        if let Err(error) = self.pool.run_only_on(n, &job) {
+        if let Err(error) = self.pool.run_on_device(n, &job) {
             self.pool.give_up(n, &format!("its first mesh failed: {error}"));
         }
         Ok(())
     }
-}
-
-/// Name of the arithmetic of a device: model and driver, and the processor's, which prepares jobs and measures meshes.
-pub(super) fn arithmetic(name: &str, device: &str) -> String {
-    format!("{name} {device} {}", crate::surface::arithmetic())
-}
-
-/// A device for people, with its driver.
-pub(super) fn describe(facts: &DeviceFacts) -> String {
-    let DeviceFacts { name, kind, api, driver, .. } = facts;
-    let driver = if driver.is_empty() { String::new() } else { format!(", {driver}") };
-    format!("{name} ({}, {api}{driver})", kind.name())
 }
 
 impl Backend for GpuBackend {
@@ -123,18 +112,18 @@ impl Backend for GpuBackend {
     ) -> Result<Meshed, SurfaceError> {
         control.check()?;
         let job = Self::job(spheres, params, limits, control)?;
-        let error = match self.pool.ran(&job) {
-            Ok(ran) => {
-                ran.finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));
-                // Several devices make one job only if they are alike.
-                let device = ran.by.first().map_or("", |work| work.device.as_str());
+        let error = match self.pool.run(&job) {
+            Ok(completed) => {
+                completed.finished.stages.iter().for_each(|(stage, ns)| control.observer.elapsed(*stage, *ns));
+                // Only identical devices share a job.
+                let device = completed.devices.first().map_or("", |work| work.device.as_str());
                 let arithmetic = arithmetic(self.name(), device);
-                let served = Served { backend: self.name(), arithmetic, device: ran.device(), instead: None };
-                return Ok(Meshed { served: Some(served), ..ran.finished.meshed });
+                let served = Served { backend: self.name(), arithmetic, device: completed.device(), instead: None };
+                return Ok(Meshed { served: Some(served), ..completed.finished.meshed });
             }
             Err(error) => error,
         };
-        // The atoms on their way to a device are not needed for what follows.
+        // Frees the input before the fallback runs.
         drop(job);
         match (error, &self.fallback) {
             (GpuError::Surface(error), _) => Err(error),
@@ -142,14 +131,14 @@ impl Backend for GpuBackend {
             (GpuError::OutOfMemory { needed, available, suggested_resolution }, _) => {
                 Err(SurfaceError::DeviceMemory { needed, available, suggested_resolution })
             }
-            (error, None) => Err(SurfaceError::Device { why: one_line(&error.to_string()) }),
+            (error, None) => Err(SurfaceError::Device { why: single_line(&error.to_string()) }),
             (error, Some(fallback)) => {
                 let meshed = fallback.run(spheres, params, limits, control)?;
                 let served = Served {
                     backend: fallback.name(),
                     arithmetic: fallback.arithmetic(),
                     device: fallback.describe(),
-                    instead: Some(one_line(&format!("the GPU failed: {error}"))),
+                    instead: Some(single_line(&format!("the GPU failed: {error}"))),
                 };
                 Ok(Meshed { served: Some(served), ..meshed })
             }
@@ -177,34 +166,5 @@ impl Backend for GpuBackend {
 
     fn devices(&self) -> Vec<DeviceStatus> {
         self.pool.status()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::surface::DeviceKind;
-
-    #[test]
-    fn model_and_driver_are_part_of_the_arithmetic() {
-        let facts = |name: &str, driver: &str| DeviceFacts {
-            name: name.to_owned(),
-            kind: DeviceKind::Discrete,
-            api: "vulkan",
-            driver: driver.to_owned(),
-            bus: String::new(),
-            binding_bytes: 0,
-            buffer_bytes: 0,
-            workgroup_bytes: 0,
-            workgroup_size: 0,
-            storage_buffers: 0,
-            timestamps: false,
-            subgroups: None,
-        };
-        let of = |name, driver| arithmetic("gpu", &describe(&facts(name, driver)));
-        assert_eq!(of("card", "driver 1"), of("card", "driver 1"));
-        assert_ne!(of("card", "driver 1"), of("card", "driver 2"));
-        assert_ne!(of("card", "driver 1"), of("other card", "driver 1"));
-        assert!(of("card", "driver 1").ends_with(&crate::surface::arithmetic()), "the processor takes part");
     }
 }

@@ -1,30 +1,30 @@
-//! Which of the devices that were found are taken, and the reason for each. Pure: facts in, verdicts out.
+//! Selection of devices, with a reason for each. Pure functions of the devices' facts and the user's choice.
 
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, DeviceName, FoundDevice};
 
-/// What the stages need of a device, as the name of the fact, its value there, and the least that will do.
-fn needs(facts: &DeviceFacts) -> [(&'static str, u64, u64); 5] {
+/// Requirements of the stages: name of the limit, its value on the device, and the minimum.
+fn requirements(facts: &DeviceFacts) -> [(&'static str, u64, u64); 5] {
     [
-        // What every implementation of WebGPU promises; larger columns are bound piece by piece.
+        // The minimum of every WebGPU implementation; larger columns are bound in pieces.
         ("largest binding", facts.binding_bytes, 128 << 20),
         ("largest buffer", facts.buffer_bytes, 256 << 20),
         ("workgroup memory", facts.workgroup_bytes, 16 << 10),
         ("workgroup size", facts.workgroup_size, 256),
-        ("storage buffers a stage", facts.storage_buffers, 14),
+        ("storage buffers per stage", facts.storage_buffers, 14),
     ]
 }
 
-/// Numbers devices and judges each. `facts` in the order of their numbers.
-pub(super) fn judge(facts: Vec<DeviceFacts>, choice: &DeviceChoice) -> Vec<FoundDevice> {
-    let best = facts.iter().filter(|f| usable(f).is_ok()).map(|f| f.kind).min();
+/// Numbers devices in the order of `facts` and selects some of them.
+pub(super) fn select(facts: Vec<DeviceFacts>, choice: &DeviceChoice) -> Vec<FoundDevice> {
+    let best_kind = facts.iter().filter(|f| check_requirements(f).is_ok()).map(|f| f.kind).min();
     let mut found: Vec<FoundDevice> = Vec::with_capacity(facts.len());
     for (number, facts) in facts.into_iter().enumerate() {
         let twin = found.iter().find(|other| same_device(&other.facts, &facts)).map(|other| other.number);
-        let verdict = match twin {
-            Some(other) if !names(choice, number) => Err(format!("the same device as {other}")),
-            _ => verdict(number, &facts, choice, best),
+        let decision = match twin {
+            Some(other) if !contains(choice, number) => Err(format!("the same device as {other}")),
+            _ => decide(number, &facts, choice, best_kind),
         };
-        let (taken, reason) = match verdict {
+        let (taken, reason) = match decision {
             Ok(reason) => (true, reason),
             Err(reason) => (false, reason),
         };
@@ -33,48 +33,48 @@ pub(super) fn judge(facts: Vec<DeviceFacts>, choice: &DeviceChoice) -> Vec<Found
     found
 }
 
-fn verdict(
+fn decide(
     number: usize,
     facts: &DeviceFacts,
     choice: &DeviceChoice,
-    best: Option<DeviceKind>,
+    best_kind: Option<DeviceKind>,
 ) -> Result<String, String> {
     let kind = facts.kind.name();
     match choice {
-        DeviceChoice::Cpu => return Err("the CPU was asked for".to_owned()),
+        DeviceChoice::Cpu => return Err("the CPU was requested".to_owned()),
         DeviceChoice::These(list) => {
             let software = facts.kind == DeviceKind::Software && list.contains(&DeviceName::Software);
-            if !software && !names(choice, number) {
+            if !software && !contains(choice, number) {
                 return Err(format!("not in --devices {choice}"));
             }
         }
         DeviceChoice::Auto | DeviceChoice::All if facts.kind == DeviceKind::Software => {
-            return Err(format!("software: only when asked for, as {number} or software"));
+            return Err(format!("software: only if requested as {number} or software"));
         }
         DeviceChoice::Auto | DeviceChoice::All => {}
     }
-    usable(facts)?;
-    match (choice, best) {
-        (DeviceChoice::These(_), _) => Ok("asked for".to_owned()),
+    check_requirements(facts)?;
+    match (choice, best_kind) {
+        (DeviceChoice::These(_), _) => Ok("requested".to_owned()),
         (DeviceChoice::Auto, Some(best)) if facts.kind > best => {
-            Err(format!("{kind}: there is a better one, {}", best.name()))
+            Err(format!("{kind}: a {} device is available", best.name()))
         }
         _ => Ok(kind.to_owned()),
     }
 }
 
-/// Whether a list names this very number.
-fn names(choice: &DeviceChoice, number: usize) -> bool {
+/// Returns true if the choice lists this number.
+fn contains(choice: &DeviceChoice, number: usize) -> bool {
     matches!(choice, DeviceChoice::These(list) if list.contains(&DeviceName::Number(number)))
 }
 
-fn usable(facts: &DeviceFacts) -> Result<(), String> {
-    let lacking = needs(facts).into_iter().find(|(_, has, needed)| has < needed);
+fn check_requirements(facts: &DeviceFacts) -> Result<(), String> {
+    let lacking = requirements(facts).into_iter().find(|(_, has, needed)| has < needed);
     lacking.map_or(Ok(()), |(what, has, needed)| Err(format!("{what} is {}, below {}", size(has), size(needed))))
 }
 
-/// A device may be reached through two drivers or two interfaces. Cards of one kind in one machine differ by their place
-/// on the bus; where that is unknown, only another interface makes an equal name suspicious.
+/// Returns true if `a` and `b` are one device with two drivers or two APIs. Bus addresses decide; without them, devices
+/// of the same kind and name are considered one only if their APIs differ.
 fn same_device(a: &DeviceFacts, b: &DeviceFacts) -> bool {
     if a.kind != b.kind {
         return false;
@@ -82,7 +82,7 @@ fn same_device(a: &DeviceFacts, b: &DeviceFacts) -> bool {
     if a.bus.is_empty() || b.bus.is_empty() { a.name == b.name && a.api != b.api } else { a.bus == b.bus }
 }
 
-/// Bytes (or a plain count) with the largest binary unit that divides them.
+/// Formats a number of bytes, or a plain count, with the largest binary unit that divides it.
 fn size(n: u64) -> String {
     match n {
         n if n >= 1 << 20 && n.is_multiple_of(1 << 20) => format!("{} MiB", n >> 20),
@@ -91,7 +91,7 @@ fn size(n: u64) -> String {
     }
 }
 
-/// The devices that a list asks for by number and that do not exist.
+/// Messages for the requested devices that do not exist.
 pub(super) fn missing(found: &[FoundDevice], choice: &DeviceChoice) -> Vec<String> {
     let DeviceChoice::These(list) = choice else { return Vec::new() };
     let exists = |name: &DeviceName| match name {
@@ -140,11 +140,11 @@ mod tests {
     }
 
     fn take(facts: Vec<DeviceFacts>, choice: &str) -> Vec<usize> {
-        taken(&judge(facts, &choice.parse().unwrap()))
+        taken(&select(facts, &choice.parse().unwrap()))
     }
 
     #[test]
-    fn software_is_taken_only_when_asked_for() {
+    fn software_is_selected_only_if_requested() {
         for (choice, expected) in [
             ("auto", vec![0, 1]),
             ("all", vec![0, 1, 2]),
@@ -157,51 +157,51 @@ mod tests {
             assert_eq!(take(machine(), choice), expected, "{choice}");
         }
         assert_eq!(take(vec![device("S", DeviceKind::Software, "")], "auto"), Vec::<usize>::new());
-        assert_eq!(take(vec![device("I", DeviceKind::Integrated, "")], "auto"), [0], "better than none");
+        assert_eq!(take(vec![device("I", DeviceKind::Integrated, "")], "auto"), [0], "the only one");
     }
 
     #[test]
     fn every_device_has_its_reason() {
         let reasons = |choice: &str| -> Vec<String> {
-            judge(machine(), &choice.parse().unwrap()).into_iter().map(|d| d.reason).collect()
+            select(machine(), &choice.parse().unwrap()).into_iter().map(|d| d.reason).collect()
         };
         assert_eq!(reasons("auto")[..2], ["discrete", "discrete"]);
-        assert_eq!(reasons("auto")[2], "integrated: there is a better one, discrete");
-        assert_eq!(reasons("auto")[3], "software: only when asked for, as 3 or software");
+        assert_eq!(reasons("auto")[2], "integrated: a discrete device is available");
+        assert_eq!(reasons("auto")[3], "software: only if requested as 3 or software");
         assert_eq!(reasons("0")[1], "not in --devices 0");
-        assert_eq!(reasons("0")[0], "asked for");
-        assert_eq!(reasons("cpu")[0], "the CPU was asked for");
+        assert_eq!(reasons("0")[0], "requested");
+        assert_eq!(reasons("cpu")[0], "the CPU was requested");
     }
 
     #[test]
-    fn a_device_that_has_too_little_is_left_even_when_asked_for() {
+    fn a_device_below_the_requirements_is_rejected_even_if_requested() {
         let facts = || vec![DeviceFacts { binding_bytes: 64 << 20, ..device("A", DeviceKind::Discrete, "0:1") }];
         for choice in ["auto", "all", "0"] {
-            let found = judge(facts(), &choice.parse().unwrap());
+            let found = select(facts(), &choice.parse().unwrap());
             assert_eq!((found[0].taken, found[0].reason.as_str()), (false, "largest binding is 64 MiB, below 128 MiB"));
         }
-        // The next best kind serves where the best one cannot.
+        // The next best kind is selected instead.
         let mut both = facts();
         both.push(device("I", DeviceKind::Integrated, "0:2"));
         assert_eq!(take(both, "auto"), [1]);
     }
 
     #[test]
-    fn a_device_is_taken_once() {
+    fn a_device_is_selected_once() {
         let twice = || vec![device("A", DeviceKind::Discrete, "0:1"), device("B", DeviceKind::Discrete, "0:1")];
-        let found = judge(twice(), &DeviceChoice::All);
+        let found = select(twice(), &DeviceChoice::All);
         assert_eq!((taken(&found), found[1].reason.as_str()), (vec![0], "the same device as 0"));
-        assert_eq!(take(twice(), "1"), [1], "unless the other way to it is asked for");
+        assert_eq!(take(twice(), "1"), [1], "unless the other number is requested");
         let metal = DeviceFacts { api: "metal", ..device("M", DeviceKind::Integrated, "") };
         let vulkan = device("M", DeviceKind::Integrated, "");
         assert_eq!(take(vec![metal, vulkan.clone()], "all"), [0]);
-        // Two cards of one name without a place on the bus may well be two.
+        // Equal names without bus addresses may be two cards.
         assert_eq!(take(vec![vulkan.clone(), vulkan], "all"), [0, 1]);
     }
 
     #[test]
-    fn what_is_asked_for_and_not_there_is_named() {
-        let found = judge(machine(), &DeviceChoice::All);
+    fn missing_devices_are_named() {
+        let found = select(machine(), &DeviceChoice::All);
         let missing = |choice: &str| missing(&found, &choice.parse().unwrap());
         assert_eq!(missing("0,7"), ["there is no device 7"]);
         assert_eq!(missing("0,3,software"), Vec::<String>::new());

@@ -1,26 +1,26 @@
-//! Opens devices, and compiles the stages on them.
+//! Opens adapters and builds engines on them.
 
 use wgpu::{Adapter, Device, DeviceDescriptor, ExperimentalFeatures, Features, MemoryHints, Queue, Trace};
 
 use super::engine::Engine;
 use super::error::GpuError;
 
-/// Optional features, requested if the device has them.
+/// Features that are used if the device has them.
 const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 
-/// Opens `adapter` and compiles the stages on it.
+/// Opens `adapter` and builds the engine on it.
 ///
 /// # Errors
-/// [`GpuError::Failed`] if the driver refuses the device, and the errors of [`Engine::new`].
+/// [`GpuError::Failed`] if the driver rejects the request; those of [`Engine::new`].
 pub(super) fn engine(adapter: &Adapter) -> Result<Engine, GpuError> {
     let (device, queue) = open(adapter)?;
     Engine::new(device, queue)
 }
 
-/// Opens `adapter` with the adapter's own limits.
+/// Opens `adapter` with its own limits.
 ///
 /// # Errors
-/// [`GpuError::Failed`] if the driver refuses.
+/// [`GpuError::Failed`] if the driver rejects the request.
 pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
     let descriptor = DeviceDescriptor {
         label: Some("molmesh"),

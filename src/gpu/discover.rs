@@ -1,4 +1,4 @@
-//! Asks the drivers what there is: adapters to facts, facts to verdicts.
+//! Discovery of devices: lists the adapters of all drivers and selects devices by the user's choice.
 
 use std::panic::catch_unwind;
 
@@ -8,23 +8,23 @@ use super::error::GpuError;
 use super::{choose, device, hardware};
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, FoundDevice};
 
-/// How thoroughly to look.
+/// Effort of a discovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Look {
-    /// Ask no driver where there is no sign of hardware and nothing else was asked for.
+    /// Load no driver if there is no sign of hardware, unless devices were requested by name.
     Quick,
-    /// Ask every driver, so that everything that is there can be listed.
+    /// Load every driver, to list all devices.
     Thorough,
 }
 
-/// What was found.
+/// Result of a discovery.
 #[derive(Debug)]
 pub struct Discovery {
-    /// Every device in the order of its number, taken or not.
+    /// All devices by number, selected or not.
     pub devices: Vec<FoundDevice>,
-    /// The adapters of `devices`, in the same order.
+    /// Adapters of `devices`, in the same order.
     pub(super) adapters: Vec<Adapter>,
-    /// What was looked at, where nothing was found.
+    /// Reason for an empty list.
     pub looked: String,
 }
 
@@ -33,15 +33,16 @@ impl Discovery {
         Self { devices: Vec::new(), adapters: Vec::new(), looked }
     }
 
-    /// The devices that are taken.
+    /// Returns the selected devices.
     pub fn taken(&self) -> impl Iterator<Item = &FoundDevice> {
         self.devices.iter().filter(|device| device.taken)
     }
 
-    /// Opens the taken device with this number, with all that its limits allow and timestamps where it has them.
+    /// Opens the selected device with this number, with its own limits and, if supported, timestamps.
     ///
     /// # Errors
-    /// [`GpuError::NoDevice`] if no taken device has the number; [`GpuError::Failed`] if the driver refuses.
+    /// Returns [`GpuError::NoDevice`] if no selected device has the number, and [`GpuError::Failed`] if the driver rejects
+    /// the request.
     pub fn open(&self, number: usize) -> Result<(wgpu::Device, wgpu::Queue), GpuError> {
         let mut all = self.devices.iter().zip(&self.adapters);
         match all.find(|(device, _)| device.taken && device.number == number) {
@@ -50,7 +51,7 @@ impl Discovery {
         }
     }
 
-    /// Why no device is taken, on one line; `None` if one is.
+    /// Reason for which no device is selected, on one line; `None` if one is.
     #[must_use]
     pub fn why_none(&self) -> Option<String> {
         if self.taken().next().is_some() {
@@ -63,48 +64,48 @@ impl Discovery {
         Some(self.devices.iter().map(each).collect::<Vec<_>>().join("; "))
     }
 
-    /// The devices that were asked for and do not exist, in words.
+    /// Messages for the requested devices that do not exist.
     #[must_use]
     pub fn missing(&self, choice: &DeviceChoice) -> Vec<String> {
         choose::missing(&self.devices, choice)
     }
 }
 
-/// Looks for devices and judges each by `choice`. Never fails: what goes wrong is a reason.
+/// Lists all devices and selects some by `choice`. Failures become reasons in the result.
 #[must_use]
 pub fn discover(choice: &DeviceChoice, look: Look) -> Discovery {
     let signs = hardware::signs();
-    // Software and numbered devices are what only drivers know of.
+    // Only drivers know software devices and device numbers.
     let named = matches!(choice, DeviceChoice::These(_));
     match (look, &signs) {
         (Look::Quick, _) if *choice == DeviceChoice::Cpu => {
-            return Discovery::nothing("the CPU was asked for".to_owned());
+            return Discovery::nothing("the CPU was requested".to_owned());
         }
         (Look::Quick, Err(why)) if !named => return Discovery::nothing(why.clone()),
         _ => {}
     }
     let Ok(mut adapters) = catch_unwind(adapters) else {
-        return Discovery::nothing("the drivers could not be asked: one of them panicked".to_owned());
+        return Discovery::nothing("a driver panicked during discovery".to_owned());
     };
-    // The order in which drivers answer changes with their versions; kind, place on the bus and name do not.
+    // The order of the drivers' answers varies with their versions; kind, bus address and name do not.
     adapters.sort_by_cached_key(|adapter| {
         let facts = facts(adapter);
         (facts.kind, facts.bus, facts.name, facts.api)
     });
     let looked = format!(
-        "no driver offers an adapter (asked: {}; hardware: {})",
-        if cfg!(target_vendor = "apple") { "Metal" } else { "every Vulkan driver that a Vulkan loader finds" },
+        "no driver offers an adapter (searched: {}; hardware: {})",
+        if cfg!(target_vendor = "apple") { "Metal" } else { "all Vulkan drivers that the loader finds" },
         signs.unwrap_or_else(|why| why),
     );
-    let devices = choose::judge(adapters.iter().map(facts).collect(), choice);
+    let devices = choose::select(adapters.iter().map(facts).collect(), choice);
     Discovery { devices, adapters, looked }
 }
 
-/// Every adapter of the interfaces that we can use.
+/// All Vulkan and Metal adapters.
 fn adapters() -> Vec<Adapter> {
     let instance = Instance::new(InstanceDescriptor {
         backends: Backends::VULKAN | Backends::METAL,
-        // Validation is for whoever writes shaders, and they are validated when they are built in.
+        // The build validates the shaders; the validation layers are not needed.
         flags: InstanceFlags::empty(),
         ..InstanceDescriptor::new_without_display_handle()
     });

@@ -1,65 +1,61 @@
-//! The engine: runs the six stages on one device.
+//! Engine of one device: its budget, pipelines and buffers, and the upload of jobs.
 //!
-//! Small jobs go through in one submission, several of them together, their output sized by an estimate. Larger ones are
-//! counted first, and their output is then made in buffers of just the right size: the round trip between is nothing
-//! against their transfer. What does not fit at once goes in chunks of tiles.
+//! Small jobs take one submission, several of them together, with output buffers sized by an estimate. Larger jobs are
+//! counted first and their output is made in buffers of exact size. Jobs that do not fit at once are cut into chunks of
+//! tiles.
 
 use std::cell::Cell;
 use std::sync::Arc;
-use std::time::Instant;
 
 use wgpu::{Buffer, Device, Queue};
 
+use super::buffers::BufferId;
+use super::device_errors::DeviceErrors;
 use super::error::GpuError;
-use super::executor::{Executor, Finished, GpuJob};
-use super::flight::VertexBytes;
-use super::health::{Complaint, Health};
-use super::landing::Landings;
-use super::pipelines::{N_STAGES, Pipelines, Variant};
-use super::record::Clock;
-use super::share::Share;
-use super::workspace::{Needs, OutputRows, ROW, Workspace};
-use crate::surface::SurfaceError;
-use crate::surface::chunks::{Chunk, ChunkLimits};
+use super::job::GpuJob;
+use super::output_layout::VertexBytes;
+use super::pipelines::{Pipelines, Variant};
+use super::plan::layout::{self, Params};
+use super::plan::{Chunk, ChunkLimits, Partition};
+use super::readback::ReadbackPool;
+use super::recording::{Dispatch, Recording, StageTimer};
+use super::workspace::{BufferSizes, OutputCapacity, ROW, Workspace};
 use crate::surface::lattice::LatticeAtom;
-use crate::surface::layout::{self, Params};
-use crate::surface::parts::Part;
 
-/// Storage buffers that a stage binds at most.
-const MOST_BINDINGS: u32 = 14;
+/// Maximum number of storage buffers that a stage binds.
+const MAX_BINDINGS: u32 = 14;
 
-/// What the engine may use of its device.
+/// Resources that the engine may use of its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Budget {
     /// Bytes of all buffers on the device.
     pub memory: u64,
-    /// Bricks whose samples are held at once.
+    /// Maximum number of bricks whose samples are held at once.
     pub chunk_bricks: u64,
-    /// Bytes of the largest column that is made at once.
+    /// Bytes of the largest output column that is made at once.
     pub piece_bytes: u64,
-    /// Bytes of the largest landing.
-    pub landing_bytes: u64,
-    /// Bytes of landings that are kept for later jobs: between jobs that follow each other, where the largest meshes should
-    /// find theirs again, as getting as much takes the system and the driver ten times as long as filling it; and once there
-    /// has been nothing to do for a while.
+    /// Bytes of the largest readback buffer.
+    pub readback_bytes: u64,
+    /// Bytes of idle readback buffers that are kept while jobs follow each other, and after a period without jobs.
+    /// Allocating such a buffer takes ten times as long as filling it, so large meshes reuse that of the previous one.
     pub idle_bytes: [u64; 2],
-    /// Jobs whose output is estimated at no more than this many bytes take one submission, together with others.
+    /// Maximum estimated output of a small job, which shares a submission with others.
     pub small_bytes: u64,
-    /// Vertices and triangles that a small job's buffers hold per brick. A surface crosses a brick of 8 × 8 × 8 cells with
-    /// about 90 vertices and 180 triangles.
+    /// Number of vertices and triangles per brick that the buffers of a small job hold. A surface crosses a brick of
+    /// 8 × 8 × 8 cells with about 90 vertices and 180 triangles.
     pub rows_per_brick: [u64; 2],
 }
 
 impl Budget {
-    /// What the limits of a device allow; of its memory, which they do not tell, 64 GiB at most.
+    /// Budget for a device with these limits. WebGPU does not report the memory size; 64 GiB are assumed.
     #[must_use]
     pub fn of(limits: &wgpu::Limits) -> Self {
-        let binding = largest_binding(limits);
+        let binding = max_binding(limits);
         Self {
             memory: 64 << 30,
             chunk_bricks: binding / (4 * layout::SAMPLES),
             piece_bytes: binding,
-            landing_bytes: limits.max_buffer_size.min(8 << 30),
+            readback_bytes: limits.max_buffer_size.min(8 << 30),
             idle_bytes: [8 << 30, 2 << 30],
             small_bytes: 16 << 20,
             rows_per_brick: [128, 256],
@@ -74,19 +70,19 @@ pub struct Engine {
     pub(super) queue: Queue,
     pub(super) budget: Budget,
     /// Bytes of the largest binding.
-    binding: u64,
+    max_binding: u64,
     pub(super) pipelines: Pipelines,
-    pub(super) clock: Option<Clock>,
+    pub(super) timer: Option<StageTimer>,
     cases: Buffer,
-    /// Idle ones.
+    /// Idle workspaces.
     pub(super) workspaces: Vec<Workspace>,
-    pub(super) landings: Landings,
-    health: Arc<Health>,
+    pub(super) readback: ReadbackPool,
+    errors: Arc<DeviceErrors>,
     pub(super) submissions: Cell<u64>,
 }
 
-/// A job on its way: its buffers are filled.
-pub(super) struct Loaded<'a> {
+/// Job whose buffers are allocated and filled.
+pub(super) struct LoadedJob<'a> {
     pub(super) job: &'a GpuJob,
     pub(super) workspace: Workspace,
     pub(super) chunks: Vec<Chunk>,
@@ -95,54 +91,57 @@ pub(super) struct Loaded<'a> {
     pub(super) vertex: VertexBytes,
 }
 
-/// Device time per stage, ns.
-pub(super) type Times = [u64; N_STAGES];
+impl LoadedJob<'_> {
+    pub(super) fn dispatch(&self, row: u64, workgroups: u32) -> Dispatch<'_> {
+        Dispatch { workspace: &self.workspace, row, workgroups, variant: self.variant }
+    }
+}
 
 impl Engine {
-    /// Compiles the stages on `device`. It needs no features; with `TIMESTAMP_QUERY` it tells the stages' times.
+    /// Compiles the stages on `device`. Reports stage times if the device has the feature `TIMESTAMP_QUERY`.
     ///
     /// # Errors
-    /// [`GpuError::Failed`] where the device's limits are too low or a shader does not compile; [`GpuError::Lost`].
+    /// [`GpuError::Failed`] if the limits of the device are too low or a shader does not compile; [`GpuError::Lost`].
     pub fn new(device: Device, queue: Queue) -> Result<Self, GpuError> {
         let budget = Budget::of(&device.limits());
         Self::with_budget(device, queue, budget)
     }
 
-    /// As [`Self::new`], within `budget`.
+    /// Compiles the stages on `device` for use within `budget`.
     ///
     /// # Errors
-    /// As [`Self::new`].
+    /// Those of [`Self::new`].
     pub fn with_budget(device: Device, queue: Queue, budget: Budget) -> Result<Self, GpuError> {
         let limits = device.limits();
         let bindings = limits.max_storage_buffers_per_shader_stage;
-        if bindings < MOST_BINDINGS {
-            return Err(GpuError::Failed(format!("{bindings} storage buffers a stage, {MOST_BINDINGS} are needed")));
+        if bindings < MAX_BINDINGS {
+            let why = format!("{bindings} storage buffers per stage are supported, {MAX_BINDINGS} are needed");
+            return Err(GpuError::Failed(why));
         }
-        let health = Health::of(&device);
+        let errors = DeviceErrors::listen(&device);
         let pipelines = Pipelines::new(&device);
         let table = layout::case_table();
         let cases = device.create_buffer(&wgpu::BufferDescriptor {
-            label: Some("molmesh.cases"),
+            label: Some("molmesh.Cases"),
             size: 4 * table.len() as u64,
             usage: wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
         queue.write_buffer(&cases, 0, bytemuck::cast_slice(&table));
-        let clock = Clock::new(&device, &queue);
         let engine = Self {
-            binding: largest_binding(&limits),
+            max_binding: max_binding(&limits),
             workspaces: Vec::new(),
-            landings: Landings::keeping(budget.idle_bytes),
+            readback: ReadbackPool::new(budget.idle_bytes),
+            timer: StageTimer::new(&device, &queue),
             device,
             queue,
             budget,
             pipelines,
-            clock,
             cases,
-            health,
+            errors,
             submissions: Cell::new(0),
         };
-        engine.healthy()?;
+        engine.check_errors()?;
         Ok(engine)
     }
 
@@ -152,105 +151,113 @@ impl Engine {
         self.submissions.get()
     }
 
-    /// What was complained about since the last look, but for memory.
-    pub(super) fn healthy(&self) -> Result<(), GpuError> {
-        match self.health.complaint() {
-            None => Ok(()),
-            Some(Complaint::OutOfMemory) => Err(GpuError::Failed("out of memory".to_owned())),
-            Some(Complaint::Lost(why)) => Err(GpuError::Lost(why)),
-            Some(Complaint::Failed(why)) => Err(GpuError::Failed(why)),
-        }
+    /// Bytes of device memory, in use and pooled.
+    pub(super) fn device_bytes(&self) -> u64 {
+        self.workspaces.iter().map(Workspace::bytes).sum::<u64>() + self.readback.held_bytes() + self.cases.size()
     }
 
-    /// Likewise, where a job of `needed` bytes may have been too much.
-    pub(super) fn healthy_with(&self, job: &GpuJob, needed: u64) -> Result<(), GpuError> {
-        match self.health.complaint() {
-            None => Ok(()),
-            Some(Complaint::OutOfMemory) => Err(out_of_memory(job, needed, self.budget.memory.min(needed))),
-            Some(Complaint::Lost(why)) => Err(GpuError::Lost(why)),
-            Some(Complaint::Failed(why)) => Err(GpuError::Failed(why)),
-        }
+    /// Fails if the graphics API has reported an error since the last check.
+    pub(super) fn check_errors(&self) -> Result<(), GpuError> {
+        self.errors.check(|| GpuError::Failed("out of memory".to_owned()))
     }
 
-    /// The chunks of a job, or of a part of it.
-    pub(super) fn chunks(&self, job: &GpuJob, part: Option<&Part>) -> Result<Vec<Chunk>, GpuError> {
+    /// Fails likewise after an allocation of `needed` bytes for `job`.
+    fn check_allocation(&self, job: &GpuJob, needed: u64) -> Result<(), GpuError> {
+        self.errors.check(|| out_of_memory(job, needed, self.budget.memory.min(needed)))
+    }
+
+    /// Starts a recording.
+    pub(super) fn recording(&self) -> Recording<'_> {
+        Recording::new(&self.device, &self.pipelines, self.timer.as_ref())
+    }
+
+    /// Cuts a job, or one partition of it, into chunks.
+    pub(super) fn chunks(&self, job: &GpuJob, partition: Option<&Partition>) -> Result<Vec<Chunk>, GpuError> {
         let plan = &job.prepared.plan;
-        let limits = ChunkLimits { bricks: self.budget.chunk_bricks, candidates: self.binding / 4 };
-        plan.chunks_of(part.map_or(0..plan.tiles.len(), |part| part.tiles.clone()), limits).ok_or_else(|| {
+        let limits = ChunkLimits { bricks: self.budget.chunk_bricks, candidates: self.max_binding / 4 };
+        let tiles = partition.map_or(0..plan.tiles.len(), |partition| partition.tiles.clone());
+        plan.chunks(tiles, limits).ok_or_else(|| {
             let tile = plan.candidates.iter().max().map_or(0, |n| 4 * n) + 512 * 4 * layout::SAMPLES;
             out_of_memory(job, tile, self.budget.chunk_bricks * 4 * layout::SAMPLES)
         })
     }
 
-    /// Fills a workspace with a job, or with what a part of it needs.
+    /// Allocates the buffers of a job and uploads its input, or that of one partition.
     pub(super) fn load<'a>(
         &mut self,
         job: &'a GpuJob,
-        part: Option<&Part>,
+        partition: Option<&Partition>,
         chunks: Vec<Chunk>,
-        rows: OutputRows,
-    ) -> Result<Loaded<'a>, GpuError> {
-        check(job)?;
+        capacity: OutputCapacity,
+    ) -> Result<LoadedJob<'a>, GpuError> {
+        job.check()?;
         let (plan, lattice, params) = (&job.prepared.plan, &job.prepared.lattice, &job.prepared.params);
-        let vertex = VertexBytes::of(params);
-        let needs = Needs::new(plan, &chunks, vertex, rows);
-        if needs.total() > self.budget.memory || needs.largest() > self.binding {
-            let available = if needs.largest() > self.binding { self.binding } else { self.budget.memory };
-            return Err(out_of_memory(job, needs.total().max(needs.largest()), available));
-        }
-        let workspace = self.workspace(&needs);
-        let complaint = self.healthy_with(job, needs.total());
-        if let Err(e) = complaint {
-            // What else is idle may have been what took the memory.
+        let vertex = VertexBytes::new(params);
+        let sizes = BufferSizes::new(plan, &chunks, vertex, capacity);
+        self.check_sizes(job, &sizes)?;
+        let workspace = self.workspace(&sizes);
+        let allocated = self.check_allocation(job, sizes.total());
+        if let Err(error) = allocated {
+            // Idle workspaces may hold the memory that is missing.
             self.workspaces.clear();
-            return Err(e);
+            return Err(error);
         }
         let variant = Variant { kernel: params.kernel, nearest: params.atom_ids };
         let params = plan.params(lattice, params);
-        let write = |name: &str, at: usize, bytes: &[u8]| {
+        let write = |id: BufferId, offset: usize, bytes: &[u8]| {
             if !bytes.is_empty() {
-                self.queue.write_buffer(workspace.buffer(name), at as u64, bytes);
+                self.queue.write_buffer(workspace.buffer(id), offset as u64, bytes);
             }
         };
-        // The last brick ends with the last atom.
-        let whole = || std::iter::once(0..plan.first_atoms.last().copied().unwrap_or_default()).collect();
-        for run in part.map_or_else(whole, |part| plan.atoms_near(part, [params.back, params.ahead])) {
+        let all_atoms = || std::iter::once(0..plan.first_atoms.last().copied().unwrap_or_default()).collect();
+        let runs =
+            partition.map_or_else(all_atoms, |partition| plan.atoms_near(partition, [params.back, params.ahead]));
+        for run in runs {
             let run = run.start as usize..run.end as usize;
-            write("atoms", run.start * size_of::<LatticeAtom>(), bytemuck::cast_slice(&lattice.atoms[run.clone()]));
-            write("reaches", run.start * 4, bytemuck::cast_slice(&plan.reaches[run]));
+            let atoms = bytemuck::cast_slice(&lattice.atoms[run.clone()]);
+            write(BufferId::Atoms, run.start * size_of::<LatticeAtom>(), atoms);
+            write(BufferId::Reaches, run.start * 4, bytemuck::cast_slice(&plan.reaches[run]));
         }
-        write("tiles", 0, bytemuck::cast_slice(&plan.tiles));
-        write("bricks", 0, bytemuck::cast_slice(&plan.bricks));
-        write("first_atoms", 0, bytemuck::cast_slice(&plan.first_atoms));
-        Ok(Loaded { job, workspace, chunks, params, variant, vertex })
+        write(BufferId::Tiles, 0, bytemuck::cast_slice(&plan.tiles));
+        write(BufferId::Bricks, 0, bytemuck::cast_slice(&plan.bricks));
+        write(BufferId::FirstAtoms, 0, bytemuck::cast_slice(&plan.first_atoms));
+        Ok(LoadedJob { job, workspace, chunks, params, variant, vertex })
     }
 
-    /// A workspace that meets `needs`: the idle one that lacks the least.
-    fn workspace(&mut self, needs: &Needs) -> Workspace {
-        let lacks = |w: &Workspace| (w.short_of(needs), w.bytes());
-        let best = (0..self.workspaces.len()).min_by_key(|&i| lacks(&self.workspaces[i]));
+    /// Returns a workspace of at least `sizes`: the idle one that needs the fewest new bytes, or a new one.
+    fn workspace(&mut self, sizes: &BufferSizes) -> Workspace {
+        let missing = |w: &Workspace| (w.missing_bytes(sizes), w.bytes());
+        let best = (0..self.workspaces.len()).min_by_key(|&i| missing(&self.workspaces[i]));
         let mut workspace = match best {
             Some(i) => self.workspaces.swap_remove(i),
             None => Workspace::new(&self.device, &self.pipelines, &self.cases),
         };
-        // Idle buffers make room before new ones are asked for.
-        self.shed(needs.total());
-        workspace.ensure(&self.device, &self.pipelines, needs, self.binding);
+        self.free_workspaces(sizes.total());
+        workspace.ensure(&self.device, &self.pipelines, sizes, self.max_binding);
         workspace
     }
 
-    /// Makes a job's buffers larger.
-    pub(super) fn grow(&mut self, loaded: &mut Loaded<'_>, needs: &Needs) -> Result<(), GpuError> {
-        if needs.total() > self.budget.memory || needs.largest() > self.binding {
-            return Err(out_of_memory(loaded.job, needs.total(), self.budget.memory));
-        }
-        self.shed(needs.total());
-        loaded.workspace.ensure(&self.device, &self.pipelines, needs, self.binding);
-        self.healthy_with(loaded.job, needs.total())
+    /// Grows the buffers of a job.
+    pub(super) fn grow(&mut self, loaded: &mut LoadedJob<'_>, sizes: &BufferSizes) -> Result<(), GpuError> {
+        self.check_sizes(loaded.job, sizes)?;
+        self.free_workspaces(sizes.total());
+        loaded.workspace.ensure(&self.device, &self.pipelines, sizes, self.max_binding);
+        self.check_allocation(loaded.job, sizes.total())
     }
 
-    /// Lets idle buffers go until `bytes` more keep within the budget.
-    fn shed(&mut self, bytes: u64) {
+    /// Rejects buffers that exceed the budget or the largest binding.
+    fn check_sizes(&self, job: &GpuJob, sizes: &BufferSizes) -> Result<(), GpuError> {
+        if sizes.max() > self.max_binding {
+            return Err(out_of_memory(job, sizes.total().max(sizes.max()), self.max_binding));
+        }
+        if sizes.total() > self.budget.memory {
+            return Err(out_of_memory(job, sizes.total(), self.budget.memory));
+        }
+        Ok(())
+    }
+
+    /// Frees idle workspaces until `bytes` more fit the budget.
+    fn free_workspaces(&mut self, bytes: u64) {
         while !self.workspaces.is_empty()
             && bytes + self.workspaces.iter().map(Workspace::bytes).sum::<u64>() > self.budget.memory
         {
@@ -258,77 +265,27 @@ impl Engine {
         }
     }
 
-    /// Writes a chunk's borrowed bricks.
+    /// Uploads the halo of a chunk.
     pub(super) fn write_halo(&self, workspace: &Workspace, chunk: &Chunk) {
         if !chunk.halo.is_empty() {
-            self.queue.write_buffer(workspace.buffer("halo"), 0, bytemuck::cast_slice(&chunk.halo_table()));
+            let table = chunk.halo_table();
+            self.queue.write_buffer(workspace.buffer(BufferId::Halo), 0, bytemuck::cast_slice(&table));
         }
     }
 
-    /// Writes a row of parameters.
+    /// Uploads a row of parameters.
     pub(super) fn write_params(&self, workspace: &Workspace, row: u64, params: &Params) {
-        self.queue.write_buffer(workspace.buffer("params"), row * ROW, bytemuck::bytes_of(params));
+        self.queue.write_buffer(workspace.buffer(BufferId::Params), row * ROW, bytemuck::bytes_of(params));
     }
 }
 
-impl Executor for Engine {
-    fn run(&mut self, jobs: &[GpuJob]) -> Vec<Result<Finished, GpuError>> {
-        let mut results: Vec<Option<Result<Finished, GpuError>>> = jobs.iter().map(|_| None).collect();
-        let mut small = Vec::new();
-        for (i, job) in jobs.iter().enumerate() {
-            let loaded = check(job).and_then(|()| self.chunks(job, None)).and_then(|chunks| {
-                let estimate = self.small_rows(job, &chunks);
-                let loaded = self.load(job, None, chunks, estimate.unwrap_or_else(Self::no_rows))?;
-                Ok((loaded, estimate))
-            });
-            match loaded {
-                Ok((loaded, Some(rows))) => small.push((i, loaded, rows)),
-                // What small jobs hold is not let go for a large one: they wait for nothing but their submission.
-                Ok((loaded, None)) => results[i] = Some(self.alone(loaded)),
-                Err(e) => results[i] = Some(Err(e)),
-            }
-        }
-        for (i, result) in self.together(small) {
-            results[i] = Some(result);
-        }
-        let unanswered = || Err(GpuError::Failed("a job without an answer".to_owned()));
-        results.into_iter().map(|result| result.unwrap_or_else(unanswered)).collect()
-    }
-
-    fn part(&mut self, job: &GpuJob, share: &Share) -> Result<Finished, GpuError> {
-        self.make_part(job, share)
-    }
-
-    fn rest(&mut self) {
-        self.landings.rest();
-    }
-
-    fn held_bytes(&self) -> u64 {
-        self.workspaces.iter().map(Workspace::bytes).sum::<u64>() + self.landings.held() + self.cases.size()
-    }
-}
-
-/// Bytes of the largest binding: limits are at times a byte less than a power of two, and buffers are whole words.
-fn largest_binding(limits: &wgpu::Limits) -> u64 {
+/// Bytes of the largest binding, rounded down to whole rows: some limits are one byte below a power of two.
+fn max_binding(limits: &wgpu::Limits) -> u64 {
     limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !(ROW - 1)
 }
 
-/// Scales ticks to ns.
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
-pub(super) fn scaled(ticks: u64, period: f64) -> u64 {
-    (ticks as f64 * period) as u64
-}
-
-/// Whether the job is still wanted.
-pub(super) fn check(job: &GpuJob) -> Result<(), GpuError> {
-    if job.cancel.is_cancelled() {
-        return Err(SurfaceError::Cancelled.into());
-    }
-    if job.deadline.is_some_and(|deadline| Instant::now() >= deadline) { Err(GpuError::Deadline) } else { Ok(()) }
-}
-
-/// The refusal of a job that needs `needed` bytes at once. What it needs grows with the inverse cube of the spacing.
-pub(super) fn out_of_memory(job: &GpuJob, needed: u64, available: u64) -> GpuError {
+/// Error of a job that needs `needed` bytes at once. The memory grows with the inverse cube of the spacing.
+fn out_of_memory(job: &GpuJob, needed: u64, available: u64) -> GpuError {
     let excess = (needed as f64 / available.max(1) as f64).max(1.0);
     let fitting = job.prepared.lattice.spacing * excess.cbrt();
     GpuError::OutOfMemory { needed, available, suggested_resolution: (fitting * 105.0).ceil() / 100.0 }

@@ -1,45 +1,46 @@
-//! Why a job did not come back from a device.
+//! Errors of jobs on devices.
 
 use thiserror::Error;
 
 use crate::surface::SurfaceError;
 
-/// Errors of the GPU room.
+/// Reason why a device did not finish a job.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum GpuError {
-    /// The job's own fault, as on any backend; the device is well.
+    /// The job itself is invalid, exceeds a limit or was cancelled; the device works.
     #[error(transparent)]
     Surface(#[from] SurfaceError),
-    /// The device has too little memory, even in tiles.
+    /// The device has too little memory, even in chunks.
     #[error(
-        "the device has too little memory: {needed} bytes are needed, {available} are there; {suggested_resolution} Å would fit"
+        "the device has too little memory: {needed} bytes are needed, {available} are available; \
+         {suggested_resolution} Å would fit"
     )]
     OutOfMemory {
-        /// Bytes that the job's smallest tile and its output need.
+        /// Bytes that the job's smallest chunk and its output need.
         needed: u64,
-        /// Bytes that the device can give.
+        /// Bytes that the device can provide.
         available: u64,
-        /// A spacing that would fit, Å.
+        /// Grid spacing that would fit, Å.
         suggested_resolution: f64,
     },
-    /// The device went away; another attempt on a rebuilt device may work.
+    /// The device was lost; the job may succeed on the rebuilt device.
     #[error("the device was lost: {0}")]
     Lost(String),
-    /// The job's deadline passed between two dispatches.
+    /// The job's deadline passed.
     #[error("the deadline passed")]
     Deadline,
-    /// The graphics API refused what we asked for, or a result makes no sense: our mistake or the driver's.
+    /// The graphics API rejected a call, or a result is inconsistent: a defect of this program or of the driver.
     #[error("the device failed: {0}")]
     Failed(String),
-    /// No device takes jobs any more.
+    /// No device accepts jobs any more.
     #[error("no device is up: {0}")]
     NoDevice(String),
 }
 
 impl GpuError {
-    /// Whether the device is to blame: the same job may work elsewhere.
+    /// Returns true if the device caused the error, so that the job may succeed elsewhere.
     #[must_use]
-    pub const fn is_the_devices(&self) -> bool {
+    pub const fn is_device_failure(&self) -> bool {
         !matches!(self, Self::Surface(_) | Self::Deadline)
     }
 }

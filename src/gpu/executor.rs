@@ -1,52 +1,29 @@
-//! What runs prepared jobs on one device. The pool knows devices through this alone, so that it can be tested with
-//! executors that fail on purpose.
-
-use std::sync::Arc;
-use std::time::Instant;
+//! Interface between the device pool and the code that runs jobs on one device. Tests implement it with executors that
+//! fail on purpose.
 
 use super::error::GpuError;
-use super::prepare::Prepared;
-use super::share::Share;
-use crate::surface::{CancelToken, Meshed, Stage};
-
-/// A job as a device's thread sees it.
-#[derive(Debug, Clone)]
-pub struct GpuJob {
-    /// The work, sized and laid out on the caller's thread.
-    pub prepared: Arc<Prepared>,
-    /// Checked between dispatches and between tiles.
-    pub cancel: CancelToken,
-    /// Checked likewise.
-    pub deadline: Option<Instant>,
-}
-
-/// A finished job.
-#[derive(Debug, Clone)]
-pub struct Finished {
-    /// The mesh and its grid.
-    pub meshed: Meshed,
-    /// Device time per stage in ns, in order; empty where the device has no timestamps.
-    pub stages: Vec<(Stage, u64)>,
-}
+use super::job::{GpuJob, JobResult};
+use super::partition_handle::PartitionHandle;
 
 /// Runs jobs on one device.
 pub trait Executor: Send {
-    /// Runs `jobs`, as few submissions as it can, and answers each: one result per job, in order.
-    fn run(&mut self, jobs: &[GpuJob]) -> Vec<Result<Finished, GpuError>>;
+    /// Runs `jobs` in as few submissions as possible. Returns one result per job, in order.
+    fn run(&mut self, jobs: &[GpuJob]) -> Vec<JobResult>;
 
-    /// Runs one part of a job that several devices make. The mesh has the part's rows, its triangles the numbers that
-    /// vertices have in the whole. Whatever becomes of it, the others are told through `share`.
+    /// Runs one partition of a job that several devices share. The mesh has the vertices and triangles of the
+    /// partition; its triangles refer to vertices by their index in the whole mesh. Partitions exchange counts through
+    /// `partition`.
     ///
     /// # Errors
-    /// As [`Self::run`]; [`GpuError::Failed`] where the program knows no parts.
-    fn part(&mut self, job: &GpuJob, share: &Share) -> Result<Finished, GpuError> {
-        let _ = (job, share);
-        Err(GpuError::Failed("this program makes meshes whole".to_owned()))
+    /// Those of [`Self::run`]; [`GpuError::Failed`] if the executor supports whole jobs only.
+    fn run_partition(&mut self, job: &GpuJob, partition: &PartitionHandle) -> JobResult {
+        let _ = (job, partition);
+        Err(GpuError::Failed("this program does not support partitions".to_owned()))
     }
 
-    /// Lets go what is kept for the next job alone and is large: there has been none for a while.
-    fn rest(&mut self) {}
+    /// Frees large buffers that are kept for the next job. The pool calls it once the device has been idle for a while.
+    fn release_idle_memory(&mut self) {}
 
-    /// Bytes of device memory that it holds now: in use and pooled.
+    /// Bytes of device memory that the executor holds, in use and pooled.
     fn held_bytes(&self) -> u64;
 }

@@ -1,5 +1,5 @@
-//! Which Vulkan drivers announce themselves: the manifests that the loader will read. Nothing is loaded; where no device is
-//! found, this tells a machine without a driver from one whose driver does not start.
+//! Manifests of Vulkan drivers that the loader would read. If no device is found, they distinguish a machine without a
+//! driver from one whose driver does not start. Nothing is loaded.
 
 use std::env;
 use std::fmt;
@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-/// A driver's manifest.
+/// Manifest of a driver.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Manifest {
-    /// Where it lies.
+    /// Path of the manifest.
     pub path: PathBuf,
-    /// The library that it names, or why it names none.
+    /// Library that it names, or the reason for which there is none.
     pub library: Result<String, String>,
 }
 
@@ -26,13 +26,13 @@ impl fmt::Display for Manifest {
     }
 }
 
-/// Manifests that replace those of the system, and their name of old, which counts where the first is not set.
-const INSTEAD: [&str; 2] = ["VK_DRIVER_FILES", "VK_ICD_FILENAMES"];
-/// Manifests that come before those of the system.
-const BESIDE: &str = "VK_ADD_DRIVER_FILES";
-/// Below each folder that the system looks in.
-const BELOW: &str = "vulkan/icd.d";
-/// Variables with folders separated by `:`, and what stands for them where they are not set, in the loader's order.
+/// Variables with manifests that replace those of the system; the second is the older name, used if the first is unset.
+const REPLACING: [&str; 2] = ["VK_DRIVER_FILES", "VK_ICD_FILENAMES"];
+/// Variable with manifests that come before those of the system.
+const ADDITIONAL: &str = "VK_ADD_DRIVER_FILES";
+/// Subfolder of the search folders.
+const SUBFOLDER: &str = "vulkan/icd.d";
+/// Variables with search folders separated by `:`, and their defaults, in the order of the loader.
 const FOLDERS: [(&str, &str); 4] = [
     ("XDG_CONFIG_HOME", "$HOME/.config"),
     ("XDG_CONFIG_DIRS", "/etc/xdg:/etc"),
@@ -40,7 +40,7 @@ const FOLDERS: [(&str, &str); 4] = [
     ("XDG_DATA_DIRS", "/usr/local/share:/usr/share"),
 ];
 
-/// The manifests that a Vulkan loader on Linux reads now, in its order; empty on other systems.
+/// Returns the manifests that a Vulkan loader on Linux would read, in its order. Empty on other systems.
 #[must_use]
 pub fn manifests() -> Vec<Manifest> {
     if cfg!(target_os = "linux") { under(Path::new("/"), |name| env::var(name).ok()) } else { Vec::new() }
@@ -49,20 +49,20 @@ pub fn manifests() -> Vec<Manifest> {
 fn under(root: &Path, variable: impl Fn(&str) -> Option<String>) -> Vec<Manifest> {
     let set = |name: &str| variable(name).filter(|value| !value.is_empty());
     let listed = |value: String| value.split(':').map(|path| inside(root, path)).collect::<Vec<_>>();
-    let instead = INSTEAD.into_iter().find_map(set);
+    let replacing = REPLACING.into_iter().find_map(set);
     let of_the_system = || {
-        let mut places = set(BESIDE).map(listed).unwrap_or_default();
+        let mut places = set(ADDITIONAL).map(listed).unwrap_or_default();
         let home = set("HOME").unwrap_or_default();
         for (name, default) in FOLDERS {
             let value = set(name).unwrap_or_else(|| default.replace("$HOME", &home));
-            // The system's own folder stays, whatever the variable says.
+            // The loader searches /etc regardless of the variable.
             let own = if name == "XDG_CONFIG_DIRS" { "/etc" } else { "" };
             let folders = value.split(':').chain([own]).filter(|folder| !folder.is_empty());
-            places.extend(folders.map(|folder| inside(root, folder).join(BELOW)));
+            places.extend(folders.map(|folder| inside(root, folder).join(SUBFOLDER)));
         }
         places
     };
-    let places = instead.map_or_else(of_the_system, listed);
+    let places = replacing.map_or_else(of_the_system, listed);
     let mut found: Vec<Manifest> = Vec::new();
     for path in places.iter().flat_map(|place| files(place)) {
         if !found.iter().any(|other| other.path == path) {
@@ -73,12 +73,12 @@ fn under(root: &Path, variable: impl Fn(&str) -> Option<String>) -> Vec<Manifest
     found
 }
 
-/// An absolute path as it is below `root`.
+/// Maps an absolute path to one below `root`.
 fn inside(root: &Path, path: &str) -> PathBuf {
     root.join(path.trim_start_matches('/'))
 }
 
-/// A file, or the manifests in a folder by name.
+/// Returns the file, or the manifests of the folder, sorted by name.
 fn files(place: &Path) -> Vec<PathBuf> {
     let Ok(entries) = place.read_dir() else {
         return if place.is_file() { vec![place.to_owned()] } else { Vec::new() };
@@ -91,7 +91,7 @@ fn files(place: &Path) -> Vec<PathBuf> {
 
 fn library(path: &Path) -> Result<String, String> {
     let text = std::fs::read_to_string(path).map_err(|e| format!("cannot be read: {e}"))?;
-    let document: Value = serde_json::from_str(&text).map_err(|e| format!("is no JSON: {e}"))?;
+    let document: Value = serde_json::from_str(&text).map_err(|e| format!("is not JSON: {e}"))?;
     let named = document.pointer("/ICD/library_path").and_then(Value::as_str);
     named.map(str::to_owned).ok_or_else(|| "names no library".to_owned())
 }
@@ -107,7 +107,7 @@ mod tests {
     }
 
     #[test]
-    fn the_loaders_places_are_looked_at_in_its_order() {
+    fn folders_are_searched_in_the_order_of_the_loader() {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path();
         let named = |set: &[(&str, &str)]| -> Vec<String> {
@@ -129,10 +129,10 @@ mod tests {
             "/opt/e.json names ../libe.so",
         ];
         assert_eq!(named(&[]), [c, a, b]);
-        assert!(named(&[("HOME", "/home/x")])[0].starts_with("/home/x/.config/vulkan/icd.d/d.json is no JSON"));
+        assert!(named(&[("HOME", "/home/x")])[0].starts_with("/home/x/.config/vulkan/icd.d/d.json is not JSON"));
         assert_eq!(named(&[("XDG_DATA_DIRS", "/nowhere"), ("XDG_CONFIG_DIRS", "/nowhere")]), [c]);
         assert_eq!(named(&[("VK_ADD_DRIVER_FILES", "/opt/e.json")]), [e, c, a, b]);
-        for name in INSTEAD {
+        for name in REPLACING {
             assert_eq!(named(&[(name, "/opt/e.json:/opt/none.json"), ("HOME", "/home/x")]), [e]);
         }
         assert_eq!(named(&[("VK_DRIVER_FILES", ""), ("VK_ICD_FILENAMES", "/usr/share/vulkan/icd.d")]), [a, b]);

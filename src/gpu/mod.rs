@@ -1,42 +1,62 @@
-//! The GPU room: the only module that may name a graphics API.
+//! GPU backend: the only module that may name a graphics API.
 //!
-//! `discover` asks the drivers what there is and `choose` judges it; `device` opens what is taken and builds the
-//! [`Engine`](engine::Engine) there. `prepare` turns spheres into what a device needs, on the caller's thread; an
-//! [`Executor`](executor::Executor) runs prepared jobs on one device; the [`DevicePool`](pool::DevicePool) owns one
-//! thread per device and decides which job runs where; [`GpuBackend`](backend::GpuBackend) is what the rest of the
-//! crate sees.
+//! Callers prepare jobs (`job`, `plan`) on their own threads. The [`DevicePool`] queues them and owns one thread per
+//! device; each thread runs them by an [`Executor`], normally the [`Engine`]. [`GpuBackend`] is the pool behind the
+//! `Backend` trait, [`GpuRenderer`] draws pictures.
+//!
+//! A module names only modules of earlier lines:
+//!
+//! ```text
+//! error, buffers, plan, describe, readback, hardware, manifests, choose, picture_targets
+//! job, shaders, device_errors, discover
+//! partition_handle, pipelines, multi_device, picture_passes
+//! executor, output_layout, device_queue
+//! workspace, scheduler
+//! recording, worker
+//! pool
+//! engine
+//! submit, device
+//! job_state, probe, backend, picture
+//! count
+//! output
+//! run_partition
+//! run
+//! ```
 
-mod assemble;
 pub mod backend;
+mod buffers;
 mod choose;
+mod count;
+mod describe;
 mod device;
+mod device_errors;
+mod device_queue;
 pub mod discover;
 pub mod engine;
 pub mod error;
 pub mod executor;
-mod flight;
 mod hardware;
-mod health;
-mod landing;
-mod lane;
+pub mod job;
+mod job_state;
 pub mod manifests;
+mod multi_device;
 mod output;
-mod part;
+mod output_layout;
+pub mod partition_handle;
 pub mod picture;
+mod picture_passes;
 mod picture_targets;
-mod picture_work;
 mod pipelines;
+pub mod plan;
 pub mod pool;
-pub mod prepare;
 #[doc(hidden)]
 pub mod probe;
-mod progress;
-mod queue;
-mod record;
+mod readback;
+mod recording;
 mod run;
+mod run_partition;
+mod scheduler;
 mod shaders;
-pub mod share;
-mod spread;
 mod submit;
 mod worker;
 mod workspace;
@@ -45,11 +65,11 @@ pub use backend::GpuBackend;
 pub use discover::{Discovery, Look, discover};
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
-pub use executor::{Executor, Finished, GpuJob};
+pub use executor::Executor;
+pub use job::{Finished, GpuJob, JobResult, Prepared};
 pub use manifests::{Manifest, manifests};
+pub use partition_handle::PartitionHandle;
 pub use picture::GpuRenderer;
-pub use pool::{DevicePool, PoolDevice, PoolSettings, Ran, Work};
-pub use prepare::Prepared;
+pub use pool::{CompletedJob, DevicePool, DeviceWork, PoolDevice, PoolSettings};
 pub use shaders::stage_shaders;
-pub use share::Share;
-pub use worker::{Build, MOST_REBUILDS};
+pub use worker::{Build, MAX_REBUILDS};

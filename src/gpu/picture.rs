@@ -1,85 +1,82 @@
-//! Pictures drawn by a device: the mesh rasterised four times, once for each sample of a pixel, then resolved and finished by
-//! the same numbers as on the CPU. Offscreen; nothing but the pixels comes back.
+//! Renderer on a device. Draws the mesh four times, once per sample of a pixel, and resolves and shades the samples
+//! with the parameters of the CPU renderer.
 
 use std::sync::{Mutex, PoisonError};
 
 use wgpu::Adapter;
 
-use super::backend::{arithmetic, describe};
+use super::describe::{arithmetic, describe};
 use super::device;
 use super::discover::Discovery;
 use super::error::GpuError;
-use super::picture_targets::Needs;
-use super::picture_work::Painter;
+use super::picture_passes::PicturePasses;
+use super::picture_targets::Requirements;
 use crate::picture::camera::Camera;
 use crate::picture::{CpuRenderer, Image, PictureError, PictureParams, Rendered, Renderer};
 use crate::surface::{Control, Mesh, Served, Vertices};
 
-/// Draws on one device; the CPU stands in for it, and says so.
+/// Renderer on one device, with an optional fallback to the CPU.
 pub struct GpuRenderer {
     adapter: Adapter,
-    name: String,
-    /// The device with its driver.
+    /// Description of the device.
     device: String,
-    /// None once the device was lost; the next picture opens it again.
-    painter: Mutex<Option<Painter>>,
+    /// `None` after the device was lost; the next picture reopens it.
+    passes: Mutex<Option<PicturePasses>>,
     fallback: Option<CpuRenderer>,
 }
 
 impl GpuRenderer {
-    /// A renderer on the first device that `discovery` takes. `fallback` draws what the device cannot; without one that is an
-    /// error.
+    /// Creates a renderer on the first device that `discovery` selected. Without a `fallback`, a picture that the
+    /// device cannot draw is an error.
     ///
     /// # Errors
-    /// [`GpuError::NoDevice`] if none is taken, and what the device says where it cannot be prepared.
+    /// [`GpuError::NoDevice`] if no device is selected, and errors of opening the device.
     pub fn start(discovery: &Discovery, fallback: Option<CpuRenderer>) -> Result<Self, GpuError> {
         let mut taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(found, _)| found.taken);
         let Some((found, adapter)) = taken.next() else {
             return Err(GpuError::NoDevice(discovery.why_none().unwrap_or_default()));
         };
-        let name = format!("{} ({}, {})", found.facts.name, found.facts.kind.name(), found.facts.api);
-        let device = describe(&found.facts);
-        let painter = Mutex::new(Some(open(adapter)?));
-        Ok(Self { adapter: adapter.clone(), name, device, painter, fallback })
+        let passes = Mutex::new(Some(open(adapter)?));
+        Ok(Self { adapter: adapter.clone(), device: describe(&found.facts), passes, fallback })
     }
 
-    fn paint(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<(Image, f64), Why> {
+    fn draw(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<(Image, f64), DrawError> {
         let Vertices::Single { positions, normals } = mesh.vertices() else {
-            return Err(Why::Picture(PictureError::Quantized));
+            return Err(DrawError::Picture(PictureError::Quantized));
         };
-        let check = || control.check().map_err(|error| Why::Picture(error.into()));
+        let check = || control.check().map_err(|error| DrawError::Picture(error.into()));
         let camera = Camera::new(positions, &mesh.triangles, params);
         check()?;
-        let mut painter = self.painter.lock().unwrap_or_else(PoisonError::into_inner);
-        // Waiting for others may have taken a while.
+        let mut passes = self.passes.lock().unwrap_or_else(PoisonError::into_inner);
+        // Other pictures may have held the lock for long.
         check()?;
-        if painter.is_none() {
-            *painter = Some(open(&self.adapter).map_err(|error| Why::Device(error.to_string()))?);
+        let opened = match passes.take() {
+            Some(opened) => opened,
+            None => open(&self.adapter).map_err(|error| DrawError::Device(error.to_string()))?,
+        };
+        let fits = Requirements::new(mesh, params).check(&opened.limits());
+        let drawn = fits
+            .map_err(GpuError::Failed)
+            .and_then(|()| opened.draw(positions, normals, &mesh.triangles, params, &camera));
+        if !matches!(drawn, Err(GpuError::Lost(_))) {
+            *passes = Some(opened);
         }
-        let Some(ready) = painter.as_ref() else { return Err(Why::Device("it is not open".to_owned())) };
-        Needs::of(mesh, params).check(&ready.limits()).map_err(Why::Device)?;
-        let painted = ready.paint(positions, normals, &mesh.triangles, params, &camera);
-        let pixels = painted.map_err(|error| {
-            if matches!(error, GpuError::Lost(_)) {
-                *painter = None;
-            }
-            Why::Device(error.to_string())
-        })?;
+        let pixels = drawn.map_err(|error| DrawError::Device(error.to_string()))?;
         Ok((Image { width: params.width, height: params.height, pixels }, camera.pixel()))
     }
 }
 
-/// Opens a device and compiles what draws on it.
-fn open(adapter: &Adapter) -> Result<Painter, GpuError> {
+/// Opens a device and compiles the passes.
+fn open(adapter: &Adapter) -> Result<PicturePasses, GpuError> {
     let (device, queue) = device::open(adapter)?;
-    Painter::new(device, queue)
+    PicturePasses::new(device, queue)
 }
 
-/// Why the device has not drawn.
-enum Why {
-    /// Nothing would.
+/// Reason for which the device did not draw a picture.
+enum DrawError {
+    /// No renderer could draw it.
     Picture(PictureError),
-    /// It could not, in words.
+    /// The device failed.
     Device(String),
 }
 
@@ -93,15 +90,15 @@ impl Renderer for GpuRenderer {
     }
 
     fn describe(&self) -> String {
-        self.name.clone()
+        self.device.clone()
     }
 
     fn render(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError> {
-        match (self.paint(mesh, params, control), &self.fallback) {
+        match (self.draw(mesh, params, control), &self.fallback) {
             (Ok((image, pixel)), _) => Ok(Rendered { image, pixel, served: None }),
-            (Err(Why::Picture(error)), _) => Err(error),
-            (Err(Why::Device(why)), None) => Err(PictureError::Device { why }),
-            (Err(Why::Device(why)), Some(cpu)) => {
+            (Err(DrawError::Picture(error)), _) => Err(error),
+            (Err(DrawError::Device(why)), None) => Err(PictureError::Device { why }),
+            (Err(DrawError::Device(why)), Some(cpu)) => {
                 let instead = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
                 let served =
                     Served { backend: cpu.name(), arithmetic: cpu.arithmetic(), device: cpu.describe(), instead };

@@ -1,4 +1,4 @@
-//! What a picture takes on a device: textures, buffers, and whether its limits allow them.
+//! Textures, buffers and uniforms of a picture on a device, and the limits that they require.
 
 use bytemuck::{Pod, Zeroable};
 use wgpu::{
@@ -12,18 +12,18 @@ use crate::picture::finish::Finish;
 use crate::picture::light::{AMBIENT, DIFFUSE, LIGHT};
 use crate::surface::Mesh;
 
-/// Where the samples of a pixel lie, in pixels: as on the CPU.
+/// Positions of the samples within a pixel, as in the CPU renderer.
 pub(super) const PATTERN: [[f32; 2]; 4] = [[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]];
-/// Normal and light of a sample.
+/// Format of the normal and the light of a sample.
 pub(super) const SHADE: TextureFormat = TextureFormat::Rgba16Float;
-/// Depth of a sample, Å.
+/// Format of the depth of a sample, Å.
 pub(super) const DEPTH: TextureFormat = TextureFormat::R32Float;
-/// What decides which sample is nearest.
+/// Format of the depth buffer.
 pub(super) const NEAREST: TextureFormat = TextureFormat::Depth32Float;
-/// Deeper than anything.
+/// Depth of samples without a surface.
 pub(super) const NOTHING: f64 = 3.0e38;
 
-/// A view, as `shaders/picture/vertex.wgsl` reads it.
+/// Uniform of the draw passes, as `shaders/picture/vertex.wgsl` reads it.
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct View {
@@ -61,48 +61,48 @@ impl View {
     }
 }
 
-/// What a picture is finished with, as `shaders/shared/picture.wgsl` reads it.
+/// Uniform of the resolve and shading passes, as `shaders/shared/picture.wgsl` reads it.
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-pub(super) struct Numbers {
+pub(super) struct FinishParams {
     pub(super) color: [f32; 4],
-    pub(super) behind: [f32; 4],
+    pub(super) background: [f32; 4],
     pub(super) size: [u32; 2],
     pub(super) n_taps: u32,
-    pub(super) line: i32,
+    pub(super) line_width: i32,
     pub(super) falloff: f32,
     pub(super) bias: f32,
     pub(super) strength: f32,
-    pub(super) darkest: f32,
-    pub(super) step_from: f32,
-    pub(super) step_to: f32,
-    pub(super) ink: f32,
+    pub(super) min_light: f32,
+    pub(super) step_min: f32,
+    pub(super) step_max: f32,
+    pub(super) line_strength: f32,
     pub(super) pad: f32,
 }
 
-impl Numbers {
+impl FinishParams {
     pub(super) fn new(finish: &Finish, params: &PictureParams) -> Self {
         let [r, g, b] = finish.color;
-        let [step_from, step_to] = finish.steps;
+        let [step_min, step_max] = finish.steps;
         Self {
             color: [r, g, b, 0.0],
-            behind: finish.behind,
+            background: finish.background,
             size: [params.width, params.height],
             n_taps: u32::try_from(finish.taps.len()).unwrap_or(0),
-            line: finish.line,
+            line_width: finish.line_width,
             falloff: finish.falloff,
             bias: finish.bias,
             strength: finish.strength,
-            darkest: finish.darkest,
-            step_from,
-            step_to,
-            ink: finish.ink,
+            min_light: finish.min_light,
+            step_min,
+            step_max,
+            line_strength: finish.line_strength,
             pad: 0.0,
         }
     }
 }
 
-/// A neighbour, as `shaders/picture/finish.wgsl` reads it.
+/// Neighbour of a pixel, as `shaders/picture/finish.wgsl` reads it.
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Tap {
@@ -110,8 +110,8 @@ pub(super) struct Tap {
     pub(super) length: [f32; 2],
 }
 
-/// Every neighbour; one that is never looked at where there are none, as buffers are not empty.
-pub(super) fn taps(finish: &Finish) -> Vec<Tap> {
+/// Neighbours of `finish`; one unused entry if there are none, because buffers must not be empty.
+pub(super) fn taps_of(finish: &Finish) -> Vec<Tap> {
     let mut all: Vec<Tap> =
         finish.taps.iter().map(|tap| Tap { pixels: [tap.dx, tap.dy], length: [tap.right, tap.up] }).collect();
     if all.is_empty() {
@@ -120,9 +120,10 @@ pub(super) fn taps(finish: &Finish) -> Vec<Tap> {
     all
 }
 
-/// What a picture needs of a device.
+/// Requirements of a picture.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Needs {
+pub(super) struct Requirements {
+    /// Larger side in pixels.
     side: u32,
     /// Bytes of the largest storage buffer.
     binding: u64,
@@ -130,14 +131,15 @@ pub(super) struct Needs {
     buffer: u64,
 }
 
-impl Needs {
-    pub(super) fn of(mesh: &Mesh, params: &PictureParams) -> Self {
+impl Requirements {
+    /// Requirements of a picture of `mesh`.
+    pub(super) fn new(mesh: &Mesh, params: &PictureParams) -> Self {
         let binding = u64::from(params.width) * u64::from(params.height) * 16;
         let columns = 12 * mesh.n_vertices().max(mesh.n_triangles()) as u64;
         Self { side: params.width.max(params.height), binding, buffer: columns.max(binding) }
     }
 
-    /// Why a device with these limits cannot draw it.
+    /// Fails with a message if a device with these limits cannot draw the picture.
     pub(super) fn check(&self, limits: &Limits) -> Result<(), String> {
         let too_large = |what: &str, needed: u64, limit: u64| {
             if needed > limit {
@@ -146,13 +148,13 @@ impl Needs {
                 Ok(())
             }
         };
-        too_large("a texture's side", self.side.into(), limits.max_texture_dimension_2d.into())?;
+        too_large("a texture side", self.side.into(), limits.max_texture_dimension_2d.into())?;
         too_large("a storage buffer in bytes", self.binding, limits.max_storage_buffer_binding_size)?;
         too_large("a buffer in bytes", self.buffer, limits.max_buffer_size)
     }
 }
 
-/// A texture with a layer for each sample.
+/// Texture with one layer per sample.
 pub(super) struct Layered {
     texture: Texture,
 }
@@ -163,7 +165,7 @@ impl Layered {
         Self { texture: texture(device, label, format, params, PATTERN.len(), usage) }
     }
 
-    /// The layer of one sample, to be drawn to.
+    /// View of the layer of one sample, as a render target.
     pub(super) fn layer(&self, sample: u32) -> TextureView {
         self.texture.create_view(&TextureViewDescriptor {
             dimension: Some(TextureViewDimension::D2),
@@ -173,14 +175,14 @@ impl Layered {
         })
     }
 
-    /// All layers, to be read.
+    /// View of all layers, for reading.
     pub(super) fn all(&self) -> TextureView {
         let dimension = Some(TextureViewDimension::D2Array);
         self.texture.create_view(&TextureViewDescriptor { dimension, ..TextureViewDescriptor::default() })
     }
 }
 
-/// A texture as large as the picture.
+/// Creates a texture of the size of the picture.
 pub(super) fn texture(
     device: &Device,
     label: &str,
@@ -202,7 +204,7 @@ pub(super) fn texture(
     })
 }
 
-/// An empty buffer.
+/// Creates a buffer.
 pub(super) fn buffer(device: &Device, label: &str, size: u64, usage: BufferUsages) -> Buffer {
     device.create_buffer(&wgpu::BufferDescriptor { label: Some(label), size, usage, mapped_at_creation: false })
 }

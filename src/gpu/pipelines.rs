@@ -1,25 +1,29 @@
-//! The stages' pipelines, built once: one for each kernel where the stage depends on it.
+//! Compute pipelines of the stages, compiled once: one per kernel for the stages that depend on it.
 
 use wgpu::{BindGroupLayout, ComputePipeline, Device};
 
-use super::shaders::{SHADERS, Shader};
+use super::buffers::BufferId;
+use super::shaders::{Binding, SHADERS, Shader};
 use crate::surface::{Kernel, Stage};
 
-/// Stages that run on a device.
+/// Number of stages that run on a device.
 pub(super) const N_STAGES: usize = 6;
-/// Their names, in order.
+/// Stages that run on a device, in order.
 pub(super) const STAGES: [Stage; N_STAGES] =
     [Stage::Bin, Stage::Field, Stage::Classify, Stage::Scan, Stage::Interpolate, Stage::Emit];
+
+/// Bytes of the timestamps of a submission: begin and end of every stage.
+pub(super) const TIMESTAMP_BYTES: u64 = 16 * N_STAGES as u64;
 
 /// One pipeline per stage and variant.
 #[derive(Debug)]
 pub(super) struct Pipelines {
     layouts: Vec<BindGroupLayout>,
-    /// Per stage its variants: by kernel, and for `interpolate` also by whether nearest atoms are asked for.
+    /// Variants per stage: by kernel, and for `interpolate` also by whether the nearest atoms are requested.
     variants: Vec<Vec<ComputePipeline>>,
 }
 
-/// What of a job decides which variant runs.
+/// Properties of a job that select the variants of its pipelines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Variant {
     pub(super) kernel: Kernel,
@@ -44,33 +48,33 @@ impl Variant {
     }
 }
 
-/// A stage's place among those of a device.
-pub(super) fn number(stage: Stage) -> usize {
-    STAGES.iter().position(|s| *s == stage).unwrap_or_default()
+/// Index of `stage` in [`STAGES`].
+pub(super) const fn stage_index(stage: Stage) -> usize {
+    stage as usize
 }
 
 impl Pipelines {
-    /// Compiles everything. Errors reach the device's callback.
+    /// Compiles all pipelines. The callbacks of the device receive the errors.
     pub(super) fn new(device: &Device) -> Self {
         let (layouts, variants) =
             STAGES.iter().zip(&SHADERS).map(|(stage, shader)| compile(device, *stage, shader)).unzip();
         Self { layouts, variants }
     }
 
-    /// What `stage` binds.
+    /// Bind group layout of `stage`.
     pub(super) fn layout(&self, stage: Stage) -> &BindGroupLayout {
-        &self.layouts[number(stage)]
+        &self.layouts[stage_index(stage)]
     }
 
-    /// What runs `stage`.
+    /// Pipeline of `stage` for `variant`.
     pub(super) fn pipeline(&self, stage: Stage, variant: Variant) -> &ComputePipeline {
-        &self.variants[number(stage)][variant.index(stage)]
+        &self.variants[stage_index(stage)][variant.index(stage)]
     }
 }
 
-fn compile(device: &Device, stage: Stage, shader: &Shader) -> (BindGroupLayout, Vec<ComputePipeline>) {
+fn compile(device: &Device, stage: Stage, shader: &Shader<BufferId>) -> (BindGroupLayout, Vec<ComputePipeline>) {
     let label = format!("molmesh.{}", shader.stage);
-    let entries: Vec<_> = shader.bindings.iter().map(super::shaders::Binding::layout).collect();
+    let entries: Vec<_> = shader.bindings.iter().map(Binding::layout).collect();
     let layout =
         device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(&label), entries: &entries });
     let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
@@ -99,7 +103,7 @@ fn compile(device: &Device, stage: Stage, shader: &Shader) -> (BindGroupLayout, 
             entry_point: Some("main"),
             compilation_options: wgpu::PipelineCompilationOptions {
                 constants,
-                // Every shader writes what it reads.
+                // Every shader writes workgroup memory before it reads it.
                 zero_initialize_workgroup_memory: false,
             },
             cache: None,
@@ -107,4 +111,14 @@ fn compile(device: &Device, stage: Stage, shader: &Shader) -> (BindGroupLayout, 
     };
     let pipelines = constants.iter().map(build).collect();
     (layout, pipelines)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stages_are_indexed_in_order() {
+        assert!(STAGES.iter().enumerate().all(|(i, &stage)| stage_index(stage) == i));
+    }
 }

@@ -1,99 +1,100 @@
-//! The device pool: one thread a device, a bounded queue before each, and callers that wait for their answers.
+//! Device pool: one thread and one bounded queue per device.
 //!
-//! A job goes to the least loaded device. If the device fails, the job is tried once more there, alone and on the
-//! rebuilt device, then on the others; a device that fails too often in a row is given up. A large job is spread over the
-//! devices that are free, and where that fails it goes to one, as any other. Cancellation and deadline are looked at while a
-//! job waits, here, and while it runs, by the executor.
+//! A job goes to the least loaded device. If the device fails, the job is retried once there, alone and on the rebuilt
+//! device, then on the others; a device that fails too often in a row is given up. A large job runs on several idle
+//! devices, and if that fails, on one. Cancellation and deadline are checked here while a job waits, and by the
+//! executor while it runs.
 
 use std::io;
 use std::sync::Arc;
 use std::sync::mpsc::RecvTimeoutError;
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use super::error::GpuError;
-use super::executor::{Finished, GpuJob};
-use super::queue::{Answer, NotPlaced, Place, Queues};
-use super::spread::Spread;
-use super::worker::{self, Build, Times};
-use crate::surface::devices::SPREAD_BRICKS;
+use super::job::{Finished, GpuJob, JobResult};
+use super::multi_device::{join, n_partitions};
+use super::partition_handle::PartitionHandle;
+use super::scheduler::{EnqueueError, Scheduler, Ticket};
+use super::worker::{self, Build, Timing};
+use crate::surface::devices::MIN_PARTITION_BRICKS;
 use crate::surface::{DeviceStatus, Stage, SurfaceError};
 
-/// How often a waiting caller looks whether it was cancelled. Answers do not wait for it.
-pub(super) const TICK: Duration = Duration::from_millis(5);
-/// Attempts at a job on one device.
-const TRIES: usize = 2;
+/// Interval at which a waiting caller checks for cancellation and deadline. Results wake it at once.
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
+/// Maximum number of attempts at a job on one device.
+const MAX_ATTEMPTS: usize = 2;
 
-/// A device and how it is built.
+/// Device of a pool.
 pub struct PoolDevice {
-    /// Its number.
+    /// Number of the device.
     pub number: usize,
-    /// Its name, for people.
+    /// Name of the device, for display.
     pub name: String,
-    /// Makes what runs jobs on it.
+    /// Builds the executor.
     pub build: Build,
 }
 
-/// Sizes of a pool.
+/// Settings of a pool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PoolSettings {
-    /// Jobs that wait for one device; callers of more wait for room.
+    /// Maximum number of jobs that wait for one device; further callers block.
     pub queue: usize,
-    /// Small jobs that may share a submission.
+    /// Maximum number of small jobs that share a submission.
     pub batch: usize,
     /// Pause after a failed rebuild, doubled each time.
-    pub pause: Duration,
-    /// How long a device has nothing to do before it lets go what it keeps for the next large job.
-    pub rest: Duration,
-    /// Bricks that each device gets at least of a job that is spread over several; none: no job is.
-    pub spread_bricks: Option<u64>,
+    pub rebuild_pause: Duration,
+    /// Time without work after which a device releases the memory that it keeps for the next large job.
+    pub idle: Duration,
+    /// Minimum number of bricks per partition of a multi-device job. `None` disables multi-device jobs.
+    pub min_partition_bricks: Option<u64>,
 }
 
 impl Default for PoolSettings {
-    /// 64 jobs wait, so that a caller never does before memory runs short; 16 share a submission, after which another
-    /// one costs less than waiting for a longer batch; a driver that restarts takes about half a second; five seconds are
-    /// longer than a caller takes to come with the next of several large jobs.
+    /// 64 waiting jobs, so that memory runs out before callers block. 16 jobs per submission: the fixed cost is
+    /// negligible beyond. 200 ms between rebuilds: a driver restarts in about half a second. 5 s of idle time: longer
+    /// than the gaps between consecutive large jobs of one caller.
     fn default() -> Self {
-        let (pause, rest) = (Duration::from_millis(200), Duration::from_secs(5));
-        Self { queue: 64, batch: 16, pause, rest, spread_bricks: Some(SPREAD_BRICKS) }
+        let (rebuild_pause, idle) = (Duration::from_millis(200), Duration::from_secs(5));
+        Self { queue: 64, batch: 16, rebuild_pause, idle, min_partition_bricks: Some(MIN_PARTITION_BRICKS) }
     }
 }
 
-/// Devices with their threads. Dropping it ends and joins the threads.
+/// Devices with their threads. Dropping the pool stops and joins the threads.
 pub struct DevicePool {
-    pub(super) queues: Arc<Queues>,
+    scheduler: Arc<Scheduler>,
     threads: Vec<JoinHandle<()>>,
-    pub(super) names: Vec<String>,
-    pub(super) spread_bricks: Option<u64>,
+    names: Vec<String>,
+    min_partition_bricks: Option<u64>,
 }
 
-/// A finished job and who made it.
+/// Finished job with the devices that made it.
 #[derive(Debug, Clone)]
-pub struct Ran {
-    /// The job. Of one that several devices made, a stage's time is the longest of theirs.
+pub struct CompletedJob {
+    /// Mesh and stage times. In a multi-device job a stage's time is the longest of all devices.
     pub finished: Finished,
-    /// Each device that had a part in it, in the order of their parts.
-    pub by: Vec<Work>,
+    /// Devices in the order of their partitions.
+    pub devices: Vec<DeviceWork>,
 }
 
-/// What a device did of a job.
+/// Contribution of a device to a job.
 #[derive(Debug, Clone)]
-pub struct Work {
-    /// Its name, for people.
+pub struct DeviceWork {
+    /// Name of the device, for display.
     pub device: String,
     /// Device time per stage, ns.
     pub stages: Vec<(Stage, u64)>,
 }
 
-impl Ran {
-    /// The device that made it, or all of them, for people.
+impl CompletedJob {
+    /// Names of the devices, for display.
     #[must_use]
     pub fn device(&self) -> String {
-        describe(&self.by.iter().map(|work| work.device.as_str()).collect::<Vec<_>>())
+        describe(&self.devices.iter().map(|work| work.device.as_str()).collect::<Vec<_>>())
     }
 }
 
-/// One device by its name, several by their number and names.
+/// Describes one device by its name and several by their number and names.
 pub(super) fn describe(devices: &[&str]) -> String {
     match devices {
         [] => "no device is up".to_owned(),
@@ -102,137 +103,198 @@ pub(super) fn describe(devices: &[&str]) -> String {
     }
 }
 
+/// Outcome of an attempt to run a job on several devices.
+enum MultiDeviceOutcome {
+    Done(Box<CompletedJob>),
+    /// The job itself failed: it is invalid, late or cancelled.
+    JobFailed(GpuError),
+    /// Devices failed: number of failures per device, and the first reason.
+    DevicesFailed(Vec<usize>, GpuError),
+    /// The job is too small, or fewer than two devices are idle.
+    NotApplicable,
+}
+
 impl DevicePool {
-    /// Starts a thread for each device and waits until every device is built or has failed to be.
+    /// Starts one thread per device and waits until every device is up or down.
     ///
     /// # Errors
-    /// [`GpuError::NoDevice`] with every device's reason if none could be built, [`GpuError::Failed`] if a thread cannot
-    /// be started.
+    /// [`GpuError::NoDevice`] with the reasons of all devices if none is up; [`GpuError::Failed`] if a thread cannot be
+    /// started.
     pub fn start(devices: Vec<PoolDevice>, settings: &PoolSettings) -> Result<Self, GpuError> {
         let known: Vec<(usize, String)> = devices.iter().map(|d| (d.number, d.name.clone())).collect();
-        let queues = Arc::new(Queues::new(&known, settings.queue, settings.batch));
+        let scheduler = Arc::new(Scheduler::new(&known, settings.queue, settings.batch));
         let names = known.into_iter().map(|(_, name)| name).collect();
-        let mut pool =
-            Self { queues, threads: Vec::with_capacity(devices.len()), names, spread_bricks: settings.spread_bricks };
+        let threads = Vec::with_capacity(devices.len());
+        let mut pool = Self { scheduler, threads, names, min_partition_bricks: settings.min_partition_bricks };
+        let timing = Timing { rebuild_pause: settings.rebuild_pause, idle: settings.idle };
         for (n, device) in devices.into_iter().enumerate() {
-            let (queues, times) = (Arc::clone(&pool.queues), Times { pause: settings.pause, rest: settings.rest });
+            let scheduler = Arc::clone(&pool.scheduler);
             let thread = std::thread::Builder::new().name(format!("molmesh-gpu-{}", device.number));
-            let started = thread.spawn(move || worker::work(&queues, n, &device.build, times));
-            let failed = |e: io::Error| GpuError::Failed(format!("a device's thread cannot be started: {e}"));
+            let started = thread.spawn(move || worker::work(&scheduler, n, &device.build, timing));
+            let failed = |e: io::Error| GpuError::Failed(format!("the thread of a device cannot be started: {e}"));
             pool.threads.push(started.map_err(failed)?);
         }
-        if pool.queues.started() { Ok(pool) } else { Err(GpuError::NoDevice(pool.queues.why_down())) }
-    }
-
-    /// Runs a job on some device, or on several, and waits for it. The name of who did it comes back too.
-    ///
-    /// # Errors
-    /// Any [`GpuError`]: of the job, or [`GpuError::NoDevice`] with what the devices died of.
-    pub fn run(&self, job: &GpuJob) -> Result<(Finished, String), GpuError> {
-        let ran = self.ran(job)?;
-        let device = ran.device();
-        Ok((ran.finished, device))
-    }
-
-    /// Likewise, with what each device did.
-    ///
-    /// # Errors
-    /// As [`Self::run`].
-    pub fn ran(&self, job: &GpuJob) -> Result<Ran, GpuError> {
-        match self.spread(job) {
-            Spread::Done(ran) => Ok(*ran),
-            Spread::Over(error) => Err(error),
-            Spread::Failed(failures, why) => self.run_on(job, failures, Some(why)),
-            Spread::No => self.run_on(job, vec![0; self.names.len()], None),
+        if pool.scheduler.wait_until_started() {
+            Ok(pool)
+        } else {
+            Err(GpuError::NoDevice(pool.scheduler.down_reasons()))
         }
     }
 
-    /// Runs a job on device `n` (by its place in the pool) alone.
+    /// Runs a job on one or several devices and waits for it.
     ///
     /// # Errors
-    /// As [`Self::run`].
-    pub fn run_only_on(&self, n: usize, job: &GpuJob) -> Result<Finished, GpuError> {
-        let tries = (0..self.names.len()).map(|other| if other == n { 0 } else { TRIES }).collect();
-        self.run_on(job, tries, None).map(|ran| ran.finished)
+    /// Any [`GpuError`] of the job; [`GpuError::NoDevice`] with the reasons if all devices are down.
+    pub fn run(&self, job: &GpuJob) -> Result<CompletedJob, GpuError> {
+        match self.run_on_several(job) {
+            MultiDeviceOutcome::Done(completed) => Ok(*completed),
+            MultiDeviceOutcome::JobFailed(error) => Err(error),
+            MultiDeviceOutcome::DevicesFailed(failures, why) => self.run_on_one(job, failures, Some(why)),
+            MultiDeviceOutcome::NotApplicable => self.run_on_one(job, vec![0; self.names.len()], None),
+        }
     }
 
-    /// Runs a job on one device. It has failed `tries` times on each, for `last` at last.
-    fn run_on(&self, job: &GpuJob, mut tries: Vec<usize>, mut last: Option<GpuError>) -> Result<Ran, GpuError> {
+    /// Runs a job on device `n`, an index in the pool, only.
+    ///
+    /// # Errors
+    /// Those of [`Self::run`].
+    pub fn run_on_device(&self, n: usize, job: &GpuJob) -> JobResult {
+        let failures = (0..self.names.len()).map(|other| if other == n { 0 } else { MAX_ATTEMPTS }).collect();
+        self.run_on_one(job, failures, None).map(|completed| completed.finished)
+    }
+
+    /// Runs a job on one device. `failures` counts earlier attempts per device, of which `last_error` is the last
+    /// error.
+    fn run_on_one(
+        &self,
+        job: &GpuJob,
+        mut failures: Vec<usize>,
+        mut last_error: Option<GpuError>,
+    ) -> Result<CompletedJob, GpuError> {
         loop {
-            let place = match self.queues.place(job, &tries, TRIES) {
-                Ok(place) => place,
-                Err(NotPlaced::Full) => {
-                    over(job)?;
-                    self.queues.moved(TICK);
+            let ticket = match self.scheduler.enqueue(job, &failures, MAX_ATTEMPTS) {
+                Ok(ticket) => ticket,
+                Err(EnqueueError::Full) => {
+                    job.check()?;
+                    self.scheduler.wait_for_change(POLL_INTERVAL);
                     continue;
                 }
-                Err(NotPlaced::NoDevice(why)) => {
-                    // What this very job met with says more than what devices died of before.
-                    return Err(last.unwrap_or(GpuError::NoDevice(why)));
-                }
+                // The error of this job is more specific than the reasons of the devices.
+                Err(EnqueueError::NoDevice(why)) => return Err(last_error.unwrap_or(GpuError::NoDevice(why))),
             };
-            match self.wait(job, &place) {
-                Ok(finished) => {
-                    let work = Work { device: self.names[place.lane].clone(), stages: finished.stages.clone() };
-                    return Ok(Ran { finished, by: vec![work] });
+            let n = ticket.device;
+            match self.wait_for_all(job, &[ticket]).into_iter().next() {
+                Some(Ok(finished)) => {
+                    let devices = vec![self.work_of(n, &finished)];
+                    return Ok(CompletedJob { finished, devices });
                 }
-                Err(error @ GpuError::OutOfMemory { .. }) => return Err(error),
-                Err(error) if error.is_the_devices() => {
-                    tries[place.lane] += 1;
-                    last = Some(error);
+                Some(Err(error)) if error.is_device_failure() && !matches!(error, GpuError::OutOfMemory { .. }) => {
+                    failures[n] += 1;
+                    last_error = Some(error);
                 }
-                Err(error) => return Err(error),
+                Some(Err(error)) => return Err(error),
+                None => return Err(thread_ended()),
             }
         }
     }
 
-    fn wait(&self, job: &GpuJob, place: &Place) -> Answer {
-        loop {
-            match place.answer.recv_timeout(TICK) {
-                Ok(answer) => return answer,
-                Err(RecvTimeoutError::Disconnected) => {
-                    return Err(thread_ended());
+    /// Runs a large job on the idle devices.
+    fn run_on_several(&self, job: &GpuJob) -> MultiDeviceOutcome {
+        let idle = self.scheduler.idle_devices();
+        let plan = &job.prepared.plan;
+        let n = n_partitions(plan.bricks.len() as u64, idle.len(), self.min_partition_bricks);
+        if n < 2 {
+            return MultiDeviceOutcome::NotApplicable;
+        }
+        let handles = PartitionHandle::for_partitions(plan.partitions(n));
+        let [first, _, ..] = &handles[..] else { return MultiDeviceOutcome::NotApplicable };
+        let first = first.clone();
+        let Some(tickets) = self.scheduler.enqueue_partitions(job, idle.into_iter().zip(handles).collect()) else {
+            return MultiDeviceOutcome::NotApplicable;
+        };
+        let results = self.wait_for_all(job, &tickets);
+        let (mut partitions, mut devices, mut job_errors) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut failures, mut device_error) = (vec![0; self.names.len()], None);
+        for (ticket, result) in tickets.iter().zip(results) {
+            match result {
+                Ok(finished) => {
+                    devices.push(self.work_of(ticket.device, &finished));
+                    partitions.push(finished);
                 }
+                Err(error) if error.is_device_failure() => {
+                    // A device without the memory for a partition does not have it for the whole job either.
+                    let no_memory = matches!(error, GpuError::OutOfMemory { .. });
+                    failures[ticket.device] = if no_memory { MAX_ATTEMPTS } else { 1 };
+                    device_error.get_or_insert(error);
+                }
+                Err(error) => job_errors.push(error),
+            }
+        }
+        if let Err(error) = job.check() {
+            return MultiDeviceOutcome::JobFailed(error);
+        }
+        if let Some(error) = device_error {
+            return MultiDeviceOutcome::DevicesFailed(failures, error);
+        }
+        // Partitions that were aborted because another one failed report a cancellation.
+        job_errors.sort_by_key(|error| *error == GpuError::Surface(SurfaceError::Cancelled));
+        match job_errors.into_iter().next() {
+            Some(error) => MultiDeviceOutcome::JobFailed(error),
+            None => {
+                let finished = join(partitions, first.has_flat_vertices());
+                MultiDeviceOutcome::Done(Box::new(CompletedJob { finished, devices }))
+            }
+        }
+    }
+
+    /// Waits for the results of all tickets of a job, in order. The failure of a partition aborts the others, which are
+    /// waited for nevertheless, because their devices are busy until then. If the job is cancelled or late, the waiting
+    /// entries are removed and nothing is waited for.
+    fn wait_for_all(&self, job: &GpuJob, tickets: &[Ticket]) -> Vec<JobResult> {
+        let mut results = Vec::with_capacity(tickets.len());
+        while let Some(ticket) = tickets.get(results.len()) {
+            match ticket.result.recv_timeout(POLL_INTERVAL) {
+                Ok(result) => results.push(result),
+                Err(RecvTimeoutError::Disconnected) => results.push(Err(thread_ended())),
                 Err(RecvTimeoutError::Timeout) => {
-                    if let Err(error) = over(job) {
-                        self.queues.forget(place);
-                        return Err(error);
+                    if let Err(error) = job.check() {
+                        for ticket in &tickets[results.len()..] {
+                            self.scheduler.cancel(ticket);
+                            results.push(ticket.result.try_recv().unwrap_or_else(|_pending| Err(error.clone())));
+                        }
                     }
                 }
             }
         }
+        results
     }
 
-    /// Gives device `n` (by its place in the pool) up.
+    fn work_of(&self, n: usize, finished: &Finished) -> DeviceWork {
+        DeviceWork { device: self.names[n].clone(), stages: finished.stages.clone() }
+    }
+
+    /// Gives up device `n`, an index in the pool.
     pub fn give_up(&self, n: usize, why: &str) {
-        self.queues.down(n, why);
+        self.scheduler.mark_down(n, why);
     }
 
-    /// How every device is doing.
+    /// Status of every device.
     #[must_use]
     pub fn status(&self) -> Vec<DeviceStatus> {
-        self.queues.status()
+        self.scheduler.status()
     }
 }
 
-/// What a caller gets whose job's thread is no more.
-pub(super) fn thread_ended() -> GpuError {
+/// Error of a job whose device thread has ended.
+fn thread_ended() -> GpuError {
     GpuError::Failed("its thread ended before the job did".to_owned())
-}
-
-/// Fails if nobody wants the job any more.
-pub(super) fn over(job: &GpuJob) -> Result<(), GpuError> {
-    if job.cancel.is_cancelled() {
-        return Err(GpuError::Surface(SurfaceError::Cancelled));
-    }
-    if job.deadline.is_some_and(|deadline| deadline <= Instant::now()) { Err(GpuError::Deadline) } else { Ok(()) }
 }
 
 impl Drop for DevicePool {
     fn drop(&mut self) {
-        self.queues.close();
+        self.scheduler.close();
         for thread in self.threads.drain(..) {
-            // What panics in there is caught in there.
+            // The thread catches its own panics.
             drop(thread.join());
         }
     }

@@ -1,39 +1,40 @@
-//! Single stages on a device, with every buffer open: what tests compare with the CPU's stages.
+//! Single stages on a device with access to every buffer, for tests that compare them with the CPU's stages.
 
+pub use super::buffers::BufferId;
 use super::engine::Engine;
 use super::error::GpuError;
-use super::executor::GpuJob;
-use super::flight::VertexBytes;
+use super::job::GpuJob;
+use super::output_layout::VertexBytes;
 use super::pipelines::Variant;
-use super::record::Dispatch;
-use super::workspace::{Needs, OutputRows, Workspace};
+use super::plan::Chunk;
+use super::plan::layout::Params;
+use super::recording::{Dispatch, workgroups};
+use super::workspace::{BufferSizes, OutputCapacity, Workspace};
 use crate::surface::Stage;
-use crate::surface::chunks::Chunk;
-use crate::surface::layout::{GROUP, Params};
 
-/// A job's buffers on a device, and its stages to be run one by one.
+/// Buffers of a job on a device, and its stages.
 #[derive(Debug)]
-pub struct Bench {
+pub struct StageProbe {
     engine: Engine,
     workspace: Workspace,
     variant: Variant,
     vertex: VertexBytes,
-    /// Row of parameters that the stages read: one chunk and one piece of output hold everything.
+    /// Parameters of the stages. One chunk and one output piece hold the whole job.
     pub params: Params,
     chunk: Chunk,
 }
 
-impl Bench {
-    /// Loads `job`, with room for so many vertices and triangles.
+impl StageProbe {
+    /// Loads `job` with output buffers for `vertices` and `triangles`.
     ///
     /// # Errors
-    /// [`GpuError`] where it does not fit.
+    /// [`GpuError`] if the job does not fit.
     pub fn new(mut engine: Engine, job: &GpuJob, vertices: u32, triangles: u32) -> Result<Self, GpuError> {
         let chunks = engine.chunks(job, None)?;
         let [chunk] = &chunks[..] else { return Err(GpuError::Failed("more than one chunk".to_owned())) };
         let chunk = chunk.clone();
-        let rows = OutputRows { vertices: vertices.into(), triangles: triangles.into(), params: 1 };
-        let loaded = engine.load(job, None, chunks, rows)?;
+        let capacity = OutputCapacity { vertices: vertices.into(), triangles: triangles.into(), params: 1 };
+        let loaded = engine.load(job, None, chunks, capacity)?;
         let params = Params {
             piece_bricks: loaded.params.n_bricks,
             vertex_capacity: vertices,
@@ -46,24 +47,24 @@ impl Bench {
 
     /// Bytes that the job needs of a buffer; the buffer may be larger.
     #[must_use]
-    pub fn needed(&self, job: &GpuJob, name: &str) -> u64 {
-        let rows = OutputRows {
+    pub fn size(&self, job: &GpuJob, id: BufferId) -> u64 {
+        let capacity = OutputCapacity {
             vertices: self.params.vertex_capacity.into(),
             triangles: self.params.triangle_capacity.into(),
             params: 1,
         };
-        Needs::new(&job.prepared.plan, std::slice::from_ref(&self.chunk), self.vertex, rows).of(name)
+        BufferSizes::new(&job.prepared.plan, std::slice::from_ref(&self.chunk), self.vertex, capacity).get(id)
     }
 
     /// Writes the start of a buffer.
-    pub fn write(&self, name: &str, bytes: &[u8]) {
-        self.engine.queue.write_buffer(self.workspace.buffer(name), 0, bytes);
+    pub fn write(&self, id: BufferId, bytes: &[u8]) {
+        self.engine.queue.write_buffer(self.workspace.buffer(id), 0, bytes);
     }
 
-    /// Fills a buffer with what no stage writes.
-    pub fn poison(&self, name: &str) {
-        let size = usize::try_from(self.workspace.buffer(name).size()).unwrap_or_default();
-        self.write(name, &vec![0xa5; size]);
+    /// Fills a buffer with a pattern that no stage writes.
+    pub fn poison(&self, id: BufferId) {
+        let size = usize::try_from(self.workspace.buffer(id).size()).unwrap_or_default();
+        self.write(id, &vec![0xa5; size]);
     }
 
     /// Runs one stage.
@@ -72,29 +73,24 @@ impl Bench {
     /// [`GpuError`] as the device reports it.
     pub fn run(&self, stage: Stage) -> Result<(), GpuError> {
         self.engine.write_params(&self.workspace, 0, &self.params);
-        let workgroups = match stage {
-            Stage::Bin | Stage::Field => self.params.n_own + self.params.n_halo,
-            Stage::Classify => self.params.n_own.div_ceil(4),
-            Stage::Scan => self.params.n_own.div_ceil(GROUP),
-            _ => self.params.piece_bricks,
-        };
+        let workgroups = workgroups(stage, &self.params);
         let mut recording = self.engine.recording();
         recording.stage(stage, &[Dispatch { workspace: &self.workspace, row: 0, workgroups, variant: self.variant }]);
-        self.engine.fly(recording, Vec::new()).map(drop)
+        self.engine.wait(self.engine.submit(recording, Vec::new())?).map(drop)
     }
 
-    /// The first `bytes` bytes of a buffer.
+    /// Reads the first `bytes` bytes of a buffer.
     ///
     /// # Errors
     /// [`GpuError`] as the device reports it.
-    pub fn read(&self, name: &str, bytes: u64) -> Result<Vec<u8>, GpuError> {
-        let landing = self.engine.landings.get(&self.engine.device, bytes.next_multiple_of(8));
+    pub fn read(&self, id: BufferId, bytes: u64) -> Result<Vec<u8>, GpuError> {
+        let mapped = bytes.next_multiple_of(8);
+        let readback = self.engine.readback.acquire(&self.engine.device, mapped);
         let mut recording = self.engine.recording();
-        let target = landing.buffer().map_err(GpuError::Failed)?;
-        recording.encoder.copy_buffer_to_buffer(self.workspace.buffer(name), 0, target, 0, bytes);
-        let landed = self.engine.fly(recording, vec![(landing, bytes.next_multiple_of(8))])?;
-        let [landed] = &landed[..] else { return Err(GpuError::Failed("no landing".to_owned())) };
-        let whole: &[u8] = (**landed).as_ref();
-        Ok(whole[..usize::try_from(bytes).unwrap_or_default()].to_vec())
+        let target = readback.buffer().map_err(GpuError::Failed)?;
+        recording.encoder.copy_buffer_to_buffer(self.workspace.buffer(id), 0, target, 0, bytes);
+        let readback = self.engine.submit_and_wait(recording, (readback, mapped))?;
+        let all: &[u8] = (*readback).as_ref();
+        Ok(all[..usize::try_from(bytes).unwrap_or_default()].to_vec())
     }
 }

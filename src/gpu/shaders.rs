@@ -1,10 +1,11 @@
-//! The six stages as the build assembled, checked and reflected them.
+//! Shaders as the build assembled, validated and reflected them.
 
 use wgpu::{BufferBindingType, ShaderStages};
 
-use crate::surface::layout::Params;
+use super::buffers::BufferId;
+use super::plan::layout::Params;
 
-/// How a shader uses a buffer.
+/// Access of a shader to a buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Access {
     Uniform,
@@ -12,46 +13,45 @@ pub(super) enum Access {
     Write,
 }
 
-/// A buffer of a shader.
+/// Buffer binding of a shader. `B` identifies the buffer: [`BufferId`] in the meshing stages, else the variable's name.
 #[derive(Debug)]
-pub(super) struct Binding {
-    /// The variable's name: what decides which buffer is bound.
-    pub(super) name: &'static str,
+pub(super) struct Binding<B: 'static> {
+    pub(super) buffer: B,
     pub(super) number: u32,
     pub(super) access: Access,
 }
 
-/// A stage's shader.
+/// Shader with its reflection.
 #[derive(Debug)]
-pub(super) struct Shader {
-    /// The stage's name.
+pub(super) struct Shader<B: 'static = &'static str> {
+    /// Name of the stage.
     pub(super) stage: &'static str,
-    /// Its text, fragments included.
+    /// Source with all fragments included.
     pub(super) source: &'static str,
-    pub(super) bindings: &'static [Binding],
+    pub(super) bindings: &'static [Binding<B>],
 }
 
-/// A struct that lies in a buffer, as a shader declares it.
+/// Struct in a buffer as a shader declares it.
 #[cfg(test)]
 #[derive(Debug)]
 pub(super) struct Layout {
     name: &'static str,
     size: usize,
-    /// Name, offset, size.
+    /// Name, offset and size of each field.
     fields: &'static [(&'static str, usize, usize)],
 }
 
 include!(concat!(env!("OUT_DIR"), "/shaders.rs"));
 
-/// Returns the complete WGSL source of every mesh stage, by stage name and in execution order.
+/// Returns the complete WGSL source of every meshing stage, by stage name and in execution order.
 pub fn stage_shaders() -> impl Iterator<Item = (&'static str, &'static str)> {
     SHADERS.iter().map(|shader| (shader.stage, shader.source))
 }
 
-impl Binding {
-    /// The binding as a layout declares it. Parameters are one of several rows of their buffer.
+impl Binding<BufferId> {
+    /// Layout entry of the binding. Parameters have a dynamic offset, which selects a row of their buffer.
     pub(super) fn layout(&self) -> wgpu::BindGroupLayoutEntry {
-        let (ty, rows) = match self.access {
+        let (ty, is_params) = match self.access {
             Access::Uniform => (BufferBindingType::Uniform, true),
             Access::Read => (BufferBindingType::Storage { read_only: true }, false),
             Access::Write => (BufferBindingType::Storage { read_only: false }, false),
@@ -61,8 +61,8 @@ impl Binding {
             visibility: ShaderStages::COMPUTE,
             ty: wgpu::BindingType::Buffer {
                 ty,
-                has_dynamic_offset: rows,
-                min_binding_size: rows.then(|| wgpu::BufferSize::new(size_of::<Params>() as u64)).flatten(),
+                has_dynamic_offset: is_params,
+                min_binding_size: is_params.then(|| wgpu::BufferSize::new(size_of::<Params>() as u64)).flatten(),
             },
             count: None,
         }
@@ -74,9 +74,9 @@ mod tests {
     use std::mem::offset_of;
 
     use super::*;
+    use crate::gpu::plan::layout::{Counters, Record, Tile};
     use crate::surface::Stage;
     use crate::surface::lattice::LatticeAtom;
-    use crate::surface::layout::{Record, Tally, Tile};
 
     /// Name, size and (field, offset) of a struct on the host.
     type Host = (&'static str, usize, Vec<(&'static str, usize)>);
@@ -128,47 +128,60 @@ mod tests {
                 base_vertex,
                 steps_per_angstrom
             ),
-            host!("Record", Record, crossing, layers, near),
-            host!("Tally", Tally, list_end, vertices, triangles, flat),
+            host!("Record", Record, crossing, layers, neighbours),
+            host!("Counters", Counters, list_end, vertices, triangles, flat),
             host!("Tile", Tile, coord, base, bricks, before, around),
         ]
     }
 
-    /// What differs between the two sides.
+    /// Returns the differences between the layouts of shaders and host.
     fn differences(shaders: &[Layout], host: &[Host]) -> Vec<String> {
         let mut wrong = Vec::new();
         for layout in shaders {
             let Some((_, size, fields)) = host.iter().find(|(name, ..)| *name == layout.name) else {
-                wrong.push(format!("{}: unknown to the host", layout.name));
+                wrong.push(format!("{}: unknown on the host", layout.name));
                 continue;
             };
             if layout.size != *size {
                 wrong.push(format!("{}: {} bytes, {size} on the host", layout.name, layout.size));
             }
-            // A field ends where the next begins: neither side has room between fields.
+            // Neither side has padding between fields, so a field ends where the next begins.
             let ends: Vec<usize> = fields.iter().skip(1).map(|(_, at)| *at).chain([*size]).collect();
-            let mine: Vec<_> = fields.iter().zip(ends).map(|((name, at), end)| (*name, *at, end - at)).collect();
-            if layout.fields != mine {
-                wrong.push(format!("{}: {:?}, {mine:?} on the host", layout.name, layout.fields));
+            let expected: Vec<_> = fields.iter().zip(ends).map(|((name, at), end)| (*name, *at, end - at)).collect();
+            if layout.fields != expected {
+                wrong.push(format!("{}: {:?}, {expected:?} on the host", layout.name, layout.fields));
             }
         }
         wrong
     }
 
     #[test]
-    fn structs_are_laid_out_alike_on_both_sides() {
+    fn structs_have_the_same_layout_on_both_sides() {
         assert_eq!(LAYOUTS.len(), host().len(), "every struct in a buffer is compared");
         assert_eq!(differences(LAYOUTS, &host()), Vec::<String>::new());
     }
 
     #[test]
-    fn the_pictures_structs_are_laid_out_alike_on_both_sides() {
-        use crate::gpu::picture_targets::{Numbers, Tap, View};
+    fn structs_of_pictures_have_the_same_layout_on_both_sides() {
+        use crate::gpu::picture_targets::{FinishParams, Tap, View};
         let mut all = vec![
             host!("View", View, right, up, toward, light, size, offset, scale, reach, diffuse, pad),
             host!(
-                "Numbers", Numbers, color, behind, size, n_taps, line, falloff, bias, strength, darkest, step_from,
-                step_to, ink, pad
+                "FinishParams",
+                FinishParams,
+                color,
+                background,
+                size,
+                n_taps,
+                line_width,
+                falloff,
+                bias,
+                strength,
+                min_light,
+                step_min,
+                step_max,
+                line_strength,
+                pad
             ),
             host!("Tap", Tap, pixels, length),
         ];
@@ -179,19 +192,19 @@ mod tests {
     }
 
     #[test]
-    fn a_moved_field_a_wrong_size_and_an_unknown_struct_are_found() {
+    fn control_a_moved_field_a_wrong_size_and_an_unknown_struct_are_found() {
         let mut host = host();
         host[0].2[1].1 += 4;
         assert_eq!(differences(LAYOUTS, &host).len(), 1);
         host[1].1 += 16;
-        // The size itself, and the last field's end.
+        // The size, and the end of the last field.
         assert_eq!(differences(LAYOUTS, &host).len(), 3);
         host.remove(4);
         assert_eq!(differences(LAYOUTS, &host).len(), 4);
     }
 
     #[test]
-    fn every_stage_has_its_shader_in_order() {
+    fn shaders_are_in_stage_order() {
         let names: Vec<_> = SHADERS.iter().map(|shader| shader.stage).collect();
         let stages: Vec<_> = Stage::ALL[..6].iter().map(|stage| stage.name()).collect();
         assert_eq!(names, stages);

@@ -1,67 +1,81 @@
-//! Submissions: sent off, waited for, read. One may be sent before another has come back: the device runs them in order,
-//! and begins the next without waiting for the host.
+//! Submissions to the device queue. A submission may follow another before that is finished: the device runs them in
+//! order without waiting for the host.
 
+use std::ops::Range;
 use std::sync::Arc;
 
-use super::engine::{Engine, Times, scaled};
+use super::engine::Engine;
 use super::error::GpuError;
-use super::flight::values;
-use super::landing::Landing;
+use super::output_layout::values;
 use super::pipelines::N_STAGES;
-use super::record::Recording;
+use super::readback::ReadbackBuffer;
+use super::recording::{Recording, ticks_to_ns};
 
-/// A submission on its way.
-pub(super) struct Flight {
+/// Device time per stage, ns.
+pub(super) type StageTimes = [u64; N_STAGES];
+
+/// Submission that was sent to the device and has not been waited for.
+pub(super) struct PendingSubmission {
     index: wgpu::SubmissionIndex,
-    landings: Vec<(Landing, u64)>,
+    readbacks: Vec<(ReadbackBuffer, u64)>,
 }
 
 impl Engine {
-    /// Submits, and asks for the landings' first bytes.
-    pub(super) fn launch(&self, recording: Recording<'_>, landings: Vec<(Landing, u64)>) -> Result<Flight, GpuError> {
-        let index = self.queue.submit([recording.encoder.finish()]);
-        for (landing, bytes) in &landings {
-            landing.request(*bytes).map_err(GpuError::Failed)?;
-        }
-        self.submissions.update(|n| n + 1);
-        Ok(Flight { index, landings })
-    }
-
-    /// Waits for a submission and all before it, and returns the landings' first bytes.
-    pub(super) fn land(&self, flight: Flight) -> Result<Vec<Arc<Landing>>, GpuError> {
-        let Flight { index, landings } = flight;
-        let waited = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });
-        if waited.is_err() {
-            // A loss is told by a callback, which a device that cannot wait any more has not run yet.
-            _ = self.device.poll(wgpu::PollType::Poll);
-        }
-        self.healthy()?;
-        waited.map_err(|e| GpuError::Failed(e.to_string()))?;
-        landings.into_iter().map(|(landing, bytes)| landing.look(bytes).map_err(GpuError::Failed)).collect()
-    }
-
-    /// Submits, waits, and returns the landings' first bytes.
-    pub(super) fn fly(
+    /// Submits a recording and requests to map the given number of bytes of each readback buffer.
+    pub(super) fn submit(
         &self,
         recording: Recording<'_>,
-        landings: Vec<(Landing, u64)>,
-    ) -> Result<Vec<Arc<Landing>>, GpuError> {
-        self.land(self.launch(recording, landings)?)
+        readbacks: Vec<(ReadbackBuffer, u64)>,
+    ) -> Result<PendingSubmission, GpuError> {
+        let index = self.queue.submit([recording.encoder.finish()]);
+        for (readback, bytes) in &readbacks {
+            readback.map(*bytes).map_err(GpuError::Failed)?;
+        }
+        self.submissions.update(|n| n + 1);
+        Ok(PendingSubmission { index, readbacks })
     }
 
-    pub(super) fn recording(&self) -> Recording<'_> {
-        Recording::new(&self.device, &self.pipelines, self.clock.as_ref())
+    /// Waits for a submission and all before it. Returns the mapped readback buffers.
+    pub(super) fn wait(&self, submission: PendingSubmission) -> Result<Vec<Arc<ReadbackBuffer>>, GpuError> {
+        let PendingSubmission { index, readbacks } = submission;
+        let waited = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });
+        if waited.is_err() {
+            // The callback that reports a lost device runs only when the device is polled.
+            _ = self.device.poll(wgpu::PollType::Poll);
+        }
+        self.check_errors()?;
+        waited.map_err(|e| GpuError::Failed(e.to_string()))?;
+        readbacks.into_iter().map(|(readback, bytes)| readback.mapped(bytes).map_err(GpuError::Failed)).collect()
     }
 
-    /// The times of the stages from `first` to `last` in a landing.
-    pub(super) fn times(&self, landing: &Landing, stages: std::ops::Range<usize>) -> Result<Times, GpuError> {
-        let mut times = [0; N_STAGES];
-        if let Some(clock) = &self.clock {
-            let ticks: &[u64] = values(landing.as_ref(), 0, 2 * N_STAGES as u64).map_err(GpuError::Failed)?;
+    /// Submits a recording with one readback buffer and waits for it.
+    pub(super) fn submit_and_wait(
+        &self,
+        recording: Recording<'_>,
+        readback: (ReadbackBuffer, u64),
+    ) -> Result<Arc<ReadbackBuffer>, GpuError> {
+        self.wait_one(self.submit(recording, vec![readback])?)
+    }
+
+    /// Waits for a submission that has one readback buffer.
+    pub(super) fn wait_one(&self, submission: PendingSubmission) -> Result<Arc<ReadbackBuffer>, GpuError> {
+        let mapped = self.wait(submission)?.pop();
+        mapped.ok_or_else(|| GpuError::Failed("a submission without its readback buffer".to_owned()))
+    }
+
+    /// Adds the times of `stages` in a readback buffer to `times`.
+    pub(super) fn add_times(
+        &self,
+        times: &mut StageTimes,
+        readback: &ReadbackBuffer,
+        stages: Range<usize>,
+    ) -> Result<(), GpuError> {
+        if let Some(timer) = &self.timer {
+            let ticks: &[u64] = values(readback.as_ref(), 0, 2 * N_STAGES as u64).map_err(GpuError::Failed)?;
             for s in stages {
-                times[s] = scaled(ticks[2 * s + 1].saturating_sub(ticks[2 * s]), f64::from(clock.period));
+                times[s] += ticks_to_ns(ticks[2 * s + 1].saturating_sub(ticks[2 * s]), timer.period);
             }
         }
-        Ok(times)
+        Ok(())
     }
 }

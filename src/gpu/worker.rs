@@ -1,90 +1,90 @@
-//! A device's thread: it owns what runs jobs there, catches what goes wrong, and builds it anew.
+//! Thread of a device: owns the executor, catches its failures and rebuilds it.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
+use super::device_queue::{QueuedJob, RunOutcome};
 use super::error::GpuError;
-use super::executor::{Executor, GpuJob};
-use super::lane::{Entry, Run};
-use super::queue::{Answer, Queues, shows_health};
+use super::executor::Executor;
+use super::job::{GpuJob, JobResult};
+use super::scheduler::{Scheduler, proves_device_works};
 
-/// Makes what runs jobs on one device: at the start, and again after a failure.
+/// Builds the executor of a device, at the start and after each failure.
 pub type Build = Box<dyn Fn() -> Result<Box<dyn Executor>, GpuError> + Send + Sync>;
 
-/// Rebuilds without a finished job before a device is given up. Three: a driver that recovers does so at the first or
-/// second attempt, and a job that kills devices must not keep one busy for ever.
-pub const MOST_REBUILDS: usize = 3;
+/// Maximum number of consecutive rebuilds without a finished job. Drivers that recover do so at the first or second
+/// attempt, and a job that crashes devices must not keep one busy forever.
+pub const MAX_REBUILDS: usize = 3;
 
-/// How long a device's thread waits.
+/// Waiting times of a device thread.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Times {
-    /// After a failed rebuild.
-    pub(super) pause: Duration,
-    /// For work, before the device lets go what it keeps for it.
-    pub(super) rest: Duration,
+pub(super) struct Timing {
+    /// Pause after a failed rebuild.
+    pub(super) rebuild_pause: Duration,
+    /// Time without work after which idle memory is released.
+    pub(super) idle: Duration,
 }
 
-/// Runs jobs on device `n` until the queues are closed or it is given up.
-pub(super) fn work(queues: &Queues, n: usize, build: &Build, times: Times) {
-    // Nothing outside the executor should panic; if it does, nobody may wait for this thread in vain.
-    let ended = catch_unwind(AssertUnwindSafe(|| run(queues, n, build, times)));
+/// Runs jobs on device `n` until the scheduler is closed or the device is given up.
+pub(super) fn work(scheduler: &Scheduler, n: usize, build: &Build, timing: Timing) {
+    // Only the executor is expected to panic. Any other panic must not leave callers waiting.
+    let ended = catch_unwind(AssertUnwindSafe(|| run(scheduler, n, build, timing)));
     if let Err(payload) = ended {
-        queues.down(n, &format!("its thread panicked: {}", words(&*payload)));
+        scheduler.mark_down(n, &format!("its thread panicked: {}", message(&*payload)));
     }
 }
 
-fn run(queues: &Queues, n: usize, build: &Build, times: Times) {
-    let mut executor = match built(build) {
+fn run(scheduler: &Scheduler, n: usize, build: &Build, timing: Timing) {
+    let mut executor = match try_build(build) {
         Ok(executor) => executor,
-        Err(error) => return queues.down(n, &error.to_string()),
+        Err(error) => return scheduler.mark_down(n, &error.to_string()),
     };
-    queues.up(n);
-    while let Some(entries) = queues.next(n, times.rest) {
-        if entries.is_empty() {
-            executor.rest();
-            queues.holds(n, executor.held_bytes());
+    scheduler.mark_up(n);
+    while let Some(batch) = scheduler.next_batch(n, timing.idle) {
+        if batch.is_empty() {
+            executor.release_idle_memory();
+            scheduler.set_held_bytes(n, executor.held_bytes());
             continue;
         }
-        let begun = Instant::now();
-        let answers = attempt(executor.as_mut(), &entries);
-        let (time, held_bytes) = (begun.elapsed(), executor.held_bytes());
-        let Some(why) = answers.iter().find_map(blame) else {
-            queues.done(n, entries, answers, Run { time, held_bytes, lost: false, down: None });
+        let start = Instant::now();
+        let results = run_batch(executor.as_mut(), &batch);
+        let (time, held_bytes) = (start.elapsed(), executor.held_bytes());
+        let Some(why) = results.iter().find_map(device_failure) else {
+            scheduler.finish_batch(n, batch, results, RunOutcome { time, held_bytes, failed: false, down: None });
             continue;
         };
-        let given_up = |why: &str| format!("given up after {MOST_REBUILDS} rebuilds without a finished job: {why}");
-        // A job that came to its end beside the failed one starts the count anew.
-        let hopeless = queues.streak(n) >= MOST_REBUILDS && !answers.iter().any(shows_health);
-        queues.done(n, entries, answers, Run { time, held_bytes, lost: true, down: hopeless.then(|| given_up(&why)) });
+        let given_up = |why: &str| format!("given up after {MAX_REBUILDS} rebuilds without a finished job: {why}");
+        let give_up = scheduler.consecutive_rebuilds(n) >= MAX_REBUILDS && !results.iter().any(proves_device_works);
+        let down = give_up.then(|| given_up(&why));
+        scheduler.finish_batch(n, batch, results, RunOutcome { time, held_bytes, failed: true, down });
         discard(executor);
-        if hopeless {
+        if give_up {
             return;
         }
-        match rebuilt(queues, n, build, times.pause, why) {
-            Ok(new) => executor = new,
-            Err(why) => return queues.down(n, &given_up(&why)),
+        match rebuild(scheduler, n, build, timing.rebuild_pause, why) {
+            Ok(rebuilt) => executor = rebuilt,
+            Err(why) => return scheduler.mark_down(n, &given_up(&why)),
         }
     }
     discard(executor);
 }
 
-/// Builds until it works, with a pause that doubles: a driver that restarts takes its time. Fails with the last reason.
-fn rebuilt(
-    queues: &Queues,
+/// Rebuilds the executor. The pause between attempts doubles, because a driver takes time to restart. Fails with the
+/// last reason.
+fn rebuild(
+    scheduler: &Scheduler,
     n: usize,
     build: &Build,
-    pause: Duration,
-    why: String,
+    mut pause: Duration,
+    mut why: String,
 ) -> Result<Box<dyn Executor>, String> {
-    let mut why = why;
-    let mut pause = pause;
-    while queues.rebuilding(n, MOST_REBUILDS) {
-        match built(build) {
+    while scheduler.count_rebuild(n, MAX_REBUILDS) {
+        match try_build(build) {
             Ok(executor) => return Ok(executor),
             Err(error) => why = error.to_string(),
         }
-        if !queues.pause(n, pause) {
+        if !scheduler.pause(n, pause) {
             return Err("the devices are being closed".to_owned());
         }
         pause *= 2;
@@ -92,43 +92,43 @@ fn rebuilt(
     Err(why)
 }
 
-fn built(build: &Build) -> Result<Box<dyn Executor>, GpuError> {
+fn try_build(build: &Build) -> Result<Box<dyn Executor>, GpuError> {
     catch_unwind(AssertUnwindSafe(build)).unwrap_or_else(|payload| Err(panicked(&*payload)))
 }
 
-/// Runs the jobs; one answer for each, whatever the executor does.
-fn attempt(executor: &mut dyn Executor, entries: &[Entry]) -> Vec<Answer> {
-    let jobs: Vec<GpuJob> = entries.iter().map(|entry| entry.job.clone()).collect();
+/// Runs a batch. Returns one result per job even if the executor panics or returns too few.
+fn run_batch(executor: &mut dyn Executor, batch: &[QueuedJob]) -> Vec<JobResult> {
+    let jobs: Vec<GpuJob> = batch.iter().map(|queued| queued.job.clone()).collect();
     let all = |error: &GpuError| jobs.iter().map(|_| Err(error.clone())).collect();
-    let run = || match entries {
-        [Entry { job, share: Some(share), .. }] => vec![executor.part(job, share)],
+    let run = || match batch {
+        [QueuedJob { job, partition: Some(partition), .. }] => vec![executor.run_partition(job, partition)],
         _ => executor.run(&jobs),
     };
     match catch_unwind(AssertUnwindSafe(run)) {
-        Ok(answers) if answers.len() == jobs.len() => answers,
-        Ok(answers) => all(&GpuError::Failed(format!("{} answers to {} jobs", answers.len(), jobs.len()))),
+        Ok(results) if results.len() == jobs.len() => results,
+        Ok(results) => all(&GpuError::Failed(format!("{} results for {} jobs", results.len(), jobs.len()))),
         Err(payload) => all(&panicked(&*payload)),
     }
 }
 
-/// What an answer holds against the device. Too little memory is no defect: the next job may be smaller.
-fn blame(answer: &Answer) -> Option<String> {
-    match answer {
+/// Reason to discard the executor. A lack of memory is none: the next job may be smaller.
+fn device_failure(result: &JobResult) -> Option<String> {
+    match result {
         Err(GpuError::OutOfMemory { .. }) | Ok(_) => None,
-        Err(error) => error.is_the_devices().then(|| error.to_string()),
+        Err(error) => error.is_device_failure().then(|| error.to_string()),
     }
 }
 
-/// Drops what has failed. Its drivers may not like that either.
+/// Drops an executor, which may panic after a failure.
 fn discard(executor: Box<dyn Executor>) {
     drop(catch_unwind(AssertUnwindSafe(|| drop(executor))));
 }
 
 fn panicked(payload: &(dyn Any + Send)) -> GpuError {
-    GpuError::Failed(format!("it panicked: {}", words(payload)))
+    GpuError::Failed(format!("it panicked: {}", message(payload)))
 }
 
-fn words(payload: &(dyn Any + Send)) -> &str {
+fn message(payload: &(dyn Any + Send)) -> &str {
     let text = payload.downcast_ref::<&str>().copied();
     text.or_else(|| payload.downcast_ref::<String>().map(String::as_str)).unwrap_or("no message")
 }

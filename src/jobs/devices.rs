@@ -1,4 +1,4 @@
-//! Tells metrics and log how the backend's devices are doing.
+//! Publishes the status of the devices as metrics and logs changes.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -6,16 +6,16 @@ use metrics::{counter, gauge};
 
 use crate::surface::DeviceStatus;
 use crate::telemetry::{
-    DEVICE_BUSY, DEVICE_JOBS, DEVICE_LOST, DEVICE_MEMORY, DEVICE_REBUILDS, DEVICE_SHARED, DEVICE_SPREAD, DEVICE_UP,
+    DEVICE_BUSY, DEVICE_JOBS, DEVICE_LOST, DEVICE_MEMORY, DEVICE_PARTITIONS, DEVICE_REBUILDS, DEVICE_SHARED, DEVICE_UP,
     DEVICE_WAITING,
 };
 
-/// What the log knows of each device: its rebuilds, and whether it was up.
+/// State of each device at the last call: number of rebuilds, and whether it was up.
 #[derive(Debug, Default)]
 pub(super) struct Watch(Mutex<Vec<(u64, bool)>>);
 
 impl Watch {
-    /// Publishes `devices`, and logs what has changed since the last time.
+    /// Publishes the status of `devices` and logs changes since the last call.
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
     pub(super) fn publish(&self, devices: &[DeviceStatus]) {
         let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -30,16 +30,16 @@ impl Watch {
             counter!(DEVICE_LOST, "device" => number.clone()).absolute(device.lost);
             counter!(DEVICE_REBUILDS, "device" => number.clone()).absolute(device.rebuilds);
             counter!(DEVICE_SHARED, "device" => number.clone()).absolute(device.shared);
-            counter!(DEVICE_SPREAD, "device" => number.clone()).absolute(device.spread);
+            counter!(DEVICE_PARTITIONS, "device" => number.clone()).absolute(device.partitions);
             for (outcome, count) in [("finished", device.finished), ("failed", device.failed)] {
                 counter!(DEVICE_JOBS, "device" => number.clone(), "outcome" => outcome).absolute(count);
             }
             let DeviceStatus { number, name, rebuilds, .. } = device;
             if *rebuilds > known.0 {
-                tracing::warn!(device = number, name, rebuilds, "a device failed and was built anew");
+                tracing::warn!(device = number, name, rebuilds, "a device failed and was rebuilt");
             }
             match &device.down {
-                Some(why) if known.1 => tracing::error!(device = number, name, why, "a device takes no jobs any more"),
+                Some(why) if known.1 => tracing::error!(device = number, name, why, "a device is down"),
                 _ => {}
             }
             *known = (*rebuilds, up);

@@ -1,26 +1,26 @@
-//! The principal axes of a surface: of its area, not of its vertices, so that a turned molecule has turned axes.
+//! Principal axes of a surface, weighted by area rather than by vertices, so that they rotate with the molecule.
 
 use rayon::prelude::*;
 
-/// Triangles that are summed by one task. Fixed, so that sums do not hang on the number of threads.
+/// Number of triangles per task. Fixed, so that sums do not depend on the number of threads.
 const CHUNK: usize = 1 << 14;
-/// Triangles that axes are taken from at most: of more, every second, third and so on. They lie in space as the others do.
-const MOST: usize = 1 << 16;
-/// Third moment, in cubes of the standard deviation, below which a shape counts as the same at both ends of an axis.
+/// Maximum number of triangles that are used; of larger meshes every second, third and so on.
+const MAX_TRIANGLES: usize = 1 << 16;
+/// Third moment, in cubes of the standard deviation, below which a shape is considered symmetric along an axis.
 const SKEWED: f64 = 1e-3;
-/// Sweeps of the eigenvalue iteration; five are enough for 3 × 3.
+/// Number of sweeps of the eigenvalue iteration; five suffice for 3 × 3 matrices.
 const SWEEPS: usize = 32;
 
 type Vec3 = [f64; 3];
 type Mat3 = [Vec3; 3];
 
-/// The axes of the view: right, up, towards the viewer. The greatest spread of the area lies along the first, the least
-/// along the last. The longer tail of the area points right and up; where both are alike, the axis' largest component in the
-/// file's coordinates is positive.
+/// Axes of the view: right, up, towards the viewer. The variance of the area is largest along the first and smallest
+/// along the last. The longer tail of the area points right and up; for symmetric shapes, the largest component of the
+/// axis in file coordinates is positive.
 pub(super) fn principal(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> Mat3 {
-    let step = triangles.len().div_ceil(MOST).max(1);
-    let some: Vec<[u32; 3]> = if step > 1 { triangles.iter().step_by(step).copied().collect() } else { Vec::new() };
-    let triangles = if step > 1 { &some[..] } else { triangles };
+    let step = triangles.len().div_ceil(MAX_TRIANGLES).max(1);
+    let sample: Vec<[u32; 3]> = if step > 1 { triangles.iter().step_by(step).copied().collect() } else { Vec::new() };
+    let triangles = if step > 1 { &sample[..] } else { triangles };
     let (area, sum, square) = moments(positions, triangles);
     if area <= 0.0 {
         return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
@@ -52,7 +52,7 @@ fn dot(a: Vec3, b: Vec3) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// A triangle's corners and its area.
+/// Corners and area of a triangle.
 fn corners(positions: &[[f32; 3]], triangle: [u32; 3]) -> ([Vec3; 3], f64) {
     let corners = triangle.map(|v| positions[v as usize].map(f64::from));
     let [a, b, c] = corners;
@@ -61,7 +61,7 @@ fn corners(positions: &[[f32; 3]], triangle: [u32; 3]) -> ([Vec3; 3], f64) {
     (corners, 0.5 * dot(normal, normal).sqrt())
 }
 
-/// Integrals over the surface: of 1, of the position, of its products.
+/// Integrals of 1, of the position, and of products of its components over the surface.
 fn moments(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> (f64, Vec3, Mat3) {
     let of_chunk = |chunk: &[[u32; 3]]| {
         let (mut area, mut sum, mut square) = (0.0, [0.0; 3], [[0.0; 3]; 3]);
@@ -72,7 +72,7 @@ fn moments(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> (f64, Vec3, Mat3) 
             for i in 0..3 {
                 sum[i] += a * total[i] / 3.0;
                 for j in 0..3 {
-                    // Exact for products over a flat triangle.
+                    // Exact over a flat triangle.
                     let corners: f64 = corners.iter().map(|c| c[i] * c[j]).sum();
                     square[i][j] += a / 12.0 * (corners + total[i] * total[j]);
                 }
@@ -88,7 +88,7 @@ fn moments(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> (f64, Vec3, Mat3) 
     })
 }
 
-/// Integrals of the third power of the distance from `mean` along two axes.
+/// Integrals of the cubed distance from `mean` along two axes over the surface.
 fn third_moments(positions: &[[f32; 3]], triangles: &[[u32; 3]], mean: Vec3, axes: [Vec3; 2]) -> [f64; 2] {
     let of_chunk = |chunk: &[[u32; 3]]| {
         let mut sums = [0.0; 2];
@@ -106,7 +106,7 @@ fn third_moments(positions: &[[f32; 3]], triangles: &[[u32; 3]], mean: Vec3, axe
     parts.iter().fold([0.0; 2], |sums, part| std::array::from_fn(|k| sums[k] + part[k]))
 }
 
-/// Eigenvalues, greatest first, and their unit vectors, by Jacobi's rotations.
+/// Eigenvalues in descending order and their unit vectors, by Jacobi rotations.
 fn eigen(mut m: Mat3) -> (Vec3, Mat3) {
     // The rows of `axes` become the vectors.
     let mut axes = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
@@ -140,7 +140,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn eigenvectors_are_what_their_name_says() {
+    fn eigenvectors_satisfy_their_definition() {
         let m = [[4.0, 1.0, -2.0], [1.0, 3.0, 0.5], [-2.0, 0.5, 1.0]];
         let (values, axes) = eigen(m);
         assert!(values[0] > values[1] && values[1] > values[2], "{values:?}");
@@ -154,8 +154,8 @@ mod tests {
     }
 
     #[test]
-    fn a_flat_plate_is_seen_from_above_however_it_is_cut() {
-        // A plate 4 × 2 in the plane of y and z, in two triangles, and in eight of the same plate.
+    fn the_view_of_a_plate_does_not_depend_on_its_triangulation() {
+        // A plate of 4 × 2 in the y-z plane, as two and as eight triangles.
         let at = |y: f32, z: f32| [0.0, y, z];
         let coarse = ([at(0., 0.), at(4., 0.), at(4., 2.), at(0., 2.)].to_vec(), vec![[0, 1, 2], [0, 2, 3]]);
         let mut fine = (Vec::new(), Vec::new());

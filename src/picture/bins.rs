@@ -1,43 +1,43 @@
-//! Triangles by tile: which of them face the viewer, and where each of them may be seen.
+//! Binning of the front-facing triangles by screen tile.
 
 use rayon::prelude::*;
 
 use super::camera::Camera;
 
-/// Columns of a tile.
+/// Width of a tile in pixels.
 pub(super) const TILE_WIDTH: usize = 64;
-/// Rows of a tile.
+/// Height of a tile in pixels.
 pub(super) const TILE_HEIGHT: usize = 16;
-/// Parts of a pixel that coordinates are rounded to: neighbours share their corners exactly.
+/// Subpixels per pixel. Rounded coordinates make adjacent triangles share their corners exactly.
 pub(super) const PARTS: i32 = 256;
-/// Tasks at most. Fixed, so that lists do not hang on the number of threads; each has an offset for every tile.
-const MOST_CHUNKS: usize = 64;
-/// Triangles of a task at least.
-const LEAST_CHUNK: usize = 1 << 12;
+/// Maximum number of tasks. Fixed, so that lists do not depend on the number of threads.
+const MAX_CHUNKS: usize = 64;
+/// Minimum number of triangles per task.
+const MIN_CHUNK: usize = 1 << 12;
 
-/// A corner: column and row in parts of a pixel.
+/// Corner of a triangle: column and row in subpixels.
 pub(super) type Corner = [i32; 2];
 
-/// Twice the area of a triangle in square parts, positive where its corners run clockwise on the screen.
+/// Twice the area of a triangle in square subpixels, positive if its corners are clockwise on the screen.
 #[inline]
 pub(super) fn twice_area([a, b, c]: [Corner; 3]) -> i64 {
     let [ab, ac] = [b, c].map(|p| [i64::from(p[0]) - i64::from(a[0]), i64::from(p[1]) - i64::from(a[1])]);
     ab[0] * ac[1] - ab[1] * ac[0]
 }
 
-/// Added to a number, it leaves the nearest whole one in the last bits: several times as fast as a call to round, which is
-/// what processors without the instruction get.
+/// Addend that leaves the nearest integer in the last bits of a sum. Several times as fast as `round`, which is a
+/// function call for processors without a rounding instruction.
 const ROUNDING: f64 = 6_755_399_441_055_744.0;
 
-/// The corner at which a position in pixels is.
+/// Corner at a position in pixels.
 #[inline]
 pub(super) fn corner(place: [f32; 3]) -> Corner {
-    #[expect(clippy::cast_possible_truncation, reason = "the last bits are what is wanted")]
+    #[expect(clippy::cast_possible_truncation, reason = "the last bits hold the integer")]
     let round = |parts: f64| ((parts + ROUNDING).to_bits() as u32).cast_signed();
     [place[0], place[1]].map(|c| round(f64::from(c) * f64::from(PARTS)))
 }
 
-/// The tiles of a picture.
+/// Tiles of a picture.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Tiles {
     pub(super) across: usize,
@@ -50,24 +50,24 @@ impl Tiles {
     }
 }
 
-/// The triangles of one task, by tile.
+/// Triangles of one task, by tile.
 struct Chunk {
-    /// Where each tile's list begins; one more than there are tiles.
+    /// Start of the list of each tile; the last entry is the total.
     starts: Vec<u32>,
     triangles: Vec<u32>,
 }
 
-/// Triangles that face the viewer, by tile, ascending.
+/// Front-facing triangles by tile, ascending.
 pub(super) struct Bins(Vec<Chunk>);
 
 impl Bins {
     pub(super) fn new(positions: &[[f32; 3]], triangles: &[[u32; 3]], camera: &Camera, tiles: Tiles) -> Self {
-        let chunk = triangles.len().div_ceil(MOST_CHUNKS).max(LEAST_CHUNK);
+        let chunk = triangles.len().div_ceil(MAX_CHUNKS).max(MIN_CHUNK);
         let of_chunk = |(n, part): (usize, &[[u32; 3]])| bin(positions, part, n * chunk, camera, tiles);
         Self(triangles.par_chunks(chunk).enumerate().map(of_chunk).collect())
     }
 
-    /// The triangles of a tile.
+    /// Returns the triangles of a tile.
     pub(super) fn of(&self, tile: usize) -> impl Iterator<Item = u32> {
         self.0.iter().flat_map(move |chunk| {
             let [from, to] = [tile, tile + 1].map(|t| chunk.starts.get(t).map_or(0, |at| *at as usize));
@@ -81,14 +81,14 @@ fn bin(positions: &[[f32; 3]], part: &[[u32; 3]], first: usize, camera: &Camera,
     let mut starts = vec![0_u32; tiles.across * tiles.down + 1];
     for (n, triangle) in part.iter().enumerate() {
         let corners = triangle.map(|v| corner(camera.place(positions[v as usize])));
-        // Rows run downwards: what is counter-clockwise from outside is clockwise with its sign turned around.
+        // Rows count downwards, so counter-clockwise triangles have a negative area on the screen.
         if twice_area(corners) >= 0 {
             continue;
         }
         let span = |axis: usize, size: usize, n: usize| {
             let low = corners.iter().map(|c| c[axis]).min().unwrap_or_default();
             let high = corners.iter().map(|c| c[axis]).max().unwrap_or_default();
-            // Samples lie inside pixels, so that a corner on a border reaches the pixel behind it in vain at most.
+            // A corner on a pixel boundary adds the next pixel, which has no sample there.
             let tile = |at: i32| usize::try_from(at.max(0) / PARTS).unwrap_or(0) / size;
             (high >= 0).then(|| (tile(low), tile(high).min(n - 1)))
         };
@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn corners_are_the_nearest_parts_and_areas_have_a_sign() {
+    fn corners_are_rounded_and_areas_are_signed() {
         for (pixels, parts) in
             [(0.0, 0), (1.0, 256), (-1.0, -256), (16_384.0, 1 << 22), (0.3, 77), (-0.3, -77), (100.75, 25_792)]
         {

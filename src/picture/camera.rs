@@ -1,57 +1,58 @@
-//! Where the viewer stands: directions, scale and place of the picture, from the mesh and the view.
+//! Camera: directions, scale and offset of a picture, from the mesh and the view.
 
 use rayon::prelude::*;
 
 use super::axes;
 use super::{PictureParams, View};
 
-/// Vertices that one task looks at.
+/// Number of vertices per task.
 const CHUNK: usize = 1 << 14;
-/// Part of the picture that stays free on each side.
+/// Margin on each side, as a share of the picture.
 const MARGIN: f64 = 0.04;
 
-/// An orthographic view.
+/// Orthographic view.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
-    /// Unit vectors of the mesh's coordinates: right, up, towards the viewer.
+    /// Unit vectors in mesh coordinates: right, up, towards the viewer.
     pub axes: [[f32; 3]; 3],
-    /// What is added to the projections of a position: the middle of the mesh lies in the middle of the picture, the point
-    /// next to the viewer at depth 0. Å.
+    /// Offsets of the projections of a position, Å. They move the centre of the mesh to the centre of the picture and
+    /// the nearest point to depth 0.
     pub shift: [f32; 3],
     /// Pixels per Å.
     pub scale: f32,
-    /// Depth of the point farthest from the viewer, Å.
+    /// Depth of the farthest point, Å.
     pub reach: f32,
-    /// Half of width and height, pixels.
+    /// Half of the width and of the height, pixels.
     pub middle: [f32; 2],
 }
 
 impl Camera {
-    /// The view of a mesh that fills the picture.
+    /// View of a mesh that fills the picture.
     #[must_use]
     pub fn new(positions: &[[f32; 3]], triangles: &[[u32; 3]], params: &PictureParams) -> Self {
-        let wide = turned(directions(positions, triangles, params.view), params.azimuth, params.elevation);
+        let wide = rotated(directions(positions, triangles, params.view), params.azimuth, params.elevation);
         #[expect(clippy::cast_possible_truncation, reason = "components of unit vectors")]
         let axes = wide.map(|axis| axis.map(|c| c as f32));
         let [low, high] = bounds(positions, &axes);
         let size: [f64; 2] = std::array::from_fn(|k| f64::from(high[k]) - f64::from(low[k]));
         let pixels = [params.width, params.height].map(f64::from);
-        let room = 1.0 - 2.0 * MARGIN;
-        // A mesh without extent is as good as one of 1 Å.
-        let fits = |k: usize| pixels[k] * room / if size[k] > 0.0 { size[k] } else { 1.0 };
+        let usable = 1.0 - 2.0 * MARGIN;
+        // A mesh without extent is treated as one of 1 Å.
+        let fits = |k: usize| pixels[k] * usable / if size[k] > 0.0 { size[k] } else { 1.0 };
         #[expect(clippy::cast_possible_truncation, reason = "16,384 pixels at most, over the extent of a mesh")]
         let (scale, middle) = (fits(0).min(fits(1)) as f32, pixels.map(|n| (n / 2.0) as f32));
         let shift = [-0.5 * (low[0] + high[0]), -0.5 * (low[1] + high[1]), high[2]];
         Self { axes, shift, scale, reach: high[2] - low[2], middle }
     }
 
-    /// Å that a pixel is wide.
+    /// Width of a pixel, Å.
     #[must_use]
     pub fn pixel(&self) -> f64 {
         1.0 / f64::from(self.scale)
     }
 
-    /// Column and row in pixels from the upper left corner, and depth in Å behind the nearest point.
+    /// Projects a position: column and row in pixels from the upper left corner, and depth in Å behind the nearest
+    /// point.
     #[inline]
     #[must_use]
     pub fn place(&self, position: [f32; 3]) -> [f32; 3] {
@@ -63,7 +64,7 @@ impl Camera {
         ]
     }
 
-    /// A direction as the viewer sees it: right, up, towards.
+    /// Transforms a direction to view space: right, up, towards.
     #[inline]
     #[must_use]
     pub fn turn(&self, direction: [f32; 3]) -> [f32; 3] {
@@ -76,7 +77,7 @@ pub(super) fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// Right, up and towards the viewer.
+/// Axes of a named view: right, up, towards the viewer.
 fn directions(positions: &[[f32; 3]], triangles: &[[u32; 3]], view: View) -> [[f64; 3]; 3] {
     const X: [f64; 3] = [1.0, 0.0, 0.0];
     const Y: [f64; 3] = [0.0, 1.0, 0.0];
@@ -93,8 +94,8 @@ fn directions(positions: &[[f32; 3]], triangles: &[[u32; 3]], view: View) -> [[f
     }
 }
 
-/// The same, after a walk around the upright axis and a climb, in degrees.
-fn turned([right, up, toward]: [[f64; 3]; 3], azimuth: f64, elevation: f64) -> [[f64; 3]; 3] {
+/// Axes rotated by azimuth and elevation, degrees.
+fn rotated([right, up, toward]: [[f64; 3]; 3], azimuth: f64, elevation: f64) -> [[f64; 3]; 3] {
     let mix = |a: [f64; 3], x: f64, b: [f64; 3], y: f64| std::array::from_fn(|k| a[k] * x + b[k] * y);
     let (sin, cos) = azimuth.to_radians().sin_cos();
     let (toward, right): ([f64; 3], [f64; 3]) = (mix(toward, cos, right, sin), mix(right, cos, toward, -sin));
@@ -102,7 +103,7 @@ fn turned([right, up, toward]: [[f64; 3]; 3], azimuth: f64, elevation: f64) -> [
     [right, mix(up, cos, toward, -sin), mix(toward, cos, up, sin)]
 }
 
-/// Lowest and highest projection on each axis.
+/// Minimum and maximum projection on each axis.
 fn bounds(positions: &[[f32; 3]], axes: &[[f32; 3]; 3]) -> [[f32; 3]; 2] {
     let of_chunk = |chunk: &[[f32; 3]]| {
         chunk.iter().fold([[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]], |[low, high], position| {
@@ -140,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn every_view_shows_the_side_that_it_names() {
+    fn named_views_have_their_directions() {
         for (view, toward, right) in [
             (View::Front, [0., 0., 1.], [1., 0., 0.]),
             (View::Back, [0., 0., -1.], [-1., 0., 0.]),

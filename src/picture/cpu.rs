@@ -1,4 +1,4 @@
-//! The renderer that every machine has: tiles in parallel, no device.
+//! CPU renderer, parallel over tiles.
 
 use rayon::prelude::*;
 
@@ -10,18 +10,18 @@ use super::raster::{Band, Samples, Shape, fill};
 use super::{PictureError, PictureParams, Rendered, Renderer};
 use crate::surface::{Control, Mesh, Vertices};
 
-/// Draws on the processor's cores.
+/// Renderer on the CPU.
 #[derive(Debug, Default)]
 pub struct CpuRenderer {
-    /// Threads of its own; rayon's where there are none.
+    /// Thread pool; `None` for the global one.
     pool: Option<rayon::ThreadPool>,
 }
 
 impl CpuRenderer {
-    /// A renderer on so many threads of its own.
+    /// Creates a renderer with its own threads.
     ///
     /// # Errors
-    /// The system's words, where they cannot be started.
+    /// Message of the system if the threads cannot be started.
     pub fn with_threads(threads: usize) -> Result<Self, String> {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().map_err(|e| e.to_string())?;
         Ok(Self { pool: Some(pool) })

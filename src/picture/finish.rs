@@ -1,4 +1,5 @@
-//! From layers to pixels: what a pixel's neighbourhood does to its light, then colour, background and alpha.
+//! Shading of layers: ambient occlusion and outline from the neighbourhood of each pixel, then colour, background and
+//! alpha.
 
 use rayon::prelude::*;
 
@@ -7,7 +8,7 @@ use super::layers::{Layers, NOTHING};
 use super::light::{self, Levels};
 use super::{Background, Image, PictureParams, Style};
 
-/// Sixteen directions around a pixel, a sixteenth of a turn apart.
+/// Sixteen directions around a pixel, at equal angles.
 const AROUND: [[f64; 2]; 16] = {
     const C: f64 = 0.923_879_532_511_286_7;
     const S: f64 = 0.382_683_432_365_089_8;
@@ -31,27 +32,28 @@ const AROUND: [[f64; 2]; 16] = {
         [C, -S],
     ]
 };
-/// Rings of neighbours, as parts of the radius. Each takes every other direction, in turn.
+/// Radii of the rings of neighbours, relative to [`Finish`]'s radius. Rings use the even and the odd directions in
+/// turn.
 const RINGS: [f64; 6] = [0.06, 0.13, 0.24, 0.4, 0.65, 1.0];
-/// Radius of what may shade a pixel: at least that of a pocket, Å, and so much of the picture's shorter side.
+/// Radius of ambient occlusion: at least that of a pocket in Å, and at least a share of the shorter side.
 const RADIUS: f64 = 6.0;
 const RADIUS_SHARE: f64 = 0.07;
-/// Sine above the tangent plane below which a neighbour shades nothing: roundness is no pocket.
+/// Sine above the tangent plane below which a neighbour does not occlude, so that convex surfaces are not darkened.
 const BIAS: f32 = 0.12;
-/// How dark it gets.
+/// Factor of the mean occlusion.
 const STRENGTH: f32 = 2.8;
-/// Least light that shading leaves.
-const DARKEST: f32 = 0.25;
-/// A step in depth becomes a line from here on, Å and pixels, and is one at so many times that.
+/// Minimum light after occlusion.
+const MIN_LIGHT: f32 = 0.25;
+/// Step in depth at which an outline begins, in Å plus pixels, and the factor at which it has full strength.
 const STEP: f32 = 1.2;
 const STEP_PIXELS: f32 = 2.5;
 const STEP_FULL: f32 = 3.0;
-/// What a line takes of the light.
+/// Share of the light that an outline removes.
 const LINE: f32 = 0.6;
-/// Pixels of the picture's shorter side per pixel of a line's width.
+/// Pixels of the shorter side per pixel of line width.
 const LINE_SIDE: u32 = 700;
 
-/// A neighbour: how far it is in pixels, and in Å (right, up).
+/// Neighbour of a pixel: offset in pixels and in Å.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tap {
     /// Columns to the right.
@@ -64,35 +66,35 @@ pub struct Tap {
     pub up: f32,
 }
 
-/// The numbers that shading is made with.
+/// Parameters of shading.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finish {
-    /// Neighbours that may shade a pixel; none where nothing is shaded so.
+    /// Neighbours that may occlude a pixel; empty without ambient occlusion.
     pub taps: Vec<Tap>,
-    /// Square of the distance at which a neighbour shades half, Å⁻².
+    /// Inverse square of the distance at which occlusion is halved, Å⁻².
     pub falloff: f32,
-    /// [`BIAS`].
+    /// Sine above the tangent plane below which a neighbour does not occlude.
     pub bias: f32,
-    /// What the mean of the neighbours is multiplied by.
+    /// Factor of the mean occlusion.
     pub strength: f32,
-    /// Least light that shading leaves.
-    pub darkest: f32,
-    /// Columns and rows to the neighbours that make a line; 0 without lines.
-    pub line: i32,
-    /// Step in depth at which a line begins, and at which it is one, Å.
+    /// Minimum light after occlusion.
+    pub min_light: f32,
+    /// Distance in pixels of the neighbours that are compared for outlines; 0 without outlines.
+    pub line_width: i32,
+    /// Steps in depth at which an outline begins and at which it has full strength, Å.
     pub steps: [f32; 2],
-    /// What a line takes of the light.
-    pub ink: f32,
-    /// The surface's colour in full light, linear.
+    /// Share of the light that an outline removes.
+    pub line_strength: f32,
+    /// Colour of the surface in full light, linear.
     pub color: [f32; 3],
-    /// The background's colour, linear and premultiplied, and its alpha.
-    pub behind: [f32; 4],
+    /// Colour of the background, linear and premultiplied, and its alpha.
+    pub background: [f32; 4],
 }
 
 impl Finish {
-    /// The numbers of a picture.
+    /// Parameters for a picture.
     #[must_use]
-    #[expect(clippy::cast_possible_truncation, reason = "small numbers; single precision is what shading has")]
+    #[expect(clippy::cast_possible_truncation, reason = "small numbers; shading uses single precision")]
     pub fn new(params: &PictureParams, camera: &Camera) -> Self {
         let side = params.width.min(params.height);
         let radius = RADIUS.max(RADIUS_SHARE * f64::from(side) * camera.pixel());
@@ -107,17 +109,17 @@ impl Finish {
             falloff: (1.0 / (radius * radius)) as f32 * 4.0,
             bias: BIAS,
             strength: STRENGTH,
-            darkest: DARKEST,
-            line: if shaded { line } else { 0 },
+            min_light: MIN_LIGHT,
+            line_width: if shaded { line } else { 0 },
             steps: [step, step * STEP_FULL],
-            ink: LINE,
+            line_strength: LINE,
             color: light::COLOR.map(|level| light::linear(level) as f32),
-            behind: [r, g, b, alpha],
+            background: [r, g, b, alpha],
         }
     }
 }
 
-/// The neighbours within `radius` pixels of `pixel` Å each.
+/// Neighbours within `radius` pixels of `pixel` Å each.
 #[expect(clippy::cast_possible_truncation, reason = "pixels of a picture")]
 fn taps(radius: f64, pixel: f64) -> Vec<Tap> {
     let mut taps = Vec::new();
@@ -133,21 +135,21 @@ fn taps(radius: f64, pixel: f64) -> Vec<Tap> {
     taps
 }
 
-/// The picture of `layers`.
-pub(super) fn finish(layers: &Layers, numbers: &Finish, params: &PictureParams) -> Image {
+/// Shades `layers`.
+pub(super) fn finish(layers: &Layers, shading: &Finish, params: &PictureParams) -> Image {
     let levels = Levels::get();
     let mut pixels = vec![[0; 4]; layers.width * layers.height];
     pixels.par_chunks_mut(layers.width.max(1)).enumerate().for_each_init(Row::default, |row, (y, out)| {
-        row.shade(layers, numbers, y);
+        row.shade(layers, shading, y);
         for (x, pixel) in out.iter_mut().enumerate() {
-            *pixel = color(layers, numbers, levels, row.open.get(x).copied(), x, y);
+            *pixel = color(layers, shading, levels, row.open.get(x).copied(), x, y);
         }
     });
     Image { width: params.width, height: params.height, pixels }
 }
 
-/// One pixel; `open` is how much light its neighbours let through, where that is asked.
-fn color(layers: &Layers, numbers: &Finish, levels: &Levels, open: Option<f32>, x: usize, y: usize) -> [u8; 4] {
+/// Colour of a pixel; `open` is the share of the light that is not occluded, if occlusion is enabled.
+fn color(layers: &Layers, shading: &Finish, levels: &Levels, open: Option<f32>, x: usize, y: usize) -> [u8; 4] {
     let at = y * layers.width + x;
     let share = layers.facing[at].share();
     let mut light = layers.light[at];
@@ -155,16 +157,16 @@ fn color(layers: &Layers, numbers: &Finish, levels: &Levels, open: Option<f32>, 
         if let Some(open) = open {
             light *= open;
         }
-        if numbers.line > 0 {
-            light *= 1.0 - numbers.ink * line(layers, numbers, x, y);
+        if shading.line_width > 0 {
+            light *= 1.0 - shading.line_strength * outline(layers, shading, x, y);
         }
     }
-    let alpha = share + numbers.behind[3] * (1.0 - share);
+    let alpha = share + shading.background[3] * (1.0 - share);
     if alpha <= 0.0 {
         return [0; 4];
     }
     let level = |k: usize| {
-        let premultiplied = numbers.color[k] * light * share + numbers.behind[k] * (1.0 - share);
+        let premultiplied = shading.color[k] * light * share + shading.background[k] * (1.0 - share);
         levels.of(premultiplied / alpha)
     };
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 255")]
@@ -172,20 +174,20 @@ fn color(layers: &Layers, numbers: &Finish, levels: &Levels, open: Option<f32>, 
     [level(0), level(1), level(2), alpha]
 }
 
-/// A row of pixels on its way: a column for each number, so that several pixels are computed at once.
+/// Row of pixels in columns, so that several pixels are computed at once.
 #[derive(Default)]
 struct Row {
     normal: [Vec<f32>; 3],
-    /// How much light reaches a pixel past its neighbours, 0 to 1; empty where nothing is shaded so.
+    /// Share of the light that is not occluded, 0 to 1; empty without ambient occlusion.
     open: Vec<f32>,
 }
 
 impl Row {
-    /// Finds out how much light reaches the pixels of row `y`: each neighbour that rises above a pixel's tangent plane takes its
-    /// part, the more the steeper and the nearer it is.
-    fn shade(&mut self, layers: &Layers, numbers: &Finish, y: usize) {
+    /// Computes the occlusion of row `y`. Each neighbour above the tangent plane of a pixel occludes it; steeper and
+    /// nearer neighbours occlude more.
+    fn shade(&mut self, layers: &Layers, shading: &Finish, y: usize) {
         self.open.clear();
-        if numbers.taps.is_empty() {
+        if shading.taps.is_empty() {
             return;
         }
         let width = layers.width;
@@ -199,9 +201,9 @@ impl Row {
         let first = facing.iter().position(|facing| facing.covered > 0).unwrap_or(width);
         let end = facing.iter().rposition(|facing| facing.covered > 0).map_or(first, |last| last + 1);
         let depth = &layers.depth[row(y)];
-        for tap in &numbers.taps {
+        for tap in &shading.taps {
             let Some(there) = y.checked_add_signed(tap.dy as isize).filter(|y| *y < layers.height) else { continue };
-            // The columns whose neighbour is in the picture.
+            // Columns whose neighbour lies in the picture.
             let shift = tap.dx.unsigned_abs() as usize;
             let (from, to) =
                 if tap.dx < 0 { (first.max(shift), end) } else { (first, end.min(width.saturating_sub(shift))) };
@@ -211,15 +213,22 @@ impl Row {
             let begin = if tap.dx < 0 { from - shift } else { from + shift };
             let other = &layers.depth[row(there)][begin..begin + to - from];
             let normal = self.normal.each_ref().map(|column| &column[from..to]);
-            taken(&mut self.open[from..to], &depth[from..to], other, normal, *tap, [numbers.bias, numbers.falloff]);
+            add_occlusion(
+                &mut self.open[from..to],
+                &depth[from..to],
+                other,
+                normal,
+                *tap,
+                [shading.bias, shading.falloff],
+            );
         }
-        let scale = numbers.strength / numbers.taps.len() as f32;
-        self.open.iter_mut().for_each(|shade| *shade = (1.0 - *shade * scale).max(numbers.darkest));
+        let scale = shading.strength / shading.taps.len() as f32;
+        self.open.iter_mut().for_each(|shade| *shade = (1.0 - *shade * scale).max(shading.min_light));
     }
 }
 
-/// Adds what the neighbours at `tap` take of the light. All slices have one length.
-fn taken(
+/// Adds the occlusion by the neighbours at `tap`. All slices have the same length.
+fn add_occlusion(
     shade: &mut [f32],
     depth: &[f32],
     other: &[f32],
@@ -234,12 +243,12 @@ fn taken(
         let rise = depth[i] - other[i];
         let square = flat + rise * rise;
         let sine = (right[i] * tap.right + up[i] * tap.up + toward[i] * rise) / square.sqrt() - bias;
-        // Where nothing is seen, here or there, the sine is no number, and nothing is taken.
+        // Without a surface at either pixel the sine is NaN and nothing is added.
         shade[i] += if sine > 0.0 { sine / (1.0 + square * falloff) } else { 0.0 };
     }
 }
 
-/// The pixel that lies so far from (x, y), if it is in the picture.
+/// Index of the pixel at offset (dx, dy) from (x, y), if it lies in the picture.
 #[inline]
 fn neighbour(layers: &Layers, x: usize, y: usize, dx: i32, dy: i32) -> Option<usize> {
     let x = x.checked_add_signed(dx as isize).filter(|x| *x < layers.width)?;
@@ -247,17 +256,17 @@ fn neighbour(layers: &Layers, x: usize, y: usize, dx: i32, dy: i32) -> Option<us
     Some(y * layers.width + x)
 }
 
-/// How much of a line a pixel is, 0 to 1: on the near side of a step in depth, and at the rim.
-fn line(layers: &Layers, numbers: &Finish, x: usize, y: usize) -> f32 {
+/// Strength of the outline at a pixel, 0 to 1: on the near side of a step in depth, and at the silhouette.
+fn outline(layers: &Layers, shading: &Finish, x: usize, y: usize) -> f32 {
     let depth = layers.depth[y * layers.width + x];
-    let n = numbers.line;
+    let n = shading.line_width;
     let (mut step, mut rim) = (0.0_f32, 0.0_f32);
     for (dx, dy) in [(n, 0), (0, n), (n, n), (n, -n)] {
         let ends = [(dx, dy), (-dx, -dy)].map(|(dx, dy)| neighbour(layers, x, y, dx, dy));
         let mut sum = 0.0;
         let mut whole = true;
         for end in ends {
-            // The picture's border is no rim.
+            // The border of the picture is not a silhouette.
             let Some(end) = end else {
                 whole = false;
                 continue;
@@ -269,7 +278,7 @@ fn line(layers: &Layers, numbers: &Finish, x: usize, y: usize) -> f32 {
             step = step.max(sum - 2.0 * depth);
         }
     }
-    let [from, to] = numbers.steps;
+    let [from, to] = shading.steps;
     let part = ((step - from) / (to - from)).clamp(0.0, 1.0);
     (part * part * (3.0 - 2.0 * part)).max(rim)
 }

@@ -1,47 +1,48 @@
-//! Light and colour: Lambert's law, and what sRGB makes of it.
+//! Light and colour: Lambert's law and the sRGB transfer function.
 
 use std::sync::LazyLock;
 
 use super::camera::dot;
 
-/// Where the light comes from, as the viewer sees it: right, up, towards. A unit vector.
+/// Direction of the light in view space (right, up, towards), a unit vector.
 pub const LIGHT: [f32; 3] = [-2.0 / 7.0, 3.0 / 7.0, 6.0 / 7.0];
-/// Light that comes from everywhere.
+/// Ambient light.
 pub const AMBIENT: f32 = 0.15;
-/// Light that comes from [`LIGHT`].
+/// Diffuse light from [`LIGHT`].
 pub const DIFFUSE: f32 = 0.85;
-/// The surface's colour in full light, sRGB.
+/// Colour of the surface in full light, sRGB.
 pub const COLOR: [u8; 3] = [0xb4, 0xd2, 0xf0];
-/// Steps of the table of sRGB: at its dark end, where it is steepest, one is less than half a level.
+/// Number of steps of the sRGB table. At the dark end, where the function is steepest, a step is less than half a
+/// level.
 const STEPS: usize = 1 << 13;
 
-/// Light that leaves a surface with this unit normal, 0 to 1.
+/// Light reflected by a surface with this unit normal, 0 to 1.
 #[inline]
 #[must_use]
 pub fn lambert(normal: [f32; 3]) -> f32 {
     AMBIENT + DIFFUSE * dot(normal, LIGHT).max(0.0)
 }
 
-/// An sRGB level as linear light, 0 to 1 (IEC 61966-2-1).
+/// Converts an sRGB level to linear light, 0 to 1 (IEC 61966-2-1).
 #[must_use]
 pub fn linear(level: u8) -> f64 {
     let value = f64::from(level) / 255.0;
     if value <= 0.040_45 { value / 12.92 } else { ((value + 0.055) / 1.055).powf(2.4) }
 }
 
-/// Linear light as an sRGB level, not rounded, 0 to 255.
+/// Converts linear light to an sRGB level, not rounded, 0 to 255.
 #[must_use]
 pub fn srgb(light: f64) -> f64 {
     let value = if light <= 0.003_130_8 { light * 12.92 } else { 1.055 * light.powf(1.0 / 2.4) - 0.055 };
     255.0 * value.clamp(0.0, 1.0)
 }
 
-/// [`srgb`] as a table.
+/// Table of [`srgb`].
 #[derive(Debug)]
 pub struct Levels(Vec<u8>);
 
 impl Levels {
-    /// The table.
+    /// Returns the table.
     #[must_use]
     pub fn get() -> &'static Self {
         static TABLE: LazyLock<Levels> = LazyLock::new(|| {
@@ -52,7 +53,7 @@ impl Levels {
         &TABLE
     }
 
-    /// The level of linear light from 0 to 1; beyond, that of the nearer end.
+    /// Level of linear light, which is clamped to 0 to 1.
     #[inline]
     #[must_use]
     pub fn of(&self, light: f32) -> u8 {
@@ -61,7 +62,7 @@ impl Levels {
         self.0.get(step).copied().unwrap_or(u8::MAX)
     }
 
-    /// The table itself, for devices.
+    /// Returns the levels by step, for devices.
     #[must_use]
     pub fn table(&self) -> &[u8] {
         &self.0

@@ -1,11 +1,11 @@
-//! Pictures of meshes: a mesh and a view in, pixels and PNG out. Pure: no files, no clock, no graphics API.
+//! Pictures of meshes: pixels and PNG from a mesh and a view. Pure: no files, no clock, no graphics API.
 //!
-//! The projection is orthographic, so that lengths can be read off a picture: [`Rendered::pixel`] says how many ångström a
-//! pixel has. [`camera`] decides from where, [`bins`] and [`raster`] find what is seen at four samples a pixel, [`finish`]
-//! shades neighbourhoods and writes pixels, [`png`] packs them. [`cpu`] is these four as a [`Renderer`]; a device does the
-//! same from the same numbers.
+//! The projection is orthographic, so lengths can be measured in a picture: [`Rendered::pixel`] is the width of a pixel
+//! in Å. [`camera`] computes the view, [`bins`] and [`raster`] the visible surface at four samples per pixel,
+//! [`finish`] shades the pixels, [`png`] encodes them. [`cpu`] combines these steps in a [`Renderer`]; a device
+//! renderer uses the same parameters.
 //!
-//! Only sums in a fixed order and correctly rounded operations: the same mesh gives the same pixels on any number of threads.
+//! All sums have a fixed order, so the same mesh gives the same pixels on any number of threads.
 
 mod axes;
 mod bins;
@@ -26,32 +26,32 @@ use crate::surface::{Control, Mesh, Served, SurfaceError, arithmetic};
 pub use cpu::CpuRenderer;
 pub use params::{Background, DEFAULT_SIDE, MOST_SIDE, PictureLimits, PictureParams, Style, View};
 
-/// Why there is no picture.
+/// Reason for which a picture cannot be made.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum PictureError {
-    /// It would have too many pixels.
+    /// A side has too many pixels.
     #[error("the picture's {side} is {pixels} pixels, the limit is {limit}")]
     TooLarge {
         /// `width` or `height`.
         side: &'static str,
-        /// Pixels asked for.
+        /// Requested pixels.
         pixels: u32,
-        /// Pixels allowed.
+        /// Maximum.
         limit: u32,
     },
-    /// Somebody asked the run to stop.
+    /// The run was cancelled.
     #[error("cancelled")]
     Cancelled,
-    /// Vertices as small integers are for files.
+    /// The vertices are quantised.
     #[error("quantised vertices cannot be drawn")]
     Quantized,
-    /// A device could not draw it, and nothing stands in for it.
+    /// The device failed, and there is no fallback.
     #[error("no device could draw the picture: {why}")]
     Device {
-        /// What it said.
+        /// Message of the device.
         why: String,
     },
-    /// The pixels cannot be packed.
+    /// The pixels cannot be encoded.
     #[error("the picture cannot be written: {0}")]
     Png(String),
 }
@@ -65,19 +65,19 @@ impl From<SurfaceError> for PictureError {
     }
 }
 
-/// Pixels in rows from the top, each red, green, blue (sRGB) and alpha, not premultiplied.
+/// Image with pixels in rows from the top, each red, green, blue (sRGB) and alpha, not premultiplied.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image {
-    /// Pixels of a row.
+    /// Number of pixels per row.
     pub width: u32,
-    /// Rows.
+    /// Number of rows.
     pub height: u32,
     /// `width` × `height` pixels.
     pub pixels: Vec<[u8; 4]>,
 }
 
 impl Image {
-    /// The pixel in column `x` of row `y`; transparent outside.
+    /// Returns the pixel in column `x` of row `y`; transparent outside the image.
     #[must_use]
     pub fn pixel(&self, x: u32, y: u32) -> [u8; 4] {
         let at = y as usize * self.width as usize + x as usize;
@@ -85,48 +85,48 @@ impl Image {
     }
 }
 
-/// A picture, and who drew it.
+/// Picture with its scale and renderer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Rendered {
-    /// The pixels.
+    /// Image.
     pub image: Image,
-    /// Å that a pixel is wide and high.
+    /// Width and height of a pixel, Å.
     pub pixel: f64,
-    /// Who drew it, where that is known only afterwards: something stood in for a device.
+    /// Fallback that drew it instead of a device, if any.
     pub served: Option<Served>,
 }
 
-/// Draws meshes. The same mesh and parameters give the same pixels.
+/// Draws meshes. Equal meshes and parameters give equal pixels.
 pub trait Renderer: Send + Sync {
-    /// Short stable name: `cpu` or `gpu`.
+    /// Stable short name: `cpu` or `gpu`.
     fn name(&self) -> &'static str;
 
-    /// Name of the arithmetic: equal names give equal pixels for equal meshes.
+    /// Name of the arithmetic. Equal names give equal pixels for equal meshes.
     fn arithmetic(&self) -> String {
         format!("{} {}", self.name(), arithmetic())
     }
 
-    /// What it runs on, for people.
+    /// Description of the hardware, for display.
     fn describe(&self) -> String;
 
     /// Draws `mesh`, whose vertices must not be quantised.
     ///
     /// # Errors
-    /// Any [`PictureError`] but [`PictureError::Png`] and [`PictureError::TooLarge`], which are met before.
+    /// Any [`PictureError`] but [`PictureError::Png`] and [`PictureError::TooLarge`], which are detected earlier.
     fn render(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError>;
 }
 
-/// What draws, and why it was taken.
+/// Renderer in use, with the reason for its choice.
 #[derive(Clone)]
 pub struct Drawer {
-    /// The renderer.
+    /// Renderer.
     pub renderer: Arc<dyn Renderer>,
-    /// Why it was taken, in words.
+    /// Reason for the choice.
     pub reason: String,
 }
 
 impl Drawer {
-    /// The CPU, on rayon's pool.
+    /// CPU renderer on the global thread pool.
     #[must_use]
     pub fn cpu(reason: &str) -> Self {
         Self { renderer: Arc::new(CpuRenderer::default()), reason: reason.to_owned() }

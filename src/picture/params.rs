@@ -1,24 +1,24 @@
-//! What a picture is to look like.
+//! Parameters of pictures.
 
 use std::fmt;
 use std::str::FromStr;
 
 use super::PictureError;
 
-/// Width and height where none is given, pixels.
+/// Default width and height, pixels.
 pub const DEFAULT_SIDE: u32 = 512;
-/// Largest width and height that can be asked for at all, pixels: the largest texture that devices have in common.
+/// Maximum width and height, pixels: the maximum texture size that devices have in common.
 pub const MOST_SIDE: u32 = 16_384;
-/// Bytes of working memory that a pixel takes at most: depth, light, normal, and the pixel itself, twice on a device.
+/// Maximum working memory per pixel, bytes: depth, light, normal and colour, twice on a device.
 const PIXEL_BYTES: u64 = 40;
 
-/// From where the molecule is seen.
+/// Direction of view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum View {
-    /// Along the least of the surface's principal axes, the greatest lying horizontally.
+    /// Along the smallest principal axis of the surface; the largest is horizontal.
     #[default]
     Principal,
-    /// From +z of the file's axes; x points right, y up.
+    /// From +z in file coordinates; x points right, y up.
     Front,
     /// From −z.
     Back,
@@ -33,11 +33,11 @@ pub enum View {
 }
 
 impl View {
-    /// Every view.
+    /// All views.
     pub const ALL: [Self; 7] =
         [Self::Principal, Self::Front, Self::Back, Self::Left, Self::Right, Self::Top, Self::Bottom];
 
-    /// Its name.
+    /// Name.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -52,21 +52,21 @@ impl View {
     }
 }
 
-/// How the surface is shaded.
+/// Style of shading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Style {
     /// Gouraud shading, with ambient occlusion and a soft outline.
     #[default]
     Surface,
-    /// Gouraud shading alone: light by vertex, interpolated.
+    /// Gouraud shading only: light per vertex, interpolated.
     Gouraud,
 }
 
 impl Style {
-    /// Every style.
+    /// All styles.
     pub const ALL: [Self; 2] = [Self::Surface, Self::Gouraud];
 
-    /// Its name.
+    /// Name.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -76,18 +76,18 @@ impl Style {
     }
 }
 
-/// What is behind the molecule: red, green, blue (sRGB) and alpha, not premultiplied.
+/// Colour of the background: red, green, blue (sRGB) and alpha, not premultiplied.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Background(pub [u8; 4]);
 
 impl Background {
-    /// Nothing.
+    /// Transparent.
     pub const TRANSPARENT: Self = Self([0; 4]);
     /// White.
     pub const WHITE: Self = Self([255; 4]);
     /// Black.
     pub const BLACK: Self = Self([0, 0, 0, 255]);
-    /// What is expected, in words.
+    /// Syntax, for messages.
     pub const EXPECTED: &'static str = "transparent, white, black, or a colour as RRGGBB or RRGGBBAA in hexadecimal";
 }
 
@@ -114,7 +114,7 @@ impl FromStr for Background {
 }
 
 impl fmt::Display for Background {
-    /// The colour with its alpha; equal for equal backgrounds however they were written.
+    /// Formats the colour with its alpha; equal for equal backgrounds regardless of their spelling.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::TRANSPARENT => f.write_str("transparent"),
@@ -127,7 +127,7 @@ impl fmt::Display for Background {
 /// Limits of a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PictureLimits {
-    /// Largest width and height, pixels.
+    /// Maximum width and height, pixels.
     pub max_side: u32,
 }
 
@@ -137,22 +137,22 @@ impl Default for PictureLimits {
     }
 }
 
-/// What a picture is to look like.
+/// Parameters of a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PictureParams {
-    /// Pixels of a row, 1 to [`MOST_SIDE`].
+    /// Width in pixels, 1 to [`MOST_SIDE`].
     pub width: u32,
-    /// Rows, 1 to [`MOST_SIDE`].
+    /// Height in pixels, 1 to [`MOST_SIDE`].
     pub height: u32,
-    /// From where.
+    /// Direction of view.
     pub view: View,
-    /// How far the viewer walks around the view's upright axis from there, to the right, degrees.
+    /// Rotation of the viewer to the right about the vertical axis of the view, degrees.
     pub azimuth: f64,
-    /// How far the viewer climbs then, degrees.
+    /// Rotation of the viewer upwards after the azimuth, degrees.
     pub elevation: f64,
-    /// What is behind the molecule.
+    /// Background.
     pub background: Background,
-    /// How the surface is shaded.
+    /// Style of shading.
     pub style: Style,
 }
 
@@ -171,7 +171,7 @@ impl Default for PictureParams {
 }
 
 impl PictureParams {
-    /// Fails where a side is longer than allowed.
+    /// Checks the sides against the limits.
     ///
     /// # Errors
     /// [`PictureError::TooLarge`].
@@ -185,18 +185,18 @@ impl PictureParams {
         Ok(())
     }
 
-    /// Bytes of working memory that drawing takes, the mesh apart.
+    /// Bytes of working memory for drawing, without the mesh.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         u64::from(self.width) * u64::from(self.height) * PIXEL_BYTES
     }
 
-    /// Everything that decides what the picture looks like, as text: equal for equal pictures.
+    /// Canonical text of the parameters: equal for equal pictures.
     #[must_use]
     pub fn canonical(&self) -> String {
         let Self { width, height, view, azimuth, elevation, background, style } = self;
         let (view, style) = (view.name(), style.name());
-        // −0 and 0 are one angle.
+        // Adding 0 turns −0 into 0.
         let (azimuth, elevation) = (azimuth + 0.0, elevation + 0.0);
         format!(
             "width={width}&height={height}&view={view}&azimuth={azimuth}&elevation={elevation}\

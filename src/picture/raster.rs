@@ -1,16 +1,16 @@
-//! What is seen in one tile: the nearest triangle at four samples of every pixel.
+//! Rasteriser of one tile: the nearest triangle at four samples of every pixel.
 
 use super::bins::{Bins, PARTS, TILE_HEIGHT, TILE_WIDTH, Tiles, corner, twice_area};
 use super::camera::{Camera, dot};
 use super::layers::{Facing, NOTHING, SAMPLES, UNIT};
 use super::light::lambert;
 
-/// Where the samples of a pixel lie, in parts of it: the pattern that graphics devices have.
+/// Positions of the samples within a pixel, in subpixels: the standard pattern of graphics devices.
 const PATTERN: [[i32; 2]; SAMPLES] = [[96, 32], [224, 96], [32, 160], [160, 224]];
-/// Samples of a tile.
+/// Number of samples of a tile.
 const N: usize = TILE_WIDTH * TILE_HEIGHT * SAMPLES;
 
-/// Positions, normals and triangles of a mesh.
+/// Columns of a mesh.
 #[derive(Clone, Copy)]
 pub(super) struct Shape<'a> {
     pub(super) positions: &'a [[f32; 3]],
@@ -18,9 +18,9 @@ pub(super) struct Shape<'a> {
     pub(super) triangles: &'a [[u32; 3]],
 }
 
-/// A row of tiles of the layers.
+/// Row of tiles of the layers.
 pub(super) struct Band<'a> {
-    /// Its first row of pixels.
+    /// First row of pixels.
     pub(super) top: usize,
     pub(super) width: usize,
     pub(super) depth: &'a mut [f32],
@@ -28,7 +28,7 @@ pub(super) struct Band<'a> {
     pub(super) facing: &'a mut [Facing],
 }
 
-/// The samples of a tile.
+/// Samples of a tile.
 pub(super) struct Samples {
     depth: Vec<f32>,
     light: Vec<f32>,
@@ -41,28 +41,28 @@ impl Default for Samples {
     }
 }
 
-/// A triangle that faces the viewer.
+/// Front-facing triangle.
 struct Facet {
-    /// Its vertices, the other way around: edges' functions are positive inside.
+    /// Vertices in reverse order, so that edge functions are positive inside.
     vertices: [u32; 3],
     corners: [[i32; 2]; 3],
-    /// Depth of each corner, divided by the triangle's doubled area.
+    /// Depth of each corner, divided by twice the area.
     depths: [f32; 3],
-    /// One by that area.
+    /// Inverse of twice the area.
     share: f32,
 }
 
-/// The function of an edge: positive on the triangle's side, 0 on the edge.
+/// Edge function: positive inside the triangle, 0 on the edge.
 struct Edge {
-    /// What a column and a row add.
+    /// Increments per column and per row.
     column: i64,
     row: i64,
-    /// Its value at the samples of the pixel that was drawn last.
+    /// Values at the samples of the current pixel.
     at: [i64; SAMPLES],
 }
 
 impl Edge {
-    /// The edge from `p` to `q`, at the pixel in column `x` of row `y`.
+    /// Edge from `p` to `q`, at the pixel in column `x` of row `y`.
     fn new(p: [i32; 2], q: [i32; 2], x: i64, y: i64) -> Self {
         let ([px, py], [qx, qy]) = (p.map(i64::from), q.map(i64::from));
         let (column, row, parts) = (py - qy, qx - px, i64::from(PARTS));
@@ -87,7 +87,7 @@ impl Facet {
         Self { vertices, corners, depths: placed.map(|place| place[2] * share), share }
     }
 
-    /// Light and normal of each corner, divided by the triangle's doubled area.
+    /// Light and normal of each corner, divided by twice the area.
     fn shades(&self, shape: Shape<'_>, camera: &Camera) -> [[f32; 4]; 3] {
         self.vertices.map(|v| {
             let normal = camera.turn(shape.normals[v as usize]);
@@ -95,13 +95,13 @@ impl Facet {
         })
     }
 
-    /// First and last pixel of an axis that samples may be covered in, within a tile that begins at `from` and has `n`.
+    /// Range of pixels along an axis that may have covered samples, within a tile of `n` pixels from `from` on.
     fn span(&self, axis: usize, from: i64, n: i64) -> std::ops::Range<i64> {
         let [a, b, c] = self.corners.map(|c| c[axis].div_euclid(PARTS));
         i64::from(a.min(b).min(c)).max(from)..(i64::from(a.max(b).max(c)) + 1).min(from + n)
     }
 
-    /// Puts its samples where they are nearer than what is there.
+    /// Draws the samples that are nearer than the present ones.
     fn draw(
         &self,
         shape: Shape<'_>,
@@ -113,7 +113,7 @@ impl Facet {
         let (rows, columns) = (self.span(1, top, height), self.span(0, left, width));
         let [a, b, c] = self.corners;
         let mut edges = [[b, c], [c, a], [a, b]].map(|[p, q]| Edge::new(p, q, columns.start, rows.start));
-        // Most triangles are small and many hidden: normals are looked up once something is seen.
+        // Most triangles are small and many are hidden, so normals are loaded with the first visible sample.
         let mut shades = None;
         for y in rows {
             for x in columns.clone() {
@@ -121,7 +121,7 @@ impl Facet {
                 let pixel = (y - top) as usize * TILE_WIDTH + (x - left) as usize;
                 for s in 0..SAMPLES {
                     let inside = [edges[0].at[s], edges[1].at[s], edges[2].at[s]];
-                    // Neighbours may both have a sample on their common edge: the first of them keeps it.
+                    // A sample on a common edge belongs to both triangles; the first keeps it.
                     if inside[0] | inside[1] | inside[2] < 0 {
                         continue;
                     }
@@ -149,7 +149,7 @@ impl Facet {
     }
 }
 
-/// Fills a row of tiles: what is seen of `shape` there.
+/// Draws `shape` in a row of tiles.
 pub(super) fn fill(
     shape: Shape<'_>,
     camera: &Camera,
@@ -181,7 +181,7 @@ pub(super) fn fill(
     }
 }
 
-/// A pixel from its samples.
+/// Resolves the samples of a pixel.
 fn resolve(samples: &Samples, pixel: usize) -> (f32, f32, Facing) {
     let of_pixel = pixel * SAMPLES..(pixel + 1) * SAMPLES;
     let (mut nearest, mut light, mut normal, mut covered) = (NOTHING, 0.0, [0.0_f32; 3], 0_u16);
@@ -195,7 +195,7 @@ fn resolve(samples: &Samples, pixel: usize) -> (f32, f32, Facing) {
         return (NOTHING, 0.0, Facing::default());
     }
     let length = dot(normal, normal).sqrt();
-    // Opposite normals in one pixel cancel: it is seen from the front then.
+    // Opposite normals cancel; the pixel then faces the viewer.
     let unit = if length > 0.0 { normal.map(|c| c / length) } else { [0.0, 0.0, 1.0] };
     #[expect(clippy::cast_possible_truncation, reason = "components of a unit vector")]
     let normal = unit.map(|c| (c * UNIT + 0.5_f32.copysign(c)) as i16);

@@ -6,7 +6,7 @@
 
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock, fit};
 use crate::surface::lattice::Lattice;
-use crate::surface::plan::Plan;
+use crate::surface::occupancy::Occupancy;
 use crate::surface::{CancelToken, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// Spacing of the coarser mesh, as a multiple of the job's, and at least so much, Å.
@@ -102,7 +102,7 @@ fn of_mesh(
     choice: &Choice<'_>,
     control: &Control<'_>,
 ) -> Result<MeshEstimate, SurfaceError> {
-    let plan = Plan::new(lattice, limits, control)?;
+    let bricks = Occupancy::new(lattice, limits, control)?.n_reached();
     let h = params.resolution;
     let single = SurfaceParams { atom_ids: false, quantize: None, ..params.clone() };
     let coarse = SurfaceParams { resolution: (COARSER * h).max(COARSE).max(h), ..single.clone() };
@@ -120,8 +120,7 @@ fn of_mesh(
     let vertices = (1.5 * area / (h * h)).round() as u64;
     let triangles = 2 * vertices;
     let bytes = params.mesh_bytes(vertices, triangles);
-    let estimate =
-        MeshEstimate { bricks: plan.occupied, samples: plan.occupied * 512, area, vertices, triangles, bytes };
+    let estimate = MeshEstimate { bricks, samples: bricks * 512, area, vertices, triangles, bytes };
     if bytes > limits.max_mesh_bytes {
         let fits = h * (bytes as f64 / limits.max_mesh_bytes as f64).sqrt();
         let suggested_resolution = (fits * 105.0).ceil() / 100.0;

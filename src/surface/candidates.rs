@@ -65,8 +65,8 @@ mod tests {
     use crate::surface::backend::Backend;
     use crate::surface::control::Control;
     use crate::surface::cpu::CpuBackend;
+    use crate::surface::occupancy::Occupancy;
     use crate::surface::params::SurfaceOptions;
-    use crate::surface::plan::Plan;
 
     fn same_place(n: usize) -> Spheres {
         Spheres::new(vec![0.3; n], vec![0.2; n], vec![0.1; n], vec![1.7; n]).unwrap()
@@ -84,7 +84,7 @@ mod tests {
     /// Exact number of candidate pairs.
     fn pairs(spheres: &Spheres, params: &SurfaceParams) -> u64 {
         let (lattice, limits) = (Lattice::new(spheres, params).unwrap(), SurfaceLimits::default());
-        Plan::new(&lattice, &limits, &Control::default()).unwrap().candidates.iter().sum()
+        Occupancy::new(&lattice, &limits, &Control::default()).unwrap().n_candidates()
     }
 
     #[test]
@@ -104,11 +104,11 @@ mod tests {
         assert!(candidates > limit && limit == exact - 1);
         let coarser = SurfaceParams { resolution: suggested_resolution.unwrap(), ..params.clone() };
         assert!(coarser.resolution > params.resolution && run(exact - 1, &coarser).is_ok());
-        // The plan for devices counts the same pairs.
+        // The occupancy count finds the same pairs.
         let lattice = Lattice::new(&spheres, &params).unwrap();
         for (max_candidates, fits) in [(exact, true), (exact - 1, false)] {
             let limits = SurfaceLimits { max_candidates, ..SurfaceLimits::default() };
-            assert_eq!(Plan::new(&lattice, &limits, &Control::default()).is_ok(), fits);
+            assert_eq!(Occupancy::new(&lattice, &limits, &Control::default()).is_ok(), fits);
         }
     }
 

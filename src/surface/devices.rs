@@ -1,48 +1,47 @@
-//! Devices as data: which are asked for, which were found, how those that run are doing. What drives them is a
-//! backend's business; nothing here opens one.
+//! Devices as data: the user's choice, the devices that were found, and the status of those in use. The GPU backend
+//! opens and drives them.
 
 use std::fmt;
 use std::str::FromStr;
 use std::time::Duration;
 
-/// Bricks that each device gets at least of a structure that several make together. On an H200 a brick takes about 0.1 µs
-/// from the upload to the host's memory, so that these take 3 ms; a part costs a tenth to a quarter of that beside them:
-/// bricks computed for its last cells' sake alone (one in twenty at this size, fewer at larger ones), two round trips, and
-/// the hand-over.
-pub const SPREAD_BRICKS: u64 = 32_768;
+/// Default of the minimum number of bricks per device in a multi-device job. On an H200 these bricks take about 3 ms. A
+/// partition costs 10 to 25 % more than its bricks alone: one halo brick in twenty, two round trips, and the exchange
+/// of counts.
+pub const MIN_PARTITION_BRICKS: u64 = 32_768;
 
-/// Which devices may be used.
+/// Choice of the devices that may be used.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum DeviceChoice {
-    /// The best kind of GPU that there is; software and lesser kinds are left alone.
+    /// All GPUs of the best kind that is available; no software devices.
     #[default]
     Auto,
-    /// Every GPU, of whatever kind.
+    /// All GPUs of any kind; no software devices.
     All,
-    /// None: the native CPU.
+    /// No device: the CPU backend.
     Cpu,
-    /// These alone, in ascending order without repeats.
+    /// Listed devices, in ascending order without duplicates.
     These(Vec<DeviceName>),
 }
 
-/// How a list names a device.
+/// Name of a device in a list.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum DeviceName {
-    /// By the number that `molmesh doctor` gives it.
+    /// Number of the device as `molmesh doctor` lists it.
     Number(usize),
-    /// Every device that is a program: good for tests.
+    /// All software devices, for tests.
     Software,
 }
 
-/// What a choice of devices may look like, for messages.
+/// Syntax of a choice, for messages.
 pub const EXPECTED: &str = "auto, all, cpu, or a list of device numbers and `software` such as 0,2";
 
 impl FromStr for DeviceChoice {
     type Err = String;
 
-    /// Reads `auto`, `all`, `cpu` or a list such as `0,2`. The error says what was expected.
+    /// Parses `auto`, `all`, `cpu` or a list such as `0,2`. The error states the expected syntax.
     fn from_str(text: &str) -> Result<Self, String> {
-        let refused = || format!("`{text}` is not allowed; expected {EXPECTED}");
+        let invalid = || format!("`{text}` is not allowed; expected {EXPECTED}");
         match text.trim() {
             "auto" => return Ok(Self::Auto),
             "all" => return Ok(Self::All),
@@ -51,11 +50,11 @@ impl FromStr for DeviceChoice {
         }
         let name = |part: &str| match part.trim() {
             "software" => Ok(DeviceName::Software),
-            // A sign or an empty part is no number, though `parse` lets `+1` through.
+            // `parse` would accept `+1`.
             digits if digits.bytes().all(|b| b.is_ascii_digit()) => {
-                digits.parse().map(DeviceName::Number).map_err(|_too_large_or_empty| refused())
+                digits.parse().map(DeviceName::Number).map_err(|_too_large_or_empty| invalid())
             }
-            _ => Err(refused()),
+            _ => Err(invalid()),
         };
         let mut names = text.split(',').map(name).collect::<Result<Vec<_>, _>>()?;
         names.sort_unstable();
@@ -81,23 +80,23 @@ impl fmt::Display for DeviceChoice {
     }
 }
 
-/// What sort of thing a device is, best first.
+/// Kind of a device, best first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum DeviceKind {
-    /// A card with memory of its own.
+    /// Card with its own memory.
     Discrete,
-    /// A slice of somebody else's card.
+    /// Virtual GPU.
     Virtual,
-    /// Part of the processor, sharing its memory.
+    /// Part of the processor, with shared memory.
     Integrated,
-    /// The driver does not say.
+    /// Kind that the driver does not report.
     Unknown,
-    /// A program that plays a GPU on the CPU.
+    /// Software implementation on the CPU.
     Software,
 }
 
 impl DeviceKind {
-    /// Its name, as `doctor` and `/v1/capabilities` spell it.
+    /// Name of the kind, as in `doctor` and `/v1/capabilities`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -110,74 +109,74 @@ impl DeviceKind {
     }
 }
 
-/// What a device says of itself.
+/// Properties that a device reports.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeviceFacts {
-    /// The device's own name.
+    /// Name.
     pub name: String,
-    /// What sort of thing it is.
+    /// Kind.
     pub kind: DeviceKind,
-    /// The interface it is reached through, such as `vulkan`.
+    /// Graphics API, such as `vulkan`.
     pub api: &'static str,
-    /// Name and version of its driver.
+    /// Name and version of the driver.
     pub driver: String,
-    /// Where it sits on the bus; empty where the driver does not say.
+    /// Bus address; empty if the driver does not report it.
     pub bus: String,
     /// Largest storage binding, bytes.
     pub binding_bytes: u64,
     /// Largest buffer, bytes.
     pub buffer_bytes: u64,
-    /// Memory of a workgroup, bytes.
+    /// Workgroup memory, bytes.
     pub workgroup_bytes: u64,
-    /// Invocations of a workgroup.
+    /// Maximum number of threads per workgroup.
     pub workgroup_size: u64,
-    /// Storage buffers that a stage can bind.
+    /// Maximum number of storage buffers per stage.
     pub storage_buffers: u64,
-    /// Whether it can time its stages.
+    /// True if timestamps are supported.
     pub timestamps: bool,
-    /// Smallest and largest subgroup, where it has subgroup operations.
+    /// Minimum and maximum subgroup size; `None` without subgroup operations.
     pub subgroups: Option<[u32; 2]>,
 }
 
-/// A device that was found, and whether it is taken.
+/// Device that was found.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FoundDevice {
-    /// Its number, by which it can be asked for.
+    /// Number, by which it can be requested.
     pub number: usize,
-    /// What it says of itself.
+    /// Properties.
     pub facts: DeviceFacts,
-    /// Whether it is taken.
+    /// True if the device is used.
     pub taken: bool,
-    /// Why, or why not, in words.
+    /// Reason for using it or not.
     pub reason: String,
 }
 
-/// How a running device is doing.
+/// Status of a device in use.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeviceStatus {
-    /// Its number.
+    /// Number.
     pub number: usize,
-    /// Its own name.
+    /// Name.
     pub name: String,
-    /// Why it takes no jobs any more; none while it does.
+    /// Reason for which it accepts no jobs; `None` while it is up.
     pub down: Option<String>,
-    /// Jobs that wait for it or run on it.
+    /// Number of jobs that wait or run.
     pub waiting: usize,
-    /// Jobs it has finished.
+    /// Number of finished jobs, including partitions.
     pub finished: u64,
-    /// Jobs that failed for its sake.
+    /// Number of jobs that failed because of the device.
     pub failed: u64,
-    /// Time that it spent on jobs.
+    /// Time spent on jobs.
     pub busy: Duration,
-    /// Times it failed and what ran on it was thrown away.
+    /// Number of failures after which its executor was discarded.
     pub lost: u64,
-    /// Times it was built anew after a failure.
+    /// Number of rebuilds after failures.
     pub rebuilds: u64,
-    /// Submissions that several jobs shared.
+    /// Number of submissions that several jobs shared.
     pub shared: u64,
-    /// Jobs of which it made a part, others the rest; among the finished.
-    pub spread: u64,
-    /// Bytes of its memory that are held: in use and pooled.
+    /// Number of finished partitions of multi-device jobs.
+    pub partitions: u64,
+    /// Bytes of device memory that are held, in use and pooled.
     pub held_bytes: u64,
 }
 
@@ -186,7 +185,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn choices_are_read_and_written() {
+    fn choices_are_parsed_and_formatted() {
         use DeviceName::{Number, Software};
         let list = DeviceChoice::These;
         for (text, choice, written) in [
@@ -202,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_choice_is_refused() {
+    fn invalid_choices_are_rejected() {
         for text in ["", ",", "0,", "-1", "+1", "0.5", "gpu", "cpu,0", "all,0", "0;1", "99999999999999999999999"] {
             let refused = text.parse::<DeviceChoice>().unwrap_err();
             assert!(refused.contains(&format!("`{text}`")) && refused.contains("0,2"), "{refused}");

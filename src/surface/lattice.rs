@@ -305,27 +305,27 @@ pub(super) fn roomier(spacing: f64) -> f64 {
 
 /// `v` as f32; the loss of digits is meant.
 #[expect(clippy::cast_possible_truncation, reason = "rounding to single precision is the point")]
-pub(super) fn to_f32(v: f64) -> f32 {
+pub(crate) fn to_f32(v: f64) -> f32 {
     v as f32
 }
 
 /// `v`, an integer value, as i32. Coordinates are at most 1e5 Å and the spacing at least 0.01 Å: 1e7 fits.
 #[expect(clippy::cast_possible_truncation, reason = "validated spheres and spacings keep it within ±1e7")]
-pub(super) fn to_i32(v: f64) -> i32 {
+pub(crate) fn to_i32(v: f64) -> i32 {
     debug_assert!(v.abs() < 1e9);
     v as i32
 }
 
 /// An index as u32. Indices within tiles, of atoms and of vertices are bounded where they arise; were a bound ever
 /// wrong, the saturated value fails the next look-up instead of aliasing another index.
-pub(super) fn to_u32(n: usize) -> u32 {
+pub(crate) fn to_u32(n: usize) -> u32 {
     debug_assert!(u32::try_from(n).is_ok(), "{n} is no 32-bit index");
     u32::try_from(n).unwrap_or(u32::MAX)
 }
 
 /// `v` as u64, saturating at both ends.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
-pub(super) fn to_u64(v: f64) -> u64 {
+pub(crate) fn to_u64(v: f64) -> u64 {
     v as u64
 }
 

@@ -53,30 +53,22 @@ pub(super) fn each<I: Items>(few: bool, items: I, work: impl Fn(<I as IntoIterat
     if few { items.into_iter().for_each(work) } else { items.into_par_iter().for_each(work) }
 }
 
-/// Likewise, with what comes of each, in order.
-pub(super) fn map<I: Items, R: Send>(
-    few: bool,
-    items: I,
-    work: impl Fn(<I as IntoIterator>::Item) -> R + Send + Sync,
-) -> Vec<R> {
-    if few { items.into_iter().map(work).collect() } else { items.into_par_iter().map(work).collect() }
-}
-
 #[cfg(test)]
 mod tests {
     use std::collections::HashSet;
+    use std::sync::Mutex;
     use std::thread::current;
 
     use super::*;
 
     #[test]
-    fn few_stay_on_their_thread_and_many_leave_it() {
+    fn small_jobs_stay_on_the_calling_thread() {
         let here = current().id();
         for few in [true, false] {
-            let threads: HashSet<_> = map(few, (0..64).collect::<Vec<_>>(), |_| current().id()).into_iter().collect();
-            assert_eq!(threads.contains(&here), few, "no thread of the test is one of the pool's");
-            let squares = map(few, vec![3, 1, 2], |n| n * n);
-            assert_eq!(squares, [9, 1, 4]);
+            let threads = Mutex::new(HashSet::new());
+            each(few, (0..64).collect::<Vec<_>>(), |_| _ = threads.lock().unwrap().insert(current().id()));
+            // The thread of the test does not belong to the pool.
+            assert_eq!(threads.into_inner().unwrap().contains(&here), few);
             let mut cells = [0; 5];
             each(few, cells.iter_mut().enumerate().collect::<Vec<_>>(), |(i, cell)| *cell = i + 1);
             assert_eq!(cells, [1, 2, 3, 4, 5]);

@@ -72,24 +72,24 @@ metrics! {
     VOXELS = "molmesh_voxels_processed_total", Counter;
     /// Triangles of finished meshes.
     TRIANGLES = "molmesh_triangles_emitted_total", Counter;
-    /// 1 while the device takes jobs, else 0.
+    /// 1 while the device accepts jobs, else 0.
     DEVICE_UP = "molmesh_device_up", Gauge, device: "numbers of devices in use";
-    /// Time that a device spent on jobs: preparing, computing and reading back, not waiting for work.
+    /// Time that a device spent on jobs: upload, computation and readback.
     DEVICE_BUSY = "molmesh_device_busy_seconds_total", Seconds, device: "numbers of devices in use";
-    /// Times that a device failed and what ran on it was thrown away.
+    /// Failures of a device after which its state was discarded.
     DEVICE_LOST = "molmesh_device_lost_total", Counter, device: "numbers of devices in use";
-    /// Times that a device was built anew after a failure, failed attempts included.
+    /// Rebuilds of a device after failures, including failed attempts.
     DEVICE_REBUILDS = "molmesh_device_rebuilds_total", Counter, device: "numbers of devices in use";
-    /// Bytes of a device's memory that are held, in use and pooled.
+    /// Bytes of device memory held, in use and pooled.
     DEVICE_MEMORY = "molmesh_device_memory_bytes", Gauge, device: "numbers of devices in use";
-    /// Jobs that wait for a device or run on it.
+    /// Jobs waiting for or running on a device.
     DEVICE_WAITING = "molmesh_device_jobs", Gauge, device: "numbers of devices in use";
-    /// Jobs that a device ended; `failed` are those that failed for the device's sake.
+    /// Jobs that a device finished or that failed because of it.
     DEVICE_JOBS = "molmesh_device_jobs_total", Counter, device: "numbers of devices in use", outcome: "finished|failed";
-    /// Submissions that several jobs shared.
+    /// Submissions shared by several jobs.
     DEVICE_SHARED = "molmesh_device_shared_submissions_total", Counter, device: "numbers of devices in use";
-    /// Jobs of which a device made a part, others the rest.
-    DEVICE_SPREAD = "molmesh_device_spread_jobs_total", Counter, device: "numbers of devices in use";
+    /// Partitions of multi-device jobs that a device finished.
+    DEVICE_PARTITIONS = "molmesh_device_partitions_total", Counter, device: "numbers of devices in use";
     /// Results asked for: of those that memory misses, the store is asked.
     CACHE_REQUESTS = "molmesh_cache_requests_total", Counter, tier: "memory|store", result: "hit|miss";
     /// Bytes kept in the store.

@@ -1,6 +1,6 @@
-//! A device for the tests: the software one, which every machine can have. A test without it fails.
+//! Software Vulkan device for tests. Tests fail if it is missing.
 
-#![allow(dead_code, reason = "every test binary uses a part")]
+#![allow(dead_code, reason = "every test binary uses some of it")]
 
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
@@ -11,7 +11,7 @@ use molmesh::surface::{
 
 pub(crate) const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
 
-/// A Vulkan device with the adapter's own limits.
+/// Opens a Vulkan device with the limits of its adapter.
 pub(crate) fn device() -> (wgpu::Device, wgpu::Queue) {
     let mut descriptor = wgpu::InstanceDescriptor::new_without_display_handle();
     descriptor.backends = wgpu::Backends::VULKAN;
@@ -28,7 +28,7 @@ pub(crate) fn device() -> (wgpu::Device, wgpu::Queue) {
     .expect("a device")
 }
 
-/// One engine for all tests of a binary: compiling it takes longer than most of them.
+/// Returns the engine that all tests of a binary share, because compiling it takes longer than most tests.
 pub(crate) fn engine() -> MutexGuard<'static, Engine> {
     static ENGINE: OnceLock<Mutex<Engine>> = OnceLock::new();
     let make = || {
@@ -38,7 +38,7 @@ pub(crate) fn engine() -> MutexGuard<'static, Engine> {
     ENGINE.get_or_init(make).lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
-/// An engine within what `change` makes of the device's budget.
+/// Creates an engine with the budget of the device as modified by `change`.
 pub(crate) fn engine_with(change: impl FnOnce(&mut Budget)) -> Engine {
     let (device, queue) = device();
     let mut budget = Budget::of(&device.limits());
@@ -71,8 +71,8 @@ pub(crate) fn params(kernel: Kernel, resolution: f64) -> SurfaceParams {
     SurfaceParams::new(&options).expect("valid")
 }
 
-/// The same parameters, with vertices rounded to the smallest step that reaches them all.
-pub(crate) fn rounded(spheres: &Spheres, params: &SurfaceParams) -> SurfaceParams {
+/// Returns the parameters with vertices quantized to the smallest step that covers them.
+pub(crate) fn quantized(spheres: &Spheres, params: &SurfaceParams) -> SurfaceParams {
     let step = Step::covering(molmesh::surface::lattice::extent(spheres, params));
     SurfaceParams { quantize: Some(step), ..params.clone() }
 }
@@ -81,7 +81,7 @@ pub(crate) fn measures(meshed: &Meshed) -> Measures {
     Measures::of(&meshed.mesh, Proof::Exact, &Control::default()).expect("not cancelled")
 }
 
-/// The spheres of a structure in `samples/`.
+/// Returns the spheres of a structure in `samples/`.
 pub(crate) fn sample(name: &str) -> Spheres {
     use molmesh::structure;
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("samples").join(name);
@@ -93,7 +93,7 @@ pub(crate) fn sample(name: &str) -> Spheres {
         .expect("spheres")
 }
 
-/// A small deterministic generator: tests must fail the same way twice.
+/// Deterministic random generator.
 pub(crate) struct Random(pub(crate) u64);
 
 impl Random {

@@ -230,7 +230,7 @@ impl Backend for Devices {
             lost: 5,
             rebuilds: 3,
             shared: 4,
-            spread: 3,
+            partitions: 3,
             held_bytes: 1 << 20,
         }]
     }

@@ -29,7 +29,7 @@ const ATOMS_PER_CHECK: usize = 256;
 /// Candidates that a list keeps memory for between tiles; longer lists are freed.
 const KEPT_CAPACITY: usize = 4096;
 /// Atoms are indexed with 31 bits.
-pub(in crate::surface) const MAX_ATOMS: usize = (1 << 31) - 1;
+pub(crate) const MAX_ATOMS: usize = (1 << 31) - 1;
 
 /// The tiles that some atom reaches, in canonical order, with their atoms.
 #[derive(Debug)]
@@ -138,13 +138,13 @@ impl Tiles {
 }
 
 /// The refusal of more atoms than 31-bit indices can number.
-pub(in crate::surface) fn too_many_atoms(n: usize) -> SurfaceError {
+pub(crate) fn too_many_atoms(n: usize) -> SurfaceError {
     let expected = format!("at most {MAX_ATOMS} spheres");
     SurfaceError::BadParameter { name: "spheres", value: n.to_string(), expected }
 }
 
 /// The refusal of a grid of (at least) `samples` samples.
-pub(in crate::surface) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
+pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
     let excess = samples as f64 / limits.max_samples.max(1) as f64;
     let mut fitting = lattice.spacing * excess.max(1.0).cbrt();
     // Ever coarser until an upper bound of the samples fits; a box of one cell needs 27 blocks at most.
@@ -173,7 +173,7 @@ pub(super) fn refuse_early(lattice: &Lattice, tiles: &Tiles, limits: &SurfaceLim
 }
 
 /// A lower bound of the samples: the volume of the blocks that lie wholly within some atom's reach.
-pub(in crate::surface) fn samples_at_least(lattice: &Lattice) -> f64 {
+pub(crate) fn samples_at_least(lattice: &Lattice) -> f64 {
     let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(f64::MAX, f64::min);
     // Half the least reach: a sphere then holds a few blocks wherever it lies.
     let side = 0.5 * reach;

@@ -19,27 +19,27 @@ const MIN_EXPONENT: f32 = -62.0;
 
 /// A kernel's constants in the form that the inner loops want.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::surface) struct Constants {
-    pub(in crate::surface) kernel: Kernel,
+pub(crate) struct Constants {
+    pub(crate) kernel: Kernel,
     /// u from which on the density is 0.
-    pub(in crate::surface) support: f32,
+    pub(crate) support: f32,
     /// Gaussian: the exponent of 2 is `share − rate·u` per axis; the three shares carry the amplitude.
-    pub(in crate::surface) share: f32,
-    pub(in crate::surface) rate: f32,
+    pub(crate) share: f32,
+    pub(crate) rate: f32,
     /// Gaussian: the C¹ cut-off's linear term is `tail_share + tail_rate·u` per axis.
-    pub(in crate::surface) tail_share: f32,
-    pub(in crate::surface) tail_rate: f32,
+    pub(crate) tail_share: f32,
+    pub(crate) tail_rate: f32,
     /// Gaussian: the linear term's value at the support.
-    pub(in crate::surface) tail_end: f32,
+    pub(crate) tail_end: f32,
     /// Soft object, inverse square: factor of the density.
-    pub(in crate::surface) amplitude: f32,
+    pub(crate) amplitude: f32,
     /// Inverse square: least u, per 1/ρ².
-    pub(in crate::surface) u_min: f32,
+    pub(crate) u_min: f32,
 }
 
 impl Constants {
     /// Constants of `profile` on a lattice of `spacing` Å.
-    pub(in crate::surface) fn new(profile: &Profile, spacing: f64) -> Self {
+    pub(crate) fn new(profile: &Profile, spacing: f64) -> Self {
         let gaussian = profile.kernel == Kernel::Gaussian;
         let support = profile.support();
         let factor = if gaussian { profile.amplitude / profile.cutoff_norm() } else { profile.amplitude };

@@ -17,21 +17,21 @@ use crate::surface::simd::{dispatched, exp2, fma};
 
 /// Constants of the slope −dF/du of a kernel.
 #[derive(Debug, Clone, Copy)]
-pub(in crate::surface) struct SlopeConstants {
+pub(crate) struct SlopeConstants {
     kernel: Kernel,
     support: f32,
     /// Gaussian: the exponent of 2 is `offset − rate·u`; the factor's logarithm is in `offset`.
-    pub(in crate::surface) offset: f32,
+    pub(crate) offset: f32,
     rate: f32,
     /// Gaussian: what the C¹ cut-off takes away.
-    pub(in crate::surface) tail: f32,
+    pub(crate) tail: f32,
     u_min: f32,
 }
 
 impl SlopeConstants {
     /// Constants of `profile` on a lattice of `spacing` Å. The amplitude is irrelevant to a direction, so it is
     /// left out: numbers stay near 1.
-    pub(in crate::surface) fn new(profile: &Profile, spacing: f64) -> Self {
+    pub(crate) fn new(profile: &Profile, spacing: f64) -> Self {
         let rate = profile.decay * std::f64::consts::LOG2_E;
         Self {
             kernel: profile.kernel,

@@ -32,11 +32,11 @@ use std::num::NonZero;
 use std::ops::Range;
 use std::sync::Arc;
 
-// What the plan of a device's work shares with this backend: formulas, refusals and their numbers.
-pub(super) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
-pub(super) use self::field::Constants;
-pub(super) use self::interpolate::SlopeConstants;
-pub(super) use self::scan::too_large as mesh_too_large;
+// Formulas and errors that the occupancy count and the plan of a device's job share with this backend.
+pub(crate) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
+pub(crate) use self::field::Constants;
+pub(crate) use self::interpolate::SlopeConstants;
+pub(crate) use self::scan::too_large as mesh_too_large;
 
 use self::bin::{Tiles, slot_brick};
 use self::classify::{Before, Found};

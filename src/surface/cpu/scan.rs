@@ -33,7 +33,7 @@ pub(super) fn scan(tiles: &mut [Tile], params: &SurfaceParams, limits: &SurfaceL
 
 /// The refusal of a mesh of `bytes` bytes. Areas stay while cells shrink: bytes grow with the inverse square of the
 /// spacing.
-pub(in crate::surface) fn too_large(bytes: u64, spacing: f64, limit: u64) -> SurfaceError {
+pub(crate) fn too_large(bytes: u64, spacing: f64, limit: u64) -> SurfaceError {
     let excess = (bytes as f64 / limit.max(1) as f64).max(1.0);
     SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution: roomier(spacing * excess.sqrt()) }
 }

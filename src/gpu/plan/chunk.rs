@@ -1,42 +1,43 @@
-//! A plan's bricks cut into chunks that fit a device. A chunk is a run of tiles, and the bricks behind it whose samples
-//! its cells need: those are computed again where they belong.
+//! Chunks of a plan: runs of tiles that fit a device, with the bricks behind them whose samples their cells need. The
+//! halo bricks are computed again in the chunk that owns them.
 
 use std::ops::Range;
 
-use super::lattice::to_u32;
+use super::Plan;
 use super::layout::{NONE, Params};
-use super::plan::Plan;
+use crate::surface::lattice::to_u32;
 
-/// What a device can hold of one chunk at once.
+/// Capacity of a device for one chunk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ChunkLimits {
-    /// Bricks with their samples.
+    /// Maximum number of bricks with samples.
     pub bricks: u64,
-    /// Entries of candidate lists.
+    /// Maximum number of entries in candidate lists.
     pub candidates: u64,
 }
 
-/// A run of bricks that is computed at once.
+/// Run of bricks that is computed at once.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Chunk {
-    /// Its first brick.
+    /// First brick.
     pub first_brick: u32,
-    /// Its bricks.
+    /// Number of own bricks.
     pub n_own: u32,
-    /// Borrowed bricks: later ones that hold samples of its cells, ascending.
+    /// Halo: later bricks that hold samples of the chunk's cells, ascending.
     pub halo: Vec<u32>,
-    /// Entries that its candidate lists take at most.
+    /// Upper bound of the entries in the candidate lists.
     pub candidates: u64,
 }
 
 impl Chunk {
-    /// Bricks with samples, own and borrowed.
+    /// Number of bricks with samples: own bricks and halo.
     #[must_use]
     pub fn n_slots(&self) -> u64 {
         u64::from(self.n_own) + self.halo.len() as u64
     }
 
-    /// The borrowed bricks, then for each brick behind the chunk its slot or [`NONE`], up to the last borrowed one.
+    /// Contents of the `halo` buffer: the halo bricks, then the slot (or [`NONE`]) of each brick behind the chunk up to
+    /// the last halo brick.
     #[must_use]
     pub fn halo_table(&self) -> Vec<u32> {
         let end = self.first_brick + self.n_own;
@@ -48,7 +49,7 @@ impl Chunk {
         table
     }
 
-    /// Entries of [`Self::halo_table`].
+    /// Number of entries of [`Self::halo_table`].
     #[must_use]
     pub fn halo_table_len(&self) -> u64 {
         self.halo.len() as u64 + u64::from(self.n_halo_slots())
@@ -58,7 +59,7 @@ impl Chunk {
         self.halo.last().map_or(0, |last| last - (self.first_brick + self.n_own) + 1)
     }
 
-    /// `params` for this chunk.
+    /// Parameters of the job with those of this chunk filled in.
     #[must_use]
     pub fn params(&self, params: &Params) -> Params {
         Params {
@@ -73,19 +74,13 @@ impl Chunk {
 }
 
 impl Plan {
-    /// Cuts the bricks into chunks. `None` where a single tile is more than the limits allow.
+    /// Cuts a run of tiles into chunks. `None` if a single tile exceeds the limits.
     #[must_use]
-    pub fn chunks(&self, limits: ChunkLimits) -> Option<Vec<Chunk>> {
-        self.chunks_of(0..self.tiles.len(), limits)
-    }
-
-    /// Likewise, of a run of tiles.
-    #[must_use]
-    pub fn chunks_of(&self, tiles: Range<usize>, limits: ChunkLimits) -> Option<Vec<Chunk>> {
+    pub fn chunks(&self, tiles: Range<usize>, limits: ChunkLimits) -> Option<Vec<Chunk>> {
         let mut chunks = Vec::new();
         let mut from = tiles.start;
         while from < tiles.end {
-            // As many tiles as fit by themselves, then fewer until the borrowed bricks fit too.
+            // As many tiles as fit without their halo, then fewer until the halo fits too.
             let mut to = from;
             let (mut bricks, mut candidates) = (0, 0);
             while to < tiles.end {
@@ -112,18 +107,13 @@ impl Plan {
         Some(chunks)
     }
 
-    /// The first brick of tile `t`; behind the last tile, the number of bricks.
-    pub(super) fn tile_start(&self, t: usize) -> u32 {
-        self.tiles.get(t).map_or(to_u32(self.bricks.len()), |tile| tile.base)
-    }
-
     fn chunk(&self, from: usize, to: usize) -> Chunk {
         let (first, end) = (self.tile_start(from), self.tile_start(to));
         let halo = self.halo(first..end);
-        let mut lenders: Vec<u32> = halo.iter().map(|&b| self.bricks[b as usize] >> 9).collect();
-        lenders.dedup();
+        let mut halo_tiles: Vec<u32> = halo.iter().map(|&b| self.bricks[b as usize] >> 9).collect();
+        halo_tiles.dedup();
         let candidates = self.candidates[from..to].iter().sum::<u64>()
-            + lenders.iter().map(|&t| self.candidates[t as usize]).sum::<u64>();
+            + halo_tiles.iter().map(|&t| self.candidates[t as usize]).sum::<u64>();
         Chunk { first_brick: first, n_own: end - first, halo, candidates }
     }
 
@@ -142,7 +132,7 @@ impl Plan {
         halo
     }
 
-    /// The neighbour towards +x (bit 0 of `n`), +y (1), +z (2) of a brick given as in [`Plan::bricks`].
+    /// Neighbour of a brick, given as in [`Plan::bricks`], towards +x (bit 0 of `n`), +y (bit 1) and +z (bit 2).
     fn neighbour(&self, brick: u32, n: u32) -> Option<u32> {
         let (tile, local) = (&self.tiles[(brick >> 9) as usize], brick & 511);
         let moved = [0, 3, 6].map(|shift| (local >> shift & 7) + (n >> (shift / 3) & 1));
@@ -163,10 +153,8 @@ mod tests {
     use std::collections::{BTreeSet, HashMap};
 
     use super::*;
-    use crate::surface::control::Control;
     use crate::surface::lattice::Lattice;
-    use crate::surface::params::{SurfaceLimits, SurfaceParams};
-    use crate::surface::spheres::Spheres;
+    use crate::surface::{Control, Spheres, SurfaceLimits, SurfaceParams};
 
     fn plan() -> Plan {
         let at = |i: u32, k: f64| 55.0 * (f64::from(i) * k).sin();
@@ -176,8 +164,8 @@ mod tests {
         Plan::new(&lattice, &SurfaceLimits::default(), &Control::default()).unwrap()
     }
 
-    /// What is wrong with `chunks`.
-    fn wrong(plan: &Plan, chunks: &[Chunk], limits: ChunkLimits) -> Option<String> {
+    /// Returns the first defect of `chunks`.
+    fn defect(plan: &Plan, chunks: &[Chunk], limits: ChunkLimits) -> Option<String> {
         let place = |b: usize| {
             let local = [0, 3, 6].map(|shift| i32::try_from(plan.bricks[b] >> shift & 7).unwrap());
             let tile = plan.tiles[(plan.bricks[b] >> 9) as usize].coord;
@@ -199,7 +187,7 @@ mod tests {
                 }
             }
             if !needed.iter().eq(&chunk.halo) {
-                return Some(format!("{} borrowed, {} needed", chunk.halo.len(), needed.len()));
+                return Some(format!("{} halo bricks, {} needed", chunk.halo.len(), needed.len()));
             }
             let table = chunk.halo_table();
             for (slot, brick) in (chunk.n_own..).zip(&chunk.halo) {
@@ -208,33 +196,33 @@ mod tests {
                 }
             }
             if table.len() as u64 != chunk.halo_table_len() {
-                return Some("the table's length".to_owned());
+                return Some("wrong length of the table".to_owned());
             }
         }
         (next as usize != plan.bricks.len()).then(|| format!("{next} bricks"))
     }
 
     #[test]
-    fn chunks_cover_all_bricks_and_borrow_what_they_need() {
+    fn chunks_cover_all_bricks_and_have_the_halo_that_they_need() {
         let plan = plan();
         let limits = |bricks| ChunkLimits { bricks, candidates: 1 << 30 };
         for bricks in [700, 1500, 4000, 1 << 20] {
-            let chunks = plan.chunks(limits(bricks)).unwrap();
-            assert_eq!(wrong(&plan, &chunks, limits(bricks)), None, "{bricks}");
+            let chunks = plan.chunks(0..plan.tiles.len(), limits(bricks)).unwrap();
+            assert_eq!(defect(&plan, &chunks, limits(bricks)), None, "{bricks}");
             assert_eq!(chunks.len() == 1, bricks == 1 << 20);
         }
-        // Few entries for lists make small chunks too.
+        // A small limit of candidates gives small chunks too.
         let few = ChunkLimits { bricks: 1 << 20, candidates: plan.candidates.iter().sum::<u64>() / 2 };
-        assert!(plan.chunks(few).unwrap().len() > 2);
-        assert!(plan.chunks(limits(100)).is_none());
-        // Controls.
-        let good = plan.chunks(limits(1500)).unwrap();
+        assert!(plan.chunks(0..plan.tiles.len(), few).unwrap().len() > 2);
+        assert!(plan.chunks(0..plan.tiles.len(), limits(100)).is_none());
+        // Negative controls.
+        let good = plan.chunks(0..plan.tiles.len(), limits(1500)).unwrap();
         let mut bad = good.clone();
         bad[0].halo.pop();
-        assert!(wrong(&plan, &bad, limits(1500)).is_some());
+        assert!(defect(&plan, &bad, limits(1500)).is_some());
         bad = good.clone();
         bad.remove(1);
-        assert!(wrong(&plan, &bad, limits(1500)).is_some());
-        assert!(wrong(&plan, &good, limits(800)).is_some());
+        assert!(defect(&plan, &bad, limits(1500)).is_some());
+        assert!(defect(&plan, &good, limits(800)).is_some());
     }
 }

@@ -1,24 +1,24 @@
-//! What lies in a device's buffers, as the shaders declare it. Lengths are in spacings of the lattice unless said
-//! otherwise. The build reflects the shaders' structs, and a test compares every field with these.
+//! Contents of a device's buffers, as the shaders declare them. Lengths are in spacings of the lattice unless said
+//! otherwise. The build reflects the structs of the shaders, and a test compares every field with these.
 
 use bytemuck::{Pod, Zeroable};
 
-use super::cases::{CASES, CellEdge, cell_edge};
+use crate::surface::cases::{CASES, CellEdge, cell_edge};
 
 /// Marks a tile or brick that does not exist.
 pub const NONE: u32 = u32::MAX;
 
-/// What a dispatch needs to know.
+/// Parameters of a dispatch.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Params {
-    /// The sample that positions are relative to.
+    /// Sample that positions are relative to.
     pub centre: [i32; 3],
     /// Spacing, Å.
     pub spacing: f32,
-    /// The density of the surface.
+    /// Density at the surface.
     pub isovalue: f32,
-    /// u from which on the density is 0.
+    /// Squared relative distance u from which on the density is 0.
     pub support: f32,
     /// Gaussian: the exponent of 2 is `share − rate·u` per axis; three shares carry the amplitude.
     pub share: f32,
@@ -38,102 +38,102 @@ pub struct Params {
     pub slope_offset: f32,
     /// Gaussian: see `slope_offset`.
     pub slope_tail: f32,
-    /// The longest reach of an atom.
+    /// Maximum reach of an atom.
     pub reach: f32,
-    /// Bricks before a brick, per axis, in which atoms that reach it can live.
+    /// Number of bricks before a brick, per axis, whose atoms may reach it.
     pub back: u32,
-    /// Bricks behind it.
+    /// Number of bricks behind a brick, per axis, whose atoms may reach it.
     pub ahead: u32,
-    /// Tiles of the job.
+    /// Number of tiles of the job.
     pub n_tiles: u32,
-    /// Bricks of the job.
+    /// Number of bricks of the job.
     pub n_bricks: u32,
     /// First brick of the chunk.
     pub first_brick: u32,
-    /// Its bricks.
+    /// Number of the chunk's own bricks.
     pub n_own: u32,
-    /// Bricks of later chunks whose samples it needs.
+    /// Number of halo bricks.
     pub n_halo: u32,
-    /// Entries of the table from bricks behind the chunk to its slots.
+    /// Number of entries of the table that maps bricks behind the chunk to slots.
     pub n_halo_slots: u32,
-    /// Entries that its candidate lists may take.
+    /// Capacity of the candidate lists, in entries.
     pub list_capacity: u32,
-    /// Vertices before the chunk.
+    /// Number of vertices before the chunk.
     pub first_vertex: u32,
-    /// Triangles before the chunk.
+    /// Number of triangles before the chunk.
     pub first_triangle: u32,
-    /// First brick of the piece of output at hand.
+    /// First brick of the output piece.
     pub piece_brick: u32,
-    /// Bricks of the piece.
+    /// Number of bricks of the output piece.
     pub piece_bricks: u32,
-    /// Vertices before the piece.
+    /// Number of vertices before the output piece.
     pub piece_vertex: u32,
-    /// Triangles before the piece.
+    /// Number of triangles before the output piece.
     pub piece_triangle: u32,
-    /// Vertices that the piece's buffers hold.
+    /// Capacity of the vertex buffers.
     pub vertex_capacity: u32,
-    /// Triangles that the piece's buffer holds.
+    /// Capacity of the triangle buffer.
     pub triangle_capacity: u32,
-    /// 0, which the shaders' compiler must not know.
+    /// Always 0, but unknown to the shader compiler; see `rounded` in `bin.wgsl`.
     pub zero: u32,
-    /// Vertices before the first that the device's own numbers count: those of other devices' parts.
+    /// Number of vertices in earlier partitions, which other devices make.
     pub base_vertex: u32,
-    /// What positions are multiplied by before they are rounded, 1/Å; 0: vertices are single-precision numbers.
+    /// Factor of positions before rounding to integers, 1/Å; 0 for vertices in single precision.
     pub steps_per_angstrom: f32,
 }
 
-/// A tile: 8 × 8 × 8 bricks, of which those with a set bit exist.
+/// Tile: 8 × 8 × 8 bricks, with a bit set for each that exists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Tile {
     /// Coordinates, in tiles.
     pub coord: [i32; 3],
-    /// Bricks of all tiles before.
+    /// Number of bricks in all tiles before.
     pub base: u32,
     /// Word z, lower half first; bit `8·y + x`.
     pub bricks: [[u32; 2]; 8],
-    /// Bricks of the tile before each word.
+    /// Number of bricks of the tile before each word.
     pub before: [u32; 8],
-    /// Tiles around, or [`NONE`]: entry `9·(z + 1) + 3·(y + 1) + (x + 1)`; the last is unused.
+    /// Adjacent tiles, or [`NONE`]: entry `9·(z + 1) + 3·(y + 1) + (x + 1)`; the last is unused.
     pub around: [u32; 28],
 }
 
-/// What `classify` keeps of a brick.
+/// Result of `classify` for a brick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Record {
     /// Crossing edges: half-word `2·(3·z + axis) + half` of 32 bits; bit `8·y + x` of the owning sample, the upper half
     /// from y = 4 on. Vertices are numbered in this order.
     pub crossing: [u32; 48],
-    /// Per layer the vertices before it (16 bits), those of its x edges (8) and of its y edges (8).
+    /// Per layer: number of vertices before it (16 bits), on its x edges (8 bits) and on its y edges (8 bits).
     pub layers: [u32; 8],
-    /// The brick and its neighbours towards +x (bit 0), +y (1), +z (2), or [`NONE`].
-    pub near: [u32; 8],
+    /// Brick and its neighbours towards +x (bit 0), +y (bit 1) and +z (bit 2), or [`NONE`].
+    pub neighbours: [u32; 8],
 }
 
-/// Counters that the host reads back.
+/// Counters that the stages update and the host reads back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Pod, Zeroable)]
 #[repr(C)]
-pub struct Tally {
-    /// Entries that the candidate lists take, or would.
+pub struct Counters {
+    /// Number of entries in the candidate lists, including those beyond the capacity.
     pub list_end: u32,
-    /// Vertices up to the end of the chunk.
+    /// Number of vertices up to the end of the chunk.
     pub vertices: u32,
-    /// Triangles likewise.
+    /// Number of triangles up to the end of the chunk.
     pub triangles: u32,
-    /// Vertices without a gradient.
+    /// Number of vertices without a gradient.
     pub flat: u32,
 }
 
-/// Samples of a brick.
+/// Number of samples of a brick.
 pub const SAMPLES: u64 = 512;
-/// Bricks of a group, whose counts `classify` adds up for `scan`.
+/// Number of bricks of a group; `classify` adds up the counts of each group for `scan`.
 pub const GROUP: u32 = 1024;
-/// Words of the case table: the number of triangles of each case; the same, eight cases a word; the twelve edges of a
-/// cell, and four words of nothing; then two words a case, four bits a corner of its triangles.
+/// Number of words of the case table: the triangle count of each case; the same with eight cases per word; the twelve
+/// edges of a cell and four unused words; then two words per case with four bits per triangle corner.
 pub const CASE_WORDS: usize = 256 + 32 + 16 + 2 * 256;
 
-/// The case table as the shaders read it.
+/// Returns the case table as the shaders read it.
 #[must_use]
 pub fn case_table() -> Vec<u32> {
     let counts = || CASES.count.iter().map(|&n| u32::from(n));
@@ -147,15 +147,16 @@ pub fn case_table() -> Vec<u32> {
     counts().chain(packed).chain(edges).chain(rows).collect()
 }
 
-/// An edge of a cell as a step from the cell's sample to its own: 1 along x, 16 along y. Behind four rows begins another
-/// word of edges, worth 64; a layer has 3 of them, with the first row of the brick behind, and an axis 9 layers.
+/// Offset of a cell's edge from the cell's sample: 1 along x and 16 along y. Each group of four rows is a word of
+/// edges, with an offset of 64; a layer has 3 words, including the first row of the next brick, and an axis has 9
+/// layers.
 fn edge_code(edge: u8) -> u32 {
     let CellEdge { offset, axis } = cell_edge(edge);
     let [x, y, z] = offset.map(u32::from);
     x + 16 * y + 64 * (3 * z + 27 * u32::from(axis))
 }
 
-/// The lower and the upper 32 bits.
+/// Returns the lower and the upper 32 bits.
 pub(super) fn halves(word: u64) -> [u32; 2] {
     let part = |v: u64| u32::try_from(v & u64::from(u32::MAX)).unwrap_or_default();
     [part(word), part(word >> 32)]

@@ -1,4 +1,4 @@
-//! The passes of a picture on one device: four that draw, one that resolves, one that finishes.
+//! Passes of a picture on a device: four draw passes, one that resolves the samples, and one that shades the pixels.
 
 use std::sync::Arc;
 
@@ -10,46 +10,48 @@ use wgpu::{
     VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
 };
 
+use super::device_errors::DeviceErrors;
 use super::error::GpuError;
-use super::health::{Complaint, Health};
-use super::picture_targets::{DEPTH, Layered, NEAREST, NOTHING, Numbers, PATTERN, SHADE, View, buffer, taps, texture};
+use super::picture_targets::{
+    DEPTH, FinishParams, Layered, NEAREST, NOTHING, PATTERN, SHADE, View, buffer, taps_of, texture,
+};
 use super::shaders::{PICTURE, Shader};
 use crate::picture::PictureParams;
 use crate::picture::camera::Camera;
 use crate::picture::finish::Finish;
 use crate::picture::light::Levels;
 
-/// Pixels of a workgroup's side, as the shaders have it.
+/// Width and height of a workgroup in pixels, as in the shaders.
 const GROUP: u32 = 8;
 
-/// A compute pass and what it binds.
-struct Step {
+/// Compute pass with its bind group layout.
+struct ComputePass {
     pipeline: ComputePipeline,
     layout: BindGroupLayout,
 }
 
-/// An open device that draws.
-pub(super) struct Painter {
+/// Open device with the compiled passes.
+pub(super) struct PicturePasses {
     device: Device,
     queue: Queue,
-    health: Arc<Health>,
+    errors: Arc<DeviceErrors>,
     draw: RenderPipeline,
     view: BindGroupLayout,
-    resolve: Step,
-    finish: Step,
+    resolve: ComputePass,
+    finish: ComputePass,
     levels: Buffer,
 }
 
-impl Painter {
-    /// Compiles everything.
+impl PicturePasses {
+    /// Compiles the passes.
     ///
     /// # Errors
-    /// What the device says.
+    /// [`GpuError::Failed`] or [`GpuError::Lost`] as reported by the device.
     pub(super) fn new(device: Device, queue: Queue) -> Result<Self, GpuError> {
-        let health = Health::of(&device);
+        let errors = DeviceErrors::listen(&device);
         let [vertex, fragment, resolve, finish] = &PICTURE;
         let view = layout(&device, "view", &[uniform(0, ShaderStages::VERTEX)]);
-        let draw = drawing(&device, &view, [vertex, fragment]);
+        let draw = draw_pipeline(&device, &view, [vertex, fragment]);
         let compute = ShaderStages::COMPUTE;
         let resolved = [uniform(0, compute), layers(1), layers(2), storage(3, false), storage(4, false)];
         let finished = [
@@ -62,30 +64,31 @@ impl Painter {
         ];
         let table: Vec<u32> = Levels::get().table().iter().copied().map(u32::from).collect();
         let levels = filled(&device, &queue, "levels", bytemuck::cast_slice(&table), BufferUsages::STORAGE);
-        let painter = Self {
-            resolve: step(&device, resolve, &resolved),
-            finish: step(&device, finish, &finished),
+        let passes = Self {
+            resolve: compute_pass(&device, resolve, &resolved),
+            finish: compute_pass(&device, finish, &finished),
             device,
             queue,
-            health,
+            errors,
             draw,
             view,
             levels,
         };
-        painter.healthy()?;
-        Ok(painter)
+        passes.check_errors()?;
+        Ok(passes)
     }
 
-    /// The device's limits.
+    /// Returns the limits of the device.
     pub(super) fn limits(&self) -> Limits {
         self.device.limits()
     }
 
-    /// Draws; pixels in rows from the top. What [`Needs`](super::picture_targets::Needs) says must be within the device's limits.
+    /// Draws a mesh. Returns the pixels in rows from the top. The caller has checked the
+    /// [`Requirements`](super::picture_targets::Requirements).
     ///
     /// # Errors
-    /// What the device says; [`GpuError::Lost`] if it is gone.
-    pub(super) fn paint(
+    /// [`GpuError::Failed`] or [`GpuError::Lost`] as reported by the device.
+    pub(super) fn draw(
         &self,
         positions: &[[f32; 3]],
         normals: &[[f32; 3]],
@@ -96,10 +99,10 @@ impl Painter {
         let (device, queue) = (&self.device, &self.queue);
         let n_pixels = u64::from(params.width) * u64::from(params.height);
         let column = |label: &str, bytes: &[u8], usage| filled(device, queue, label, bytes, usage);
-        let places = column("positions", bytemuck::cast_slice(positions), BufferUsages::VERTEX);
-        let facing = column("normals", bytemuck::cast_slice(normals), BufferUsages::VERTEX);
-        let corners = column("triangles", bytemuck::cast_slice(triangles), BufferUsages::INDEX);
-        let n_corners = u32::try_from(3 * triangles.len()).map_err(|_too_many| {
+        let position_buffer = column("positions", bytemuck::cast_slice(positions), BufferUsages::VERTEX);
+        let normal_buffer = column("normals", bytemuck::cast_slice(normals), BufferUsages::VERTEX);
+        let index_buffer = column("triangles", bytemuck::cast_slice(triangles), BufferUsages::INDEX);
+        let n_indices = u32::try_from(3 * triangles.len()).map_err(|_too_many| {
             GpuError::Failed(format!("{} triangles are too many for one draw", triangles.len()))
         })?;
         let shades = Layered::new(device, "molmesh.picture.shades", SHADE, params);
@@ -107,7 +110,7 @@ impl Painter {
         let attachment = TextureUsages::RENDER_ATTACHMENT;
         let nearest = texture(device, "molmesh.picture.nearest", NEAREST, params, 1, attachment);
         let nearest = nearest.create_view(&TextureViewDescriptor::default());
-        self.healthy()?;
+        self.check_errors()?;
 
         let mut encoder =
             device.create_command_encoder(&wgpu::CommandEncoderDescriptor { label: Some("molmesh.picture") });
@@ -116,68 +119,62 @@ impl Painter {
             let view = column("view", bytemuck::bytes_of(&view), BufferUsages::UNIFORM);
             let group = bind(device, &self.view, &[view.as_entire_binding()]);
             let views = [shades.layer(sample), depths.layer(sample)];
-            let mut pass = begin(&mut encoder, &views, &nearest);
+            let mut pass = begin_draw(&mut encoder, &views, &nearest);
             pass.set_pipeline(&self.draw);
             pass.set_bind_group(0, &group, &[]);
-            pass.set_vertex_buffer(0, places.slice(..));
-            pass.set_vertex_buffer(1, facing.slice(..));
-            pass.set_index_buffer(corners.slice(..), wgpu::IndexFormat::Uint32);
-            pass.draw_indexed(0..n_corners, 0, 0..1);
+            pass.set_vertex_buffer(0, position_buffer.slice(..));
+            pass.set_vertex_buffer(1, normal_buffer.slice(..));
+            pass.set_index_buffer(index_buffer.slice(..), wgpu::IndexFormat::Uint32);
+            pass.draw_indexed(0..n_indices, 0, 0..1);
         }
         let finish = Finish::new(params, camera);
-        let numbers = Numbers::new(&finish, params);
-        let numbers = column("numbers", bytemuck::bytes_of(&numbers), BufferUsages::UNIFORM);
-        let around = column("taps", bytemuck::cast_slice(&taps(&finish)), BufferUsages::STORAGE);
+        let finish_params = FinishParams::new(&finish, params);
+        let finish_params = column("params", bytemuck::bytes_of(&finish_params), BufferUsages::UNIFORM);
+        let taps = column("taps", bytemuck::cast_slice(&taps_of(&finish)), BufferUsages::STORAGE);
         let rows = |label| buffer(device, label, 16 * n_pixels, BufferUsages::STORAGE);
-        let (seen, facing) = (rows("molmesh.picture.seen"), rows("molmesh.picture.facing"));
+        let (seen, resolved_normals) = (rows("molmesh.picture.seen"), rows("molmesh.picture.normals"));
         let both = BufferUsages::STORAGE | BufferUsages::COPY_SRC;
         let pixels = buffer(device, "molmesh.picture.pixels", 4 * n_pixels, both);
-        let landing = BufferUsages::COPY_DST | BufferUsages::MAP_READ;
-        let landing = buffer(device, "molmesh.picture.landing", 4 * n_pixels, landing);
+        let mappable = BufferUsages::COPY_DST | BufferUsages::MAP_READ;
+        let readback = buffer(device, "molmesh.picture.readback", 4 * n_pixels, mappable);
         let groups = [params.width.div_ceil(GROUP), params.height.div_ceil(GROUP)];
         let (all_shades, all_depths) = (shades.all(), depths.all());
         let resources = [
-            numbers.as_entire_binding(),
+            finish_params.as_entire_binding(),
             BindingResource::TextureView(&all_shades),
             BindingResource::TextureView(&all_depths),
             seen.as_entire_binding(),
-            facing.as_entire_binding(),
+            resolved_normals.as_entire_binding(),
         ];
         self.resolve.run(device, &mut encoder, &resources, groups);
-        let resources = [&numbers, &seen, &facing, &around, &self.levels, &pixels].map(Buffer::as_entire_binding);
+        let resources =
+            [&finish_params, &seen, &resolved_normals, &taps, &self.levels, &pixels].map(Buffer::as_entire_binding);
         self.finish.run(device, &mut encoder, &resources, groups);
-        encoder.copy_buffer_to_buffer(&pixels, 0, &landing, 0, 4 * n_pixels);
+        encoder.copy_buffer_to_buffer(&pixels, 0, &readback, 0, 4 * n_pixels);
         queue.submit([encoder.finish()]);
-        self.read(&landing)
+        self.read(&readback)
     }
 
-    /// What a buffer holds once everything that was submitted is done.
-    fn read(&self, landing: &Buffer) -> Result<Vec<[u8; 4]>, GpuError> {
-        landing.map_async(MapMode::Read, .., |_mapped| {});
+    /// Waits for all submissions and returns the contents of a buffer.
+    fn read(&self, readback: &Buffer) -> Result<Vec<[u8; 4]>, GpuError> {
+        readback.map_async(MapMode::Read, .., |_mapped| {});
         let waited = self.device.poll(PollType::wait_indefinitely());
-        self.healthy()?;
+        self.check_errors()?;
         waited.map_err(|error| GpuError::Failed(error.to_string()))?;
-        let view = landing.get_mapped_range(..).map_err(|error| GpuError::Failed(error.to_string()))?;
+        let view = readback.get_mapped_range(..).map_err(|error| GpuError::Failed(error.to_string()))?;
         let pixels = bytemuck::cast_slice::<u8, [u8; 4]>(&view).to_vec();
         drop(view);
-        landing.unmap();
+        readback.unmap();
         Ok(pixels)
     }
 
-    /// Whether the device has complained.
-    fn healthy(&self) -> Result<(), GpuError> {
-        match self.health.complaint() {
-            None => Ok(()),
-            Some(Complaint::Lost(why)) => Err(GpuError::Lost(why)),
-            Some(Complaint::OutOfMemory) => {
-                Err(GpuError::Failed("it has too little memory for the picture".to_owned()))
-            }
-            Some(Complaint::Failed(why)) => Err(GpuError::Failed(why)),
-        }
+    /// Fails if the graphics API has reported an error since the last check.
+    fn check_errors(&self) -> Result<(), GpuError> {
+        self.errors.check(|| GpuError::Failed("it has too little memory for the picture".to_owned()))
     }
 }
 
-impl Step {
+impl ComputePass {
     fn run(&self, device: &Device, encoder: &mut CommandEncoder, resources: &[BindingResource<'_>], groups: [u32; 2]) {
         let group = bind(device, &self.layout, resources);
         let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: None, timestamp_writes: None });
@@ -187,8 +184,8 @@ impl Step {
     }
 }
 
-/// Begins to draw one sample of every pixel, over nothing.
-fn begin<'a>(
+/// Begins a pass that draws one sample of every pixel onto cleared targets.
+fn begin_draw<'a>(
     encoder: &'a mut CommandEncoder,
     views: &[wgpu::TextureView; 2],
     nearest: &wgpu::TextureView,
@@ -211,8 +208,8 @@ fn begin<'a>(
     })
 }
 
-/// The pipeline that draws.
-fn drawing(device: &Device, view: &BindGroupLayout, [vertex, fragment]: [&Shader; 2]) -> RenderPipeline {
+/// Compiles the pipeline of the draw passes.
+fn draw_pipeline(device: &Device, view: &BindGroupLayout, [vertex, fragment]: [&Shader; 2]) -> RenderPipeline {
     let attributes =
         [0, 1].map(|shader_location| [VertexAttribute { format: VertexFormat::Float32x3, offset: 0, shader_location }]);
     let columns = attributes
@@ -263,22 +260,22 @@ fn module(device: &Device, shader: &Shader) -> ShaderModule {
     device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(shader.stage), source })
 }
 
-fn step(device: &Device, shader: &Shader, entries: &[BindGroupLayoutEntry]) -> Step {
+fn compute_pass(device: &Device, shader: &Shader, entries: &[BindGroupLayoutEntry]) -> ComputePass {
     let layout = layout(device, shader.stage, entries);
-    let of_pipeline = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+    let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
         label: Some(shader.stage),
         bind_group_layouts: &[Some(&layout)],
         immediate_size: 0,
     });
     let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: Some(shader.stage),
-        layout: Some(&of_pipeline),
+        layout: Some(&pipeline_layout),
         module: &module(device, shader),
         entry_point: Some("main"),
         compilation_options: wgpu::PipelineCompilationOptions::default(),
         cache: None,
     });
-    Step { pipeline, layout }
+    ComputePass { pipeline, layout }
 }
 
 fn layout(device: &Device, label: &str, entries: &[BindGroupLayoutEntry]) -> BindGroupLayout {
@@ -315,7 +312,7 @@ fn layers(binding: u32) -> BindGroupLayoutEntry {
     entry(binding, ShaderStages::COMPUTE, BindingType::Texture { sample_type, view_dimension, multisampled: false })
 }
 
-/// A buffer that holds `bytes`, a multiple of four.
+/// Creates a buffer that holds `bytes`, a multiple of four.
 fn filled(device: &Device, queue: &Queue, label: &str, bytes: &[u8], usage: BufferUsages) -> Buffer {
     let buffer = buffer(device, label, bytes.len() as u64, usage | BufferUsages::COPY_DST);
     queue.write_buffer(&buffer, 0, bytes);

@@ -1,52 +1,54 @@
-//! What comes back from a device: which rows of output are computed together, and where they lie when they arrive.
+//! Layout of a job's output: pieces that are computed at once, and the columns of each piece in a readback buffer.
 
 use std::sync::Arc;
 
 use bytemuck::Pod;
 
-use super::landing::Landing;
-use super::record::CLOCK_BYTES;
+use super::pipelines::TIMESTAMP_BYTES;
+use super::plan::layout::{Counters, GROUP};
+use super::readback::ReadbackBuffer;
 use crate::surface::SurfaceParams;
-use crate::surface::layout::{GROUP, Tally};
 
-/// Where the counters lie in a landing, behind the timestamps.
-pub(super) const TALLY_AT: u64 = 128;
-/// Where everything else begins.
-pub(super) const BODY_AT: u64 = 256;
-const _: () = assert!(CLOCK_BYTES <= TALLY_AT && TALLY_AT + size_of::<Tally>() as u64 <= BODY_AT);
+/// Offset of the counters in a readback buffer, behind the timestamps.
+pub(super) const COUNTERS_OFFSET: u64 = 128;
+/// Offset of everything else.
+pub(super) const BODY_OFFSET: u64 = 256;
+const _: () =
+    assert!(TIMESTAMP_BYTES <= COUNTERS_OFFSET && COUNTERS_OFFSET + size_of::<Counters>() as u64 <= BODY_OFFSET);
 
-/// A run of bricks whose output is computed at once.
+/// Run of bricks whose output is computed at once.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Piece {
+pub(super) struct OutputPiece {
     pub(super) brick: u32,
     pub(super) n_bricks: u32,
-    /// Vertices before it in the mesh.
+    /// Number of vertices before the piece.
     pub(super) vertex: u64,
     pub(super) n_vertices: u64,
+    /// Number of triangles before the piece.
     pub(super) triangle: u64,
     pub(super) n_triangles: u64,
 }
 
-/// Cuts a chunk into pieces of at most so many vertices and triangles, by the sums of its groups of bricks. A group
-/// never is more than a device can hold.
+/// Cuts a chunk into pieces of at most `max_vertices` and `max_triangles`, by the counts of its groups of bricks. A
+/// single group never exceeds the capacity of a device.
 pub(super) fn pieces(
     [first_brick, n_bricks]: [u32; 2],
     groups: &[[u32; 4]],
     [vertex, triangle]: [u64; 2],
-    [most_vertices, most_triangles]: [u64; 2],
-) -> Vec<Piece> {
-    let mut pieces: Vec<Piece> = Vec::new();
-    let mut at = Piece { brick: first_brick, vertex, triangle, ..Piece::default() };
+    [max_vertices, max_triangles]: [u64; 2],
+) -> Vec<OutputPiece> {
+    let mut pieces: Vec<OutputPiece> = Vec::new();
+    let mut at = OutputPiece { brick: first_brick, vertex, triangle, ..OutputPiece::default() };
     let mut left = n_bricks;
     for &[v, t, ..] in groups {
         let (v, t, n) = (u64::from(v), u64::from(t), left.min(GROUP));
-        if at.n_vertices + v > most_vertices || at.n_triangles + t > most_triangles {
+        if at.n_vertices + v > max_vertices || at.n_triangles + t > max_triangles {
             pieces.extend(Some(at).filter(|p| p.n_bricks > 0));
-            at = Piece {
+            at = OutputPiece {
                 brick: at.brick + at.n_bricks,
                 vertex: at.vertex + at.n_vertices,
                 triangle: at.triangle + at.n_triangles,
-                ..Piece::default()
+                ..OutputPiece::default()
             };
         }
         at.n_bricks += n;
@@ -58,60 +60,60 @@ pub(super) fn pieces(
     pieces
 }
 
-/// Bytes of a vertex in each column.
+/// Bytes per vertex in each column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct VertexBytes {
     pub(super) positions: u64,
     pub(super) normals: u64,
-    /// 0 where nearest atoms are not asked for.
+    /// 0 unless the nearest atoms are requested.
     pub(super) sources: u64,
 }
 
 impl VertexBytes {
-    /// As a job wants its vertices.
-    pub(super) const fn of(params: &SurfaceParams) -> Self {
+    /// Bytes per vertex for `params`.
+    pub(super) const fn new(params: &SurfaceParams) -> Self {
         let (positions, normals) = if params.quantize.is_some() { (8, 4) } else { (12, 12) };
         Self { positions, normals, sources: if params.atom_ids { 4 } else { 0 } }
     }
 }
 
-/// Bytes of a triangle.
+/// Bytes per triangle.
 pub(super) const TRIANGLE_BYTES: u64 = 12;
 
-/// Where the columns of some pieces lie in a landing: byte offsets.
+/// Byte offsets of the columns in a readback buffer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(super) struct Places {
+pub(super) struct ReadbackLayout {
     pub(super) positions: u64,
     pub(super) normals: u64,
     pub(super) sources: u64,
     pub(super) triangles: u64,
-    /// Bytes of the landing.
+    /// Total bytes.
     pub(super) end: u64,
 }
 
-impl Places {
-    /// Places for so many rows.
-    pub(super) fn new(n_vertices: u64, n_triangles: u64, vertex: VertexBytes) -> Self {
-        let positions = BODY_AT;
+impl ReadbackLayout {
+    /// Layout of `n_vertices` and `n_triangles`.
+    pub(super) fn new([n_vertices, n_triangles]: [u64; 2], vertex: VertexBytes) -> Self {
+        let positions = BODY_OFFSET;
         let normals = positions + vertex.positions * n_vertices;
         let sources = normals + vertex.normals * n_vertices;
         let triangles = sources + vertex.sources * n_vertices;
-        // A mapped range is a multiple of 8 bytes.
+        // The size of a mapped range is a multiple of 8 bytes.
         let end = (triangles + TRIANGLE_BYTES * n_triangles).next_multiple_of(8);
         Self { positions, normals, sources, triangles, end }
     }
 }
 
-/// A submission's results in host memory.
+/// Vertices and triangles in a mapped readback buffer.
 #[derive(Debug, Clone)]
-pub(super) struct Arrived {
-    pub(super) landing: Arc<Landing>,
-    pub(super) places: Places,
+pub(super) struct ReadbackRows {
+    pub(super) readback: Arc<ReadbackBuffer>,
+    pub(super) layout: ReadbackLayout,
     pub(super) n_vertices: u64,
     pub(super) n_triangles: u64,
 }
 
-/// `n` values at `offset` of a landing.
+/// Returns `n` values at byte `offset` of a readback buffer.
 pub(super) fn values<T: Pod>(bytes: &[u8], offset: u64, n: u64) -> Result<&[T], String> {
     let from = usize::try_from(offset).map_err(|e| e.to_string())?;
     let len = usize::try_from(n).map_err(|e| e.to_string())? * size_of::<T>();
@@ -125,18 +127,18 @@ mod tests {
     use crate::surface::Step;
 
     #[test]
-    fn rounded_vertices_take_half_the_place() {
+    fn quantized_vertices_take_half_the_bytes() {
         let single = SurfaceParams::default();
         let rounded = SurfaceParams { quantize: Some(Step::covering(9.0)), ..single.clone() };
         for atom_ids in [false, true] {
             let [single, rounded] = [&single, &rounded]
-                .map(|params| VertexBytes::of(&SurfaceParams { atom_ids, ..params.clone() }))
-                .map(|vertex| Places::new(1000, 2001, vertex));
+                .map(|params| VertexBytes::new(&SurfaceParams { atom_ids, ..params.clone() }))
+                .map(|vertex| ReadbackLayout::new([1000, 2001], vertex));
             assert_eq!(single.triangles - rounded.triangles, 12 * 1000);
             assert_eq!(single.end - rounded.end, 12 * 1000);
             let columns = [rounded.positions, rounded.normals, rounded.sources, rounded.triangles];
             let n_ids = if atom_ids { 4000 } else { 0 };
-            assert_eq!(columns.map(|at| at - BODY_AT), [0, 8000, 12_000, 12_000 + n_ids]);
+            assert_eq!(columns.map(|at| at - BODY_OFFSET), [0, 8000, 12_000, 12_000 + n_ids]);
         }
     }
 

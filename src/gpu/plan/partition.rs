@@ -1,38 +1,39 @@
-//! A plan's bricks cut into parts for several devices, and what one part takes from the others.
+//! Partitions of a plan for several devices, and the bricks and atoms of other partitions that each needs.
 //!
-//! A part is a run of tiles. Its last cells have corners in bricks of later parts: it computes their samples again, as a
-//! chunk does, but which of their edges are crossed, and what the vertices there are called, only their owner knows.
+//! A partition is a run of tiles. Its last cells have corners in bricks of later partitions. It computes the samples of
+//! these halo bricks again, as a chunk does, but only their owner knows which of their edges are crossed and how the
+//! vertices there are numbered.
 
 use std::ops::Range;
 
-use super::lattice::{tile_order, to_u32};
-use super::plan::Plan;
+use super::Plan;
+use crate::surface::lattice::{tile_order, to_u32};
 
-/// Runs of bricks or atoms with fewer than so many others between them are taken as one: a copy more costs more than
-/// those.
-const GAP: u32 = 64;
+/// Maximum gap between two runs of bricks or atoms that are joined into one: transferring 64 elements more is cheaper
+/// than an additional copy command.
+const MAX_GAP: u32 = 64;
 
-/// A run of tiles that one device works on.
+/// Run of tiles that one device works on.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Part {
-    /// Its tiles, by their place in the plan.
+pub struct Partition {
+    /// Indices of its tiles.
     pub tiles: Range<usize>,
-    /// Its bricks.
+    /// Indices of its bricks.
     pub bricks: Range<u32>,
-    /// Bricks of later parts that it needs the records of, as runs in ascending order. A run may hold others too, but lies
-    /// within one part.
-    pub borrowed: Vec<Range<u32>>,
+    /// Bricks of later partitions whose records it needs, as ascending runs. A run may contain further bricks, but lies
+    /// within one partition.
+    pub imports: Vec<Range<u32>>,
 }
 
 impl Plan {
-    /// Cuts the bricks into `n` parts of about equally many, fewer where there are not as many tiles.
+    /// Cuts the bricks into `n` partitions of about equal size, or into fewer if there are fewer tiles.
     #[must_use]
-    pub fn parts(&self, n: usize) -> Vec<Part> {
+    pub fn partitions(&self, n: usize) -> Vec<Partition> {
         let total = self.bricks.len() as u64;
         let n = n.clamp(1, self.tiles.len().max(1)) as u64;
         let mut cuts: Vec<usize> = (1..n)
             .map(|i| {
-                // The tile's border that is nearest to an equal share.
+                // The tile boundary nearest to an equal share.
                 let share = to_u32(usize::try_from(total * i / n).unwrap_or(usize::MAX));
                 let after = self.tiles.partition_point(|tile| tile.base < share);
                 let below = after.saturating_sub(1);
@@ -42,44 +43,45 @@ impl Plan {
             .collect();
         cuts.dedup();
         let ends = cuts.iter().copied().chain([self.tiles.len()]);
-        let mut parts: Vec<Part> = Vec::with_capacity(cuts.len() + 1);
+        let mut partitions: Vec<Partition> = Vec::with_capacity(cuts.len() + 1);
         for (from, to) in [0].into_iter().chain(cuts.iter().copied()).zip(ends) {
             let bricks = self.tile_start(from)..self.tile_start(to);
-            parts.push(Part { tiles: from..to, bricks, borrowed: Vec::new() });
+            partitions.push(Partition { tiles: from..to, bricks, imports: Vec::new() });
         }
-        for k in 0..parts.len() {
-            let halo = self.halo(parts[k].bricks.clone());
-            parts[k].borrowed = parts[k + 1..]
+        for k in 0..partitions.len() {
+            let halo = self.halo(partitions[k].bricks.clone());
+            partitions[k].imports = partitions[k + 1..]
                 .iter()
                 .flat_map(|owner| {
                     let own = &halo[halo.partition_point(|b| *b < owner.bricks.start)..];
-                    runs(own[..own.partition_point(|b| *b < owner.bricks.end)].iter().map(|&b| b..b + 1))
+                    join_runs(own[..own.partition_point(|b| *b < owner.bricks.end)].iter().map(|&b| b..b + 1))
                 })
                 .collect();
         }
-        parts
+        partitions
     }
 
-    /// Atoms that some brick of `part`, or one borrowed by its chunks, may look at: runs in ascending order. `back` and
-    /// `ahead` are those of [`Params`](super::layout::Params).
+    /// Atoms that the bricks of `partition` and of its chunks' halos may need, as ascending runs. `back` and `ahead`
+    /// are those of [`Params`](super::layout::Params).
     #[must_use]
-    pub fn atoms_near(&self, part: &Part, [back, ahead]: [u32; 2]) -> Vec<Range<u32>> {
-        let (Some(first), Some(last)) = (self.tiles.get(part.tiles.start), self.tiles[..part.tiles.end].last()) else {
+    pub fn atoms_near(&self, partition: &Partition, [back, ahead]: [u32; 2]) -> Vec<Range<u32>> {
+        let tiles = &partition.tiles;
+        let (Some(first), Some(last)) = (self.tiles.get(tiles.start), self.tiles[..tiles.end].last()) else {
             return Vec::new();
         };
         let signed = |n: u32| i32::try_from(n).unwrap_or(i32::MAX / 16);
-        // A borrowed brick lies one further on.
+        // A halo brick lies one brick further away.
         let (back, ahead) = (signed(back), signed(ahead).saturating_add(1));
-        // Tiles are in lexicographic order, which a common step does not change: nothing before the first tile's furthest
-        // neighbour is a neighbour of any.
+        // Tile order is lexicographic and translation keeps it: no tile before the first tile's furthest neighbour is a
+        // neighbour of any tile.
         let far = back.max(ahead).div_euclid(8) + 1;
         let lowest = tile_order(first.coord).map(|c| c.saturating_sub(far));
         let highest = tile_order(last.coord).map(|c| c.saturating_add(far));
         let from = self.tiles.partition_point(|tile| tile_order(tile.coord) < lowest);
         let to = self.tiles.partition_point(|tile| tile_order(tile.coord) <= highest);
         let layers = (8 * first.coord[2]).saturating_sub(back)..=(8 * last.coord[2] + 7).saturating_add(ahead);
-        runs((from..to).filter_map(|t| {
-            // A tile's bricks come layer by layer.
+        join_runs((from..to).filter_map(|t| {
+            // The bricks of a tile are ordered by layer.
             let tile = &self.tiles[t];
             let below = |layer: i32| match usize::try_from(layer) {
                 Err(_) => tile.base,
@@ -92,21 +94,21 @@ impl Plan {
     }
 }
 
-/// Joins runs, which are in ascending order, where little lies between them.
-fn runs(all: impl Iterator<Item = Range<u32>>) -> Vec<Range<u32>> {
+/// Joins ascending runs with gaps of at most [`MAX_GAP`].
+fn join_runs(runs: impl Iterator<Item = Range<u32>>) -> Vec<Range<u32>> {
     let mut joined: Vec<Range<u32>> = Vec::new();
-    for run in all {
+    for run in runs {
         match joined.last_mut() {
-            Some(last) if run.start - last.end <= GAP => last.end = run.end,
+            Some(last) if run.start - last.end <= MAX_GAP => last.end = run.end,
             _ => joined.push(run),
         }
     }
     joined
 }
 
-/// How many there are in some runs.
+/// Number of elements in `runs`.
 #[must_use]
-pub fn n_in(runs: &[Range<u32>]) -> u64 {
+pub fn total_len(runs: &[Range<u32>]) -> u64 {
     runs.iter().map(|run| u64::from(run.end - run.start)).sum()
 }
 
@@ -115,10 +117,8 @@ mod tests {
     use std::collections::{BTreeSet, HashMap};
 
     use super::*;
-    use crate::surface::control::Control;
     use crate::surface::lattice::{BRICK, Lattice};
-    use crate::surface::params::{SurfaceLimits, SurfaceOptions, SurfaceParams};
-    use crate::surface::spheres::Spheres;
+    use crate::surface::{Control, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams};
 
     fn plan(resolution: f64) -> (Lattice, Plan) {
         let at = |i: u32, k: f64| 70.0 * (f64::from(i) * k).sin();
@@ -130,33 +130,33 @@ mod tests {
         (lattice, plan)
     }
 
-    fn places(plan: &Plan) -> Vec<[i32; 3]> {
-        let place = |b: &u32| {
+    fn coords(plan: &Plan) -> Vec<[i32; 3]> {
+        let coord = |b: &u32| {
             let local = [0, 3, 6].map(|shift| i32::try_from(b >> shift & 7).unwrap());
             let tile = plan.tiles[(b >> 9) as usize].coord;
             std::array::from_fn::<i32, 3, _>(|k| 8 * tile[k] + local[k])
         };
-        plan.bricks.iter().map(place).collect()
+        plan.bricks.iter().map(coord).collect()
     }
 
-    /// What is wrong with `parts`.
-    fn wrong(plan: &Plan, parts: &[Part]) -> Option<String> {
-        let places = places(plan);
-        let index: HashMap<[i32; 3], u32> = places.iter().copied().zip(0..).collect();
+    /// Returns the first defect of `partitions`.
+    fn defect(plan: &Plan, partitions: &[Partition]) -> Option<String> {
+        let coords = coords(plan);
+        let index: HashMap<[i32; 3], u32> = coords.iter().copied().zip(0..).collect();
         let (mut tile, mut brick) = (0, 0);
-        for part in parts {
+        for part in partitions {
             if (part.tiles.start, part.bricks.start) != (tile, brick) || part.tiles.is_empty() {
                 return Some(format!("{part:?} behind tile {tile}"));
             }
             (tile, brick) = (part.tiles.end, part.bricks.end);
-            let has: BTreeSet<u32> = part.borrowed.iter().cloned().flatten().collect();
-            for run in &part.borrowed {
-                if !parts.iter().any(|owner| owner.bricks.start <= run.start && run.end <= owner.bricks.end) {
+            let has: BTreeSet<u32> = part.imports.iter().cloned().flatten().collect();
+            for run in &part.imports {
+                if !partitions.iter().any(|owner| owner.bricks.start <= run.start && run.end <= owner.bricks.end) {
                     return Some(format!("{run:?} has several owners"));
                 }
             }
             for own in part.bricks.clone() {
-                let at = places[own as usize];
+                let at = coords[own as usize];
                 for n in 1..8 {
                     let there = std::array::from_fn(|k| at[k] + (n >> k & 1));
                     if index.get(&there).is_some_and(|b| *b >= brick && !has.contains(b)) {
@@ -165,47 +165,47 @@ mod tests {
                 }
             }
         }
-        ((tile, brick as usize) != (plan.tiles.len(), plan.bricks.len())).then(|| "the end".to_owned())
+        ((tile, brick as usize) != (plan.tiles.len(), plan.bricks.len())).then(|| "wrong end".to_owned())
     }
 
     #[test]
-    fn parts_cover_all_bricks_evenly_and_borrow_what_they_need() {
+    fn partitions_are_even_and_import_what_they_need() {
         let (_, plan) = plan(0.5);
         for n in [1, 2, 3, 4, 7] {
-            let parts = plan.parts(n);
-            assert_eq!((parts.len(), wrong(&plan, &parts)), (n, None));
+            let parts = plan.partitions(n);
+            assert_eq!((parts.len(), defect(&plan, &parts)), (n, None));
             for part in &parts {
                 let (share, tile) = (plan.bricks.len() / n, 512);
                 assert!(part.bricks.len().abs_diff(share) <= tile, "{} of {share}", part.bricks.len());
             }
         }
-        assert!(plan.parts(1)[0].borrowed.is_empty());
-        let many = plan.parts(10_000);
+        assert!(plan.partitions(1)[0].imports.is_empty());
+        let many = plan.partitions(10_000);
         assert!(many.len() > 1 && many.len() <= plan.tiles.len());
-        assert_eq!(wrong(&plan, &many), None);
-        // Controls.
-        let good = plan.parts(3);
+        assert_eq!(defect(&plan, &many), None);
+        // Negative controls.
+        let good = plan.partitions(3);
         let mut bad = good.clone();
-        bad[0].borrowed.pop();
-        assert!(wrong(&plan, &bad).is_some());
+        bad[0].imports.pop();
+        assert!(defect(&plan, &bad).is_some());
         bad = good.clone();
         bad.remove(1);
-        assert!(wrong(&plan, &bad).is_some());
+        assert!(defect(&plan, &bad).is_some());
         bad = good;
         let end = bad[1].bricks.end;
-        bad[0].borrowed.push(end - 1..end + 1);
-        assert!(wrong(&plan, &bad).is_some());
+        bad[0].imports.push(end - 1..end + 1);
+        assert!(defect(&plan, &bad).is_some());
     }
 
     #[test]
-    fn atoms_near_a_part_are_all_that_its_bricks_may_look_at_and_not_many_more() {
-        // From reaches within a brick to reaches over several tiles.
+    fn atoms_near_a_partition_are_all_that_its_bricks_need_and_few_others() {
+        // From reaches of less than a brick to reaches of several tiles.
         for resolution in [1.0, 0.4, 0.1] {
             let (lattice, plan) = plan(resolution);
             let params = plan.params(&lattice, &SurfaceParams::default());
             let (back, ahead) = (params.back.cast_signed(), params.ahead.cast_signed());
-            let parts = plan.parts(5);
-            let places = places(&plan);
+            let parts = plan.partitions(5);
+            let coords = coords(&plan);
             let mut fewest = usize::MAX;
             for part in &parts {
                 let near = plan.atoms_near(part, [params.back, params.ahead]);
@@ -213,18 +213,18 @@ mod tests {
                 let has: BTreeSet<u32> = near.iter().cloned().flatten().collect();
                 fewest = fewest.min(has.len());
                 let halo = plan.halo(part.bricks.clone());
-                let own: Vec<[i32; 3]> = part.bricks.clone().chain(halo).map(|b| places[b as usize]).collect();
+                let own: Vec<[i32; 3]> = part.bricks.clone().chain(halo).map(|b| coords[b as usize]).collect();
                 let lacking = |has: &BTreeSet<u32>| {
                     (0_u32..).zip(&lattice.atoms).any(|(i, atom)| {
-                        let home = atom.cell.map(|c| c.div_euclid(BRICK));
-                        let close = |at: &&[i32; 3]| (0..3).all(|k| (-back..=ahead).contains(&(home[k] - at[k])));
+                        let own_brick = atom.cell.map(|c| c.div_euclid(BRICK));
+                        let close = |at: &&[i32; 3]| (0..3).all(|k| (-back..=ahead).contains(&(own_brick[k] - at[k])));
                         !has.contains(&i) && own.iter().any(|at| close(&at))
                     })
                 };
-                assert!(!lacking(&has), "{resolution}: part at {}", part.bricks.start);
+                assert!(!lacking(&has), "{resolution}: partition at {}", part.bricks.start);
                 assert!(lacking(&BTreeSet::new()), "control");
             }
-            assert!(resolution < 0.5 || fewest < lattice.atoms.len(), "every part needs all atoms");
+            assert!(resolution < 0.5 || fewest < lattice.atoms.len(), "every partition needs all atoms");
         }
     }
 }

@@ -1,0 +1,91 @@
+//! Buffers that the stages bind.
+
+/// Buffer of a job. The build derives the variant from the name of the shader variable: `first_atoms` binds
+/// [`BufferId::FirstAtoms`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BufferId {
+    /// Rows of parameters, one per dispatch.
+    Params,
+    /// Atoms on the lattice.
+    Atoms,
+    /// Reach of each atom.
+    Reaches,
+    /// Tile table.
+    Tiles,
+    /// Bricks by tile and index.
+    Bricks,
+    /// First atom of each brick.
+    FirstAtoms,
+    /// Halo bricks of the chunk and the table of their slots.
+    Halo,
+    /// Candidate lists.
+    Lists,
+    /// Header of each candidate list: start, number of atoms that reach a sample, number of all, brick.
+    Heads,
+    /// Densities.
+    Field,
+    /// Bits of the samples inside the surface.
+    Inside,
+    /// Records of bricks.
+    Records,
+    /// Vertex and triangle counts of bricks.
+    Counts,
+    /// First vertex and first triangle of bricks.
+    Offsets,
+    /// Counts of groups of bricks.
+    Groups,
+    /// Counters that the host reads back.
+    Counters,
+    /// Vertex positions.
+    Positions,
+    /// Vertex normals.
+    Normals,
+    /// Nearest atom of each vertex, as index into the caller's input.
+    Sources,
+    /// Triangle indices.
+    Triangles,
+    /// Case table, shared by all jobs.
+    Cases,
+}
+
+impl BufferId {
+    /// Buffers that each job has for itself: all but [`Self::Cases`], in the order of the variants.
+    pub(super) const OF_JOB: [Self; 20] = [
+        Self::Params,
+        Self::Atoms,
+        Self::Reaches,
+        Self::Tiles,
+        Self::Bricks,
+        Self::FirstAtoms,
+        Self::Halo,
+        Self::Lists,
+        Self::Heads,
+        Self::Field,
+        Self::Inside,
+        Self::Records,
+        Self::Counts,
+        Self::Offsets,
+        Self::Groups,
+        Self::Counters,
+        Self::Positions,
+        Self::Normals,
+        Self::Sources,
+        Self::Triangles,
+    ];
+
+    /// Index of the buffer among those of a job; [`Self::Cases`] comes last.
+    pub(super) const fn index(self) -> usize {
+        self as usize
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn buffers_of_a_job_are_listed_by_index() {
+        assert!(BufferId::OF_JOB.iter().enumerate().all(|(i, id)| id.index() == i));
+        assert_eq!(BufferId::Cases.index(), BufferId::OF_JOB.len());
+    }
+}

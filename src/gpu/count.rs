@@ -1,0 +1,59 @@
+//! First half of a job: the stages that sample a chunk and count its vertices and triangles.
+
+use super::engine::Engine;
+use super::error::GpuError;
+use super::job_state::{ChunkCounts, JobState};
+use super::output_layout::BODY_OFFSET;
+use super::plan::Chunk;
+use super::plan::layout::{GROUP, Params};
+use super::submit::PendingSubmission;
+
+/// Number of the stages that run before the size of the output is known: `bin` to `scan`.
+pub(super) const N_COUNT_STAGES: usize = 4;
+
+/// Bytes of the group counts of a chunk.
+pub(super) fn group_bytes(chunk: &Chunk) -> u64 {
+    16 * u64::from(chunk.n_own.div_ceil(GROUP))
+}
+
+/// Converts a number of rows to 32 bits; buffers are smaller than that.
+pub(super) fn narrow(n: u64) -> Result<u32, GpuError> {
+    u32::try_from(n).map_err(|e| GpuError::Failed(format!("{n} rows: {e}")))
+}
+
+impl Engine {
+    /// Submits the stages `bin` to `scan` of a chunk.
+    pub(super) fn submit_count(&self, state: &JobState<'_>, chunk: usize) -> Result<PendingSubmission, GpuError> {
+        let loaded = &state.loaded;
+        let own = &loaded.chunks[chunk];
+        let [first_vertex, first_triangle] = state.total.map(|n| n & u64::from(u32::MAX));
+        let params = Params {
+            first_vertex: narrow(first_vertex)?,
+            first_triangle: narrow(first_triangle)?,
+            ..own.params(&loaded.params)
+        };
+        self.write_params(&loaded.workspace, 0, &params);
+        self.write_halo(&loaded.workspace, own);
+        let mut recording = self.recording();
+        recording.count_stages(&[(loaded.dispatch(0, 0), params)]);
+        let bytes = BODY_OFFSET + group_bytes(own);
+        let readback = self.readback.acquire(&self.device, bytes);
+        let target = readback.buffer().map_err(GpuError::Failed)?;
+        recording.copy_timestamps(target);
+        recording.copy_counters(&loaded.workspace, target);
+        recording.copy_groups(&loaded.workspace, target, BODY_OFFSET, group_bytes(own));
+        self.submit(recording, vec![(readback, bytes)])
+    }
+
+    /// Waits for the counts of a chunk.
+    pub(super) fn wait_for_counts(
+        &self,
+        state: &mut JobState<'_>,
+        chunk: usize,
+        submission: PendingSubmission,
+    ) -> Result<ChunkCounts, GpuError> {
+        let readback = self.wait_one(submission)?;
+        self.add_times(&mut state.times, &readback, 0..N_COUNT_STAGES)?;
+        state.add_counts(&readback, chunk, BODY_OFFSET)
+    }
+}

@@ -1,0 +1,89 @@
+//! Jobs for devices: prepared on the caller's thread, independent of the device that runs them.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use super::error::GpuError;
+use super::plan::Plan;
+use crate::surface::lattice::Lattice;
+use crate::surface::{
+    CancelToken, Control, Meshed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
+};
+
+/// Maximum number of atoms of a small job. Latency dominates its cost, so several small jobs share a submission.
+const MAX_SMALL_ATOMS: usize = 5_000;
+
+/// Input of a job that any device can run.
+#[derive(Debug)]
+pub struct Prepared {
+    /// Atoms in canonical order.
+    pub lattice: Lattice,
+    /// Bricks of the lattice.
+    pub plan: Plan,
+    /// Surface parameters.
+    pub params: SurfaceParams,
+    /// Limits.
+    pub limits: SurfaceLimits,
+}
+
+impl Prepared {
+    /// Prepares a job.
+    ///
+    /// # Errors
+    /// Any [`SurfaceError`] that can be detected without a device.
+    pub fn new(
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+    ) -> Result<Self, SurfaceError> {
+        control.check()?;
+        candidates::check(spheres, params, limits)?;
+        let lattice = Lattice::new(spheres, params)?;
+        control.check()?;
+        let plan = Plan::new(&lattice, limits, control)?;
+        Ok(Self { lattice, plan, params: params.clone(), limits: *limits })
+    }
+
+    /// Returns true if the job may share a submission with others.
+    #[must_use]
+    pub fn is_small(&self) -> bool {
+        self.lattice.atoms.len() <= MAX_SMALL_ATOMS
+    }
+}
+
+/// Job with its cancellation token and deadline.
+#[derive(Debug, Clone)]
+pub struct GpuJob {
+    /// Input.
+    pub prepared: Arc<Prepared>,
+    /// Cancellation token, checked between dispatches and between chunks.
+    pub cancel: CancelToken,
+    /// Deadline, checked at the same places.
+    pub deadline: Option<Instant>,
+}
+
+impl GpuJob {
+    /// Fails if the job was cancelled or its deadline has passed.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`], [`GpuError::Deadline`].
+    pub fn check(&self) -> Result<(), GpuError> {
+        if self.cancel.is_cancelled() {
+            return Err(SurfaceError::Cancelled.into());
+        }
+        if self.deadline.is_some_and(|deadline| deadline <= Instant::now()) { Err(GpuError::Deadline) } else { Ok(()) }
+    }
+}
+
+/// Finished job.
+#[derive(Debug, Clone)]
+pub struct Finished {
+    /// Mesh and grid.
+    pub meshed: Meshed,
+    /// Device time per stage in ns, in stage order; empty if the device has no timestamps.
+    pub stages: Vec<(Stage, u64)>,
+}
+
+/// Result of a job.
+pub type JobResult = Result<Finished, GpuError>;

@@ -1,0 +1,325 @@
+//! Scheduler: one bounded queue per device, behind one lock. Callers enqueue jobs and device threads take them.
+
+use std::cmp::Reverse;
+use std::collections::VecDeque;
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use super::device_queue::{DeviceQueue, DeviceState, QueuedJob, RunOutcome, down_reasons, reject};
+use super::error::GpuError;
+use super::job::{GpuJob, JobResult};
+use super::partition_handle::PartitionHandle;
+use crate::surface::{DeviceStatus, SurfaceError};
+
+struct State {
+    queues: Vec<DeviceQueue>,
+    closed: bool,
+    next_id: u64,
+}
+
+/// Queues of all devices.
+pub(super) struct Scheduler {
+    state: Mutex<State>,
+    /// Notified when a queue or the state of a device has changed.
+    changed: Condvar,
+    /// Notified when a job was added, one per device.
+    added: Vec<Condvar>,
+    /// Maximum number of jobs that wait for one device.
+    limit: usize,
+    /// Maximum number of jobs that share a submission.
+    batch: usize,
+}
+
+/// Ticket of an enqueued job.
+pub(super) struct Ticket {
+    /// Index of the device.
+    pub(super) device: usize,
+    id: u64,
+    pub(super) result: Receiver<JobResult>,
+}
+
+/// Reason why a job was not enqueued.
+pub(super) enum EnqueueError {
+    /// The queues of all eligible devices are full.
+    Full,
+    /// No device is eligible; with the reasons of those that are down.
+    NoDevice(String),
+}
+
+impl State {
+    /// Adds a job to the queue of device `n`.
+    fn push(&mut self, n: usize, job: &GpuJob, partition: Option<PartitionHandle>, retry: bool) -> Ticket {
+        let (reply, result) = sync_channel(1);
+        let id = self.next_id;
+        self.next_id += 1;
+        self.queues[n].push(QueuedJob { id, job: job.clone(), partition, retry, reply });
+        Ticket { device: n, id, result }
+    }
+}
+
+impl Scheduler {
+    /// Creates the queues of `devices`, given by number and name.
+    pub(super) fn new(devices: &[(usize, String)], limit: usize, batch: usize) -> Self {
+        let queue = |(number, name): &(usize, String)| DeviceQueue::new(*number, name.clone(), limit);
+        Self {
+            state: Mutex::new(State { queues: devices.iter().map(queue).collect(), closed: false, next_id: 0 }),
+            changed: Condvar::new(),
+            added: devices.iter().map(|_| Condvar::new()).collect(),
+            limit: limit.max(1),
+            batch: batch.max(1),
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // No code panics between two changes under the lock, so a poisoned state is consistent.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Enqueues `job` at the least loaded device that is up and on which it has failed fewer than `max_failures` times.
+    /// Prefers a device that already failed this job: it has just been rebuilt, and the others are probably busy.
+    pub(super) fn enqueue(
+        &self,
+        job: &GpuJob,
+        failures: &[usize],
+        max_failures: usize,
+    ) -> Result<Ticket, EnqueueError> {
+        let mut state = self.lock();
+        let queues = &state.queues;
+        let eligible = |n: &usize| failures[*n] < max_failures && matches!(queues[*n].state, DeviceState::Up);
+        if !(0..queues.len()).any(|n| eligible(&n)) {
+            return Err(EnqueueError::NoDevice(down_reasons(queues)));
+        }
+        let best = (0..queues.len())
+            .filter(|n| eligible(n) && queues[*n].waiting.len() < self.limit)
+            .min_by_key(|&n| (Reverse(failures[n]), queues[n].load, queues[n].finished));
+        let Some(n) = best else { return Err(EnqueueError::Full) };
+        let ticket = state.push(n, job, None, failures.iter().any(|n| *n > 0));
+        drop(state);
+        self.added[n].notify_one();
+        Ok(ticket)
+    }
+
+    /// Returns the idle devices, least loaded first.
+    pub(super) fn idle_devices(&self) -> Vec<usize> {
+        let state = self.lock();
+        let mut idle: Vec<usize> = (0..state.queues.len()).filter(|&n| state.queues[n].is_idle()).collect();
+        idle.sort_by_key(|&n| (state.queues[n].load, state.queues[n].finished));
+        idle
+    }
+
+    /// Enqueues the partitions of `job` at their devices, all at once: the partitions of two jobs are then in the same
+    /// order on every device and never wait for each other. `None` if one of the devices is no longer idle.
+    pub(super) fn enqueue_partitions(
+        &self,
+        job: &GpuJob,
+        partitions: Vec<(usize, PartitionHandle)>,
+    ) -> Option<Vec<Ticket>> {
+        let mut state = self.lock();
+        let accepts = |queue: &DeviceQueue| queue.is_idle() && queue.waiting.len() < self.limit;
+        if !partitions.iter().all(|(n, _)| accepts(&state.queues[*n])) {
+            return None;
+        }
+        let tickets: Vec<Ticket> =
+            partitions.into_iter().map(|(n, partition)| state.push(n, job, Some(partition), false)).collect();
+        drop(state);
+        for ticket in &tickets {
+            self.added[ticket.device].notify_one();
+        }
+        Some(tickets)
+    }
+
+    /// Waits until a queue or a device has changed, at most for `timeout`.
+    pub(super) fn wait_for_change(&self, timeout: Duration) {
+        drop(self.changed.wait_timeout(self.lock(), timeout));
+    }
+
+    /// Removes a job from its queue. A running job checks its cancellation token by itself.
+    pub(super) fn cancel(&self, ticket: &Ticket) {
+        let mut state = self.lock();
+        let queue = &mut state.queues[ticket.device];
+        let position = queue.waiting.iter().position(|job| job.id == ticket.id);
+        let removed = position.and_then(|at| queue.waiting.remove(at));
+        queue.load -= removed.as_ref().map_or(0, QueuedJob::load);
+        drop(state);
+        self.changed.notify_all();
+        // The input, which may be large, is freed outside the lock.
+        drop(removed);
+    }
+
+    /// Waits for the next batch of device `n`: one job, or several small ones. The batch is empty if none came for
+    /// `idle`. `None` once the device is down or the scheduler is closed.
+    pub(super) fn next_batch(&self, n: usize, idle: Duration) -> Option<Vec<QueuedJob>> {
+        let mut state = self.lock();
+        let mut timed_out = false;
+        loop {
+            let closed = state.closed;
+            let queue = &mut state.queues[n];
+            if closed || matches!(queue.state, DeviceState::Down(_)) {
+                return None;
+            }
+            let mut batch = Vec::new();
+            while let Some(first) = queue.waiting.pop_front() {
+                if let Err(error) = first.job.check() {
+                    queue.load -= first.load();
+                    first.reply(Err(error));
+                    continue;
+                }
+                let batchable = first.is_batchable();
+                batch.push(first);
+                if batchable {
+                    self.fill_batch(&mut queue.waiting, &mut batch);
+                }
+                break;
+            }
+            if !batch.is_empty() {
+                queue.running = batch.len();
+                queue.shared += u64::from(batch.len() > 1);
+                drop(state);
+                self.changed.notify_all();
+                return Some(batch);
+            }
+            if timed_out {
+                return Some(batch);
+            }
+            let waited = self.added[n].wait_timeout(state, idle).unwrap_or_else(PoisonError::into_inner);
+            (state, timed_out) = (waited.0, waited.1.timed_out());
+        }
+    }
+
+    /// Sets the bytes of memory that device `n` holds.
+    pub(super) fn set_held_bytes(&self, n: usize, bytes: u64) {
+        self.lock().queues[n].held_bytes = bytes;
+    }
+
+    /// Moves small jobs from anywhere in `waiting` to `batch`. A large job ahead of them becomes the next batch.
+    fn fill_batch(&self, waiting: &mut VecDeque<QueuedJob>, batch: &mut Vec<QueuedJob>) {
+        let mut at = 0;
+        while at < waiting.len() && batch.len() < self.batch {
+            if waiting[at].is_batchable() && waiting[at].job.check().is_ok() {
+                batch.extend(waiting.remove(at));
+            } else {
+                at += 1;
+            }
+        }
+    }
+
+    /// Records the results of a batch of device `n` and then sends them. Callers that retry find the state of the
+    /// device updated.
+    pub(super) fn finish_batch(&self, n: usize, batch: Vec<QueuedJob>, results: Vec<JobResult>, outcome: RunOutcome) {
+        let RunOutcome { time, held_bytes, failed, down } = outcome;
+        let mut left = VecDeque::new();
+        {
+            let mut state = self.lock();
+            let queue = &mut state.queues[n];
+            for (job, result) in batch.iter().zip(&results) {
+                queue.load -= job.load();
+                match result {
+                    Ok(_) => {
+                        queue.finished += 1;
+                        queue.partitions += u64::from(job.partition.is_some());
+                    }
+                    Err(error) if error.is_device_failure() => queue.failed += 1,
+                    Err(_) => {}
+                }
+            }
+            if results.iter().any(proves_device_works) {
+                queue.consecutive_rebuilds = 0;
+            }
+            queue.running = 0;
+            queue.busy += time;
+            queue.lost += u64::from(failed);
+            queue.held_bytes = held_bytes;
+            if let Some(why) = &down {
+                left = queue.mark_down(why);
+            }
+        }
+        self.changed.notify_all();
+        batch.into_iter().zip(results).for_each(|(job, result)| job.reply(result));
+        reject(left, &down.unwrap_or_default());
+    }
+
+    /// Counts a rebuild of device `n`. Returns false, without counting, after `max` consecutive rebuilds.
+    pub(super) fn count_rebuild(&self, n: usize, max: usize) -> bool {
+        let queue = &mut self.lock().queues[n];
+        let allowed = queue.consecutive_rebuilds < max;
+        queue.consecutive_rebuilds += usize::from(allowed);
+        queue.rebuilds += u64::from(allowed);
+        allowed
+    }
+
+    /// Number of rebuilds of device `n` since it last finished a job.
+    pub(super) fn consecutive_rebuilds(&self, n: usize) -> usize {
+        self.lock().queues[n].consecutive_rebuilds
+    }
+
+    /// Marks device `n` as up.
+    pub(super) fn mark_up(&self, n: usize) {
+        let mut state = self.lock();
+        if matches!(state.queues[n].state, DeviceState::Starting) {
+            state.queues[n].state = DeviceState::Up;
+        }
+        drop(state);
+        self.changed.notify_all();
+    }
+
+    /// Marks device `n` as down and rejects its waiting jobs.
+    pub(super) fn mark_down(&self, n: usize, why: &str) {
+        let left = self.lock().queues[n].mark_down(why);
+        self.changed.notify_all();
+        self.added[n].notify_all();
+        reject(left, why);
+    }
+
+    /// Waits until every device is up or down. Returns true if one is up.
+    pub(super) fn wait_until_started(&self) -> bool {
+        let mut state = self.lock();
+        while state.queues.iter().any(|queue| matches!(queue.state, DeviceState::Starting)) {
+            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+        state.queues.iter().any(|queue| matches!(queue.state, DeviceState::Up))
+    }
+
+    /// Waits for `time`. Returns false if the scheduler is closed.
+    pub(super) fn pause(&self, n: usize, time: Duration) -> bool {
+        let end = Instant::now() + time;
+        let mut state = self.lock();
+        while !state.closed {
+            let Some(left) = end.checked_duration_since(Instant::now()).filter(|left| !left.is_zero()) else {
+                return true;
+            };
+            state = self.added[n].wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        false
+    }
+
+    /// Reasons of all devices that are down.
+    pub(super) fn down_reasons(&self) -> String {
+        down_reasons(&self.lock().queues)
+    }
+
+    /// Stops all device threads and rejects all waiting jobs.
+    pub(super) fn close(&self) {
+        let mut state = self.lock();
+        state.closed = true;
+        let left: VecDeque<QueuedJob> = state.queues.iter_mut().flat_map(|queue| queue.waiting.drain(..)).collect();
+        drop(state);
+        self.added.iter().for_each(Condvar::notify_all);
+        self.changed.notify_all();
+        reject(left, "the devices are being closed");
+    }
+
+    /// Status of every device.
+    pub(super) fn status(&self) -> Vec<DeviceStatus> {
+        self.lock().queues.iter().map(DeviceQueue::status).collect()
+    }
+}
+
+/// Returns true if a result proves that the device works.
+pub(super) fn proves_device_works(result: &JobResult) -> bool {
+    match result {
+        Ok(_) => true,
+        Err(GpuError::Surface(error)) => *error != SurfaceError::Cancelled,
+        Err(_) => false,
+    }
+}
