@@ -1,12 +1,10 @@
 //! Where the mesh goes: stdout, or a file that appears under its name only when it is complete.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
+use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-#[cfg(unix)]
-use molmesh::formats::PlaceBytes;
 use molmesh::surface::CancelToken;
 
 use super::error::CliError;
@@ -24,7 +22,7 @@ pub(crate) struct Output {
 }
 
 enum To {
-    Stdout(io::StdoutLock<'static>),
+    Stdout(io::Stdout),
     /// What cannot be replaced by a rename: a pipe, a terminal, `/dev/null`.
     Device(File),
     /// A file beside `target`, renamed when it is complete.
@@ -38,25 +36,16 @@ impl Output {
     /// Opens `path`; `-` is stdout. Fails before any work is done where it would fail after it.
     pub(crate) fn open(path: &Path, cancel: &CancelToken) -> Result<Self, CliError> {
         let name = if is_stdio(path) { "stdout".to_owned() } else { path.display().to_string() };
-        let to = if is_stdio(path) { Ok(To::Stdout(io::stdout().lock())) } else { open_file(path) };
+        let to = if is_stdio(path) { Ok(To::Stdout(io::stdout())) } else { open_file(path) };
         match to {
             Ok(to) => Ok(Self { to, name, cancel: cancel.clone(), bytes: 0, writing: Duration::ZERO }),
             Err(source) => Err(CliError::Output { name, source }),
         }
     }
 
-    /// A way to write at any place of the file, if it is one.
-    #[cfg(unix)]
-    pub(crate) fn placer(&self) -> Option<Placer<'_>> {
-        match &self.to {
-            To::Staged { file, .. } => Some(Placer { file, cancel: &self.cancel }),
-            To::Stdout(_) | To::Device(_) => None,
-        }
-    }
-
-    /// The length of a file that was written through [`Self::placer`].
-    pub(crate) fn set_len(&mut self, bytes: u64) {
-        self.bytes = bytes;
+    /// Returns true if the output supports seeking: it is a file, not a stream.
+    pub(crate) fn is_file(&self) -> bool {
+        matches!(self.to, To::Staged { .. })
     }
 
     /// Whether the mesh goes to stdout.
@@ -91,20 +80,12 @@ impl Drop for Output {
     }
 }
 
-/// Writes at any place of a staged file.
-#[cfg(unix)]
-pub(crate) struct Placer<'a> {
-    file: &'a File,
-    cancel: &'a CancelToken,
-}
-
-#[cfg(unix)]
-impl PlaceBytes for Placer<'_> {
-    fn place(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
-        if self.cancel.is_cancelled() {
-            return Err(io::Error::other("interrupted"));
+impl Seek for Output {
+    fn seek(&mut self, position: SeekFrom) -> io::Result<u64> {
+        match &mut self.to {
+            To::Device(file) | To::Staged { file, .. } => file.seek(position),
+            To::Stdout(_) => Err(io::ErrorKind::NotSeekable.into()),
         }
-        std::os::unix::fs::FileExt::write_all_at(self.file, bytes, offset)
     }
 }
 

@@ -34,7 +34,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     }
     referee::quiet_panics();
     let asked =
-        Asked { backend: args.backend, devices: &config.devices.choice, threads: None, enough: usize::MAX, work: None };
+        Asked { backend: args.backend, devices: &config.devices.choice, threads: None, work: None };
     let picked = backend::pick(&asked, &backend::Use::Service(config.devices.clone()))?;
     let others = survey::survey(&picked);
     let Picked { backend, reason, drawer, devices, .. } = picked;

@@ -41,8 +41,8 @@ fn column<T: Pod>(parts: &[Arrived], place: impl Fn(&Arrived) -> (u64, u64)) -> 
         let (offset, n) = place(part);
         let from = usize::try_from(offset).map_err(|e| e.to_string())?;
         let bytes = usize::try_from(n).map_err(|e| e.to_string())? * size_of::<T>();
-        Column::foreign(part.landing.clone(), from..from + bytes)
+        Column::shared(part.landing.clone(), from..from + bytes)
             .ok_or_else(|| format!("{bytes} bytes at {from} are no column"))
     };
-    parts.iter().map(piece).collect::<Result<_, String>>().map(Column::pieced)
+    parts.iter().map(piece).collect::<Result<_, String>>().map(Column::from_chunks)
 }

@@ -10,7 +10,7 @@ use super::lane::one_line;
 use super::pool::{self, DevicePool, PoolDevice, PoolSettings};
 use super::prepare::Prepared;
 use crate::surface::{
-    Backend, Control, DeviceFacts, DeviceStatus, Meshed, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
+    Backend, Control, DeviceFacts, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, backend::one_atom,
 };
 
@@ -18,7 +18,7 @@ use crate::surface::{
 pub struct GpuBackend {
     pool: DevicePool,
     name: &'static str,
-    /// Serves what no device could, and says so in [`Meshed::served`].
+    /// Serves what no device could, and says so in [`MeshOutput::served`].
     fallback: Option<Box<dyn Backend>>,
 }
 
@@ -117,13 +117,14 @@ impl Backend for GpuBackend {
         pool::describe(&up)
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
         control.check()?;
         let job = Self::job(spheres, params, limits, control)?;
         let error = match self.pool.ran(&job) {
@@ -132,8 +133,9 @@ impl Backend for GpuBackend {
                 // Several devices make one job only if they are alike.
                 let device = ran.by.first().map_or("", |work| work.device.as_str());
                 let arithmetic = arithmetic(self.name, device);
-                let served = Served { backend: self.name(), arithmetic, device: ran.device(), instead: None };
-                return Ok(Meshed { served: Some(served), ..ran.finished.meshed });
+                let served = Served { backend: self.name(), arithmetic, device: ran.device(), fallback_reason: None };
+                let output = MeshOutput { served: Some(served), ..ran.finished.meshed };
+                return output.deliver(params, control, sink);
             }
             Err(error) => error,
         };
@@ -147,14 +149,14 @@ impl Backend for GpuBackend {
             }
             (error, None) => Err(SurfaceError::Device { why: one_line(&error.to_string()) }),
             (error, Some(fallback)) => {
-                let meshed = fallback.run(spheres, params, limits, control)?;
+                let output = fallback.write(spheres, params, limits, control, sink)?;
                 let served = Served {
                     backend: fallback.name(),
                     arithmetic: fallback.arithmetic(),
                     device: fallback.describe(),
-                    instead: Some(one_line(&format!("the GPU failed: {error}"))),
+                    fallback_reason: Some(one_line(&format!("the GPU failed: {error}"))),
                 };
-                Ok(Meshed { served: Some(served), ..meshed })
+                Ok(MeshOutput { served: Some(served), ..output })
             }
         }
     }

@@ -7,7 +7,7 @@ use std::time::Instant;
 use super::error::GpuError;
 use super::prepare::Prepared;
 use super::share::Share;
-use crate::surface::{CancelToken, Meshed, Stage};
+use crate::surface::{CancelToken, MeshOutput, Stage};
 
 /// A job as a device's thread sees it.
 #[derive(Debug, Clone)]
@@ -24,7 +24,7 @@ pub struct GpuJob {
 #[derive(Debug, Clone)]
 pub struct Finished {
     /// The mesh and its grid.
-    pub meshed: Meshed,
+    pub meshed: MeshOutput,
     /// Device time per stage in ns, in order; empty where the device has no timestamps.
     pub stages: Vec<(Stage, u64)>,
 }

@@ -26,7 +26,7 @@ use super::record::Recording;
 use crate::surface::lattice::Lattice;
 use crate::surface::layout::Params;
 use crate::surface::plan::check_totals;
-use crate::surface::{Column, GridStats, Kernel, Mesh, Meshed, Stage, SurfaceError, SurfaceParams};
+use crate::surface::{Column, GridStats, Kernel, Mesh, MeshOutput, Stage, SurfaceError, SurfaceParams};
 
 /// Fixed-point units of the isovalue, as the shaders have it. Rounding a term moves a density by less than 3·10⁻⁷ of the
 /// isovalue, and densities up to 1024 isovalues are told from those that may have overflowed.
@@ -202,7 +202,7 @@ impl Paper {
         let column = |at: u64| {
             let from = usize::try_from(at).unwrap_or(usize::MAX);
             let bytes = usize::try_from(12 * n_vertices).unwrap_or(usize::MAX);
-            Column::foreign(landing.clone(), from..from.saturating_add(bytes)).ok_or_else(|| failed("a short landing"))
+            Column::shared(landing.clone(), from..from.saturating_add(bytes)).ok_or_else(|| failed("a short landing"))
         };
         let mut mesh = Mesh {
             centre: lattice.centre(),
@@ -224,7 +224,7 @@ impl Paper {
             (Stage::Interpolate, vertices + normals),
         ];
         let stages = if self.engine.has_clock() { all.to_vec() } else { Vec::new() };
-        Ok(Finished { meshed: Meshed::new(mesh, grid), stages })
+        Ok(Finished { meshed: MeshOutput::new(mesh, grid), stages })
     }
 
     /// The first three stages. Returns the numbers of active cubes and triangles.

@@ -102,9 +102,9 @@ impl Renderer for GpuRenderer {
             (Err(Why::Picture(error)), _) => Err(error),
             (Err(Why::Device(why)), None) => Err(PictureError::Device { why }),
             (Err(Why::Device(why)), Some(cpu)) => {
-                let instead = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
+                let fallback_reason = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
                 let served =
-                    Served { backend: cpu.name(), arithmetic: cpu.arithmetic(), device: cpu.describe(), instead };
+                    Served { backend: cpu.name(), arithmetic: cpu.arithmetic(), device: cpu.describe(), fallback_reason };
                 Ok(Rendered { served: Some(served), ..cpu.render(mesh, params, control)? })
             }
         }

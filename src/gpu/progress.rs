@@ -11,7 +11,7 @@ use super::submit::Flight;
 use crate::surface::chunks::Chunk;
 use crate::surface::layout::{self, GROUP, Tally};
 use crate::surface::plan::check_totals;
-use crate::surface::{GridStats, Meshed};
+use crate::surface::{GridStats, MeshOutput};
 
 /// What a chunk's stages up to `scan` counted.
 #[derive(Debug, Default)]
@@ -154,6 +154,6 @@ impl<'a> Progress<'a> {
         };
         let timed = self.times.iter().any(|&ns| ns > 0);
         let stages = if timed { STAGES.into_iter().zip(self.times).collect() } else { Vec::new() };
-        Ok(Finished { meshed: Meshed::new(mesh, grid), stages })
+        Ok(Finished { meshed: MeshOutput::new(mesh, grid), stages })
     }
 }

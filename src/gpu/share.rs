@@ -10,7 +10,7 @@ use super::engine::check;
 use super::error::GpuError;
 use super::executor::GpuJob;
 use crate::surface::SurfaceError;
-use crate::surface::column::Foreign;
+use crate::surface::SharedBytes;
 use crate::surface::parts::Part;
 
 /// How often a waiting part looks whether its job is still wanted. What the others say does not wait for it.
@@ -43,7 +43,7 @@ pub(super) struct Counts {
     pub(super) vertices: u64,
     pub(super) triangles: u64,
     /// Records and offsets of the bricks that earlier parts borrow, in the order of [`Share::lends`].
-    pub(super) lent: Foreign,
+    pub(super) lent: SharedBytes,
 }
 
 /// Bricks of a later part, with what their owner knows of them.
@@ -53,7 +53,7 @@ pub(super) struct Borrowed {
     pub(super) at: u64,
     /// How many bricks are lent there.
     pub(super) of: u64,
-    pub(super) lent: Foreign,
+    pub(super) lent: SharedBytes,
     /// Vertices before their owner's part.
     pub(super) first_vertex: u64,
 }

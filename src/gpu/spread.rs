@@ -11,7 +11,7 @@ use super::executor::{Finished, GpuJob};
 use super::pool::{DevicePool, Ran, TICK, Work, over, thread_ended};
 use super::queue::{Answer, Place};
 use super::share::Share;
-use crate::surface::{Column, GridStats, Mesh, Meshed, Quantized, Stage, SurfaceError};
+use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage, SurfaceError};
 
 /// How many devices of `free` ones make a job of `n_bricks`: as many as get `least` bricks each. 1: it is not spread.
 pub(super) fn n_parts(n_bricks: u64, free: usize, least: Option<u64>) -> usize {
@@ -132,16 +132,16 @@ impl DevicePool {
             grid = GridStats { surface_bricks, ..meshed.grid };
             by.push(Work { device: self.names[lane].clone(), stages });
         }
-        mesh.positions = Column::pieced(positions);
-        mesh.normals = Column::pieced(normals);
-        let (rounded_positions, rounded_normals) = (Column::pieced(rounded.0), Column::pieced(rounded.1));
+        mesh.positions = Column::from_chunks(positions);
+        mesh.normals = Column::from_chunks(normals);
+        let (rounded_positions, rounded_normals) = (Column::from_chunks(rounded.0), Column::from_chunks(rounded.1));
         mesh.quantized = step.map(|step| Quantized { step, positions: rounded_positions, normals: rounded_normals });
-        mesh.triangles = Column::pieced(triangles);
-        mesh.atom_ids = (!atom_ids.is_empty()).then(|| Column::pieced(atom_ids));
+        mesh.triangles = Column::from_chunks(triangles);
+        mesh.atom_ids = (!atom_ids.is_empty()).then(|| Column::from_chunks(atom_ids));
         if flat {
             mesh.fill_flat_normals();
         }
-        Ran { finished: Finished { meshed: Meshed::new(mesh, grid), stages: longest(&by) }, by }
+        Ran { finished: Finished { meshed: MeshOutput::new(mesh, grid), stages: longest(&by) }, by }
     }
 }
 

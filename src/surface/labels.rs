@@ -7,17 +7,17 @@
 use rayon::prelude::*;
 
 use super::column::Column;
-use super::lattice::to_u32;
 use super::measure::Component;
 use super::mesh::Mesh;
 use super::sums::NONE;
+use super::union_find::UnionFind;
 
 /// The component of every vertex.
 pub(super) struct Labels {
     /// A label per vertex; vertices that no triangle uses have none.
     of_vertex: Column<u32>,
-    /// The component that a label stands for: the lowest label in it.
-    equal: Vec<u32>,
+    /// The lowest label of the component that a label belongs to.
+    component_of: Vec<u32>,
 }
 
 /// The vertices and triangles of one part of a mesh.
@@ -33,9 +33,9 @@ pub(super) struct Part<'a> {
 /// What a part hands on.
 #[derive(Default)]
 pub(super) struct Joined {
-    /// Per label of the part, from 0, a label that it equals: itself or a lower one.
-    pub(super) equal: Vec<u32>,
-    /// The edges that leave the part.
+    /// Labels of the part, from 0; those of one component are united.
+    pub(super) equal: UnionFind,
+    /// Edges that leave the part.
     leaving: Vec<[u32; 2]>,
 }
 
@@ -43,13 +43,8 @@ impl Labels {
     /// Joins the parts of `mesh`, whose vertices have been labelled part by part.
     pub(super) fn join(mesh: &Mesh, mut of_vertex: Column<u32>, joined: &[Joined]) -> Self {
         // Labels are counted per part: number them through.
-        let mut equal = Vec::new();
-        let mut offsets = Vec::with_capacity(joined.len());
-        for part in joined {
-            let offset = to_u32(equal.len());
-            offsets.push(offset);
-            equal.extend(part.equal.iter().map(|label| label + offset));
-        }
+        let mut equal = UnionFind::default();
+        let offsets: Vec<u32> = joined.iter().map(|part| equal.append(&part.equal)).collect();
         split(mesh, &mut of_vertex).into_par_iter().zip(&offsets).for_each(|(part, offset)| {
             part.labels.iter_mut().filter(|label| **label != NONE).for_each(|label| *label += offset);
         });
@@ -58,15 +53,11 @@ impl Labels {
             // Neighbouring triangles mostly ask for what the last one asked for.
             let pair = [of_vertex[a as usize], of_vertex[b as usize]];
             if pair != last {
-                join(&mut equal, pair[0], pair[1]);
+                equal.union(pair[0], pair[1]);
                 last = pair;
             }
         }
-        for label in 0..equal.len() {
-            // Ascending, so the lower label that this one equals is final already.
-            equal[label] = equal[equal[label] as usize];
-        }
-        Self { of_vertex, equal }
+        Self { of_vertex, component_of: equal.into_representatives() }
     }
 
     /// The label of a vertex that some triangle uses. Several labels may stand for one component.
@@ -76,33 +67,18 @@ impl Labels {
 
     /// The component that a label stands for.
     pub(super) fn component_of(&self, label: u32) -> u32 {
-        self.equal[label as usize]
+        self.component_of[label as usize]
     }
 
     /// One entry per label, with the vertices of the component that it stands for counted at the component's own.
     pub(super) fn count_vertices(&self) -> Vec<Component> {
-        let mut components = vec![Component::default(); self.equal.len()];
+        let mut components = vec![Component::default(); self.component_of.len()];
         for run in self.of_vertex.chunk_by(|a, b| a == b) {
-            if let Some(&component) = self.equal.get(run[0] as usize) {
+            if let Some(&component) = self.component_of.get(run[0] as usize) {
                 components[component as usize].vertices += run.len() as u64;
             }
         }
         components
-    }
-}
-
-/// Makes two labels equal. Entries only ever get lower.
-fn join(equal: &mut [u32], a: u32, b: u32) {
-    let find = |mut label: u32| {
-        while equal[label as usize] != label {
-            label = equal[label as usize];
-        }
-        label
-    };
-    let (root_a, root_b) = (find(a), find(b));
-    let low = root_a.min(root_b);
-    for label in [a, b, root_a, root_b] {
-        equal[label as usize] = low;
     }
 }
 
@@ -138,8 +114,7 @@ impl Part<'_> {
             let (i, j, k) = (i.unwrap_or(NONE), j.unwrap_or(NONE), k.unwrap_or(NONE));
             let mut low = i.min(j).min(k);
             if low == NONE {
-                low = to_u32(joined.equal.len());
-                joined.equal.push(low);
+                low = joined.equal.push();
             }
             for v in [a, b, c] {
                 if let Some(label) = labels.get_mut(v.wrapping_sub(first) as usize) {
@@ -150,7 +125,7 @@ impl Part<'_> {
             let known = |label: u32| if label == NONE { low } else { label };
             if known(i).max(known(j)).max(known(k)) != low {
                 for label in [i, j, k].map(known) {
-                    join(&mut joined.equal, label, low);
+                    joined.equal.union(label, low);
                 }
             }
         }

@@ -1,13 +1,11 @@
 //! Which bricks exist: atoms mark those that they reach, run by run in parallel, and the marks are merged tile by tile.
 
-use std::collections::hash_map::Entry;
-
+use indexmap::IndexMap;
 use rayon::prelude::*;
-use rustc_hash::FxHashMap;
+use rustc_hash::FxBuildHasher;
 
 use super::lattice::{BRICK, LatticeAtom, TILE, tile_of, tile_order, to_i32, to_u32};
 use super::layout::NONE;
-use super::split::map;
 
 /// Atoms that one piece of parallel work marks the bricks of.
 const RUN: usize = 1024;
@@ -21,8 +19,8 @@ pub(super) type Bits = [u64; 8];
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Marked {
     pub(super) tile: [i32; 3],
-    /// Bricks that exist.
-    pub(super) closed: Bits,
+    /// Bricks within reach of at least one atom.
+    pub(super) occupied: Bits,
     /// Those with a sample in reach.
     pub(super) reached: Bits,
     pub(super) candidates: u64,
@@ -70,7 +68,7 @@ fn to_usize(v: f32) -> usize {
 impl Marked {
     /// Adds what others mark in the same tile.
     fn add(&mut self, other: &Self) {
-        self.closed.iter_mut().zip(other.closed).for_each(|(word, more)| *word |= more);
+        self.occupied.iter_mut().zip(other.occupied).for_each(|(word, more)| *word |= more);
         self.reached.iter_mut().zip(other.reached).for_each(|(word, more)| *word |= more);
         self.candidates += other.candidates;
         self.pairs += other.pairs;
@@ -97,7 +95,7 @@ impl Marked {
             }
             let [near, hit] = rows.map(|rows| u64::from_le_bytes(rows.map(|row| row.to_le_bytes()[0])));
             let hit = hit & near;
-            self.closed[bz] |= near;
+            self.occupied[bz] |= near;
             self.reached[bz] |= hit;
             candidates += near.count_ones();
             pairs += hit.count_ones();
@@ -132,7 +130,7 @@ impl Around {
         let at = &mut self.at[((z * side + y) * side + x).unsigned_abs() as usize];
         if *at == NONE {
             *at = to_u32(self.marked.len());
-            self.marked.push(Marked { tile, closed: [0; 8], reached: [0; 8], candidates: 0, pairs: 0 });
+            self.marked.push(Marked { tile, occupied: [0; 8], reached: [0; 8], candidates: 0, pairs: 0 });
         }
         &mut self.marked[*at as usize]
     }
@@ -165,7 +163,7 @@ pub(super) fn mark_run(atoms: &[LatticeAtom], reaches: &[f32], longest: f32) -> 
         }
         // Where spheres are tiny, an atom may reach nothing of the brick that it lives in; its atoms are found there.
         let local = local_of(atom);
-        around.tile(home).closed[local as usize >> 6] |= 1 << (local & 63);
+        around.tile(home).occupied[local as usize >> 6] |= 1 << (local & 63);
     }
     around.marked
 }
@@ -179,8 +177,8 @@ fn tile_step(local: f32) -> i32 {
     (local * (1.0 / TILE as f32) + OFFSET as f32) as i32 - OFFSET
 }
 
-/// Where each tile's atoms begin. `few`: looked for on this thread.
-pub(super) fn starts(atoms: &[LatticeAtom], few: bool) -> Vec<usize> {
+/// Index of the first atom of each tile.
+pub(super) fn starts(atoms: &[LatticeAtom]) -> Vec<usize> {
     let tile = |i: usize| tile_of(atoms[i].cell);
     let in_piece = |piece: usize| {
         let end = (piece + RUN).min(atoms.len());
@@ -190,8 +188,7 @@ pub(super) fn starts(atoms: &[LatticeAtom], few: bool) -> Vec<usize> {
     // A piece begins within a tile, as a rule.
     let begins = |&at: &usize| at == 0 || tile(at - 1) != tile(at);
     let pieces: Vec<usize> = (0..atoms.len()).step_by(RUN).collect();
-    let found = map(few, pieces, |piece| in_piece(piece).filter(begins).collect::<Vec<_>>());
-    found.into_iter().flatten().collect()
+    pieces.into_par_iter().flat_map_iter(|piece| in_piece(piece).filter(begins)).collect()
 }
 
 /// The atoms of each tile, which `starts` tells, cut into runs.
@@ -211,25 +208,18 @@ pub(super) fn merge(marks: &[Vec<Marked>]) -> Vec<Marked> {
         merged(&parts)
     };
     // A tile may be in an atom's range by a corner that no brick is near to.
-    all.retain(|mark| mark.closed != [0; 8]);
+    all.retain(|mark| mark.occupied != [0; 8]);
     all.par_sort_unstable_by_key(|mark| tile_order(mark.tile));
     all
 }
 
-/// One entry a tile, in any order.
+/// Adds up the marks of each tile. The order of the tiles is unspecified.
 fn merged(marks: &[Vec<Marked>]) -> Vec<Marked> {
-    let mut all: Vec<Marked> = Vec::new();
-    let mut at: FxHashMap<[i32; 3], usize> = FxHashMap::default();
+    let mut all: IndexMap<[i32; 3], Marked, FxBuildHasher> = IndexMap::default();
     for mark in marks.iter().flatten() {
-        match at.entry(mark.tile) {
-            Entry::Vacant(entry) => {
-                entry.insert(all.len());
-                all.push(*mark);
-            }
-            Entry::Occupied(entry) => all[*entry.get()].add(mark),
-        }
+        all.entry(mark.tile).and_modify(|sum| sum.add(mark)).or_insert(*mark);
     }
-    all
+    all.into_values().collect()
 }
 
 /// An atom's brick within its tile.

@@ -5,6 +5,8 @@
 //! of a run of bricks are one range. A brick exists where an atom reaches one of its samples, or the gap up to its
 //! neighbours' first samples: cells live there too.
 
+use rayon::prelude::*;
+
 use super::candidates;
 use super::column::Column;
 use super::control::Control;
@@ -15,7 +17,6 @@ use super::layout::{NONE, Params, Tile, halves};
 use super::marks::{Bits, Marked, local_of, mark_run, merge, runs, starts};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
-use super::split::{Caller, each, map};
 
 /// More tiles than this in all runs together, and the grid is looked at before it is built.
 const MANY_TILES: f64 = 1e6;
@@ -59,24 +60,22 @@ impl Plan {
         if atoms.len() > cpu::MAX_ATOMS {
             return Err(cpu::too_many_atoms(atoms.len()));
         }
-        let caller = Caller::new();
-        let few = caller.few(atoms.len());
-        let starts = starts(atoms, few);
+        let starts = starts(atoms);
         let runs = runs(&starts, atoms.len());
-        let mut reaches = Column::scratch(atoms.len());
+        let mut reaches = Column::zeroed(atoms.len());
         let part = |(reaches, atoms): (&mut [f32], &[LatticeAtom])| {
             reaches.iter_mut().zip(atoms).for_each(|(reach, atom)| *reach = reach_of(lattice, atom));
             reaches.iter().copied().fold(0.0, f32::max)
         };
-        let parts: Vec<_> = reaches.chunks_mut(4096).zip(atoms.chunks(4096)).collect();
-        let longest = map(few, parts, part).into_iter().fold(0.0, f32::max);
+        let parts = reaches.par_chunks_mut(4096).zip(atoms.par_chunks(4096));
+        let longest = parts.map(part).reduce(|| 0.0, f32::max);
         refuse_early(lattice, runs.len(), longest, limits)?;
         control.check()?;
         let marked_by = |&(start, end): &(usize, usize)| {
             control.check()?;
             Ok(mark_run(&atoms[start..end], &reaches[start..end], longest))
         };
-        let marks: Vec<Vec<Marked>> = map(few, &runs, marked_by).into_iter().collect::<Result<_, SurfaceError>>()?;
+        let marks: Vec<Vec<Marked>> = runs.par_iter().map(marked_by).collect::<Result<_, SurfaceError>>()?;
         let marked = merge(&marks);
         control.check()?;
         let occupied = marked.iter().map(|m| ones(&m.reached)).sum::<u64>();
@@ -95,13 +94,13 @@ impl Plan {
             pairs: marked.iter().map(|m| m.pairs).sum(),
             ..Self::default()
         };
-        plan.number(&marked, few).ok_or_else(|| cpu::grid_too_large(lattice, u64::from(u32::MAX) * 512, limits))?;
-        plan.place(&marked, atoms, &starts, few);
+        plan.number(&marked).ok_or_else(|| cpu::grid_too_large(lattice, u64::from(u32::MAX) * 512, limits))?;
+        plan.place(&marked, atoms, &starts);
         Ok(plan)
     }
 
     /// Numbers tiles and bricks. `None` where 32 bits do not.
-    fn number(&mut self, marked: &[Marked], few: bool) -> Option<()> {
+    fn number(&mut self, marked: &[Marked]) -> Option<()> {
         if marked.len() >= 1 << 23 {
             return None;
         }
@@ -109,12 +108,12 @@ impl Plan {
         let mut bases = Vec::with_capacity(marked.len());
         for m in marked {
             bases.push(base);
-            base = base.checked_add(u32::try_from(ones(&m.closed)).ok()?)?;
+            base = base.checked_add(u32::try_from(ones(&m.occupied)).ok()?)?;
         }
         let tile = |(m, &base): (&Marked, &u32)| {
             let mut tile = Tile { coord: m.tile, base, bricks: [[0; 2]; 8], before: [0; 8], around: [NONE; 28] };
             let mut before = 0;
-            for (z, word) in m.closed.iter().enumerate() {
+            for (z, word) in m.occupied.iter().enumerate() {
                 tile.bricks[z] = halves(*word);
                 tile.before[z] = before;
                 before += word.count_ones();
@@ -132,30 +131,30 @@ impl Plan {
             }
             tile
         };
-        self.tiles = map(few, marked.iter().zip(&bases).collect::<Vec<_>>(), tile);
-        self.bricks = Column::scratch(base as usize);
-        self.first_atoms = Column::scratch(base as usize + 1);
+        self.tiles = marked.par_iter().zip(&bases).map(tile).collect();
+        self.bricks = Column::zeroed(base as usize);
+        self.first_atoms = Column::zeroed(base as usize + 1);
         Some(())
     }
 
     /// Lists the bricks and finds their first atoms; `starts` tells where each tile's atoms begin.
-    fn place(&mut self, marked: &[Marked], atoms: &[LatticeAtom], starts: &[usize], few: bool) {
+    fn place(&mut self, marked: &[Marked], atoms: &[LatticeAtom], starts: &[usize]) {
         let mut parts = Vec::with_capacity(marked.len());
         let (mut bricks, mut firsts) = (&mut self.bricks[..], &mut self.first_atoms[..]);
         for (t, m) in (0_u32..).zip(marked) {
-            let n = usize::try_from(ones(&m.closed)).unwrap_or_default();
+            let n = usize::try_from(ones(&m.occupied)).unwrap_or_default();
             let ((own, more), (first, rest)) = (bricks.split_at_mut(n), firsts.split_at_mut(n));
             parts.push((t, m, own, first));
             (bricks, firsts) = (more, rest);
         }
         firsts.fill(to_u32(atoms.len()));
-        each(few, parts, |(t, m, own, firsts)| {
+        parts.into_par_iter().for_each(|(t, m, own, firsts)| {
             let before = |&start: &usize| tile_order(tile_of(atoms[start].cell)) < tile_order(m.tile);
             let tile = starts.partition_point(before);
             let [mut at, next] = [tile, tile + 1].map(|t| starts.get(t).copied().unwrap_or(atoms.len()));
             // Of a tile without atoms the next one's are found: they are behind all its bricks.
             let end = if atoms.get(at).is_some_and(|atom| tile_of(atom.cell) == m.tile) { next } else { at };
-            for ((local, brick), first) in set_bits(&m.closed).zip(own).zip(firsts) {
+            for ((local, brick), first) in set_bits(&m.occupied).zip(own).zip(firsts) {
                 (*brick, *first) = (t << 9 | local, to_u32(at));
                 // Every atom's own brick exists, so none is passed over.
                 at += atoms[at..end].iter().take_while(|atom| local_of(atom) == local).count();

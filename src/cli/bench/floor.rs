@@ -15,7 +15,7 @@
 
 use molmesh::gpu::Prepared;
 use molmesh::gpu::yardstick::Rates;
-use molmesh::surface::{Meshed, Stage};
+use molmesh::surface::{MeshOutput, Stage};
 
 /// What a stage must do at least.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -27,7 +27,7 @@ pub(super) struct Work {
 
 impl Work {
     /// Of `stage` in a job.
-    pub(super) fn of(stage: Stage, job: &Prepared, meshed: &Meshed) -> Self {
+    pub(super) fn of(stage: Stage, job: &Prepared, meshed: &MeshOutput) -> Self {
         let atoms = job.lattice.atoms.len() as f64;
         let (bricks, tiles) = (job.plan.bricks.len() as f64, job.plan.tiles.len() as f64);
         let entries = job.plan.candidates.iter().sum::<u64>() as f64;

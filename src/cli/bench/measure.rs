@@ -6,7 +6,7 @@ use std::time::Instant;
 use molmesh::gpu::yardstick::Rates;
 use molmesh::gpu::{Engine, Executor, GpuJob, Paper, Prepared};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Measures, Mesh, Meshed, Proof, Spheres, Stage, Step, SurfaceLimits,
+    Backend, CancelToken, Control, CpuBackend, Measures, Mesh, MeshOutput, Validation, Spheres, Stage, Step, SurfaceLimits,
     SurfaceParams,
 };
 use rayon::prelude::*;
@@ -230,7 +230,7 @@ pub(super) fn measure(
     })
 }
 
-fn stage_row(stage: Stage, ms: Vec<f64>, job: &Prepared, meshed: &Meshed, rates: Option<&Rates>) -> StageRow {
+fn stage_row(stage: Stage, ms: Vec<f64>, job: &Prepared, meshed: &MeshOutput, rates: Option<&Rates>) -> StageRow {
     let (ms, work) = (Spread::of(ms), Work::of(stage, job, meshed));
     let floor_ms = rates.map(|rates| work.seconds(rates) * 1e3);
     let ratio = floor_ms.map(|floor| ms.median / floor);
@@ -260,14 +260,14 @@ pub(super) fn bytes_of(mesh: &Mesh) -> Vec<&[u8]> {
 }
 
 fn compare(
-    meshed: &Meshed,
+    meshed: &MeshOutput,
     spheres: &Spheres,
     params: &SurfaceParams,
     limits: &SurfaceLimits,
 ) -> Result<Check, String> {
     let control = Control::default();
     let words = |e: molmesh::surface::SurfaceError| e.to_string();
-    let of = |mesh: &Mesh| Measures::of(mesh, Proof::Checksum, &control).map_err(words);
+    let of = |mesh: &Mesh| Measures::of(mesh, Validation::Checksum, &control).map_err(words);
     let theirs = CpuBackend::new(None)?.run(spheres, params, limits, &control).map_err(words)?;
     let (here, there) = (of(&meshed.mesh)?, of(&theirs.mesh)?);
     let count = |mesh: &Mesh| i64::try_from(mesh.n_triangles()).unwrap_or(i64::MAX);

@@ -57,7 +57,6 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
         backend: args.serve.backend,
         devices: &config.devices.choice,
         threads: None,
-        enough: usize::MAX,
         work: None,
     };
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);

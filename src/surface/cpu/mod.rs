@@ -8,7 +8,6 @@
 //! The same input gives the same bytes whatever the thread count: no result depends on which thread ran what.
 
 mod bin;
-mod build;
 mod classify;
 mod edge;
 mod emit;
@@ -16,7 +15,6 @@ mod field;
 mod interpolate;
 mod join;
 mod near;
-mod pour;
 #[doc(hidden)]
 pub mod probe;
 mod reach;
@@ -27,10 +25,9 @@ mod slabs;
 mod table;
 mod tally;
 mod threads;
+mod write;
 
-use std::num::NonZero;
 use std::ops::Range;
-use std::sync::Arc;
 
 // What the plan of a device's work shares with this backend: formulas, refusals and their numbers.
 pub(super) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
@@ -43,7 +40,7 @@ use self::classify::{Before, Found};
 use self::near::Numbered;
 use self::sample::Pass;
 use self::scan::Totals;
-use super::backend::{Backend, GridStats, Meshed};
+use super::backend::{Backend, GridStats, MeshOutput};
 use super::candidates;
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
@@ -51,7 +48,7 @@ use super::lattice::{Lattice, to_f32, to_u32};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
 use super::simd;
-use super::sink::{MeshSink, Poured};
+use super::sink::MeshSink;
 use super::spheres::Spheres;
 
 /// The native CPU backend.
@@ -81,35 +78,6 @@ impl CpuBackend {
         Ok(Self { pool: pool.map_err(|e| e.to_string())? })
     }
 
-    /// A backend for a process that meshes once and ends: the calling thread works too, instead of waiting for a pool
-    /// whose threads compete with it for the processors between the stages. It has `threads`, or as many as there are
-    /// processors but not more than are `enough`.
-    ///
-    /// # Errors
-    /// The pool's, in words, where this thread is in one already or others cannot be started.
-    pub fn on_this_thread(threads: Option<usize>, enough: usize) -> Result<Self, String> {
-        // Counted before this thread is held in one place, which would count as one processor.
-        let processors = || std::thread::available_parallelism().map_or(1, NonZero::get);
-        let n = threads.unwrap_or_else(|| processors().min(enough));
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(n).use_current_thread();
-        let homes = threads::Homes::hold().map(Arc::new);
-        let pool = match homes.clone() {
-            Some(homes) => pool.start_handler(move |index| begin(&homes, index)).build(),
-            None => pool.build(),
-        };
-        if let Some(homes) = homes {
-            // The others begin on this processor and leave it at once; they are not waited for.
-            std::thread::yield_now();
-            homes.free();
-        }
-        let pool = pool.map_err(|e| e.to_string())?;
-        // The other threads get their memory while this one reads the file, and are awake when there is work.
-        for _ in 1..pool.current_num_threads() {
-            pool.spawn(warm);
-        }
-        Ok(Self { pool: Some(pool) })
-    }
-
     /// Threads that a run uses.
     #[must_use]
     pub fn threads(&self) -> usize {
@@ -136,41 +104,19 @@ impl Backend for CpuBackend {
         format!("native CPU, {threads} thread{plural}, {}", simd::extension())
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
-        self.install(|free_threads| run(spheres, Means { params, limits, control, free_threads }))
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
+        self.install(|free_threads| {
+            let scanned = scan(spheres, Means { params, limits, control, free_threads })?;
+            write::write(&scanned, params.atom_ids, control, sink)
+        })
     }
-
-    fn pour(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: &dyn MeshSink,
-    ) -> Result<Poured, SurfaceError> {
-        self.install(|free_threads| pour(spheres, Means { params, limits, control, free_threads }, sink))
-    }
-}
-
-/// What a thread of a pool does first.
-fn begin(homes: &threads::Homes, index: usize) {
-    homes.spread(index);
-    // The processor is asked for its extensions once a process: in a virtual machine that takes longer than reading a small
-    // structure does.
-    let _known = simd::extension();
-}
-
-/// Makes what a thread keeps from tile to tile, and the tables that all share.
-fn warm() {
-    sample::warm();
-    pour::warm();
-    emit::warm();
 }
 
 /// A tile between the stages.
@@ -279,17 +225,6 @@ fn scan_lattice(lattice: Lattice, means: Means<'_>) -> Result<Scanned, SurfaceEr
     Ok(Scanned { lattice, tiles, done, totals, grid, pieces, quantize: params.quantize })
 }
 
-fn run(spheres: &Spheres, means: Means<'_>) -> Result<Meshed, SurfaceError> {
-    let scanned = scan(spheres, means)?;
-    let (mesh, measures) = build::build(&scanned, means.params.atom_ids, means.control)?;
-    Ok(Meshed { measures, ..Meshed::new(mesh, scanned.grid) })
-}
-
-fn pour(spheres: &Spheres, means: Means<'_>, sink: &dyn MeshSink) -> Result<Poured, SurfaceError> {
-    let scanned = scan(spheres, means)?;
-    pour::pour(&scanned, means.control, sink)
-}
-
 impl Tile {
     /// What comes before the first brick of a piece of this tile, and before the first one after it.
     fn span(&self, piece: &Piece) -> [Before; 2] {
@@ -308,23 +243,5 @@ impl Tile {
         // `scan` made sure that ids fit 32 bits; there are fewer bricks than vertices.
         let (id, first) = (to_u32(self.first_brick + ix), to_u32(self.first_vertex) + brick.vertex);
         Some((ix, Numbered { brick, id, first, t, edges }))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn no_more_threads_than_are_enough_unless_they_are_asked_for() {
-        // Each in a thread of its own, as a thread is in one pool.
-        let threads = |asked, enough| {
-            let made = std::thread::spawn(move || CpuBackend::on_this_thread(asked, enough).unwrap().threads());
-            made.join().unwrap()
-        };
-        let processors = std::thread::available_parallelism().unwrap().get();
-        assert_eq!(threads(None, usize::MAX), processors);
-        assert_eq!(threads(None, 1), 1);
-        assert_eq!(threads(Some(processors + 1), 1), processors + 1);
     }
 }
