@@ -13,8 +13,8 @@ use gpu_fakes::Step::{Hold, Lose, OutOfMemory, Serve};
 use gpu_fakes::{Rig, SETTINGS, devices, spheres};
 use molmesh::gpu::{DevicePool, GpuBackend, GpuError, Look, Program, discover};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, Meshed, Observer, Stage, Step, SurfaceError,
-    SurfaceLimits, SurfaceParams,
+    Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, MeshOutput, Observer, Stage, Step,
+    SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 fn over(rigs: &[Arc<Rig>], fallback: bool) -> GpuBackend {
@@ -22,7 +22,7 @@ fn over(rigs: &[Arc<Rig>], fallback: bool) -> GpuBackend {
     GpuBackend::over(DevicePool::start(devices(rigs), &SETTINGS).unwrap(), fallback)
 }
 
-fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<Meshed, SurfaceError> {
+fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
     backend.run(&spheres(2), &SurfaceParams::default(), &SurfaceLimits::default(), control)
 }
 
@@ -47,7 +47,7 @@ fn the_cpu_stands_in_and_says_so() {
         let meshed = run(&backend, &Control::default()).unwrap();
         assert_eq!(meshed.mesh, cpu.mesh);
         let served = meshed.served.unwrap();
-        let why = served.instead.unwrap();
+        let why = served.fallback_reason.unwrap();
         assert_eq!((served.backend, &served.arithmetic), ("cpu", &CpuBackend::new(None).unwrap().arithmetic()));
         // As long as the device is up it is expected to serve; once it is given up, the CPU is.
         assert_eq!(backend.arithmetic() == served.arithmetic, backend.devices()[0].down.is_some(), "{n}");
@@ -64,7 +64,7 @@ fn the_cpu_stands_in_and_says_so() {
     assert!(stood_in.mesh.quantized.is_some() && stood_in.measures.is_some());
     // A device that works is not stood in for.
     let well = run(&over(&[Rig::new(&[])], true), &Control::default()).unwrap().served.unwrap();
-    assert_eq!((well.backend, well.instead), ("gpu", None));
+    assert_eq!((well.backend, well.fallback_reason), ("gpu", None));
 }
 
 #[test]

@@ -13,11 +13,11 @@ use molmesh::gpu::{Budget, Engine, Executor, GpuError, GpuJob, Prepared};
 use molmesh::surface::chunks::ChunkLimits;
 use molmesh::surface::quantize::BEYOND;
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Mesh, Meshed, Quantized, Spheres, SurfaceError, SurfaceLimits, SurfaceOptions,
+    Backend, Control, CpuBackend, Mesh, MeshOutput, Quantized, Spheres, SurfaceError, SurfaceLimits, SurfaceOptions,
     SurfaceParams,
 };
 
-fn cpu(spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+fn cpu(spheres: &Spheres, params: &SurfaceParams) -> MeshOutput {
     CpuBackend::new(Some(2)).unwrap().run(spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap()
 }
 
@@ -40,7 +40,7 @@ fn difference(mesh: &Mesh, expected: &Mesh) -> Option<String> {
         .then(|| format!("{n} vertices of {}, {apart} Å apart, normals {turned}", expected.n_vertices()))
 }
 
-fn assert_equal(gpu: &Meshed, spheres: &Spheres, params: &SurfaceParams, what: &str) {
+fn assert_equal(gpu: &MeshOutput, spheres: &Spheres, params: &SurfaceParams, what: &str) {
     let cpu = cpu(spheres, params);
     assert_eq!(difference(&gpu.mesh, &cpu.mesh), None, "{what}");
     assert_eq!(gpu.grid, cpu.grid, "{what}");
@@ -69,7 +69,7 @@ fn structures_are_as_on_the_cpu_with_every_kernel() {
 /// Asserts that the engine's rounded vertices are its own single-precision ones rounded by the host, bit for bit, and that
 /// everything else is as it was. Returns the rounded mesh.
 #[track_caller]
-fn assert_rounded(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams, what: &str) -> Meshed {
+fn assert_rounded(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams, what: &str) -> MeshOutput {
     let single = mesh_of(engine, spheres, params).mesh;
     let small = rounded(spheres, params);
     let meshed = mesh_of(engine, spheres, &small);

@@ -10,11 +10,11 @@ use std::sync::{Mutex, OnceLock};
 use gpu_support::{KERNELS, device, job, measures, params, sample, spheres};
 use molmesh::gpu::{Engine, Executor, GpuError, GpuJob, Paper, Prepared};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Kernel, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits,
+    Backend, CancelToken, Control, CpuBackend, Kernel, Mesh, MeshOutput, Spheres, SurfaceError, SurfaceLimits,
     SurfaceOptions, SurfaceParams,
 };
 
-fn run(job: &GpuJob) -> Result<Meshed, GpuError> {
+fn run(job: &GpuJob) -> Result<MeshOutput, GpuError> {
     static PAPER: OnceLock<Mutex<Paper>> = OnceLock::new();
     let make = || {
         let (device, queue) = device();
@@ -28,7 +28,7 @@ fn run(job: &GpuJob) -> Result<Meshed, GpuError> {
 }
 
 /// What the soup has otherwise than the CPU's mesh: triangles, and what single precision does not explain.
-fn difference(soup: &Meshed, cpu: &Meshed) -> Vec<String> {
+fn difference(soup: &MeshOutput, cpu: &MeshOutput) -> Vec<String> {
     let mut wrong = Vec::new();
     let (here, there) = (&soup.mesh, &cpu.mesh);
     if here.n_triangles() != there.n_triangles() {
@@ -83,7 +83,7 @@ fn near(places: &HashSet<[i64; 3]>, p: &[f32; 3]) -> bool {
     (0..27).any(|n| places.contains(&[at[0] + n % 3 - 1, at[1] + n / 3 % 3 - 1, at[2] + n / 9 - 1]))
 }
 
-fn cpu(spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+fn cpu(spheres: &Spheres, params: &SurfaceParams) -> MeshOutput {
     CpuBackend::new(Some(2)).unwrap().run(spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap()
 }
 

@@ -97,7 +97,7 @@ fn what_a_device_cannot_draw_is_drawn_by_the_cpu_which_says_so_or_by_nobody() {
     let rendered = helped.render(&mesh, &wide, &Control::default()).unwrap();
     let served = rendered.served.unwrap();
     assert_eq!(served.backend, "cpu");
-    assert!(served.instead.unwrap().contains("the GPU could not draw it"));
+    assert!(served.fallback_reason.unwrap().contains("the GPU could not draw it"));
     assert_eq!(rendered.image, of(&CpuRenderer::default(), &mesh, &wide));
     // What nobody draws is not handed on.
     let cancel = CancelToken::default();

@@ -14,8 +14,8 @@ use molmesh::gpu::{
     Budget, DevicePool, Engine, Executor, Finished, GpuBackend, GpuError, GpuJob, PoolDevice, PoolSettings, Ran, Share,
 };
 use molmesh::surface::{
-    Backend, Control, Kernel, Measures, Mesh, Proof, Quantized, Spheres, Step, SurfaceError, SurfaceLimits,
-    SurfaceOptions, SurfaceParams,
+    Backend, Control, Kernel, Measures, Mesh, Quantized, Spheres, Step, SurfaceError, SurfaceLimits, SurfaceOptions,
+    SurfaceParams, Validation,
 };
 
 /// Every job is spread that can be.
@@ -110,7 +110,7 @@ fn a_spread_mesh_is_that_of_one_device_to_the_byte() {
                 let ran = pool.ran(&job).unwrap();
                 let mesh = assert_same(&ran, &job, parts.len(), &what);
                 assert_eq!((mesh.atom_ids.is_some(), mesh.quantized.is_some()), (ids, small));
-                let measures = Measures::of(&ran.finished.meshed.mesh, Proof::Exact, &Control::default()).unwrap();
+                let measures = Measures::of(&ran.finished.meshed.mesh, Validation::Exact, &Control::default()).unwrap();
                 assert!(measures.closed && measures.manifold, "{what}");
             }
         }

@@ -295,7 +295,7 @@ mod tests {
             "20,000 vertices",
             "steps of 0.0009765625 Å",
             "39,996 triangles",
-            "closed, oriented, NOT manifold, Euler number 2",
+            "watertight (by edge checksum), oriented, NOT manifold, Euler number 2",
             "2 components, of which 1 void",
             "3,200.0 Å²",
             "7,100.0 Å³",

@@ -10,8 +10,8 @@ use super::lane::one_line;
 use super::pool::{self, DevicePool, PoolDevice, PoolSettings};
 use super::prepare::Prepared;
 use crate::surface::{
-    Backend, Control, DeviceFacts, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
-    SurfaceParams, backend::one_atom,
+    Backend, Control, DeviceFacts, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams, backend::one_atom,
 };
 
 /// Meshes on devices.

@@ -103,8 +103,12 @@ impl Renderer for GpuRenderer {
             (Err(Why::Device(why)), None) => Err(PictureError::Device { why }),
             (Err(Why::Device(why)), Some(cpu)) => {
                 let fallback_reason = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
-                let served =
-                    Served { backend: cpu.name(), arithmetic: cpu.arithmetic(), device: cpu.describe(), fallback_reason };
+                let served = Served {
+                    backend: cpu.name(),
+                    arithmetic: cpu.arithmetic(),
+                    device: cpu.describe(),
+                    fallback_reason,
+                };
                 Ok(Rendered { served: Some(served), ..cpu.render(mesh, params, control)? })
             }
         }

@@ -9,8 +9,8 @@ use std::time::Duration;
 use super::engine::check;
 use super::error::GpuError;
 use super::executor::GpuJob;
-use crate::surface::SurfaceError;
 use crate::surface::SharedBytes;
+use crate::surface::SurfaceError;
 use crate::surface::parts::Part;
 
 /// How often a waiting part looks whether its job is still wanted. What the others say does not wait for it.

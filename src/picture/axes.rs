@@ -5,7 +5,7 @@ use rayon::prelude::*;
 /// Triangles that are summed by one task. Fixed, so that sums do not hang on the number of threads.
 const CHUNK: usize = 1 << 14;
 /// Triangles that axes are taken from at most: of more, every second, third and so on. They lie in space as the others do.
-const MOST: usize = 1 << 16;
+const MAX_TRIANGLES: usize = 1 << 16;
 /// Third moment, in cubes of the standard deviation, below which a shape counts as the same at both ends of an axis.
 const SKEWED: f64 = 1e-3;
 /// Sweeps of the eigenvalue iteration; five are enough for 3 × 3.
@@ -18,7 +18,7 @@ type Mat3 = [Vec3; 3];
 /// along the last. The longer tail of the area points right and up; where both are alike, the axis' largest component in the
 /// file's coordinates is positive.
 pub(super) fn principal(positions: &[[f32; 3]], triangles: &[[u32; 3]]) -> Mat3 {
-    let step = triangles.len().div_ceil(MOST).max(1);
+    let step = triangles.len().div_ceil(MAX_TRIANGLES).max(1);
     let some: Vec<[u32; 3]> = if step > 1 { triangles.iter().step_by(step).copied().collect() } else { Vec::new() };
     let triangles = if step > 1 { &some[..] } else { triangles };
     let (area, sum, square) = moments(positions, triangles);

@@ -1,7 +1,7 @@
-//! A column of a mesh: a slice of plain rows in memory that costs little to get.
+//! Column of a mesh: a slice of plain rows.
 //!
-//! Large columns come from the system as huge pages where it has them: faulting 350 MB in
-//! pages of 4 KiB took half as long as meshing them.
+//! Large columns are mapped with huge pages if the system has them: page faults of 4 KiB for 350 MB took half as long as
+//! meshing.
 
 use std::fmt;
 use std::ops::{Deref, DerefMut, Range};
@@ -11,20 +11,20 @@ use bytemuck::Pod;
 use memmap2::MmapMut;
 use rayon::prelude::*;
 
-/// From this many bytes on, a column is mapped.
+/// Size from which a column is mapped, bytes.
 const MAP_FROM: usize = 64 << 10;
-/// From this many bytes on, a mapped column asks for huge pages: two of them. Below, its pages are made present in one
-/// call instead of by a page fault each.
+/// Size from which a mapped column uses huge pages, bytes. The pages of smaller mappings are populated in one call instead
+/// of one page fault each.
 const HUGE_FROM: usize = 4 << 20;
 
-/// Bytes that one task copies.
+/// Bytes per copying task.
 const COPIED: usize = 4 << 20;
 
-/// Memory that somebody else owns and gives back when nobody looks at it any more.
+/// Memory with another owner, released with the last reference.
 pub type SharedBytes = Arc<dyn AsRef<[u8]> + Send + Sync>;
 
-/// Rows of a mesh: behaves like a slice. One that lies in several pieces is copied into one when it is first used as a
-/// slice; [`Self::pieces`] shows it as it lies.
+/// Rows of a mesh; dereferences to a slice. A column in several chunks is copied into one when it is first used as a slice;
+/// [`Self::pieces`] gives the chunks without a copy.
 pub struct Column<T: Pod>(Storage<T>);
 
 enum Storage<T: Pod> {
@@ -37,9 +37,9 @@ enum Storage<T: Pod> {
         owner: SharedBytes,
         bytes: Range<usize>,
     },
-    /// In order, none of them pieced.
+    /// In order; no chunk is itself in chunks.
     Chunks {
-        pieces: Vec<Column<T>>,
+        chunks: Vec<Column<T>>,
         joined: OnceLock<Box<Column<T>>>,
     },
 }
@@ -56,10 +56,10 @@ impl<T: Pod> Column<T> {
     }
 }
 
-/// Zeroed memory from the system, where that is worth it.
+/// Maps zeroed memory; `None` if the column is small or the system refuses.
 fn mapped(bytes: usize) -> Option<MmapMut> {
     let map = MmapMut::map_anon(bytes).ok().filter(|_| bytes >= MAP_FROM)?;
-    // Advice only: where the kernel has no huge pages, small ones do.
+    // Advice only: kernels without huge pages ignore it.
     #[cfg(target_os = "linux")]
     let _advised =
         map.advise(if bytes >= HUGE_FROM { memmap2::Advice::HugePage } else { memmap2::Advice::PopulateWrite }).is_ok();
@@ -67,8 +67,8 @@ fn mapped(bytes: usize) -> Option<MmapMut> {
 }
 
 impl<T: Pod> Column<T> {
-    /// The rows in `bytes` of memory that somebody else owns, without a copy; kept until the column is dropped or
-    /// written to. `None` where the range does not lie in that memory, on a row's alignment, as whole rows.
+    /// Column over `bytes` of shared memory, without a copy; the memory is kept until the column is dropped or written to.
+    /// `None` if the range is out of bounds, misaligned, or not a whole number of rows.
     #[must_use]
     pub fn shared(owner: SharedBytes, bytes: Range<usize>) -> Option<Self> {
         let rows = (*owner).as_ref().get(bytes.clone())?;
@@ -76,62 +76,62 @@ impl<T: Pod> Column<T> {
         Some(Self(Storage::Shared { owner, bytes }))
     }
 
-    /// The rows of several columns, one after the other, where they lie.
+    /// Concatenates columns without a copy.
     #[must_use]
     pub fn from_chunks(columns: Vec<Self>) -> Self {
-        let mut pieces = Vec::with_capacity(columns.len());
+        let mut chunks = Vec::with_capacity(columns.len());
         for column in columns {
             match column.0 {
-                Storage::Chunks { pieces: own, .. } => pieces.extend(own),
+                Storage::Chunks { chunks: own, .. } => chunks.extend(own),
                 _ if column.is_empty() => {}
-                _ => pieces.push(column),
+                _ => chunks.push(column),
             }
         }
-        match pieces.len() {
+        match chunks.len() {
             0 => Self::default(),
-            1 => pieces.swap_remove(0),
-            _ => Self(Storage::Chunks { pieces, joined: OnceLock::new() }),
+            1 => chunks.swap_remove(0),
+            _ => Self(Storage::Chunks { chunks, joined: OnceLock::new() }),
         }
     }
 
-    /// The rows as they lie, in order: one slice unless they lie in pieces.
+    /// Contiguous runs of rows, in order: one unless the column is in chunks.
     pub fn pieces(&self) -> impl Iterator<Item = &[T]> {
-        let (whole, pieces): (Option<&[T]>, &[Self]) = match &self.0 {
-            Storage::Chunks { pieces, joined } if joined.get().is_none() => (None, pieces),
+        let (whole, chunks): (Option<&[T]>, &[Self]) = match &self.0 {
+            Storage::Chunks { chunks, joined } if joined.get().is_none() => (None, chunks),
             _ => (Some(self), &[]),
         };
-        whole.into_iter().chain(pieces.iter().map(|piece| &**piece))
+        whole.into_iter().chain(chunks.iter().map(|chunk| &**chunk))
     }
 
-    /// Copies pieces into one, and lets them go: what is used as a slice often need not be held twice.
+    /// Copies the chunks into one and drops them, so that the rows are not held twice.
     pub fn make_contiguous(&mut self) {
-        if let Storage::Chunks { pieces, joined } = &mut self.0 {
+        if let Storage::Chunks { chunks, joined } = &mut self.0 {
             let joined = joined.take().map(|column| *column);
             *self = joined.unwrap_or_else(|| {
-                let n = pieces.iter().map(Self::len).sum();
-                Self::copied(n, pieces.iter().map(|piece| &**piece))
+                let n = chunks.iter().map(Self::len).sum();
+                Self::copied(n, chunks.iter().map(|chunk| &**chunk))
             });
         }
     }
 
-    /// Whether there are no rows.
+    /// Returns true if there are no rows.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Number of rows; joins no pieces.
+    /// Number of rows. Does not join chunks.
     #[must_use]
     pub fn len(&self) -> usize {
         match &self.0 {
             Storage::Owned(rows) => rows.len(),
             Storage::Mapped { bytes, .. } => bytes / size_of::<T>(),
             Storage::Shared { bytes, .. } => bytes.len() / size_of::<T>(),
-            Storage::Chunks { pieces, .. } => pieces.iter().map(Self::len).sum(),
+            Storage::Chunks { chunks, .. } => chunks.iter().map(Self::len).sum(),
         }
     }
 
-    /// The rows as a vector, to add or remove some. Copies a column that is none yet.
+    /// Rows as a vector, for adding and removing. Copies the column if it is not one yet.
     pub fn edit(&mut self) -> &mut Vec<T> {
         if !matches!(self.0, Storage::Owned(_)) {
             self.0 = Storage::Owned(self.to_vec());
@@ -142,18 +142,18 @@ impl<T: Pod> Column<T> {
         }
     }
 
-    /// A copy in one piece.
-    fn copied<'a>(n: usize, pieces: impl Iterator<Item = &'a [T]>) -> Self
+    /// Copies chunks into one column of `n` rows.
+    fn copied<'a>(n: usize, chunks: impl Iterator<Item = &'a [T]>) -> Self
     where
         T: 'a,
     {
         let mut copy = Self::zeroed(n);
         let mut rest: &mut [u8] = bytemuck::cast_slice_mut(&mut copy[..]);
         let mut copies = Vec::new();
-        for piece in pieces {
-            let piece: &[u8] = bytemuck::cast_slice(piece);
-            let (target, tail) = std::mem::take(&mut rest).split_at_mut(piece.len());
-            copies.extend(target.chunks_mut(COPIED).zip(piece.chunks(COPIED)));
+        for chunk in chunks {
+            let chunk: &[u8] = bytemuck::cast_slice(chunk);
+            let (target, tail) = std::mem::take(&mut rest).split_at_mut(chunk.len());
+            copies.extend(target.chunks_mut(COPIED).zip(chunk.chunks(COPIED)));
             rest = tail;
         }
         copies.into_par_iter().for_each(|(target, source)| target.copy_from_slice(source));
@@ -167,12 +167,12 @@ impl<T: Pod> Deref for Column<T> {
     fn deref(&self) -> &[T] {
         match &self.0 {
             Storage::Owned(rows) => rows,
-            // A mapping begins on a page boundary, so any plain row type is aligned.
+            // Mappings begin at a page boundary, which aligns every plain row type.
             Storage::Mapped { map, bytes } => bytemuck::cast_slice(&map[..*bytes]),
             // Checked when the column was made.
             Storage::Shared { owner, bytes } => bytemuck::cast_slice(&(**owner).as_ref()[bytes.clone()]),
-            Storage::Chunks { pieces, joined } => {
-                let rows = || pieces.iter().map(|piece| &**piece);
+            Storage::Chunks { chunks, joined } => {
+                let rows = || chunks.iter().map(|chunk| &**chunk);
                 joined.get_or_init(|| Box::new(Self::copied(self.len(), rows())))
             }
         }
@@ -182,7 +182,7 @@ impl<T: Pod> Deref for Column<T> {
 impl<T: Pod> DerefMut for Column<T> {
     fn deref_mut(&mut self) -> &mut [T] {
         if matches!(self.0, Storage::Shared { .. } | Storage::Chunks { .. }) {
-            // What belongs to somebody else is only read: the first write makes a copy.
+            // Shared memory is read-only: the first write makes a copy.
             *self = self.clone();
         }
         match &mut self.0 {
@@ -267,23 +267,24 @@ mod tests {
     }
 
     #[test]
-    fn a_chunked_column_is_shown_as_it_lies_and_joined_when_used_as_a_slice() {
+    fn a_column_in_chunks_is_joined_when_used_as_a_slice() {
         let of = |rows: &[u32]| Column::from(rows.to_vec());
-        let pieced = || Column::from_chunks(vec![of(&[1, 2]), of(&[]), Column::from_chunks(vec![of(&[3]), of(&[4, 5])])]);
-        let column = from_chunks();
+        let chunked =
+            || Column::from_chunks(vec![of(&[1, 2]), of(&[]), Column::from_chunks(vec![of(&[3]), of(&[4, 5])])]);
+        let column = chunked();
         assert_eq!(column.pieces().collect::<Vec<_>>(), [&[1, 2][..], &[3], &[4, 5]]);
         assert_eq!((column.len(), column.clone().pieces().count()), (5, 1));
         assert_eq!(column.pieces().count(), 3, "a copy leaves it as it is");
         assert_eq!((column[3], column.len()), (4, 5));
         assert_eq!(column.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
-        let mut written = from_chunks();
+        let mut written = chunked();
         written[4] = 9;
         assert_eq!(written.to_vec(), [1, 2, 3, 4, 9]);
-        let mut contiguous = from_chunks();
+        let mut contiguous = chunked();
         contiguous.make_contiguous();
         assert_eq!(contiguous.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
         assert!(matches!(contiguous.0, Storage::Owned(_)));
-        let mut longer = from_chunks();
+        let mut longer = chunked();
         longer.edit().push(6);
         assert_eq!(longer.len(), 6);
         assert_eq!(Column::from_chunks(vec![of(&[]), of(&[7])]).pieces().collect::<Vec<_>>(), [[7]]);

@@ -195,7 +195,8 @@ mod tests {
     }
 
     fn both(mesh: &Mesh) -> [Measures; 2] {
-        [Validation::Checksum, Validation::Exact].map(|validation| Measures::of(mesh, validation, &Control::default()).unwrap())
+        [Validation::Checksum, Validation::Exact]
+            .map(|validation| Measures::of(mesh, validation, &Control::default()).unwrap())
     }
 
     #[test]

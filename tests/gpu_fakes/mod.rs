@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::gpu::{DevicePool, Executor, Finished, GpuError, GpuJob, PoolDevice, PoolSettings, Prepared};
 use molmesh::surface::{
-    CancelToken, Control, GridStats, Mesh, Meshed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
+    CancelToken, Control, GridStats, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 /// What a lost device says, in the manner of drivers.
@@ -112,7 +112,7 @@ impl Executor for Fake {
                 Err(GpuError::Deadline)
             }
             Step::Serve | Step::Hold | Step::Forget => Ok(Finished {
-                meshed: Meshed::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),
+                meshed: MeshOutput::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),
                 stages: vec![(Stage::Field, 2_000), (Stage::Emit, 1_000)],
             }),
             Step::Lose => Err(GpuError::Lost(LOST.to_owned())),

@@ -6,8 +6,8 @@ use std::time::Instant;
 use molmesh::gpu::yardstick::Rates;
 use molmesh::gpu::{Engine, Executor, GpuJob, Paper, Prepared};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Measures, Mesh, MeshOutput, Validation, Spheres, Stage, Step, SurfaceLimits,
-    SurfaceParams,
+    Backend, CancelToken, Control, CpuBackend, Measures, Mesh, MeshOutput, Spheres, Stage, Step, SurfaceLimits,
+    SurfaceParams, Validation,
 };
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};

@@ -223,9 +223,8 @@ impl PieceRows<'_> {
         stages: &mut Stages,
         control: &Control<'_>,
     ) -> Result<Written, SurfaceError> {
-        let flat = control.span(Stage::Interpolate, || {
-            self.interpolate(scanned, piece, slope, &mut stages.batch, control)
-        })?;
+        let flat =
+            control.span(Stage::Interpolate, || self.interpolate(scanned, piece, slope, &mut stages.batch, control))?;
         let tally = control.span(Stage::Emit, || self.emit(scanned, piece, &mut stages.table, &mut stages.sheets));
         Ok(Written { flat, tally, bounds: EMPTY })
     }
