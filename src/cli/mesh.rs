@@ -48,7 +48,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let findings = if strict { Some(check(input_path, &input, &limits)?) } else { None };
     let work = Work { path: input_path, job: &job, limits: &limits, picked: &picked, input: &input, cancel: &cancel };
     let product = if format == Format::Glb && output.is_file() {
-        work.into_file(&mut output, &progress)?
+        work.run_to_file(&mut output, &progress)?
     } else {
         work.run(&progress, None).map_err(|source| work.failure(source))?
     };
@@ -146,7 +146,7 @@ impl Work<'_> {
     }
 
     /// Runs the job and writes a GLB while it is meshed, if the job allows that.
-    fn into_file(&self, output: &mut Output, progress: &Progress) -> Result<Product, CliError> {
+    fn run_to_file(&self, output: &mut Output, progress: &Progress) -> Result<Product, CliError> {
         let sink = GlbSink::new(output);
         let product = self.run(progress, Some(&sink));
         let cause = sink.failure();
