@@ -1,4 +1,4 @@
-//! `molmesh mesh`: one structure to one mesh file.
+//! `molmesh mesh`: converts one structure to one mesh file.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -23,7 +23,7 @@ use super::style::Style;
 use super::summary::{self, Written};
 use super::{interrupt, request};
 
-/// Runs the command. The order is that of cost: flags, output, input, backend, mesh.
+/// Runs the command. Cheap steps come first: flags, output, input, backend, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let Request { mut job, format: asked, strict, .. } = request::of_mesh(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
@@ -76,7 +76,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     tell(args, &report, findings.as_deref(), &written, to_stdout)
 }
 
-/// The format that an output's name says: by its extension, GLB on stdout.
+/// Format of an output by its file extension; GLB on stdout.
 fn format(output: &Path) -> Result<Format, CliError> {
     let hint = || Some("name the format with --format".to_owned());
     let name = output.display();
@@ -91,7 +91,7 @@ fn format(output: &Path) -> Result<Format, CliError> {
     }
 }
 
-/// The whole input, at most `limit` bytes of it: compressed or not, what inflates from it is no smaller.
+/// Reads the input, at most `limit` bytes. Inflating does not make it smaller, so the limit holds for compressed files.
 pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
     let stdin = is_stdio(path);
     let name = || name_of(path);
@@ -101,7 +101,7 @@ pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
         }
         let file = File::open(path)?;
         let size = file.metadata()?.len();
-        // One byte more than there is, so that the end is seen without growing the buffer.
+        // One extra byte, so that the end is detected without growing the buffer.
         take(file, if size > limit { 0 } else { size + 1 }, limit)
     };
     let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
@@ -117,12 +117,12 @@ fn take(source: impl Read, capacity: u64, limit: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// What messages call the input.
+/// Name of the input in messages.
 fn name_of(input: &Path) -> String {
     if is_stdio(input) { "stdin".to_owned() } else { input.display().to_string() }
 }
 
-/// What there is to do.
+/// Input and settings of the job.
 struct Work<'a> {
     path: &'a Path,
     job: &'a Job,
@@ -158,7 +158,7 @@ impl Work<'_> {
     }
 }
 
-/// What it means that a job failed.
+/// Error of the command for that of a job.
 pub(super) fn failure(path: &Path, input: &[u8], limits: &JobLimits, source: JobError) -> CliError {
     match source {
         JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
@@ -179,7 +179,7 @@ fn sink_failure(output: &Output, cause: Option<GlbSinkError>) -> CliError {
     }
 }
 
-/// The strict check: the referee's findings, or a refusal if there are errors among them.
+/// Runs the strict check. Returns its findings, or an error if one of them is an error.
 pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
     let name = || name_of(path);
     let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
@@ -194,7 +194,7 @@ pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec
     }
 }
 
-/// What the referee holds against a file that our reader could not read.
+/// Worst finding of the strict check in a file with a syntax error.
 fn opinion(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
     let findings = referee::check(input, &limits.read).ok()?;
@@ -218,7 +218,7 @@ fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn Progre
     Ok(encoding.as_secs_f64() * 1e3)
 }
 
-/// Writes the report where the file did not go.
+/// Writes the report to the stream that the mesh does not use.
 pub(super) fn tell(
     args: &JobArgs,
     report: &Report,
@@ -232,7 +232,7 @@ pub(super) fn tell(
             let lines: Option<Vec<String>> =
                 findings.map(|all| all.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect());
             let text = summary::text(report, written, lines.as_deref(), Style::stderr());
-            // A closed stderr is no reason to call a finished mesh a failure.
+            // A closed stderr does not make a finished mesh a failure.
             drop(io::stderr().write_all(text.as_bytes()));
             Ok(())
         }

@@ -1,4 +1,4 @@
-//! One job from end to end: structure bytes to spheres to mesh to report. No HTTP, no paths, no queue.
+//! One job from end to end: structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
 mod clock;
 mod draw;
@@ -36,29 +36,29 @@ use crate::surface::{
 };
 use report::Counts;
 
-/// Everything that decides what a mesh looks like, and how its vertices are stored.
+/// Parameters of a job: the surface, and how the mesh is stored.
 #[derive(Debug, Clone, Default)]
 pub struct Job {
-    /// Which atoms.
+    /// Selection of atoms.
     pub selection: Selection,
-    /// Which surface. Its resolution stands where `spacing` is [`Spacing::Given`].
+    /// Parameters of the surface. The resolution applies if `spacing` is [`Spacing::Given`].
     pub params: SurfaceParams,
-    /// How the resolution is chosen.
+    /// Choice of the grid spacing.
     pub spacing: Spacing,
     /// Method that checks whether the mesh is watertight.
     pub validation: Validation,
-    /// How vertices are stored, in formats that have a choice.
+    /// Encoding of vertices, in formats that support several.
     pub compress: Compress,
-    /// Whether vertices have normals, in formats that have a choice.
+    /// Vertex normals, in formats where they are optional.
     pub normals: Normals,
-    /// The units of a file's coordinates.
+    /// Units of the file's coordinates.
     pub units: Units,
-    /// What a picture of the mesh is to look like; none: the mesh itself is wanted.
+    /// Parameters of a picture of the mesh; `None` for a mesh file.
     pub picture: Option<PictureParams>,
 }
 
 impl Job {
-    /// Fails where its picture would be larger than allowed: before anything else is done for it.
+    /// Checks the size of the picture before any other work.
     ///
     /// # Errors
     /// [`JobError::Picture`].
@@ -75,7 +75,7 @@ impl Job {
             && self.picture.is_none()
     }
 
-    /// The parameters for so many atoms, where the resolution does not hang on the mesh.
+    /// Parameters for a number of atoms, unless the resolution depends on the mesh.
     fn params_for(&self, atoms: usize) -> SurfaceParams {
         let resolution = match self.spacing {
             Spacing::Detail(level) => spacing::of_detail(level, atoms as f64),
@@ -94,15 +94,15 @@ pub struct JobLimits {
     pub surface: SurfaceLimits,
     /// Limits of drawing.
     pub picture: PictureLimits,
-    /// When the mesh must be there; none: whenever.
+    /// Time by which the mesh must be finished.
     pub deadline: Option<Instant>,
 }
 
-/// A backend and the reason why it was taken, for reports and logs.
+/// Chosen backend and the reason for the choice, for reports and logs.
 pub struct Choice<'a> {
     /// The backend.
     pub backend: &'a dyn Backend,
-    /// Why it was taken, in words.
+    /// Reason for the choice.
     pub reason: &'a str,
 }
 
@@ -111,9 +111,9 @@ pub struct Choice<'a> {
 pub struct Product {
     /// The mesh.
     pub mesh: Mesh,
-    /// How a file stores it.
+    /// Encoding in a file.
     pub storage: Storage,
-    /// What was measured.
+    /// Report of the job.
     pub report: Report,
     /// The PNG, once it is drawn; the mesh is then dropped.
     pub picture: Option<Vec<u8>>,
@@ -122,14 +122,14 @@ pub struct Product {
 }
 
 impl Product {
-    /// What a mesh file says about this product.
+    /// Metadata for a mesh file.
     #[must_use]
     pub fn meta(&self) -> Meta {
         Meta { name: self.report.id.clone(), extras: self.report.extras() }
     }
 }
 
-/// Why a job failed.
+/// Error of a job.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum JobError {
     /// Reading or selecting failed.
@@ -146,7 +146,7 @@ pub enum JobError {
 impl From<PictureError> for JobError {
     fn from(error: PictureError) -> Self {
         match error {
-            // Whoever stops a job asks for one kind of end.
+            // Cancellation has a single error, whatever the stage.
             PictureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
             PictureError::Device { why } => Self::Surface(SurfaceError::Device { why }),
             error => Self::Picture(error),
@@ -157,7 +157,7 @@ impl From<PictureError> for JobError {
 /// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh.
 ///
 /// A mesh for a GLB file goes straight into `sink`, if there is one and the job does not need the whole mesh in memory;
-/// [`Product::streamed_bytes`] tells.
+/// [`Product::streamed_bytes`] is set in that case.
 ///
 /// # Errors
 /// Any [`JobError`]; [`SurfaceError::Sink`] if `sink` failed.
@@ -216,8 +216,7 @@ pub fn run(
     Ok(product)
 }
 
-/// How the mesh of `spheres` is stored; `params` ask the backend for vertices of that kind then. Depends on nothing that the
-/// backend computes: a file can be written, and a device can fill it, before the mesh is known.
+/// Storage of the mesh of `spheres`; also sets the vertex encoding in `params`. Known before the mesh is computed.
 fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage {
     params.quantize = match job.compress {
         Compress::None => None,
@@ -227,7 +226,7 @@ fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage 
     Storage { packing, normals: job.normals, units: job.units }
 }
 
-/// Bytes to spheres.
+/// Reads a structure and selects its spheres.
 fn read(
     bytes: &[u8],
     job: &Job,

@@ -1,8 +1,8 @@
 //! Connected components of a mesh's vertices.
 //!
 //! Each part of the mesh labels its own vertices in one pass over its triangles, in parallel and in cache: a vertex
-//! takes the lowest label among its triangle's corners, a triangle without any label starts a new one, and labels
-//! that meet are made equal in a small table. Edges that leave a part are joined afterwards.
+//! takes the lowest label of its triangle's corners, a triangle without a label starts a new one, and labels that meet
+//! are united. Edges that leave a part are joined afterwards.
 
 use rayon::prelude::*;
 
@@ -12,17 +12,17 @@ use super::mesh::Mesh;
 use super::sums::NONE;
 use super::union_find::UnionFind;
 
-/// The component of every vertex.
+/// Component of every vertex.
 pub(super) struct Labels {
-    /// A label per vertex; vertices that no triangle uses have none.
+    /// Label per vertex; [`NONE`] for vertices that no triangle uses.
     of_vertex: Column<u32>,
-    /// The lowest label of the component that a label belongs to.
+    /// Lowest label of the component, by label.
     component_of: Vec<u32>,
 }
 
-/// The vertices and triangles of one part of a mesh.
+/// Vertices and triangles of one part of a mesh.
 pub(super) struct Part<'a> {
-    /// The part's first vertex.
+    /// First vertex of the part.
     pub(super) first: u32,
     /// Labels of its vertices.
     pub(super) labels: &'a mut [u32],
@@ -30,7 +30,7 @@ pub(super) struct Part<'a> {
     pub(super) triangles: &'a [[u32; 3]],
 }
 
-/// What a part hands on.
+/// Labels of a part and the edges that connect it to others.
 #[derive(Default)]
 pub(super) struct Joined {
     /// Labels of the part, from 0; those of one component are united.
@@ -42,7 +42,7 @@ pub(super) struct Joined {
 impl Labels {
     /// Joins the parts of `mesh`, whose vertices have been labelled part by part.
     pub(super) fn join(mesh: &Mesh, mut of_vertex: Column<u32>, joined: &[Joined]) -> Self {
-        // Labels are counted per part: number them through.
+        // Labels start at 0 in every part.
         let mut equal = UnionFind::default();
         let offsets: Vec<u32> = joined.iter().map(|part| equal.append(&part.equal)).collect();
         split(mesh, &mut of_vertex).into_par_iter().zip(&offsets).for_each(|(part, offset)| {
@@ -50,7 +50,7 @@ impl Labels {
         });
         let mut last = [NONE; 2];
         for &[a, b] in joined.iter().flat_map(|part| &part.leaving) {
-            // Neighbouring triangles mostly ask for what the last one asked for.
+            // Consecutive triangles mostly have the same labels.
             let pair = [of_vertex[a as usize], of_vertex[b as usize]];
             if pair != last {
                 equal.union(pair[0], pair[1]);
@@ -65,12 +65,12 @@ impl Labels {
         self.of_vertex[v as usize]
     }
 
-    /// The component that a label stands for.
+    /// Component of a label.
     pub(super) fn component_of(&self, label: u32) -> u32 {
         self.component_of[label as usize]
     }
 
-    /// One entry per label, with the vertices of the component that it stands for counted at the component's own.
+    /// One entry per label; the vertices of a component are counted at its lowest label.
     pub(super) fn count_vertices(&self) -> Vec<Component> {
         let mut components = vec![Component::default(); self.component_of.len()];
         for run in self.of_vertex.chunk_by(|a, b| a == b) {
@@ -82,7 +82,7 @@ impl Labels {
     }
 }
 
-/// Cuts the labels and the triangles into the mesh's parts; one part where it names none.
+/// Splits the labels and the triangles into the mesh's parts, or one part if it has none.
 pub(super) fn split<'a>(mesh: &'a Mesh, labels: &'a mut [u32]) -> Vec<Part<'a>> {
     let whole = [(0, 0)];
     let starts = if mesh.parts.is_empty() { &whole[..] } else { &mesh.parts[..] };
@@ -110,7 +110,7 @@ impl Part<'_> {
             if [i, j, k].contains(&None) {
                 joined.leaving.extend([[a, b], [b, c]]);
             }
-            // A foreign corner counts as one without a label here.
+            // A corner in another part counts as unlabelled here.
             let (i, j, k) = (i.unwrap_or(NONE), j.unwrap_or(NONE), k.unwrap_or(NONE));
             let mut low = i.min(j).min(k);
             if low == NONE {
@@ -121,7 +121,7 @@ impl Part<'_> {
                     *label = low;
                 }
             }
-            // Selections, not branches: whether a corner has a label yet is a coin toss.
+            // Selections instead of branches, which would be unpredictable.
             let known = |label: u32| if label == NONE { low } else { label };
             if known(i).max(known(j)).max(known(k)) != low {
                 for label in [i, j, k].map(known) {

@@ -1,11 +1,11 @@
-//! The native CPU backend: the six stages over occupied bricks, parallel over tiles, SIMD inside.
+//! Native CPU backend: six stages over occupied bricks, parallel over tiles, with SIMD.
 //!
-//! Order of work: `bin` assigns atoms to tiles. Then each tile (or a slab of it), in parallel, finds its bricks'
-//! candidates, computes `field` into a scratch that fits the core's cache, and `classify` keeps what the surface needs:
-//! crossing bits, edge parameters, cases. The field is never stored beyond a tile. `scan` numbers the tiles, `interpolate` and
-//! `emit` write vertices and triangles straight to their final place.
+//! First pass (`sample.rs`): `bin` assigns atoms to tiles. Each tile, or a slab of it, finds the candidates of its bricks,
+//! evaluates `field` into a scratch that fits the core's cache, and `classify` keeps crossing bits, edge parameters and
+//! cases. The field is never stored beyond a tile. `scan` numbers the tiles. Second pass (`write.rs`): `interpolate` and
+//! `emit` write vertices and triangles to memory or to a sink.
 //!
-//! The same input gives the same bytes whatever the thread count: no result depends on which thread ran what.
+//! The same input gives the same bytes on any number of threads.
 
 mod bin;
 mod classify;
@@ -29,7 +29,7 @@ mod write;
 
 use std::ops::Range;
 
-// What the plan of a device's work shares with this backend: formulas, refusals and their numbers.
+// Formulas, errors and limits that the planning of GPU jobs shares.
 pub(super) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
 pub(super) use self::field::Constants;
 pub(super) use self::interpolate::SlopeConstants;
@@ -51,40 +51,40 @@ use super::simd;
 use super::sink::MeshSink;
 use super::spheres::Spheres;
 
-/// The native CPU backend.
+/// Native CPU backend.
 #[derive(Debug)]
 pub struct CpuBackend {
-    /// Its own pool where a thread count was asked for; otherwise the process's.
+    /// Thread pool, if a number of threads was requested; otherwise the global pool is used.
     pool: Option<rayon::ThreadPool>,
 }
 
-/// What a run is given beside its input.
+/// Parameters and context of a run.
 #[derive(Clone, Copy)]
 struct Means<'a> {
     params: &'a SurfaceParams,
     limits: &'a SurfaceLimits,
     control: &'a Control<'a>,
-    /// Threads that have nothing else to do: one where several runs share the process's.
+    /// Threads reserved for this run: 1 if it shares the global pool.
     free_threads: usize,
 }
 
 impl CpuBackend {
-    /// A backend on `threads` threads, or on as many as there are processors.
+    /// Backend with a pool of `threads` threads, or on the global pool.
     ///
     /// # Errors
-    /// The pool's, in words, where the threads cannot be started.
+    /// Message of the pool if the threads cannot be started.
     pub fn new(threads: Option<usize>) -> Result<Self, String> {
         let pool = threads.map(|n| rayon::ThreadPoolBuilder::new().num_threads(n).build()).transpose();
         Ok(Self { pool: pool.map_err(|e| e.to_string())? })
     }
 
-    /// Threads that a run uses.
+    /// Number of threads that a run uses.
     #[must_use]
     pub fn threads(&self) -> usize {
         self.pool.as_ref().map_or_else(rayon::current_num_threads, rayon::ThreadPool::current_num_threads)
     }
 
-    /// Runs `work` on its threads. Says how many of them have nothing else to do.
+    /// Runs `work` on the backend's threads with the number of threads reserved for it.
     fn install<T: Send>(&self, work: impl FnOnce(usize) -> T + Send) -> T {
         match &self.pool {
             Some(pool) => pool.install(|| work(pool.current_num_threads())),
@@ -134,7 +134,7 @@ struct Tile {
 
 const NO_BRICK: u16 = u16::MAX;
 
-/// The stages up to `scan`: everything that must be known before the first row can be written.
+/// Result of the stages up to `scan`, on which the second pass depends.
 struct Scanned {
     lattice: Lattice,
     tiles: Tiles,
@@ -142,21 +142,21 @@ struct Scanned {
     totals: Totals,
     grid: GridStats,
     pieces: Vec<Piece>,
-    /// How vertices are rounded, if they are.
+    /// Step of quantized vertices.
     quantize: Option<Step>,
 }
 
-/// Surface bricks of a tile whose part of the mesh is written by one thread in one go.
+/// Surface bricks of a tile whose rows one thread writes at once.
 #[derive(Debug, Clone)]
 struct Piece {
     tile: usize,
     bricks: Range<usize>,
 }
 
-/// Surface bricks of a piece: some 3,000 vertices with their triangles, a small part of the second-level cache.
+/// Surface bricks per piece: about 3,000 vertices with their triangles, a small part of the L2 cache.
 const PIECE_BRICKS: usize = 32;
 
-/// Cuts the tiles into pieces, in order.
+/// Splits the tiles into pieces, in order.
 fn pieces(done: &mut [Tile]) -> Vec<Piece> {
     let (mut pieces, mut bricks) = (Vec::new(), 0);
     for (t, tile) in done.iter_mut().enumerate() {
@@ -226,12 +226,12 @@ fn scan_lattice(lattice: Lattice, means: Means<'_>) -> Result<Scanned, SurfaceEr
 }
 
 impl Tile {
-    /// What comes before the first brick of a piece of this tile, and before the first one after it.
+    /// Counts before the first brick of a piece of this tile, and before the first brick after it.
     fn span(&self, piece: &Piece) -> [Before; 2] {
         [self.found.before(piece.bricks.start), self.found.before(piece.bricks.end)]
     }
 
-    /// The surface brick in `slot`: its place among the tile's, and itself with its first vertex's global id.
+    /// The surface brick in `slot`: its index in the tile, and the brick with the global id of its first vertex.
     #[inline(always)]
     fn numbered(&self, slot: usize) -> Option<(usize, Numbered<'_>)> {
         let [x, y, z] = slot_brick(slot);
@@ -240,7 +240,7 @@ impl Tile {
         let end = self.found.bricks.get(ix + 1).map_or(self.found.vertices, |next| next.vertex);
         let own = brick.vertex as usize..end as usize;
         let (t, edges) = (&self.found.t[own.clone()], &self.found.edges[own]);
-        // `scan` made sure that ids fit 32 bits; there are fewer bricks than vertices.
+        // `scan` checked that ids fit 32 bits; there are fewer bricks than vertices.
         let (id, first) = (to_u32(self.first_brick + ix), to_u32(self.first_vertex) + brick.vertex);
         Some((ix, Numbered { brick, id, first, t, edges }))
     }
