@@ -63,7 +63,7 @@ fn main() {
             let started = Instant::now();
             let run = || backend.run(&spheres, &SurfaceParams::default(), &SurfaceLimits::default(), &control).unwrap();
             let meshed = clock.pass(run);
-            assert!(meshed.measures.is_some(), "the backend measures on the way");
+            assert!(meshed.measures.is_some(), "the backend measures as it writes");
             totals.push(started.elapsed().as_secs_f64() * 1e3);
             (triangles, grid) = (meshed.mesh.n_triangles(), Some(meshed.grid));
             for (stage, ms) in clock.finish() {

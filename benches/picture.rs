@@ -29,9 +29,9 @@ fn mesh(path: &PathBuf) -> Mesh {
     let choice = Choice { backend: &backend, reason: "measured" };
     let job = params::parse::<&str, &str>([]).unwrap().job;
     let bytes = std::fs::read(path).unwrap();
-    let product = pipeline::run(&bytes, &job, &JobLimits::default(), &choice, &CancelToken::default(), &());
+    let product = pipeline::run(&bytes, &job, &JobLimits::default(), &choice, &CancelToken::default(), &(), None);
     let mut mesh = product.unwrap().mesh;
-    mesh.settle();
+    mesh.make_contiguous();
     mesh
 }
 

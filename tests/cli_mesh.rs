@@ -238,8 +238,15 @@ fn the_summary_fits_a_screen_and_has_no_colour_here() {
     assert_eq!(stdout(&done), "");
     assert!(text.lines().count() <= 25, "{text}");
     assert!(!text.contains('\x1b'), "{text}");
-    let expected =
-        ["10 of 10", "bricks", "vertices", "closed, oriented, manifold, Euler number 2", "1 component", "Å²", "Å³"];
+    let expected = [
+        "10 of 10",
+        "bricks",
+        "vertices",
+        "watertight (by edge checksum), oriented, manifold, Euler number 2",
+        "1 component",
+        "Å²",
+        "Å³",
+    ];
     for part in expected.iter().chain(&["cpu: ", "field", "encode", "rod.glb (glb, "]) {
         assert!(text.contains(part), "no `{part}` in\n{text}");
     }

@@ -75,7 +75,7 @@ fn it_writes_the_same_bytes() {
             ("glb", &["--kernel", "soft-object", "--threads", "3"]),
             ("glb", &["--compress", "quantize", "--ligands", "--waters"]),
             ("ply", &["--kernel", "inverse-square", "--atom-ids", "--resolution", "1"]),
-            ("stl", &["--proof", "exact"]),
+            ("stl", &["--validation", "exact"]),
             ("obj", &["--normals", "none"]),
             ("obj", &["--units", "nanometer"]),
         ] {

@@ -5,10 +5,12 @@
 
 mod tools;
 
-use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Meta, Packing, PlaceError, Step};
+use std::io::Cursor;
+
+use molmesh::formats::{Encoder, Format, FormatError, GlbSink, GlbSinkError, Meta, Packing, Step};
 use molmesh::surface::Mesh;
 use serde_json::{Value, json};
-use tools::files::{Anywhere, Files, pour};
+use tools::files::{Files, write_parts};
 use tools::readers::{Contents, Glb, accessor_of, accessor_offset, gltf_contents, split_glb, split_gltf};
 use tools::shapes::{FAR, area_and_volume, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres};
 
@@ -149,9 +151,8 @@ fn vertices_that_are_integers_already_are_written_as_they_lie() {
         }
         if mesh.colors.is_none() && mesh.atom_ids.is_none() {
             for n_parts in [1, 3] {
-                let file = Anywhere::default();
-                placed(&file, Packing::Quantized(step(&mesh)), &small, n_parts).unwrap();
-                assert!(file.bytes() == quantized(Format::Glb, &mesh), "{name} in {n_parts}");
+                let placed = placed(Packing::Quantized(step(&mesh)), &small, n_parts).unwrap();
+                assert!(placed == quantized(Format::Glb, &mesh), "{name} in {n_parts}");
             }
         }
         let mut moved = small.clone();
@@ -182,11 +183,11 @@ fn integers_are_neither_rounded_again_nor_made_longer() {
         assert_eq!(Encoder::stored(format, Packing::Full, &small, &meta()).unwrap_err(), own);
     }
     for packing in [Packing::Full, other] {
-        let (file, sink_failed) = (Anywhere::default(), |sink: &GlbSink<'_>| sink.failure());
-        let sink = GlbSink::new(&file);
+        let mut file = Cursor::new(Vec::new());
+        let sink = GlbSink::new(&mut file);
         sink.store(packing);
-        pour(&sink, &small, 1);
-        assert!(matches!(sink_failed(&sink), Some(PlaceError::Format(FormatError::OtherPacking { .. }))));
+        write_parts(&sink, &small, 1);
+        assert!(matches!(sink.failure(), Some(GlbSinkError::Format(FormatError::OtherPacking { .. }))));
     }
     assert!(Encoder::stored(Format::Glb, Packing::of(&small), &small, &meta()).is_ok());
 }
@@ -204,9 +205,8 @@ fn integers_out_of_reach_and_numbers_that_were_none_are_refused() {
             let refusal = Encoder::stored(format, packing, &broken, &meta()).unwrap_err();
             assert!(matches!(refusal, FormatError::BeyondStep { .. }), "{bad}: {refusal}");
         }
-        let file = Anywhere::default();
-        let refusal = placed(&file, packing, &broken, 2);
-        assert!(matches!(refusal, Err(PlaceError::Format(FormatError::BeyondStep { .. }))), "{bad}: {refusal:?}");
+        let refusal = placed(packing, &broken, 2);
+        assert!(matches!(refusal, Err(GlbSinkError::Format(FormatError::BeyondStep { .. }))), "{bad}: {refusal:?}");
     }
 }
 
@@ -238,16 +238,19 @@ fn what_a_step_does_not_reach_and_other_formats_are_refused() {
         assert_eq!(refusal, FormatError::NotQuantized { format: format.extension() });
         assert!(Encoder::stored(format, Packing::Full, &mesh, &meta()).is_ok());
     }
-    let file = Anywhere::default();
-    assert!(matches!(placed(&file, small, &mesh, 2), Err(PlaceError::Format(FormatError::BeyondStep { .. }))));
+    assert!(matches!(placed(small, &mesh, 2), Err(GlbSinkError::Format(FormatError::BeyondStep { .. }))));
 }
 
-/// Writes a mesh out of order.
-fn placed(file: &Anywhere, packing: Packing, mesh: &Mesh, n_parts: usize) -> Result<u64, PlaceError> {
-    let sink = GlbSink::new(file);
+/// The GLB of a mesh that is written out of order.
+fn placed(packing: Packing, mesh: &Mesh, n_parts: usize) -> Result<Vec<u8>, GlbSinkError> {
+    let mut file = Cursor::new(Vec::new());
+    let sink = GlbSink::new(&mut file);
     sink.store(packing);
-    pour(&sink, mesh, n_parts);
-    sink.finish(&meta(), mesh.centre, mesh.bounds())
+    write_parts(&sink, mesh, n_parts);
+    let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).map_err(|_| sink.failure().unwrap())?;
+    drop(sink);
+    assert_eq!(len, file.get_ref().len() as u64);
+    Ok(file.into_inner())
 }
 
 #[test]
@@ -260,14 +263,10 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
         let in_order = quantized(Format::Glb, &mesh);
         large += usize::from(in_order.len() > 1 << 20);
         for n_parts in [1, 3] {
-            let file = Anywhere::default();
-            let len = placed(&file, Packing::Quantized(step(&mesh)), &mesh, n_parts).unwrap();
-            assert_eq!(len, in_order.len() as u64, "{name}");
-            assert!(file.bytes() == in_order, "{name} in {n_parts}");
+            let placed = placed(Packing::Quantized(step(&mesh)), &mesh, n_parts).unwrap();
+            assert!(placed == in_order, "{name} in {n_parts}");
         }
-        let file = Anywhere::default();
-        placed(&file, Packing::Full, &mesh, 3).unwrap();
-        assert!(file.bytes() != in_order, "{name}: the sink packs only when told to");
+        assert!(placed(Packing::Full, &mesh, 3).unwrap() != in_order, "{name}: the sink packs only when told to");
     }
     assert!(large > 0, "a large buffer was among them");
 }

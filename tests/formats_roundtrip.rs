@@ -6,13 +6,13 @@
 
 mod tools;
 
-use std::io::{self, ErrorKind, Write};
+use std::io::{self, Cursor, ErrorKind, Seek, SeekFrom, Write};
 
-use molmesh::formats::{self, Encoder, Format, FormatError, GlbSink, Meta, PlaceBytes, PlaceError};
+use molmesh::formats::{self, Encoder, Format, FormatError, GlbSink, GlbSinkError, Meta};
 use molmesh::surface::{Mesh, MeshPart, MeshSink};
 use proptest::prelude::*;
 use serde_json::{Value, json};
-use tools::files::{Anywhere, pour};
+use tools::files::write_parts;
 use tools::readers::{
     Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_stl, split_glb, split_gltf, u32_at,
 };
@@ -213,11 +213,12 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
         let in_order = encode(Format::Glb, &mesh, &meta());
         large += usize::from(in_order.len() > 1 << 20);
         for n_parts in [1, 3] {
-            let file = Anywhere::default();
-            let sink = GlbSink::new(&file);
-            pour(&sink, &mesh, n_parts);
+            let mut file = Cursor::new(vec![0xee; in_order.len()]);
+            let sink = GlbSink::new(&mut file);
+            write_parts(&sink, &mesh, n_parts);
             let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).unwrap();
-            let placed = file.bytes();
+            drop(sink);
+            let placed = file.into_inner();
             assert_eq!(len, in_order.len() as u64, "{name}");
             assert!(placed == in_order, "{name} in {n_parts}");
         }
@@ -225,36 +226,46 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
     assert!(large > 0, "a large buffer was among them");
 }
 
-/// A file on a disk without room.
+/// A file on a full disk.
 struct Full;
 
-impl PlaceBytes for Full {
-    fn place(&self, _: u64, _: &[u8]) -> io::Result<()> {
+impl Write for Full {
+    fn write(&mut self, _: &[u8]) -> io::Result<usize> {
         Err(ErrorKind::StorageFull.into())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Seek for Full {
+    fn seek(&mut self, _: SeekFrom) -> io::Result<u64> {
+        Ok(0)
     }
 }
 
 #[test]
 fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
     let mesh = torus(255, 257);
-    let file = Anywhere::default();
-    let sink = GlbSink::new(&file);
-    pour(&sink, &mesh, 2);
+    let mut file = Cursor::new(Vec::new());
+    let sink = GlbSink::new(&mut file);
+    write_parts(&sink, &mesh, 2);
     let mut long = meta();
     long.extras.insert("title".to_owned(), json!("x".repeat(20_000)));
-    let refused = sink.finish(&long, mesh.centre, mesh.bounds()).unwrap_err();
-    assert!(matches!(refused, PlaceError::HeadTooLong { bytes: 32_768 }), "{refused}");
+    assert!(sink.finish(&long, mesh.centre, mesh.bounds()).is_err());
+    assert!(matches!(sink.failure(), Some(GlbSinkError::HeadTooLong { bytes: 32_768 })));
 
-    let sink = GlbSink::new(&Full);
+    let mut full = Full;
+    let sink = GlbSink::new(&mut full);
     sink.begin(mesh.n_vertices(), mesh.n_triangles()).unwrap();
-    let (vertices, triangles) = (mesh.vertices(), &mesh.triangles[..]);
-    let part = MeshPart { first_vertex: 0, vertices, first_triangle: 0, triangles };
-    assert!(sink.part(&part).is_err());
-    assert!(matches!(sink.failure(), Some(PlaceError::Io(e)) if e.kind() == ErrorKind::StorageFull));
+    assert!(sink.part(&MeshPart::whole(&mesh)).is_err());
+    assert!(matches!(sink.failure(), Some(GlbSinkError::Io(e)) if e.kind() == ErrorKind::StorageFull));
 
-    let sink = GlbSink::new(&Full);
+    let mut full = Full;
+    let sink = GlbSink::new(&mut full);
     assert!(sink.begin(90_000_000, 180_000_000).is_err());
-    assert!(matches!(sink.failure(), Some(PlaceError::Format(FormatError::GlbTooLarge { .. }))));
+    assert!(matches!(sink.failure(), Some(GlbSinkError::Format(FormatError::GlbTooLarge { .. }))));
 }
 
 #[test]

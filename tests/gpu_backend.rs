@@ -13,8 +13,8 @@ use gpu_fakes::Step::{Block, Finish, Lose, OutOfMemory};
 use gpu_fakes::{FakeDevice, SETTINGS, devices, spheres};
 use molmesh::gpu::{DevicePool, GpuBackend, GpuError, Look, discover};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, Meshed, Observer, Stage, Step, SurfaceError,
-    SurfaceLimits, SurfaceParams,
+    Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, MeshOutput, Observer, Stage, Step,
+    SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 fn backend_with(fakes: &[Arc<FakeDevice>], fallback: bool) -> GpuBackend {
@@ -22,7 +22,7 @@ fn backend_with(fakes: &[Arc<FakeDevice>], fallback: bool) -> GpuBackend {
     GpuBackend::with_pool(DevicePool::start(devices(fakes), &SETTINGS).unwrap(), fallback)
 }
 
-fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<Meshed, SurfaceError> {
+fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
     backend.run(&spheres(2), &SurfaceParams::default(), &SurfaceLimits::default(), control)
 }
 
@@ -47,7 +47,7 @@ fn the_cpu_is_the_fallback_and_is_reported() {
         let meshed = run(&backend, &Control::default()).unwrap();
         assert_eq!(meshed.mesh, cpu.mesh);
         let served = meshed.served.unwrap();
-        let why = served.instead.unwrap();
+        let why = served.fallback_reason.unwrap();
         assert_eq!((served.backend, &served.arithmetic), ("cpu", &CpuBackend::new(None).unwrap().arithmetic()));
         // While the device is up, look-ups use its key.
         assert_eq!(backend.arithmetic() == served.arithmetic, backend.devices()[0].down.is_some(), "{n}");
@@ -64,7 +64,7 @@ fn the_cpu_is_the_fallback_and_is_reported() {
     assert!(fallback.mesh.quantized.is_some() && fallback.measures.is_some());
     // Negative control: a device that works.
     let working = run(&backend_with(&[FakeDevice::new(&[])], true), &Control::default()).unwrap().served.unwrap();
-    assert_eq!((working.backend, working.instead), ("gpu", None));
+    assert_eq!((working.backend, working.fallback_reason), ("gpu", None));
 }
 
 #[test]

@@ -13,11 +13,11 @@ use molmesh::gpu::plan::ChunkLimits;
 use molmesh::gpu::{Budget, Engine, Executor, GpuError, GpuJob, Prepared};
 use molmesh::surface::quantize::BEYOND;
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Mesh, Meshed, Quantized, Spheres, SurfaceError, SurfaceLimits, SurfaceOptions,
+    Backend, Control, CpuBackend, Mesh, MeshOutput, Quantized, Spheres, SurfaceError, SurfaceLimits, SurfaceOptions,
     SurfaceParams,
 };
 
-fn cpu(spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+fn cpu(spheres: &Spheres, params: &SurfaceParams) -> MeshOutput {
     CpuBackend::new(Some(2)).unwrap().run(spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap()
 }
 
@@ -40,7 +40,7 @@ fn difference(mesh: &Mesh, expected: &Mesh) -> Option<String> {
         .then(|| format!("{n} vertices of {}, {apart} Å apart, normals {turned}", expected.n_vertices()))
 }
 
-fn assert_equal(gpu: &Meshed, spheres: &Spheres, params: &SurfaceParams, what: &str) {
+fn assert_equal(gpu: &MeshOutput, spheres: &Spheres, params: &SurfaceParams, what: &str) {
     let cpu = cpu(spheres, params);
     assert_eq!(difference(&gpu.mesh, &cpu.mesh), None, "{what}");
     assert_eq!(gpu.grid, cpu.grid, "{what}");
@@ -69,7 +69,7 @@ fn structures_are_equal_to_the_cpu_with_every_kernel() {
 /// Asserts that the engine's quantized vertices equal its single-precision vertices quantized by the host, bit by bit,
 /// and that the rest of the mesh is unchanged. Returns the quantized mesh.
 #[track_caller]
-fn assert_quantized(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams, what: &str) -> Meshed {
+fn assert_quantized(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams, what: &str) -> MeshOutput {
     let single = mesh_of(engine, spheres, params).mesh;
     let small = quantized(spheres, params);
     let meshed = mesh_of(engine, spheres, &small);

@@ -15,8 +15,8 @@ use molmesh::gpu::{
     PoolDevice, PoolSettings,
 };
 use molmesh::surface::{
-    Backend, Control, Kernel, Measures, Mesh, Proof, Quantized, Spheres, Step, SurfaceError, SurfaceLimits,
-    SurfaceOptions, SurfaceParams,
+    Backend, Control, Kernel, Measures, Mesh, Quantized, Spheres, Step, SurfaceError, SurfaceLimits, SurfaceOptions,
+    SurfaceParams, Validation,
 };
 
 /// Runs every job on all devices if possible.
@@ -116,7 +116,7 @@ fn a_multi_device_mesh_has_the_bytes_of_one_device() {
                 let ran = pool.run(&job).unwrap();
                 let mesh = assert_same(&ran, &job, parts.len(), &what);
                 assert_eq!((mesh.atom_ids.is_some(), mesh.quantized.is_some()), (ids, small));
-                let measures = Measures::of(&ran.finished.meshed.mesh, Proof::Exact, &Control::default()).unwrap();
+                let measures = Measures::of(&ran.finished.meshed.mesh, Validation::Exact, &Control::default()).unwrap();
                 assert!(measures.closed && measures.manifold, "{what}");
             }
         }

@@ -96,7 +96,7 @@ fn the_cpu_is_the_fallback_and_is_reported() {
     let rendered = with.render(&mesh, &wide, &Control::default()).unwrap();
     let served = rendered.served.unwrap();
     assert_eq!(served.backend, "cpu");
-    assert!(served.instead.unwrap().contains("the GPU could not draw it"));
+    assert!(served.fallback_reason.unwrap().contains("the GPU could not draw it"));
     assert_eq!(rendered.image, of(&CpuRenderer::default(), &mesh, &wide));
     // Errors of the request are not passed to the fallback.
     let cancel = CancelToken::default();

@@ -8,9 +8,9 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use molmesh::gpu::{DevicePool, Engine, Executor, GpuBackend, GpuError, Look, PoolDevice, PoolSettings, discover};
-use molmesh::surface::{Backend, Control, CpuBackend, Meshed, SurfaceError, SurfaceLimits, SurfaceParams};
+use molmesh::surface::{Backend, Control, CpuBackend, MeshOutput, SurfaceError, SurfaceLimits, SurfaceParams};
 
-fn run(backend: &dyn Backend) -> Result<Meshed, SurfaceError> {
+fn run(backend: &dyn Backend) -> Result<MeshOutput, SurfaceError> {
     let params = SurfaceParams::default();
     backend.run(&gpu_support::sample("4pti.pdb"), &params, &SurfaceLimits::default(), &Control::default())
 }
@@ -23,7 +23,7 @@ fn a_discovered_device_gives_the_mesh_of_the_cpu() {
     let (cpu, gpu) = (run(&CpuBackend::new(None).unwrap()).unwrap(), run(&backend).unwrap());
     assert_eq!(gpu.mesh.n_triangles(), cpu.mesh.n_triangles());
     let served = gpu.served.unwrap();
-    assert_eq!((served.backend, served.instead), ("gpu", None));
+    assert_eq!((served.backend, served.fallback_reason), ("gpu", None));
     assert_eq!(served.device, backend.describe());
     let status = backend.devices().remove(0);
     assert_eq!((status.finished, status.failed, status.down), (2, 0, None));
@@ -89,7 +89,7 @@ fn the_cpu_replaces_a_device_that_is_lost_permanently() {
     for _ in 0..3 {
         let meshed = run(&backend).unwrap();
         assert!(meshed.mesh == cpu, "not the CPU's mesh");
-        assert!(meshed.served.unwrap().instead.unwrap().contains("the GPU failed"));
+        assert!(meshed.served.unwrap().fallback_reason.unwrap().contains("the GPU failed"));
     }
     let why = backend.devices().remove(0).down.unwrap();
     assert!(why.contains("given up after 3 rebuilds") && !why.contains('\n'), "{why}");

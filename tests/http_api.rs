@@ -257,7 +257,7 @@ fn bad_parameters_are_named_with_what_was_expected() {
         ("format=usdz", "format", None),
         ("report=xml", "report", None),
         ("check=lax", "check", None),
-        ("proof=trust", "proof", None),
+        ("validation=trust", "validation", None),
         ("compress=draco", "compress", None),
         ("compress=quantize&format=ply", "compress", None),
         ("detial=3", "detial", Some("detail")),

@@ -237,7 +237,7 @@ fn canonical_texts_tell_jobs_apart_and_nothing_else() {
         &[("model", "2")],
         &[("altloc", "B")],
         &[("atom_ids", "true")],
-        &[("proof", "exact")],
+        &[("validation", "exact")],
         &[("compress", "quantize")],
         &[("normals", "none")],
         &[("units", "nanometer")],

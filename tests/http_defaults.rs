@@ -145,7 +145,7 @@ fn a_default_goes_with_everything() {
         &[("chains", "A")],
         &[("select", "ligand")],
         &[("altloc", "B")],
-        &[("proof", "exact")],
+        &[("validation", "exact")],
         &[("check", "strict")],
         &[("report", "json")],
         &[("compress", "quantize")],

@@ -10,15 +10,15 @@ use std::time::Duration;
 
 use http_support::{Fake, Mode, SAMPLE, log_lines, send, start_on, wait_for};
 use molmesh::surface::{
-    Backend, Control, DeviceFacts, DeviceKind, DeviceStatus, FoundDevice, Meshed, Served, Spheres, SurfaceError,
-    SurfaceLimits, SurfaceParams,
+    Backend, Control, DeviceFacts, DeviceKind, DeviceStatus, FoundDevice, MeshOutput, MeshSink, Served, Spheres,
+    SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 /// A backend with two devices, of which the second can be taken down.
 struct Devices {
     fake: Arc<Fake>,
     /// Serves by another backend, and why.
-    instead: Mutex<Option<&'static str>>,
+    fallback_reason: Mutex<Option<&'static str>>,
     /// The arithmetic of the first device, and of the one that serves if that is another.
     arithmetic: Mutex<&'static str>,
     served: Mutex<Option<&'static str>>,
@@ -32,7 +32,7 @@ impl Devices {
     fn new() -> Arc<Self> {
         Arc::new(Self {
             fake: Fake::new(Mode::Octahedra),
-            instead: Mutex::default(),
+            fallback_reason: Mutex::default(),
             arithmetic: Mutex::new("card 1, driver 1"),
             served: Mutex::default(),
             error: Mutex::default(),
@@ -55,24 +55,25 @@ impl Backend for Devices {
         "two devices".to_owned()
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
         if let Some(error) = self.error.lock().unwrap().clone() {
             return Err(error);
         }
-        let instead = self.instead.lock().unwrap().map(str::to_owned);
-        let (backend, device) = if instead.is_some() { ("cpu", "the processor") } else { ("gpu", "card 1") };
-        let arithmetic = match &instead {
+        let fallback_reason = self.fallback_reason.lock().unwrap().map(str::to_owned);
+        let (backend, device) = if fallback_reason.is_some() { ("cpu", "the processor") } else { ("gpu", "card 1") };
+        let arithmetic = match &fallback_reason {
             Some(_) => "cpu".to_owned(),
             None => self.served.lock().unwrap().map_or_else(|| self.arithmetic(), str::to_owned),
         };
-        let served = Some(Served { backend, arithmetic, device: device.to_owned(), instead });
-        Ok(Meshed { served, ..self.fake.run(spheres, params, limits, control)? })
+        let served = Some(Served { backend, arithmetic, device: device.to_owned(), fallback_reason });
+        Ok(MeshOutput { served, ..self.fake.write(spheres, params, limits, control, sink)? })
     }
 
     fn warm(&self) -> Result<(), SurfaceError> {
@@ -177,17 +178,17 @@ fn what_stands_in_is_said_in_answer_report_log_and_metrics() {
     let report = server.post("/v1/meshes?report=json", &[], SAMPLE).json();
     assert_eq!((&report["device"], report.get("fallback")), (&"card 1".into(), None));
 
-    *backend.instead.lock().unwrap() = Some("the card is on fire 7431");
+    *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
     // The first result is kept, and would be the answer to the same request.
     let other = http_support::sample(1);
     let stood_in = server.post("/v1/meshes", &[], &other);
     assert_eq!(stood_in.header("molmesh-backend"), Some("cpu"));
     assert_eq!(stood_in.header("molmesh-backend-reason"), Some("a test says so; but the card is on fire 7431"));
-    *backend.instead.lock().unwrap() = None;
+    *backend.fallback_reason.lock().unwrap() = None;
     let again = server.post("/v1/meshes", &[], &other);
     assert_eq!(again.header("molmesh-backend"), Some("gpu"), "what stood in is no answer once the devices are back");
     assert_ne!(stood_in.header("etag"), again.header("etag"), "other bytes under one tag");
-    *backend.instead.lock().unwrap() = Some("the card is on fire 7431");
+    *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
     let report = server.post("/v1/meshes?report=json", &[], &other).json();
     assert_eq!((&report["backend"], &report["fallback"]), (&"cpu".into(), &"the card is on fire 7431".into()));
     assert_eq!(report["device"], "the processor");

@@ -10,7 +10,9 @@ use std::time::Duration;
 
 use http_support::{Fake, Mode, Running, SAMPLE, log_lines, sample, start, wait_for};
 use molmesh::http::Stop;
-use molmesh::surface::{Backend, Control, DeviceStatus, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
+use molmesh::surface::{
+    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+};
 use serde_json::Value;
 
 /// Names of the checks that are not as they should be; all three must be there.
@@ -112,14 +114,15 @@ impl Backend for OneDevice {
         "one device".to_owned()
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
-        self.fake.run(spheres, params, limits, control)
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
+        self.fake.write(spheres, params, limits, control, sink)
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {

@@ -13,7 +13,8 @@ use std::path::{Path, PathBuf};
 use molmesh::formats::{self, Format, Meta};
 use molmesh::structure::{self, ReadLimits, Selection, StructureError};
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Kernel, Measures, Mesh, Proof, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    Backend, Control, CpuBackend, Kernel, Measures, Mesh, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    Validation,
 };
 
 /// Largest number of selected atoms of structures that run every time.
@@ -104,8 +105,8 @@ fn every_structure_and_kernel_yields_a_closed_oriented_manifold() {
             for resolution in [1.0, 0.5] {
                 let what = format!("{} {kernel} {resolution}", case.name);
                 let mesh = mesh(&case.spheres, kernel, resolution, 2);
-                let exact = Measures::of(&mesh, Proof::Exact, &Control::default()).unwrap();
-                let quick = Measures::of(&mesh, Proof::Checksum, &Control::default()).unwrap();
+                let exact = Measures::of(&mesh, Validation::Exact, &Control::default()).unwrap();
+                let quick = Measures::of(&mesh, Validation::Checksum, &Control::default()).unwrap();
                 assert!(exact.closed && exact.oriented && exact.manifold, "{what}: {exact:?}");
                 assert!(quick.closed && quick.manifold && quick.euler == exact.euler, "{what}: {quick:?}");
                 assert!(exact.volume > 0.0 && exact.area > 0.0, "{what}");

@@ -8,7 +8,7 @@ mod gpu_support;
 mod tools;
 
 use std::fs;
-use std::io::{Read, Write};
+use std::io::{Cursor, Read, Write};
 use std::net::TcpStream;
 
 use cli_support::{Folder, Service, assert_code, mesh, run, stdout};
@@ -16,10 +16,10 @@ use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Packing, Step};
 use molmesh::gpu::{DevicePool, Executor, GpuBackend, PoolDevice, PoolSettings};
 use molmesh::pipeline::{self, Choice, Job, JobLimits, Product, params};
 use molmesh::surface::{
-    Backend, CancelToken, Control, CpuBackend, Mesh, Proof, ReferenceBackend, SurfaceLimits, SurfaceParams,
+    Backend, CancelToken, Control, CpuBackend, Mesh, ReferenceBackend, SurfaceLimits, SurfaceParams, Validation,
 };
 use serde_json::Value;
-use tools::files::{Anywhere, Files};
+use tools::files::Files;
 use tools::readers::{gltf_contents, split_glb};
 
 const SAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
@@ -45,7 +45,7 @@ fn devices(n: usize) -> GpuBackend {
 
 fn made(backend: &dyn Backend, job: &Job) -> Product {
     let choice = Choice { backend, reason: "told" };
-    pipeline::run(&sample(), job, &JobLimits::default(), &choice, &CancelToken::default(), &()).unwrap()
+    pipeline::run(&sample(), job, &JobLimits::default(), &choice, &CancelToken::default(), &(), None).unwrap()
 }
 
 fn glb(product: &Product) -> Vec<u8> {
@@ -100,11 +100,11 @@ fn every_backend_hands_integers_on_and_reports_what_they_measure() {
 }
 
 #[test]
-fn the_exact_proof_measures_the_same_vertices() {
+fn the_exact_validation_measures_the_same_vertices() {
     for backend in [&devices(1) as &dyn Backend, &CpuBackend::new(Some(2)).unwrap()] {
-        let [quick, exact] =
-            ["checksum", "exact"].map(|proof| made(backend, &job(&[("proof", proof), ("resolution", "1")])));
-        assert_eq!((quick.report.proof, exact.report.proof), ("checksum", "exact"));
+        let [quick, exact] = ["checksum", "exact"]
+            .map(|validation| made(backend, &job(&[("validation", validation), ("resolution", "1")])));
+        assert_eq!((quick.report.validation, exact.report.validation), ("checksum", "exact"));
         assert!(quick.mesh == exact.mesh);
         assert!(near(quick.report.area, exact.report.area, 2e-6) && exact.report.manifold);
     }
@@ -123,7 +123,7 @@ fn a_coarse_step_shows_in_the_measures() {
     let (fine, found) = (of(&single), of(&coarse));
     let device = devices(1);
     let meshed = device.run(&spheres, &coarse, &SurfaceLimits::default(), &Control::default()).unwrap();
-    let theirs = molmesh::surface::Measures::of(&meshed.mesh, Proof::Checksum, &Control::default()).unwrap();
+    let theirs = molmesh::surface::Measures::of(&meshed.mesh, Validation::Checksum, &Control::default()).unwrap();
     assert!(near(found.area, theirs.area, 1e-4) && near(found.volume, theirs.volume, 1e-4), "{found:?} {theirs:?}");
     assert!(!near(found.area, fine.area, 1e-3), "{} {}", found.area, fine.area);
 }
@@ -150,12 +150,14 @@ fn one_device_and_two_make_the_same_file_in_order_and_out_of_order() {
     let sums = [&alone, &spread].map(|product| (product.report.area, product.report.volume));
     assert!(near(sums[0].0, sums[1].0, 1e-12) && near(sums[0].1, sums[1].1, 1e-12), "{sums:?}");
     for (backend, expected) in [(&one as &dyn Backend, &expected[0]), (&two, &expected[1])] {
-        let file = Anywhere::default();
-        let sink = GlbSink::new(&file);
+        let mut file = Cursor::new(Vec::new());
+        let sink = GlbSink::new(&mut file);
         let (choice, limits) = (Choice { backend, reason: "told" }, JobLimits::default());
-        let poured = pipeline::pour(&sample(), &job, &limits, &choice, &CancelToken::default(), &(), &sink).unwrap();
-        sink.finish(&poured.meta(), poured.centre, poured.bounds).unwrap();
-        assert!(file.bytes() == *expected);
+        let cancel = CancelToken::default();
+        let product = pipeline::run(&sample(), &job, &limits, &choice, &cancel, &(), Some(&sink)).unwrap();
+        drop(sink);
+        assert!(product.mesh.positions.is_empty() && product.streamed_bytes == Some(expected.len() as u64));
+        assert!(file.into_inner() == *expected);
     }
     // Control: another spacing is another file.
     let other = glb(&made(&one, &self::job(&[("resolution", "0.45")])));

@@ -17,7 +17,8 @@ use std::time::{Duration, Instant};
 use http_support::{Fake, Mode, Reply, SAMPLE, log_lines, sample, send, start};
 use molmesh::store::{Folder, Store};
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Meshed, ReferenceBackend, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, Control, CpuBackend, MeshOutput, MeshSink, ReferenceBackend, Spheres, SurfaceError, SurfaceLimits,
+    SurfaceParams,
 };
 use serde_json::Value;
 use store_support::Service;
@@ -259,20 +260,21 @@ impl Backend for Gated {
         self.fake.describe()
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
         self.waiting.fetch_add(1, Ordering::SeqCst);
         while !self.open.load(Ordering::SeqCst) {
             control.check()?;
             std::thread::sleep(Duration::from_millis(5));
         }
         self.waiting.fetch_sub(1, Ordering::SeqCst);
-        self.fake.run(spheres, params, limits, control)
+        self.fake.write(spheres, params, limits, control, sink)
     }
 }
 

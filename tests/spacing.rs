@@ -40,7 +40,7 @@ fn with(input: &[u8], pairs: &[(&str, &str)], surface: SurfaceLimits) -> Result<
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     let backend = CpuBackend::new(None).unwrap();
     let choice = Choice { backend: &backend, reason: "asked for" };
-    run(input, &job, &JobLimits { surface, ..JobLimits::default() }, &choice, &CancelToken::default(), &())
+    run(input, &job, &JobLimits { surface, ..JobLimits::default() }, &choice, &CancelToken::default(), &(), None)
 }
 
 fn product(input: &[u8], pairs: &[(&str, &str)]) -> Result<Product, JobError> {

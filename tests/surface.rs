@@ -10,9 +10,9 @@
 
 use molmesh::surface::reference::Density;
 use molmesh::surface::{
-    Backend, CancelToken, Component, Control, CpuBackend, Kernel, Measures, Mesh, MeshPart, MeshSink, Meshed, Observer,
-    Proof, Quantized, ReferenceBackend, SinkFailed, Spheres, Stage, Step, SurfaceError, SurfaceLimits, SurfaceOptions,
-    SurfaceParams, Vertices, lattice,
+    Backend, CancelToken, Component, Control, CpuBackend, Kernel, Measures, Mesh, MeshOutput, MeshPart, MeshSink,
+    Observer, Quantized, ReferenceBackend, SinkFailed, Spheres, Stage, Step, SurfaceError, SurfaceLimits,
+    SurfaceOptions, SurfaceParams, Validation, Vertices, lattice,
 };
 use std::collections::BTreeSet;
 use std::sync::Mutex;
@@ -29,22 +29,22 @@ fn params(kernel: Kernel, resolution: f64) -> SurfaceParams {
     SurfaceParams::new(&options).unwrap()
 }
 
-fn run_on(backend: &dyn Backend, spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+fn run_on(backend: &dyn Backend, spheres: &Spheres, params: &SurfaceParams) -> MeshOutput {
     backend.run(spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap()
 }
 
-fn run(spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+fn run(spheres: &Spheres, params: &SurfaceParams) -> MeshOutput {
     run_on(&CpuBackend::new(Some(2)).unwrap(), spheres, params)
 }
 
-fn exact(meshed: &Meshed) -> Measures {
-    Measures::of(&meshed.mesh, Proof::Exact, &Control::default()).unwrap()
+fn exact(meshed: &MeshOutput) -> Measures {
+    Measures::of(&meshed.mesh, Validation::Exact, &Control::default()).unwrap()
 }
 
-fn assert_sound(meshed: &Meshed, what: &str) -> Measures {
+fn assert_sound(meshed: &MeshOutput, what: &str) -> Measures {
     let m = exact(meshed);
     assert!(m.closed && m.oriented && m.manifold, "{what}: {m:?}");
-    let quick = Measures::of(&meshed.mesh, Proof::Checksum, &Control::default()).unwrap();
+    let quick = Measures::of(&meshed.mesh, Validation::Checksum, &Control::default()).unwrap();
     assert_eq!((quick.closed, quick.manifold, quick.euler), (true, true, m.euler), "{what}");
     if let Some(taken) = &meshed.measures {
         assert!(agree(taken, &quick, &meshed.mesh), "{what}: {taken:?} {quick:?}");
@@ -292,7 +292,7 @@ fn the_native_backend_agrees_with_the_sequential_reference() {
         );
         assert_eq!(native.mesh.centre, reference.mesh.centre);
         // The two number vertices differently: compare them in the order of their grid edges.
-        let sorted = |m: &Meshed| {
+        let sorted = |m: &MeshOutput| {
             let ids = m.mesh.atom_ids.as_ref().unwrap();
             let mut rows: Vec<_> =
                 m.mesh.positions.iter().zip(ids).map(|(p, id)| (p.map(|c| (c * 500.0).round() as i64), *id)).collect();
@@ -547,7 +547,7 @@ impl MeshSink for Collected {
 }
 
 #[test]
-fn what_is_poured_is_what_is_returned() {
+fn a_sink_gets_the_rows_that_a_mesh_in_memory_has() {
     // Tiles side by side; and a spacing so wide that vertices lie where no atom reaches. There is no gradient there, and
     // normals are taken from the triangles: every row comes a second time.
     let lone = spheres(&[[0.0, 0.0, 0.0, 1.7]]);
@@ -561,7 +561,8 @@ fn what_is_poured_is_what_is_returned() {
         for threads in [1, 3] {
             let sink = Collected::default();
             let backend = CpuBackend::new(Some(threads)).unwrap();
-            let poured = backend.pour(at, &p, &SurfaceLimits::default(), &Control::default(), &sink).unwrap();
+            let limits = SurfaceLimits::default();
+            let output = backend.write(at, &p, &limits, &Control::default(), Some(&sink)).unwrap();
             let (mut mesh, came) = sink.0.into_inner().unwrap();
             assert_eq!(came, times * mesh.n_vertices(), "{h} Å");
             assert_eq!(mesh.quantized.is_some(), quantized);
@@ -571,9 +572,11 @@ fn what_is_poured_is_what_is_returned() {
             assert!(mesh.positions == whole.mesh.positions && mesh.normals == whole.mesh.normals);
             assert!(mesh.quantized == whole.mesh.quantized);
             assert!(mesh.triangles == whole.mesh.triangles);
-            assert_eq!((poured.n_vertices, poured.n_triangles), (mesh.n_vertices(), mesh.n_triangles()));
-            assert_eq!((poured.bounds, poured.centre, poured.grid), (mesh.bounds(), whole.mesh.centre, whole.grid));
-            assert_eq!(Some(&poured.measures), whole.measures.as_ref());
+            assert_eq!(output.size(), [mesh.n_vertices(), mesh.n_triangles()]);
+            let bounds = output.streamed.unwrap().bounds;
+            assert_eq!((bounds, output.mesh.centre, output.grid), (mesh.bounds(), whole.mesh.centre, whole.grid));
+            assert_eq!(output.measures, whole.measures);
+            assert!(output.mesh.triangles.is_empty());
         }
     }
 }
@@ -596,7 +599,7 @@ fn rounded_vertices_are_the_computed_ones_rounded_and_are_what_is_measured() {
                 let mut expected = whole.mesh.clone();
                 assert!(expected.quantize(step));
                 assert!(meshed.mesh == expected, "{kernel} {step:?}");
-                let found = Measures::of(&meshed.mesh, Proof::Checksum, &Control::default()).unwrap();
+                let found = Measures::of(&meshed.mesh, Validation::Checksum, &Control::default()).unwrap();
                 let taken = meshed.measures.unwrap();
                 let unrounded = whole.measures.as_ref().unwrap();
                 assert_eq!((taken.euler, taken.components.len()), (found.euler, found.components.len()));
@@ -672,7 +675,7 @@ fn a_sink_that_fails_ends_the_run() {
     let p = params(Kernel::Gaussian, 0.5);
     let (backend, limits) = (CpuBackend::new(Some(2)).unwrap(), SurfaceLimits::default());
     for room in [0, usize::MAX] {
-        let error = backend.pour(&at, &p, &limits, &Control::default(), &Full(room)).unwrap_err();
+        let error = backend.write(&at, &p, &limits, &Control::default(), Some(&Full(room))).unwrap_err();
         assert_eq!(error, SurfaceError::Sink);
     }
 }

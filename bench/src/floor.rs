@@ -14,7 +14,7 @@
 //! | emit | 300 B per brick with surface | 12 B per triangle | – |
 
 use molmesh::gpu::Prepared;
-use molmesh::surface::{Meshed, Stage};
+use molmesh::surface::{MeshOutput, Stage};
 
 use crate::rates::Rates;
 
@@ -28,7 +28,7 @@ pub(crate) struct Work {
 
 impl Work {
     /// The work of `stage` in a finished job.
-    pub(crate) fn of(stage: Stage, job: &Prepared, meshed: &Meshed) -> Self {
+    pub(crate) fn of(stage: Stage, job: &Prepared, meshed: &MeshOutput) -> Self {
         let atoms = job.lattice.atoms.len() as f64;
         let (bricks, tiles) = (job.plan.bricks.len() as f64, job.plan.tiles.len() as f64);
         let entries = job.plan.candidates.iter().sum::<u64>() as f64;

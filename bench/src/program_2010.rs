@@ -13,9 +13,9 @@ use std::collections::BTreeMap;
 
 use bytemuck::{Pod, Zeroable};
 use molmesh::gpu::Prepared;
+use molmesh::gpu::plan::layout::case_table;
 use molmesh::surface::Kernel;
 use molmesh::surface::lattice::Lattice;
-use molmesh::surface::layout::case_table;
 use wgpu::{Buffer, BufferUsages, CommandEncoder, ComputePipeline};
 
 use crate::device::{Gpu, Timer};

@@ -127,7 +127,7 @@ pub(crate) struct JobArgs {
     pub(crate) backend: BackendName,
     #[command(flatten)]
     pub(crate) devices: DeviceArgs,
-    /// Threads of the CPU backend; every core by default, 8 at most for a mesh of a file below 1 MiB
+    /// Threads of the CPU backend; one per core by default
     #[arg(long, value_name = "N")]
     pub(crate) threads: Option<usize>,
     /// How the report is written
@@ -139,9 +139,9 @@ pub(crate) struct JobArgs {
     /// Refuse a file in which a second, strict reader finds errors, and report what else it finds
     #[arg(long)]
     pub(crate) check: bool,
-    /// How the mesh is proven closed: checksum (fast) or exact (edge by edge) [default: checksum]
-    #[arg(long, value_name = "PROOF")]
-    pub(crate) proof: Option<String>,
+    /// Check that the mesh is watertight: checksum (of its edges, fast) or exact (edge by edge) [default: checksum]
+    #[arg(long, value_name = "METHOD")]
+    pub(crate) validation: Option<String>,
     #[command(flatten)]
     pub(crate) surface: SurfaceArgs,
     #[command(flatten)]

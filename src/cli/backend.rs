@@ -26,8 +26,6 @@ pub(crate) struct Asked<'a> {
     pub(crate) devices: &'a DeviceChoice,
     /// Threads of the CPU backend.
     pub(crate) threads: Option<usize>,
-    /// Threads that are enough where no number is asked for.
-    pub(crate) enough: usize,
     /// Estimated work of a command's only job, if there is one and its input is known.
     pub(crate) work: Option<f64>,
 }
@@ -36,13 +34,12 @@ impl<'a> Asked<'a> {
     /// Flags of a command with a single job, whose work is not known yet.
     pub(crate) fn once(args: &'a JobArgs) -> Self {
         let (backend, devices, threads) = (args.backend, &args.devices.devices, args.threads);
-        Self { backend, devices, threads, enough: usize::MAX, work: None }
+        Self { backend, devices, threads, work: None }
     }
 
     /// Threads that the CPU backend gets.
     fn n_threads(&self) -> usize {
-        let processors = || std::thread::available_parallelism().map_or(1, NonZero::get);
-        self.threads.unwrap_or_else(|| processors().min(self.enough))
+        self.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, NonZero::get))
     }
 }
 
@@ -151,7 +148,7 @@ fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
 
 fn cpu(asked: &Asked<'_>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
     let backend = match use_ {
-        Use::Once | Use::Picture => CpuBackend::on_this_thread(asked.threads, asked.enough),
+        Use::Once | Use::Picture => CpuBackend::new(Some(asked.n_threads())),
         #[cfg(feature = "server")]
         Use::Service(_) => CpuBackend::new(asked.threads),
     };

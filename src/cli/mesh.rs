@@ -1,14 +1,12 @@
-//! `molmesh mesh`: one structure to one mesh file.
+//! `molmesh mesh`: converts one structure to one mesh file.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::Path;
 use std::str::FromStr;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use molmesh::formats::{Encoder, Format};
-#[cfg(unix)]
-use molmesh::formats::{GlbSink, PlaceError};
+use molmesh::formats::{Encoder, Format, GlbSink, GlbSinkError};
 use molmesh::pipeline::params::Request;
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, ProgressSink, Report};
 use molmesh::structure::StructureError;
@@ -25,7 +23,7 @@ use super::style::Style;
 use super::summary::{self, Written};
 use super::{interrupt, request};
 
-/// Runs the command. The order is that of cost: flags, output, input, backend, mesh.
+/// Runs the command. Cheap steps come first: flags, output, input, backend, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let Request { mut job, format: asked, strict, .. } = request::of_mesh(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
@@ -43,28 +41,33 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = read(input_path, limits.read.max_inflated_bytes)?;
-    let (enough, work) = (enough(&input, job.params.resolution), Some(pipeline::work(&input, &job)));
-    let asked = Asked { enough, work, ..Asked::once(args) };
+    let asked = Asked { work: Some(pipeline::work(&input, &job)), ..Asked::once(args) };
     let picked = backend::pick(&asked, &backend::Use::Once)?;
 
     let progress = Progress::new(!args.quiet);
     let findings = if strict { Some(check(input_path, &input, &limits)?) } else { None };
     let work = Work { path: input_path, job: &job, limits: &limits, picked: &picked, input: &input, cancel: &cancel };
-    let mut poured = None;
-    if format == Format::Glb && pipeline::can_pour(&job) {
-        poured = work.pour(&mut output, &progress)?;
-    }
-    let mut report = match poured {
-        Some(report) => report,
-        None => work.whole(format, &mut output, &progress)?,
+    let product = if format == Format::Glb && output.is_file() {
+        work.run_to_file(&mut output, &progress)?
+    } else {
+        work.run(&progress, None).map_err(|source| work.failure(source))?
     };
+    let mut report = product.report.clone();
+    let mut writing = Duration::ZERO;
+    if let Some(bytes) = product.streamed_bytes {
+        output.bytes = bytes;
+    } else {
+        report.add_timing("encode", encode(&product, format, &mut output, &progress)?);
+        writing = output.writing;
+    }
+    // The process ends soon, which frees the memory at once.
+    std::mem::forget(product);
     drop(progress);
     if cancel.is_cancelled() {
         return Err(CliError::Interrupted);
     }
     let (to_stdout, bytes) = (output.is_stdout(), output.bytes);
     let start = Instant::now();
-    let writing = output.writing;
     output.finish()?;
     report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
 
@@ -73,19 +76,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     tell(args, &report, findings.as_deref(), &written, to_stdout)
 }
 
-/// Bytes of a structure file that is small at a resolution of 0.5 Å.
-const SMALL: f64 = (1 << 20) as f64;
-/// Threads that are enough for it: on sixteen cores all of them gained nothing that was there again in another run, and
-/// took a structure of 600 atoms an eighth longer.
-const FEW_THREADS: usize = 8;
-
-/// Threads that are enough for a file. What there is to do grows with its bytes and the inverse square of the spacing.
-fn enough(input: &[u8], resolution: f64) -> usize {
-    let small = input.len() as f64 * (0.5 / resolution).powi(2) < SMALL;
-    if small { FEW_THREADS } else { usize::MAX }
-}
-
-/// The format that an output's name says: by its extension, GLB on stdout.
+/// Format of an output by its file extension; GLB on stdout.
 fn format(output: &Path) -> Result<Format, CliError> {
     let hint = || Some("name the format with --format".to_owned());
     let name = output.display();
@@ -100,7 +91,7 @@ fn format(output: &Path) -> Result<Format, CliError> {
     }
 }
 
-/// The whole input, at most `limit` bytes of it: compressed or not, what inflates from it is no smaller.
+/// Reads the input, at most `limit` bytes. Inflating does not make it smaller, so the limit holds for compressed files.
 pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
     let stdin = is_stdio(path);
     let name = || name_of(path);
@@ -110,7 +101,7 @@ pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
         }
         let file = File::open(path)?;
         let size = file.metadata()?.len();
-        // One byte more than there is, so that the end is seen without growing the buffer.
+        // One extra byte, so that the end is detected without growing the buffer.
         take(file, if size > limit { 0 } else { size + 1 }, limit)
     };
     let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
@@ -126,12 +117,12 @@ fn take(source: impl Read, capacity: u64, limit: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// What messages call the input.
+/// Name of the input in messages.
 fn name_of(input: &Path) -> String {
     if is_stdio(input) { "stdin".to_owned() } else { input.display().to_string() }
 }
 
-/// What there is to do.
+/// Input and settings of the job.
 struct Work<'a> {
     path: &'a Path,
     job: &'a Job,
@@ -150,45 +141,24 @@ impl Work<'_> {
         failure(self.path, self.input, self.limits, source)
     }
 
-    /// Meshes, then writes the mesh in order. Returns the report.
-    fn whole(&self, format: Format, output: &mut Output, progress: &Progress) -> Result<Report, CliError> {
-        let product = pipeline::run(self.input, self.job, self.limits, &self.choice(), self.cancel, progress)
-            .map_err(|source| self.failure(source))?;
-        let report = encode(&product, format, output, progress)?;
-        // The process ends soon: nobody gains from the mesh being freed first.
-        std::mem::forget(product);
-        Ok(report)
+    fn run(&self, progress: &Progress, sink: Option<&GlbSink<'_>>) -> Result<Product, JobError> {
+        pipeline::run(self.input, self.job, self.limits, &self.choice(), self.cancel, progress, sink)
     }
 
-    /// Writes a GLB while it is meshed. `None` if this output takes bytes in order only.
-    #[cfg(unix)]
-    fn pour(&self, output: &mut Output, progress: &Progress) -> Result<Option<Report>, CliError> {
-        let Some(placer) = output.placer() else { return Ok(None) };
-        let sink = GlbSink::new(&placer);
-        let poured = pipeline::pour(self.input, self.job, self.limits, &self.choice(), self.cancel, progress, &sink);
-        let poured = match poured {
-            Ok(poured) => poured,
-            Err(JobError::Surface(SurfaceError::Sink)) => return Err(place_failure(output, sink.failure())),
-            Err(source) => return Err(self.failure(source)),
-        };
-        progress.progress("encode", 0.0);
-        let start = Instant::now();
-        let finished = sink.finish(&poured.meta(), poured.centre, poured.bounds);
-        let len = finished.map_err(|error| place_failure(output, Some(error)))?;
-        output.set_len(len);
-        let mut report = poured.report;
-        report.add_timing("encode", start.elapsed().as_secs_f64() * 1e3);
-        Ok(Some(report))
-    }
-
-    /// There is no portable way to write one file from several threads.
-    #[cfg(not(unix))]
-    fn pour(&self, _output: &mut Output, _progress: &Progress) -> Result<Option<Report>, CliError> {
-        Ok(None)
+    /// Runs the job and writes a GLB while it is meshed, if the job allows that.
+    fn run_to_file(&self, output: &mut Output, progress: &Progress) -> Result<Product, CliError> {
+        let sink = GlbSink::new(output);
+        let product = self.run(progress, Some(&sink));
+        let cause = sink.failure();
+        drop(sink);
+        match product {
+            Err(JobError::Surface(SurfaceError::Sink)) => Err(sink_failure(output, cause)),
+            product => product.map_err(|source| self.failure(source)),
+        }
     }
 }
 
-/// What it means that a job failed.
+/// Error of the command for that of a job.
 pub(super) fn failure(path: &Path, input: &[u8], limits: &JobLimits, source: JobError) -> CliError {
     match source {
         JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
@@ -199,18 +169,17 @@ pub(super) fn failure(path: &Path, input: &[u8], limits: &JobLimits, source: Job
     }
 }
 
-/// What it means that a mesh could not be placed.
-#[cfg(unix)]
-fn place_failure(output: &Output, error: Option<PlaceError>) -> CliError {
-    match error {
-        Some(PlaceError::Format(error)) => error.into(),
-        Some(PlaceError::Io(source)) => output.failure(source),
-        Some(error @ PlaceError::HeadTooLong { .. }) => CliError::Internal(error.to_string()),
-        None => CliError::Internal("the output failed without a reason".to_owned()),
+/// Error of the command for that of its sink.
+fn sink_failure(output: &Output, cause: Option<GlbSinkError>) -> CliError {
+    match cause {
+        Some(GlbSinkError::Format(error)) => error.into(),
+        Some(GlbSinkError::Io(source)) => output.failure(source),
+        Some(error @ GlbSinkError::HeadTooLong { .. }) => CliError::Internal(error.to_string()),
+        None => CliError::Internal("the output failed without a cause".to_owned()),
     }
 }
 
-/// The strict check: the referee's findings, or a refusal if there are errors among them.
+/// Runs the strict check. Returns its findings, or an error if one of them is an error.
 pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
     let name = || name_of(path);
     let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
@@ -225,7 +194,7 @@ pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec
     }
 }
 
-/// What the referee holds against a file that our reader could not read.
+/// Worst finding of the strict check in a file with a syntax error.
 fn opinion(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
     let findings = referee::check(input, &limits.read).ok()?;
@@ -239,19 +208,17 @@ fn finding(finding: &Diagnostic) -> String {
     format!("{place}{}", finding.message.split_whitespace().collect::<Vec<_>>().join(" "))
 }
 
-/// Encodes the mesh straight into the output. Returns the report with the time that took, without the writes.
-fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<Report, CliError> {
+/// Encodes the mesh into the output. Returns the time that took, without the writes, in ms.
+fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<f64, CliError> {
     sink.progress("encode", 0.0);
     let start = Instant::now();
     let written = Encoder::stored(format, product.storage, &product.mesh, &product.meta())?.write(out);
     let encoding = start.elapsed().saturating_sub(out.writing);
     written.map_err(|source| out.failure(source))?;
-    let mut report = product.report.clone();
-    report.add_timing("encode", encoding.as_secs_f64() * 1e3);
-    Ok(report)
+    Ok(encoding.as_secs_f64() * 1e3)
 }
 
-/// Writes the report where the file did not go.
+/// Writes the report to the stream that the mesh does not use.
 pub(super) fn tell(
     args: &JobArgs,
     report: &Report,
@@ -265,7 +232,7 @@ pub(super) fn tell(
             let lines: Option<Vec<String>> =
                 findings.map(|all| all.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect());
             let text = summary::text(report, written, lines.as_deref(), Style::stderr());
-            // A closed stderr is no reason to call a finished mesh a failure.
+            // A closed stderr does not make a finished mesh a failure.
             drop(io::stderr().write_all(text.as_bytes()));
             Ok(())
         }
@@ -291,18 +258,4 @@ fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Writt
     let mut text = serde_json::to_string_pretty(&value).map_err(failed)?;
     text.push('\n');
     Ok(text)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn small_files_get_few_threads_and_all_others_every_processor() {
-        let (small, large) = (vec![b' '; (1 << 20) - 1], vec![b' '; 1 << 20]);
-        assert_eq!(enough(&small, 0.5), FEW_THREADS);
-        assert_eq!(enough(&large, 0.5), usize::MAX);
-        assert_eq!(enough(&large, 1.0), FEW_THREADS, "a quarter of the work");
-        assert_eq!(enough(&small, 0.25), usize::MAX, "four times the work");
-    }
 }

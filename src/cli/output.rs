@@ -1,31 +1,29 @@
-//! Where the mesh goes: stdout, or a file that appears under its name only when it is complete.
+//! Output of a command: stdout, or a file that gets its name only when it is complete.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
+use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-#[cfg(unix)]
-use molmesh::formats::PlaceBytes;
 use molmesh::surface::CancelToken;
 
 use super::error::CliError;
 use super::interrupt;
 
-/// An open output. Dropped without [`Output::finish`], it leaves nothing behind.
+/// Open output. Dropping it without [`Output::finish`] removes the file.
 pub(crate) struct Output {
     to: To,
     name: String,
     cancel: CancelToken,
     /// Bytes written so far.
     pub(crate) bytes: u64,
-    /// Time spent in the system's writes: what is left of the whole is encoding.
+    /// Time spent in system writes.
     pub(crate) writing: Duration,
 }
 
 enum To {
-    Stdout(io::StdoutLock<'static>),
-    /// What cannot be replaced by a rename: a pipe, a terminal, `/dev/null`.
+    Stdout(io::Stdout),
+    /// Output that a rename cannot replace: a pipe, a terminal, `/dev/null`.
     Device(File),
     /// A file beside `target`, renamed when it is complete.
     Staged {
@@ -35,36 +33,27 @@ enum To {
 }
 
 impl Output {
-    /// Opens `path`; `-` is stdout. Fails before any work is done where it would fail after it.
+    /// Opens `path`; `-` is stdout. Detects errors before any work is done.
     pub(crate) fn open(path: &Path, cancel: &CancelToken) -> Result<Self, CliError> {
         let name = if is_stdio(path) { "stdout".to_owned() } else { path.display().to_string() };
-        let to = if is_stdio(path) { Ok(To::Stdout(io::stdout().lock())) } else { open_file(path) };
+        let to = if is_stdio(path) { Ok(To::Stdout(io::stdout())) } else { open_file(path) };
         match to {
             Ok(to) => Ok(Self { to, name, cancel: cancel.clone(), bytes: 0, writing: Duration::ZERO }),
             Err(source) => Err(CliError::Output { name, source }),
         }
     }
 
-    /// A way to write at any place of the file, if it is one.
-    #[cfg(unix)]
-    pub(crate) fn placer(&self) -> Option<Placer<'_>> {
-        match &self.to {
-            To::Staged { file, .. } => Some(Placer { file, cancel: &self.cancel }),
-            To::Stdout(_) | To::Device(_) => None,
-        }
+    /// Returns true if the output supports seeking: it is a file, not a stream.
+    pub(crate) fn is_file(&self) -> bool {
+        matches!(self.to, To::Staged { .. })
     }
 
-    /// The length of a file that was written through [`Self::placer`].
-    pub(crate) fn set_len(&mut self, bytes: u64) {
-        self.bytes = bytes;
-    }
-
-    /// Whether the mesh goes to stdout.
+    /// Returns true if the mesh goes to stdout.
     pub(crate) fn is_stdout(&self) -> bool {
         matches!(self.to, To::Stdout(_))
     }
 
-    /// Gives the file its name.
+    /// Renames the file to its final name.
     pub(crate) fn finish(mut self) -> Result<(), CliError> {
         let done = self.flush().and_then(|()| match &self.to {
             To::Staged { target, .. } => interrupt::commit(target),
@@ -73,7 +62,7 @@ impl Output {
         done.map_err(|source| self.failure(source))
     }
 
-    /// What a failed write means: a signal, or a failed write.
+    /// Error of the command for a failed write: an interrupt, or the error itself.
     pub(crate) fn failure(&self, source: io::Error) -> CliError {
         if self.cancel.is_cancelled() {
             CliError::Interrupted
@@ -91,27 +80,19 @@ impl Drop for Output {
     }
 }
 
-/// Writes at any place of a staged file.
-#[cfg(unix)]
-pub(crate) struct Placer<'a> {
-    file: &'a File,
-    cancel: &'a CancelToken,
-}
-
-#[cfg(unix)]
-impl PlaceBytes for Placer<'_> {
-    fn place(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
-        if self.cancel.is_cancelled() {
-            return Err(io::Error::other("interrupted"));
+impl Seek for Output {
+    fn seek(&mut self, position: SeekFrom) -> io::Result<u64> {
+        match &mut self.to {
+            To::Device(file) | To::Staged { file, .. } => file.seek(position),
+            To::Stdout(_) => Err(io::ErrorKind::NotSeekable.into()),
         }
-        std::os::unix::fs::FileExt::write_all_at(self.file, bytes, offset)
     }
 }
 
 impl Write for Output {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         if self.cancel.is_cancelled() {
-            // Not `Interrupted`: callers repeat a write that ends with that.
+            // Not `Interrupted`: callers retry a write that fails with it.
             return Err(io::Error::other("interrupted"));
         }
         let start = Instant::now();
@@ -131,20 +112,20 @@ impl Write for Output {
     }
 }
 
-/// Whether `path` means stdin or stdout.
+/// Returns true if `path` denotes stdin or stdout.
 pub(crate) fn is_stdio(path: &Path) -> bool {
     path.as_os_str() == "-"
 }
 
 fn open_file(path: &Path) -> io::Result<To> {
-    // A link is followed, so that the file that it points to is replaced, not the link.
+    // Resolves links, so that the target is replaced instead of the link.
     let target = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let existing = fs::metadata(&target).ok();
     match &existing {
         Some(meta) if meta.is_dir() => return Err(io::ErrorKind::IsADirectory.into()),
         Some(meta) if !meta.is_file() => return Ok(To::Device(OpenOptions::new().write(true).open(&target)?)),
         Some(_) => {
-            // A file that may not be written is not to be replaced through its directory either.
+            // A read-only file must not be replaced through its directory.
             OpenOptions::new().write(true).open(&target)?;
         }
         None => {}
@@ -152,11 +133,11 @@ fn open_file(path: &Path) -> io::Result<To> {
     let Some(file_name) = target.file_name() else { return Err(io::ErrorKind::InvalidInput.into()) };
     let mut staged_name = std::ffi::OsString::from(".");
     staged_name.push(file_name);
-    // The time makes it unique where every process has the same id, as in containers that share a volume.
+    // The time makes the name unique if processes share an id, as in containers with a common volume.
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
     staged_name.push(format!(".{}-{now:x}.part", std::process::id()));
     let staged = target.with_file_name(staged_name);
-    // Before it exists, so that no interrupt comes between.
+    // Registered before the file exists, so that no interrupt can come in between.
     interrupt::stage(&staged);
     let created = OpenOptions::new().write(true).create_new(true).open(&staged).and_then(|file| {
         existing.map_or(Ok(()), |meta| file.set_permissions(meta.permissions()))?;

@@ -36,7 +36,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     let findings = if strict { Some(mesh::check(input_path, &input, &limits)?) } else { None };
     let choice = Choice { backend: picked.backend.as_ref(), reason: &picked.reason };
     let failed = |source| mesh::failure(input_path, &input, &limits, source);
-    let mut product = pipeline::run(&input, &job, &limits, &choice, &cancel, &progress).map_err(failed)?;
+    let mut product = pipeline::run(&input, &job, &limits, &choice, &cancel, &progress, None).map_err(failed)?;
     let plain = PictureParams::default();
     pipeline::draw(&mut product, job.picture.as_ref().unwrap_or(&plain), &picked.drawer, &cancel, &progress)
         .map_err(failed)?;

@@ -79,7 +79,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
         ("chains", &atoms.chains),
         ("model", &atoms.model),
         ("altloc", &atoms.altloc),
-        ("proof", &args.proof),
+        ("validation", &args.validation),
     ];
     let mut pairs: Vec<_> =
         own.iter().copied().chain(given).filter_map(|(name, value)| value.clone().map(|value| (name, value))).collect();
@@ -137,7 +137,7 @@ mod tests {
             let flag = format!("--{}", parameter.name.replace('_', "-"));
             let value = match parameter.name {
                 "atom_ids" | "check" => vec![flag.as_str()],
-                "proof" => vec![&flag, "exact"],
+                "validation" => vec![&flag, "exact"],
                 "compress" => vec![&flag, "quantize"],
                 "normals" => vec![&flag, "none"],
                 "units" => vec![&flag, "nanometer"],

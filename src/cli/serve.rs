@@ -33,8 +33,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         tracing::warn!("{warning}");
     }
     referee::quiet_panics();
-    let asked =
-        Asked { backend: args.backend, devices: &config.devices.choice, threads: None, enough: usize::MAX, work: None };
+    let asked = Asked { backend: args.backend, devices: &config.devices.choice, threads: None, work: None };
     let picked = backend::pick(&asked, &backend::Use::Service(config.devices.clone()))?;
     let others = survey::survey(&picked);
     let Picked { backend, reason, drawer, devices, .. } = picked;

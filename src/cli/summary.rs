@@ -1,6 +1,7 @@
 //! The report of a mesh on one screen, for people. Pure: a report in, text out.
 
 use molmesh::pipeline::{LeftOutReport, PictureReport, Report};
+use molmesh::surface::Validation;
 
 use super::page::Page;
 use super::style::Style;
@@ -47,7 +48,7 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     if !stored.is_empty() {
         page.row("stored", &stored.join(", "));
     }
-    page.row("proof", &proof(report, style));
+    page.row("validation", &validation(report, style));
     page.row("parts", &parts(report));
     page.row("area", &format!("{} Å²", decimal(report.area)));
     page.row("volume", &format!("{} Å³", decimal(report.volume)));
@@ -106,11 +107,12 @@ fn drawn(picture: &PictureReport) -> String {
     format!("{width} × {height}, {view} view{turned}, {style}, {background} background, {pixel:.4} Å a pixel")
 }
 
-fn proof(report: &Report, style: Style) -> String {
+fn validation(report: &Report, style: Style) -> String {
     let says = |holds: bool, yes: &str, no: &str| if holds { style.green(yes) } else { style.red(no) };
+    let method = if report.validation == Validation::Exact.name() { "exact edge matching" } else { "edge checksum" };
     format!(
-        "{}, {}, {}, Euler number {}",
-        says(report.closed, "closed", "NOT closed"),
+        "{} (by {method}), {}, {}, Euler number {}",
+        says(report.closed, "watertight", "NOT watertight"),
         says(report.oriented, "oriented", "NOT oriented"),
         says(report.manifold, "manifold", "NOT manifold"),
         report.euler
@@ -242,7 +244,7 @@ mod tests {
             closed: true,
             oriented: true,
             manifold: false,
-            proof: "checksum",
+            validation: "checksum",
             euler: 2,
             components: 2,
             voids: 1,
@@ -293,7 +295,7 @@ mod tests {
             "20,000 vertices",
             "steps of 0.0009765625 Å",
             "39,996 triangles",
-            "closed, oriented, NOT manifold, Euler number 2",
+            "watertight (by edge checksum), oriented, NOT manifold, Euler number 2",
             "2 components, of which 1 void",
             "3,200.0 Å²",
             "7,100.0 Å³",

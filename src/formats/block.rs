@@ -72,19 +72,6 @@ pub(super) fn convert_words<const N: usize, T: Copy>(
     })
 }
 
-/// One record of `N` bytes per value, to the end of what is in memory.
-pub(super) fn extend_words<const N: usize, T: Copy>(
-    bytes: &mut Vec<u8>,
-    values: &[T],
-    bytes_of: impl Fn(T) -> [u8; N],
-) {
-    let start = bytes.len();
-    bytes.resize(start + N * values.len(), 0);
-    for (record, &value) in bytes[start..].as_chunks_mut::<N>().0.iter_mut().zip(values) {
-        *record = bytes_of(value);
-    }
-}
-
 /// What turns a vertex into the structure file's coordinates.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {

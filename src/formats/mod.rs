@@ -26,7 +26,7 @@ use std::io::{self, Write};
 use check::Depth;
 pub use error::FormatError;
 pub use format::{Format, UnknownFormat};
-pub use gltf::{GlbSink, PlaceBytes, PlaceError};
+pub use gltf::{GlbSink, GlbSinkError, RandomAccess};
 pub use quantize::{Compress, Packing, Step};
 pub use storage::{Normals, Storage, Units};
 

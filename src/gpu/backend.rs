@@ -11,14 +11,14 @@ use super::executor::Executor;
 use super::job::{GpuJob, Prepared};
 use super::pool::{self, DevicePool, PoolDevice, PoolSettings};
 use crate::surface::{
-    Backend, Control, DeviceStatus, Meshed, Served, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
-    backend::one_atom,
+    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
+    SurfaceParams, backend::one_atom,
 };
 
 /// Backend that meshes on devices.
 pub struct GpuBackend {
     pool: DevicePool,
-    /// Backend for jobs that no device could run; reported in [`Meshed::served`].
+    /// Backend for jobs that no device could run; reported in [`MeshOutput::served`].
     fallback: Option<Box<dyn Backend>>,
 }
 
@@ -103,13 +103,14 @@ impl Backend for GpuBackend {
         pool::describe(&up)
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
         control.check()?;
         let job = Self::job(spheres, params, limits, control)?;
         let error = match self.pool.run(&job) {
@@ -118,8 +119,10 @@ impl Backend for GpuBackend {
                 // Only identical devices share a job.
                 let device = completed.devices.first().map_or("", |work| work.device.as_str());
                 let arithmetic = arithmetic(self.name(), device);
-                let served = Served { backend: self.name(), arithmetic, device: completed.device(), instead: None };
-                return Ok(Meshed { served: Some(served), ..completed.finished.meshed });
+                let served =
+                    Served { backend: self.name(), arithmetic, device: completed.device(), fallback_reason: None };
+                let output = MeshOutput { served: Some(served), ..completed.finished.meshed };
+                return output.deliver(params, control, sink);
             }
             Err(error) => error,
         };
@@ -133,14 +136,14 @@ impl Backend for GpuBackend {
             }
             (error, None) => Err(SurfaceError::Device { why: single_line(&error.to_string()) }),
             (error, Some(fallback)) => {
-                let meshed = fallback.run(spheres, params, limits, control)?;
+                let output = fallback.write(spheres, params, limits, control, sink)?;
                 let served = Served {
                     backend: fallback.name(),
                     arithmetic: fallback.arithmetic(),
                     device: fallback.describe(),
-                    instead: Some(single_line(&format!("the GPU failed: {error}"))),
+                    fallback_reason: Some(single_line(&format!("the GPU failed: {error}"))),
                 };
-                Ok(Meshed { served: Some(served), ..meshed })
+                Ok(MeshOutput { served: Some(served), ..output })
             }
         }
     }

@@ -196,7 +196,9 @@ mod tests {
     use crate::gpu::job::{Finished, Prepared};
     use crate::gpu::plan::Partition;
     use crate::surface::backend::one_atom;
-    use crate::surface::{CancelToken, Control, GridStats, Mesh, Meshed, SurfaceError, SurfaceLimits, SurfaceParams};
+    use crate::surface::{
+        CancelToken, Control, GridStats, Mesh, MeshOutput, SurfaceError, SurfaceLimits, SurfaceParams,
+    };
 
     /// Two partitions; the first is queued.
     fn queued() -> (QueuedJob, PartitionHandle) {
@@ -219,7 +221,7 @@ mod tests {
         job.reply(Err(GpuError::Deadline));
         assert_eq!(other.check(), cancelled, "failed");
         let (job, other) = queued();
-        job.reply(Ok(Finished { meshed: Meshed::new(Mesh::default(), GridStats::default()), stages: Vec::new() }));
+        job.reply(Ok(Finished { meshed: MeshOutput::new(Mesh::default(), GridStats::default()), stages: Vec::new() }));
         assert_eq!(other.check(), Ok(()), "succeeded");
     }
 }

@@ -7,7 +7,7 @@ use super::error::GpuError;
 use super::plan::Plan;
 use crate::surface::lattice::Lattice;
 use crate::surface::{
-    CancelToken, Control, Meshed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
+    CancelToken, Control, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
 };
 
 /// Maximum number of atoms of a small job. Latency dominates its cost, so several small jobs share a submission.
@@ -80,7 +80,7 @@ impl GpuJob {
 #[derive(Debug, Clone)]
 pub struct Finished {
     /// Mesh and grid.
-    pub meshed: Meshed,
+    pub meshed: MeshOutput,
     /// Device time per stage in ns, in stage order; empty if the device has no timestamps.
     pub stages: Vec<(Stage, u64)>,
 }

@@ -12,7 +12,7 @@ use super::plan::check_totals;
 use super::plan::layout::{self, Counters, GROUP};
 use super::readback::ReadbackBuffer;
 use super::submit::{PendingSubmission, StageTimes};
-use crate::surface::{Column, GridStats, Mesh, Meshed, Quantized, Stage};
+use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage};
 
 /// Counts of a chunk.
 #[derive(Debug, Default)]
@@ -157,7 +157,7 @@ impl<'a> JobState<'a> {
         };
         let timed = self.times.iter().any(|&ns| ns > 0);
         let stages = if timed { STAGES.into_iter().zip(self.times).collect() } else { Vec::new() };
-        Ok(Finished { meshed: Meshed::new(mesh, grid), stages })
+        Ok(Finished { meshed: MeshOutput::new(mesh, grid), stages })
     }
 
     fn mesh(&mut self) -> Result<Mesh, String> {
@@ -191,10 +191,10 @@ fn column<T: Pod>(pieces: &[ReadbackRows], place: impl Fn(&ReadbackRows) -> (u64
         let (offset, n) = place(rows);
         let from = usize::try_from(offset).map_err(|e| e.to_string())?;
         let bytes = usize::try_from(n).map_err(|e| e.to_string())? * size_of::<T>();
-        Column::foreign(rows.readback.clone(), from..from + bytes)
+        Column::shared(rows.readback.clone(), from..from + bytes)
             .ok_or_else(|| format!("{bytes} bytes at {from} are not a column"))
     };
-    pieces.iter().map(piece).collect::<Result<_, String>>().map(Column::pieced)
+    pieces.iter().map(piece).collect::<Result<_, String>>().map(Column::from_chunks)
 }
 
 /// Counters in a readback buffer.

@@ -4,7 +4,7 @@
 //! makes its triangles with the final vertex numbers. The mesh has the same bytes as that of one device.
 
 use super::job::Finished;
-use crate::surface::{Column, GridStats, Mesh, Meshed, Quantized, Stage};
+use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage};
 
 /// Number of devices for a job of `n_bricks`, given `idle` devices and a minimum of bricks per partition. A job runs on
 /// one device if the result is 1, which is always the case without a minimum.
@@ -39,19 +39,19 @@ pub(super) fn join(partitions: Vec<Finished>, has_flat_vertices: bool) -> Finish
         let surface_bricks = grid.surface_bricks + meshed.grid.surface_bricks;
         grid = GridStats { surface_bricks, ..meshed.grid };
     }
-    mesh.positions = Column::pieced(positions);
-    mesh.normals = Column::pieced(normals);
+    mesh.positions = Column::from_chunks(positions);
+    mesh.normals = Column::from_chunks(normals);
     mesh.quantized = step.map(|step| Quantized {
         step,
-        positions: Column::pieced(quantized_positions),
-        normals: Column::pieced(quantized_normals),
+        positions: Column::from_chunks(quantized_positions),
+        normals: Column::from_chunks(quantized_normals),
     });
-    mesh.triangles = Column::pieced(triangles);
-    mesh.atom_ids = (!atom_ids.is_empty()).then(|| Column::pieced(atom_ids));
+    mesh.triangles = Column::from_chunks(triangles);
+    mesh.atom_ids = (!atom_ids.is_empty()).then(|| Column::from_chunks(atom_ids));
     if has_flat_vertices {
         mesh.fill_flat_normals();
     }
-    Finished { meshed: Meshed::new(mesh, grid), stages }
+    Finished { meshed: MeshOutput::new(mesh, grid), stages }
 }
 
 /// Maximum time per stage over all partitions, which run side by side.
@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn the_maximum_time_of_a_stage_counts() {
         let finished = |stages: &[(Stage, u64)]| Finished {
-            meshed: Meshed::new(Mesh::default(), GridStats::default()),
+            meshed: MeshOutput::new(Mesh::default(), GridStats::default()),
             stages: stages.to_vec(),
         };
         let all = [

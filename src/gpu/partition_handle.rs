@@ -11,7 +11,7 @@ use super::job::GpuJob;
 use super::plan::Partition;
 use super::plan::partition::total_len;
 use crate::surface::SurfaceError;
-use crate::surface::column::Foreign;
+use crate::surface::column::SharedBytes;
 
 /// Interval at which a waiting partition checks for cancellation and deadline. Published counts wake it at once.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
@@ -45,7 +45,7 @@ pub(super) struct PartitionCounts {
     pub(super) triangles: u64,
     /// Records and then offsets of the bricks that earlier partitions import, in the order of
     /// [`PartitionHandle::exports`].
-    pub(super) exported: Foreign,
+    pub(super) exported: SharedBytes,
 }
 
 /// Run of bricks that a partition imports from a later one.
@@ -55,7 +55,7 @@ pub(super) struct Import {
     pub(super) position: u64,
     /// Number of bricks in `exported`.
     pub(super) n_exported: u64,
-    pub(super) exported: Foreign,
+    pub(super) exported: SharedBytes,
     /// Number of vertices before the owner's partition.
     pub(super) first_vertex: u64,
 }

@@ -99,9 +99,13 @@ impl Renderer for GpuRenderer {
             (Err(DrawError::Picture(error)), _) => Err(error),
             (Err(DrawError::Device(why)), None) => Err(PictureError::Device { why }),
             (Err(DrawError::Device(why)), Some(cpu)) => {
-                let instead = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
-                let served =
-                    Served { backend: cpu.name(), arithmetic: cpu.arithmetic(), device: cpu.describe(), instead };
+                let fallback_reason = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
+                let served = Served {
+                    backend: cpu.name(),
+                    arithmetic: cpu.arithmetic(),
+                    device: cpu.describe(),
+                    fallback_reason,
+                };
                 Ok(Rendered { served: Some(served), ..cpu.render(mesh, params, control)? })
             }
         }

@@ -68,7 +68,7 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
                 (None, None)
             };
             let mut product =
-                pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref())
+                pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref(), None)
                     .map_err(|error| explained(shared, &task.input, error))?;
             if let Some(picture) = &task.job.picture {
                 pipeline::draw(&mut product, picture, &shared.drawer, &cancel, progress.as_ref())

@@ -19,8 +19,8 @@ pub fn draw(
     let clock = StageClock::new(progress);
     let mut mesh = std::mem::take(&mut product.mesh);
     let drawn = clock.time("draw", || {
-        // Corners are looked up anywhere.
-        mesh.settle();
+        // The renderer needs random access to the corners.
+        mesh.make_contiguous();
         let control = Control { cancel: cancel.clone(), deadline: None, observer: &clock };
         drawer.renderer.render(&mesh, params, &control)
     })?;

@@ -155,7 +155,7 @@ mod tests {
             let job = params::parse([("resolution", resolution)]).unwrap().job;
             let (limits, cancel) = (JobLimits::default(), CancelToken::default());
             let estimate = estimate(SAMPLE, &job, &limits, &choice, &cancel).unwrap();
-            let report = run(SAMPLE, &job, &limits, &choice, &cancel, &()).unwrap().report;
+            let report = run(SAMPLE, &job, &limits, &choice, &cancel, &(), None).unwrap().report;
             let mesh = estimate.mesh.unwrap();
             assert_eq!((mesh.samples, estimate.atoms), (report.samples, report.atoms));
             let ratio = mesh.triangles as f64 / report.triangles as f64;

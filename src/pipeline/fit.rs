@@ -7,7 +7,7 @@
 use super::clock::StageClock;
 use super::spacing::{COARSEST, FINEST, Spacing};
 use super::{Choice, Job};
-use crate::surface::{Control, Meshed, Observer, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams};
+use crate::surface::{Control, MeshOutput, Observer, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams};
 
 /// Meshes that are made at most, the first coarse one and a last one again included.
 pub(super) const MOST_TRIES: u32 = 8;
@@ -149,7 +149,7 @@ fn rounded(spacing: f64) -> f64 {
 
 /// A mesh whose spacing was searched for.
 pub(super) struct Fitted {
-    pub(super) meshed: Meshed,
+    pub(super) output: MeshOutput,
     pub(super) resolution: f64,
     /// Meshes that were made.
     pub(super) tries: u32,
@@ -171,14 +171,14 @@ pub(super) fn mesh(
 ) -> Result<Fitted, SurfaceError> {
     let mut search = Search::new(limit, &job.params, spheres.len());
     // What was made last, and who made it.
-    let mut last: Option<(f64, Meshed)> = None;
+    let mut last: Option<(f64, MeshOutput)> = None;
     let mut served = None;
     let mut restarted = false;
     loop {
         let (spacing, again) = match search.next() {
             Next::Try(spacing) => (spacing, false),
             Next::Take(spacing) => match last.take().filter(|(made, _)| made.total_cmp(&spacing).is_eq()) {
-                Some((resolution, meshed)) => return Ok(Fitted { meshed, resolution, tries: search.tries() }),
+                Some((resolution, meshed)) => return Ok(Fitted { output: meshed, resolution, tries: search.tries() }),
                 None => (spacing, true),
             },
             Next::Refuse { resolution, triangles } => return Err(refusal(&job.params, limit, resolution, triangles)),
@@ -208,7 +208,7 @@ pub(super) fn mesh(
             // The same input gives the same mesh: it fits as it did.
             let meshed = made.filter(|_| triangles.is_some_and(|n| n <= limit));
             let meshed = meshed.ok_or_else(|| SurfaceError::Device { why: "two runs gave two meshes".into() })?;
-            return Ok(Fitted { meshed, resolution: spacing, tries: search.tries() });
+            return Ok(Fitted { output: meshed, resolution: spacing, tries: search.tries() });
         }
         last = made.map(|meshed| (spacing, meshed));
     }
@@ -241,7 +241,7 @@ pub(super) fn expected(
 }
 
 /// A mesh, or none where atoms fell through the grid.
-fn some(made: Result<Meshed, SurfaceError>) -> Result<Option<Meshed>, SurfaceError> {
+fn some(made: Result<MeshOutput, SurfaceError>) -> Result<Option<MeshOutput>, SurfaceError> {
     match made {
         Err(SurfaceError::NoSurface { .. }) => Ok(None),
         made => made.map(Some),

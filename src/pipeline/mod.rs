@@ -1,4 +1,4 @@
-//! One job from end to end: structure bytes to spheres to mesh to report. No HTTP, no paths, no queue.
+//! One job from end to end: structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
 mod clock;
 mod draw;
@@ -31,34 +31,34 @@ use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, U
 use crate::picture::{PictureError, PictureLimits, PictureParams};
 use crate::structure::{self, ReadLimits, Selected, Selection, Structure, StructureError};
 use crate::surface::{
-    Backend, CancelToken, Control, Measures, Mesh, Meshed, Proof, Spheres, Stage, SurfaceError, SurfaceLimits,
-    SurfaceParams, lattice,
+    Backend, CancelToken, Control, Measures, Mesh, MeshOutput, MeshSink, SinkFailed, Spheres, Stage, SurfaceError,
+    SurfaceLimits, SurfaceParams, Validation, lattice,
 };
 use report::Counts;
 
-/// Everything that decides what a mesh looks like, and how its vertices are stored.
+/// Parameters of a job: the surface, and how the mesh is stored.
 #[derive(Debug, Clone, Default)]
 pub struct Job {
-    /// Which atoms.
+    /// Selection of atoms.
     pub selection: Selection,
-    /// Which surface. Its resolution stands where `spacing` is [`Spacing::Given`].
+    /// Parameters of the surface. The resolution applies if `spacing` is [`Spacing::Given`].
     pub params: SurfaceParams,
-    /// How the resolution is chosen.
+    /// Choice of the grid spacing.
     pub spacing: Spacing,
-    /// How the mesh is proven closed and manifold.
-    pub proof: Proof,
-    /// How vertices are stored, in formats that have a choice.
+    /// Method that checks whether the mesh is watertight.
+    pub validation: Validation,
+    /// Encoding of vertices, in formats that support several.
     pub compress: Compress,
-    /// Whether vertices have normals, in formats that have a choice.
+    /// Vertex normals, in formats where they are optional.
     pub normals: Normals,
-    /// The units of a file's coordinates.
+    /// Units of the file's coordinates.
     pub units: Units,
-    /// What a picture of the mesh is to look like; none: the mesh itself is wanted.
+    /// Parameters of a picture of the mesh; `None` for a mesh file.
     pub picture: Option<PictureParams>,
 }
 
 impl Job {
-    /// Fails where its picture would be larger than allowed: before anything else is done for it.
+    /// Checks the size of the picture before any other work.
     ///
     /// # Errors
     /// [`JobError::Picture`].
@@ -66,7 +66,16 @@ impl Job {
         self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
     }
 
-    /// The parameters for so many atoms, where the resolution does not hang on the mesh.
+    /// Returns true if the mesh can be written without being held as a whole. Atoms by vertex, the exact validation and a
+    /// bound on triangles need the whole mesh.
+    fn can_stream(&self) -> bool {
+        !self.params.atom_ids
+            && self.validation == Validation::Checksum
+            && self.spacing.max_triangles().is_none()
+            && self.picture.is_none()
+    }
+
+    /// Parameters for a number of atoms, unless the resolution depends on the mesh.
     fn params_for(&self, atoms: usize) -> SurfaceParams {
         let resolution = match self.spacing {
             Spacing::Detail(level) => spacing::of_detail(level, atoms as f64),
@@ -85,15 +94,15 @@ pub struct JobLimits {
     pub surface: SurfaceLimits,
     /// Limits of drawing.
     pub picture: PictureLimits,
-    /// When the mesh must be there; none: whenever.
+    /// Time by which the mesh must be finished.
     pub deadline: Option<Instant>,
 }
 
-/// A backend and the reason why it was taken, for reports and logs.
+/// Chosen backend and the reason for the choice, for reports and logs.
 pub struct Choice<'a> {
     /// The backend.
     pub backend: &'a dyn Backend,
-    /// Why it was taken, in words.
+    /// Reason for the choice.
     pub reason: &'a str,
 }
 
@@ -102,23 +111,25 @@ pub struct Choice<'a> {
 pub struct Product {
     /// The mesh.
     pub mesh: Mesh,
-    /// How a file stores it.
+    /// Encoding in a file.
     pub storage: Storage,
-    /// What was measured.
+    /// Report of the job.
     pub report: Report,
-    /// The PNG, once it was drawn: then the mesh is gone.
+    /// The PNG, once it is drawn; the mesh is then dropped.
     pub picture: Option<Vec<u8>>,
+    /// Length of the GLB that the mesh was written to instead of `mesh`, whose columns are then empty.
+    pub streamed_bytes: Option<u64>,
 }
 
 impl Product {
-    /// What a mesh file says about this product.
+    /// Metadata for a mesh file.
     #[must_use]
     pub fn meta(&self) -> Meta {
         Meta { name: self.report.id.clone(), extras: self.report.extras() }
     }
 }
 
-/// Why a job failed.
+/// Error of a job.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum JobError {
     /// Reading or selecting failed.
@@ -135,7 +146,7 @@ pub enum JobError {
 impl From<PictureError> for JobError {
     fn from(error: PictureError) -> Self {
         match error {
-            // Whoever stops a job asks for one kind of end.
+            // Cancellation has a single error, whatever the stage.
             PictureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
             PictureError::Device { why } => Self::Surface(SurfaceError::Device { why }),
             error => Self::Picture(error),
@@ -143,29 +154,13 @@ impl From<PictureError> for JobError {
     }
 }
 
-/// A job whose mesh went into a sink.
-#[derive(Debug, Clone)]
-pub struct Poured {
-    /// What was measured.
-    pub report: Report,
-    /// What to add to a position to get the structure file's own coordinates, Å.
-    pub centre: [f64; 3],
-    /// Lowest and highest relative position per axis, Å.
-    pub bounds: [[f32; 3]; 2],
-}
-
-impl Poured {
-    /// What a mesh file says about this job.
-    #[must_use]
-    pub fn meta(&self) -> Meta {
-        Meta { name: self.report.id.clone(), extras: self.report.extras() }
-    }
-}
-
 /// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh.
 ///
+/// A mesh for a GLB file goes straight into `sink`, if there is one and the job does not need the whole mesh in memory;
+/// [`Product::streamed_bytes`] is set in that case.
+///
 /// # Errors
-/// Any [`JobError`].
+/// Any [`JobError`]; [`SurfaceError::Sink`] if `sink` failed.
 pub fn run(
     bytes: &[u8],
     job: &Job,
@@ -173,90 +168,55 @@ pub fn run(
     choice: &Choice<'_>,
     cancel: &CancelToken,
     progress: &dyn ProgressSink,
+    sink: Option<&GlbSink<'_>>,
 ) -> Result<Product, JobError> {
     job.check(limits)?;
     let clock = StageClock::new(progress);
     let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
     let mut params = job.params_for(spheres.len());
-    let (mut meshed, tries, storage) = if let Spacing::MaxTriangles(most) = job.spacing {
+    let sink = sink.filter(|_| job.can_stream());
+    let (output, tries, storage) = if let Spacing::MaxTriangles(most) = job.spacing {
         let fitted = fit::mesh(&spheres, job, most, &limits.surface, choice, &clock, &control)?;
         params.resolution = fitted.resolution;
-        (fitted.meshed, Some(fitted.tries), storage(job, &mut params, &spheres))
+        let storage = storage(job, &mut params, &spheres);
+        (fitted.output, Some(fitted.tries), storage)
     } else {
         let storage = storage(job, &mut params, &spheres);
-        (clock.pass(|| choice.backend.run(&spheres, &params, &limits.surface, &control))?, None, storage)
+        if let Some(sink) = sink {
+            sink.store(storage);
+        }
+        let sink = sink.map(|sink| sink as &dyn MeshSink);
+        (clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink))?, None, storage)
     };
-    // What a backend that does not round has measured is not what is handed on.
-    if let Some(step) = params.quantize
-        && meshed.mesh.quantize(step)
-    {
-        meshed.measures = None;
-    }
-    if let Some(ids) = &mut meshed.mesh.atom_ids {
-        // The core speaks of spheres; people ask for atoms of the file.
+    let [n_vertices, n_triangles] = output.size();
+    let MeshOutput { mut mesh, streamed, grid, measures, served } = output;
+    if let Some(ids) = &mut mesh.atom_ids {
+        // The core numbers spheres; the result numbers atoms of the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
     }
-    let measures = match meshed.measures.take().filter(|taken| taken.proof == job.proof) {
-        Some(taken) => taken,
+    let measures = match measures.filter(|measures| measures.validation == job.validation) {
+        Some(measures) => measures,
         None => clock.time(Stage::Measure.name(), || {
-            // Triangles ask for positions anywhere; normals stay where several devices put them.
-            meshed.mesh.settle_geometry();
-            Measures::of(&meshed.mesh, job.proof, &control)
+            mesh.make_geometry_contiguous();
+            Measures::of(&mesh, job.validation, &control)
         })?,
     };
-    let Meshed { mesh, grid, served, .. } = meshed;
-    let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
     let (resolution, centre) = (params.resolution, mesh.centre);
     let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, served, storage };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
-    Ok(Product { mesh, storage, report, picture: None })
+    let mut product = Product { mesh, storage, report, picture: None, streamed_bytes: None };
+    if let (Some(sink), Some(streamed)) = (sink, streamed) {
+        let clock = StageClock::new(progress);
+        let finish = || sink.finish(&product.meta(), centre, streamed.bounds);
+        let bytes = clock.time("encode", finish).map_err(|SinkFailed| SurfaceError::Sink)?;
+        product.streamed_bytes = Some(bytes);
+        clock.finish().into_iter().for_each(|(stage, ms)| product.report.add_timing(stage, ms));
+    }
+    Ok(product)
 }
 
-/// Whether [`pour`] can run a job: atoms by vertex and the exact proof need the whole mesh, and a bound on triangles meshes that
-/// are not kept.
-#[must_use]
-pub fn can_pour(job: &Job) -> bool {
-    !job.params.atom_ids && job.proof == Proof::Checksum && job.spacing.max_triangles().is_none()
-}
-
-/// Runs a job that [`can_pour`], handing the mesh on to `sink` part by part, packed as the job asks: the same mesh and report
-/// as [`run`] gives, but the mesh is never held as a whole.
-///
-/// # Errors
-/// Any [`JobError`]; [`SurfaceError::Sink`] if `sink` failed.
-pub fn pour(
-    bytes: &[u8],
-    job: &Job,
-    limits: &JobLimits,
-    choice: &Choice<'_>,
-    cancel: &CancelToken,
-    progress: &dyn ProgressSink,
-    sink: &GlbSink<'_>,
-) -> Result<Poured, JobError> {
-    let clock = StageClock::new(progress);
-    let (structure, selected, spheres) = read(bytes, job, limits, &clock)?;
-    let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
-    let mut params = job.params_for(spheres.len());
-    let storage = storage(job, &mut params, &spheres);
-    sink.store(storage);
-    let poured = clock.pass(|| choice.backend.pour(&spheres, &params, &limits.surface, &control, sink))?;
-    let counts = Counts {
-        resolution: params.resolution,
-        centre: poured.centre,
-        tries: None,
-        grid: poured.grid,
-        n_vertices: poured.n_vertices,
-        n_triangles: poured.n_triangles,
-        served: poured.served,
-        storage,
-    };
-    let report = Report::new(&structure, &selected, job, choice, &counts, &poured.measures, clock.finish());
-    Ok(Poured { report, centre: poured.centre, bounds: poured.bounds })
-}
-
-/// How the mesh of `spheres` is stored; `params` ask the backend for vertices of that kind then. Depends on nothing that the
-/// backend computes: a file can be written, and a device can fill it, before the mesh is known.
+/// Storage of the mesh of `spheres`; also sets the vertex encoding in `params`. Known before the mesh is computed.
 fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage {
     params.quantize = match job.compress {
         Compress::None => None,
@@ -266,7 +226,7 @@ fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage 
     Storage { packing, normals: job.normals, units: job.units }
 }
 
-/// Bytes to spheres.
+/// Reads a structure and selects its spheres.
 fn read(
     bytes: &[u8],
     job: &Job,

@@ -19,7 +19,7 @@ use super::{Job, Spacing};
 use crate::formats::{Compress, Format, Normals, Units};
 use crate::picture::{Background, MOST_SIDE, PictureParams, Style, View};
 use crate::structure::Selection;
-use crate::surface::{Kernel, PaperParams, Preset, Proof, SurfaceError, SurfaceOptions, SurfaceParams};
+use crate::surface::{Kernel, PaperParams, Preset, SurfaceError, SurfaceOptions, SurfaceParams, Validation};
 
 /// Why parameters are refused.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -222,7 +222,7 @@ fn set(
             expected: e.expected,
         })?,
         "altloc" => selection.altloc = Some(one_char(text).ok_or_else(bad)?),
-        "proof" => request.job.proof = named(&PROOFS, Proof::name, text).ok_or_else(bad)?,
+        "validation" => request.job.validation = named(&VALIDATIONS, Validation::name, text).ok_or_else(bad)?,
         "check" => request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
         "format" => request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
         "compress" => request.job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
@@ -259,7 +259,7 @@ fn set_picture(parameter: &Parameter, text: &str, picture: &mut PictureParams) -
     Ok(())
 }
 
-const PROOFS: [Proof; 2] = [Proof::Checksum, Proof::Exact];
+const VALIDATIONS: [Validation; 2] = [Validation::Checksum, Validation::Exact];
 
 /// The value of this name.
 fn named<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, text: &str) -> Option<T> {
@@ -286,7 +286,7 @@ fn one_char(text: &str) -> Option<char> {
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a field that is added without a place here does not compile.
-    let Job { selection, params, spacing, proof, compress, normals, units, picture } = job;
+    let Job { selection, params, spacing, validation, compress, normals, units, picture } = job;
     let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = selection;
     let SurfaceParams {
         kernel,
@@ -312,8 +312,8 @@ pub fn canonical(job: &Job) -> String {
         "kernel={kernel}&{spacing}&isovalue={isovalue}&smoothness={smoothness}\
          &radius_scale={radius_scale}&radius_offset={radius_offset}&cutoff_tolerance={cutoff_tolerance}\
          &preset={preset}&atom_ids={atom_ids}&model={model:?}&chains={chains:?}&polymer={polymer}\
-         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}&proof={}&compress={}&normals={}&units={}",
-        proof.name(),
+         &ligands={ligands}&waters={waters}&hydrogens={hydrogens}&altloc={altloc:?}&validation={}&compress={}&normals={}&units={}",
+        validation.name(),
         compress.name(),
         normals.name(),
         units.name()

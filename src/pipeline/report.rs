@@ -144,7 +144,7 @@ impl PictureReport {
             backend: drawer.renderer.name(),
             arithmetic: drawer.renderer.arithmetic(),
             device: drawer.renderer.describe(),
-            instead: None,
+            fallback_reason: None,
         });
         Self {
             width: params.width,
@@ -158,11 +158,11 @@ impl PictureReport {
             renderer: served.backend,
             arithmetic: served.arithmetic,
             device: served.device,
-            reason: match &served.instead {
+            reason: match &served.fallback_reason {
                 Some(why) => format!("{}; but {why}", drawer.reason),
                 None => drawer.reason.clone(),
             },
-            fallback: served.instead,
+            fallback: served.fallback_reason,
         }
     }
 }
@@ -235,7 +235,7 @@ pub struct Report {
     /// Manifold edges and vertices.
     pub manifold: bool,
     /// How the last three were established: `checksum` or `exact`.
-    pub proof: &'static str,
+    pub validation: &'static str,
     /// V − E + F.
     pub euler: i64,
     /// Number of connected components.
@@ -309,7 +309,7 @@ impl Report {
             backend: choice.backend.name(),
             arithmetic: choice.backend.arithmetic(),
             device: choice.backend.describe(),
-            instead: None,
+            fallback_reason: None,
         });
         let mut voids: Vec<&Component> = measures.components.iter().filter(|c| c.volume < 0.0).collect();
         voids.sort_by(|a, b| a.volume.total_cmp(&b.volume));
@@ -341,7 +341,7 @@ impl Report {
             closed: measures.closed,
             oriented: measures.oriented,
             manifold: measures.manifold,
-            proof: measures.proof.name(),
+            validation: measures.validation.name(),
             euler: measures.euler,
             components: measures.components.len() as u64,
             voids: voids.len() as u64,
@@ -356,11 +356,11 @@ impl Report {
             backend: served.backend,
             arithmetic: served.arithmetic,
             device: served.device,
-            backend_reason: match &served.instead {
+            backend_reason: match &served.fallback_reason {
                 Some(why) => format!("{}; but {why}", choice.reason),
                 None => choice.reason.to_owned(),
             },
-            fallback: served.instead,
+            fallback: served.fallback_reason,
             picture: None,
             timings_ms: timings
                 .into_iter()

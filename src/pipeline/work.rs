@@ -13,7 +13,7 @@ const BINARY: f64 = 5.0;
 /// for a large one.
 const DESCRIPTION: f64 = 150e3;
 /// Work of the smallest job, in atoms.
-const LEAST: f64 = 2_000.0;
+const MIN_WORK: f64 = 2_000.0;
 /// Time of a mesh whose spacing is searched for, relative to the final one: a coarse mesh precedes it, and sometimes a
 /// third is needed.
 const TRIES: f64 = 1.5;
@@ -37,7 +37,7 @@ pub fn work(input: &[u8], job: &Job) -> f64 {
     let fineness = 0.5 / job.spacing.expected(&job.params, atoms);
     let again = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
     let pixels = job.picture.map_or(0.0, |picture| f64::from(picture.width) * f64::from(picture.height));
-    (atoms + LEAST) * (0.3 + 0.7 * again * fineness.powf(2.5)) + PIXEL * pixels
+    (atoms + MIN_WORK) * (0.3 + 0.7 * again * fineness.powf(2.5)) + PIXEL * pixels
 }
 
 #[cfg(test)]

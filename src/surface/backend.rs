@@ -1,151 +1,183 @@
-//! What a backend is: something that turns spheres into a mesh.
+//! The trait of meshing backends, and the result of a run.
 
 use super::control::{Control, Stage};
 use super::devices::DeviceStatus;
 use super::error::SurfaceError;
-use super::measure::{Measures, Proof};
+use super::measure::{Measures, Validation};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::simd;
-use super::sink::{MeshPart, MeshSink, Poured, SinkFailed};
+use super::sink::{MeshPart, MeshSink, SinkFailed};
 use super::spheres::Spheres;
 
-/// What the grid of a run looked like.
+/// Statistics of the sampling grid of a run.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct GridStats {
-    /// Bricks (8 × 8 × 8 cells) that some sphere's support reaches.
+    /// Bricks (8 × 8 × 8 cells) within the support of at least one sphere.
     pub bricks: u64,
-    /// Bricks that the surface passes through.
+    /// Bricks that the surface intersects.
     pub surface_bricks: u64,
-    /// Samples at which the density was evaluated, each counted once.
+    /// Grid points at which the density was evaluated, each counted once.
     pub samples: u64,
-    /// Cells of the box around the structure, had the grid been dense.
+    /// Cells of the bounding box, as a dense grid would have them.
     pub box_cells: u64,
-    /// Sphere–brick pairs: the work of the field stage is 512 evaluations for each.
+    /// Sphere–brick pairs; the field stage performs 512 evaluations for each.
     pub candidates: u64,
 }
 
-/// A finished run.
+/// Result of a run.
 #[derive(Debug, Clone)]
-pub struct Meshed {
-    /// The mesh.
+pub struct MeshOutput {
+    /// The mesh. Its columns are empty if a sink took them.
     pub mesh: Mesh,
-    /// Its grid.
+    /// Size and bounds of the mesh if a sink took it.
+    pub streamed: Option<StreamedMesh>,
+    /// Statistics of the grid.
     pub grid: GridStats,
-    /// Its measures with [`Proof::Checksum`](super::measure::Proof::Checksum), if the backend took them on the way and
-    /// the mesh is closed. They are those of the vertices as the mesh has them: what [`Measures::of`] finds is the same up
-    /// to the rounding of single precision.
+    /// Measures of the vertices as delivered, validated by [`Validation::Checksum`]; `None` if the backend did not
+    /// measure. Always present if a sink took the mesh.
     pub measures: Option<Measures>,
-    /// Who made it, where that is known only afterwards: one of several devices, or a stand-in for them.
+    /// The backend that made the mesh, if that is known only after the run.
     pub served: Option<Served>,
 }
 
-impl Meshed {
-    /// The run of a backend that is one thing, always serves by itself, and did not measure.
+/// Size and bounds of a mesh that was written to a sink.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StreamedMesh {
+    /// Number of vertices.
+    pub n_vertices: usize,
+    /// Number of triangles.
+    pub n_triangles: usize,
+    /// Lowest and highest relative position per axis, Å.
+    pub bounds: [[f32; 3]; 2],
+}
+
+impl MeshOutput {
+    /// Result of a backend that keeps the mesh in memory and has not measured it.
     #[must_use]
     pub const fn new(mesh: Mesh, grid: GridStats) -> Self {
-        Self { mesh, grid, measures: None, served: None }
+        Self { mesh, streamed: None, grid, measures: None, served: None }
+    }
+
+    /// Number of vertices and triangles, wherever the mesh is.
+    #[must_use]
+    pub fn size(&self) -> [usize; 2] {
+        match &self.streamed {
+            Some(streamed) => [streamed.n_vertices, streamed.n_triangles],
+            None => [self.mesh.n_vertices(), self.mesh.n_triangles()],
+        }
+    }
+
+    /// Brings a mesh in memory to its destination: rounds vertices that `params` want quantized, and hands the mesh to
+    /// `sink`, if there is one, measured and in a single part.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Sink`] and [`SurfaceError::Cancelled`].
+    pub fn deliver(
+        mut self,
+        params: &SurfaceParams,
+        control: &Control<'_>,
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<Self, SurfaceError> {
+        if params.quantize.is_some_and(|step| self.mesh.quantize(step)) {
+            // The measures are those of the vertices before rounding.
+            self.measures = None;
+        }
+        let Some(sink) = sink else { return Ok(self) };
+        self.mesh.make_contiguous();
+        if self.measures.is_none() {
+            let measure = || Measures::of(&self.mesh, Validation::Checksum, control);
+            self.measures = Some(control.span(Stage::Measure, measure)?);
+        }
+        let (mesh, failed) = (std::mem::take(&mut self.mesh), |SinkFailed| SurfaceError::Sink);
+        let [n_vertices, n_triangles] = [mesh.n_vertices(), mesh.n_triangles()];
+        sink.begin(n_vertices, n_triangles).map_err(failed)?;
+        sink.part(&MeshPart::whole(&mesh)).map_err(failed)?;
+        self.streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds: mesh.bounds() });
+        self.mesh.centre = mesh.centre;
+        Ok(self)
     }
 }
 
-/// Who made a mesh.
+/// Identity of the backend that made a mesh.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Served {
-    /// The name of the backend that did, as [`Backend::name`] gives it.
+    /// Its name, as in [`Backend::name`].
     pub backend: &'static str,
-    /// Its arithmetic, as [`Backend::arithmetic`] gives it.
+    /// Its arithmetic, as in [`Backend::arithmetic`].
     pub arithmetic: String,
-    /// What it ran on, for people.
+    /// The hardware that it ran on, for display.
     pub device: String,
-    /// Why this one stood in for the backend that was asked; none where none had to.
-    pub instead: Option<String>,
+    /// The reason why this backend replaced the requested one; `None` if it did not.
+    pub fallback_reason: Option<String>,
 }
 
-/// Turns spheres into a mesh. The same input gives the same bytes, whatever the thread count.
+/// A meshing backend. The same input gives the same bytes on any number of threads.
 pub trait Backend: Send + Sync {
     /// Short stable name: `cpu`, `reference`, `gpu`.
     fn name(&self) -> &'static str;
 
-    /// Name of the arithmetic: equal names give equal bytes for equal input. Of several devices, that of the first one
-    /// that takes jobs. Part of the keys of results.
+    /// Name of the arithmetic: equal names give equal bytes for equal input. With several devices, that of the first one
+    /// that accepts jobs. Part of the keys of cached results.
     fn arithmetic(&self) -> String {
         format!("{} {}", self.name(), simd::arithmetic())
     }
 
-    /// What it runs on, for people: threads and vector extension, or the adapter's name.
+    /// Description of the hardware for display: threads and vector extension, or the adapter's name.
     fn describe(&self) -> String;
 
-    /// Meshes `spheres`.
+    /// Meshes `spheres`, in memory or, if there is a `sink`, into that. Both get the same rows.
     ///
     /// # Errors
-    /// Any [`SurfaceError`]; limits are checked before memory is allocated for them.
+    /// Any [`SurfaceError`]; limits are checked before memory is allocated. [`SurfaceError::Sink`] if the sink fails.
+    fn write(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError>;
+
+    /// Meshes `spheres` in memory.
+    ///
+    /// # Errors
+    /// As [`Self::write`].
     fn run(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError>;
-
-    /// Meshes `spheres` into `sink`: the same rows as [`Self::run`] returns, measured with
-    /// [`Proof::Checksum`]. A backend that need not hold the whole mesh for that does not.
-    ///
-    /// # Errors
-    /// As [`Self::run`], and [`SurfaceError::Sink`].
-    fn pour(
-        &self,
-        spheres: &Spheres,
-        params: &SurfaceParams,
-        limits: &SurfaceLimits,
-        control: &Control<'_>,
-        sink: &dyn MeshSink,
-    ) -> Result<Poured, SurfaceError> {
-        let Meshed { mut mesh, grid, measures, served } = self.run(spheres, params, limits, control)?;
-        // It is handed on in one part.
-        mesh.settle();
-        let measures = match measures {
-            Some(measures) => measures,
-            None => control.span(Stage::Measure, || Measures::of(&mesh, Proof::Checksum, control))?,
-        };
-        pour_whole(&mesh, sink)?;
-        let (n_vertices, n_triangles) = (mesh.n_vertices(), mesh.n_triangles());
-        Ok(Poured { centre: mesh.centre, n_vertices, n_triangles, bounds: mesh.bounds(), grid, measures, served })
+    ) -> Result<MeshOutput, SurfaceError> {
+        self.write(spheres, params, limits, control, None)
     }
 
-    /// Makes a first, tiny mesh on everything that it runs on: threads are started, code is paged in, and what cannot
-    /// work is found out.
+    /// Makes a first, tiny mesh on all threads and devices: starts threads, loads code and detects what does not work.
     ///
     /// # Errors
-    /// Those of [`Backend::run`].
+    /// As [`Self::write`].
     fn warm(&self) -> Result<(), SurfaceError> {
         let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
         self.run(&one_atom()?, &params, &limits, &Control::default()).map(|_mesh| ())
     }
 
-    /// Whether it can run jobs at all: a device is up, or something stands in for them.
+    /// Returns true if jobs can be run: a device or a fallback is available.
     fn able(&self) -> bool {
         let devices = self.devices();
         devices.is_empty() || devices.iter().any(|device| device.down.is_none())
     }
 
-    /// How the devices behind it are doing; empty where there are none but the processor.
+    /// Status of the devices; empty for backends that use the processor alone.
     fn devices(&self) -> Vec<DeviceStatus> {
         Vec::new()
     }
 }
 
-/// Hands a finished mesh on as one part.
-fn pour_whole(mesh: &Mesh, sink: &dyn MeshSink) -> Result<(), SurfaceError> {
-    let failed = |SinkFailed| SurfaceError::Sink;
-    sink.begin(mesh.n_vertices(), mesh.n_triangles()).map_err(failed)?;
-    let (vertices, triangles) = (mesh.vertices(), &mesh.triangles[..]);
-    sink.part(&MeshPart { first_vertex: 0, vertices, first_triangle: 0, triangles }).map_err(failed)
-}
-
-/// The smallest structure that has a surface: one carbon.
+/// The smallest structure that has a surface: one carbon atom.
 ///
 /// # Errors
-/// None that could be met: the sphere is a good one.
+/// Never in practice: the sphere is valid.
 pub fn one_atom() -> Result<Spheres, SurfaceError> {
     Spheres::new(vec![0.0], vec![0.0], vec![0.0], vec![1.7])
 }

@@ -1,7 +1,7 @@
-//! A column of a mesh: a slice of plain rows in memory that costs little to get.
+//! Column of a mesh: a slice of plain rows.
 //!
-//! Large columns come from the system as huge pages where it has them: faulting 350 MB in
-//! pages of 4 KiB took half as long as meshing them.
+//! Large columns are mapped with huge pages if the system has them: page faults of 4 KiB for 350 MB took half as long as
+//! meshing.
 
 use std::fmt;
 use std::ops::{Deref, DerefMut, Range};
@@ -11,22 +11,20 @@ use bytemuck::Pod;
 use memmap2::MmapMut;
 use rayon::prelude::*;
 
-use super::recycle::Recycled;
-
-/// From this many bytes on, a column is mapped.
+/// Size from which a column is mapped, bytes.
 const MAP_FROM: usize = 64 << 10;
-/// From this many bytes on, a mapped column asks for huge pages: two of them. Below, its pages are made present in one
-/// call instead of by a page fault each.
+/// Size from which a mapped column uses huge pages, bytes. The pages of smaller mappings are populated in one call instead
+/// of one page fault each.
 const HUGE_FROM: usize = 4 << 20;
 
-/// Bytes that one task copies.
+/// Bytes per copying task.
 const COPIED: usize = 4 << 20;
 
-/// Memory that somebody else owns and gives back when nobody looks at it any more.
-pub type Foreign = Arc<dyn AsRef<[u8]> + Send + Sync>;
+/// Memory with another owner, released with the last reference.
+pub type SharedBytes = Arc<dyn AsRef<[u8]> + Send + Sync>;
 
-/// Rows of a mesh: behaves like a slice. One that lies in several pieces is copied into one when it is first used as a
-/// slice; [`Self::pieces`] shows it as it lies.
+/// Rows of a mesh; dereferences to a slice. A column in several chunks is copied into one when it is first used as a slice;
+/// [`Self::pieces`] gives the chunks without a copy.
 pub struct Column<T: Pod>(Storage<T>);
 
 enum Storage<T: Pod> {
@@ -35,17 +33,13 @@ enum Storage<T: Pod> {
         map: MmapMut,
         bytes: usize,
     },
-    Recycled {
-        memory: Recycled,
-        bytes: usize,
-    },
-    Foreign {
-        owner: Foreign,
+    Shared {
+        owner: SharedBytes,
         bytes: Range<usize>,
     },
-    /// In order, none of them pieced.
-    Pieces {
-        pieces: Vec<Column<T>>,
+    /// In order; no chunk is itself in chunks.
+    Chunks {
+        chunks: Vec<Column<T>>,
         joined: OnceLock<Box<Column<T>>>,
     },
 }
@@ -60,26 +54,12 @@ impl<T: Pod> Column<T> {
             None => Self(Storage::Owned(vec![T::zeroed(); n])),
         }
     }
-
-    /// `n` rows of anything, for working memory that is written before it is read and soon dropped: earlier columns of
-    /// this kind serve again.
-    #[must_use]
-    pub(super) fn scratch(n: usize) -> Self {
-        let bytes = n * size_of::<T>();
-        if bytes < MAP_FROM {
-            return Self::zeroed(n);
-        }
-        match Recycled::new(bytes, || mapped(bytes)) {
-            Some(memory) => Self(Storage::Recycled { memory, bytes }),
-            None => Self::zeroed(n),
-        }
-    }
 }
 
-/// Zeroed memory from the system, where that is worth it.
+/// Maps zeroed memory; `None` if the column is small or the system refuses.
 fn mapped(bytes: usize) -> Option<MmapMut> {
     let map = MmapMut::map_anon(bytes).ok().filter(|_| bytes >= MAP_FROM)?;
-    // Advice only: where the kernel has no huge pages, small ones do.
+    // Advice only: kernels without huge pages ignore it.
     #[cfg(target_os = "linux")]
     let _advised =
         map.advise(if bytes >= HUGE_FROM { memmap2::Advice::HugePage } else { memmap2::Advice::PopulateWrite }).is_ok();
@@ -87,71 +67,71 @@ fn mapped(bytes: usize) -> Option<MmapMut> {
 }
 
 impl<T: Pod> Column<T> {
-    /// The rows in `bytes` of memory that somebody else owns, without a copy; kept until the column is dropped or
-    /// written to. `None` where the range does not lie in that memory, on a row's alignment, as whole rows.
+    /// Column over `bytes` of shared memory, without a copy; the memory is kept until the column is dropped or written to.
+    /// `None` if the range is out of bounds, misaligned, or not a whole number of rows.
     #[must_use]
-    pub fn foreign(owner: Foreign, bytes: Range<usize>) -> Option<Self> {
+    pub fn shared(owner: SharedBytes, bytes: Range<usize>) -> Option<Self> {
         let rows = (*owner).as_ref().get(bytes.clone())?;
         bytemuck::try_cast_slice::<u8, T>(rows).ok()?;
-        Some(Self(Storage::Foreign { owner, bytes }))
+        Some(Self(Storage::Shared { owner, bytes }))
     }
 
-    /// The rows of several columns, one after the other, where they lie.
+    /// Concatenates columns without a copy.
     #[must_use]
-    pub fn pieced(columns: Vec<Self>) -> Self {
-        let mut pieces = Vec::with_capacity(columns.len());
+    pub fn from_chunks(columns: Vec<Self>) -> Self {
+        let mut chunks = Vec::with_capacity(columns.len());
         for column in columns {
             match column.0 {
-                Storage::Pieces { pieces: own, .. } => pieces.extend(own),
+                Storage::Chunks { chunks: own, .. } => chunks.extend(own),
                 _ if column.is_empty() => {}
-                _ => pieces.push(column),
+                _ => chunks.push(column),
             }
         }
-        match pieces.len() {
+        match chunks.len() {
             0 => Self::default(),
-            1 => pieces.swap_remove(0),
-            _ => Self(Storage::Pieces { pieces, joined: OnceLock::new() }),
+            1 => chunks.swap_remove(0),
+            _ => Self(Storage::Chunks { chunks, joined: OnceLock::new() }),
         }
     }
 
-    /// The rows as they lie, in order: one slice unless they lie in pieces.
+    /// Contiguous runs of rows, in order: one unless the column is in chunks.
     pub fn pieces(&self) -> impl Iterator<Item = &[T]> {
-        let (whole, pieces): (Option<&[T]>, &[Self]) = match &self.0 {
-            Storage::Pieces { pieces, joined } if joined.get().is_none() => (None, pieces),
+        let (whole, chunks): (Option<&[T]>, &[Self]) = match &self.0 {
+            Storage::Chunks { chunks, joined } if joined.get().is_none() => (None, chunks),
             _ => (Some(self), &[]),
         };
-        whole.into_iter().chain(pieces.iter().map(|piece| &**piece))
+        whole.into_iter().chain(chunks.iter().map(|chunk| &**chunk))
     }
 
-    /// Copies pieces into one, and lets them go: what is used as a slice often need not be held twice.
-    pub fn settle(&mut self) {
-        if let Storage::Pieces { pieces, joined } = &mut self.0 {
+    /// Copies the chunks into one and drops them, so that the rows are not held twice.
+    pub fn make_contiguous(&mut self) {
+        if let Storage::Chunks { chunks, joined } = &mut self.0 {
             let joined = joined.take().map(|column| *column);
             *self = joined.unwrap_or_else(|| {
-                let n = pieces.iter().map(Self::len).sum();
-                Self::copied(n, pieces.iter().map(|piece| &**piece))
+                let n = chunks.iter().map(Self::len).sum();
+                Self::copied(n, chunks.iter().map(|chunk| &**chunk))
             });
         }
     }
 
-    /// Whether there are no rows.
+    /// Returns true if there are no rows.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Number of rows; joins no pieces.
+    /// Number of rows. Does not join chunks.
     #[must_use]
     pub fn len(&self) -> usize {
         match &self.0 {
             Storage::Owned(rows) => rows.len(),
-            Storage::Mapped { bytes, .. } | Storage::Recycled { bytes, .. } => bytes / size_of::<T>(),
-            Storage::Foreign { bytes, .. } => bytes.len() / size_of::<T>(),
-            Storage::Pieces { pieces, .. } => pieces.iter().map(Self::len).sum(),
+            Storage::Mapped { bytes, .. } => bytes / size_of::<T>(),
+            Storage::Shared { bytes, .. } => bytes.len() / size_of::<T>(),
+            Storage::Chunks { chunks, .. } => chunks.iter().map(Self::len).sum(),
         }
     }
 
-    /// The rows as a vector, to add or remove some. Copies a column that is none yet.
+    /// Rows as a vector, for adding and removing. Copies the column if it is not one yet.
     pub fn edit(&mut self) -> &mut Vec<T> {
         if !matches!(self.0, Storage::Owned(_)) {
             self.0 = Storage::Owned(self.to_vec());
@@ -162,18 +142,18 @@ impl<T: Pod> Column<T> {
         }
     }
 
-    /// A copy in one piece.
-    fn copied<'a>(n: usize, pieces: impl Iterator<Item = &'a [T]>) -> Self
+    /// Copies chunks into one column of `n` rows.
+    fn copied<'a>(n: usize, chunks: impl Iterator<Item = &'a [T]>) -> Self
     where
         T: 'a,
     {
         let mut copy = Self::zeroed(n);
         let mut rest: &mut [u8] = bytemuck::cast_slice_mut(&mut copy[..]);
         let mut copies = Vec::new();
-        for piece in pieces {
-            let piece: &[u8] = bytemuck::cast_slice(piece);
-            let (target, tail) = std::mem::take(&mut rest).split_at_mut(piece.len());
-            copies.extend(target.chunks_mut(COPIED).zip(piece.chunks(COPIED)));
+        for chunk in chunks {
+            let chunk: &[u8] = bytemuck::cast_slice(chunk);
+            let (target, tail) = std::mem::take(&mut rest).split_at_mut(chunk.len());
+            copies.extend(target.chunks_mut(COPIED).zip(chunk.chunks(COPIED)));
             rest = tail;
         }
         copies.into_par_iter().for_each(|(target, source)| target.copy_from_slice(source));
@@ -187,13 +167,12 @@ impl<T: Pod> Deref for Column<T> {
     fn deref(&self) -> &[T] {
         match &self.0 {
             Storage::Owned(rows) => rows,
-            // A mapping begins on a page boundary, so any plain row type is aligned.
+            // Mappings begin at a page boundary, which aligns every plain row type.
             Storage::Mapped { map, bytes } => bytemuck::cast_slice(&map[..*bytes]),
-            Storage::Recycled { memory, bytes } => bytemuck::cast_slice(&memory[..*bytes]),
             // Checked when the column was made.
-            Storage::Foreign { owner, bytes } => bytemuck::cast_slice(&(**owner).as_ref()[bytes.clone()]),
-            Storage::Pieces { pieces, joined } => {
-                let rows = || pieces.iter().map(|piece| &**piece);
+            Storage::Shared { owner, bytes } => bytemuck::cast_slice(&(**owner).as_ref()[bytes.clone()]),
+            Storage::Chunks { chunks, joined } => {
+                let rows = || chunks.iter().map(|chunk| &**chunk);
                 joined.get_or_init(|| Box::new(Self::copied(self.len(), rows())))
             }
         }
@@ -202,15 +181,14 @@ impl<T: Pod> Deref for Column<T> {
 
 impl<T: Pod> DerefMut for Column<T> {
     fn deref_mut(&mut self) -> &mut [T] {
-        if matches!(self.0, Storage::Foreign { .. } | Storage::Pieces { .. }) {
-            // What belongs to somebody else is only read: the first write makes a copy.
+        if matches!(self.0, Storage::Shared { .. } | Storage::Chunks { .. }) {
+            // Shared memory is read-only: the first write makes a copy.
             *self = self.clone();
         }
         match &mut self.0 {
             Storage::Owned(rows) => rows,
             Storage::Mapped { map, bytes } => bytemuck::cast_slice_mut(&mut map[..*bytes]),
-            Storage::Recycled { memory, bytes } => bytemuck::cast_slice_mut(&mut memory[..*bytes]),
-            Storage::Foreign { .. } | Storage::Pieces { .. } => unreachable!("copied by now"),
+            Storage::Shared { .. } | Storage::Chunks { .. } => unreachable!("copied by now"),
         }
     }
 }
@@ -271,45 +249,46 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_foreign_column_is_read_in_place_and_copied_when_written() {
-        let owner: Foreign = Arc::new([7_u32, 8, 9, 10].iter().flat_map(|v| v.to_ne_bytes()).collect::<Vec<u8>>());
+    fn a_shared_column_is_read_in_place_and_copied_when_written() {
+        let owner: SharedBytes = Arc::new([7_u32, 8, 9, 10].iter().flat_map(|v| v.to_ne_bytes()).collect::<Vec<u8>>());
         let start = (*owner).as_ref().as_ptr().align_offset(4);
         assert_eq!(start, 0, "an allocation of 16 bytes is aligned to 4");
-        let mut column: Column<u32> = Column::foreign(owner.clone(), 4..12).unwrap();
+        let mut column: Column<u32> = Column::shared(owner.clone(), 4..12).unwrap();
         assert_eq!(column.to_vec(), [8, 9]);
         assert_eq!(Arc::strong_count(&owner), 2);
         column[0] = 1;
         assert_eq!((column.to_vec(), Arc::strong_count(&owner)), (vec![1, 9], 1));
-        let mut other: Column<u32> = Column::foreign(owner.clone(), 0..16).unwrap();
+        let mut other: Column<u32> = Column::shared(owner.clone(), 0..16).unwrap();
         other.edit().push(3);
         assert_eq!(other.to_vec(), [7, 8, 9, 10, 3]);
         for bad in [1..5, 0..6, 8..20] {
-            assert!(Column::<u32>::foreign(owner.clone(), bad).is_none());
+            assert!(Column::<u32>::shared(owner.clone(), bad).is_none());
         }
     }
 
     #[test]
-    fn a_pieced_column_is_shown_as_it_lies_and_joined_when_used_as_a_slice() {
+    fn a_column_in_chunks_is_joined_when_used_as_a_slice() {
         let of = |rows: &[u32]| Column::from(rows.to_vec());
-        let pieced = || Column::pieced(vec![of(&[1, 2]), of(&[]), Column::pieced(vec![of(&[3]), of(&[4, 5])])]);
-        let column = pieced();
+        let chunked =
+            || Column::from_chunks(vec![of(&[1, 2]), of(&[]), Column::from_chunks(vec![of(&[3]), of(&[4, 5])])]);
+        let column = chunked();
         assert_eq!(column.pieces().collect::<Vec<_>>(), [&[1, 2][..], &[3], &[4, 5]]);
         assert_eq!((column.len(), column.clone().pieces().count()), (5, 1));
         assert_eq!(column.pieces().count(), 3, "a copy leaves it as it is");
         assert_eq!((column[3], column.len()), (4, 5));
         assert_eq!(column.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
-        let mut written = pieced();
+        let mut written = chunked();
         written[4] = 9;
         assert_eq!(written.to_vec(), [1, 2, 3, 4, 9]);
-        let mut settled = pieced();
-        settled.settle();
-        assert_eq!(settled.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
-        assert!(matches!(settled.0, Storage::Owned(_)));
-        let mut longer = pieced();
+        let mut contiguous = chunked();
+        contiguous.make_contiguous();
+        assert_eq!(contiguous.pieces().collect::<Vec<_>>(), [[1, 2, 3, 4, 5]]);
+        assert!(matches!(contiguous.0, Storage::Owned(_)));
+        let mut longer = chunked();
         longer.edit().push(6);
         assert_eq!(longer.len(), 6);
-        assert_eq!(Column::pieced(vec![of(&[]), of(&[7])]).pieces().collect::<Vec<_>>(), [[7]]);
-        assert_eq!(Column::<u32>::pieced(Vec::new()).len(), 0);
+        assert_eq!(Column::from_chunks(vec![of(&[]), of(&[7])]).pieces().collect::<Vec<_>>(), [[7]]);
+        assert_eq!(Column::<u32>::from_chunks(Vec::new()).len(), 0);
     }
 
     #[test]
@@ -326,12 +305,6 @@ mod tests {
             assert_eq!(column, column.clone());
             column.edit().push([4.0; 3]);
             assert_eq!((column.len(), column.last()), (n + 1, Some(&[4.0; 3])));
-            let mut scratch: Column<[f32; 3]> = Column::scratch(n);
-            assert_eq!(scratch.len(), n);
-            scratch.fill([5.0; 3]);
-            assert_eq!(scratch, Column::from(vec![[5.0; 3]; n]));
-            scratch.edit().push([6.0; 3]);
-            assert_eq!((scratch.len(), scratch.last()), (n + 1, Some(&[6.0; 3])));
         }
     }
 }

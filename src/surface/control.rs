@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use super::error::SurfaceError;
 
-/// The stages of a meshing run, in order; `measure` is the proof that follows them.
+/// Stages of a meshing run, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Stage {
     /// Atoms to occupied bricks and their candidate lists.
@@ -21,9 +21,9 @@ pub enum Stage {
     Interpolate,
     /// Triangle indices.
     Emit,
-    /// Handing finished parts of the mesh on.
+    /// Writing finished parts of the mesh to a sink.
     Write,
-    /// Area, volume, components, closedness.
+    /// Area, volume, components and the check that the mesh is watertight.
     Measure,
 }
 

@@ -12,9 +12,7 @@ use super::error::SurfaceError;
 use super::kernel::Profile;
 use super::params::SurfaceParams;
 use super::simd::dispatched;
-use super::sort::sorted;
 use super::spheres::Spheres;
-use super::split::{Caller, each};
 
 /// Samples along a brick's edge.
 pub const BRICK: i32 = 8;
@@ -78,9 +76,7 @@ impl Lattice {
         let (smallest, largest) = spheres.radius_range();
         params.check_radius(smallest)?;
         let largest = effective_radius(largest, params);
-        let caller = Caller::new();
-        let few = caller.few(spheres.len());
-        let atoms = Placing { spheres, params, profile: &profile }.in_canonical_order([lo, hi], few);
+        let atoms = Placing { spheres, params, profile: &profile }.in_canonical_order([lo, hi]);
         let margin = 2.0 * profile.reach(profile.length(largest));
         let box_cells = (0..3).map(|k| ((hi[k] - lo[k] + margin) / spacing).ceil()).product::<f64>();
         Ok(Self {
@@ -154,21 +150,21 @@ impl Placing<'_> {
     }
 
     /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order last.
-    /// `bounds`: lowest and highest coordinates; `few`: on this thread.
-    fn in_canonical_order(&self, bounds: [[f64; 3]; 2], few: bool) -> Column<LatticeAtom> {
+    /// `bounds`: lowest and highest coordinates.
+    fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
         let n = self.spheres.len();
         // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
         let rank =
             TileRanks::new(bounds.map(|c| tile_of(self.cell(c))), n, |i| tile_of(self.cell(self.spheres.centre(i))));
-        let mut atoms = Column::scratch(n);
+        let mut atoms = Column::zeroed(n);
         if rank.end() <= u64::from(u32::MAX) >> PLACE_BITS && u32::try_from(n).is_ok() {
-            let order = sorted(few, n, |first, keys| write_short_keys(self, &rank, first, keys));
-            let parts: Vec<_> = atoms.chunks_mut(PART).zip(order.chunks(PART)).collect();
-            each(few, parts, |(atoms, order)| place_by_short_keys(self, order, atoms));
+            let order = sorted(n, |first, keys| write_short_keys(self, &rank, first, keys));
+            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
+            parts.for_each(|(atoms, order)| place_by_short_keys(self, order, atoms));
         } else {
-            let order = sorted(few, n, |first, keys| write_keys(self, &rank, first, keys));
-            let parts: Vec<_> = atoms.chunks_mut(PART).zip(order.chunks(PART)).collect();
-            each(few, parts, |(atoms, order)| place_by_keys(self, order, atoms));
+            let order = sorted(n, |first, keys| write_keys(self, &rank, first, keys));
+            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
+            parts.for_each(|(atoms, order)| place_by_keys(self, order, atoms));
         }
         let same = |a: &LatticeAtom, b: &LatticeAtom| a.cell == b.cell;
         let order = |same: &mut [LatticeAtom]| {
@@ -178,13 +174,17 @@ impl Placing<'_> {
                 axis(2).then(axis(1)).then(axis(0)).then(size).then(a.source.cmp(&b.source))
             });
         };
-        if few {
-            atoms.chunk_by_mut(same).filter(|same| same.len() > 1).for_each(order);
-        } else {
-            atoms.par_chunk_by_mut(same).filter(|same| same.len() > 1).for_each(order);
-        }
+        atoms.par_chunk_by_mut(same).filter(|same| same.len() > 1).for_each(order);
         atoms
     }
+}
+
+/// Returns `n` keys in ascending order; `make(first, part)` writes those from number `first` on.
+fn sorted<K: Pod + Ord + Send + Sync>(n: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
+    let mut keys = Column::zeroed(n);
+    keys.par_chunks_mut(PART).enumerate().for_each(|(part, keys)| make(part * PART, keys));
+    keys.par_sort_unstable();
+    keys
 }
 
 /// Atoms that one task puts in place.

@@ -1,4 +1,4 @@
-//! What people compute surfaces for, and the proof that the mesh is one: area, volume, components, closedness.
+//! What people compute surfaces for, and the validation that the mesh is one: area, volume, components, closedness.
 //!
 //! Sums run over the parts of the mesh, merged in order: the same mesh gives the same digits whatever the thread count.
 
@@ -14,7 +14,7 @@ use super::topology;
 
 /// How closedness and manifoldness are established.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Proof {
+pub enum Validation {
     /// A 64-bit checksum over the directed edges of the index buffer: opposite directions cancel, so anything but
     /// a closed, consistently wound mesh leaves a remainder (but for one chance in 2⁶⁴). That no edge is used more
     /// than twice then follows from the case table, which the tests prove: meant for meshes that a backend made.
@@ -24,7 +24,7 @@ pub enum Proof {
     Exact,
 }
 
-impl Proof {
+impl Validation {
     /// `checksum` or `exact`.
     #[must_use]
     pub const fn name(self) -> &'static str {
@@ -74,7 +74,7 @@ pub struct Measures {
     /// Every edge has exactly two triangles and the triangles around every vertex form one closed fan.
     pub manifold: bool,
     /// How the last three were established.
-    pub proof: Proof,
+    pub validation: Validation,
     /// Connected components, largest area first.
     pub components: Vec<Component>,
 }
@@ -84,12 +84,12 @@ impl Measures {
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`].
-    pub fn of(mesh: &Mesh, proof: Proof, control: &Control<'_>) -> Result<Self, SurfaceError> {
+    pub fn of(mesh: &Mesh, validation: Validation, control: &Control<'_>) -> Result<Self, SurfaceError> {
         control.check()?;
         let Totals { components, used, checksum, degenerate } = Totals::of(mesh);
         control.check()?;
         let balanced = checksum == 0 && !degenerate;
-        let exact = (proof == Proof::Exact).then(|| topology::check(&mesh.triangles));
+        let exact = (validation == Validation::Exact).then(|| topology::check(&mesh.triangles));
         let faces = mesh.n_triangles() as u64;
         // Where every edge has two triangles there are 3F/2 of them; otherwise only counting tells.
         let edges = match &exact {
@@ -104,7 +104,7 @@ impl Measures {
             closed: exact.as_ref().map_or(balanced, |t| t.closed),
             oriented: exact.as_ref().map_or(balanced, |t| t.oriented),
             manifold: exact.as_ref().map_or(balanced, |t| t.manifold),
-            proof,
+            validation,
             components,
         })
     }
@@ -122,7 +122,7 @@ impl Measures {
             closed: true,
             oriented: true,
             manifold: true,
-            proof: Proof::Checksum,
+            validation: Validation::Checksum,
             components,
         }
     }
@@ -195,7 +195,8 @@ mod tests {
     }
 
     fn both(mesh: &Mesh) -> [Measures; 2] {
-        [Proof::Checksum, Proof::Exact].map(|proof| Measures::of(mesh, proof, &Control::default()).unwrap())
+        [Validation::Checksum, Validation::Exact]
+            .map(|validation| Measures::of(mesh, validation, &Control::default()).unwrap())
     }
 
     #[test]
@@ -221,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn defects_are_seen_by_both_proofs() {
+    fn defects_are_seen_by_both_validations() {
         let mut whole = Mesh::default();
         tetrahedron(&mut whole, [0.0; 3], false);
         let mut hole = whole.clone();
@@ -251,7 +252,7 @@ mod tests {
                     *v = shared.iter().find(|(from, _)| from == v).map_or(*v, |(_, to)| *to);
                 }
             }
-            let m = Measures::of(&joined, Proof::Exact, &Control::default()).unwrap();
+            let m = Measures::of(&joined, Validation::Exact, &Control::default()).unwrap();
             assert!(m.closed && !m.manifold && m.components.len() == 1, "{shared:?} {m:?}");
         }
     }

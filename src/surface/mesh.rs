@@ -173,21 +173,21 @@ impl Mesh {
         true
     }
 
-    /// Copies what lies in pieces into one: positions and triangles, which measures look up anywhere.
-    pub fn settle_geometry(&mut self) {
-        self.positions.settle();
-        self.triangles.settle();
+    /// Makes positions and triangles contiguous, as measuring needs random access to them.
+    pub fn make_geometry_contiguous(&mut self) {
+        self.positions.make_contiguous();
+        self.triangles.make_contiguous();
         if let Some(quantized) = &mut self.quantized {
-            quantized.positions.settle();
+            quantized.positions.make_contiguous();
         }
     }
 
-    /// Likewise for normals, too.
-    pub fn settle(&mut self) {
-        self.settle_geometry();
-        self.normals.settle();
+    /// Makes positions, normals and triangles contiguous.
+    pub fn make_contiguous(&mut self) {
+        self.make_geometry_contiguous();
+        self.normals.make_contiguous();
         if let Some(quantized) = &mut self.quantized {
-            quantized.normals.settle();
+            quantized.normals.make_contiguous();
         }
     }
 
@@ -301,7 +301,7 @@ mod tests {
                 rows[row] = [-7, 9, quantize::BEYOND, 0];
                 let cut = n / 3;
                 let pieces = vec![Column::from(rows[..cut].to_vec()), Column::from(rows[cut..].to_vec())];
-                let quantized = Quantized { positions: Column::pieced(pieces), ..Quantized::zeroed(step, 0) };
+                let quantized = Quantized { positions: Column::from_chunks(pieces), ..Quantized::zeroed(step, 0) };
                 let [low, high] = [[-7, 2, quantize::BEYOND], [1, 9, 3]];
                 let expected = if n == 1 { [[-7, 9, quantize::BEYOND]; 2] } else { [low, high] };
                 assert_eq!(quantized.bounds(), Some(expected), "{row} of {n}");

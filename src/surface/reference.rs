@@ -3,7 +3,7 @@
 //! This is the program that the parallel backends are compared with, as in Dias, Bora and Gomes (HPDC 2010): time
 //! grows with atoms times samples. It shares the formulas and the case table with the others and nothing else.
 
-use super::backend::{Backend, GridStats, Meshed};
+use super::backend::{Backend, GridStats, MeshOutput};
 use super::cases::{CASES, cell_edge};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
@@ -11,6 +11,7 @@ use super::kernel::{MIN_DISTANCE2, Profile};
 use super::lattice::{EDGE_MARGIN, roomier, to_f32, to_i32, to_u64};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
+use super::sink::MeshSink;
 use super::spheres::Spheres;
 
 /// The sequential reference backend.
@@ -135,13 +136,14 @@ impl Backend for ReferenceBackend {
         "sequential reference, 1 thread, double precision".to_owned()
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
         let smallest = spheres.radii().iter().copied().fold(f32::MAX, f32::min);
         params.check_radius(smallest)?;
         let density = Density::new(spheres, params);
@@ -180,7 +182,7 @@ impl Backend for ReferenceBackend {
         let n = grid.len() as u64;
         let stats =
             GridStats { bricks: 0, surface_bricks: 0, samples: n, box_cells: cases.len() as u64, candidates: 0 };
-        Ok(Meshed::new(mesh, stats))
+        MeshOutput::new(mesh, stats).deliver(params, control, sink)
     }
 }
 

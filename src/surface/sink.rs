@@ -1,22 +1,21 @@
-//! A mesh that leaves the backend part by part, and is never held as a whole.
+//! Sinks: destinations that take a mesh part by part, so that it is never held as a whole.
 
-use super::backend::{GridStats, Served};
-use super::measure::Measures;
+use super::mesh::Mesh;
 use super::quantize::Step;
 
-/// Vertices as they lie in memory, in rows of equal number.
+/// Vertex rows as they lie in memory; all columns have the same length.
 #[derive(Debug, Clone, Copy)]
 pub enum Vertices<'a> {
-    /// In single precision.
+    /// Single precision.
     Single {
         /// Positions relative to the mesh's centre, Å.
         positions: &'a [[f32; 3]],
         /// Unit normals.
         normals: &'a [[f32; 3]],
     },
-    /// As small integers: see [`Quantized`](super::mesh::Quantized).
+    /// Small integers: see [`Quantized`](super::mesh::Quantized).
     Quantized {
-        /// What an integer of a position is multiplied by, Å.
+        /// Length of a unit of the positions, Å.
         step: Step,
         /// Positions relative to the mesh's centre, in steps.
         positions: &'a [[i16; 4]],
@@ -26,7 +25,7 @@ pub enum Vertices<'a> {
 }
 
 impl Vertices<'_> {
-    /// Rows.
+    /// Number of rows.
     #[must_use]
     pub const fn len(&self) -> usize {
         match self {
@@ -35,61 +34,50 @@ impl Vertices<'_> {
         }
     }
 
-    /// Whether there are none.
+    /// Returns true if there are no rows.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.len() == 0
     }
 }
 
-/// A part of a mesh: rows of its columns, each in its final place.
+/// Part of a mesh: consecutive rows of its columns.
 #[derive(Debug, Clone, Copy)]
 pub struct MeshPart<'a> {
-    /// Row of the first vertex.
+    /// Row of the first vertex in the mesh.
     pub first_vertex: usize,
-    /// Its vertices; all parts of a mesh have the same kind.
+    /// The vertices; all parts of a mesh have the same representation.
     pub vertices: Vertices<'a>,
-    /// Row of the first triangle.
+    /// Row of the first triangle in the mesh.
     pub first_triangle: usize,
-    /// Vertex indices, counted over the whole mesh.
+    /// Vertex indices into the whole mesh.
     pub triangles: &'a [[u32; 3]],
 }
 
-/// The sink failed and knows why: whoever made it asks it.
+impl<'a> MeshPart<'a> {
+    /// The whole of `mesh`, whose columns are contiguous or become so.
+    #[must_use]
+    pub fn whole(mesh: &'a Mesh) -> Self {
+        Self { first_vertex: 0, vertices: mesh.vertices(), first_triangle: 0, triangles: &mesh.triangles }
+    }
+}
+
+/// Error of a sink. The sink keeps the cause for its owner.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SinkFailed;
 
-/// Takes a mesh part by part.
+/// Destination of a mesh that arrives in parts.
 pub trait MeshSink: Sync {
-    /// How much will come. Called once before the first part.
+    /// Announces the size of the mesh. Called once, before the first part.
     ///
     /// # Errors
-    /// [`SinkFailed`] ends the run.
+    /// [`SinkFailed`], which ends the run.
     fn begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), SinkFailed>;
 
-    /// A part. Called from several threads at once, in any order; parts cover every row. A row that comes a second time
-    /// replaces the first.
+    /// Takes a part. Called from several threads at once and in any order; the parts cover every row. A row that
+    /// arrives again replaces the earlier one.
     ///
     /// # Errors
-    /// [`SinkFailed`] ends the run.
+    /// [`SinkFailed`], which ends the run.
     fn part(&self, part: &MeshPart<'_>) -> Result<(), SinkFailed>;
-}
-
-/// What is known of a mesh that went into a sink.
-#[derive(Debug, Clone)]
-pub struct Poured {
-    /// What to add to a position to get the structure file's own coordinates, Å.
-    pub centre: [f64; 3],
-    /// Vertices.
-    pub n_vertices: usize,
-    /// Triangles.
-    pub n_triangles: usize,
-    /// Lowest and highest relative position per axis, Å.
-    pub bounds: [[f32; 3]; 2],
-    /// Its grid.
-    pub grid: GridStats,
-    /// Its measures.
-    pub measures: Measures,
-    /// Who made it, as in [`Meshed`](super::backend::Meshed).
-    pub served: Option<Served>,
 }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::gpu::{DevicePool, Executor, Finished, GpuError, GpuJob, PoolDevice, PoolSettings, Prepared};
 use molmesh::surface::{
-    CancelToken, Control, GridStats, Mesh, Meshed, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
+    CancelToken, Control, GridStats, Mesh, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 /// Message of a lost device, with line breaks as drivers write them.
@@ -113,7 +113,7 @@ impl Executor for FakeExecutor {
                 Err(GpuError::Deadline)
             }
             Step::Finish | Step::Block | Step::OmitResult => Ok(Finished {
-                meshed: Meshed::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),
+                meshed: MeshOutput::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),
                 stages: vec![(Stage::Field, 2_000), (Stage::Emit, 1_000)],
             }),
             Step::Lose => Err(GpuError::Lost(LOST.to_owned())),

@@ -6,7 +6,8 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
 use molmesh::gpu::{Budget, Engine, Executor, Finished, GpuError, GpuJob, Prepared};
 use molmesh::surface::{
-    CancelToken, Control, Kernel, Measures, Meshed, Proof, Spheres, Step, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    CancelToken, Control, Kernel, Measures, MeshOutput, Spheres, Step, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    Validation,
 };
 
 pub(crate) const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
@@ -55,7 +56,7 @@ pub(crate) fn run(engine: &mut Engine, job: &GpuJob) -> Result<Finished, GpuErro
     engine.run(std::slice::from_ref(job)).pop().expect("one answer")
 }
 
-pub(crate) fn mesh_of(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams) -> Meshed {
+pub(crate) fn mesh_of(engine: &mut Engine, spheres: &Spheres, params: &SurfaceParams) -> MeshOutput {
     run(engine, &job(spheres, params)).expect("a mesh").meshed
 }
 
@@ -77,8 +78,8 @@ pub(crate) fn quantized(spheres: &Spheres, params: &SurfaceParams) -> SurfacePar
     SurfaceParams { quantize: Some(step), ..params.clone() }
 }
 
-pub(crate) fn measures(meshed: &Meshed) -> Measures {
-    Measures::of(&meshed.mesh, Proof::Exact, &Control::default()).expect("not cancelled")
+pub(crate) fn measures(meshed: &MeshOutput) -> Measures {
+    Measures::of(&meshed.mesh, Validation::Exact, &Control::default()).expect("not cancelled")
 }
 
 /// Returns the spheres of a structure in `samples/`.

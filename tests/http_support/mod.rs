@@ -15,7 +15,8 @@ use molmesh::config::Config;
 use molmesh::http::{Chosen, Server, Stop};
 use molmesh::picture::Drawer;
 use molmesh::surface::{
-    Backend, Control, FoundDevice, GridStats, Mesh, Meshed, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, Control, FoundDevice, GridStats, Mesh, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
+    SurfaceParams,
 };
 
 /// The sample that ships with the product.
@@ -80,13 +81,14 @@ impl Backend for Fake {
         "nothing".to_owned()
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         _: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
         let warm_up = spheres.len() == 1 && !self.also_warm.load(Ordering::SeqCst);
         let mode = if warm_up { Mode::Octahedra } else { *self.mode.lock().unwrap() };
         if !warm_up {
@@ -133,7 +135,8 @@ impl Backend for Fake {
         if !warm_up {
             self.finished.fetch_add(1, Ordering::SeqCst);
         }
-        Ok(Meshed::new(mesh, GridStats { samples: 7, ..GridStats::default() }))
+        let output = MeshOutput::new(mesh, GridStats { samples: 7, ..GridStats::default() });
+        output.deliver(params, control, sink)
     }
 }
 

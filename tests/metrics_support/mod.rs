@@ -10,7 +10,7 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
 use molmesh::surface::{
-    Backend, Control, DeviceStatus, Meshed, Served, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 use molmesh::telemetry::{Kind, Metric};
 
@@ -167,13 +167,14 @@ impl Backend for Held {
         "nothing".to_owned()
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
         // The warm-up is one sphere.
         if spheres.len() > 1 {
             self.holds.store(true, Ordering::SeqCst);
@@ -183,7 +184,7 @@ impl Backend for Held {
                 open = self.changed.wait_timeout(open, Duration::from_millis(5)).unwrap().0;
             }
         }
-        self.fake.run(spheres, params, limits, control)
+        self.fake.write(spheres, params, limits, control, sink)
     }
 }
 
@@ -205,17 +206,18 @@ impl Backend for Devices {
         "a device".to_owned()
     }
 
-    fn run(
+    fn write(
         &self,
         spheres: &Spheres,
         params: &SurfaceParams,
         limits: &SurfaceLimits,
         control: &Control<'_>,
-    ) -> Result<Meshed, SurfaceError> {
-        let instead = Some("as told".to_owned());
-        let served =
-            Some(Served { backend: "cpu", arithmetic: "cpu".to_owned(), device: "the processor".to_owned(), instead });
-        Ok(Meshed { served, ..self.0.run(spheres, params, limits, control)? })
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
+        let fallback_reason = Some("as told".to_owned());
+        let (arithmetic, device) = ("cpu".to_owned(), "the processor".to_owned());
+        let served = Some(Served { backend: "cpu", arithmetic, device, fallback_reason });
+        Ok(MeshOutput { served, ..self.0.write(spheres, params, limits, control, sink)? })
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {

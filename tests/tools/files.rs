@@ -1,10 +1,9 @@
-//! Places to write to: a folder that goes away, and a file in memory that takes bytes anywhere.
+//! A temporary folder of files, and a mesh written to a sink in parts.
 
+use std::fs;
 use std::path::PathBuf;
-use std::sync::Mutex;
-use std::{fs, io};
 
-use molmesh::formats::{GlbSink, PlaceBytes};
+use molmesh::formats::GlbSink;
 use molmesh::surface::{Mesh, MeshPart, MeshSink, Vertices};
 use tempfile::TempDir;
 
@@ -26,28 +25,8 @@ impl Files {
     }
 }
 
-/// A file in memory that takes bytes anywhere.
-#[derive(Default)]
-pub struct Anywhere(Mutex<Vec<u8>>);
-
-impl Anywhere {
-    pub fn bytes(&self) -> Vec<u8> {
-        self.0.lock().unwrap().clone()
-    }
-}
-
-impl PlaceBytes for Anywhere {
-    fn place(&self, offset: u64, bytes: &[u8]) -> io::Result<()> {
-        let (mut file, start) = (self.0.lock().unwrap(), usize::try_from(offset).unwrap());
-        let len = file.len().max(start + bytes.len());
-        file.resize(len, 0xee);
-        file[start..start + bytes.len()].copy_from_slice(bytes);
-        Ok(())
-    }
-}
-
-/// Hands a mesh on in parts, from the last to the first.
-pub fn pour(sink: &GlbSink<'_>, mesh: &Mesh, n_parts: usize) {
+/// Writes a mesh in parts, from the last to the first.
+pub fn write_parts(sink: &GlbSink<'_>, mesh: &Mesh, n_parts: usize) {
     let (n, m) = (mesh.n_vertices(), mesh.n_triangles());
     sink.begin(n, m).unwrap();
     for part in (0..n_parts).rev() {
@@ -63,7 +42,7 @@ pub fn pour(sink: &GlbSink<'_>, mesh: &Mesh, n_parts: usize) {
             }
         };
         let triangles = &mesh.triangles[t];
-        // Whoever made the sink asks it why.
+        // The caller asks the sink for the cause.
         if sink.part(&MeshPart { first_vertex, vertices, first_triangle, triangles }).is_err() {
             return;
         }

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use molmesh::gpu::{Engine, Executor as _};
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Measures, Mesh, Proof, Spheres, Stage, Step, SurfaceError, SurfaceParams,
+    Backend, Control, CpuBackend, Measures, Mesh, Spheres, Stage, Step, SurfaceError, SurfaceParams, Validation,
 };
 use rayon::prelude::*;
 use serde::Serialize;
@@ -165,8 +165,9 @@ fn compare(here: &Mesh, spheres: &Spheres, params: &SurfaceParams) -> Result<Che
     let control = Control::default();
     let cpu = CpuBackend::new(None).map_err(Error::Failed)?;
     let there = cpu.run(spheres, params, &LIMITS, &control).map_err(Error::failed)?.mesh;
-    let measures =
-        |mesh: &Mesh| -> std::result::Result<Measures, SurfaceError> { Measures::of(mesh, Proof::Checksum, &control) };
+    let measures = |mesh: &Mesh| -> std::result::Result<Measures, SurfaceError> {
+        Measures::of(mesh, Validation::Checksum, &control)
+    };
     let (a, b) = (measures(here).map_err(Error::failed)?, measures(&there).map_err(Error::failed)?);
     Ok(Check {
         triangles: here.n_triangles().cast_signed() as i64 - there.n_triangles().cast_signed() as i64,

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 use std::time::Instant;
 
-use molmesh::gpu::{GpuBackend, PoolSettings, Ran};
+use molmesh::gpu::{CompletedJob, GpuBackend, PoolSettings};
 use molmesh::surface::{DeviceChoice, Spheres, Step, SurfaceParams};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -56,7 +56,7 @@ pub(super) fn run(
 ) -> Result<Value> {
     say("one structure at a time; ms, medians (minima)\n")?;
     let (mut rows, mut digests) = (Vec::new(), vec![None; cases.len()]);
-    let settings = PoolSettings { spread_bricks: Some(min_bricks), ..PoolSettings::default() };
+    let settings = PoolSettings { min_partition_bricks: Some(min_bricks), ..PoolSettings::default() };
     on_more_devices(choice, &settings, |backend, devices| {
         for ((case, spheres, params), first) in cases.iter().zip(&mut digests) {
             let (row, digest) = measure(backend, spheres, params, runs)?;
@@ -73,7 +73,7 @@ pub(super) fn run(
 /// Measures a case on the devices of `backend`. The SHA-256 of its mesh comes back too.
 fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs: usize) -> Result<(Row, Vec<u8>)> {
     let [mut prepare_ms, mut ready_ms] = [const { Vec::new() }; 2];
-    let mut all: Vec<Ran> = Vec::with_capacity(runs);
+    let mut all: Vec<CompletedJob> = Vec::with_capacity(runs);
     let mut last = None;
     for run in 0..WARM_UP + runs {
         // The previous mesh goes first: its memory is reused.
@@ -81,7 +81,7 @@ fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs
         let start = Instant::now();
         let job = prepare(spheres, params)?;
         let prepared_at = start.elapsed().as_secs_f64() * 1e3;
-        let mut ran = backend.pool().ran(&job).map_err(Error::failed)?;
+        let mut ran = backend.pool().run(&job).map_err(Error::failed)?;
         let ready_at = start.elapsed().as_secs_f64() * 1e3;
         let mesh = std::mem::take(&mut ran.finished.meshed.mesh);
         if run >= WARM_UP {
@@ -110,16 +110,16 @@ fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs
 }
 
 /// Summarises each part over all runs: parts are the same in every run, and idle devices take them in turn.
-fn parts(all: &[Ran]) -> Vec<Part> {
-    let n = all.iter().map(|ran| ran.by.len()).min().unwrap_or_default();
+fn parts(all: &[CompletedJob]) -> Vec<Part> {
+    let n = all.iter().map(|ran| ran.devices.len()).min().unwrap_or_default();
     let part = |k: usize| {
         let ms = |ns: u64| ns as f64 * 1e-6;
-        let first = &all[0].by[k];
-        let stage = |i: usize| all.iter().filter_map(move |ran| ran.by[k].stages.get(i)).map(move |(_, ns)| ms(*ns));
+        let first = &all[0].devices[k];
+        let stage = |i: usize| all.iter().filter_map(move |ran| ran.devices[k].stages.get(i)).map(move |(_, ns)| ms(*ns));
         Part {
             device: first.device.clone(),
             stages: (0..first.stages.len()).map(|i| (first.stages[i].0.name(), Summary::of(stage(i)))).collect(),
-            stages_ms: Summary::of(all.iter().map(|ran| ran.by[k].stages.iter().map(|(_, ns)| ms(*ns)).sum())),
+            stages_ms: Summary::of(all.iter().map(|ran| ran.devices[k].stages.iter().map(|(_, ns)| ms(*ns)).sum())),
         }
     };
     (0..n).map(part).collect()
@@ -139,7 +139,7 @@ fn text(r: &Row) -> String {
         r.ready_ms.min,
         if r.same { "the same bytes as on one device" } else { "OTHER BYTES THAN ON ONE DEVICE" },
     );
-    for (k, part) in r.by.iter().enumerate() {
+    for (k, part) in r.devices.iter().enumerate() {
         let stages: Vec<String> = part.stages.iter().map(|(stage, ms)| format!("{stage} {:.3}", ms.median)).collect();
         // Writing to a string does not fail.
         _ = writeln!(text, "  part {k}, {}: {}; sum {:.3}", part.device, stages.join(", "), part.stages_ms.median);

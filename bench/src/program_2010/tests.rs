@@ -5,7 +5,7 @@ use std::mem::offset_of;
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 use molmesh::surface::{
-    Backend, Control, CpuBackend, Measures, Mesh, Proof, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
+    Backend, Control, CpuBackend, Measures, Mesh, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams, Validation,
 };
 
 use super::*;
@@ -60,7 +60,7 @@ fn spheres(rows: &[[f64; 4]]) -> Spheres {
 }
 
 fn measures(mesh: &Mesh) -> Measures {
-    Measures::of(mesh, Proof::Exact, &Control::default()).unwrap()
+    Measures::of(mesh, Validation::Exact, &Control::default()).unwrap()
 }
 
 /// Lists the differences between the soup and the CPU's mesh, except those that single precision explains.

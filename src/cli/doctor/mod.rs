@@ -53,13 +53,7 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     let mut checks = vec![checks::sources(args.serve.config.as_deref(), &loaded), checks::log(&config)];
     checks.extend(checks::secrets(&loaded));
     // As a service would do it: every driver is asked, the stages are built on what is taken, and a mesh is made.
-    let asked = Asked {
-        backend: args.serve.backend,
-        devices: &config.devices.choice,
-        threads: None,
-        enough: usize::MAX,
-        work: None,
-    };
+    let asked = Asked { backend: args.serve.backend, devices: &config.devices.choice, threads: None, work: None };
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
     match backend::pick(&asked, &Use::Service(config.devices.clone())) {
         Ok(picked) => {

@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use super::layout::{AtomType, IndexType, Layout};
-use crate::formats::block::{convert_words, extend_words, write_bytes, write_floats, write_integers, write_shorts};
+use crate::formats::block::{convert_words, write_bytes, write_floats, write_integers, write_shorts};
 use crate::formats::{Packing, quantize};
 use crate::surface::Mesh;
 
@@ -67,15 +67,6 @@ pub(super) fn write_indices(out: &mut dyn Write, index_type: IndexType, indices:
         IndexType::U8 => convert_words(out, indices, one_byte),
         IndexType::U16 => convert_words(out, indices, two_bytes),
         IndexType::U32 => write_integers(out, indices),
-    }
-}
-
-/// The same, to the end of what is in memory.
-pub(super) fn extend_indices(bytes: &mut Vec<u8>, index_type: IndexType, indices: &[u32]) {
-    match index_type {
-        IndexType::U8 => extend_words(bytes, indices, one_byte),
-        IndexType::U16 => extend_words(bytes, indices, two_bytes),
-        IndexType::U32 => extend_words(bytes, indices, u32::to_le_bytes),
     }
 }
 

@@ -10,8 +10,8 @@ mod document;
 mod glb;
 mod json;
 mod layout;
-mod placed;
+mod sink;
 
 pub(super) use glb::GlbPlan;
 pub(super) use json::GltfPlan;
-pub use placed::{GlbSink, PlaceBytes, PlaceError};
+pub use sink::{GlbSink, GlbSinkError, RandomAccess};

@@ -7,7 +7,7 @@ use crate::picture::{Background, MOST_SIDE, Style, View};
 use crate::pipeline::spacing::{LEAST_TRIANGLES, MOST_TRIANGLES};
 use crate::structure::select::KIND_NAMES;
 use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
-use crate::surface::{Kernel, Preset, Proof};
+use crate::surface::{Kernel, Preset, Validation};
 
 /// What values a parameter takes.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -131,7 +131,7 @@ const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
 const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
-const PROOFS: &[&str] = &[Proof::Checksum.name(), Proof::Exact.name()];
+const VALIDATIONS: &[&str] = &[Validation::Checksum.name(), Validation::Exact.name()];
 
 const fn names(all: &[Kernel]) -> [&'static str; 3] {
     [all[0].name(), all[1].name(), all[2].name()]
@@ -249,10 +249,10 @@ pub const TABLE: &[Parameter] = &[
         doc: "The alternative location to take.",
     },
     Parameter {
-        name: "proof",
-        domain: Domain::Choice(PROOFS),
+        name: "validation",
+        domain: Domain::Choice(VALIDATIONS),
         default: "checksum",
-        doc: "How closedness is proven: by a checksum over edges, or exactly, edge by edge and vertex by vertex.",
+        doc: "Method that checks whether the mesh is watertight: a checksum of its edges, or exact matching of every edge and the triangles around every vertex.",
     },
     Parameter {
         name: "check",

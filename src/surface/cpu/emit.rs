@@ -32,11 +32,6 @@ struct CaseRow {
 
 static ROWS: LazyLock<Vec<CaseRow>> = LazyLock::new(|| (0..=255).map(CaseRow::new).collect());
 
-/// Makes the table of cases.
-pub(super) fn warm() {
-    LazyLock::force(&ROWS);
-}
-
 impl CaseRow {
     fn new(case: u8) -> Self {
         let offset = |e: u8| {

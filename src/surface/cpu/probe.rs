@@ -4,7 +4,7 @@
 use super::bin::{Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
 use super::field::{self, Constants, Need, Samples};
-use super::{Means, Tile, build};
+use super::{Means, Tile, write};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK, BRICK_SAMPLES, Lattice, to_f32};
@@ -81,7 +81,7 @@ pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) 
         }
     }
     let scanned = super::scan_lattice(lattice.clone(), Means { params, limits, control: &control, free_threads: 1 })?;
-    let (mesh, _) = build::build(&scanned, params.atom_ids, &control)?;
+    let mesh = write::write(&scanned, params.atom_ids, &control, None)?.mesh;
     Ok(Probe { bricks, surface: scanned.done.iter().flat_map(surface_of).collect(), mesh })
 }
 

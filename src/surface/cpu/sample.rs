@@ -61,14 +61,6 @@ thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
-/// Fields of a layer of a small structure, which a thread is to have before there is work.
-const WARM_FIELDS: usize = 36;
-
-/// Makes the calling thread's scratch.
-pub(super) fn warm() {
-    SCRATCH.with_borrow_mut(|scratch| scratch.layers.iter_mut().for_each(|layer| layer.grow(WARM_FIELDS)));
-}
-
 impl Layer {
     /// Makes this many bricks.
     fn grow(&mut self, n: usize) {

@@ -1,26 +1,30 @@
-//! The sheets of surface within a brick: which of its vertices hang together by its own triangles.
+//! Sheets of a brick: its vertices, connected by its own triangles.
 
 use super::edge::EDGES;
+use crate::surface::union_find::UnionFind;
 
-/// The mark of a vertex that no triangle has met yet.
+/// Mark of a vertex that no triangle has used yet.
 pub(super) const NONE: u16 = u16::MAX;
 
-/// Sheets of the brick at hand, numbered as they are met. Sheets that meet are made equal.
+/// Sheets of the current brick. Provisional numbers are given as sheets are found; sheets that meet are united.
 #[derive(Default)]
 pub(super) struct Sheets {
-    /// Per sheet one that it equals: itself or a lower one. After [`Sheets::resolve`] the final number.
-    equal: Vec<u16>,
+    united: UnionFind,
+    /// Final number by provisional number, after [`Sheets::resolve`].
+    numbers: Vec<u32>,
 }
 
 impl Sheets {
-    /// Forgets all.
+    /// Removes all sheets.
     pub(super) fn clear(&mut self) {
-        self.equal.clear();
+        self.united.clear();
     }
 
-    /// Starts with `n` sheets that do not meet.
+    /// Starts with `n` separate sheets.
     pub(super) fn known(&mut self, n: u16) {
-        self.equal.extend(0..n);
+        for _ in 0..n {
+            self.united.push();
+        }
     }
 
     /// Puts the vertices on `edges` onto one sheet: the lowest that any of them is on, or a new one.
@@ -30,13 +34,12 @@ impl Sheets {
         for &edge in edges {
             let on = sheet[usize::from(edge) % EDGES];
             low = low.min(on);
-            // One more than the highest; none is 0.
+            // One more than the highest; `NONE` wraps to 0.
             above = above.max(on.wrapping_add(1));
         }
         if low == NONE {
             // A brick has at most 512 cells with four loops each.
-            low = u16::try_from(self.equal.len()).unwrap_or_default();
-            self.equal.push(low);
+            low = u16::try_from(self.united.push()).unwrap_or_default();
         } else if above > low + 1 {
             for &edge in edges {
                 self.unite(sheet[usize::from(edge) % EDGES], low);
@@ -49,37 +52,19 @@ impl Sheets {
 
     #[cold]
     fn unite(&mut self, a: u16, b: u16) {
-        if a == NONE || a == b {
-            return;
+        if a != NONE && a != b {
+            self.united.union(u32::from(a), u32::from(b));
         }
-        let find = |mut on: u16| {
-            while self.equal[usize::from(on)] != on {
-                on = self.equal[usize::from(on)];
-            }
-            on
-        };
-        let (a, b) = (find(a), find(b));
-        self.equal[usize::from(a.max(b))] = a.min(b);
     }
 
     /// Numbers the sheets that are left, from 0, and returns how many there are.
     pub(super) fn resolve(&mut self) -> u16 {
-        let mut n = 0;
-        for on in 0..self.equal.len() {
-            // Ascending: the lower sheet that this one equals has its final number already.
-            let equals = usize::from(self.equal[on]);
-            if equals == on {
-                (self.equal[on], n) = (n, n + 1);
-            } else {
-                self.equal[on] = self.equal[equals];
-            }
-        }
-        n
+        u16::try_from(self.united.number_sets(&mut self.numbers)).unwrap_or(u16::MAX)
     }
 
-    /// The final number of a sheet.
+    /// Final number of a sheet.
     #[inline(always)]
     pub(super) fn of(&self, on: u16) -> u16 {
-        self.equal[usize::from(on)]
+        u16::try_from(self.numbers[usize::from(on)]).unwrap_or(u16::MAX)
     }
 }

@@ -24,7 +24,7 @@ pub(super) struct Slab {
 }
 
 /// Slabs of a tile at most: each has to evaluate one layer of samples beyond its own.
-const MOST: usize = 4;
+const MAX_SLABS: usize = 4;
 
 /// Cuts the tiles for so many threads that have nothing else to do: cut for sixteen, the first pass over a small
 /// structure takes a fifth to two fifths more of their time, which belongs to others where there are any. The largest
@@ -45,7 +45,7 @@ pub(super) fn cut(tiles: &Tiles, threads: usize) -> Vec<Slab> {
 /// Slabs of a tile with `own` of `all` atoms: several if it is more than one of the threads' share, each some two thirds
 /// of a share then.
 fn pieces(own: usize, all: usize, threads: usize) -> usize {
-    if own * threads <= all { 1 } else { (3 * own * threads).div_ceil(2 * all).next_power_of_two().min(MOST) }
+    if own * threads <= all { 1 } else { (3 * own * threads).div_ceil(2 * all).next_power_of_two().min(MAX_SLABS) }
 }
 
 /// Tiles of which some slabs were sampled and others were not.

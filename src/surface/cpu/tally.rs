@@ -110,11 +110,14 @@ impl Sheet {
 }
 
 impl Tally {
-    /// Makes room for what most pieces of this many bricks add up.
-    pub(super) fn make_room(&mut self, bricks: usize) {
-        self.bricks.reserve_exact(bricks);
-        self.sheets.reserve_exact(2 * bricks);
-        self.lone.reserve_exact(4 * bricks);
+    /// An empty tally with memory for a typical piece of this many bricks.
+    pub(super) fn with_capacity(bricks: usize) -> Self {
+        Self {
+            bricks: Vec::with_capacity(bricks),
+            sheets: Vec::with_capacity(2 * bricks),
+            lone: Vec::with_capacity(4 * bricks),
+            ..Self::default()
+        }
     }
 
     /// Adds the brick that `emit` has just written.

@@ -1,0 +1,376 @@
+//! The second pass: `interpolate` and `emit` write the rows of every piece, in memory or into a sink.
+//!
+//! In memory, a piece is written to its final place. For a sink, it lives in the thread's scratch until the sink has
+//! taken it.
+
+use std::cell::RefCell;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Mutex, PoisonError};
+
+use super::bin::{Tiles, slot_origin};
+use super::emit;
+use super::interpolate::{self, Batch, Rows, SlopeConstants, Source, Target, take};
+use super::join;
+use super::near::{self, Numbered};
+use super::sheets::Sheets;
+use super::table::{BrickTable, Rounding};
+use super::tally::Tally;
+use super::{Piece, Scanned, Tile, threads};
+use crate::surface::backend::{MeshOutput, StreamedMesh};
+use crate::surface::column::Column;
+use crate::surface::control::{Control, Stage};
+use crate::surface::error::SurfaceError;
+use crate::surface::lattice::Lattice;
+use crate::surface::measure::{Measures, Validation};
+use crate::surface::mesh::{Mesh, Quantized};
+use crate::surface::quantize::Step;
+use crate::surface::simd::dispatched;
+use crate::surface::sink::{MeshPart, MeshSink, SinkFailed, Vertices};
+
+thread_local! {
+    // As in the first pass: kept per thread, not per piece.
+    static SCRATCH: RefCell<Scratch> = RefCell::default();
+}
+
+/// Buffers that a thread reuses from piece to piece.
+#[derive(Default)]
+struct Scratch {
+    stages: Stages,
+    rows: ScratchRows,
+}
+
+/// Working memory of the stages.
+#[derive(Default)]
+struct Stages {
+    batch: Batch,
+    table: BrickTable,
+    sheets: Sheets,
+}
+
+/// Rows of a piece on their way to a sink.
+#[derive(Default)]
+struct ScratchRows {
+    positions: Vec<[f32; 3]>,
+    normals: Vec<[f32; 3]>,
+    quantized: (Vec<[i16; 4]>, Vec<[i8; 4]>),
+    triangles: Vec<[u32; 3]>,
+}
+
+/// Rows of the mesh that a piece fills.
+struct PieceRows<'a> {
+    rows: Rows<'a>,
+    triangles: &'a mut [[u32; 3]],
+    atom_ids: Option<&'a mut [u32]>,
+}
+
+/// Destination of the rows.
+enum Destination<'a> {
+    /// Rows of each piece. The locks only hand them to the thread that fills them.
+    Memory(Vec<Mutex<PieceRows<'a>>>),
+    Sink(&'a dyn MeshSink),
+}
+
+/// Summary of a piece.
+pub(super) struct Written {
+    /// Vertices whose gradient vanishes.
+    flat: usize,
+    /// Sums over its triangles.
+    pub(super) tally: Tally,
+    /// Bounds of its positions, for a sink only.
+    bounds: Bounds,
+}
+
+type Bounds = [[f32; 3]; 2];
+
+/// Bounds of nothing.
+const EMPTY: Bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
+
+/// Runs `interpolate` and `emit` for every piece. The output has measures unless the mesh is in memory and not closed.
+///
+/// # Errors
+/// [`SurfaceError::Cancelled`], [`SurfaceError::Sink`].
+pub(super) fn write(
+    scanned: &Scanned,
+    atom_ids: bool,
+    control: &Control<'_>,
+    sink: Option<&dyn MeshSink>,
+) -> Result<MeshOutput, SurfaceError> {
+    let Some(sink) = sink else { return in_memory(scanned, atom_ids, control) };
+    let failed = |SinkFailed| SurfaceError::Sink;
+    let [n_vertices, n_triangles] = [scanned.totals.vertices, scanned.totals.triangles];
+    sink.begin(n_vertices, n_triangles).map_err(failed)?;
+    let written = write_pieces(scanned, control, &Destination::Sink(sink))?;
+    let measures = control.span(Stage::Measure, || join::measures(scanned, &written));
+    let measures = match measures {
+        Some(measures) if written.iter().all(|piece| piece.flat == 0) => measures,
+        // A normal without a gradient depends on the triangles around it, and measuring a mesh that is not closed takes
+        // all of it: the mesh is made again, in memory, and its rows replace the first ones.
+        _ => {
+            let MeshOutput { mesh, measures, .. } = in_memory(scanned, false, control)?;
+            sink.part(&MeshPart::whole(&mesh)).map_err(failed)?;
+            measures.map_or_else(|| Measures::of(&mesh, Validation::Checksum, control), Ok)?
+        }
+    };
+    let bounds = written.iter().map(|piece| piece.bounds).fold(EMPTY, join_bounds);
+    let mesh = Mesh { centre: scanned.lattice.centre(), ..Mesh::default() };
+    let streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds });
+    Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, scanned.grid) })
+}
+
+fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result<MeshOutput, SurfaceError> {
+    let Scanned { lattice, done, totals, pieces, .. } = scanned;
+    let n_single = if scanned.quantize.is_some() { 0 } else { totals.vertices };
+    let mut mesh = Mesh {
+        centre: lattice.centre(),
+        positions: Column::zeroed(n_single),
+        normals: Column::zeroed(n_single),
+        quantized: scanned.quantize.map(|step| Quantized::zeroed(step, totals.vertices)),
+        triangles: Column::zeroed(totals.triangles),
+        atom_ids: atom_ids.then(|| Column::zeroed(totals.vertices)),
+        colors: None,
+        parts: done.iter().map(|tile| (tile.first_vertex, tile.first_triangle)).collect(),
+    };
+    let mut rows = match &mut mesh.quantized {
+        Some(quantized) => Rows::of(quantized),
+        None => Rows::Single { positions: &mut mesh.positions, normals: &mut mesh.normals },
+    };
+    let (mut triangles, mut ids) = (&mut mesh.triangles[..], mesh.atom_ids.as_deref_mut());
+    let of_piece = pieces.iter().map(|piece| {
+        let [n, m] = scanned.size_of(piece);
+        let atom_ids = ids.as_mut().map(|ids| take(ids, n));
+        Mutex::new(PieceRows { rows: rows.take(n), triangles: take(&mut triangles, m), atom_ids })
+    });
+    let written = write_pieces(scanned, control, &Destination::Memory(of_piece.collect()))?;
+    if written.iter().any(|piece| piece.flat > 0) {
+        control.span(Stage::Interpolate, || mesh.fill_flat_normals());
+    }
+    let measures = control.span(Stage::Measure, || join::measures(scanned, &written));
+    Ok(MeshOutput { measures, ..MeshOutput::new(mesh, scanned.grid) })
+}
+
+/// Writes all pieces, in parallel.
+fn write_pieces(
+    scanned: &Scanned,
+    control: &Control<'_>,
+    destination: &Destination<'_>,
+) -> Result<Vec<Written>, SurfaceError> {
+    let Scanned { lattice, pieces, .. } = scanned;
+    let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
+    let finished = AtomicUsize::new(0);
+    threads::each(pieces.len(), |i| {
+        control.check()?;
+        let written = SCRATCH.with_borrow_mut(|Scratch { stages, rows }| match destination {
+            Destination::Memory(of_piece) => {
+                let mut rows = of_piece[i].lock().unwrap_or_else(PoisonError::into_inner);
+                rows.write(scanned, &pieces[i], &slope, stages, control)
+            }
+            Destination::Sink(sink) => rows.write(scanned, &pieces[i], &slope, stages, control, *sink),
+        })?;
+        let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
+        control.observer.progress(Stage::Emit, n, pieces.len());
+        Ok(written)
+    })
+}
+
+impl ScratchRows {
+    /// Writes a piece into the scratch, then into `sink`.
+    fn write(
+        &mut self,
+        scanned: &Scanned,
+        piece: &Piece,
+        slope: &SlopeConstants,
+        stages: &mut Stages,
+        control: &Control<'_>,
+        sink: &dyn MeshSink,
+    ) -> Result<Written, SurfaceError> {
+        let [n, m] = scanned.size_of(piece);
+        let rows = match scanned.quantize {
+            None => Rows::Single { positions: first(&mut self.positions, n), normals: first(&mut self.normals, n) },
+            Some(step) => {
+                let (positions, normals) = &mut self.quantized;
+                Rows::Quantized { step, positions: first(positions, n), normals: first(normals, n) }
+            }
+        };
+        let mut rows = PieceRows { rows, triangles: first(&mut self.triangles, m), atom_ids: None };
+        let mut written = rows.write(scanned, piece, slope, stages, control)?;
+        let vertices = match rows.rows {
+            Rows::Single { positions, normals } => Vertices::Single { positions, normals },
+            Rows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
+        };
+        written.bounds = bounds_of(&vertices);
+        let (tile, [start, _]) = (&scanned.done[piece.tile], scanned.done[piece.tile].span(piece));
+        let part = MeshPart {
+            first_vertex: tile.first_vertex + start.vertices,
+            vertices,
+            first_triangle: tile.first_triangle + start.triangles,
+            triangles: rows.triangles,
+        };
+        control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
+        Ok(written)
+    }
+}
+
+impl PieceRows<'_> {
+    /// Writes the vertices and triangles of a piece and sums over them.
+    ///
+    /// # Errors
+    /// [`SurfaceError::Cancelled`].
+    fn write(
+        &mut self,
+        scanned: &Scanned,
+        piece: &Piece,
+        slope: &SlopeConstants,
+        stages: &mut Stages,
+        control: &Control<'_>,
+    ) -> Result<Written, SurfaceError> {
+        let flat =
+            control.span(Stage::Interpolate, || self.interpolate(scanned, piece, slope, &mut stages.batch, control))?;
+        let tally = control.span(Stage::Emit, || self.emit(scanned, piece, &mut stages.table, &mut stages.sheets));
+        Ok(Written { flat, tally, bounds: EMPTY })
+    }
+
+    /// Writes the vertices. Returns how many have no gradient.
+    fn interpolate(
+        &mut self,
+        scanned: &Scanned,
+        piece: &Piece,
+        slope: &SlopeConstants,
+        batch: &mut Batch,
+        control: &Control<'_>,
+    ) -> Result<usize, SurfaceError> {
+        let tile = &scanned.done[piece.tile];
+        let found = &tile.found;
+        let base = found.before(piece.bricks.start).vertices;
+        let mut flat = 0;
+        for i in piece.bricks.clone() {
+            let (brick, all) = (&found.bricks[i], found.before(i).vertices..found.before(i + 1).vertices);
+            if all.is_empty() {
+                continue;
+            }
+            let candidates = &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize];
+            let rows = all.start - base..all.end - base;
+            let target = Target {
+                rows: self.rows.slice(rows.clone()),
+                atom_ids: self.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
+            };
+            let (t, edges) = (&found.t[all.clone()], &found.edges[all]);
+            let source = Source { tile: tile.coord, candidates, t, edges };
+            flat += interpolate::interpolate(&scanned.lattice, slope, brick, &source, batch, target, control)?;
+        }
+        Ok(flat)
+    }
+
+    /// Writes the triangles. Returns the sums over them.
+    fn emit(&mut self, scanned: &Scanned, piece: &Piece, table: &mut BrickTable, sheets: &mut Sheets) -> Tally {
+        let Scanned { tiles, done, .. } = scanned;
+        let tile = &done[piece.tile];
+        let near = Near::new(tiles, done, tile.coord);
+        let found = &tile.found;
+        let base = found.before(piece.bricks.start).triangles;
+        let mut tally = Tally::with_capacity(piece.bricks.len());
+        for i in piece.bricks.clone() {
+            let (brick, before, end) = (&found.bricks[i], found.before(i), found.before(i + 1));
+            let around: [Option<Numbered<'_>>; 8] =
+                std::array::from_fn(|n| near.of(usize::from(brick.slot), n).map(|(_, _, numbered)| numbered));
+            let cases = &found.cases[before.cases..end.cases];
+            let out = &mut self.triangles[before.triangles - base..end.triangles - base];
+            let own_sheets = match brick.n_sheets.map_or(0, |n| usize::from(n.get())) {
+                0 | 1 => &[][..],
+                n => &found.sheets[brick.sheets as usize..][..n],
+            };
+            let origin = slot_origin(tile.coord, usize::from(brick.slot));
+            let rounding = scanned.quantize.map(|step| scanned.rounding(step, origin));
+            emit::emit(table, sheets, &around, cases, own_sheets, rounding, out);
+            tally.add(table, sheets, &around, origin, out);
+        }
+        tally
+    }
+}
+
+impl Scanned {
+    /// Vertices and triangles of a piece.
+    fn size_of(&self, piece: &Piece) -> [usize; 2] {
+        let [start, end] = self.done[piece.tile].span(piece);
+        [end.vertices - start.vertices, end.triangles - start.triangles]
+    }
+
+    /// Rounding of the vertices of the brick at `origin`.
+    fn rounding(&self, step: Step, origin: [i32; 3]) -> Rounding {
+        let Lattice { spacing, centre, .. } = &self.lattice;
+        let offset = std::array::from_fn(|k| f64::from(origin[k] - centre[k]));
+        Rounding { step, spacing: *spacing, offset }
+    }
+}
+
+/// A tile and its neighbours towards +x, +y, +z.
+pub(super) struct Near<'a> {
+    tiles: [Option<(usize, &'a Tile)>; 8],
+}
+
+impl<'a> Near<'a> {
+    pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3]) -> Self {
+        Self {
+            tiles: std::array::from_fn(|n| {
+                let coord = std::array::from_fn(|k| coord[k] + i32::from(n >> k & 1 == 1));
+                tiles.index.get(&coord).map(|&t| (t as usize, &done[t as usize]))
+            }),
+        }
+    }
+
+    /// The neighbour `n` (bits: 0 x, 1 y, 2 z; 0 is the brick itself) of the brick in `slot`, if the surface intersects
+    /// it: the index of its tile, its index in the tile, and the brick.
+    #[inline(always)]
+    pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, Numbered<'a>)> {
+        let (slot, beyond) = near::neighbour_slot(slot, n);
+        let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
+        let (ix, numbered) = tile.numbered(slot)?;
+        Some((t, ix, numbered))
+    }
+}
+
+/// Returns the first `n` rows of a scratch, which grows if necessary.
+fn first<T: Clone + Default>(rows: &mut Vec<T>, n: usize) -> &mut [T] {
+    if rows.len() < n {
+        rows.resize(n, T::default());
+    }
+    &mut rows[..n]
+}
+
+/// Lowest and highest position, Å.
+fn bounds_of(vertices: &Vertices<'_>) -> Bounds {
+    match vertices {
+        Vertices::Single { positions, .. } => bounds(positions),
+        Vertices::Quantized { step, positions, .. } => positions.iter().fold(EMPTY, |bounds, [x, y, z, _]| {
+            let p = step.decoded([*x, *y, *z]);
+            join_bounds(bounds, [p, p])
+        }),
+    }
+}
+
+dispatched! {
+/// Lowest and highest of positions in single precision, sixteen at a time.
+fn bounds(positions: &[[f32; 3]]) -> Bounds {
+    const LANES: usize = 16;
+    let (batches, rest) = positions.as_chunks::<LANES>();
+    let (mut low, mut high) = ([[f32::INFINITY; 3]; LANES], [[f32::NEG_INFINITY; 3]; LANES]);
+    for batch in batches {
+        let rows = low.as_flattened_mut().iter_mut().zip(high.as_flattened_mut()).zip(batch.as_flattened());
+        for ((low, high), v) in rows {
+            *low = if *v < *low { *v } else { *low };
+            *high = if *v > *high { *v } else { *high };
+        }
+    }
+    let lanes = low.into_iter().zip(high).map(|(low, high)| [low, high]);
+    lanes.chain(rest.iter().map(|p| [*p, *p])).fold(EMPTY, join_bounds)
+}
+}
+
+/// Union of two bounds.
+#[inline(always)]
+fn join_bounds([low, high]: Bounds, [other_low, other_high]: Bounds) -> Bounds {
+    // These comparisons compile to vector minimum and maximum.
+    [
+        std::array::from_fn(|k| if other_low[k] < low[k] { other_low[k] } else { low[k] }),
+        std::array::from_fn(|k| if other_high[k] > high[k] { other_high[k] } else { high[k] }),
+    ]
+}
