@@ -78,7 +78,12 @@ const ROOMS: &[Room] = &[
         rooms: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any), ("pipeline", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "wgpu", "clap"],
     },
-    Room { name: "telemetry", rooms: &[("config", Any)], crates: &["axum", "tower", "hyper", "wgpu", "clap"] },
+    Room { name: "tls", rooms: &[], crates: SERVICE },
+    Room {
+        name: "telemetry",
+        rooms: &[("config", Any), ("tls", Any)],
+        crates: &["axum", "tower", "hyper", "wgpu", "clap"],
+    },
     Room {
         name: "access",
         rooms: &[("pipeline", Only(&["nearest"])), ("config", Any)],
@@ -98,12 +103,12 @@ const ROOMS: &[Room] = &[
     },
     Room {
         name: "store",
-        rooms: &[("config", Any), ("telemetry", Any)],
+        rooms: &[("config", Any), ("telemetry", Any), ("tls", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
     Room {
         name: "archive",
-        rooms: &[("structure", Any), ("config", Any), ("telemetry", Any), ("store", Any)],
+        rooms: &[("structure", Any), ("config", Any), ("telemetry", Any), ("tls", Any), ("store", Any)],
         crates: &["axum", "tower", "tower_http", "wgpu", "clap"],
     },
     Room {
