@@ -1,6 +1,6 @@
 //! `.gltf`: the document as JSON, with the buffer as a base64 data URI that is encoded while it is written.
 
-use std::io::{self, Write};
+use std::io::{self, BufWriter, IntoInnerError, Write};
 
 use base64::engine::general_purpose::STANDARD;
 use base64::write::EncoderWriter;
@@ -9,6 +9,7 @@ use serde_json::Value;
 use super::buffer::write_buffer;
 use super::document::document;
 use super::layout::Layout;
+use crate::formats::block::BLOCK_BYTES;
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::Mesh;
@@ -52,9 +53,11 @@ impl GltfPlan {
     pub(in crate::formats) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(&self.before)?;
         if let Some(layout) = &self.layout {
-            let mut base64 = EncoderWriter::new(&mut *out, &STANDARD);
+            // The encoder writes pieces of 1 KiB.
+            let buffered = BufWriter::with_capacity(BLOCK_BYTES, &mut *out);
+            let mut base64 = EncoderWriter::new(buffered, &STANDARD);
             write_buffer(mesh, layout, &mut base64)?;
-            base64.finish()?;
+            base64.finish()?.into_inner().map_err(IntoInnerError::into_error)?;
         }
         out.write_all(self.after)
     }
