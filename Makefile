@@ -8,15 +8,20 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run test nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
 
 run: web-if-possible ## Build (the first time takes minutes) and serve on http://127.0.0.1:8080
-	$(CARGO) run --release --bin molmesh -- serve $(ARGS)
+	$(CARGO) run --profile fast-build --bin molmesh -- serve $(ARGS)
 
-test: tools web fmt-check lint deny-if-installed matrix static-if-possible tests ## Run all checks of a commit; installs the tools
+# The steps add a line to this file for each check that they skip; the last step prints it.
+test: export SKIPPED := $(CURDIR)/target/skipped
+test: nothing-skipped tools web fmt-check lint deny-if-installed matrix static-if-possible tests ## All checks and tests; installs what they need
+
+nothing-skipped:
+	@mkdir -p target && : >"$$SKIPPED"
 
 tools: ## Install what the tests need (a Python environment, Node packages, software Vulkan, Chromium)
 	@if [ -f tests/tools/setup.sh ]; then bash tests/tools/setup.sh; fi
@@ -37,15 +42,13 @@ fmt-check:
 lint: ## Clippy on everything, warnings are errors
 	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
 
-# Compiles the layers separately, so an async type in the core or a flag in the service is an error.
-matrix: ## Clippy on every supported combination of features
+# `lint` checks all features together. No code of the library depends on `cli`, so that `cli,gpu` and `cli,server` check
+# the library with `gpu` and with `server` alone as well.
+matrix: ## Clippy on the other supported combinations of features
 	$(CARGO) clippy --locked --lib --no-default-features -- -D warnings
-	$(CARGO) clippy --locked --lib --no-default-features --features gpu -- -D warnings
-	$(CARGO) clippy --locked --lib --no-default-features --features server -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,gpu -- -D warnings
 	$(CARGO) clippy --locked --lib --bins --no-default-features --features cli,server -- -D warnings
-	$(CARGO) clippy --locked --lib --bins -- -D warnings
 
 deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (three minutes) when absent
 	@command -v cargo-deny >/dev/null || $(CARGO) install cargo-deny --locked
@@ -53,7 +56,7 @@ deny: ## Licences, bans and sources of all dependencies; installs cargo-deny (th
 
 deny-if-installed:
 	@if command -v cargo-deny >/dev/null; then $(MAKE) --no-print-directory deny; \
-	else echo "SKIPPED: cargo-deny is not installed; make deny installs and runs it"; fi
+	else echo "SKIPPED: cargo-deny is not installed; make deny installs and runs it" | tee -a "$${SKIPPED:-/dev/null}"; fi
 
 audit: ## Known vulnerabilities of dependencies; ADVISORY_DB=FOLDER names the database, ALLOW_SKIP=1 permits its absence
 	deploy/audit.sh

@@ -8,7 +8,6 @@ fn main() {
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rerun-if-changed=shaders");
     built_by();
-    unwinder();
     page::build();
     #[cfg(feature = "gpu")]
     shaders::build();
@@ -23,23 +22,6 @@ fn built_by() {
     });
     println!("cargo::rustc-env=MOLMESH_TARGET={target}");
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
-}
-
-/// Links the unwinder in where Linux has it as an archive, which compilers there bring with them. As a library of its
-/// own it has to be found, mapped and bound by every process, and asks the processor for its features once more: 0.13
-/// ms of each start on a virtual machine. A linker script stands in for the library that the standard library names.
-fn unwinder() {
-    let [target, host] = ["TARGET", "HOST"].map(|name| std::env::var(name).unwrap_or_default());
-    if target != host || !target.ends_with("-linux-gnu") {
-        return;
-    }
-    let archive = std::process::Command::new("cc").arg("-print-file-name=libgcc_eh.a").output();
-    let Some(out) = std::env::var_os("OUT_DIR").map(std::path::PathBuf::from) else { return };
-    // What is not there is printed as it was asked for.
-    let there = archive.is_ok_and(|said| said.stdout.starts_with(b"/"));
-    if there && std::fs::write(out.join("libgcc_s.so"), "GROUP ( -lgcc_eh -lgcc )\n").is_ok() {
-        println!("cargo::rustc-link-search=native={}", out.display());
-    }
 }
 
 /// The page, if it was built: a table of what lies in `web/dist`.

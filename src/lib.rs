@@ -26,3 +26,5 @@ pub mod jobs;
 pub mod store;
 #[cfg(feature = "server")]
 pub mod telemetry;
+#[cfg(feature = "server")]
+mod tls;

@@ -1,10 +1,9 @@
-//! The `molmesh` command: parses nothing, decides nothing, hands over to [`cli`].
+//! The `molmesh` command.
 
 mod cli;
 
-#[cfg(target_env = "musl")]
 #[global_allocator]
-static HEAP: mimalloc::MiMalloc = mimalloc::MiMalloc;
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() {
     cli::leave(cli::main());

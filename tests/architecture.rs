@@ -79,7 +79,12 @@ const LAYERS: &[Layer] = &[
         layers: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any), ("pipeline", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "wgpu", "clap"],
     },
-    Layer { name: "telemetry", layers: &[("config", Any)], crates: &["axum", "tower", "hyper", "wgpu", "clap"] },
+    Layer { name: "tls", layers: &[], crates: SERVICE },
+    Layer {
+        name: "telemetry",
+        layers: &[("config", Any), ("tls", Any)],
+        crates: &["axum", "tower", "hyper", "wgpu", "clap"],
+    },
     Layer {
         name: "access",
         layers: &[("pipeline", Only(&["nearest"])), ("config", Any)],
@@ -104,12 +109,19 @@ const LAYERS: &[Layer] = &[
     },
     Layer {
         name: "store",
-        layers: &[("config", Any), ("telemetry", Any)],
+        layers: &[("config", Any), ("telemetry", Any), ("tls", Any)],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
     },
     Layer {
         name: "archive",
-        layers: &[("structure", Any), ("config", Any), ("telemetry", Any), ("single_flight", Any), ("store", Any)],
+        layers: &[
+            ("structure", Any),
+            ("config", Any),
+            ("telemetry", Any),
+            ("single_flight", Any),
+            ("tls", Any),
+            ("store", Any),
+        ],
         crates: &["axum", "tower", "tower_http", "wgpu", "clap"],
     },
     Layer {

@@ -137,7 +137,7 @@ const ROWS: &[Row] = &[
     ("access.hsts_s", "", "http_access::browsers_are_told_what_not_to_do"),
     ("telemetry.sample_ratio", "molmesh_trace_spans_total", "traces::a_share_of_the_traces_is_recorded"),
     ("telemetry.timeout_ms", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
-    ("telemetry.queue", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
+    ("telemetry.queue", "", "traces::collectors_that_take_nothing_disturb_nobody"),
     ("telemetry.flush_timeout_ms", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
     ("store.memory_object_bytes", "molmesh_cache_requests_total", "store::hot_results_are_answered_from_memory"),
 ];

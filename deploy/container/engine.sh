@@ -28,7 +28,7 @@ install_packages() {
     echo "installing $*" >&2
     local log
     log=$(mktemp)
-    { apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends "$@"; } >"$log" 2>&1 ||
+    { apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=300 install -qy --no-install-recommends "$@"; } >"$log" 2>&1 ||
         { tail -20 "$log" >&2; exit 1; }
     rm -f "$log"
 }

@@ -15,7 +15,7 @@ use super::memory::{NoMemory, Share};
 use super::whole;
 use crate::config::{ArchiveConfig, Templates};
 use crate::store::Digest;
-use crate::telemetry::TraceContext;
+use crate::telemetry::{SpanContext, traceparent, tracestate};
 
 /// Redirects that are followed.
 const HOPS: usize = 3;
@@ -77,6 +77,7 @@ pub(super) struct Limits {
 
 /// The client of all questions. Blocks: it reads the system's certificates.
 pub(super) fn build(config: &ArchiveConfig) -> Result<Client, reqwest::Error> {
+    crate::tls::install_provider();
     let builder = || {
         let builder = Client::builder()
             .user_agent(USER_AGENT)
@@ -127,12 +128,12 @@ pub(super) async fn get(
     known: Option<&Validators>,
     limits: Limits,
     mut share: Box<dyn Share>,
-    trace: &TraceContext,
+    trace: &SpanContext,
 ) -> Result<Answer, Failed> {
     let compressed = Path::new(url.path()).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gz"));
     let name = url.to_string();
-    let mut request = client.get(url).header(TRACEPARENT, trace.to_string());
-    request = trace.tracestate().into_iter().fold(request, |request, state| request.header(TRACESTATE, state));
+    let mut request = client.get(url).header(TRACEPARENT, traceparent(trace));
+    request = tracestate(trace).into_iter().fold(request, |request, state| request.header(TRACESTATE, state));
     if let Some(Validators { etag, last_modified }) = known {
         for (header, value) in [(IF_NONE_MATCH, etag), (IF_MODIFIED_SINCE, last_modified)] {
             request = value.iter().fold(request, |request, value| request.header(header.clone(), value));

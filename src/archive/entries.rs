@@ -17,7 +17,7 @@ use super::remote::{Origin, Remote};
 use crate::config::Config;
 use crate::store::Digest;
 use crate::structure::{Archive as Folder, EntryId, Stamp};
-use crate::telemetry::{ARCHIVE_FETCH, ARCHIVE_REQUESTS, Scope};
+use crate::telemetry::{ARCHIVE_FETCH, ARCHIVE_REQUESTS, TraceSpan};
 
 /// Entries whose digests are remembered: more than a day's visitors ask for, in a few megabytes.
 const REMEMBERED: usize = 16_384;
@@ -105,11 +105,11 @@ impl Archive {
         let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
         // It goes on without whoever starts it, but it is done in their name.
         let flight = self.shared.flights.join(id, move || {
-            let scope = Scope::current();
+            let span = TraceSpan::current();
             let find = async move { shared.find(&wanted).await };
             let find = async move {
-                match scope {
-                    Some(scope) => scope.run(find).await,
+                match span {
+                    Some(span) => span.run(find).await,
                     None => find.await,
                 }
             };

@@ -14,7 +14,7 @@ use super::error::{FetchError, Why};
 use super::memory::{Memory, NoMemory};
 use crate::config::{ArchiveConfig, Template};
 use crate::structure::EntryId;
-use crate::telemetry::{Closing, Scope, SpanKind};
+use crate::telemetry::{SpanKind, SpanParent, TraceSpan};
 
 /// Longest that a host is left alone on its own word.
 const LONGEST: Duration = Duration::from_mins(10);
@@ -168,12 +168,14 @@ impl Remote {
         let url = template.url(id).ok_or_else(|| Failed::other(Why::Client, "the address is no URL"))?;
         let known = copy.filter(|copy| copy.url == url.as_str()).map(|copy| &copy.validators);
         let pass = breaker.enter().map_err(paused)?;
-        let scope = Scope::open(&Scope::current_origin(), std::time::Instant::now());
-        let get = client::get(client, url, known, self.limits, self.memory.begin(), scope.context());
+        let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());
+        let trace = span.context();
+        let get = client::get(client, url, known, self.limits, self.memory.begin(), &trace);
         let answer = tokio::time::timeout_at(deadline, get)
             .await
             .unwrap_or_else(|_elapsed| Err(Failed::other(Why::Timeout, "not whole in time")));
-        scope.close(|| closing(id, breaker.host(), &answer));
+        describe(&span, id, breaker.host(), &answer);
+        span.end();
         match &answer {
             Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => pass.succeeded(),
             Err(Failed::Other { retry_after: Some(wait), why, .. })
@@ -198,13 +200,11 @@ impl Remote {
     }
 }
 
-/// What is known of an attempt once it is over.
-fn closing(id: &EntryId, host: &str, answer: &Result<Answer, Failed>) -> Closing {
-    let mut attributes = vec![
-        ("http.request.method", "GET".into()),
-        ("server.address", host.to_owned().into()),
-        ("molmesh.entry", id.as_str().to_owned().into()),
-    ];
+/// Sets the attributes and the status of an attempt's span.
+fn describe(span: &TraceSpan, id: &EntryId, host: &str, answer: &Result<Answer, Failed>) {
+    span.set("http.request.method", "GET");
+    span.set("server.address", host.to_owned());
+    span.set("molmesh.entry", id.as_str().to_owned());
     let (status, error) = match answer {
         Ok(Answer::Body { .. }) | Err(Failed::TooLarge(_)) => (Some(200), None),
         Ok(Answer::Unchanged) => (Some(304), None),
@@ -212,12 +212,16 @@ fn closing(id: &EntryId, host: &str, answer: &Result<Answer, Failed>) -> Closing
         Ok(Answer::Absent) => (Some(404), None),
         Err(Failed::Memory(_)) => (Some(200), Some("no memory for it".to_owned())),
         Err(Failed::Other { why, detail, .. }) => match why {
-            Why::Status(status) => (Some(u64::from(*status)), Some(detail.clone())),
+            Why::Status(status) => (Some(i64::from(*status)), Some(detail.clone())),
             _ => (None, Some(detail.clone())),
         },
     };
-    attributes.extend(status.map(|status| ("http.response.status_code", status.into())));
-    Closing { name: "GET".into(), kind: SpanKind::Client, attributes, error }
+    if let Some(status) = status {
+        span.set("http.response.status_code", status);
+    }
+    if let Some(error) = error {
+        span.fail(error);
+    }
 }
 
 /// A random number of [0, 1). The standard library seeds its hashers at random, which is all that pauses need.

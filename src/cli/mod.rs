@@ -14,7 +14,6 @@ mod error;
 mod estimate;
 #[cfg(feature = "server")]
 mod healthcheck;
-mod heap;
 mod interrupt;
 #[cfg(feature = "server")]
 mod key;
@@ -56,8 +55,8 @@ fn run() -> i32 {
         Err(error) => return usage(&error),
     };
     let result = match args.command {
-        Command::Mesh(args) => once(|| mesh::run(&args)),
-        Command::Render(args) => once(|| render::run(&args)),
+        Command::Mesh(args) => panics::contained(|| mesh::run(&args)),
+        Command::Render(args) => panics::contained(|| render::run(&args)),
         #[cfg(feature = "server")]
         Command::Serve(args) => serve::run(&args),
         #[cfg(feature = "server")]
@@ -79,12 +78,6 @@ fn run() -> i32 {
             error.code()
         }
     }
-}
-
-/// Runs a command that makes one mesh and ends.
-fn once(command: impl FnOnce() -> Result<(), CliError>) -> Result<(), CliError> {
-    heap::keep();
-    panics::contained(command)
 }
 
 /// Ends the process as it is. Not by returning: freeing a mesh of a few hundred megabytes that nobody will look at again

@@ -15,7 +15,6 @@ use super::args::ServeArgs;
 use super::backend::{self, Asked, Picked};
 use super::banner::{self, Facts};
 use super::error::CliError;
-use super::heap;
 use super::style::Style;
 use super::survey;
 
@@ -63,7 +62,6 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
             error => CliError::Service(error.to_string()),
         },
     )?;
-    heap::tend().map_err(|e| CliError::Service(format!("cannot start a thread: {e}")))?;
     let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
     // The service runs whether or not somebody reads its banner.
     drop(io::stderr().write_all(text.as_bytes()));

@@ -1,4 +1,4 @@
-//! Where spans of traces go, and how many of them.
+//! Configuration of the trace export.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -12,30 +12,30 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::Secret;
 
-/// The export of traces to a collector that speaks OTLP over HTTP, as protobuf. Off by default.
+/// Export of traces to a collector with OTLP over HTTP (protobuf). Off by default.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TelemetryConfig {
-    /// Address of a collector, such as `http://localhost:4318`; spans go to `/v1/traces` under it. Default `none`: nothing is
-    /// sent. Trace ids are passed on and logged nevertheless.
+    /// Base URL of the collector, such as `http://localhost:4318`; spans are sent to `/v1/traces` below it. Default `none`:
+    /// no spans are recorded. Trace ids are passed on and logged in any case.
     pub endpoint: Option<CollectorUrl>,
-    /// Part of the traces that are recorded, from 0 to 1, among those that begin here. Default 1. Whoever is above decides
-    /// for the others, by the flag in `traceparent`.
+    /// Fraction of new traces that are sampled, from 0 to 1. Default 1. A request with `traceparent` is sampled as its
+    /// sampled flag says.
     pub sample_ratio: Ratio,
-    /// The name of this service among others. Default `molmesh`.
+    /// Value of the resource attribute `service.name`. Default `molmesh`.
     pub service_name: String,
-    /// Headers for the collector, as `name=value,name=value`: where it asks for a key. Default `none`. Better given by the
-    /// environment than by a file.
+    /// HTTP headers for the collector, as `name=value,name=value`, such as an API key. Default `none`. Prefer the
+    /// environment variable or `secret_headers_file` to the configuration file.
     pub secret_headers: Option<SecretHeaders>,
-    /// File with `secret_headers`, in their place. Default `none`.
+    /// File that contains the value of `secret_headers`. Default `none`.
     pub secret_headers_file: Option<PathBuf>,
-    /// Time for one attempt to send a batch, ms. Default 10,000: that of OpenTelemetry's own exporters.
+    /// Maximum time to send a batch, retries included, ms. Default 10,000, the default of OpenTelemetry's exporters.
     pub timeout_ms: u64,
-    /// Spans that wait to be sent; further ones are thrown away and counted. Default 4,096: 250 requests' worth, some
-    /// 2 MB.
+    /// Maximum number of spans that wait for export; further ones are dropped. Default 4,096: the spans of some 250
+    /// requests, about 2 MB.
     pub queue: usize,
-    /// Time for what waits to be sent when the service stops, ms. Default 2,000: a collector that is there needs a
-    /// fraction of it, and one that is not must not hold up the stop.
+    /// Maximum time to export the queued spans when the service stops, ms. Default 2,000: a running collector needs a
+    /// fraction of it, and an unreachable one must not delay the stop.
     pub flush_timeout_ms: u64,
 }
 
@@ -55,26 +55,26 @@ impl Default for TelemetryConfig {
 }
 
 impl TelemetryConfig {
-    /// Time for one attempt to send a batch.
+    /// Returns the maximum time to send a batch, retries included.
     #[must_use]
     pub fn timeout(&self) -> Duration {
         Duration::from_millis(self.timeout_ms)
     }
 
-    /// Time for what waits to be sent when the service stops.
+    /// Returns the maximum time to export the queued spans when the service stops.
     #[must_use]
     pub fn flush_timeout(&self) -> Duration {
         Duration::from_millis(self.flush_timeout_ms)
     }
 }
 
-/// A number from 0 to 1.
+/// Number from 0 to 1.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(transparent)]
 pub struct Ratio(f64);
 
 impl Ratio {
-    /// The number.
+    /// Returns the number.
     #[must_use]
     pub fn get(self) -> f64 {
         self.0
@@ -103,13 +103,13 @@ impl<'de> Deserialize<'de> for Ratio {
     }
 }
 
-/// The address of a collector: `http(s)://host:port`, perhaps with a path, without a name, a password or a query.
+/// Base URL of a collector: `http(s)://host:port` with an optional path, without user name, password or query.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(transparent)]
 pub struct CollectorUrl(String);
 
 impl CollectorUrl {
-    /// Where traces are sent.
+    /// Returns the URL that traces are sent to.
     #[must_use]
     pub fn traces(&self) -> String {
         format!("{}/v1/traces", self.0.trim_end_matches('/'))
@@ -141,12 +141,12 @@ impl<'de> Deserialize<'de> for CollectorUrl {
                 && url.query().is_none()
                 && url.fragment().is_none()
         });
-        let expected = "none, or http(s)://host:port without a password, which belongs into secret_headers";
+        let expected = "none, or http(s)://host:port without a password; put secrets into secret_headers";
         if good { Ok(Self(text)) } else { Err(serde::de::Error::custom(expected)) }
     }
 }
 
-/// Headers that are never shown.
+/// HTTP headers that are never displayed or logged.
 #[derive(Clone, PartialEq, Eq)]
 pub struct SecretHeaders {
     text: Secret,
@@ -154,7 +154,7 @@ pub struct SecretHeaders {
 }
 
 impl SecretHeaders {
-    /// The headers, marked as what must not be shown.
+    /// Returns the headers; the values are marked as sensitive.
     #[must_use]
     pub fn reveal(&self) -> &HeaderMap {
         &self.headers

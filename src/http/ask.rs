@@ -20,7 +20,7 @@ use crate::formats::Format;
 use crate::jobs::{ContentKey, Lease, Order, Task, Ticket};
 use crate::pipeline::params::Request;
 use crate::store::Digest;
-use crate::telemetry::Scope;
+use crate::telemetry::{SpanParent, TraceSpan};
 
 /// A mesh, or its report, that somebody asks for.
 pub(super) struct Ask {
@@ -104,9 +104,9 @@ impl Ask {
         let task = self.task(&input);
         let mut ticket = app.pool.submit(task, app.config.jobs.deadline(), None)?;
         if ticket.is_shared()
-            && let Some(scope) = Scope::current()
+            && let Some(span) = TraceSpan::current()
         {
-            scope.link(ticket.scope().context());
+            span.link(ticket.span().context());
         }
         let patience = match self.wish.wait {
             // A report has no address of its own that could be promised: it is waited for until its deadline.
@@ -154,7 +154,7 @@ impl Ask {
             job: self.request.job.clone(),
             rank: self.wish.rank,
             lease: Some(Arc::clone(&input.lease)),
-            origin: Scope::current_origin(),
+            parent: SpanParent::current(),
             id: None,
         }
     }

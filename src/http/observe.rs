@@ -19,13 +19,13 @@ use tracing::Instrument as _;
 use super::request_id::RequestId;
 use super::timing;
 use crate::telemetry::{
-    Closing, HTTP_ACTIVE, HTTP_DURATION, HTTP_REQUEST_SIZE, HTTP_RESPONSE_SIZE, Origin, Scope, SpanKind, TraceContext,
-    Tracer, Value,
+    HTTP_ACTIVE, HTTP_DURATION, HTTP_REQUEST_SIZE, HTTP_RESPONSE_SIZE, SpanKind, SpanParent, TraceSpan, Tracer,
+    read_trace_context, traceparent,
 };
 
-/// W3C's name for a place in a trace: in and out.
+/// Header for the position in a trace, of requests and responses.
 pub(super) const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
-/// What vendors add to it: in alone, and on to whom we ask.
+/// Vendor data of the trace, of requests alone.
 const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
 /// Watches one request.
@@ -34,24 +34,31 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
     let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
     let route = request.extensions().get::<MatchedPath>().cloned();
     let method = request.method().clone();
-    let scope = {
-        let all = |name| request.headers().get_all(name).iter().map(HeaderValue::as_bytes);
-        let context = TraceContext::read(all(TRACEPARENT), all(TRACESTATE));
-        Scope::open(&Origin { request: Some(id.as_str().into()), context, tracer }, start)
+    let trace = {
+        // Several values are joined, as HTTP has it: right for `tracestate`, and an invalid `traceparent`.
+        let header = |name| {
+            let values = request.headers().get_all(name).iter();
+            values.map(|value| value.to_str().unwrap_or_default()).collect::<Vec<_>>().join(",")
+        };
+        let context = read_trace_context(&header(TRACEPARENT), &header(TRACESTATE));
+        let parent = SpanParent { request: Some(id.as_str().into()), context, tracer };
+        let method = known(&method);
+        let name = route.as_ref().map_or_else(|| method.to_owned(), |route| format!("{method} {}", route.as_str()));
+        TraceSpan::start(&parent, name, SpanKind::Server, start)
     };
     // The query stays out: a signature may stand in it. The guard adds whose key it is.
     let path = request.uri().path();
     let span = tracing::info_span!(
         "request",
         request_id = id.as_str(),
-        trace_id = %scope.trace_id(),
+        trace_id = %trace.trace_id(),
         %method,
         path,
         key = tracing::field::Empty
     );
     let received = Arc::new(AtomicU64::new(0));
     gauge!(HTTP_ACTIVE, "method" => known(&method)).increment(1.0);
-    let path = if scope.is_recorded() { path.to_owned() } else { String::new() };
+    let path = if trace.is_recording() { path.to_owned() } else { String::new() };
     let mut log = Log {
         start,
         method,
@@ -59,14 +66,14 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         path,
         status: None,
         span: span.clone(),
-        scope: scope.clone(),
+        trace: trace.clone(),
         received: Arc::clone(&received),
         bytes: 0,
         complete: false,
     };
     let request = request.map(|body| Body::new(Received { body, bytes: received }));
-    let place = HeaderValue::from_str(&scope.context().to_string());
-    let mut response = scope.run(next.run(request)).instrument(span).await;
+    let place = HeaderValue::from_str(&traceparent(&trace.context()));
+    let mut response = trace.run(next.run(request)).instrument(span).await;
     timing::tell(&mut response, start.elapsed());
     if let Ok(place) = place {
         response.headers_mut().insert(TRACEPARENT, place);
@@ -89,7 +96,7 @@ struct Log {
     /// None if the client left before there was an answer.
     status: Option<u16>,
     span: tracing::Span,
-    scope: Scope,
+    trace: TraceSpan,
     /// Bytes of the request's body.
     received: Arc<AtomicU64>,
     /// Bytes of the answer's.
@@ -121,29 +128,33 @@ impl Drop for Log {
                 tracing::info!(ms, "the client left before it was answered");
             }
         });
-        self.scope.close(|| self.closing(method, route, received));
+        if self.trace.is_recording() {
+            self.describe(method, route, received);
+        }
+        self.trace.end();
     }
 }
 
 impl Log {
-    /// The span, with attributes as OpenTelemetry names them.
-    fn closing(&self, method: &'static str, route: String, received: u64) -> Closing {
-        let mut attributes: Vec<(&'static str, Value)> = vec![
-            ("http.request.method", method.into()),
-            ("url.path", self.path.clone().into()),
-            ("http.request.body.size", received.into()),
-            ("http.response.body.size", (self.bytes as u64).into()),
-            ("molmesh.request.id", self.scope.request().to_owned().into()),
-            ("molmesh.complete", Value::Flag(self.complete)),
-        ];
-        let name = if self.route.is_some() { format!("{method} {route}") } else { method.to_owned() };
+    /// Sets the attributes of the span, named by OpenTelemetry's conventions, and its status.
+    fn describe(&self, method: &'static str, route: String, received: u64) {
+        let trace = &self.trace;
+        trace.set("http.request.method", method);
+        trace.set("url.path", self.path.clone());
+        trace.set("http.request.body.size", received.cast_signed());
+        trace.set("http.response.body.size", (self.bytes as u64).cast_signed());
+        trace.set("molmesh.request.id", trace.request().to_owned());
+        trace.set("molmesh.complete", self.complete);
         if self.route.is_some() {
-            attributes.push(("http.route", route.into()));
+            trace.set("http.route", route);
         }
-        attributes.extend(self.status.map(|status| ("http.response.status_code", u64::from(status).into())));
-        // What the client did wrong is no failure of ours.
-        let error = self.status.filter(|status| *status >= 500).map(|status| format!("answered with {status}"));
-        Closing { name: name.into(), kind: SpanKind::Server, attributes, error }
+        if let Some(status) = self.status {
+            trace.set("http.response.status_code", i64::from(status));
+            // By OpenTelemetry's conventions, 4xx are not errors of a server.
+            if status >= 500 {
+                trace.fail(format!("answered with {status}"));
+            }
+        }
     }
 }
 

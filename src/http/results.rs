@@ -28,7 +28,7 @@ use super::{conditional, delivery};
 use crate::formats::Format;
 use crate::jobs::{self, ContentKey, Finished, REPORT};
 use crate::pipeline::Report;
-use crate::telemetry::{Closing, RESULTS_NOT_KEPT, Scope};
+use crate::telemetry::{RESULTS_NOT_KEPT, SpanKind, SpanParent, TraceSpan};
 
 /// The name says what the bytes are: they never change.
 pub(super) const IMMUTABLE: HeaderValue = HeaderValue::from_static("public, max-age=31536000, immutable");
@@ -200,14 +200,14 @@ pub(super) fn keep_later(app: &Shared, finished: &Arc<Finished>, format: Format,
         }
     };
     let (app, finished, key) = (Arc::clone(app), Arc::clone(finished), *key);
-    let scope = Scope::open(&Scope::current_origin(), Instant::now());
+    let span = TraceSpan::start(&SpanParent::current(), "keep", SpanKind::Internal, Instant::now());
     let keep = async move {
         let limit = app.config.limits.output_bytes;
         if let Err(error) = jobs::save(&app.store, finished, format, &key, limit).await {
             counter!(RESULTS_NOT_KEPT, "reason" => "failed").increment(1);
             tracing::warn!(%error, "a result cannot be kept");
         }
-        scope.close(|| Closing::of("keep"));
+        span.end();
         drop(keeping);
     };
     tokio::spawn(keep.in_current_span());

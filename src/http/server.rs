@@ -23,7 +23,7 @@ use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
 use crate::picture::Drawer;
 use crate::store::{FolderLock, LockError, Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
-use crate::telemetry::{self, Exporter, TelemetryError};
+use crate::telemetry::{self, TelemetryError, Traces};
 
 /// How often the recorder tidies up its histograms.
 const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
@@ -86,7 +86,7 @@ pub struct Server {
     addr: SocketAddr,
     metrics_addr: Option<SocketAddr>,
     stop: watch::Sender<Stop>,
-    exporter: Option<Exporter>,
+    traces: Traces,
     /// Held until the service has ended.
     data: FolderLock,
 }
@@ -118,7 +118,7 @@ impl Server {
         if metrics_listener.is_some() {
             telemetry::recorder()?;
         }
-        let (tracer, exporter) = Exporter::start(&config.telemetry);
+        let traces = Traces::start(&config.telemetry)?;
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
@@ -127,7 +127,7 @@ impl Server {
             budget: Budget::new(config.limits.memory_bytes),
             drawer,
             meter: Some(Arc::new(Bill(Arc::clone(&access)))),
-            tracer: tracer.clone(),
+            tracer: traces.tracer(),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let secret = store.secret().await?;
@@ -160,11 +160,11 @@ impl Server {
             deliveries,
             readiness,
             probe: Probe::new(),
-            tracer,
+            tracer: traces.tracer(),
             found,
             capabilities,
         });
-        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop, exporter, data })
+        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop, traces, data })
     }
 
     /// Address of the service.
@@ -237,9 +237,7 @@ impl Server {
         if let Some(metrics) = metrics {
             metrics.abort();
         }
-        if let Some(exporter) = self.exporter {
-            exporter.finish().await;
-        }
+        self.traces.shut_down().await;
         drop(self.data);
         Ok(requests)
     }

@@ -17,7 +17,7 @@ use super::problem::Problem;
 use super::unfit;
 use crate::formats::Format;
 use crate::jobs::{Budget, Finished};
-use crate::telemetry::{STAGE_DURATION, Scope};
+use crate::telemetry::{STAGE_DURATION, TraceSpan};
 
 /// Bytes of a piece: few wake-ups for large meshes, small enough to be in a cache while it is sent.
 const PIECE: usize = 256 << 10;
@@ -42,9 +42,9 @@ pub(super) async fn start(
     let (head, answer) = oneshot::channel();
     let (sender, receiver) = mpsc::channel(PIECES);
     let pieces = Pieces { sender, buffer: BytesMut::new(), budget };
-    let (span, scope) = (tracing::Span::current(), Scope::current());
+    let (log, span) = (tracing::Span::current(), TraceSpan::current());
     tokio::task::spawn_blocking(move || {
-        span.in_scope(|| write(&finished, format, limit, head, pieces, scope.as_ref()));
+        log.in_scope(|| write(&finished, format, limit, head, pieces, span.as_ref()));
         drop(place);
     });
     // A writer that panics drops its end; the panic hook has logged it.
@@ -59,7 +59,7 @@ fn write(
     limit: u64,
     head: oneshot::Sender<Result<Option<u64>, Problem>>,
     mut writer: Pieces,
-    scope: Option<&Scope>,
+    span: Option<&TraceSpan>,
 ) {
     let start = Instant::now();
     let product = &finished.product;
@@ -76,14 +76,17 @@ fn write(
     // Without a receiver the client is gone; the first piece would find out as well.
     let gone = head.send(length).is_err();
     let Some(file) = file.filter(|_| !gone) else { return };
-    match file.write(&mut writer).and_then(|()| writer.finish()) {
-        Ok(()) => {
-            let time = start.elapsed();
-            histogram!(STAGE_DURATION, "stage" => "encode").record(time.as_secs_f64());
-            if let Some(scope) = scope {
-                scope.part("encode", start, time);
-            }
+    let written = file.write(&mut writer).and_then(|()| {
+        // Recorded before the last piece is sent, with which the span of the request ends.
+        let time = start.elapsed();
+        histogram!(STAGE_DURATION, "stage" => "encode").record(time.as_secs_f64());
+        if let Some(span) = span {
+            span.part("encode", start, time);
         }
+        writer.finish()
+    });
+    match written {
+        Ok(()) => {}
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => tracing::debug!("the client left"),
         // The body ends without its end, which breaks the connection off: a truncated mesh must not look whole.
         Err(error) => tracing::error!(%error, format = format.extension(), "writing a mesh failed"),

@@ -9,7 +9,7 @@ use axum::response::Response;
 
 use super::delivery;
 use crate::pipeline::Report;
-use crate::telemetry::Scope;
+use crate::telemetry::TraceSpan;
 
 /// The header.
 pub(super) const SERVER_TIMING: HeaderName = HeaderName::from_static("server-timing");
@@ -31,8 +31,8 @@ impl Timing {
     /// `name` is over. It is a part of the request's span too.
     pub(super) fn lap(&mut self, name: &'static str) {
         let (begun, time) = self.look();
-        if let Some(scope) = Scope::current() {
-            scope.part(name, begun, time);
+        if let Some(span) = TraceSpan::current() {
+            span.part(name, begun, time);
         }
         self.add(name, ms(time));
     }

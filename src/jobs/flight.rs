@@ -11,7 +11,7 @@ use super::{Outcome, Task};
 use crate::pipeline::{Job, ProgressSink, Tracker, params};
 use crate::store::Digest;
 use crate::surface::CancelToken;
-use crate::telemetry::Scope;
+use crate::telemetry::TraceSpan;
 
 /// What makes two tasks one: the same input, the same parameters, the same check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -81,7 +81,7 @@ pub(super) struct Flight {
     pub(super) cancel: CancelToken,
     pub(super) progress: Arc<Progress>,
     /// The span of the work, from its acceptance on, under that of the first who asked.
-    pub(super) scope: Scope,
+    pub(super) span: TraceSpan,
     pub(super) waiters: Vec<Waiter>,
     pub(super) claims: Vec<Claim>,
     /// Taken by the worker.
@@ -96,5 +96,5 @@ pub(super) struct Entry {
     pub(super) progress: Arc<Progress>,
     pub(super) claims: Vec<Claim>,
     pub(super) accepted: Instant,
-    pub(super) scope: Scope,
+    pub(super) span: TraceSpan,
 }

@@ -175,7 +175,7 @@ impl Ledger {
             finished_ms: None,
             result: None,
             problem: None,
-            requester: Requester::of(&order.task.origin),
+            requester: Requester::of(&order.task.parent),
         };
         if order.idempotency.is_some()
             && let Some(view) = self.view(&id).await?

@@ -42,7 +42,7 @@ use bytes::Bytes;
 use crate::pipeline::{Job, Product};
 use crate::store::Digest;
 use crate::structure::referee::Diagnostic;
-use crate::telemetry::Origin;
+use crate::telemetry::SpanParent;
 
 /// One job to run.
 #[derive(Debug)]
@@ -60,7 +60,7 @@ pub struct Task {
     /// Memory that the input is charged to, given back with it.
     pub lease: Option<Arc<Lease>>,
     /// Who asked for it.
-    pub origin: Origin,
+    pub parent: SpanParent,
     /// The id of the job that was promised; none if somebody waits.
     pub id: Option<JobId>,
 }

@@ -19,7 +19,7 @@ use crate::formats::Format;
 use crate::pipeline::{JobError, params};
 use crate::store::{Digest, Pin};
 use crate::surface::SurfaceError;
-use crate::telemetry::{Closing, JOBS_OPEN, Scope, Tracer};
+use crate::telemetry::{JOBS_OPEN, SpanKind, TraceSpan, Tracer};
 
 /// How often a running job's progress is looked at.
 const TICK: Duration = Duration::from_millis(100);
@@ -161,8 +161,7 @@ impl Ledger {
     /// Sees a job through, beside everything else, in the name of the request that asked for it.
     pub(super) fn spawn(&self, runner: Runner<[Pin; 2]>) {
         let record = runner.promise.record();
-        let origin = record.requester.origin(self.0.pool.tracer());
-        let log = Scope::open(&origin, Instant::now()).log(Some(record.id.as_str()));
+        let log = record.requester.parent(self.0.pool.tracer()).log_span(Some(record.id.as_str()));
         gauge!(JOBS_OPEN).increment(1.0);
         self.0.open.send_modify(|open| *open += 1);
         let ledger = self.clone();
@@ -304,12 +303,13 @@ async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Resu
     let (resolution, digest) = (report.resolution, finished.digest);
     let key = ContentKey::new(&digest, &job, format, &report.maker());
     let (store, settings) = (&ledger.0.store, &ledger.0.settings);
-    let scope = Scope::open(&record.requester.origin(ledger.0.pool.tracer()), Instant::now());
+    let parent = record.requester.parent(ledger.0.pool.tracer());
+    let span = TraceSpan::start(&parent, "keep", SpanKind::Internal, Instant::now());
     let keep = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
     insist(&record.id, settings.patience, SaveError::is_transient, keep)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
-    scope.close(|| Closing::of("keep"));
+    span.end();
     Ok(key.to_string())
 }
 
@@ -332,6 +332,6 @@ pub(super) fn task(
     let (job, format) = read(record)?;
     let rank = Rank { client: Client::numbered(record.client), batch: true, urgency: record.urgency };
     let strict = record.parameters.iter().any(|(name, _)| name == "check");
-    let (origin, id) = (record.requester.origin(tracer), Some(record.id.clone()));
-    Ok((Task { input, digest, strict, job, rank, lease: Some(Arc::new(lease)), origin, id }, format))
+    let (parent, id) = (record.requester.parent(tracer), Some(record.id.clone()));
+    Ok((Task { input, digest, strict, job, rank, lease: Some(Arc::new(lease)), parent, id }, format))
 }

@@ -13,7 +13,7 @@ use super::returns::Returns;
 use super::{Outcome, Refusal, Task};
 use crate::pipeline;
 use crate::surface::CancelToken;
-use crate::telemetry::{Closing, QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, Scope};
+use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, SpanKind, TraceSpan};
 
 struct State {
     flights: Vec<Flight>,
@@ -45,7 +45,7 @@ pub(super) struct Place {
     pub(super) outcome: oneshot::Receiver<Outcome>,
     pub(super) progress: Arc<Progress>,
     /// The span of the work.
-    pub(super) scope: Scope,
+    pub(super) span: TraceSpan,
     /// The same work was in the house already.
     pub(super) shared: bool,
     /// It runs already, so that no claim is called.
@@ -100,16 +100,16 @@ impl Queue {
             let begun = flight.begun.is_some();
             // Work that runs cannot be held back any more: whoever claims it records that by itself.
             flight.claims.extend(claim.filter(|_| !begun));
-            if let Some(context) = &task.origin.context {
-                flight.scope.link(context);
+            if let Some(context) = &task.parent.context {
+                flight.span.link(context.clone());
             }
-            let (progress, scope) = (Arc::clone(&flight.progress), flight.scope.clone());
-            return Ok(Place { flight: flight.id, waiter, outcome, progress, scope, shared: true, begun });
+            let (progress, span) = (Arc::clone(&flight.progress), flight.span.clone());
+            return Ok(Place { flight: flight.id, waiter, outcome, progress, span, shared: true, begun });
         }
         if state.leaving && task.rank.batch {
             // Its promise is kept by the next process: nobody will answer on the other end.
-            let (progress, scope) = (Arc::default(), Scope::open(&task.origin, Instant::now()));
-            return Ok(Place { flight: waiter, waiter, outcome, progress, scope, shared: false, begun: false });
+            let (progress, span) = (Arc::default(), job_span(&task, Instant::now()));
+            return Ok(Place { flight: waiter, waiter, outcome, progress, span, shared: false, begun: false });
         }
         let now = Instant::now();
         let units = pipeline::work(&task.input, &task.job);
@@ -131,7 +131,7 @@ impl Queue {
             return Err(Refusal::TooLate { wait, allowed });
         }
         let tag = state.shares.tag(&task.rank, units);
-        let (progress, scope) = (Arc::new(Progress::default()), Scope::open(&task.origin, now));
+        let (progress, span) = (Arc::new(Progress::default()), job_span(&task, now));
         state.flights.push(Flight {
             id: waiter,
             work,
@@ -142,7 +142,7 @@ impl Queue {
             begun: None,
             cancel: CancelToken::default(),
             progress: Arc::clone(&progress),
-            scope: scope.clone(),
+            span: span.clone(),
             waiters: vec![Waiter { id: waiter, reply }],
             claims: claim.into_iter().collect(),
             task: Some(task),
@@ -150,7 +150,7 @@ impl Queue {
         self.publish(&mut state);
         drop(state);
         self.filled.notify_one();
-        Ok(Place { flight: waiter, waiter, outcome, progress, scope, shared: false, begun: false })
+        Ok(Place { flight: waiter, waiter, outcome, progress, span, shared: false, begun: false })
     }
 
     /// The next job; blocks until there is one. `None` once the queue is closed and empty.
@@ -190,7 +190,7 @@ impl Queue {
             progress: Arc::clone(&flight.progress),
             claims: std::mem::take(&mut flight.claims),
             accepted: flight.accepted,
-            scope: flight.scope.clone(),
+            span: flight.span.clone(),
         })
     }
 
@@ -235,8 +235,8 @@ impl Queue {
         drop(state);
         // The input, which may be large, is freed outside the lock.
         if let Some(flight) = left {
-            let error = Some("nobody waits for it any more".to_owned());
-            flight.scope.close(|| Closing { error, ..Closing::of("job") });
+            flight.span.fail("nobody waits for it any more");
+            flight.span.end();
         }
     }
 
@@ -337,4 +337,11 @@ impl Queue {
         gauge!(QUEUE_AGE).set(oldest.as_secs_f64());
         gauge!(QUEUE_WAIT).set(self.wait(state, now).as_secs_f64());
     }
+}
+
+/// Starts the span of a job, below that of the first request for it.
+fn job_span(task: &Task, start: Instant) -> TraceSpan {
+    // Nobody waits for an asynchronous job in its request.
+    let kind = if task.rank.batch { SpanKind::Consumer } else { SpanKind::Internal };
+    TraceSpan::start(&task.parent, "job", kind, start)
 }

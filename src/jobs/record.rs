@@ -11,7 +11,7 @@ use sha2::Sha256;
 use thiserror::Error;
 
 use crate::store::Secret;
-use crate::telemetry::{Origin, TraceContext, Tracer};
+use crate::telemetry::{SpanParent, Tracer, read_trace_context, traceparent, tracestate};
 
 /// Not a job's id: 32 hexadecimal digits in lower case are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
@@ -167,24 +167,23 @@ pub struct Requester {
 }
 
 impl Requester {
-    /// What is to be kept of an origin.
+    /// Returns the part of a span's parent that is stored.
     #[must_use]
-    pub fn of(origin: &Origin) -> Self {
+    pub fn of(parent: &SpanParent) -> Self {
         Self {
-            request: origin.request.as_deref().map(str::to_owned),
-            traceparent: origin.context.as_ref().map(ToString::to_string),
-            tracestate: origin.context.as_ref().and_then(TraceContext::tracestate).map(str::to_owned),
+            request: parent.request.as_deref().map(str::to_owned),
+            traceparent: parent.context.as_ref().map(traceparent),
+            tracestate: parent.context.as_ref().and_then(tracestate),
         }
     }
 
-    /// The origin that was kept, whose spans go to `tracer` now.
+    /// Returns the stored parent, for spans of `tracer`.
     #[must_use]
-    pub fn origin(&self, tracer: &Tracer) -> Origin {
-        let bytes = |text: &Option<String>| text.clone().map(String::into_bytes);
-        let (parent, state) = (bytes(&self.traceparent), bytes(&self.tracestate));
-        Origin {
+    pub fn parent(&self, tracer: &Tracer) -> SpanParent {
+        let text = |text: &'_ Option<String>| text.clone().unwrap_or_default();
+        SpanParent {
             request: self.request.as_deref().map(Into::into),
-            context: TraceContext::read(parent.as_deref(), state.as_deref()),
+            context: read_trace_context(&text(&self.traceparent), &text(&self.tracestate)),
             tracer: tracer.clone(),
         }
     }
@@ -268,15 +267,15 @@ mod tests {
     #[test]
     fn who_asked_comes_back_as_it_was() {
         let parent = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
-        let context = TraceContext::read([parent.as_bytes()], [&b"a=1"[..]]);
-        let origin = Origin { request: Some("r".into()), context, tracer: Tracer::default() };
+        let context = read_trace_context(parent, "a=1");
+        let origin = SpanParent { request: Some("r".into()), context, tracer: Tracer::default() };
         let kept = Requester::of(&origin);
         assert_eq!(kept.traceparent.as_deref(), Some(parent));
-        let back = kept.origin(&Tracer::default());
+        let back = kept.parent(&Tracer::default());
         assert_eq!((&back.request, &back.context), (&origin.request, &origin.context));
         // Whoever changes a record cannot put more into it than into a request.
         let hostile = Requester { traceparent: Some("00-x".to_owned()), ..kept };
-        assert_eq!(hostile.origin(&Tracer::default()).context, None);
+        assert_eq!(hostile.parent(&Tracer::default()).context, None);
     }
 
     #[test]

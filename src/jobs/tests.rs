@@ -23,7 +23,7 @@ use crate::pipeline::{JobLimits, params};
 use crate::store::faulty::{Faults, faulty};
 use crate::store::{Digest, Folder, Name, Store, StoreError};
 use crate::surface::ReferenceBackend;
-use crate::telemetry::{Origin, Tracer};
+use crate::telemetry::{SpanParent, Tracer};
 
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 const PATIENT: Duration = Duration::from_mins(2);
@@ -67,7 +67,7 @@ impl House {
             job: request.job,
             rank,
             lease: None,
-            origin: Origin::default(),
+            parent: SpanParent::default(),
             id: None,
         };
         let order = Order { task, parameters: pairs.to_vec(), format: Format::Stl, idempotency: None };

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use super::flight::Progress;
 use super::queue::{Place, Queue};
 use super::{Failure, Outcome};
-use crate::telemetry::Scope;
+use crate::telemetry::TraceSpan;
 
 /// An accepted job.
 #[must_use = "dropping the ticket cancels the job"]
@@ -44,8 +44,8 @@ impl Ticket {
 
     /// The span of the work.
     #[must_use]
-    pub fn scope(&self) -> &Scope {
-        &self.place.scope
+    pub fn span(&self) -> &TraceSpan {
+        &self.place.span
     }
 
     /// Whether the work ran already when this ticket was given out: then its claim is not called.

@@ -14,9 +14,7 @@ use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report
 use crate::structure::referee::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, SurfaceError};
-use crate::telemetry::{
-    Closing, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, Scope, SpanKind, TRIANGLES, VOXELS,
-};
+use crate::telemetry::{JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan, VOXELS};
 
 /// Largest text of which the referee explains a refusal, bytes: it takes some 10 ms for so much, and 40 in the worst case.
 const MAX_EXPLAINED: u64 = 512 << 10;
@@ -39,17 +37,17 @@ pub(super) fn work(shared: &Shared) {
 
 /// Runs one job. None if nobody wants it any more.
 fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
-    let Entry { task, cancel, progress, claims, accepted, scope, .. } = entry;
-    let log = scope.log(task.id.as_ref().map(JobId::as_str));
+    let Entry { task, cancel, progress, claims, accepted, span, .. } = entry;
+    let log = span.as_parent().log_span(task.id.as_ref().map(JobId::as_str));
     let _entered = log.enter();
-    let trace = Trace { scope, promised: task.rank.batch, job: task.id.clone() };
+    let trace = Trace { span, job: task.id.clone() };
     if cancel.is_cancelled() {
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
         trace.close("dismissed", None);
         return None;
     }
     let waited = accepted.elapsed();
-    trace.scope.part("queue", accepted, waited);
+    trace.span.part("queue", accepted, waited);
     let outcome = shared.budget.check().map_err(Failure::from).and_then(|()| {
         // Drawing's memory is known before anything is done for it.
         let mut drawing = shared.budget.lease();
@@ -101,7 +99,7 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
     drop(task);
     let outcome = outcome.map(Arc::new);
     for (stage, begun, time) in progress.stages() {
-        trace.scope.part(stage, begun, time);
+        trace.span.part(stage, begun, time);
     }
     trace.close(tell(&outcome), Some(&outcome));
     Some(outcome)
@@ -109,32 +107,34 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
 
 /// The span of a job.
 struct Trace {
-    scope: Scope,
-    promised: bool,
+    span: TraceSpan,
     job: Option<JobId>,
 }
 
 impl Trace {
+    /// Sets the attributes and the status, and ends the span.
     fn close(&self, label: &'static str, outcome: Option<&Outcome>) {
-        self.scope.close(|| {
-            let mut attributes = vec![("molmesh.job.outcome", label.into())];
-            attributes.extend(self.job.iter().map(|id| ("molmesh.job.id", id.to_string().into())));
-            if let Some(Ok(finished)) = outcome {
+        let span = &self.span;
+        span.set("molmesh.job.outcome", label);
+        if let Some(id) = &self.job {
+            span.set("molmesh.job.id", id.to_string());
+        }
+        match outcome {
+            Some(Ok(finished)) => {
                 let report = &finished.product.report;
-                attributes.extend([
-                    ("molmesh.backend", report.backend.into()),
-                    ("molmesh.device", report.device.clone().into()),
-                    ("molmesh.atoms", report.atoms.into()),
-                    ("molmesh.samples", report.samples.into()),
-                    ("molmesh.triangles", report.triangles.into()),
-                ]);
-                attributes.extend(report.picture.iter().map(|p| ("molmesh.renderer", p.renderer.into())));
+                span.set("molmesh.backend", report.backend);
+                span.set("molmesh.device", report.device.clone());
+                span.set("molmesh.atoms", report.atoms.cast_signed());
+                span.set("molmesh.samples", report.samples.cast_signed());
+                span.set("molmesh.triangles", report.triangles.cast_signed());
+                if let Some(picture) = &report.picture {
+                    span.set("molmesh.renderer", picture.renderer);
+                }
             }
-            // A promise is kept after its request was answered: nobody waits for it there.
-            let kind = if self.promised { SpanKind::Consumer } else { SpanKind::Internal };
-            let error = outcome.and_then(|outcome| outcome.as_ref().err()).map(ToString::to_string);
-            Closing { name: "job".into(), kind, attributes, error }
-        });
+            Some(Err(failure)) => span.fail(failure.to_string()),
+            None => {}
+        }
+        span.end();
     }
 }
 

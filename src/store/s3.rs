@@ -66,6 +66,7 @@ pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn Object
     if let Some(secret) = &config.secret_access_key {
         builder = builder.with_secret_access_key(secret.reveal());
     }
+    crate::tls::install_provider();
     let s3 = builder.build().map_err(|e| e.to_string())?;
     let client = ReqwestConnector::default().connect(&plain).map_err(|e| e.to_string())?;
     let objects: Arc<dyn ObjectStore> = Arc::new(PrefixStore::new(s3.clone(), prefix.clone()));

@@ -1,8 +1,8 @@
-//! Why logs, metrics or traces cannot be set up.
+//! Errors of setting up logs, metrics and traces.
 
 use thiserror::Error;
 
-/// Why logs, metrics or traces cannot be set up.
+/// Error of setting up logs, metrics or traces.
 #[derive(Debug, Error)]
 pub enum TelemetryError {
     /// The log filter cannot be read.
@@ -10,15 +10,15 @@ pub enum TelemetryError {
     Filter {
         /// The filter.
         filter: String,
-        /// The parser's words.
+        /// Message of the parser.
         reason: String,
     },
-    /// Another logger or recorder is installed in this process.
+    /// A part of the telemetry cannot be installed, such as a second logger in one process.
     #[error("{what} cannot be installed: {reason}")]
     Install {
-        /// `the log` or `the metrics recorder`.
+        /// `the log`, `the metrics recorder` or `the trace exporter`.
         what: &'static str,
-        /// The library's words.
+        /// Message of the library.
         reason: String,
     },
 }

@@ -1,22 +1,20 @@
-//! What the service tells about itself: logs, metrics, traces. The one place that installs global state: the log
-//! subscriber, the panic hook and the metrics recorder.
+//! Logs, metrics and traces of the service. The only module that installs global state: the log subscriber, the panic
+//! hook and the metrics recorder.
 
-mod context;
 mod error;
-mod export;
 mod logs;
 mod metrics;
 mod names;
-mod otlp;
 mod process;
 mod recorder;
-mod scope;
+mod span;
+mod traces;
 
-pub use context::TraceContext;
 pub use error::TelemetryError;
-pub use export::{Exporter, Tracer};
 pub use logs::{check_logs, init_logs};
 pub use metrics::{Kind, Label, Metric};
 pub use names::*;
+pub use opentelemetry::trace::{SpanContext, SpanKind};
 pub use recorder::{Recorder, recorder};
-pub use scope::{Closing, Origin, Scope, SpanKind, Value};
+pub use span::{SpanParent, TraceSpan, read_trace_context, traceparent, tracestate};
+pub use traces::{Tracer, Traces};

@@ -109,9 +109,8 @@ metrics! {
     ARCHIVE_BREAKER = "molmesh_archive_breaker_open", Gauge, host: "hosts of `archive.url`";
     /// Bytes of copies of archive entries on disk.
     ARCHIVE_KEPT = "molmesh_archive_cache_bytes", Gauge;
-    /// Spans for the collector of traces: sent, thrown away because the queue was full, because the collector could not be
-    /// reached, or because it refused them.
-    TRACE_SPANS = "molmesh_trace_spans_total", Counter, result: "exported|queue-full|failed|refused";
+    /// Spans sent to the trace collector, by the result of their batch. Spans dropped from a full queue are logged instead.
+    TRACE_SPANS = "molmesh_trace_spans_total", Counter, result: "exported|failed";
     /// Panics that were caught.
     PANICS = "molmesh_panics_total", Counter, place: "job|http";
     /// 1, labelled with the version.

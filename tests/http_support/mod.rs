@@ -170,7 +170,7 @@ static LOG: LazyLock<Arc<Mutex<Vec<u8>>>> = LazyLock::new(|| {
     let log = Arc::new(Mutex::new(Vec::new()));
     let sink = Sink(Arc::clone(&log));
     let subscriber = tracing_subscriber::fmt()
-        .with_env_filter("molmesh=debug")
+        .with_env_filter("warn,molmesh=debug")
         .with_ansi(false)
         .with_writer(move || sink.clone())
         .finish();

@@ -139,7 +139,7 @@ fn text(r: &Row) -> String {
         r.ready_ms.min,
         if r.same { "the same bytes as on one device" } else { "OTHER BYTES THAN ON ONE DEVICE" },
     );
-    for (k, part) in r.devices.iter().enumerate() {
+    for (k, part) in r.by.iter().enumerate() {
         let stages: Vec<String> = part.stages.iter().map(|(stage, ms)| format!("{stage} {:.3}", ms.median)).collect();
         // Writing to a string does not fail.
         _ = writeln!(text, "  part {k}, {}: {}; sum {:.3}", part.device, stages.join(", "), part.stages_ms.median);

@@ -1,23 +1,25 @@
-//! `.gltf`: the document as JSON text, with the buffer in it as a base64 data URI, encoded as it is written.
+//! `.gltf`: the document as JSON, with the buffer as a base64 data URI that is encoded while it is written.
 
-use std::io::{self, Write};
+use std::io::{self, BufWriter, IntoInnerError, Write};
 
+use base64::engine::general_purpose::STANDARD;
+use base64::write::EncoderWriter;
 use serde_json::Value;
 
-use super::base64::{Base64Writer, encoded_len};
 use super::buffer::write_buffer;
 use super::document::document;
 use super::layout::Layout;
+use crate::formats::block::BLOCK_BYTES;
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::Mesh;
 
-/// A `.gltf` that is laid out.
+/// Layout of a `.gltf` file.
 #[derive(Debug)]
 pub(in crate::formats) struct GltfPlan {
-    /// The text before the base64, or all of it if there is no buffer.
+    /// Text before the base64; the whole text if there is no buffer.
     before: Vec<u8>,
-    /// The text after the base64.
+    /// Text after the base64.
     after: &'static [u8],
     layout: Option<Layout>,
 }
@@ -31,7 +33,7 @@ impl GltfPlan {
     ) -> Result<Self, FormatError> {
         let layout = Layout::of(mesh, storage, summary)?;
         let mut document = document(mesh.centre, summary, storage, layout.as_ref(), meta)?;
-        // The buffer's entry comes last and is written by hand, so that its text can be left open.
+        // The entry of the buffer comes last and is formatted here, so that `write` can insert the base64 into it.
         document.shift_remove("buffers");
         let json = |error: serde_json::Error| FormatError::Json { reason: error.to_string() };
         let mut before = serde_json::to_vec(&Value::Object(document)).map_err(json)?;
@@ -45,15 +47,17 @@ impl GltfPlan {
 
     pub(in crate::formats) fn len(&self) -> u64 {
         let text = (self.before.len() + self.after.len()) as u64;
-        text + self.layout.map_or(0, |layout| encoded_len(layout.len))
+        text + self.layout.map_or(0, |layout| layout.len.div_ceil(3) * 4)
     }
 
     pub(in crate::formats) fn write(&self, mesh: &Mesh, out: &mut dyn Write) -> io::Result<()> {
         out.write_all(&self.before)?;
         if let Some(layout) = &self.layout {
-            let mut base64 = Base64Writer::new(out);
+            // The encoder writes pieces of 1 KiB.
+            let buffered = BufWriter::with_capacity(BLOCK_BYTES, &mut *out);
+            let mut base64 = EncoderWriter::new(buffered, &STANDARD);
             write_buffer(mesh, layout, &mut base64)?;
-            base64.finish()?;
+            base64.finish()?.into_inner().map_err(IntoInnerError::into_error)?;
         }
         out.write_all(self.after)
     }

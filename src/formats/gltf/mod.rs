@@ -4,7 +4,6 @@
 //! Buffers are in Å relative to the mesh's centre; the root node's translation gives the structure file's own
 //! coordinates back, so 32-bit floats keep their digits far from the origin.
 
-mod base64;
 mod buffer;
 mod document;
 mod glb;
