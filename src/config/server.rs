@@ -49,11 +49,11 @@ pub struct ServerConfig {
     pub heartbeat_ms: u64,
     /// How long an idle HTTP/2 connection is kept, ms. Default 120,000: front-ends come back within that time.
     pub idle_timeout_ms: u64,
-    /// Time after SIGTERM in which `/readyz` says 503 and everything is served as before, new connections too, ms; `none`:
-    /// no such time. Default 3,000: load balancers and orchestrators need a second or two until they send nothing more.
-    pub notice_ms: Option<u64>,
-    /// Time behind that for requests and jobs that run to finish, ms. Default 20,000: orchestrators commonly kill
-    /// after 30 seconds; with `notice_ms` and the last second for what is cancelled it makes 24.
+    /// Time after SIGTERM in which `/readyz` answers 503 while all requests are served, on new connections too, ms; `none`
+    /// skips it. Default 3,000: load balancers and orchestrators need a second or two to stop sending requests.
+    pub termination_notice_ms: Option<u64>,
+    /// Time after `termination_notice_ms` for running requests and jobs to finish, ms. Default 20,000: orchestrators commonly
+    /// kill after 30 seconds; with `termination_notice_ms` and one second for cancelled jobs a stop takes 24.
     pub drain_timeout_ms: u64,
     /// Proxies in front, by address or network, whose word about their clients is taken. Default `none`: whoever connects is
     /// the client, and what he says about others is not looked at.
@@ -78,7 +78,7 @@ impl Default for ServerConfig {
             streams: 64,
             heartbeat_ms: 15_000,
             idle_timeout_ms: 120_000,
-            notice_ms: Some(3000),
+            termination_notice_ms: Some(3000),
             drain_timeout_ms: 20_000,
             trusted_proxies: None,
             forwarded_header: ForwardedHeader::default(),
@@ -117,13 +117,13 @@ impl ServerConfig {
         Duration::from_millis(self.heartbeat_ms)
     }
 
-    /// Time after SIGTERM in which everything is served as before.
+    /// Time after SIGTERM in which all requests are served.
     #[must_use]
-    pub fn notice(&self) -> Duration {
-        Duration::from_millis(self.notice_ms.unwrap_or_default())
+    pub fn termination_notice(&self) -> Duration {
+        Duration::from_millis(self.termination_notice_ms.unwrap_or_default())
     }
 
-    /// Time behind that for running requests and jobs to finish.
+    /// Time after the termination notice for running requests and jobs to finish.
     #[must_use]
     pub fn drain_timeout(&self) -> Duration {
         Duration::from_millis(self.drain_timeout_ms)

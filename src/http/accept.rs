@@ -25,10 +25,10 @@ use tokio::time::Instant;
 use tower::ServiceExt as _;
 
 use super::guard::Peer;
-use super::io::Guarded;
 use super::kinds::Kind;
 use super::pace::{self, MAX_PATIENCE, Pace, Rate, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
+use super::socket::Guarded;
 use super::stop::{self, Stop};
 use crate::config::ServerConfig;
 use crate::telemetry::{CONNECTIONS, REJECTED};

@@ -9,9 +9,9 @@ use tower_http::cors::{AllowHeaders, AllowOrigin, Any, CorsLayer};
 
 use super::guard::{API_KEY, RATE_LIMIT, RATE_LIMIT_POLICY};
 use super::observe::TRACEPARENT;
+use super::preferences::{IDEMPOTENCY_KEY, PREFER, PREFERENCE_APPLIED, PRIORITY};
 use super::state::Shared;
 use super::timing::SERVER_TIMING;
-use super::wish::{IDEMPOTENCY_KEY, PREFER, PREFERENCE_APPLIED, PRIORITY};
 use super::{delivery, request_id};
 use crate::access::Access;
 use crate::config::Origins;

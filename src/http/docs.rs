@@ -5,7 +5,7 @@ use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, R
 use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
-use super::packed;
+use super::embedded;
 use super::problem::Problem;
 
 /// Our own files and resources, as on the page; besides, Swagger UI has icons in its style, and shows downloads. What it
@@ -27,7 +27,7 @@ fn headers(media_type: &'static str) -> [(HeaderName, &'static str); 4] {
 
 /// A packed file with what it is.
 fn packed(request: &HeaderMap, media_type: &'static str, bytes: &'static [u8]) -> Result<Response, Problem> {
-    Ok((headers(media_type), packed::file(request, bytes)?).into_response())
+    Ok((headers(media_type), embedded::file(request, bytes)?).into_response())
 }
 
 /// The description, to read and to try.

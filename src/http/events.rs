@@ -19,14 +19,14 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::View;
+use crate::jobs::JobView;
 
 /// The last event that a client has seen.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
 /// What a listener has seen, and where it looks.
 struct Listener {
-    watched: watch::Receiver<View>,
+    watched: watch::Receiver<JobView>,
     stopping: watch::Receiver<Stop>,
     seen: u64,
     over: bool,
@@ -49,7 +49,7 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let id = jobs::id(path)?;
-    let watched = app.ledger.watch(&id).await?.ok_or_else(|| jobs::none(id.as_str()))?;
+    let watched = app.job_store.watch(&id).await?.ok_or_else(|| jobs::none(id.as_str()))?;
     let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()?.trim().parse::<u64>().ok());
     // After a restart of the service counting begins anew: an id that lies ahead is one of another life.
     let seen = last.filter(|last| *last <= watched.borrow().version).unwrap_or(0);

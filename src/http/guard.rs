@@ -261,9 +261,9 @@ impl App {
 
 /// Charges jobs to the clients that they are for.
 #[derive(Debug)]
-pub(super) struct Bill(pub(super) Arc<Access>);
+pub(super) struct UsageRecorder(pub(super) Arc<Access>);
 
-impl Meter for Bill {
+impl Meter for UsageRecorder {
     fn spent(&self, client: Client, time: Duration) {
         self.0.meter().spent(client.number(), time, Instant::now());
     }

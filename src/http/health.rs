@@ -117,7 +117,7 @@ fn devices(app: &Shared) -> Check {
 }
 
 async fn store(app: &Shared) -> Check {
-    let found = match app.probe.failure(app).await {
+    let found = match app.probe.failure(&app.store, &app.config.store).await {
         None => Ok("it can be written and read".to_owned()),
         Some(why) => Err(format!("the store does not work: {why}")),
     };

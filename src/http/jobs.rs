@@ -21,7 +21,7 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::{ContentKey, JobId, Status, View, rfc3339};
+use crate::jobs::{ContentKey, JobId, JobView, Status, rfc3339};
 
 /// Longest poll, s: proxies commonly cut an exchange after a minute.
 pub(super) const MAX_WAIT_S: u64 = 55;
@@ -148,7 +148,7 @@ pub(super) async fn show(
             .with("limit", MAX_WAIT_S)
             .with("expected", format!("a whole number of seconds up to {MAX_WAIT_S}")));
     }
-    let mut watched = app.ledger.watch(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let mut watched = app.job_store.watch(&id).await?.ok_or_else(|| none(id.as_str()))?;
     let mut stopping = app.stopping.clone();
     let ended = async {
         tokio::select! {
@@ -170,7 +170,7 @@ pub(super) async fn dismiss(
     path: Result<Path<String>, PathRejection>,
 ) -> Result<Response, Problem> {
     let id = id(path)?;
-    let view = app.ledger.dismiss(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let view = app.job_store.dismiss(&id).await?.ok_or_else(|| none(id.as_str()))?;
     if view.record.status != Status::Dismissed {
         let detail = format!("the job is {} and cannot be cancelled any more", view.record.status.name());
         return Err(Problem::new(Kind::JobEnded, detail).with("status_name", view.record.status.name()));
@@ -190,7 +190,7 @@ pub(super) async fn result(
     path: Result<Path<String>, PathRejection>,
 ) -> Result<Response, Problem> {
     let id = id(path)?;
-    let view = app.ledger.view(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let view = app.job_store.view(&id).await?.ok_or_else(|| none(id.as_str()))?;
     let record = &view.record;
     match (record.status, &record.result) {
         (Status::Successful, Some(key)) => {
@@ -212,11 +212,11 @@ pub(super) async fn result(
 }
 
 /// The answer that promises a job.
-pub(super) fn accepted(view: &View, wait: Duration) -> Response {
+pub(super) fn accepted(view: &JobView, wait: Duration) -> Response {
     answer(StatusCode::ACCEPTED, view, Some(wait))
 }
 
-fn answer(status: StatusCode, view: &View, wait: Option<Duration>) -> Response {
+fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Response {
     let mut response = (status, Json(document(view))).into_response();
     let headers = response.headers_mut();
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
@@ -231,7 +231,7 @@ fn answer(status: StatusCode, view: &View, wait: Option<Duration>) -> Response {
 }
 
 /// A job as JSON.
-pub(super) fn document(view: &View) -> JobDocument {
+pub(super) fn document(view: &JobView) -> JobDocument {
     let record = &view.record;
     let own = format!("/v1/jobs/{}", record.id);
     let link = |rel, href: String, kind| Link { rel, href, r#type: kind };

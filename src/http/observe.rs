@@ -67,7 +67,7 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
     let request = request.map(|body| Body::new(Received { body, bytes: received }));
     let place = HeaderValue::from_str(&scope.context().to_string());
     let mut response = scope.run(next.run(request)).instrument(span).await;
-    timing::tell(&mut response, start.elapsed());
+    timing::write_header(&mut response, start.elapsed());
     if let Ok(place) = place {
         response.headers_mut().insert(TRACEPARENT, place);
     }

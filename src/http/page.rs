@@ -7,10 +7,10 @@ use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, R
 use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
+use super::embedded;
 use super::kinds::Kind;
 use super::openapi::parameters::AssetPath;
 use super::openapi::refusals;
-use super::packed;
 use super::problem::Problem;
 
 /// Only our own files run, only our own resources are asked. WebAssembly is allowed, evaluating text is not: the decoder of
@@ -66,7 +66,7 @@ fn is_named_by_contents(path: &str) -> bool {
 /// A file of the page, or what stands in for it.
 fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Response, Problem> {
     match found(path) {
-        Some(bytes) => Ok((headers(path), packed::file(request, bytes)?).into_response()),
+        Some(bytes) => Ok((headers(path), embedded::file(request, bytes)?).into_response()),
         None => Ok((headers(path), instead).into_response()),
     }
 }

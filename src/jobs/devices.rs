@@ -1,4 +1,4 @@
-//! Tells metrics and log how the backend's devices are doing.
+//! Metrics and log lines about the backend's devices.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -10,12 +10,12 @@ use crate::telemetry::{
     DEVICE_WAITING,
 };
 
-/// What the log knows of each device: its rebuilds, and whether it was up.
+/// Logged state of each device: number of rebuilds, and whether it was up.
 #[derive(Debug, Default)]
 pub(super) struct Watch(Mutex<Vec<(u64, bool)>>);
 
 impl Watch {
-    /// Publishes `devices`, and logs what has changed since the last time.
+    /// Updates the metrics and logs changes since the last call.
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
     pub(super) fn publish(&self, devices: &[DeviceStatus]) {
         let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
@@ -36,10 +36,10 @@ impl Watch {
             }
             let DeviceStatus { number, name, rebuilds, .. } = device;
             if *rebuilds > known.0 {
-                tracing::warn!(device = number, name, rebuilds, "a device failed and was built anew");
+                tracing::warn!(device = number, name, rebuilds, "a device failed and was set up again");
             }
             match &device.down {
-                Some(why) if known.1 => tracing::error!(device = number, name, why, "a device takes no jobs any more"),
+                Some(why) if known.1 => tracing::error!(device = number, name, why, "a device is out of service"),
                 _ => {}
             }
             *known = (*rebuilds, up);

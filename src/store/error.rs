@@ -95,9 +95,9 @@ pub enum StoreError {
 }
 
 impl StoreError {
-    /// Whether the same may go well later: the store answers again, lets us again, or has room again.
+    /// Whether a later attempt may succeed: the store may answer, permit it or have space again.
     #[must_use]
-    pub fn may_pass(&self) -> bool {
+    pub fn is_temporary(&self) -> bool {
         matches!(self, Self::Full { .. } | Self::NoSpace { .. } | Self::Denied { .. } | Self::Failed { .. })
     }
 

@@ -24,7 +24,7 @@ const REFUSALS: &[Kind] =
 const OF_ADDRESSES: &[Kind] = &[Kind::SignatureInvalid, Kind::SignatureExpired];
 
 /// Writes rights into the description, from the table that requests are checked with.
-pub(super) struct Rights;
+pub(in crate::http) struct Rights;
 
 impl Modify for Rights {
     fn modify(&self, api: &mut OpenApi) {

@@ -1,4 +1,4 @@
-//! One promised job from its acceptance to its end, and whoever watches it.
+//! One durable job from its acceptance to its end, and the state that its watchers see.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -8,37 +8,37 @@ use metrics::gauge;
 use tokio::sync::{Notify, watch};
 use tracing::Instrument as _;
 
-use super::flight::Progress;
-use super::ledger::{Ledger, View};
-use super::patience::{self, insist};
+use super::coalesced_job::Progress;
+use super::job_store::{JobStore, JobView};
 use super::rank::{Client, Rank};
 use super::record::{JobId, Record, Status, now_ms};
 use super::results::{self, SaveError};
+use super::retry::{self, retry};
 use super::{ContentKey, EndError, Failure, Finished, Lease, Refusal, Task, Ticket};
 use crate::formats::Format;
-use crate::pipeline::{JobError, params};
+use crate::pipeline::JobError;
 use crate::store::{Digest, Pin};
 use crate::surface::SurfaceError;
 use crate::telemetry::{Closing, JOBS_OPEN, Scope, Tracer};
 
-/// How often a running job's progress is looked at.
+/// Interval at which the progress of a running job is published.
 const TICK: Duration = Duration::from_millis(100);
-/// Between two attempts to get a place in the queue, or memory.
+/// Pause between two attempts to get a place in the queue, or memory.
 const PAUSE: Duration = Duration::from_millis(500);
 
-/// A promised job.
-pub(super) struct Promise {
-    view: watch::Sender<View>,
+/// A job whose record is in the store.
+pub(super) struct DurableJob {
+    view: watch::Sender<JobView>,
     progress: Mutex<Option<Arc<Progress>>>,
     dismissed: Notify,
     /// Held while the record is written.
     pub(super) writing: tokio::sync::Mutex<()>,
 }
 
-impl Promise {
+impl DurableJob {
     pub(super) fn new(record: Record) -> Self {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
-        let (view, _) = watch::channel(View { record, stage: None, fraction, version: 1, written: Arc::default() });
+        let (view, _) = watch::channel(JobView { record, stage: None, fraction, version: 1, written: Arc::default() });
         Self { view, progress: Mutex::default(), dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
     }
 
@@ -50,21 +50,21 @@ impl Promise {
         self.view.borrow().record.clone()
     }
 
-    pub(super) fn view(&self) -> View {
+    pub(super) fn view(&self) -> JobView {
         self.view.borrow().clone()
     }
 
-    pub(super) fn subscribe(&self) -> watch::Receiver<View> {
+    pub(super) fn subscribe(&self) -> watch::Receiver<JobView> {
         self.view.subscribe()
     }
 
-    /// When it ended, and its id; none if it has not.
+    /// Returns the time of its end, ms since 1970, and its id; `None` if it has not ended.
     pub(super) fn ended(&self) -> Option<(u64, JobId)> {
         let view = self.view.borrow();
         view.record.finished_ms.map(|ms| (ms, view.record.id.clone()))
     }
 
-    /// The work begins. False if the job was dismissed meanwhile: then it stays so.
+    /// Marks the job as running and counts an attempt. Returns false if the job has ended, for example by a dismissal.
     pub(super) fn begin(&self) -> bool {
         self.view.send_if_modified(|view| {
             if view.record.status.is_final() {
@@ -78,13 +78,14 @@ impl Promise {
         })
     }
 
-    /// The work is left for the next start: the attempt, if there was one, does not count. True if that changed the record.
-    fn leave(&self, tried: u32) -> bool {
+    /// Marks the job as accepted again, with `attempts` attempts, for the next process. Returns true if that changed the
+    /// record.
+    fn leave(&self, attempts: u32) -> bool {
         self.view.send_if_modified(|view| {
-            if view.record.status.is_final() || view.record.attempts == tried && view.record.started_ms.is_none() {
+            if view.record.status.is_final() || view.record.attempts == attempts && view.record.started_ms.is_none() {
                 return false;
             }
-            view.record.attempts = tried;
+            view.record.attempts = attempts;
             view.record.status = Status::Accepted;
             view.record.started_ms = None;
             view.stage = None;
@@ -93,7 +94,7 @@ impl Promise {
         })
     }
 
-    /// The job ends, unless it has. True if it did.
+    /// Ends the job with `status` and changes its record with `and`. Returns false if it had already ended.
     pub(super) fn end(&self, status: Status, and: impl FnOnce(&mut Record)) -> bool {
         self.view.send_if_modified(|view| {
             if view.record.status.is_final() {
@@ -111,7 +112,7 @@ impl Promise {
         })
     }
 
-    /// Tells the runner that nobody wants the result any more.
+    /// Tells the runner to stop the work.
     pub(super) fn dismiss(&self) {
         self.dismissed.notify_one();
     }
@@ -120,18 +121,19 @@ impl Promise {
         *self.progress.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::clone(progress));
     }
 
-    /// Publishes how far the work is, if it is further.
-    fn look(&self) {
+    /// Publishes the progress of the work.
+    fn publish_progress(&self) {
         let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
         let Some((stage, fraction)) = progress.and_then(|progress| progress.now()) else { return };
-        self.tell(stage, fraction);
+        self.publish_stage(stage, fraction);
     }
 
-    fn tell(&self, stage: &'static str, fraction: f64) {
+    /// Publishes stage and fraction if they have advanced.
+    fn publish_stage(&self, stage: &'static str, fraction: f64) {
         self.view.send_if_modified(|view| {
             let waits = view.record.status == Status::Accepted;
-            let further = view.stage != Some(stage) || fraction > view.fraction + 0.004;
-            if view.record.status.is_final() || !(waits || further) {
+            let advanced = view.stage != Some(stage) || fraction > view.fraction + 0.004;
+            if view.record.status.is_final() || !(waits || advanced) {
                 return false;
             }
             if waits {
@@ -146,81 +148,82 @@ impl Promise {
     }
 }
 
-/// Sees a promised job through. `P` keeps its input in the store.
+/// Runs a durable job to its end.
 pub(super) struct Runner<P> {
-    pub(super) promise: Arc<Promise>,
-    /// The right to the outcome of work that waits or runs; none for a job from the records.
+    pub(super) job: Arc<DurableJob>,
+    /// Ticket of queued or running work; `None` for a job from the records.
     pub(super) ticket: Option<Ticket>,
+    /// Keeps input and record in the store.
     pub(super) pin: P,
     pub(super) digest: Digest,
-    /// Times that it was begun before this process took it up.
-    pub(super) tried: u32,
+    /// Number of attempts by earlier processes.
+    pub(super) earlier_attempts: u32,
 }
 
-impl Ledger {
-    /// Sees a job through, beside everything else, in the name of the request that asked for it.
+impl JobStore {
+    /// Runs a job in a task of its own, traced under the request that created it.
     pub(super) fn spawn(&self, runner: Runner<[Pin; 2]>) {
-        let record = runner.promise.record();
+        let record = runner.job.record();
         let origin = record.requester.origin(self.0.pool.tracer());
         let log = Scope::open(&origin, Instant::now()).log(Some(record.id.as_str()));
         gauge!(JOBS_OPEN).increment(1.0);
         self.0.open.send_modify(|open| *open += 1);
-        let ledger = self.clone();
+        let jobs = self.clone();
         let run = async move {
-            runner.run(&ledger).await;
+            runner.run(&jobs).await;
             gauge!(JOBS_OPEN).decrement(1.0);
-            ledger.0.open.send_modify(|open| *open -= 1);
+            jobs.0.open.send_modify(|open| *open -= 1);
         };
         tokio::spawn(run.instrument(log));
     }
 
-    /// Waits until every job that was taken up has ended, or is left, and that is on record. The pool must be drained.
+    /// Waits until every job has ended or is left, and its record is written. The pool must be drained.
     pub async fn settled(&self) {
         drop(self.0.open.subscribe().wait_for(|open| *open == 0).await);
     }
 }
 
-/// What became of one attempt.
+/// Result of one attempt to run a job.
 enum Attempt {
     Ended(Result<String, EndError>),
-    /// It can be tried again soon: nothing about the job stands against it.
-    Again,
-    /// The store does not do its part; it is asked less and less often.
-    Silent,
-    /// The service stops; the job stays on record, for the next start.
+    /// A temporary shortage of places or memory.
+    Retry,
+    /// The store fails; it is retried with growing pauses.
+    StoreFailed,
+    /// The service stops; the next process runs the job.
     Left,
 }
 
 impl<P> Runner<P> {
-    pub(super) async fn run(self, ledger: &Ledger) {
-        let Self { promise, mut ticket, pin, digest, tried } = self;
-        let mut pause = patience::FIRST;
+    pub(super) async fn run(self, jobs: &JobStore) {
+        let Self { job, mut ticket, pin, digest, earlier_attempts } = self;
+        let mut pause = retry::FIRST_PAUSE;
         loop {
-            let attempt = attempt(ledger, &promise, &mut ticket, digest);
+            let attempt = attempt(jobs, &job, &mut ticket, digest);
             let attempt = tokio::select! {
                 attempt = attempt => attempt,
                 // Dropping the ticket stops the work.
-                () = promise.dismissed.notified() => break,
+                () = job.dismissed.notified() => break,
             };
             match attempt {
                 Attempt::Ended(ending) => {
-                    ledger.finish(&promise, ending).await;
+                    jobs.finish(&job, ending).await;
                     break;
                 }
-                Attempt::Again => {
-                    pause = patience::FIRST;
+                Attempt::Retry => {
+                    pause = retry::FIRST_PAUSE;
                     tokio::time::sleep(PAUSE).await;
                 }
-                Attempt::Silent => {
+                Attempt::StoreFailed => {
                     tokio::time::sleep(pause).await;
-                    pause = (pause * 2).min(patience::LONGEST);
+                    pause = (pause * 2).min(retry::MAX_PAUSE);
                 }
                 Attempt::Left => {
-                    // Stopping a service is not the job's fault, however often it happens.
-                    if promise.leave(tried)
-                        && let Err(error) = ledger.0.keep_up(&promise).await
+                    // An attempt that the service cut short does not count.
+                    if job.leave(earlier_attempts)
+                        && let Err(error) = jobs.0.write_job(&job).await
                     {
-                        tracing::warn!(job_id = %promise.id(), %error, "a job that is left counts an attempt too many");
+                        tracing::warn!(job_id = %job.id(), %error, "the record of an interrupted job counts one attempt too many");
                     }
                     break;
                 }
@@ -230,98 +233,89 @@ impl<P> Runner<P> {
     }
 }
 
-async fn attempt(ledger: &Ledger, promise: &Arc<Promise>, ticket: &mut Option<Ticket>, digest: Digest) -> Attempt {
-    let record = promise.record();
+async fn attempt(jobs: &JobStore, job: &Arc<DurableJob>, ticket: &mut Option<Ticket>, digest: Digest) -> Attempt {
+    let record = job.record();
     let mut ticket = match ticket.take() {
         Some(ticket) => ticket,
-        None => match submit(ledger, promise, &record, digest).await {
+        None => match submit(jobs, job, &record, digest).await {
             Ok(ticket) => ticket,
             Err(attempt) => return attempt,
         },
     };
-    promise.follow(ticket.progress());
+    job.follow(ticket.progress());
     let outcome = loop {
         tokio::select! {
             outcome = ticket.wait() => break outcome,
-            () = tokio::time::sleep(TICK) => promise.look(),
+            () = tokio::time::sleep(TICK) => job.publish_progress(),
         }
     };
     match outcome {
         Ok(finished) => {
-            promise.tell("encode", 0.95);
-            match save(ledger, &record, finished).await {
-                // The mesh is not held for ever. As long as it may be begun again, it is made anew once the store answers.
+            job.publish_stage("encode", 0.95);
+            match save(jobs, &record, finished).await {
+                // The mesh is not held for ever. It is computed again while attempts are left.
                 Err(EndError::Save { error, .. })
-                    if error.may_pass() && promise.record().attempts < ledger.0.settings.attempts =>
+                    if error.is_temporary() && job.record().attempts < jobs.0.settings.attempts =>
                 {
-                    tracing::warn!(job_id = %record.id, %error, "a result was given up; it is made again");
-                    Attempt::Silent
+                    tracing::warn!(job_id = %record.id, %error, "a result was not stored; computing it again");
+                    Attempt::StoreFailed
                 }
                 ending => Attempt::Ended(ending),
             }
         }
-        // Work that somebody waits for is cancelled by the end of the service alone.
+        // Work with a ticket is cancelled only when the service stops.
         Err(Failure::Stopped | Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => Attempt::Left,
-        Err(Failure::Memory(_)) => Attempt::Again,
+        Err(Failure::Memory(_)) => Attempt::Retry,
         Err(failure) => Attempt::Ended(Err(failure.into())),
     }
 }
 
-/// Puts a job from the records into the queue.
-async fn submit(ledger: &Ledger, promise: &Arc<Promise>, record: &Record, digest: Digest) -> Result<Ticket, Attempt> {
-    let settings = &ledger.0.settings;
+/// Submits a job from its record to the queue.
+async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &Record, digest: Digest) -> Result<Ticket, Attempt> {
+    let settings = &jobs.0.settings;
     if record.attempts >= settings.attempts {
         return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
     }
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
-    // A store that does not answer now is no reason to give a promise up.
-    let silent = |error| {
+    let failed = |error| {
         tracing::warn!(job_id = %record.id, %error, "a job waits for the store");
-        Attempt::Silent
+        Attempt::StoreFailed
     };
-    let (task, format) = ledger.task(record, digest).await.map_err(silent)?.map_err(lost)?;
-    // An earlier process may have ended between the result and its record.
-    if let Some(key) = ledger.made(&task, format).await.map_err(silent)? {
+    let (task, format) = jobs.load_task(record, digest).await.map_err(failed)?.map_err(lost)?;
+    // An earlier process may have ended between storing the result and updating the record.
+    if let Some(key) = jobs.stored_result(&task, format).await.map_err(failed)? {
         return Err(Attempt::Ended(Ok(key)));
     }
-    let claim = ledger.claim(promise, None);
-    let ticket = ledger.0.pool.submit(task, settings.allowed, Some(claim)).map_err(|refusal| match refusal {
+    let on_start = jobs.on_start(job, None);
+    let ticket = jobs.0.pool.submit(task, settings.allowed, Some(on_start)).map_err(|refusal| match refusal {
         Refusal::Draining => Attempt::Left,
-        // It was accepted once: it waits until there is room.
-        Refusal::QueueFull { .. } | Refusal::TooLate { .. } => Attempt::Again,
+        // An accepted job waits until the queue has a place.
+        Refusal::QueueFull { .. } | Refusal::TooLate { .. } => Attempt::Retry,
     })?;
-    if ticket.came_late() && promise.begin() {
-        ledger.0.keep_up(promise).await.map_err(silent)?;
+    if ticket.joined_running() && job.begin() {
+        jobs.0.write_job(job).await.map_err(failed)?;
     }
     Ok(ticket)
 }
 
-/// Keeps the result. Its key comes back.
-async fn save(ledger: &Ledger, record: &Record, finished: Arc<Finished>) -> Result<String, EndError> {
+/// Stores the result and returns its key.
+async fn save(jobs: &JobStore, record: &Record, finished: Arc<Finished>) -> Result<String, EndError> {
     let lost = |why| EndError::Lost { why };
-    let (job, format) = read(record).map_err(lost)?;
+    let (request, format) = record.request().map_err(lost)?;
     let report = &finished.product.report;
     let (resolution, digest) = (report.resolution, finished.digest);
-    let key = ContentKey::new(&digest, &job, format, &report.maker());
-    let (store, settings) = (&ledger.0.store, &ledger.0.settings);
-    let scope = Scope::open(&record.requester.origin(ledger.0.pool.tracer()), Instant::now());
-    let keep = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
-    insist(&record.id, settings.patience, SaveError::may_pass, keep)
+    let key = ContentKey::new(&digest, &request.job, format, &report.maker());
+    let (store, settings) = (&jobs.0.store, &jobs.0.settings);
+    let scope = Scope::open(&record.requester.origin(jobs.0.pool.tracer()), Instant::now());
+    let save = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
+    retry(&record.id, settings.retry_for, SaveError::is_temporary, save)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
     scope.close(|| Closing::of("keep"));
     Ok(key.to_string())
 }
 
-/// The job and the format of a record.
-fn read(record: &Record) -> Result<(crate::pipeline::Job, Format), String> {
-    let mut request = params::parse(record.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
-    let format = record.format.parse().map_err(|_bad| format!("its format `{}` is unknown", record.format))?;
-    params::settle(&mut request.job, format).map_err(|e| e.to_string())?;
-    Ok((request.job, format))
-}
-
-/// The task of a record, with its input.
+/// Returns the task of a record, or why it cannot be run any more.
 pub(super) fn task(
     record: &Record,
     digest: Digest,
@@ -329,9 +323,9 @@ pub(super) fn task(
     lease: Lease,
     tracer: &Tracer,
 ) -> Result<(Task, Format), String> {
-    let (job, format) = read(record)?;
+    let (request, format) = record.request()?;
     let rank = Rank { client: Client::numbered(record.client), batch: true, urgency: record.urgency };
-    let strict = record.parameters.iter().any(|(name, _)| name == "check");
     let (origin, id) = (record.requester.origin(tracer), Some(record.id.clone()));
-    Ok((Task { input, digest, strict, job, rank, lease: Some(Arc::new(lease)), origin, id }, format))
+    let lease = Some(Arc::new(lease));
+    Ok((Task { input, digest, strict: request.strict, job: request.job, rank, lease, origin, id }, format))
 }

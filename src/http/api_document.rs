@@ -1,11 +1,5 @@
-//! `/openapi.yaml` and `/openapi.json`: the description of this interface, collected from what stands beside each
-//! handler. `openapi.yaml` at the top level is the same text; a test says so, and writes it anew when told to.
-
-pub(super) mod access;
-pub(super) mod bodies;
-pub(super) mod meshes;
-pub(super) mod parameters;
-pub(super) mod problems;
+//! `/openapi.yaml` and `/openapi.json`: the OpenAPI document, assembled from the annotations of the handlers. A test keeps
+//! `openapi.yaml` in the repository equal to it.
 
 use std::sync::LazyLock;
 
@@ -14,9 +8,8 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use utoipa::OpenApi;
 
-use access::Rights;
-pub(super) use problems::refusals;
-
+use super::openapi::access::Rights;
+use super::openapi::problems;
 use super::problem::Problem;
 
 const ABOUT: &str = "Molecules in, surface meshes out.
