@@ -24,7 +24,7 @@ impl<T> ResultSender<T> {
         ResultReceiver(self.0.subscribe())
     }
 
-    /// Whether no receiver is left.
+    /// Returns true if no receiver is left.
     pub(crate) fn is_abandoned(&self) -> bool {
         self.0.receiver_count() == 0
     }

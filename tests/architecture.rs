@@ -96,6 +96,7 @@ const ROOMS: &[Room] = &[
             "reqwest",
         ],
     },
+    Room { name: "single_flight", rooms: &[], crates: &["axum", "tower", "hyper", "tracing", "wgpu", "clap"] },
     Room {
         name: "store",
         rooms: &[("config", Any), ("telemetry", Any)],
@@ -103,7 +104,7 @@ const ROOMS: &[Room] = &[
     },
     Room {
         name: "archive",
-        rooms: &[("structure", Any), ("config", Any), ("telemetry", Any), ("store", Any)],
+        rooms: &[("structure", Any), ("config", Any), ("telemetry", Any), ("single_flight", Any), ("store", Any)],
         crates: &["axum", "tower", "tower_http", "wgpu", "clap"],
     },
     Room {
@@ -116,6 +117,7 @@ const ROOMS: &[Room] = &[
             ("pipeline", Any),
             ("config", Any),
             ("telemetry", Any),
+            ("single_flight", Any),
             ("store", Any),
         ],
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap"],
@@ -130,6 +132,7 @@ const ROOMS: &[Room] = &[
             ("pipeline", Any),
             ("config", Any),
             ("telemetry", Any),
+            ("single_flight", Any),
             ("store", Any),
             ("archive", Any),
             ("jobs", Any),
@@ -365,17 +368,30 @@ fn wrong_edges(sources: &[Source]) -> Vec<String> {
 
 type Edges = BTreeMap<String, BTreeSet<String>>;
 
-/// A cycle between rooms, if there is one.
-fn cycle(sources: &[Source]) -> Option<Vec<String>> {
-    fn visit(at: &str, edges: &Edges, trail: &mut Vec<String>) -> bool {
+/// A cycle in a graph, if there is one.
+fn find_cycle(edges: &Edges) -> Option<Vec<String>> {
+    fn visit(at: &str, edges: &Edges, trail: &mut Vec<String>, done: &mut BTreeSet<String>) -> bool {
+        if done.contains(at) {
+            return false;
+        }
         let seen = trail.iter().any(|t| t == at);
         trail.push(at.to_owned());
-        if seen || edges.get(at).is_some_and(|next| next.iter().any(|n| visit(n, edges, trail))) {
+        if seen || edges.get(at).is_some_and(|next| next.iter().any(|n| visit(n, edges, trail, done))) {
             return true;
         }
         trail.pop();
+        done.insert(at.to_owned());
         false
     }
+    let mut done = BTreeSet::new();
+    edges.keys().find_map(|node| {
+        let mut trail = Vec::new();
+        visit(node, edges, &mut trail, &mut done).then_some(trail)
+    })
+}
+
+/// A cycle between rooms, if there is one.
+fn cycle(sources: &[Source]) -> Option<Vec<String>> {
     let mut edges = Edges::new();
     for source in sources {
         let room = room_of(&source.path);
@@ -384,10 +400,63 @@ fn cycle(sources: &[Source]) -> Option<Vec<String>> {
             edges.entry(room.to_owned()).or_default().extend(others);
         }
     }
-    edges.keys().find_map(|room| {
-        let mut trail = Vec::new();
-        visit(room, &edges, &mut trail).then_some(trail)
-    })
+    find_cycle(&edges)
+}
+
+/// Files of `src/http` that a source uses; those of `openapi/` with the folder, which is a folder of its own.
+fn http_uses(source: &Source) -> BTreeSet<String> {
+    let code = code(&source.text);
+    let tests_from = tests_start(&source.text).unwrap_or(usize::MAX);
+    let mut found = BTreeSet::new();
+    for start in ["super::", "crate::http::"] {
+        for (at, _) in code.match_indices(start) {
+            if code[..at].chars().next_back().is_some_and(|c| is_ident(c) || c == ':') {
+                continue;
+            }
+            let rest = code[at..].trim_start_matches(start);
+            let mut depth = if start == "super::" { (code.len() - at - rest.len()) / start.len() } else { usize::MAX };
+            if code[..at].matches('\n').count() >= tests_from && depth != usize::MAX {
+                depth -= 1;
+            }
+            let in_openapi = source.path.starts_with("src/http/openapi/");
+            for (file, item) in paths(rest).into_iter().filter(|_| depth > 0) {
+                if in_openapi && depth == 1 {
+                    found.insert(format!("openapi/{file}"));
+                } else if file == "openapi" {
+                    let re_exported = ["refusals", ""].contains(&item.as_str());
+                    found.insert(if re_exported { "openapi/problems".to_owned() } else { format!("openapi/{item}") });
+                } else {
+                    found.insert(file);
+                }
+            }
+        }
+    }
+    found
+}
+
+/// Uses of files that `src/http/mod.rs` declares in the same group or below, and of `openapi/` where it has a cycle.
+fn wrong_http_order(groups: &str, sources: &[Source]) -> Vec<String> {
+    let mut group_of = BTreeMap::new();
+    for (number, group) in groups.split("\n\n").enumerate() {
+        let files = group.lines().filter_map(|line| line.strip_prefix("mod ")?.strip_suffix(';'));
+        group_of.extend(files.map(|file| (file.to_owned(), number)));
+    }
+    let mut wrong = Vec::new();
+    for source in sources {
+        let file = source.path.trim_start_matches("src/http/").trim_end_matches(".rs");
+        let Some(own) = group_of.get(file) else { continue };
+        for used in http_uses(source).iter().filter(|used| !used.starts_with("openapi/")) {
+            if group_of.get(used).is_some_and(|group| group >= own) {
+                wrong.push(format!("{file} uses {used}, which mod.rs does not declare in an earlier group"));
+            }
+        }
+    }
+    let uses = |source: &Source| {
+        let file = source.path.trim_start_matches("src/http/").trim_end_matches(".rs").to_owned();
+        (file.clone(), http_uses(source).into_iter().filter(|used| *used != file).collect::<BTreeSet<_>>())
+    };
+    wrong.extend(find_cycle(&sources.iter().map(uses).collect()).map(|cycle| cycle.join(" uses ")));
+    wrong
 }
 
 fn too_long(sources: &[Source]) -> Vec<String> {
@@ -458,6 +527,12 @@ fn arrows_point_one_way() {
 #[test]
 fn rooms_have_no_cycle() {
     assert_eq!(cycle(&sources_under("src")), None);
+}
+
+#[test]
+fn files_of_http_use_each_other_one_way() {
+    let groups = fs::read_to_string(root().join("src/http/mod.rs")).unwrap();
+    nothing(&wrong_http_order(&groups, &sources_under("src/http")));
 }
 
 #[test]
@@ -556,6 +631,23 @@ fn control_a_cycle_is_seen() {
     assert_eq!(cycle(&sources), None);
     sources.push(source("src/c/deep/er.rs", "fn f() { crate::a::f() }"));
     assert_eq!(cycle(&sources), Some(["a", "b", "c", "a"].map(String::from).to_vec()));
+}
+
+#[test]
+fn control_wrong_uses_in_http_are_seen() {
+    let groups = "mod a;\nmod b;\n\nmod c;\n";
+    let faults = |path: &str, text: &str| wrong_http_order(groups, &made_up(path, text)).len();
+    assert_eq!(faults("src/http/c.rs", "use super::{a, b};\nfn f() { crate::http::a::f() }"), 0);
+    assert_eq!(faults("src/http/a.rs", "use crate::a::B;\n#[cfg(test)]\nmod tests {\n    use super::*;\n}"), 0);
+    for bad in ["use super::c;", "use super::b::B;", "fn f() { crate::http::c::f() }", "use super::{x, c};"] {
+        assert_eq!(faults("src/http/a.rs", bad), 1, "{bad}");
+    }
+    let source = |path: &str, text: &str| Source { path: path.to_owned(), text: text.to_owned() };
+    let mut sources =
+        vec![source("src/http/c.rs", "use super::openapi::x;"), source("src/http/openapi/x.rs", "use super::y;")];
+    assert_eq!(wrong_http_order(groups, &sources).len(), 0);
+    sources.push(source("src/http/openapi/y.rs", "use crate::http::c;"));
+    assert_eq!(wrong_http_order(groups, &sources).len(), 1);
 }
 
 #[test]

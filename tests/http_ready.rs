@@ -76,7 +76,7 @@ fn a_full_queue_does_not_make_it_unready() {
     let backend = Fake::new(Mode::Slow(Duration::from_mins(5)));
     let server = start(Arc::clone(&backend) as _, |c| {
         (c.jobs.workers, c.jobs.queue, c.store.probe_ms) = (1, 1, 1);
-        (c.jobs.deadline_ms, c.jobs.sync_wait_ms) = (600_000, 600_000);
+        c.jobs.deadline_ms = 600_000;
         c.server.drain_timeout_ms = 1;
     });
     let server = &server;

@@ -287,7 +287,6 @@ fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
         c.store.memory_bytes = 0;
         c.jobs.workers = 2;
         c.jobs.store_patience_ms = 600_000;
-        c.jobs.sync_wait_ms = 60_000;
     });
     let addr = server.addr;
     let mesh = |n| send(addr, "POST", "/v1/meshes?format=stl", &[], &sample(n));

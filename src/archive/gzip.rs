@@ -5,8 +5,8 @@ use std::io::{self, Read as _};
 
 use flate2::bufread::MultiGzDecoder;
 
-/// Whether `bytes` inflate without an error. Stops after `limit` inflated bytes, since the reader rejects larger files.
-/// Blocks for a few milliseconds per megabyte.
+/// Returns true if `bytes` inflate without an error. Stops after `limit` inflated bytes, since the reader rejects
+/// larger files. Blocks for a few milliseconds per megabyte.
 pub(super) fn is_complete_gzip(bytes: &[u8], limit: u64) -> bool {
     io::copy(&mut MultiGzDecoder::new(bytes).take(limit), &mut io::sink()).is_ok()
 }

@@ -9,32 +9,32 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct JobsConfig {
-    /// Number of concurrent jobs. Default 2: the backend uses all cores for one job, and a second one fills them while the
-    /// first reads its file or measures its mesh. GPUs run more: see `devices.jobs`.
+    /// Number of concurrent jobs. Default 2: the backend uses all cores for one job, and a second one fills them while
+    /// the first reads its file or measures its mesh. GPUs run more: see `devices.jobs`.
     pub workers: usize,
     /// Number of queued jobs. Default 64: at a typical 0.1 s per job on two workers the last one waits three seconds; a
     /// longer queue would only delay refusals. Further requests get a 503 with an estimated `Retry-After`.
     pub queue: usize,
-    /// Number of concurrent requests for meshes, from the submission of the job to the last byte of the answer. Default 256:
-    /// each one holds a thread while its mesh is written, and threads for reading files must be left.
+    /// Number of concurrent requests for meshes, from the submission of the job to the last byte of the answer. Default
+    /// 256: each one holds a thread while its mesh is written, and threads for reading files must be left.
     pub deliveries: usize,
-    /// Time from acceptance to the finished mesh, ms, time in the queue included; also the longest wait for `Prefer: wait=`.
-    /// Default 60,000: proxies commonly cut an exchange after a minute.
+    /// Time from acceptance to the finished mesh, ms, time in the queue included; also the longest wait for `Prefer:
+    /// wait=`. Default 60,000: proxies commonly cut an exchange after a minute.
     pub deadline_ms: u64,
     /// Time from acceptance to the result of an asynchronous job, ms, time in the queue included. Default 3,600,000: no
     /// connection is held for it.
     pub batch_deadline_ms: u64,
-    /// Maximum time that an asynchronous job yields to interactive requests, ms. Default 10,000: interactive requests come
-    /// first, but asynchronous jobs must make progress under constant load.
+    /// Maximum time that an asynchronous job yields to interactive requests, ms. Default 10,000: interactive requests
+    /// come first, but asynchronous jobs must make progress under constant load.
     pub batch_max_delay_ms: u64,
-    /// Maximum number of attempts to run an asynchronous job. Default 3: a job that crashed the process that often is assumed
-    /// to crash it again.
+    /// Maximum number of attempts to run an asynchronous job. Default 3: a job that crashed the process that often is
+    /// assumed to crash it again.
     pub attempts: u32,
-    /// Time for which an asynchronous job retries to store its mesh, ms. Default 60,000: longer than a restart of the store
-    /// takes. After that the mesh is computed again, for at most `attempts` attempts.
+    /// Time for which an asynchronous job retries to store its mesh, ms. Default 60,000: longer than a restart of the
+    /// store takes. After that the mesh is computed again, for at most `attempts` attempts.
     pub store_patience_ms: u64,
-    /// Number of results of synchronous requests that are stored concurrently. Default 4: more would compete with meshing; a
-    /// result that is not stored is computed again for the next request.
+    /// Number of results of synchronous requests that are stored concurrently. Default 4: more would compete with
+    /// meshing; a result that is not stored is computed again for the next request.
     pub concurrent_saves: usize,
 }
 

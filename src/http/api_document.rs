@@ -1,5 +1,5 @@
-//! `/openapi.yaml` and `/openapi.json`: the OpenAPI document, assembled from the annotations of the handlers. A test keeps
-//! `openapi.yaml` in the repository equal to it.
+//! `/openapi.yaml` and `/openapi.json`: the OpenAPI document, assembled from the annotations of the handlers. A test
+//! keeps `openapi.yaml` in the repository equal to it.
 
 use std::sync::LazyLock;
 
@@ -24,7 +24,7 @@ where none is listed means a defect of the server. Where a quota applies, answer
 401 or 403, and every key is ignored. Every answer has an `X-Request-Id`: the client's own, if it sent one of 64 letters, \
 digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
 
-/// The description.
+/// OpenAPI document.
 #[derive(OpenApi)]
 #[openapi(
     info(title = "molmesh", description = ABOUT, license(name = "MIT OR Apache-2.0", identifier = "MIT OR Apache-2.0")),
@@ -32,7 +32,7 @@ digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
     tags(
         (name = "meshes", description = "Structures to meshes."),
         (name = "structures", description = "Structures that are uploaded once."),
-        (name = "jobs", description = "Meshes that are promised."),
+        (name = "jobs", description = "Asynchronous jobs."),
         (name = "results", description = "Meshes that were made, for as long as they are kept."),
         (name = "service", description = "About the service."),
         (name = "page", description = "The pages and what they consist of."),
@@ -53,7 +53,7 @@ digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
 )]
 struct Description;
 
-/// The description as YAML and as JSON.
+/// OpenAPI document as YAML and as JSON.
 static TEXTS: LazyLock<Result<[Bytes; 2], String>> = LazyLock::new(|| {
     let description = Description::openapi();
     let yaml = description.to_yaml().map_err(|error| error.to_string())?;

@@ -112,7 +112,8 @@ pub(super) async fn of_entry(
     source.document(&app, &headers, async |input| list(&app, input).await).await
 }
 
-/// Parses a structure and lists its atoms, on a blocking thread. The list is charged to the memory budget until it is sent.
+/// Parses a structure and lists its atoms, on a blocking thread. The list is charged to the memory budget until it is
+/// sent.
 async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
     let mut limits = app.config.limits.job().read;
     limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);

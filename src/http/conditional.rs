@@ -3,7 +3,7 @@
 use axum::http::header::IF_NONE_MATCH;
 use axum::http::{HeaderMap, HeaderValue};
 
-/// Whether the client has the file with this `etag`, by weak comparison.
+/// Returns true if the client has the file with this `etag`, by weak comparison.
 pub(super) fn is_unchanged(headers: &HeaderMap, etag: &HeaderValue) -> bool {
     let Ok(etag) = etag.to_str() else { return false };
     headers

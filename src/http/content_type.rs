@@ -43,7 +43,7 @@ impl DeclaredType {
         }
     }
 
-    /// Whether a structure format is declared, which the bytes must have.
+    /// Returns true if a structure format is declared, which the bytes must have.
     pub(super) const fn is_structure(&self) -> bool {
         matches!(self, Self::Structure(..))
     }

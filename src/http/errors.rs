@@ -46,7 +46,8 @@ fn diagnosed(problem: Problem, diagnostics: &[Diagnostic]) -> Problem {
     }
 }
 
-/// Returns the problem of a mesh file that exceeds `limit` bytes. File sizes grow with the inverse square of the spacing.
+/// Returns the problem of a mesh file that exceeds `limit` bytes. File sizes grow with the inverse square of the
+/// spacing.
 #[expect(clippy::cast_precision_loss, reason = "an estimate: 52 bits suffice")]
 pub(super) fn file_too_large(bytes: u64, limit: u64, resolution: f64) -> Problem {
     let fits = resolution * (bytes as f64 / limit as f64).sqrt();

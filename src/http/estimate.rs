@@ -1,5 +1,5 @@
-//! `POST /v1/estimate`: size and duration of a mesh, and a resolution that fits if it is too large. Takes the requests of
-//! `POST /v1/meshes`.
+//! `POST /v1/estimate`: size and duration of a mesh, and a resolution that fits if it is too large. Takes the requests
+//! of `POST /v1/meshes`.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -41,14 +41,14 @@ impl Drop for CancelOnDrop {
 /// Estimate of a mesh. Figures of the grid are exact, those of the mesh are estimated.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct EstimateDocument {
-    /// The mesh would be made.
+    /// True if the mesh would be accepted.
     accepted: bool,
-    /// Why it would not be made.
+    /// Problem of a mesh that would be refused.
     #[schema(required, value_type = Option<ProblemDocument>)]
     problem: Option<Value>,
-    /// Atoms that would be meshed.
+    /// Number of selected atoms.
     atoms: u64,
-    /// Atoms in the file, all models.
+    /// Number of atoms in the file, all models.
     atoms_in_file: u64,
     /// Grid spacing, Å; estimated where it follows from `max_triangles`.
     resolution: f64,
@@ -80,11 +80,11 @@ pub(super) struct EstimateDocument {
     mesh_bytes: Option<u64>,
     /// SHA-256 of the structure.
     structure: String,
-    /// Time that making it would take, s.
+    /// Estimated duration of the job, s.
     seconds: f64,
-    /// Time that it would wait, s.
+    /// Estimated time in the queue, s.
     wait_seconds: f64,
-    /// The backend that would make it.
+    /// Backend that would compute it.
     backend: &'static str,
 }
 
@@ -92,7 +92,7 @@ refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
     Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
 ]]);
 
-/// Says what a mesh would come to, without making it.
+/// Estimates size and duration of a mesh.
 ///
 /// Takes what `POST /v1/meshes` takes.
 #[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",

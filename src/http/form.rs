@@ -34,8 +34,8 @@ enum FeedError {
     Body(#[from] axum::Error),
 }
 
-/// Passes a body to the parser in pieces, at most `allowance` bytes: the parser buffers the preamble and the head of a part
-/// until it finds their end.
+/// Passes a body to the parser in pieces, at most `allowance` bytes: the parser buffers the preamble and the head of a
+/// part until it finds their end.
 struct Feed<'a> {
     body: BodyDataStream,
     rest: Bytes,

@@ -1,5 +1,5 @@
-//! JSON bodies: an object of parameters, one of which names a structure. Parsed into names and texts without a tree, so a body
-//! within `limits.json_bytes` takes less than a millisecond.
+//! JSON bodies: an object of parameters, one of which names a structure. Parsed into names and texts without a tree, so
+//! a body within `limits.json_bytes` takes less than a millisecond.
 
 use std::fmt;
 

@@ -17,8 +17,8 @@ pub(super) fn publish_clients(access: &Access) {
     gauge!(QUOTA_CLIENTS).set(access.meter().clients() as f64);
 }
 
-/// Reloads the key file when it changes and on SIGHUP. Without keys it does nothing, and SIGHUP keeps its default action.
-/// Listens for the signal from the call on, not from the first poll.
+/// Reloads the key file when it changes and on SIGHUP. Without keys it does nothing, and SIGHUP keeps its default
+/// action. Listens for the signal from the call on, not from the first poll.
 pub(super) fn run(access: Arc<Access>) -> impl Future<Output = ()> + Send + 'static {
     let hangup = access.has_keys().then(Hangup::listen);
     async move {

@@ -23,8 +23,8 @@ refusals!(MeshRefusals: [BODY, NAMED, PARAMETERS, READING, MESHING, ASKING, [Kin
 
 /// Meshes a structure.
 ///
-/// The body is a file, a form with a file, or a JSON document that names a structure. The format is that of `format`, else
-/// what `Accept` prefers, else GLB.
+/// The body is a file, a form with a file, or a JSON document that names a structure. The format is that of `format`,
+/// else what `Accept` prefers, else GLB.
 #[utoipa::path(post, path = "/v1/meshes", tag = "meshes", operation_id = "createMesh",
     params(MeshParameters, Wishes, Coding),
     request_body(description = "A structure, or a document that names one.", content(

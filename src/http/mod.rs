@@ -1,9 +1,9 @@
 //! The HTTP service. axum, hyper and tower are used here and nowhere else.
 //!
-//! Nothing here computes a mesh or blocks the runtime: work goes to [`crate::jobs`], files are parsed on blocking threads.
-//! A file uses only files that are declared above it; `tests/architecture.rs` checks this order.
+//! Nothing here computes a mesh or blocks the runtime: work goes to [`crate::jobs`], files are parsed on blocking
+//! threads. A file uses only files of earlier groups in the list below; `tests/architecture.rs` checks this order.
 
-// Protocol rules that know no other file.
+// Protocol rules that use no other file.
 mod conditional;
 mod kinds;
 mod pace;
@@ -15,11 +15,13 @@ mod socket;
 mod stop;
 mod timing;
 
-// Problems: errors as responses.
+// Problems, and what can be checked without the state of the service.
 mod problem;
 
+mod content_type;
 mod embedded;
 mod errors;
+mod json_body;
 mod limit;
 mod negotiate;
 
@@ -27,13 +29,12 @@ mod negotiate;
 mod state;
 
 mod guard;
-mod preferences;
 
-// Requests: bodies, structures, parameters.
-mod content_type;
+// Requests: preferences, bodies, structures, parameters.
 mod form;
-mod json_body;
+mod preferences;
 mod source;
+
 mod upload;
 
 mod parsed_request;
@@ -43,7 +44,7 @@ mod stream;
 
 mod delivery;
 
-// Resources, with the parts of their OpenAPI description that they share.
+// Resources. `openapi` holds the parts of their description that they share.
 mod openapi;
 
 mod jobs;
@@ -69,9 +70,10 @@ mod api_document;
 
 // The service: middleware, routes, connections.
 mod accept;
-mod browsers;
 mod key_reload;
 mod observe;
+
+mod browsers;
 
 mod middleware;
 

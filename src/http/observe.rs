@@ -1,4 +1,4 @@
-//! The span of a request, its place in a trace, its log line and its metrics, which end with the last byte of the answer.
+//! Span, log line and metrics of a request, which end with the last byte of the response.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -23,12 +23,12 @@ use crate::telemetry::{
     Tracer, Value,
 };
 
-/// W3C's name for a place in a trace: in and out.
+/// `traceparent` (W3C Trace Context), of requests and responses.
 pub(super) const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
-/// What vendors add to it: in alone, and on to whom we ask.
+/// `tracestate` (W3C Trace Context), of requests; passed on to the archive.
 const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
-/// Watches one request.
+/// Middleware: observes one request.
 pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next: Next) -> Response {
     let start = Instant::now();
     let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
@@ -39,7 +39,7 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         let context = TraceContext::read(all(TRACEPARENT), all(TRACESTATE));
         Scope::open(&Origin { request: Some(id.as_str().into()), context, tracer }, start)
     };
-    // The query stays out: a signature may stand in it. The guard adds whose key it is.
+    // Without the query, which may hold a signature. The guard adds the id of the key.
     let path = request.uri().path();
     let span = tracing::info_span!(
         "request",
@@ -73,26 +73,26 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
     }
     log.status = Some(response.status().as_u16());
     response.map(|body| {
-        // Nobody polls a body that is empty, or the answer to HEAD.
+        // An empty body and the answer to HEAD are not polled.
         log.complete = body.is_end_stream() || log.method == Method::HEAD;
         Body::new(Observed { body, log })
     })
 }
 
-/// What is said about a request once it is over, however it ends.
+/// Facts about a request, recorded when it is dropped.
 struct Log {
     start: Instant,
     method: Method,
     route: Option<MatchedPath>,
-    /// Of a request whose span is recorded.
+    /// Path of a request whose span is recorded; otherwise empty.
     path: String,
-    /// None if the client left before there was an answer.
+    /// `None` if the client left before the response.
     status: Option<u16>,
     span: tracing::Span,
     scope: Scope,
-    /// Bytes of the request's body.
+    /// Size of the request body, bytes.
     received: Arc<AtomicU64>,
-    /// Bytes of the answer's.
+    /// Size of the response body, bytes.
     bytes: usize,
     complete: bool,
 }
@@ -118,7 +118,7 @@ impl Drop for Log {
             if let Some(status) = status {
                 tracing::info!(status, ms, bytes, complete, "answered");
             } else {
-                tracing::info!(ms, "the client left before it was answered");
+                tracing::info!(ms, "the client left before the response");
             }
         });
         self.scope.close(|| self.closing(method, route, received));
@@ -126,7 +126,7 @@ impl Drop for Log {
 }
 
 impl Log {
-    /// The span, with attributes as OpenTelemetry names them.
+    /// Returns the attributes of the span, with the names of OpenTelemetry.
     fn closing(&self, method: &'static str, route: String, received: u64) -> Closing {
         let mut attributes: Vec<(&'static str, Value)> = vec![
             ("http.request.method", method.into()),
@@ -141,13 +141,13 @@ impl Log {
             attributes.push(("http.route", route.into()));
         }
         attributes.extend(self.status.map(|status| ("http.response.status_code", u64::from(status).into())));
-        // What the client did wrong is no failure of ours.
+        // Errors of clients are not failures of the server.
         let error = self.status.filter(|status| *status >= 500).map(|status| format!("answered with {status}"));
         Closing { name: name.into(), kind: SpanKind::Server, attributes, error }
     }
 }
 
-/// A method as a label: clients can make up any number of others.
+/// Returns a method as a label. Unknown methods share one, since clients can invent any number.
 fn known(method: &Method) -> &'static str {
     match method.as_str() {
         "GET" => "GET",
@@ -161,7 +161,7 @@ fn known(method: &Method) -> &'static str {
     }
 }
 
-/// A request's body that is counted.
+/// Request body that counts its bytes.
 struct Received {
     body: Body,
     bytes: Arc<AtomicU64>,
@@ -188,7 +188,7 @@ impl HttpBody for Received {
     }
 }
 
-/// An answer's body that is counted.
+/// Response body that counts its bytes.
 struct Observed {
     body: Body,
     log: Log,

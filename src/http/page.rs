@@ -1,5 +1,5 @@
-//! `/`: the viewer, if it was there when this was built, and `<molmesh-viewer>` for other pages. All is embedded: nothing is
-//! loaded from elsewhere.
+//! `/`: the embedded viewer, if the program was built with it, and `<molmesh-viewer>` for other pages. Nothing is
+//! loaded from other servers.
 
 use axum::extract::Path;
 use axum::extract::rejection::PathRejection;
@@ -13,24 +13,23 @@ use super::openapi::parameters::AssetPath;
 use super::openapi::refusals;
 use super::problem::Problem;
 
-/// Only our own files run, only our own resources are asked. WebAssembly is allowed, evaluating text is not: the decoder of
-/// meshes that are compressed with meshopt is a module of it, and no other part of the page. Pictures may be blobs, since an
-/// image's own address could not carry a key.
+/// Content security policy of the page: scripts and requests of this server only. WebAssembly is allowed for the
+/// meshopt decoder, `eval` is not. Images may be blobs, since the address of an image cannot carry a key.
 const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; \
                       img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
                       frame-ancestors 'none'";
 
-// `static FILES`: the paths of what lay in `web/dist`, and the bytes, packed with gzip; nothing, if nothing did.
+// `static FILES`: paths below `web/dist` with their contents, compressed with gzip; empty if the page was not built.
 include!(concat!(env!("OUT_DIR"), "/page.rs"));
 
-/// Instead of the viewer.
+/// Page of a server without the viewer.
 const NONE: &str = include_str!("../../web/none.html");
 const ICON: &str = include_str!("../../web/public/assets/icon.svg");
-/// Instead of the component: whoever embeds it finds out why nothing is shown.
+/// Script of a server without the component; explains why nothing is shown.
 const NO_COMPONENT: &str =
     "console.error(\"This server was built without its viewer, and has no <molmesh-viewer> to give.\");\n";
 
-/// Whether the viewer was there when this was built.
+/// Returns true if the program was built with the viewer.
 #[must_use]
 pub fn has_viewer() -> bool {
     found("index.html").is_some()
@@ -57,13 +56,13 @@ fn headers(path: &str) -> [(HeaderName, &'static str); 4] {
     ]
 }
 
-/// Whether a name ends in a hash of eight characters before its extension: `index-Dx3k_9aZ.js`.
+/// Returns true if a name ends in a hash of eight characters before its extension: `index-Dx3k_9aZ.js`.
 fn is_named_by_contents(path: &str) -> bool {
     let stem = path.rsplit_once('.').map_or(path, |(stem, _)| stem).as_bytes();
     path.starts_with("assets/") && stem.len() > 16 && stem[stem.len() - 9] == b'-'
 }
 
-/// A file of the page, or what stands in for it.
+/// Answers with a file of the page, or with `instead`.
 fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Response, Problem> {
     match found(path) {
         Some(bytes) => Ok((headers(path), embedded::file(request, bytes)?).into_response()),
@@ -91,7 +90,7 @@ pub(super) async fn component(request: HeaderMap) -> Result<Response, Problem> {
 
 refusals!(AssetRefusals: [[Kind::BadRequest, Kind::NotFound]]);
 
-/// What the page consists of.
+/// Serves the files of the page.
 #[utoipa::path(get, path = "/assets/{file}", tag = "page", operation_id = "asset", params(AssetPath),
     responses(
         (status = 200, description = "A script, a style, a picture or a text.", content(
@@ -105,7 +104,7 @@ pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: He
     let path = format!("assets/{file}");
     if found(&path).is_none() && file != "icon.svg" {
         let shown: String = file.chars().take(80).collect();
-        return Err(Problem::new(Kind::NotFound, format!("the page has no `{shown}`; reload it")));
+        return Err(Problem::new(Kind::NotFound, format!("the page has no file `{shown}`; reload the page")));
     }
     answer(&request, &path, ICON)
 }

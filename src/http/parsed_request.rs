@@ -46,8 +46,8 @@ impl ParsedRequest {
         Ok(Self { source, request, pairs, format, declared: DeclaredType::Neutral })
     }
 
-    /// Receives a body: a structure file, a form with a file, or a JSON document that names a structure. Invalid parameters in
-    /// the query are rejected before the body is received.
+    /// Receives a body: a structure file, a form with a file, or a JSON document that names a structure. Invalid
+    /// parameters in the query are rejected before the body is received.
     pub(super) async fn from_body(
         app: &Shared,
         query: Pairs,
@@ -81,7 +81,8 @@ fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {
     Ok((pairs, request))
 }
 
-/// Returns the format of a request and checks the request against it. A report has the default format, which is not written.
+/// Returns the format of a request and checks the request against it. A report has the default format, which is not
+/// written.
 fn finish(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Format, Problem> {
     let format = match (request.format, request.report) {
         (Some(format), _) => format,

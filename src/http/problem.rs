@@ -42,7 +42,7 @@ impl Problem {
         Self::new(Kind::Internal, "The request could not be answered.")
     }
 
-    /// Whether the problem is of this kind.
+    /// Returns true if the problem is of this kind.
     pub(super) fn is(&self, kind: Kind) -> bool {
         self.kind == kind
     }

@@ -1,4 +1,5 @@
-//! `Range` and `If-Range` (RFC 9110): one range of bytes. A request for several ranges gets the whole file, as the RFC allows.
+//! `Range` and `If-Range` (RFC 9110): one range of bytes. A request for several ranges gets the whole file, as the RFC
+//! allows.
 
 use std::ops::Range;
 

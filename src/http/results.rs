@@ -181,8 +181,8 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
     Ok(Some(headers))
 }
 
-/// Stores the result of a synchronous request in the background. Returns false if too many results are being stored already;
-/// then the next request computes it again.
+/// Stores the result of a synchronous request in the background. Returns false if too many results are being stored
+/// already; then the next request computes it again.
 pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format, key: &ContentKey) -> bool {
     if app.saves.running(key).is_some() {
         return true;

@@ -181,13 +181,12 @@ impl Server {
         self.metrics_addr
     }
 
-    /// Serves until `orders` requests a stop, then shuts down in the phases of [`Stop`]: `server.termination_notice_ms` for
-    /// [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], one second for cancelled jobs. A further order during
-    /// the drain cuts it short. Must run on a tokio runtime with timers and several threads. Returns true if every request was
-    /// finished; unfinished durable jobs are left for the next process.
+    /// Serves until `orders` requests a stop, then shuts down in the phases of [`Stop`]: `server.termination_notice_ms`
+    /// for [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], one second for cancelled jobs. A further
+    /// order during the drain cuts it short. Must run on a tokio runtime with timers and several threads. Returns true
+    /// if every request was finished; unfinished durable jobs are left for the next process.
     ///
-    /// # Errors
-    /// [`ServeError`].
+    /// # Errors [`ServeError`].
     pub async fn run(self, mut orders: watch::Receiver<Stop>) -> Result<bool, ServeError> {
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());

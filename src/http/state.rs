@@ -108,7 +108,7 @@ impl Readiness {
         self.warm.store(warm as u8, Ordering::Relaxed);
     }
 
-    /// Whether the service has been told to stop.
+    /// Returns true if the service has been told to stop.
     pub(super) fn is_ending(&self) -> bool {
         self.ending.load(Ordering::Relaxed)
     }

@@ -1,5 +1,5 @@
-//! Streaming of mesh files: the writer runs on a blocking thread and sends pieces to the body through a bounded channel, so
-//! that memory use stays small and a slow client slows the writer down.
+//! Streaming of mesh files: the writer runs on a blocking thread and sends pieces to the body through a bounded
+//! channel, so that memory use stays small and a slow client slows the writer down.
 
 use std::io::{self, Write};
 use std::pin::Pin;

@@ -1,4 +1,5 @@
-//! `/v1/structures`: structures that are uploaded once and meshed many times, named by the SHA-256 of the uploaded bytes.
+//! `/v1/structures`: structures that are uploaded once and meshed many times, named by the SHA-256 of the uploaded
+//! bytes.
 
 use axum::Json;
 use axum::body::Body;
@@ -32,50 +33,50 @@ const MAX_CHAINS: usize = 1000;
 /// Contents of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct StructureDocument {
-    /// SHA-256 of its bytes as they came.
+    /// SHA-256 of the uploaded bytes.
     digest: String,
-    /// How many these are.
+    /// Size of the upload, bytes.
     bytes: usize,
     /// `pdb`, `mmcif` or `bcif`.
     format: &'static str,
     /// PDB id or data block name.
     #[schema(required)]
     id: Option<String>,
-    /// Its title.
+    /// Title.
     #[schema(required)]
     title: Option<String>,
-    /// Atoms, all models.
+    /// Number of atoms in all models.
     atoms: u64,
-    /// The numbers of its models.
+    /// Numbers of the models.
     models: Vec<i32>,
-    /// The model that the counts are of.
+    /// Model that the counts refer to.
     model: i32,
     atoms_in_model: KindCounts,
-    /// Atoms with alternative locations.
+    /// Number of atoms with alternative locations.
     alternatives: u64,
-    /// Atoms of unknown elements.
+    /// Number of atoms of unknown elements.
     unknown_elements: u64,
-    /// Values that could not be read and do not matter for a mesh, at most 12.
+    /// Unreadable values that do not affect the mesh, at most 12.
     warnings: Vec<String>,
-    /// Chains.
+    /// Number of chains.
     chain_count: usize,
-    /// The first thousand of them.
+    /// First 1000 chains.
     chains: Vec<ChainDocument>,
-    /// A mesh of it.
+    /// Address of a mesh.
     surface: String,
 }
 
-/// A chain.
+/// Chain of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 struct ChainDocument {
-    /// The author's name for it.
+    /// Name by the author.
     name: String,
-    /// Its atoms.
+    /// Number of atoms.
     atoms: u64,
     of: KindCounts,
 }
 
-/// Atoms by what they belong to.
+/// Numbers of atoms by kind.
 #[derive(Debug, Serialize, ToSchema)]
 struct KindCounts {
     polymer: u64,
@@ -104,7 +105,7 @@ refusals!(SurfaceRefusals: [
     PARAMETERS, READING, MESHING, ASKING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
 ]);
 
-/// Takes a structure in, to be meshed many times.
+/// Stores a structure.
 #[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure", params(Coding),
     request_body(description = "The structure.", content(
         (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
@@ -119,7 +120,8 @@ refusals!(SurfaceRefusals: [
     ))]
 pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
     if upload::is_json(&headers) {
-        let detail = "this address takes a structure file, not a JSON document; `POST /v1/meshes` takes JSON that names a structure";
+        let detail =
+            "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
         return Err(Problem::new(Kind::UnsupportedMediaType, detail).with("declared", "application/json"));
     }
     let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
@@ -142,7 +144,7 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
 }
 
-/// Contents of a structure.
+/// Describes a stored structure.
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
     params(StructurePath, Unchanged),
     responses(
@@ -161,7 +163,7 @@ pub(super) async fn show(
     source.document(&app, &headers, write).await
 }
 
-/// Meshes a structure that was uploaded.
+/// Meshes a stored structure.
 #[utoipa::path(
     get,
     path = "/v1/structures/{digest}/{file}",

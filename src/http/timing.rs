@@ -1,4 +1,5 @@
-//! `Server-Timing`: consecutive phases of a request, which add up to the time from its arrival to the head of the answer.
+//! `Server-Timing`: consecutive phases of a request, which add up to the time from its arrival to the head of the
+//! answer.
 
 use std::fmt::Write as _;
 use std::time::{Duration, Instant};

@@ -26,12 +26,12 @@ pub(super) struct Upload {
     pub(super) declared: DeclaredType,
 }
 
-/// Whether the body is declared as a form.
+/// Returns true if the body is declared as a form.
 pub(super) fn is_multipart(headers: &HeaderMap) -> bool {
     text(headers, &CONTENT_TYPE).is_some_and(|t| t.trim_start().to_ascii_lowercase().starts_with("multipart/form-data"))
 }
 
-/// Whether the body is declared as JSON.
+/// Returns true if the body is declared as JSON.
 pub(super) fn is_json(headers: &HeaderMap) -> bool {
     let essence = text(headers, &CONTENT_TYPE).and_then(|t| t.split(';').next()).unwrap_or_default();
     essence.trim().eq_ignore_ascii_case("application/json")

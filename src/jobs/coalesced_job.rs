@@ -83,7 +83,7 @@ pub(super) struct CoalescedJob {
 }
 
 impl CoalescedJob {
-    /// Whether no ticket is left.
+    /// Returns true if no ticket is left.
     pub(super) fn is_abandoned(&self) -> bool {
         self.outcome.as_ref().is_none_or(ResultSender::is_abandoned)
     }

@@ -25,9 +25,9 @@ impl Rate {
 
     /// Learns from a job of `units` of work that took `seconds`.
     pub(super) fn learn(&mut self, units: f64, seconds: f64) {
-        // Compares with the present estimate, not with that at acceptance: a full queue would correct the same error for every
-        // job. On a logarithmic scale, a job that takes 100 times as long as expected weighs as much as one that takes a
-        // hundredth.
+        // Compares with the present estimate, not with that at acceptance: a full queue would correct the same error
+        // for every job. On a logarithmic scale, a job that takes 100 times as long as expected weighs as much as one
+        // that takes a hundredth.
         let miss = (seconds.max(1e-6) / self.seconds(units).max(1e-9)).ln();
         self.per_unit *= (NEWEST * miss.clamp(-4.0, 4.0)).exp();
     }

@@ -78,8 +78,8 @@ impl DurableJob {
         })
     }
 
-    /// Marks the job as accepted again, with `attempts` attempts, for the next process. Returns true if that changed the
-    /// record.
+    /// Marks the job as accepted again, with `attempts` attempts, for the next process. Returns true if that changed
+    /// the record.
     fn leave(&self, attempts: u32) -> bool {
         self.view.send_if_modified(|view| {
             if view.record.status.is_final() || view.record.attempts == attempts && view.record.started_ms.is_none() {
@@ -223,7 +223,7 @@ impl<P> Runner<P> {
                     if job.leave(earlier_attempts)
                         && let Err(error) = jobs.0.write_job(&job).await
                     {
-                        tracing::warn!(job_id = %job.id(), %error, "the record of an interrupted job counts one attempt too many");
+                        tracing::warn!(job_id = %job.id(), %error, "an interrupted attempt is counted");
                     }
                     break;
                 }

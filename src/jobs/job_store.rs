@@ -1,5 +1,5 @@
-//! Durable jobs: the record is in the store before the client is told of the job, and unfinished jobs are resumed after a
-//! restart.
+//! Durable jobs: the record is in the store before the client is told of the job, and unfinished jobs are resumed after
+//! a restart.
 //!
 //! A job is accepted in three steps: store the input, store the record, answer. Results are named by their contents, so
 //! computing one twice is harmless; a crash costs time and never loses a job.
@@ -108,8 +108,8 @@ impl Inner {
         self.store.put(&Name::job(record.id.as_str())?, Bytes::from(bytes)).await
     }
 
-    /// Writes the present record of a job. Writers of one job take turns, so the last write has the latest state, and a job
-    /// that was dismissed while it started stays dismissed after a restart.
+    /// Writes the present record of a job. Writers of one job take turns, so the last write has the latest state, and a
+    /// job that was dismissed while it started stays dismissed after a restart.
     pub(super) async fn write_job(&self, job: &DurableJob) -> Result<(), StoreError> {
         let _turn = job.writing.lock().await;
         self.write(&job.record()).await
@@ -151,10 +151,10 @@ impl JobStore {
         }))
     }
 
-    /// Accepts a job, which survives the process from then on. `ticket` is that of work that is queued or running already.
+    /// Accepts a job, which survives the process from then on. `ticket` is that of work that is queued or running
+    /// already.
     ///
-    /// # Errors
-    /// [`AcceptError`]; no job exists then.
+    /// # Errors [`AcceptError`]; no job exists then.
     pub async fn accept(&self, spec: JobSpec, ticket: Option<Ticket>) -> Result<JobView, AcceptError> {
         let inner = &self.0;
         let client = spec.task.rank.client.number();
@@ -317,8 +317,8 @@ impl JobStore {
         Ok(job)
     }
 
-    /// Returns the callback that records an attempt before the worker starts it, so that a job that crashes the process is
-    /// detected. It first waits for a message on `recorded`, which says that the job itself is on record.
+    /// Returns the callback that records an attempt before the worker starts it, so that a job that crashes the process
+    /// is detected. It first waits for a message on `recorded`, which says that the job itself is on record.
     pub(super) fn on_start(&self, job: &Arc<DurableJob>, recorded: Option<mpsc::Receiver<()>>) -> OnStart {
         let (jobs, job) = (self.clone(), Arc::clone(job));
         let runtime = tokio::runtime::Handle::current();

@@ -12,8 +12,8 @@ use crate::store::{BadDigest, Digest, Name, StoreError};
 pub struct ContentKey(Digest);
 
 impl ContentKey {
-    /// Returns the key of a result. `maker` names the arithmetic of the backend, followed by that of a picture's renderer. The
-    /// version is part of the key, since a release may change the last bits.
+    /// Returns the key of a result. `maker` names the arithmetic of the backend, followed by that of a picture's
+    /// renderer. The version is part of the key, since a release may change the last bits.
     #[must_use]
     pub fn new(input: &Digest, job: &Job, format: Format, maker: &str) -> Self {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));

@@ -87,11 +87,10 @@ impl Pool {
         Ok(pool)
     }
 
-    /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called before the
-    /// work starts, unless the task joins a running job.
+    /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called
+    /// before the work starts, unless the task joins a running job.
     ///
-    /// # Errors
-    /// Any [`Refusal`].
+    /// # Errors Any [`Refusal`].
     pub fn submit(&self, task: Task, allowed: Duration, on_start: Option<OnStart>) -> Result<Ticket, Refusal> {
         let mode = if task.rank.batch { "async" } else { "sync" };
         let deadline = Instant::now() + allowed;
@@ -166,8 +165,8 @@ impl Pool {
         self.shared.queue.leave();
     }
 
-    /// Accepts no more jobs and waits for the accepted ones until `end`; then cancels the rest, whose tickets end as stopped.
-    /// Returns true if every job finished.
+    /// Accepts no more jobs and waits for the accepted ones until `end`; then cancels the rest, whose tickets end as
+    /// stopped. Returns true if every job finished.
     pub async fn drain(&self, end: impl Future<Output = ()>) -> bool {
         self.shared.queue.close();
         let in_time = tokio::select! {

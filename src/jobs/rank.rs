@@ -1,7 +1,7 @@
 //! Order of queued jobs: interactive jobs before durable ones, fair shares for clients, bounded delays.
 //!
-//! Shares follow start-time fair queueing (Goyal, Vin, Cheng, 1996): the tag of a job is the virtual time, in units of work, at
-//! which the earlier jobs of its client would be finished; the lowest tag runs first.
+//! Shares follow start-time fair queueing (Goyal, Vin, Cheng, 1996): the tag of a job is the virtual time, in units of
+//! work, at which the earlier jobs of its client would be finished; the lowest tag runs first.
 
 use std::time::Duration;
 
@@ -39,8 +39,8 @@ impl Client {
         Self(number)
     }
 
-    /// Returns the client with this `name`, an address or a key. Numbers are truncated SHA-256 hashes, so a client cannot choose
-    /// a name with the number of another client.
+    /// Returns the client with this `name`, an address or a key. Numbers are truncated SHA-256 hashes, so a client
+    /// cannot choose a name with the number of another client.
     #[must_use]
     pub fn named(name: &str) -> Self {
         Self(Sha256::digest(name.as_bytes()).iter().take(8).fold(0, |number, byte| number << 8 | u64::from(*byte)))
@@ -61,7 +61,7 @@ pub(super) fn turn(rank: &Rank, tag: f64, id: u64, waited: Duration, batch_max_d
     (rank.batch && waited < batch_max_delay, tag, id)
 }
 
-/// Whether `a` runs before `b`.
+/// Returns true if `a` runs before `b`.
 pub(super) fn before(a: &Turn, b: &Turn) -> bool {
     a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)).is_lt()
 }

@@ -115,7 +115,7 @@ impl Status {
         }
     }
 
-    /// Whether the job has ended.
+    /// Returns true if the job has ended.
     #[must_use]
     pub const fn is_final(self) -> bool {
         matches!(self, Self::Successful | Self::Failed | Self::Dismissed)
@@ -204,7 +204,7 @@ impl Record {
         Ok((request, format))
     }
 
-    /// Whether both records are of the same request: equal input, format and parsed parameters.
+    /// Returns true if both records are of the same request: equal input, format and parsed parameters.
     pub(super) fn is_same_request(&self, other: &Self) -> bool {
         let parsed = |record: &Self| {
             let (request, _) = record.request().ok()?;

@@ -36,18 +36,17 @@ pub enum SaveError {
 }
 
 impl SaveError {
-    /// Whether a later attempt may succeed.
+    /// Returns true if a later attempt may succeed.
     #[must_use]
     pub fn is_temporary(&self) -> bool {
         matches!(self, Self::Store(error) if error.is_temporary())
     }
 }
 
-/// Stores the report and the mesh as `format`, unless the mesh is stored already. The report comes first, so that every stored
-/// mesh has one.
+/// Stores the report and the mesh as `format`, unless the mesh is stored already. The report comes first, so that every
+/// stored mesh has one.
 ///
-/// # Errors
-/// [`SaveError`].
+/// # Errors [`SaveError`].
 pub async fn save(
     store: &Store,
     finished: Arc<Finished>,

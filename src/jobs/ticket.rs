@@ -43,13 +43,13 @@ impl Ticket {
         &self.admission.scope
     }
 
-    /// Whether the job was already running when it was joined; its `on_start` callback is not called then.
+    /// Returns true if the job was already running when it was joined; its `on_start` callback is not called then.
     #[must_use]
     pub fn joined_running(&self) -> bool {
         self.admission.running
     }
 
-    /// Whether the ticket joined a job that was queued or running.
+    /// Returns true if the ticket joined a job that was queued or running.
     #[must_use]
     pub fn is_shared(&self) -> bool {
         self.admission.shared
