@@ -66,14 +66,14 @@ fn answer(which: usize, media_type: &'static str) -> Result<Response, Problem> {
     Ok(([(CONTENT_TYPE, media_type), (CACHE_CONTROL, "no-cache")], texts[which].clone()).into_response())
 }
 
-/// This description as YAML.
+/// Returns this document as YAML.
 #[utoipa::path(get, path = "/openapi.yaml", tag = "service", operation_id = "describeYaml",
     responses((status = 200, description = "The description.", body = Object, content_type = "application/yaml")))]
 pub(super) async fn yaml() -> Result<Response, Problem> {
     answer(0, "application/yaml")
 }
 
-/// This description as JSON.
+/// Returns this document as JSON.
 #[utoipa::path(get, path = "/openapi.json", tag = "service", operation_id = "describeJson",
     responses((status = 200, description = "The description.", body = Object, content_type = "application/json")))]
 pub(super) async fn json() -> Result<Response, Problem> {

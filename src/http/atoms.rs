@@ -22,14 +22,14 @@ use crate::structure::{self, Structure, StructureError, element};
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
 const BYTES_PER_ATOM: u64 = 24;
 
-/// The atoms of a structure: every model, in the order of the file, which is what `_ATOM` counts from 0.
+/// Atoms of a structure: every model, in the order of the file, from 0 as in `_ATOM`.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct AtomsDocument {
-    /// Atoms: rows of `atoms`.
+    /// Number of atoms, which are the rows of `atoms`.
     count: usize,
-    /// The distinct names of atoms.
+    /// Distinct names of atoms.
     names: Vec<String>,
-    /// The distinct elements; `?` is an unknown one.
+    /// Distinct elements; `?` is an unknown one.
     elements: Vec<&'static str>,
     atoms: AtomColumns,
     residues: ResidueColumns,

@@ -94,7 +94,7 @@ refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
 
 /// Estimates size and duration of a mesh.
 ///
-/// Takes what `POST /v1/meshes` takes.
+/// Takes the same requests as `POST /v1/meshes`.
 #[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",
     params(MeshParameters, Coding),
     request_body(description = "A structure, or a document that names one.", content(

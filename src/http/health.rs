@@ -32,7 +32,7 @@ pub(super) struct Version {
     version: &'static str,
 }
 
-/// The process answers.
+/// Shows that the process answers.
 #[utoipa::path(get, path = "/livez", tag = "service", operation_id = "live",
     responses((status = 200, description = "The process lives.", body = Health)))]
 pub(super) async fn live() -> Response {
@@ -73,8 +73,8 @@ refusals!(ReadyRefusals: [[Kind::NotReady]]);
 
 /// Checks that the service is ready for requests.
 ///
-/// The service was not told to stop, a mesh was computed and a device (or what stands in for it) takes jobs, and the
-/// store can be written and read. Load does not change the answer. `checks` says each, also in the problem.
+/// The service is ready if it is not stopping, has computed a first mesh, has a device (or a fallback) in service, and can
+/// write and read the store. Load does not change the answer. `checks` lists each result, also in the problem.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
     responses((status = 200, description = "The service takes requests.", body = ReadyDocument), ReadyRefusals))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {

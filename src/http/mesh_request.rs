@@ -108,7 +108,7 @@ impl MeshRequest {
         if method != Method::HEAD || request.report {
             return Ok(None);
         }
-        // Headers that sum up the mesh would need a run.
+        // The summary headers would need a run.
         let media_type = HeaderValue::from_static(format.media_type());
         let response = [(header::CONTENT_TYPE, media_type), (header::ETAG, etag)].into_response();
         Ok(Some(self.cached(response)))

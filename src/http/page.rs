@@ -70,7 +70,7 @@ fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Resp
     }
 }
 
-/// The page.
+/// Serves the viewer.
 #[utoipa::path(get, path = "/", tag = "page", operation_id = "page",
     responses((status = 200, description = "The viewer, or how to get it.", body = String,
         content_type = "text/html; charset=utf-8")))]
@@ -78,9 +78,9 @@ pub(super) async fn index(request: HeaderMap) -> Result<Response, Problem> {
     answer(&request, "index.html", NONE)
 }
 
-/// `<molmesh-viewer>`, for pages elsewhere.
+/// Serves the script of `<molmesh-viewer>` for other pages.
 ///
-/// A module that defines the element; what it needs it loads from beside itself.
+/// A module that defines the element and loads its parts from this server.
 #[utoipa::path(get, path = "/molmesh-viewer.js", tag = "page", operation_id = "component",
     responses((status = 200, description = "A script.", body = String,
         content_type = "text/javascript; charset=utf-8")))]
@@ -109,7 +109,7 @@ pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: He
     answer(&request, &path, ICON)
 }
 
-/// A structure to try.
+/// Serves a sample structure.
 #[utoipa::path(get, path = "/sample.pdb", tag = "page", operation_id = "sample",
     responses((status = 200, description = "A structure to try.", body = String,
         content_type = "chemical/x-pdb")))]

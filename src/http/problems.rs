@@ -36,14 +36,14 @@ fn describe(row: &Row) -> ProblemType {
 
 refusals!(OneRefusals: [[Kind::BadRequest, Kind::NotFound]]);
 
-/// Every type of problem.
+/// Lists all problem types.
 #[utoipa::path(get, path = "/problems", tag = "service", operation_id = "listProblems",
     responses((status = 200, description = "All types.", body = Vec<ProblemType>)))]
 pub(super) async fn list() -> Response {
     Json(KINDS.iter().map(describe).collect::<Vec<_>>()).into_response()
 }
 
-/// One type of problem.
+/// Explains one problem type.
 #[utoipa::path(get, path = "/problems/{slug}", tag = "service", operation_id = "showProblem",
     params(("slug" = String, Path, description = "Last segment of a problem's `type`.", example = "grid-too-large")),
     responses((status = 200, description = "What it means.", body = ProblemType), OneRefusals))]

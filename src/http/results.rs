@@ -44,7 +44,7 @@ refusals!(ShowRefusals: [[
 ]]);
 refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
 
-/// A mesh that was made before.
+/// Returns a stored result.
 #[utoipa::path(
     get,
     path = "/v1/results/{file}",
@@ -71,7 +71,7 @@ pub(super) async fn show(
     stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))
 }
 
-/// A result's report, of the run that made it.
+/// Returns the report of the run that computed a result.
 #[utoipa::path(get, path = "/v1/results/{key}/report.json", tag = "results", operation_id = "showReport",
     params(ResultPath, Unchanged),
     responses(

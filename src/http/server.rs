@@ -186,7 +186,8 @@ impl Server {
     /// order during the drain cuts it short. Must run on a tokio runtime with timers and several threads. Returns true
     /// if every request was finished; unfinished durable jobs are left for the next process.
     ///
-    /// # Errors [`ServeError`].
+    /// # Errors
+    /// [`ServeError`].
     pub async fn run(self, mut orders: watch::Receiver<Stop>) -> Result<bool, ServeError> {
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());

@@ -154,7 +154,8 @@ impl JobStore {
     /// Accepts a job, which survives the process from then on. `ticket` is that of work that is queued or running
     /// already.
     ///
-    /// # Errors [`AcceptError`]; no job exists then.
+    /// # Errors
+    /// [`AcceptError`]; no job exists then.
     pub async fn accept(&self, spec: JobSpec, ticket: Option<Ticket>) -> Result<JobView, AcceptError> {
         let inner = &self.0;
         let client = spec.task.rank.client.number();

@@ -90,7 +90,8 @@ impl Pool {
     /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called
     /// before the work starts, unless the task joins a running job.
     ///
-    /// # Errors Any [`Refusal`].
+    /// # Errors
+    /// Any [`Refusal`].
     pub fn submit(&self, task: Task, allowed: Duration, on_start: Option<OnStart>) -> Result<Ticket, Refusal> {
         let mode = if task.rank.batch { "async" } else { "sync" };
         let deadline = Instant::now() + allowed;

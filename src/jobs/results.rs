@@ -46,7 +46,8 @@ impl SaveError {
 /// Stores the report and the mesh as `format`, unless the mesh is stored already. The report comes first, so that every
 /// stored mesh has one.
 ///
-/// # Errors [`SaveError`].
+/// # Errors
+/// [`SaveError`].
 pub async fn save(
     store: &Store,
     finished: Arc<Finished>,
