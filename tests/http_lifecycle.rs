@@ -75,7 +75,7 @@ fn a_client_that_leaves_cancels_its_job() {
     drop(stream);
     wait_for("the job to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
     assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
-    wait_for("it is told", || !log_lines("the client left before it was answered").is_empty());
+    wait_for("it is told", || !log_lines("the client left before the response").is_empty());
     assert!(server.metric("http_server_request_duration_seconds_count", &["status=\"none\""]) >= 1.0);
     assert!(server.metric("molmesh_jobs_finished_total", &["dismissed"]) >= 1.0);
     backend.set(Mode::Octahedra);
