@@ -124,7 +124,7 @@ fn ready_only_after_the_first_mesh() {
         let server = start_cold(Arc::clone(&broken) as _, |_| {});
         wait_for("the warm-up to fail", || {
             let reply = server.get("/readyz");
-            reply.status == 503 && reply.text().contains("could not be computed")
+            reply.status == 503 && reply.text().contains("the first mesh failed")
         });
         assert_eq!(server.get("/livez").status, 200);
     }
