@@ -19,7 +19,7 @@ impl Default for Rate {
 
 impl Rate {
     /// Returns the expected duration of `units` of work, s.
-    pub(super) fn seconds(&self, units: f64) -> f64 {
+    pub(super) fn seconds(self, units: f64) -> f64 {
         self.per_unit * units
     }
 
