@@ -167,5 +167,5 @@ fn a_promise_that_is_asked_for_while_the_service_drains_is_given() {
 fn by_default_an_end_takes_less_than_twenty_five_seconds() {
     let server = Config::default().server;
     // A second for what is cancelled comes behind.
-    assert!(server.notice() + server.drain_timeout() + Duration::from_secs(2) <= Duration::from_secs(25));
+    assert!(server.termination_notice() + server.drain_timeout() + Duration::from_secs(2) <= Duration::from_secs(25));
 }
