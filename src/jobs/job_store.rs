@@ -343,12 +343,12 @@ impl JobStore {
             Ok(key) => {
                 let changed = job.end(Status::Successful, |record| record.result = Some(key));
                 if changed {
-                    tracing::info!(job_id = %id, "a job has finished");
+                    tracing::info!(job_id = %id, "a job finished");
                 }
                 changed
             }
             Err(error) => {
-                tracing::info!(job_id = %id, %error, "a job has failed");
+                tracing::info!(job_id = %id, %error, "a job failed");
                 let problem = (self.0.describe)(&error);
                 job.end(Status::Failed, |record| record.problem = Some(problem))
             }
