@@ -23,6 +23,8 @@ pub mod http;
 #[cfg(feature = "server")]
 pub mod jobs;
 #[cfg(feature = "server")]
+mod single_flight;
+#[cfg(feature = "server")]
 pub mod store;
 #[cfg(feature = "server")]
 pub mod telemetry;

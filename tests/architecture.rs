@@ -426,6 +426,15 @@ fn cycle(sources: &[Source]) -> Option<Vec<String>> {
         done.insert(at.to_owned());
         false
     }
+    let mut done = BTreeSet::new();
+    edges.keys().find_map(|node| {
+        let mut trail = Vec::new();
+        visit(node, edges, &mut trail, &mut done).then_some(trail)
+    })
+}
+
+/// A cycle between rooms, if there is one.
+fn cycle(sources: &[Source]) -> Option<Vec<String>> {
     let mut edges = Edges::new();
     for source in sources {
         let layer = layer_of(&source.path);

@@ -70,7 +70,7 @@ fn the_component_follows_jobs_and_shows_its_fallback() {
 
 #[test]
 fn long_meshes_are_followed_as_jobs() {
-    drive("jobs.mjs", &["--set", "jobs.sync_wait_ms=1"], &[]);
+    drive("jobs.mjs", &[], &[]);
 }
 
 #[test]

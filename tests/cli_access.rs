@@ -99,7 +99,7 @@ fn a_hangup_means_that_the_keys_are_read_again() {
     }
     let (code, log) = service.stop("TERM");
     assert_eq!(code, Some(0), "{log}");
-    assert!(log.contains("the keys were read again"), "{log}");
+    assert!(log.contains("reloaded the keys"), "{log}");
 }
 
 #[test]

@@ -48,7 +48,7 @@ fn ask(stream: &mut TcpStream, body: &[u8]) -> (u16, bool) {
 #[test]
 fn no_request_fails_under_load() {
     let folder = Folder::new();
-    let service = Service::start(&folder, &["--devices", "cpu", "--set", "server.notice_ms=3600000"]);
+    let service = Service::start(&folder, &["--devices", "cpu", "--set", "server.termination_notice_ms=3600000"]);
     let addr = addr(&service);
     let (noticed, answered, behind) = (AtomicBool::new(false), AtomicUsize::new(0), AtomicUsize::new(0));
     std::thread::scope(|scope| {

@@ -43,7 +43,7 @@ fn what_is_printed_is_a_file_that_gives_the_same_again() {
         ),
     );
     let odd = "quote\" back\\slash \u{7f}tab\t line\n Å end";
-    let env = pairs(&[("MOLMESH__JOBS__QUEUE", "5"), ("MOLMESH__SERVER__NOTICE_MS", "none")]);
+    let env = pairs(&[("MOLMESH__JOBS__QUEUE", "5"), ("MOLMESH__SERVER__TERMINATION_NOTICE_MS", "none")]);
     let flags = pairs(&[
         ("server.data_dir", odd),
         ("devices.min_partition_bricks", "none"),

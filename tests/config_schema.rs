@@ -70,8 +70,8 @@ fn the_schema_and_the_loader_refuse_the_same_files() {
     let good = [
         "[limits]\nbody_bytes = \"64MiB\"\natoms = 5",
         "[limits]\nbody_bytes = \"1_000 KiB\"",
-        "[server]\nmetrics_listen = \"none\"\nnotice_ms = \"none\"\nhead_bytes = 8192",
-        "[server]\nmetrics_listen = \"127.0.0.1:9090\"\nnotice_ms = 1",
+        "[server]\nmetrics_listen = \"none\"\ntermination_notice_ms = \"none\"\nhead_bytes = 8192",
+        "[server]\nmetrics_listen = \"127.0.0.1:9090\"\ntermination_notice_ms = 1",
         "[devices]\nmin_partition_bricks = \"none\"\nuse = \"0,2\"",
         "[archive]\nurl = [\"http://a/{id}\", \"https://b/{middle}/{id_upper}.cif\"]\nproxy = \"http://p:1\"",
         "[archive]\nurl = \"none\"\nproxy = \"none\"\ndir = \"/pdb\"",

@@ -185,6 +185,12 @@ fn compressed_bodies_are_seen_by_their_bytes_and_by_their_header() {
         assert_eq!(reply.problem(415, "unsupported-encoding")["available"][0], "gzip", "{encoding}");
     }
     post(&[], &gz[..gz.len() / 2]).problem(422, "unreadable-structure");
+    let json = ("content-type", "application/json");
+    let encoded = SERVER.post("/v1/meshes", &[json, ("content-encoding", "gzip")], br#"{"pdb_id": "4pti"}"#);
+    encoded.problem(415, "unsupported-encoding");
+    let structure = SERVER.post("/v1/structures", &[json], br#"{"pdb_id": "4pti"}"#);
+    let problem = structure.problem(415, "unsupported-media-type");
+    assert!(problem["detail"].as_str().unwrap().contains("/v1/meshes"), "{problem}");
 }
 
 #[test]

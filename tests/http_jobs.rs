@@ -79,23 +79,49 @@ fn a_promised_job_ends_with_the_bytes_of_a_synchronous_one() {
 }
 
 #[test]
-fn a_request_that_outlasts_its_wait_becomes_a_job_and_no_work_is_lost() {
-    let backend = slow(700);
-    let server = start(Arc::clone(&backend) as _, |c| c.jobs.sync_wait_ms = 200);
-    let reply = server.post("/v1/meshes", &[], SAMPLE);
+fn a_request_that_exceeds_its_wait_becomes_a_job_and_its_work_continues() {
+    let backend = slow(1_500);
+    let server = start(Arc::clone(&backend) as _, |_| {});
+    let reply = server.post("/v1/meshes", &[("prefer", "wait=1")], SAMPLE);
     assert_eq!(reply.status, 202);
     assert_eq!(reply.header("preference-applied"), None);
     let job = reply.header("location").unwrap().to_owned();
     server.get(&format!("{job}/result")).problem(404, "no-result-yet");
     ended(&server, &job, "successful");
-    assert_eq!(backend.started.load(Ordering::SeqCst), 1, "the job went on");
+    assert_eq!(backend.started.load(Ordering::SeqCst), 1, "the work continued");
     assert!(!result(&server, &job).body.is_empty());
-    // A report cannot be promised, so it is waited for.
-    let report = server.post("/v1/meshes?report=json", &[("prefer", "wait=0")], &sample(3));
-    assert_eq!((report.status, report.json()["atoms"].as_u64()), (200, Some(454)));
-    // Who would wait less is promised earlier.
-    let reply = server.post("/v1/meshes", &[("prefer", "wait=0")], &sample(2));
-    assert_eq!(reply.status, 202);
+    // A report cannot be the result of a job, and a mesh in time is an answer.
+    for (path, wait) in [("/v1/meshes?report=json", "wait=0"), ("/v1/meshes", "wait=50")] {
+        assert_eq!(server.post(path, &[("prefer", wait)], &sample(3)).status, 200, "{path} {wait}");
+    }
+}
+
+#[test]
+fn a_wait_is_limited_by_the_deadline() {
+    let server = start(slow(30_000), |c| (c.jobs.deadline_ms, c.server.drain_timeout_ms) = (200, 1));
+    assert_eq!(server.post("/v1/meshes", &[("prefer", "wait=100000")], SAMPLE).status, 202);
+}
+
+#[test]
+fn a_request_without_a_preference_is_answered_in_time_or_refused() {
+    let backend = slow(30_000);
+    let server = start(Arc::clone(&backend) as _, |c| (c.jobs.deadline_ms, c.server.drain_timeout_ms) = (400, 1));
+    let refused = |path| server.post(path, &[], SAMPLE).problem(504, "deadline")["detail"].as_str().unwrap().to_owned();
+    let detail = refused("/v1/meshes");
+    assert!(detail.contains("`Prefer: respond-async`"), "{detail}");
+    wait_for("its work to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
+    // A report has no asynchronous form to recommend.
+    let detail = refused("/v1/meshes?report=json");
+    assert!(!detail.contains("Prefer"), "{detail}");
+    wait_for("its work to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 2);
+    // Work that a job shares goes on.
+    let job = promise(&server, "/v1/meshes", &[], SAMPLE);
+    wait_for("the job to run", || backend.started.load(Ordering::SeqCst) == 3);
+    refused("/v1/meshes");
+    assert_eq!(server.get(&job).json()["status"], "running");
+    assert_eq!((backend.started.load(Ordering::SeqCst), backend.cancelled.load(Ordering::SeqCst)), (3, 2));
+    delete(&server, &job);
+    wait_for("the job to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 3);
 }
 
 #[test]
@@ -203,15 +229,21 @@ fn an_idempotency_key_makes_one_job_of_many_requests() {
     ended(&server, &first, "successful");
     assert_eq!(promise(&server, "/v1/meshes", &key, SAMPLE), first);
     let both = [LATER, key[0]];
+    // Parameters are compared by value.
+    let other = [("idempotency-key", "upload-2")];
+    let second = promise(&server, "/v1/meshes?resolution=0.70&format=glb", &other, SAMPLE);
+    assert_eq!(promise(&server, "/v1/meshes?format=glb&resolution=0.7", &other, SAMPLE), second);
+    ended(&server, &second, "successful");
+    server.post("/v1/meshes", &[LATER, key[0], other[0]], SAMPLE).problem(400, "bad-request");
     server.post("/v1/meshes?resolution=0.7", &both, SAMPLE).problem(422, "other-request");
     server.post("/v1/meshes", &both, &sample(1)).problem(422, "other-request");
     // Without a key every request is a job of its own.
-    assert_eq!(backend.started.load(Ordering::SeqCst), 1);
+    assert_eq!(backend.started.load(Ordering::SeqCst), 2);
     let (a, b) = (promise(&server, "/v1/meshes", &[], SAMPLE), promise(&server, "/v1/meshes", &[], SAMPLE));
     assert_ne!(a, b);
-    // What was made before is not made again.
+    // A stored result is not computed again.
     assert_eq!(ended(&server, &a, "successful")["attempts"], 0);
-    assert_eq!(backend.started.load(Ordering::SeqCst), 1);
+    assert_eq!(backend.started.load(Ordering::SeqCst), 2);
 }
 
 /// The events of a stream until it ends: id, name, document.

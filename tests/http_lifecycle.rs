@@ -75,7 +75,7 @@ fn a_client_that_leaves_cancels_its_job() {
     drop(stream);
     wait_for("the job to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
     assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
-    wait_for("it is told", || !log_lines("the client left before it was answered").is_empty());
+    wait_for("it is told", || !log_lines("the client left before the response").is_empty());
     assert!(server.metric("http_server_request_duration_seconds_count", &["status=\"none\""]) >= 1.0);
     assert!(server.metric("molmesh_jobs_finished_total", &["dismissed"]) >= 1.0);
     backend.set(Mode::Octahedra);
@@ -124,7 +124,7 @@ fn ready_only_after_the_first_mesh() {
         let server = start_cold(Arc::clone(&broken) as _, |_| {});
         wait_for("the warm-up to fail", || {
             let reply = server.get("/readyz");
-            reply.status == 503 && reply.text().contains("could not be computed")
+            reply.status == 503 && reply.text().contains("the first mesh failed")
         });
         assert_eq!(server.get("/livez").status, 200);
     }

@@ -494,10 +494,11 @@ fn silent_event_streams_give_signs_of_life() {
 }
 
 #[test]
-fn promised_jobs_stand_back_for_so_long() {
-    for (patience_ms, order) in [(1, [2, 3, 4]), (3_600_000, [2, 4, 3])] {
+fn asynchronous_jobs_yield_for_the_maximum_delay() {
+    for (batch_max_delay_ms, order) in [(1, [2, 3, 4]), (3_600_000, [2, 4, 3])] {
         let backend = Fake::new(Mode::Held);
-        let server = start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.jobs.patience_ms) = (1, patience_ms));
+        let server =
+            start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.jobs.batch_max_delay_ms) = (1, batch_max_delay_ms));
         let server = &server;
         std::thread::scope(|scope| {
             let running = scope.spawn(|| server.post("/v1/meshes", &[], &carbons(2)).status);
@@ -510,13 +511,13 @@ fn promised_jobs_stand_back_for_so_long() {
             assert_eq!((running.join().unwrap(), waiting.join().unwrap()), (200, 200));
         });
         wait_for("all to have begun", || backend.started.load(Ordering::SeqCst) == 3);
-        assert_eq!(*backend.begun.lock().unwrap(), order, "patience of {patience_ms} ms");
+        assert_eq!(*backend.begun.lock().unwrap(), order, "maximum delay of {batch_max_delay_ms} ms");
     }
 }
 
 #[test]
-fn so_many_results_are_kept_at_once() {
-    let server = fake(|c| (c.jobs.keepers, c.jobs.queue) = (1, 100));
+fn concurrent_saves_are_limited() {
+    let server = fake(|c| (c.jobs.concurrent_saves, c.jobs.queue) = (1, 100));
     let (server, busy) = (&server, || server.metric("molmesh_results_not_kept_total", &["reason=\"busy\""]));
     let (before, end) = (busy(), Instant::now() + Duration::from_mins(1));
     for round in 0.. {
@@ -528,7 +529,7 @@ fn so_many_results_are_kept_at_once() {
         if busy() > before {
             break;
         }
-        assert!(Instant::now() < end, "every one of six results at once was kept");
+        assert!(Instant::now() < end, "all six concurrent results were stored");
     }
 }
 

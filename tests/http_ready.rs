@@ -55,9 +55,9 @@ fn a_store_that_cannot_be_written_is_seen_and_so_is_its_return() {
     let said = problem["detail"].as_str().unwrap();
     assert!(said.contains("store") && !problem.to_string().contains(server.dir.path().to_str().unwrap()), "{problem}");
     assert_eq!(server.get("/livez").status, 200);
-    let logged = || log_lines("the store has stopped working").len();
+    let logged = || log_lines("the store has failed").len();
     assert_eq!(logged(), 1, "the log says it once, and why");
-    assert!(log_lines("the store has stopped working")[0].contains("error="));
+    assert!(log_lines("the store has failed")[0].contains("error="));
     take_away(&server, false);
     wait_for("the store is back", || server.get("/readyz").status == 200);
     assert_eq!((logged(), log_lines("the store works again").len()), (1, 1));
@@ -78,7 +78,7 @@ fn a_full_queue_does_not_make_it_unready() {
     let backend = Fake::new(Mode::Slow(Duration::from_mins(5)));
     let server = start(Arc::clone(&backend) as _, |c| {
         (c.jobs.workers, c.jobs.queue, c.store.probe_ms) = (1, 1, 1);
-        (c.jobs.deadline_ms, c.jobs.sync_wait_ms) = (600_000, 600_000);
+        c.jobs.deadline_ms = 600_000;
         c.server.drain_timeout_ms = 1;
     });
     let server = &server;

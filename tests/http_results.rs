@@ -57,7 +57,7 @@ fn a_synchronous_result_is_found_at_its_content_location() {
 
 #[test]
 fn a_result_is_kept_once_however_many_ask_for_it() {
-    let server = start(Fake::new(Mode::Octahedra), |c| c.jobs.keepers = 1);
+    let server = start(Fake::new(Mode::Octahedra), |c| c.jobs.concurrent_saves = 1);
     for round in 0..20 {
         let input = carbons(2_000 + round);
         let replies: Vec<Reply> = std::thread::scope(|scope| {

@@ -19,8 +19,8 @@ use serde_json::Value;
 const NEVER_MS: u64 = 3_600_000;
 
 fn patient(config: &mut Config) {
-    (config.server.notice_ms, config.server.drain_timeout_ms) = (Some(NEVER_MS), NEVER_MS);
-    (config.jobs.deadline_ms, config.jobs.sync_wait_ms) = (NEVER_MS, NEVER_MS);
+    (config.server.termination_notice_ms, config.server.drain_timeout_ms) = (Some(NEVER_MS), NEVER_MS);
+    config.jobs.deadline_ms = NEVER_MS;
 }
 
 /// Sends the head of an upload and a part of its body.
@@ -74,10 +74,10 @@ fn notice_is_given_while_everything_is_served() {
 
 #[test]
 fn the_notice_has_an_end_and_can_be_none() {
-    for notice_ms in [Some(1), None] {
-        let mut server = start(Fake::new(Mode::Octahedra), |c| c.server.notice_ms = notice_ms);
+    for termination_notice_ms in [Some(1), None] {
+        let mut server = start(Fake::new(Mode::Octahedra), |c| c.server.termination_notice_ms = termination_notice_ms);
         server.order(Stop::Notice);
-        assert!(server.wait(), "{notice_ms:?}");
+        assert!(server.wait(), "{termination_notice_ms:?}");
     }
 }
 
@@ -167,5 +167,5 @@ fn a_promise_that_is_asked_for_while_the_service_drains_is_given() {
 fn by_default_an_end_takes_less_than_twenty_five_seconds() {
     let server = Config::default().server;
     // A second for what is cancelled comes behind.
-    assert!(server.notice() + server.drain_timeout() + Duration::from_secs(2) <= Duration::from_secs(25));
+    assert!(server.termination_notice() + server.drain_timeout() + Duration::from_secs(2) <= Duration::from_secs(25));
 }

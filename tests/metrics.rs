@@ -93,7 +93,7 @@ fn held(look: &dyn Fn()) {
     let backend = Held::new();
     let server = start(Arc::clone(&backend) as _, |config| {
         config.jobs.workers = 1;
-        config.jobs.sync_wait_ms = 600_000;
+        config.jobs.deadline_ms = 600_000;
     });
     std::thread::scope(|scope| {
         let running = scope.spawn(|| server.post("/v1/meshes", &[], &sample(1)));

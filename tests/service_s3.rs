@@ -289,7 +289,6 @@ fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
         c.store.memory_bytes = 0;
         c.jobs.workers = 2;
         c.jobs.store_patience_ms = 600_000;
-        c.jobs.sync_wait_ms = 60_000;
     });
     let addr = server.addr;
     let mesh = |n| send(addr, "POST", "/v1/meshes?format=stl", &[], &sample(n));
@@ -309,7 +308,7 @@ fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
     backend.open.store(true, Ordering::SeqCst);
     let reply = waiting.join().unwrap();
     assert_eq!((reply.status, reply.complete, reply.body == before.body), (200, true, true));
-    until("an attempt to keep the result", || !log_lines("a job waits for the store to take something").is_empty());
+    until("an attempt to keep the result", || !log_lines("the store rejected a write; retrying").is_empty());
     assert_eq!(get(addr, &promised).json()["status"], "running");
 
     // What needs the store is refused, in words for clients; what does not is done.

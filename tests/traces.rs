@@ -236,7 +236,7 @@ fn a_restart_does_not_tear_a_trace_apart() {
 #[test]
 fn work_that_two_requests_share_is_linked() {
     let (held, collector) = (Held::new(), Collector::start(Manner::Takes));
-    let server = traced(Arc::clone(&held) as _, &collector, |config| config.jobs.sync_wait_ms = 600_000);
+    let server = traced(Arc::clone(&held) as _, &collector, |config| config.jobs.deadline_ms = 600_000);
     let other = PARENT.replace(TRACE, "33333333333333333333333333333333");
     let joined = || server.metric("molmesh_jobs_submitted_total", &["dedup=\"yes\""]);
     let timing = std::thread::scope(|scope| {

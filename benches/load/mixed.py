@@ -157,9 +157,9 @@ class Load:
             self.count("bad: wrong bytes")
 
     def mesh(self, dice):
-        """A mesh that is waited for. One that takes long becomes a job, which is followed."""
+        """Requests a mesh with a wait. If it takes longer, the answer is a job, which is followed."""
         fresh, query, want = self.expected.question(dice)
-        answer = self.ask("POST", f"/v1/meshes?{query}", fresh, good=(200, 202))
+        answer = self.ask("POST", f"/v1/meshes?{query}", fresh, {"prefer": "wait=10"}, good=(200, 202))
         if answer is None:
             return
         if answer[0] == 202:

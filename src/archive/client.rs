@@ -11,8 +11,8 @@ use reqwest::{Client, Proxy, Response, StatusCode, Url};
 
 use super::address::{Checked, Refused};
 use super::error::Why;
+use super::gzip;
 use super::memory::{NoMemory, Share};
-use super::whole;
 use crate::config::{ArchiveConfig, Templates};
 use crate::store::Digest;
 use crate::telemetry::{SpanContext, traceparent, tracestate};
@@ -71,7 +71,7 @@ pub(super) struct Limits {
     pub(super) head: Duration,
     pub(super) pause: Duration,
     pub(super) bytes: u64,
-    /// How far a compressed file is inflated to see whether it is whole.
+    /// Inflated bytes after which the completeness check of a gzip file stops.
     pub(super) inflated: u64,
 }
 
@@ -160,8 +160,8 @@ pub(super) async fn get(
     let validators = Validators { etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
     let bytes = body(response, limits, share.as_mut()).await?;
     let (bytes, digest) = tokio::task::spawn_blocking(move || {
-        if compressed && !whole::is_whole_gzip(&bytes, limits.inflated) {
-            return Err(Failed::other(Why::Damaged, "the file is not whole"));
+        if compressed && !gzip::is_complete_gzip(&bytes, limits.inflated) {
+            return Err(Failed::other(Why::Damaged, "the file is incomplete"));
         }
         let digest = Digest::of(&bytes);
         Ok((bytes, digest))

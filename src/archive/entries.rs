@@ -11,10 +11,10 @@ use tracing::Instrument as _;
 use super::client::Answer;
 use super::disk::{Disk, Found, Stored};
 use super::error::FetchError;
-use super::flight::Flights;
 use super::memory::Memory;
 use super::remote::{Origin, Remote};
 use crate::config::Config;
+use crate::single_flight::SingleFlight;
 use crate::store::Digest;
 use crate::structure::{Archive as Folder, EntryId, Stamp};
 use crate::telemetry::{ARCHIVE_FETCH, ARCHIVE_REQUESTS, TraceSpan};
@@ -67,7 +67,7 @@ struct Shared {
     folder: Folder,
     disk: Disk,
     remote: Option<Remote>,
-    flights: Flights<Result<Entry, FetchError>>,
+    fetches: SingleFlight<EntryId, Result<Entry, FetchError>>,
     known: Cache<EntryId, Known>,
     /// Entries that no remote archive has, and until when that is believed.
     absent: Cache<EntryId, Instant>,
@@ -86,7 +86,7 @@ impl Archive {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
             remote: Remote::new(archive, inflated, memory),
-            flights: Flights::new(),
+            fetches: SingleFlight::default(),
             known: Cache::new(REMEMBERED),
             absent: Cache::new(REMEMBERED),
             check: archive.check(),
@@ -103,8 +103,8 @@ impl Archive {
     /// Any [`FetchError`].
     pub async fn fetch(&self, id: &EntryId) -> Result<Entry, FetchError> {
         let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
-        // It goes on without whoever starts it, but it is done in their name.
-        let flight = self.shared.flights.join(id, move || {
+        // The fetch outlives its first caller, but is traced under that caller's request.
+        let mut fetch = self.shared.fetches.run(id, move || {
             let span = TraceSpan::current();
             let find = async move { shared.find(&wanted).await };
             let find = async move {
@@ -115,7 +115,7 @@ impl Archive {
             };
             find.in_current_span()
         });
-        flight.await.unwrap_or(Err(FetchError::Internal("its fetch ended without a result")))
+        fetch.recv().await.unwrap_or(Err(FetchError::Internal("its fetch ended without a result")))
     }
 
     /// Asks every host of the remote archive for the head of one entry, each for `limit` at most: the host, and the status of its

@@ -83,7 +83,7 @@ pub enum Why {
 impl Why {
     /// Whether another attempt may do better.
     #[must_use]
-    pub fn may_pass(self) -> bool {
+    pub fn is_temporary(self) -> bool {
         match self {
             Self::Connect | Self::Timeout | Self::Broken | Self::Damaged => true,
             Self::Status(status) => status == 429 || status >= 500,

@@ -1,9 +1,8 @@
-//! The id of an entry to the bytes of its file: from the local folder, from a copy on disk, from a remote archive, in
-//! this order.
+//! Archive entries by id: from the local folder, else from a copy on disk, else from a remote archive.
 //!
-//! The folder is the operator's and always right. A copy is used as it is for a day, then asked about; where the
-//! archive cannot be reached it serves for longer. Whoever asks for an entry that is being fetched waits for that one
-//! fetch. Ids become parts of paths and addresses only as [`EntryId`](crate::structure::EntryId)s.
+//! The folder belongs to the operator and always takes precedence. A copy is used for a day, then revalidated; if the
+//! remote archive is unreachable, a stale copy is used. Concurrent requests for one entry share one fetch. Ids become
+//! parts of paths and addresses only as [`EntryId`](crate::structure::EntryId)s.
 
 mod address;
 mod breaker;
@@ -11,10 +10,9 @@ mod client;
 mod disk;
 mod entries;
 mod error;
-mod flight;
+mod gzip;
 mod memory;
 mod remote;
-mod whole;
 
 pub use entries::{Archive, Entry, Source};
 pub use error::{FetchError, Why};

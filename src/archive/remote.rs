@@ -125,7 +125,7 @@ impl Remote {
             };
             tracing::debug!(%id, host = breaker.host(), attempt, detail, "an attempt failed");
             let pause = self.pause(attempt, asked_for);
-            let again = why.may_pass()
+            let again = why.is_temporary()
                 && attempt < self.config.attempts
                 && breaker.left_alone_for().is_none()
                 && Instant::now() + pause < deadline;
@@ -133,9 +133,9 @@ impl Remote {
                 if why != Why::Paused {
                     tracing::warn!(%id, host = breaker.host(), attempt, detail, "the archive cannot be asked");
                 }
-                let may_pass = why.may_pass() || matches!(why, Why::Paused | Why::Busy);
+                let is_temporary = why.is_temporary() || matches!(why, Why::Paused | Why::Busy);
                 let later = breaker.left_alone_for().or(asked_for).unwrap_or(LATER);
-                return Err(unavailable(why, may_pass.then_some(later)));
+                return Err(unavailable(why, is_temporary.then_some(later)));
             }
             tokio::time::sleep(pause).await;
             attempt += 1;
@@ -179,7 +179,7 @@ impl Remote {
         match &answer {
             Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => pass.succeeded(),
             Err(Failed::Other { retry_after: Some(wait), why, .. })
-                if why.may_pass() && *wait > self.config.retry_after() =>
+                if why.is_temporary() && *wait > self.config.retry_after() =>
             {
                 pass.told_to_wait((*wait).min(LONGEST));
             }

@@ -1,4 +1,5 @@
-//! The accept loop: connections to hyper, with the timeouts and the cap that `axum::serve` does not have, and a drain.
+//! Accept loop: passes connections to hyper, with the timeouts, the connection limit and the drain that `axum::serve`
+//! lacks.
 
 use std::convert::Infallible;
 use std::error::Error;
@@ -25,36 +26,37 @@ use tokio::time::Instant;
 use tower::ServiceExt as _;
 
 use super::guard::Peer;
-use super::io::Guarded;
 use super::kinds::Kind;
 use super::pace::{self, MAX_PATIENCE, Pace, Rate, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
+use super::socket::Guarded;
 use super::stop::{self, Stop};
 use crate::config::ServerConfig;
 use crate::telemetry::{CONNECTIONS, REJECTED};
 
-/// How long the first request of a connection is waited for once the service stops: it may be on its way.
+/// Time for the first request of a connection after the service begins to stop.
 const UNDER_WAY: Duration = Duration::from_millis(500);
-/// Pause after the system could not accept, most likely for want of file descriptors.
+/// Pause after a failed accept, most likely because no file descriptor is left.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
-/// Clients at once that are being told that there are too many.
+/// Number of connections beyond the limit that are answered with 503 at the same time; further ones are closed without
+/// an answer. It bounds the file descriptors that refusals take.
 const MAX_REFUSALS: usize = 64;
-/// What an HTTP/2 client may send before it is read, per request and per connection: enough for full speed over
-/// long distances.
+/// HTTP/2 flow control windows per request and per connection, bytes: large enough for long distances.
 const WINDOWS: [u32; 2] = [1 << 20, 2 << 20];
-/// Bytes of a stream that HTTP/2 buffers while the connection is busy with others.
+/// Send buffer of an HTTP/2 stream, bytes.
 const SEND_BUFFER: usize = 64 << 10;
-/// Send buffer that the system keeps for a connection. It accepts more only when a third of the buffer is free. The
-/// megabytes of the default make a steady but slow client look stalled for a minute.
+/// Send buffer of a socket, bytes. The system accepts more data only when a third of it is free, so with the default of
+/// megabytes a slow client seems to stall for a minute.
 const SOCKET_BUFFER: usize = 256 << 10;
-/// Unsent bytes that the system buffers for a connection: few enough to see a slow client's progress every few seconds.
+/// Unsent bytes that the system buffers per connection: few enough to see the progress of a slow client every few
+/// seconds.
 #[cfg(target_os = "linux")]
 const UNSENT: u32 = 256 << 10;
-/// How often an HTTP/2 client is asked whether it is still there.
+/// Interval of HTTP/2 pings.
 const PING: Duration = Duration::from_secs(20);
 
-/// Serves `router` on `listener` until it is told to drain; then lets requests finish until the drain timeout has passed or
-/// it is told to stop now. True if all of them did.
+/// Serves `router` on `listener` until the drain; then lets requests finish until the drain timeout or [`Stop::Now`].
+/// Returns true if all of them finished.
 pub(super) async fn serve(
     listener: TcpListener,
     router: Router,
@@ -67,7 +69,7 @@ pub(super) async fn serve(
     let mut stopping = false;
     loop {
         let accepted = if stopping {
-            // Who was let in by the system before the listener closed is served as well.
+            // Serves connections that the system accepted before the listener was closed.
             match listener.accept().now_or_never() {
                 Some(accepted) => accepted,
                 None => break,
@@ -93,14 +95,13 @@ pub(super) async fn serve(
         };
         let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
             counter!(REJECTED, "reason" => Kind::TooManyConnections.row().slug).increment(1);
-            // Beyond these few, closing without a word is all that there is room for.
             if let Ok(hold) = Arc::clone(&refusals).try_acquire_owned() {
                 refuse(stream, hold);
             }
             continue;
         };
         if let Err(error) = set_up(&stream) {
-            tracing::debug!(%error, "the client left at once");
+            tracing::debug!(%error, "the client disconnected at once");
             continue;
         }
         let stream = Guarded::new(stream, Place::new(place), MAX_PATIENCE * config.write_timeout());
@@ -122,11 +123,11 @@ fn set_up(stream: &TcpStream) -> io::Result<()> {
     socket.set_send_buffer_size(SOCKET_BUFFER)?;
     #[cfg(target_os = "linux")]
     socket.set_tcp_notsent_lowat(UNSENT)?;
-    // Answers are written in pieces that are large already; waiting for more only delays them.
+    // Responses are written in large pieces, which Nagle's algorithm would only delay.
     stream.set_nodelay(true)
 }
 
-/// A connection's place among those that there may be.
+/// Permit of `server.connections`.
 struct Place(#[expect(dead_code, reason = "held for its drop")] OwnedSemaphorePermit);
 
 impl Place {
@@ -142,34 +143,34 @@ impl Drop for Place {
     }
 }
 
-/// Tells one client too many so. Its request is not waited for: that would cost what there is no room for.
+/// Answers a connection beyond the limit with 503, without reading its request.
 fn refuse(stream: TcpStream, hold: OwnedSemaphorePermit) {
     let body =
-        Problem::new(Kind::TooManyConnections, "the server holds as many connections as it may").document("unknown");
+        Problem::new(Kind::TooManyConnections, "the server has reached its limit of connections").document("unknown");
     let head = format!(
         "HTTP/1.1 503 Service Unavailable\r\ncontent-type: {MEDIA_TYPE}\r\ncontent-length: {}\r\n\
          retry-after: 1\r\nconnection: close\r\n\r\n",
         body.len()
     );
-    // A fresh socket has room for these few bytes; dropping the guard closes it gently.
+    // The buffer of a new socket holds these few bytes. Dropping the stream closes it gently.
     let mut stream = Guarded::new(stream, hold, Duration::from_secs(1));
     tokio::spawn(async move {
         if let Err(error) = stream.write_all(&[head.as_bytes(), &body].concat()).await {
-            tracing::debug!(%error, "a refused client left");
+            tracing::debug!(%error, "a refused client disconnected");
         }
     });
 }
 
-/// Whether a connection does anything.
+/// Activity of a connection.
 #[derive(Default)]
 struct Activity {
     requests: AtomicUsize,
     begun: AtomicBool,
-    /// Set by every request, cleared by every look.
+    /// Set by each request, cleared by each check.
     busy: AtomicBool,
 }
 
-/// Counts a request while it lives.
+/// Counts a request until it is dropped.
 struct Working(Arc<Activity>);
 
 impl Working {
@@ -208,7 +209,7 @@ async fn connection(
         async move {
             let Ok(mut answer): Result<Response<Body>, Infallible> = answer.await;
             drop(working);
-            // So that clients turn elsewhere for their next request, before connections are closed on them.
+            // Clients open their next connection elsewhere, before this one is closed.
             if *phase.borrow() >= Stop::Notice && version < Version::HTTP_2 {
                 answer.headers_mut().insert(CONNECTION, HeaderValue::from_static("close"));
             }
@@ -247,7 +248,7 @@ async fn connection(
                 look = Instant::now() + config.header_timeout();
             }
             () = tokio::time::sleep_until(look), if !patient => {
-                // hyper's own timer starts only once the protocol's version is known.
+                // hyper starts its own timer only when the protocol version is known.
                 if !activity.begun.load(Ordering::Relaxed) {
                     late();
                     return;
@@ -273,7 +274,7 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
         .http2()
         .timer(TokioTimer::new())
         .keep_alive_interval(PING)
-        // A slow reader answers a ping when it has read what lies before it.
+        // A slow client answers a ping after it has read all data before it.
         .keep_alive_timeout(MAX_PATIENCE * config.write_timeout())
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
@@ -283,7 +284,7 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
     builder
 }
 
-/// A connection that ended badly: its client's doing, nothing for an operator.
+/// Counts and logs a connection that ended with an error of the client.
 fn report(error: &(dyn Error + Send + Sync + 'static)) {
     let hyper = error.downcast_ref::<hyper::Error>();
     if hyper.is_some_and(hyper::Error::is_timeout) {

@@ -1,39 +1,35 @@
-//! `…/atoms`: who the atoms of a structure are, in columns whose rows are what `_ATOM` of a mesh counts.
+//! `…/atoms`: identity of the atoms of a structure, in columns that are indexed by `_ATOM` of a mesh.
 
 use axum::body::Body;
-use axum::extract::rejection::PathRejection;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::http::header::{self, HeaderMap};
-use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::ask::Input;
 use super::kinds::Kind;
 use super::openapi::meshes::NotModified;
 use super::openapi::parameters::{EntryPath, StructurePath, Unchanged};
 use super::openapi::problems::READING;
 use super::openapi::refusals;
 use super::problem::Problem;
+use super::source::{Input, StructureSource};
 use super::state::Shared;
-use super::{conditional, pdb, structures};
 use crate::jobs::Failure;
-use crate::store::{Digest, Name};
 use crate::structure::{self, Structure, StructureError, element};
 
-/// Bytes of the document that are set aside for an atom: two numbers, and a tenth of a residue's five.
+/// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
 const BYTES_PER_ATOM: u64 = 24;
 
-/// The atoms of a structure: every model, in the order of the file, which is what `_ATOM` counts from 0.
+/// Atoms of a structure: every model, in the order of the file, from 0 as in `_ATOM`.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct AtomsDocument {
-    /// Atoms: rows of `atoms`.
+    /// Number of atoms, which are the rows of `atoms`.
     count: usize,
-    /// The distinct names of atoms.
+    /// Distinct names of atoms.
     names: Vec<String>,
-    /// The distinct elements; `?` is an unknown one.
+    /// Distinct elements; `?` is an unknown one.
     elements: Vec<&'static str>,
     atoms: AtomColumns,
     residues: ResidueColumns,
@@ -42,9 +38,9 @@ pub(super) struct AtomsDocument {
 /// A row for each atom.
 #[derive(Debug, Default, Serialize, ToSchema)]
 struct AtomColumns {
-    /// Which of `names`.
+    /// Index into `names`.
     name: Vec<u32>,
-    /// Which of `elements`.
+    /// Index into `elements`.
     element: Vec<u8>,
 }
 
@@ -63,7 +59,7 @@ struct ResidueColumns {
     chain: Vec<String>,
     /// Its model.
     model: Vec<i32>,
-    /// What its first atom is: `polymer`, `ligand`, `water` or `virtual` (a site that is not an atom).
+    /// Kind of its first atom: `polymer`, `ligand`, `water` or `virtual` (a site that is not an atom).
     kind: Vec<&'static str>,
 }
 
@@ -76,7 +72,7 @@ refusals!(EntryRefusals: [READING, [
     Kind::MemoryFull, Kind::TooManyDeliveries,
 ]]);
 
-/// Who the atoms of a structure are.
+/// Lists the atoms of a structure.
 ///
 /// For meshes with `atom_ids=true`: their `_ATOM` (in PLY `atom`) counts the rows of `atoms` here.
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
@@ -90,21 +86,13 @@ refusals!(EntryRefusals: [READING, [
     ))]
 pub(super) async fn of_structure(
     State(app): State<Shared>,
-    path: Result<Path<String>, PathRejection>,
+    source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let digest = structures::digest_of(&text)?;
-    let caching = caching(&digest)?;
-    if conditional::is_unchanged(&headers, &caching[0].1) && app.store.head(&Name::input(&digest)).await?.is_some() {
-        return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
-    }
-    let _place = app.delivery()?;
-    let input = structures::input(&app, &digest).await?;
-    Ok((caching, list(&app, input).await?).into_response())
+    source.document(&app, &headers, async |input| list(&app, input).await).await
 }
 
-/// Who the atoms of an entry are.
+/// Lists the atoms of an entry.
 ///
 /// For meshes with `atom_ids=true`: their `_ATOM` (in PLY `atom`) counts the rows of `atoms` here.
 #[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
@@ -118,26 +106,14 @@ pub(super) async fn of_structure(
     ))]
 pub(super) async fn of_entry(
     State(app): State<Shared>,
-    path: Result<Path<String>, PathRejection>,
+    source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let id = text.parse().map_err(|error| pdb::of_folder(&error))?;
-    let unchanged = caching(&pdb::digest(&app, &id).await?)?;
-    if conditional::is_unchanged(&headers, &unchanged[0].1) {
-        return Ok((StatusCode::NOT_MODIFIED, unchanged).into_response());
-    }
-    let _place = app.delivery()?;
-    let input = pdb::input(&app, &id).await?;
-    Ok((caching(&input.digest)?, list(&app, input).await?).into_response())
+    source.document(&app, &headers, async |input| list(&app, input).await).await
 }
 
-fn caching(digest: &Digest) -> Result<[(header::HeaderName, HeaderValue); 2], Problem> {
-    let etag = HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)?;
-    Ok([(header::ETAG, etag), (header::CACHE_CONTROL, pdb::CACHE)])
-}
-
-/// Reads a structure and lists its atoms, on a thread that may block. What is listed is charged until it is sent.
+/// Parses a structure and lists its atoms, on a blocking thread. The list is charged to the memory budget until it is
+/// sent.
 async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
     let mut limits = app.config.limits.job().read;
     limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
@@ -153,7 +129,7 @@ async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
     Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
 }
 
-/// Why atoms cannot be listed.
+/// Error of [`list`].
 enum Failed {
     Structure(StructureError),
     Memory(crate::jobs::Exhausted),
@@ -176,11 +152,11 @@ impl From<Failed> for Problem {
     }
 }
 
-/// The columns of a structure.
+/// Builds the columns.
 fn document(structure: &Structure) -> AtomsDocument {
     let count = structure.len();
     let mut elements: Vec<&'static str> = Vec::new();
-    // Where each atomic number stands among the elements of this structure.
+    // Index of each atomic number in `elements`.
     let mut element_at = [u8::MAX; 1 + element::SYMBOLS.len()];
     let mut atoms = AtomColumns { name: structure.name.ids().to_vec(), element: Vec::with_capacity(count) };
     let mut residues = ResidueColumns::default();
@@ -245,7 +221,7 @@ mod tests {
         }
         assert_eq!(listed.residues.kind.first(), Some(&"polymer"));
         assert_eq!(listed.residues.kind.last(), Some(&"water"));
-        // What is set aside is enough.
+        // The charged memory suffices.
         let bytes = serde_json::to_vec(&listed).unwrap().len() as u64;
         assert!(bytes < BYTES_PER_ATOM * listed.count as u64, "{bytes}");
     }

@@ -1,4 +1,4 @@
-//! What browsers are told: whose pages may read answers (CORS), and what they must not do with them.
+//! Headers for browsers: CORS, and restrictions on the use of responses.
 
 use axum::extract::{Request, State};
 use axum::http::header::{self, HeaderName};
@@ -9,17 +9,17 @@ use tower_http::cors::{AllowHeaders, AllowOrigin, Any, CorsLayer};
 
 use super::guard::{API_KEY, RATE_LIMIT, RATE_LIMIT_POLICY};
 use super::observe::TRACEPARENT;
+use super::preferences::{IDEMPOTENCY_KEY, PREFER, PREFERENCE_APPLIED, PRIORITY};
 use super::state::Shared;
 use super::timing::SERVER_TIMING;
-use super::wish::{IDEMPOTENCY_KEY, PREFER, PREFERENCE_APPLIED, PRIORITY};
 use super::{delivery, request_id};
 use crate::access::Access;
 use crate::config::Origins;
 
-/// For answers that are no pages: should one be shown, nothing in it runs, and no page has it in a frame.
+/// Content security policy of responses that are not pages: no scripts, no frames.
 const POLICY: HeaderValue = HeaderValue::from_static("default-src 'none'; frame-ancestors 'none'");
 
-/// Request headers that pages may set, where `*` does not say it.
+/// Request headers that listed origins may send.
 const ALLOWED: [HeaderName; 14] = [
     header::ACCEPT,
     header::AUTHORIZATION,
@@ -38,7 +38,7 @@ const ALLOWED: [HeaderName; 14] = [
 ];
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
-/// Answers preflights and says who may read answers.
+/// Builds the CORS layer.
 pub(super) fn cors(access: &Access) -> CorsLayer {
     let exposed = [
         header::ETAG,
@@ -64,7 +64,7 @@ pub(super) fn cors(access: &Access) -> CorsLayer {
         .max_age(std::time::Duration::from_hours(24));
     match &access.config().cors_origins {
         Some(Origins::Any) if access.is_closed() => {
-            // `*` is every header but the one that a key stands in.
+            // `*` does not include `Authorization`.
             let all = [HeaderName::from_static("*"), header::AUTHORIZATION];
             layer.allow_origin(Any).allow_headers(AllowHeaders::list(all))
         }
@@ -76,21 +76,21 @@ pub(super) fn cors(access: &Access) -> CorsLayer {
                 .allow_headers(AllowHeaders::list(ALLOWED))
                 .allow_credentials(access.config().cors_credentials)
         }
-        // A preflight is answered without a word, so the browser refuses.
+        // Without CORS headers browsers reject cross-origin requests.
         None => layer,
     }
 }
 
-/// Says what browsers must not do with an answer, unless its handler has said so.
+/// Adds security headers that the handler has not set.
 pub(super) async fn restrain(State(app): State<Shared>, request: Request, next: Next) -> Response {
     let mut response = next.run(request).await;
     let config = app.access.config();
-    let everybody = config.cors_origins == Some(Origins::Any);
+    let any_origin = config.cors_origins == Some(Origins::Any);
     let headers = response.headers_mut();
-    // Meshes are data: no browser should take one for a script or a page.
+    // Browsers must not interpret a mesh as a script or a page.
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
-    // Whoever may not read an answer may not embed it either.
-    let embedders = if everybody { "cross-origin" } else { "same-origin" };
+    // Only origins that may read responses may embed them.
+    let embedders = if any_origin { "cross-origin" } else { "same-origin" };
     headers.insert(CROSS_ORIGIN_RESOURCE_POLICY, HeaderValue::from_static(embedders));
     or(headers, header::REFERRER_POLICY, HeaderValue::from_static("no-referrer"));
     or(headers, header::CONTENT_SECURITY_POLICY, POLICY);

@@ -1,4 +1,4 @@
-//! `/v1/capabilities`: what the service can do and what it refuses, for front-ends that build their forms from it.
+//! `/v1/capabilities`: formats, parameters and limits of the service, for front ends that build their forms from it.
 
 use axum::extract::State;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
@@ -17,7 +17,7 @@ use crate::pipeline::params::{Domain, Parameter, TABLE};
 use crate::structure::{element, radii};
 use crate::surface::{DeviceStatus, FoundDevice, Kernel, Preset, SurfaceOptions, SurfaceParams};
 
-/// What the service can do and what it refuses.
+/// Capabilities and limits of the service.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Capabilities {
     /// `molmesh`.
@@ -40,14 +40,14 @@ pub(super) struct Capabilities {
     limits: Limits,
     /// The backend that makes the meshes.
     backends: Vec<BackendDocument>,
-    /// What draws pictures.
+    /// Renderer of pictures.
     renderers: Vec<BackendDocument>,
     /// Every device that was found.
     devices: Vec<DeviceDocument>,
     radii: Radii,
-    /// Whether the page at `/` is the viewer; without it, it says how to get it.
+    /// True if `/` is the viewer; otherwise it is a page that explains how to build it.
     viewer: bool,
-    /// Where the types of problems are listed.
+    /// Address of the list of problem types.
     problems: &'static str,
 }
 
@@ -59,7 +59,7 @@ struct Units {
     volume: &'static str,
 }
 
-/// What can be uploaded.
+/// Formats and encodings of uploads.
 #[derive(Debug, Serialize, ToSchema)]
 struct Inputs {
     /// Structure formats.
@@ -77,7 +77,7 @@ struct FormatDocument {
     media_type: &'static str,
 }
 
-/// What a preset stands for.
+/// Values of a preset.
 #[derive(Debug, Serialize, ToSchema)]
 struct PresetValues {
     smoothness: f64,
@@ -88,17 +88,17 @@ struct PresetValues {
 #[derive(Debug, Serialize, ToSchema)]
 struct ParameterDocument {
     name: &'static str,
-    /// What it does.
+    /// Effect.
     doc: &'static str,
-    /// What values it takes, in words.
+    /// Allowed values, in words.
     expected: String,
-    /// The value where it is absent, in words.
+    /// Default value, in words.
     default: &'static str,
     #[serde(flatten)]
     domain: DomainDocument,
 }
 
-/// What values a parameter takes.
+/// Allowed values of a parameter.
 #[derive(Debug, Serialize, ToSchema)]
 #[serde(tag = "type", rename_all = "lowercase")]
 enum DomainDocument {
@@ -136,7 +136,6 @@ struct Limits {
     queue: usize,
     deliveries: usize,
     deadline_ms: u64,
-    sync_wait_ms: u64,
     batch_deadline_ms: u64,
     attempts: u32,
     body_timeout_ms: u64,
@@ -146,13 +145,13 @@ struct Limits {
     connections: usize,
 }
 
-/// What makes meshes, or draws them.
+/// Backend or renderer.
 #[derive(Debug, Serialize, ToSchema)]
 struct BackendDocument {
     name: &'static str,
-    /// What it runs on.
+    /// Processor or device that it uses.
     device: String,
-    /// Why it was taken.
+    /// Reason for its choice.
     reason: String,
 }
 
@@ -162,7 +161,7 @@ struct DeviceDocument {
     /// Its number, by which it is chosen.
     number: usize,
     name: String,
-    /// What kind of device.
+    /// Kind of the device.
     kind: &'static str,
     /// The graphics API that offers it.
     api: &'static str,
@@ -178,14 +177,14 @@ struct DeviceDocument {
     taken: bool,
     /// It takes jobs now.
     up: bool,
-    /// Why, or why not.
+    /// Reason why it is used or not.
     reason: String,
 }
 
 /// Van der Waals radii.
 #[derive(Debug, Serialize, ToSchema)]
 struct Radii {
-    /// Where they are from.
+    /// Source of the values.
     table: &'static str,
     unit: &'static str,
     /// The radius of elements that the table lacks.
@@ -195,7 +194,7 @@ struct Radii {
     values: Map<String, Value>,
 }
 
-/// What the service can do and what it refuses.
+/// Lists formats, parameters, limits and devices.
 #[utoipa::path(get, path = "/v1/capabilities", tag = "service", operation_id = "capabilities",
     responses((status = 200, description = "Formats, parameters, limits, devices.", body = Capabilities)))]
 pub(super) async fn show(State(app): State<Shared>) -> Response {
@@ -215,7 +214,7 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
         inputs: Inputs {
             formats: &["pdb", "mmcif", "bcif"],
             encodings: &["identity", "gzip", "zstd"],
-            note: "The bytes are looked at; Content-Type is a hint.",
+            note: "The format is detected from the bytes; Content-Type is a hint.",
         },
         formats: Format::ALL.map(|f| FormatDocument { name: f.extension(), media_type: f.media_type() }).into(),
         default_format: Format::default().extension(),
@@ -238,11 +237,11 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
         viewer: page::has_viewer(),
         problems: "/problems",
     };
-    // A document of text and numbers can be written.
+    // Serializing text and numbers does not fail.
     serde_json::to_vec(&document).map(Bytes::from).unwrap_or_default()
 }
 
-/// Every device that was found; `up` says whether it takes jobs now, `reason` why or why not.
+/// Describes every device that was found.
 fn devices(found: &[FoundDevice], running: &[DeviceStatus]) -> Vec<DeviceDocument> {
     let device = |found: &FoundDevice| {
         let status = running.iter().find(|status| status.number == found.number);
@@ -310,7 +309,6 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         queue: jobs.queue,
         deliveries: jobs.deliveries,
         deadline_ms: jobs.deadline_ms,
-        sync_wait_ms: jobs.sync_wait_ms,
         batch_deadline_ms: jobs.batch_deadline_ms,
         attempts: jobs.attempts,
         body_timeout_ms: server.body_timeout_ms,

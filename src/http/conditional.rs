@@ -1,9 +1,9 @@
-//! `If-None-Match`, after RFC 9110.
+//! `If-None-Match` (RFC 9110).
 
 use axum::http::header::IF_NONE_MATCH;
 use axum::http::{HeaderMap, HeaderValue};
 
-/// Whether the client has what `etag` names. Weak validators count, as the comparison is the weak one.
+/// Returns true if the client has the file with this `etag`, by weak comparison.
 pub(super) fn is_unchanged(headers: &HeaderMap, etag: &HeaderValue) -> bool {
     let Ok(etag) = etag.to_str() else { return false };
     headers

@@ -1,4 +1,4 @@
-//! A finished job as an answer: the mesh with its summary in headers, or the report.
+//! Answer of a finished job: the mesh, with a summary in headers, or the report.
 
 use std::sync::Arc;
 
@@ -10,7 +10,8 @@ use serde::Serialize;
 use serde_json::Value;
 use tokio::sync::OwnedSemaphorePermit;
 
-use super::problem::{self, Finding, Problem};
+use super::errors::{self, Finding};
+use super::problem::Problem;
 use super::state::App;
 use super::stream;
 use super::timing::Timing;
@@ -19,7 +20,7 @@ use crate::jobs::{ContentKey, Finished};
 use crate::pipeline::Report;
 use utoipa::ToSchema;
 
-/// Headers that sum up the report.
+/// Headers that summarise the report.
 pub(super) const SUMMARY: [&str; 17] = [
     "molmesh-atoms",
     "molmesh-vertices",
@@ -40,7 +41,7 @@ pub(super) const SUMMARY: [&str; 17] = [
     "molmesh-backend-reason",
 ];
 
-/// Headers that sum up the report of a picture, and the members of its `picture`.
+/// Headers that summarise the report of a picture, with the members of its `picture`.
 pub(super) const PICTURE: [(&str, &str); 4] = [
     ("molmesh-renderer", "renderer"),
     ("molmesh-renderer-device", "device"),
@@ -48,25 +49,25 @@ pub(super) const PICTURE: [(&str, &str); 4] = [
     ("molmesh-pixel", "pixel"),
 ];
 
-/// A report, and what was found on the way to it.
+/// Report of a run.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReportDocument {
     #[serde(flatten)]
     report: Report,
-    /// What a second, strict reader says of the file; absent where it was not asked.
+    /// Findings of the strict parser; absent without `check=strict`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     diagnostics: Option<Vec<Finding>>,
 }
 
-/// The mesh as `format`; `place` is given back when its last byte is written.
+/// Sends the mesh as `format`. `permit` is dropped after the last byte was written.
 pub(super) async fn mesh(
     app: &App,
     finished: Arc<Finished>,
     format: Format,
     key: &ContentKey,
     mut timing: Timing,
-    place: OwnedSemaphorePermit,
+    permit: OwnedSemaphorePermit,
 ) -> Result<Response, Problem> {
     let report = &finished.product.report;
     let mut headers = summary(&serde_json::to_value(report).map_err(Problem::internal)?);
@@ -74,7 +75,7 @@ pub(super) async fn mesh(
     headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
     headers.insert(header::ETAG, etag(key));
     let (length, body) =
-        stream::start(finished, format, app.config.limits.output_bytes, app.pool.budget().clone(), place).await?;
+        stream::start(finished, format, app.config.limits.output_bytes, app.pool.budget().clone(), permit).await?;
     if let Some(length) = length {
         headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     }
@@ -84,14 +85,14 @@ pub(super) async fn mesh(
     Ok(response)
 }
 
-/// The report as JSON.
+/// Sends the report as JSON.
 pub(super) fn report(finished: &Finished, mut timing: Timing) -> Result<Response, Problem> {
     let report = &finished.product.report;
     let mut headers = summary(&serde_json::to_value(report).map_err(Problem::internal)?);
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
-    // Times differ from run to run, so no two reports are the same.
+    // Every report holds the times of its own run.
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
-    let diagnostics = finished.diagnostics.as_deref().map(problem::findings);
+    let diagnostics = finished.diagnostics.as_deref().map(errors::findings);
     let document = ReportDocument { report: report.clone(), diagnostics };
     let mut response = (headers, serde_json::to_string(&document).map_err(Problem::internal)?).into_response();
     timing.head();
@@ -99,27 +100,27 @@ pub(super) fn report(finished: &Finished, mut timing: Timing) -> Result<Response
     Ok(response)
 }
 
-/// The strong validator of a mesh file.
+/// Returns the strong validator of a mesh file.
 pub(super) fn etag(key: &ContentKey) -> HeaderValue {
     HeaderValue::from_str(&format!("\"{key}\"")).unwrap_or_else(|_| HeaderValue::from_static("\"\""))
 }
 
-/// A file name for browsers, which show pictures and save meshes.
+/// Returns the file name for browsers, which show pictures and save meshes.
 pub(super) fn disposition(id: Option<&str>, format: Format) -> HeaderValue {
     let safe = |c: &char| c.is_ascii_alphanumeric() || "-_.".contains(*c);
     let stem: String = id.unwrap_or_default().chars().filter(safe).take(64).collect();
     let stem = if stem.trim_matches('.').is_empty() { "surface" } else { &stem };
-    let way = if format.is_picture() { "inline" } else { "attachment" };
-    text(&format!("{way}; filename=\"{stem}.{}\"", format.extension()))
+    let kind = if format.is_picture() { "inline" } else { "attachment" };
+    text(&format!("{kind}; filename=\"{stem}.{}\"", format.extension()))
 }
 
-/// A header value; characters that headers cannot hold are written as `?`.
+/// Returns a header value; characters that are not printable ASCII become `?`.
 pub(super) fn text(value: &str) -> HeaderValue {
     let plain: String = value.chars().map(|c| if (' '..='~').contains(&c) { c } else { '?' }).collect();
     HeaderValue::from_str(&plain).unwrap_or_else(|_| HeaderValue::from_static("?"))
 }
 
-/// The headers that sum up a report, from its JSON: fresh or kept, the same.
+/// Returns the summary headers of a report, from its JSON.
 pub(super) fn summary(report: &Value) -> HeaderMap {
     let header = |name: &'static str, value: &Value| {
         let value = match value {

@@ -1,15 +1,15 @@
-//! `/docs`: the description to read and to try, in Swagger UI. Its files are embedded, packed as they came in the package
-//! `swagger-ui-dist`; nothing is loaded from elsewhere.
+//! `/docs`: Swagger UI for the OpenAPI document. Its files are those of the package `swagger-ui-dist`, embedded with
+//! gzip; nothing is loaded from other servers.
 
 use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY};
 use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
-use super::packed;
+use super::embedded;
 use super::problem::Problem;
 
-/// Our own files and resources, as on the page; besides, Swagger UI has icons in its style, and shows downloads. What it
-/// lays out by `style` goes through the document's objects, which a policy does not touch.
+/// Content security policy: as on the page, and data URIs for the icons of Swagger UI. Its inline styles are set by
+/// scripts, which a policy does not restrict.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
                       connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
@@ -25,19 +25,19 @@ fn headers(media_type: &'static str) -> [(HeaderName, &'static str); 4] {
     ]
 }
 
-/// A packed file with what it is.
+/// Answers with an embedded file of this type.
 fn packed(request: &HeaderMap, media_type: &'static str, bytes: &'static [u8]) -> Result<Response, Problem> {
-    Ok((headers(media_type), packed::file(request, bytes)?).into_response())
+    Ok((headers(media_type), embedded::file(request, bytes)?).into_response())
 }
 
-/// The description, to read and to try.
+/// Serves Swagger UI for the OpenAPI document.
 #[utoipa::path(get, path = "/docs", tag = "page", operation_id = "docs",
     responses((status = 200, description = "A page.", body = String, content_type = "text/html; charset=utf-8")))]
 pub(super) async fn index() -> Response {
     (headers("text/html; charset=utf-8"), include_str!("../../web/docs.html")).into_response()
 }
 
-/// What starts the page.
+/// Serves the script that starts the page.
 #[utoipa::path(get, path = "/docs.js", tag = "page", operation_id = "docsStart",
     responses((status = 200, description = "A script.", body = String,
         content_type = "text/javascript; charset=utf-8")))]
@@ -45,14 +45,14 @@ pub(super) async fn start() -> Response {
     (headers("text/javascript; charset=utf-8"), include_str!("../../web/docs.js")).into_response()
 }
 
-/// The style of Swagger UI.
+/// Serves the style of Swagger UI.
 #[utoipa::path(get, path = "/swagger-ui.css", tag = "page", operation_id = "docsStyle",
     responses((status = 200, description = "A style.", body = String, content_type = "text/css; charset=utf-8")))]
 pub(super) async fn style(headers: HeaderMap) -> Result<Response, Problem> {
     packed(&headers, "text/css; charset=utf-8", STYLE)
 }
 
-/// Swagger UI.
+/// Serves the script of Swagger UI.
 #[utoipa::path(get, path = "/swagger-ui-bundle.js", tag = "page", operation_id = "docsBundle",
     responses((status = 200, description = "A script.", body = String,
         content_type = "text/javascript; charset=utf-8")))]

@@ -1,4 +1,5 @@
-//! `POST /v1/estimate`: what a mesh would cost, and what would fit if it were refused. Takes what `POST /v1/meshes` takes.
+//! `POST /v1/estimate`: size and duration of a mesh, and a resolution that fits if it is too large. Takes the requests
+//! of `POST /v1/meshes`.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -13,40 +14,41 @@ use serde::Serialize;
 use serde_json::Value;
 use utoipa::ToSchema;
 
-use super::ask::Input;
+use super::errors::file_too_large;
 use super::guard::Caller;
 use super::kinds::Kind;
-use super::meshes::{self, Pairs};
 use super::openapi::bodies::{MeshForm, MeshOrder, StructureFile};
 use super::openapi::parameters::{Coding, MeshParameters};
 use super::openapi::problems::{BODY, NAMED, PARAMETERS, ProblemDocument, READING};
 use super::openapi::refusals;
+use super::parsed_request::{Pairs, ParsedRequest};
 use super::problem::Problem;
+use super::source::Input;
 use super::state::Shared;
 use crate::jobs::Failure;
 use crate::pipeline::{self, Choice, Estimate};
 use crate::surface::CancelToken;
 
-/// Stops the work when its request ends.
-struct StopOnDrop(CancelToken);
+/// Cancels the work when its request ends.
+struct CancelOnDrop(CancelToken);
 
-impl Drop for StopOnDrop {
+impl Drop for CancelOnDrop {
     fn drop(&mut self) {
         self.0.cancel();
     }
 }
 
-/// What a mesh would come to. What stands in the grid's part is exact, what stands in the mesh's part is estimated.
+/// Estimate of a mesh. Figures of the grid are exact, those of the mesh are estimated.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct EstimateDocument {
-    /// The mesh would be made.
+    /// True if the mesh would be accepted.
     accepted: bool,
-    /// Why it would not be made.
+    /// Problem of a mesh that would be refused.
     #[schema(required, value_type = Option<ProblemDocument>)]
     problem: Option<Value>,
-    /// Atoms that would be meshed.
+    /// Number of selected atoms.
     atoms: u64,
-    /// Atoms in the file, all models.
+    /// Number of atoms in the file, all models.
     atoms_in_file: u64,
     /// Grid spacing, Å; estimated where it follows from `max_triangles`.
     resolution: f64,
@@ -78,11 +80,11 @@ pub(super) struct EstimateDocument {
     mesh_bytes: Option<u64>,
     /// SHA-256 of the structure.
     structure: String,
-    /// Time that making it would take, s.
+    /// Estimated duration of the job, s.
     seconds: f64,
-    /// Time that it would wait, s.
+    /// Estimated time in the queue, s.
     wait_seconds: f64,
-    /// The backend that would make it.
+    /// Backend that would compute it.
     backend: &'static str,
 }
 
@@ -90,9 +92,9 @@ refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
     Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
 ]]);
 
-/// Says what a mesh would come to, without making it.
+/// Estimates size and duration of a mesh.
 ///
-/// Takes what `POST /v1/meshes` takes.
+/// Takes the same requests as `POST /v1/meshes`.
 #[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",
     params(MeshParameters, Coding),
     request_body(description = "A structure, or a document that names one.", content(
@@ -109,16 +111,17 @@ pub(super) async fn create(
 ) -> Result<Response, Problem> {
     let caller = Caller::of(&extensions);
     app.admit_work(&caller)?;
-    // What it says is of the answer, which is no mesh.
+    // The answer is no mesh, so `Accept` does not choose a format.
     headers.remove(ACCEPT);
-    let taken = meshes::take(&app, query, &headers, body).await?;
-    let format = taken.request.format.unwrap_or_default();
-    // Half a mesh is work as well: it takes a place among those that are made.
-    let place = app.delivery()?;
-    let (declared, job) = (taken.declared.clone(), taken.request.job.clone());
-    let Input { bytes, digest, lease } = taken.input(&app).await?;
+    let parsed = ParsedRequest::from_body(&app, query, &headers, body).await?;
+    let ParsedRequest { source, request, format, declared, .. } = parsed;
+    let job = request.job;
+    // An estimate is about half the work of a mesh, so it takes a place as well.
+    let permit = app.delivery()?;
+    let Input { bytes, digest, lease } = source.load(&app).await?;
+    drop(source);
     let seconds = app.pool.expected(&bytes, &job);
-    let stop = StopOnDrop(CancelToken::default());
+    let stop = CancelOnDrop(CancelToken::default());
     let limit = app.config.jobs.deadline();
     let limits = pipeline::JobLimits { deadline: Some(Instant::now() + limit), ..app.config.limits.job() };
     let estimating = tokio::task::spawn_blocking({
@@ -128,11 +131,11 @@ pub(super) async fn create(
             let choice = Choice { backend: app.pool.backend().as_ref(), reason: app.pool.reason() };
             let estimate = pipeline::estimate(&bytes, &job, &limits, &choice, &cancel);
             app.charge(&caller, start.elapsed());
-            drop((lease, place));
+            drop((lease, permit));
             estimate
         }
     });
-    // Backends may leave the deadline to whoever can cancel them, which the end of this request does.
+    // A backend may ignore the deadline. Then the end of this request cancels it.
     let estimate = tokio::time::timeout(limit, estimating)
         .await
         .map_err(|_elapsed| Problem::from(Failure::Deadline { limit }))?
@@ -140,7 +143,7 @@ pub(super) async fn create(
         .map_err(|error| declared.explain(Failure::Job { error, diagnostics: Vec::new() }))?;
     drop(stop);
     let wait = app.pool.estimated_wait().as_secs_f64();
-    // A picture is as large as its pixels, however large the mesh.
+    // The size of a picture does not depend on the mesh.
     let limit = if format.is_picture() { u64::MAX } else { app.config.limits.output_bytes };
     let problem = refusal(&estimate, limit);
     let mesh = estimate.mesh.as_ref().ok();
@@ -168,10 +171,10 @@ pub(super) async fn create(
     Ok(([(CACHE_CONTROL, "no-store")], Json(document)).into_response())
 }
 
-/// Why the mesh would not be made, or its file of more than `limit` bytes not be sent.
+/// Returns why the mesh would be refused; `limit` is the maximum size of its file, bytes.
 fn refusal(estimate: &Estimate, limit: u64) -> Option<Problem> {
     match &estimate.mesh {
-        Ok(mesh) if mesh.bytes > limit => Some(super::unfit::file_too_large(mesh.bytes, limit, estimate.resolution)),
+        Ok(mesh) if mesh.bytes > limit => Some(file_too_large(mesh.bytes, limit, estimate.resolution)),
         Ok(_) => None,
         Err(error) => Some(Problem::from(error.clone())),
     }

@@ -1,5 +1,5 @@
-//! `GET /v1/jobs/{id}/events`: a job as it goes on, as server-sent events. Each event is the whole state, so that whoever
-//! comes back with `Last-Event-ID` misses nothing that still matters.
+//! `GET /v1/jobs/{id}/events`: status of a job as server-sent events. Each event holds the whole state, so a client
+//! that reconnects with `Last-Event-ID` needs no earlier events.
 
 use std::convert::Infallible;
 
@@ -19,14 +19,14 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::View;
+use crate::jobs::JobView;
 
-/// The last event that a client has seen.
+/// `Last-Event-ID`.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
-/// What a listener has seen, and where it looks.
+/// State of one event stream.
 struct Listener {
-    watched: watch::Receiver<View>,
+    watched: watch::Receiver<JobView>,
     stopping: watch::Receiver<Stop>,
     seen: u64,
     over: bool,
@@ -49,12 +49,12 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let id = jobs::id(path)?;
-    let watched = app.ledger.watch(&id).await?.ok_or_else(|| jobs::none(id.as_str()))?;
+    let watched = app.job_store.watch(&id).await?.ok_or_else(|| jobs::none(id.as_str()))?;
     let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()?.trim().parse::<u64>().ok());
-    // After a restart of the service counting begins anew: an id that lies ahead is one of another life.
+    // Versions start again with the service, so a larger id is from an earlier process.
     let seen = last.filter(|last| *last <= watched.borrow().version).unwrap_or(0);
     if last == Some(watched.borrow().version) && watched.borrow().record.status.is_final() {
-        // Browsers reconnect for ever, unless they are told that there is nothing more to come.
+        // A 204 stops browsers from reconnecting.
         return Ok(StatusCode::NO_CONTENT.into_response());
     }
     let listener = Listener { watched, stopping: app.stopping.clone(), seen, over: false };
@@ -79,7 +79,7 @@ impl Listener {
                 let write = || serde_json::to_string(&jobs::document(&view)).unwrap_or_default();
                 Some(event.data(view.written.get_or_init(write)))
             }
-            // The stream ends with the service; clients reconnect by themselves.
+            // The stream ends with the service; clients reconnect.
             () = stop::reached(&mut self.stopping, Stop::Drain) => None,
         }
     }

@@ -1,4 +1,4 @@
-//! Forms: one file and parameters as `multipart/form-data`, every part of it bounded before it is buffered.
+//! `multipart/form-data` bodies: one file and parameters. Every part is limited before it is buffered.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -11,21 +11,21 @@ use futures_util::{Stream, StreamExt as _};
 use multer::{Constraints, Multipart, SizeLimit};
 use thiserror::Error;
 
-use super::declared::Declared;
+use super::content_type::DeclaredType;
 use super::kinds::Kind;
+use super::limit::Limit;
 use super::problem::Problem;
-use super::upload::{Limit, Upload};
 use crate::config::LimitsConfig;
 use crate::jobs::Lease;
 
-/// Bytes of a form field that is a parameter.
+/// Maximum size of a parameter field, bytes.
 const MAX_FIELD_BYTES: usize = 4096;
-/// Characters of a boundary (RFC 2046, 5.1.1).
+/// Maximum length of a boundary (RFC 2046, 5.1.1).
 const MAX_BOUNDARY: usize = 70;
-/// Bytes that the parser gets at once. It searches all that it has buffered whenever it gets more.
+/// Size of the pieces that the parser gets, bytes. The parser searches its whole buffer for each piece.
 const PIECE: usize = 64 << 10;
 
-/// Errors that end the parser's input.
+/// Error of the parser's input.
 #[derive(Debug, Error)]
 enum FeedError {
     #[error("the head of a part is too long")]
@@ -34,13 +34,13 @@ enum FeedError {
     Body(#[from] axum::Error),
 }
 
-/// Hands a body to the parser in pieces, and no more than `allowance` bytes: the parser buffers the preamble and the
-/// head of a part until it has seen their end.
+/// Passes a body to the parser in pieces, at most `allowance` bytes: the parser buffers the preamble and the head of a
+/// part until it finds their end.
 struct Feed<'a> {
     body: BodyDataStream,
     rest: Bytes,
     allowance: &'a AtomicUsize,
-    /// Set after each piece: the parser must process it before it gets the next one.
+    /// Set after each piece, which the parser must process before it gets the next one.
     paused: bool,
 }
 
@@ -71,10 +71,10 @@ impl Stream for Feed<'_> {
     }
 }
 
-/// The allowance while a part's content is read: content is passed on as it arrives.
+/// Allowance for the content of a part, which the parser does not buffer.
 const UNBOUNDED: usize = usize::MAX;
 
-/// Limits that a form is checked against.
+/// Limits of a form.
 struct Bounds {
     body: Limit,
     head: Limit,
@@ -83,8 +83,8 @@ struct Bounds {
 
 impl Bounds {
     fn new(limits: &LimitsConfig, body: Limit) -> Self {
-        let head = Limit { key: "limits.part_head_bytes", most: limits.part_head_bytes };
-        Self { body, head, parts: Limit { key: "limits.parts", most: limits.parts as u64 } }
+        let head = Limit { key: "limits.part_head_bytes", max: limits.part_head_bytes };
+        Self { body, head, parts: Limit { key: "limits.parts", max: limits.parts as u64 } }
     }
 
     fn head_too_long(&self) -> Problem {
@@ -104,6 +104,16 @@ impl Bounds {
     }
 }
 
+/// Received form.
+pub(super) struct Form {
+    pub(super) bytes: Bytes,
+    pub(super) lease: Lease,
+    /// Parameters.
+    pub(super) fields: Vec<(String, String)>,
+    /// Content type of the file.
+    pub(super) declared: DeclaredType,
+}
+
 /// Reads a form: one file in `file` or `structure`, parameters in the other fields.
 pub(super) async fn read(
     limits: &LimitsConfig,
@@ -111,26 +121,26 @@ pub(super) async fn read(
     content_type: &str,
     body: Body,
     mut lease: Lease,
-) -> Result<Upload, Problem> {
+) -> Result<Form, Problem> {
     let bounds = Bounds::new(limits, within);
     let boundary = multer::parse_boundary(content_type).map_err(|e| bounds.problem(&e))?;
     if boundary.len() > MAX_BOUNDARY {
         let detail = format!("the form's boundary has more than {MAX_BOUNDARY} characters");
         return Err(Problem::new(Kind::BadRequest, detail).with("limit", MAX_BOUNDARY));
     }
-    // The most that the parser buffers.
-    lease.grow(bounds.head.most.saturating_add(PIECE as u64))?;
+    // Upper limit of the parser's buffer.
+    lease.grow(bounds.head.max.saturating_add(PIECE as u64))?;
     let allowance = AtomicUsize::new(0);
     let mut feed = Feed { body: body.into_data_stream(), rest: Bytes::new(), allowance: &allowance, paused: false };
-    let constraints = Constraints::new().size_limit(SizeLimit::new().whole_stream(bounds.body.most));
+    let constraints = Constraints::new().size_limit(SizeLimit::new().whole_stream(bounds.body.max));
     let mut form = Multipart::with_constraints(&mut feed, boundary, constraints);
     let (mut file, mut fields) = (None, Vec::new());
-    let head = usize::try_from(bounds.head.most).unwrap_or(UNBOUNDED);
+    let head = usize::try_from(bounds.head.max).unwrap_or(UNBOUNDED);
     loop {
         allowance.store(head, Ordering::Relaxed);
         let Some(mut field) = form.next_field().await.map_err(|e| bounds.problem(&e))? else { break };
         allowance.store(UNBOUNDED, Ordering::Relaxed);
-        // The beginning of the head may have come with the content before it.
+        // The head may have begun in a piece that the allowance did not count.
         if head_bytes(field.headers()) > head {
             return Err(bounds.head_too_long());
         }
@@ -143,7 +153,7 @@ pub(super) async fn read(
         if is_file && file.is_some() {
             return Err(Problem::new(Kind::BadRequest, "the form has more than one file").with("parameter", name));
         }
-        let declared = Declared::new(field.content_type().map_or("", |mime| mime.as_ref()));
+        let declared = DeclaredType::new(field.content_type().map_or("", |mime| mime.as_ref()));
         let mut content = BytesMut::new();
         while let Some(chunk) = field.chunk().await.map_err(|e| bounds.problem(&e))? {
             lease.grow(chunk.len() as u64)?;
@@ -159,7 +169,7 @@ pub(super) async fn read(
         }
     }
     drop(form);
-    // The epilogue has no meaning, but a connection is closed if its request body is not read to the end.
+    // The epilogue is ignored, but the connection can be reused only if the body is read to its end.
     allowance.store(head, Ordering::Relaxed);
     while let Some(piece) = feed.next().await {
         piece.map_err(|e| bounds.problem(&multer::Error::StreamReadFailed(e.into())))?;
@@ -168,10 +178,10 @@ pub(super) async fn read(
         let detail = "the form has no file; put it into a field named `file` or `structure`";
         return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
     };
-    Ok(Upload { bytes, lease, fields, declared })
+    Ok(Form { bytes, lease, fields, declared })
 }
 
-/// Bytes of a part's headers as they are sent.
+/// Returns the size of a part's headers, bytes.
 fn head_bytes(headers: &HeaderMap) -> usize {
     headers.iter().map(|(name, value)| name.as_str().len() + ": \r\n".len() + value.len()).sum()
 }

@@ -1,7 +1,7 @@
-//! Who asks, whether he may, and whether it is too much: keys, signed addresses and quotas in front of the handlers.
+//! Authentication, authorization and quotas: keys, signed addresses, limits per client.
 //!
-//! What is counted is a request that may be made, on an operation that needs a scope: those without a right are refused
-//! before, those beyond a quota do not count either. Work is charged when it is done, to whoever asked for it first.
+//! Only permitted requests for operations that need a scope count towards a quota. Work is charged when it is done, to
+//! the client that requested it first.
 
 use std::net::IpAddr;
 use std::pin::Pin;
@@ -28,27 +28,27 @@ use super::state::{App, Shared};
 use crate::access::{Access, Account, Denied, Exceeded, Key, Quota, Running, Scope, Signed, limits, policies, without};
 use crate::jobs::{Client, Meter, rfc3339};
 
-/// Where a key may stand instead of `Authorization`.
+/// `X-Api-Key`, an alternative to `Authorization`.
 pub(super) const API_KEY: HeaderName = HeaderName::from_static("x-api-key");
-/// What there is, and what of it is left.
+/// `RateLimit-Policy` and `RateLimit`: the quotas, and the remainder.
 pub(super) const RATE_LIMIT_POLICY: HeaderName = HeaderName::from_static("ratelimit-policy");
 pub(super) const RATE_LIMIT: HeaderName = HeaderName::from_static("ratelimit");
 
-/// Where a request comes from.
+/// Remote address of a connection.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Peer(pub(super) IpAddr);
 
-/// Whom a request belongs to.
+/// Client of a request.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Caller {
-    /// Whom its jobs belong to: a key, else an address.
+    /// Identity for the queue: a key, else an address.
     pub(super) client: Client,
-    /// What it is counted on; none: nothing is limited.
+    /// Account of its quota; `None` without limits.
     account: Option<Account>,
 }
 
 impl Caller {
-    /// The caller that the guard has found.
+    /// Returns the caller that [`check`] has found.
     pub(super) fn of(extensions: &Extensions) -> Self {
         extensions.get::<Self>().cloned().unwrap_or_default()
     }
@@ -70,7 +70,7 @@ impl Caller {
     }
 }
 
-/// An address as a client: of IPv6 the network, as everybody has 2⁶⁴ addresses in his.
+/// Name of an address as a client. IPv6 addresses count by their /64 network, which one client commonly owns.
 fn place(address: IpAddr) -> String {
     match address {
         IpAddr::V4(address) => address.to_string(),
@@ -81,10 +81,10 @@ fn place(address: IpAddr) -> String {
     }
 }
 
-/// Lets a request through to its handler, or not.
+/// Middleware: passes permitted requests on, refuses the others.
 pub(super) async fn check(State(app): State<Shared>, mut request: Request, next: Next) -> Response {
     let key = presented(request.headers());
-    // From here on nobody sees a key.
+    // Handlers and logs do not see the key.
     request.headers_mut().remove(AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
     let Some(scope) = scopes::needed(&request) else { return next.run(request).await };
@@ -107,7 +107,7 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
         }
     };
     if let Some(account) = &account {
-        tell(&app.access, account, &mut response);
+        add_quota_headers(&app.access, account, &mut response);
     }
     if app.access.is_closed() {
         keep_private(response.headers_mut());
@@ -115,8 +115,8 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     response
 }
 
-/// Reads the body of a request that is refused, if it is small and comes at once: over HTTP/2, some clients take an answer
-/// that overtakes their own last bytes for a broken stream.
+/// Reads the body of a refused request if it is small and arrives at once: some HTTP/2 clients report a broken stream
+/// if the response arrives before they have sent their body.
 async fn swallow(request: Request) {
     const MOST: u64 = 64 << 10;
     const PATIENCE: Duration = Duration::from_millis(500);
@@ -137,11 +137,11 @@ async fn swallow(request: Request) {
     drop(tokio::time::timeout(PATIENCE, read).await);
 }
 
-/// What a request presents as a key.
+/// Key of a request as the client sent it.
 enum Presented {
     Nothing,
     Text(String),
-    /// More than one, or no text.
+    /// Several keys, or not text.
     Nonsense,
 }
 
@@ -149,7 +149,7 @@ fn presented(headers: &HeaderMap) -> Presented {
     const SCHEME: &str = "bearer ";
     let bearer = headers.get_all(AUTHORIZATION).iter().filter_map(|value| {
         let value = value.as_bytes();
-        // Other schemes are for somebody else, such as a proxy.
+        // Other schemes are meant for proxies.
         let ours = value.len() > SCHEME.len() && value[..SCHEME.len()].eq_ignore_ascii_case(SCHEME.as_bytes());
         ours.then(|| value[SCHEME.len()..].trim_ascii())
     });
@@ -162,7 +162,7 @@ fn presented(headers: &HeaderMap) -> Presented {
     }
 }
 
-/// Finds out whose request it is, and whether he may make it. Takes a signature out of the address.
+/// Identifies and authorizes the client. Removes a signature from the address.
 fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -> Result<Caller, Problem> {
     if !access.is_closed() {
         return Ok(Caller::address(access, request));
@@ -182,7 +182,7 @@ fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -
     let key = found.map_err(no_key)?;
     Span::current().record("key", key.id.as_str());
     if !key.allows(scope) {
-        let detail = format!("this needs the scope `{}`, which the key `{}` does not have", scope.name(), key.id);
+        let detail = format!("the scope `{}` is required, which the key `{}` does not have", scope.name(), key.id);
         let challenge = format!("Bearer realm=\"molmesh\", error=\"insufficient_scope\", scope=\"{}\"", scope.name());
         return Err(Problem::new(Kind::ScopeMissing, detail)
             .with("scope", scope.name())
@@ -191,7 +191,7 @@ fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -
     Ok(Caller::key(&key))
 }
 
-/// The address without its signature.
+/// Returns the address without its signature.
 fn unsigned(uri: &Uri) -> Result<Uri, Problem> {
     let rest = uri.query().and_then(without);
     let target = rest.map_or_else(|| uri.path().to_owned(), |rest| format!("{}?{rest}", uri.path()));
@@ -205,17 +205,16 @@ fn by_signature(worth: &Signed) -> Result<(), Problem> {
         Signed::Valid => Ok(()),
         Signed::No => Err(Problem::new(
             Kind::KeyRequired,
-            "this needs a key, in `Authorization: Bearer …` or `X-Api-Key`; a GET may have a signed address instead",
+            "a key is required, in `Authorization: Bearer …` or `X-Api-Key`; a GET may use a signed address instead",
         )
         .header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\"")),
         Signed::Invalid => {
-            let detail =
-                "the signature is not one of this address; it must be used as it was given, with nothing changed";
+            let detail = "the signature does not match this address, which must be used unchanged";
             Err(Problem::new(Kind::SignatureInvalid, detail))
         }
         Signed::Expired(end) => {
             let end = rfc3339(end.saturating_mul(1000));
-            let detail = format!("the address was signed until {end}");
+            let detail = format!("the signed address expired at {end}");
             Err(Problem::new(Kind::SignatureExpired, detail).with("expired", end))
         }
     }
@@ -223,21 +222,21 @@ fn by_signature(worth: &Signed) -> Result<(), Problem> {
 
 fn no_key(denied: Denied) -> Problem {
     let problem = match denied {
-        Denied::Unknown => Problem::new(Kind::KeyInvalid, "the key is not known here"),
+        Denied::Unknown => Problem::new(Kind::KeyInvalid, "the key is unknown"),
         Denied::Expired(end) => {
             let end = humantime::format_rfc3339_seconds(end).to_string();
-            Problem::new(Kind::KeyExpired, format!("the key was good until {end}")).with("expired", end)
+            Problem::new(Kind::KeyExpired, format!("the key expired at {end}")).with("expired", end)
         }
     };
     problem.header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\", error=\"invalid_token\"")
 }
 
-/// The refusal of a request beyond a quota.
+/// Returns the problem of an exceeded quota.
 fn refusal(exceeded: &Exceeded) -> Problem {
     let Exceeded { policy, limit, wait } = *exceeded;
     let what = match policy {
         "work" => format!("the jobs of this client took {limit} s of this window or more, which is its quota"),
-        "concurrency" => format!("{limit} requests of this client are under way, which is its quota"),
+        "concurrency" => format!("{limit} requests of this client are running, which is its quota"),
         _ => format!("this client has made {limit} requests in this window, which is its quota"),
     };
     Problem::new(Kind::QuotaExceeded, what)
@@ -247,31 +246,31 @@ fn refusal(exceeded: &Exceeded) -> Problem {
 }
 
 impl App {
-    /// Whether a job may be begun for `caller`.
+    /// Fails if the caller's quota of work is used up.
     pub(super) fn admit_work(&self, caller: &Caller) -> Result<(), Problem> {
         let Some(account) = &caller.account else { return Ok(()) };
         self.access.meter().admit_work(account, Instant::now()).map_err(|exceeded| refusal(&exceeded))
     }
 
-    /// `time` was spent on work for `caller` that is no job.
+    /// Charges `time` of work that is not a job to `caller`.
     pub(super) fn charge(&self, caller: &Caller, time: Duration) {
         self.access.meter().spent(caller.client.number(), time, Instant::now());
     }
 }
 
-/// Charges jobs to the clients that they are for.
+/// Charges jobs to the quotas of their clients.
 #[derive(Debug)]
-pub(super) struct Bill(pub(super) Arc<Access>);
+pub(super) struct UsageRecorder(pub(super) Arc<Access>);
 
-impl Meter for Bill {
+impl Meter for UsageRecorder {
     fn spent(&self, client: Client, time: Duration) {
         self.0.meter().spent(client.number(), time, Instant::now());
     }
 }
 
-/// Tells a client how it stands.
-fn tell(access: &Access, account: &Account, response: &mut Response) {
-    // A client that has nothing left would not follow a redirect at once.
+/// Adds the quota headers to a response.
+fn add_quota_headers(access: &Access, account: &Account, response: &mut Response) {
+    // A client without remaining quota would delay following the redirect.
     let redirects = response.headers().contains_key(header::LOCATION) && response.status().is_redirection();
     let standing = access.meter().standing(account, Instant::now());
     let fields = [
@@ -285,7 +284,7 @@ fn tell(access: &Access, account: &Account, response: &mut Response) {
     }
 }
 
-/// What a key or a signature has opened is not for caches that others share.
+/// Makes a cacheable response private, since a key or a signature was needed for it.
 fn keep_private(headers: &mut HeaderMap) {
     let Some(value) = headers.get(header::CACHE_CONTROL).and_then(|value| value.to_str().ok()) else { return };
     let private = value.strip_prefix("public").map(|rest| HeaderValue::try_from(format!("private{rest}")));
@@ -294,7 +293,7 @@ fn keep_private(headers: &mut HeaderMap) {
     }
 }
 
-/// A body that counts as a request under way until it is gone.
+/// Response body that holds a concurrency slot until it is dropped.
 struct Held {
     body: Body,
     _running: Running,

@@ -1,4 +1,4 @@
-//! `/livez`, `/readyz`, `/version`: for orchestrators.
+//! `/livez`, `/readyz` and `/version`, for orchestrators.
 
 use std::time::Duration;
 
@@ -16,46 +16,46 @@ use super::state::{Shared, Warm};
 
 const NO_STORE: [(axum::http::HeaderName, &str); 1] = [(CACHE_CONTROL, "no-store")];
 
-/// What a probe is told.
+/// Answer of the liveness probe.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Health {
     /// `live`.
     status: &'static str,
 }
 
-/// What is running.
+/// Name and version of the program.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Version {
     /// `molmesh`.
     name: &'static str,
-    /// The program's version.
+    /// Version of the program.
     version: &'static str,
 }
 
-/// The process answers.
+/// Shows that the process answers.
 #[utoipa::path(get, path = "/livez", tag = "service", operation_id = "live",
     responses((status = 200, description = "The process lives.", body = Health)))]
 pub(super) async fn live() -> Response {
     (NO_STORE, Json(Health { status: "live" })).into_response()
 }
 
-/// Whether requests should come here, with what was looked at.
+/// Answer of the readiness probe, with its checks.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReadyDocument {
     /// `ready`.
     status: &'static str,
-    /// Each check; all are `ok`.
+    /// Checks; all are `ok`.
     checks: Vec<Check>,
 }
 
-/// Something without which the service is not ready.
+/// Check that must succeed for the service to be ready.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Check {
     /// `accepting`, `devices` or `store`.
     name: &'static str,
-    /// Whether it is as it should be.
+    /// True if the check succeeded.
     ok: bool,
-    /// What was found, in words.
+    /// Result in words.
     detail: String,
 }
 
@@ -71,10 +71,10 @@ impl Check {
 
 refusals!(ReadyRefusals: [[Kind::NotReady]]);
 
-/// Whether requests should come here.
+/// Checks that the service is ready for requests.
 ///
-/// The service was not told to stop, a mesh was computed and a device (or what stands in for it) takes jobs, and the store
-/// can be written and read. Load does not change the answer. `checks` says each, also in the problem.
+/// The service is ready if it is not stopping, has computed a first mesh, has a device (or a fallback) in service, and can
+/// write and read the store. Load does not change the answer. `checks` lists each result, also in the problem.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
     responses((status = 200, description = "The service takes requests.", body = ReadyDocument), ReadyRefusals))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
@@ -102,14 +102,14 @@ fn devices(app: &Shared) -> Check {
     let backend = app.pool.backend();
     let found = match app.readiness.warm() {
         Warm::Warming => Err("the first mesh is being computed".to_owned()),
-        Warm::Broken => Err("the first mesh could not be computed; the log says why".to_owned()),
-        Warm::Yes if !backend.able() => Err("no device takes jobs any more, and nothing stands in for them".to_owned()),
+        Warm::Broken => Err("the first mesh failed; see the log".to_owned()),
+        Warm::Yes if !backend.able() => Err("no device is in service, and there is no fallback".to_owned()),
         Warm::Yes => {
             let devices = backend.devices();
             let up = devices.iter().filter(|device| device.down.is_none()).count();
             Ok(match devices.len() {
-                0 => format!("{} has made its first mesh", backend.name()),
-                all => format!("{} has made its first mesh; {up} of {all} devices take jobs", backend.name()),
+                0 => format!("{} has computed its first mesh", backend.name()),
+                all => format!("{} has computed its first mesh; {up} of {all} devices are in service", backend.name()),
             })
         }
     };
@@ -117,14 +117,14 @@ fn devices(app: &Shared) -> Check {
 }
 
 async fn store(app: &Shared) -> Check {
-    let found = match app.probe.failure(app).await {
-        None => Ok("it can be written and read".to_owned()),
+    let found = match app.probe.failure(&app.store, &app.config.store).await {
+        None => Ok("the store can be written and read".to_owned()),
         Some(why) => Err(format!("the store does not work: {why}")),
     };
     Check::new("store", found)
 }
 
-/// What is running.
+/// Returns the name and the version of the program.
 #[utoipa::path(get, path = "/version", tag = "service", operation_id = "version",
     responses((status = 200, description = "Name and version.", body = Version)))]
 pub(super) async fn version() -> Response {

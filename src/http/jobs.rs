@@ -1,5 +1,5 @@
-//! `/v1/jobs/{id}`: how a promised job stands, with a long poll; its result; its end. Names and statuses are those of OGC
-//! API Processes.
+//! `/v1/jobs/{id}`: status of a durable job, with long polling; its result; its cancellation. Names and statuses are
+//! those of OGC API Processes.
 
 use std::time::Duration;
 
@@ -21,25 +21,25 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::{ContentKey, JobId, Status, View, rfc3339};
+use crate::jobs::{ContentKey, JobId, JobView, Status, rfc3339};
 
-/// Longest poll, s: proxies commonly cut an exchange after a minute.
+/// Longest poll, s. Proxies commonly cut an exchange after a minute.
 pub(super) const MAX_WAIT_S: u64 = 55;
 
-/// The long poll.
+/// Parameters of a long poll.
 #[derive(Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Poll {
-    /// Seconds to wait for the job's end.
+    /// Seconds to wait for the end of the job.
     #[param(minimum = 0, maximum = 55, nullable = false)]
     wait: Option<u64>,
 }
 
-/// How a job stands; names and statuses are those of OGC API Processes.
+/// Status of a job; names and values are those of OGC API Processes.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct JobDocument {
-    /// The job's id.
+    /// Id of the job.
     #[serde(rename = "jobID")]
     job_id: String,
     /// `surface`.
@@ -55,50 +55,50 @@ pub(super) struct JobDocument {
     /// The same, finer.
     #[schema(minimum = 0, maximum = 1)]
     fraction: f64,
-    /// What is being done.
+    /// Running stage.
     #[schema(required)]
     stage: Option<&'static str>,
-    /// Times that it was begun.
+    /// Number of attempts to run it.
     attempts: u32,
-    /// When it was accepted.
+    /// Time of acceptance.
     #[schema(format = DateTime)]
     created: String,
-    /// When it was begun last.
+    /// Start of the last attempt.
     #[schema(required, format = DateTime)]
     started: Option<String>,
-    /// When it ended.
+    /// End of the job.
     #[schema(required, format = DateTime)]
     finished: Option<String>,
     /// SHA-256 of the structure.
     structure: String,
     /// The mesh format, as a file name's extension.
     format: String,
-    /// The parameters as they were given.
+    /// Parameters as the client wrote them.
     #[schema(value_type = std::collections::BTreeMap<String, String>)]
     parameters: Map<String, Value>,
-    /// Why there is no result.
+    /// Problem of a failed job.
     #[schema(required, value_type = Option<ProblemDocument>)]
     problem: Option<Value>,
-    /// Where more is found.
+    /// Links to related resources.
     links: Vec<Link>,
 }
 
-/// Where something is found.
+/// Link to a related resource.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Link {
-    /// What it is to this document.
+    /// Relation of the resource to this document.
     rel: &'static str,
-    /// Its address.
+    /// Address.
     href: String,
-    /// Its media type.
+    /// Media type.
     r#type: &'static str,
 }
 
-/// How a job stands, as text.
+/// Status of a job.
 #[derive(Debug, Serialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 #[schema(as = JobStatus)]
-#[expect(dead_code, reason = "for the schema alone: the record's own status is what is written")]
+#[expect(dead_code, reason = "for the schema alone: documents hold the status of the record")]
 enum StatusSchema {
     Accepted,
     Running,
@@ -114,19 +114,19 @@ refusals!(ResultRefusals: [READING, MESHING, [
     Kind::StoreFull, Kind::StoreFailed,
 ]]);
 
-/// The job of a path.
+/// Parses the job id of a path.
 pub(super) fn id(path: Result<Path<String>, PathRejection>) -> Result<JobId, Problem> {
     let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     text.parse().map_err(|_bad| none(&text))
 }
 
-/// There is no such job.
+/// Returns the problem of an unknown job.
 pub(super) fn none(id: &str) -> Problem {
     let shown: String = id.chars().take(40).collect();
-    Problem::new(Kind::NoSuchJob, format!("there is no job `{shown}`: jobs are kept for some time after their end"))
+    Problem::new(Kind::NoSuchJob, format!("there is no job `{shown}`: jobs are removed some time after their end"))
 }
 
-/// How a job stands; with `wait`, once it has ended or the time is over.
+/// Shows the status of a job; with `wait`, as soon as the job has ended or the time is over.
 #[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "showJob", params(JobPath, Poll),
     responses(
         (status = 200, description = "How the job stands.", body = JobDocument,
@@ -148,12 +148,12 @@ pub(super) async fn show(
             .with("limit", MAX_WAIT_S)
             .with("expected", format!("a whole number of seconds up to {MAX_WAIT_S}")));
     }
-    let mut watched = app.ledger.watch(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let mut watched = app.job_store.watch(&id).await?.ok_or_else(|| none(id.as_str()))?;
     let mut stopping = app.stopping.clone();
     let ended = async {
         tokio::select! {
             _ = watched.wait_for(|view| view.record.status.is_final()) => {}
-            // The service ends: the client asks again, here after the restart or elsewhere.
+            // The service stops. The client polls again after the restart.
             () = stop::reached(&mut stopping, Stop::Drain) => {}
         }
     };
@@ -170,15 +170,15 @@ pub(super) async fn dismiss(
     path: Result<Path<String>, PathRejection>,
 ) -> Result<Response, Problem> {
     let id = id(path)?;
-    let view = app.ledger.dismiss(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let view = app.job_store.dismiss(&id).await?.ok_or_else(|| none(id.as_str()))?;
     if view.record.status != Status::Dismissed {
-        let detail = format!("the job is {} and cannot be cancelled any more", view.record.status.name());
+        let detail = format!("the job is {} and cannot be cancelled", view.record.status.name());
         return Err(Problem::new(Kind::JobEnded, detail).with("status_name", view.record.status.name()));
     }
     Ok(answer(StatusCode::OK, &view, None))
 }
 
-/// The way to a job's result; if it failed, why.
+/// Redirects to the result of a job, or returns the problem of a failed job.
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(
         (status = 303, description = "The job was successful.",
@@ -190,13 +190,12 @@ pub(super) async fn result(
     path: Result<Path<String>, PathRejection>,
 ) -> Result<Response, Problem> {
     let id = id(path)?;
-    let view = app.ledger.view(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let view = app.job_store.view(&id).await?.ok_or_else(|| none(id.as_str()))?;
     let record = &view.record;
     match (record.status, &record.result) {
         (Status::Successful, Some(key)) => {
-            let gone = || {
-                Problem::new(Kind::ResultGone, "the result was kept for some time and is gone; ask for the mesh again")
-            };
+            let gone =
+                || Problem::new(Kind::ResultGone, "the result was removed after some time; request the mesh again");
             let key: ContentKey = key.parse().map_err(|_bad| gone())?;
             if app.store.head(&key.name(&record.format)?).await?.is_none() {
                 return Err(gone());
@@ -206,17 +205,17 @@ pub(super) async fn result(
         }
         (Status::Failed, _) => Err(Problem::recorded(record.problem.as_ref())),
         (Status::Dismissed, _) => Err(Problem::new(Kind::JobDismissed, "the job was cancelled and has no result")),
-        _ => Err(Problem::new(Kind::NoResultYet, "the job has not ended; ask with ?wait= or watch its events")
+        _ => Err(Problem::new(Kind::NoResultYet, "the job has not ended; poll with `?wait=` or read its events")
             .retry_after(Duration::from_secs(1))),
     }
 }
 
-/// The answer that promises a job.
-pub(super) fn accepted(view: &View, wait: Duration) -> Response {
+/// Answers a request with a job that takes about `wait`.
+pub(super) fn accepted(view: &JobView, wait: Duration) -> Response {
     answer(StatusCode::ACCEPTED, view, Some(wait))
 }
 
-fn answer(status: StatusCode, view: &View, wait: Option<Duration>) -> Response {
+fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Response {
     let mut response = (status, Json(document(view))).into_response();
     let headers = response.headers_mut();
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
@@ -230,8 +229,8 @@ fn answer(status: StatusCode, view: &View, wait: Option<Duration>) -> Response {
     response
 }
 
-/// A job as JSON.
-pub(super) fn document(view: &View) -> JobDocument {
+/// Returns the document of a job.
+pub(super) fn document(view: &JobView) -> JobDocument {
     let record = &view.record;
     let own = format!("/v1/jobs/{}", record.id);
     let link = |rel, href: String, kind| Link { rel, href, r#type: kind };

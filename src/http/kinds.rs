@@ -1,8 +1,8 @@
-//! The kinds of problems: stable names, statuses and what each means in words. The one table of status codes.
+//! Kinds of problems: stable names, HTTP statuses and explanations. The only table of status codes.
 
 use axum::http::StatusCode;
 
-/// What went wrong, as a stable name.
+/// Kind of a problem.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     BadRequest,
@@ -57,16 +57,16 @@ pub(super) enum Kind {
     Deadline,
 }
 
-/// A kind's row.
+/// Row of the table of problems.
 pub(super) struct Row {
     pub(super) kind: Kind,
-    /// Last segment of its `type`: `/problems/{slug}`.
+    /// Last segment of the `type`: `/problems/{slug}`.
     pub(super) slug: &'static str,
     pub(super) status: StatusCode,
     pub(super) title: &'static str,
-    /// What it means and what to do, for people.
+    /// Meaning of the problem, and what the client can do.
     pub(super) about: &'static str,
-    /// A limit was reached, or a right was missing: counted as a rejection.
+    /// Counted as a rejection: a limit was reached or a right was missing.
     pub(super) limit: bool,
 }
 
@@ -83,7 +83,7 @@ const fn row(
 
 use StatusCode as S;
 
-/// Every kind.
+/// Every kind, in the order of [`Kind`].
 #[rustfmt::skip]
 pub(super) const KINDS: &[Row] = &[
     row(Kind::BadRequest, "bad-request", S::BAD_REQUEST, false, "The request is malformed",
@@ -157,12 +157,12 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::NoSurface, "no-surface", S::UNPROCESSABLE_ENTITY, false, "There is no surface",
         "The density reaches `isovalue` nowhere on the grid. Take a lower isovalue or a finer resolution."),
     row(Kind::OtherRequest, "other-request", S::UNPROCESSABLE_ENTITY, false, "The idempotency key is another request's",
-        "`Idempotency-Key` was used before, with another structure, other parameters or another format."),
+        "`Idempotency-Key` was used before with another structure, other parameters or another format."),
     row(Kind::ArchiveUnavailable, "archive-unavailable", S::FAILED_DEPENDENCY, false, "The archive cannot be reached",
         "This server has no copy of the entry, and the archive at `host` could not be asked for it: `detail` says why, `found` is the status that it answered with, if it did. Try again after `Retry-After` seconds, or POST the file to /v1/meshes."),
     row(Kind::QuotaExceeded, "quota-exceeded", S::TOO_MANY_REQUESTS, true, "The quota is used up",
         "`violated-policies` names the quota that this client has used up: `requests` in a window, `work` (seconds of computing in a window), or `concurrency` (requests at once). `RateLimit-Policy` and `RateLimit` say what there is and what is left. Try again after `Retry-After` seconds; what is refused does not count."),
-    row(Kind::Internal, "internal", S::INTERNAL_SERVER_ERROR, false, "Our mistake",
+    row(Kind::Internal, "internal", S::INTERNAL_SERVER_ERROR, false, "Internal error",
         "Something failed that should not have. The log has the details under the request id that `instance` gives."),
     row(Kind::JobAbandoned, "job-abandoned", S::INTERNAL_SERVER_ERROR, false, "The job was given up",
         "The job was begun several times, and each time the service ended before the job did; or what it needs is not there any more. The log says more."),
@@ -171,7 +171,7 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::DeviceFailed, "device-failed", S::SERVICE_UNAVAILABLE, false, "No device could run the job",
         "Every device that could have run the job failed, and nothing stands in for them. It is not the job's fault. Try again after `Retry-After` seconds; the log says what happened."),
     row(Kind::QueueFull, "queue-full", S::SERVICE_UNAVAILABLE, true, "Too many jobs are waiting",
-        "All workers are busy and `limit` jobs wait already. `Retry-After` is the estimated time in seconds until there is room."),
+        "All workers are busy and `limit` jobs are waiting, or the job would miss its deadline in the queue. `Retry-After` is an estimate in seconds."),
     row(Kind::MemoryFull, "memory-full", S::SERVICE_UNAVAILABLE, true, "Too much is held in memory",
         "Uploads and meshes that clients have not taken yet use the memory that is set aside for them (`limit` bytes). Try again after `Retry-After` seconds."),
     row(Kind::StoreFull, "store-full", S::SERVICE_UNAVAILABLE, true, "The store is full",
@@ -179,25 +179,25 @@ pub(super) const KINDS: &[Row] = &[
     row(Kind::StoreFailed, "store-failed", S::SERVICE_UNAVAILABLE, false, "The store does not answer",
         "What must be kept cannot be kept, or what is kept cannot be read. The log says more. Try again after `Retry-After` seconds."),
     row(Kind::TooManyDeliveries, "too-many-deliveries", S::SERVICE_UNAVAILABLE, true, "Too many meshes are being delivered",
-        "`limit` requests for meshes are in the house, most of them with clients that take their meshes slowly. Try again after `Retry-After` seconds."),
+        "`limit` requests for meshes are being processed, most of them for clients that read slowly. Try again after `Retry-After` seconds."),
     row(Kind::ShuttingDown, "shutting-down", S::SERVICE_UNAVAILABLE, false, "The service is shutting down",
         "The job was not done before the service stopped. Try again: another instance, or this one after its restart, will do it."),
     row(Kind::TooManyConnections, "too-many-connections", S::SERVICE_UNAVAILABLE, true, "Too many connections",
         "The server holds as many connections as it may. Try again after `Retry-After` seconds."),
     row(Kind::Deadline, "deadline", S::GATEWAY_TIMEOUT, true, "The deadline passed",
-        "The mesh was not done within `limit` milliseconds, the time in the queue included. A coarser resolution is faster: the work grows with the cube of its inverse."),
+        "The mesh was not finished within `limit` milliseconds, time in the queue included. Send `Prefer: respond-async` to get a job, which has more time, or use a coarser resolution: the work grows with the cube of its inverse."),
 ];
 
 impl Kind {
-    /// The kind's row.
+    /// Returns the row of the kind.
     pub(super) fn row(self) -> &'static Row {
         match KINDS.iter().find(|row| row.kind == self) {
             Some(row) => row,
-            None => unreachable!("every kind has a row: a test says so"),
+            None => unreachable!("every kind has a row, which a test checks"),
         }
     }
 
-    /// The kind of an answer that a library gave, by its status.
+    /// Returns the kind of a library's error response by its status.
     pub(super) fn of_status(status: StatusCode) -> Self {
         match status {
             S::NOT_FOUND => Self::NotFound,

@@ -1,4 +1,4 @@
-//! `/metrics`, on a listener of its own.
+//! `/metrics`, on a separate listener.
 
 use axum::Router;
 use axum::http::header::CONTENT_TYPE;
@@ -9,12 +9,12 @@ use axum::routing::get;
 use super::problem::{self, Problem};
 use crate::telemetry::Recorder;
 
-/// The metrics' router.
+/// Builds the router of the metrics listener.
 pub(super) fn router(recorder: Recorder) -> Router {
     let show = move || {
         let recorder = recorder.clone();
         async move {
-            // Looking at the process reads files.
+            // Process metrics are read from files.
             tokio::task::spawn_blocking(move || recorder.render()).await.map(answer).map_err(Problem::internal)
         }
     };

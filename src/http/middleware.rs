@@ -1,14 +1,14 @@
-//! What every request goes through, outermost first. This file is the documented order:
+//! Middleware of every request, outermost first:
 //!
-//! 1. **request id**: everything below can name the request;
-//! 2. **observe**: the place in the trace, the span, one log line, metrics, `Server-Timing`; it sees the final status;
+//! 1. **request id**, which everything below uses;
+//! 2. **observe**: trace context, span, log line, metrics, `Server-Timing`; sees the final status;
 //! 3. **problems**: errors of everything below become `application/problem+json`;
-//! 4. **browsers**: what they must not do with an answer, also with problems that a layer below made;
-//! 5. **CORS**: answers preflights; errors below carry its headers, so that scripts can read them;
-//! 6. **panics**: a panic of a handler is a 500, and the connection lives on;
-//! 7. **guard**: keys, signed addresses, quotas; nothing below sees a key or a signature;
-//! 8. **timeout**: a backstop above the body's timeout and the job's deadline, which are the ones that are met;
-//! 9. the router. Limits of bodies, queue and memory are where the resource is used.
+//! 4. **browsers**: security headers, also on problems of the layers below;
+//! 5. **CORS**: answers preflights and adds headers, also to errors of the layers below;
+//! 6. **panics**: a panic of a handler becomes a 500, and the connection stays open;
+//! 7. **guard**: keys, signed addresses, quotas; removes keys and signatures from the request;
+//! 8. **timeout**: a backstop above the body timeout and the job deadline;
+//! 9. the router. Limits of bodies, queue and memory apply where the resource is used.
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ use super::state::Shared;
 use super::{browsers, guard, observe, request_id};
 use crate::telemetry::PANICS;
 
-/// Puts the layers around `router`.
+/// Adds the layers to `router`.
 pub(super) fn apply(router: Router, timeout: Duration, app: &Shared) -> Router {
     router.layer(
         ServiceBuilder::new()

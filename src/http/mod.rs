@@ -1,55 +1,85 @@
-//! The HTTP service: requests to jobs, jobs to answers. axum, hyper and tower live here and nowhere else.
+//! The HTTP service. axum, hyper and tower are used here and nowhere else.
 //!
-//! [`router`](self) is the table of contents, `middleware` the order of what every request goes through, `kinds` the
-//! only table of status codes. One file per resource. Nothing here computes a mesh or blocks the runtime: work goes
-//! to [`crate::jobs`], files are read on threads that may block.
+//! Nothing here computes a mesh or blocks the runtime: work goes to [`crate::jobs`], files are parsed on blocking
+//! threads. A file uses only files of earlier groups in the list below; `tests/architecture.rs` checks this order.
 
-mod accept;
-mod ask;
-mod atoms;
-mod browsers;
-mod capabilities;
+// Protocol rules that use no other file.
 mod conditional;
-mod declared;
+mod kinds;
+mod pace;
+mod probe;
+mod range;
+mod request_id;
+mod scopes;
+mod socket;
+mod stop;
+mod timing;
+
+// Problems, and what can be checked without the state of the service.
+mod problem;
+
+mod content_type;
+mod embedded;
+mod errors;
+mod json_body;
+mod limit;
+mod negotiate;
+
+// State of the service, and the identity of clients.
+mod state;
+
+mod guard;
+
+// Requests: preferences, bodies, structures, parameters.
+mod form;
+mod preferences;
+mod source;
+
+mod upload;
+
+mod parsed_request;
+
+// Responses.
+mod stream;
+
 mod delivery;
+
+// Resources. `openapi` holds the parts of their description that they share.
+mod openapi;
+
+mod jobs;
+mod results;
+
+mod mesh_request;
+
+mod atoms;
 mod docs;
-mod document;
 mod estimate;
 mod events;
-mod form;
-mod guard;
 mod health;
-mod io;
-mod jobs;
-mod kinds;
 mod meshes;
 mod metrics;
-mod middleware;
-mod negotiate;
-mod observe;
-mod openapi;
-mod pace;
-mod packed;
 mod page;
 mod pdb;
-mod probe;
-mod problem;
 mod problems;
-mod range;
-mod renew;
-mod request_id;
-mod results;
-mod router;
-mod scopes;
-mod server;
-mod state;
-mod stop;
-mod stream;
 mod structures;
-mod timing;
-mod unfit;
-mod upload;
-mod wish;
+
+mod capabilities;
+
+mod api_document;
+
+// The service: middleware, routes, connections.
+mod accept;
+mod key_reload;
+mod observe;
+
+mod browsers;
+
+mod middleware;
+
+mod router;
+
+mod server;
 
 pub use page::has_viewer;
 pub use server::{Chosen, ServeError, Server};

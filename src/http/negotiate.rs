@@ -1,4 +1,4 @@
-//! `Accept` to a mesh format, after RFC 9110: the most specific range that matches a media type gives its weight.
+//! Mesh format from `Accept` (RFC 9110): the most specific matching range determines the weight of a media type.
 
 use axum::http::HeaderMap;
 use axum::http::header::ACCEPT;
@@ -7,17 +7,17 @@ use super::kinds::Kind;
 use super::problem::Problem;
 use crate::formats::Format;
 
-/// The format that `Accept` prefers; ties go to the range that stands first, then to the order of [`Format::ALL`].
+/// Returns the preferred format; ties go to the first range, then to the order of [`Format::ALL`].
 pub(super) fn format(headers: &HeaderMap) -> Result<Format, Problem> {
     let values: Vec<&str> = headers.get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok()).collect();
     choose(&values.join(",")).ok_or_else(|| {
         let available: Vec<&str> = Format::ALL.iter().map(|format| format.media_type()).collect();
-        Problem::new(Kind::NotAcceptable, format!("a mesh can be had as {}", available.join(", ")))
+        Problem::new(Kind::NotAcceptable, format!("the available formats are {}", available.join(", ")))
             .with("available", available)
     })
 }
 
-/// A media range with its weight and its place.
+/// Media range with its weight and its position in the header.
 struct Range<'a> {
     kind: &'a str,
     subtype: &'a str,
@@ -26,7 +26,7 @@ struct Range<'a> {
 }
 
 impl Range<'_> {
-    /// 0: no match; higher is more specific.
+    /// Returns 0 without a match; higher is more specific.
     fn specificity(&self, media_type: &str) -> u8 {
         let (kind, subtype) = media_type.split_once('/').unwrap_or_default();
         match (self.kind, self.subtype) {
@@ -48,11 +48,11 @@ fn choose(accept: &str) -> Option<Format> {
         let range = matching.max_by_key(|r| (r.specificity(format.media_type()), usize::MAX - r.place))?;
         (range.weight > 0.0).then_some((range.weight, usize::MAX - range.place, format))
     });
-    // `max_by_key` takes the last of equals; the formats' order wants the first.
+    // `max_by` returns the last of equal elements; the first one is wanted.
     best.rev().max_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).map(|(_, _, format)| format)
 }
 
-/// One member of the list; malformed ones are ignored.
+/// Parses one member of the list; malformed ones are ignored.
 fn range(place: usize, text: &str) -> Option<Range<'_>> {
     let mut parts = text.split(';').map(str::trim);
     let (kind, subtype) = parts.next()?.split_once('/')?;

@@ -1,4 +1,4 @@
-//! The span of a request, its place in a trace, its log line and its metrics, which end with the last byte of the answer.
+//! Span, log line and metrics of a request, which end with the last byte of the response.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -23,12 +23,12 @@ use crate::telemetry::{
     read_trace_context, traceparent,
 };
 
-/// Header for the position in a trace, of requests and responses.
+/// `traceparent` (W3C Trace Context), of requests and responses.
 pub(super) const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
-/// Vendor data of the trace, of requests alone.
+/// `tracestate` (W3C Trace Context), of requests; passed on to the archive.
 const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
-/// Watches one request.
+/// Middleware: observes one request.
 pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next: Next) -> Response {
     let start = Instant::now();
     let id = request.extensions().get::<RequestId>().cloned().unwrap_or_default();
@@ -46,7 +46,7 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         let name = route.as_ref().map_or_else(|| method.to_owned(), |route| format!("{method} {}", route.as_str()));
         TraceSpan::start(&parent, name, SpanKind::Server, start)
     };
-    // The query stays out: a signature may stand in it. The guard adds whose key it is.
+    // Without the query, which may hold a signature. The guard adds the id of the key.
     let path = request.uri().path();
     let span = tracing::info_span!(
         "request",
@@ -74,32 +74,32 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
     let request = request.map(|body| Body::new(Received { body, bytes: received }));
     let place = HeaderValue::from_str(&traceparent(&trace.context()));
     let mut response = trace.run(next.run(request)).instrument(span).await;
-    timing::tell(&mut response, start.elapsed());
+    timing::write_header(&mut response, start.elapsed());
     if let Ok(place) = place {
         response.headers_mut().insert(TRACEPARENT, place);
     }
     log.status = Some(response.status().as_u16());
     response.map(|body| {
-        // Nobody polls a body that is empty, or the answer to HEAD.
+        // An empty body and the answer to HEAD are not polled.
         log.complete = body.is_end_stream() || log.method == Method::HEAD;
         Body::new(Observed { body, log })
     })
 }
 
-/// What is said about a request once it is over, however it ends.
+/// Facts about a request, recorded when it is dropped.
 struct Log {
     start: Instant,
     method: Method,
     route: Option<MatchedPath>,
-    /// Of a request whose span is recorded.
+    /// Path of a request whose span is recorded; otherwise empty.
     path: String,
-    /// None if the client left before there was an answer.
+    /// `None` if the client left before the response.
     status: Option<u16>,
     span: tracing::Span,
     trace: TraceSpan,
-    /// Bytes of the request's body.
+    /// Size of the request body, bytes.
     received: Arc<AtomicU64>,
-    /// Bytes of the answer's.
+    /// Size of the response body, bytes.
     bytes: usize,
     complete: bool,
 }
@@ -125,7 +125,7 @@ impl Drop for Log {
             if let Some(status) = status {
                 tracing::info!(status, ms, bytes, complete, "answered");
             } else {
-                tracing::info!(ms, "the client left before it was answered");
+                tracing::info!(ms, "the client left before the response");
             }
         });
         if self.trace.is_recording() {
@@ -158,7 +158,7 @@ impl Log {
     }
 }
 
-/// A method as a label: clients can make up any number of others.
+/// Returns a method as a label. Unknown methods share one, since clients can invent any number.
 fn known(method: &Method) -> &'static str {
     match method.as_str() {
         "GET" => "GET",
@@ -172,7 +172,7 @@ fn known(method: &Method) -> &'static str {
     }
 }
 
-/// A request's body that is counted.
+/// Request body that counts its bytes.
 struct Received {
     body: Body,
     bytes: Arc<AtomicU64>,
@@ -199,7 +199,7 @@ impl HttpBody for Received {
     }
 }
 
-/// An answer's body that is counted.
+/// Response body that counts its bytes.
 struct Observed {
     body: Body,
     log: Log,

@@ -1,8 +1,8 @@
-//! Minimum pace of response bodies: a client that takes too little of a body for too long is cut off.
+//! Minimum pace of response bodies: a client that reads too slowly for too long is disconnected.
 //!
-//! hyper polls a body ahead of the client and does not poll it again while the client takes nothing, so a body cannot
-//! watch itself. Instead [`Paced`] counts each slice until hyper has written it and dropped it, and the task that runs
-//! the exchange also waits for [`Pace::stalled`]: for HTTP/1.1 the connection, for HTTP/2 the stream's own task
+//! hyper polls a body ahead of the client and not again while the client reads nothing, so a body cannot measure its
+//! own pace. Instead, [`Paced`] counts each slice until hyper has written and dropped it, and the task that runs the
+//! exchange also waits for [`Pace::stalled`]: the connection for HTTP/1.1, the task of the stream for HTTP/2
 //! ([`Streams`]).
 
 use std::future::Future;
@@ -24,33 +24,33 @@ use tokio::time::Instant;
 use crate::config::ServerConfig;
 use crate::telemetry::{BODIES_OPEN, REJECTED};
 
-/// Bytes of a slice over HTTP/1.1: at 8 KiB/s one is taken in eight seconds.
+/// Size of a slice over HTTP/1.1, bytes: eight seconds at 8 KiB/s.
 const SLICE: usize = 64 << 10;
-/// Bytes of a slice over HTTP/2: a frame, so that the progress of many bodies on one line is seen.
+/// Size of a slice over HTTP/2, bytes: one frame, so that the progress of many concurrent bodies is visible.
 const STREAM_SLICE: usize = 16 << 10;
-/// Bytes of a body that is sent without being watched: too few to hold resources with.
+/// Size up to which a body is not watched, bytes.
 const SMALL: u64 = 1 << 10;
 
 tokio::task_local! {
-    /// The pace of the HTTP/2 stream that this task serves.
+    /// Pace of the HTTP/2 stream that this task serves.
     static STREAM: Arc<Pace>;
 }
 
-/// Bytes that a client must take within a time.
+/// Number of bytes that a client must read within a time.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rate {
     bytes: u64,
     within: Duration,
 }
 
-/// Bytes that let a client pause for one second longer.
+/// Number of bytes for which a client may pause one second longer.
 const BYTES_PER_SECOND: u64 = 16 << 10;
-/// Longest time between two signs of progress, as a multiple of the rate's time.
+/// Maximum time without progress, as a multiple of the rate's time.
 pub(super) const MAX_PATIENCE: u32 = 4;
 
 impl Rate {
-    /// Time for the next bytes of a client that has taken `total` bytes. A client that reads slowly over a fast line takes
-    /// what its system buffers, then nothing until a part of these megabytes is read.
+    /// Returns the time for the next bytes of a client that has read `total` bytes. A slow client on a fast line fills
+    /// the buffers of its system first, then pauses until it has read a part of these megabytes.
     fn patience(&self, total: u64) -> Duration {
         let more = Duration::from_secs(total / BYTES_PER_SECOND);
         self.within.saturating_add(more).min(MAX_PATIENCE * self.within)
@@ -61,7 +61,7 @@ impl Rate {
     }
 }
 
-/// The pace at which one client takes one body after another.
+/// Pace at which one client reads its bodies.
 #[derive(Debug)]
 pub(super) struct Pace {
     rate: Rate,
@@ -70,14 +70,14 @@ pub(super) struct Pace {
 
 #[derive(Debug)]
 struct State {
-    /// Bytes that hyper has and the client has not taken.
+    /// Bytes that hyper holds and the client has not read.
     offered: u64,
-    /// Bytes taken since `since`, fewer than the rate asks for.
+    /// Bytes read since `since`, fewer than the rate requires.
     taken: u64,
     since: Instant,
-    /// Bytes taken in all.
+    /// Bytes read in all.
     total: u64,
-    /// Waits until everything is taken.
+    /// Task that waits until everything is read.
     waker: Option<Waker>,
 }
 
@@ -91,7 +91,7 @@ impl Pace {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Counts a slice until the last reference to it is dropped.
+    /// Counts a slice until its last reference is dropped.
     fn offer(self: &Arc<Self>, bytes: Bytes) -> Bytes {
         let mut state = self.state();
         if state.offered == 0 {
@@ -126,18 +126,18 @@ impl Pace {
         Poll::Pending
     }
 
-    /// Waits until everything that was offered is taken.
+    /// Waits until everything that was offered is read.
     async fn taken(&self) {
         std::future::poll_fn(|cx| self.poll_taken(cx)).await;
     }
 
-    /// Waits until the client has been slower than the rate for the rate's whole time.
+    /// Waits until the client was too slow for the whole time of the rate.
     pub(super) async fn stalled(&self) {
         loop {
             let now = Instant::now();
             let due = {
                 let state = self.state();
-                // Bytes offered later are due later.
+                // Without outstanding bytes the time starts now.
                 let since = if state.offered == 0 { now } else { state.since };
                 since + self.rate.patience(state.total)
             };
@@ -148,8 +148,8 @@ impl Pace {
         }
     }
 
-    /// Watches the body of an answer: at the pace of its stream for HTTP/2, else at `connection`'s. Event streams are
-    /// as slow as their events, and hold no more than one.
+    /// Watches the body of a response, with the pace of its HTTP/2 stream or else of `connection`. Event streams are
+    /// exempt: they are as slow as their events and hold only one.
     pub(super) fn watch(answer: Response<Body>, connection: &Arc<Self>, version: Version) -> Response<Body> {
         let is_small = answer.body().size_hint().upper().is_some_and(|bytes| bytes <= SMALL);
         let is_events =
@@ -164,13 +164,13 @@ impl Pace {
     }
 }
 
-/// Counts a body that was cut off.
+/// Counts and logs a disconnected client.
 pub(super) fn cut_off() {
     counter!(REJECTED, "reason" => "write-timeout").increment(1);
-    tracing::debug!("a client took too little of a body");
+    tracing::debug!("a client read a body too slowly");
 }
 
-/// Bytes on their way to the client.
+/// Slice of a body that is being sent.
 struct Slice {
     bytes: Bytes,
     pace: Arc<Pace>,
@@ -188,7 +188,7 @@ impl Drop for Slice {
     }
 }
 
-/// Counts an open body while it lives.
+/// Counts an open body until it is dropped.
 struct Open;
 
 impl Open {
@@ -204,15 +204,15 @@ impl Drop for Open {
     }
 }
 
-/// A body in slices that are counted until they are sent.
+/// Body in slices that are counted until they are sent.
 struct Paced {
     body: Body,
-    /// The rest of the current frame.
+    /// Rest of the current frame.
     rest: Bytes,
-    /// The body has nothing more.
+    /// The inner body has ended.
     ended: bool,
-    /// Holds the end back until everything is taken: hyper ends an HTTP/2 stream's task with the body, and the rest of
-    /// the buffer could not be freed after that.
+    /// Delays the end until everything is read: hyper ends the task of an HTTP/2 stream with its body, and the rest of
+    /// the buffer could not be freed afterwards.
     stays: bool,
     pace: Arc<Pace>,
     _open: Open,
@@ -261,8 +261,8 @@ impl HttpBody for Paced {
     }
 }
 
-/// Runs the streams of an HTTP/2 connection, each until its client is too slow. A stream that is cut off is reset, and
-/// its buffers are freed; if the reset is not sent either, `broken` is notified.
+/// Executor for the streams of an HTTP/2 connection, which ends a stream if its client is too slow. Such a stream is
+/// reset and its buffers are freed; if the reset cannot be sent either, `broken` is notified.
 #[derive(Clone)]
 pub(super) struct Streams {
     rate: Rate,

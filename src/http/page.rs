@@ -1,5 +1,5 @@
-//! `/`: the viewer, if it was there when this was built, and `<molmesh-viewer>` for other pages. All is embedded: nothing is
-//! loaded from elsewhere.
+//! `/`: the embedded viewer, if the program was built with it, and `<molmesh-viewer>` for other pages. Nothing is
+//! loaded from other servers.
 
 use axum::extract::Path;
 use axum::extract::rejection::PathRejection;
@@ -7,30 +7,29 @@ use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, R
 use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
+use super::embedded;
 use super::kinds::Kind;
 use super::openapi::parameters::AssetPath;
 use super::openapi::refusals;
-use super::packed;
 use super::problem::Problem;
 
-/// Only our own files run, only our own resources are asked. WebAssembly is allowed, evaluating text is not: the decoder of
-/// meshes that are compressed with meshopt is a module of it, and no other part of the page. Pictures may be blobs, since an
-/// image's own address could not carry a key.
+/// Content security policy of the page: scripts and requests of this server only. WebAssembly is allowed for the
+/// meshopt decoder, `eval` is not. Images may be blobs, since the address of an image cannot carry a key.
 const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; \
                       img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
                       frame-ancestors 'none'";
 
-// `static FILES`: the paths of what lay in `web/dist`, and the bytes, packed with gzip; nothing, if nothing did.
+// `static FILES`: paths below `web/dist` with their contents, compressed with gzip; empty if the page was not built.
 include!(concat!(env!("OUT_DIR"), "/page.rs"));
 
-/// Instead of the viewer.
+/// Page of a server without the viewer.
 const NONE: &str = include_str!("../../web/none.html");
 const ICON: &str = include_str!("../../web/public/assets/icon.svg");
-/// Instead of the component: whoever embeds it finds out why nothing is shown.
+/// Script of a server without the component; explains why nothing is shown.
 const NO_COMPONENT: &str =
     "console.error(\"This server was built without its viewer, and has no <molmesh-viewer> to give.\");\n";
 
-/// Whether the viewer was there when this was built.
+/// Returns true if the program was built with the viewer.
 #[must_use]
 pub fn has_viewer() -> bool {
     found("index.html").is_some()
@@ -57,21 +56,21 @@ fn headers(path: &str) -> [(HeaderName, &'static str); 4] {
     ]
 }
 
-/// Whether a name ends in a hash of eight characters before its extension: `index-Dx3k_9aZ.js`.
+/// Returns true if a name ends in a hash of eight characters before its extension: `index-Dx3k_9aZ.js`.
 fn is_named_by_contents(path: &str) -> bool {
     let stem = path.rsplit_once('.').map_or(path, |(stem, _)| stem).as_bytes();
     path.starts_with("assets/") && stem.len() > 16 && stem[stem.len() - 9] == b'-'
 }
 
-/// A file of the page, or what stands in for it.
+/// Answers with a file of the page, or with `instead`.
 fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Response, Problem> {
     match found(path) {
-        Some(bytes) => Ok((headers(path), packed::file(request, bytes)?).into_response()),
+        Some(bytes) => Ok((headers(path), embedded::file(request, bytes)?).into_response()),
         None => Ok((headers(path), instead).into_response()),
     }
 }
 
-/// The page.
+/// Serves the viewer.
 #[utoipa::path(get, path = "/", tag = "page", operation_id = "page",
     responses((status = 200, description = "The viewer, or how to get it.", body = String,
         content_type = "text/html; charset=utf-8")))]
@@ -79,9 +78,9 @@ pub(super) async fn index(request: HeaderMap) -> Result<Response, Problem> {
     answer(&request, "index.html", NONE)
 }
 
-/// `<molmesh-viewer>`, for pages elsewhere.
+/// Serves the script of `<molmesh-viewer>` for other pages.
 ///
-/// A module that defines the element; what it needs it loads from beside itself.
+/// A module that defines the element and loads its parts from this server.
 #[utoipa::path(get, path = "/molmesh-viewer.js", tag = "page", operation_id = "component",
     responses((status = 200, description = "A script.", body = String,
         content_type = "text/javascript; charset=utf-8")))]
@@ -91,7 +90,7 @@ pub(super) async fn component(request: HeaderMap) -> Result<Response, Problem> {
 
 refusals!(AssetRefusals: [[Kind::BadRequest, Kind::NotFound]]);
 
-/// What the page consists of.
+/// Serves the files of the page.
 #[utoipa::path(get, path = "/assets/{file}", tag = "page", operation_id = "asset", params(AssetPath),
     responses(
         (status = 200, description = "A script, a style, a picture or a text.", content(
@@ -105,12 +104,12 @@ pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: He
     let path = format!("assets/{file}");
     if found(&path).is_none() && file != "icon.svg" {
         let shown: String = file.chars().take(80).collect();
-        return Err(Problem::new(Kind::NotFound, format!("the page has no `{shown}`; reload it")));
+        return Err(Problem::new(Kind::NotFound, format!("the page has no file `{shown}`; reload the page")));
     }
     answer(&request, &path, ICON)
 }
 
-/// A structure to try.
+/// Serves a sample structure.
 #[utoipa::path(get, path = "/sample.pdb", tag = "page", operation_id = "sample",
     responses((status = 200, description = "A structure to try.", body = String,
         content_type = "chemical/x-pdb")))]

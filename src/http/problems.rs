@@ -1,4 +1,4 @@
-//! `/problems/{slug}`: what the `type` of a problem means, in words.
+//! `/problems/{slug}`: explanations of problem types.
 
 use axum::Json;
 use axum::extract::Path;
@@ -11,17 +11,17 @@ use super::kinds::{KINDS, Kind, Row};
 use super::openapi::refusals;
 use super::problem::Problem;
 
-/// What a `type` of problems means.
+/// Explanation of a problem type.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ProblemType {
-    /// The problems' `type`, and the address of this document.
+    /// `type` of such problems, which is the address of this document.
     r#type: String,
-    /// The status that goes with it.
+    /// HTTP status.
     #[schema(minimum = 400, maximum = 599)]
     status: u16,
-    /// The problem in a few words.
+    /// Short description.
     title: &'static str,
-    /// What it means and what to do.
+    /// Meaning of the problem, and what the client can do.
     about: &'static str,
 }
 
@@ -36,14 +36,14 @@ fn describe(row: &Row) -> ProblemType {
 
 refusals!(OneRefusals: [[Kind::BadRequest, Kind::NotFound]]);
 
-/// Every type of problem.
+/// Lists all problem types.
 #[utoipa::path(get, path = "/problems", tag = "service", operation_id = "listProblems",
     responses((status = 200, description = "All types.", body = Vec<ProblemType>)))]
 pub(super) async fn list() -> Response {
     Json(KINDS.iter().map(describe).collect::<Vec<_>>()).into_response()
 }
 
-/// One type of problem.
+/// Explains one problem type.
 #[utoipa::path(get, path = "/problems/{slug}", tag = "service", operation_id = "showProblem",
     params(("slug" = String, Path, description = "Last segment of a problem's `type`.", example = "grid-too-large")),
     responses((status = 200, description = "What it means.", body = ProblemType), OneRefusals))]
@@ -51,5 +51,5 @@ pub(super) async fn one(path: Result<Path<String>, PathRejection>) -> Result<Res
     let Path(slug) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let row = KINDS.iter().find(|row| row.slug == slug);
     row.map(|row| Json(describe(row)).into_response())
-        .ok_or_else(|| Problem::new(Kind::NotFound, "no problem has this name; /problems lists all"))
+        .ok_or_else(|| Problem::new(Kind::NotFound, "there is no problem type with this name; /problems lists all"))
 }

@@ -1,24 +1,25 @@
-//! `Range` and `If-Range`, after RFC 9110: one range of bytes. Of several the whole is sent, as the standard allows.
+//! `Range` and `If-Range` (RFC 9110): one range of bytes. A request for several ranges gets the whole file, as the RFC
+//! allows.
 
 use std::ops::Range;
 
 use axum::http::header::{IF_RANGE, RANGE};
 use axum::http::{HeaderMap, HeaderValue};
 
-/// What part of a file is asked for.
+/// Requested part of a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Wanted {
     All,
-    /// Not empty, within the file.
+    /// Non-empty range within the file.
     Part(Range<u64>),
-    /// Nothing of the file.
+    /// Range outside the file.
     Nothing,
 }
 
-/// What part of a file of `length` bytes with the strong validator `etag` is asked for.
+/// Returns the requested part of a file of `length` bytes with the strong validator `etag`.
 pub(super) fn wanted(headers: &HeaderMap, etag: &HeaderValue, length: u64) -> Wanted {
     let Some(text) = headers.get(RANGE).and_then(|value| value.to_str().ok()) else { return Wanted::All };
-    // Another version's parts are of no use; dates are no strong validators here.
+    // A range of another version is useless. Dates are not supported as validators.
     if headers.get(IF_RANGE).is_some_and(|tag| tag != etag) {
         return Wanted::All;
     }

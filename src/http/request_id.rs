@@ -1,4 +1,4 @@
-//! The id of a request: the client's own if it sent a sane one, else a random one.
+//! Request ids: the client's own if it is valid, else a random one.
 
 use std::collections::hash_map::RandomState;
 use std::hash::BuildHasher as _;
@@ -10,23 +10,23 @@ use axum::http::{HeaderName, HeaderValue};
 use axum::middleware::Next;
 use axum::response::Response;
 
-/// The header, in and out.
+/// `X-Request-Id`, of requests and responses.
 pub(super) const HEADER: HeaderName = HeaderName::from_static("x-request-id");
-/// Longest id that is taken from a client; it goes into every log line.
+/// Maximum length of a client's id, which is part of every log line.
 const MAX_LEN: usize = 64;
 
-/// A request's id: visible ASCII.
+/// Id of a request: visible ASCII.
 #[derive(Debug, Clone)]
 pub(super) struct RequestId(HeaderValue);
 
 impl RequestId {
-    /// The id as text.
+    /// Returns the id as text.
     pub(super) fn as_str(&self) -> &str {
         self.0.to_str().unwrap_or_default()
     }
 
     fn random() -> Self {
-        // The standard library's hash keys are random, which is all that an id needs.
+        // The random hash keys of the standard library suffice for an id.
         static KEYS: LazyLock<[RandomState; 2]> = LazyLock::new(Default::default);
         static NEXT: AtomicU64 = AtomicU64::new(0);
         let n = NEXT.fetch_add(1, Ordering::Relaxed);
@@ -41,14 +41,14 @@ impl Default for RequestId {
     }
 }
 
-fn is_sane(id: &HeaderValue) -> bool {
+fn is_valid(id: &HeaderValue) -> bool {
     let allowed = |b: &u8| b.is_ascii_alphanumeric() || b"-_.".contains(b);
     (1..=MAX_LEN).contains(&id.len()) && id.as_bytes().iter().all(allowed)
 }
 
-/// Gives the request its id and the answer its header.
+/// Middleware: assigns the id and adds it to the response.
 pub(super) async fn assign(mut request: Request, next: Next) -> Response {
-    let sent = request.headers().get(&HEADER).filter(|id| is_sane(id)).cloned();
+    let sent = request.headers().get(&HEADER).filter(|id| is_valid(id)).cloned();
     let id = sent.map_or_else(RequestId::random, RequestId);
     request.extensions_mut().insert(id.clone());
     let mut response = next.run(request).await;

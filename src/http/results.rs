@@ -1,4 +1,4 @@
-//! `GET /v1/results/{key}.{ext}` and `…/{key}/report.json`: what was made once, byte for byte, for ever.
+//! `GET /v1/results/{key}.{ext}` and `…/{key}/report.json`: stored results, byte for byte.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -13,7 +13,6 @@ use axum::response::{IntoResponse, Response};
 use futures_util::TryStreamExt as _;
 use metrics::counter;
 use serde_json::Value;
-use tokio::sync::OwnedSemaphorePermit;
 use tracing::Instrument as _;
 
 use super::kinds::Kind;
@@ -30,12 +29,12 @@ use crate::jobs::{self, ContentKey, Finished, REPORT};
 use crate::pipeline::Report;
 use crate::telemetry::{RESULTS_NOT_KEPT, SpanKind, SpanParent, TraceSpan};
 
-/// The name says what the bytes are: they never change.
+/// Caching of results, whose bytes follow from their key.
 pub(super) const IMMUTABLE: HeaderValue = HeaderValue::from_static("public, max-age=31536000, immutable");
-/// Patience with a result that is being kept at this moment.
-const KEEPING: Duration = Duration::from_secs(20);
+/// Maximum wait for a result that is being stored.
+const MAX_SAVE_WAIT: Duration = Duration::from_secs(20);
 
-/// Where a result is found.
+/// Returns the address of a result.
 pub(super) fn path(key: &ContentKey, extension: &str) -> String {
     format!("/v1/results/{key}.{extension}")
 }
@@ -45,7 +44,7 @@ refusals!(ShowRefusals: [[
 ]]);
 refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
 
-/// A mesh that was made before.
+/// Returns a stored result.
 #[utoipa::path(
     get,
     path = "/v1/results/{file}",
@@ -61,18 +60,18 @@ pub(super) async fn show(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let Path(file) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let (key, format) = parse(&file).ok_or_else(|| none(&file))?;
+    let (key, format) = parse(&file).ok_or_else(|| no_such_result(&file))?;
     let etag = delivery::etag(&key);
     if conditional::is_unchanged(&headers, &etag) {
         return Ok(
             (StatusCode::NOT_MODIFIED, [(header::ETAG, etag), (header::CACHE_CONTROL, IMMUTABLE)]).into_response()
         );
     }
-    app.kept(&key).await;
-    stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| none(&file))
+    wait_for_save(&app, &key).await;
+    stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))
 }
 
-/// A result's report, of the run that made it.
+/// Returns the report of the run that computed a result.
 #[utoipa::path(get, path = "/v1/results/{key}/report.json", tag = "results", operation_id = "showReport",
     params(ResultPath, Unchanged),
     responses(
@@ -86,10 +85,10 @@ pub(super) async fn report(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let key: ContentKey = text.parse().map_err(|_bad| none(&text))?;
-    app.kept(&key).await;
-    let bytes = app.store.get(&key.name(REPORT)?).await?.ok_or_else(|| none(&text))?.bytes;
-    // Times are those of the run that made it, so a report has a name of its own.
+    let key: ContentKey = text.parse().map_err(|_bad| no_such_result(&text))?;
+    wait_for_save(&app, &key).await;
+    let bytes = app.store.get(&key.name(REPORT)?).await?.ok_or_else(|| no_such_result(&text))?.bytes;
+    // A report holds the times of one run, so its validator is its own digest.
     let etag =
         HeaderValue::from_str(&format!("\"{}\"", crate::store::Digest::of(&bytes))).map_err(Problem::internal)?;
     let caching = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, HeaderValue::from_static("public, no-cache"))];
@@ -99,11 +98,11 @@ pub(super) async fn report(
     Ok((caching, [(header::CONTENT_TYPE, "application/json")], bytes).into_response())
 }
 
-fn none(what: &str) -> Problem {
+fn no_such_result(what: &str) -> Problem {
     let shown: String = what.chars().take(80).collect();
     Problem::new(
         Kind::NotFound,
-        format!("there is no result `{shown}`: results are kept for some time; ask for the mesh again"),
+        format!("there is no result `{shown}`: results are stored for some time; request the mesh again"),
     )
 }
 
@@ -113,13 +112,7 @@ fn parse(file: &str) -> Option<(ContentKey, Format)> {
     Some((key.parse().ok()?, format))
 }
 
-/// What a result's answers have in common.
-#[derive(Debug)]
-pub(super) struct Head {
-    pub(super) headers: HeaderMap,
-}
-
-/// The answer with a result of the store, if it is there: all of it or the part that is asked for.
+/// Returns a stored result, or the requested range of it; `None` if it is not stored.
 pub(super) async fn stored(
     app: &App,
     key: &ContentKey,
@@ -130,8 +123,8 @@ pub(super) async fn stored(
     let name = key.name(format.extension())?;
     app.pool.budget().check()?;
     let Some((meta, mut body)) = app.store.read(&name, None).await? else { return Ok(None) };
-    let Some(head) = head(app, key, format).await? else { return Ok(None) };
-    let mut out = head.headers.clone();
+    let Some(headers_of_result) = result_headers(app, key, format).await? else { return Ok(None) };
+    let mut out = HeaderMap::clone(&headers_of_result);
     let wanted = match range::wanted(headers, &delivery::etag(key), meta.size) {
         Wanted::All => None,
         Wanted::Part(range) => Some(range),
@@ -158,7 +151,7 @@ pub(super) async fn stored(
         let Some((_, part)) = app.store.read(&name, Some(part)).await? else { return Ok(None) };
         body = part;
     }
-    // Pieces of bodies that have begun are held in any case; new bodies wait until there is room.
+    // Pieces of running answers are charged regardless of the limit; new answers are refused while it is exceeded.
     let budget = app.pool.budget().clone();
     let charged = body.map_ok(move |piece| {
         let mut lease = budget.lease();
@@ -168,10 +161,10 @@ pub(super) async fn stored(
     Ok(Some((status, out, Body::from_stream(charged)).into_response()))
 }
 
-/// The headers of a result, from its report.
-async fn head(app: &App, key: &ContentKey, format: Format) -> Result<Option<Arc<Head>>, Problem> {
-    if let Some(head) = app.heads.get(key) {
-        return Ok(Some(head));
+/// Returns the headers of a result, from its report.
+async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<Option<Arc<HeaderMap>>, Problem> {
+    if let Some(headers) = app.result_headers.get(key) {
+        return Ok(Some(headers));
     }
     let Some(report) = app.store.get(&key.name(REPORT)?).await? else { return Ok(None) };
     let report: Value = serde_json::from_slice(&report.bytes).map_err(Problem::internal)?;
@@ -183,85 +176,46 @@ async fn head(app: &App, key: &ContentKey, format: Format) -> Result<Option<Arc<
     headers.insert(header::CACHE_CONTROL, IMMUTABLE);
     headers.insert(header::CONTENT_LOCATION, delivery::text(&path(key, format.extension())));
     headers.insert(SERVER_TIMING, HeaderValue::from_static("cache;desc=hit"));
-    let head = Arc::new(Head { headers });
-    app.heads.insert(*key, Arc::clone(&head));
-    Ok(Some(head))
+    let headers = Arc::new(headers);
+    app.result_headers.insert(*key, Arc::clone(&headers));
+    Ok(Some(headers))
 }
 
-/// Keeps the result of a synchronous request, beside the answer. False if too many are being kept already: then it is made
-/// again when somebody asks for it. What is being kept at this moment is not kept twice.
-pub(super) fn keep_later(app: &Shared, finished: &Arc<Finished>, format: Format, key: &ContentKey) -> bool {
-    let keeping = match app.begin_keeping(key) {
-        Begun::Yes(keeping) => keeping,
-        Begun::Already => return true,
-        Begun::NoPlace => {
-            counter!(RESULTS_NOT_KEPT, "reason" => "busy").increment(1);
-            return false;
-        }
+/// Stores the result of a synchronous request in the background. Returns false if too many results are being stored
+/// already; then the next request computes it again.
+pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format, key: &ContentKey) -> bool {
+    if app.saves.running(key).is_some() {
+        return true;
+    }
+    let Ok(permit) = Arc::clone(&app.save_permits).try_acquire_owned() else {
+        counter!(RESULTS_NOT_KEPT, "reason" => "busy").increment(1);
+        return false;
     };
-    let (app, finished, key) = (Arc::clone(app), Arc::clone(finished), *key);
-    let span = TraceSpan::start(&SpanParent::current(), "keep", SpanKind::Internal, Instant::now());
-    let keep = async move {
-        let limit = app.config.limits.output_bytes;
-        if let Err(error) = jobs::save(&app.store, finished, format, &key, limit).await {
+    let (shared, finished, saved) = (Arc::clone(app), Arc::clone(finished), *key);
+    let span = TraceSpan::start(&SpanParent::current(), "save", SpanKind::Internal, Instant::now());
+    let save = async move {
+        let limit = shared.config.limits.output_bytes;
+        if let Err(error) = jobs::save(&shared.store, finished, format, &saved, limit).await {
             counter!(RESULTS_NOT_KEPT, "reason" => "failed").increment(1);
-            tracing::warn!(%error, "a result cannot be kept");
+            tracing::warn!(%error, "cannot store a result");
         }
         span.end();
-        drop(keeping);
+        drop(permit);
     };
-    tokio::spawn(keep.in_current_span());
+    drop(app.saves.run(key, || save.in_current_span()));
     true
 }
 
-impl App {
-    /// Waits for a result that is being kept.
-    async fn kept(&self, key: &ContentKey) {
-        let waiting = self.keeping.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get(key).cloned();
-        if let Some(mut done) = waiting {
-            // The sender never sends; it is dropped.
-            drop(tokio::time::timeout(KEEPING, done.changed()).await);
-        }
-    }
-
-    /// Waits until no result is being kept. Nothing new may be made by then.
-    pub(super) async fn all_kept(&self) {
-        let places = u32::try_from(self.config.jobs.keepers).unwrap_or(u32::MAX);
-        // It is never closed.
-        drop(self.keepers.acquire_many(places).await);
-    }
-
-    fn begin_keeping(self: &Arc<Self>, key: &ContentKey) -> Begun {
-        let mut kept = self.keeping.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        if kept.contains_key(key) {
-            return Begun::Already;
-        }
-        let Ok(place) = Arc::clone(&self.keepers).try_acquire_owned() else { return Begun::NoPlace };
-        let (done, waiting) = tokio::sync::watch::channel(());
-        kept.insert(*key, waiting);
-        Begun::Yes(Keeping { app: Arc::clone(self), key: *key, place: Some(place), _done: done })
+/// Waits while a result is being stored.
+async fn wait_for_save(app: &App, key: &ContentKey) {
+    if let Some(mut saved) = app.saves.running(key) {
+        drop(tokio::time::timeout(MAX_SAVE_WAIT, saved.recv()).await);
     }
 }
 
-/// Whether a result is kept from now on.
-enum Begun {
-    Yes(Keeping),
-    Already,
-    NoPlace,
-}
-
-/// A result that is being kept, as long as this lives.
-struct Keeping {
-    app: Shared,
-    key: ContentKey,
-    place: Option<OwnedSemaphorePermit>,
-    _done: tokio::sync::watch::Sender<()>,
-}
-
-impl Drop for Keeping {
-    fn drop(&mut self) {
-        // Whoever hears that it is kept finds its place free.
-        drop(self.place.take());
-        self.app.keeping.lock().unwrap_or_else(std::sync::PoisonError::into_inner).remove(&self.key);
-    }
+/// Waits until no result is being stored. No new results may be computed by then.
+pub(super) async fn all_saved(app: &App) {
+    let permits = u32::try_from(app.config.jobs.concurrent_saves).unwrap_or(u32::MAX);
+    // The semaphore is never closed.
+    drop(app.save_permits.acquire_many(permits).await);
 }

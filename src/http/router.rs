@@ -1,4 +1,4 @@
-//! Every resource of the service: the table of contents.
+//! Routes of the service.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,14 +8,14 @@ use axum::routing::{get, post};
 
 use super::state::Shared;
 use super::{
-    atoms, capabilities, docs, estimate, events, health, jobs, meshes, middleware, openapi, page, pdb, problems,
+    api_document, atoms, capabilities, docs, estimate, events, health, jobs, meshes, middleware, page, pdb, problems,
     results, structures,
 };
 
-/// Time beyond the limits that are met in order, before the backstop: reading the archive, writing the head.
+/// Margin of the backstop timeout over the sum of the regular timeouts.
 const MARGIN: Duration = Duration::from_secs(10);
 
-/// The service.
+/// Builds the router with its middleware.
 pub(super) fn router(app: &Shared) -> Router {
     let longest = app.config.jobs.deadline().max(Duration::from_secs(jobs::MAX_WAIT_S));
     let input = app.config.server.body_timeout().max(app.config.archive.timeout());
@@ -30,26 +30,26 @@ pub(super) fn router(app: &Shared) -> Router {
         .route("/v1/structures/{digest}/atoms", get(atoms::of_structure))
         .route("/v1/structures/{digest}/{file}", get(structures::surface))
         .route("/v1/estimate", post(estimate::create))
-        // Jobs and what they have made.
+        // Jobs and results.
         .route("/v1/jobs/{id}", get(jobs::show).delete(jobs::dismiss))
         .route("/v1/jobs/{id}/events", get(events::show))
         .route("/v1/jobs/{id}/result", get(jobs::result))
         .route("/v1/results/{file}", get(results::show))
         .route("/v1/results/{key}/report.json", get(results::report))
-        // About the service.
+        // The service itself.
         .route("/v1/capabilities", get(capabilities::show))
         .route("/problems", get(problems::list))
         .route("/problems/{slug}", get(problems::one))
         .route("/livez", get(health::live))
         .route("/readyz", get(health::ready))
         .route("/version", get(health::version))
-        .route("/openapi.yaml", get(openapi::yaml))
-        .route("/openapi.json", get(openapi::json))
+        .route("/openapi.yaml", get(api_document::yaml))
+        .route("/openapi.json", get(api_document::json))
         .route("/docs", get(docs::index))
         .route("/docs.js", get(docs::start))
         .route("/swagger-ui.css", get(docs::style))
         .route("/swagger-ui-bundle.js", get(docs::bundle))
-        // The page.
+        // The web page.
         .route("/", get(page::index))
         .route("/assets/{file}", get(page::asset))
         .route("/molmesh-viewer.js", get(page::component))

@@ -1,12 +1,11 @@
-//! What each operation needs: the one table of who may do what. The description of the interface is made from it, and a test
-//! compares it with the table of contents.
+//! Scopes that the operations need. The OpenAPI document uses this table, and a test compares it with the router.
 
 use axum::extract::{MatchedPath, Request};
 use axum::http::Method;
 
 use crate::access::Scope;
 
-/// An operation, and the scope that it needs; none: it is open to everybody.
+/// Operation with the scope that it needs; `None`: open to everybody.
 pub(super) struct Row {
     pub(super) method: Method,
     pub(super) path: &'static str,
@@ -39,7 +38,7 @@ pub(super) const TABLE: &[Row] = &[
     row(Method::GET, "/v1/results/{file}", READ),
     row(Method::GET, "/v1/results/{key}/report.json", READ),
     row(Method::GET, "/v1/capabilities", READ),
-    // Explanations, orchestrators, people.
+    // Explanations, probes, pages.
     row(Method::GET, "/problems", OPEN),
     row(Method::GET, "/problems/{slug}", OPEN),
     row(Method::GET, "/livez", OPEN),
@@ -57,14 +56,14 @@ pub(super) const TABLE: &[Row] = &[
     row(Method::GET, "/sample.pdb", OPEN),
 ];
 
-/// The scope that a request needs; none: it is open.
+/// Returns the scope that a request needs; `None`: it is open.
 pub(super) fn needed(request: &Request) -> Option<Scope> {
     let path = request.extensions().get::<MatchedPath>().map(MatchedPath::as_str);
-    // Where there is nothing, there is nothing to be kept from anybody.
+    // A request without a route is answered with 404.
     path.and_then(|path| of(request.method(), path))
 }
 
-/// What is not in the table needs more than most have: a route without a row is closed, not open.
+/// Returns the scope of an operation. A route without a row needs `mesh`, so that it is not open by mistake.
 fn of(method: &Method, path: &str) -> Option<Scope> {
     let method = if *method == Method::HEAD { &Method::GET } else { method };
     let mut rows = TABLE.iter().filter(|row| row.path == path);
@@ -81,7 +80,7 @@ mod tests {
 
     use super::*;
 
-    /// The operations of the table of contents.
+    /// Operations of the router.
     fn routes() -> BTreeSet<String> {
         let lines = include_str!("router.rs").lines().filter_map(|line| line.trim().strip_prefix(".route(\""));
         let operations = lines.flat_map(|line| {

@@ -1,8 +1,8 @@
-//! The server: binds its listeners, warms the backend up, serves until it is told to stop, drains.
+//! The server: binds its listeners, warms up the backend, serves, and shuts down.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use quick_cache::sync::Cache;
@@ -10,43 +10,45 @@ use thiserror::Error;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinHandle;
 
-use super::guard::Bill;
+use super::guard::UsageRecorder;
 use super::probe::Probe;
 use super::problem::Problem;
+use super::source::FetchMemory;
 use super::state::{App, Readiness, Shared, Warm};
 use super::stop::{self, Stop};
-use super::{accept, capabilities, metrics, pdb, renew, router};
+use super::{accept, capabilities, key_reload, metrics, results, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::config::Config;
-use crate::jobs::{Budget, EndError, Ledger, LedgerSettings, Pool, Settings};
+use crate::jobs::{Budget, EndError, JobStore, JobStoreSettings, Pool, Settings};
 use crate::picture::Drawer;
+use crate::single_flight::SingleFlight;
 use crate::store::{FolderLock, LockError, Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, TelemetryError, Traces};
 
-/// How often the recorder tidies up its histograms.
+/// Interval of metrics upkeep.
 const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
 
-/// Between two attempts to list the jobs of earlier processes.
+/// Pause between two attempts to list the jobs of earlier processes.
 const RECOVER_PAUSE: std::time::Duration = std::time::Duration::from_secs(5);
-/// Results whose headers are kept at hand: a kilobyte each.
-const HEADS: usize = 4096;
+/// Number of results whose headers are cached, about 1 KB each.
+const CACHED_HEADERS: usize = 4096;
 
-/// Time for jobs to notice that they were cancelled, and for that to be on record.
+/// Time for cancelled jobs to stop and for their records to be written.
 const CANCELLING: std::time::Duration = std::time::Duration::from_secs(1);
 
-/// Why the server cannot start.
+/// Error of a server that cannot start.
 #[derive(Debug, Error)]
 pub enum ServeError {
     /// An address cannot be listened on.
     #[error("cannot listen on {addr} ({key}): {error}")]
     Listen {
-        /// The key of the configuration that says the address.
+        /// Configuration key of the address.
         key: &'static str,
-        /// The address.
+        /// Address.
         addr: SocketAddr,
-        /// The system's words.
+        /// Error of the operating system.
         error: io::Error,
     },
     /// A worker thread cannot be started.
@@ -58,7 +60,7 @@ pub enum ServeError {
     /// The data folder is in use or cannot be locked.
     #[error(transparent)]
     Lock(#[from] LockError),
-    /// What the service keeps cannot be kept.
+    /// The store cannot be opened.
     #[error(transparent)]
     Store(#[from] StoreError),
     /// Metrics cannot be set up.
@@ -66,19 +68,19 @@ pub enum ServeError {
     Telemetry(#[from] TelemetryError),
 }
 
-/// What the service computes with, and why.
+/// Backend and renderer of the service, with the reasons for their choice.
 pub struct Chosen {
-    /// The backend.
+    /// Backend.
     pub backend: Arc<dyn Backend>,
-    /// Why it was taken.
+    /// Reason for its choice.
     pub reason: String,
-    /// What draws pictures, and why.
+    /// Renderer of pictures.
     pub drawer: Drawer,
-    /// Every device that was found, taken or not.
+    /// Every device that was found, used or not.
     pub devices: Vec<FoundDevice>,
 }
 
-/// A server whose listeners are bound and whose workers run.
+/// A server with bound listeners and running workers.
 pub struct Server {
     app: Shared,
     listener: TcpListener,
@@ -87,7 +89,7 @@ pub struct Server {
     metrics_addr: Option<SocketAddr>,
     stop: watch::Sender<Stop>,
     traces: Traces,
-    /// Held until the service has ended.
+    /// Lock of the data folder.
     data: FolderLock,
 }
 
@@ -114,7 +116,7 @@ impl Server {
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
         let (metrics_listener, metrics_addr) = metrics.unzip();
         let data = FolderLock::acquire(&config.server.data_dir, addr)?;
-        // Before anything is counted; what nobody can read is not.
+        // Before any metric is recorded. Without a listener none is.
         if metrics_listener.is_some() {
             telemetry::recorder()?;
         }
@@ -122,29 +124,29 @@ impl Server {
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
-            patience: config.jobs.patience(),
+            batch_max_delay: config.jobs.batch_max_delay(),
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
             drawer,
-            meter: Some(Arc::new(Bill(Arc::clone(&access)))),
+            meter: Some(Arc::new(UsageRecorder(Arc::clone(&access)))),
             tracer: traces.tracer(),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
-        let promises = LedgerSettings {
+        let settings = JobStoreSettings {
             allowed: config.jobs.batch_deadline(),
             attempts: config.jobs.attempts,
             output_bytes: config.limits.output_bytes,
-            patience: config.jobs.store_patience(),
+            retry_for: config.jobs.store_patience(),
         };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
-        let ledger = Ledger::new(store.clone(), Arc::clone(&pool), promises, secret, describe);
-        let archive = Archive::new(&config, Arc::new(pdb::Fetching(pool.budget().clone())));
+        let job_store = JobStore::new(store.clone(), Arc::clone(&pool), settings, secret, describe);
+        let archive = Archive::new(&config, Arc::new(FetchMemory(pool.budget().clone())));
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();
-        let keepers = Arc::new(Semaphore::new(config.jobs.keepers));
+        let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);
         let app = Arc::new(App {
             config,
@@ -152,10 +154,10 @@ impl Server {
             pool,
             archive,
             store,
-            ledger,
-            heads: Cache::new(HEADS),
-            keepers,
-            keeping: Mutex::default(),
+            job_store,
+            result_headers: Cache::new(CACHED_HEADERS),
+            save_permits,
+            saves: SingleFlight::default(),
             stopping,
             deliveries,
             readiness,
@@ -167,37 +169,36 @@ impl Server {
         Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop, traces, data })
     }
 
-    /// Address of the service.
+    /// Returns the address of the service.
     #[must_use]
     pub fn addr(&self) -> SocketAddr {
         self.addr
     }
 
-    /// Address of `/metrics`, if it is served.
+    /// Returns the address of `/metrics`, if it is served.
     #[must_use]
     pub fn metrics_addr(&self) -> Option<SocketAddr> {
         self.metrics_addr
     }
 
-    /// Serves until `orders` say otherwise, then ends step by step as [`Stop`] says: `server.notice_ms` for
-    /// [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], a second for what is cancelled. Whatever is ordered
-    /// while it drains, once the notice is over by itself or by order, cuts it short. Must run on a tokio
-    /// runtime with timers and several threads. True if every request was finished; promised jobs that were not are left
-    /// for the next start.
+    /// Serves until `orders` requests a stop, then shuts down in the phases of [`Stop`]: `server.termination_notice_ms`
+    /// for [`Stop::Notice`], `server.drain_timeout_ms` for [`Stop::Drain`], one second for cancelled jobs. A further
+    /// order during the drain cuts it short. Must run on a tokio runtime with timers and several threads. Returns true
+    /// if every request was finished; unfinished durable jobs are left for the next process.
     ///
     /// # Errors
     /// [`ServeError`].
     pub async fn run(self, mut orders: watch::Receiver<Stop>) -> Result<bool, ServeError> {
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
-        let renewing = tokio::spawn(renew::keys(Arc::clone(&self.app.access)));
+        let renewing = tokio::spawn(key_reload::run(Arc::clone(&self.app.access)));
         let warming = tokio::task::spawn_blocking({
             let app = Arc::clone(&self.app);
             move || warm_up(&app)
         });
         let recovering = tokio::spawn({
-            let ledger = self.app.ledger.clone();
-            async move { recover(&ledger).await }
+            let jobs = self.app.job_store.clone();
+            async move { recover(&jobs).await }
         });
         let sweeping = tokio::spawn({
             let (store, every) = (self.app.store.clone(), self.app.config.store.sweep());
@@ -225,7 +226,7 @@ impl Server {
             loop {
                 tokio::time::sleep(UPKEEP).await;
                 watched.pool.publish();
-                renew::tell(&watched.access);
+                key_reload::publish_clients(&watched.access);
                 recorder.iter().for_each(telemetry::Recorder::run_upkeep);
             }
         });
@@ -243,7 +244,7 @@ impl Server {
     }
 }
 
-/// Ends the service step by step, as far as `orders` say. True if every request was finished.
+/// Shuts the service down in the phases that `orders` requests. Returns true if every request was finished.
 async fn wind_down(
     app: &Shared,
     stop: &watch::Sender<Stop>,
@@ -251,15 +252,15 @@ async fn wind_down(
     mut serving: JoinHandle<bool>,
 ) -> bool {
     app.readiness.end();
-    let notice = app.config.server.notice();
+    let notice = app.config.server.termination_notice();
     if orders.has_changed().is_ok() && *orders.borrow() == Stop::Notice && !notice.is_zero() {
         stop.send_replace(Stop::Notice);
-        tracing::info!(notice_ms = notice.as_millis(), "not ready any more; everything is served for a while");
+        tracing::info!(notice_ms = notice.as_millis(), "termination notice: not ready, but serving");
         drop(tokio::time::timeout(notice, stop::reached(orders, Stop::Drain)).await);
     }
-    tracing::info!("stopping: what has begun is finished, nothing new is accepted");
+    tracing::info!("draining: finishing requests, accepting no new ones");
     let end = tokio::time::Instant::now() + app.config.server.drain_timeout();
-    // Whatever is ordered from now on is an order more.
+    // Only orders received from here on count as new.
     orders.borrow_and_update();
     app.pool.leave();
     stop.send_replace(Stop::Drain);
@@ -271,7 +272,7 @@ async fn wind_down(
         stop.send_replace(Stop::Now);
     };
     tokio::pin!(cut);
-    // Requests whose bodies are still under way may still submit their jobs; after the last one nothing can.
+    // Requests whose bodies are still arriving may submit jobs; after the last one no job can be submitted.
     let served = tokio::select! {
         served = &mut serving => Some(served),
         () = cut.as_mut() => None,
@@ -280,8 +281,8 @@ async fn wind_down(
         Some(served) => (served.unwrap_or(false), app.pool.drain(cut).await),
         None => (serving.await.unwrap_or(false), app.pool.drain(std::future::ready(())).await),
     };
-    // Endings of promised jobs go on record, and results that are on their way into the store arrive.
-    let ends = async { tokio::join!(app.ledger.settled(), app.all_kept()) };
+    // Records of ended jobs and results that are being stored.
+    let ends = async { tokio::join!(app.job_store.settled(), results::all_saved(app)) };
     let settled = tokio::time::timeout(CANCELLING, ends).await.is_ok();
     tracing::info!(requests, jobs, settled, "stopped");
     requests
@@ -295,22 +296,22 @@ fn tokio_listener(
     tokio::net::TcpListener::from_std(listener).map_err(|error| ServeError::Listen { key, addr, error })
 }
 
-/// Takes up what earlier processes left undone; tries again while the store does not answer.
-async fn recover(ledger: &Ledger) {
+/// Resumes unfinished jobs of earlier processes; retries while the store fails.
+async fn recover(jobs: &JobStore) {
     loop {
-        match ledger.recover().await {
+        match jobs.recover().await {
             Ok(0) => return,
             Ok(jobs) => {
-                tracing::info!(jobs, "jobs of an earlier process were taken up again");
+                tracing::info!(jobs, "resumed jobs of an earlier process");
                 return;
             }
-            Err(error) => tracing::error!(%error, "jobs of earlier processes cannot be listed"),
+            Err(error) => tracing::error!(%error, "cannot list the jobs of earlier processes"),
         }
         tokio::time::sleep(RECOVER_PAUSE).await;
     }
 }
 
-/// Computes a first, tiny mesh on every device, or on the processor where there is none.
+/// Computes a tiny first mesh on every device, or on the CPU without devices.
 fn warm_up(app: &App) {
     let start = Instant::now();
     let backend = Arc::clone(app.pool.backend());

@@ -1,9 +1,9 @@
-//! What the handlers share.
+//! State of the service that the handlers share.
 
-use std::collections::HashMap;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
-use std::sync::{Arc, Mutex};
 
+use axum::http::HeaderMap;
 use bytes::Bytes;
 use quick_cache::sync::Cache;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
@@ -11,82 +11,86 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
 use super::kinds::Kind;
 use super::probe::Probe;
 use super::problem::Problem;
-use super::results::Head;
 use super::stop::Stop;
 use crate::access::Access;
 use crate::archive::Archive;
 use crate::config::Config;
-use crate::jobs::{ContentKey, Failure, Ledger, Pool};
+use crate::jobs::{ContentKey, Failure, JobStore, Pool};
 use crate::pipeline::Job;
+use crate::single_flight::SingleFlight;
 use crate::store::Store;
 use crate::surface::FoundDevice;
 use crate::telemetry::Tracer;
 
-/// State of the service, behind one pointer.
+/// State of the service.
 pub(super) struct App {
     pub(super) config: Config,
     pub(super) access: Arc<Access>,
     pub(super) pool: Arc<Pool>,
     pub(super) archive: Archive,
     pub(super) store: Store,
-    pub(super) ledger: Ledger,
-    /// Headers of results that were asked for lately.
-    pub(super) heads: Cache<ContentKey, Arc<Head>>,
-    /// Places for results that are kept beside their answers: see `jobs.keepers`.
-    pub(super) keepers: Arc<Semaphore>,
-    /// Results that are being kept at this moment; their receivers hang up when it is over.
-    pub(super) keeping: Mutex<HashMap<ContentKey, watch::Receiver<()>>>,
-    /// How far the service's end has come: long answers end with it.
+    pub(super) job_store: JobStore,
+    /// Headers of recently requested results.
+    pub(super) result_headers: Cache<ContentKey, Arc<HeaderMap>>,
+    /// Permits of `jobs.concurrent_saves`.
+    pub(super) save_permits: Arc<Semaphore>,
+    /// Results that are being stored.
+    pub(super) saves: SingleFlight<ContentKey, ()>,
+    /// Phase of the shutdown, which ends long answers.
     pub(super) stopping: watch::Receiver<Stop>,
-    /// Places for requests for meshes: see `jobs.deliveries`.
+    /// Permits of `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
     pub(super) readiness: Readiness,
-    /// Whether the store works.
+    /// Health check of the store.
     pub(super) probe: Probe,
-    /// Where spans go.
+    /// Exporter of spans.
     pub(super) tracer: Tracer,
-    /// The devices that were found when the service started.
+    /// Devices that were found at the start.
     pub(super) found: Vec<FoundDevice>,
-    /// The body of `/v1/capabilities`, which changes only where devices can fail: with devices it is written anew.
+    /// Body of `/v1/capabilities` without devices; with devices, which may fail, it is written for each request.
     pub(super) capabilities: Bytes,
 }
 
 impl App {
-    /// Refuses what can be refused before anything is read.
+    /// Rejects a job that is invalid regardless of its input.
     pub(super) fn accepts(&self, job: &Job) -> Result<(), Problem> {
         let refused = |error| Failure::Job { error, diagnostics: Vec::new() };
         job.check(&self.config.limits.job()).map_err(|error| refused(error).into())
     }
 
-    /// A place for one request for a mesh.
+    /// Takes a permit for one request for a mesh.
     pub(super) fn delivery(&self) -> Result<OwnedSemaphorePermit, Problem> {
         Arc::clone(&self.deliveries).try_acquire_owned().map_err(|_full| {
             let limit = self.config.jobs.deliveries;
-            Problem::new(Kind::TooManyDeliveries, format!("{limit} meshes are being made or sent, which is the limit"))
-                .with("limit", limit)
-                .retry_after(self.pool.estimated_wait())
+            Problem::new(
+                Kind::TooManyDeliveries,
+                format!("{limit} meshes are being computed or sent, which is the limit"),
+            )
+            .with("limit", limit)
+            .retry_after(self.pool.estimated_wait())
         })
     }
 }
 
-/// What handlers extract.
+/// State as handlers extract it.
 pub(super) type Shared = Arc<App>;
 
-/// Whether requests should come here, as far as the process itself knows.
+/// Readiness of the process, for `/readyz`.
 #[derive(Debug, Default)]
 pub(super) struct Readiness {
     warm: AtomicU8,
     ending: AtomicBool,
 }
 
-/// How the first mesh went.
+/// State of the first mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]
 pub(super) enum Warm {
-    /// It is being computed.
+    /// The first mesh is being computed.
     Warming = 0,
+    /// The first mesh was computed.
     Yes = 1,
-    /// It could not be computed.
+    /// The first mesh failed.
     Broken = 2,
 }
 
@@ -99,17 +103,17 @@ impl Readiness {
         }
     }
 
-    /// Notes how the first mesh went.
+    /// Sets the state of the first mesh.
     pub(super) fn set(&self, warm: Warm) {
         self.warm.store(warm as u8, Ordering::Relaxed);
     }
 
-    /// Whether the service has been told to stop.
+    /// Returns true if the service has been told to stop.
     pub(super) fn is_ending(&self) -> bool {
         self.ending.load(Ordering::Relaxed)
     }
 
-    /// The service has been told to stop. That is final.
+    /// Marks the service as stopping, which is final.
     pub(super) fn end(&self) {
         self.ending.store(true, Ordering::Relaxed);
     }

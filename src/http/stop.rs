@@ -1,23 +1,23 @@
-//! The end of a service, step by step, and the signals that ask for it.
+//! Phases of the shutdown, and the signals that start them.
 
 use tokio::sync::watch;
 
-/// How far the end has come; each step holds what the ones before it hold.
+/// Phase of the shutdown. Later phases include the restrictions of earlier ones.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stop {
-    /// Everything is served.
+    /// All requests are served.
     #[default]
     Serve,
-    /// `/readyz` is 503; everything is served as before, but connections are not kept after an answer.
+    /// `/readyz` answers 503 and connections are closed after a response; all requests are served.
     Notice,
-    /// The listener is closed; what has begun is finished.
+    /// The listener is closed; running requests are finished.
     Drain,
-    /// What has not finished is cut off.
+    /// Unfinished requests are cancelled.
     Now,
 }
 
 impl Stop {
-    /// The step behind this one.
+    /// Returns the next phase.
     #[must_use]
     pub const fn next(self) -> Self {
         match self {
@@ -28,22 +28,22 @@ impl Stop {
     }
 }
 
-/// Waits until the end has come as far as `step`. Where nobody can order it any more, that is an order to drain.
+/// Waits for phase `step` or a later one. A dropped sender counts as [`Stop::Drain`].
 pub(super) async fn reached(orders: &mut watch::Receiver<Stop>, step: Stop) {
     if orders.wait_for(|stop| *stop >= step).await.is_err() && step > Stop::Drain {
         std::future::pending::<()>().await;
     }
 }
 
-/// Waits until something more is ordered.
+/// Waits for a further order.
 pub(super) async fn further(orders: &mut watch::Receiver<Stop>) {
     if orders.changed().await.is_err() {
         std::future::pending::<()>().await;
     }
 }
 
-/// The end as signals order it: SIGTERM gives notice first, SIGINT (Ctrl-C) drains at once; every further signal ends the
-/// step that is under way. Must be called on a tokio runtime.
+/// Returns the orders that signals give: SIGTERM starts with the termination notice, SIGINT (Ctrl-C) with the drain;
+/// each further signal starts the next phase. Must be called on a tokio runtime.
 #[must_use]
 pub fn shutdown_signals() -> watch::Receiver<Stop> {
     let (order, orders) = watch::channel(Stop::Serve);
@@ -57,7 +57,7 @@ pub fn shutdown_signals() -> watch::Receiver<Stop> {
     orders
 }
 
-/// Signals that end a service, each with the step that it asks for at least.
+/// Signals that stop the service, each with its first phase.
 #[cfg(unix)]
 struct Signals {
     terminate: Option<tokio::signal::unix::Signal>,

@@ -1,5 +1,5 @@
-//! A mesh on its way to the client: the writer runs on a blocking thread and hands small pieces to the body through a
-//! bounded channel, so the file never exists in memory as a whole and a slow client slows the writer down.
+//! Streaming of mesh files: the writer runs on a blocking thread and sends pieces to the body through a bounded
+//! channel, so that memory use stays small and a slow client slows the writer down.
 
 use std::io::{self, Write};
 use std::pin::Pin;
@@ -13,31 +13,31 @@ use hyper::body::{Body as HttpBody, Frame, SizeHint};
 use metrics::histogram;
 use tokio::sync::{OwnedSemaphorePermit, mpsc, oneshot};
 
+use super::errors::{file_too_large, format_problem};
 use super::problem::Problem;
-use super::unfit;
 use crate::formats::Format;
 use crate::jobs::{Budget, Finished};
 use crate::telemetry::{STAGE_DURATION, TraceSpan};
 
-/// Bytes of a piece: few wake-ups for large meshes, small enough to be in a cache while it is sent.
+/// Size of a piece, bytes: large enough for few wake-ups, small enough for the CPU cache.
 const PIECE: usize = 256 << 10;
-/// Pieces under way to one client.
+/// Number of buffered pieces per client.
 const PIECES: usize = 4;
 
-/// What the writer sends.
+/// Message of the writer.
 enum Piece {
     Data(Bytes),
-    /// Everything was written. A channel that closes without it is a writer that failed.
+    /// The file is complete. If the channel closes without it, the writer has failed.
     End,
 }
 
-/// Starts writing; the length comes with the body where it is known.
+/// Starts the writer. Returns the length of the file if it is known, and the body.
 pub(super) async fn start(
     finished: Arc<Finished>,
     format: Format,
     limit: u64,
     budget: Budget,
-    place: OwnedSemaphorePermit,
+    permit: OwnedSemaphorePermit,
 ) -> Result<(Option<u64>, Body), Problem> {
     let (head, answer) = oneshot::channel();
     let (sender, receiver) = mpsc::channel(PIECES);
@@ -45,14 +45,14 @@ pub(super) async fn start(
     let (log, span) = (tracing::Span::current(), TraceSpan::current());
     tokio::task::spawn_blocking(move || {
         log.in_scope(|| write(&finished, format, limit, head, pieces, span.as_ref()));
-        drop(place);
+        drop(permit);
     });
-    // A writer that panics drops its end; the panic hook has logged it.
+    // The writer has panicked; the panic hook has logged it.
     let length = answer.await.map_err(|_dropped| Problem::internal("the writer failed"))??;
     Ok((length, Body::new(MeshBody { pieces: receiver, left: length, ended: false })))
 }
 
-/// Lays the file out, says how long it is, writes it.
+/// Plans the file, sends its length, writes it.
 fn write(
     finished: &Finished,
     format: Format,
@@ -65,15 +65,15 @@ fn write(
     let product = &finished.product;
     let resolution = product.report.resolution;
     let file = match product.file(format) {
-        Ok(file) if file.bytes_bound() > limit => Err(unfit::file_too_large(file.bytes_bound(), limit, resolution)),
+        Ok(file) if file.bytes_bound() > limit => Err(file_too_large(file.bytes_bound(), limit, resolution)),
         Ok(file) => Ok(file),
-        Err(error) => Err(unfit::of_format(&error, resolution)),
+        Err(error) => Err(format_problem(&error, resolution)),
     };
     let (length, file) = match file {
         Ok(file) => (Ok(file.bytes()), Some(file)),
         Err(problem) => (Err(problem), None),
     };
-    // Without a receiver the client is gone; the first piece would find out as well.
+    // Without a receiver the client has left.
     let gone = head.send(length).is_err();
     let Some(file) = file.filter(|_| !gone) else { return };
     let written = file.write(&mut writer).and_then(|()| {
@@ -88,16 +88,16 @@ fn write(
     match written {
         Ok(()) => {}
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => tracing::debug!("the client left"),
-        // The body ends without its end, which breaks the connection off: a truncated mesh must not look whole.
+        // The body fails without `Piece::End`, which aborts the connection: a truncated mesh must not look complete.
         Err(error) => tracing::error!(%error, format = format.extension(), "writing a mesh failed"),
     }
 }
 
-/// Collects what is written into pieces. Blocks while the client is slow.
+/// Writer that collects pieces. Blocks while the client is slow.
 struct Pieces {
     sender: mpsc::Sender<Piece>,
     buffer: BytesMut,
-    /// Charged with every piece until it is sent.
+    /// Charged with each piece until it is sent.
     budget: Budget,
 }
 
@@ -117,7 +117,7 @@ impl Pieces {
         if !self.buffer.is_empty() {
             self.send_buffer()?;
         }
-        // Whoever knows the length hangs up after the last byte and does not wait for the end.
+        // A receiver that knows the length may hang up after the last byte.
         self.send(Piece::End).or(Ok(()))
     }
 }
@@ -140,7 +140,7 @@ impl Write for Pieces {
     }
 }
 
-/// The receiving end.
+/// Body that receives the pieces.
 struct MeshBody {
     pieces: mpsc::Receiver<Piece>,
     left: Option<u64>,

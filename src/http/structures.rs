@@ -1,102 +1,82 @@
-//! `/v1/structures`: upload once, mesh many times. A structure's name is the SHA-256 of its bytes as they came.
+//! `/v1/structures`: structures that are uploaded once and meshed many times, named by the SHA-256 of the uploaded
+//! bytes.
 
 use axum::Json;
 use axum::body::Body;
-use axum::extract::rejection::PathRejection;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::http::header::{self, HeaderMap};
-use axum::http::{Extensions, HeaderValue, Method, StatusCode};
+use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
-use bytes::Bytes;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::ask::{self, Input};
+use super::delivery;
 use super::kinds::Kind;
-use super::meshes::Pairs;
+use super::mesh_request::MeshRequest;
 use super::openapi::bodies::{StructureFile, StructureForm};
 use super::openapi::meshes::{Addressed, NotModified};
 use super::openapi::parameters::{Coding, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
 use super::openapi::problems::{ASKING, BODY, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
+use super::source::{Input, StructureSource};
 use super::state::Shared;
-use super::timing::Timing;
 use super::upload::{self, Upload};
-use super::wish::Wish;
-use super::{conditional, delivery, pdb};
 use crate::jobs::Failure;
 use crate::store::{Digest, Name};
 use crate::structure::contents::Counts;
 use crate::structure::{self, Contents, Structure};
 
-/// The name says what the bytes are, and the mesh follows from them and the parameters.
-const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stale-while-revalidate=604800");
-/// Chains that a summary lists at most.
+/// Maximum number of listed chains.
 const MAX_CHAINS: usize = 1000;
 
-/// The digest that a client names.
-pub(super) fn digest_of(text: &str) -> Result<Digest, Problem> {
-    text.parse().map_err(|_bad| none(text))
-}
-
-fn none(digest: &str) -> Problem {
-    let shown: String = digest.chars().take(80).collect();
-    Problem::new(
-        Kind::NoSuchStructure,
-        format!(
-            "there is no structure `{shown}`: structures are kept for some time after their last use; upload it again"
-        ),
-    )
-}
-
-/// What a structure holds.
+/// Contents of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct StructureDocument {
-    /// SHA-256 of its bytes as they came.
+    /// SHA-256 of the uploaded bytes.
     digest: String,
-    /// How many these are.
+    /// Size of the upload, bytes.
     bytes: usize,
     /// `pdb`, `mmcif` or `bcif`.
     format: &'static str,
     /// PDB id or data block name.
     #[schema(required)]
     id: Option<String>,
-    /// Its title.
+    /// Title.
     #[schema(required)]
     title: Option<String>,
-    /// Atoms, all models.
+    /// Number of atoms in all models.
     atoms: u64,
-    /// The numbers of its models.
+    /// Numbers of the models.
     models: Vec<i32>,
-    /// The model that the counts are of.
+    /// Model that the counts refer to.
     model: i32,
     atoms_in_model: KindCounts,
-    /// Atoms with alternative locations.
+    /// Number of atoms with alternative locations.
     alternatives: u64,
-    /// Atoms of unknown elements.
+    /// Number of atoms of unknown elements.
     unknown_elements: u64,
-    /// Values that could not be read and do not matter for a mesh, at most 12.
+    /// Unreadable values that do not affect the mesh, at most 12.
     warnings: Vec<String>,
-    /// Chains.
+    /// Number of chains.
     chain_count: usize,
-    /// The first thousand of them.
+    /// First 1000 chains.
     chains: Vec<ChainDocument>,
-    /// A mesh of it.
+    /// Address of a mesh.
     surface: String,
 }
 
-/// A chain.
+/// Chain of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 struct ChainDocument {
-    /// The author's name for it.
+    /// Name by the author.
     name: String,
-    /// Its atoms.
+    /// Number of atoms.
     atoms: u64,
     of: KindCounts,
 }
 
-/// Atoms by what they belong to.
+/// Numbers of atoms by kind.
 #[derive(Debug, Serialize, ToSchema)]
 struct KindCounts {
     polymer: u64,
@@ -125,7 +105,7 @@ refusals!(SurfaceRefusals: [
     PARAMETERS, READING, MESHING, ASKING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
 ]);
 
-/// Takes a structure in, to be meshed many times.
+/// Stores a structure.
 #[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure", params(Coding),
     request_body(description = "The structure.", content(
         (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
@@ -139,24 +119,32 @@ refusals!(SurfaceRefusals: [
         CreateRefusals,
     ))]
 pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
+    if upload::is_json(&headers) {
+        let detail =
+            "a structure is uploaded as a file, not as JSON; `POST /v1/meshes` takes JSON that names a structure";
+        return Err(Problem::new(Kind::UnsupportedMediaType, detail).with("declared", "application/json"));
+    }
     let Upload { bytes, lease, fields, declared } = upload::receive(&app, &headers, body).await?;
     if let Some((name, _)) = fields.first() {
-        return Err(Problem::new(Kind::BadParameter, format!("a structure has no parameter `{name}`; meshes have"))
-            .with("parameter", name.as_str()));
+        return Err(Problem::new(
+            Kind::BadParameter,
+            format!("a structure has no parameter `{name}`; parameters belong to meshes"),
+        )
+        .with("parameter", name.as_str()));
     }
-    let _place = app.delivery()?;
-    let digest = ask::digest(&bytes).await?;
-    // Read before it is kept: what cannot be read is nobody's structure.
-    let summary = summarise(&app, digest, bytes.clone()).await.map_err(|failure| declared.explain(failure))?;
+    let _permit = app.delivery()?;
+    let input = Input::uploaded(bytes, lease).await?;
+    let digest = input.digest;
+    // Parse before storing, so that only readable structures are stored.
+    let summary = summarise(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(summary.format)?;
-    let created = app.store.put_new(&Name::input(&digest), bytes).await?;
-    drop(lease);
+    let created = app.store.put_new(&Name::input(&digest), input.bytes).await?;
     let status = if created { StatusCode::CREATED } else { StatusCode::OK };
     let location = delivery::text(&format!("/v1/structures/{digest}"));
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
 }
 
-/// What a structure holds.
+/// Describes a stored structure.
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
     params(StructurePath, Unchanged),
     responses(
@@ -168,24 +156,14 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     ))]
 pub(super) async fn show(
     State(app): State<Shared>,
-    path: Result<Path<String>, PathRejection>,
+    source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let digest = digest_of(&text)?;
-    let etag = HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)?;
-    let caching = [(header::ETAG, etag.clone()), (header::CACHE_CONTROL, CACHE)];
-    // Whoever has the summary is answered without reading the structure.
-    if conditional::is_unchanged(&headers, &etag) && app.store.head(&Name::input(&digest)).await?.is_some() {
-        return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
-    }
-    let _place = app.delivery()?;
-    let Input { bytes, lease: _lease, .. } = input(&app, &digest).await?;
-    let summary = summarise(&app, digest, bytes).await?;
-    Ok((caching, Json(summary)).into_response())
+    let write = async |input| Ok(Json(summarise(&app, input).await?).into_response());
+    source.document(&app, &headers, write).await
 }
 
-/// Meshes a structure that was uploaded.
+/// Meshes a stored structure.
 #[utoipa::path(
     get,
     path = "/v1/structures/{digest}/{file}",
@@ -197,45 +175,21 @@ pub(super) async fn show(
 pub(super) async fn surface(
     State(app): State<Shared>,
     method: Method,
-    path: Result<Path<(String, String)>, PathRejection>,
-    query: Pairs,
     headers: HeaderMap,
-    extensions: Extensions,
+    request: MeshRequest,
 ) -> Result<Response, Problem> {
-    let mut timing = Timing::start();
-    let Path((text, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let named = pdb::named(&app, &file, query)?;
-    let digest = digest_of(&text)?;
-    let wish = Wish::of(&headers, &extensions)?;
-    timing.lap("receive");
-    let mut ask = named.ask(digest, wish, timing);
-    if app.store.head(&Name::input(&digest)).await?.is_none() {
-        return Err(none(&text));
-    }
-    if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
-        return Ok(response);
-    }
-    ask.timing.lap("lookup");
-    let input = input(&app, &digest).await?;
-    ask.timing.lap("load");
-    ask.make(&app, input).await
+    request.answer(&app, &method, &headers).await
 }
 
-/// The bytes of a structure.
-pub(super) async fn input(app: &Shared, digest: &Digest) -> Result<Input, Problem> {
-    let bytes = app.store.get(&Name::input(digest)).await?.ok_or_else(|| none(&digest.to_string()))?.bytes;
-    Input::new(app, bytes, *digest)
-}
-
-/// Reads a structure and says what it holds, on a thread that may block.
-async fn summarise(app: &Shared, digest: Digest, bytes: Bytes) -> Result<StructureDocument, Failure> {
+/// Parses a structure and describes its contents, on a blocking thread.
+async fn summarise(app: &Shared, input: Input) -> Result<StructureDocument, Failure> {
     let limits = app.config.limits.job().read;
-    let reading = tokio::task::spawn_blocking(move || {
-        let structure = structure::read(&bytes, &limits)?;
-        Ok(summary(&digest, bytes.len(), &structure))
+    let parsing = tokio::task::spawn_blocking(move || {
+        let structure = structure::read(&input.bytes, &limits)?;
+        Ok(summary(&input.digest, input.bytes.len(), &structure))
     });
-    let read = reading.await.map_err(|error| Failure::Panicked { message: error.to_string() })?;
-    read.map_err(|error: structure::StructureError| Failure::Job { error: error.into(), diagnostics: Vec::new() })
+    let parsed = parsing.await.map_err(|error| Failure::Panicked { message: error.to_string() })?;
+    parsed.map_err(|error: structure::StructureError| Failure::Job { error: error.into(), diagnostics: Vec::new() })
 }
 
 fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDocument {

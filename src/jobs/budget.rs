@@ -1,4 +1,4 @@
-//! Memory that all requests share, counted in bytes: uploads and meshes that nobody has taken yet.
+//! Memory budget of all requests, in bytes: uploads, and meshes that are not yet sent.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -9,17 +9,17 @@ use thiserror::Error;
 
 use crate::telemetry::MEMORY_HELD;
 
-/// The budget is used up.
+/// Error of an exhausted budget.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("{held} of {limit} bytes of memory for uploads and meshes are in use")]
 pub struct Exhausted {
-    /// Bytes allowed.
+    /// Size of the budget, bytes.
     pub limit: u64,
-    /// Bytes in use.
+    /// Used part of it, bytes.
     pub held: u64,
 }
 
-/// Bytes that may be held at once. Clones share one budget.
+/// Memory budget in bytes. Clones share one budget.
 #[derive(Debug, Clone)]
 pub struct Budget {
     limit: u64,
@@ -27,13 +27,13 @@ pub struct Budget {
 }
 
 impl Budget {
-    /// A budget of `limit` bytes.
+    /// Creates a budget of `limit` bytes.
     #[must_use]
     pub fn new(limit: u64) -> Self {
         Self { limit, held: Arc::default() }
     }
 
-    /// Fails while more than the limit is held.
+    /// Fails while more than the limit is in use.
     ///
     /// # Errors
     /// [`Exhausted`].
@@ -42,14 +42,14 @@ impl Budget {
         if held > self.limit { Err(Exhausted { limit: self.limit, held }) } else { Ok(()) }
     }
 
-    /// A lease of nothing, to grow.
+    /// Creates a lease of 0 bytes.
     #[must_use]
     pub fn lease(&self) -> Lease {
         Lease { budget: self.clone(), bytes: 0 }
     }
 }
 
-/// Bytes held; dropping it gives them back.
+/// Bytes taken from a budget, until this is dropped.
 #[derive(Debug)]
 pub struct Lease {
     budget: Budget,
@@ -57,7 +57,7 @@ pub struct Lease {
 }
 
 impl Lease {
-    /// Holds `bytes` more, or fails and holds what it held before.
+    /// Adds `bytes` to the lease; changes nothing on failure.
     ///
     /// # Errors
     /// [`Exhausted`].
@@ -70,7 +70,7 @@ impl Lease {
         Ok(())
     }
 
-    /// Holds `bytes` more, whatever the limit: for what exists already.
+    /// Adds `bytes` regardless of the limit, for memory that is allocated already.
     pub fn force(&mut self, bytes: u64) {
         self.budget.held.fetch_add(bytes, Ordering::Relaxed);
         self.bytes += bytes;
@@ -102,7 +102,7 @@ impl Drop for Lease {
     }
 }
 
-/// Tells the gauge of a difference, so that several budgets in one process add up.
+/// Changes the gauge by a difference, so that several budgets in one process add up.
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
 fn publish(bytes: u64, sign: f64) {
     gauge!(MEMORY_HELD).increment(sign * bytes as f64);

@@ -1,41 +1,35 @@
-//! What a job will cost, before it is read: a model with one constant per machine, learned from the jobs that have run.
+//! Duration estimate of a job that has not been read: one constant per machine, learned from finished jobs.
 
-/// Assumed time of a unit of work before any job has run, s: an atom at 0.5 Å on two cores.
+/// Time of a unit of work before any job has run, s: one atom at 0.5 Å on two cores.
 const FIRST_GUESS: f64 = 4e-6;
-/// Weight of the newest job in the moving averages.
+/// Weight of the newest job in the moving average.
 const NEWEST: f64 = 0.2;
 
-/// Seconds per unit, and seconds per job, as lately measured.
+/// Seconds per unit of work, as a moving average.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rate {
     per_unit: f64,
-    per_job: Option<f64>,
 }
 
 impl Default for Rate {
     fn default() -> Self {
-        Self { per_unit: FIRST_GUESS, per_job: None }
+        Self { per_unit: FIRST_GUESS }
     }
 }
 
 impl Rate {
-    /// Expected seconds of so many units.
-    pub(super) fn seconds(&self, units: f64) -> f64 {
+    /// Returns the expected duration of `units` of work, s.
+    pub(super) fn seconds(self, units: f64) -> f64 {
         self.per_unit * units
     }
 
-    /// Mean seconds of the jobs of late; `expected` before there were any.
-    pub(super) fn mean(&self, expected: f64) -> f64 {
-        self.per_job.unwrap_or(expected)
-    }
-
-    /// A job of so many units took `seconds`.
+    /// Learns from a job of `units` of work that took `seconds`.
     pub(super) fn learn(&mut self, units: f64, seconds: f64) {
-        // Against what is expected now, not when the job came: a full queue would correct the same mistake a hundred times.
-        // By the logarithm: a job a hundred times as long as expected says no more than one a hundredth as long.
+        // Compares with the present estimate, not with that at acceptance: a full queue would correct the same error
+        // for every job. On a logarithmic scale, a job that takes 100 times as long as expected weighs as much as one
+        // that takes a hundredth.
         let miss = (seconds.max(1e-6) / self.seconds(units).max(1e-9)).ln();
         self.per_unit *= (NEWEST * miss.clamp(-4.0, 4.0)).exp();
-        self.per_job = Some(self.per_job.map_or(seconds, |mean| mean + NEWEST * (seconds - mean)));
     }
 }
 
@@ -50,11 +44,10 @@ mod tests {
             rate.learn(1e5, 2.0);
         }
         assert!((rate.seconds(1e5) - 2.0).abs() < 0.01, "{rate:?}");
-        assert!((rate.mean(0.0) - 2.0).abs() < 1e-9);
-        // One stray job does not turn everything over.
+        // One outlier changes little.
         rate.learn(1e5, 2e4);
         assert!(rate.seconds(1e5) < 5.0, "{rate:?}");
-        // However many were expected to take something else when they came, it settles.
+        // It converges to the new duration.
         for _ in 0..500 {
             rate.learn(1e5, 0.02);
         }

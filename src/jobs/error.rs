@@ -1,4 +1,4 @@
-//! Why a job is not accepted or promised, and why one that was ends without a mesh.
+//! Errors of jobs: refused by the queue, not accepted as durable, failed.
 
 use std::time::Duration;
 
@@ -9,25 +9,25 @@ use crate::pipeline::JobError;
 use crate::store::StoreError;
 use crate::structure::referee::{Diagnostic, Level};
 
-/// Why a job is not accepted.
+/// Error of a task that the queue does not accept.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum Refusal {
-    /// As many jobs wait as may.
-    #[error("{waiting} jobs are waiting, the limit is {limit}; the next place is free in about {} s", wait.as_secs_f64().ceil())]
+    /// The queue is full.
+    #[error("{waiting} jobs are waiting and the limit is {limit}; the queue takes about {} s", wait.as_secs_f64().ceil())]
     QueueFull {
-        /// Jobs that wait.
+        /// Number of queued jobs.
         waiting: usize,
-        /// Jobs that may wait.
+        /// Maximum number of queued jobs.
         limit: usize,
-        /// Estimated time until the queue has moved.
+        /// Estimated time until the present jobs are finished.
         wait: Duration,
     },
-    /// The job would wait for longer than it has.
-    #[error("the jobs ahead take about {} s, longer than the {} s that this one has", wait.as_secs_f64().ceil(), allowed.as_secs_f64())]
+    /// The job would miss its deadline in the queue.
+    #[error("the jobs ahead take about {} s and the deadline is {} s", wait.as_secs_f64().ceil(), allowed.as_secs_f64())]
     TooLate {
         /// Estimated time in the queue.
         wait: Duration,
-        /// Time from acceptance to the mesh.
+        /// Time allowed from acceptance to the mesh.
         allowed: Duration,
     },
     /// The pool is shutting down.
@@ -35,39 +35,39 @@ pub enum Refusal {
     Draining,
 }
 
-/// Why an accepted job ended without a mesh.
+/// Error of an accepted job.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum Failure {
     /// The job itself failed.
     #[error("{error}")]
     Job {
-        /// Why.
+        /// Cause.
         error: JobError,
-        /// What the referee says of a file that cannot be read; empty otherwise.
+        /// Findings of the strict parser if the file cannot be read; empty otherwise.
         diagnostics: Vec<Diagnostic>,
     },
-    /// A strict check was asked for, and the referee found errors.
+    /// The strict parser found errors.
     #[error("the strict check found {} errors", errors(diagnostics))]
     Check {
-        /// Everything that it found.
+        /// All findings.
         diagnostics: Vec<Diagnostic>,
     },
     /// The deadline passed.
     #[error("the deadline of {} s passed", limit.as_secs_f64())]
     Deadline {
-        /// Time that was allowed.
+        /// Allowed time.
         limit: Duration,
     },
-    /// Too much memory is held by meshes that clients have not taken yet.
+    /// The memory budget is exhausted.
     #[error(transparent)]
     Memory(#[from] Exhausted),
-    /// The pool stopped before the job was done.
-    #[error("the service shut down before the job was done")]
+    /// The pool stopped before the job was finished.
+    #[error("the service shut down before the job was finished")]
     Stopped,
-    /// The job panicked; the message is for the log.
+    /// The job panicked; the message belongs in the log.
     #[error("the job panicked: {message}")]
     Panicked {
-        /// What the panic said.
+        /// Message of the panic.
         message: String,
     },
 }
@@ -76,47 +76,47 @@ fn errors(diagnostics: &[Diagnostic]) -> usize {
     diagnostics.iter().filter(|d| d.level == Level::Error).count()
 }
 
-/// Why a job cannot be promised.
+/// Error of [`JobStore::accept`](super::JobStore::accept).
 #[derive(Debug, Error)]
-pub enum PromiseError {
-    /// The queue has no room.
+pub enum AcceptError {
+    /// The queue refused the task.
     #[error(transparent)]
     Refused(#[from] Refusal),
-    /// The record cannot be kept.
+    /// Input or record could not be stored.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// The idempotency key belongs to another request.
+    /// The idempotency key was used for another request.
     #[error("the idempotency key was used for another request")]
     OtherRequest,
-    /// No random numbers.
+    /// The operating system has no random numbers.
     #[error("no random numbers: {0}")]
     Random(std::io::Error),
 }
 
-/// Why a promised job ended without a result.
+/// Error of a durable job that ended without a result.
 #[derive(Debug, Clone, Error)]
 pub enum EndError {
-    /// There is no mesh.
+    /// The mesh could not be computed.
     #[error(transparent)]
     Job(#[from] Failure),
-    /// There is one, but no file of it.
+    /// The mesh could not be stored.
     #[error("{error}")]
     Save {
-        /// Why.
+        /// Cause.
         error: SaveError,
-        /// The grid spacing, Å.
+        /// Grid spacing, Å.
         resolution: f64,
     },
-    /// It was begun so many times without an end that it is taken for what ended the process.
-    #[error("the job was begun {attempts} times and never ended")]
+    /// The job was started repeatedly and never finished: it is assumed to crash the process.
+    #[error("the job was started {attempts} times and never finished")]
     Poison {
-        /// Times that it was begun.
+        /// Number of attempts.
         attempts: u32,
     },
-    /// Its input or its parameters cannot be read any more.
-    #[error("the job cannot be taken up again: {why}")]
+    /// Input or parameters cannot be read any more.
+    #[error("the job cannot be resumed: {why}")]
     Lost {
-        /// Why.
+        /// Cause.
         why: String,
     },
 }

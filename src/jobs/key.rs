@@ -1,4 +1,4 @@
-//! The name of what is made of an input: equal names, equal bytes.
+//! Content keys: names of results that follow from input, parameters, format, arithmetic and version.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,13 +7,13 @@ use crate::formats::Format;
 use crate::pipeline::{Job, params};
 use crate::store::{BadDigest, Digest, Name, StoreError};
 
-/// The name of a mesh file: equal keys, equal bytes.
+/// Name of a mesh file. Equal keys mean equal bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct ContentKey(Digest);
 
 impl ContentKey {
-    /// The key of what `maker` makes of an input: the arithmetic of a backend, followed by that of a picture's
-    /// renderer. The version is part of it, as any release may move a bit.
+    /// Returns the key of a result. `maker` names the arithmetic of the backend, followed by that of a picture's
+    /// renderer. The version is part of the key, since a release may change the last bits.
     #[must_use]
     pub fn new(input: &Digest, job: &Job, format: Format, maker: &str) -> Self {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
@@ -23,10 +23,10 @@ impl ContentKey {
 }
 
 impl ContentKey {
-    /// The name under which the store keeps it, or its report.
+    /// Returns the name in the store, of the file or of its report.
     ///
     /// # Errors
-    /// [`StoreError::Name`] for an extension that no file has.
+    /// [`StoreError::Name`] for an invalid extension.
     pub fn name(&self, extension: &str) -> Result<Name, StoreError> {
         Ok(Name::result(&self.0.to_string(), extension)?)
     }

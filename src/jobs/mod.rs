@@ -1,35 +1,38 @@
-//! The worker pool: a bounded queue in front of one backend, on threads of its own.
+//! The worker pool: a bounded queue in front of one backend, with worker threads of its own, and durable jobs on top.
 //!
-//! Structure bytes and a [`crate::pipeline::Job`] go in; a mesh with its report comes out. Deadlines, cancellation
-//! and panics are dealt with here, so that whoever submits only waits. It knows no HTTP and no graphics API.
+//! A [`Task`] (structure bytes and a [`crate::pipeline::Job`]) goes in, a mesh with its report comes out. Deadlines,
+//! cancellation and panics are handled here, so callers only wait for a [`Ticket`]. This module knows no HTTP and no
+//! graphics API.
+//!
+//! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps the records of `durable_job`s, which
+//! survive the process.
 
 mod budget;
+mod coalesced_job;
 mod cost;
 mod devices;
+mod durable_job;
 mod error;
-mod flight;
+mod job_store;
 mod key;
-mod ledger;
-mod patience;
 mod pool;
-mod promise;
 mod queue;
 mod rank;
 mod record;
 mod results;
-mod returns;
+mod retry;
 #[cfg(test)]
 mod tests;
 mod ticket;
 mod worker;
 
 pub use budget::{Budget, Exhausted, Lease};
-pub use error::{EndError, Failure, PromiseError, Refusal};
-pub use flight::{Claim, Progress};
+pub use coalesced_job::{OnStart, Progress};
+pub use error::{AcceptError, EndError, Failure, Refusal};
+pub use job_store::{DescribeError, JobSpec, JobStore, JobStoreSettings, JobView};
 pub use key::ContentKey;
-pub use ledger::{Describe, Ledger, LedgerSettings, Order, View};
 pub use pool::{Meter, Pool, Settings};
-pub use rank::{Client, Rank, USUAL_URGENCY};
+pub use rank::{Client, DEFAULT_URGENCY, Rank};
 pub use record::{BadJobId, JobId, Record, Requester, Status, now_ms, rfc3339};
 pub use results::{REPORT, SaveError, save};
 pub use ticket::Ticket;
@@ -44,41 +47,41 @@ use crate::store::Digest;
 use crate::structure::referee::Diagnostic;
 use crate::telemetry::SpanParent;
 
-/// One job to run.
+/// Work for the pool.
 #[derive(Debug)]
 pub struct Task {
-    /// The structure file as it came, compressed or not.
+    /// Structure file, compressed or not.
     pub input: Bytes,
-    /// Its digest.
+    /// SHA-256 of `input`.
     pub digest: Digest,
-    /// Ask the referee, and refuse a file in which it finds errors.
+    /// Run the strict parser as well, and reject a file in which it finds errors.
     pub strict: bool,
-    /// What to make of it.
+    /// Parameters of the mesh.
     pub job: Job,
-    /// Whose job it is, and how it stands to others.
+    /// Client and priority.
     pub rank: Rank,
-    /// Memory that the input is charged to, given back with it.
+    /// Memory budget that `input` is charged to.
     pub lease: Option<Arc<Lease>>,
-    /// Who asked for it.
+    /// Parent of the spans of the task.
     pub parent: SpanParent,
-    /// The id of the job that was promised; none if somebody waits.
+    /// Id of the durable job; `None` for an interactive request.
     pub id: Option<JobId>,
 }
 
-/// A finished job.
+/// Result of a job.
 #[derive(Debug)]
 pub struct Finished {
     /// Mesh and report.
     pub product: Product,
-    /// What the referee said, if it was asked.
+    /// Findings of the strict parser if the task was strict.
     pub diagnostics: Option<Vec<Diagnostic>>,
-    /// Digest of the input.
+    /// SHA-256 of the input.
     pub digest: Digest,
     /// Time in the queue.
     pub waited: Duration,
-    /// Memory that the mesh is charged to, given back when this is dropped.
+    /// Memory budget that the mesh is charged to, until this is dropped.
     pub lease: Lease,
 }
 
-/// What a job comes to.
+/// Outcome of a job.
 pub type Outcome = Result<Arc<Finished>, Failure>;

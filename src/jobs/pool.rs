@@ -1,4 +1,4 @@
-//! The pool: worker threads, the queue in front of them, the memory that they share.
+//! The pool: worker threads, their queue, and the memory budget that they share.
 
 use std::io;
 use std::sync::Arc;
@@ -8,41 +8,41 @@ use metrics::counter;
 
 use super::devices::Watch;
 use super::queue::Queue;
-use super::{Budget, Claim, Client, Refusal, Task, Ticket, worker};
+use super::{Budget, Client, OnStart, Refusal, Task, Ticket, worker};
 use crate::picture::Drawer;
 use crate::pipeline::{self, Job, JobLimits, maker};
 use crate::surface::Backend;
 use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 
-/// Sizes of a pool.
+/// Settings of a [`Pool`].
 #[derive(Clone)]
 pub struct Settings {
-    /// Jobs that run at once, at least 1.
+    /// Number of concurrent jobs, at least 1.
     pub workers: usize,
-    /// Jobs that wait.
+    /// Number of queued jobs.
     pub queue: usize,
-    /// How long promised jobs stand back for those that somebody waits for.
-    pub patience: Duration,
+    /// Maximum time that a durable job yields to interactive ones.
+    pub batch_max_delay: Duration,
     /// Limits of every job.
     pub limits: JobLimits,
-    /// Memory for uploads and meshes.
+    /// Memory budget for uploads and meshes.
     pub budget: Budget,
-    /// What draws pictures.
+    /// Renderer of pictures.
     pub drawer: Drawer,
-    /// Who is told what workers spend; none: nobody.
+    /// Receiver of the time that each job took.
     pub meter: Option<Arc<dyn Meter>>,
-    /// Where the spans of jobs go that come from an earlier process.
+    /// Exporter for the spans of resumed jobs.
     pub tracer: Tracer,
 }
 
-/// Is told what clients cost.
+/// Receiver of the computing time that clients use.
 pub trait Meter: std::fmt::Debug + Send + Sync {
-    /// A worker has spent `time` on a job of `client`, well or in vain. Work that several take part in is the first one's.
-    /// Called before anybody gets the outcome.
+    /// Records that a worker spent `time` on a job of `client`, successful or not. A shared job is charged to its first
+    /// client. Called before the outcome is sent.
     fn spent(&self, client: Client, time: Duration);
 }
 
-/// What workers share.
+/// State that workers share.
 pub(super) struct Shared {
     pub(super) queue: Arc<Queue>,
     pub(super) backend: Arc<dyn Backend>,
@@ -57,26 +57,26 @@ pub(super) struct Shared {
 }
 
 impl Shared {
-    /// Tells metrics and log how the devices are doing.
+    /// Updates metrics and log with the state of the devices.
     pub(super) fn publish_devices(&self) {
         self.watch.publish(&self.backend.devices());
     }
 }
 
-/// A running pool. Dropping it cancels what runs.
+/// A running pool. Dropping it cancels running jobs.
 pub struct Pool {
     shared: Arc<Shared>,
 }
 
 impl Pool {
-    /// Starts the workers. `reason` says why this backend was taken, for reports.
+    /// Starts the workers. `reason` says why this backend was chosen, for reports.
     ///
     /// # Errors
-    /// That of the system, if a thread cannot be started.
+    /// That of the operating system if a thread cannot be started.
     pub fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
-        let Settings { workers, queue, patience, limits, budget, drawer, meter, tracer } = settings;
+        let Settings { workers, queue, batch_max_delay, limits, budget, drawer, meter, tracer } = settings;
         let workers = workers.max(1);
-        let queue = Arc::new(Queue::new(queue, workers, patience));
+        let queue = Arc::new(Queue::new(queue, workers, batch_max_delay));
         let watch = Watch::default();
         let shared = Shared { queue, backend, reason, limits, budget, workers, drawer, meter, tracer, watch };
         let pool = Self { shared: Arc::new(shared) };
@@ -87,87 +87,87 @@ impl Pool {
         Ok(pool)
     }
 
-    /// Accepts a job that has `allowed` time until its mesh must be there, waiting included, or says at once why not. `claim`
-    /// is called before the work begins.
+    /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called
+    /// before the work starts, unless the task joins a running job.
     ///
     /// # Errors
     /// Any [`Refusal`].
-    pub fn submit(&self, task: Task, allowed: Duration, claim: Option<Claim>) -> Result<Ticket, Refusal> {
+    pub fn submit(&self, task: Task, allowed: Duration, on_start: Option<OnStart>) -> Result<Ticket, Refusal> {
         let mode = if task.rank.batch { "async" } else { "sync" };
         let deadline = Instant::now() + allowed;
-        let place = self.shared.queue.push(task, allowed, claim)?;
-        let dedup = if place.shared { "yes" } else { "no" };
+        let admission = self.shared.queue.push(task, allowed, on_start)?;
+        let dedup = if admission.shared { "yes" } else { "no" };
         counter!(JOBS_SUBMITTED, "mode" => mode, "dedup" => dedup).increment(1);
-        Ok(Ticket { queue: Arc::clone(&self.shared.queue), place, deadline, allowed })
+        Ok(Ticket { queue: Arc::clone(&self.shared.queue), admission, deadline, allowed })
     }
 
-    /// Expected time of a job on this machine, s, once it runs.
+    /// Estimates the duration of a job on this machine, s, without its time in the queue.
     #[must_use]
     pub fn expected(&self, input: &[u8], job: &Job) -> f64 {
         self.shared.queue.expected(pipeline::work(input, job))
     }
 
-    /// How long a job that is accepted now would wait.
+    /// Estimates the queueing time of a job that is accepted now.
     #[must_use]
     pub fn estimated_wait(&self) -> Duration {
         self.shared.queue.estimated_wait()
     }
 
-    /// The backend.
+    /// Returns the backend.
     #[must_use]
     pub fn backend(&self) -> &Arc<dyn Backend> {
         &self.shared.backend
     }
 
-    /// Why the backend was taken.
+    /// Returns why the backend was chosen.
     #[must_use]
     pub fn reason(&self) -> &str {
         &self.shared.reason
     }
 
-    /// What draws pictures.
+    /// Returns the renderer of pictures.
     #[must_use]
     pub fn drawer(&self) -> &Drawer {
         &self.shared.drawer
     }
 
-    /// Arithmetic of a job's file, if neither the backend nor the renderer falls back to another.
+    /// Returns the arithmetic of a job's file, provided that neither backend nor renderer falls back to another one.
     #[must_use]
     pub fn maker(&self, job: &Job) -> String {
         let renderer = job.picture.map(|_| self.shared.drawer.renderer.arithmetic());
         maker(&self.shared.backend.arithmetic(), renderer.as_deref())
     }
 
-    /// Jobs that run at once.
+    /// Number of concurrent jobs.
     #[must_use]
     pub fn workers(&self) -> usize {
         self.shared.workers
     }
 
-    /// Tells metrics and log how the queue and the backend's devices are doing, as every finished job does.
+    /// Updates metrics and log with the state of the queue and the devices, as every finished job does.
     pub fn publish(&self) {
         self.shared.queue.refresh();
         self.shared.publish_devices();
     }
 
-    /// Where the spans of jobs go that come from an earlier process.
+    /// Exporter for the spans of resumed jobs.
     pub(super) fn tracer(&self) -> &Tracer {
         &self.shared.tracer
     }
 
-    /// Memory for uploads and meshes.
+    /// Returns the memory budget for uploads and meshes.
     #[must_use]
     pub fn budget(&self) -> &Budget {
         &self.shared.budget
     }
 
-    /// From now on promised jobs that do not run yet are left: their tickets end as stopped.
+    /// Leaves queued durable jobs for the next process: their tickets end as stopped.
     pub fn leave(&self) {
         self.shared.queue.leave();
     }
 
-    /// Accepts no more jobs and waits for those that were accepted, until `end` at most; then cancels the rest, whose
-    /// tickets end as stopped. True if all of them ended by themselves.
+    /// Accepts no more jobs and waits for the accepted ones until `end`; then cancels the rest, whose tickets end as
+    /// stopped. Returns true if every job finished.
     pub async fn drain(&self, end: impl Future<Output = ()>) -> bool {
         self.shared.queue.close();
         let in_time = tokio::select! {

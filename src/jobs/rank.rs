@@ -1,45 +1,46 @@
-//! Whose turn it is: people who wait come before work that nobody watches, clients share fairly, and nobody waits for ever.
+//! Order of queued jobs: interactive jobs before durable ones, fair shares for clients, bounded delays.
 //!
-//! Clients share by start-time fair queueing (Goyal, Vin, Cheng, 1996): a job's tag is the time, counted in work, at which its
-//! client's earlier jobs would be done; the lowest tag goes first.
+//! Shares follow start-time fair queueing (Goyal, Vin, Cheng, 1996): the tag of a job is the virtual time, in units of
+//! work, at which the earlier jobs of its client would be finished; the lowest tag runs first.
 
 use std::time::Duration;
 
 use rustc_hash::FxHashMap;
 use sha2::{Digest as _, Sha256};
 
-/// Urgency of a request that does not say one (RFC 9218).
-pub const USUAL_URGENCY: u8 = 3;
+/// Urgency of a request without a `Priority` header (RFC 9218).
+pub const DEFAULT_URGENCY: u8 = 3;
 
-/// Whose job it is, and how it stands to others.
+/// Client and priority of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rank {
-    /// The client.
+    /// Client.
     pub client: Client,
-    /// Nobody waits for the answer on an open connection.
+    /// No connection waits for the result.
     pub batch: bool,
-    /// 0 (first) to 7 (last) among the same client's jobs of the same kind, as RFC 9218 counts it.
+    /// Urgency among the jobs of the same client, from 0 (first) to 7 (last) as in RFC 9218.
     pub urgency: u8,
 }
 
-/// A client, as far as fairness needs to tell one from another.
+/// Identity of a client for fair queueing.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Client(u64);
 
 impl Client {
-    /// The client's number, for records.
+    /// Returns the number of the client, for records.
     #[must_use]
     pub const fn number(self) -> u64 {
         self.0
     }
 
-    /// The client with a number.
+    /// Returns the client with this number.
     #[must_use]
     pub const fn numbered(number: u64) -> Self {
         Self(number)
     }
 
-    /// The client that is known by `name`: an address, a key. Nobody can look for a name with the number of another.
+    /// Returns the client with this `name`, an address or a key. Numbers are truncated SHA-256 hashes, so a client
+    /// cannot choose a name with the number of another client.
     #[must_use]
     pub fn named(name: &str) -> Self {
         Self(Sha256::digest(name.as_bytes()).iter().take(8).fold(0, |number, byte| number << 8 | u64::from(*byte)))
@@ -48,34 +49,34 @@ impl Client {
 
 impl Default for Rank {
     fn default() -> Self {
-        Self { client: Client::default(), batch: false, urgency: USUAL_URGENCY }
+        Self { client: Client::default(), batch: false, urgency: DEFAULT_URGENCY }
     }
 }
 
-/// What orders two jobs: lower goes first.
+/// Sort key of a job: the lowest one runs first.
 pub(super) type Turn = (bool, f64, u64);
 
-/// The turn of a job that has waited so long. Work that nobody watches stands back for people's until its `patience` is over.
-pub(super) fn turn(rank: &Rank, tag: f64, id: u64, waited: Duration, patience: Duration) -> Turn {
-    (rank.batch && waited < patience, tag, id)
+/// Returns the sort key of a job. Durable jobs yield to interactive ones until they have waited for `batch_max_delay`.
+pub(super) fn turn(rank: &Rank, tag: f64, id: u64, waited: Duration, batch_max_delay: Duration) -> Turn {
+    (rank.batch && waited < batch_max_delay, tag, id)
 }
 
-/// Whether `a` goes before `b`.
+/// Returns true if `a` runs before `b`.
 pub(super) fn before(a: &Turn, b: &Turn) -> bool {
     a.0.cmp(&b.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)).is_lt()
 }
 
-/// The clients' shares.
+/// Virtual time of fair queueing.
 #[derive(Debug, Default)]
 pub(super) struct Shares {
-    /// Work done so far, as the clients' clock: the tag of the job that began last.
+    /// Virtual time: the tag of the job that started last.
     clock: f64,
-    /// Where each client's jobs end on that clock.
+    /// Virtual end of the jobs of each client.
     ends: FxHashMap<(Client, bool), f64>,
 }
 
 impl Shares {
-    /// The tag of a client's next job, which is expected to take `cost`.
+    /// Returns the tag of the client's next job, which has the expected work `cost`.
     pub(super) fn tag(&mut self, rank: &Rank, cost: f64) -> f64 {
         let end = self.ends.entry((rank.client, rank.batch)).or_insert(self.clock);
         let start = end.max(self.clock);
@@ -83,7 +84,7 @@ impl Shares {
         start
     }
 
-    /// A job with this tag begins. Clients whose jobs are all begun are forgotten.
+    /// Advances the virtual time to the tag of a job that starts. Forgets clients without queued jobs.
     pub(super) fn begin(&mut self, tag: f64) {
         self.clock = self.clock.max(tag);
         let clock = self.clock;
@@ -92,8 +93,8 @@ impl Shares {
         }
     }
 
-    /// Nothing waits: nobody owes anybody anything.
-    pub(super) fn settle(&mut self) {
+    /// Starts over when no job is left.
+    pub(super) fn reset(&mut self) {
         self.ends.clear();
         self.clock = 0.0;
     }
@@ -114,35 +115,35 @@ mod tests {
         let first: Vec<f64> = (0..50).map(|_| shares.tag(&greedy, 1.0)).collect();
         shares.begin(first[0]);
         let tag = shares.tag(&modest, 1.0);
-        // Behind the one that runs, before the rest.
+        // After the running job, before the others.
         assert!(first.iter().filter(|t| **t < tag).count() <= 1, "{tag} {first:?}");
-        // A client of dear jobs gets fewer of them.
-        let dear = rank("dear", false);
-        let tags = [shares.tag(&dear, 10.0), shares.tag(&dear, 10.0)];
+        // A client with larger jobs gets fewer of them.
+        let large = rank("large", false);
+        let tags = [shares.tag(&large, 10.0), shares.tag(&large, 10.0)];
         assert!(first.iter().filter(|t| **t < tags[1]).count() >= 9);
     }
 
     #[test]
-    fn people_come_before_batches_until_these_have_waited_long() {
-        let patience = Duration::from_secs(7);
+    fn interactive_jobs_run_before_durable_ones_up_to_the_maximum_delay() {
+        let delay = Duration::from_secs(7);
         let (person, batch) = (rank("a", false), rank("b", true));
-        let at = |rank, tag, id, waited| turn(rank, tag, id, waited, patience);
-        for waited in [Duration::ZERO, patience / 2] {
+        let at = |rank, tag, id, waited| turn(rank, tag, id, waited, delay);
+        for waited in [Duration::ZERO, delay / 2] {
             assert!(before(&at(&person, 5.0, 2, waited), &at(&batch, 0.0, 1, waited)));
         }
-        assert!(before(&at(&batch, 0.0, 1, patience), &at(&person, 5.0, 2, patience)));
-        assert!(before(&at(&person, 1.0, 1, patience), &at(&person, 1.0, 2, patience)));
+        assert!(before(&at(&batch, 0.0, 1, delay), &at(&person, 5.0, 2, delay)));
+        assert!(before(&at(&person, 1.0, 1, delay), &at(&person, 1.0, 2, delay)));
     }
 
     #[test]
-    fn forgotten_clients_owe_nothing() {
+    fn idle_clients_are_forgotten() {
         let mut shares = Shares::default();
         for n in 0..100 {
             let tag = shares.tag(&rank(&n.to_string(), false), 1.0);
             shares.begin(tag + 2.0);
         }
         assert!(shares.ends.len() <= 66, "{}", shares.ends.len());
-        shares.settle();
+        shares.reset();
         assert!(shares.tag(&rank("x", false), 1.0).abs() < 1e-12);
     }
 }

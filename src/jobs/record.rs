@@ -1,4 +1,4 @@
-//! The record of a job that was promised: what survives the process.
+//! Record of a durable job: the state that survives the process.
 
 use std::fmt;
 use std::str::FromStr;
@@ -10,24 +10,26 @@ use serde_json::Value;
 use sha2::Sha256;
 use thiserror::Error;
 
+use crate::formats::Format;
+use crate::pipeline::params;
 use crate::store::Secret;
 use crate::telemetry::{SpanParent, Tracer, read_trace_context, traceparent, tracestate};
 
-/// Not a job's id: 32 hexadecimal digits in lower case are.
+/// Error of a text that is not a job id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-#[error("a job's id has 32 hexadecimal digits in lower case")]
+#[error("a job id has 32 lower-case hexadecimal digits")]
 pub struct BadJobId;
 
-/// The id of a job. Whoever knows it may see and cancel the job, so it cannot be guessed.
+/// Id of a job. It is a secret: every client that knows it can see and cancel the job.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct JobId(String);
 
 impl JobId {
-    /// A new id, of 128 random bits.
+    /// Creates an id of 128 random bits.
     ///
     /// # Errors
-    /// That of the system, if it has no random numbers.
+    /// That of the operating system if it has no random numbers.
     pub fn random() -> std::io::Result<Self> {
         let mut bytes = [0; 16];
         getrandom::fill(&mut bytes).map_err(std::io::Error::from)?;
@@ -48,7 +50,7 @@ impl JobId {
         Self(format!("{id:032x}"))
     }
 
-    /// The id.
+    /// Returns the id as text.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
@@ -84,24 +86,24 @@ impl From<JobId> for String {
     }
 }
 
-/// How a job stands, in the words of OGC API Processes.
+/// Status of a job, as in OGC API Processes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
-    /// It waits.
+    /// Queued.
     Accepted,
-    /// It runs.
+    /// Running.
     Running,
-    /// Its result is there.
+    /// Finished with a result.
     Successful,
-    /// It ended without a result.
+    /// Finished without a result.
     Failed,
-    /// It was cancelled.
+    /// Cancelled.
     Dismissed,
 }
 
 impl Status {
-    /// The status's name.
+    /// Returns the name of the status.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -113,56 +115,56 @@ impl Status {
         }
     }
 
-    /// Whether nothing will change any more.
+    /// Returns true if the job has ended.
     #[must_use]
     pub const fn is_final(self) -> bool {
         matches!(self, Self::Successful | Self::Failed | Self::Dismissed)
     }
 }
 
-/// What is on record about a job.
+/// Stored state of a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Record {
-    /// Its id.
+    /// Id of the job.
     pub id: JobId,
-    /// SHA-256 of its input.
+    /// SHA-256 of the input.
     pub input: String,
-    /// Its parameters as they were given, name by name.
+    /// Names and values of the parameters, as the client wrote them.
     pub parameters: Vec<(String, String)>,
-    /// The mesh format, as a file name's extension.
+    /// Mesh format, as a file name extension.
     pub format: String,
-    /// The client, for fairness after a restart.
+    /// Number of the client, for fair queueing after a restart.
     pub client: u64,
-    /// Its urgency among the client's jobs.
+    /// Urgency among the jobs of the client.
     pub urgency: u8,
-    /// How it stands. A record of a running job is one of a job that was running when it was last written.
+    /// Status at the last write.
     pub status: Status,
-    /// Times that it was begun.
+    /// Number of attempts to run it.
     pub attempts: u32,
-    /// When it was accepted, ms since 1970.
+    /// Time of acceptance, ms since 1970.
     pub created_ms: u64,
-    /// When it was begun last.
+    /// Start of the last attempt, ms since 1970.
     pub started_ms: Option<u64>,
-    /// When it ended.
+    /// End, ms since 1970.
     pub finished_ms: Option<u64>,
-    /// The key of its result.
+    /// Key of the result.
     pub result: Option<String>,
-    /// Why there is none: a problem document.
+    /// Problem document of a failed job.
     pub problem: Option<Value>,
-    /// Who asked for it.
+    /// Request that created it.
     #[serde(default)]
     pub requester: Requester,
 }
 
-/// Who asked for a job: the request, and its place in a trace as W3C writes it.
+/// Request that created a job, with its W3C trace context.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Requester {
-    /// The request's id.
+    /// Id of the request.
     pub request: Option<String>,
-    /// The span of the request.
+    /// `traceparent` of the request's span.
     pub traceparent: Option<String>,
-    /// What vendors had added.
+    /// `tracestate` of the request.
     pub tracestate: Option<String>,
 }
 
@@ -190,27 +192,43 @@ impl Requester {
 }
 
 impl Record {
-    /// Whether both are of requests for the same thing.
-    #[must_use]
-    pub fn asks_as(&self, other: &Self) -> bool {
-        (&self.input, &self.parameters, &self.format) == (&other.input, &other.parameters, &other.format)
+    /// Parses the stored parameters and the format.
+    ///
+    /// # Errors
+    /// The reason, for the error of the job.
+    pub(super) fn request(&self) -> Result<(params::Request, Format), String> {
+        let mut request = params::parse(self.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
+        let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
+        params::settle(&mut request.job, format).map_err(|e| e.to_string())?;
+        Ok((request, format))
+    }
+
+    /// Returns true if both records are of the same request: equal input, format and parsed parameters.
+    pub(super) fn is_same_request(&self, other: &Self) -> bool {
+        let parsed = |record: &Self| {
+            let (request, _) = record.request().ok()?;
+            Some((params::canonical(&request.job), request.strict))
+        };
+        let same_parameters =
+            || self.parameters == other.parameters || parsed(self).is_some_and(|own| parsed(other) == Some(own));
+        (&self.input, &self.format) == (&other.input, &other.format) && same_parameters()
     }
 }
 
-/// Milliseconds since 1970.
+/// Returns the present time, ms since 1970.
 #[must_use]
 pub fn now_ms() -> u64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// A time as RFC 3339 writes it.
+/// Formats a time as RFC 3339.
 #[must_use]
 pub fn rfc3339(ms: u64) -> String {
     humantime::format_rfc3339_millis(UNIX_EPOCH + Duration::from_millis(ms.min(MAX_MS))).to_string()
 }
 
-/// The end of the year 9999, up to which RFC 3339 counts.
+/// End of the year 9999, the last one of RFC 3339.
 const MAX_MS: u64 = 253_402_300_799_000;
 
 #[cfg(test)]
@@ -229,19 +247,18 @@ mod tests {
         for other in [of(1, 1, "x"), of(0, 2, "x"), of(0, 1, "y")] {
             assert_ne!(of(0, 1, "x"), other);
         }
-        // HMAC-SHA-256, computed elsewhere.
+        // Computed with another implementation of HMAC-SHA-256.
         assert_eq!(of(7, 255, "upload-1").as_str(), "0a0f88f773ba0077f73431b46274a47a");
         for bad in ["", "..", &"A".repeat(32), &"a".repeat(31), &"a".repeat(33), "../../../../etc/passwd0123456789"] {
             assert_eq!(bad.parse::<JobId>(), Err(BadJobId), "{bad}");
         }
     }
 
-    #[test]
-    fn records_come_back_as_they_were() {
-        let record = Record {
+    fn record(parameters: &[(&str, &str)]) -> Record {
+        Record {
             id: JobId::random().unwrap(),
             input: Digest::of(b"x").to_string(),
-            parameters: vec![("resolution".to_owned(), "0.5".to_owned())],
+            parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), (*v).to_owned())).collect(),
             format: "glb".to_owned(),
             client: u64::MAX,
             urgency: 3,
@@ -253,10 +270,30 @@ mod tests {
             result: None,
             problem: None,
             requester: Requester { request: Some("r".to_owned()), ..Requester::default() },
-        };
+        }
+    }
+
+    #[test]
+    fn requests_are_compared_by_their_parsed_parameters() {
+        let (a, b) = (
+            record(&[("resolution", "0.70"), ("atom_ids", "true")]),
+            record(&[("atom_ids", "true"), ("resolution", "0.7")]),
+        );
+        assert!(a.is_same_request(&b));
+        assert!(!a.is_same_request(&record(&[("resolution", "0.71"), ("atom_ids", "true")])));
+        assert!(!a.is_same_request(&Record { format: "stl".to_owned(), ..b.clone() }));
+        assert!(!record(&[("check", "strict")]).is_same_request(&record(&[])));
+        // Parameters that this version cannot parse are compared as text.
+        let unknown = record(&[("unknown", "1")]);
+        assert!(unknown.is_same_request(&unknown) && !unknown.is_same_request(&record(&[("unknown", "2")])));
+    }
+
+    #[test]
+    fn records_survive_a_round_trip() {
+        let record = record(&[("resolution", "0.5")]);
         let text = serde_json::to_vec(&record).unwrap();
         assert_eq!(serde_json::from_slice::<Record>(&text).unwrap(), record);
-        // Records of earlier versions say nothing of who asked.
+        // Records of earlier versions have no requester.
         let mut old = serde_json::to_value(&record).unwrap();
         old.as_object_mut().unwrap().remove("requester").unwrap();
         assert_eq!(serde_json::from_value::<Record>(old).unwrap().requester, Requester::default());
@@ -265,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn who_asked_comes_back_as_it_was() {
+    fn requesters_survive_a_round_trip() {
         let parent = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
         let context = read_trace_context(parent, "a=1");
         let origin = SpanParent { request: Some("r".into()), context, tracer: Tracer::default() };
@@ -273,13 +310,13 @@ mod tests {
         assert_eq!(kept.traceparent.as_deref(), Some(parent));
         let back = kept.parent(&Tracer::default());
         assert_eq!((&back.request, &back.context), (&origin.request, &origin.context));
-        // Whoever changes a record cannot put more into it than into a request.
+        // A changed record cannot hold more than a request can.
         let hostile = Requester { traceparent: Some("00-x".to_owned()), ..kept };
         assert_eq!(hostile.parent(&Tracer::default()).context, None);
     }
 
     #[test]
-    fn times_are_written_as_the_web_does() {
+    fn times_are_written_as_rfc_3339() {
         assert_eq!(rfc3339(1_700_000_000_123), "2023-11-14T22:13:20.123Z");
         assert!(rfc3339(u64::MAX).starts_with("9999-12-31"));
         assert!(now_ms() > 1_700_000_000_000);

@@ -1,4 +1,4 @@
-//! Results on their way into the store: the mesh file and its report, under the key of their contents.
+//! Storing of results: the mesh file and its report, named by their content key.
 
 use std::io::Write as _;
 use std::sync::Arc;
@@ -10,21 +10,21 @@ use super::{ContentKey, Finished};
 use crate::formats::{Format, FormatError};
 use crate::store::{Store, StoreError};
 
-/// The extension of a result's report.
+/// File name extension of a report.
 pub const REPORT: &str = "json";
 
-/// Why a result was not kept.
+/// Error of [`save`].
 #[derive(Debug, Clone, Error)]
 pub enum SaveError {
-    /// No file of this format can hold the mesh.
+    /// The format cannot hold the mesh.
     #[error(transparent)]
     Format(#[from] FormatError),
-    /// The file would be larger than allowed.
+    /// The file would be too large.
     #[error("the file would take {bytes} bytes, the limit is {limit}")]
     TooLarge {
-        /// Its length.
+        /// Size of the file, bytes.
         bytes: u64,
-        /// Bytes allowed.
+        /// Allowed size, bytes.
         limit: u64,
     },
     /// The store failed.
@@ -36,14 +36,15 @@ pub enum SaveError {
 }
 
 impl SaveError {
-    /// Whether the same may go well later.
+    /// Returns true if a later attempt may succeed.
     #[must_use]
-    pub fn is_transient(&self) -> bool {
-        matches!(self, Self::Store(error) if error.is_transient())
+    pub fn is_temporary(&self) -> bool {
+        matches!(self, Self::Store(error) if error.is_temporary())
     }
 }
 
-/// Keeps a finished job as `format`: its report first, so that a mesh that is there has one. What is there already stays.
+/// Stores the report and the mesh as `format`, unless the mesh is stored already. The report comes first, so that every
+/// stored mesh has one.
 ///
 /// # Errors
 /// [`SaveError`].
@@ -73,7 +74,7 @@ pub async fn save(
     tokio::task::spawn_blocking(encode).await.map_err(|e| SaveError::Other(e.to_string()))?
 }
 
-/// What a writer of the store said, in the store's own words.
+/// Converts an I/O error of a store writer back into the store's error.
 fn of_io(error: std::io::Error) -> SaveError {
     match error.downcast::<StoreError>() {
         Ok(error) => error.into(),

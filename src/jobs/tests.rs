@@ -1,4 +1,4 @@
-//! Promised jobs on a store that does not do its part.
+//! Durable jobs on a store that fails on command.
 
 use std::fmt::Debug;
 use std::future::Future;
@@ -11,11 +11,11 @@ use serde_json::Value;
 use tempfile::TempDir;
 use tokio::sync::watch;
 
-use super::promise::Promise;
-use super::rank::{Client, Rank, USUAL_URGENCY};
+use super::durable_job::DurableJob;
+use super::rank::{Client, DEFAULT_URGENCY, Rank};
 use super::{
-    Budget, EndError, JobId, Ledger, LedgerSettings, Order, Pool, PromiseError, Record, Requester, Settings, Status,
-    Task, View, now_ms,
+    AcceptError, Budget, EndError, JobId, JobSpec, JobStore, JobStoreSettings, JobView, Pool, Record, Requester,
+    Settings, Status, Task, now_ms,
 };
 use crate::formats::Format;
 use crate::picture::Drawer;
@@ -28,37 +28,37 @@ use crate::telemetry::{SpanParent, Tracer};
 const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 const PATIENT: Duration = Duration::from_mins(2);
 
-/// A ledger on a disk that fails on command.
-struct House {
+/// Job store on a disk that fails on command.
+struct Fixture {
     faults: Arc<Faults>,
     store: Store,
-    ledger: Ledger,
+    jobs: JobStore,
     _dir: TempDir,
 }
 
-impl House {
-    async fn new(attempts: u32, patience: Duration) -> Self {
+impl Fixture {
+    async fn new(attempts: u32, retry_for: Duration) -> Self {
         let (dir, faults, store) = faulty(1 << 30).await;
         let settings = Settings {
             workers: 1,
             queue: 8,
-            patience: Duration::from_secs(10),
+            batch_max_delay: Duration::from_secs(10),
             limits: JobLimits::default(),
             budget: Budget::new(1 << 30),
-            drawer: Drawer::cpu("a test says so"),
+            drawer: Drawer::cpu("a test"),
             meter: None,
             tracer: Tracer::default(),
         };
-        let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test says so".to_owned()).unwrap());
-        let settings = LedgerSettings { allowed: PATIENT, attempts, output_bytes: 1 << 30, patience };
+        let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
+        let settings = JobStoreSettings { allowed: PATIENT, attempts, output_bytes: 1 << 30, retry_for };
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
-        Self { faults, ledger: Ledger::new(store.clone(), pool, settings, [0; 32], describe), store, _dir: dir }
+        Self { faults, jobs: JobStore::new(store.clone(), pool, settings, [0; 32], describe), store, _dir: dir }
     }
 
-    async fn promise(&self) -> Result<View, PromiseError> {
+    async fn accept(&self) -> Result<JobView, AcceptError> {
         let pairs = [("resolution", "2")].map(|(name, value)| (name.to_owned(), value.to_owned()));
         let request = params::parse(pairs.iter().map(|(name, value)| (name, value))).unwrap();
-        let rank = Rank { client: Client::named("a"), batch: true, urgency: USUAL_URGENCY };
+        let rank = Rank { client: Client::named("a"), batch: true, urgency: DEFAULT_URGENCY };
         let (input, digest) = (Bytes::from_static(SAMPLE), Digest::of(SAMPLE));
         let task = Task {
             input,
@@ -70,11 +70,11 @@ impl House {
             parent: SpanParent::default(),
             id: None,
         };
-        let order = Order { task, parameters: pairs.to_vec(), format: Format::Stl, idempotency: None };
-        self.ledger.promise(order, None).await
+        let spec = JobSpec { task, parameters: pairs.to_vec(), format: Format::Stl, idempotency_key: None };
+        self.jobs.accept(spec, None).await
     }
 
-    /// A job that an earlier process promised.
+    /// Stores the record of a job that an earlier process accepted.
     async fn inherit(&self) -> JobId {
         let record = Record {
             id: JobId::random().unwrap(),
@@ -82,7 +82,7 @@ impl House {
             parameters: vec![("resolution".to_owned(), "2".to_owned())],
             format: "stl".to_owned(),
             client: 1,
-            urgency: USUAL_URGENCY,
+            urgency: DEFAULT_URGENCY,
             status: Status::Accepted,
             requester: Requester::default(),
             attempts: 0,
@@ -92,22 +92,22 @@ impl House {
             result: None,
             problem: None,
         };
-        self.ledger.0.keep(&record).await.unwrap();
+        self.jobs.0.write(&record).await.unwrap();
         self.store.put(&Name::input(&Digest::of(SAMPLE)), Bytes::from_static(SAMPLE)).await.unwrap();
         record.id
     }
 
-    /// The job as the store has it.
+    /// Returns the stored record of a job.
     async fn on_record(&self, id: &JobId) -> Record {
         let stored = self.store.get(&Name::job(id.as_str()).unwrap()).await.unwrap().unwrap();
         serde_json::from_slice(&stored.bytes).unwrap()
     }
 
-    async fn watch(&self, id: &JobId) -> watch::Receiver<View> {
-        self.ledger.watch(id).await.unwrap().unwrap()
+    async fn watch(&self, id: &JobId) -> watch::Receiver<JobView> {
+        self.jobs.watch(id).await.unwrap().unwrap()
     }
 
-    /// Waits until the store has not answered so often.
+    /// Waits until the store has failed `times` times.
     async fn unanswered(&self, times: usize) {
         until("questions", || async { self.faults.unanswered.load(Ordering::SeqCst) >= times }).await;
     }
@@ -122,139 +122,139 @@ async fn until<F: Future<Output = bool>>(what: &str, mut holds: impl FnMut() -> 
 }
 
 #[track_caller]
-fn is<T: PartialEq + Debug>(seen: &watch::Receiver<View>, of: impl Fn(&Record) -> T, expected: &T) {
+fn is<T: PartialEq + Debug>(seen: &watch::Receiver<JobView>, of: impl Fn(&Record) -> T, expected: &T) {
     let record = seen.borrow().record.clone();
     assert_eq!(&of(&record), expected, "{record:?}");
 }
 
-async fn ended(seen: &mut watch::Receiver<View>) {
+async fn ended(seen: &mut watch::Receiver<JobView>) {
     let end = seen.wait_for(|view| view.record.status.is_final());
     tokio::time::timeout(PATIENT, end).await.expect("the job ends").unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_store_that_is_silent_gives_no_job_up() {
-    let house = House::new(1, PATIENT).await;
-    let id = house.inherit().await;
-    house.faults.silence(Some(Folder::Inputs));
-    assert_eq!(house.ledger.recover().await.unwrap(), 1);
-    let mut seen = house.watch(&id).await;
-    // More than there are attempts: being asked for the input is none.
-    house.unanswered(3).await;
+async fn a_failing_store_ends_no_job() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    fixture.faults.silence(Some(Folder::Inputs));
+    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    let mut seen = fixture.watch(&id).await;
+    // More failures than attempts: a failed read of the input is not an attempt.
+    fixture.unanswered(3).await;
     is(&seen, |record| (record.status, record.attempts), &(Status::Accepted, 0));
-    house.faults.silence(None);
+    fixture.faults.silence(None);
     ended(&mut seen).await;
     is(&seen, |record| (record.status, record.attempts), &(Status::Successful, 1));
-    assert_eq!(house.store.usage(Folder::Results).objects, 2);
-    // A store that says that there is no input is another matter.
-    let id = house.inherit().await;
-    house.store.delete(&Name::input(&Digest::of(SAMPLE))).await.unwrap();
-    assert_eq!(house.ledger.recover().await.unwrap(), 1);
-    let mut seen = house.watch(&id).await;
+    assert_eq!(fixture.store.usage(Folder::Results).objects, 2);
+    // A store that answers that the input does not exist is different.
+    let id = fixture.inherit().await;
+    fixture.store.delete(&Name::input(&Digest::of(SAMPLE))).await.unwrap();
+    assert_eq!(fixture.jobs.recover().await.unwrap(), 1);
+    let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;
     is(&seen, |record| record.status, &Status::Failed);
     assert!(seen.borrow().record.problem.as_ref().unwrap().as_str().unwrap().starts_with("Lost"));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_result_is_held_until_the_store_takes_it() {
-    let house = House::new(1, PATIENT).await;
-    house.faults.seal(Folder::Results);
-    let id = house.promise().await.unwrap().record.id;
-    let mut seen = house.watch(&id).await;
-    house.unanswered(3).await;
+async fn a_result_is_held_until_it_is_stored() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    fixture.faults.seal(Folder::Results);
+    let id = fixture.accept().await.unwrap().record.id;
+    let mut seen = fixture.watch(&id).await;
+    fixture.unanswered(3).await;
     is(&seen, |record| record.status, &Status::Running);
-    house.faults.silence(None);
+    fixture.faults.silence(None);
     ended(&mut seen).await;
     is(&seen, |record| (record.status, record.attempts), &(Status::Successful, 1));
-    until("the record", || async { house.on_record(&id).await.status == Status::Successful }).await;
-    assert_eq!(house.store.usage(Folder::Results).objects, 2);
+    until("the record", || async { fixture.on_record(&id).await.status == Status::Successful }).await;
+    assert_eq!(fixture.store.usage(Folder::Results).objects, 2);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_result_that_the_store_never_takes_is_made_as_often_as_may_be() {
-    let house = House::new(3, Duration::ZERO).await;
-    house.faults.seal(Folder::Results);
-    let id = house.promise().await.unwrap().record.id;
-    let mut seen = house.watch(&id).await;
+async fn a_result_that_is_never_stored_is_computed_for_every_attempt() {
+    let fixture = Fixture::new(3, Duration::ZERO).await;
+    fixture.faults.seal(Folder::Results);
+    let id = fixture.accept().await.unwrap().record.id;
+    let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;
     is(&seen, |record| (record.status, record.attempts), &(Status::Failed, 3));
     let problem = seen.borrow().record.problem.clone().unwrap();
-    assert!(problem.as_str().unwrap().starts_with("Save"), "why it failed, not how often: {problem}");
-    assert_eq!(house.faults.unanswered.load(Ordering::SeqCst), 3, "once for each mesh");
-    until("the record", || async { house.on_record(&id).await.status == Status::Failed }).await;
-    // What is too large will not fit later either, and is made once.
-    let mut house = House::new(3, PATIENT).await;
-    house.ledger = Ledger::new(
-        house.store.clone(),
-        Arc::clone(&house.ledger.0.pool),
-        LedgerSettings { output_bytes: 100, ..house.ledger.0.settings },
+    assert!(problem.as_str().unwrap().starts_with("Save"), "the cause, not the number of attempts: {problem}");
+    assert_eq!(fixture.faults.unanswered.load(Ordering::SeqCst), 3, "once for each mesh");
+    until("the record", || async { fixture.on_record(&id).await.status == Status::Failed }).await;
+    // A result that is too large is not retried.
+    let mut fixture = Fixture::new(3, PATIENT).await;
+    fixture.jobs = JobStore::new(
+        fixture.store.clone(),
+        Arc::clone(&fixture.jobs.0.pool),
+        JobStoreSettings { output_bytes: 100, ..fixture.jobs.0.settings },
         [0; 32],
-        house.ledger.0.describe,
+        fixture.jobs.0.describe,
     );
-    let id = house.promise().await.unwrap().record.id;
-    let mut seen = house.watch(&id).await;
+    let id = fixture.accept().await.unwrap().record.id;
+    let mut seen = fixture.watch(&id).await;
     ended(&mut seen).await;
     is(&seen, |record| (record.status, record.attempts), &(Status::Failed, 1));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn an_ending_is_written_down_when_the_store_answers_again() {
-    let house = House::new(1, PATIENT).await;
-    house.faults.seal(Folder::Results);
-    let id = house.promise().await.unwrap().record.id;
-    let mut seen = house.watch(&id).await;
-    house.unanswered(1).await;
-    house.faults.silence(Some(Folder::Jobs));
+async fn the_end_of_a_job_is_recorded_once_the_store_works_again() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    fixture.faults.seal(Folder::Results);
+    let id = fixture.accept().await.unwrap().record.id;
+    let mut seen = fixture.watch(&id).await;
+    fixture.unanswered(1).await;
+    fixture.faults.silence(Some(Folder::Jobs));
     ended(&mut seen).await;
     is(&seen, |record| record.status, &Status::Successful);
-    house.unanswered(2).await;
-    house.faults.silence(None);
-    until("the record", || async { house.on_record(&id).await.status == Status::Successful }).await;
+    fixture.unanswered(2).await;
+    fixture.faults.silence(None);
+    until("the record", || async { fixture.on_record(&id).await.status == Status::Successful }).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn nothing_is_promised_that_is_not_on_record() {
-    let house = House::new(1, PATIENT).await;
+async fn no_job_is_accepted_without_a_record() {
+    let fixture = Fixture::new(1, PATIENT).await;
     for folder in Folder::ALL {
-        house.faults.silence(Some(folder));
-        let refused = house.promise().await;
-        assert!(matches!(refused, Err(PromiseError::Store(StoreError::Failed { .. }))), "{refused:?}");
+        fixture.faults.silence(Some(folder));
+        let refused = fixture.accept().await;
+        assert!(matches!(refused, Err(AcceptError::Store(StoreError::Failed { .. }))), "{refused:?}");
     }
-    house.faults.silence(None);
-    assert_eq!((house.store.usage(Folder::Jobs).objects, house.ledger.recover().await.unwrap()), (0, 0));
-    house.promise().await.unwrap();
+    fixture.faults.silence(None);
+    assert_eq!((fixture.store.usage(Folder::Jobs).objects, fixture.jobs.recover().await.unwrap()), (0, 0));
+    fixture.accept().await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_job_that_was_dismissed_does_not_begin() {
-    let house = House::new(1, PATIENT).await;
-    let id = house.inherit().await;
-    let promise = Arc::new(Promise::new(house.on_record(&id).await));
-    let claim = house.ledger.claim(&promise, None);
-    assert!(promise.end(Status::Dismissed, |_| {}));
-    house.ledger.0.keep_up(&promise).await.unwrap();
-    // The worker had it in hand already.
-    tokio::task::spawn_blocking(claim).await.unwrap();
-    for record in [promise.record(), house.on_record(&id).await] {
+async fn a_dismissed_job_does_not_start() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    let job = Arc::new(DurableJob::new(fixture.on_record(&id).await));
+    let on_start = fixture.jobs.on_start(&job, None);
+    assert!(job.end(Status::Dismissed, |_| {}));
+    fixture.jobs.0.write_job(&job).await.unwrap();
+    // The worker has already taken the job.
+    tokio::task::spawn_blocking(on_start).await.unwrap();
+    for record in [job.record(), fixture.on_record(&id).await] {
         assert_eq!((record.status, record.attempts), (Status::Dismissed, 0), "{record:?}");
     }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_is_on_record_last_is_what_was_so_last() {
-    let house = House::new(1, PATIENT).await;
-    let id = house.inherit().await;
-    let promise = Arc::new(Promise::new(house.on_record(&id).await));
-    assert!(promise.begin());
-    // Somebody else is writing the record when the worker wants to write that it begins.
-    let turn = promise.writing.lock().await;
-    let (ledger, begun) = (house.ledger.clone(), Arc::clone(&promise));
-    let mut writes = tokio::spawn(async move { ledger.0.keep_up(&begun).await.unwrap() });
+async fn the_last_record_has_the_latest_state() {
+    let fixture = Fixture::new(1, PATIENT).await;
+    let id = fixture.inherit().await;
+    let job = Arc::new(DurableJob::new(fixture.on_record(&id).await));
+    assert!(job.begin());
+    // Another task writes the record when the worker wants to record the start.
+    let turn = job.writing.lock().await;
+    let (jobs, begun) = (fixture.jobs.clone(), Arc::clone(&job));
+    let mut writes = tokio::spawn(async move { jobs.0.write_job(&begun).await.unwrap() });
     let waits = tokio::time::timeout(Duration::from_millis(200), &mut writes).await.is_err();
-    assert!(waits, "two wrote at once");
-    assert!(promise.end(Status::Dismissed, |_| {}));
+    assert!(waits, "two concurrent writers");
+    assert!(job.end(Status::Dismissed, |_| {}));
     drop(turn);
     writes.await.unwrap();
-    assert_eq!(house.on_record(&id).await.status, Status::Dismissed);
+    assert_eq!(fixture.on_record(&id).await.status, Status::Dismissed);
 }

@@ -1,68 +1,64 @@
-//! The right to a job's outcome. Whoever drops it has lost interest; work that nobody is interested in is cancelled.
+//! Handle of a job's outcome. A job is cancelled when its last ticket is dropped.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::flight::Progress;
-use super::queue::{Place, Queue};
+use super::coalesced_job::Progress;
+use super::queue::{Admission, Queue};
 use super::{Failure, Outcome};
 use crate::telemetry::TraceSpan;
 
-/// An accepted job.
+/// Handle of an accepted job.
 #[must_use = "dropping the ticket cancels the job"]
 pub struct Ticket {
     pub(super) queue: Arc<Queue>,
-    pub(super) place: Place,
+    pub(super) admission: Admission,
     pub(super) deadline: Instant,
     pub(super) allowed: Duration,
 }
 
 impl Ticket {
-    /// Waits for the outcome, until the deadline at most. Cancel safe: dropping the future loses nothing.
+    /// Waits for the outcome, at most until the deadline. Cancel safe.
     ///
     /// # Errors
     /// Any [`Failure`].
     pub async fn wait(&mut self) -> Outcome {
-        match tokio::time::timeout_at(self.deadline.into(), &mut self.place.outcome).await {
+        let Some(outcome) = &mut self.admission.outcome else { return Err(Failure::Stopped) };
+        match tokio::time::timeout_at(self.deadline.into(), outcome.recv()).await {
             Err(_elapsed) => Err(Failure::Deadline { limit: self.allowed }),
-            Ok(Ok(outcome)) => outcome,
-            Ok(Err(_dropped)) => Err(Failure::Stopped),
+            Ok(Some(outcome)) => outcome,
+            Ok(None) => Err(Failure::Stopped),
         }
     }
 
-    /// The same right, with `allowed` time from now.
-    pub fn with_time(mut self, allowed: Duration) -> Self {
-        (self.deadline, self.allowed) = (Instant::now() + allowed, allowed);
-        self
-    }
-
-    /// How far the job is.
+    /// Progress of the job.
     #[must_use]
     pub fn progress(&self) -> &Arc<Progress> {
-        &self.place.progress
+        &self.admission.progress
     }
 
-    /// The span of the work.
+    /// Span of the job.
     #[must_use]
     pub fn span(&self) -> &TraceSpan {
-        &self.place.span
+        &self.admission.span
     }
 
-    /// Whether the work ran already when this ticket was given out: then its claim is not called.
+    /// Returns true if the job was already running when it was joined; its `on_start` callback is not called then.
     #[must_use]
-    pub fn came_late(&self) -> bool {
-        self.place.begun
+    pub fn joined_running(&self) -> bool {
+        self.admission.running
     }
 
-    /// Whether the same work was in the house already.
+    /// Returns true if the ticket joined a job that was queued or running.
     #[must_use]
     pub fn is_shared(&self) -> bool {
-        self.place.shared
+        self.admission.shared
     }
 }
 
 impl Drop for Ticket {
     fn drop(&mut self) {
-        self.queue.forget(self.place.flight, self.place.waiter);
+        drop(self.admission.outcome.take());
+        self.queue.leave_job(self.admission.job);
     }
 }

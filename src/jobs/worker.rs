@@ -1,4 +1,4 @@
-//! One worker: takes a job, runs it, answers. A panic ends the job, never the worker.
+//! Worker thread: takes a job, runs it, sends its outcome. A panic ends the job, not the worker.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use metrics::{counter, histogram};
 
-use super::flight::Entry;
+use super::coalesced_job::Entry;
 use super::pool::Shared;
 use super::{Failure, Finished, JobId, Outcome};
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report};
@@ -16,7 +16,7 @@ use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, SurfaceError};
 use crate::telemetry::{JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan, VOXELS};
 
-/// Largest text of which the referee explains a refusal, bytes: it takes some 10 ms for so much, and 40 in the worst case.
+/// Size limit of files that the strict parser examines after a failure, bytes: it takes 10 to 40 ms for this size.
 const MAX_EXPLAINED: u64 = 512 << 10;
 
 /// Runs jobs until the queue is closed and empty.
@@ -29,15 +29,15 @@ pub(super) fn work(shared: &Shared) {
             meter.spent(client, start.elapsed());
         }
         shared.publish_devices();
-        // Only a mesh says how long jobs take.
+        // Only successful jobs count in the duration estimate.
         let time = matches!(outcome, Some(Ok(_))).then(|| start.elapsed());
-        shared.queue.done(id, outcome.as_ref(), time);
+        shared.queue.done(id, outcome, time);
     }
 }
 
-/// Runs one job. None if nobody wants it any more.
+/// Runs one job. `None` if it was cancelled before its start.
 fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
-    let Entry { task, cancel, progress, claims, accepted, span, .. } = entry;
+    let Entry { task, cancel, progress, on_start, accepted, span, .. } = entry;
     let log = span.as_parent().log_span(task.id.as_ref().map(JobId::as_str));
     let _entered = log.enter();
     let trace = Trace { span, job: task.id.clone() };
@@ -49,13 +49,13 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
     let waited = accepted.elapsed();
     trace.span.part("queue", accepted, waited);
     let outcome = shared.budget.check().map_err(Failure::from).and_then(|()| {
-        // Drawing's memory is known before anything is done for it.
+        // The memory for drawing is known in advance.
         let mut drawing = shared.budget.lease();
         drawing.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
         let work = || {
-            for claim in claims {
-                claim();
+            for callback in on_start {
+                callback();
             }
             let (diagnostics, checked) = if task.strict {
                 let begun = Instant::now();
@@ -83,29 +83,29 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
         count(&product.report);
         if let Some(why) = &product.report.fallback {
             counter!(JOBS_FALLBACK).increment(1);
-            tracing::warn!(backend = product.report.backend, why, "another backend served a job");
+            tracing::warn!(backend = product.report.backend, why, "a job fell back to another backend");
         }
         if let Some((renderer, why)) =
             product.report.picture.as_ref().and_then(|p| Some((p.renderer, p.fallback.as_ref()?)))
         {
             counter!(JOBS_FALLBACK).increment(1);
-            tracing::warn!(renderer, why, "another renderer drew a picture");
+            tracing::warn!(renderer, why, "a picture fell back to another renderer");
         }
         let mut lease = shared.budget.lease();
         lease.force(bytes_of(&product));
         Ok(Finished { product, diagnostics, digest: task.digest, waited, lease })
     });
-    // The input is freed before the answer goes out: the receiver then sees the memory that is really held.
+    // Frees the input before the outcome is sent, so that the receiver sees the true memory use.
     drop(task);
     let outcome = outcome.map(Arc::new);
     for (stage, begun, time) in progress.stages() {
         trace.span.part(stage, begun, time);
     }
-    trace.close(tell(&outcome), Some(&outcome));
+    trace.close(count_outcome(&outcome), Some(&outcome));
     Some(outcome)
 }
 
-/// The span of a job.
+/// Span of a job.
 struct Trace {
     span: TraceSpan,
     job: Option<JobId>,
@@ -138,7 +138,7 @@ impl Trace {
     }
 }
 
-/// The strict check: the referee's findings, or a refusal if there are errors among them.
+/// Runs the strict parser. Fails if it finds errors.
 fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
     let diagnostics = referee::check(input, &shared.limits.read)
         .map_err(|error| Failure::Job { error: error.into(), diagnostics: Vec::new() })?;
@@ -148,25 +148,25 @@ fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
     Ok(diagnostics)
 }
 
-/// A failure, with the referee's opinion of a file that our reader refused and that is small enough to ask about.
+/// Adds the findings of the strict parser to the failure of a small file that cannot be read.
 fn explained(shared: &Shared, input: &[u8], error: JobError) -> Failure {
     let unreadable =
         matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
     let limits = ReadLimits { max_inflated_bytes: MAX_EXPLAINED, ..shared.limits.read };
-    // A file of which the referee cannot say anything either gets our refusal alone.
+    // If the strict parser fails as well, there are no findings.
     let diagnostics = if unreadable { referee::check(input, &limits).unwrap_or_default() } else { Vec::new() };
     Failure::Job { error, diagnostics }
 }
 
-/// What drivers say of a failed device is for the log alone.
+/// Logs the driver's message about a failed device, which clients do not get.
 fn log_device(failure: &Failure) {
     if let Failure::Job { error: JobError::Surface(SurfaceError::Device { why }), .. } = failure {
         tracing::error!(why, "no device could run a job");
     }
 }
 
-/// Counts an outcome, and logs what is for the log. What it is called comes back.
-fn tell(outcome: &Outcome) -> &'static str {
+/// Counts and logs an outcome. Returns its label.
+fn count_outcome(outcome: &Outcome) -> &'static str {
     let label = match outcome {
         Ok(_) => "successful",
         Err(Failure::Job { error: JobError::Surface(SurfaceError::Cancelled), .. }) => "dismissed",
@@ -194,7 +194,7 @@ fn count(report: &Report) {
     }
 }
 
-/// Bytes that a product holds.
+/// Memory use of a product, bytes.
 fn bytes_of(Product { mesh, picture, .. }: &Product) -> u64 {
     let drawn = picture.as_ref().map_or(0, Vec::len) as u64;
     let optional = mesh.atom_ids.as_ref().map_or(0, Column::len) + mesh.colors.as_ref().map_or(0, Column::len);

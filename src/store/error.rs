@@ -97,7 +97,7 @@ pub enum StoreError {
 impl StoreError {
     /// Returns true if a retry may succeed: the store may become reachable or permitted, or have space again.
     #[must_use]
-    pub fn is_transient(&self) -> bool {
+    pub fn is_temporary(&self) -> bool {
         matches!(self, Self::Full { .. } | Self::NoSpace { .. } | Self::Denied { .. } | Self::Failed { .. })
     }
 

@@ -25,7 +25,7 @@ const service = http.createServer((request, reply) => {
   if (area === "lost.glb") return reply.writeHead(202).end();
   if (area !== "meshes" && area !== "jobs") return reply.writeHead(area === "favicon.ico" ? 204 : 404).end();
   const asked = (jobs[job] ??= []);
-  asked.push({ what: `${request.method} ${part ?? area}${search}`, at: performance.now() - begun });
+  asked.push({ what: `${request.method} ${part ?? area}${search}`, prefer: request.headers.prefer, at: performance.now() - begun });
   const times = asked.filter(({ what }) => what.startsWith("GET jobs?wait=")).length;
   if (area === "meshes") return reply.writeHead(202, { location: `/jobs/${job}`, "retry-after": "1", "content-type": "application/json" }).end(state(job, "accepted"));
   if (request.method === "DELETE") return reply.writeHead(200, { "content-type": "application/json" }).end(state(job, "dismissed"));
@@ -64,6 +64,7 @@ await run({
     await load("/meshes/quick");
     assert.ok((await told("load")).report.triangles > 1000);
     assert.deepEqual(asked("quick"), ["GET meshes", "GET events", "GET result"]);
+    assert.match(jobs.quick[0].prefer, /^wait=[1-9]/);
     assert.deepEqual(await page.evaluate(() => window.told.map(({ name, status }) => status ?? name)), ["accepted", "running", "successful", "load"]);
     const seen = silhouette(await picture(page, "#viewer"));
     assert.ok(seen.share > 0.1, JSON.stringify(seen));
@@ -128,6 +129,16 @@ await run({
     await told("load");
     await page.locator("#viewer").click();
     assert.equal(await page.evaluate(() => window.picks), 1);
+  },
+
+  "a file on another origin needs no preflight": async () => {
+    const other = http.createServer((request, reply) =>
+      request.method === "GET" ? reply.writeHead(200, { "access-control-allow-origin": "*" }).end(mesh) : reply.writeHead(405).end());
+    await new Promise((resolve) => other.listen(0, "127.0.0.1", resolve));
+    await load(`http://127.0.0.1:${other.address().port}/plain.glb`);
+    await told("load");
+    other.close();
+    other.closeAllConnections();
   },
 
   "without WebGL the content between the tags is shown": async () => {

@@ -1,19 +1,29 @@
-// A service that promises what takes longer than an instant: progress is shown, and what is superseded is dismissed.
+// Meshes that exceed the wait of their request: progress is shown, and a superseded job is cancelled.
 import http from "node:http";
 import { assert, browser, clean, fetched, open, reported, run, shown, PATIENCE, URL_OF_SERVICE } from "./lib.mjs";
 
 const chromium = await browser();
 const page = await open(chromium);
+/** Shortens the wait that a page asks for, so that every mesh becomes a job. A request without `Prefer` is left as it is. */
+const preferences = [];
+const shorten = (page) =>
+  page.route(/\/surface\.glb/, (route) => {
+    const headers = route.request().headers();
+    preferences.push(headers.prefer);
+    return route.continue({ headers: headers.prefer ? { ...headers, prefer: "wait=0" } : headers });
+  });
+await shorten(page);
 const jobs = () => page.asked.filter((line) => line.includes("/v1/jobs/"));
 
 await run({
-  "a promised mesh is followed by its events and shown": async () => {
+  "a job is followed by its events and its mesh is shown": async () => {
     await page.waitForFunction(() => window.seen.length > 0, null, { timeout: PATIENCE });
     await page.locator("#p-resolution").fill("0.2");
     const before = await shown(page);
     await page.locator("#p-resolution").press("Enter");
     await page.waitForFunction((n) => window.seen.length > n, before, { timeout: PATIENCE });
     assert.equal(await reported(page, "resolution"), 0.2);
+    assert.match(preferences.at(-1), /^wait=[1-9]/);
     for (const part of ["/events", "/result"]) assert.ok(jobs().some((line) => line.endsWith(part)), `${jobs()}`);
   },
 
@@ -50,6 +60,7 @@ await run({
     const server = http.createServer((_, reply) => reply.writeHead(200, { "content-type": "text/html" }).end(`${element}<script type="module" src="${URL_OF_SERVICE}/molmesh-viewer.js"></script>`));
     await new Promise((resolve) => server.listen(0, "127.0.0.1", resolve));
     const other = await open(chromium, { url: `http://127.0.0.1:${server.address().port}/` });
+    await shorten(other);
     const load = (resolution, event) =>
       other.evaluate(([src, event]) => new Promise((resolve) => {
         const viewer = document.querySelector("molmesh-viewer");

@@ -49,7 +49,7 @@ pub fn molmesh() -> Command {
     command.env("NODEVICE_SELECT", "1");
     // Tests stay on this machine, and there is no load balancer that would have to notice the end of a service.
     command.env("MOLMESH__ARCHIVE__URL", "none");
-    command.env("MOLMESH__SERVER__NOTICE_MS", "none");
+    command.env("MOLMESH__SERVER__TERMINATION_NOTICE_MS", "none");
     command.stdin(Stdio::null());
     command
 }

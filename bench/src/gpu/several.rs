@@ -115,7 +115,8 @@ fn parts(all: &[CompletedJob]) -> Vec<Part> {
     let part = |k: usize| {
         let ms = |ns: u64| ns as f64 * 1e-6;
         let first = &all[0].devices[k];
-        let stage = |i: usize| all.iter().filter_map(move |ran| ran.devices[k].stages.get(i)).map(move |(_, ns)| ms(*ns));
+        let stage =
+            |i: usize| all.iter().filter_map(move |ran| ran.devices[k].stages.get(i)).map(move |(_, ns)| ms(*ns));
         Part {
             device: first.device.clone(),
             stages: (0..first.stages.len()).map(|i| (first.stages[i].0.name(), Summary::of(stage(i)))).collect(),

@@ -17,14 +17,14 @@ const BEARER: &str = "bearer";
 const API_KEY: &str = "apiKey";
 const SIGNED: &str = "signedAddress";
 
-/// What an operation that takes a key may be refused with.
+/// Problems of operations that need a key.
 const REFUSALS: &[Kind] =
     &[Kind::KeyRequired, Kind::KeyInvalid, Kind::KeyExpired, Kind::ScopeMissing, Kind::QuotaExceeded];
-/// What a signed address adds.
+/// Further problems of signed addresses.
 const OF_ADDRESSES: &[Kind] = &[Kind::SignatureInvalid, Kind::SignatureExpired];
 
 /// Writes rights into the description, from the table that requests are checked with.
-pub(super) struct Rights;
+pub(in crate::http) struct Rights;
 
 impl Modify for Rights {
     fn modify(&self, api: &mut OpenApi) {

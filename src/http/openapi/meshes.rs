@@ -20,7 +20,7 @@ fn text(doc: &str) -> Header {
     header(Type::String, doc)
 }
 
-/// What each summary header says, in the order of [`SUMMARY`].
+/// Summary headers with their descriptions, in the order of [`SUMMARY`].
 fn summary() -> impl Iterator<Item = (&'static str, Header)> {
     let of = |name: &str| match name {
         "molmesh-atoms" | "molmesh-vertices" | "molmesh-triangles" | "molmesh-components" | "molmesh-euler" => {
@@ -80,7 +80,7 @@ const LOCATION: &str = "Where the same bytes are found for as long as they are k
 /// 202: a job.
 fn promised() -> RefOr<Response> {
     let response = ResponseBuilder::new()
-        .description("A job is promised: it was asked for, or the mesh takes longer than the answer may.")
+        .description("A job was accepted: the request has `Prefer: respond-async`, or `Prefer: wait=` and the mesh takes longer.")
         .content("application/json", reference::<JobDocument>())
         .header("Location", text("The job."))
         .header("Retry-After", header(Type::Integer, "Seconds after which asking for the job is worth it."))

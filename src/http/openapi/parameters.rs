@@ -10,7 +10,7 @@ use utoipa::openapi::{ArrayBuilder, KnownFormat, ObjectBuilder, Required, Schema
 use crate::formats::Format;
 use crate::pipeline::params::{self, Domain, TABLE};
 
-/// Where a value stands: only some places have lists.
+/// Place of a value; only some places have lists.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Place {
     /// A query, where lists are separated by commas.
@@ -57,7 +57,7 @@ pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
     }
 }
 
-/// What front ends build controls from, as `x-control`: `unit`, `usual` (the part of the bounds for a slider), `instead_of`
+/// Hints for the controls of front ends, as `x-control`: `unit`, `usual` (the part of the bounds for a slider), `instead_of`
 /// (parameters that cannot stand beside this one), and `format` (the only one that it goes with). One member, as their order would be anybody's.
 fn hints(parameter: &params::Parameter) -> Option<Extensions> {
     let mut control = serde_json::Map::new();
@@ -202,7 +202,7 @@ macro_rules! request_headers {
 }
 
 request_headers!(
-    /// How an answer is wished for.
+    /// Preferences of a request.
     Wishes: [
         (
             "Prefer", None, "respond-async",
@@ -227,7 +227,7 @@ request_headers!(
     )]
 );
 request_headers!(
-    /// What the client has already.
+    /// Validators of the client's copy.
     Unchanged: [(
         "If-None-Match", None, "\"ba7816bf\"", "`ETag`s that the client has: if one still holds, the answer is 304.",
     )]
@@ -244,7 +244,7 @@ request_headers!(
     ]
 );
 request_headers!(
-    /// Where a listener was cut off.
+    /// Last event that the client received.
     Resumption: [(
         "Last-Event-ID", None, "3", "The last event that was seen: only newer ones are sent. After the last, 204.",
     )]

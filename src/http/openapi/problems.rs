@@ -14,7 +14,7 @@ use utoipa::{PartialSchema, ToSchema};
 use crate::http::kinds::{KINDS, Kind, Row};
 use crate::http::problem::MEDIA_TYPE;
 
-/// What receiving a body can end in.
+/// Problems of receiving a body.
 pub(in crate::http) const BODY: &[Kind] = &[
     Kind::BadRequest,
     Kind::BodyTimeout,
@@ -23,15 +23,15 @@ pub(in crate::http) const BODY: &[Kind] = &[
     Kind::UnsupportedEncoding,
     Kind::MemoryFull,
 ];
-/// What a JSON document that names a structure adds.
+/// Further problems of a JSON document that names a structure.
 pub(in crate::http) const NAMED: &[Kind] =
     &[Kind::NoSuchStructure, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable, Kind::StoreFailed];
-/// What parameters can be.
+/// Problems of parameters.
 pub(in crate::http) const PARAMETERS: &[Kind] = &[Kind::BadRequest, Kind::BadParameter];
-/// What reading a structure can end in.
+/// Problems of reading a structure.
 pub(in crate::http) const READING: &[Kind] =
     &[Kind::InflatedTooLarge, Kind::UnreadableStructure, Kind::NoAtoms, Kind::TooManyAtoms];
-/// What a job can end in, reading apart.
+/// Problems of a job, without those of reading.
 pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::EmptySelection,
     Kind::GridTooLarge,
@@ -46,7 +46,7 @@ pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::ShuttingDown,
     Kind::Deadline,
 ];
-/// What asking for a job can end in before it runs.
+/// Problems of requesting a job, before it runs.
 pub(in crate::http) const ASKING: &[Kind] =
     &[Kind::OtherRequest, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFull, Kind::StoreFailed];
 

@@ -1,6 +1,6 @@
 /**
- * Files that may take long. If the service answers with a job (202), the job is followed to its result, and cancelled
- * when the caller no longer wants it. Used by the page and by `<molmesh-viewer>`.
+ * Requests for files that may take long. The service is asked for a job if the file is not ready after a few seconds; the
+ * job is followed to its result, and cancelled on abort. Used by the page and by `<molmesh-viewer>`.
  */
 
 import type { Client } from "./client";
@@ -17,7 +17,9 @@ export interface Job {
 /** Called with the state of a job that is being followed. */
 export type Progress = (job: Job) => void;
 
-/** Longest wait for a job's end in one poll, s. */
+/** Time after which the service answers with a job, s. */
+const WAIT_S = 5;
+/** Longest wait for the end of a job in one poll, s. */
 const POLL_S = 5;
 /** Bounds of the pause between two polls, s, whatever `Retry-After` says. */
 const PAUSE_S = { least: 0.5, most: 30 };
@@ -26,14 +28,22 @@ const PAUSE_S = { least: 0.5, most: 30 };
 const UNCACHED: RequestInit = { cache: "no-store" };
 
 /**
- * Fetches the file at `path`. A job is followed through its `Location` to the result; a failed job is thrown as its
- * Problem. Aborting `signal` cancels the request and the job.
+ * Fetches the file at `path`. Follows a job through its `Location` to the result; throws the Problem of a failed job.
+ * Aborting `signal` cancels the request and the job.
  */
 export async function fetchFile(
   client: Client, path: string, signal: AbortSignal, progress: Progress, options: RequestInit = UNCACHED,
 ): Promise<Response> {
-  const reply = await client.ask(path, { ...options, signal });
+  const headers = new Headers(options.headers);
+  if (acceptsPreference(path)) headers.set("prefer", `wait=${WAIT_S}`);
+  const reply = await client.ask(path, { ...options, headers, signal });
   return reply.status === 202 ? follow(client, reply, signal, progress) : complete(reply);
+}
+
+/** Whether `Prefer` may be sent: the header makes browsers send a preflight, which a static file server elsewhere rejects. */
+function acceptsPreference(path: string): boolean {
+  const { origin, pathname } = new URL(path, location.href);
+  return origin === location.origin || pathname.includes("/v1/");
 }
 
 /** Follows the job that `reply` announces. */
@@ -54,13 +64,13 @@ async function follow(client: Client, reply: Response, signal: AbortSignal, prog
   return complete(await client.ask(`${address}/result`, { ...UNCACHED, signal }));
 }
 
-/** Rejects successes without a file, such as a 204. */
+/** Throws on a success without a file, such as a 204. */
 function complete(reply: Response): Response {
   if (reply.status !== 200) throw new Error(`the server answered ${reply.status} ${reply.statusText} instead of a file`);
   return reply;
 }
 
-/** Resolves with a job that has ended. Follows its events, and polls if their stream breaks off or is unavailable. */
+/** Resolves when a job has ended. Follows its events; polls if their stream breaks or is unavailable. */
 async function ended(client: Client, address: string, signal: AbortSignal, progress: Progress): Promise<Job> {
   for (;;) {
     const last = await endedInEvents(client, address, signal, progress);
@@ -70,9 +80,24 @@ async function ended(client: Client, address: string, signal: AbortSignal, progr
     progress(job);
     if (isOver(job)) return job;
     const pause = Math.min(PAUSE_S.most, Math.max(PAUSE_S.least, Number(reply.headers.get("retry-after")) || 0));
-    await new Promise((resolve) => setTimeout(resolve, 1000 * pause));
-    signal.throwIfAborted();
+    await sleep(1000 * pause, signal);
   }
+}
+
+/** Waits for some milliseconds. Rejects as soon as `signal` is aborted. */
+function sleep(ms: number, signal: AbortSignal): Promise<void> {
+  return new Promise((resolve, reject) => {
+    const abort = () => {
+      clearTimeout(timer);
+      reject(signal.reason as Error);
+    };
+    const timer = setTimeout(() => {
+      signal.removeEventListener("abort", abort);
+      resolve();
+    }, ms);
+    if (signal.aborted) abort();
+    else signal.addEventListener("abort", abort, { once: true });
+  });
 }
 
 /**

@@ -1,4 +1,4 @@
-//! Files that are embedded packed with gzip, for whoever takes them so and for whoever does not.
+//! Embedded files: stored with gzip, inflated for clients that do not accept it.
 
 use std::io::Read as _;
 
@@ -9,7 +9,7 @@ use bytes::Bytes;
 
 use super::problem::Problem;
 
-/// A file whose packed bytes these are: packed, if the `request` takes that. The caller adds what it is.
+/// Answers with an embedded file; `bytes` are compressed with gzip. The caller adds the content type.
 pub(super) fn file(request: &HeaderMap, bytes: &'static [u8]) -> Result<Response, Problem> {
     let takes = |coding: &str| {
         let (name, weight) = coding.split_once(';').unwrap_or((coding, "q=1"));

@@ -1,4 +1,4 @@
-//! JSON bodies: an object that names a structure, and parameters. Parsed into names and texts, never into a tree:
+//! JSON bodies: an object of parameters, one of which names a structure. Parsed into names and texts without a tree, so
 //! a body within `limits.json_bytes` takes less than a millisecond.
 
 use std::fmt;
@@ -8,24 +8,24 @@ use serde::de::{Deserialize, Deserializer, Error, IgnoredAny, MapAccess, SeqAcce
 use super::kinds::Kind;
 use super::problem::Problem;
 
-/// Returns the members of an object, in order, each as written in a query.
+/// Returns the members of an object in order, with their values as in a query.
 pub(super) fn members(bytes: &[u8]) -> Result<Vec<(String, String)>, Problem> {
     let Members(members) = serde_json::from_slice(bytes)
         .map_err(|e| bad(&e.to_string()).with("line", e.line()).with("column", e.column()))?;
     let text = |(name, Member(text)): (String, Member)| match text {
         Some(text) => Ok((name, text)),
-        None => Err(unfit(&name)),
+        None => Err(bad_member(&name)),
     };
     members.into_iter().map(text).collect()
 }
 
-/// Returns the problem for a body that is not such a document.
+/// Returns the problem of a body that is not such a document.
 pub(super) fn bad(detail: &str) -> Problem {
     Problem::new(Kind::BadRequest, format!("the JSON cannot be read: {detail}"))
         .with("expected", "{\"pdb_id\": \"4pti\", …}")
 }
 
-fn unfit(name: &str) -> Problem {
+fn bad_member(name: &str) -> Problem {
     let name: String = name.chars().take(80).collect();
     let detail = format!("member `{name}` is neither text, number, true or false, nor a list of them");
     Problem::new(Kind::BadParameter, detail).with("parameter", name)
@@ -33,7 +33,7 @@ fn unfit(name: &str) -> Problem {
 
 struct Members(Vec<(String, Member)>);
 
-/// A scalar or a list of scalars as text; none for anything else.
+/// Scalar or list of scalars as text; `None` for any other value.
 struct Member(Option<String>);
 
 impl<'de> Deserialize<'de> for Members {
@@ -64,7 +64,7 @@ impl<'de> Deserialize<'de> for Member {
     }
 }
 
-/// Reads a value as text. Lists in lists are not accepted.
+/// Visitor that reads a value as text. Nested lists are rejected.
 #[derive(Clone, Copy)]
 struct Scalars {
     is_item: bool,
@@ -123,7 +123,7 @@ impl<'de> Visitor<'de> for Scalars {
     }
 }
 
-/// An item of a list.
+/// Item of a list.
 struct Item;
 
 impl<'de> serde::de::DeserializeSeed<'de> for Item {
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn values_that_are_no_parameters_are_named() {
+    fn invalid_values_are_named() {
         for value in ["null", "{}", "{\"b\": 1}", "[]", "[[]]", "[[1]]", "[null]", "[1, {}]"] {
             let problem = members(format!("{{\"a\": {value}}}").as_bytes()).unwrap_err();
             assert!(problem.is(Kind::BadParameter), "{value}");

@@ -1,19 +1,18 @@
-//! A piece of work in the house: whoever asks for the same while it waits or runs takes part in it.
+//! A queued or running job with everybody who waits for it: identical requests share one job.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use tokio::sync::oneshot;
-
 use super::rank::Rank;
 use super::{Outcome, Task};
 use crate::pipeline::{Job, ProgressSink, Tracker, params};
+use crate::single_flight::ResultSender;
 use crate::store::Digest;
 use crate::surface::CancelToken;
 use crate::telemetry::TraceSpan;
 
-/// What makes two tasks one: the same input, the same parameters, the same check.
+/// Identity of the work of a task: input, parameters and strictness. Tasks with equal keys share one job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct WorkKey(Digest);
 
@@ -23,7 +22,7 @@ impl WorkKey {
     }
 }
 
-/// How far a piece of work is. Told by the worker, read by whoever wants to know.
+/// Progress of a job, written by its worker.
 #[derive(Debug, Default)]
 pub struct Progress {
     begun: AtomicBool,
@@ -32,7 +31,7 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// The stage that runs and the fraction of the whole; none while the work waits.
+    /// Returns the running stage and the finished fraction of the job, from 0 to 1; `None` while the job is queued.
     #[must_use]
     pub fn now(&self) -> Option<(&'static str, f64)> {
         self.begun.load(Ordering::Acquire).then(|| self.tracker.now())
@@ -42,7 +41,7 @@ impl Progress {
         self.begun.store(true, Ordering::Release);
     }
 
-    /// The stages that are over, with when they began and how long they took.
+    /// Takes the finished stages, each with its start and its duration.
     pub(super) fn stages(&self) -> Vec<(&'static str, Instant, Duration)> {
         std::mem::take(&mut *self.ended.lock().unwrap_or_else(PoisonError::into_inner))
     }
@@ -58,43 +57,45 @@ impl ProgressSink for Progress {
     }
 }
 
-/// Called on the worker's thread right before the work begins: what must be on record by then.
-pub type Claim = Box<dyn FnOnce() + Send>;
+/// Callback that a worker runs right before it starts a job.
+pub type OnStart = Box<dyn FnOnce() + Send>;
 
-/// Whoever waits for an outcome.
-pub(super) struct Waiter {
-    pub(super) id: u64,
-    pub(super) reply: oneshot::Sender<Outcome>,
-}
-
-/// A piece of work that waits or runs.
-pub(super) struct Flight {
+/// A queued or running job.
+pub(super) struct CoalescedJob {
     pub(super) id: u64,
     pub(super) work: WorkKey,
     pub(super) rank: Rank,
-    /// Expected work.
+    /// Expected work, in the units of [`crate::pipeline::work`].
     pub(super) units: f64,
-    /// Place among the clients' fair shares: lower goes first.
+    /// Start tag of fair queueing: the lowest one runs first.
     pub(super) tag: f64,
     pub(super) accepted: Instant,
     pub(super) begun: Option<Instant>,
     pub(super) cancel: CancelToken,
     pub(super) progress: Arc<Progress>,
-    /// The span of the work, from its acceptance on, under that of the first who asked.
+    /// Span of the job, a child of the span of its first request.
     pub(super) span: TraceSpan,
-    pub(super) waiters: Vec<Waiter>,
-    pub(super) claims: Vec<Claim>,
-    /// Taken by the worker.
+    /// Sends the outcome to the tickets; `None` once they were told that the service stops.
+    pub(super) outcome: Option<ResultSender<Outcome>>,
+    pub(super) on_start: Vec<OnStart>,
+    /// `None` once a worker has taken it.
     pub(super) task: Option<Task>,
 }
 
-/// What a worker takes.
+impl CoalescedJob {
+    /// Returns true if no ticket is left.
+    pub(super) fn is_abandoned(&self) -> bool {
+        self.outcome.as_ref().is_none_or(ResultSender::is_abandoned)
+    }
+}
+
+/// A job as a worker takes it from the queue.
 pub(super) struct Entry {
     pub(super) id: u64,
     pub(super) task: Task,
     pub(super) cancel: CancelToken,
     pub(super) progress: Arc<Progress>,
-    pub(super) claims: Vec<Claim>,
+    pub(super) on_start: Vec<OnStart>,
     pub(super) accepted: Instant,
     pub(super) span: TraceSpan,
 }

@@ -1,5 +1,5 @@
-//! A connection's stream, guarded in two ways that hyper leaves to others: a client that takes no bytes is given up,
-//! and a connection that is closed while the client still sends is closed gently, so that the client gets to read why.
+//! TCP stream with a write timeout and a lingering close. A client that reads nothing is disconnected, and a connection
+//! that is closed while the client still sends stays open for reading, so that the client receives the response.
 
 use std::io;
 use std::pin::Pin;
@@ -10,15 +10,15 @@ use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
 use tokio::time::{Instant, Sleep};
 
-/// How long a closed connection still takes what its client sends.
+/// Time for which a closed connection still reads.
 const LINGER: Duration = Duration::from_secs(2);
-/// How much of it.
+/// Maximum number of bytes that a closed connection still reads.
 const LINGER_BYTES: u64 = 64 << 20;
 
-/// A guarded stream.
+/// TCP stream with a write timeout and a lingering close.
 pub(super) struct Guarded<H: Send + 'static> {
     stream: Option<TcpStream>,
-    /// Kept until the socket is really closed: the connection's place.
+    /// Permit of the connection, held until the socket is closed.
     hold: Option<H>,
     timeout: Duration,
     stalled: Option<Pin<Box<Sleep>>>,
@@ -26,7 +26,7 @@ pub(super) struct Guarded<H: Send + 'static> {
 }
 
 impl<H: Send + 'static> Guarded<H> {
-    /// Guards `stream`; `hold` is dropped when the socket is closed.
+    /// Wraps `stream`; `hold` is dropped when the socket is closed.
     pub(super) fn new(stream: TcpStream, hold: H, timeout: Duration) -> Self {
         Self { stream: Some(stream), hold: Some(hold), timeout, stalled: None, peer_ended: false }
     }
@@ -35,7 +35,7 @@ impl<H: Send + 'static> Guarded<H> {
         self.stream.as_mut().map(Pin::new).ok_or_else(|| io::ErrorKind::NotConnected.into())
     }
 
-    /// A write that waits starts the clock, one that goes on stops it.
+    /// Starts the timeout when a write is pending, stops it when the write proceeds.
     fn watch<T>(&mut self, cx: &mut Context<'_>, polled: Poll<io::Result<T>>) -> Poll<io::Result<T>> {
         if polled.is_ready() {
             self.stalled = None;
@@ -44,7 +44,7 @@ impl<H: Send + 'static> Guarded<H> {
         let timeout = self.timeout;
         let sleep = self.stalled.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(Instant::now() + timeout)));
         ready!(sleep.as_mut().poll(cx));
-        Poll::Ready(Err(io::Error::new(io::ErrorKind::TimedOut, "the client takes no bytes")))
+        Poll::Ready(Err(io::Error::new(io::ErrorKind::TimedOut, "the client reads nothing")))
     }
 }
 
@@ -98,8 +98,8 @@ impl<H: Send + 'static> Drop for Guarded<H> {
     }
 }
 
-/// Closing a socket with unread bytes makes the system tell the client of a reset, which throws away the answer that
-/// it has not read yet. So: say that nothing more comes, and swallow what does, for a while.
+/// Closes a socket without losing the response. Closing with unread bytes would send a reset, which discards what the
+/// client has not read yet, so this shuts down the sending side and discards input for a while.
 async fn linger<H>(mut stream: TcpStream, hold: H) {
     use tokio::io::AsyncWriteExt as _;
     let swallow = async {
@@ -108,7 +108,7 @@ async fn linger<H>(mut stream: TcpStream, hold: H) {
         tokio::io::copy(&mut reader, &mut sink).await
     };
     if let Ok(Err(error)) = tokio::time::timeout(LINGER, swallow).await {
-        tracing::trace!(%error, "a client was gone before its connection was closed");
+        tracing::trace!(%error, "a client left before its connection was closed");
     }
     drop(hold);
 }

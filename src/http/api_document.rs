@@ -1,11 +1,5 @@
-//! `/openapi.yaml` and `/openapi.json`: the description of this interface, collected from what stands beside each
-//! handler. `openapi.yaml` at the top level is the same text; a test says so, and writes it anew when told to.
-
-pub(super) mod access;
-pub(super) mod bodies;
-pub(super) mod meshes;
-pub(super) mod parameters;
-pub(super) mod problems;
+//! `/openapi.yaml` and `/openapi.json`: the OpenAPI document, assembled from the annotations of the handlers. A test
+//! keeps `openapi.yaml` in the repository equal to it.
 
 use std::sync::LazyLock;
 
@@ -14,9 +8,8 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use utoipa::OpenApi;
 
-use access::Rights;
-pub(super) use problems::refusals;
-
+use super::openapi::access::Rights;
+use super::openapi::problems;
 use super::problem::Problem;
 
 const ABOUT: &str = "Molecules in, surface meshes out.
@@ -31,7 +24,7 @@ where none is listed means a defect of the server. Where a quota applies, answer
 401 or 403, and every key is ignored. Every answer has an `X-Request-Id`: the client's own, if it sent one of 64 letters, \
 digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
 
-/// The description.
+/// OpenAPI document.
 #[derive(OpenApi)]
 #[openapi(
     info(title = "molmesh", description = ABOUT, license(name = "MIT OR Apache-2.0", identifier = "MIT OR Apache-2.0")),
@@ -39,7 +32,7 @@ digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
     tags(
         (name = "meshes", description = "Structures to meshes."),
         (name = "structures", description = "Structures that are uploaded once."),
-        (name = "jobs", description = "Meshes that are promised."),
+        (name = "jobs", description = "Asynchronous jobs."),
         (name = "results", description = "Meshes that were made, for as long as they are kept."),
         (name = "service", description = "About the service."),
         (name = "page", description = "The pages and what they consist of."),
@@ -60,7 +53,7 @@ digits, `-`, `_` or `.` at most. Lengths are in ångström (Å).";
 )]
 struct Description;
 
-/// The description as YAML and as JSON.
+/// OpenAPI document as YAML and as JSON.
 static TEXTS: LazyLock<Result<[Bytes; 2], String>> = LazyLock::new(|| {
     let description = Description::openapi();
     let yaml = description.to_yaml().map_err(|error| error.to_string())?;
@@ -73,14 +66,14 @@ fn answer(which: usize, media_type: &'static str) -> Result<Response, Problem> {
     Ok(([(CONTENT_TYPE, media_type), (CACHE_CONTROL, "no-cache")], texts[which].clone()).into_response())
 }
 
-/// This description as YAML.
+/// Returns this document as YAML.
 #[utoipa::path(get, path = "/openapi.yaml", tag = "service", operation_id = "describeYaml",
     responses((status = 200, description = "The description.", body = Object, content_type = "application/yaml")))]
 pub(super) async fn yaml() -> Result<Response, Problem> {
     answer(0, "application/yaml")
 }
 
-/// This description as JSON.
+/// Returns this document as JSON.
 #[utoipa::path(get, path = "/openapi.json", tag = "service", operation_id = "describeJson",
     responses((status = 200, description = "The description.", body = Object, content_type = "application/json")))]
 pub(super) async fn json() -> Result<Response, Problem> {

@@ -1,5 +1,5 @@
-//! What a `Content-Type` says a structure is, and whether the bytes agree. The bytes decide what is read; a type that
-//! contradicts them is refused, as one of the two is not what the client thinks.
+//! Declared type of a structure file. The format is detected from the bytes; a `Content-Type` that contradicts them is
+//! rejected, since one of the two is a mistake.
 
 use super::kinds::Kind;
 use super::problem::Problem;
@@ -8,21 +8,21 @@ use crate::pipeline::JobError;
 use crate::structure::StructureError;
 use crate::structure::atoms::SourceFormat;
 
-/// What was declared.
+/// Declared type of a body.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Declared {
-    /// Nothing that could contradict a structure file: nothing, text, octets, curl's form type.
+pub(super) enum DeclaredType {
+    /// No type, or one that contradicts no structure file: text, octets, curl's default form type.
     Neutral,
-    /// A structure format.
+    /// Structure format, with the type.
     Structure(SourceFormat, String),
-    /// A compressed file, with its first bytes.
+    /// Compressed file, with its first bytes and the type.
     Compressed(&'static [u8], String),
-    /// Something else altogether.
+    /// Type of another kind of file.
     Foreign(String),
 }
 
-impl Declared {
-    /// Reads a media type; parameters such as `charset` are ignored.
+impl DeclaredType {
+    /// Parses a media type; parameters such as `charset` are ignored.
     pub(super) fn new(content_type: &str) -> Self {
         let essence = content_type.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
         let (kind, subtype) = essence.split_once('/').unwrap_or_default();
@@ -43,22 +43,22 @@ impl Declared {
         }
     }
 
-    /// Whether it names a structure format, which the bytes must then have.
+    /// Returns true if a structure format is declared, which the bytes must have.
     pub(super) const fn is_structure(&self) -> bool {
         matches!(self, Self::Structure(..))
     }
 
-    /// Checks what the first bytes can tell.
+    /// Checks the first bytes.
     pub(super) fn check_bytes(&self, bytes: &[u8]) -> Result<(), Problem> {
         match self {
             Self::Compressed(magic, essence) if !bytes.starts_with(magic) => {
-                Err(contradiction(essence, "no such compressed data"))
+                Err(contradiction(essence, "not compressed that way"))
             }
             _ => Ok(()),
         }
     }
 
-    /// Checks the format that was read.
+    /// Checks the detected format.
     pub(super) fn check_format(&self, found: &str) -> Result<(), Problem> {
         match self {
             Self::Structure(format, essence) if format.name() != found => Err(contradiction(essence, found)),
@@ -66,7 +66,7 @@ impl Declared {
         }
     }
 
-    /// The problem of a job that failed: bytes that are no structure are what a foreign type said all along.
+    /// Converts a failure. Bytes of unknown format under a foreign type are a contradiction of that type.
     pub(super) fn explain(&self, failure: Failure) -> Problem {
         match (self, failure) {
             (
@@ -81,7 +81,7 @@ impl Declared {
 fn contradiction(declared: &str, found: &str) -> Problem {
     Problem::new(
         Kind::UnsupportedMediaType,
-        format!("the body is declared as {declared}, but its bytes are {found}; leave the type out, or say what it is"),
+        format!("the body is declared as {declared}, but its bytes are {found}; omit `Content-Type` or correct it"),
     )
     .with("declared", declared)
     .with("found", found)
@@ -96,21 +96,21 @@ mod tests {
         for neutral in
             ["", "application/x-www-form-urlencoded", "text/plain; charset=utf-8", "application/octet-stream", "x"]
         {
-            assert_eq!(Declared::new(neutral), Declared::Neutral, "{neutral}");
+            assert_eq!(DeclaredType::new(neutral), DeclaredType::Neutral, "{neutral}");
         }
-        assert!(matches!(Declared::new("Image/PNG"), Declared::Foreign(e) if e == "image/png"));
+        assert!(matches!(DeclaredType::new("Image/PNG"), DeclaredType::Foreign(e) if e == "image/png"));
     }
 
     #[test]
     fn contradictions_are_seen() {
-        assert!(Declared::new("chemical/x-pdb").check_format("mmcif").is_err());
-        assert!(Declared::new("chemical/x-pdb").check_format("pdb").is_ok());
+        assert!(DeclaredType::new("chemical/x-pdb").check_format("mmcif").is_err());
+        assert!(DeclaredType::new("chemical/x-pdb").check_format("pdb").is_ok());
         for binary in ["chemical/x-bcif", "application/vnd.binarycif", "application/vnd.msgpack; charset=binary"] {
-            assert!(Declared::new(binary).check_format("bcif").is_ok(), "{binary}");
-            assert!(Declared::new(binary).check_format("mmcif").is_err(), "{binary}");
+            assert!(DeclaredType::new(binary).check_format("bcif").is_ok(), "{binary}");
+            assert!(DeclaredType::new(binary).check_format("mmcif").is_err(), "{binary}");
         }
-        assert!(Declared::new("chemical/x-mmcif").check_format("bcif").is_err());
-        assert!(Declared::new("application/gzip").check_bytes(b"ATOM").is_err());
-        assert!(Declared::new("application/gzip").check_bytes(&[0x1f, 0x8b, 8]).is_ok());
+        assert!(DeclaredType::new("chemical/x-mmcif").check_format("bcif").is_err());
+        assert!(DeclaredType::new("application/gzip").check_bytes(b"ATOM").is_err());
+        assert!(DeclaredType::new("application/gzip").check_bytes(&[0x1f, 0x8b, 8]).is_ok());
     }
 }

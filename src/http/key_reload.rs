@@ -1,4 +1,4 @@
-//! Keys that change while the service runs: their file is looked at from time to time, and read when somebody says so.
+//! Reloading of the key file: periodically, and on SIGHUP.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,43 +8,43 @@ use metrics::gauge;
 use crate::access::Access;
 use crate::telemetry::QUOTA_CLIENTS;
 
-/// How often the file of keys is looked at: a key that is withdrawn is of no use a few seconds later.
-const LOOK: Duration = Duration::from_secs(2);
+/// Interval between two checks of the key file, so that a withdrawn key is rejected a few seconds later.
+const INTERVAL: Duration = Duration::from_secs(2);
 
-/// Tells metrics how many clients there are.
+/// Publishes the number of clients with a quota.
 #[expect(clippy::cast_precision_loss, reason = "gauges are floats, counts of clients are small")]
-pub(super) fn tell(access: &Access) {
+pub(super) fn publish_clients(access: &Access) {
     gauge!(QUOTA_CLIENTS).set(access.meter().clients() as f64);
 }
 
-/// Reads the file of keys again whenever it has changed, and on SIGHUP. Without keys, does nothing: SIGHUP then means what
-/// it means to other programs. The signal is listened for from the call on, not from the first poll.
-pub(super) fn keys(access: Arc<Access>) -> impl Future<Output = ()> + Send + 'static {
+/// Reloads the key file when it changes and on SIGHUP. Without keys it does nothing, and SIGHUP keeps its default
+/// action. Listens for the signal from the call on, not from the first poll.
+pub(super) fn run(access: Arc<Access>) -> impl Future<Output = ()> + Send + 'static {
     let hangup = access.has_keys().then(Hangup::listen);
     async move {
         if let Some(hangup) = hangup {
-            renew(&access, hangup).await;
+            reload(&access, hangup).await;
         }
     }
 }
 
-async fn renew(access: &Arc<Access>, mut hangup: Hangup) {
+async fn reload(access: &Arc<Access>, mut hangup: Hangup) {
     loop {
-        let told = tokio::select! {
+        let requested = tokio::select! {
             () = hangup.next() => true,
-            () = tokio::time::sleep(LOOK) => false,
+            () = tokio::time::sleep(INTERVAL) => false,
         };
         let access = Arc::clone(access);
-        match tokio::task::spawn_blocking(move || access.refresh(told)).await {
+        match tokio::task::spawn_blocking(move || access.refresh(requested)).await {
             Ok(Ok(None)) => {}
-            Ok(Ok(Some(keys))) => tracing::info!(keys, "the keys were read again"),
-            Ok(Err(error)) => tracing::error!(%error, "the keys stay as they were"),
-            Err(error) => tracing::error!(%error, "the keys cannot be read"),
+            Ok(Ok(Some(keys))) => tracing::info!(keys, "reloaded the keys"),
+            Ok(Err(error)) => tracing::error!(%error, "cannot reload the keys; the earlier ones stay valid"),
+            Err(error) => tracing::error!(%error, "reloading the keys panicked"),
         }
     }
 }
 
-/// SIGHUP, where there is one.
+/// SIGHUP, on systems that have it.
 struct Hangup {
     #[cfg(unix)]
     signal: Option<tokio::signal::unix::Signal>,

@@ -1,0 +1,276 @@
+//! Conversion of the errors of other modules into problems. No other file does this for jobs, meshes and the store.
+
+use std::time::Duration;
+
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use super::kinds::Kind;
+use super::problem::Problem;
+use crate::formats::FormatError;
+use crate::jobs::{AcceptError, EndError, Exhausted, Failure, Refusal, SaveError};
+use crate::picture::PictureError;
+use crate::pipeline::JobError;
+use crate::pipeline::params::ParamError;
+use crate::store::StoreError;
+use crate::structure::StructureError;
+use crate::structure::referee::Diagnostic;
+use crate::surface::SurfaceError;
+
+/// Finding of the strict parser.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Finding {
+    /// `note`, `warning` or `error`.
+    level: &'static str,
+    /// Line in the file, from 1.
+    #[schema(required)]
+    line: Option<u64>,
+    /// Description.
+    message: String,
+}
+
+/// Converts the findings of the strict parser.
+pub(super) fn findings(diagnostics: &[Diagnostic]) -> Vec<Finding> {
+    let finding = |d: &Diagnostic| Finding { level: d.level.name(), line: d.line, message: d.message.clone() };
+    diagnostics.iter().map(finding).collect()
+}
+
+/// Adds the findings of the strict parser, if there are any.
+fn diagnosed(problem: Problem, diagnostics: &[Diagnostic]) -> Problem {
+    if diagnostics.is_empty() {
+        return problem;
+    }
+    match serde_json::to_value(findings(diagnostics)) {
+        Ok(findings) => problem.with("diagnostics", findings),
+        Err(error) => Problem::internal(error),
+    }
+}
+
+/// Returns the problem of a mesh file that exceeds `limit` bytes. File sizes grow with the inverse square of the
+/// spacing.
+#[expect(clippy::cast_precision_loss, reason = "an estimate: 52 bits suffice")]
+pub(super) fn file_too_large(bytes: u64, limit: u64, resolution: f64) -> Problem {
+    let fits = resolution * (bytes as f64 / limit as f64).sqrt();
+    let fits = (fits * 105.0).ceil() / 100.0;
+    Problem::new(
+        Kind::MeshTooLarge,
+        format!("the file would have {bytes} bytes and the limit is {limit}; a resolution of {fits} Å would fit"),
+    )
+    .with("limit", limit)
+    .with("actual", bytes)
+    .with("suggested_resolution", fits)
+}
+
+/// Returns the problem of a mesh that cannot be written.
+pub(super) fn format_problem(error: &FormatError, resolution: f64) -> Problem {
+    match *error {
+        FormatError::GlbTooLarge { bytes, limit } => file_too_large(bytes, limit, resolution),
+        FormatError::TooMany { count, limit, .. } => file_too_large(count, limit, resolution),
+        FormatError::AtomIndexTooLarge { limit, .. } => {
+            Problem::new(Kind::MeshTooLarge, error.to_string()).with("limit", limit).with("parameter", "atom_ids")
+        }
+        _ => Problem::internal(error),
+    }
+}
+
+impl From<ParamError> for Problem {
+    fn from(error: ParamError) -> Self {
+        let problem = Self::new(Kind::BadParameter, error.to_string());
+        match error {
+            ParamError::Unknown { name, nearest } => problem.with("parameter", name).with("nearest", nearest),
+            ParamError::Repeated { name } => problem.with("parameter", name),
+            ParamError::BadValue { name, value, expected } => {
+                problem.with("parameter", name).with("value", value.trim_matches('`')).with("expected", expected)
+            }
+        }
+    }
+}
+
+impl From<Exhausted> for Problem {
+    fn from(error: Exhausted) -> Self {
+        Self::new(Kind::MemoryFull, error.to_string())
+            .with("limit", error.limit)
+            .with("actual", error.held)
+            .retry_after(Duration::from_secs(1))
+    }
+}
+
+impl From<Refusal> for Problem {
+    fn from(error: Refusal) -> Self {
+        match error {
+            Refusal::QueueFull { waiting, limit, wait } => Self::new(Kind::QueueFull, error.to_string())
+                .with("limit", limit)
+                .with("actual", waiting)
+                .with("estimated_wait_s", wait.as_secs_f64())
+                .retry_after(wait),
+            Refusal::TooLate { wait, allowed } => Self::new(Kind::QueueFull, error.to_string())
+                .with("limit", u64::try_from(allowed.as_millis()).unwrap_or(u64::MAX))
+                .with("estimated_wait_s", wait.as_secs_f64())
+                .retry_after(wait.saturating_sub(allowed)),
+            Refusal::Draining => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
+        }
+    }
+}
+
+impl From<Failure> for Problem {
+    fn from(error: Failure) -> Self {
+        match error {
+            Failure::Job { error: JobError::Structure(error), diagnostics } => diagnosed(error.into(), &diagnostics),
+            Failure::Job { error: JobError::Surface(error), .. } => error.into(),
+            Failure::Job { error: JobError::Picture(error), .. } => error.into(),
+            Failure::Check { ref diagnostics } => {
+                let problem = Self::new(Kind::UnreadableStructure, error.to_string()).with("parameter", "check");
+                diagnosed(problem, diagnostics)
+            }
+            Failure::Deadline { limit } => Self::new(Kind::Deadline, error.to_string())
+                .with("limit", u64::try_from(limit.as_millis()).unwrap_or(u64::MAX)),
+            Failure::Memory(error) => error.into(),
+            Failure::Stopped => Self::new(Kind::ShuttingDown, error.to_string()).retry_after(Duration::from_secs(1)),
+            Failure::Panicked { .. } => Self::internal(error),
+        }
+    }
+}
+
+impl From<EndError> for Problem {
+    fn from(error: EndError) -> Self {
+        match error {
+            EndError::Job(failure) => failure.into(),
+            EndError::Save { error: SaveError::Format(error), resolution } => format_problem(&error, resolution),
+            EndError::Save { error: SaveError::TooLarge { bytes, limit }, resolution } => {
+                file_too_large(bytes, limit, resolution)
+            }
+            EndError::Save { error: SaveError::Store(error), .. } => error.into(),
+            EndError::Save { error: SaveError::Other(error), .. } => Self::internal(error),
+            EndError::Poison { attempts } => Self::new(Kind::JobAbandoned, error.to_string()).with("actual", attempts),
+            EndError::Lost { .. } => Self::new(Kind::JobAbandoned, error.to_string()),
+        }
+    }
+}
+
+impl From<AcceptError> for Problem {
+    fn from(error: AcceptError) -> Self {
+        match error {
+            AcceptError::Refused(refusal) => refusal.into(),
+            AcceptError::Store(error) => error.into(),
+            AcceptError::OtherRequest => {
+                Self::new(Kind::OtherRequest, error.to_string()).with("parameter", "Idempotency-Key")
+            }
+            AcceptError::Random(_) => Self::internal(error),
+        }
+    }
+}
+
+impl From<StoreError> for Problem {
+    /// Logs the details, which may name places that clients need not know.
+    fn from(error: StoreError) -> Self {
+        let wait = Duration::from_secs(5);
+        match error {
+            StoreError::TooLarge { bytes, max_bytes } => Self::new(Kind::StoreFull, error.to_string())
+                .with("actual", bytes)
+                .with("limit", max_bytes)
+                .retry_after(wait),
+            StoreError::Full { held, max_bytes, .. } => Self::new(Kind::StoreFull, error.to_string())
+                .with("actual", held)
+                .with("limit", max_bytes)
+                .retry_after(wait),
+            other => {
+                tracing::error!(error = %other, "the store failed");
+                Self::new(Kind::StoreFailed, "the store cannot be reached").retry_after(wait)
+            }
+        }
+    }
+}
+
+impl From<StructureError> for Problem {
+    fn from(error: StructureError) -> Self {
+        use StructureError as E;
+        let detail = error.to_string();
+        match error {
+            E::UnknownFormat { found } => Self::new(Kind::UnreadableStructure, detail).with("found", found),
+            E::Syntax { line, column, found, expected } => Self::new(Kind::UnreadableStructure, detail)
+                .with("line", line)
+                .with("column", column)
+                .with("found", found)
+                .with("expected", expected),
+            E::Malformed { place, found, expected } => Self::new(Kind::UnreadableStructure, detail)
+                .with("place", place)
+                .with("found", found)
+                .with("expected", expected),
+            E::Decompress { encoding, .. } => Self::new(Kind::UnreadableStructure, detail).with("encoding", encoding),
+            E::InflatedTooLarge { limit } => Self::new(Kind::InflatedTooLarge, detail).with("limit", limit),
+            E::TooManyAtoms { limit } => Self::new(Kind::TooManyAtoms, detail).with("limit", limit),
+            E::NoAtoms { found } => Self::new(Kind::NoAtoms, detail).with("found", found),
+            E::EmptySelection { holds } => Self::new(Kind::EmptySelection, detail).with("found", holds),
+            E::NotFound { what, asked, available } => Self::new(Kind::EmptySelection, detail)
+                .with("parameter", if what == "chain" { "chains" } else { what })
+                .with("value", asked.trim_matches('`'))
+                .with("expected", available),
+        }
+    }
+}
+
+impl From<PictureError> for Problem {
+    fn from(error: PictureError) -> Self {
+        let detail = error.to_string();
+        match error {
+            PictureError::TooLarge { side, pixels, limit } => Self::new(Kind::PictureTooLarge, detail)
+                .with("parameter", side)
+                .with("limit", limit)
+                .with("actual", pixels),
+            // The other errors are parameter errors.
+            _ => Self::internal(detail),
+        }
+    }
+}
+
+impl From<SurfaceError> for Problem {
+    fn from(error: SurfaceError) -> Self {
+        use SurfaceError as E;
+        let detail = error.to_string();
+        match error {
+            E::NoSpheres => Self::new(Kind::NoAtoms, detail),
+            E::BadSphere { index, expected, .. } => {
+                Self::new(Kind::UnreadableStructure, detail).with("atom", index).with("expected", expected)
+            }
+            E::BadParameter { .. } => ParamError::from(error).into(),
+            E::GridTooLarge { samples, limit, resolution, suggested_resolution } => {
+                Self::new(Kind::GridTooLarge, detail)
+                    .with("limit", limit)
+                    .with("actual", samples)
+                    .with("resolution", resolution)
+                    .with("suggested_resolution", suggested_resolution)
+            }
+            E::TooManyCandidates { candidates, limit, resolution, suggested_resolution } => {
+                let problem = Self::new(Kind::TooManyCandidates, detail)
+                    .with("limit", limit)
+                    .with("actual", candidates)
+                    .with("resolution", resolution);
+                suggested_resolution.into_iter().fold(problem, |p, h| p.with("suggested_resolution", h))
+            }
+            E::MeshTooLarge { bytes, limit, suggested_resolution } => Self::new(Kind::MeshTooLarge, detail)
+                .with("limit", limit)
+                .with("actual", bytes)
+                .with("suggested_resolution", suggested_resolution),
+            E::TooManyTriangles { triangles, limit, resolution } => Self::new(Kind::MeshTooLarge, detail)
+                .with("parameter", "max_triangles")
+                .with("limit", limit)
+                .with("actual", triangles)
+                .with("resolution", resolution),
+            E::NoSurface { isovalue } => {
+                Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
+            }
+            E::DeviceMemory { needed, available, suggested_resolution } => Self::new(Kind::DeviceMemory, detail)
+                .with("limit", available)
+                .with("actual", needed)
+                .with("suggested_resolution", suggested_resolution),
+            // The worker has logged the driver's message.
+            E::Device { .. } => {
+                Self::new(Kind::DeviceFailed, "no device could run the job").retry_after(Duration::from_secs(1))
+            }
+            E::Deadline => Self::new(Kind::Deadline, detail),
+            E::Cancelled => Self::from(Failure::Stopped),
+            // Responses are not written to a sink.
+            E::Sink => Self::internal(detail),
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! Limit of a request body, with the configuration key that sets it.
+
+use super::kinds::Kind;
+use super::problem::Problem;
+
+/// Upper limit with its configuration key.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Limit {
+    pub(super) key: &'static str,
+    pub(super) max: u64,
+}
+
+impl Limit {
+    /// Returns the problem of a body with too many bytes.
+    pub(super) fn exceeded_by_body(self) -> Problem {
+        self.exceeded("the body has", "bytes")
+    }
+
+    /// Returns the problem of an exceeded limit; `what` begins the sentence.
+    pub(super) fn exceeded(self, what: &str, unit: &str) -> Problem {
+        let Self { key, max } = self;
+        Problem::new(Kind::BodyTooLarge, format!("{what} more than {max} {unit} ({key})")).with("limit", max)
+    }
+}

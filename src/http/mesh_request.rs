@@ -1,0 +1,231 @@
+//! Answers to requests for meshes: from the store, from a job that the request waits for, or with a job (202).
+//!
+//! A request gets a 202 only if it has `Prefer: respond-async` or `Prefer: wait=`. Any other request is answered within
+//! `jobs.deadline_ms` or refused; its work is cancelled then, unless another request shares it.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::extract::{FromRequestParts, Query};
+use axum::http::header::{self, HeaderMap};
+use axum::http::request::Parts;
+use axum::http::{HeaderValue, Method, StatusCode};
+use axum::response::{IntoResponse, Response};
+use tracing::Instrument as _;
+
+use super::kinds::Kind;
+use super::parsed_request::ParsedRequest;
+use super::preferences::{PREFERENCE_APPLIED, RequestPreferences};
+use super::problem::Problem;
+use super::source::{self, Input, StructureSource};
+use super::state::Shared;
+use super::timing::Timing;
+use super::{conditional, delivery, jobs, results};
+use crate::jobs::{ContentKey, Failure, JobSpec, Refusal, Task, Ticket};
+use crate::store::Digest;
+use crate::telemetry::{SpanParent, TraceSpan};
+
+/// Request for a mesh or its report.
+pub(super) struct MeshRequest {
+    parsed: ParsedRequest,
+    preferences: RequestPreferences,
+    /// `Cache-Control` of the answer; `None` if it belongs to this request alone.
+    cache: Option<HeaderValue>,
+    timing: Timing,
+}
+
+/// Reads a GET request: the path names the structure and ends in `{file}`, which is `surface.{ext}`.
+impl FromRequestParts<Shared> for MeshRequest {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
+        let timing = Timing::start();
+        let path = source::path_parameters(parts, app).await?;
+        let file = path.iter().find_map(|(name, value)| (name == "file").then_some(value)).unwrap_or_default();
+        let query = Query::from_request_parts(parts, app).await;
+        let preferences = RequestPreferences::of(&parts.headers, &parts.extensions)?;
+        let structure = StructureSource::from_request_parts(parts, app).await?;
+        let parsed = ParsedRequest::from_address(app, structure, file, query)?;
+        Ok(Self { parsed, preferences, cache: Some(source::CACHE), timing })
+    }
+}
+
+impl MeshRequest {
+    /// Creates the request of an upload, whose reception began with `timing`.
+    pub(super) fn of_upload(parsed: ParsedRequest, preferences: RequestPreferences, timing: Timing) -> Self {
+        Self { parsed, preferences, cache: None, timing }
+    }
+
+    /// Answers the request. `headers` may hold conditions and a range.
+    pub(super) async fn answer(
+        mut self,
+        app: &Shared,
+        method: &Method,
+        headers: &HeaderMap,
+    ) -> Result<Response, Problem> {
+        let digest = self.parsed.source.digest(app).await?;
+        self.timing.lap("receive");
+        if let Some(response) = self.without_work(app, &digest, method, headers).await? {
+            return Ok(response);
+        }
+        self.timing.lap("lookup");
+        let input = self.parsed.source.load(app).await?;
+        self.timing.lap("load");
+        self.compute(app, input).await
+    }
+
+    /// Returns an answer that needs no job: a stored result, a 304, or the headers for a HEAD request.
+    async fn without_work(
+        &self,
+        app: &Shared,
+        digest: &Digest,
+        method: &Method,
+        headers: &HeaderMap,
+    ) -> Result<Option<Response>, Problem> {
+        let ParsedRequest { request, format, declared, .. } = &self.parsed;
+        // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
+        let is_reusable =
+            !request.strict && !request.report && !declared.is_structure() && !self.preferences.respond_async;
+        let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job));
+        let etag = delivery::etag(&key);
+        if is_reusable {
+            if let Some(cache) = &self.cache
+                && conditional::is_unchanged(headers, &etag)
+            {
+                let caching = [(header::ETAG, etag), (header::CACHE_CONTROL, cache.clone())];
+                return Ok(Some((StatusCode::NOT_MODIFIED, caching).into_response()));
+            }
+            let stored = match results::stored(app, &key, *format, method, headers).await {
+                // The store has logged its error. The mesh is computed again.
+                Err(problem) if problem.is(Kind::StoreFailed) => None,
+                stored => stored?,
+            };
+            if let Some(mut response) = stored {
+                response.headers_mut().remove(header::CACHE_CONTROL);
+                return Ok(Some(self.cached(response)));
+            }
+        }
+        if method != Method::HEAD || request.report {
+            return Ok(None);
+        }
+        // The summary headers would need a run.
+        let media_type = HeaderValue::from_static(format.media_type());
+        let response = [(header::CONTENT_TYPE, media_type), (header::ETAG, etag)].into_response();
+        Ok(Some(self.cached(response)))
+    }
+
+    fn cached(&self, mut response: Response) -> Response {
+        if let Some(cache) = &self.cache {
+            response.headers_mut().insert(header::CACHE_CONTROL, cache.clone());
+        }
+        response
+    }
+
+    /// Computes the mesh, or answers with a job.
+    async fn compute(self, app: &Shared, input: Input) -> Result<Response, Problem> {
+        app.admit_work(&self.preferences.caller)?;
+        if self.preferences.respond_async {
+            return self.accept(app, input, None).await;
+        }
+        let permit = app.delivery()?;
+        // A report has no address of its own, so it cannot be the result of a job.
+        let wait = self.preferences.wait.filter(|_| !self.parsed.request.report);
+        let jobs = &app.config.jobs;
+        let allowed = if wait.is_some() { jobs.batch_deadline() } else { jobs.deadline() };
+        let ticket = app.pool.submit(self.task(&input), allowed, None);
+        let mut ticket = ticket.map_err(|refusal| self.refused(refusal))?;
+        if ticket.is_shared()
+            && let Some(span) = TraceSpan::current()
+        {
+            span.link(ticket.span().context());
+        }
+        let outcome = match wait {
+            None => ticket.wait().await,
+            Some(wait) => match tokio::time::timeout(wait.min(jobs.deadline()), ticket.wait()).await {
+                Ok(outcome) => outcome,
+                Err(_elapsed) => {
+                    drop(permit);
+                    return self.accept(app, input, Some(ticket)).await;
+                }
+            },
+        };
+        let (digest, joined) = (input.digest, ticket.is_shared());
+        // Dropping the last ticket of unfinished work cancels it.
+        drop((ticket, input));
+        let finished = outcome.map_err(|failure| self.failed(failure))?;
+        let Self { parsed: ParsedRequest { source, request, format, declared, .. }, cache, mut timing, .. } = self;
+        drop(source);
+        if joined {
+            // The stages belong to another request as well, and some ended before this one began.
+            timing.lap("joined");
+        } else {
+            timing.job(&finished.product.report);
+        }
+        declared.check_format(finished.product.report.source_format)?;
+        if request.report {
+            return delivery::report(&finished, timing);
+        }
+        // Another backend may have computed the mesh, with other bytes.
+        let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker());
+        let is_stored = results::save_later(app, &finished, format, &key);
+        let mut response = delivery::mesh(app, Arc::clone(&finished), format, &key, timing, permit).await?;
+        let headers = response.headers_mut();
+        if is_stored {
+            headers.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, format.extension())));
+        }
+        if let Some(cache) = cache {
+            headers.insert(header::CACHE_CONTROL, cache);
+        }
+        Ok(response)
+    }
+
+    fn task(&self, input: &Input) -> Task {
+        Task {
+            input: input.bytes.clone(),
+            digest: input.digest,
+            strict: self.parsed.request.strict,
+            job: self.parsed.request.job.clone(),
+            rank: self.preferences.rank,
+            lease: Some(Arc::clone(&input.lease)),
+            parent: SpanParent::current(),
+            id: None,
+        }
+    }
+
+    /// Accepts a durable job and answers with its address.
+    async fn accept(self, app: &Shared, input: Input, ticket: Option<Ticket>) -> Result<Response, Problem> {
+        if self.parsed.request.report {
+            let detail = "a job has no report of its own; request the mesh, then `report.json` of its result";
+            return Err(Problem::new(Kind::BadParameter, detail).with("parameter", "report"));
+        }
+        let task = self.task(&input);
+        let Self { parsed: ParsedRequest { request, pairs, format, .. }, preferences, .. } = self;
+        let spec = JobSpec { task, parameters: pairs, format, idempotency_key: preferences.idempotency_key };
+        let job_store = app.job_store.clone();
+        // A client that disconnects now does not interrupt the acceptance.
+        let accepted = tokio::spawn(async move { job_store.accept(spec, ticket).await }.in_current_span());
+        let view = accepted.await.map_err(Problem::internal)??;
+        let duration = Duration::from_secs_f64(app.pool.expected(&input.bytes, &request.job));
+        let mut response = jobs::accepted(&view, app.pool.estimated_wait() + duration);
+        if preferences.respond_async {
+            response.headers_mut().insert(PREFERENCE_APPLIED, HeaderValue::from_static("respond-async"));
+        }
+        Ok(response)
+    }
+
+    fn refused(&self, refusal: Refusal) -> Problem {
+        let is_late = matches!(refusal, Refusal::TooLate { .. });
+        let problem = Problem::from(refusal);
+        if is_late { self.advise(problem) } else { problem }
+    }
+
+    fn failed(&self, failure: Failure) -> Problem {
+        let problem = self.parsed.declared.explain(failure);
+        if problem.is(Kind::Deadline) { self.advise(problem) } else { problem }
+    }
+
+    /// Recommends a job to a client whose request cannot be answered in time.
+    fn advise(&self, problem: Problem) -> Problem {
+        if self.parsed.request.report { problem } else { problem.advise("send `Prefer: respond-async` to get a job") }
+    }
+}

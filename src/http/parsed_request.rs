@@ -1,0 +1,152 @@
+//! Parsed requests for meshes: structure, parameters and format, from an address or from a body.
+
+use axum::body::Body;
+use axum::extract::Query;
+use axum::extract::rejection::QueryRejection;
+use axum::http::header::HeaderMap;
+
+use super::content_type::DeclaredType;
+use super::kinds::Kind;
+use super::problem::Problem;
+use super::source::{Input, StructureSource};
+use super::state::{App, Shared};
+use super::upload::{self, Upload};
+use super::{json_body, negotiate};
+use crate::formats::Format;
+use crate::pipeline::params::{self, Request};
+
+/// Pairs of a query, in order.
+pub(super) type Pairs = Result<Query<Vec<(String, String)>>, QueryRejection>;
+
+/// Structure, parameters and format of a request.
+pub(super) struct ParsedRequest {
+    pub(super) source: StructureSource,
+    pub(super) request: Request,
+    /// Parameters as the client wrote them.
+    pub(super) pairs: Vec<(String, String)>,
+    pub(super) format: Format,
+    pub(super) declared: DeclaredType,
+}
+
+impl ParsedRequest {
+    /// Parses an address that ends in `surface.{ext}`.
+    pub(super) fn from_address(app: &App, source: StructureSource, file: &str, query: Pairs) -> Result<Self, Problem> {
+        let format = format_of(file)?;
+        let (pairs, mut request) = parse(query)?;
+        if let Some(other) = request.format {
+            let value = other.extension();
+            let detail = format!("parameter `format`: the address already says {}", format.extension());
+            return Err(Problem::new(Kind::BadParameter, detail)
+                .with("parameter", "format")
+                .with("value", value)
+                .with("expected", format!("no value here, or the address surface.{value}")));
+        }
+        params::settle(&mut request.job, format)?;
+        app.accepts(&request.job)?;
+        Ok(Self { source, request, pairs, format, declared: DeclaredType::Neutral })
+    }
+
+    /// Receives a body: a structure file, a form with a file, or a JSON document that names a structure. Invalid
+    /// parameters in the query are rejected before the body is received.
+    pub(super) async fn from_body(
+        app: &Shared,
+        query: Pairs,
+        headers: &HeaderMap,
+        body: Body,
+    ) -> Result<Self, Problem> {
+        let (mut pairs, mut request) = parse(query)?;
+        let is_json = upload::is_json(headers);
+        let body_has_parameters = is_json || upload::is_multipart(headers);
+        let early = if body_has_parameters { None } else { Some(finish(app, &mut request, headers)?) };
+        let (source, fields, declared) = if is_json {
+            let (source, fields) = named(&upload::receive_json(app, headers, body).await?)?;
+            // The type of the document says nothing about the structure.
+            (source, fields, DeclaredType::Neutral)
+        } else {
+            let Upload { bytes, lease, fields, declared } = upload::receive(app, headers, body).await?;
+            (StructureSource::Uploaded(Input::uploaded(bytes, lease).await?), fields, declared)
+        };
+        if body_has_parameters {
+            pairs.extend(fields);
+            request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
+        }
+        let format = early.map_or_else(|| finish(app, &mut request, headers), Ok)?;
+        Ok(Self { source, request, pairs, format, declared })
+    }
+}
+
+fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {
+    let Query(pairs) = query.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
+    Ok((pairs, request))
+}
+
+/// Returns the format of a request and checks the request against it. A report has the default format, which is not
+/// written.
+fn finish(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Format, Problem> {
+    let format = match (request.format, request.report) {
+        (Some(format), _) => format,
+        (None, true) => Format::default(),
+        (None, false) => negotiate::format(headers)?,
+    };
+    params::settle(&mut request.job, format)?;
+    app.accepts(&request.job)?;
+    Ok(format)
+}
+
+/// Returns the format that `surface.{ext}` names.
+fn format_of(file: &str) -> Result<Format, Problem> {
+    let format = |ext| Format::ALL.into_iter().find(|format| format.extension() == ext);
+    file.strip_prefix("surface.").and_then(format).ok_or_else(|| {
+        let available: Vec<String> = Format::ALL.iter().map(|f| format!("surface.{}", f.extension())).collect();
+        let detail = format!("a structure has no `{file}`; it has {}", available.join(", "));
+        Problem::new(Kind::NotFound, detail).with("available", available)
+    })
+}
+
+/// Parses `{"pdb_id": …}` or `{"structure": …}`; the other members are parameters.
+fn named(bytes: &[u8]) -> Result<(StructureSource, Vec<(String, String)>), Problem> {
+    let (mut source, mut fields) = (None, Vec::new());
+    for (name, text) in json_body::members(bytes)? {
+        let found = match name.as_str() {
+            "pdb_id" => StructureSource::from_pdb_id(&text)?,
+            "structure" => StructureSource::from_digest(&text)?,
+            _ => {
+                fields.push((name, text));
+                continue;
+            }
+        };
+        if source.replace(found).is_some() {
+            return Err(json_body::bad("it names more than one structure"));
+        }
+    }
+    let none = || json_body::bad("it names no structure: it has neither `pdb_id` nor `structure`");
+    Ok((source.ok_or_else(none)?, fields))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn json_members_become_parameters() {
+        let (source, fields) =
+            named(br#"{"pdb_id": "4PTI", "resolution": 0.5, "chains": ["A", "B"], "atom_ids": true}"#).ok().unwrap();
+        assert!(matches!(source, StructureSource::Entry(id) if id.as_str() == "4pti"));
+        let expected = [("resolution", "0.5"), ("chains", "A,B"), ("atom_ids", "true")];
+        assert_eq!(fields, expected.map(|(n, v)| (n.to_owned(), v.to_owned())));
+        for bad in [
+            "[]",
+            "{",
+            "{}",
+            "{\"resolution\": 1}",
+            "{\"pdb_id\": {}}",
+            "{\"pdb_id\": \"../x\"}",
+            "{\"pdb_id\": null}",
+            "{\"structure\": \"xyz\"}",
+            "{\"pdb_id\": \"4pti\", \"chains\": []}",
+        ] {
+            assert!(named(bad.as_bytes()).is_err(), "{bad}");
+        }
+    }
+}

@@ -1,0 +1,216 @@
+//! The structure that a request names: uploaded bytes, a stored structure or an archive entry.
+
+use std::sync::Arc;
+
+use axum::extract::FromRequestParts;
+use axum::extract::RawPathParams;
+use axum::extract::rejection::RawPathParamsRejection;
+use axum::http::header::{self, HeaderMap, HeaderName};
+use axum::http::request::Parts;
+use axum::http::{HeaderValue, StatusCode};
+use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
+
+use super::conditional;
+use super::kinds::Kind;
+use super::problem::Problem;
+use super::state::Shared;
+use crate::archive::{Entry, FetchError, Memory, NoMemory, Share, Why};
+use crate::jobs::{Budget, Exhausted, Lease};
+use crate::store::{Digest, Name};
+use crate::structure::{ArchiveError, EntryId};
+
+/// Caching of everything that follows from a structure and its parameters. Archive entries are revised rarely, so a day
+/// without revalidation is acceptable.
+pub(super) const CACHE: HeaderValue = HeaderValue::from_static("public, max-age=86400, stale-while-revalidate=604800");
+
+/// Inputs up to this size are hashed on the runtime's threads, which takes about 1 ns per byte.
+const MAX_INLINE_HASH: usize = 128 << 10;
+
+/// Structure that a request names.
+pub(super) enum StructureSource {
+    /// Uploaded with this request.
+    Uploaded(Input),
+    /// Uploaded earlier.
+    Stored(Digest),
+    /// Entry of the archive.
+    Entry(EntryId),
+}
+
+/// Bytes of a structure file, with the memory that they are charged to. Clones share both.
+#[derive(Clone)]
+pub(super) struct Input {
+    pub(super) bytes: Bytes,
+    /// SHA-256 of `bytes`. An archive entry may have changed since its digest was first asked for.
+    pub(super) digest: Digest,
+    pub(super) lease: Arc<Lease>,
+}
+
+impl Input {
+    /// Charges bytes to the service's memory budget.
+    fn new(app: &Shared, bytes: Bytes, digest: Digest) -> Result<Self, Problem> {
+        let mut lease = app.pool.budget().lease();
+        lease.grow(bytes.len() as u64)?;
+        Ok(Self { bytes, digest, lease: Arc::new(lease) })
+    }
+
+    /// Hashes uploaded bytes, which `lease` is charged with already.
+    pub(super) async fn uploaded(bytes: Bytes, lease: Lease) -> Result<Self, Problem> {
+        let digest = if bytes.len() <= MAX_INLINE_HASH {
+            Digest::of(&bytes)
+        } else {
+            let bytes = bytes.clone();
+            tokio::task::spawn_blocking(move || Digest::of(&bytes)).await.map_err(Problem::internal)?
+        };
+        Ok(Self { bytes, digest, lease: Arc::new(lease) })
+    }
+}
+
+impl StructureSource {
+    /// Parses a PDB id.
+    pub(super) fn from_pdb_id(text: &str) -> Result<Self, Problem> {
+        text.parse().map(Self::Entry).map_err(|error| folder_problem(&error))
+    }
+
+    /// Parses the digest of a stored structure.
+    pub(super) fn from_digest(text: &str) -> Result<Self, Problem> {
+        text.parse().map(Self::Stored).map_err(|_bad| no_such_structure(text))
+    }
+
+    /// Returns the digest of the file. Fails if there is no such structure.
+    pub(super) async fn digest(&self, app: &Shared) -> Result<Digest, Problem> {
+        match self {
+            Self::Uploaded(input) => Ok(input.digest),
+            Self::Stored(digest) => match app.store.head(&Name::input(digest)).await? {
+                Some(_) => Ok(*digest),
+                None => Err(no_such_structure(&digest.to_string())),
+            },
+            Self::Entry(id) => app.archive.digest(id).await.map_err(|error| archive_problem(&error)),
+        }
+    }
+
+    /// Returns the file.
+    pub(super) async fn load(&self, app: &Shared) -> Result<Input, Problem> {
+        match self {
+            Self::Uploaded(input) => Ok(input.clone()),
+            Self::Stored(digest) => {
+                let stored = app.store.get(&Name::input(digest)).await?;
+                let bytes = stored.ok_or_else(|| no_such_structure(&digest.to_string()))?.bytes;
+                Input::new(app, bytes, *digest)
+            }
+            Self::Entry(id) => {
+                let entry = app.archive.fetch(id).await.map_err(|error| archive_problem(&error))?;
+                let Entry { bytes, digest, .. } = entry;
+                Input::new(app, bytes, digest)
+            }
+        }
+    }
+
+    /// Answers with a document that `write` makes of the structure. The digest is its `ETag`; 304 if the client has it.
+    pub(super) async fn document<F>(
+        self,
+        app: &Shared,
+        headers: &HeaderMap,
+        write: impl FnOnce(Input) -> F,
+    ) -> Result<Response, Problem>
+    where
+        F: Future<Output = Result<Response, Problem>>,
+    {
+        let validators = validators(&self.digest(app).await?)?;
+        if conditional::is_unchanged(headers, &validators[0].1) {
+            return Ok((StatusCode::NOT_MODIFIED, validators).into_response());
+        }
+        let _permit = app.delivery()?;
+        let input = self.load(app).await?;
+        let validators = self::validators(&input.digest)?;
+        Ok((validators, write(input).await?).into_response())
+    }
+}
+
+/// Reads the structure from the path: `{id}` is a PDB id, `{digest}` that of a stored structure.
+impl FromRequestParts<Shared> for StructureSource {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
+        let path = path_parameters(parts, app).await?;
+        let mut sources = path.iter().filter_map(|(name, value)| match name {
+            "id" => Some(Self::from_pdb_id(value)),
+            "digest" => Some(Self::from_digest(value)),
+            _ => None,
+        });
+        sources.next().unwrap_or_else(|| Err(Problem::internal("the path names no structure")))
+    }
+}
+
+/// Returns the parameters of the path, decoded.
+pub(super) async fn path_parameters(parts: &mut Parts, app: &Shared) -> Result<RawPathParams, Problem> {
+    let bad = |e: RawPathParamsRejection| Problem::new(Kind::BadRequest, e.body_text());
+    RawPathParams::from_request_parts(parts, app).await.map_err(bad)
+}
+
+fn validators(digest: &Digest) -> Result<[(HeaderName, HeaderValue); 2], Problem> {
+    let etag = HeaderValue::from_str(&format!("\"{digest}\"")).map_err(Problem::internal)?;
+    Ok([(header::ETAG, etag), (header::CACHE_CONTROL, CACHE)])
+}
+
+fn no_such_structure(digest: &str) -> Problem {
+    let shown: String = digest.chars().take(80).collect();
+    let detail =
+        format!("there is no structure `{shown}`: unused structures are removed after some time; upload it again");
+    Problem::new(Kind::NoSuchStructure, detail)
+}
+
+/// Memory budget of the service as the archive sees it.
+#[derive(Debug)]
+pub(super) struct FetchMemory(pub(super) Budget);
+
+impl Memory for FetchMemory {
+    fn begin(&self) -> Box<dyn Share> {
+        Box::new(self.0.lease())
+    }
+}
+
+impl Share for Lease {
+    fn grow(&mut self, bytes: u64) -> Result<(), NoMemory> {
+        Self::grow(self, bytes).map_err(|Exhausted { limit, held }| NoMemory { limit, held })
+    }
+}
+
+/// Converts an error of the archive.
+fn archive_problem(error: &FetchError) -> Problem {
+    let detail = error.to_string();
+    match error {
+        FetchError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
+        FetchError::Local(error) => folder_problem(error),
+        FetchError::TooLarge { bytes, limit, .. } => {
+            let problem = Problem::new(Kind::EntryTooLarge, detail).with("limit", *limit);
+            bytes.iter().fold(problem, |problem, bytes| problem.with("actual", *bytes))
+        }
+        FetchError::Unavailable { host, why, retry_after } => {
+            let problem = Problem::new(Kind::ArchiveUnavailable, detail).with("host", host.as_str());
+            let problem = match why {
+                Why::Status(status) => problem.with("found", *status),
+                _ => problem,
+            };
+            retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
+        }
+        FetchError::Memory { limit, held, .. } => Exhausted { limit: *limit, held: *held }.into(),
+        FetchError::Internal(_) => Problem::internal(detail),
+    }
+}
+
+/// Converts an error of the local folder, whose paths clients do not get.
+fn folder_problem(error: &ArchiveError) -> Problem {
+    let detail = error.to_string();
+    match error {
+        ArchiveError::BadId { id } => Problem::new(Kind::BadParameter, detail)
+            .with("parameter", "id")
+            .with("value", id.as_str())
+            .with("expected", "a PDB id such as 4pti or pdb_00004pti"),
+        ArchiveError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
+        ArchiveError::TooLarge { bytes, limit, .. } => {
+            Problem::new(Kind::InflatedTooLarge, detail).with("limit", *limit).with("actual", *bytes)
+        }
+        ArchiveError::Io(io) => Problem::internal(format!("{error}: {io}")),
+    }
+}

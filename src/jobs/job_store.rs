@@ -1,0 +1,386 @@
+//! Durable jobs: the record is in the store before the client is told of the job, and unfinished jobs are resumed after
+//! a restart.
+//!
+//! A job is accepted in three steps: store the input, store the record, answer. Results are named by their contents, so
+//! computing one twice is harmless; a crash costs time and never loses a job.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
+use std::time::Duration;
+
+use bytes::Bytes;
+use metrics::counter;
+use serde_json::Value;
+use tokio::sync::watch;
+
+use super::durable_job::{self, DurableJob, Runner};
+use super::record::{JobId, Record, Requester, Status, now_ms};
+use super::retry::retry;
+use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket};
+use crate::formats::Format;
+use crate::store::{Digest, Folder, Name, Pin, Secret, Store, StoreError};
+use crate::telemetry::JOBS_RECOVERED;
+
+/// Number of ended jobs that are held in memory; older ones are read from the store.
+const MAX_ENDED: usize = 10_000;
+
+/// Settings of a [`JobStore`].
+#[derive(Debug, Clone, Copy)]
+pub struct JobStoreSettings {
+    /// Time from acceptance to the result, time in the queue included.
+    pub allowed: Duration,
+    /// Maximum number of attempts to run a job.
+    pub attempts: u32,
+    /// Maximum size of a result, bytes.
+    pub output_bytes: u64,
+    /// Time for which a write is retried that the store rejects.
+    pub retry_for: Duration,
+}
+
+/// Request for a durable job.
+#[derive(Debug)]
+pub struct JobSpec {
+    /// The task.
+    pub task: Task,
+    /// Parameters as the client wrote them.
+    pub parameters: Vec<(String, String)>,
+    /// Mesh format.
+    pub format: Format,
+    /// Idempotency key of the request.
+    pub idempotency_key: Option<String>,
+}
+
+/// State of a job that its watchers see.
+#[derive(Debug, Clone, PartialEq)]
+pub struct JobView {
+    /// Record of the job.
+    pub record: Record,
+    /// Running stage.
+    pub stage: Option<&'static str>,
+    /// Finished fraction, from 0 to 1.
+    pub fraction: f64,
+    /// Number of this state; grows with every change.
+    pub version: u64,
+    /// Text of this state, written once for all event streams.
+    pub written: Arc<OnceLock<String>>,
+}
+
+impl JobView {
+    /// Marks the state as changed.
+    pub(super) fn changed(&mut self) {
+        self.version += 1;
+        self.written = Arc::default();
+    }
+}
+
+/// Converts the error of a failed job into the document that clients get.
+pub type DescribeError = fn(&EndError) -> Value;
+
+/// Durable jobs. Clones share one state.
+#[derive(Clone)]
+pub struct JobStore(pub(super) Arc<Inner>);
+
+pub(super) struct Inner {
+    pub(super) store: Store,
+    pub(super) pool: Arc<Pool>,
+    pub(super) settings: JobStoreSettings,
+    pub(super) describe: DescribeError,
+    /// Secret that derives job ids from idempotency keys.
+    secret: Secret,
+    jobs: Mutex<HashMap<JobId, Arc<DurableJob>>>,
+    /// Number of jobs with a runner.
+    pub(super) open: watch::Sender<usize>,
+}
+
+impl Inner {
+    fn lock(&self) -> MutexGuard<'_, HashMap<JobId, Arc<DurableJob>>> {
+        self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Protects input and record of an unfinished job from eviction.
+    fn pin(&self, id: &JobId, input: &Digest) -> Result<[Pin; 2], StoreError> {
+        Ok([self.store.pin(&Name::input(input)), self.store.pin(&Name::job(id.as_str())?)])
+    }
+
+    /// Writes a record to the store.
+    pub(super) async fn write(&self, record: &Record) -> Result<(), StoreError> {
+        let bytes = serde_json::to_vec(record).unwrap_or_default();
+        self.store.put(&Name::job(record.id.as_str())?, Bytes::from(bytes)).await
+    }
+
+    /// Writes the present record of a job. Writers of one job take turns, so the last write has the latest state, and a
+    /// job that was dismissed while it started stays dismissed after a restart.
+    pub(super) async fn write_job(&self, job: &DurableJob) -> Result<(), StoreError> {
+        let _turn = job.writing.lock().await;
+        self.write(&job.record()).await
+    }
+
+    /// Adds a job to the map, unless there is one with this id, and returns the job in the map.
+    fn insert(&self, id: &JobId, job: &Arc<DurableJob>) -> Arc<DurableJob> {
+        let mut jobs = self.lock();
+        let inserted = Arc::clone(jobs.entry(id.clone()).or_insert_with(|| Arc::clone(job)));
+        if jobs.len() > MAX_ENDED + MAX_ENDED / 10 {
+            let mut ended: Vec<_> = jobs.values().filter_map(|job| job.ended()).collect();
+            ended.sort_unstable();
+            for (_, id) in ended.iter().take(jobs.len().saturating_sub(MAX_ENDED)) {
+                jobs.remove(id);
+            }
+        }
+        inserted
+    }
+}
+
+impl JobStore {
+    /// Creates an empty job store over `store`, whose jobs run on `pool`. `secret` is the secret of the store.
+    #[must_use]
+    pub(crate) fn new(
+        store: Store,
+        pool: Arc<Pool>,
+        settings: JobStoreSettings,
+        secret: Secret,
+        describe: DescribeError,
+    ) -> Self {
+        Self(Arc::new(Inner {
+            store,
+            pool,
+            settings,
+            describe,
+            secret,
+            jobs: Mutex::default(),
+            open: watch::channel(0).0,
+        }))
+    }
+
+    /// Accepts a job, which survives the process from then on. `ticket` is that of work that is queued or running
+    /// already.
+    ///
+    /// # Errors
+    /// [`AcceptError`]; no job exists then.
+    pub async fn accept(&self, spec: JobSpec, ticket: Option<Ticket>) -> Result<JobView, AcceptError> {
+        let inner = &self.0;
+        let client = spec.task.rank.client.number();
+        let id = match &spec.idempotency_key {
+            Some(key) => JobId::of_key(&inner.secret, client, key),
+            None => JobId::random().map_err(AcceptError::Random)?,
+        };
+        let record = Record {
+            id: id.clone(),
+            input: spec.task.digest.to_string(),
+            parameters: spec.parameters,
+            format: spec.format.extension().to_owned(),
+            client,
+            urgency: spec.task.rank.urgency,
+            status: Status::Accepted,
+            attempts: u32::from(ticket.is_some()),
+            created_ms: now_ms(),
+            started_ms: None,
+            finished_ms: None,
+            result: None,
+            problem: None,
+            requester: Requester::of(&spec.task.parent),
+        };
+        if spec.idempotency_key.is_some()
+            && let Some(view) = self.view(&id).await?
+        {
+            return existing(&record, view);
+        }
+        if ticket.is_none()
+            && let Some(key) = self.stored_result(&spec.task, spec.format).await?
+        {
+            let ended = Some(now_ms());
+            let record = Record { status: Status::Successful, result: Some(key), finished_ms: ended, ..record };
+            inner.write(&record).await?;
+            return Ok(inner.insert(&id, &Arc::new(DurableJob::new(record))).view());
+        }
+        // The job gets its place in the queue first: a record without one could not be run soon.
+        let job = Arc::new(DurableJob::new(record));
+        let (input, digest) = (spec.task.input.clone(), spec.task.digest);
+        let pin = inner.pin(&id, &digest)?;
+        let (recorded, wait_for_record) = mpsc::sync_channel(1);
+        let ticket = if let Some(ticket) = ticket {
+            ticket
+        } else {
+            let on_start = self.on_start(&job, Some(wait_for_record));
+            let task = Task { id: Some(id.clone()), ..spec.task };
+            let ticket = inner.pool.submit(task, inner.settings.allowed, Some(on_start))?;
+            if ticket.joined_running() {
+                job.begin();
+            }
+            ticket
+        };
+        inner.store.put_new(&Name::input(&digest), input).await?;
+        let record = serde_json::to_vec(&job.record()).unwrap_or_default();
+        let name = Name::job(id.as_str()).map_err(StoreError::from)?;
+        if !inner.store.put_new(&name, Bytes::from(record)).await?
+            && let Some(view) = self.view(&id).await?
+        {
+            // A concurrent request with the same key stored its record first.
+            return existing(&job.record(), view);
+        }
+        // Releases the worker that waits in `on_start`; no worker does if the job was joined while it ran.
+        _ = recorded.send(());
+        let inserted = inner.insert(&id, &job);
+        let view = inserted.view();
+        // Otherwise a request for the job has resumed it from its record; it shares the same work.
+        if Arc::ptr_eq(&inserted, &job) {
+            self.spawn(Runner { job, ticket: Some(ticket), pin, digest, earlier_attempts: 0 });
+        }
+        Ok(view)
+    }
+
+    /// Returns the key of a task's result if it is stored. Strict tasks always run.
+    pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<String>, StoreError> {
+        let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job));
+        let found = !task.strict && self.0.store.head(&key.name(format.extension())?).await?.is_some();
+        Ok(found.then(|| key.to_string()))
+    }
+
+    /// Watches the state of a job; `None` if there is no such job.
+    ///
+    /// # Errors
+    /// That of the store.
+    pub async fn watch(&self, id: &JobId) -> Result<Option<watch::Receiver<JobView>>, StoreError> {
+        if let Some(job) = self.0.lock().get(id) {
+            return Ok(Some(job.subscribe()));
+        }
+        let Some(stored) = self.0.store.get(&Name::job(id.as_str())?).await? else { return Ok(None) };
+        // Only a foreign program writes records that cannot be parsed.
+        let Ok(record) = serde_json::from_slice::<Record>(&stored.bytes) else { return Ok(None) };
+        if record.status.is_final() {
+            return Ok(Some(DurableJob::new(record).subscribe()));
+        }
+        Ok(Some(self.resume(record).await?.subscribe()))
+    }
+
+    /// Returns the present state of a job; `None` if there is no such job.
+    ///
+    /// # Errors
+    /// That of the store.
+    pub async fn view(&self, id: &JobId) -> Result<Option<JobView>, StoreError> {
+        Ok(self.watch(id).await?.map(|watched| watched.borrow().clone()))
+    }
+
+    /// Cancels a job unless it has ended, and returns its state; `None` if there is no such job.
+    ///
+    /// # Errors
+    /// That of the store; the job is cancelled nevertheless.
+    pub async fn dismiss(&self, id: &JobId) -> Result<Option<JobView>, StoreError> {
+        let job = self.0.lock().get(id).cloned();
+        let Some(job) = job else { return self.view(id).await };
+        if job.end(Status::Dismissed, |_| {}) {
+            job.dismiss();
+            self.0.write_job(&job).await?;
+        }
+        Ok(Some(job.view()))
+    }
+
+    /// Resumes the unfinished jobs of earlier processes and returns their number.
+    ///
+    /// # Errors
+    /// That of the store if the records cannot be listed or read.
+    pub async fn recover(&self) -> Result<usize, StoreError> {
+        let mut open = Vec::new();
+        for (name, _) in self.0.store.list(Folder::Jobs).await? {
+            let Some(stored) = self.0.store.get(&name).await? else { continue };
+            match serde_json::from_slice::<Record>(&stored.bytes) {
+                Ok(record) if !record.status.is_final() => open.push(record),
+                Ok(_) => {}
+                Err(error) => tracing::warn!(name = %name, %error, "cannot parse the record of a job"),
+            }
+        }
+        // In the order of their acceptance.
+        open.sort_by_key(|record| (record.created_ms, record.id.clone()));
+        let before = self.0.lock().len();
+        for record in open {
+            self.resume(record).await?;
+        }
+        Ok(self.0.lock().len() - before)
+    }
+
+    /// Resumes a job from its record, unless it runs already.
+    async fn resume(&self, record: Record) -> Result<Arc<DurableJob>, StoreError> {
+        let (id, input, earlier_attempts) = (record.id.clone(), record.input.parse::<Digest>(), record.attempts);
+        let fresh = Arc::new(DurableJob::new(record));
+        let known = self.0.lock().get(&id).cloned();
+        if let Some(known) = known {
+            return Ok(known);
+        }
+        let Ok(digest) = input else {
+            self.finish(&fresh, Err(EndError::Lost { why: "its input has no valid digest".to_owned() })).await;
+            return Ok(fresh);
+        };
+        let pin = self.0.pin(&id, &digest)?;
+        let job = self.0.insert(&id, &fresh);
+        if Arc::ptr_eq(&job, &fresh) {
+            counter!(JOBS_RECOVERED).increment(1);
+            self.spawn(Runner { job: fresh, ticket: None, pin, digest, earlier_attempts });
+        }
+        Ok(job)
+    }
+
+    /// Returns the callback that records an attempt before the worker starts it, so that a job that crashes the process
+    /// is detected. It first waits for a message on `recorded`, which says that the job itself is on record.
+    pub(super) fn on_start(&self, job: &Arc<DurableJob>, recorded: Option<mpsc::Receiver<()>>) -> OnStart {
+        let (jobs, job) = (self.clone(), Arc::clone(job));
+        let runtime = tokio::runtime::Handle::current();
+        Box::new(move || {
+            // The sender is dropped if the job could not be recorded; the work is cancelled then.
+            if recorded.is_some_and(|recorded| recorded.recv().is_err()) {
+                return;
+            }
+            if job.begin()
+                && let Err(error) = runtime.block_on(jobs.0.write_job(&job))
+            {
+                tracing::error!(job_id = %job.id(), %error, "cannot record an attempt to run a job");
+            }
+        })
+    }
+
+    /// Records the end of a job, unless it was dismissed meanwhile.
+    pub(super) async fn finish(&self, job: &DurableJob, ending: Result<String, EndError>) {
+        let id = job.id();
+        let changed = match ending {
+            Ok(key) => {
+                let changed = job.end(Status::Successful, |record| record.result = Some(key));
+                if changed {
+                    tracing::info!(job_id = %id, "a job finished");
+                }
+                changed
+            }
+            Err(error) => {
+                tracing::info!(job_id = %id, %error, "a job failed");
+                let problem = (self.0.describe)(&error);
+                job.end(Status::Failed, |record| record.problem = Some(problem))
+            }
+        };
+        if !changed {
+            return;
+        }
+        let write = || self.0.write_job(job);
+        // Without the record a restart runs the job again: wasted work, but nothing is lost.
+        if let Err(error) = retry(&id, self.0.settings.retry_for, StoreError::is_temporary, write).await {
+            tracing::error!(job_id = %id, %error, "cannot record the end of a job");
+        }
+    }
+
+    /// Returns the task of a record, with its input.
+    ///
+    /// # Errors
+    /// That of the store, which may be temporary. The inner error says why the task cannot be run any more.
+    pub(super) async fn load_task(
+        &self,
+        record: &Record,
+        digest: Digest,
+    ) -> Result<Result<(Task, Format), String>, StoreError> {
+        let stored = self.0.store.get(&Name::input(&digest)).await?;
+        let Some(input) = stored.map(|stored| stored.bytes) else { return Ok(Err("its input was removed".to_owned())) };
+        let mut lease = self.0.pool.budget().lease();
+        lease.force(input.len() as u64);
+        Ok(durable_job::task(record, digest, input, lease, self.0.pool.tracer()))
+    }
+}
+
+/// Returns the job that has the idempotency key of `record`, if both requests are the same.
+fn existing(record: &Record, view: JobView) -> Result<JobView, AcceptError> {
+    if record.is_same_request(&view.record) { Ok(view) } else { Err(AcceptError::OtherRequest) }
+}
