@@ -1,4 +1,4 @@
-//! Which devices run the meshing, and how much of it at once.
+//! Configuration of the devices.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -10,21 +10,19 @@ use crate::surface::devices::{EXPECTED, SPREAD_BRICKS};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DevicesConfig {
-    /// Which devices may be used: `auto`, `all`, `cpu`, or a list such as `0,2` or `software`. Default `auto`: the
-    /// best kind of GPU that there is, else the CPU.
+    /// Permitted devices: `auto`, `all`, `cpu`, or a list such as `0,2` or `software`. Default `auto`: the best kind of GPU
+    /// that is present, else the CPU.
     #[serde(rename = "use", serialize_with = "write", deserialize_with = "read")]
     #[schemars(with = "String")]
     pub choice: DeviceChoice,
-    /// Jobs that run at once for each device, instead of `jobs.workers` where there are more of them so. Default 16: a
-    /// device is done with a small job before the next file is read, and only jobs that are there can share a
-    /// submission.
+    /// Number of concurrent jobs per device, if that exceeds `jobs.workers`. Default 16: a device finishes a small job before
+    /// the next file is read, and only concurrent jobs can share a submission.
     pub jobs: usize,
-    /// Small jobs that may share a submission. Default 16: a submission costs as much as meshing one of them, so that a
-    /// longer batch gains little and delays its first job.
+    /// Maximum number of small jobs in a submission. Default 16: a submission costs as much as meshing one small job, so a
+    /// larger batch gains little and delays its first job.
     pub batch: usize,
-    /// Bricks of 8 × 8 × 8 cells that each device gets at least of one structure that several make together; none: every
-    /// structure is made by one. Default 32,768, about 130,000 atoms at 1 Å: what a device saves with fewer is little beside
-    /// what handing over costs.
+    /// Minimum number of bricks (8 × 8 × 8 cells) per device if a job is divided among several devices; `none` never divides
+    /// jobs. Default 32,768, about 130,000 atoms at 1 Å: below that, the transfer costs more than another device saves.
     pub spread_bricks: Option<u64>,
 }
 
