@@ -1,7 +1,7 @@
 //! Header fields `RateLimit-Policy` and `RateLimit`, structured fields of draft-ietf-httpapi-ratelimit-headers-11.
 //!
-//! The policies are `requests`, `work` and `concurrency`. The draft defines no unit of computing time, so `work` has its
-//! own.
+//! The policies are `requests`, `work` and `concurrency`. The draft defines no unit of computing time, so `work` has
+//! its own.
 
 use super::account::{Quota, QuotaUsage};
 

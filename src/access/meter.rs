@@ -1,8 +1,8 @@
 //! Quota usage of clients, in bounded memory.
 //!
-//! A fixed window begins with the client's first request, which the `RateLimit` fields can describe exactly. Up to twice
-//! the quota can be used around the end of a window; the limit of concurrent requests and fair scheduling bound the
-//! effect. Rejected requests are not counted, so retries do not prolong a rejection.
+//! A fixed window begins with the client's first request, which the `RateLimit` fields can describe exactly. Up to
+//! twice the quota can be used around the end of a window; the limit of concurrent requests and fair scheduling bound
+//! the effect. Rejected requests are not counted, so retries do not prolong a rejection.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -124,8 +124,8 @@ pub struct Meter {
 }
 
 impl Meter {
-    /// Creates a meter with separate counters for `capacity` addresses; further addresses share one. Keys always have their
-    /// own.
+    /// Creates a meter with separate counters for `capacity` addresses; further addresses share one. Keys always have
+    /// their own.
     #[must_use]
     pub fn new(capacity: usize) -> Self {
         Self { state: Mutex::default(), capacity }

@@ -1,7 +1,7 @@
 //! Access control: API keys, quotas, signed URLs and the addresses of clients behind proxies.
 //!
-//! Decisions depend on values only: the text of a key, an address, a time. The module uses no HTTP library and starts no
-//! task. [`crate::http`] consults [`Access`] once per request.
+//! Decisions depend on values only: the text of a key, an address, a time. The module uses no HTTP library and starts
+//! no task. [`crate::http`] consults [`Access`] once per request.
 
 mod account;
 mod authorizer;

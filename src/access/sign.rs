@@ -1,8 +1,8 @@
 //! Signed URLs, which allow GET without a key until they expire.
 //!
 //! The signature covers the path and all query parameters as sent, sorted by their bytes: no parameter can be added,
-//! removed or rewritten. Three parameters carry it: [`EXPIRES`] in seconds of Unix time, [`KEY_ID`], and [`SIGNATURE`], an
-//! HMAC-SHA-256 in base64url. The host is not signed, because a service behind proxies does not know its own.
+//! removed or rewritten. Three parameters carry it: [`EXPIRES`] in seconds of Unix time, [`KEY_ID`], and [`SIGNATURE`],
+//! an HMAC-SHA-256 in base64url. The host is not signed, because a service behind proxies does not know its own.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -88,8 +88,7 @@ impl SigningKeys {
         let mut keys: Vec<(String, Hmac<Sha256>)> = Vec::new();
         for (n, word) in text.split_whitespace().enumerate() {
             let nth = n + 1;
-            let expected =
-                || format!("key {nth} is not ID:SECRET with an id of lower-case letters, digits and `-`");
+            let expected = || format!("key {nth} is not ID:SECRET with an id of lower-case letters, digits and `-`");
             let (id, secret) = word.split_once(':').filter(|(id, _)| token::is_id(id)).ok_or_else(expected)?;
             if secret.len() < MIN_SECRET {
                 return Err(format!(
@@ -106,8 +105,8 @@ impl SigningKeys {
         if keys.is_empty() { Err("there is no key; expected ID:SECRET".to_owned()) } else { Ok(Self(keys)) }
     }
 
-    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time), with the key of this name, else the
-    /// first one. The target comes back with the three parameters behind it.
+    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time), with the key of this name,
+    /// else the first one. The target comes back with the three parameters behind it.
     ///
     /// # Errors
     /// [`SignError`].

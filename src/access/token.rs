@@ -1,7 +1,7 @@
 //! Text of a key, `mm_<id>_<secret>`, and the hash that is stored instead.
 //!
-//! The secret is 256 random bits and cannot be guessed, so a plain SHA-256 of the text is as safe as a slow password hash,
-//! which would only make every request expensive.
+//! The secret is 256 random bits and cannot be guessed, so a plain SHA-256 of the text is as safe as a slow password
+//! hash, which would only make every request expensive.
 
 use std::fmt;
 use std::str::FromStr;

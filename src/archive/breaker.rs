@@ -34,7 +34,8 @@ pub(super) struct Breaker {
 
 impl Breaker {
     pub(super) fn new(host: &str, max_failures: u32, pause: Duration) -> Self {
-        let breaker = Self { host: host.to_owned(), max_failures, pause, state: Mutex::new(State::Closed { failures: 0 }) };
+        let breaker =
+            Self { host: host.to_owned(), max_failures, pause, state: Mutex::new(State::Closed { failures: 0 }) };
         breaker.publish(false);
         breaker
     }

@@ -1,5 +1,5 @@
-//! Copies of entries on disk: two files each, `{middle}/{id}.body` and `{id}.json` with the length and digest of the body.
-//! Files that do not match, after a crash or a disk error, are discarded. All functions block.
+//! Copies of entries on disk: two files each, `{middle}/{id}.body` and `{id}.json` with the length and digest of the
+//! body. Files that do not match, after a crash or a disk error, are discarded. All functions block.
 
 use std::collections::HashMap;
 use std::fs::{self, File};
@@ -80,8 +80,8 @@ impl Index {
         self.total -= self.entries.remove(id).map_or(0, |entry| entry.bytes);
     }
 
-    /// Returns the least recently used copies to evict if the total exceeds `cap`. Evicts down to nine tenths of `cap`, so
-    /// that not every insertion sorts.
+    /// Returns the least recently used copies to evict if the total exceeds `cap`. Evicts down to nine tenths of `cap`,
+    /// so that not every insertion sorts.
     fn to_evict(&self, cap: u64) -> Vec<EntryId> {
         let mut over = self.total.saturating_sub(cap);
         if over > 0 {

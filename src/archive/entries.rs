@@ -77,8 +77,8 @@ struct Shared {
 }
 
 impl Archive {
-    /// Creates the archive of a configuration. `memory` counts the bytes of running fetches. The first request starts all
-    /// I/O.
+    /// Creates the archive of a configuration. `memory` counts the bytes of running fetches. The first request starts
+    /// all I/O.
     #[must_use]
     pub fn new(config: &Config, memory: Arc<dyn Memory>) -> Self {
         let (archive, inflated) = (&config.archive, config.limits.inflated_bytes);
@@ -96,8 +96,8 @@ impl Archive {
         Self { shared: Arc::new(shared) }
     }
 
-    /// Returns the bytes of an entry from the first source that has it. Waits at most `archive.timeout_ms` for the remote
-    /// archive. Must run on a tokio runtime with timers.
+    /// Returns the bytes of an entry from the first source that has it. Waits at most `archive.timeout_ms` for the
+    /// remote archive. Must run on a tokio runtime with timers.
     ///
     /// # Errors
     /// Returns any [`FetchError`].
@@ -118,8 +118,8 @@ impl Archive {
         flight.await.unwrap_or(Err(FetchError::Internal("its fetch ended without a result")))
     }
 
-    /// Sends a HEAD request for one entry to every host of the remote archive, with a timeout of `limit` each. Returns the
-    /// hosts with the status or the error; empty without a remote archive.
+    /// Sends a HEAD request for one entry to every host of the remote archive, with a timeout of `limit` each. Returns
+    /// the hosts with the status or the error; empty without a remote archive.
     pub async fn reach(&self, id: &EntryId, limit: Duration) -> Vec<(String, Result<u16, String>)> {
         match &self.shared.remote {
             Some(remote) => remote.reach(id, limit).await,

@@ -16,11 +16,11 @@ use super::Secret;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AccessConfig {
-    /// TOML file of keys; `molmesh key new` prints entries for it. Default `none`: no key is required. The file is reloaded
-    /// when it changes, and on SIGHUP.
+    /// TOML file of keys; `molmesh key new` prints entries for it. Default `none`: no key is required. The file is
+    /// reloaded when it changes, and on SIGHUP.
     pub keys_file: Option<PathBuf>,
-    /// Keys that sign URLs, as `ID:SECRET` separated by white space. The first one signs, all are accepted, so that keys can
-    /// be rotated. Default `none`: no signature is accepted.
+    /// Keys that sign URLs, as `ID:SECRET` separated by white space. The first one signs, all are accepted, so that
+    /// keys can be rotated. Default `none`: no signature is accepted.
     pub signing_secret: Option<Secret>,
     /// File that contains the value of `signing_secret`. Default `none`.
     pub signing_secret_file: Option<PathBuf>,
@@ -33,19 +33,20 @@ pub struct AccessConfig {
     /// Concurrent requests of one address, each counted to the last byte of the response. Default `none`: unlimited.
     #[serde(deserialize_with = "count")]
     pub address_concurrent: Option<u64>,
-    /// Length of a quota window, s, for addresses and for keys without their own. Default 60: a used-up quota is restored
-    /// within a minute. The window begins with the client's first request, so that not all clients retry at the same time.
+    /// Length of a quota window, s, for addresses and for keys without their own. Default 60: a used-up quota is
+    /// restored within a minute. The window begins with the client's first request, so that not all clients retry at
+    /// the same time.
     pub window_s: u64,
-    /// Number of addresses with a separate quota. Default 10,000, about 2 MB. Further addresses share one quota, because
-    /// forgetting an address would give it a new one.
+    /// Number of addresses with a separate quota. Default 10,000, about 2 MB. Further addresses share one quota,
+    /// because forgetting an address would give it a new one.
     pub clients: usize,
-    /// Origins whose pages may read responses: `*`, or a list such as `https://viewer.example`. Default `*`: the service uses
-    /// no cookies, and only a page that has a key can send it. `none`: only pages of this server.
+    /// Origins whose pages may read responses: `*`, or a list such as `https://viewer.example`. Default `*`: the
+    /// service uses no cookies, and only a page that has a key can send it. `none`: only pages of this server.
     pub cors_origins: Option<Origins>,
     /// Allows pages of these origins to send credentials, such as the cookies of a proxy. Default false. Excludes `*`.
     pub cors_credentials: bool,
-    /// Duration of HTTP Strict Transport Security, s. Default `none`: no header, because TLS is the proxy's task and browsers
-    /// remember the header.
+    /// Duration of HTTP Strict Transport Security, s. Default `none`: no header, because TLS is the proxy's task and
+    /// browsers remember the header.
     #[serde(deserialize_with = "count")]
     pub hsts_s: Option<u64>,
 }

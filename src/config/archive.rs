@@ -12,44 +12,45 @@ use super::{ProxyUrl, Templates};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ArchiveConfig {
-    /// Local folder, flat or in wwPDB's `divided` layout. Default `none`: `archive` in the data folder, so that one mount is
-    /// enough.
+    /// Local folder, flat or in wwPDB's `divided` layout. Default `none`: `archive` in the data folder, so that one
+    /// mount is enough.
     pub dir: Option<PathBuf>,
-    /// Time between checks of a local file for changes, ms. Default 1,000: a check costs a dozen system calls, and entries
-    /// change rarely.
+    /// Time between checks of a local file for changes, ms. Default 1,000: a check costs a dozen system calls, and
+    /// entries change rarely.
     pub check_ms: u64,
-    /// URL templates of an entry, tried in order until one has it; `none` disables the remote archive. Default: compressed
-    /// mmCIF from RCSB's download service, the smallest complete format.
+    /// URL templates of an entry, tried in order until one has it; `none` disables the remote archive. Default:
+    /// compressed mmCIF from RCSB's download service, the smallest complete format.
     pub url: Option<Templates>,
-    /// Proxy for all requests to the remote archive. Default `none`. Environment variables such as `HTTPS_PROXY` are ignored,
-    /// because the check for private addresses does not apply behind a proxy: a proxy is set here deliberately or not at
-    /// all.
+    /// Proxy for all requests to the remote archive. Default `none`. Environment variables such as `HTTPS_PROXY` are
+    /// ignored, because the check for private addresses does not apply behind a proxy: a proxy is set here deliberately
+    /// or not at all.
     pub proxy: Option<ProxyUrl>,
-    /// Allows host names that resolve to private, loopback and link-local addresses. Default false: DNS records of others
-    /// must not lead to the operator's machines. IP addresses in `url` are always allowed.
+    /// Allows host names that resolve to private, loopback and link-local addresses. Default false: DNS records of
+    /// others must not lead to the operator's machines. IP addresses in `url` are always allowed.
     pub allow_private: bool,
     /// Time for a connection, name resolution and TLS included, ms. Default 5,000.
     pub connect_timeout_ms: u64,
-    /// Time for the head of a response, and the longest pause within its body, ms. Default 10,000: archives serve stored
-    /// files.
+    /// Time for the head of a response, and the longest pause within its body, ms. Default 10,000: archives serve
+    /// stored files.
     pub first_byte_timeout_ms: u64,
-    /// Total time for an entry, ms: waiting for other fetches, all attempts and pauses. Default 60,000: 100 MB at 14 Mbit/s.
+    /// Total time for an entry, ms: waiting for other fetches, all attempts and pauses. Default 60,000: 100 MB at 14
+    /// Mbit/s.
     pub timeout_ms: u64,
-    /// Attempts per URL, the first included. Default 3. Retries only temporary failures: no connection, timeouts, damaged
-    /// files, 429 and 5xx.
+    /// Attempts per URL, the first included. Default 3. Retries only temporary failures: no connection, timeouts,
+    /// damaged files, 429 and 5xx.
     pub attempts: u32,
-    /// Longest pause before the second attempt, ms. It doubles with every further attempt, and the pause is a random part of
-    /// it, so that servers do not retry in step. Default 200.
+    /// Longest pause before the second attempt, ms. It doubles with every further attempt, and the pause is a random
+    /// part of it, so that servers do not retry in step. Default 200.
     pub backoff_ms: u64,
-    /// Longest `Retry-After` of the archive that a fetch waits for, ms; for longer ones, requests to the host pause until
-    /// then. Default 5,000: callers wait meanwhile.
+    /// Longest `Retry-After` of the archive that a fetch waits for, ms; for longer ones, requests to the host pause
+    /// until then. Default 5,000: callers wait meanwhile.
     pub retry_after_ms: u64,
     /// Size of an entry as sent, bytes. Default 256 MiB, as for uploads. At most `concurrent` entries are in memory.
     pub max_bytes: u64,
     /// Number of concurrent fetches. Default 8: public archives ask for restraint.
     pub concurrent: usize,
-    /// Time for which a copy is used without revalidation, ms. Default 86,400,000, a day: entries are released and revised
-    /// weekly.
+    /// Time for which a copy is used without revalidation, ms. Default 86,400,000, a day: entries are released and
+    /// revised weekly.
     pub fresh_ms: u64,
     /// Time for which a missing entry is not requested again, ms. Default 60,000.
     pub absent_ms: u64,

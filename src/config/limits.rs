@@ -16,34 +16,35 @@ pub struct LimitsConfig {
     pub body_bytes: u64,
     /// Size of a JSON request body, bytes. Default 64 KiB: a document names a structure and about thirty parameters.
     pub json_bytes: u64,
-    /// Size of the headers of a form part, and of the preamble before the first part, bytes. Default 16 KiB: browsers send a
-    /// few hundred bytes.
+    /// Size of the headers of a form part, and of the preamble before the first part, bytes. Default 16 KiB: browsers
+    /// send a few hundred bytes.
     pub part_head_bytes: u64,
     /// Number of parts of a form. Default 128: one file and all parameters are fewer than half.
     pub parts: usize,
-    /// Size of a structure file after decompression, bytes. Default 2 GiB: the largest entries inflate to about 1 GB. Stops
-    /// compression bombs.
+    /// Size of a structure file after decompression, bytes. Default 2 GiB: the largest entries inflate to about 1 GB.
+    /// Stops compression bombs.
     pub inflated_bytes: u64,
-    /// Number of atoms in all models of a structure. Default 10,000,000: four times the largest PDB entry; at 80 bytes each
-    /// 800 MB.
+    /// Number of atoms in all models of a structure. Default 10,000,000: four times the largest PDB entry; at 80 bytes
+    /// each 800 MB.
     pub atoms: u64,
-    /// Number of atoms whose names are listed, for web pages that show them. Default 1,000,000: about 10 MB of JSON, the most
-    /// that is useful in a browser.
+    /// Number of atoms whose names are listed, for web pages that show them. Default 1,000,000: about 10 MB of JSON,
+    /// the most that is useful in a browser.
     pub labels: u64,
-    /// Number of grid points in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; 4 GiB as 32-bit numbers.
+    /// Number of grid points in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; 4 GiB as 32-bit
+    /// numbers.
     pub grid_samples: u64,
-    /// Number of pairs of an atom and a brick (8³ grid points) that its support reaches. Default 268,435,456: 128 atoms per
-    /// brick of `grid_samples`, several times the number in ordinary structures. Limits the computing time to about 16 s of
-    /// one core, and the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
+    /// Number of pairs of an atom and a brick (8³ grid points) that its support reaches. Default 268,435,456: 128 atoms
+    /// per brick of `grid_samples`, several times the number in ordinary structures. Limits the computing time to about
+    /// 16 s of one core, and the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
     pub candidate_pairs: u64,
     /// Size of a mesh in memory (24 bytes a vertex, 12 a triangle), bytes. Default 2 GiB: 85 million triangles.
     pub mesh_bytes: u64,
-    /// Size of a mesh file, bytes. Default 3 GiB: below the 4 GiB limit of GLB, and above the mesh in memory because text
-    /// formats are larger.
+    /// Size of a mesh file, bytes. Default 3 GiB: below the 4 GiB limit of GLB, and above the mesh in memory because
+    /// text formats are larger.
     pub output_bytes: u64,
-    /// Memory of uploads, finished meshes and responses of all requests together, bytes. Default 8 GiB. While it is used up,
-    /// new uploads, jobs and stored results are rejected. Running jobs may exceed it by `mesh_bytes` and the candidate lists
-    /// of `candidate_pairs` each, responses by their next chunk.
+    /// Memory of uploads, finished meshes and responses of all requests together, bytes. Default 8 GiB. While it is
+    /// used up, new uploads, jobs and stored results are rejected. Running jobs may exceed it by `mesh_bytes` and the
+    /// candidate lists of `candidate_pairs` each, responses by their next chunk.
     pub memory_bytes: u64,
     /// Width and height of a picture, pixels. Default 4,096: at 40 bytes a pixel the largest picture needs 640 MiB, and
     /// rendering takes seconds.

@@ -73,8 +73,8 @@ pub fn load_process(file: Option<&Path>, flags: &[(String, String)]) -> Result<L
 /// Loads a configuration: defaults, then `file`, then the variables of `env` that begin with `MOLMESH__`, then
 /// `flags` as pairs of a path such as `server.listen` and a value.
 ///
-/// Values from the environment and flags are text: `none` clears a key, sizes may have the form `64MiB`. For each secret
-/// there is a key with the suffix `_file` that names a file with its value.
+/// Values from the environment and flags are text: `none` clears a key, sizes may have the form `64MiB`. For each
+/// secret there is a key with the suffix `_file` that names a file with its value.
 ///
 /// # Errors
 /// Returns [`ConfigError`] for the first unknown key or invalid value, or if a file cannot be read.

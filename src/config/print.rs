@@ -43,8 +43,8 @@ impl Loaded {
         }
     }
 
-    /// Returns the effective configuration as a TOML file that loads to the same configuration, except for secrets. A comment
-    /// after each value names its source.
+    /// Returns the effective configuration as a TOML file that loads to the same configuration, except for secrets. A
+    /// comment after each value names its source.
     #[must_use]
     pub fn to_toml(&self) -> String {
         let row = |(key, shown, source): &(String, Shown, Source)| match shown {
@@ -59,7 +59,8 @@ impl Loaded {
         self.rows().into_iter().map(section).collect::<Vec<_>>().join("\n")
     }
 
-    /// Returns the effective configuration as JSON: `config` has the form of the file, `sources` has the source of every key.
+    /// Returns the effective configuration as JSON: `config` has the form of the file, `sources` has the source of
+    /// every key.
     #[must_use]
     pub fn to_json(&self) -> Value {
         let (mut config, mut sources) = (Map::new(), Map::new());
@@ -101,8 +102,8 @@ fn one_line(source: &Source) -> String {
     source.to_string().replace(|c: char| c.is_control(), " ")
 }
 
-/// Formats a value as TOML. Strings are as in JSON, except that TOML requires DEL to be escaped. Numbers beyond the range
-/// of TOML are written as strings.
+/// Formats a value as TOML. Strings are as in JSON, except that TOML requires DEL to be escaped. Numbers beyond the
+/// range of TOML are written as strings.
 fn toml(value: &Value) -> String {
     match value {
         Value::String(text) => Value::from(text.as_str()).to_string().replace('\u{7f}', "\\u007f"),

@@ -9,8 +9,8 @@ use super::load::minimum;
 /// Pattern of sizes written as text.
 const SIZE: &str = r"^[0_]*[1-9][0-9_]*\s*(KiB|MiB|GiB)?$";
 
-/// Returns the schema of the configuration file. Optional keys accept the text `none` and sizes text such as `64MiB`, as
-/// the loader does.
+/// Returns the schema of the configuration file. Optional keys accept the text `none` and sizes text such as `64MiB`,
+/// as the loader does.
 #[must_use]
 pub fn schema() -> Value {
     let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);

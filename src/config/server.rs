@@ -13,52 +13,53 @@ use super::{ForwardedHeader, Proxies};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServerConfig {
-    /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a free
-    /// port.
+    /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a
+    /// free port.
     pub listen: SocketAddr,
-    /// Address of `/metrics`. Default `none`: no port is free on every machine. A separate address, so that a proxy cannot
-    /// expose the metrics by accident.
+    /// Address of `/metrics`. Default `none`: no port is free on every machine. A separate address, so that a proxy
+    /// cannot expose the metrics by accident.
     pub metrics_listen: Option<SocketAddr>,
     /// Folder of all stored data, and by default of the archive. Default `molmesh-data` in the working folder, which is
     /// usually writable.
     pub data_dir: PathBuf,
-    /// Number of open connections. Default 1,024. Further ones get a 503 and are closed. The hard limit of open files should
-    /// be a few hundred higher; `molmesh doctor` compares them.
+    /// Number of open connections. Default 1,024. Further ones get a 503 and are closed. The hard limit of open files
+    /// should be a few hundred higher; `molmesh doctor` compares them.
     pub connections: usize,
-    /// Time for the head of a request, ms, counted from the connection or the previous response; also the time that an idle
-    /// HTTP/1.1 connection is kept. Default 15,000: slow clients need seconds, only attackers need a minute.
+    /// Time for the head of a request, ms, counted from the connection or the previous response; also the time that an
+    /// idle HTTP/1.1 connection is kept. Default 15,000: slow clients need seconds, only attackers need a minute.
     pub header_timeout_ms: u64,
     /// Time for the whole body of a request, ms. Default 60,000: 256 MiB at 36 Mbit/s.
     pub body_timeout_ms: u64,
-    /// Time in which a client must receive `write_bytes` of a response body, or the rest of it, ms. Default 30,000: buffers
-    /// and delivery slots are held until a body is sent. A client that has received more may pause longer, one second per
-    /// 16 KiB, up to four times this value. Event streams are exempt.
+    /// Time in which a client must receive `write_bytes` of a response body, or the rest of it, ms. Default 30,000:
+    /// buffers and delivery slots are held until a body is sent. A client that has received more may pause longer, one
+    /// second per 16 KiB, up to four times this value. Event streams are exempt.
     pub write_timeout_ms: u64,
-    /// Bytes of a response body that a client must receive within `write_timeout_ms`. Default 16 KiB: half a kilobyte per
-    /// second, so that a connection of 8 KiB/s carries a dozen concurrent bodies.
+    /// Bytes of a response body that a client must receive within `write_timeout_ms`. Default 16 KiB: half a kilobyte
+    /// per second, so that a connection of 8 KiB/s carries a dozen concurrent bodies.
     pub write_bytes: u64,
-    /// Size of the head of a request, that is its request line and headers, bytes, at least 8 KiB. Default 64 KiB: browsers
-    /// and proxies send a few. Larger heads get a 431.
+    /// Size of the head of a request, that is its request line and headers, bytes, at least 8 KiB. Default 64 KiB:
+    /// browsers and proxies send a few. Larger heads get a 431.
     pub head_bytes: u32,
-    /// Number of concurrent requests on one HTTP/2 connection. Default 64: a page sends a dozen; clients can open further
-    /// connections, which are counted.
+    /// Number of concurrent requests on one HTTP/2 connection. Default 64: a page sends a dozen; clients can open
+    /// further connections, which are counted.
     pub streams: u32,
     /// Longest silence of an event stream before a comment is sent, ms. Default 15,000: proxies commonly close idle
     /// connections after half a minute.
     pub heartbeat_ms: u64,
     /// Time that an idle HTTP/2 connection is kept, ms. Default 120,000: proxies usually reuse it within that time.
     pub idle_timeout_ms: u64,
-    /// Time after SIGTERM in which `/readyz` says 503 and everything is served as before, new connections too, ms; `none`:
-    /// no such time. Default 3,000: load balancers and orchestrators need a second or two until they send nothing more.
+    /// Time after SIGTERM in which `/readyz` says 503 and everything is served as before, new connections too, ms;
+    /// `none`: no such time. Default 3,000: load balancers and orchestrators need a second or two until they send
+    /// nothing more.
     pub notice_ms: Option<u64>,
     /// Time behind that for requests and jobs that run to finish, ms. Default 20,000: orchestrators commonly kill
     /// after 30 seconds; with `notice_ms` and the last second for what is cancelled it makes 24.
     pub drain_timeout_ms: u64,
-    /// Trusted proxies, by address or network, whose forwarding header names the client. Default `none`: the peer is the
-    /// client, and its forwarding headers are ignored.
+    /// Trusted proxies, by address or network, whose forwarding header names the client. Default `none`: the peer is
+    /// the client, and its forwarding headers are ignored.
     pub trusted_proxies: Option<Proxies>,
-    /// Forwarding header of the trusted proxies: `x-forwarded-for` or `forwarded` (RFC 7239). Default `x-forwarded-for`, which
-    /// most proxies write. The other header is ignored, because the client may have sent it.
+    /// Forwarding header of the trusted proxies: `x-forwarded-for` or `forwarded` (RFC 7239). Default
+    /// `x-forwarded-for`, which most proxies write. The other header is ignored, because the client may have sent it.
     pub forwarded_header: ForwardedHeader,
 }
 

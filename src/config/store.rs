@@ -12,45 +12,48 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct StoreConfig {
-    /// Location of the store: `s3://bucket` or `s3://bucket/prefix`. Default `none`: the folder `store` in `server.data_dir`.
+    /// Location of the store: `s3://bucket` or `s3://bucket/prefix`. Default `none`: the folder `store` in
+    /// `server.data_dir`.
     pub url: Option<String>,
-    /// URL of an S3-compatible service, such as `https://minio.example:9000`. Default `none`: `AWS_ENDPOINT_URL`, else AWS in
-    /// the region.
+    /// URL of an S3-compatible service, such as `https://minio.example:9000`. Default `none`: `AWS_ENDPOINT_URL`, else
+    /// AWS in the region.
     pub endpoint: Option<String>,
     /// Region of the bucket. Default `none`: `AWS_REGION`, else `us-east-1`.
     pub region: Option<String>,
     /// Allows an endpoint with plain `http`. Default false: contents would not be encrypted.
     pub allow_http: bool,
-    /// Puts the bucket into the path of URLs instead of the host name. Default true: all S3-compatible services accept it.
+    /// Puts the bucket into the path of URLs instead of the host name. Default true: all S3-compatible services accept
+    /// it.
     pub path_style: bool,
     /// Access key id. Default `none`: `AWS_ACCESS_KEY_ID`, else the other AWS credential sources of the machine.
     pub access_key_id: Option<String>,
     /// Secret access key. Default `none`: `AWS_SECRET_ACCESS_KEY`. Prefer the environment variable or
     /// `secret_access_key_file` to the configuration file.
     pub secret_access_key: Option<Secret>,
-    /// File that contains the value of `secret_access_key`, such as a mounted container secret; one line break at its end is
-    /// ignored. Default `none`. Excludes `secret_access_key`.
+    /// File that contains the value of `secret_access_key`, such as a mounted container secret; one line break at its
+    /// end is ignored. Default `none`. Excludes `secret_access_key`.
     pub secret_access_key_file: Option<PathBuf>,
     /// Time without a response after which a request to S3 fails or is retried, ms. Default 30,000: a part of 8 MiB at
     /// 2 Mbit/s.
     pub timeout_ms: u64,
-    /// Minimum time between health checks of the store, ms; `/readyz` writes, reads and removes a small object. Default 5,000:
-    /// orchestrators send a request every few seconds.
+    /// Minimum time between health checks of the store, ms; `/readyz` writes, reads and removes a small object. Default
+    /// 5,000: orchestrators send a request every few seconds.
     pub probe_ms: u64,
-    /// Time after which a health check of the store fails, ms. Default 10,000: a busy disk takes seconds, and load must not
-    /// make the service unready.
+    /// Time after which a health check of the store fails, ms. Default 10,000: a busy disk takes seconds, and load must
+    /// not make the service unready.
     pub probe_timeout_ms: u64,
     /// Time between removals of expired objects, ms. Default 60,000: times to live are hours.
     pub sweep_ms: u64,
-    /// Capacity for results and inputs together, bytes. Default 10 GiB: thousands of meshes. The least recently used objects
-    /// are evicted.
+    /// Capacity for results and inputs together, bytes. Default 10 GiB: thousands of meshes. The least recently used
+    /// objects are evicted.
     pub max_bytes: u64,
     /// Time that a result is kept after its last use, ms. Default 86,400,000 (a day): most repeated requests come soon.
     pub result_ttl_ms: u64,
-    /// Time that an input is kept after its last use, ms. Default 604,800,000 (7 days): users mesh a structure again with
-    /// other parameters.
+    /// Time that an input is kept after its last use, ms. Default 604,800,000 (7 days): users mesh a structure again
+    /// with other parameters.
     pub input_ttl_ms: u64,
-    /// Time that a job document is kept after it was last written or read, ms. Default 86,400,000 (a day), as for results.
+    /// Time that a job document is kept after it was last written or read, ms. Default 86,400,000 (a day), as for
+    /// results.
     pub job_ttl_ms: u64,
     /// Memory for cached small results, bytes. Default 256 MiB: thousands of small proteins.
     pub memory_bytes: u64,
