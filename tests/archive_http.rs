@@ -1,6 +1,6 @@
-//! Entries from a remote archive that answers well, badly, slowly, or not at all.
+//! Entries from a remote archive: correct, faulty, slow and missing responses.
 #![cfg(feature = "server")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod archive_support;
 mod http_support;
@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use archive_support::{Remote, Say, ok, status, tagged, with};
+use archive_support::{Remote, Response, ok, status, tagged, with};
 use http_support::{Fake, Mode, SAMPLE, send, start};
 use molmesh::archive::{Archive, Entry, FetchError, Source, Uncounted, Why};
 use molmesh::config::Config;
@@ -31,13 +31,13 @@ fn gzip(data: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// An archive's configuration with short times, and the folder that it works in.
-struct Place {
+/// Configuration with short times, and its data folder.
+struct Setup {
     dir: tempfile::TempDir,
     config: Config,
 }
 
-impl Place {
+impl Setup {
     fn new(url: &str, change: impl FnOnce(&mut Config)) -> Self {
         let dir = tempfile::tempdir().unwrap();
         let mut config = Config::default();
@@ -68,9 +68,9 @@ impl Place {
     }
 }
 
-/// Asks a fresh archive for 4pti once.
+/// Fetches 4pti once from a new archive.
 async fn once(url: &str, change: impl FnOnce(&mut Config)) -> Result<Entry, FetchError> {
-    Place::new(url, change).archive().fetch(&id("4pti")).await
+    Setup::new(url, change).archive().fetch(&id("4pti")).await
 }
 
 #[track_caller]
@@ -85,13 +85,13 @@ async fn pause(ms: u64) {
     tokio::time::sleep(Duration::from_millis(ms)).await;
 }
 
-// ------------------------------------------------------------------------------------------------- what goes well
+// ------------------------------------------------------------------------------------------- successful fetches
 
 #[tokio::test(flavor = "multi_thread")]
-async fn entries_come_compressed_and_plain() {
+async fn fetches_compressed_and_plain_entries() {
     for (path, body) in [(GZ, gzip(b"data_4PTI")), (CIF, b"data_4PTI".to_vec())] {
         let remote = Remote::saying(ok(&body));
-        let place = Place::new(&remote.url(path), |_| {});
+        let place = Setup::new(&remote.url(path), |_| {});
         let archive = place.archive();
         let entry = archive.fetch(&id("4PTI")).await.unwrap();
         assert_eq!((&entry.bytes[..], entry.digest, entry.source), (&body[..], Digest::of(&body), Source::Remote));
@@ -105,21 +105,22 @@ async fn entries_come_compressed_and_plain() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_chunked_answer_is_an_answer() {
-    let remote =
-        Remote::saying(Say::Raw(b"HTTP/1.1 200 X\r\ntransfer-encoding: chunked\r\n\r\n2\r\nab\r\n0\r\n\r\n".into()));
+async fn accepts_chunked_responses() {
+    let remote = Remote::saying(Response::Raw(
+        b"HTTP/1.1 200 X\r\ntransfer-encoding: chunked\r\n\r\n2\r\nab\r\n0\r\n\r\n".into(),
+    ));
     assert_eq!(&once(&remote.url(CIF), |_| {}).await.unwrap().bytes[..], b"ab");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_folder_comes_first() {
+async fn the_folder_takes_precedence() {
     let remote = Remote::saying(ok(b"remote"));
-    let place = Place::new(&remote.url(CIF), |c| c.archive.check_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.check_ms = 1);
     place.put("4pti.cif", b"local");
     let archive = place.archive();
     let entry = archive.fetch(&id("4pti")).await.unwrap();
     assert_eq!((&entry.bytes[..], entry.source, remote.count()), (&b"local"[..], Source::Local, 0));
-    // Also where the remote archive has been asked before.
+    // Also if the entry was fetched before.
     assert_eq!(archive.digest(&id("1abc")).await.unwrap(), Digest::of(b"remote"));
     place.put("1abc.cif", b"mine");
     pause(5).await;
@@ -128,24 +129,24 @@ async fn the_folder_comes_first() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn digests_are_known_without_reading() {
+async fn digests_are_cached() {
     let remote = Remote::saying(ok(b"remote"));
-    let place = Place::new(&remote.url(CIF), |_| {});
+    let place = Setup::new(&remote.url(CIF), |_| {});
     let archive = place.archive();
     assert_eq!(archive.known(&id("4pti")).await, None);
     archive.fetch(&id("4pti")).await.unwrap();
     std::fs::remove_dir_all(place.copies()).unwrap();
     assert_eq!(archive.known(&id("4pti")).await, Some(Digest::of(b"remote")));
-    // What is known grows old.
-    let place = Place::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1000);
+    // Cached digests expire.
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1000);
     let archive = place.archive();
     archive.fetch(&id("4pti")).await.unwrap();
     assert!(archive.known(&id("4pti")).await.is_some());
     pause(1100).await;
     assert_eq!(archive.known(&id("4pti")).await, None);
-    // A file of the folder is looked at again, but not all the time.
+    // A local file is checked again after `check_ms`.
     for (check_ms, expected) in [(60_000, &b"old"[..]), (1, &b"newer"[..])] {
-        let place = Place::new(&remote.url(CIF), |c| c.archive.check_ms = check_ms);
+        let place = Setup::new(&remote.url(CIF), |c| c.archive.check_ms = check_ms);
         place.put("4pti.cif", b"old");
         let archive = place.archive();
         assert_eq!(archive.digest(&id("4pti")).await.unwrap(), Digest::of(b"old"));
@@ -158,14 +159,14 @@ async fn digests_are_known_without_reading() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn old_copies_are_asked_about() {
+async fn old_copies_are_revalidated() {
     let remote = Remote::start(|asked, n| match n {
         0 => tagged("\"a\"", b"first"),
         _ if asked.header("if-none-match") == Some("\"a\"") && n == 1 => status(304),
         2 => tagged("\"b\"", b"second"),
         _ => status(500),
     });
-    let place = Place::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1000);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1000);
     let archive = place.archive();
     let fetch = async || {
         let entry = archive.fetch(&id("4pti")).await.unwrap();
@@ -175,11 +176,11 @@ async fn old_copies_are_asked_about() {
     pause(1100).await;
     assert_eq!(fetch().await, ("first".to_owned(), Source::Cache));
     assert_eq!(remote.asked()[1].header("if-none-match"), Some("\"a\""));
-    // That was word enough for another while.
+    // The confirmation renews the copy.
     assert_eq!((fetch().await.1, remote.count()), (Source::Cache, 2));
     pause(1100).await;
     assert_eq!(fetch().await, ("second".to_owned(), Source::Remote));
-    // What one address said of its file means nothing to another.
+    // Validators are not sent to another URL.
     let other = Remote::saying(ok(b"third"));
     let mut config = place.config.clone();
     config.archive.url = Some(other.url(CIF).parse().unwrap());
@@ -189,13 +190,13 @@ async fn old_copies_are_asked_about() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn dates_do_where_there_are_no_tags() {
+async fn revalidates_by_date_without_an_etag() {
     let date = "Wed, 21 Oct 2015 07:28:00 GMT";
     let remote = Remote::start(move |asked, _| match asked.header("if-modified-since") {
         Some(since) if since == date => status(304),
-        _ => Say::Whole(200, vec![("last-modified", date.to_owned())], b"x".to_vec()),
+        _ => Response::Whole(200, vec![("last-modified", date.to_owned())], b"x".to_vec()),
     });
-    let place = Place::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
     let archive = place.archive();
     for source in [Source::Remote, Source::Cache, Source::Cache] {
         assert_eq!(archive.fetch(&id("4pti")).await.unwrap().source, source);
@@ -205,7 +206,7 @@ async fn dates_do_where_there_are_no_tags() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_second_address_has_what_the_first_has_not() {
+async fn tries_the_second_url_if_the_first_fails() {
     for first in [status(404), status(403), status(500)] {
         let (first, second) = (Remote::saying(first), Remote::saying(ok(b"x")));
         let urls = format!("{} {}", first.url(CIF), second.url("/{middle}/{id_upper}"));
@@ -213,19 +214,19 @@ async fn a_second_address_has_what_the_first_has_not() {
         assert_eq!((&entry.bytes[..], first.count()), (&b"x"[..], 1));
         assert_eq!(second.asked()[0].path, "/pt/4PTI");
     }
-    // One that cannot be asked may have it: nobody says that it does not exist.
+    // The unavailable URL may have the entry, so the error is not "not found".
     let (dead, without) = (Remote::saying(status(500)), Remote::saying(status(404)));
     let urls = format!("{} {}", dead.url(CIF), without.url(CIF));
     assert_eq!(why(once(&urls, |c| c.archive.attempts = 1).await).0, Why::Status(500));
 }
 
-// ------------------------------------------------------------------------------------------------ what is not there
+// -------------------------------------------------------------------------------------------------- missing entries
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_nobody_has_is_not_found_and_not_asked_for_again_soon() {
+async fn missing_entries_are_not_requested_again_for_a_while() {
     for absent in [404, 410] {
         let remote = Remote::saying(status(absent));
-        let place = Place::new(&remote.url(CIF), |c| c.archive.absent_ms = 1000);
+        let place = Setup::new(&remote.url(CIF), |c| c.archive.absent_ms = 1000);
         let archive = place.archive();
         for _ in 0..3 {
             assert!(matches!(archive.fetch(&id("4pti")).await, Err(FetchError::NotFound { .. })), "{absent}");
@@ -240,9 +241,9 @@ async fn what_nobody_has_is_not_found_and_not_asked_for_again_soon() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_copy_of_what_is_withdrawn_goes_too() {
+async fn copies_of_withdrawn_entries_are_removed() {
     let remote = Remote::start(|_, n| if n == 0 { ok(b"x") } else { status(410) });
-    let place = Place::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
     let archive = place.archive();
     archive.fetch(&id("4pti")).await.unwrap();
     pause(5).await;
@@ -252,9 +253,9 @@ async fn a_copy_of_what_is_withdrawn_goes_too() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_addresses_nobody_is_asked() {
+async fn without_urls_no_request_is_sent() {
     let remote = Remote::saying(ok(b"x"));
-    let mut place = Place::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let mut place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
     place.archive().fetch(&id("4pti")).await.unwrap();
     place.config.archive.url = None;
     pause(5).await;
@@ -268,7 +269,7 @@ async fn without_addresses_nobody_is_asked() {
 // ------------------------------------------------------------------------------------------------------- redirects
 
 #[tokio::test(flavor = "multi_thread")]
-async fn redirects_stay_on_their_host_and_end() {
+async fn redirects_are_limited_and_stay_on_their_host() {
     let hops = |n: usize| {
         Remote::start(move |_, at| if at < n { with(302, "location", format!("/hop/{at}")) } else { ok(b"x") })
     };
@@ -278,13 +279,13 @@ async fn redirects_stay_on_their_host_and_end() {
         assert_eq!((result.is_ok(), remote.count()), (good, n.min(3) + 1), "{n}: {result:?}");
     }
     let elsewhere = Remote::saying(ok(b"x"));
-    let places = [
+    let targets = [
         elsewhere.url("/x"),
         format!("http://localhost:{}/x", elsewhere.addr.port()),
         format!("https://{}/x", elsewhere.addr),
         "file:///etc/passwd".to_owned(),
     ];
-    for to in places {
+    for to in targets {
         let remote = Remote::saying(with(307, "location", &to));
         let result = once(&remote.url(CIF), |c| c.archive.allow_private = true).await;
         assert_eq!((why(result), remote.count()), ((Why::Redirect, None), 1), "{to}");
@@ -295,13 +296,13 @@ async fn redirects_stay_on_their_host_and_end() {
     assert!(looped.count() <= 4);
 }
 
-// --------------------------------------------------------------------------------------------------- what goes badly
+// --------------------------------------------------------------------------------------------------------- failures
 
 #[tokio::test(flavor = "multi_thread")]
-async fn slow_heads_and_bodies_are_given_up() {
+async fn slow_heads_and_bodies_time_out() {
     let head = b"HTTP/1.1 200 X\r\ncontent-length: 9\r\n\r\nab".to_vec();
     for bytes in [b"HTTP/1.1 200 X\r\n".to_vec(), head] {
-        let remote = Remote::saying(Say::Stall(bytes, Duration::from_mins(1)));
+        let remote = Remote::saying(Response::Stall(bytes, Duration::from_mins(1)));
         let begin = Instant::now();
         let result = once(&remote.url(CIF), |c| {
             c.archive.connect_timeout_ms = 100;
@@ -312,8 +313,8 @@ async fn slow_heads_and_bodies_are_given_up() {
         assert_eq!((why(result).0, remote.count()), (Why::Timeout, 2));
         assert!(begin.elapsed() < Duration::from_secs(30), "{:?}", begin.elapsed());
     }
-    // The time for everything ends even an answer that keeps coming.
-    let remote = Remote::saying(Say::Endless);
+    // The total time also ends a response that keeps arriving.
+    let remote = Remote::saying(Response::Endless);
     let result = once(&remote.url(CIF), |c| {
         c.archive.timeout_ms = 300;
         c.archive.max_bytes = u64::MAX;
@@ -323,49 +324,51 @@ async fn slow_heads_and_bodies_are_given_up() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn answers_that_are_not_as_long_as_they_say_are_refused() {
+async fn responses_of_the_wrong_length_are_rejected() {
     let gz = gzip(&[b'x'; 500]);
-    let says = |n: usize| {
+    let announcing = |n: usize| {
         [format!("HTTP/1.1 200 X\r\nconnection: close\r\ncontent-length: {n}\r\n\r\n").as_bytes(), &gz].concat()
     };
     for (n, expected) in [(gz.len() + 1, Why::Broken), (gz.len() - 1, Why::Damaged), (4, Why::Damaged)] {
-        let remote = Remote::saying(Say::Raw(says(n)));
-        let place = Place::new(&remote.url(GZ), |_| {});
+        let remote = Remote::saying(Response::Raw(announcing(n)));
+        let place = Setup::new(&remote.url(GZ), |_| {});
         let result = place.archive().fetch(&id("4pti")).await;
         assert_eq!((why(result).0, remote.count()), (expected, 3), "{n}");
         assert!(!place.copies().exists(), "{n}");
     }
-    let remote = Remote::saying(Say::Raw(says(gz.len())));
+    let remote = Remote::saying(Response::Raw(announcing(gz.len())));
     assert_eq!(&once(&remote.url(GZ), |_| {}).await.unwrap().bytes[..], &gz[..]);
-    let cut = Remote::saying(Say::Raw(b"HTTP/1.1 200 X\r\ntransfer-encoding: chunked\r\n\r\n5\r\nab".into()));
+    let cut = Remote::saying(Response::Raw(b"HTTP/1.1 200 X\r\ntransfer-encoding: chunked\r\n\r\n5\r\nab".into()));
     assert_eq!(why(once(&cut.url(CIF), |_| {}).await).0, Why::Broken);
     let page = Remote::saying(ok(b"<html>please log in</html>"));
     assert_eq!(why(once(&page.url(GZ), |_| {}).await).0, Why::Damaged);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bodies_are_limited_while_they_come() {
-    for say in
-        [ok(&[b'x'; 1001]), Say::Endless, Say::Raw(b"HTTP/1.1 200 X\r\ncontent-length: 99999999999\r\n\r\n".into())]
-    {
-        let remote = Remote::saying(say);
+async fn bodies_are_limited_during_the_transfer() {
+    for response in [
+        ok(&[b'x'; 1001]),
+        Response::Endless,
+        Response::Raw(b"HTTP/1.1 200 X\r\ncontent-length: 99999999999\r\n\r\n".into()),
+    ] {
+        let remote = Remote::saying(response);
         match once(&remote.url(CIF), |c| c.archive.max_bytes = 1000).await {
             Err(FetchError::TooLarge { limit: 1000, .. }) => {}
             other => panic!("{other:?}"),
         }
-        assert_eq!(remote.count(), 1, "it will not be smaller the next time");
+        assert_eq!(remote.count(), 1, "not retried");
     }
     let remote = Remote::saying(ok(&[b'x'; 1000]));
     assert_eq!(once(&remote.url(CIF), |c| c.archive.max_bytes = 1000).await.unwrap().bytes.len(), 1000);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_may_pass_is_tried_again_and_nothing_else() {
-    for (bad, asked) in [(500, 3), (503, 3), (429, 3), (403, 1), (401, 1), (304, 1), (206, 1)] {
+async fn only_temporary_failures_are_retried() {
+    for (bad, requests) in [(500, 3), (503, 3), (429, 3), (403, 1), (401, 1), (304, 1), (206, 1)] {
         let remote = Remote::saying(status(bad));
         let (why, retry_after) = why(once(&remote.url(CIF), |_| {}).await);
-        assert_eq!((why, remote.count()), (Why::Status(bad), asked));
-        assert_eq!(retry_after.is_some(), asked > 1, "{bad}");
+        assert_eq!((why, remote.count()), (Why::Status(bad), requests));
+        assert_eq!(retry_after.is_some(), requests > 1, "{bad}");
     }
     let remote = Remote::start(|_, n| if n < 2 { status(500) } else { ok(b"x") });
     assert_eq!(once(&remote.url(CIF), |_| {}).await.unwrap().source, Source::Remote);
@@ -373,14 +376,14 @@ async fn what_may_pass_is_tried_again_and_nothing_else() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn hosts_are_asked_when_they_say() {
-    let patient = Remote::start(|_, n| if n == 0 { with(429, "retry-after", "1") } else { ok(b"x") });
+async fn retry_after_is_respected() {
+    let limited = Remote::start(|_, n| if n == 0 { with(429, "retry-after", "1") } else { ok(b"x") });
     let begin = Instant::now();
-    once(&patient.url(CIF), |_| {}).await.unwrap();
-    assert!(begin.elapsed() >= Duration::from_secs(1) && patient.count() == 2, "{:?}", begin.elapsed());
-    // Too long to keep a caller waiting: the caller is told, and the host left alone.
+    once(&limited.url(CIF), |_| {}).await.unwrap();
+    assert!(begin.elapsed() >= Duration::from_secs(1) && limited.count() == 2, "{:?}", begin.elapsed());
+    // A longer `Retry-After` is reported to the caller, and requests to the host pause.
     let busy = Remote::saying(with(503, "retry-after", "100"));
-    let place = Place::new(&busy.url(CIF), |_| {});
+    let place = Setup::new(&busy.url(CIF), |_| {});
     let archive = place.archive();
     for expected in [Why::Status(503), Why::Paused] {
         let (why, retry_after) = why(archive.fetch(&id("4pti")).await);
@@ -389,22 +392,22 @@ async fn hosts_are_asked_when_they_say() {
     }
 }
 
-/// An address of this machine where nobody listens.
-fn nobody() -> String {
+/// Returns a URL template of this machine without a listener.
+fn unreachable() -> String {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     format!("http://{}{CIF}", listener.local_addr().unwrap())
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_dead_archive_costs_milliseconds_and_comes_back() {
-    let (result, retry_after) = why(once(&nobody(), |_| {}).await);
+async fn the_circuit_breaker_opens_and_closes() {
+    let (result, retry_after) = why(once(&unreachable(), |_| {}).await);
     assert_eq!(result, Why::Connect);
     assert!(retry_after.is_some());
 
     let broken = Arc::new(AtomicBool::new(true));
     let seen = Arc::clone(&broken);
     let remote = Remote::start(move |_, _| if seen.load(Ordering::SeqCst) { status(500) } else { ok(b"x") });
-    let place = Place::new(&remote.url(CIF), |c| {
+    let place = Setup::new(&remote.url(CIF), |c| {
         c.archive.attempts = 1;
         c.archive.breaker_failures = 2;
         c.archive.breaker_ms = 1500;
@@ -418,8 +421,8 @@ async fn a_dead_archive_costs_milliseconds_and_comes_back() {
         assert_eq!(why, Why::Paused);
         assert!(retry_after.unwrap() <= Duration::from_millis(1500));
     }
-    assert_eq!(remote.count(), 2, "who is left alone is not asked");
-    // One tries, and it is still dead.
+    assert_eq!(remote.count(), 2, "no requests during the pause");
+    // The probe fails.
     pause(1600).await;
     assert_eq!(why(archive.fetch(&id("4pti")).await).0, Why::Status(500));
     assert_eq!(why(archive.fetch(&id("4pti")).await).0, Why::Paused);
@@ -432,9 +435,9 @@ async fn a_dead_archive_costs_milliseconds_and_comes_back() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_stale_copy_stands_in_for_a_dead_archive() {
+async fn a_stale_copy_is_used_if_the_archive_fails() {
     let remote = Remote::start(|_, n| if n == 0 { ok(b"x") } else { status(500) });
-    let place = Place::new(&remote.url(CIF), |c| {
+    let place = Setup::new(&remote.url(CIF), |c| {
         c.archive.fresh_ms = 1;
         c.archive.attempts = 1;
         c.archive.breaker_failures = 1;
@@ -442,7 +445,7 @@ async fn a_stale_copy_stands_in_for_a_dead_archive() {
     let archive = place.archive();
     archive.fetch(&id("4pti")).await.unwrap();
     pause(5).await;
-    // The first asks in vain, the second does not ask.
+    // The first request fails, the second is not sent.
     for _ in 0..2 {
         let entry = archive.fetch(&id("4pti")).await.unwrap();
         assert_eq!((&entry.bytes[..], entry.source, remote.count()), (&b"x"[..], Source::Cache, 2));
@@ -451,19 +454,19 @@ async fn a_stale_copy_stands_in_for_a_dead_archive() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn names_may_not_lead_to_private_addresses() {
+async fn names_must_not_resolve_to_private_addresses() {
     let remote = Remote::saying(ok(b"x"));
     let by_name = format!("http://localhost:{}{CIF}", remote.addr.port());
     assert_eq!(why(once(&by_name, |_| {}).await), (Why::Private, None));
     assert_eq!(remote.count(), 0);
     once(&by_name, |c| c.archive.allow_private = true).await.unwrap();
-    // An address that is written out is the operator's own word.
+    // IP addresses in the configuration are allowed.
     once(&remote.url(CIF), |_| {}).await.unwrap();
     assert_eq!(remote.count(), 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_proxy_is_taken_when_the_configuration_names_one() {
+async fn a_configured_proxy_is_used() {
     let proxy = Remote::saying(ok(b"x"));
     let url = format!("http://archive.invalid{CIF}");
     let named = format!("http://{}", proxy.addr);
@@ -473,21 +476,21 @@ async fn a_proxy_is_taken_when_the_configuration_names_one() {
     assert_eq!(why(once(&url, |_| {}).await).0, Why::Connect);
 }
 
-// --------------------------------------------------------------------------------------------------- many at once
+// ------------------------------------------------------------------------------------------------------ concurrency
 
 #[tokio::test(flavor = "multi_thread")]
-async fn everybody_waits_for_one_fetch_even_when_the_first_leaves() {
-    let slow = Say::After(Duration::from_millis(1500), Box::new(ok(b"x")));
+async fn concurrent_callers_share_a_fetch_that_outlives_them() {
+    let slow = Response::After(Duration::from_millis(1500), Box::new(ok(b"x")));
     let remote = Remote::saying(slow);
-    let place = Place::new(&remote.url(CIF), |_| {});
+    let place = Setup::new(&remote.url(CIF), |_| {});
     let archive = place.archive();
-    let ask = || {
+    let fetch = || {
         let archive = archive.clone();
         tokio::spawn(async move { archive.fetch(&id("4pti")).await })
     };
-    let first = ask();
+    let first = fetch();
     pause(50).await;
-    let others: Vec<_> = (0..20).map(|_| ask()).collect();
+    let others: Vec<_> = (0..20).map(|_| fetch()).collect();
     pause(50).await;
     first.abort();
     assert!(first.await.unwrap_err().is_cancelled());
@@ -495,20 +498,20 @@ async fn everybody_waits_for_one_fetch_even_when_the_first_leaves() {
         assert_eq!(&other.await.unwrap().unwrap().bytes[..], b"x");
     }
     assert_eq!(remote.count(), 1);
-    // Nobody is left, and it still lands on disk.
+    // Without any caller left, the copy is still stored.
     let (archive, entry) = (archive.clone(), id("1abc"));
     let alone = tokio::spawn(async move { archive.fetch(&entry).await });
     pause(50).await;
     alone.abort();
-    let landed = place.copies().join("ab/1abc.json");
-    http_support::wait_for("a copy", || landed.exists());
+    let copy = place.copies().join("ab/1abc.json");
+    http_support::wait_for("a copy", || copy.exists());
     assert_eq!(remote.count(), 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn so_many_are_fetched_at_once_and_no_more() {
-    let remote = Remote::saying(Say::After(Duration::from_secs(1), Box::new(ok(b"x"))));
-    let place = Place::new(&remote.url(CIF), |c| c.archive.concurrent = 2);
+async fn concurrent_fetches_are_limited() {
+    let remote = Remote::saying(Response::After(Duration::from_secs(1), Box::new(ok(b"x"))));
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.concurrent = 2);
     let archive = place.archive();
     let done = Arc::new(AtomicUsize::new(0));
     for entry in ["1aaa", "2aaa", "3aaa"] {
@@ -520,11 +523,11 @@ async fn so_many_are_fetched_at_once_and_no_more() {
     }
     http_support::wait_for("two requests", || remote.count() == 2);
     pause(100).await;
-    assert_eq!(remote.count(), 2, "the third waits for a place");
+    assert_eq!(remote.count(), 2, "the third one waits");
     http_support::wait_for("all three", || done.load(Ordering::SeqCst) == 3);
-    // Nobody waits for a place for ever.
-    let remote = Remote::saying(Say::After(Duration::from_millis(900), Box::new(ok(b"x"))));
-    let place = Place::new(&remote.url(CIF), |c| {
+    // Waiting for other fetches is limited.
+    let remote = Remote::saying(Response::After(Duration::from_millis(900), Box::new(ok(b"x"))));
+    let place = Setup::new(&remote.url(CIF), |c| {
         c.archive.concurrent = 1;
         c.archive.timeout_ms = 200;
         c.archive.attempts = 1;
@@ -541,28 +544,28 @@ async fn so_many_are_fetched_at_once_and_no_more() {
 // ------------------------------------------------------------------------------------------------- copies on disk
 
 #[tokio::test(flavor = "multi_thread")]
-async fn copies_outlive_the_process() {
+async fn copies_survive_a_restart() {
     let remote = Remote::saying(ok(b"x"));
-    let place = Place::new(&remote.url(CIF), |_| {});
+    let place = Setup::new(&remote.url(CIF), |_| {});
     let digest = place.archive().fetch(&id("4pti")).await.unwrap().digest;
     let entry = place.archive().fetch(&id("4pti")).await.unwrap();
     assert_eq!((entry.digest, entry.source, remote.count()), (digest, Source::Cache, 1));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn damaged_copies_are_noticed_and_fetched_again() {
+async fn damaged_copies_are_fetched_again() {
     type Damage = fn(&Path, &Path);
     let damages: [(&str, Damage); 6] = [
-        ("nothing, as a control", |_, _| {}),
-        ("a bit", |body, _| std::fs::write(body, b"whole entrz").unwrap()),
-        ("a cut", |body, _| std::fs::write(body, b"whole").unwrap()),
-        ("more", |body, _| std::fs::write(body, b"whole entry and more").unwrap()),
+        ("no damage (control)", |_, _| {}),
+        ("a changed byte", |body, _| std::fs::write(body, b"whole entrz").unwrap()),
+        ("a truncated body", |body, _| std::fs::write(body, b"whole").unwrap()),
+        ("a longer body", |body, _| std::fs::write(body, b"whole entry and more").unwrap()),
         ("no body", |body, _| std::fs::remove_file(body).unwrap()),
-        ("no note", |_, note| std::fs::write(note, b"{").unwrap()),
+        ("invalid metadata", |_, metadata| std::fs::write(metadata, b"{").unwrap()),
     ];
     for (what, damage) in damages {
         let remote = Remote::saying(ok(b"whole entry"));
-        let place = Place::new(&remote.url(CIF), |_| {});
+        let place = Setup::new(&remote.url(CIF), |_| {});
         place.archive().fetch(&id("4pti")).await.unwrap();
         let copy = |extension: &str| place.copies().join("pt/4pti").with_extension(extension);
         damage(&copy("body"), &copy("json"));
@@ -575,9 +578,9 @@ async fn damaged_copies_are_noticed_and_fetched_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn copies_take_so_much_room_and_the_least_used_goes() {
+async fn least_recently_used_copies_are_evicted() {
     let remote = Remote::saying(ok(&[b'x'; 1000]));
-    let mut place = Place::new(&remote.url(CIF), |c| c.archive.cache_bytes = 2500);
+    let mut place = Setup::new(&remote.url(CIF), |c| c.archive.cache_bytes = 2500);
     let archive = place.archive();
     let fetch = async |archive: &Archive, entry: &str| {
         pause(5).await;
@@ -588,7 +591,7 @@ async fn copies_take_so_much_room_and_the_least_used_goes() {
     {
         assert_eq!(fetch(&archive, entry).await.unwrap(), source, "{entry}");
     }
-    // A later process knows what was used last, and what is whole.
+    // A later process knows the order of use and removes temporary files.
     let leftover = place.copies().join("aa/.1-1.tmp");
     std::fs::write(&leftover, b"half").unwrap();
     let old = std::time::SystemTime::now() - Duration::from_hours(2);
@@ -603,8 +606,8 @@ async fn copies_take_so_much_room_and_the_least_used_goes() {
     for (entry, kept) in [("1aaa", true), ("2aaa", true), ("3aaa", false)] {
         assert_eq!(fetch(&offline, entry).await.is_ok(), kept, "{entry}");
     }
-    // One that is larger than all the room is served, and not kept.
-    let place = Place::new(&remote.url(CIF), |c| c.archive.cache_bytes = 999);
+    // An entry larger than the capacity is served but not stored.
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.cache_bytes = 999);
     let archive = place.archive();
     for _ in 0..2 {
         assert_eq!(fetch(&archive, "4pti").await.unwrap(), Source::Remote);
@@ -612,10 +615,10 @@ async fn copies_take_so_much_room_and_the_least_used_goes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_entry_that_cannot_be_kept_is_still_served() {
+async fn an_entry_that_cannot_be_stored_is_still_served() {
     let remote = Remote::saying(ok(b"x"));
-    let place = Place::new(&remote.url(CIF), |_| {});
-    std::fs::write(place.dir.path().join("cache"), "a file where the folder would be").unwrap();
+    let place = Setup::new(&remote.url(CIF), |_| {});
+    std::fs::write(place.dir.path().join("cache"), "a file in place of the folder").unwrap();
     let archive = place.archive();
     for _ in 0..2 {
         assert_eq!(archive.fetch(&id("4pti")).await.unwrap().source, Source::Remote);
@@ -636,7 +639,7 @@ fn server(url: &str, change: impl FnOnce(&mut Config)) -> http_support::Running 
 }
 
 #[test]
-fn a_mesh_of_an_entry_that_was_never_here() {
+fn meshes_an_entry_of_the_remote_archive() {
     let remote = Remote::saying(tagged("\"a\"", &gzip(SAMPLE)));
     let server = server(&remote.url(GZ), |_| {});
     let counted = |source: &str, result: &str| {
@@ -651,11 +654,11 @@ fn a_mesh_of_an_entry_that_was_never_here() {
     assert!(server.metric("molmesh_archive_fetch_seconds_count", &["result=\"found\""]) >= 1.0);
     assert!(server.metric("molmesh_archive_cache_bytes", &[]) > 0.0);
     let cached = counted("cache", "found");
-    // Another mesh of it needs the entry's bytes; the same might be answered from the results by now.
+    // Other parameters, because the same mesh may come from the stored results.
     assert_eq!(server.get(&SURFACE.replace("=2", "=1.9")).status, 200);
     assert!(counted("cache", "found") > cached);
     assert_eq!(server.get(SURFACE).header("etag"), reply.header("etag"));
-    // Who has the mesh is answered from memory, though the copy is gone.
+    // Conditional requests use the cached digest and need no copy.
     std::fs::remove_dir_all(server.dir.path().join("cache")).unwrap();
     let tag = reply.header("etag").unwrap();
     let known = counted("cache", "known");
@@ -666,9 +669,9 @@ fn a_mesh_of_an_entry_that_was_never_here() {
 }
 
 #[test]
-fn an_archive_that_cannot_be_asked_is_a_problem_of_its_own() {
-    let server = server(&nobody(), |c| c.archive.breaker_failures = 3);
-    for detail in ["connected", "left alone"] {
+fn an_unavailable_archive_has_its_own_problem_type() {
+    let server = server(&unreachable(), |c| c.archive.breaker_failures = 3);
+    for detail in ["connected", "paused"] {
         let reply = server.get(SURFACE);
         let problem = reply.problem(424, "archive-unavailable");
         assert_eq!(problem["host"], "127.0.0.1");
@@ -684,7 +687,7 @@ fn an_archive_that_cannot_be_asked_is_a_problem_of_its_own() {
 }
 
 #[test]
-fn what_the_archive_has_not_or_has_too_much_of() {
+fn missing_and_too_large_entries_are_reported() {
     let remote = Remote::start(|asked, _| if asked.path.contains("4pti") { ok(&[b'x'; 2000]) } else { status(404) });
     let server = server(&remote.url(CIF), |c| c.archive.max_bytes = 1000);
     let problem = server.get(SURFACE).problem(413, "entry-too-large");
@@ -695,11 +698,11 @@ fn what_the_archive_has_not_or_has_too_much_of() {
         let reply = server.get(&format!("/v1/pdb/{bad}/surface.glb"));
         assert!([400, 404].contains(&reply.status), "{bad}: {}", reply.status);
     }
-    assert_eq!(remote.count(), before, "no such id becomes an address");
+    assert_eq!(remote.count(), before, "invalid ids cause no requests");
 }
 
 #[test]
-fn a_stale_copy_is_said_so() {
+fn stale_copies_are_counted_and_logged() {
     let remote = Remote::start(|_, n| if n == 0 { ok(SAMPLE) } else { status(500) });
     let server = server(&remote.url(CIF), |c| {
         c.archive.fresh_ms = 1;
@@ -714,26 +717,26 @@ fn a_stale_copy_is_said_so() {
 }
 
 #[test]
-fn entries_take_memory_while_they_come() {
-    let remote = Remote::start(|_, n| if n == 0 { Say::Endless } else { ok(SAMPLE) });
+fn running_fetches_count_as_memory() {
+    let remote = Remote::start(|_, n| if n == 0 { Response::Endless } else { ok(SAMPLE) });
     let server = server(&remote.url(CIF), |c| {
         c.limits.memory_bytes = 4 << 20;
         c.archive.breaker_failures = 1;
     });
-    // It would end at `archive.max_bytes`, which is far more.
+    // `archive.max_bytes` is much larger.
     let document = server.get(SURFACE).problem(503, "memory-full");
     assert_eq!(
         (&document["limit"], document["actual"].as_u64().is_some_and(|held| held > 1 << 20)),
         (&(4 << 20).into(), true)
     );
     http_support::wait_for("the memory", || server.metric("molmesh_memory_held_bytes", &[]) == 0.0);
-    // Nobody is to blame: the next one comes, and the first was not tried again.
+    // The breaker stays closed, and the first request was not retried.
     assert_eq!((server.get(SURFACE).status, remote.count()), (200, 2));
 }
 
 #[test]
-fn the_breaker_is_a_metric() {
-    let server = server(&nobody().replace("127.0.0.1", "127.0.0.7"), |c| c.archive.breaker_failures = 1);
+fn an_open_circuit_breaker_is_a_metric() {
+    let server = server(&unreachable().replace("127.0.0.1", "127.0.0.7"), |c| c.archive.breaker_failures = 1);
     let open = || server.metric("molmesh_archive_breaker_open", &["host=\"127.0.0.7\""]);
     let before = open();
     server.get(SURFACE).problem(424, "archive-unavailable");

@@ -123,7 +123,7 @@ fn what_cannot_be_made_or_signed_says_why() {
         (&["https://host", "--set", secret], "expected http(s)://host/path"),
         (&["/x?a b", "--set", secret], "%XX"),
         (&["/x?signature=1", "--set", secret], "already"),
-        (&["/x", "--set", secret, "--key-id", "b"], "there are: a"),
+        (&["/x", "--set", secret, "--key-id", "b"], "expected one of a"),
         (&["/x", "--set", secret, "--expires", "0s"], "parameter `expires`"),
     ] {
         let refused = run(["sign"].iter().chain(args));

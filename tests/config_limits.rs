@@ -1,15 +1,14 @@
-//! Every number of the configuration is on the list: where it is met, what counts it, and that the operator's table says the
-//! same.
+//! Every limit of the configuration has a metric and a test, and is documented.
 #![cfg(feature = "server")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use std::collections::BTreeSet;
 use std::path::Path;
 
 use serde_json::Value;
 
-/// A key; what counts that it was met, as a metric or as a reason of `molmesh_requests_rejected_total` (nothing where nobody
-/// is refused and nothing is lost); the test that meets it.
+/// Key; metric or reason in `molmesh_requests_rejected_total` that counts hits of the limit (empty if nothing is
+/// rejected or lost); test that reaches the limit.
 type Row = (&'static str, &'static str, &'static str);
 
 const ROWS: &[Row] = &[
@@ -76,65 +75,57 @@ const ROWS: &[Row] = &[
         "molmesh_device_partitions_total",
         "gpu_multi_device::concurrent_callers_neither_deadlock_nor_mix_partitions",
     ),
-    ("archive.check_ms", "", "archive_http::digests_are_known_without_reading"),
-    (
-        "archive.connect_timeout_ms",
-        "molmesh_archive_requests_total",
-        "archive_http::slow_heads_and_bodies_are_given_up",
-    ),
-    (
-        "archive.first_byte_timeout_ms",
-        "molmesh_archive_requests_total",
-        "archive_http::slow_heads_and_bodies_are_given_up",
-    ),
-    ("archive.timeout_ms", "molmesh_archive_requests_total", "archive_http::slow_heads_and_bodies_are_given_up"),
-    ("archive.attempts", "molmesh_archive_fetch_seconds", "archive_http::slow_heads_and_bodies_are_given_up"),
-    ("archive.backoff_ms", "molmesh_archive_fetch_seconds", "archive/remote::pauses_double_and_differ"),
-    ("archive.retry_after_ms", "molmesh_archive_breaker_open", "archive_http::hosts_are_asked_when_they_say"),
-    ("archive.max_bytes", "entry-too-large", "archive_http::bodies_are_limited_while_they_come"),
-    ("archive.concurrent", "molmesh_archive_fetch_seconds", "archive_http::so_many_are_fetched_at_once_and_no_more"),
-    ("archive.fresh_ms", "molmesh_archive_requests_total", "archive_http::old_copies_are_asked_about"),
+    ("archive.check_ms", "", "archive_http::digests_are_cached"),
+    ("archive.connect_timeout_ms", "molmesh_archive_requests_total", "archive_http::slow_heads_and_bodies_time_out"),
+    ("archive.first_byte_timeout_ms", "molmesh_archive_requests_total", "archive_http::slow_heads_and_bodies_time_out"),
+    ("archive.timeout_ms", "molmesh_archive_requests_total", "archive_http::slow_heads_and_bodies_time_out"),
+    ("archive.attempts", "molmesh_archive_fetch_seconds", "archive_http::slow_heads_and_bodies_time_out"),
+    ("archive.backoff_ms", "molmesh_archive_fetch_seconds", "archive/remote::pauses_double_and_are_random"),
+    ("archive.retry_after_ms", "molmesh_archive_breaker_open", "archive_http::retry_after_is_respected"),
+    ("archive.max_bytes", "entry-too-large", "archive_http::bodies_are_limited_during_the_transfer"),
+    ("archive.concurrent", "molmesh_archive_fetch_seconds", "archive_http::concurrent_fetches_are_limited"),
+    ("archive.fresh_ms", "molmesh_archive_requests_total", "archive_http::old_copies_are_revalidated"),
     (
         "archive.absent_ms",
         "molmesh_archive_requests_total",
-        "archive_http::what_nobody_has_is_not_found_and_not_asked_for_again_soon",
+        "archive_http::missing_entries_are_not_requested_again_for_a_while",
     ),
-    (
-        "archive.cache_bytes",
-        "molmesh_archive_cache_bytes",
-        "archive_http::copies_take_so_much_room_and_the_least_used_goes",
-    ),
-    ("archive.breaker_failures", "molmesh_archive_breaker_open", "archive_http::the_breaker_is_a_metric"),
-    (
-        "archive.breaker_ms",
-        "molmesh_archive_breaker_open",
-        "archive_http::a_dead_archive_costs_milliseconds_and_comes_back",
-    ),
+    ("archive.cache_bytes", "molmesh_archive_cache_bytes", "archive_http::least_recently_used_copies_are_evicted"),
+    ("archive.breaker_failures", "molmesh_archive_breaker_open", "archive_http::an_open_circuit_breaker_is_a_metric"),
+    ("archive.breaker_ms", "molmesh_archive_breaker_open", "archive_http::the_circuit_breaker_opens_and_closes"),
     ("store.timeout_ms", "molmesh_store_errors_total", "cli_doctor::a_store_that_is_silent_is_given_up"),
     ("store.probe_ms", "molmesh_store_errors_total", "http_ready::the_store_is_not_asked_more_often_than_configured"),
     ("store.probe_timeout_ms", "molmesh_store_errors_total", "http/probe::a_slow_check_fails_after_its_timeout"),
     ("store.sweep_ms", "molmesh_store_removed_total", "http_limits::what_is_too_old_is_swept_as_often_as_configured"),
-    ("store.max_bytes", "store-full", "store::what_cannot_fit_is_refused_with_numbers"),
-    ("store.result_ttl_ms", "molmesh_store_removed_total", "store::time_is_up_by_folder_and_use_prolongs_it"),
-    ("store.input_ttl_ms", "molmesh_store_removed_total", "store::time_is_up_by_folder_and_use_prolongs_it"),
-    ("store.job_ttl_ms", "molmesh_store_removed_total", "store::time_is_up_by_folder_and_use_prolongs_it"),
-    ("store.memory_bytes", "molmesh_cache_requests_total", "store::memory_is_bounded_and_forgets_what_is_removed"),
+    ("store.max_bytes", "store-full", "store::objects_over_the_capacity_are_rejected"),
+    (
+        "store.result_ttl_ms",
+        "molmesh_store_removed_total",
+        "store::objects_expire_by_folder_and_use_prolongs_their_life",
+    ),
+    (
+        "store.input_ttl_ms",
+        "molmesh_store_removed_total",
+        "store::objects_expire_by_folder_and_use_prolongs_their_life",
+    ),
+    ("store.job_ttl_ms", "molmesh_store_removed_total", "store::objects_expire_by_folder_and_use_prolongs_their_life"),
+    ("store.memory_bytes", "molmesh_cache_requests_total", "store::memory_cache_is_bounded_and_drops_removed_objects"),
     (
         "jobs.store_patience_ms",
         "molmesh_store_errors_total",
         "service_s3::while_s3_is_away_the_service_says_so_and_keeps_its_promises",
     ),
-    ("access.address_requests", "quota-exceeded", "http_access::addresses_have_quotas_and_proxies_of_ours_name_them"),
-    ("access.address_work_s", "quota-exceeded", "http_access::addresses_have_the_other_quotas_too"),
-    ("access.address_concurrent", "quota-exceeded", "http_access::addresses_have_the_other_quotas_too"),
-    ("access.window_s", "quota-exceeded", "http_access::addresses_have_the_other_quotas_too"),
-    ("access.clients", "molmesh_quota_clients", "access/meter::memory_is_bounded_and_nobody_is_forgotten_for_it"),
-    ("access.hsts_s", "", "http_access::browsers_are_told_what_not_to_do"),
+    ("access.address_requests", "quota-exceeded", "http_access::addresses_have_quotas_also_behind_trusted_proxies"),
+    ("access.address_work_s", "quota-exceeded", "http_access::addresses_have_quotas_of_time_and_concurrency"),
+    ("access.address_concurrent", "quota-exceeded", "http_access::addresses_have_quotas_of_time_and_concurrency"),
+    ("access.window_s", "quota-exceeded", "http_access::addresses_have_quotas_of_time_and_concurrency"),
+    ("access.clients", "molmesh_quota_clients", "access/meter::memory_is_bounded_and_no_usage_is_forgotten"),
+    ("access.hsts_s", "", "http_access::security_headers_are_sent"),
     ("telemetry.sample_ratio", "molmesh_trace_spans_total", "traces::a_share_of_the_traces_is_recorded"),
     ("telemetry.timeout_ms", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
     ("telemetry.queue", "", "traces::collectors_that_take_nothing_disturb_nobody"),
     ("telemetry.flush_timeout_ms", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
-    ("store.memory_object_bytes", "molmesh_cache_requests_total", "store::hot_results_are_answered_from_memory"),
+    ("store.memory_object_bytes", "molmesh_cache_requests_total", "store::small_results_are_cached_in_memory"),
 ];
 
 fn read(path: &str) -> String {
@@ -142,7 +133,7 @@ fn read(path: &str) -> String {
     std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
 }
 
-/// The numbers of the schema: key and default.
+/// Returns the keys and defaults of all numbers in the schema.
 fn numbers() -> Vec<(String, Value)> {
     let schema = molmesh::config::schema();
     let mut found = Vec::new();
@@ -156,33 +147,33 @@ fn numbers() -> Vec<(String, Value)> {
     found
 }
 
-/// What is wrong with a list of rows.
+/// Returns the errors in a list of rows.
 fn faults(rows: &[Row]) -> Vec<String> {
     let mut faults = Vec::new();
     let listed: BTreeSet<String> = rows.iter().map(|(key, ..)| (*key).to_owned()).collect();
     let known: BTreeSet<String> = numbers().into_iter().map(|(key, _)| key).collect();
-    faults.extend(listed.symmetric_difference(&known).map(|key| format!("{key} is on one side only")));
+    faults.extend(listed.symmetric_difference(&known).map(|key| format!("{key} is only in one of list and schema")));
     let (names, kinds) = (read("src/telemetry/names.rs"), read("src/http/kinds.rs") + &read("src/http/accept.rs"));
     for (key, counted, test) in rows {
         let quoted = format!("\"{counted}\"");
         if !counted.is_empty() && !names.contains(&quoted) && !kinds.contains(&quoted) {
-            faults.push(format!("{key}: nothing counts {counted}"));
+            faults.push(format!("{key}: no metric or reason {counted}"));
         }
         let (file, name) = test.split_once("::").unwrap();
         let folder = if file.contains('/') { "src" } else { "tests" };
         let source = read(&format!("{folder}/{file}.rs"));
         let field = key.split_once('.').unwrap().1.trim_end_matches("_ms").trim_end_matches("_s");
         if !source.contains(&format!("fn {name}(")) || !source.contains(field) && folder == "tests" {
-            faults.push(format!("{key}: {file} has no {name}, or does not name the key"));
+            faults.push(format!("{key}: {file} has no {name}, or does not contain the key"));
         }
     }
     faults
 }
 
 #[test]
-fn every_number_is_counted_and_tested() {
+fn every_limit_has_a_metric_and_a_test() {
     assert_eq!(faults(ROWS), Vec::<String>::new());
-    // The control: a key that is missing, one that there is not, a metric and a test that there are not.
+    // Control: a missing key, an unknown key, an unknown metric and an unknown test.
     assert!(faults(&ROWS[1..])[0].contains("server.connections"));
     for bad in [
         ("server.nothing", "deadline", "http_limits::atoms_are_limited"),
@@ -194,7 +185,7 @@ fn every_number_is_counted_and_tested() {
     }
 }
 
-/// What is wrong with the operator's table.
+/// Returns the differences between a documentation page and the list.
 fn differences(page: &str) -> Vec<String> {
     let mut rows: Vec<(String, String, String)> = Vec::new();
     for line in page.lines().filter(|line| line.starts_with("| `")) {
@@ -208,7 +199,7 @@ fn differences(page: &str) -> Vec<String> {
     let mut faults = Vec::new();
     for (key, default) in numbers() {
         let default = match (default.as_u64(), default.as_str()) {
-            (Some(n), _) => shown(&key, n),
+            (Some(n), _) => formatted(&key, n),
             (None, Some(text)) => text.to_owned(),
             (None, None) => default.to_string(),
         };
@@ -216,17 +207,17 @@ fn differences(page: &str) -> Vec<String> {
         let counted = if counted.is_empty() { "–" } else { counted };
         let of_key: Vec<_> = rows.iter().filter(|row| row.0 == key).collect();
         match of_key[..] {
-            [(_, said, by)] if *said == default && by == counted => {}
-            _ => faults.push(format!("`{key}` | {default} | … | `{counted}`, not {of_key:?}")),
+            [(_, documented, by)] if *documented == default && by == counted => {}
+            _ => faults.push(format!("expected `{key}` | {default} | … | `{counted}`, found {of_key:?}")),
         }
     }
     let known: BTreeSet<String> = numbers().into_iter().map(|(key, _)| key).collect();
-    faults.extend(rows.iter().filter(|row| !known.contains(&row.0)).map(|row| format!("{} is no limit", row.0)));
+    faults.extend(rows.iter().filter(|row| !known.contains(&row.0)).map(|row| format!("{} is not a limit", row.0)));
     faults
 }
 
-/// A number as the table shows it.
-fn shown(key: &str, n: u64) -> String {
+/// Formats a number as in the documentation.
+fn formatted(key: &str, n: u64) -> String {
     if key.ends_with("_bytes") {
         let (shift, suffix) = [(30, "GiB"), (20, "MiB"), (10, "KiB")].into_iter().find(|(s, _)| n >= 1 << s).unwrap();
         assert_eq!(n >> shift << shift, n, "{key}");
@@ -240,10 +231,10 @@ fn shown(key: &str, n: u64) -> String {
 }
 
 #[test]
-fn the_operators_table_is_the_list() {
+fn the_documented_limits_match_the_configuration() {
     let page = read("docs/operate/limits.md");
     assert_eq!(differences(&page), Vec::<String>::new());
-    // The control: another default, a row too few.
+    // Control: a different default, a missing row.
     assert_eq!(differences(&page.replace("| 1,024 |", "| 1,025 |")).len(), 1);
     let fewer = page.lines().filter(|line| !line.contains("`jobs.queue`")).collect::<Vec<_>>().join("\n");
     assert_eq!(differences(&fewer).len(), 1);

@@ -1,7 +1,7 @@
-//! The effective configuration as it is printed: it gives the same configuration again, says where each value is from, and
-//! shows no secret; secrets that come from files.
+//! Printing of the effective configuration: it loads to the same configuration, names the sources of values and
+//! contains no secrets. Reading secrets from files.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod cli_support;
 
@@ -15,12 +15,12 @@ fn pairs(list: &[(&str, &str)]) -> Vec<(String, String)> {
     list.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect()
 }
 
-fn again(folder: &Folder, loaded: &Loaded) -> molmesh::config::Config {
-    load(Some(&folder.file("again.toml", loaded.to_toml())), [], &[])
+fn reload(folder: &Folder, loaded: &Loaded) -> molmesh::config::Config {
+    load(Some(&folder.file("reload.toml", loaded.to_toml())), [], &[])
         .unwrap_or_else(|e| panic!("{e}\n{}", loaded.to_toml()))
 }
 
-/// A file that only its owner can read.
+/// Creates a file that only its owner can read.
 fn secret_file(folder: &Folder, text: &str) -> std::path::PathBuf {
     use std::os::unix::fs::PermissionsExt as _;
     let path = folder.file("secret", text);
@@ -29,10 +29,10 @@ fn secret_file(folder: &Folder, text: &str) -> std::path::PathBuf {
 }
 
 #[test]
-fn what_is_printed_is_a_file_that_gives_the_same_again() {
+fn the_printed_configuration_loads_to_the_same() {
     let folder = Folder::new();
     let defaults = load_with_sources(None, [], &[]).unwrap();
-    assert_eq!(again(&folder, &defaults), defaults.config);
+    assert_eq!(reload(&folder, &defaults), defaults.config);
     let secret = secret_file(&folder, "from a file\n");
     let file = folder.file(
         "molmesh.toml",
@@ -52,14 +52,14 @@ fn what_is_printed_is_a_file_that_gives_the_same_again() {
     let loaded = load_with_sources(Some(&file), env, &flags).unwrap();
     assert_eq!(loaded.config.store.secret_access_key.as_ref().unwrap().reveal(), "from a file");
     assert_eq!(loaded.config.server.data_dir, Path::new(odd));
-    assert_eq!(again(&folder, &loaded), loaded.config);
-    // The control: another value is another configuration.
+    assert_eq!(reload(&folder, &loaded), loaded.config);
+    // Control: a different value gives a different configuration.
     let other = loaded.to_toml().replace("workers = 3", "workers = 4");
     assert_ne!(load(Some(&folder.file("other.toml", other)), [], &[]).unwrap(), loaded.config);
 }
 
 #[test]
-fn every_value_says_where_it_is_from() {
+fn every_value_is_printed_with_its_source() {
     let folder = Folder::new();
     let file = folder.file("molmesh.toml", "[jobs]\nworkers = 3\nqueue = 4\ndeliveries = 7\n");
     let done = molmesh()
@@ -94,7 +94,7 @@ fn every_value_says_where_it_is_from() {
 }
 
 #[test]
-fn secrets_are_not_shown_only_that_there_is_one() {
+fn secrets_are_printed_as_set_only() {
     let folder = Folder::new();
     let file = folder.file("molmesh.toml", "[store]\nsecret_access_key = \"hush-one\"\n");
     let secret = secret_file(&folder, "hush-two");
@@ -136,7 +136,7 @@ fn secrets_are_not_shown_only_that_there_is_one() {
             assert!(from_env.contains("# secret_access_key is set and not shown"), "{from_env}");
         }
     }
-    // Nor in the refusal of one.
+    // Errors do not quote secrets either.
     for (key, value) in [("archive.proxy", "ftp://me:hush@p:1"), ("store.secret_access_key", "none")] {
         let message = load(None, [], &pairs(&[(key, value)])).map_or_else(|e| e.to_string(), |_| String::new());
         assert!(!message.contains("hush"), "{message}");
@@ -144,7 +144,7 @@ fn secrets_are_not_shown_only_that_there_is_one() {
 }
 
 #[test]
-fn secrets_come_from_files_one_line_break_aside() {
+fn secrets_are_read_from_files_without_one_line_break() {
     let folder = Folder::new();
     let read = |text: &str| {
         let path = folder.file("secret", text).display().to_string();
@@ -193,14 +193,14 @@ fn a_secret_and_its_file_exclude_each_other() {
     ] {
         assert!(message.contains(part) && !message.contains("hush"), "{message}");
     }
-    // Whoever clears one of them has decided.
+    // Clearing one of them resolves the conflict.
     let cleared = load(Some(&file), env.clone(), &pairs(&[("store.secret_access_key", "none")])).unwrap();
     assert_eq!(cleared.store.secret_access_key.unwrap().reveal(), "hush");
     load(Some(&file), env, &pairs(&[("store.secret_access_key_file", "none")])).unwrap();
 }
 
 #[test]
-fn files_that_others_can_read_are_warned_of() {
+fn secret_files_that_all_users_can_read_cause_a_warning() {
     use std::os::unix::fs::PermissionsExt as _;
     let folder = Folder::new();
     let path = folder.file("secret", "hush");
@@ -212,7 +212,7 @@ fn files_that_others_can_read_are_warned_of() {
         assert!(loaded.warnings.iter().all(|w| w.contains(path.to_str().unwrap()) && !w.contains("hush")));
         assert_eq!(loaded.source("store.secret_access_key_file"), Source::Flag);
     }
-    // The service logs it, before anything else that could go wrong.
+    // The service logs the warning before it can fail.
     let set = format!("store.secret_access_key_file={}", path.display());
     let blocked = folder.file("blocked", "");
     let done = run([

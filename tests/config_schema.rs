@@ -1,7 +1,7 @@
-//! The schema of the configuration file: the committed one is what the types say, it is a schema in the eyes of others, and
-//! it and the loader refuse the same files. `MOLMESH_BLESS=1 cargo test --test config_schema` writes it anew.
+//! Schema of the configuration file: the committed file matches the types, an external validator accepts it, and it
+//! rejects the same files as the loader. `MOLMESH_BLESS=1 cargo test --test config_schema` updates it.
 #![cfg(feature = "server")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod tools;
 
@@ -11,17 +11,17 @@ use molmesh::config::{load, load_with_sources, schema};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-/// What the judge says.
+/// Result of the external validator.
 #[derive(Debug, Deserialize)]
 struct Verdict {
-    /// Why the schema is none.
+    /// Error in the schema.
     schema: Option<String>,
-    /// What it has against each document.
+    /// Errors in each document.
     documents: Vec<Vec<String>>,
 }
 
-/// Asks the judge; none where it is not installed.
-fn judge(schema: &Value, documents: &[Value]) -> Option<Verdict> {
+/// Runs the external validator. Returns `None` if it is not installed.
+fn validate(schema: &Value, documents: &[Value]) -> Option<Verdict> {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("case.json");
     std::fs::write(&path, json!({ "schema": schema, "documents": documents }).to_string()).unwrap();
@@ -37,7 +37,7 @@ fn document(toml: &str) -> Value {
 }
 
 #[test]
-fn the_committed_schema_is_what_the_types_say() {
+fn the_committed_schema_matches_the_types() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("molmesh.schema.json");
     let now = format!("{:#}\n", schema());
     if std::env::var_os("MOLMESH_BLESS").is_some() {
@@ -45,28 +45,28 @@ fn the_committed_schema_is_what_the_types_say() {
     }
     let committed = std::fs::read_to_string(&path).unwrap_or_default();
     let first = committed.lines().zip(now.lines()).position(|(a, b)| a != b);
-    assert!(committed == now, "molmesh.schema.json differs from line {first:?} on; MOLMESH_BLESS=1 writes it anew");
+    assert!(committed == now, "molmesh.schema.json differs from line {first:?}; MOLMESH_BLESS=1 updates it");
     assert_eq!(schema()["$schema"], "https://json-schema.org/draft/2020-12/schema");
 }
 
 #[test]
-fn others_take_it_for_a_schema_and_the_example_for_a_document() {
+fn an_external_validator_accepts_the_schema_and_the_example() {
     let example = document(&std::fs::read_to_string(self::example()).unwrap());
     let effective = load_with_sources(Some(&self::example()), [], &[]).unwrap().to_json();
-    let Some(verdict) = judge(&schema(), &[example.clone(), effective["config"].clone(), json!({})]) else { return };
+    let Some(verdict) = validate(&schema(), &[example.clone(), effective["config"].clone(), json!({})]) else { return };
     assert_eq!((verdict.schema, verdict.documents), (None, vec![Vec::<String>::new(); 3]));
-    // The control: a schema that is none, and one that the example does not fit.
+    // Control: an invalid schema, and one that the example violates.
     let mut broken = schema();
     broken["properties"]["jobs"]["properties"]["workers"]["type"] = "number of workers".into();
-    assert!(judge(&broken, &[]).unwrap().schema.is_some());
+    assert!(validate(&broken, &[]).unwrap().schema.is_some());
     let mut narrow = schema();
     narrow["properties"]["jobs"]["properties"]["workers"]["maximum"] = 1.into();
-    let said = judge(&narrow, &[example]).unwrap().documents;
-    assert!(said[0].len() == 1 && said[0][0].starts_with("$.jobs.workers"), "{said:?}");
+    let errors = validate(&narrow, &[example]).unwrap().documents;
+    assert!(errors[0].len() == 1 && errors[0][0].starts_with("$.jobs.workers"), "{errors:?}");
 }
 
 #[test]
-fn the_schema_and_the_loader_refuse_the_same_files() {
+fn the_schema_and_the_loader_reject_the_same_files() {
     let good = [
         "[limits]\nbody_bytes = \"64MiB\"\natoms = 5",
         "[limits]\nbody_bytes = \"1_000 KiB\"",
@@ -116,8 +116,8 @@ fn the_schema_and_the_loader_refuse_the_same_files() {
         assert!(!loads(text), "{text}");
     }
     let documents: Vec<Value> = good.iter().chain(&bad).map(|text| document(text)).collect();
-    let Some(verdict) = judge(&schema(), &documents) else { return };
-    for (n, (text, said)) in good.iter().chain(&bad).zip(&verdict.documents).enumerate() {
-        assert_eq!(said.is_empty(), n < good.len(), "{text}: {said:?}");
+    let Some(verdict) = validate(&schema(), &documents) else { return };
+    for (n, (text, errors)) in good.iter().chain(&bad).zip(&verdict.documents).enumerate() {
+        assert_eq!(errors.is_empty(), n < good.len(), "{text}: {errors:?}");
     }
 }

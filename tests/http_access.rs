@@ -1,6 +1,6 @@
-//! Keys, quotas and signed addresses, through the real server: off by default, complete when on.
+//! Keys, quotas and signed URLs of the real server: off by default, complete if enabled.
 #![cfg(feature = "server")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod access_support;
 mod http_support;
@@ -17,7 +17,7 @@ use molmesh::config::{Config, Secret};
 const ZERO: &str = "0000000000000000000000000000000000000000000000000000000000000000";
 const ENTRY: &str = "/v1/pdb/4pti/surface.glb";
 
-/// A server with one entry in its archive.
+/// Starts a server with one entry in its archive.
 fn server(mode: Mode, change: impl FnOnce(&mut Config)) -> Running {
     on(Fake::new(mode), change)
 }
@@ -34,17 +34,17 @@ fn get(server: &Running, path: &str, headers: &[(&str, &str)]) -> Reply {
     send(server.addr, "GET", path, headers, b"")
 }
 
-/// A GET with a key.
+/// Sends a GET with a key.
 fn with(server: &Running, key: &str, path: &str) -> Reply {
     get(server, path, &[("x-api-key", key)])
 }
 
-/// Only uploads have a body.
+/// Returns the body for a method; only uploads have one.
 fn body_of(method: &str) -> &'static [u8] {
     if method == "POST" { SAMPLE } else { b"" }
 }
 
-/// Every operation that takes a key, with its scope.
+/// Returns every operation that requires a key, with its scope.
 fn operations() -> Vec<(&'static str, String, &'static str)> {
     vec![
         ("POST", "/v1/meshes".into(), "mesh"),
@@ -65,7 +65,7 @@ fn operations() -> Vec<(&'static str, String, &'static str)> {
 }
 
 #[test]
-fn by_default_nothing_is_asked_for_and_nothing_is_counted() {
+fn by_default_no_key_is_required_and_nothing_is_counted() {
     let server = server(Mode::Octahedra, |_| {});
     for (method, path, _) in operations() {
         for headers in [&[][..], &[("authorization", "Bearer mm_nobody_x"), ("x-api-key", "y")]] {
@@ -82,7 +82,7 @@ fn by_default_nothing_is_asked_for_and_nothing_is_counted() {
 }
 
 #[test]
-fn every_operation_wants_a_good_key_with_its_scope() {
+fn every_operation_requires_a_valid_key_with_its_scope() {
     let mut keys = Keys::new(&[
         ("reads", "read", ""),
         ("makes", "mesh", ""),
@@ -129,7 +129,7 @@ fn every_operation_wants_a_good_key_with_its_scope() {
             assert!(![401, 403].contains(&reply.status), "{method} {path}: {}", reply.status);
             assert_eq!(reply.header("ratelimit-policy"), None, "no quota, no fields");
         }
-        // Two keys are none.
+        // Two keys are rejected.
         refused(&[("authorization", &bearer), ("x-api-key", keys.text("both"))], 401, "key-invalid", "invalid_token");
     }
     for open in
@@ -150,7 +150,7 @@ fn forwarded(address: &str) -> (&'static str, &str) {
     ("x-forwarded-for", address)
 }
 
-/// The parameters of an item of a structured list.
+/// Returns the parameters of an item in a structured list.
 fn item(reply: &Reply, field: &str, policy: &str) -> Vec<(String, u64)> {
     let items = reply.header(field).unwrap_or_else(|| panic!("no {field}: {reply:?}")).split(", ");
     let of = items.filter_map(|item| item.strip_prefix(&format!("\"{policy}\";")));
@@ -164,7 +164,7 @@ fn number(reply: &Reply, field: &str, policy: &str, parameter: &str) -> u64 {
 }
 
 #[test]
-fn requests_are_counted_by_key_and_the_fields_say_so() {
+fn requests_are_counted_per_key_and_reported_in_header_fields() {
     let keys =
         Keys::new(&[("a", "read", "requests = 3\nwindow_s = 86400"), ("b", "read", "requests = 3\nwindow_s = 86400")]);
     let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
@@ -177,7 +177,7 @@ fn requests_are_counted_by_key_and_the_fields_say_so() {
         let t = number(&reply, "ratelimit", "requests", "t");
         assert!((1..=last).contains(&t), "{t} after {last}");
         last = t;
-        // What is open, and what is refused for another reason, is not counted.
+        // Public paths and requests rejected for other reasons are not counted.
         assert_eq!(with(&server, keys.text("a"), "/livez").header("ratelimit"), None);
         assert_eq!(with(&server, keys.text("a"), ENTRY).status, 403);
     }
@@ -187,7 +187,7 @@ fn requests_are_counted_by_key_and_the_fields_say_so() {
         assert_eq!((&problem["violated-policies"], &problem["limit"]), (&serde_json::json!(["requests"]), &3.into()));
         assert_eq!(number(&refused, "ratelimit", "requests", "r"), 0);
         let wait: u64 = refused.header("retry-after").unwrap().parse().unwrap();
-        // Both are rounded up, the field a moment later.
+        // Both are rounded up; the field is computed later.
         let t = number(&refused, "ratelimit", "requests", "t");
         assert!(wait >= t && wait <= last && t > 600, "{wait} {t}");
     }
@@ -197,18 +197,18 @@ fn requests_are_counted_by_key_and_the_fields_say_so() {
 }
 
 #[test]
-fn a_quota_that_is_used_up_comes_back() {
+fn a_used_up_quota_is_restored() {
     let keys = Keys::new(&[("a", "read", "requests = 1\nwindow_s = 1")]);
     let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
     let status = || with(&server, keys.text("a"), "/v1/capabilities").status;
     for _ in 0..2 {
-        eventually("it is used up", || status() == 429);
-        eventually("it is back", || status() == 200);
+        eventually("the quota is used up", || status() == 429);
+        eventually("the quota is restored", || status() == 200);
     }
 }
 
 #[test]
-fn work_is_charged_and_what_needs_none_is_still_answered() {
+fn computing_time_is_limited_but_other_requests_are_served() {
     let keys =
         Keys::new(&[("a", "mesh,read", "work_s = 1\nwindow_s = 86400"), ("b", "mesh", "work_s = 1\nwindow_s = 86400")]);
     let backend = Fake::new(Mode::Slow(Duration::from_millis(1100)));
@@ -227,37 +227,37 @@ fn work_is_charged_and_what_needs_none_is_still_answered() {
         assert_eq!(problem["violated-policies"], serde_json::json!(["work"]), "{path}");
     }
     assert_eq!(with(&server, keys.text("a"), "/v1/capabilities").status, 200);
-    eventually("what is kept costs nothing", || post("a", "/v1/meshes", 1, &[]).status == 200);
-    assert_eq!(post("b", "/v1/meshes", 3, &[]).status, 200, "the other one has his own");
-    // A promised job is charged as well, when it is done.
+    eventually("stored results cost no computing time", || post("a", "/v1/meshes", 1, &[]).status == 200);
+    assert_eq!(post("b", "/v1/meshes", 3, &[]).status, 200, "each key has its own quota");
+    // Asynchronous jobs are charged when they end.
     let keys = Keys::new(&[("c", "mesh,read", "work_s = 1\nwindow_s = 86400")]);
     let server = on(backend, |c| c.access.keys_file = Some(keys.path()));
     let ask = |n: usize, more: &[(&str, &str)]| {
         server.post("/v1/meshes", &[&[("x-api-key", keys.text("c"))], more].concat(), &sample(n))
     };
-    let promised = ask(4, &[("prefer", "respond-async")]);
-    let job = promised.header("location").unwrap();
-    eventually("it ends", || with(&server, keys.text("c"), job).json()["status"] == "successful");
+    let accepted = ask(4, &[("prefer", "respond-async")]);
+    let job = accepted.header("location").unwrap();
+    eventually("the job ends", || with(&server, keys.text("c"), job).json()["status"] == "successful");
     assert_eq!(ask(5, &[]).status, 429);
 }
 
 #[test]
-fn requests_at_once_are_counted_to_the_last_byte() {
+fn concurrent_requests_are_counted_to_the_last_byte() {
     let keys = Keys::new(&[("a", "mesh,read", "concurrent = 1")]);
     let server = server(Mode::Slow(Duration::from_mins(10)), |c| {
         c.access.keys_file = Some(keys.path());
-        // The job that never ends is not waited for.
+        // The stop must not wait for the endless job.
         c.server.drain_timeout_ms = 100;
     });
-    let promised = server.post("/v1/meshes", &[("x-api-key", keys.text("a")), ("prefer", "respond-async")], SAMPLE);
-    assert_eq!(promised.status, 202);
-    assert_eq!(promised.header("ratelimit-policy"), Some("\"concurrency\";q=1;qu=\"concurrent-requests\""));
-    assert_eq!(promised.header("ratelimit"), Some("\"concurrency\";r=0"));
-    let job = promised.header("location").unwrap();
+    let accepted = server.post("/v1/meshes", &[("x-api-key", keys.text("a")), ("prefer", "respond-async")], SAMPLE);
+    assert_eq!(accepted.status, 202);
+    assert_eq!(accepted.header("ratelimit-policy"), Some("\"concurrency\";q=1;qu=\"concurrent-requests\""));
+    assert_eq!(accepted.header("ratelimit"), Some("\"concurrency\";r=0"));
+    let job = accepted.header("location").unwrap();
     let mut listening = connect(server.addr);
     let head = format!("GET {job}/events HTTP/1.1\r\nhost: t\r\nx-api-key: {}\r\n\r\n", keys.text("a"));
     let mut begun = [0; 12];
-    eventually("the promise's own request is over", || {
+    eventually("the POST request has ended", || {
         listening = connect(server.addr);
         listening.write_all(head.as_bytes()).unwrap();
         listening.read_exact(&mut begun).unwrap();
@@ -270,15 +270,15 @@ fn requests_at_once_are_counted_to_the_last_byte() {
         (&serde_json::json!(["concurrency"]), Some("1"))
     );
     drop(listening);
-    eventually("the listener is gone", || with(&server, keys.text("a"), "/v1/capabilities").status == 200);
+    eventually("the event stream has ended", || with(&server, keys.text("a"), "/v1/capabilities").status == 200);
 }
 
 #[test]
-fn addresses_have_quotas_and_proxies_of_ours_name_them() {
+fn addresses_have_quotas_also_behind_trusted_proxies() {
     let limited = |c: &mut Config| (c.access.address_requests, c.access.window_s) = (Some(2), 86_400);
     let own = server(Mode::Octahedra, limited);
     let ask = |server: &Running, header: (&str, &str)| get(server, "/v1/capabilities", &[header]).status;
-    // Whoever connects is the client, whatever he says.
+    // Without trusted proxies the peer is the client.
     let statuses = ["198.51.100.1", "198.51.100.2", "198.51.100.3"].map(|address| ask(&own, forwarded(address)));
     assert_eq!(statuses, [200, 200, 429]);
     let behind = server(Mode::Octahedra, |c| {
@@ -286,11 +286,11 @@ fn addresses_have_quotas_and_proxies_of_ours_name_them() {
         c.server.trusted_proxies = "127.0.0.0/8".parse().ok();
     });
     for client in ["198.51.100.1", "198.51.100.2", "2001:db8:0:1::1"] {
-        let statuses = ["", "203.0.113.7, ", "203.0.113.8, "]
-            .map(|made_up| ask(&behind, forwarded(&format!("{made_up}{client}"))));
+        let statuses =
+            ["", "203.0.113.7, ", "203.0.113.8, "].map(|forged| ask(&behind, forwarded(&format!("{forged}{client}"))));
         assert_eq!(statuses, [200, 200, 429], "{client}");
     }
-    // The same network is the same client; the other header is not looked at.
+    // Addresses of one IPv6 network are one client. The other header is ignored.
     assert_eq!(ask(&behind, forwarded("2001:db8:0:1:ffff::1")), 429);
     assert_eq!(ask(&behind, forwarded("2001:db8:0:2::1")), 200);
     let statuses = ["198.51.100.7", "198.51.100.8", "198.51.100.9"]
@@ -308,7 +308,7 @@ fn addresses_have_quotas_and_proxies_of_ours_name_them() {
 }
 
 #[test]
-fn addresses_have_the_other_quotas_too() {
+fn addresses_have_quotas_of_time_and_concurrency() {
     let server = server(Mode::Slow(Duration::from_secs(2)), |c| {
         c.access.address_work_s = Some(1);
         c.access.address_concurrent = Some(1);
@@ -318,11 +318,11 @@ fn addresses_have_the_other_quotas_too() {
     assert_eq!(first.status, 200);
     let policy = first.header("ratelimit-policy").unwrap();
     assert!(policy.contains("\"work\";q=1") && policy.contains("\"concurrency\";q=1"), "{policy}");
-    // Two seconds of work are more than one; what needs no work is answered.
+    // Two seconds of computing exceed the quota of one. Other requests are served.
     let again = server.post("/v1/meshes?resolution=1.5", &[], SAMPLE);
     assert_eq!(again.problem(429, "quota-exceeded")["violated-policies"], serde_json::json!(["work"]));
-    eventually("nothing is under way", || get(&server, "/v1/capabilities", &[]).status == 200);
-    // A body that is still to come is a request under way.
+    eventually("no request is running", || get(&server, "/v1/capabilities", &[]).status == 200);
+    // A request with an incomplete body is running.
     let upload = || {
         let mut stream = connect(server.addr);
         stream.write_all(b"POST /v1/structures HTTP/1.1\r\nhost: t\r\ncontent-length: 1000\r\n\r\nATOM").unwrap();
@@ -330,26 +330,26 @@ fn addresses_have_the_other_quotas_too() {
         stream
     };
     let mut sending = upload();
-    eventually("there is no room beside it", || {
-        // A request counts until the service has let go of it, a moment after its answer was read: what comes then is
-        // refused, and sent again here.
+    eventually("the concurrent request is rejected", || {
+        // A request is counted until shortly after its response was read, so the upload may be rejected. Sends it
+        // again.
         if sending.peek(&mut [0]).is_ok() {
             sending = upload();
         }
         get(&server, "/v1/capabilities", &[]).status == 429
     });
     drop(sending);
-    eventually("it is gone", || get(&server, "/v1/capabilities", &[]).status == 200);
+    eventually("the upload has ended", || get(&server, "/v1/capabilities", &[]).status == 200);
 }
 
 #[test]
-fn a_key_is_a_client_wherever_it_comes_from() {
+fn a_key_is_one_client_at_any_address() {
     let keys = Keys::new(&[("a", "mesh", ""), ("b", "mesh", "")]);
     let server = server(Mode::Octahedra, |c| {
         c.access.keys_file = Some(keys.path());
         c.server.trusted_proxies = "127.0.0.1".parse().ok();
     });
-    let promise = |key: &str, address: &str| {
+    let submit = |key: &str, address: &str| {
         let headers = [
             ("x-api-key", keys.text(key)),
             ("x-forwarded-for", address),
@@ -360,9 +360,9 @@ fn a_key_is_a_client_wherever_it_comes_from() {
         assert_eq!(reply.status, 202, "{}", reply.text());
         reply.header("location").unwrap().to_owned()
     };
-    let first = promise("a", "198.51.100.1");
-    assert_eq!(promise("a", "198.51.100.2"), first);
-    assert_ne!(promise("b", "198.51.100.1"), first);
+    let first = submit("a", "198.51.100.1");
+    assert_eq!(submit("a", "198.51.100.2"), first);
+    assert_ne!(submit("b", "198.51.100.1"), first);
 }
 
 const SECRETS: &str = "new:0123456789abcdef0123456789abcdef old:fedcba9876543210fedcba9876543210";
@@ -383,7 +383,7 @@ fn signing(keys: &Keys, secrets: &str) -> Running {
 }
 
 #[test]
-fn a_signed_address_opens_in_place_of_a_key_and_changes_nothing_else() {
+fn a_signed_url_replaces_a_key_and_changes_nothing_else() {
     let keys = Keys::new(&[("a", "mesh,read", "")]);
     let server = signing(&keys, SECRETS);
     for target in [format!("{ENTRY}?resolution=1&atom_ids=true"), ENTRY.to_owned(), "/v1/capabilities".to_owned()] {
@@ -394,7 +394,7 @@ fn a_signed_address_opens_in_place_of_a_key_and_changes_nothing_else() {
             assert_eq!(signed.header(name), keyed.header(name), "{name}");
         }
         assert!(!signed.headers.iter().any(|(_, value)| value.contains("signature")), "{:?}", signed.headers);
-        // A key beside it does no harm, nor does it hide that the key is none.
+        // An additional valid key is accepted; an invalid one is rejected.
         assert_eq!(with(&server, keys.text("a"), &sign(&target, None)).status, 200);
         assert_eq!(with(&server, "mm_a_x", &sign(&target, None)).status, 401);
     }
@@ -402,15 +402,15 @@ fn a_signed_address_opens_in_place_of_a_key_and_changes_nothing_else() {
     assert_eq!(send(server.addr, "HEAD", &target, &[], b"").status, 200);
     let etag = get(&server, &target, &[]).header("etag").unwrap().to_owned();
     assert_eq!(get(&server, &target, &[("if-none-match", &etag)]).status, 304);
-    // Where the same bytes are found does not depend on it.
+    // `Content-Location` does not contain the signature.
     let fresh = get(&server, &sign(&format!("{ENTRY}?resolution=0.9"), None), &[]);
-    let place = fresh.header("content-location").unwrap();
-    assert!(place.starts_with("/v1/results/") && !place.contains('?'), "{place}");
-    eventually("it is kept", || get(&server, &sign(place, None), &[]).body == fresh.body);
-    // It opens for reading alone.
+    let location = fresh.header("content-location").unwrap();
+    assert!(location.starts_with("/v1/results/") && !location.contains('?'), "{location}");
+    eventually("the result is stored", || get(&server, &sign(location, None), &[]).body == fresh.body);
+    // A signature allows GET and HEAD only.
     send(server.addr, "POST", &sign("/v1/meshes", None), &[], SAMPLE).problem(401, "key-required");
     send(server.addr, "DELETE", &sign("/v1/jobs/x", None), &[], b"").problem(401, "key-required");
-    // Its own names are no parameters elsewhere, and no name is one of them that is not signed.
+    // Its parameters are unknown without a signature, and unknown parameters are rejected although signed.
     let key = [("x-api-key", keys.text("a"))];
     send(server.addr, "POST", &sign("/v1/meshes", None), &key, SAMPLE).problem(400, "bad-parameter");
     get(&server, &format!("{ENTRY}?expires=1"), &key).problem(400, "bad-parameter");
@@ -418,7 +418,7 @@ fn a_signed_address_opens_in_place_of_a_key_and_changes_nothing_else() {
 }
 
 #[test]
-fn a_signature_holds_for_one_address_until_its_end() {
+fn a_signature_is_valid_for_one_url_until_its_expiry() {
     let keys = Keys::new(&[("a", "mesh,read", "")]);
     let server = signing(&keys, SECRETS);
     let good = sign(&format!("{ENTRY}?resolution=1"), None);
@@ -439,14 +439,14 @@ fn a_signature_holds_for_one_address_until_its_end() {
     let past = SigningKeys::parse(SECRETS).unwrap().sign(None, ENTRY, 1_577_836_800).unwrap();
     let problem = get(&server, &past, &[]).problem(403, "signature-expired");
     assert!(problem["expired"].as_str().unwrap().starts_with("2020-01-01T00:00:00"), "{problem}");
-    // The end is told to whom had the address alone.
+    // Expiry is reported only for a correct signature.
     get(&server, &past.replace(".glb", ".stl"), &[]).problem(403, "signature-invalid");
     assert!(server.metric("molmesh_requests_rejected_total", &["reason=\"signature-invalid\""]) >= 8.0);
     assert!(server.metric("molmesh_requests_rejected_total", &["reason=\"signature-expired\""]) >= 1.0);
 }
 
 #[test]
-fn every_byte_of_a_signed_address_counts() {
+fn every_byte_of_a_url_is_signed() {
     let keys = Keys::new(&[("a", "mesh,read", "")]);
     let server = signing(&keys, SECRETS);
     let good = sign(&format!("{ENTRY}?resolution=1"), None);
@@ -460,7 +460,7 @@ fn every_byte_of_a_signed_address_counts() {
 }
 
 #[test]
-fn keys_that_sign_take_over_from_each_other() {
+fn signing_keys_can_be_rotated() {
     let keys = Keys::new(&[]);
     let both = signing(&keys, SECRETS);
     for key in ["new", "old"] {
@@ -469,7 +469,7 @@ fn keys_that_sign_take_over_from_each_other() {
     let later = signing(&keys, SECRETS.split(' ').next().unwrap());
     assert_eq!(get(&later, &sign(ENTRY, Some("new")), &[]).status, 200);
     get(&later, &sign(ENTRY, Some("old")), &[]).problem(403, "signature-invalid");
-    // Without a file of keys nothing but a signature opens; what is open stays open.
+    // Without a key file, only signatures are accepted. Public paths stay public.
     let alone = server(Mode::Octahedra, |c| c.access.signing_secret = Some(Secret::new(SECRETS)));
     assert_eq!(get(&alone, &sign(ENTRY, None), &[]).status, 200);
     get(&alone, ENTRY, &[]).problem(401, "key-required");
@@ -478,22 +478,22 @@ fn keys_that_sign_take_over_from_each_other() {
 }
 
 #[test]
-fn keys_that_change_are_read_again() {
+fn changed_key_files_are_reloaded() {
     let mut keys = Keys::new(&[("a", "read", "")]);
     let server = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
     let status = |key: &str| with(&server, key, "/v1/capabilities").status;
     assert_eq!(status(keys.text("a")), 200);
-    keys.write(&[("b", "read", "note = \"instead of a\"")]);
+    keys.write(&[("b", "read", "note = \"replaces a\"")]);
     eventually("the new key is known", || status(keys.text("b")) == 200);
     assert_eq!(status(keys.text("a")), 401);
     std::fs::write(keys.path(), "[[key]]\nnmae = 3").unwrap();
-    eventually("the log says what is wrong", || !http_support::log_lines("line 2: unknown name `nmae`").is_empty());
+    eventually("the error is logged", || !http_support::log_lines("line 2: unknown name `nmae`").is_empty());
     assert_eq!(status(keys.text("b")), 200);
 }
 
 #[test]
-fn pages_of_the_origins_that_are_listed_may_read() {
-    let (ours, others) = ("https://viewer.example", "https://other.example");
+fn pages_of_listed_origins_may_read_responses() {
+    let (trusted, other) = ("https://viewer.example", "https://other.example");
     let preflight = |server: &Running, origin: &str| {
         let headers = [
             ("origin", origin),
@@ -503,41 +503,41 @@ fn pages_of_the_origins_that_are_listed_may_read() {
         send(server.addr, "OPTIONS", "/v1/meshes", &headers, b"")
     };
     let listed = server(Mode::Octahedra, |c| {
-        c.access.cors_origins = ours.parse().ok();
+        c.access.cors_origins = trusted.parse().ok();
         c.access.cors_credentials = true;
     });
-    let reply = preflight(&listed, ours);
-    assert_eq!(reply.header("access-control-allow-origin"), Some(ours));
+    let reply = preflight(&listed, trusted);
+    assert_eq!(reply.header("access-control-allow-origin"), Some(trusted));
     assert_eq!(reply.header("access-control-allow-credentials"), Some("true"));
     assert!(reply.header("access-control-allow-headers").unwrap().contains("authorization"));
-    assert_eq!(preflight(&listed, others).header("access-control-allow-origin"), None);
-    let plain = get(&listed, "/v1/capabilities", &[("origin", ours)]);
-    assert_eq!(plain.header("access-control-allow-origin"), Some(ours));
+    assert_eq!(preflight(&listed, other).header("access-control-allow-origin"), None);
+    let plain = get(&listed, "/v1/capabilities", &[("origin", trusted)]);
+    assert_eq!(plain.header("access-control-allow-origin"), Some(trusted));
     assert!(plain.header("vary").unwrap().to_ascii_lowercase().contains("origin"));
     assert_eq!(plain.header("cross-origin-resource-policy"), Some("same-origin"));
     let exposed = plain.header("access-control-expose-headers").unwrap();
     assert!(exposed.contains("ratelimit") && exposed.contains("retry-after") && !exposed.contains('*'), "{exposed}");
 
     let keys = Keys::new(&[]);
-    let anybody = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
-    let reply = preflight(&anybody, others);
+    let any_origin = server(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let reply = preflight(&any_origin, other);
     assert_eq!(reply.header("access-control-allow-origin"), Some("*"));
     assert_eq!(reply.header("access-control-allow-credentials"), None);
-    // `*` does not stand for this one.
+    // `*` does not cover this header.
     assert!(reply.header("access-control-allow-headers").unwrap().contains("authorization"));
-    let refused = get(&anybody, "/v1/capabilities", &[("origin", others)]);
+    let refused = get(&any_origin, "/v1/capabilities", &[("origin", other)]);
     assert_eq!(
         (refused.status, refused.header("access-control-allow-origin")),
         (401, Some("*")),
-        "scripts can read why"
+        "scripts can read the error"
     );
-    let nobody = server(Mode::Octahedra, |c| c.access.cors_origins = None);
-    assert_eq!(preflight(&nobody, ours).header("access-control-allow-origin"), None);
-    assert_eq!(get(&nobody, "/v1/capabilities", &[("origin", ours)]).header("access-control-allow-origin"), None);
+    let own_pages = server(Mode::Octahedra, |c| c.access.cors_origins = None);
+    assert_eq!(preflight(&own_pages, trusted).header("access-control-allow-origin"), None);
+    assert_eq!(get(&own_pages, "/v1/capabilities", &[("origin", trusted)]).header("access-control-allow-origin"), None);
 }
 
 #[test]
-fn browsers_are_told_what_not_to_do() {
+fn security_headers_are_sent() {
     let plain = server(Mode::Octahedra, |_| {});
     for path in ["/", "/docs", "/v1/capabilities", ENTRY, "/v1/nothing"] {
         let reply = get(&plain, path, &[]);

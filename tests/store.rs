@@ -1,6 +1,6 @@
-//! What the service keeps: one suite of behaviours, on a folder and on S3.
+//! Store: the same tests on a folder and on S3.
 #![cfg(feature = "server")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod store_support;
 mod tools;
@@ -17,12 +17,12 @@ use molmesh::store::{Digest, Folder, Name, Store, StoreError, Usage};
 use object_store::aws::AmazonS3Builder;
 use object_store::path::Path;
 use object_store::{ObjectStoreExt as _, PutPayload};
-use store_support::{Place, Service, input, job, local, noise, result, s3, shared};
+use store_support::{Service, TestStore, input, job, local, noise, result, s3, shared};
 
 const HOUR: Duration = Duration::from_hours(1);
 const MIB: usize = 1 << 20;
 
-/// Every behaviour is asked of both backends.
+/// Runs each test on both backends.
 macro_rules! on_both {
     ($($test:ident),+ $(,)?) => {
         mod folder {
@@ -41,22 +41,22 @@ macro_rules! on_both {
 }
 
 on_both!(
-    what_was_put_is_there_until_it_is_deleted,
-    parts_are_read_and_bad_ranges_refused,
-    something_new_is_kept_once,
-    readers_see_one_whole_object_or_the_other,
-    a_writer_shows_nothing_before_its_end,
-    a_writer_that_is_dropped_leaves_nothing,
-    a_writer_keeps_its_promise_or_nothing,
-    the_least_recently_used_goes_first,
-    what_cannot_fit_is_refused_with_numbers,
-    writers_make_room_too,
-    time_is_up_by_folder_and_use_prolongs_it,
-    pinned_objects_stay,
-    hot_results_are_answered_from_memory,
-    memory_is_bounded_and_forgets_what_is_removed,
-    a_restart_finds_what_there_was,
-    a_put_that_nobody_waits_for_is_finished,
+    objects_are_stored_and_deleted,
+    ranges_are_read_and_invalid_ranges_rejected,
+    put_new_keeps_the_first_object,
+    replacing_an_object_is_atomic,
+    a_written_object_appears_when_finished,
+    a_dropped_writer_leaves_nothing,
+    a_writer_must_write_the_declared_length,
+    least_recently_used_objects_are_evicted,
+    objects_over_the_capacity_are_rejected,
+    writers_evict_objects,
+    objects_expire_by_folder_and_use_prolongs_their_life,
+    pinned_objects_are_neither_evicted_nor_expired,
+    small_results_are_cached_in_memory,
+    memory_cache_is_bounded_and_drops_removed_objects,
+    a_restart_finds_existing_objects,
+    a_cancelled_put_still_finishes,
     the_probe_leaves_nothing,
 );
 
@@ -82,22 +82,22 @@ async fn part(store: &Store, name: &Name, range: Option<Range<u64>>) -> Option<(
     Some((meta.size, pieces.concat()))
 }
 
-/// Waits for what happens on other threads.
+/// Waits until `holds` returns true.
 async fn until<F: Future<Output = bool>>(what: &str, mut holds: impl FnMut() -> F) {
     let begun = Instant::now();
     while !holds().await {
-        assert!(begun.elapsed() < Duration::from_secs(30), "{what} did not come");
+        assert!(begun.elapsed() < Duration::from_secs(30), "timed out waiting for {what}");
         tokio::time::sleep(Duration::from_millis(5)).await;
     }
 }
 
-/// Runs what blocks.
+/// Runs blocking `work`.
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T {
     tokio::task::spawn_blocking(work).await.unwrap()
 }
 
 #[test]
-fn names_cannot_escape() {
+fn names_cannot_leave_their_folder() {
     let key = "0123456789abcdef".repeat(4);
     assert_eq!(Name::job("0a-1f").unwrap().to_string(), "jobs/0a-1f.json");
     assert_eq!(Name::result(&key, "report.json").unwrap().to_string(), format!("results/{key}.report.json"));
@@ -114,7 +114,7 @@ fn names_cannot_escape() {
     }
 }
 
-async fn what_was_put_is_there_until_it_is_deleted(place: Place) {
+async fn objects_are_stored_and_deleted(place: TestStore) {
     let store = place.open().await;
     let names = [result(1), result(2), input(1), job(1)];
     for (seed, name) in (1..).zip(&names) {
@@ -142,9 +142,9 @@ async fn what_was_put_is_there_until_it_is_deleted(place: Place) {
     assert_eq!(store.list(Folder::Results).await.unwrap(), []);
 }
 
-async fn parts_are_read_and_bad_ranges_refused(place: Place) {
+async fn ranges_are_read_and_invalid_ranges_rejected(place: TestStore) {
     let store = place.open().await;
-    // Too large for memory in one case, in memory in the other; both in more than one piece on disk.
+    // One result is too large for the memory cache, one fits; all objects have several chunks on disk.
     for (name, length) in [(result(1), 5 * MIB), (result(2), MIB), (input(1), MIB)] {
         let bytes = noise(length, 3);
         store.put(&name, bytes.clone().into()).await.unwrap();
@@ -177,20 +177,20 @@ async fn parts_are_read_and_bad_ranges_refused(place: Place) {
         store.delete(&input(4)).await.unwrap();
         assert!(matches!(stream.try_collect::<Vec<_>>().await, Err(StoreError::Failed { .. })));
         store.put(&input(4), noise(MIB, 4).into()).await.unwrap();
-        assert_eq!(store.sweep(old).await.expired, 1, "the control: nothing is read");
+        assert_eq!(store.sweep(old).await.expired, 1, "control: no reader");
     }
 }
 
-async fn something_new_is_kept_once(place: Place) {
+async fn put_new_keeps_the_first_object(place: TestStore) {
     let store = place.open().await;
     for name in [result(1), input(1), job(1)] {
         assert!(store.put_new(&name, noise(10, 1).into()).await.unwrap());
         assert!(!store.put_new(&name, noise(20, 2).into()).await.unwrap());
         assert_eq!(get(&store, &name).await, Some(noise(10, 1)), "{name}");
-        // Of many at once, one wins, and its bytes stay.
+        // Of concurrent calls exactly one succeeds, and its bytes are stored.
         store.delete(&name).await.unwrap();
-        let tries = (0..8).map(|seed| store.put_new(&name, noise(30, seed).into()));
-        let won = futures_util::future::join_all(tries).await.into_iter().map(Result::unwrap).collect::<Vec<_>>();
+        let calls = (0..8).map(|seed| store.put_new(&name, noise(30, seed).into()));
+        let won = futures_util::future::join_all(calls).await.into_iter().map(Result::unwrap).collect::<Vec<_>>();
         assert_eq!(won.iter().filter(|&&won| won).count(), 1, "{name}: {won:?}");
         let seed = won.iter().position(|&won| won).unwrap() as u64;
         assert_eq!(get(&store, &name).await, Some(noise(30, seed)));
@@ -198,7 +198,7 @@ async fn something_new_is_kept_once(place: Place) {
     assert_eq!(Folder::ALL.map(|f| store.usage(f)), [usage(30, 1); 3]);
 }
 
-async fn readers_see_one_whole_object_or_the_other(place: Place) {
+async fn replacing_an_object_is_atomic(place: TestStore) {
     let store = place.open().await;
     let bodies = [noise(MIB, 1), noise(2 * MIB, 2)];
     store.put(&job(1), bodies[0].clone().into()).await.unwrap();
@@ -214,35 +214,35 @@ async fn readers_see_one_whole_object_or_the_other(place: Place) {
     while !writer.is_finished() {
         let read = get(&store, &job(1)).await.unwrap();
         let which = bodies.iter().position(|body| *body == read);
-        seen[which.unwrap_or_else(|| panic!("{} bytes that nobody wrote", read.len()))] += 1;
+        seen[which.unwrap_or_else(|| panic!("{} bytes that were never written", read.len()))] += 1;
     }
     writer.await.unwrap();
-    assert!(seen.iter().all(|&n| n > 0), "only one was ever seen: {seen:?}");
+    assert!(seen.iter().all(|&n| n > 0), "readers saw only one of them: {seen:?}");
 }
 
-async fn a_writer_shows_nothing_before_its_end(place: Place) {
+async fn a_written_object_appears_when_finished(place: TestStore) {
     let store = place.open().await;
     let bytes = noise(if place.is_local() { 8 * MIB } else { 60 * MIB } + 17, 5);
     for (name, length) in [(result(1), None), (result(2), Some(bytes.len() as u64))] {
         let (step, stepped) = std::sync::mpsc::sync_channel::<()>(0);
-        let (told, tell) = tokio::sync::oneshot::channel();
+        let (sender, written) = tokio::sync::oneshot::channel();
         let mut writer = store.writer(&name, length);
         let body = bytes.clone();
         let thread = std::thread::spawn(move || {
             for piece in body.chunks(100_000) {
                 writer.write_all(piece).unwrap();
             }
-            told.send(()).unwrap();
+            sender.send(()).unwrap();
             stepped.recv().unwrap();
             writer.finish().unwrap();
         });
-        // A reader that polls all the time sees nothing or all of it.
-        let done = tokio::spawn(tell);
+        // Polling finds nothing while the writer is running.
+        let done = tokio::spawn(written);
         while !done.is_finished() {
             assert!(!has(&store, &name).await && store.get(&name).await.unwrap().is_none());
             tokio::time::sleep(Duration::from_millis(1)).await;
         }
-        // All but the last parts are on disk by now, under another name.
+        // All but the last parts are stored under a temporary name by now.
         assert!(store.list(Folder::Results).await.unwrap().iter().all(|(listed, _)| *listed != name));
         assert!(!has(&store, &name).await && part(&store, &name, None).await.is_none());
         assert_eq!(place.unfinished().len(), 1);
@@ -252,7 +252,7 @@ async fn a_writer_shows_nothing_before_its_end(place: Place) {
         assert_eq!(place.unfinished(), Vec::<String>::new());
     }
     assert_eq!(store.usage(Folder::Results), usage(2 * bytes.len(), 2));
-    // One that fits into a part.
+    // An object that fits into one part.
     let mut writer = store.writer(&result(3), None);
     blocking(move || writer.write_all(b"solid").map(|()| writer.finish())).await.unwrap().unwrap();
     assert_eq!(get(&store, &result(3)).await, Some(b"solid".to_vec()));
@@ -261,40 +261,40 @@ async fn a_writer_shows_nothing_before_its_end(place: Place) {
     assert_eq!(get(&store, &result(4)).await, Some(Vec::new()));
 }
 
-async fn a_writer_that_is_dropped_leaves_nothing(place: Place) {
+async fn a_dropped_writer_leaves_nothing(place: TestStore) {
     let store = place.open().await;
     let size = if place.is_local() { 8 * MIB } else { 60 * MIB };
     put(&store, &result(3), 5).await;
     for (name, length, panics) in [(result(1), None, false), (result(2), Some(1 << 30), true), (result(3), None, false)]
     {
         let mut writer = store.writer(&name, length);
-        let (told, tell) = std::sync::mpsc::sync_channel::<()>(0);
+        let (step, stepped) = std::sync::mpsc::sync_channel::<()>(0);
         let thread = std::thread::spawn(move || {
             writer.write_all(&noise(size, 1)).unwrap();
-            tell.recv().unwrap();
+            stepped.recv().unwrap();
             assert!(!panics, "the encoder fails on purpose");
         });
         until("the upload", async || !place.unfinished().is_empty()).await;
-        told.send(()).unwrap();
+        step.send(()).unwrap();
         assert_eq!(blocking(move || thread.join()).await.is_err(), panics);
         until("the end of the upload", async || place.unfinished().is_empty()).await;
     }
     assert!(!has(&store, &result(1)).await && !has(&store, &result(2)).await);
-    // What was there before is there.
+    // The previous object remains.
     assert_eq!(get(&store, &result(3)).await, Some(noise(5, 1)));
     assert_eq!(store.usage(Folder::Results), usage(5, 1));
 }
 
-async fn a_writer_keeps_its_promise_or_nothing(place: Place) {
+async fn a_writer_must_write_the_declared_length(place: TestStore) {
     let store = place.open().await;
-    for (promised, written) in [(10, 9), (10, 11), (5, 20 * MIB), (20 * MIB, 5), (9 * MIB, 9 * MIB - 1)] {
-        let mut writer = store.writer(&result(1), Some(promised as u64));
+    for (declared, written) in [(10, 9), (10, 11), (5, 20 * MIB), (20 * MIB, 5), (9 * MIB, 9 * MIB - 1)] {
+        let mut writer = store.writer(&result(1), Some(declared as u64));
         let refused = blocking(move || match writer.write_all(&noise(written, 1)) {
             Ok(()) => writer.finish(),
             Err(e) => Err(e.downcast::<StoreError>().unwrap()),
         });
         let refused = refused.await;
-        assert!(matches!(refused, Err(StoreError::Length { .. })), "{promised} {written}: {refused:?}");
+        assert!(matches!(refused, Err(StoreError::Length { .. })), "{declared} {written}: {refused:?}");
         until("the end of the upload", async || place.unfinished().is_empty()).await;
         assert!(!has(&store, &result(1)).await);
     }
@@ -303,21 +303,21 @@ async fn a_writer_keeps_its_promise_or_nothing(place: Place) {
     assert!(has(&store, &result(1)).await);
 }
 
-async fn the_least_recently_used_goes_first(mut place: Place) {
+async fn least_recently_used_objects_are_evicted(mut place: TestStore) {
     place.config.max_bytes = 1000;
     let store = place.open().await;
     for i in 1..=4 {
         put(&store, &result(i), 250).await;
     }
-    // Documents of jobs do not count.
+    // Job documents do not count.
     put(&store, &job(1), 5000).await;
     assert_eq!(store.usage(Folder::Results), usage(1000, 4));
-    // 1 and 2 are used again, in two ways; 3 has become the oldest.
+    // 1 and 2 are used in two ways, so 3 is the least recently used.
     assert!(get(&store, &result(1)).await.is_some());
     store.touch(&result(2), SystemTime::now());
     put(&store, &input(1), 250).await;
     assert!(!has(&store, &result(3)).await);
-    // Now 4 is; an input goes when its turn comes.
+    // Next are 4, then 1 and 2.
     put(&store, &result(5), 10).await;
     assert!(!has(&store, &result(4)).await);
     put(&store, &result(6), 700).await;
@@ -328,18 +328,18 @@ async fn the_least_recently_used_goes_first(mut place: Place) {
     }
     assert_eq!((store.usage(Folder::Results), store.usage(Folder::Inputs)), (usage(710, 2), usage(250, 1)));
     assert!(has(&store, &job(1)).await);
-    // An object makes room for its own successor.
+    // Replacing an object frees its previous size.
     put(&store, &result(6), 900).await;
     assert_eq!((store.usage(Folder::Results), store.usage(Folder::Inputs)), (usage(900, 1), usage(0, 0)));
     put(&store, &result(7), 100).await;
-    // A cap that was lowered holds after a sweep.
+    // A lowered capacity is enforced by the next sweep.
     place.config.max_bytes = 999;
     let store = place.open().await;
     let swept = store.sweep(SystemTime::now()).await;
     assert_eq!((swept.evicted, swept.expired, store.usage(Folder::Results).objects), (1, 0, 1));
 }
 
-async fn what_cannot_fit_is_refused_with_numbers(mut place: Place) {
+async fn objects_over_the_capacity_are_rejected(mut place: TestStore) {
     place.config.max_bytes = 1000;
     let store = place.open().await;
     put(&store, &result(1), 600).await;
@@ -359,37 +359,37 @@ async fn what_cannot_fit_is_refused_with_numbers(mut place: Place) {
             "{message}"
         );
     }
-    // Nothing was removed for what could never fit; what fits exactly goes in.
+    // A rejected object evicts nothing. An object of exactly the capacity is stored.
     assert!(has(&store, &result(1)).await && !has(&store, &result(2)).await);
     put(&store, &result(2), 1000).await;
     assert_eq!(store.usage(Folder::Results), usage(1000, 1));
 }
 
-async fn writers_make_room_too(mut place: Place) {
+async fn writers_evict_objects(mut place: TestStore) {
     place.config.max_bytes = 20 * MIB as u64;
     let store = place.open().await;
     for i in 1..=4 {
         put(&store, &result(i), 5 * MIB).await;
     }
-    // Room is promised from the start when the length is known.
+    // With a declared length, the space is reserved at the start.
     let mut writer = store.writer(&result(5), Some(9 * MIB as u64));
-    until("room", async || store.usage(Folder::Results).objects == 2).await;
+    until("eviction", async || store.usage(Folder::Results).objects == 2).await;
     assert!(!has(&store, &result(1)).await && !has(&store, &result(2)).await && has(&store, &result(3)).await);
     blocking(move || writer.write_all(&noise(9 * MIB, 1)).map(|()| writer.finish())).await.unwrap().unwrap();
     assert_eq!(store.usage(Folder::Results), usage(19 * MIB, 3));
-    // And as it grows otherwise, until it is larger than everything may be.
+    // Otherwise the reservation grows up to the capacity.
     let mut writer = store.writer(&result(6), None);
     let refused = blocking(move || writer.write_all(&noise(64 * MIB, 1))).await.unwrap_err();
     assert_eq!(refused.kind(), std::io::ErrorKind::FileTooLarge);
     assert!(matches!(refused.downcast::<StoreError>().unwrap(), StoreError::TooLarge { .. }));
     until("the end of the upload", async || place.unfinished().is_empty()).await;
     assert!(!has(&store, &result(6)).await);
-    // What was promised to it is free again.
+    // Its reservation is released.
     put(&store, &result(7), 20 * MIB).await;
     assert_eq!(store.usage(Folder::Results), usage(20 * MIB, 1));
 }
 
-async fn time_is_up_by_folder_and_use_prolongs_it(mut place: Place) {
+async fn objects_expire_by_folder_and_use_prolongs_their_life(mut place: TestStore) {
     let hours = |n: u64| n * 3_600_000;
     (place.config.result_ttl_ms, place.config.input_ttl_ms, place.config.job_ttl_ms) = (hours(2), hours(4), hours(6));
     let store = place.open().await;
@@ -406,7 +406,7 @@ async fn time_is_up_by_folder_and_use_prolongs_it(mut place: Place) {
         }
         there
     };
-    // Before the time, a minute's margin for slow machines; the clock may also go back.
+    // One minute of tolerance for slow machines. The clock may be set back.
     for early in [now - HOUR, now, now + 2 * HOUR - HOUR / 60] {
         assert_eq!(store.sweep(early).await.expired, 0);
     }
@@ -414,7 +414,7 @@ async fn time_is_up_by_folder_and_use_prolongs_it(mut place: Place) {
     let swept = store.sweep(now + 2 * HOUR + HOUR / 60).await;
     assert_eq!((swept.expired, swept.evicted, swept.bytes, swept.failed), (1, 0, 100, 0));
     assert_eq!(there().await, [false, true, true, true]);
-    // A use that lies further back does not shorten anything.
+    // An earlier use does not shorten the life of an object.
     store.touch(&result(2), now);
     assert_eq!(store.sweep(now + 3 * HOUR).await.expired, 0);
     assert_eq!(store.sweep(now + 5 * HOUR).await.expired, 2);
@@ -424,11 +424,11 @@ async fn time_is_up_by_folder_and_use_prolongs_it(mut place: Place) {
     assert_eq!(Folder::ALL.map(|f| store.usage(f)), [usage(0, 0); 3]);
 }
 
-async fn pinned_objects_stay(mut place: Place) {
+async fn pinned_objects_are_neither_evicted_nor_expired(mut place: TestStore) {
     place.config.max_bytes = 1000;
     let store = place.open().await;
     let far = SystemTime::now() + 10_000 * HOUR;
-    // A pin may come before its object, and counts.
+    // Pins are counted, and may precede their object.
     let pins = [store.pin(&result(1)), store.pin(&result(1)), store.pin(&job(1))];
     for name in [result(1), result(2), job(1)] {
         put(&store, &name, 500).await;
@@ -440,18 +440,18 @@ async fn pinned_objects_stay(mut place: Place) {
     let refused = store.put(&result(3), noise(600, 1).into()).await;
     assert!(matches!(refused, Err(StoreError::Full { bytes: 600, held: 500, max_bytes: 1000 })), "{refused:?}");
     put(&store, &result(3), 500).await;
-    // Its neighbour goes instead, though it is younger.
+    // The unpinned object is evicted, although it is more recent.
     put(&store, &result(4), 500).await;
     assert!(has(&store, &result(1)).await && !has(&store, &result(3)).await);
     drop(second);
     put(&store, &result(5), 500).await;
     assert!(!has(&store, &result(1)).await);
-    // Whoever owns it may delete it all the same.
+    // Pinned objects can be deleted.
     store.delete(&job(1)).await.unwrap();
     assert!(!has(&store, &job(1)).await);
 }
 
-async fn hot_results_are_answered_from_memory(mut place: Place) {
+async fn small_results_are_cached_in_memory(mut place: TestStore) {
     place.config.memory_object_bytes = 1000;
     let store = place.open().await;
     for name in [result(1), result(2), input(1)] {
@@ -460,27 +460,27 @@ async fn hot_results_are_answered_from_memory(mut place: Place) {
     put(&store, &result(3), 1001).await;
     let store = place.open().await;
     assert_eq!(store.memory_held(), 0);
-    // The first time it comes from the disk.
+    // The first read is from disk.
     assert_eq!(get(&store, &result(1)).await, Some(noise(1000, 1)));
     assert!(store.memory_held() >= 1000);
     for name in [result(3), input(1)] {
         assert!(get(&store, &name).await.is_some());
     }
     for name in [result(1), result(2), result(3), input(1)] {
-        place.steal(&name);
+        place.remove_directly(&name);
     }
-    // From now on at once, whatever becomes of the disk.
-    let hot = store.get(&result(1)).now_or_never().expect("an answer at once").unwrap().unwrap();
-    assert_eq!((hot.bytes.to_vec(), hot.meta.size), (noise(1000, 1), 1000));
+    // Further reads are from memory.
+    let cached = store.get(&result(1)).now_or_never().expect("an immediate result").unwrap().unwrap();
+    assert_eq!((cached.bytes.to_vec(), cached.meta.size), (noise(1000, 1), 1000));
     assert_eq!(part(&store, &result(1), Some(10..20)).await, Some((1000, noise(1000, 1)[10..20].to_vec())));
-    // What is not small, not a result, or was not asked for is gone, and the index learns it.
+    // Large objects, inputs and objects that were not read are missing, and the index is corrected.
     for name in [result(2), result(3), input(1)] {
         assert_eq!(get(&store, &name).await, None, "{name}");
     }
     assert_eq!((store.usage(Folder::Results), store.usage(Folder::Inputs)), (usage(1000, 1), usage(0, 0)));
 }
 
-async fn memory_is_bounded_and_forgets_what_is_removed(mut place: Place) {
+async fn memory_cache_is_bounded_and_drops_removed_objects(mut place: TestStore) {
     (place.config.memory_bytes, place.config.memory_object_bytes) = (20_000, 5000);
     let store = place.open().await;
     for i in 0..20 {
@@ -492,7 +492,7 @@ async fn memory_is_bounded_and_forgets_what_is_removed(mut place: Place) {
         assert_eq!(get(&store, &result(i)).await, Some(noise(3000, 1)));
         assert!(store.memory_held() <= 20_000);
     }
-    // Overwritten: the new bytes. Deleted or swept: none.
+    // Replaced objects give the new bytes; deleted and expired ones none.
     store.put(&result(19), noise(10, 7).into()).await.unwrap();
     assert_eq!(get(&store, &result(19)).await, Some(noise(10, 7)));
     let mut writer = store.writer(&result(19), None);
@@ -507,7 +507,7 @@ async fn memory_is_bounded_and_forgets_what_is_removed(mut place: Place) {
     }
 }
 
-async fn a_restart_finds_what_there_was(mut place: Place) {
+async fn a_restart_finds_existing_objects(mut place: TestStore) {
     let store = place.open().await;
     for (i, name) in [result(1), result(2), result(3), input(1), job(1)].iter().enumerate() {
         put(&store, name, 100 + i).await;
@@ -515,15 +515,15 @@ async fn a_restart_finds_what_there_was(mut place: Place) {
     let before = Folder::ALL.map(|f| store.usage(f));
     drop(store);
     if place.is_local() {
-        // The second was written first. Somebody else's files are neither counted nor removed.
+        // The second object is the oldest. Foreign files are neither counted nor removed.
         let old = std::fs::File::options().write(true).open(place.root().join(result(2).to_string())).unwrap();
         old.set_modified(SystemTime::now() - HOUR).unwrap();
-        std::fs::write(place.root().join("results/notes.txt"), "mine").unwrap();
+        std::fs::write(place.root().join("results/notes.txt"), "notes").unwrap();
     }
     let store = place.open().await;
     assert_eq!(Folder::ALL.map(|f| store.usage(f)), before);
     assert_eq!(get(&store, &result(3)).await, Some(noise(102, 1)));
-    // What another process writes is found and counted when somebody asks for it.
+    // Objects of other processes are counted when they are first read.
     let other = place.open().await;
     put(&other, &input(2), 50).await;
     assert_eq!(get(&store, &input(2)).await, Some(noise(50, 1)));
@@ -534,17 +534,17 @@ async fn a_restart_finds_what_there_was(mut place: Place) {
     assert_eq!((swept.expired, swept.evicted), (0, 1));
     if place.is_local() {
         assert!(!has(&store, &result(2)).await && has(&store, &result(1)).await);
-        assert_eq!(std::fs::read_to_string(place.root().join("results/notes.txt")).unwrap(), "mine");
+        assert_eq!(std::fs::read_to_string(place.root().join("results/notes.txt")).unwrap(), "notes");
     }
 }
 
-async fn a_put_that_nobody_waits_for_is_finished(place: Place) {
+async fn a_cancelled_put_still_finishes(place: TestStore) {
     let store = place.open().await;
     for i in 0..8 {
-        // Polled once, then dropped, as when a client goes away; whether it was done by then is not the question.
+        // Polled once and dropped, as when a client disconnects.
         let _dropped = store.put(&input(i), noise(1000, i).into()).now_or_never();
     }
-    until("all of them", async || store.usage(Folder::Inputs) == usage(8000, 8)).await;
+    until("all objects", async || store.usage(Folder::Inputs) == usage(8000, 8)).await;
     for i in 0..8 {
         assert_eq!(get(&store, &input(i)).await, Some(noise(1000, i)));
     }
@@ -553,7 +553,7 @@ async fn a_put_that_nobody_waits_for_is_finished(place: Place) {
     assert!(!has(&store, &input(0)).await);
 }
 
-async fn the_probe_leaves_nothing(place: Place) {
+async fn the_probe_leaves_nothing(place: TestStore) {
     let store = place.open().await;
     store.probe().await.unwrap();
     assert_eq!(Folder::ALL.map(|f| store.usage(f)), [usage(0, 0); 3]);
@@ -585,7 +585,7 @@ async fn staged_files_of_crashed_processes_are_removed() {
     }
     assert_eq!(place.open().await.usage(Folder::Results), usage(10, 1));
     assert_eq!([&old, &young, &foreign].map(|p| p.exists()), [false, true, true]);
-    // A sweep finds later what was too young at the start, but does not look all the time.
+    // A later sweep removes files that were too recent at the start, but not every sweep searches.
     let now = SystemTime::now();
     assert_eq!(store.sweep(now + HOUR / 2).await.stale, 0);
     assert_eq!(store.sweep(now + 2 * HOUR).await.stale, 1);
@@ -608,7 +608,7 @@ async fn uploads_of_crashed_processes_are_removed() {
         .with_secret_access_key("any")
         .build()
         .unwrap();
-    // Of ours one, of others one that only looks like ours, and one that does not.
+    // One upload of this store, one of a foreign file, and one with a similar prefix.
     let elsewhere = format!("{prefix}-other/{}", result(1));
     for path in [format!("{prefix}/{}", result(1)), format!("{prefix}/results/notes.txt"), elsewhere.clone()] {
         let mut upload = bucket.put_multipart(&Path::from(path)).await.unwrap();
@@ -631,7 +631,7 @@ async fn refusal(config: &StoreConfig, data_dir: &std::path::Path) -> (&'static 
 }
 
 #[tokio::test]
-async fn a_folder_that_cannot_be_used_is_named() {
+async fn errors_name_an_unusable_folder() {
     let dir = tempfile::tempdir().unwrap();
     let config = StoreConfig::default();
     // A file where the folder should be, at three depths.
@@ -645,7 +645,7 @@ async fn a_folder_that_cannot_be_used_is_named() {
         std::fs::remove_file(&file).unwrap();
         Store::open(&config, &data_dir).await.unwrap();
     }
-    // A folder that is not ours to write: the superuser needs a harder one.
+    // A read-only folder. The superuser can write there, so /sys is used instead.
     let closed = dir.path().join("closed");
     Store::open(&config, &closed).await.unwrap();
     let mut mode = std::fs::metadata(&closed).unwrap().permissions();
@@ -660,11 +660,11 @@ async fn a_folder_that_cannot_be_used_is_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bucket_that_cannot_be_used_is_named_and_secrets_are_not() {
-    let guarded = Service::start(&["--guarded"]);
+async fn errors_name_an_unusable_bucket_but_no_secret() {
+    let service = Service::start(&["--guarded"]);
     let dir = tempfile::tempdir().unwrap();
-    let good = guarded.config("here");
-    // The control: with these it opens, and with the others it does not.
+    let good = service.config("here");
+    // Control: the store opens with valid settings.
     let store = Store::open(&good, dir.path()).await.unwrap();
     store.put(&input(1), noise(9 * MIB, 1).into()).await.unwrap();
     assert_eq!(get(&store, &input(1)).await, Some(noise(9 * MIB, 1)));
@@ -672,7 +672,7 @@ async fn a_bucket_that_cannot_be_used_is_named_and_secrets_are_not() {
     for bad in [
         StoreConfig { url: Some("s3://nowhere".to_owned()), ..good.clone() },
         StoreConfig { secret_access_key: Some(secret.clone()), ..good.clone() },
-        StoreConfig { access_key_id: Some("somebody".to_owned()), secret_access_key: Some(secret), ..good.clone() },
+        StoreConfig { access_key_id: Some("unknown".to_owned()), secret_access_key: Some(secret), ..good.clone() },
         StoreConfig { url: Some("http://meshes".to_owned()), ..good.clone() },
         StoreConfig { allow_http: false, ..good.clone() },
         StoreConfig { endpoint: Some("http://127.0.0.1:1".to_owned()), ..good.clone() },
@@ -687,25 +687,25 @@ async fn a_bucket_that_cannot_be_used_is_named_and_secrets_are_not() {
             assert!(!shown.contains(secret), "{shown}");
         }
     }
-    // Nothing was made where the folder would be.
+    // No folder was created.
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
-    // A service that goes away is noticed, and what was said stays true.
-    drop(guarded);
+    // If the service stops, operations fail and the usage is unchanged.
+    drop(service);
     assert!(store.probe().await.is_err());
     assert!(store.put(&input(2), Bytes::from_static(b"x")).await.is_err());
     assert_eq!(store.usage(Folder::Inputs), usage(9 * MIB, 1));
 }
 
 #[test]
-fn metrics_say_what_is_held_and_what_went() {
+fn metrics_report_stored_and_removed_objects() {
     let recorder = metrics_exporter_prometheus::PrometheusBuilder::new().build_recorder();
-    // On one thread, whose recorder this is.
+    // The recorder is local to this thread.
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let value = |line: &str| {
         let text = recorder.handle().render();
         text.lines().find_map(|l| l.strip_prefix(line)?.trim().parse::<u64>().ok()).unwrap_or_default()
     };
-    let asked =
+    let requests =
         |tier: &str, found: &str| value(&format!("molmesh_cache_requests_total{{tier=\"{tier}\",result=\"{found}\"}}"));
     metrics::with_local_recorder(&recorder, || {
         runtime.block_on(async {
@@ -723,12 +723,12 @@ fn metrics_say_what_is_held_and_what_went() {
                 )
             });
             assert_eq!(held, [(201, 2), (50, 1), (7, 1)]);
-            // From memory; from the disk; not at all; and an input, which is no answer to anybody.
+            // From memory, from disk, and missing. Inputs are not counted.
             for name in [result(1), result(2), result(3), input(1)] {
-                let _asked = get(&store, &name).await;
+                let _found = get(&store, &name).await;
             }
-            assert_eq!([asked("memory", "hit"), asked("memory", "miss")], [1, 2]);
-            assert_eq!([asked("store", "hit"), asked("store", "miss")], [1, 1]);
+            assert_eq!([requests("memory", "hit"), requests("memory", "miss")], [1, 2]);
+            assert_eq!([requests("store", "hit"), requests("store", "miss")], [1, 1]);
             put(&store, &result(4), 1000).await;
             assert_eq!(value("molmesh_store_removed_total{reason=\"cap\"}"), 3);
             store.sweep(SystemTime::now() + 10_000 * HOUR).await;
@@ -744,7 +744,7 @@ fn metrics_say_what_is_held_and_what_went() {
 }
 
 #[test]
-fn secrets_are_not_quoted_when_they_are_refused() {
+fn errors_do_not_quote_secrets() {
     let load = |text: &str| {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), text).unwrap();
@@ -752,7 +752,7 @@ fn secrets_are_not_quoted_when_they_are_refused() {
     };
     let message = load("[store]\nsecret_access_key = 8675309").unwrap_err().to_string();
     assert!(message.contains("store.secret_access_key") && !message.contains("8675309"), "{message}");
-    // The control: what is no secret is quoted.
+    // Control: other values are quoted.
     assert!(load("[store]\naccess_key_id = 8675309").unwrap_err().to_string().contains("8675309"));
     let config = load("[store]\nsecret_access_key = \"8675309\"\nallow_http = true").unwrap();
     assert_eq!(config.store.secret_access_key.as_ref().map(Secret::reveal), Some("8675309"));

@@ -1,66 +1,66 @@
-//! A quota, whom it is counted for, and how he stands.
+//! Quotas, the accounts that they apply to, and their usage.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-/// How much a client may have; none of a thing: any amount.
+/// Limits of one client. `None` means unlimited.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Quota {
-    /// Requests in a window.
+    /// Requests per window.
     pub requests: Option<u64>,
-    /// Seconds in a window that workers spend on its jobs.
+    /// Computing time of its jobs per window, s.
     pub work_s: Option<u64>,
-    /// Requests at once, to the last byte of the answer.
+    /// Concurrent requests, each counted until the last byte of its response.
     pub concurrent: Option<u64>,
-    /// Length of a window, s, at least 1.
+    /// Length of the window, s, at least 1.
     pub window_s: u64,
 }
 
 impl Quota {
-    /// Whether nothing is limited.
+    /// Returns true if nothing is limited.
     #[must_use]
     pub fn is_unlimited(&self) -> bool {
         self.requests.is_none() && self.work_s.is_none() && self.concurrent.is_none()
     }
 
-    /// Length of a window.
+    /// Returns the length of the window, at least 1 s.
     #[must_use]
     pub fn window(&self) -> Duration {
         Duration::from_secs(self.window_s.max(1))
     }
 }
 
-/// Whom requests are counted for.
+/// Client whose requests are counted.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Account {
-    /// The client's number, which its jobs have as well.
+    /// Number of the client, also recorded with its jobs.
     pub client: u64,
-    /// It is a key's. Addresses, of which there may be any number, are counted apart from keys.
+    /// True for an API key, false for an address. Addresses, of which there may be any number, are counted separately.
     pub is_key: bool,
-    /// How much it may have.
+    /// Limits of this client.
     pub quota: Arc<Quota>,
 }
 
-/// How an account stands.
+/// Usage of a quota in the current window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Standing {
-    /// Requests in this window.
+pub struct QuotaUsage {
+    /// Requests.
     pub requests: u64,
-    /// Time in this window that workers spent.
+    /// Computing time.
     pub work: Duration,
-    /// Requests at this moment.
+    /// Requests that are running.
     pub running: u64,
     /// Time until the next window.
     pub left: Duration,
 }
 
-/// A quota is used up.
+/// Error: a quota is used up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Exceeded {
-    /// Which one, as the fields name it: `requests`, `work`, `concurrency`.
+    /// Policy as named in the `RateLimit` fields: `requests`, `work` or `concurrency`.
     pub policy: &'static str,
-    /// How much of it there is.
+    /// Limit of the policy.
     pub limit: u64,
-    /// When trying again is worth it.
+    /// Time after which a retry may succeed.
     pub wait: Duration,
 }

@@ -1,42 +1,42 @@
-//! Why access cannot be set up. No message holds a secret, a key's text or a hash.
+//! Errors of access control. No message contains a secret, the text of a key or a hash.
 
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// What is wrong with a file of keys.
+/// Error in a key file.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("line {line}: {what}")]
+#[error("line {line}: {reason}")]
 pub struct KeyFileError {
-    /// The line, from 1.
+    /// Line number, from 1.
     pub line: usize,
-    /// What is wrong there, and what would be right.
-    pub what: String,
+    /// Cause, and the expected form.
+    pub reason: String,
 }
 
-/// Why access cannot be set up.
+/// Errors of creating the access control.
 #[derive(Debug, Error)]
 pub enum AccessError {
-    /// The file of keys cannot be read.
+    /// The key file cannot be read.
     #[error("cannot read access.keys_file {}: {error}", path.display())]
     Read {
-        /// The file.
+        /// Key file.
         path: PathBuf,
-        /// The system's words.
+        /// Error of the system.
         error: std::io::Error,
     },
-    /// The file of keys cannot be used.
+    /// The key file is invalid.
     #[error("access.keys_file {}, {error}", path.display())]
     Keys {
-        /// The file.
+        /// Key file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Line and cause.
         error: KeyFileError,
     },
-    /// The keys that sign cannot be used.
+    /// The signing keys are invalid.
     #[error("access.signing_secret: {0}")]
     Signing(String),
-    /// Every page would be sent what browsers keep for others.
-    #[error("access.cors_credentials cannot go with access.cors_origins = \"*\"; expected a list of origins")]
+    /// Pages of every origin would be allowed to send credentials.
+    #[error("access.cors_credentials excludes access.cors_origins = \"*\"; expected a list of origins")]
     CredentialsForAll,
 }

@@ -1,5 +1,5 @@
-//! The file of keys: TOML, one `[[key]]` each. What is wrong is said with its line; values are not quoted, as somebody may
-//! have put a key's text where its hash belongs.
+//! Key file: TOML with one `[[key]]` table per key. Errors name the line but do not quote values, because the text of a
+//! key may have been written in place of its hash.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -14,17 +14,17 @@ use super::keys::{Key, KeyRing, Scope};
 use super::token;
 use crate::pipeline::nearest::nearest;
 
-/// What a key may say.
+/// Fields of a key.
 const NAMES: [&str; 9] = ["id", "hash", "scopes", "requests", "work_s", "concurrent", "window_s", "expires", "note"];
 
 type Field<'a> = (Range<usize>, &'a DeValue<'a>);
 
-/// Reads a file of keys. `window_s` is the window of keys that do not say their own.
+/// Parses a key file. `window_s` is the quota window of keys without their own, s.
 ///
 /// # Errors
-/// The first thing that is wrong.
+/// Returns the first error in the file.
 pub fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> {
-    let wrong = |span: Range<usize>, what: String| KeyFileError { line: line_of(text, span.start), what };
+    let wrong = |span: Range<usize>, reason: String| KeyFileError { line: line_of(text, span.start), reason };
     let table = DeTable::parse(text).map_err(|e| wrong(e.span().unwrap_or_default(), e.message().to_owned()))?;
     let mut keys = BTreeMap::new();
     for (name, value) in table.get_ref() {
@@ -35,19 +35,20 @@ pub fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> {
         for entry in entries {
             let fields =
                 entry.get_ref().as_table().ok_or_else(|| wrong(entry.span(), "expected [[key]]".to_owned()))?;
-            let key = key(fields, entry.span(), window_s).map_err(|(span, what)| wrong(span, what))?;
+            let key = key(fields, entry.span(), window_s).map_err(|(span, reason)| wrong(span, reason))?;
             let (span, id) = (entry.span(), key.id.clone());
             if keys.insert(id.clone(), Arc::new(key)).is_some() {
-                return Err(wrong(span, format!("there are two keys `{id}`")));
+                return Err(wrong(span, format!("duplicate key `{id}`")));
             }
         }
     }
     Ok(KeyRing(keys))
 }
 
-type Wrong = (Range<usize>, String);
+/// Span and cause of an error.
+type SpannedError = (Range<usize>, String);
 
-fn key(fields: &DeTable<'_>, place: Range<usize>, window_s: u64) -> Result<Key, Wrong> {
+fn key(fields: &DeTable<'_>, span_of_key: Range<usize>, window_s: u64) -> Result<Key, SpannedError> {
     for name in fields.keys() {
         if !NAMES.contains(&&**name.get_ref()) {
             return Err((name.span(), unknown(name.get_ref(), NAMES)));
@@ -57,17 +58,17 @@ fn key(fields: &DeTable<'_>, place: Range<usize>, window_s: u64) -> Result<Key, 
         fields.iter().find(|(n, _)| n.get_ref() == name).map(|(_, value)| (value.span(), value.get_ref()))
     };
     let text = |name: &str| text(name, get(name));
-    let needed = |name: &str| -> Result<(Range<usize>, &str), Wrong> {
-        text(name)?.ok_or_else(|| (place.clone(), format!("the key has no `{name}`")))
+    let required = |name: &str| -> Result<(Range<usize>, &str), SpannedError> {
+        text(name)?.ok_or_else(|| (span_of_key.clone(), format!("the key has no `{name}`")))
     };
     let count = |name: &str| count(name, get(name));
-    let (span, id) = needed("id")?;
+    let (span, id) = required("id")?;
     if !token::is_id(id) {
         return Err((span, "`id`: expected 1 to 32 lower-case letters, digits and hyphens".to_owned()));
     }
-    let (span, hash) = needed("hash")?;
+    let (span, hash) = required("hash")?;
     let hash = hash.parse().map_err(|expected| (span, format!("`hash`: expected {expected}")))?;
-    let scopes = get("scopes").ok_or_else(|| (place.clone(), "the key has no `scopes`".to_owned()))?;
+    let scopes = get("scopes").ok_or_else(|| (span_of_key.clone(), "the key has no `scopes`".to_owned()))?;
     let expires = text("expires")?.map(|(span, time)| {
         let expected = "`expires`: expected a time such as \"2030-01-31T00:00:00Z\"";
         humantime::parse_rfc3339(time).map_err(|_other| (span, expected.to_owned()))
@@ -88,24 +89,24 @@ fn key(fields: &DeTable<'_>, place: Range<usize>, window_s: u64) -> Result<Key, 
     })
 }
 
-fn text<'a>(name: &str, field: Option<Field<'a>>) -> Result<Option<(Range<usize>, &'a str)>, Wrong> {
+fn text<'a>(name: &str, field: Option<Field<'a>>) -> Result<Option<(Range<usize>, &'a str)>, SpannedError> {
     let Some((span, value)) = field else { return Ok(None) };
     match value.as_str() {
         Some(text) => Ok(Some((span, text))),
-        None => Err((span, format!("`{name}`: expected text in quotes"))),
+        None => Err((span, format!("`{name}`: expected a string"))),
     }
 }
 
-fn count(name: &str, field: Option<Field<'_>>) -> Result<Option<u64>, Wrong> {
+fn count(name: &str, field: Option<Field<'_>>) -> Result<Option<u64>, SpannedError> {
     let Some((span, value)) = field else { return Ok(None) };
     let number = value.as_integer().and_then(|n| u64::from_str_radix(&n.as_str().replace('_', ""), n.radix()).ok());
     match number.filter(|number| *number >= 1) {
         Some(number) => Ok(Some(number)),
-        None => Err((span, format!("`{name}`: expected a whole number of 1 or more"))),
+        None => Err((span, format!("`{name}`: expected a positive integer"))),
     }
 }
 
-fn scopes((span, value): Field<'_>) -> Result<Vec<Scope>, Wrong> {
+fn scopes((span, value): Field<'_>) -> Result<Vec<Scope>, SpannedError> {
     let expected = || format!("`scopes`: expected a list of {}", quoted(Scope::ALL.map(Scope::name)));
     let items = value.as_array().filter(|items| items.iter().next().is_some());
     let items = items.ok_or_else(|| (span.clone(), expected()))?;
@@ -116,7 +117,7 @@ fn scopes((span, value): Field<'_>) -> Result<Vec<Scope>, Wrong> {
     items.iter().map(scope).collect()
 }
 
-/// Names as they stand in a message.
+/// Formats names for a message.
 fn quoted<const N: usize>(names: [&str; N]) -> String {
     names.map(|name| format!("`{name}`")).join(", ")
 }
@@ -124,21 +125,21 @@ fn quoted<const N: usize>(names: [&str; N]) -> String {
 fn unknown<const N: usize>(name: &str, known: [&str; N]) -> String {
     let shown: String = name.chars().take(MAX_SHOWN).collect();
     let nearest = nearest(name, known).map(|nearest| format!("; did you mean `{nearest}`?"));
-    format!("unknown name `{shown}`{}", nearest.unwrap_or_else(|| format!("; there are {}", quoted(known))))
+    format!("unknown name `{shown}`{}", nearest.unwrap_or_else(|| format!("; expected one of {}", quoted(known))))
 }
 
-/// Characters of an unknown name that are shown.
+/// Maximum number of characters of an unknown name in a message.
 const MAX_SHOWN: usize = 32;
 
-/// The line of a place, from 1.
-fn line_of(text: &str, at: usize) -> usize {
-    text.bytes().take(at).filter(|b| *b == b'\n').count() + 1
+/// Returns the line number of a byte offset, from 1.
+fn line_of(text: &str, offset: usize) -> usize {
+    text.bytes().take(offset).filter(|b| *b == b'\n').count() + 1
 }
 
-/// The lines of a key in the file.
+/// Formats a key as a `[[key]]` table.
 #[must_use]
 pub fn entry(key: &Key) -> String {
-    // JSON's escapes are among TOML's; what JSON leaves bare and TOML does not take is left out.
+    // TOML accepts all escapes of JSON. DEL, which only JSON allows unescaped, is removed.
     let quote = |text: &str| serde_json::Value::from(text.replace('\u{7f}', "")).to_string();
     let scopes: Vec<String> = key.scopes.iter().map(|scope| quote(scope.name())).collect();
     let mut lines =
@@ -165,7 +166,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_written_is_read() {
+    fn formatted_keys_parse_back() {
         let hash = token::Hash::of("x");
         let quota = Quota { requests: Some(1000), work_s: Some(60), concurrent: Some(4), window_s: 3600 };
         let expires = Some(SystemTime::UNIX_EPOCH + Duration::from_secs(1_900_000_000));
@@ -194,26 +195,26 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said_with_its_line_and_what_is_near() {
+    fn errors_name_the_line_and_a_similar_name() {
         let hash = token::Hash::of("x");
         let good = format!("[[key]]\nid = \"a\"\nhash = \"{hash}\"\nscopes = [\"read\"]\n");
-        for (change, line, what) in [
+        for (change, line, reason) in [
             (("scopes = ", "scope = "), 4, "did you mean `scopes`?"),
             (("[[key]]", "[[keys]]"), 1, "did you mean `key`?"),
             (("[[key]]", "[key]"), 1, "expected [[key]]"),
             (("\"read\"", "\"raed\""), 4, "did you mean `read`?"),
-            (("\"read\"", "\"admin\""), 4, "there are `mesh`, `read`"),
+            (("\"read\"", "\"admin\""), 4, "expected one of `mesh`, `read`"),
             (("[\"read\"]", "\"read\""), 4, "expected a list of"),
             (("[\"read\"]", "[]"), 4, "expected a list of"),
             (("[\"read\"]", "[1]"), 4, "expected a list of"),
             (("scopes = [\"read\"]", ""), 1, "has no `scopes`"),
             (("id = \"a\"", "id = \"A B\""), 2, "`id`: expected"),
-            (("id = \"a\"", "id = 3"), 2, "`id`: expected text"),
+            (("id = \"a\"", "id = 3"), 2, "`id`: expected a string"),
             (("sha256:", "mm_a_"), 3, "`hash`: expected"),
-            (("id = \"a\"", "id = \"a\"\nrequests = 0"), 3, "`requests`: expected a whole number"),
-            (("id = \"a\"", "id = \"a\"\nwork_s = 1.5"), 3, "`work_s`: expected a whole number"),
+            (("id = \"a\"", "id = \"a\"\nrequests = 0"), 3, "`requests`: expected a positive integer"),
+            (("id = \"a\"", "id = \"a\"\nwork_s = 1.5"), 3, "`work_s`: expected a positive integer"),
             (("id = \"a\"", "id = \"a\"\nexpires = \"soon\""), 3, "`expires`: expected a time"),
-            (("id = \"a\"", "id = \"a\"\nexpires = 2030-01-01"), 3, "`expires`: expected text"),
+            (("id = \"a\"", "id = \"a\"\nexpires = 2030-01-01"), 3, "`expires`: expected a string"),
             (("id = \"a\"", "id = \"a\"\nid = \"b\""), 3, "duplicate"),
             (("id = \"a\"", "id = "), 2, ""),
         ] {
@@ -221,12 +222,12 @@ mod tests {
             assert_ne!(text, good, "{change:?}");
             let error = parse(&text, 60).map(|ring| ring.len()).unwrap_err();
             assert_eq!(error.line, line, "{error}\n{text}");
-            assert!(error.what.contains(what), "{error}\n{text}");
-            assert!(!error.what.contains(&hash.to_string()[20..]), "{error}");
+            assert!(error.reason.contains(reason), "{error}\n{text}");
+            assert!(!error.reason.contains(&hash.to_string()[20..]), "{error}");
         }
         assert_eq!(
             parse(&format!("{good}{good}"), 60).unwrap_err(),
-            KeyFileError { line: 5, what: "there are two keys `a`".into() }
+            KeyFileError { line: 5, reason: "duplicate key `a`".into() }
         );
         assert!(parse(&good, 60).is_ok());
     }

@@ -1,14 +1,13 @@
-//! Who a client behind proxies is: the nearest one that is no proxy of ours.
+//! Address of a client behind proxies.
 
 use std::net::{IpAddr, SocketAddr};
 
 use crate::config::{ForwardedHeader, Proxies};
 
-/// The client of a request that came from `peer` with these values of `header`, in their order.
+/// Returns the client address of a request from `peer` with these values of `header`, in order.
 ///
-/// Every proxy adds at the end who it was asked by, so the list is read from there: as long as somebody is a proxy of ours,
-/// what it says is believed. What comes before may be made up. Where a proxy does not name an address, it stands for its
-/// clients itself.
+/// Every proxy appends the address of its peer, so the list is read from the end while the address is a trusted proxy.
+/// Earlier elements may be forged. If a trusted proxy names no valid address, its own address is the client.
 pub fn client<'a>(
     peer: IpAddr,
     header: ForwardedHeader,
@@ -33,7 +32,7 @@ pub fn client<'a>(
     client
 }
 
-/// The elements of a list; commas within quotes separate nothing.
+/// Splits a list at its commas, except those within quotes.
 fn elements(value: &str) -> Vec<&str> {
     let mut quoted = false;
     let separates = move |c: char| {
@@ -43,7 +42,7 @@ fn elements(value: &str) -> Vec<&str> {
     value.split(separates).map(str::trim).filter(|element| !element.is_empty()).collect()
 }
 
-/// The `for` of an element of `Forwarded`.
+/// Returns the `for` parameter of a `Forwarded` element.
 fn forwarded_for(element: &str) -> Option<&str> {
     element.split(';').find_map(|pair| {
         let (name, value) = pair.split_once('=')?;
@@ -51,7 +50,7 @@ fn forwarded_for(element: &str) -> Option<&str> {
     })
 }
 
-/// An address, perhaps in brackets, perhaps with a port.
+/// Parses an address with optional brackets and port.
 fn address(text: &str) -> Option<IpAddr> {
     let bare = text.strip_prefix('[').and_then(|rest| rest.strip_suffix(']')).unwrap_or(text);
     let address = bare.parse().ok().or_else(|| text.parse().ok().map(|socket: SocketAddr| socket.ip()));
@@ -63,18 +62,18 @@ mod tests {
     use super::*;
     use ForwardedHeader::{Forwarded, XForwardedFor};
 
-    fn ask(peer: &str, header: ForwardedHeader, values: &[&str]) -> String {
+    fn client_of(peer: &str, header: ForwardedHeader, values: &[&str]) -> String {
         let trusted: Proxies = "10.0.0.0/8 fd00::/8".parse().unwrap();
         client(peer.parse().unwrap(), header, values.iter().copied(), Some(&trusted)).to_string()
     }
 
     #[test]
-    fn only_proxies_of_ours_are_believed() {
+    fn only_trusted_proxies_are_believed() {
         for (peer, header, values, expected) in [
             ("203.0.113.9", XForwardedFor, &["198.51.100.1"][..], "203.0.113.9"),
             ("10.0.0.1", XForwardedFor, &[], "10.0.0.1"),
             ("10.0.0.1", XForwardedFor, &["198.51.100.1"], "198.51.100.1"),
-            // What the client itself made up lies further left.
+            // Elements that the client forged are further left.
             ("10.0.0.1", XForwardedFor, &["127.0.0.1, 198.51.100.1"], "198.51.100.1"),
             ("10.0.0.1", XForwardedFor, &["198.51.100.1, 10.0.0.2"], "198.51.100.1"),
             ("10.0.0.1", XForwardedFor, &["192.0.2.1", "198.51.100.1,10.0.0.2"], "198.51.100.1"),
@@ -82,7 +81,7 @@ mod tests {
             ("10.0.0.1", XForwardedFor, &["198.51.100.1:4711"], "198.51.100.1"),
             ("::ffff:10.0.0.1", XForwardedFor, &["[2001:db8::1]:4711"], "2001:db8::1"),
             ("fd00::1", XForwardedFor, &["::ffff:198.51.100.1"], "198.51.100.1"),
-            // A name that is no address: the proxy stands for whom it hides, and nothing before is believed.
+            // The proxy hides the address: its own address counts, and earlier elements are ignored.
             ("10.0.0.1", XForwardedFor, &["198.51.100.1, unknown"], "10.0.0.1"),
             ("10.0.0.1", XForwardedFor, &["198.51.100.1, , "], "198.51.100.1"),
             ("10.0.0.1", Forwarded, &["for=198.51.100.1;proto=https;by=10.0.0.1"], "198.51.100.1"),
@@ -91,9 +90,9 @@ mod tests {
             ("10.0.0.1", Forwarded, &["proto=https"], "10.0.0.1"),
             ("10.0.0.1", Forwarded, &["198.51.100.1"], "10.0.0.1"),
         ] {
-            assert_eq!(ask(peer, header, values), expected, "{peer} {header:?} {values:?}");
+            assert_eq!(client_of(peer, header, values), expected, "{peer} {header:?} {values:?}");
         }
-        let nobody = client("10.0.0.1".parse().unwrap(), XForwardedFor, ["198.51.100.1"].into_iter(), None);
-        assert_eq!(nobody.to_string(), "10.0.0.1");
+        let untrusted = client("10.0.0.1".parse().unwrap(), XForwardedFor, ["198.51.100.1"].into_iter(), None);
+        assert_eq!(untrusted.to_string(), "10.0.0.1");
     }
 }

@@ -1,4 +1,4 @@
-//! Keys and what each may do.
+//! API keys and their scopes.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, LazyLock};
@@ -7,20 +7,20 @@ use std::time::SystemTime;
 use super::account::Quota;
 use super::token::{self, Hash};
 
-/// What a key may be for.
+/// Permission of a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Scope {
-    /// To compute: meshes, estimates, uploads, and the end of a job.
+    /// Compute: meshes, estimates, uploads and the cancellation of jobs.
     Mesh,
-    /// To read what there is: results, jobs, what structures hold, what the service can do.
+    /// Read: results, jobs, structures and capabilities.
     Read,
 }
 
 impl Scope {
-    /// All of them.
+    /// All scopes.
     pub const ALL: [Self; 2] = [Self::Mesh, Self::Read];
 
-    /// Its name in files and documents.
+    /// Returns the name in files and documents.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -29,44 +29,44 @@ impl Scope {
         }
     }
 
-    /// The scope with a name.
+    /// Returns the scope with this name.
     #[must_use]
     pub fn named(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|scope| scope.name() == name)
     }
 }
 
-/// A key as it is kept.
+/// API key as stored in the key file.
 #[derive(Debug, Clone)]
 pub struct Key {
-    /// Its name, which is no secret: it stands in logs.
+    /// Public name, which also appears in logs.
     pub id: String,
-    /// The hash of its text.
+    /// Hash of the text.
     pub hash: Hash,
-    /// What it is for.
+    /// Permissions.
     pub scopes: Vec<Scope>,
-    /// How much of it.
+    /// Limits.
     pub quota: Arc<Quota>,
-    /// When it ends; none: never.
+    /// Time of expiry; `None` means never.
     pub expires: Option<SystemTime>,
-    /// For whom reads the file.
+    /// Remark for the operator.
     pub note: Option<String>,
 }
 
 impl Key {
-    /// Whether it is for `scope`.
+    /// Returns true if the key has `scope`.
     #[must_use]
     pub fn allows(&self, scope: Scope) -> bool {
         self.scopes.contains(&scope)
     }
 }
 
-/// Why a key is of no use.
+/// Reason to reject a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Denied {
-    /// It is none of ours: which part of it is wrong is not said.
+    /// The key does not exist. The wrong part is not revealed.
     Unknown,
-    /// It was one of ours until then.
+    /// The key expired at this time.
     Expired(SystemTime),
 }
 
@@ -75,27 +75,27 @@ pub enum Denied {
 pub struct KeyRing(pub(super) BTreeMap<String, Arc<Key>>);
 
 impl KeyRing {
-    /// How many there are.
+    /// Returns the number of keys.
     #[must_use]
     pub fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// Whether there are none.
+    /// Returns true if there are no keys.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// The key whose text this is.
+    /// Returns the key with this text.
     ///
     /// # Errors
-    /// [`Denied`]; that a key has expired is told to its owner alone.
+    /// Returns [`Denied`] if the key is unknown or has expired. Expiry is reported only for the correct secret.
     pub fn verify(&self, text: &str, now: SystemTime) -> Result<Arc<Key>, Denied> {
-        // An id that nobody has takes as long as one that somebody has.
-        static NOBODY: LazyLock<Hash> = LazyLock::new(|| Hash::of(""));
+        // Unknown ids take as long as known ones.
+        static UNKNOWN: LazyLock<Hash> = LazyLock::new(|| Hash::of(""));
         let key = token::id_of(text).and_then(|id| self.0.get(id));
-        let same = Hash::of(text).same(key.map_or(&*NOBODY, |key| &key.hash));
+        let same = Hash::of(text).same(key.map_or(&*UNKNOWN, |key| &key.hash));
         let key = key.filter(|_| same).ok_or(Denied::Unknown)?;
         match key.expires {
             Some(end) if end <= now => Err(Denied::Expired(end)),
@@ -111,7 +111,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_key_opens_with_its_text_until_its_end() {
+    fn a_key_is_valid_until_its_expiry() {
         let minted = token::mint("a").unwrap();
         let end = SystemTime::UNIX_EPOCH + Duration::from_secs(100);
         let key = Key {
@@ -129,7 +129,7 @@ mod tests {
         };
         assert_eq!(verify(&minted.text, 99), Ok("a".into()));
         assert_eq!(verify(&minted.text, 100), Err(Denied::Expired(end)));
-        // Every single character counts, and whoever has another secret does not learn of the end.
+        // Every character is compared, and a wrong secret does not reveal the expiry.
         for at in 0..minted.text.len() {
             let mut other = minted.text.clone().into_bytes();
             other[at] = if other[at] == b'0' { b'1' } else { b'0' };

@@ -1,10 +1,10 @@
-//! Who may ask for what, and how much of it: keys, quotas, signed addresses, and who a client behind a proxy is.
+//! Access control: API keys, quotas, signed URLs and the addresses of clients behind proxies.
 //!
-//! Everything here is decided from values: a key's text, an address, a time. It knows no HTTP library and starts nothing;
-//! [`crate::http`] asks it once per request. [`Access`] is what is asked, the other files are its parts.
+//! Decisions depend on values only: the text of a key, an address, a time. The module uses no HTTP library and starts
+//! no task. [`crate::http`] consults [`Access`] once per request.
 
 mod account;
-mod door;
+mod authorizer;
 mod error;
 mod fields;
 mod file;
@@ -14,8 +14,8 @@ mod meter;
 mod sign;
 mod token;
 
-pub use account::{Account, Exceeded, Quota, Standing};
-pub use door::Access;
+pub use account::{Account, Exceeded, Quota, QuotaUsage};
+pub use authorizer::Access;
 pub use error::{AccessError, KeyFileError};
 pub use fields::{limits, policies};
 pub use file::{entry, parse};
@@ -23,4 +23,4 @@ pub use forwarded::client;
 pub use keys::{Denied, Key, KeyRing, Scope};
 pub use meter::{Meter, Running};
 pub use sign::{EXPIRES, KEY_ID, SIGNATURE, SignError, Signed, SigningKeys, new_secret, without};
-pub use token::{Hash, Minted, is_id, mint};
+pub use token::{Hash, NewKey, is_id, mint};

@@ -1,9 +1,8 @@
-//! Signed addresses: whoever has one may GET it until it expires, without a key.
+//! Signed URLs, which allow GET without a key until they expire.
 //!
-//! What is signed is the path as it is sent and every parameter of the query as it is sent, in the order of their bytes: no
-//! parameter can be added, taken away or written otherwise. Three parameters carry the signature: [`EXPIRES`] in seconds of
-//! Unix time, [`KEY_ID`], and [`SIGNATURE`], an HMAC-SHA-256 in base64url. The host is not signed: behind proxies the
-//! service does not know its own.
+//! The signature covers the path and all query parameters as sent, sorted by their bytes: no parameter can be added,
+//! removed or rewritten. Three parameters carry it: [`EXPIRES`] in seconds of Unix time, [`KEY_ID`], and [`SIGNATURE`],
+//! an HMAC-SHA-256 in base64url. The host is not signed, because a service behind proxies does not know its own.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -15,62 +14,62 @@ use thiserror::Error;
 
 use super::token;
 
-/// When the address ends, s of Unix time.
+/// Query parameter of the expiry, s of Unix time.
 pub const EXPIRES: &str = "expires";
-/// Which key has signed it.
+/// Query parameter of the signing key's id.
 pub const KEY_ID: &str = "key_id";
-/// The signature.
+/// Query parameter of the signature.
 pub const SIGNATURE: &str = "signature";
 
-/// What is hashed first, so that a signature of something else never is one of an address.
+/// Prefix of the signed message, which separates it from messages of other kinds.
 const DOMAIN: &str = "molmesh-address-1\n";
-/// Characters of a secret at least: 128 bits, if they are hexadecimal digits. [`new_secret`] makes twice as many.
+/// Minimum length of a secret, characters: 128 bits in hexadecimal. [`new_secret`] returns twice as many.
 const MIN_SECRET: usize = 32;
 
-/// A fresh secret, 256 random bits as text.
+/// Returns a new secret, 256 random bits in hexadecimal.
 ///
 /// # Errors
-/// That of the system, if it has no random numbers.
+/// Returns the error of the system's random number generator.
 pub fn new_secret() -> Result<String, getrandom::Error> {
     token::random_hex()
 }
 
-/// Why an address cannot be signed.
+/// Errors of signing a URL.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum SignError {
-    /// It is no path.
-    #[error("it has no path that begins with `/`")]
+    /// The target does not begin with `/`.
+    #[error("expected a path that begins with `/`")]
     NoPath,
-    /// Browsers would change it before they send it.
-    #[error("`{0}` has to be written as %XX in an address")]
+    /// Browsers would escape this character.
+    #[error("`{0}` must be escaped as %XX in a URL")]
     Character(char),
-    /// It has one of our own parameters.
-    #[error("it has a parameter `{0}` already")]
+    /// The query contains a parameter of a signature.
+    #[error("the query contains the parameter `{0}` already")]
     Signed(&'static str),
-    /// There is no such key.
-    #[error("no key that signs is named `{asked}`; there are: {available}")]
+    /// No signing key has this id.
+    #[error("no signing key has the id `{requested}`; expected one of {available}")]
     UnknownKey {
-        /// The name that was given.
-        asked: String,
-        /// Those that there are.
+        /// Requested id.
+        requested: String,
+        /// Existing ids.
         available: String,
     },
 }
 
-/// What a signature is worth.
+/// Result of checking a signature.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Signed {
-    /// There is none.
+    /// The query has no signature.
     No,
-    /// It holds.
+    /// The signature is valid.
     Valid,
-    /// It does not. Which part is wrong is not said.
+    /// The signature is invalid. The wrong part is not revealed.
     Invalid,
-    /// It did until then, s of Unix time.
+    /// The signature is correct but expired at this time, s of Unix time.
     Expired(u64),
 }
 
-/// The keys that sign. The first one signs, all are accepted.
+/// Signing keys. The first one signs, all are accepted.
 #[derive(Clone)]
 pub struct SigningKeys(Vec<(String, Hmac<Sha256>)>);
 
@@ -81,24 +80,23 @@ impl std::fmt::Debug for SigningKeys {
 }
 
 impl SigningKeys {
-    /// Reads `ID:SECRET`, one or more with blanks or line breaks between them.
+    /// Parses one or more `ID:SECRET`, separated by white space.
     ///
     /// # Errors
-    /// What was expected, without the text.
+    /// Returns the expected form, without the text.
     pub fn parse(text: &str) -> Result<Self, String> {
         let mut keys: Vec<(String, Hmac<Sha256>)> = Vec::new();
         for (n, word) in text.split_whitespace().enumerate() {
             let nth = n + 1;
-            let expected =
-                || format!("key {nth} is not written ID:SECRET, the id of lower-case letters, digits and `-`");
+            let expected = || format!("key {nth} is not ID:SECRET with an id of lower-case letters, digits and `-`");
             let (id, secret) = word.split_once(':').filter(|(id, _)| token::is_id(id)).ok_or_else(expected)?;
             if secret.len() < MIN_SECRET {
                 return Err(format!(
-                    "the secret of `{id}` has less than {MIN_SECRET} characters; `molmesh key signing` makes one"
+                    "the secret of `{id}` has less than {MIN_SECRET} characters; `molmesh key signing` prints a new one"
                 ));
             }
             if keys.iter().any(|(other, _)| other == id) {
-                return Err(format!("there are two keys `{id}`"));
+                return Err(format!("duplicate key `{id}`"));
             }
             // HMAC takes keys of any length.
             let mac = Hmac::new_from_slice(secret.as_bytes()).map_err(|error| error.to_string())?;
@@ -107,8 +105,8 @@ impl SigningKeys {
         if keys.is_empty() { Err("there is no key; expected ID:SECRET".to_owned()) } else { Ok(Self(keys)) }
     }
 
-    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time), with the key of this name, else the
-    /// first one. The target comes back with the three parameters behind it.
+    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time), with the key of this name,
+    /// else the first one. The target comes back with the three parameters behind it.
     ///
     /// # Errors
     /// [`SignError`].
@@ -116,22 +114,22 @@ impl SigningKeys {
         if !target.starts_with('/') {
             return Err(SignError::NoPath);
         }
-        let kept = |c: &char| c.is_ascii_alphanumeric() || "-._~:/?@!$&()*+,;=%".contains(*c);
-        if let Some(other) = target.chars().find(|c| !kept(c)) {
+        let unescaped = |c: &char| c.is_ascii_alphanumeric() || "-._~:/?@!$&()*+,;=%".contains(*c);
+        if let Some(other) = target.chars().find(|c| !unescaped(c)) {
             return Err(SignError::Character(other));
         }
         let (path, query) = target.split_once('?').map_or((target, None), |(path, query)| (path, Some(query)));
         let mut parameters: Vec<&str> = query.into_iter().flat_map(|query| query.split('&')).collect();
-        let ours = [EXPIRES, KEY_ID, SIGNATURE];
-        if let Some(name) = ours.into_iter().find(|ours| parameters.iter().any(|p| name_of(p) == *ours)) {
+        let own = [EXPIRES, KEY_ID, SIGNATURE];
+        if let Some(name) = own.into_iter().find(|own| parameters.iter().any(|p| name_of(p) == *own)) {
             return Err(SignError::Signed(name));
         }
         let (id, mac) = match key_id {
             None => self.0.first(),
-            Some(asked) => self.0.iter().find(|(id, _)| id == asked),
+            Some(requested) => self.0.iter().find(|(id, _)| id == requested),
         }
         .ok_or_else(|| SignError::UnknownKey {
-            asked: key_id.unwrap_or_default().to_owned(),
+            requested: key_id.unwrap_or_default().to_owned(),
             available: self.0.iter().map(|(id, _)| id.as_str()).collect::<Vec<_>>().join(", "),
         })?;
         let own = format!("{EXPIRES}={expires}&{KEY_ID}={id}");
@@ -141,7 +139,7 @@ impl SigningKeys {
         Ok(format!("{target}{separator}{own}&{SIGNATURE}={}", URL_SAFE_NO_PAD.encode(tag)))
     }
 
-    /// What the signature of a request's path and query is worth now. Tags are compared in constant time.
+    /// Checks the signature of a path and query at `now`. Compares in constant time.
     #[must_use]
     pub fn check(&self, path: &str, query: Option<&str>, now: SystemTime) -> Signed {
         let parameters: Vec<&str> = query.into_iter().flat_map(|query| query.split('&')).collect();
@@ -155,14 +153,14 @@ impl SigningKeys {
         };
         let Ok(tag) = URL_SAFE_NO_PAD.decode(signature) else { return Signed::Invalid };
         let signed = parameters.iter().copied().filter(|parameter| name_of(parameter) != SIGNATURE).collect();
-        // An id that nobody has takes as long as one that somebody has.
+        // Unknown ids take as long as known ones.
         let found = self.0.iter().find(|(id, _)| id == key_id);
         let Some((_, mac)) = found.or(self.0.first()) else { return Signed::Invalid };
-        let holds = message(mac, path, signed).verify_slice(&tag).is_ok();
-        if !holds || found.is_none() {
+        let matches = message(mac, path, signed).verify_slice(&tag).is_ok();
+        if !matches || found.is_none() {
             return Signed::Invalid;
         }
-        // Only our own signers write this, so text that is no number is none of ours.
+        // `sign` writes numbers only.
         let Ok(end) = expires.parse::<u64>() else { return Signed::Invalid };
         if UNIX_EPOCH.checked_add(Duration::from_secs(end)).is_some_and(|end| end <= now) {
             return Signed::Expired(end);
@@ -171,11 +169,11 @@ impl SigningKeys {
     }
 }
 
-/// A query without the three parameters; none if nothing else is in it.
+/// Removes the three parameters from a query. Returns `None` if nothing else remains.
 #[must_use]
 pub fn without(query: &str) -> Option<String> {
-    let ours = [EXPIRES, KEY_ID, SIGNATURE];
-    let rest: Vec<&str> = query.split('&').filter(|p| !ours.contains(&name_of(p))).collect();
+    let own = [EXPIRES, KEY_ID, SIGNATURE];
+    let rest: Vec<&str> = query.split('&').filter(|p| !own.contains(&name_of(p))).collect();
     (!rest.is_empty()).then(|| rest.join("&"))
 }
 
@@ -183,14 +181,14 @@ fn name_of(parameter: &str) -> &str {
     parameter.split('=').next().unwrap_or_default()
 }
 
-/// The value of a parameter that is there once.
+/// Returns the value of a parameter that occurs exactly once.
 fn only<'a>(parameters: &[&'a str], name: &str) -> Option<&'a str> {
     let mut values = parameters.iter().filter(|parameter| name_of(parameter) == name);
     let (first, more) = (values.next()?, values.next());
     first.split_once('=').map(|(_, value)| value).filter(|_| more.is_none())
 }
 
-/// The hash of a path and its parameters. Neither can hold a line break, so no two pairs are hashed alike.
+/// Returns the MAC of a path and its parameters. Neither can contain a line break, so the message is unambiguous.
 fn message(mac: &Hmac<Sha256>, path: &str, mut parameters: Vec<&str>) -> Hmac<Sha256> {
     parameters.sort_unstable();
     let mut mac = mac.clone();
@@ -226,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_signed_holds_until_its_end() {
+    fn a_signature_is_valid_until_its_expiry() {
         let keys = keys();
         for (target, rest) in [
             ("/v1/pdb/4pti/surface.glb", None),
@@ -241,15 +239,15 @@ mod tests {
             assert_eq!(check(&keys, &signed, 100), Signed::Expired(100));
             assert_eq!(check(&keys, target, 99), Signed::No);
         }
-        // The order of parameters says nothing.
+        // The order of parameters is irrelevant.
         let signed = keys.sign(None, "/x?b=1&a=2", 100).unwrap();
         let (_, query) = signed.split_once('?').unwrap();
-        let turned: Vec<&str> = query.split('&').rev().collect();
-        assert_eq!(check(&keys, &format!("/x?{}", turned.join("&")), 0), Signed::Valid);
+        let reversed: Vec<&str> = query.split('&').rev().collect();
+        assert_eq!(check(&keys, &format!("/x?{}", reversed.join("&")), 0), Signed::Valid);
     }
 
     #[test]
-    fn one_key_takes_over_from_another() {
+    fn signing_keys_can_be_rotated() {
         let both = keys();
         let signed = both.sign(Some("old"), "/x", 100).unwrap();
         assert_eq!(check(&both, &signed, 0), Signed::Valid);
@@ -264,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_can_be_added_taken_away_or_said_twice() {
+    fn added_removed_and_repeated_parameters_are_rejected() {
         let keys = keys();
         let signed = keys.sign(None, "/x?a=1&b=2", 100).unwrap();
         for other in [
@@ -283,35 +281,36 @@ mod tests {
         ] {
             assert_eq!(check(&keys, &other, 0), Signed::Invalid, "{other}");
         }
-        // An early end is told to whom has the whole address alone.
+        // Expiry is reported only for a correct signature.
         assert_eq!(check(&keys, &signed.replace("a=1", "a=2"), 200), Signed::Invalid);
     }
 
     proptest! {
         #[test]
-        fn every_character_counts(at in 0_usize..200, to in "[!-~]") {
+        fn every_character_is_signed(at in 0_usize..200, to in "[!-~]") {
             let keys = keys();
             let signed = keys.sign(None, "/v1/pdb/4pti/surface.glb?resolution=1&chains=A,B", 100).unwrap();
             let at = at % signed.len();
             let other = format!("{}{to}{}", &signed[..at], &signed[at + 1..]);
             prop_assume!(other != signed);
-            let worth = check(&keys, &other, 0);
-            // A broken name of the signature's parameter leaves an address without one.
-            prop_assert!(matches!(worth, Signed::Invalid | Signed::No), "{other}: {worth:?}");
+            let result = check(&keys, &other, 0);
+            // With a changed name of the signature parameter, the URL is unsigned.
+            prop_assert!(matches!(result, Signed::Invalid | Signed::No), "{other}: {result:?}");
         }
     }
 
     #[test]
-    fn secrets_are_long_and_named_and_not_shown() {
+    fn secrets_are_long_and_named_and_hidden() {
         for (bad, why) in [
             ("", "no key"),
             ("justasecretjustasecretjustasecret", "key 1"),
             ("A:justasecretjustasecretjustasecret", "key 1"),
             ("a:short", "less than 32"),
-            ("a:justasecretjustasecretjustasecret a:justasecretjustasecretjustasecret", "two keys `a`"),
+            ("a:justasecretjustasecretjustasecret a:justasecretjustasecretjustasecret", "duplicate key `a`"),
         ] {
-            let said = SigningKeys::parse(bad).unwrap_err();
-            assert!(said.contains(why) && !said.contains("justasecret") && !said.contains("short"), "{said}");
+            let message = SigningKeys::parse(bad).unwrap_err();
+            assert!(message.contains(why), "{message}");
+            assert!(!message.contains("justasecret") && !message.contains("short"), "{message}");
         }
         assert_eq!(format!("{:?}", keys()), "[\"new\", \"old\"]");
         assert_eq!(new_secret().unwrap().len(), 64);

@@ -1,7 +1,7 @@
-//! A key as its owner has it, `mm_<id>_<secret>`, and as we have it: a hash.
+//! Text of a key, `mm_<id>_<secret>`, and the hash that is stored instead.
 //!
-//! The secret is 256 random bits, so a plain SHA-256 of the whole text is as good at rest as a password hash: there is no
-//! guessing to be slowed down. Argon2 would only make every request cost what it makes an attacker's guess cost.
+//! The secret is 256 random bits and cannot be guessed, so a plain SHA-256 of the text is as safe as a slow password
+//! hash, which would only make every request expensive.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,46 +9,46 @@ use std::str::FromStr;
 use sha2::{Digest as _, Sha256};
 use subtle::ConstantTimeEq as _;
 
-/// What every key begins with, so that scanners of repositories and logs can tell one.
+/// Prefix of every key, by which secret scanners recognise keys.
 const PREFIX: &str = "mm_";
-/// Characters of a secret: 256 bits in lower-case hexadecimal digits.
+/// Length of a secret: 256 bits in lower-case hexadecimal digits.
 const SECRET_CHARS: usize = 64;
-/// Characters of an id at most.
+/// Maximum length of an id.
 const MAX_ID: usize = 32;
 
-/// Whether `id` can name a key: 1 to 32 lower-case letters, digits and hyphens.
+/// Returns true if `id` is a valid key id: 1 to 32 lower-case letters, digits and hyphens.
 #[must_use]
 pub fn is_id(id: &str) -> bool {
     let allowed = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'-';
     (1..=MAX_ID).contains(&id.len()) && id.bytes().all(allowed)
 }
 
-/// A key that was just made.
-pub struct Minted {
-    /// Its text, which is kept nowhere.
+/// New key.
+pub struct NewKey {
+    /// Text, which is not stored.
     pub text: String,
-    /// What is kept of it.
+    /// Hash of the text, which is stored.
     pub hash: Hash,
 }
 
-/// Makes a key. `id` has passed [`is_id`].
+/// Creates a key. `id` must have passed [`is_id`].
 ///
 /// # Errors
-/// That of the system, if it has no random numbers.
-pub fn mint(id: &str) -> Result<Minted, getrandom::Error> {
+/// Returns the error of the system's random number generator.
+pub fn mint(id: &str) -> Result<NewKey, getrandom::Error> {
     let text = format!("{PREFIX}{id}_{}", random_hex()?);
     let hash = Hash::of(&text);
-    Ok(Minted { text, hash })
+    Ok(NewKey { text, hash })
 }
 
-/// 256 random bits in hexadecimal digits.
+/// Returns 256 random bits in hexadecimal digits.
 pub(super) fn random_hex() -> Result<String, getrandom::Error> {
     let mut bytes = [0; SECRET_CHARS / 2];
     getrandom::fill(&mut bytes)?;
     Ok(hex(&bytes))
 }
 
-/// The id that a key's text names, if it is shaped like one.
+/// Returns the id in the text of a key, or `None` if the text is malformed.
 pub(super) fn id_of(text: &str) -> Option<&str> {
     let (id, secret) = text.strip_prefix(PREFIX)?.split_once('_')?;
     let digit = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
@@ -61,18 +61,18 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 15)]).collect()
 }
 
-/// The SHA-256 of a key's text. Two are compared in constant time, and in no other way: there is no `PartialEq`.
+/// SHA-256 of the text of a key. Comparison is in constant time only, hence no `PartialEq`.
 #[derive(Clone)]
 pub struct Hash([u8; 32]);
 
 impl Hash {
-    /// The hash of a key's text.
+    /// Returns the hash of a text.
     #[must_use]
     pub fn of(text: &str) -> Self {
         Self(Sha256::digest(text.as_bytes()).into())
     }
 
-    /// Whether both are of the same text, in a time that does not depend on them.
+    /// Returns true if both hashes are equal, in constant time.
     #[must_use]
     pub fn same(&self, other: &Self) -> bool {
         self.0.ct_eq(&other.0).into()
@@ -80,7 +80,7 @@ impl Hash {
 }
 
 impl fmt::Display for Hash {
-    /// As the file of keys has it: `sha256:` and 64 digits.
+    /// Writes `sha256:` and 64 digits, as in the key file.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "sha256:{}", hex(&self.0))
     }
@@ -95,7 +95,7 @@ impl fmt::Debug for Hash {
 impl FromStr for Hash {
     type Err = &'static str;
 
-    /// The error says what was expected.
+    /// Parses `sha256:` and 64 digits. The error states the expected form.
     fn from_str(text: &str) -> Result<Self, &'static str> {
         const EXPECTED: &str = "`sha256:` and 64 lower-case hexadecimal digits";
         let digits = text.strip_prefix("sha256:").ok_or(EXPECTED)?.as_bytes();
@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_key_that_was_made_is_shaped_like_one_and_no_two_are_alike() {
+    fn new_keys_are_well_formed_and_unique() {
         let [a, b] = [mint("viewer-1").unwrap(), mint("viewer-1").unwrap()];
         assert_eq!(id_of(&a.text), Some("viewer-1"));
         assert!(a.text != b.text && !a.hash.same(&b.hash) && a.hash.same(&Hash::of(&a.text)));
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_key_has_no_id() {
+    fn malformed_keys_have_no_id() {
         let good = mint("a").unwrap().text;
         let secret = &good[5..];
         for bad in [
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn the_hash_is_the_one_that_everybody_can_compute() {
+    fn the_hash_is_sha_256() {
         let abc = "sha256:ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
         assert_eq!(Hash::of("abc").to_string(), abc);
     }

@@ -1,5 +1,5 @@
-//! Names to addresses, and only to those that may be connected to. The client asks here for every name, so what was
-//! checked is what is connected to, whatever the name leads to a moment later.
+//! DNS resolver that returns public addresses only. The HTTP client connects to the addresses checked here, so a later
+//! change of the name has no effect.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -7,20 +7,20 @@ use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 use reqwest::dns::{Addrs, Name, Resolve, Resolving};
 use thiserror::Error;
 
-/// A name that leads nowhere but to addresses that must not be connected to.
+/// Error: a name has no permitted address.
 #[derive(Debug, Error)]
-#[error("{name} is {address}, which is not a public address; archive.allow_private would allow it")]
+#[error("{name} is {address}, which is not a public address; set archive.allow_private to allow it")]
 pub(super) struct Refused {
     name: String,
     address: IpAddr,
 }
 
-/// Resolves names through the system and drops what is not public.
-pub(super) struct Checked {
+/// System resolver that drops addresses that are not public, unless `allow_private` is set.
+pub(super) struct PublicResolver {
     pub(super) allow_private: bool,
 }
 
-impl Resolve for Checked {
+impl Resolve for PublicResolver {
     fn resolve(&self, name: Name) -> Resolving {
         let allow_private = self.allow_private;
         Box::pin(async move {
@@ -28,18 +28,18 @@ impl Resolve for Checked {
             let Some(first) = found.first().map(SocketAddr::ip) else {
                 return Err(io::Error::new(io::ErrorKind::NotFound, "the name has no address").into());
             };
-            let good: Vec<SocketAddr> =
+            let permitted: Vec<SocketAddr> =
                 found.into_iter().filter(|found| allow_private || is_public(found.ip())).collect();
-            if good.is_empty() {
+            if permitted.is_empty() {
                 return Err(Refused { name: name.as_str().to_owned(), address: first }.into());
             }
-            Ok(Box::new(good.into_iter()) as Addrs)
+            Ok(Box::new(permitted.into_iter()) as Addrs)
         })
     }
 }
 
-/// Whether an address belongs to the internet at large: the registries of special addresses, said as code. Addresses
-/// that wrap an older one are as public as that one.
+/// Returns true if the address is globally reachable according to IANA's registries of special-purpose addresses. IPv6
+/// addresses that embed an IPv4 address are as public as that one.
 pub(super) fn is_public(address: IpAddr) -> bool {
     match address {
         IpAddr::V4(v4) => is_public_v4(v4),
@@ -54,7 +54,7 @@ fn is_public_v4(v4: Ipv4Addr) -> bool {
         || v4.is_link_local()
         || v4.is_multicast()
         || v4.is_documentation()
-        // "This network", shared by carriers, protocol assignments, benchmarks, reserved and broadcast.
+        // "This network", carrier-grade NAT, protocol assignments, benchmarks, reserved and broadcast.
         || a == 0
         || (a == 100 && (64..128).contains(&b))
         || (a, b, c) == (192, 0, 0)
@@ -65,15 +65,15 @@ fn is_public_v4(v4: Ipv4Addr) -> bool {
 
 fn is_public_v6(v6: Ipv6Addr) -> bool {
     let [a, b, c, d, e, f, g, h] = v6.segments();
-    let wrapped = |high: u16, low: u16| {
+    let embedded = |high: u16, low: u16| {
         let ([a, b], [c, d]) = (high.to_be_bytes(), low.to_be_bytes());
         is_public_v4(Ipv4Addr::new(a, b, c, d))
     };
     match (a, b, c, d, e, f) {
-        // Mapped, translated, and 6to4; the unspecified address and loopback fall under the old "compatible" form.
-        (0, 0, 0, 0, 0, 0 | 0xffff) | (0x64, 0xff9b, 0, 0, 0, 0) => wrapped(g, h),
-        (0x2002, ..) => wrapped(b, c),
-        // Global unicast is 2000::/3; protocol assignments (Teredo among them) and documentation lie in it.
+        // Mapped, translated and 6to4. The unspecified address and loopback have the deprecated "compatible" form.
+        (0, 0, 0, 0, 0, 0 | 0xffff) | (0x64, 0xff9b, 0, 0, 0, 0) => embedded(g, h),
+        (0x2002, ..) => embedded(b, c),
+        // Global unicast is 2000::/3 without protocol assignments (such as Teredo) and documentation.
         _ => {
             (a & 0xe000) == 0x2000
                 && !(a == 0x2001 && b < 0x200)
@@ -88,7 +88,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_internet_is_told_from_the_rest() {
+    fn special_addresses_are_not_public() {
         for public in ["8.8.8.8", "128.6.159.248", "172.32.0.1", "100.128.0.1", "2607:f8b0::1", "2a00:1450::1"] {
             assert!(is_public(public.parse().unwrap()), "{public}");
         }

@@ -1,5 +1,4 @@
-//! A circuit breaker: a host that fails again and again is left alone for a while, so that asking costs nothing; then
-//! one request tries whether it is back.
+//! Circuit breaker of a host. Repeated failures open it: requests fail at once for a while, then one probe decides.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -8,8 +7,8 @@ use metrics::gauge;
 
 use crate::telemetry::ARCHIVE_BREAKER;
 
-/// What others are told while one request tries.
-const SOON: Duration = Duration::from_secs(1);
+/// Retry time for other requests during a probe.
+const PROBE_WAIT: Duration = Duration::from_secs(1);
 
 #[derive(Debug, Clone, Copy)]
 enum State {
@@ -19,23 +18,24 @@ enum State {
     Open {
         until: Instant,
     },
-    /// One request is out to see.
+    /// One request tests the host.
     Probing,
 }
 
-/// The breaker of a host.
+/// Circuit breaker of a host.
 #[derive(Debug)]
 pub(super) struct Breaker {
     host: String,
-    /// Failures in a row that open it.
-    allowed: u32,
+    /// Consecutive failures that open the breaker.
+    max_failures: u32,
     pause: Duration,
     state: Mutex<State>,
 }
 
 impl Breaker {
-    pub(super) fn new(host: &str, allowed: u32, pause: Duration) -> Self {
-        let breaker = Self { host: host.to_owned(), allowed, pause, state: Mutex::new(State::Closed { failures: 0 }) };
+    pub(super) fn new(host: &str, max_failures: u32, pause: Duration) -> Self {
+        let breaker =
+            Self { host: host.to_owned(), max_failures, pause, state: Mutex::new(State::Closed { failures: 0 }) };
         breaker.publish(false);
         breaker
     }
@@ -44,29 +44,29 @@ impl Breaker {
         &self.host
     }
 
-    /// How long the host is left alone from now; none if it may be asked.
-    pub(super) fn left_alone_for(&self) -> Option<Duration> {
+    /// Returns the time for which the breaker stays open, or `None` if requests are allowed.
+    pub(super) fn open_for(&self) -> Option<Duration> {
         match *self.state() {
             State::Closed { .. } => None,
             State::Open { until } => Some(until.saturating_duration_since(Instant::now())).filter(|d| !d.is_zero()),
-            State::Probing => Some(SOON),
+            State::Probing => Some(PROBE_WAIT),
         }
     }
 
-    /// Leave to ask the host, or how long it is left alone.
-    pub(super) fn enter(&self) -> Result<Pass<'_>, Duration> {
-        if let Some(wait) = self.left_alone_for() {
+    /// Returns a permit for one request, or the time to wait while the breaker is open.
+    pub(super) fn acquire(&self) -> Result<Permit<'_>, Duration> {
+        if let Some(wait) = self.open_for() {
             return Err(wait);
         }
         let mut state = self.state();
         match *state {
-            State::Closed { .. } => Ok(Pass { breaker: self, probe: false, told: false }),
+            State::Closed { .. } => Ok(Permit { breaker: self, probe: false, reported: false }),
             State::Open { .. } => {
                 *state = State::Probing;
-                Ok(Pass { breaker: self, probe: true, told: false })
+                Ok(Permit { breaker: self, probe: true, reported: false })
             }
-            // Somebody else was faster.
-            State::Probing => Err(SOON),
+            // Another request became the probe since the check above.
+            State::Probing => Err(PROBE_WAIT),
         }
     }
 
@@ -79,27 +79,27 @@ impl Breaker {
     }
 
     fn open(&self, state: &mut State, pause: Duration) {
-        tracing::warn!(host = self.host, ms = pause.as_millis(), "the archive is left alone");
+        tracing::warn!(host = self.host, ms = pause.as_millis(), "requests to the archive are paused");
         *state = State::Open { until: Instant::now() + pause };
         self.publish(true);
     }
 }
 
-/// Leave to ask once. Says how it went, or, dropped untold, that nobody knows.
+/// Permit for one request. Reports its outcome; a drop without a report means unknown.
 #[derive(Debug)]
-pub(super) struct Pass<'a> {
+pub(super) struct Permit<'a> {
     breaker: &'a Breaker,
     probe: bool,
-    told: bool,
+    reported: bool,
 }
 
-impl Pass<'_> {
-    /// The host answered.
+impl Permit<'_> {
+    /// Reports a success and closes the breaker after a probe.
     pub(super) fn succeeded(mut self) {
-        self.told = true;
+        self.reported = true;
         let mut state = self.breaker.state();
         if self.probe {
-            tracing::info!(host = self.breaker.host, "the archive is back");
+            tracing::info!(host = self.breaker.host, "the archive is available again");
             self.breaker.publish(false);
         }
         if self.probe || matches!(*state, State::Closed { .. }) {
@@ -107,12 +107,12 @@ impl Pass<'_> {
         }
     }
 
-    /// It did not, or with an error of its own.
+    /// Reports a failure.
     pub(super) fn failed(mut self) {
-        self.told = true;
+        self.reported = true;
         let mut state = self.breaker.state();
         match *state {
-            State::Closed { failures } if failures + 1 < self.breaker.allowed => {
+            State::Closed { failures } if failures + 1 < self.breaker.max_failures => {
                 *state = State::Closed { failures: failures + 1 };
             }
             State::Closed { .. } => self.breaker.open(&mut state, self.breaker.pause),
@@ -121,18 +121,18 @@ impl Pass<'_> {
         }
     }
 
-    /// It asked to be left alone for `pause`.
-    pub(super) fn told_to_wait(mut self, pause: Duration) {
-        self.told = true;
+    /// Opens the breaker for the `pause` that the host requested.
+    pub(super) fn asked_to_wait(mut self, pause: Duration) {
+        self.reported = true;
         let mut state = self.breaker.state();
         self.breaker.open(&mut state, pause);
     }
 }
 
-impl Drop for Pass<'_> {
+impl Drop for Permit<'_> {
     fn drop(&mut self) {
-        if self.probe && !self.told {
-            // The next one tries.
+        if self.probe && !self.reported {
+            // The next request becomes the probe.
             *self.breaker.state() = State::Open { until: Instant::now() };
         }
     }
@@ -143,33 +143,33 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_opens_after_failures_in_a_row_and_lets_one_try() {
+    fn opens_after_consecutive_failures_and_allows_one_probe() {
         let breaker = Breaker::new("h", 2, Duration::from_millis(30));
-        breaker.enter().unwrap().failed();
-        breaker.enter().unwrap().succeeded();
-        breaker.enter().unwrap().failed();
-        assert_eq!(breaker.left_alone_for(), None, "a success starts the count anew");
-        let late = breaker.enter().unwrap();
-        breaker.enter().unwrap().failed();
-        assert!(breaker.enter().unwrap_err() <= Duration::from_millis(30));
-        // Whoever was under way neither closes it nor lengthens it.
+        breaker.acquire().unwrap().failed();
+        breaker.acquire().unwrap().succeeded();
+        breaker.acquire().unwrap().failed();
+        assert_eq!(breaker.open_for(), None, "a success resets the count");
+        let late = breaker.acquire().unwrap();
+        breaker.acquire().unwrap().failed();
+        assert!(breaker.acquire().unwrap_err() <= Duration::from_millis(30));
+        // Requests that began before neither close nor prolong it.
         late.succeeded();
-        assert!(breaker.left_alone_for().is_some());
+        assert!(breaker.open_for().is_some());
         std::thread::sleep(Duration::from_millis(40));
-        let probe = breaker.enter().unwrap();
-        assert_eq!(breaker.enter().unwrap_err(), SOON);
+        let probe = breaker.acquire().unwrap();
+        assert_eq!(breaker.acquire().unwrap_err(), PROBE_WAIT);
         probe.failed();
-        assert!(breaker.enter().is_err());
+        assert!(breaker.acquire().is_err());
         std::thread::sleep(Duration::from_millis(40));
-        drop(breaker.enter().unwrap());
-        breaker.enter().unwrap().succeeded();
-        assert!(breaker.left_alone_for().is_none() && breaker.enter().is_ok());
+        drop(breaker.acquire().unwrap());
+        breaker.acquire().unwrap().succeeded();
+        assert!(breaker.open_for().is_none() && breaker.acquire().is_ok());
     }
 
     #[test]
-    fn it_waits_as_long_as_it_is_told() {
+    fn stays_open_for_the_requested_time() {
         let breaker = Breaker::new("h", 5, Duration::from_millis(1));
-        breaker.enter().unwrap().told_to_wait(Duration::from_secs(100));
-        assert!(breaker.enter().unwrap_err() > Duration::from_secs(90));
+        breaker.acquire().unwrap().asked_to_wait(Duration::from_secs(100));
+        assert!(breaker.acquire().unwrap_err() > Duration::from_secs(90));
     }
 }

@@ -1,4 +1,4 @@
-//! One question to a remote archive: the address of an entry to its bytes, counted while they come.
+//! One HTTP request to a remote archive. The memory of the body is counted while it arrives.
 
 use std::error::Error;
 use std::path::Path;
@@ -9,7 +9,7 @@ use reqwest::header::{ETAG, HeaderMap, HeaderName, IF_MODIFIED_SINCE, IF_NONE_MA
 use reqwest::redirect::{Attempt, Policy};
 use reqwest::{Client, Proxy, Response, StatusCode, Url};
 
-use super::address::{Checked, Refused};
+use super::address::{PublicResolver, Refused};
 use super::error::Why;
 use super::gzip;
 use super::memory::{NoMemory, Share};
@@ -17,44 +17,43 @@ use crate::config::{ArchiveConfig, Templates};
 use crate::store::Digest;
 use crate::telemetry::{SpanContext, traceparent, tracestate};
 
-/// Redirects that are followed.
-const HOPS: usize = 3;
-/// Memory that is set aside on the word of a `Content-Length`.
-const TRUSTED: u64 = 1 << 20;
-/// Longest `Retry-After` that is taken for meant.
-const DAY: Duration = Duration::from_hours(24);
-/// Who asks.
+/// Maximum number of redirects.
+const MAX_REDIRECTS: usize = 3;
+/// Maximum memory that is allocated because of a `Content-Length`, bytes.
+const MAX_PREALLOCATION: u64 = 1 << 20;
+/// Longest accepted `Retry-After`.
+const MAX_RETRY_AFTER: Duration = Duration::from_hours(24);
 const USER_AGENT: &str = concat!("molmesh/", env!("CARGO_PKG_VERSION"), " (molecular surface service)");
 
 const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
 const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
-/// What an archive says of the version that it sent, to ask later whether that is still the one.
+/// Validators of a response, for a later conditional request.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub(super) struct Validators {
     pub(super) etag: Option<String>,
     pub(super) last_modified: Option<String>,
 }
 
-/// What an archive answered.
+/// Answer of an archive.
 #[derive(Debug)]
 pub(super) enum Answer {
     /// The entry.
     Body { bytes: Bytes, digest: Digest, url: String, validators: Validators, share: Box<dyn Share> },
-    /// What we have is still the one.
+    /// The copy is still current.
     Unchanged,
-    /// It has no such entry.
+    /// The archive does not have the entry.
     Absent,
 }
 
-/// Why there is no answer.
+/// Failure of a request.
 #[derive(Debug)]
 pub(super) enum Failed {
-    /// The answer is longer than allowed; the bytes that were announced, if any.
+    /// The body is too large. Contains the announced size, bytes, if any.
     TooLarge(Option<u64>),
-    /// There is no memory for it.
+    /// The memory limit is reached.
     Memory(NoMemory),
-    /// Anything else: what, when to come back if the host said so, details for the log.
+    /// Any other failure: cause, `Retry-After` of the host, details for the log.
     Other { why: Why, retry_after: Option<Duration>, detail: String },
 }
 
@@ -64,18 +63,20 @@ impl Failed {
     }
 }
 
-/// Limits of a question.
+/// Limits of a request.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Limits {
-    /// Time for the head, redirects included, and longest pause within the body.
+    /// Time for the response head, redirects included.
     pub(super) head: Duration,
+    /// Longest pause within the body.
     pub(super) pause: Duration,
+    /// Size of the body, bytes.
     pub(super) bytes: u64,
     /// Inflated bytes after which the completeness check of a gzip file stops.
     pub(super) inflated: u64,
 }
 
-/// The client of all questions. Blocks: it reads the system's certificates.
+/// Creates the HTTP client. Blocks, because it reads the system's certificates.
 pub(super) fn build(config: &ArchiveConfig) -> Result<Client, reqwest::Error> {
     crate::tls::install_provider();
     let builder = || {
@@ -84,7 +85,7 @@ pub(super) fn build(config: &ArchiveConfig) -> Result<Client, reqwest::Error> {
             .connect_timeout(config.connect_timeout())
             .redirect(Policy::custom(follow))
             .referer(false)
-            .dns_resolver(Checked { allow_private: config.allow_private || config.proxy.is_some() });
+            .dns_resolver(PublicResolver { allow_private: config.allow_private || config.proxy.is_some() });
         Ok(match &config.proxy {
             Some(proxy) => builder.proxy(Proxy::all(proxy.as_str())?),
             None => builder.no_proxy(),
@@ -93,17 +94,17 @@ pub(super) fn build(config: &ArchiveConfig) -> Result<Client, reqwest::Error> {
     let templates = config.url.as_ref().map(Templates::as_slice).unwrap_or_default();
     let needs_tls = templates.iter().any(|t| t.to_string().starts_with("https:"));
     match builder()?.build() {
-        // A machine without certificates can still speak plain HTTP.
+        // Plain HTTP also works on machines without certificates.
         Err(_no_certificates) if !needs_tls => builder()?.tls_certs_only([]).build(),
         built => built,
     }
 }
 
-/// Redirects stay on their host, and what was encrypted stays so.
+/// Follows redirects that stay on their host and do not drop TLS.
 fn follow(attempt: Attempt<'_>) -> reqwest::redirect::Action {
     let why = match attempt.previous() {
-        [] => "from nowhere",
-        previous if previous.len() > HOPS => "too many redirects",
+        [] => "a redirect without an origin",
+        previous if previous.len() > MAX_REDIRECTS => "too many redirects",
         [.., last] if !may_follow(last, attempt.url()) => "a redirect to another host, port or scheme",
         _ => return attempt.follow(),
     };
@@ -111,17 +112,17 @@ fn follow(attempt: Attempt<'_>) -> reqwest::redirect::Action {
 }
 
 fn may_follow(from: &Url, to: &Url) -> bool {
-    let same_place = from.scheme() == to.scheme() && from.port_or_known_default() == to.port_or_known_default();
+    let same_origin = from.scheme() == to.scheme() && from.port_or_known_default() == to.port_or_known_default();
     let upgrade = from.scheme() == "http" && to.scheme() == "https" && from.port().is_none() && to.port().is_none();
-    from.host_str() == to.host_str() && (same_place || upgrade)
+    from.host_str() == to.host_str() && (same_origin || upgrade)
 }
 
-/// Asks for a head alone: the status of the answer.
+/// Sends a HEAD request and returns the status of the response.
 pub(super) async fn head(client: &Client, url: Url) -> Result<u16, Failed> {
     client.head(url).send().await.map(|answer| answer.status().as_u16()).map_err(|error| of_client(&error))
 }
 
-/// Asks once. What comes is counted by `share` while it comes, and for as long as the answer lives.
+/// Sends one GET request. `share` counts the memory of the body while it arrives and until the answer is dropped.
 pub(super) async fn get(
     client: &Client,
     url: Url,
@@ -147,7 +148,7 @@ pub(super) async fn get(
         StatusCode::OK => {}
         StatusCode::NOT_MODIFIED if known.is_some() => return Ok(Answer::Unchanged),
         StatusCode::NOT_FOUND | StatusCode::GONE => return Ok(Answer::Absent),
-        // Where the client would not even know how to follow.
+        // Redirects without a valid location.
         status if status.is_redirection() && status != StatusCode::NOT_MODIFIED => {
             return Err(Failed::other(Why::Redirect, &status));
         }
@@ -171,14 +172,14 @@ pub(super) async fn get(
     Ok(Answer::Body { bytes, digest, url: name, validators, share })
 }
 
-/// Receives the body, and no more than is allowed of it.
+/// Receives the body up to the limit.
 async fn body(mut response: Response, limits: Limits, share: &mut dyn Share) -> Result<Bytes, Failed> {
     let announced = response.content_length();
     if announced.is_some_and(|bytes| bytes > limits.bytes) {
         return Err(Failed::TooLarge(announced));
     }
-    let room = usize::try_from(announced.unwrap_or(0).min(TRUSTED)).unwrap_or(0);
-    let mut body = BytesMut::with_capacity(room);
+    let capacity = usize::try_from(announced.unwrap_or(0).min(MAX_PREALLOCATION)).unwrap_or(0);
+    let mut body = BytesMut::with_capacity(capacity);
     loop {
         let chunk = tokio::time::timeout(limits.pause, response.chunk())
             .await
@@ -192,13 +193,13 @@ async fn body(mut response: Response, limits: Limits, share: &mut dyn Share) -> 
     }
     match announced {
         Some(bytes) if bytes != body.len() as u64 => {
-            Err(Failed::other(Why::Broken, &format!("{} bytes came where {bytes} were announced", body.len())))
+            Err(Failed::other(Why::Broken, &format!("received {} of {bytes} announced bytes", body.len())))
         }
         _ => Ok(body.freeze()),
     }
 }
 
-/// What the client's error means to us.
+/// Converts an error of the HTTP client.
 fn of_client(error: &reqwest::Error) -> Failed {
     let (mut causes, mut next): (Vec<&dyn Error>, Option<&dyn Error>) = (Vec::new(), Some(error));
     while let Some(cause) = next {
@@ -220,14 +221,14 @@ fn of_client(error: &reqwest::Error) -> Failed {
     Failed::other(why, &words.join(": "))
 }
 
-/// `Retry-After`, as seconds or as a date.
+/// Returns the value of `Retry-After`, given in seconds or as a date.
 fn retry_after(headers: &HeaderMap) -> Option<Duration> {
     let text = headers.get(RETRY_AFTER)?.to_str().ok()?.trim();
     if let Ok(seconds) = text.parse() {
-        return Some(Duration::from_secs(seconds).min(DAY));
+        return Some(Duration::from_secs(seconds).min(MAX_RETRY_AFTER));
     }
     let date = httpdate::parse_http_date(text).ok()?;
-    Some(date.duration_since(SystemTime::now()).unwrap_or_default().min(DAY))
+    Some(date.duration_since(SystemTime::now()).unwrap_or_default().min(MAX_RETRY_AFTER))
 }
 
 #[cfg(test)]
@@ -235,7 +236,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn redirects_stay_where_they_are() {
+    fn redirects_keep_host_port_and_tls() {
         let may = |from: &str, to: &str| may_follow(&from.parse().unwrap(), &to.parse().unwrap());
         assert!(may("https://h/a", "https://h/b?c"));
         assert!(may("https://h/a", "https://h:443/b"));
@@ -255,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn hosts_say_when_to_come_back() {
+    fn retry_after_is_parsed_as_seconds_or_a_date() {
         let of = |text: &str| {
             let mut headers = HeaderMap::new();
             headers.insert(RETRY_AFTER, text.parse().unwrap());
@@ -265,7 +266,7 @@ mod tests {
         let soon = httpdate::fmt_http_date(SystemTime::now() + Duration::from_secs(100));
         assert!(of(&soon).is_some_and(|d| (95..=100).contains(&d.as_secs())), "{soon}");
         assert_eq!(of("Wed, 21 Oct 2015 07:28:00 GMT"), Some(Duration::ZERO));
-        assert_eq!(of("18446744073709551615"), Some(DAY));
+        assert_eq!(of("18446744073709551615"), Some(MAX_RETRY_AFTER));
         assert_eq!((of("soon"), of("-1"), of("1e9")), (None, None, None));
         assert_eq!(retry_after(&HeaderMap::new()), None);
     }

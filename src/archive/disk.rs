@@ -1,5 +1,5 @@
-//! Copies of entries on disk. Each is two files, `{middle}/{id}.body` and `{id}.json`, which says the body's length and
-//! digest: whatever does not fit together, after a crash or a bad disk, is no copy. Everything here blocks.
+//! Copies of entries on disk: two files each, `{middle}/{id}.body` and `{id}.json` with the length and digest of the
+//! body. Files that do not match, after a crash or a disk error, are discarded. All functions block.
 
 use std::collections::HashMap;
 use std::fs::{self, File};
@@ -19,73 +19,75 @@ use crate::store::Digest;
 use crate::structure::EntryId;
 use crate::telemetry::ARCHIVE_KEPT;
 
-/// Bytes of a description; validators are short.
-const NOTE_BYTES: u64 = 64 << 10;
-/// A staged file that is older was left by a process that died.
-const ABANDONED: Duration = Duration::from_hours(1);
+/// Maximum size of the metadata, bytes; validators are short.
+const METADATA_BYTES: u64 = 64 << 10;
+/// Age after which a temporary file is assumed to be left over from a crashed process.
+const STALE_TEMPORARY: Duration = Duration::from_hours(1);
 
-/// What is written beside a body.
+/// Metadata of a copy, stored beside the body.
 #[derive(Debug, Serialize, Deserialize)]
-struct Note {
+struct Metadata {
     bytes: u64,
     sha256: String,
     url: String,
     etag: Option<String>,
     last_modified: Option<String>,
-    /// When the archive last said that this is the entry, ms since 1970.
+    /// Time of the last confirmation by the archive, ms of Unix time.
     checked_ms: u64,
 }
 
-/// A copy.
+/// Copy of an entry.
 #[derive(Debug, Clone)]
 pub(super) struct Stored {
     pub(super) bytes: Bytes,
     pub(super) digest: Digest,
     pub(super) origin: Origin,
-    /// Time since the archive last said that this is the entry; none if the clock went backwards since.
+    /// Time since the last confirmation by the archive; `None` if the clock was set back since.
     pub(super) age: Option<Duration>,
 }
 
-/// What there is of an entry.
+/// Result of a look-up.
 #[derive(Debug)]
 pub(super) enum Found {
     Nothing,
-    /// Files that do not fit together; they are gone now.
+    /// The files did not match and were removed.
     Corrupt,
     Copy(Stored),
 }
 
+/// Size and last use of a copy.
 #[derive(Debug)]
-struct Slot {
+struct IndexEntry {
     bytes: u64,
     used: SystemTime,
 }
 
-/// What is on disk: read once, then kept up to date.
+/// Index of the copies on disk, read once and then updated.
 #[derive(Debug, Default)]
-struct Ledger {
-    slots: HashMap<EntryId, Slot>,
+struct Index {
+    entries: HashMap<EntryId, IndexEntry>,
     total: u64,
 }
 
-impl Ledger {
+impl Index {
     fn put(&mut self, id: &EntryId, bytes: u64, used: SystemTime) {
         self.remove(id);
-        self.slots.insert(id.clone(), Slot { bytes, used });
+        self.entries.insert(id.clone(), IndexEntry { bytes, used });
         self.total += bytes;
     }
 
     fn remove(&mut self, id: &EntryId) {
-        self.total -= self.slots.remove(id).map_or(0, |slot| slot.bytes);
+        self.total -= self.entries.remove(id).map_or(0, |entry| entry.bytes);
     }
 
-    /// Those not used for longest, until nine tenths of `cap` are left: clearing up one by one would sort every time.
-    fn surplus(&self, cap: u64) -> Vec<EntryId> {
+    /// Returns the least recently used copies to evict if the total exceeds `cap`. Evicts down to nine tenths of `cap`,
+    /// so that not every insertion sorts.
+    fn to_evict(&self, cap: u64) -> Vec<EntryId> {
         let mut over = self.total.saturating_sub(cap);
         if over > 0 {
             over = self.total - cap / 10 * 9;
         }
-        let mut by_use: Vec<_> = self.slots.iter().map(|(id, slot)| (slot.used, id, slot.bytes)).collect();
+        let mut by_use: Vec<_> = self.entries.iter().map(|(id, entry)| (entry.used, id, entry.bytes)).collect();
         by_use.sort_unstable();
         let needed = by_use.into_iter().take_while(|(.., bytes)| {
             let more = over > 0;
@@ -96,80 +98,80 @@ impl Ledger {
     }
 }
 
-/// The folder of copies.
+/// Folder of copies.
 #[derive(Debug)]
 pub(super) struct Disk {
     dir: PathBuf,
     cap: u64,
-    ledger: Mutex<Option<Ledger>>,
-    staged: AtomicU64,
+    index: Mutex<Option<Index>>,
+    n_temporary: AtomicU64,
 }
 
 impl Disk {
-    /// Copies in `dir`, which is made when the first is written, of `cap` bytes together.
+    /// Creates a store of at most `cap` bytes in `dir`. The first write creates the folder.
     pub(super) fn new(dir: PathBuf, cap: u64) -> Self {
-        Self { dir, cap, ledger: Mutex::new(None), staged: AtomicU64::new(0) }
+        Self { dir, cap, index: Mutex::new(None), n_temporary: AtomicU64::new(0) }
     }
 
     fn path(&self, id: &EntryId, extension: &str) -> PathBuf {
         self.dir.join(id.middle()).join(format!("{id}.{extension}"))
     }
 
-    /// The copy of an entry, if it is whole.
+    /// Loads and verifies the copy of an entry.
     pub(super) fn load(&self, id: &EntryId) -> io::Result<Found> {
-        let note = match read(&self.path(id, "json"), NOTE_BYTES) {
+        let metadata = match read(&self.path(id, "json"), METADATA_BYTES) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(Found::Nothing),
-            note => note?,
+            metadata => metadata?,
         };
-        let Some(stored) = self.stored(id, &note)? else {
+        let Some(stored) = self.stored(id, &metadata)? else {
             self.remove(id)?;
             return Ok(Found::Corrupt);
         };
         let now = SystemTime::now();
-        // The order of use outlives the process where the file system lets it.
+        // The modification time preserves the order of use across restarts.
         if let Err(error) = File::options().append(true).open(self.path(id, "body")).and_then(|f| f.set_modified(now)) {
-            tracing::debug!(%id, %error, "the use of a copy cannot be noted");
+            tracing::debug!(%id, %error, "the modification time of a copy cannot be set");
         }
-        self.with_ledger(|ledger| ledger.put(id, stored.bytes.len() as u64, now));
+        self.with_index(|index| index.put(id, stored.bytes.len() as u64, now));
         Ok(Found::Copy(stored))
     }
 
-    fn stored(&self, id: &EntryId, note: &[u8]) -> io::Result<Option<Stored>> {
-        let Ok(note) = serde_json::from_slice::<Note>(note) else { return Ok(None) };
-        let Ok(digest) = note.sha256.parse::<Digest>() else { return Ok(None) };
-        let body = match read(&self.path(id, "body"), note.bytes.min(self.cap)) {
+    fn stored(&self, id: &EntryId, metadata: &[u8]) -> io::Result<Option<Stored>> {
+        let Ok(metadata) = serde_json::from_slice::<Metadata>(metadata) else { return Ok(None) };
+        let Ok(digest) = metadata.sha256.parse::<Digest>() else { return Ok(None) };
+        let body = match read(&self.path(id, "body"), metadata.bytes.min(self.cap)) {
             Err(e) if [io::ErrorKind::NotFound, io::ErrorKind::FileTooLarge].contains(&e.kind()) => return Ok(None),
             body => body?,
         };
-        if body.len() as u64 != note.bytes || Digest::of(&body) != digest {
+        if body.len() as u64 != metadata.bytes || Digest::of(&body) != digest {
             return Ok(None);
         }
-        let checked = SystemTime::UNIX_EPOCH + Duration::from_millis(note.checked_ms);
-        let validators = Validators { etag: note.etag, last_modified: note.last_modified };
-        let (bytes, origin) = (Bytes::from(body), Origin { url: note.url, validators });
+        let checked = SystemTime::UNIX_EPOCH + Duration::from_millis(metadata.checked_ms);
+        let validators = Validators { etag: metadata.etag, last_modified: metadata.last_modified };
+        let (bytes, origin) = (Bytes::from(body), Origin { url: metadata.url, validators });
         Ok(Some(Stored { bytes, digest, origin, age: SystemTime::now().duration_since(checked).ok() }))
     }
 
-    /// Keeps an entry, and drops others where there is no room. One that is larger than all the room is not kept.
+    /// Stores an entry and evicts others if necessary. An entry larger than the capacity is not stored.
     pub(super) fn store(&self, id: &EntryId, bytes: &[u8], digest: &Digest, origin: &Origin) -> io::Result<()> {
         let n_bytes = bytes.len() as u64;
         if n_bytes > self.cap {
             return self.remove(id);
         }
         self.write(&self.path(id, "body"), bytes)?;
-        self.note(id, n_bytes, digest, origin)?;
-        let surplus = self.with_ledger(|ledger| {
-            ledger.put(id, n_bytes, SystemTime::now());
-            ledger.surplus(self.cap)
+        self.confirm(id, n_bytes, digest, origin)?;
+        let evicted = self.with_index(|index| {
+            index.put(id, n_bytes, SystemTime::now());
+            index.to_evict(self.cap)
         });
-        surplus.iter().try_for_each(|other| self.remove(other))
+        evicted.iter().try_for_each(|other| self.remove(other))
     }
 
-    /// Notes that the archive has just said that a copy is still the entry.
-    pub(super) fn note(&self, id: &EntryId, bytes: u64, digest: &Digest, origin: &Origin) -> io::Result<()> {
+    /// Writes the metadata of a copy that the archive has just sent or confirmed.
+    pub(super) fn confirm(&self, id: &EntryId, bytes: u64, digest: &Digest, origin: &Origin) -> io::Result<()> {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let Validators { etag, last_modified } = origin.validators.clone();
-        let note = Note {
+        let metadata = Metadata {
             bytes,
             sha256: digest.to_string(),
             url: origin.url.clone(),
@@ -177,13 +179,13 @@ impl Disk {
             last_modified,
             checked_ms: u64::try_from(now.as_millis()).unwrap_or(u64::MAX),
         };
-        self.write(&self.path(id, "json"), serde_json::to_string(&note)?.as_bytes())
+        self.write(&self.path(id, "json"), serde_json::to_string(&metadata)?.as_bytes())
     }
 
-    /// Drops a copy.
+    /// Removes a copy.
     pub(super) fn remove(&self, id: &EntryId) -> io::Result<()> {
-        self.with_ledger(|ledger| ledger.remove(id));
-        // The note first: a body without one is nothing.
+        self.with_index(|index| index.remove(id));
+        // Metadata first: a body without metadata is ignored.
         for extension in ["json", "body"] {
             match fs::remove_file(self.path(id, extension)) {
                 Err(e) if e.kind() != io::ErrorKind::NotFound => return Err(e),
@@ -193,26 +195,26 @@ impl Disk {
         Ok(())
     }
 
-    /// Writes a file whole or not at all. No fsync: what a power cut leaves is noticed when it is read.
+    /// Writes a file atomically. Without fsync: damage by a power failure is detected on reading.
     fn write(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
         let folder = path.parent().unwrap_or(&self.dir);
         fs::create_dir_all(folder)?;
-        let n = self.staged.fetch_add(1, Ordering::Relaxed);
-        let staged = folder.join(format!(".{}-{n}.tmp", std::process::id()));
-        let written = File::create(&staged).and_then(|mut file| file.write_all(bytes));
-        let renamed = written.and_then(|()| fs::rename(&staged, path));
+        let n = self.n_temporary.fetch_add(1, Ordering::Relaxed);
+        let temporary = folder.join(format!(".{}-{n}.tmp", std::process::id()));
+        let written = File::create(&temporary).and_then(|mut file| file.write_all(bytes));
+        let renamed = written.and_then(|()| fs::rename(&temporary, path));
         if renamed.is_err() {
-            // What cannot be removed either is removed by a later process.
-            drop(fs::remove_file(&staged));
+            // A later process removes the file if this fails.
+            drop(fs::remove_file(&temporary));
         }
         renamed
     }
 
-    fn with_ledger<T>(&self, act: impl FnOnce(&mut Ledger) -> T) -> T {
-        let mut ledger = self.ledger.lock().unwrap_or_else(PoisonError::into_inner);
-        let ledger = ledger.get_or_insert_with(|| take_stock(&self.dir));
-        let result = act(ledger);
-        gauge!(ARCHIVE_KEPT).set(ledger.total as f64);
+    fn with_index<T>(&self, act: impl FnOnce(&mut Index) -> T) -> T {
+        let mut index = self.index.lock().unwrap_or_else(PoisonError::into_inner);
+        let index = index.get_or_insert_with(|| scan(&self.dir));
+        let result = act(index);
+        gauge!(ARCHIVE_KEPT).set(index.total as f64);
         result
     }
 }
@@ -226,9 +228,9 @@ fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     if bytes.len() as u64 > limit { Err(io::ErrorKind::FileTooLarge.into()) } else { Ok(bytes) }
 }
 
-/// What earlier processes left, and away with what they left half done. What cannot be read is not there.
-fn take_stock(dir: &Path) -> Ledger {
-    let mut ledger = Ledger::default();
+/// Indexes the copies of earlier processes and removes their temporary files. Skips unreadable files.
+fn scan(dir: &Path) -> Index {
+    let mut index = Index::default();
     let folders = fs::read_dir(dir).into_iter().flatten().flatten();
     for file in folders.filter_map(|folder| fs::read_dir(folder.path()).ok()).flatten().flatten() {
         let (path, Ok(data)) = (file.path(), file.metadata()) else { continue };
@@ -237,16 +239,16 @@ fn take_stock(dir: &Path) -> Ledger {
         match path.extension().and_then(|extension| extension.to_str()) {
             Some("body") => {
                 if let Some(id) = stem.parse::<EntryId>().ok().filter(|id| id.as_str() == stem) {
-                    ledger.put(&id, data.len(), used);
+                    index.put(&id, data.len(), used);
                 }
             }
-            Some("tmp") if used.elapsed().is_ok_and(|age| age > ABANDONED) => {
+            Some("tmp") if used.elapsed().is_ok_and(|age| age > STALE_TEMPORARY) => {
                 if let Err(error) = fs::remove_file(&path) {
-                    tracing::debug!(%error, "a file that was left behind cannot be removed");
+                    tracing::debug!(%error, "a stale temporary file cannot be removed");
                 }
             }
             _ => {}
         }
     }
-    ledger
+    index
 }

@@ -1,4 +1,4 @@
-//! The order in which an entry is looked for, and what is remembered of what was found.
+//! Look-up of entries in the folder, the copies and the remote archive, and a cache of their digests.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -19,44 +19,44 @@ use crate::store::Digest;
 use crate::structure::{Archive as Folder, EntryId, Stamp};
 use crate::telemetry::{ARCHIVE_FETCH, ARCHIVE_REQUESTS, TraceSpan};
 
-/// Entries whose digests are remembered: more than a day's visitors ask for, in a few megabytes.
-const REMEMBERED: usize = 16_384;
+/// Number of entries whose digests are cached, in a few megabytes.
+const CACHED_DIGESTS: usize = 16_384;
 
-/// Where the bytes of an entry came from.
+/// Source of an entry's bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Source {
-    /// The local folder.
+    /// Local folder.
     Local,
-    /// A copy of what the remote archive sent before.
+    /// Copy of an earlier response of the remote archive.
     Cache,
-    /// The remote archive, just now.
+    /// Remote archive.
     Remote,
 }
 
-/// An entry's file, compressed or not.
+/// File of an entry, compressed or not.
 #[derive(Debug, Clone)]
 pub struct Entry {
-    /// The bytes as they are kept or were sent.
+    /// Bytes as stored or received.
     pub bytes: Bytes,
-    /// Their name.
+    /// Digest of the bytes.
     pub digest: Digest,
-    /// Where they came from.
+    /// Source of the bytes.
     pub source: Source,
 }
 
-/// What is remembered of an entry.
+/// Cached facts about an entry.
 #[derive(Debug, Clone)]
 struct Known {
     digest: Digest,
-    /// Which file of the folder it is; none if it is a copy, and the folder has none.
+    /// Stamp of the file in the folder; `None` for a copy of an entry that the folder does not have.
     stamp: Option<Stamp>,
-    /// When the folder was last looked at.
-    looked: Instant,
-    /// Until when a copy is fresh; none if it does not age.
+    /// Time of the last check of the folder.
+    checked: Instant,
+    /// End of the freshness of a copy; `None` if it does not expire.
     fresh_until: Option<Instant>,
 }
 
-/// Entries by id. Clones share everything.
+/// Entries by id. Clones share their state.
 #[derive(Debug, Clone)]
 pub struct Archive {
     shared: Arc<Shared>,
@@ -69,7 +69,7 @@ struct Shared {
     remote: Option<Remote>,
     fetches: SingleFlight<EntryId, Result<Entry, FetchError>>,
     known: Cache<EntryId, Known>,
-    /// Entries that no remote archive has, and until when that is believed.
+    /// Entries that no remote archive has, each with the time until which it is not requested again.
     absent: Cache<EntryId, Instant>,
     check: Duration,
     fresh: Duration,
@@ -77,8 +77,8 @@ struct Shared {
 }
 
 impl Archive {
-    /// The archive of a configuration. What a remote archive sends is counted by `memory` until the fetch is over. Nothing is
-    /// read and nobody is asked before the first entry is wanted.
+    /// Creates the archive of a configuration. `memory` counts the bytes of running fetches. The first request starts
+    /// all I/O.
     #[must_use]
     pub fn new(config: &Config, memory: Arc<dyn Memory>) -> Self {
         let (archive, inflated) = (&config.archive, config.limits.inflated_bytes);
@@ -87,8 +87,8 @@ impl Archive {
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
             remote: Remote::new(archive, inflated, memory),
             fetches: SingleFlight::default(),
-            known: Cache::new(REMEMBERED),
-            absent: Cache::new(REMEMBERED),
+            known: Cache::new(CACHED_DIGESTS),
+            absent: Cache::new(CACHED_DIGESTS),
             check: archive.check(),
             fresh: archive.fresh(),
             absent_for: archive.absent(),
@@ -96,11 +96,11 @@ impl Archive {
         Self { shared: Arc::new(shared) }
     }
 
-    /// An entry's bytes, from wherever they are nearest. Waits for the remote archive for `archive.timeout_ms` an
-    /// address at most. Must run on a tokio runtime with timers.
+    /// Returns the bytes of an entry from the first source that has it. Waits at most `archive.timeout_ms` for the
+    /// remote archive. Must run on a tokio runtime with timers.
     ///
     /// # Errors
-    /// Any [`FetchError`].
+    /// Returns any [`FetchError`].
     pub async fn fetch(&self, id: &EntryId) -> Result<Entry, FetchError> {
         let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
         // The fetch outlives its first caller, but is traced under that caller's request.
@@ -118,8 +118,8 @@ impl Archive {
         fetch.recv().await.unwrap_or(Err(FetchError::Internal("its fetch ended without a result")))
     }
 
-    /// Asks every host of the remote archive for the head of one entry, each for `limit` at most: the host, and the status of its
-    /// answer or why there is none. Empty where there is no remote archive. No copy is made.
+    /// Sends a HEAD request for one entry to every host of the remote archive, with a timeout of `limit` each. Returns
+    /// the hosts with the status or the error; empty without a remote archive.
     pub async fn reach(&self, id: &EntryId, limit: Duration) -> Vec<(String, Result<u16, String>)> {
         match &self.shared.remote {
             Some(remote) => remote.reach(id, limit).await,
@@ -127,10 +127,10 @@ impl Archive {
         }
     }
 
-    /// The digest of an entry's bytes, without reading them where they are known and fresh.
+    /// Returns the digest of an entry's bytes, without reading them if the digest is cached and fresh.
     ///
     /// # Errors
-    /// Any [`FetchError`].
+    /// Returns any [`FetchError`].
     pub async fn digest(&self, id: &EntryId) -> Result<Digest, FetchError> {
         match self.known(id).await {
             Some(digest) => Ok(digest),
@@ -138,20 +138,20 @@ impl Archive {
         }
     }
 
-    /// The digest of an entry's bytes if it is known and fresh: no file is read, nobody is asked.
+    /// Returns the digest of an entry's bytes if it is cached and fresh. Reads no file and sends no request.
     pub async fn known(&self, id: &EntryId) -> Option<Digest> {
         let known = self.shared.known.get(id)?;
         if known.fresh_until.is_some_and(|end| Instant::now() >= end) {
             return None;
         }
-        if known.looked.elapsed() >= self.shared.check {
+        if known.checked.elapsed() >= self.shared.check {
             let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
-            let looked = Instant::now();
+            let checked = Instant::now();
             let stamp = blocking(move || shared.folder.stamp(&wanted)).await.ok()?.ok()?;
             if stamp != known.stamp {
                 return None;
             }
-            self.shared.known.insert(id.clone(), Known { looked, ..known.clone() });
+            self.shared.known.insert(id.clone(), Known { checked, ..known.clone() });
         }
         count(if known.stamp.is_some() { "local" } else { "cache" }, "known");
         Some(known.digest)
@@ -160,24 +160,24 @@ impl Archive {
 
 impl Shared {
     async fn find(self: &Arc<Self>, id: &EntryId) -> Result<Entry, FetchError> {
-        let looked = Instant::now();
+        let checked = Instant::now();
         if let Some((bytes, digest, stamp)) = self.local(id).await? {
-            self.remember(id, Known { digest, stamp: Some(stamp), looked, fresh_until: None });
+            self.remember(id, Known { digest, stamp: Some(stamp), checked, fresh_until: None });
             return Ok(Entry { bytes, digest, source: Source::Local });
         }
         let stored = self.stored(id).await?;
         let is_fresh = |stored: &Stored| stored.age.is_some_and(|age| age < self.fresh);
         let (remote, stored) = match (&self.remote, stored) {
-            // Nobody can be asked, so it is as fresh as it gets.
-            (None, Some(stored)) => return Ok(self.copy(id, stored, looked, None)),
+            // Without a remote archive a copy does not expire.
+            (None, Some(stored)) => return Ok(self.copy(id, stored, checked, None)),
             (Some(_), Some(stored)) if is_fresh(&stored) => {
                 let left = self.fresh.saturating_sub(stored.age.unwrap_or_default());
-                return Ok(self.copy(id, stored, looked, Some(left)));
+                return Ok(self.copy(id, stored, checked, Some(left)));
             }
             (None, None) => return Err(FetchError::NotFound { id: id.clone() }),
             (Some(remote), stored) => (remote, stored),
         };
-        if self.absent.get(id).is_some_and(|until| looked < until) {
+        if self.absent.get(id).is_some_and(|until| checked < until) {
             count("cache", "absent");
             return Err(FetchError::NotFound { id: id.clone() });
         }
@@ -191,32 +191,32 @@ impl Shared {
             Err(_) => "unavailable",
         };
         count("remote", result);
-        histogram!(ARCHIVE_FETCH, "result" => result).record(looked.elapsed().as_secs_f64());
+        histogram!(ARCHIVE_FETCH, "result" => result).record(checked.elapsed().as_secs_f64());
         match (answer, stored) {
             (Ok(Answer::Body { bytes, digest, url, validators, share }), _) => {
-                tracing::info!(%id, url, bytes = bytes.len(), ms = looked.elapsed().as_millis(), "fetched an entry");
+                tracing::info!(%id, url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
                 let (origin, kept) = (Origin { url, validators }, bytes.clone());
-                self.on_disk(id, "kept", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
-                self.remember(id, Known { digest, stamp: None, looked, fresh_until: Some(looked + self.fresh) });
-                // From here on whoever asked counts it.
+                self.on_disk(id, "stored", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
+                self.remember(id, Known { digest, stamp: None, checked, fresh_until: Some(checked + self.fresh) });
+                // From here on the caller counts the memory.
                 drop(share);
                 Ok(Entry { bytes, digest, source: Source::Remote })
             }
             (Ok(Answer::Unchanged), Some(stored)) => {
                 let (n_bytes, digest, origin) = (stored.bytes.len() as u64, stored.digest, stored.origin.clone());
-                self.on_disk(id, "noted", move |disk, id| disk.note(id, n_bytes, &digest, &origin)).await;
-                Ok(self.copy(id, stored, looked, Some(self.fresh)))
+                self.on_disk(id, "confirmed", move |disk, id| disk.confirm(id, n_bytes, &digest, &origin)).await;
+                Ok(self.copy(id, stored, checked, Some(self.fresh)))
             }
-            (Ok(_), _) => Err(FetchError::Internal("the archive says that a copy is unchanged which there is not")),
+            (Ok(_), _) => Err(FetchError::Internal("the archive answered `304 Not Modified` without a copy")),
             (Err(error @ FetchError::NotFound { .. }), _) => {
                 self.on_disk(id, "removed", Disk::remove).await;
                 self.known.remove(id);
-                self.absent.insert(id.clone(), looked + self.absent_for);
+                self.absent.insert(id.clone(), checked + self.absent_for);
                 Err(error)
             }
             (Err(error @ FetchError::Unavailable { .. }), Some(stored)) => {
                 let age_s = stored.age.map(|age| age.as_secs());
-                tracing::warn!(%id, %error, age_s, "a stale copy stands in for the archive");
+                tracing::warn!(%id, %error, age_s, "a stale copy is used because the archive is unavailable");
                 count("cache", "stale");
                 Ok(Entry { bytes: stored.bytes, digest: stored.digest, source: Source::Cache })
             }
@@ -224,7 +224,7 @@ impl Shared {
         }
     }
 
-    /// The entry in the folder.
+    /// Reads the entry from the folder.
     async fn local(self: &Arc<Self>, id: &EntryId) -> Result<Option<(Bytes, Digest, Stamp)>, FetchError> {
         let (shared, wanted) = (Arc::clone(self), id.clone());
         let found = blocking(move || {
@@ -243,14 +243,14 @@ impl Shared {
         found.map_err(|error| FetchError::Local(Arc::new(error)))
     }
 
-    /// The copy on disk, if there is one that is whole and can be read.
+    /// Reads the copy on disk. Treats damaged and unreadable copies as missing.
     async fn stored(self: &Arc<Self>, id: &EntryId) -> Result<Option<Stored>, FetchError> {
         let (shared, wanted) = (Arc::clone(self), id.clone());
         match blocking(move || shared.disk.load(&wanted)).await? {
             Ok(Found::Copy(stored)) => return Ok(Some(stored)),
             Ok(Found::Nothing) => {}
             Ok(Found::Corrupt) => {
-                tracing::warn!(%id, "a copy on disk was damaged and is dropped");
+                tracing::warn!(%id, "a damaged copy on disk was removed");
                 count("cache", "corrupt");
             }
             Err(error) => {
@@ -261,11 +261,11 @@ impl Shared {
         Ok(None)
     }
 
-    /// A copy as an entry, fresh for as long as `left`.
-    fn copy(&self, id: &EntryId, stored: Stored, looked: Instant, left: Option<Duration>) -> Entry {
+    /// Turns a copy into an entry that is fresh for `left`.
+    fn copy(&self, id: &EntryId, stored: Stored, checked: Instant, left: Option<Duration>) -> Entry {
         count("cache", "found");
         let Stored { bytes, digest, .. } = stored;
-        self.remember(id, Known { digest, stamp: None, looked, fresh_until: left.map(|left| looked + left) });
+        self.remember(id, Known { digest, stamp: None, checked, fresh_until: left.map(|left| checked + left) });
         Entry { bytes, digest, source: Source::Cache }
     }
 
@@ -274,7 +274,7 @@ impl Shared {
         self.known.insert(id.clone(), known);
     }
 
-    /// Changes a copy on disk. An entry that cannot be kept can still be used.
+    /// Changes a copy on disk. A failure is only logged, since the entry itself is still usable.
     async fn on_disk(
         self: &Arc<Self>,
         id: &EntryId,
@@ -289,7 +289,7 @@ impl Shared {
     }
 }
 
-/// Runs `work` where it may block.
+/// Runs blocking `work` on its own thread.
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, FetchError> {
     let ended = tokio::task::spawn_blocking(work).await;
     ended.map_err(|_panicked_or_stopped| FetchError::Internal("reading ended without a result"))

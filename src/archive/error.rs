@@ -1,4 +1,4 @@
-//! Why an entry cannot be had, for every caller that waited for it.
+//! Errors of fetching an entry, shared by all callers that waited for it.
 
 use std::fmt;
 use std::sync::Arc;
@@ -8,80 +8,80 @@ use thiserror::Error;
 
 use crate::structure::{ArchiveError, EntryId};
 
-/// Why an entry cannot be had.
+/// Errors of fetching an entry.
 #[derive(Debug, Clone, Error)]
 pub enum FetchError {
     /// Neither the folder nor any remote archive has it.
     #[error("entry {id} is not in the archive")]
     NotFound {
-        /// The entry.
+        /// Requested entry.
         id: EntryId,
     },
     /// The local folder or its file cannot be read, or the file is too large.
     #[error(transparent)]
     Local(Arc<ArchiveError>),
-    /// The remote archive sends more than is allowed.
-    #[error("entry {id} has more than {limit} bytes as the archive sends it")]
+    /// The file of the remote archive is too large.
+    #[error("the archive's file of entry {id} exceeds {limit} bytes")]
     TooLarge {
-        /// The entry.
+        /// Requested entry.
         id: EntryId,
-        /// Bytes that the archive announced, if it did.
+        /// Announced size, bytes, if any.
         bytes: Option<u64>,
-        /// Bytes allowed.
+        /// Maximum size, bytes.
         limit: u64,
     },
-    /// The remote archive could not be asked, and there is no copy.
+    /// The remote archive is unavailable, and there is no copy.
     #[error("the archive at {host} {why}")]
     Unavailable {
-        /// The host, as the configuration names it.
+        /// Host as in the configuration.
         host: String,
-        /// What happened.
+        /// Cause.
         why: Why,
-        /// When to try again; none where time alone will not help.
+        /// Time until a retry is useful; `None` if retries will not help.
         retry_after: Option<Duration>,
     },
-    /// There is no memory for it now.
-    #[error("entry {id} is not fetched: {held} of {limit} bytes of memory for uploads and meshes are in use")]
+    /// The memory limit is reached.
+    #[error("entry {id} cannot be fetched now: {held} of {limit} bytes of memory for uploads and meshes are in use")]
     Memory {
-        /// The entry.
+        /// Requested entry.
         id: EntryId,
-        /// Bytes allowed.
+        /// Memory limit, bytes.
         limit: u64,
-        /// Bytes in use.
+        /// Memory in use, bytes.
         held: u64,
     },
-    /// A defect of ours, or the service is being stopped.
+    /// Internal error, or the service is stopping.
     #[error("the entry could not be fetched: {0}")]
     Internal(&'static str),
 }
 
-/// What came between us and a remote archive.
+/// Cause of a failed request to a remote archive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Why {
-    /// No connection: no such name, refused, no TLS.
+    /// No connection: unknown name, refused, TLS error.
     Connect,
-    /// Nothing came in time.
+    /// Timeout.
     Timeout,
-    /// The answer broke off, or was not as long as it said.
+    /// The response was truncated, or its length differs from the announced one.
     Broken,
-    /// What came is not the compressed file that its name promises.
+    /// The file is not a valid gzip file.
     Damaged,
-    /// It answered with this status.
+    /// Unexpected HTTP status.
     Status(u16),
-    /// It sent us to another host, or around too often.
+    /// Redirect to another host, or too many redirects.
     Redirect,
-    /// Its name leads to an address that must not be connected to.
+    /// The host name has only private addresses.
     Private,
-    /// It failed too often, and is left alone for a while.
+    /// The circuit breaker is open after repeated failures.
     Paused,
-    /// Too many entries were being fetched for too long.
+    /// No fetch could start in time, because too many others were running.
     Busy,
-    /// The client cannot be set up: no certificates, a bad proxy.
+    /// The HTTP client cannot be created: no certificates, invalid proxy.
     Client,
 }
 
 impl Why {
-    /// Whether another attempt may do better.
+    /// Returns true if a retry may succeed.
     #[must_use]
     pub fn is_temporary(self) -> bool {
         match self {
@@ -91,8 +91,8 @@ impl Why {
         }
     }
 
-    /// Whether the host did what hosts do, though not for us.
-    pub(super) fn is_the_hosts_word(self) -> bool {
+    /// Returns true if the host works but declined the request, so that the circuit breaker does not count a failure.
+    pub(super) fn is_host_response(self) -> bool {
         matches!(self, Self::Redirect) || matches!(self, Self::Status(status) if status < 500)
     }
 }
@@ -101,15 +101,15 @@ impl fmt::Display for Why {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Connect => "cannot be connected to",
-            Self::Timeout => "does not answer in time",
-            Self::Broken => "broke its answer off",
+            Self::Timeout => "did not respond in time",
+            Self::Broken => "sent an incomplete response",
             Self::Damaged => "sent a damaged file",
             Self::Status(status) => return write!(f, "answered with status {status}"),
-            Self::Redirect => "redirects to where it may not",
-            Self::Private => "has an address that this server does not connect to",
-            Self::Paused => "failed too often and is left alone for a while",
-            Self::Busy => "is busy with other entries",
-            Self::Client => "cannot be asked from this server",
+            Self::Redirect => "sent a redirect that is not allowed",
+            Self::Private => "has a private address (archive.allow_private)",
+            Self::Paused => "failed repeatedly; requests to it are paused",
+            Self::Busy => "cannot be queried: too many other fetches are running",
+            Self::Client => "cannot be queried from this server",
         })
     }
 }

@@ -1,32 +1,32 @@
-//! The memory of what is being fetched. How much there may be is known to whoever owns the archive; here it is asked, byte by byte.
+//! Memory accounting of fetches. The owner of the archive implements the limit.
 
 use std::fmt::Debug;
 
-/// There is no more.
+/// Error: the memory limit is reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NoMemory {
-    /// Bytes allowed.
+    /// Memory limit, bytes.
     pub limit: u64,
-    /// Bytes in use.
+    /// Memory in use, bytes.
     pub held: u64,
 }
 
-/// Counts the memory of fetches.
+/// Memory accounting of all fetches.
 pub trait Memory: Debug + Send + Sync {
-    /// Begins to count one fetch.
+    /// Starts the accounting of one fetch.
     fn begin(&self) -> Box<dyn Share>;
 }
 
-/// The memory of one fetch; dropping it gives it back.
+/// Memory of one fetch, released on drop.
 pub trait Share: Debug + Send {
-    /// Takes `bytes` more.
+    /// Reserves `bytes` more.
     ///
     /// # Errors
-    /// [`NoMemory`]; what was taken before is still held.
+    /// Returns [`NoMemory`] if the limit is reached; earlier reservations remain.
     fn grow(&mut self, bytes: u64) -> Result<(), NoMemory>;
 }
 
-/// Memory that nobody counts: only `archive.max_bytes` and `archive.concurrent` bound it.
+/// Accounting without a limit: only `archive.max_bytes` and `archive.concurrent` bound the memory.
 #[derive(Debug, Clone, Copy)]
 pub struct Uncounted;
 

@@ -1,4 +1,4 @@
-//! The remote archive: addresses in order, attempts with pauses, hosts that are left alone, places for so many at once.
+//! Remote archive: URLs in order, retries, a circuit breaker per host and a limit of concurrent fetches.
 
 use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::sync::Arc;
@@ -16,12 +16,12 @@ use crate::config::{ArchiveConfig, Template};
 use crate::structure::EntryId;
 use crate::telemetry::{SpanKind, SpanParent, TraceSpan};
 
-/// Longest that a host is left alone on its own word.
-const LONGEST: Duration = Duration::from_mins(10);
-/// What callers are told where nothing better is known.
-const LATER: Duration = Duration::from_secs(1);
+/// Longest pause that a host can request.
+const MAX_PAUSE: Duration = Duration::from_mins(10);
+/// Retry time reported to callers if no better one is known.
+const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(1);
 
-/// Where the copy that we have came from, and what was said of it.
+/// URL and validators of a copy.
 #[derive(Debug, Clone)]
 pub(super) struct Origin {
     pub(super) url: String,
@@ -31,18 +31,18 @@ pub(super) struct Origin {
 /// The remote archive.
 #[derive(Debug)]
 pub(super) struct Remote {
-    /// Every address with the breaker of its host.
+    /// URL templates with the circuit breakers of their hosts.
     sources: Vec<(Template, Arc<Breaker>)>,
     config: ArchiveConfig,
     limits: Limits,
-    places: Semaphore,
+    permits: Semaphore,
     memory: Arc<dyn Memory>,
-    /// Made when it is first needed: it reads the system's certificates.
+    /// Created on first use, because it reads the system's certificates.
     client: OnceCell<Client>,
 }
 
 impl Remote {
-    /// The archive of a configuration, if it names one. What it sends is counted by `memory`.
+    /// Creates the remote archive of a configuration, if it names one. `memory` counts the bytes of fetches.
     pub(super) fn new(config: &ArchiveConfig, inflated: u64, memory: Arc<dyn Memory>) -> Option<Self> {
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
         for template in config.url.as_ref()?.as_slice() {
@@ -57,15 +57,15 @@ impl Remote {
             bytes: config.max_bytes,
             inflated,
         };
-        let places = Semaphore::new(config.concurrent);
-        Some(Self { sources, config: config.clone(), limits, places, memory, client: OnceCell::new() })
+        let permits = Semaphore::new(config.concurrent);
+        Some(Self { sources, config: config.clone(), limits, permits, memory, client: OnceCell::new() })
     }
 
-    /// Asks every address for the head of one well-known entry: whether somebody answers there, each host with its status.
+    /// Sends a HEAD request for `id` to every URL. Returns the hosts with the status or the error.
     pub(super) async fn reach(&self, id: &EntryId, limit: Duration) -> Vec<(String, Result<u16, String>)> {
         let mut reached = Vec::new();
         for (template, breaker) in &self.sources {
-            let ask = async {
+            let request = async {
                 let failed = |failed: Failed| match failed {
                     Failed::TooLarge(_) => "too large".to_owned(),
                     Failed::Memory(none) => format!("no memory: {} of {} bytes are in use", none.held, none.limit),
@@ -75,23 +75,23 @@ impl Remote {
                 let url = template.url(id).ok_or("the address is no URL")?;
                 client::head(client, url).await.map_err(failed)
             };
-            let answer = tokio::time::timeout(limit, ask).await;
+            let answer = tokio::time::timeout(limit, request).await;
             let silent = |_elapsed| Err(format!("no answer within {} ms", limit.as_millis()));
             reached.push((breaker.host().to_owned(), answer.unwrap_or_else(silent)));
         }
         reached
     }
 
-    /// Asks every address in order until one has the entry.
+    /// Requests the entry from every URL in order until one has it.
     pub(super) async fn fetch(&self, id: &EntryId, copy: Option<&Origin>) -> Result<Answer, FetchError> {
         let deadline = Instant::now() + self.config.timeout();
         let mut failure = None;
         for (template, breaker) in &self.sources {
-            match self.ask(id, template, breaker, copy, deadline).await {
+            match self.fetch_from(id, template, breaker, copy, deadline).await {
                 Ok(Answer::Absent) => {}
                 Ok(answer) => return Ok(answer),
                 Err(error @ (FetchError::TooLarge { .. } | FetchError::Memory { .. })) => return Err(error),
-                // Another address may still have it; if none does, this one might have had it.
+                // A later URL may have the entry. If none has, this failure is reported instead of "not found".
                 Err(error) => {
                     failure.get_or_insert(error);
                 }
@@ -100,8 +100,8 @@ impl Remote {
         Err(failure.unwrap_or_else(|| FetchError::NotFound { id: id.clone() }))
     }
 
-    /// Asks one address, several times where that may help.
-    async fn ask(
+    /// Requests the entry from one URL, with retries.
+    async fn fetch_from(
         &self,
         id: &EntryId,
         template: &Template,
@@ -113,7 +113,7 @@ impl Remote {
             |why, retry_after| FetchError::Unavailable { host: breaker.host().to_owned(), why, retry_after };
         let mut attempt = 1;
         loop {
-            let (why, asked_for, detail) = match self.attempt(id, template, breaker, copy, deadline).await {
+            let (why, requested, detail) = match self.attempt(id, template, breaker, copy, deadline).await {
                 Ok(answer) => return Ok(answer),
                 Err(Failed::TooLarge(bytes)) => {
                     return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.limits.bytes });
@@ -124,31 +124,31 @@ impl Remote {
                 Err(Failed::Other { why, retry_after, detail }) => (why, retry_after, detail),
             };
             tracing::debug!(%id, host = breaker.host(), attempt, detail, "an attempt failed");
-            let pause = self.pause(attempt, asked_for);
+            let pause = self.pause(attempt, requested);
             let again = why.is_temporary()
                 && attempt < self.config.attempts
-                && breaker.left_alone_for().is_none()
+                && breaker.open_for().is_none()
                 && Instant::now() + pause < deadline;
             if !again {
                 if why != Why::Paused {
-                    tracing::warn!(%id, host = breaker.host(), attempt, detail, "the archive cannot be asked");
+                    tracing::warn!(%id, host = breaker.host(), attempt, detail, "the request to the archive failed");
                 }
                 let is_temporary = why.is_temporary() || matches!(why, Why::Paused | Why::Busy);
-                let later = breaker.left_alone_for().or(asked_for).unwrap_or(LATER);
-                return Err(unavailable(why, is_temporary.then_some(later)));
+                let retry_after = breaker.open_for().or(requested).unwrap_or(DEFAULT_RETRY_AFTER);
+                return Err(unavailable(why, is_temporary.then_some(retry_after)));
             }
             tokio::time::sleep(pause).await;
             attempt += 1;
         }
     }
 
-    /// The pause after an attempt: a random part of a span that doubles, behind what the host asked for.
-    fn pause(&self, attempt: u32, asked_for: Option<Duration>) -> Duration {
+    /// Returns the pause after an attempt: the time that the host requested, plus a random part of a span that doubles.
+    fn pause(&self, attempt: u32, requested: Option<Duration>) -> Duration {
         let span = self.config.backoff().saturating_mul(1 << (attempt - 1).min(16));
-        asked_for.unwrap_or_default() + span.mul_f64(fraction())
+        requested.unwrap_or_default() + span.mul_f64(fraction())
     }
 
-    /// Asks once, if the host is not left alone and there is a place.
+    /// Sends one request, unless the circuit breaker is open or no permit is available in time.
     async fn attempt(
         &self,
         id: &EntryId,
@@ -157,34 +157,34 @@ impl Remote {
         copy: Option<&Origin>,
         deadline: Instant,
     ) -> Result<Answer, Failed> {
-        let paused = |wait: Duration| Failed::other(Why::Paused, &format!("left alone for {} ms", wait.as_millis()));
-        // Nobody waits for a place to ask somebody who is not asked.
-        breaker.left_alone_for().map_or(Ok(()), |wait| Err(paused(wait)))?;
-        let _place = tokio::time::timeout_at(deadline, self.places.acquire())
+        let paused = |wait: Duration| Failed::other(Why::Paused, &format!("paused for {} ms", wait.as_millis()));
+        // Checked before waiting for a permit.
+        breaker.open_for().map_or(Ok(()), |wait| Err(paused(wait)))?;
+        let _permit = tokio::time::timeout_at(deadline, self.permits.acquire())
             .await
-            .map_err(|_elapsed| Failed::other(Why::Busy, "no place in time"))?
+            .map_err(|_elapsed| Failed::other(Why::Busy, "no permit in time"))?
             .map_err(|closed| Failed::other(Why::Busy, &closed))?;
         let client = self.client().await?;
         let url = template.url(id).ok_or_else(|| Failed::other(Why::Client, "the address is no URL"))?;
         let known = copy.filter(|copy| copy.url == url.as_str()).map(|copy| &copy.validators);
-        let pass = breaker.enter().map_err(paused)?;
+        let permit = breaker.acquire().map_err(paused)?;
         let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());
         let trace = span.context();
         let get = client::get(client, url, known, self.limits, self.memory.begin(), &trace);
         let answer = tokio::time::timeout_at(deadline, get)
             .await
-            .unwrap_or_else(|_elapsed| Err(Failed::other(Why::Timeout, "not whole in time")));
+            .unwrap_or_else(|_elapsed| Err(Failed::other(Why::Timeout, "incomplete at the deadline")));
         describe(&span, id, breaker.host(), &answer);
         span.end();
         match &answer {
-            Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => pass.succeeded(),
+            Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => permit.succeeded(),
             Err(Failed::Other { retry_after: Some(wait), why, .. })
                 if why.is_temporary() && *wait > self.config.retry_after() =>
             {
-                pass.told_to_wait((*wait).min(LONGEST));
+                permit.asked_to_wait((*wait).min(MAX_PAUSE));
             }
-            Err(Failed::Other { why, .. }) if why.is_the_hosts_word() => pass.succeeded(),
-            Err(Failed::Other { .. }) => pass.failed(),
+            Err(Failed::Other { why, .. }) if why.is_host_response() => permit.succeeded(),
+            Err(Failed::Other { .. }) => permit.failed(),
         }
         answer
     }
@@ -208,9 +208,9 @@ fn describe(span: &TraceSpan, id: &EntryId, host: &str, answer: &Result<Answer, 
     let (status, error) = match answer {
         Ok(Answer::Body { .. }) | Err(Failed::TooLarge(_)) => (Some(200), None),
         Ok(Answer::Unchanged) => (Some(304), None),
-        // It may have been 410: what counts is that there is none.
+        // 410 is reported as 404.
         Ok(Answer::Absent) => (Some(404), None),
-        Err(Failed::Memory(_)) => (Some(200), Some("no memory for it".to_owned())),
+        Err(Failed::Memory(_)) => (Some(200), Some("memory limit reached".to_owned())),
         Err(Failed::Other { why, detail, .. }) => match why {
             Why::Status(status) => (Some(i64::from(*status)), Some(detail.clone())),
             _ => (None, Some(detail.clone())),
@@ -224,7 +224,7 @@ fn describe(span: &TraceSpan, id: &EntryId, host: &str, answer: &Result<Answer, 
     }
 }
 
-/// A random number of [0, 1). The standard library seeds its hashers at random, which is all that pauses need.
+/// Returns a random number in [0, 1), from the random seeds of the standard library's hashers.
 fn fraction() -> f64 {
     let bits = RandomState::new().build_hasher().finish() >> 11;
     bits as f64 / (1_u64 << 53) as f64
@@ -236,7 +236,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pauses_double_and_differ() {
+    fn pauses_double_and_are_random() {
         let config = ArchiveConfig { backoff_ms: 1000, ..ArchiveConfig::default() };
         let remote = Remote::new(&config, 1, Arc::new(Uncounted)).unwrap();
         let longest = |attempt| (0..200).map(|_| remote.pause(attempt, None)).max().unwrap_or_default().as_millis();

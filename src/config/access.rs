@@ -1,4 +1,4 @@
-//! Who may ask for what, and how much of it: keys, quotas, signed addresses, and which pages may read answers.
+//! Configuration of access: keys, quotas, signed URLs and cross-origin requests.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -12,42 +12,41 @@ use serde_json::Value;
 
 use super::Secret;
 
-/// Keys, quotas, signed addresses; what browsers are told.
+/// Keys, quotas, signed URLs and headers for browsers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AccessConfig {
-    /// TOML file of keys, which `molmesh key new` writes the lines of. Default `none`: no key is asked for. The file is read
-    /// again when it changes, and on SIGHUP.
+    /// TOML file of keys; `molmesh key new` prints entries for it. Default `none`: no key is required. The file is
+    /// reloaded when it changes, and on SIGHUP.
     pub keys_file: Option<PathBuf>,
-    /// Keys that sign addresses, as `ID:SECRET` with blanks or line breaks between them; the first one signs, all are
-    /// accepted, so that one can take over from another. Default `none`: no signature is accepted.
+    /// Keys that sign URLs, as `ID:SECRET` separated by white space. The first one signs, all are accepted, so that
+    /// keys can be rotated. Default `none`: no signature is accepted.
     pub signing_secret: Option<Secret>,
-    /// File with `signing_secret`, in its place. Default `none`.
+    /// File that contains the value of `signing_secret`. Default `none`.
     pub signing_secret_file: Option<PathBuf>,
-    /// Requests of one address in a window. Default `none`: any number. Those who present a key have the key's quota instead.
+    /// Requests of one address per window. Default `none`: unlimited. Requests with a key have the key's quota instead.
     #[serde(deserialize_with = "count")]
     pub address_requests: Option<u64>,
-    /// Seconds in a window that workers spend on the jobs of one address. Default `none`: any number.
+    /// Computing time for the jobs of one address per window, s. Default `none`: unlimited.
     #[serde(deserialize_with = "count")]
     pub address_work_s: Option<u64>,
-    /// Requests of one address at once, to the last byte of the answer. Default `none`: any number.
+    /// Concurrent requests of one address, each counted to the last byte of the response. Default `none`: unlimited.
     #[serde(deserialize_with = "count")]
     pub address_concurrent: Option<u64>,
-    /// Length of a window, s, for addresses and for keys that do not say their own. Default 60: who has used his quota up is
-    /// back within a minute. It begins with the client's first request, not with the clock's minute, so that clients do not
-    /// all come back at once.
+    /// Length of a quota window, s, for addresses and for keys without their own. Default 60: a used-up quota is
+    /// restored within a minute. The window begins with the client's first request, so that not all clients retry at
+    /// the same time.
     pub window_s: u64,
-    /// Addresses whose quota is counted one by one. Default 10,000, some 2 MB. Those beyond share one quota, as forgetting
-    /// somebody would give him a new one.
+    /// Number of addresses with a separate quota. Default 10,000, about 2 MB. Further addresses share one quota,
+    /// because forgetting an address would give it a new one.
     pub clients: usize,
-    /// Origins whose pages may read answers: `*`, or a list such as `https://viewer.example`. Default `*`: there are no
-    /// cookies here, and a key is sent only by a page that has it. `none`: pages of this server alone.
+    /// Origins whose pages may read responses: `*`, or a list such as `https://viewer.example`. Default `*`: the
+    /// service uses no cookies, and only a page that has a key can send it. `none`: only pages of this server.
     pub cors_origins: Option<Origins>,
-    /// Whether pages of these origins may send what the browser keeps, such as the cookies of a proxy in front. Default
-    /// false. It cannot go with `*`.
+    /// Allows pages of these origins to send credentials, such as the cookies of a proxy. Default false. Excludes `*`.
     pub cors_credentials: bool,
-    /// Seconds for which browsers are told to use https alone. Default `none`: not at all, as TLS is a proxy's, and the
-    /// promise cannot be taken back.
+    /// Duration of HTTP Strict Transport Security, s. Default `none`: no header, because TLS is the proxy's task and
+    /// browsers remember the header.
     #[serde(deserialize_with = "count")]
     pub hsts_s: Option<u64>,
 }
@@ -70,7 +69,7 @@ impl Default for AccessConfig {
     }
 }
 
-/// A count that may be absent: its default says nothing about its type, so text is read here.
+/// Deserialises an optional count from a number or text; its default `none` does not tell the loader the type.
 fn count<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<u64>, D::Error> {
     let number = match Value::deserialize(deserializer)? {
         Value::Null => return Ok(None),
@@ -79,34 +78,34 @@ fn count<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<u64>, D::E
         _ => None,
     };
     let number = number.filter(|number| *number >= 1);
-    number.map(Some).ok_or_else(|| serde::de::Error::custom("none, or a whole number of 1 or more"))
+    number.map(Some).ok_or_else(|| serde::de::Error::custom("none, or a positive integer"))
 }
 
-/// Whose pages may read answers.
+/// Origins whose pages may read responses.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Origins {
-    /// Anybody's.
+    /// All origins.
     Any,
-    /// Those of these origins, each as a browser writes it; at least one.
+    /// These origins, at least one, each in the form of the `Origin` header.
     These(Vec<String>),
 }
 
 impl FromStr for Origins {
     type Err = String;
 
-    /// The error says what was expected.
+    /// Parses `*` or origins separated by white space. The error states the expected form.
     fn from_str(text: &str) -> Result<Self, String> {
         let all: Vec<&str> = text.split_whitespace().collect();
         if all == ["*"] {
             return Ok(Self::Any);
         }
-        let as_written = |origin: &&str| {
+        let is_origin = |origin: &&str| {
             let url = origin.parse::<Url>().ok().filter(|url| ["http", "https"].contains(&url.scheme()));
             url.is_some_and(|url| url.origin().ascii_serialization() == **origin)
         };
-        if let Some(bad) = all.iter().find(|origin| !as_written(origin)) {
+        if let Some(bad) = all.iter().find(|origin| !is_origin(origin)) {
             return Err(format!(
-                "*, none, or origins such as https://viewer.example without a path, which `{bad}` is not"
+                "*, none, or origins such as https://viewer.example without a path; `{bad}` is not one"
             ));
         }
         if all.is_empty() {
@@ -150,7 +149,7 @@ impl JsonSchema for Origins {
 
 impl<'de> Deserialize<'de> for Origins {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        super::words(deserializer)?.parse().map_err(serde::de::Error::custom)
+        super::joined(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 
@@ -159,7 +158,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn origins_are_as_browsers_write_them() {
+    fn parses_origins_in_the_form_of_the_header() {
         assert_eq!("*".parse(), Ok(Origins::Any));
         let two = "https://a.example http://localhost:3000";
         assert_eq!(two.parse::<Origins>().unwrap().to_string(), two);

@@ -1,4 +1,4 @@
-//! Where structures are looked up by PDB id: a folder, and an archive that is asked over HTTP for what it lacks.
+//! Configuration of the structure archive: a local folder, and a remote archive for entries that it lacks.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -8,59 +8,58 @@ use serde::{Deserialize, Serialize};
 
 use super::{ProxyUrl, Templates};
 
-/// The folder of structures, the remote archive, and the copies that are kept of it.
+/// Local folder, remote archive and copies of its entries.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ArchiveConfig {
-    /// The folder, flat or in wwPDB's `divided` layout. Default `none`: `archive` in the data folder, so that one folder is
-    /// all that an operator has to mount.
+    /// Local folder, flat or in wwPDB's `divided` layout. Default `none`: `archive` in the data folder, so that one
+    /// mount is enough.
     pub dir: Option<PathBuf>,
-    /// How long a file of the folder is believed to be as it was, ms. Default 1,000: looking at it again costs a
-    /// dozen system calls, and nobody replaces an entry more often.
+    /// Time between checks of a local file for changes, ms. Default 1,000: a check costs a dozen system calls, and
+    /// entries change rarely.
     pub check_ms: u64,
-    /// Addresses of an entry, asked in order until one has it; `none` asks nobody. Default: compressed mmCIF from
-    /// RCSB's download service, the smallest of the complete forms.
+    /// URL templates of an entry, tried in order until one has it; `none` disables the remote archive. Default:
+    /// compressed mmCIF from RCSB's download service, the smallest complete format.
     pub url: Option<Templates>,
-    /// A proxy for every remote request. Default `none`. The variables of the environment (`HTTPS_PROXY` and the
-    /// like) are not looked at: with a proxy it is the proxy that connects, so that the check of addresses is the
-    /// proxy's too, which should be somebody's decision.
+    /// Proxy for all requests to the remote archive. Default `none`. Environment variables such as `HTTPS_PROXY` are
+    /// ignored, because the check for private addresses does not apply behind a proxy: a proxy is set here deliberately
+    /// or not at all.
     pub proxy: Option<ProxyUrl>,
-    /// Whether names may lead to private, loopback and link-local addresses. Default false: who controls a name must
-    /// not choose among the operator's own machines. Addresses that `url` writes out as numbers are always allowed.
+    /// Allows host names that resolve to private, loopback and link-local addresses. Default false: DNS records of
+    /// others must not lead to the operator's machines. IP addresses in `url` are always allowed.
     pub allow_private: bool,
-    /// Time for a connection, name and TLS included, ms. Default 5,000.
+    /// Time for a connection, name resolution and TLS included, ms. Default 5,000.
     pub connect_timeout_ms: u64,
-    /// Time for the head of an answer, and the longest pause within its body, ms. Default 10,000: archives build
-    /// nothing on request.
+    /// Time for the head of a response, and the longest pause within its body, ms. Default 10,000: archives serve
+    /// stored files.
     pub first_byte_timeout_ms: u64,
-    /// Time for an entry altogether, ms: waiting for a place, every attempt, every pause. Default 60,000: 100 MB at
-    /// 14 Mbit/s.
+    /// Total time for an entry, ms: waiting for other fetches, all attempts and pauses. Default 60,000: 100 MB at 14
+    /// Mbit/s.
     pub timeout_ms: u64,
-    /// Attempts for each address, the first included. Default 3. Only what may pass is tried again: no connection,
-    /// timeouts, 429 and 5xx.
+    /// Attempts per URL, the first included. Default 3. Retries only temporary failures: no connection, timeouts,
+    /// damaged files, 429 and 5xx.
     pub attempts: u32,
-    /// Longest pause before the second attempt, ms; it doubles with every further one, and the pause is a random part
-    /// of it, so that many servers do not come back at once. Default 200.
+    /// Longest pause before the second attempt, ms. It doubles with every further attempt, and the pause is a random
+    /// part of it, so that servers do not retry in step. Default 200.
     pub backoff_ms: u64,
-    /// Longest wait that the archive may ask for with `Retry-After` before it counts as out of reach until then, ms.
-    /// Default 5,000: callers wait meanwhile.
+    /// Longest `Retry-After` of the archive that a fetch waits for, ms; for longer ones, requests to the host pause
+    /// until then. Default 5,000: callers wait meanwhile.
     pub retry_after_ms: u64,
-    /// Bytes of an entry as it is sent. Default 256 MiB, as for uploads. They are held in memory, `concurrent` times
-    /// at most.
+    /// Size of an entry as sent, bytes. Default 256 MiB, as for uploads. At most `concurrent` entries are in memory.
     pub max_bytes: u64,
-    /// Entries that are fetched at once. Default 8: public archives ask for restraint.
+    /// Number of concurrent fetches. Default 8: public archives ask for restraint.
     pub concurrent: usize,
-    /// How long a copy is used without asking again, ms. Default 86,400,000, a day: entries are released and revised
-    /// weekly.
+    /// Time for which a copy is used without revalidation, ms. Default 86,400,000, a day: entries are released and
+    /// revised weekly.
     pub fresh_ms: u64,
-    /// How long an entry that nobody has is not asked for again, ms. Default 60,000.
+    /// Time for which a missing entry is not requested again, ms. Default 60,000.
     pub absent_ms: u64,
-    /// Bytes of copies on disk; those not used for longest go first. Default 4 GiB: ten thousand entries of the
-    /// usual size.
+    /// Size of the copies on disk, bytes; the least recently used ones are evicted. Default 4 GiB: ten thousand typical
+    /// entries.
     pub cache_bytes: u64,
-    /// Failures in a row after which a host is left alone. Default 5.
+    /// Consecutive failures after which requests to a host pause. Default 5.
     pub breaker_failures: u32,
-    /// How long it is left alone before one request tries again, ms. Default 30,000.
+    /// Length of the pause before one request tests the host, ms. Default 30,000.
     pub breaker_ms: u64,
 }
 
@@ -90,55 +89,55 @@ impl Default for ArchiveConfig {
 }
 
 impl ArchiveConfig {
-    /// How long a file of the folder is believed to be as it was.
+    /// Returns the time between checks of a local file.
     #[must_use]
     pub fn check(&self) -> Duration {
         Duration::from_millis(self.check_ms)
     }
 
-    /// Time for a connection.
+    /// Returns the time for a connection.
     #[must_use]
     pub fn connect_timeout(&self) -> Duration {
         Duration::from_millis(self.connect_timeout_ms)
     }
 
-    /// Time for the head of an answer, and the longest pause within its body.
+    /// Returns the time for the head of a response, and the longest pause within its body.
     #[must_use]
     pub fn first_byte_timeout(&self) -> Duration {
         Duration::from_millis(self.first_byte_timeout_ms)
     }
 
-    /// Time for an entry altogether.
+    /// Returns the total time for an entry.
     #[must_use]
     pub fn timeout(&self) -> Duration {
         Duration::from_millis(self.timeout_ms)
     }
 
-    /// Longest pause before the second attempt.
+    /// Returns the longest pause before the second attempt.
     #[must_use]
     pub fn backoff(&self) -> Duration {
         Duration::from_millis(self.backoff_ms)
     }
 
-    /// Longest wait that is granted to a `Retry-After`.
+    /// Returns the longest `Retry-After` that a fetch waits for.
     #[must_use]
     pub fn retry_after(&self) -> Duration {
         Duration::from_millis(self.retry_after_ms)
     }
 
-    /// How long a copy is used without asking again.
+    /// Returns the time for which a copy is used without revalidation.
     #[must_use]
     pub fn fresh(&self) -> Duration {
         Duration::from_millis(self.fresh_ms)
     }
 
-    /// How long an entry that nobody has is not asked for again.
+    /// Returns the time for which a missing entry is not requested again.
     #[must_use]
     pub fn absent(&self) -> Duration {
         Duration::from_millis(self.absent_ms)
     }
 
-    /// How long a host that fails is left alone.
+    /// Returns the length of the pause after repeated failures.
     #[must_use]
     pub fn breaker(&self) -> Duration {
         Duration::from_millis(self.breaker_ms)

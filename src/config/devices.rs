@@ -10,19 +10,20 @@ use crate::surface::devices::{EXPECTED, MIN_PARTITION_BRICKS};
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DevicesConfig {
-    /// Devices that may be used: `auto`, `all`, `cpu`, or a list such as `0,2` or `software`. Default `auto`: all GPUs
-    /// of the best available kind, else the CPU.
+    /// Permitted devices: `auto`, `all`, `cpu`, or a list such as `0,2` or `software`. Default `auto`: the best kind of
+    /// GPU that is present, else the CPU.
     #[serde(rename = "use", serialize_with = "write", deserialize_with = "read")]
     #[schemars(with = "String")]
     pub choice: DeviceChoice,
-    /// Jobs that run at once per device; replaces `jobs.workers` if larger. Default 16: a device finishes a small job
-    /// before the next file is read, and only waiting jobs can share a submission.
+    /// Number of concurrent jobs per device, if that exceeds `jobs.workers`. Default 16: a device finishes a small job
+    /// before the next file is read, and only concurrent jobs can share a submission.
     pub jobs: usize,
-    /// Maximum number of small jobs that share a submission. Default 16: a submission costs as much as meshing one
-    /// small job, so a larger batch gains little and delays its first job.
+    /// Maximum number of small jobs in a submission. Default 16: a submission costs as much as meshing one small job,
+    /// so a larger batch gains little and delays its first job.
     pub batch: usize,
-    /// Minimum number of bricks (8 × 8 × 8 cells) per device when several devices share one structure; `none` disables
-    /// sharing. Default 32,768, about 130,000 atoms at 1 Å: the overhead of smaller partitions outweighs the gain.
+    /// Minimum number of bricks (8 × 8 × 8 cells) per device if a job is divided among several devices; `none` never
+    /// divides jobs. Default 32,768, about 130,000 atoms at 1 Å: below that, the transfer costs more than another
+    /// device saves.
     pub min_partition_bricks: Option<u64>,
 }
 

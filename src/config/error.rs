@@ -1,4 +1,4 @@
-//! Why a configuration is refused. Every message names the key and the layer that it came from.
+//! Errors of the configuration. Every message names the key and the layer that set it.
 
 use std::path::PathBuf;
 
@@ -12,59 +12,59 @@ pub enum ConfigError {
     /// The file cannot be read.
     #[error("cannot read the configuration file {}: {error}", path.display())]
     Read {
-        /// The file.
+        /// Configuration file.
         path: PathBuf,
-        /// The system's words.
+        /// Error of the system.
         error: std::io::Error,
     },
     /// The file is not TOML.
     #[error("{} is not valid TOML: {reason}", path.display())]
     Syntax {
-        /// The file.
+        /// Configuration file.
         path: PathBuf,
-        /// The parser's words, with line and column.
+        /// Message of the parser, with line and column.
         reason: String,
     },
-    /// No key has this name.
+    /// The key does not exist.
     #[error("{source_layer}: unknown key `{key}`{}", nearest.as_ref().map_or(String::new(), |n| format!("; did you mean `{n}`?")))]
     UnknownKey {
-        /// The key as `section.key`.
+        /// Key as `section.key`.
         key: String,
-        /// The known key that is nearest, if one is near.
+        /// Most similar known key, if one is similar.
         nearest: Option<String>,
-        /// The layer that it came from.
+        /// Layer that set the key.
         source_layer: Source,
     },
-    /// A secret is given twice.
-    #[error("`{}` ({}) and `{}` ({}) exclude each other: give one of them", one.0, one.1, other.0, other.1)]
+    /// A secret is set directly and by its file.
+    #[error("`{}` ({}) and `{}` ({}) exclude each other: set one of them", one.0, one.1, other.0, other.1)]
     Both {
-        /// The key and the layer that it came from.
+        /// Key and layer of the secret.
         one: (String, Source),
-        /// The key that names its file, and the layer.
+        /// Key and layer of its file.
         other: (String, Source),
     },
-    /// The file of a secret cannot be used.
+    /// The file of a secret cannot be read.
     #[error("{source_layer}: `{key}`: cannot read {}: {reason}", path.display())]
     SecretFile {
-        /// The key as `section.key`.
+        /// Key as `section.key`.
         key: String,
-        /// The file.
+        /// File of the secret.
         path: PathBuf,
-        /// The system's words.
+        /// Cause.
         reason: String,
-        /// The layer that it came from.
+        /// Layer that set the key.
         source_layer: Source,
     },
     /// A value has the wrong type or is out of range.
     #[error("{source_layer}: `{key}` is {value}; expected {expected}")]
     BadValue {
-        /// The key as `section.key`.
+        /// Key as `section.key`.
         key: String,
-        /// The value that was given.
+        /// Given value.
         value: String,
-        /// What was expected, in words.
+        /// Expected form.
         expected: String,
-        /// The layer that it came from.
+        /// Layer that set the key.
         source_layer: Source,
     },
 }

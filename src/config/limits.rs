@@ -1,4 +1,4 @@
-//! What one request may cost, checked before anything is allocated for it.
+//! Configuration of the limits of a request, which are checked before memory is allocated.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -8,47 +8,46 @@ use crate::pipeline::JobLimits;
 use crate::structure::ReadLimits;
 use crate::surface::SurfaceLimits;
 
-/// Limits of a request, and of all of them together.
+/// Limits of a request and of all requests together.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LimitsConfig {
-    /// Bytes of a request body as sent. Default 256 MiB: the largest entries of the archive are about 100 MB
-    /// compressed.
+    /// Size of a request body as sent, bytes. Default 256 MiB: the largest PDB entries have about 100 MB compressed.
     pub body_bytes: u64,
-    /// Bytes of a JSON request body. Default 64 KiB: a document names a structure and has about thirty parameters.
+    /// Size of a JSON request body, bytes. Default 64 KiB: a document names a structure and about thirty parameters.
     pub json_bytes: u64,
-    /// Bytes ahead of the content of a form's part: its headers, and the preamble in front of the first one. Default
-    /// 16 KiB: browsers send a few hundred.
+    /// Size of the headers of a form part, and of the preamble before the first part, bytes. Default 16 KiB: browsers
+    /// send a few hundred bytes.
     pub part_head_bytes: u64,
-    /// Parts of a form. Default 128: one file and every parameter once are fewer than half.
+    /// Number of parts of a form. Default 128: one file and all parameters are fewer than half.
     pub parts: usize,
-    /// Bytes of a structure after decompression. Default 2 GiB: the largest entries inflate to about 1 GB; a
-    /// compression bomb stops here.
+    /// Size of a structure file after decompression, bytes. Default 2 GiB: the largest entries inflate to about 1 GB.
+    /// Stops compression bombs.
     pub inflated_bytes: u64,
-    /// Atoms in all models of a structure. Default 10,000,000: four times the largest entry of the archive; at
-    /// 80 bytes each they take 800 MB.
+    /// Number of atoms in all models of a structure. Default 10,000,000: four times the largest PDB entry; at 80 bytes
+    /// each 800 MB.
     pub atoms: u64,
-    /// Atoms of a structure whose names are listed, for front ends that show them. Default 1,000,000: some 10 MB of
-    /// JSON; beyond that a browser is better served without.
+    /// Number of atoms whose names are listed, for web pages that show them. Default 1,000,000: about 10 MB of JSON,
+    /// the most that is useful in a browser.
     pub labels: u64,
-    /// Grid samples in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; as 32-bit numbers
-    /// they take 4 GiB.
+    /// Number of grid points in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; 4 GiB as 32-bit
+    /// numbers.
     pub grid_samples: u64,
-    /// Pairs of an atom and a grid brick (8³ samples) within its reach. Default 268,435,456: 128 atoms for each brick
-    /// of `grid_samples`, several times as many as ordinary structures have. Bounds time, some 16 s of one core, and
-    /// the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
+    /// Number of pairs of an atom and a brick (8³ grid points) that its support reaches. Default 268,435,456: 128 atoms
+    /// per brick of `grid_samples`, several times the number in ordinary structures. Limits the computing time to about
+    /// 16 s of one core, and the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
     pub candidate_pairs: u64,
-    /// Bytes of a mesh in memory (24 a vertex, 12 a triangle). Default 2 GiB: 85 million triangles.
+    /// Size of a mesh in memory (24 bytes a vertex, 12 a triangle), bytes. Default 2 GiB: 85 million triangles.
     pub mesh_bytes: u64,
-    /// Bytes of a mesh file. Default 3 GiB: below the 4 GiB that a GLB can say, and text formats take more than
-    /// the mesh in memory.
+    /// Size of a mesh file, bytes. Default 3 GiB: below the 4 GiB limit of GLB, and above the mesh in memory because
+    /// text formats are larger.
     pub output_bytes: u64,
-    /// Bytes of uploads, finished meshes and responses being sent that all requests together hold in memory. Default
-    /// 8 GiB. A new upload, job or stored result is refused while it is used up; running jobs may overshoot it by
-    /// `mesh_bytes` and the candidate lists of `candidate_pairs` each, responses by their next piece.
+    /// Memory of uploads, finished meshes and responses of all requests together, bytes. Default 8 GiB. While it is
+    /// used up, new uploads, jobs and stored results are rejected. Running jobs may exceed it by `mesh_bytes` and the
+    /// candidate lists of `candidate_pairs` each, responses by their next chunk.
     pub memory_bytes: u64,
-    /// Pixels of a picture's width and of its height. Default 4,096: at 40 bytes a pixel the working memory of the largest is
-    /// 640 MiB, and drawing it takes seconds.
+    /// Width and height of a picture, pixels. Default 4,096: at 40 bytes a pixel the largest picture needs 640 MiB, and
+    /// rendering takes seconds.
     pub picture_side: u32,
 }
 
@@ -73,7 +72,7 @@ impl Default for LimitsConfig {
 }
 
 impl LimitsConfig {
-    /// The limits of reading, meshing and drawing.
+    /// Returns the limits of reading, meshing and rendering.
     #[must_use]
     pub fn job(&self) -> JobLimits {
         JobLimits {

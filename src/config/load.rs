@@ -1,4 +1,4 @@
-//! The layers: each sets single keys of a tree whose shape the defaults give.
+//! Loading of the configuration in layers. Each layer sets single keys; the defaults define which keys exist.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -14,16 +14,16 @@ use crate::pipeline::nearest::nearest;
 /// Prefix of environment variables; sections and keys follow, separated by two underscores.
 const PREFIX: &str = "MOLMESH__";
 
-/// Where a value came from.
+/// Layer that set a value.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Source {
-    /// Nobody said anything.
+    /// No layer set the value.
     Default,
-    /// The TOML file.
+    /// TOML file.
     File(PathBuf),
-    /// An environment variable.
+    /// Environment variable.
     Environment(String),
-    /// A flag of the command line.
+    /// Flag of the command line.
     Flag,
 }
 
@@ -38,24 +38,24 @@ impl fmt::Display for Source {
     }
 }
 
-/// A configuration and where its values are from.
+/// Configuration with the sources of its values.
 #[derive(Debug, Clone)]
 pub struct Loaded {
-    /// The configuration; secrets that files hold are in it.
+    /// Configuration, including the secrets read from files.
     pub config: Config,
-    /// What an operator should know, one sentence each.
+    /// Warnings for the operator, one sentence each.
     pub warnings: Vec<String>,
     sources: BTreeMap<String, Source>,
 }
 
 impl Loaded {
-    /// Where the value of `section.key` is from.
+    /// Returns the source of the value of `section.key`.
     #[must_use]
     pub fn source(&self, key: &str) -> Source {
         self.sources.get(key).cloned().unwrap_or(Source::Default)
     }
 
-    /// Every key that is not at its default because nobody said anything, with who did.
+    /// Returns all keys that a layer set, with their sources.
     pub fn sources(&self) -> impl Iterator<Item = (&str, &Source)> {
         self.sources.iter().map(|(key, source)| (key.as_str(), source))
     }
@@ -64,7 +64,7 @@ impl Loaded {
 /// Loads the configuration of this process: `file`, then the environment, then `flags`.
 ///
 /// # Errors
-/// See [`load`].
+/// Returns the errors of [`load`].
 pub fn load_process(file: Option<&Path>, flags: &[(String, String)]) -> Result<Loaded, ConfigError> {
     let env = std::env::vars_os().filter_map(|(k, v)| Some((k.into_string().ok()?, v.to_string_lossy().into_owned())));
     load_with_sources(file, env, flags)
@@ -73,11 +73,11 @@ pub fn load_process(file: Option<&Path>, flags: &[(String, String)]) -> Result<L
 /// Loads a configuration: defaults, then `file`, then the variables of `env` that begin with `MOLMESH__`, then
 /// `flags` as pairs of a path such as `server.listen` and a value.
 ///
-/// Values from the environment and flags are text: `none` clears a key, sizes may be written as `64MiB`. A secret may be given
-/// by a file that the key with `_file` behind its name names.
+/// Values from the environment and flags are text: `none` clears a key, sizes may have the form `64MiB`. For each
+/// secret there is a key with the suffix `_file` that names a file with its value.
 ///
 /// # Errors
-/// [`ConfigError`] names the first key that is unknown or whose value cannot be used.
+/// Returns [`ConfigError`] for the first unknown key or invalid value, or if a file cannot be read.
 pub fn load(
     file: Option<&Path>,
     env: impl IntoIterator<Item = (String, String)>,
@@ -86,10 +86,10 @@ pub fn load(
     load_with_sources(file, env, flags).map(|loaded| loaded.config)
 }
 
-/// [`load`], with the source of every value.
+/// Loads a configuration as [`load`] does, and returns it with the source of every value.
 ///
 /// # Errors
-/// See [`load`].
+/// Returns the errors of [`load`].
 pub fn load_with_sources(
     file: Option<&Path>,
     env: impl IntoIterator<Item = (String, String)>,
@@ -123,7 +123,7 @@ pub fn load_with_sources(
     Ok(Loaded { config: tree.config, warnings, sources: tree.sources })
 }
 
-/// The configuration so far, typed and as a tree.
+/// Configuration of the layers applied so far, typed and as a JSON tree.
 struct Tree {
     defaults: Value,
     values: Value,
@@ -143,14 +143,14 @@ impl Tree {
         for (section, keys) in self.defaults.as_object().into_iter().flatten() {
             known.extend(keys.as_object().into_iter().flatten().map(|(key, _)| format!("{section}.{key}")));
         }
-        // A key under the wrong section, or under none, is nearest to its namesake.
+        // A key in the wrong section or in none: suggest the key of the same name.
         let last = key.rsplit('.').next().unwrap_or(key);
         let namesake = known.iter().find(|k| k.rsplit('.').next() == Some(last)).cloned();
         let nearest = namesake.or_else(|| nearest(key, known.iter().map(String::as_str)).map(str::to_owned));
         ConfigError::UnknownKey { key: key.to_owned(), nearest, source_layer }
     }
 
-    /// Sets one key and checks the whole, so that a bad value is blamed on the layer that gave it.
+    /// Sets one key and validates the whole configuration, so that an error names the layer that set the value.
     fn set(&mut self, key: &str, value: &Value, source: &Source) -> Result<(), ConfigError> {
         let pointer = format!("/{}", key.replace('.', "/"));
         let default = self.defaults.pointer(&pointer).filter(|d| !d.is_object());
@@ -170,30 +170,30 @@ impl Tree {
             }
             (Value::String(text), Value::Number(_)) => {
                 let size = key.ends_with("_bytes");
-                let expected = if size { "a whole number, or a size such as 64MiB" } else { "a whole number" };
-                Value::from(whole(text, size).ok_or_else(|| bad(expected.to_owned()))?)
+                let expected = if size { "an integer, or a size such as 64MiB" } else { "an integer" };
+                Value::from(parse_integer(text, size).ok_or_else(|| bad(expected.to_owned()))?)
             }
             (Value::String(text), Value::Bool(_)) => {
                 Value::Bool(text.trim().parse().map_err(|_neither| bad("true or false".to_owned()))?)
             }
             _ => value.clone(),
         };
-        // What may be a fraction says its own range.
-        let least = least(key);
-        if !default.is_f64() && typed.as_f64().is_some_and(|v| v < least as f64) {
-            return Err(bad(format!("{least} or more")));
+        // The types of fractions check their own range.
+        let minimum = minimum(key);
+        if !default.is_f64() && typed.as_f64().is_some_and(|v| v < minimum as f64) {
+            return Err(bad(format!("{minimum} or more")));
         }
-        if let Some(place) = self.values.pointer_mut(&pointer) {
-            *place = typed;
+        if let Some(slot) = self.values.pointer_mut(&pointer) {
+            *slot = typed;
         }
         let number = clears && default.is_number();
-        let why = |e: serde_json::Error| bad(if number { "a whole number".to_owned() } else { e.to_string() });
+        let why = |e: serde_json::Error| bad(if number { "an integer".to_owned() } else { e.to_string() });
         self.config = serde_json::from_value(self.values.clone()).map_err(why)?;
         self.sources.insert(key.to_owned(), source.clone());
         Ok(())
     }
 
-    /// Takes secrets from the files that are named for them. What is to be said about the files comes back.
+    /// Reads secrets from their files. Returns warnings about the files.
     fn read_secrets(&mut self) -> Result<Vec<String>, ConfigError> {
         let mut warnings = Vec::new();
         for key in secrets::SECRETS {
@@ -213,8 +213,8 @@ impl Tree {
                 source_layer,
             })?;
             warnings.extend(read.warning.map(|warning| format!("{file_key}: {warning}")));
-            if let Some(place) = self.values.pointer_mut(&at(key)) {
-                *place = Value::String(read.text);
+            if let Some(slot) = self.values.pointer_mut(&at(key)) {
+                *slot = Value::String(read.text);
             }
             self.config = serde_json::from_value(self.values.clone()).map_err(|e| ConfigError::BadValue {
                 key: key.to_owned(),
@@ -227,18 +227,17 @@ impl Tree {
     }
 }
 
-/// The least that a number may be. Nothing can be served with a limit or a timeout of zero; ports are part of addresses, not
-/// numbers.
-pub(super) fn least(key: &str) -> u64 {
+/// Returns the minimum of a number. A limit or timeout of zero would prevent all service.
+pub(super) fn minimum(key: &str) -> u64 {
     match key {
-        // What the parser of requests needs for itself.
+        // Minimum buffer of the HTTP/1.1 parser.
         "server.head_bytes" => 8 << 10,
         _ => 1,
     }
 }
 
-/// A whole number, with underscores between digits, and for sizes with a binary suffix.
-fn whole(text: &str, size: bool) -> Option<u64> {
+/// Parses an integer with optional underscores and, for sizes, an optional binary suffix.
+fn parse_integer(text: &str, size: bool) -> Option<u64> {
     let text = text.trim();
     let (digits, factor) = [("KiB", 1 << 10), ("MiB", 1 << 20), ("GiB", 1u64 << 30)]
         .into_iter()

@@ -1,26 +1,26 @@
-//! What is logged, and how.
+//! Configuration of the log.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The form of log lines.
+/// Format of log lines.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum LogFormat {
-    /// For people.
+    /// Text for terminals.
     #[default]
     Pretty,
-    /// One JSON object a line, for collectors.
+    /// One JSON object per line, for log collectors.
     Json,
 }
 
-/// Logs, written to standard error.
+/// Log, written to standard error.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LogConfig {
-    /// What is logged, as `level` or `target=level,…`. Default `info`: one line a request.
+    /// Filter of log lines, as `level` or `target=level,…`. Default `info`: one line per request.
     pub filter: String,
-    /// `pretty` or `json`. Default `pretty`: who starts the service by hand reads it.
+    /// Format of log lines, `pretty` or `json`. Default `pretty`, which is readable on a terminal.
     pub format: LogFormat,
 }
 

@@ -1,7 +1,7 @@
 //! Configuration of the service: defaults, then a TOML file, then `MOLMESH__SECTION__KEY`, then flags.
 //!
-//! One small struct per concern. Every key says its unit and why its default is what it is; keys end in their
-//! unit (`_ms`, `_bytes`). A key that does not exist is refused, whichever layer it comes from.
+//! One struct per section. The documentation of every key states its unit and the reason for its default; keys end in
+//! their unit (`_ms`, `_bytes`). Unknown keys are rejected in every layer.
 
 mod access;
 mod archive;
@@ -40,54 +40,54 @@ pub use store::{Secret, StoreConfig};
 pub use telemetry::{CollectorUrl, Ratio, SecretHeaders, TelemetryConfig};
 pub use template::{ProxyUrl, Template, Templates};
 
-/// The whole configuration.
+/// Complete configuration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
     /// Addresses, connections and their timeouts.
     pub server: ServerConfig,
-    /// What one request may cost.
+    /// Limits of a request.
     pub limits: LimitsConfig,
-    /// The worker pool.
+    /// Worker pool.
     pub jobs: JobsConfig,
     /// GPUs.
     pub devices: DevicesConfig,
     /// Structures by PDB id.
     pub archive: ArchiveConfig,
-    /// What the service keeps.
+    /// Store of inputs, results and jobs.
     pub store: StoreConfig,
-    /// Who may ask for what.
+    /// Keys, quotas and signed URLs.
     pub access: AccessConfig,
-    /// Logs.
+    /// Log.
     pub log: LogConfig,
     /// Traces.
     pub telemetry: TelemetryConfig,
 }
 
 impl Config {
-    /// The folder in which structures are looked up by PDB id.
+    /// Returns the folder of structures by PDB id.
     #[must_use]
     pub fn archive_dir(&self) -> PathBuf {
         self.archive.dir.clone().unwrap_or_else(|| self.server.data_dir.join("archive"))
     }
 
-    /// The folder of copies of what a remote archive has sent.
+    /// Returns the folder of copies from the remote archive.
     #[must_use]
     pub fn archive_cache_dir(&self) -> PathBuf {
         self.server.data_dir.join("cache").join("archive")
     }
 }
 
-/// Words with blanks between them, or a list of them, as one text.
-fn words<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+/// Deserialises a string, or a list of strings joined with spaces.
+fn joined<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged)]
-    enum Written {
+    enum StringOrList {
         Text(String),
         List(Vec<String>),
     }
-    Ok(match Written::deserialize(deserializer)? {
-        Written::Text(text) => text,
-        Written::List(texts) => texts.join(" "),
+    Ok(match StringOrList::deserialize(deserializer)? {
+        StringOrList::Text(text) => text,
+        StringOrList::List(texts) => texts.join(" "),
     })
 }

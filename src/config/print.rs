@@ -1,24 +1,24 @@
-//! The effective configuration as it is shown: every value with its source, no secret.
+//! Printing of the effective configuration: every value with its source, without secrets.
 
 use serde_json::{Map, Value, json};
 
 use super::load::{Loaded, Source};
 use super::secrets::{SECRETS, file_key, is_hidden};
 
-/// What is shown of a value.
+/// Printed form of a value.
 enum Shown {
     Value(Value),
-    /// It is set, and not for other eyes.
+    /// Set, but secret.
     Hidden,
-    /// It came from the file that its namesake names.
+    /// Secret read from the file that the `_file` key names.
     FromFile,
 }
 
-/// A key, what is shown of its value, and where that is from.
+/// Key, printed value and source.
 type Row = (String, Shown, Source);
 
 impl Loaded {
-    /// The sections with their keys, what is shown of each value, and its source.
+    /// Returns the sections with their rows.
     fn rows(&self) -> Vec<(String, Vec<Row>)> {
         let tree = serde_json::to_value(&self.config).unwrap_or_default();
         let keys = |section: &str, keys: &Map<String, Value>| {
@@ -36,15 +36,15 @@ impl Loaded {
     fn shown(&self, path: &str, value: &Value) -> Shown {
         match value {
             Value::Null => Shown::Value("none".into()),
-            // The secret itself was set by nobody.
+            // No layer set the secret itself.
             _ if SECRETS.contains(&path) && self.source(&file_key(path)) != Source::Default => Shown::FromFile,
             Value::String(text) if is_hidden(path, text) => Shown::Hidden,
             other => Shown::Value(other.clone()),
         }
     }
 
-    /// The effective configuration as a file that gives the same configuration again, secrets aside; a comment behind
-    /// each value says where it is from.
+    /// Returns the effective configuration as a TOML file that loads to the same configuration, except for secrets. A
+    /// comment after each value names its source.
     #[must_use]
     pub fn to_toml(&self) -> String {
         let row = |(key, shown, source): &(String, Shown, Source)| match shown {
@@ -59,8 +59,8 @@ impl Loaded {
         self.rows().into_iter().map(section).collect::<Vec<_>>().join("\n")
     }
 
-    /// The effective configuration: `config` as the file would have it, `sources` the same keys with where each value is
-    /// from.
+    /// Returns the effective configuration as JSON: `config` has the form of the file, `sources` has the source of
+    /// every key.
     #[must_use]
     pub fn to_json(&self) -> Value {
         let (mut config, mut sources) = (Map::new(), Map::new());
@@ -86,7 +86,7 @@ impl Loaded {
 }
 
 impl Source {
-    /// The source for programs.
+    /// Returns the source as JSON.
     fn document(&self) -> Value {
         match self {
             Self::Default => json!({ "source": "default" }),
@@ -97,13 +97,13 @@ impl Source {
     }
 }
 
-/// A source in a comment, which a line break would end.
+/// Formats a source for a comment, without control characters, which would end it.
 fn one_line(source: &Source) -> String {
     source.to_string().replace(|c: char| c.is_control(), " ")
 }
 
-/// A value as TOML writes it. Its strings are those of JSON, but for one character that TOML wants escaped; numbers beyond its
-/// own are read from text.
+/// Formats a value as TOML. Strings are as in JSON, except that TOML requires DEL to be escaped. Numbers beyond the
+/// range of TOML are written as strings.
 fn toml(value: &Value) -> String {
     match value {
         Value::String(text) => Value::from(text.as_str()).to_string().replace('\u{7f}', "\\u007f"),

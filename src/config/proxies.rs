@@ -1,4 +1,4 @@
-//! Which peers are proxies whose word about their clients is taken.
+//! Trusted proxies and the header in which they name their clients.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -9,12 +9,12 @@ use ipnet::IpNet;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Addresses and networks of proxies; at least one. Text with blanks between them, or a list of texts.
+/// Addresses and networks of proxies, at least one: a string separated by white space, or a list of strings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Proxies(Vec<IpNet>);
 
 impl Proxies {
-    /// Whether `address` is one of theirs. IPv4 written as IPv6 counts as IPv4.
+    /// Returns true if `address` is a trusted proxy. IPv4-mapped IPv6 addresses count as IPv4.
     #[must_use]
     pub fn contains(&self, address: IpAddr) -> bool {
         let address = address.to_canonical();
@@ -25,12 +25,12 @@ impl Proxies {
 impl FromStr for Proxies {
     type Err = String;
 
-    /// The error says what was expected.
+    /// Parses addresses and networks separated by white space. The error states the expected form.
     fn from_str(text: &str) -> Result<Self, String> {
         const EXPECTED: &str = "none, or addresses and networks such as 10.0.0.7 or 10.0.0.0/8";
         let net = |word: &str| {
             let net = word.parse::<IpNet>().ok().or_else(|| word.parse::<IpAddr>().ok().map(IpNet::from));
-            net.ok_or_else(|| format!("{EXPECTED}, which `{word}` is not"))
+            net.ok_or_else(|| format!("{EXPECTED}; `{word}` is neither"))
         };
         let nets = text.split_whitespace().map(net).collect::<Result<Vec<_>, _>>()?;
         if nets.is_empty() { Err(EXPECTED.to_owned()) } else { Ok(Self(nets)) }
@@ -69,11 +69,11 @@ impl JsonSchema for Proxies {
 
 impl<'de> Deserialize<'de> for Proxies {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        super::words(deserializer)?.parse().map_err(serde::de::Error::custom)
+        super::joined(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 
-/// The header in which the proxies name their clients.
+/// Header in which proxies name their clients.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 pub enum ForwardedHeader {
@@ -85,7 +85,7 @@ pub enum ForwardedHeader {
 }
 
 impl ForwardedHeader {
-    /// Its name.
+    /// Returns the name of the header.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -100,7 +100,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn addresses_and_networks_are_told_from_others() {
+    fn contains_listed_addresses_and_networks_only() {
         let proxies: Proxies = "10.0.0.0/8 192.0.2.7 2001:db8::/32".parse().unwrap();
         for (address, trusted) in [
             ("10.1.2.3", true),

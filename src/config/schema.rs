@@ -1,16 +1,16 @@
-//! The JSON Schema (2020-12) of the configuration file, from the types that read it and their docstrings.
+//! JSON Schema (2020-12) of the configuration file, generated from its types and their docstrings.
 
 use schemars::generate::SchemaSettings;
 use serde_json::{Map, Value, json};
 
 use super::Config;
-use super::load::least;
+use super::load::minimum;
 
-/// What a size may be besides a number.
+/// Pattern of sizes written as text.
 const SIZE: &str = r"^[0_]*[1-9][0-9_]*\s*(KiB|MiB|GiB)?$";
 
-/// The schema of the configuration file: sections, keys, units and reasons, defaults. Keys that may be absent take the text
-/// `none`, sizes take text such as `64MiB`, as the file does.
+/// Returns the schema of the configuration file. Optional keys accept the text `none` and sizes text such as `64MiB`,
+/// as the loader does.
 #[must_use]
 pub fn schema() -> Value {
     let settings = SchemaSettings::draft2020_12().with(|settings| settings.inline_subschemas = true);
@@ -18,9 +18,7 @@ pub fn schema() -> Value {
     let defaults = serde_json::to_value(Config::default()).unwrap_or_default();
     schema["title"] = "Configuration of molmesh".into();
     schema["description"] =
-        "The file that `molmesh serve --config FILE` reads. A key that does not exist is refused; none \
-                             is required."
-            .into();
+        "The file that `molmesh serve --config FILE` reads. All keys are optional; unknown keys are rejected.".into();
     for (section, of_section) in schema["properties"].as_object_mut().into_iter().flatten() {
         let Some(of_section) = of_section.as_object_mut() else { continue };
         of_section.remove("default");
@@ -34,15 +32,15 @@ pub fn schema() -> Value {
     schema
 }
 
-/// What the file takes for a key, where it is not what the type says.
+/// Adapts the schema of a key to the loader: optional values, sizes, minimum and default.
 fn finish(key: &str, of_key: &mut Map<String, Value>, default: &Value) {
     one_line(of_key);
     let absent = drop_null(of_key);
     let of_type = |of_key: &Map<String, Value>, name: &str| of_key.get("type").is_some_and(|kind| kind == name);
     if of_type(of_key, "integer") {
-        // Formats such as uint64 are nobody's but the generator's.
+        // Formats such as uint64 are not standard.
         of_key.remove("format");
-        of_key.insert("minimum".to_owned(), least(key).into());
+        of_key.insert("minimum".to_owned(), minimum(key).into());
         let texts = match (key.ends_with("_bytes"), absent) {
             (true, false) => Some(SIZE.to_owned()),
             (true, true) => Some(format!("{SIZE}|^none$")),
@@ -60,12 +58,11 @@ fn finish(key: &str, of_key: &mut Map<String, Value>, default: &Value) {
         kinds.push(json!({ "const": "none" }));
     }
     of_key.remove("default");
-    // What is shown of a default secret is nothing: there is none.
     let default = if default.is_null() { json!("none") } else { default.clone() };
     of_key.insert("default".to_owned(), default);
 }
 
-/// TOML has no null: absence is written `none`. True if the key may be absent.
+/// Removes `null` from the schema of a key, because TOML has none. Returns true if the key is optional.
 fn drop_null(of_key: &mut Map<String, Value>) -> bool {
     match of_key.get_mut("type") {
         Some(Value::Array(kinds)) => {
@@ -85,7 +82,7 @@ fn drop_null(of_key: &mut Map<String, Value>) -> bool {
     let before = kinds.len();
     kinds.retain(|kind| *kind != json!({ "type": "null" }));
     let absent = kinds.len() < before;
-    // One kind that is left stands for itself; one of several of its own is among them.
+    // Replaces an alternative of one schema by that schema.
     if let [Value::Object(one)] = kinds.as_slice() {
         let one = one.clone();
         of_key.remove("anyOf");
@@ -94,7 +91,7 @@ fn drop_null(of_key: &mut Map<String, Value>) -> bool {
     absent
 }
 
-/// Docstrings are wrapped where the source is.
+/// Joins the lines of a description; docstrings are wrapped like the source.
 fn one_line(of: &mut Map<String, Value>) {
     if let Some(Value::String(text)) = of.get_mut("description") {
         *text = text.split("\n\n").map(|part| part.replace('\n', " ")).collect::<Vec<_>>().join("\n\n");
@@ -106,25 +103,25 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_key_says_its_reason_and_its_default() {
+    fn every_key_documents_its_unit_and_default() {
         let schema = schema();
         let defaults = serde_json::to_value(Config::default()).unwrap();
         for (section, keys) in defaults.as_object().unwrap() {
             assert_eq!(schema["properties"][section]["additionalProperties"], false, "{section}");
             for (key, default) in keys.as_object().unwrap() {
                 let of_key = &schema["properties"][section]["properties"][key];
-                let said = of_key["description"].as_str().unwrap_or_default();
-                assert!(said.contains("Default"), "{section}.{key} does not say why: {said}");
-                assert!(!said.contains('\n') && !of_key.to_string().contains("null"), "{section}.{key}: {of_key}");
+                let text = of_key["description"].as_str().unwrap_or_default();
+                assert!(text.contains("Default"), "{section}.{key} has no default: {text}");
+                assert!(!text.contains('\n') && !of_key.to_string().contains("null"), "{section}.{key}: {of_key}");
                 let unit = if key.ends_with("_ms") { "ms" } else { "" };
-                assert!(said.contains(unit), "{section}.{key} does not say its unit: {said}");
+                assert!(text.contains(unit), "{section}.{key} has no unit: {text}");
                 assert_eq!(of_key["default"], if default.is_null() { json!("none") } else { default.clone() });
             }
         }
     }
 
     #[test]
-    fn secrets_are_the_keys_that_are_never_read_back() {
+    fn write_only_keys_are_the_secrets() {
         let schema = schema();
         let mut secret = Vec::new();
         for (section, keys) in schema["properties"].as_object().unwrap() {

@@ -1,21 +1,21 @@
-//! Secrets: which keys they are, how they come from files, and what of other values is never shown.
+//! Secrets: their keys, reading them from files, and values that are never printed.
 
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// Keys whose values are secret. Each has a namesake that ends in `_file`.
+/// Keys whose values are secret. For each there is a key with the suffix `_file`.
 pub(super) const SECRETS: [&str; 3] = ["store.secret_access_key", "access.signing_secret", "telemetry.secret_headers"];
 
-/// Bytes of a secret at most: keys and tokens have a few hundred.
+/// Maximum size of a secret, bytes: keys and tokens have a few hundred.
 const MAX_BYTES: u64 = 64 << 10;
 
-/// The key that names the file of a secret.
+/// Returns the key that names the file of a secret.
 pub(super) fn file_key(key: &str) -> String {
     format!("{key}_file")
 }
 
-/// Whether a value must not be shown: it belongs to a secret key, or is an address with a password in it.
+/// Returns true if a value must not be printed: it belongs to a secret key or is a URL with user information.
 pub(super) fn is_hidden(key: &str, text: &str) -> bool {
     let userinfo = |text: &str| {
         let rest = text.split_once("://").map(|(_, rest)| rest)?;
@@ -24,27 +24,27 @@ pub(super) fn is_hidden(key: &str, text: &str) -> bool {
     SECRETS.contains(&key) || userinfo(text) == Some(true)
 }
 
-/// A secret from a file, and what is to be said about the file.
+/// Secret from a file.
 pub(super) struct FromFile {
-    /// The secret.
+    /// Secret.
     pub(super) text: String,
-    /// That others may read the file, if they may.
+    /// Warning if all users can read the file.
     pub(super) warning: Option<String>,
 }
 
-/// Reads a secret; one line break at its end is not part of it.
+/// Reads a secret, without one line break at its end.
 ///
 /// # Errors
-/// Why not, in words that do not hold the secret.
+/// Returns the cause, without the secret.
 pub(super) fn read(path: &Path) -> Result<FromFile, String> {
-    let words = |e: std::io::Error| e.to_string();
-    let file = File::open(path).map_err(words)?;
-    let data = file.metadata().map_err(words)?;
+    let message = |e: std::io::Error| e.to_string();
+    let file = File::open(path).map_err(message)?;
+    let data = file.metadata().map_err(message)?;
     if data.is_dir() {
         return Err("it is a folder".to_owned());
     }
     let mut bytes = Vec::new();
-    file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(words)?;
+    file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(message)?;
     if bytes.len() as u64 > MAX_BYTES {
         return Err(format!("it has more than {MAX_BYTES} bytes"));
     }
@@ -65,8 +65,8 @@ pub(super) fn read(path: &Path) -> Result<FromFile, String> {
 fn readable_by_others(path: &Path, data: &std::fs::Metadata) -> Option<String> {
     use std::os::unix::fs::PermissionsExt as _;
     let mode = data.permissions().mode() & 0o777;
-    let says = || format!("every user of this machine can read {} (mode {mode:03o}); 0400 is enough", path.display());
-    (mode & 0o004 != 0).then(says)
+    let warning = || format!("all users can read {} (mode {mode:03o}); mode 0400 is sufficient", path.display());
+    (mode & 0o004 != 0).then(warning)
 }
 
 #[cfg(not(unix))]
@@ -74,7 +74,7 @@ fn readable_by_others(_path: &Path, _data: &std::fs::Metadata) -> Option<String>
     None
 }
 
-/// A path of the tree of values.
+/// Returns the path in a value of the configuration.
 pub(super) fn path_of(value: Option<&serde_json::Value>) -> Option<PathBuf> {
     value?.as_str().map(PathBuf::from)
 }
@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn passwords_in_addresses_are_hidden_and_nothing_else() {
+    fn urls_with_user_information_are_hidden() {
         for text in ["http://u:p@proxy:3128", "https://token@h/x", "s3://a@b"] {
             assert!(is_hidden("archive.proxy", text), "{text}");
         }

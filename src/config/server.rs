@@ -1,4 +1,4 @@
-//! Addresses, connections and their timeouts.
+//! Configuration of the server: addresses, connections and timeouts.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
@@ -9,45 +9,44 @@ use serde::{Deserialize, Serialize};
 
 use super::{ForwardedHeader, Proxies};
 
-/// The listeners and what a connection may do.
+/// Listeners and limits of connections.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServerConfig {
-    /// Address of the service. Default 127.0.0.1:8080: nothing is exposed until somebody says so. Port 0 takes
-    /// any free port.
+    /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a
+    /// free port.
     pub listen: SocketAddr,
-    /// Address of `/metrics`. Default `none`: there is no port that is free on every machine. It is apart from
-    /// the service, so that a proxy in front cannot expose it by accident.
+    /// Address of `/metrics`. Default `none`: no port is free on every machine. A separate address, so that a proxy
+    /// cannot expose the metrics by accident.
     pub metrics_listen: Option<SocketAddr>,
-    /// Folder of everything that the service keeps; the archive is looked for in it. Default `molmesh-data` in the
-    /// working folder: it can be written where the service can be started.
+    /// Folder of all stored data, and by default of the archive. Default `molmesh-data` in the working folder, which is
+    /// usually writable.
     pub data_dir: PathBuf,
-    /// Connections at once. Default 1,024. One more is answered with 503 and closed. The hard limit of open files
+    /// Number of open connections. Default 1,024. Further ones get a 503 and are closed. The hard limit of open files
     /// should be a few hundred higher; `molmesh doctor` compares them.
     pub connections: usize,
-    /// Time for the head of a request, ms, from the connection or the answer before it: also how long an idle
-    /// HTTP/1.1 connection is kept. Default 15,000: clients on slow lines need seconds, a minute serves only those
-    /// who send one byte at a time.
+    /// Time for the head of a request, ms, counted from the connection or the previous response; also the time that an
+    /// idle HTTP/1.1 connection is kept. Default 15,000: slow clients need seconds, only attackers need a minute.
     pub header_timeout_ms: u64,
     /// Time for the whole body of a request, ms. Default 60,000: 256 MiB at 36 Mbit/s.
     pub body_timeout_ms: u64,
-    /// Time in which a client must take `write_bytes` of a response body, or all that is left of it, ms. Default
-    /// 30,000: buffers and delivery slots are held until a body is sent. A client that has taken more may pause for
-    /// longer, one second for each 16 KiB, four times this value at most. Event streams are exempt.
+    /// Time in which a client must receive `write_bytes` of a response body, or the rest of it, ms. Default 30,000:
+    /// buffers and delivery slots are held until a body is sent. A client that has received more may pause longer, one
+    /// second per 16 KiB, up to four times this value. Event streams are exempt.
     pub write_timeout_ms: u64,
-    /// Bytes of a response body that a client must take within `write_timeout_ms`. Default 16 KiB: half a kilobyte a
-    /// second, so that a line of 8 KiB/s carries a dozen bodies at once.
+    /// Bytes of a response body that a client must receive within `write_timeout_ms`. Default 16 KiB: half a kilobyte
+    /// per second, so that a connection of 8 KiB/s carries a dozen concurrent bodies.
     pub write_bytes: u64,
-    /// Bytes of the head of a request: its line and its headers, 8 KiB at least. Default 64 KiB: browsers and proxies
-    /// send a few; 431 beyond.
+    /// Size of the head of a request, that is its request line and headers, bytes, at least 8 KiB. Default 64 KiB:
+    /// browsers and proxies send a few. Larger heads get a 431.
     pub head_bytes: u32,
-    /// Requests at once on one HTTP/2 connection. Default 64: a page asks for a dozen; who wants more opens another
-    /// connection, which is counted.
+    /// Number of concurrent requests on one HTTP/2 connection. Default 64: a page sends a dozen; clients can open
+    /// further connections, which are counted.
     pub streams: u32,
-    /// Longest silence of an event stream, ms, before a sign of life is sent. Default 15,000: proxies commonly give up
-    /// after half a minute.
+    /// Longest silence of an event stream before a comment is sent, ms. Default 15,000: proxies commonly close idle
+    /// connections after half a minute.
     pub heartbeat_ms: u64,
-    /// How long an idle HTTP/2 connection is kept, ms. Default 120,000: front-ends come back within that time.
+    /// Time that an idle HTTP/2 connection is kept, ms. Default 120,000: proxies usually reuse it within that time.
     pub idle_timeout_ms: u64,
     /// Time after SIGTERM in which `/readyz` answers 503 while all requests are served, on new connections too, ms;
     /// `none` skips it. Default 3,000: load balancers and orchestrators need a second or two to stop sending requests.
@@ -55,12 +54,11 @@ pub struct ServerConfig {
     /// Time after `termination_notice_ms` for running requests and jobs to finish, ms. Default 20,000: orchestrators
     /// commonly kill after 30 seconds; with `termination_notice_ms` and one second for cancelled jobs a stop takes 24.
     pub drain_timeout_ms: u64,
-    /// Proxies in front, by address or network, whose word about their clients is taken. Default `none`: whoever
-    /// connects is the client, and what he says about others is not looked at.
+    /// Trusted proxies, by address or network, whose forwarding header names the client. Default `none`: the peer is
+    /// the client, and its forwarding headers are ignored.
     pub trusted_proxies: Option<Proxies>,
-    /// The header in which they name their clients: `x-forwarded-for` or `forwarded` (RFC 7239). Default
-    /// `x-forwarded-for`, which most proxies write. Only this one is looked at: the other one may be the client's own,
-    /// passed on.
+    /// Forwarding header of the trusted proxies: `x-forwarded-for` or `forwarded` (RFC 7239). Default
+    /// `x-forwarded-for`, which most proxies write. The other header is ignored, because the client may have sent it.
     pub forwarded_header: ForwardedHeader,
 }
 
@@ -88,31 +86,31 @@ impl Default for ServerConfig {
 }
 
 impl ServerConfig {
-    /// Time for the head of a request.
+    /// Returns the time for the head of a request.
     #[must_use]
     pub fn header_timeout(&self) -> Duration {
         Duration::from_millis(self.header_timeout_ms)
     }
 
-    /// Time for the whole body of a request.
+    /// Returns the time for the whole body of a request.
     #[must_use]
     pub fn body_timeout(&self) -> Duration {
         Duration::from_millis(self.body_timeout_ms)
     }
 
-    /// Time in which a client must take `write_bytes` of a response body.
+    /// Returns the time in which a client must receive `write_bytes` of a response body.
     #[must_use]
     pub fn write_timeout(&self) -> Duration {
         Duration::from_millis(self.write_timeout_ms)
     }
 
-    /// How long an idle HTTP/2 connection is kept.
+    /// Returns the time that an idle HTTP/2 connection is kept.
     #[must_use]
     pub fn idle_timeout(&self) -> Duration {
         Duration::from_millis(self.idle_timeout_ms)
     }
 
-    /// Longest silence of an event stream.
+    /// Returns the longest silence of an event stream.
     #[must_use]
     pub fn heartbeat(&self) -> Duration {
         Duration::from_millis(self.heartbeat_ms)

@@ -1,4 +1,4 @@
-//! What the service keeps: where, how much of it, how long.
+//! Configuration of the store: location, capacity and retention.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -8,53 +8,56 @@ use std::time::Duration;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// The store of inputs, results and job documents.
+/// Store of inputs, results and job documents.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct StoreConfig {
-    /// `s3://bucket` or `s3://bucket/prefix`. Default `none`: the folder `store` in `server.data_dir`.
+    /// Location of the store: `s3://bucket` or `s3://bucket/prefix`. Default `none`: the folder `store` in
+    /// `server.data_dir`.
     pub url: Option<String>,
-    /// Address of a service that speaks S3, such as `https://minio.example:9000`. Default `none`: that of AWS for the
-    /// region, or `AWS_ENDPOINT_URL`.
+    /// URL of an S3-compatible service, such as `https://minio.example:9000`. Default `none`: `AWS_ENDPOINT_URL`, else
+    /// AWS in the region.
     pub endpoint: Option<String>,
     /// Region of the bucket. Default `none`: `AWS_REGION`, else `us-east-1`.
     pub region: Option<String>,
-    /// Whether the endpoint may be plain `http`. Default false: credentials and contents would travel in the clear.
+    /// Allows an endpoint with plain `http`. Default false: contents would not be encrypted.
     pub allow_http: bool,
-    /// Whether the bucket is named in the path, not in the host. Default true: every service that speaks S3 takes it.
+    /// Puts the bucket into the path of URLs instead of the host name. Default true: all S3-compatible services accept
+    /// it.
     pub path_style: bool,
-    /// Key id. Default `none`: `AWS_ACCESS_KEY_ID`, or whatever else the machine has for AWS.
+    /// Access key id. Default `none`: `AWS_ACCESS_KEY_ID`, else the other AWS credential sources of the machine.
     pub access_key_id: Option<String>,
-    /// Key. Default `none`: `AWS_SECRET_ACCESS_KEY`. Better given by the environment than by a file.
+    /// Secret access key. Default `none`: `AWS_SECRET_ACCESS_KEY`. Prefer the environment variable or
+    /// `secret_access_key_file` to the configuration file.
     pub secret_access_key: Option<Secret>,
-    /// File that holds the key, one line break at its end aside. Default `none`. So that secrets that containers get as files
-    /// stay there; it and `secret_access_key` exclude each other.
+    /// File that contains the value of `secret_access_key`, such as a mounted container secret; one line break at its
+    /// end is ignored. Default `none`. Excludes `secret_access_key`.
     pub secret_access_key_file: Option<PathBuf>,
-    /// Time without an answer after which a request to S3 is given up or tried again, ms. Default 30,000: a part of
-    /// 8 MiB at 2 Mbit/s.
+    /// Time without a response after which a request to S3 fails or is retried, ms. Default 30,000: a part of 8 MiB at
+    /// 2 Mbit/s.
     pub timeout_ms: u64,
-    /// How long the answer to whether the store works is believed, ms: `/readyz` writes, reads and removes a small object
-    /// no more often. Default 5,000: orchestrators ask every few seconds.
+    /// Minimum time between health checks of the store, ms; `/readyz` writes, reads and removes a small object. Default
+    /// 5,000: orchestrators send a request every few seconds.
     pub probe_ms: u64,
-    /// Time without an answer to that after which the store counts as not working, ms. Default 10,000: a busy disk takes
-    /// seconds, and load shall not make the service unready.
+    /// Time after which a health check of the store fails, ms. Default 10,000: a busy disk takes seconds, and load must
+    /// not make the service unready.
     pub probe_timeout_ms: u64,
-    /// How often what is too old is removed, ms. Default 60,000: times to live are hours.
+    /// Time between removals of expired objects, ms. Default 60,000: times to live are hours.
     pub sweep_ms: u64,
-    /// Bytes of results and inputs together. Default 10 GiB: thousands of meshes. What was used least recently goes
-    /// when there is no room.
+    /// Capacity for results and inputs together, bytes. Default 10 GiB: thousands of meshes. The least recently used
+    /// objects are evicted.
     pub max_bytes: u64,
-    /// Time that a result is kept after its last use, ms. Default 86,400,000 (a day): whoever asks again, asks soon.
+    /// Time that a result is kept after its last use, ms. Default 86,400,000 (a day): most repeated requests come soon.
     pub result_ttl_ms: u64,
-    /// Time that an input is kept after its last use, ms. Default 604,800,000 (7 days): people come back to a
-    /// structure with other parameters.
+    /// Time that an input is kept after its last use, ms. Default 604,800,000 (7 days): users mesh a structure again
+    /// with other parameters.
     pub input_ttl_ms: u64,
-    /// Time that the document of a job is kept after it was last written or read, ms. Default 86,400,000 (a day): as
-    /// long as its result.
+    /// Time that a job document is kept after it was last written or read, ms. Default 86,400,000 (a day), as for
+    /// results.
     pub job_ttl_ms: u64,
-    /// Bytes of small results that are kept in memory as well. Default 256 MiB: thousands of small proteins.
+    /// Memory for cached small results, bytes. Default 256 MiB: thousands of small proteins.
     pub memory_bytes: u64,
-    /// Largest result that is kept in memory. Default 4 MiB: a small protein, so that hundreds fit.
+    /// Largest result that is cached in memory, bytes. Default 4 MiB: hundreds of results of that size fit.
     pub memory_object_bytes: u64,
 }
 
@@ -84,64 +87,64 @@ impl Default for StoreConfig {
 }
 
 impl StoreConfig {
-    /// Time without an answer after which a request to S3 is given up or tried again.
+    /// Returns the time without a response after which a request to S3 fails or is retried.
     #[must_use]
     pub fn timeout(&self) -> Duration {
         Duration::from_millis(self.timeout_ms)
     }
 
-    /// How long the answer to whether the store works is believed.
+    /// Returns the minimum time between health checks of the store.
     #[must_use]
     pub fn probe(&self) -> Duration {
         Duration::from_millis(self.probe_ms)
     }
 
-    /// Time without an answer to that after which the store counts as not working.
+    /// Returns the time after which a health check of the store fails.
     #[must_use]
     pub fn probe_timeout(&self) -> Duration {
         Duration::from_millis(self.probe_timeout_ms)
     }
 
-    /// How often what is too old is removed.
+    /// Returns the time between removals of expired objects.
     #[must_use]
     pub fn sweep(&self) -> Duration {
         Duration::from_millis(self.sweep_ms)
     }
 
-    /// Time that a result is kept after its last use.
+    /// Returns the time that a result is kept after its last use.
     #[must_use]
     pub fn result_ttl(&self) -> Duration {
         Duration::from_millis(self.result_ttl_ms)
     }
 
-    /// Time that an input is kept after its last use.
+    /// Returns the time that an input is kept after its last use.
     #[must_use]
     pub fn input_ttl(&self) -> Duration {
         Duration::from_millis(self.input_ttl_ms)
     }
 
-    /// Time that the document of a job is kept after it was last written or read.
+    /// Returns the time that a job document is kept after it was last written or read.
     #[must_use]
     pub fn job_ttl(&self) -> Duration {
         Duration::from_millis(self.job_ttl_ms)
     }
 }
 
-/// A text that is never shown: not by `Debug`, not by serialisation, not in the refusal of a bad value.
+/// Text that `Debug`, serialisation and error messages never show.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(String);
 
-/// What is shown in place of a [`Secret`].
+/// Replacement text for a [`Secret`].
 pub(super) const HIDDEN: &str = "(hidden)";
 
 impl Secret {
-    /// Hides `text`.
+    /// Creates a secret from `text`.
     #[must_use]
     pub fn new(text: impl Into<String>) -> Self {
         Self(text.into())
     }
 
-    /// The text, for whoever has to present it.
+    /// Returns the text.
     #[must_use]
     pub fn reveal(&self) -> &str {
         &self.0
@@ -176,10 +179,10 @@ impl JsonSchema for Secret {
 
 impl<'de> Deserialize<'de> for Secret {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        // Through a value, since serde's own refusal would quote what it was given.
+        // Through a value, because serde's own error would quote the secret.
         match serde_json::Value::deserialize(deserializer)? {
             serde_json::Value::String(text) => Ok(Self(text)),
-            _ => Err(serde::de::Error::custom("a text")),
+            _ => Err(serde::de::Error::custom("a string")),
         }
     }
 }

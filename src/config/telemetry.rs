@@ -212,7 +212,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn addresses_ratios_and_headers_are_what_they_say() {
+    fn urls_ratios_and_headers_are_validated() {
         let url = |text: &str| serde_json::from_value::<CollectorUrl>(json!(text));
         for (text, traces) in [
             ("http://localhost:4318", "http://localhost:4318/v1/traces"),

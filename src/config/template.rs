@@ -1,4 +1,4 @@
-//! Addresses of a remote archive, with places for an entry's id.
+//! URL templates of a remote archive, and the URL of its proxy.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -13,11 +13,12 @@ use crate::structure::EntryId;
 /// RCSB's download service: compressed mmCIF.
 const RCSB: &str = "https://files.rcsb.org/download/{id}.cif.gz";
 
-/// What stands for the id, and what for parts and forms of it.
-const PLACES: [&str; 3] = ["{id}", "{id_upper}", "{middle}"];
+/// Placeholders for the id.
+const PLACEHOLDERS: [&str; 3] = ["{id}", "{id_upper}", "{middle}"];
 
-/// The address of an entry: an http or https URL whose path or query holds `{id}` or `{id_upper}` (the id in its
-/// shortest form, such as `4pti` or `pdb_12345678`) and perhaps `{middle}` (the two characters by which mirrors divide).
+/// URL template of an entry: an http or https URL whose path or query contains `{id}` or `{id_upper}` (the id in its
+/// shortest form, such as `4pti` or `pdb_12345678`) and optionally `{middle}` (the two characters by which mirrors are
+/// divided).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Template {
     text: String,
@@ -25,13 +26,13 @@ pub struct Template {
 }
 
 impl Template {
-    /// The host that is asked, as the URL says it.
+    /// Returns the host as written in the URL.
     #[must_use]
     pub fn host(&self) -> &str {
         &self.host
     }
 
-    /// The address of an entry. Ids have only letters, digits and `_`, which need no escapes.
+    /// Returns the URL of an entry. Ids contain only letters, digits and `_`, which need no escapes.
     #[must_use]
     pub fn url(&self, id: &EntryId) -> Option<Url> {
         fill(&self.text, id.as_str(), id.middle()).parse().ok()
@@ -45,17 +46,17 @@ fn fill(text: &str, id: &str, middle: &str) -> String {
 impl FromStr for Template {
     type Err = String;
 
-    /// The error says what was expected.
+    /// Parses a template. The error states the expected form and the cause.
     fn from_str(text: &str) -> Result<Self, String> {
-        let refused = |why: &str| format!("http(s)://host/…{{id}}…, which `{text}` is not: {why}");
-        if !text.contains(PLACES[0]) && !text.contains(PLACES[1]) {
-            return Err(refused("it has no place for the id"));
+        let refused = |why: &str| format!("http(s)://host/…{{id}}…, but `{text}` is invalid: {why}");
+        if !text.contains(PLACEHOLDERS[0]) && !text.contains(PLACEHOLDERS[1]) {
+            return Err(refused("it has neither {id} nor {id_upper}"));
         }
-        // Two ids that differ everywhere must give addresses that differ in path and query alone.
+        // URLs of two ids without common characters may differ in path and query only.
         let parse = |id: &str, middle: &str| -> Result<Url, String> {
             let url: Url = fill(text, id, middle).parse().map_err(|e| refused(&format!("{e}")))?;
             if url.path().contains("%7B") || url.query().is_some_and(|q| q.contains('{')) {
-                return Err(refused("of places there are {id}, {id_upper} and {middle}"));
+                return Err(refused("the placeholders are {id}, {id_upper} and {middle}"));
             }
             Ok(url)
         };
@@ -64,14 +65,14 @@ impl FromStr for Template {
             return Err(refused("it is neither http nor https"));
         }
         if url.username() != "" || url.password().is_some() {
-            return Err(refused("it holds a name or a password, which would end up in logs"));
+            return Err(refused("it contains a user name or password, which would appear in logs"));
         }
         if url.fragment().is_some() {
-            return Err(refused("a fragment is never sent"));
+            return Err(refused("fragments are never sent"));
         }
-        let place = |url: &Url| (url.scheme().to_owned(), url.host_str().map(str::to_owned), url.port());
-        if place(&url) != place(&other) {
-            return Err(refused("the id belongs into the path or the query"));
+        let origin = |url: &Url| (url.scheme().to_owned(), url.host_str().map(str::to_owned), url.port());
+        if origin(&url) != origin(&other) {
+            return Err(refused("placeholders are allowed in the path and query only"));
         }
         let host = url.host_str().ok_or_else(|| refused("it has no host"))?.to_owned();
         Ok(Self { text: text.to_owned(), host })
@@ -84,7 +85,7 @@ impl fmt::Display for Template {
     }
 }
 
-/// Templates in the order in which they are asked; at least one. Text with blanks between them, or a list of texts.
+/// Templates in the order of requests, at least one: a string separated by white space, or a list of strings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Templates(Vec<Template>);
 
@@ -95,7 +96,7 @@ impl Default for Templates {
 }
 
 impl Templates {
-    /// The templates in order.
+    /// Returns the templates in order.
     #[must_use]
     pub fn as_slice(&self) -> &[Template] {
         &self.0
@@ -107,7 +108,7 @@ impl FromStr for Templates {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let templates = text.split_whitespace().map(str::parse).collect::<Result<Vec<_>, String>>()?;
-        if templates.is_empty() { Err("none, or addresses with {id}".to_owned()) } else { Ok(Self(templates)) }
+        if templates.is_empty() { Err("none, or URLs with {id}".to_owned()) } else { Ok(Self(templates)) }
     }
 }
 
@@ -144,17 +145,17 @@ impl JsonSchema for Templates {
 
 impl<'de> Deserialize<'de> for Templates {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        super::words(deserializer)?.parse().map_err(serde::de::Error::custom)
+        super::joined(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 
-/// The address of a proxy: `http://host:port` or `https://host:port`.
+/// URL of a proxy: `http://host:port` or `https://host:port`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 #[serde(transparent)]
 pub struct ProxyUrl(String);
 
 impl ProxyUrl {
-    /// The address.
+    /// Returns the URL.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
@@ -192,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn old_ids_take_the_short_form_and_extended_ones_the_long() {
+    fn old_ids_use_the_short_form_and_extended_ids_the_long() {
         for (id, expected) in [
             ("4PTI", "https://files.rcsb.org/download/4pti.cif.gz"),
             ("pdb_00004pti", "https://files.rcsb.org/download/4pti.cif.gz"),
@@ -205,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_address_of_an_entry_is_refused() {
+    fn invalid_templates_are_rejected() {
         for bad in [
             "https://h/4pti.cif",
             "file:///pdb/{id}",

@@ -272,10 +272,10 @@ impl Meter for UsageRecorder {
 fn add_quota_headers(access: &Access, account: &Account, response: &mut Response) {
     // A client without remaining quota would delay following the redirect.
     let redirects = response.headers().contains_key(header::LOCATION) && response.status().is_redirection();
-    let standing = access.meter().standing(account, Instant::now());
+    let usage = access.meter().usage(account, Instant::now());
     let fields = [
         (RATE_LIMIT_POLICY, policies(&account.quota)),
-        (RATE_LIMIT, limits(&account.quota, &standing).filter(|_| !redirects)),
+        (RATE_LIMIT, limits(&account.quota, &usage).filter(|_| !redirects)),
     ];
     for (name, value) in fields {
         if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {

@@ -1,6 +1,6 @@
-//! Files of keys for tests, and waiting for what may take a while.
-#![allow(dead_code, reason = "every test binary uses its own part")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+//! Key files for tests, and waiting for a condition.
+#![allow(dead_code, reason = "each test binary uses a part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -8,21 +8,21 @@ use std::time::{Duration, Instant};
 
 use molmesh::access::{Hash, mint};
 
-/// A file of keys, and the keys.
+/// Key file and the texts of its keys.
 pub(crate) struct Keys {
     dir: tempfile::TempDir,
     texts: BTreeMap<String, String>,
 }
 
 impl Keys {
-    /// Keys by id, with their scopes and more lines.
+    /// Creates keys from ids, scopes and further lines.
     pub(crate) fn new(keys: &[(&str, &str, &str)]) -> Self {
-        let mut made = Self { dir: tempfile::tempdir().unwrap(), texts: BTreeMap::new() };
-        made.write(keys);
-        made
+        let mut created = Self { dir: tempfile::tempdir().unwrap(), texts: BTreeMap::new() };
+        created.write(keys);
+        created
     }
 
-    /// Writes the file anew. Keys that there were before keep their text.
+    /// Rewrites the file. Existing keys keep their text.
     pub(crate) fn write(&mut self, keys: &[(&str, &str, &str)]) {
         let lines = keys.iter().map(|(id, scopes, more)| {
             let text = self.texts.entry((*id).to_owned()).or_insert_with(|| mint(id).unwrap().text);
@@ -37,17 +37,17 @@ impl Keys {
         self.dir.path().join("keys.toml")
     }
 
-    /// The text of a key.
+    /// Returns the text of a key.
     pub(crate) fn text(&self, id: &str) -> &str {
         &self.texts[id]
     }
 }
 
-/// Waits for something to become true, a minute at most.
+/// Waits at most a minute until a condition holds.
 #[track_caller]
-pub(crate) fn eventually(what: &str, mut is: impl FnMut() -> bool) {
+pub(crate) fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
     let end = Instant::now() + Duration::from_mins(1);
-    while !is() {
+    while !holds() {
         assert!(Instant::now() < end, "waited too long for: {what}");
         std::thread::sleep(Duration::from_millis(20));
     }

@@ -1,7 +1,7 @@
-//! A remote archive over plain HTTP/1.1 that misbehaves on command, and counts what it is asked.
-#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
-#![allow(clippy::format_push_string, reason = "answers read best as they are sent")]
+//! Remote archive over plain HTTP/1.1 with scripted responses. Records all requests.
+#![allow(dead_code, reason = "each test binary uses a part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
+#![allow(clippy::format_push_string, reason = "responses are readable in the order in which they are sent")]
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -9,42 +9,42 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-/// What the archive answers.
+/// Response of the archive.
 #[derive(Debug, Clone)]
-pub(crate) enum Say {
-    /// A whole answer: status, headers, body.
+pub(crate) enum Response {
+    /// Complete response: status, headers, body.
     Whole(u16, Vec<(&'static str, String)>, Vec<u8>),
-    /// These bytes as they are, then the end.
+    /// Raw bytes, then the end of the connection.
     Raw(Vec<u8>),
-    /// These bytes, and nothing more for so long.
+    /// Raw bytes, then silence for the duration.
     Stall(Vec<u8>, Duration),
-    /// A chunked body that does not end before the client does.
+    /// Chunked body without end.
     Endless,
-    /// The answer after so long.
-    After(Duration, Box<Say>),
+    /// Response after a delay.
+    After(Duration, Box<Response>),
 }
 
-/// 200 with a body.
-pub(crate) fn ok(body: &[u8]) -> Say {
-    Say::Whole(200, Vec::new(), body.to_vec())
+/// Returns a 200 with a body.
+pub(crate) fn ok(body: &[u8]) -> Response {
+    Response::Whole(200, Vec::new(), body.to_vec())
 }
 
-/// A bare status.
-pub(crate) fn status(status: u16) -> Say {
-    Say::Whole(status, Vec::new(), Vec::new())
+/// Returns a response with a status only.
+pub(crate) fn status(status: u16) -> Response {
+    Response::Whole(status, Vec::new(), Vec::new())
 }
 
-/// A status with one header.
-pub(crate) fn with(status: u16, name: &'static str, value: impl Into<String>) -> Say {
-    Say::Whole(status, vec![(name, value.into())], Vec::new())
+/// Returns a response with a status and one header.
+pub(crate) fn with(status: u16, name: &'static str, value: impl Into<String>) -> Response {
+    Response::Whole(status, vec![(name, value.into())], Vec::new())
 }
 
-/// 200 with a body and a validator; 304 to whoever names the validator.
-pub(crate) fn tagged(tag: &str, body: &[u8]) -> Say {
-    Say::Whole(200, vec![("etag", tag.to_owned())], body.to_vec())
+/// Returns a 200 with a body and an `ETag`. [`Remote::saying`] turns it into a 304 for a matching `If-None-Match`.
+pub(crate) fn tagged(tag: &str, body: &[u8]) -> Response {
+    Response::Whole(200, vec![("etag", tag.to_owned())], body.to_vec())
 }
 
-/// A request as it came.
+/// Received request.
 #[derive(Debug, Clone)]
 pub(crate) struct Asked {
     pub(crate) path: String,
@@ -60,9 +60,9 @@ impl Asked {
     }
 }
 
-type Script = Box<dyn FnMut(&Asked, usize) -> Say + Send>;
+type Script = Box<dyn FnMut(&Asked, usize) -> Response + Send>;
 
-/// A running archive.
+/// Running archive, stopped on drop.
 pub(crate) struct Remote {
     pub(crate) addr: SocketAddr,
     asked: Arc<Mutex<Vec<Asked>>>,
@@ -70,54 +70,54 @@ pub(crate) struct Remote {
 }
 
 impl Remote {
-    /// Answers each request with what `script` says of it and of the number of requests before it.
-    pub(crate) fn start(script: impl FnMut(&Asked, usize) -> Say + Send + 'static) -> Self {
+    /// Starts an archive. `script` maps a request and the number of earlier requests to the response.
+    pub(crate) fn start(script: impl FnMut(&Asked, usize) -> Response + Send + 'static) -> Self {
         Self::start_on("127.0.0.1:0".parse().unwrap(), script)
     }
 
-    /// The same on a given address.
-    pub(crate) fn start_on(addr: SocketAddr, script: impl FnMut(&Asked, usize) -> Say + Send + 'static) -> Self {
+    /// Starts an archive on a given address.
+    pub(crate) fn start_on(addr: SocketAddr, script: impl FnMut(&Asked, usize) -> Response + Send + 'static) -> Self {
         let listener = TcpListener::bind(addr).unwrap();
         let addr = listener.local_addr().unwrap();
         let asked = Arc::new(Mutex::new(Vec::new()));
         let stop = Arc::new(AtomicBool::new(false));
-        let (asked_there, stop_there) = (Arc::clone(&asked), Arc::clone(&stop));
+        let (requests, stopped) = (Arc::clone(&asked), Arc::clone(&stop));
         let script: Arc<Mutex<Script>> = Arc::new(Mutex::new(Box::new(script)));
         std::thread::spawn(move || {
             for stream in listener.incoming().map_while(Result::ok) {
-                if stop_there.load(Ordering::SeqCst) {
+                if stopped.load(Ordering::SeqCst) {
                     return;
                 }
-                let (asked, script) = (Arc::clone(&asked_there), Arc::clone(&script));
+                let (asked, script) = (Arc::clone(&requests), Arc::clone(&script));
                 std::thread::spawn(move || answer(stream, &asked, &script));
             }
         });
         Self { addr, asked, stop }
     }
 
-    /// The same answer to every request.
-    pub(crate) fn saying(say: Say) -> Self {
-        Self::start(move |asked, _| match &say {
-            Say::Whole(200, headers, _)
+    /// Starts an archive with the same response to every request.
+    pub(crate) fn saying(response: Response) -> Self {
+        Self::start(move |asked, _| match &response {
+            Response::Whole(200, headers, _)
                 if headers.iter().any(|(n, v)| *n == "etag" && asked.header("if-none-match") == Some(v)) =>
             {
                 status(304)
             }
-            say => say.clone(),
+            response => response.clone(),
         })
     }
 
-    /// The template of its entries.
+    /// Returns the URL template of its entries.
     pub(crate) fn url(&self, path: &str) -> String {
         format!("http://{}{path}", self.addr)
     }
 
-    /// Everything that was asked.
+    /// Returns all requests.
     pub(crate) fn asked(&self) -> Vec<Asked> {
         self.asked.lock().unwrap().clone()
     }
 
-    /// How often it was asked.
+    /// Returns the number of requests.
     pub(crate) fn count(&self) -> usize {
         self.asked.lock().unwrap().len()
     }
@@ -126,7 +126,7 @@ impl Remote {
 impl Drop for Remote {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::SeqCst);
-        // The one that waits for a connection gets one; afterwards nobody listens.
+        // Wakes the listener, which then ends.
         drop(TcpStream::connect(self.addr));
     }
 }
@@ -148,14 +148,14 @@ fn answer(mut stream: TcpStream, asked: &Mutex<Vec<Asked>>, script: &Mutex<Scrip
         asked.push(request.clone());
         asked.len() - 1
     };
-    let say = script.lock().unwrap()(&request, n);
-    // A client that has heard enough hangs up.
-    drop(speak(&mut stream, say));
+    let response = script.lock().unwrap()(&request, n);
+    // The client may disconnect early.
+    drop(send(&mut stream, response));
 }
 
-fn speak(stream: &mut TcpStream, say: Say) -> std::io::Result<()> {
-    match say {
-        Say::Whole(status, headers, body) => {
+fn send(stream: &mut TcpStream, response: Response) -> std::io::Result<()> {
+    match response {
+        Response::Whole(status, headers, body) => {
             let mut head = format!("HTTP/1.1 {status} X\r\nconnection: close\r\n");
             if status != 304 {
                 head += &format!("content-length: {}\r\n", body.len());
@@ -166,22 +166,22 @@ fn speak(stream: &mut TcpStream, say: Say) -> std::io::Result<()> {
             stream.write_all(format!("{head}\r\n").as_bytes())?;
             stream.write_all(&body)
         }
-        Say::Raw(bytes) => stream.write_all(&bytes),
-        Say::Stall(bytes, time) => {
+        Response::Raw(bytes) => stream.write_all(&bytes),
+        Response::Stall(bytes, time) => {
             stream.write_all(&bytes)?;
             stream.flush()?;
             std::thread::sleep(time);
             Ok(())
         }
-        Say::Endless => {
+        Response::Endless => {
             stream.write_all(b"HTTP/1.1 200 X\r\ntransfer-encoding: chunked\r\n\r\n")?;
             loop {
                 stream.write_all(format!("400\r\n{}\r\n", "x".repeat(0x400)).as_bytes())?;
             }
         }
-        Say::After(time, say) => {
+        Response::After(time, response) => {
             std::thread::sleep(time);
-            speak(stream, *say)
+            send(stream, *response)
         }
     }
 }

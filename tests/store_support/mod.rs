@@ -1,6 +1,6 @@
-//! Places for a store: a folder that goes away with the test, and a bucket of an S3 service in memory (moto).
-#![allow(dead_code, reason = "every test binary uses its own part")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+//! Locations for test stores: a temporary folder, and a bucket of an in-memory S3 service (moto).
+#![allow(dead_code, reason = "each test binary uses a part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
@@ -16,7 +16,7 @@ use tempfile::TempDir;
 
 use crate::tools;
 
-/// An S3 service with the bucket `meshes`. It ends when this is dropped, or with the process.
+/// S3 service with the bucket `meshes`, stopped on drop or with the process.
 pub(crate) struct Service {
     child: Child,
     stdin: Option<ChildStdin>,
@@ -24,7 +24,7 @@ pub(crate) struct Service {
     pub(crate) access: Access,
 }
 
-/// What the service says when it is ready.
+/// Address and credentials, which the service prints when it is ready.
 #[derive(Debug, Clone, Deserialize)]
 pub(crate) struct Access {
     pub(crate) endpoint: String,
@@ -48,21 +48,21 @@ impl Service {
         let mut stdout = BufReader::new(child.stdout.take().unwrap());
         let mut line = String::new();
         stdout.read_line(&mut line).unwrap();
-        let access = serde_json::from_str(&line).unwrap_or_else(|e| panic!("the S3 service said {line:?}: {e}"));
+        let access = serde_json::from_str(&line).unwrap_or_else(|e| panic!("the S3 service printed {line:?}: {e}"));
         Self { child, stdin, stdout, access }
     }
 
-    /// Goes away, and keeps what it has: from now on connections are broken off without an answer.
+    /// Makes the service unavailable: it closes connections without a response and keeps its objects.
     pub(crate) fn away(&mut self) {
-        self.tell("away");
+        self.command("away");
     }
 
-    /// Comes back.
+    /// Makes the service available again.
     pub(crate) fn back(&mut self) {
-        self.tell("back");
+        self.command("back");
     }
 
-    fn tell(&mut self, word: &str) {
+    fn command(&mut self, word: &str) {
         writeln!(self.stdin.as_mut().unwrap(), "{word}").unwrap();
         let mut line = String::new();
         self.stdout.read_line(&mut line).unwrap();
@@ -81,7 +81,7 @@ impl Service {
         }
     }
 
-    /// Sends a request behind the store's back. The signature is made up: the service asks for one and does not look.
+    /// Sends a request that bypasses the store. The service requires a signature but does not check it.
     pub(crate) fn send(&self, method: &str, path: &str) -> String {
         let host = self.access.endpoint.strip_prefix("http://").unwrap();
         let mut stream = TcpStream::connect(host).unwrap();
@@ -89,10 +89,13 @@ impl Service {
             "AWS4-HMAC-SHA256 Credential=any/20260101/us-east-1/s3/aws4_request, SignedHeaders=host, Signature=x";
         let head = format!("{method} {path} HTTP/1.0\r\nHost: {host}\r\nAuthorization: {signed}");
         write!(stream, "{head}\r\nContent-Length: 0\r\n\r\n").unwrap();
-        let mut answer = String::new();
-        stream.read_to_string(&mut answer).unwrap();
-        assert!(answer.split(' ').nth(1).is_some_and(|status| status.starts_with('2')), "{method} {path}: {answer}");
-        answer
+        let mut response = String::new();
+        stream.read_to_string(&mut response).unwrap();
+        assert!(
+            response.split(' ').nth(1).is_some_and(|status| status.starts_with('2')),
+            "{method} {path}: {response}"
+        );
+        response
     }
 }
 
@@ -105,30 +108,30 @@ impl Drop for Service {
 
 static SHARED: LazyLock<Service> = LazyLock::new(|| Service::start(&[]));
 
-/// The service of all tests that need no other.
+/// Returns the service that tests share.
 pub(crate) fn shared() -> &'static Service {
     &SHARED
 }
 
-/// Where a test keeps its store.
-pub(crate) struct Place {
+/// Configuration and location of a test's store.
+pub(crate) struct TestStore {
     pub(crate) config: StoreConfig,
     pub(crate) dir: TempDir,
     service: Option<(&'static Service, String)>,
 }
 
-pub(crate) fn local() -> Place {
-    Place { config: StoreConfig::default(), dir: tempfile::tempdir().unwrap(), service: None }
+pub(crate) fn local() -> TestStore {
+    TestStore { config: StoreConfig::default(), dir: tempfile::tempdir().unwrap(), service: None }
 }
 
-pub(crate) fn s3() -> Place {
+pub(crate) fn s3() -> TestStore {
     static COUNT: AtomicU64 = AtomicU64::new(0);
     let prefix = format!("test/{}", COUNT.fetch_add(1, Ordering::Relaxed));
     let service = shared();
-    Place { config: service.config(&prefix), dir: tempfile::tempdir().unwrap(), service: Some((service, prefix)) }
+    TestStore { config: service.config(&prefix), dir: tempfile::tempdir().unwrap(), service: Some((service, prefix)) }
 }
 
-impl Place {
+impl TestStore {
     pub(crate) async fn try_open(&self) -> Result<Store, StoreError> {
         Store::open(&self.config, self.dir.path()).await
     }
@@ -141,21 +144,21 @@ impl Place {
         self.service.is_none()
     }
 
-    /// The root of a local store.
+    /// Returns the root of a local store.
     pub(crate) fn root(&self) -> PathBuf {
         assert!(self.is_local());
         self.dir.path().join("store")
     }
 
-    /// Takes an object away behind the store's back.
-    pub(crate) fn steal(&self, name: &Name) {
+    /// Removes an object, bypassing the store.
+    pub(crate) fn remove_directly(&self, name: &Name) {
         match &self.service {
             None => std::fs::remove_file(self.root().join(name.to_string())).unwrap(),
             Some((service, prefix)) => drop(service.send("DELETE", &format!("/meshes/{prefix}/{name}"))),
         }
     }
 
-    /// What is there and unfinished: names of staged files, keys of uploads.
+    /// Returns unfinished objects: names of staged files, or keys of multipart uploads.
     pub(crate) fn unfinished(&self) -> Vec<String> {
         match &self.service {
             None => {
@@ -164,30 +167,30 @@ impl Place {
                 files.filter_map(|file| file.into_string().ok().filter(|name| name.contains('#'))).collect()
             }
             Some((service, prefix)) => {
-                let answer = service.send("GET", "/meshes?uploads");
-                let keys = answer.split("<Key>").skip(1).filter_map(|rest| rest.split("</Key>").next());
+                let response = service.send("GET", "/meshes?uploads");
+                let keys = response.split("<Key>").skip(1).filter_map(|rest| rest.split("</Key>").next());
                 keys.filter(|key| key.starts_with(&format!("{prefix}/"))).map(str::to_owned).collect()
             }
         }
     }
 }
 
-/// Names of results; the same number gives the same name.
+/// Returns the name of a result by number.
 pub(crate) fn result(number: u64) -> Name {
     Name::result(&format!("{number:064x}"), "glb").unwrap()
 }
 
-/// Names of inputs.
+/// Returns the name of an input by number.
 pub(crate) fn input(number: u64) -> Name {
     Name::input(&Digest::of(&number.to_le_bytes()))
 }
 
-/// Names of jobs.
+/// Returns the name of a job by number.
 pub(crate) fn job(number: u64) -> Name {
     Name::job(&format!("{number:x}")).unwrap()
 }
 
-/// Bytes that differ from place to place, and from seed to seed.
+/// Returns pseudorandom bytes for a seed.
 pub(crate) fn noise(length: usize, seed: u64) -> Vec<u8> {
     let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
     let mut next = || {

@@ -1,4 +1,4 @@
-//! What is asked once per request: keys, signatures, quotas, as they are configured.
+//! Keys, signing keys and quotas of a configuration.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -13,28 +13,28 @@ use super::sign::{Signed, SigningKeys};
 use super::{file, forwarded};
 use crate::config::{AccessConfig, Config, Origins, ServerConfig};
 
-/// Access as it is configured.
+/// Access control of a configuration.
 #[derive(Debug)]
 pub struct Access {
     keys: Option<Keys>,
     signing: Option<SigningKeys>,
-    /// The quota of those who present no key; none: there is no limit.
+    /// Quota per address of clients without a key; `None` means unlimited.
     address_quota: Option<Arc<Quota>>,
     meter: Arc<Meter>,
     config: AccessConfig,
     server: ServerConfig,
 }
 
-/// Keys from a file.
+/// Keys of a key file.
 #[derive(Debug)]
 struct Keys {
     path: PathBuf,
     ring: RwLock<Arc<KeyRing>>,
-    /// What the file looked like when it was read last, well or not.
+    /// Stamp of the file at the last attempt to read it.
     seen: Mutex<Option<Stamp>>,
 }
 
-/// A file's time and length.
+/// Modification time and length of a file.
 type Stamp = (SystemTime, u64);
 
 fn stamp(path: &Path) -> Option<Stamp> {
@@ -43,10 +43,10 @@ fn stamp(path: &Path) -> Option<Stamp> {
 }
 
 impl Access {
-    /// Sets access up. Reads the file of keys, if there is one.
+    /// Creates the access control and reads the key file, if one is configured.
     ///
     /// # Errors
-    /// [`AccessError`].
+    /// Returns any [`AccessError`].
     pub fn open(config: &Config) -> Result<Self, AccessError> {
         let (config, server) = (config.access.clone(), config.server.clone());
         if config.cors_credentials && config.cors_origins == Some(Origins::Any) {
@@ -74,52 +74,52 @@ impl Access {
         })
     }
 
-    /// Whether a key or a signature is asked for. Where only signatures are configured, nothing else opens.
+    /// Returns true if requests need a key or a signature. If only signatures are configured, no key is accepted.
     #[must_use]
     pub fn is_closed(&self) -> bool {
         self.keys.is_some() || self.signing.is_some()
     }
 
-    /// Whether there are keys, so that looking for other ones is worth it.
+    /// Returns true if a key file is configured.
     #[must_use]
     pub fn has_keys(&self) -> bool {
         self.keys.is_some()
     }
 
-    /// The key whose text this is.
+    /// Returns the key with this text.
     ///
     /// # Errors
-    /// [`Denied`].
+    /// Returns [`Denied`] if the key is unknown or has expired at `now`.
     pub fn verify(&self, text: &str, now: SystemTime) -> Result<Arc<Key>, Denied> {
         let ring = self.keys.as_ref().map(|keys| Arc::clone(&keys.ring.read().unwrap_or_else(PoisonError::into_inner)));
         ring.map_or(Err(Denied::Unknown), |ring| ring.verify(text, now))
     }
 
-    /// What the signature of a path and query is worth; [`Signed::No`] where signatures are off.
+    /// Checks the signature of a path and query. Returns [`Signed::No`] if signatures are off.
     #[must_use]
     pub fn signed(&self, path: &str, query: Option<&str>, now: SystemTime) -> Signed {
         self.signing.as_ref().map_or(Signed::No, |keys| keys.check(path, query, now))
     }
 
-    /// The quota of those who present no key.
+    /// Returns the quota of clients without a key.
     #[must_use]
     pub fn address_quota(&self) -> Option<&Arc<Quota>> {
         self.address_quota.as_ref()
     }
 
-    /// What clients have used.
+    /// Returns the usage meter.
     #[must_use]
     pub fn meter(&self) -> &Arc<Meter> {
         &self.meter
     }
 
-    /// The configuration.
+    /// Returns the configuration.
     #[must_use]
     pub fn config(&self) -> &AccessConfig {
         &self.config
     }
 
-    /// The client of a request from `peer`, with the values of the header in which proxies name him.
+    /// Returns the client address of a request from `peer`, given the values of the forwarding header.
     pub fn client<'a>(
         &self,
         peer: std::net::IpAddr,
@@ -128,21 +128,22 @@ impl Access {
         forwarded::client(peer, self.server.forwarded_header, values, self.server.trusted_proxies.as_ref())
     }
 
-    /// The name of that header.
+    /// Returns the name of the forwarding header.
     #[must_use]
     pub fn forwarded_header(&self) -> &'static str {
         self.server.forwarded_header.name()
     }
 
-    /// Reads the file of keys again if it has changed, or if it `must`. How many keys there are now; none: nothing was read.
+    /// Reads the key file again if it has changed, or always with `force`. Returns the number of keys, or `None` if the
+    /// file was not read.
     ///
     /// # Errors
-    /// [`AccessError`]; the keys stay as they were. A file that stays wrong is an error once.
-    pub fn refresh(&self, must: bool) -> Result<Option<usize>, AccessError> {
+    /// Returns any [`AccessError`] and keeps the previous keys. An invalid file is reported once until it changes.
+    pub fn refresh(&self, force: bool) -> Result<Option<usize>, AccessError> {
         let Some(keys) = &self.keys else { return Ok(None) };
         let now = stamp(&keys.path);
         let mut seen = keys.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        if *seen == now && !must {
+        if *seen == now && !force {
             return Ok(None);
         }
         *seen = now;
@@ -172,15 +173,15 @@ mod tests {
         Access::open(&config)
     }
 
-    fn written(id: &str) -> (String, String) {
-        let token::Minted { text, hash } = token::mint(id).unwrap();
+    fn new_key(id: &str) -> (String, String) {
+        let token::NewKey { text, hash } = token::mint(id).unwrap();
         let key =
             Key { id: id.into(), hash, scopes: vec![Scope::Read], quota: Arc::default(), expires: None, note: None };
         (text, file::entry(&key))
     }
 
     #[test]
-    fn by_default_nothing_is_asked_for() {
+    fn default_configuration_requires_no_key() {
         let access = open(|_| {}).unwrap();
         assert!(!access.is_closed() && access.address_quota().is_none());
         assert_eq!(access.signed("/", Some("signature=x"), SystemTime::now()), Signed::No);
@@ -188,10 +189,10 @@ mod tests {
     }
 
     #[test]
-    fn keys_are_read_again_and_a_broken_file_changes_nothing() {
+    fn key_file_is_reloaded_and_an_invalid_file_keeps_the_keys() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("keys.toml");
-        let [(a, lines_a), (b, lines_b)] = [written("a"), written("b")];
+        let [(a, lines_a), (b, lines_b)] = [new_key("a"), new_key("b")];
         fs::write(&path, &lines_a).unwrap();
         let access = open(|c| c.keys_file = Some(path.clone())).unwrap();
         let knows = |text: &str| access.verify(text, SystemTime::now()).is_ok();
@@ -201,9 +202,9 @@ mod tests {
         assert_eq!(access.refresh(false).unwrap(), Some(2));
         assert!(knows(&a) && knows(&b));
         fs::write(&path, "[[key]]\nidd = 1").unwrap();
-        let said = access.refresh(false).unwrap_err().to_string();
-        assert!(said.contains("keys.toml, line 2: unknown name `idd`; did you mean `id`?"), "{said}");
-        assert!(knows(&a) && access.refresh(false).unwrap().is_none(), "it is said once");
+        let message = access.refresh(false).unwrap_err().to_string();
+        assert!(message.contains("keys.toml, line 2: unknown name `idd`; did you mean `id`?"), "{message}");
+        assert!(knows(&a) && access.refresh(false).unwrap().is_none(), "reported once");
         fs::write(&path, &lines_b).unwrap();
         assert_eq!(access.refresh(true).unwrap(), Some(1));
         assert!(!knows(&a) && knows(&b));
@@ -213,11 +214,11 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_is_refused() {
+    fn invalid_configurations_are_rejected() {
         assert!(matches!(open(|c| c.cors_credentials = true), Err(AccessError::CredentialsForAll)));
         assert!(open(|c| c.keys_file = Some("/no/such".into())).is_err());
-        let said = open(|c| c.signing_secret = Some(Secret::new("a:geheim"))).unwrap_err().to_string();
-        assert!(said.contains("access.signing_secret") && !said.contains("geheim"), "{said}");
+        let message = open(|c| c.signing_secret = Some(Secret::new("a:hush"))).unwrap_err().to_string();
+        assert!(message.contains("access.signing_secret") && !message.contains("hush"), "{message}");
         let listed = open(|c| (c.cors_credentials, c.cors_origins) = (true, "https://a.b".parse().ok()));
         assert!(listed.is_ok());
     }
