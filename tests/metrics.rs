@@ -57,7 +57,7 @@ const ROWS: &[Row] = &[
     (t::DEVICE_WAITING, &["device=\"0\""], devices),
     (t::DEVICE_JOBS, &["device=\"0\"", "outcome=\"failed\""], devices),
     (t::DEVICE_SHARED, &["device=\"0\""], devices),
-    (t::DEVICE_SPREAD, &["device=\"0\""], devices),
+    (t::DEVICE_PARTITIONS, &["device=\"0\""], devices),
     (t::CACHE_REQUESTS, &["tier=\"memory\"", "result=\"hit\""], meshes),
     (t::STORE_BYTES, &["folder=\"results\""], meshes),
     (t::STORE_OBJECTS, &["folder=\"results\""], meshes),
