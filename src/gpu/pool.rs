@@ -238,13 +238,11 @@ impl DevicePool {
         }
         // Partitions that were aborted because another one failed report a cancellation.
         job_errors.sort_by_key(|error| *error == GpuError::Surface(SurfaceError::Cancelled));
-        match job_errors.into_iter().next() {
-            Some(error) => MultiDeviceOutcome::JobFailed(error),
-            None => {
-                let finished = join(partitions, first.has_flat_vertices());
-                MultiDeviceOutcome::Done(Box::new(CompletedJob { finished, devices }))
-            }
+        if let Some(error) = job_errors.into_iter().next() {
+            return MultiDeviceOutcome::JobFailed(error);
         }
+        let finished = join(partitions, first.has_flat_vertices());
+        MultiDeviceOutcome::Done(Box::new(CompletedJob { finished, devices }))
     }
 
     /// Waits for the results of all tickets of a job, in order. The failure of a partition aborts the others, which are

@@ -32,7 +32,7 @@ const AROUND: [[f64; 2]; 16] = {
         [C, -S],
     ]
 };
-/// Radii of the rings of neighbours, relative to [`Finish`]'s radius. Rings use the even and the odd directions in
+/// Radii of the rings of neighbours, relative to the radius. Rings use the even and the odd directions in
 /// turn.
 const RINGS: [f64; 6] = [0.06, 0.13, 0.24, 0.4, 0.65, 1.0];
 /// Radius of ambient occlusion: at least that of a pocket in Å, and at least a share of the shorter side.

@@ -17,7 +17,7 @@ mod labels;
 pub mod lattice;
 pub mod measure;
 pub mod mesh;
-pub(crate) mod occupancy;
+pub mod occupancy;
 pub mod params;
 pub mod quantize;
 pub mod reference;

@@ -24,34 +24,34 @@ const MAX_UNCHECKED_TILES: f64 = 1e6;
 const NONE: u32 = u32::MAX;
 
 /// Bricks of a tile as bits: word z, bit `8·y + x`.
-pub(crate) type BrickBits = [u64; 8];
+pub type BrickBits = [u64; 8];
 
 /// Occupied bricks of one tile.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct TileOccupancy {
+pub struct TileOccupancy {
     /// Tile coordinates.
-    pub(crate) tile: [i32; 3],
+    pub tile: [i32; 3],
     /// Occupied bricks.
-    pub(crate) occupied: BrickBits,
+    pub occupied: BrickBits,
     /// Bricks with a sample in reach of an atom.
-    pub(crate) reached: BrickBits,
+    pub reached: BrickBits,
     /// Pairs of an occupied brick and an atom that reaches it.
-    pub(crate) candidates: u64,
+    pub candidates: u64,
     /// Pairs of a brick and an atom that reaches one of its samples.
-    pub(crate) pairs: u64,
+    pub pairs: u64,
 }
 
 /// Occupied bricks of a lattice.
 #[derive(Debug, Clone)]
-pub(crate) struct Occupancy {
+pub struct Occupancy {
     /// Tiles with occupied bricks, in tile order.
-    pub(crate) tiles: Vec<TileOccupancy>,
+    pub tiles: Vec<TileOccupancy>,
     /// Reach of each atom, in spacings, with slack for rounding.
-    pub(crate) reaches: Vec<f32>,
+    pub reaches: Vec<f32>,
     /// Maximum of `reaches`.
-    pub(crate) max_reach: f32,
+    pub max_reach: f32,
     /// Index of the first atom of each tile that holds atoms.
-    pub(crate) tile_starts: Vec<usize>,
+    pub tile_starts: Vec<usize>,
 }
 
 impl Occupancy {
@@ -60,7 +60,7 @@ impl Occupancy {
     /// # Errors
     /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond the
     /// limits, [`SurfaceError::BadParameter`] for more atoms than 31 bits can number, [`SurfaceError::Cancelled`].
-    pub(crate) fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
+    pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let atoms = &lattice.atoms;
         if atoms.len() > cpu::MAX_ATOMS {
             return Err(cpu::too_many_atoms(atoms.len()));
@@ -89,23 +89,27 @@ impl Occupancy {
     }
 
     /// Number of bricks with a sample in reach of an atom.
-    pub(crate) fn n_reached(&self) -> u64 {
+    #[must_use]
+    pub fn n_reached(&self) -> u64 {
         self.tiles.iter().map(|tile| count_ones(&tile.reached)).sum()
     }
 
     /// Number of pairs of an occupied brick and an atom that reaches it.
-    pub(crate) fn n_candidates(&self) -> u64 {
+    #[must_use]
+    pub fn n_candidates(&self) -> u64 {
         self.tiles.iter().map(|tile| tile.candidates).sum()
     }
 
     /// Number of pairs of a brick and an atom that reaches one of its samples.
-    pub(crate) fn n_pairs(&self) -> u64 {
+    #[must_use]
+    pub fn n_pairs(&self) -> u64 {
         self.tiles.iter().map(|tile| tile.pairs).sum()
     }
 }
 
 /// Number of bricks in `bits`.
-pub(crate) fn count_ones(bits: &BrickBits) -> u64 {
+#[must_use]
+pub fn count_ones(bits: &BrickBits) -> u64 {
     bits.iter().map(|word| u64::from(word.count_ones())).sum()
 }
 
@@ -323,7 +327,8 @@ fn merge(marks: &[Vec<TileOccupancy>]) -> Vec<TileOccupancy> {
 
 /// Index of an atom's brick within its tile.
 #[inline(always)]
-pub(crate) fn local_brick(atom: &LatticeAtom) -> u32 {
+#[must_use]
+pub fn local_brick(atom: &LatticeAtom) -> u32 {
     let [x, y, z] = atom.cell;
     let brick = |c: i32| c.rem_euclid(TILE).unsigned_abs() / BRICK.unsigned_abs();
     brick(z) << 6 | brick(y) << 3 | brick(x)

@@ -13,7 +13,9 @@ use rayon::prelude::*;
 pub use self::chunk::{Chunk, ChunkLimits};
 use self::layout::{NONE, Params, Tile, halves};
 pub use self::partition::Partition;
-use crate::surface::cpu::{self, Constants, SlopeConstants};
+use crate::surface::cpu::field::Constants;
+use crate::surface::cpu::interpolate::SlopeConstants;
+use crate::surface::cpu::{self, scan};
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, tile_of, tile_order, to_f32, to_u32, to_u64};
 use crate::surface::occupancy::{BrickBits, Occupancy, TileOccupancy, count_ones, local_brick};
 use crate::surface::{Control, Step, SurfaceError, SurfaceLimits, SurfaceParams};
@@ -118,7 +120,7 @@ pub fn check_totals(
     }
     let bytes = params.mesh_bytes(n_vertices, n_triangles);
     let limit = limits.max_mesh_bytes.min(params.mesh_bytes(u64::from(u32::MAX), 0));
-    if bytes <= limit { Ok(()) } else { Err(cpu::mesh_too_large(bytes, lattice.spacing, limit)) }
+    if bytes <= limit { Ok(()) } else { Err(scan::too_large(bytes, lattice.spacing, limit)) }
 }
 
 /// First brick of each tile. `None` if there are more tiles or bricks than the shaders can number.

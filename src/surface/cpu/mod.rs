@@ -11,15 +11,15 @@ mod bin;
 mod classify;
 mod edge;
 mod emit;
-mod field;
-mod interpolate;
+pub(crate) mod field;
+pub(crate) mod interpolate;
 mod join;
 mod near;
 #[doc(hidden)]
 pub mod probe;
 mod reach;
 mod sample;
-mod scan;
+pub(crate) mod scan;
 mod sheets;
 mod slabs;
 mod table;
@@ -29,14 +29,12 @@ mod write;
 
 use std::ops::Range;
 
-// Formulas and errors that the occupancy count and the plan of a device's job share with this backend.
+// Errors that the occupancy count shares with this backend.
 pub(crate) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
-pub(crate) use self::field::Constants;
-pub(crate) use self::interpolate::SlopeConstants;
-pub(crate) use self::scan::too_large as mesh_too_large;
 
 use self::bin::{Tiles, slot_brick};
 use self::classify::{Before, Found};
+use self::field::Constants;
 use self::near::Numbered;
 use self::sample::Pass;
 use self::scan::Totals;
