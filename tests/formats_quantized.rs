@@ -8,7 +8,7 @@ mod tools;
 use std::io::Cursor;
 
 use molmesh::formats::{Encoder, Format, FormatError, GlbSink, GlbSinkError, Meta, Packing, Step};
-use molmesh::surface::Mesh;
+use molmesh::surface::{Mesh, SinkFailed};
 use serde_json::{Value, json};
 use tools::files::{Files, write_parts};
 use tools::readers::{Contents, Glb, accessor_of, accessor_offset, gltf_contents, split_glb, split_gltf};
@@ -247,7 +247,7 @@ fn placed(packing: Packing, mesh: &Mesh, n_parts: usize) -> Result<Vec<u8>, GlbS
     let sink = GlbSink::new(&mut file);
     sink.store(packing);
     write_parts(&sink, mesh, n_parts);
-    let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).map_err(|_| sink.failure().unwrap())?;
+    let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).map_err(|SinkFailed| sink.failure().unwrap())?;
     drop(sink);
     assert_eq!(len, file.get_ref().len() as u64);
     Ok(file.into_inner())
