@@ -1,4 +1,4 @@
-//! The `molmesh` command: parses nothing, decides nothing, hands over to [`cli`].
+//! The `molmesh` command.
 
 mod cli;
 

@@ -1,5 +1,5 @@
-//! The effective configuration as it is printed: it gives the same configuration again, says where each value is from, and
-//! shows no secret; secrets that come from files.
+//! The effective configuration as it is printed: it gives the same configuration again, says where each value is from,
+//! and shows no secret; secrets that come from files.
 #![cfg(all(feature = "cli", feature = "server"))]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 
@@ -72,7 +72,7 @@ fn every_value_says_where_it_is_from() {
         "queue = 5 # MOLMESH__JOBS__QUEUE".to_owned(),
         "deliveries = 8 # command line".to_owned(),
         "attempts = 3 # default".to_owned(),
-        "# Not a matter of this file: --backend cpu".to_owned(),
+        "# Not part of this file: --backend cpu".to_owned(),
     ] {
         assert!(text.lines().any(|l| l == line), "no `{line}` in\n{text}");
     }

@@ -1,4 +1,4 @@
-//! `molmesh mesh`: one structure to one mesh file.
+//! `molmesh mesh`: meshes one structure into one file.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -25,14 +25,14 @@ use super::style::Style;
 use super::summary::{self, Written};
 use super::{interrupt, request};
 
-/// Runs the command. The order is that of cost: flags, output, input, backend, mesh.
+/// Runs the command. Cheap steps come first: flags, output, input, backend, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let Request { mut job, format: asked, strict, .. } = request::of_mesh(args)?;
     let format = asked.map_or_else(|| format(&args.output), Ok)?;
     if format.is_picture() {
         return Err(CliError::Usage {
             message: format!("{format} is a picture, not a mesh"),
-            hint: Some("molmesh render draws pictures".to_owned()),
+            hint: Some("molmesh render writes pictures".to_owned()),
         });
     }
     request::settle(&mut job, format)?;
@@ -70,7 +70,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
 
     let name = if to_stdout { "stdout".to_owned() } else { output_path.display().to_string() };
     let written = Written { name: &name, format: format.extension(), bytes };
-    tell(args, &report, findings.as_deref(), &written, to_stdout)
+    write_report(args, &report, findings.as_deref(), &written, to_stdout)
 }
 
 /// Bytes of a structure file that is small at a resolution of 0.5 Å.
@@ -100,7 +100,7 @@ fn format(output: &Path) -> Result<Format, CliError> {
     }
 }
 
-/// The whole input, at most `limit` bytes of it: compressed or not, what inflates from it is no smaller.
+/// Reads the input. `limit` is that of the decompressed bytes, which are not fewer.
 pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
     let stdin = is_stdio(path);
     let name = || name_of(path);
@@ -110,7 +110,7 @@ pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
         }
         let file = File::open(path)?;
         let size = file.metadata()?.len();
-        // One byte more than there is, so that the end is seen without growing the buffer.
+        // The spare byte lets the reader detect the end of the file without growing the buffer.
         take(file, if size > limit { 0 } else { size + 1 }, limit)
     };
     let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
@@ -126,12 +126,12 @@ fn take(source: impl Read, capacity: u64, limit: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// What messages call the input.
+/// Returns the name of the input in messages.
 fn name_of(input: &Path) -> String {
     if is_stdio(input) { "stdin".to_owned() } else { input.display().to_string() }
 }
 
-/// What there is to do.
+/// One job with its input.
 struct Work<'a> {
     path: &'a Path,
     job: &'a Job,
@@ -188,12 +188,12 @@ impl Work<'_> {
     }
 }
 
-/// What it means that a job failed.
+/// Converts the error of a job.
 pub(super) fn failure(path: &Path, input: &[u8], limits: &JobLimits, source: JobError) -> CliError {
     match source {
         JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
         source => {
-            let (name, opinion) = (name_of(path), opinion(&source, input, limits));
+            let (name, opinion) = (name_of(path), worst_finding(&source, input, limits));
             CliError::Job { name, opinion, source }
         }
     }
@@ -210,7 +210,7 @@ fn place_failure(output: &Output, error: Option<PlaceError>) -> CliError {
     }
 }
 
-/// The strict check: the referee's findings, or a refusal if there are errors among them.
+/// Returns the findings of the strict validator, or an error if there are errors among them.
 pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
     let name = || name_of(path);
     let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
@@ -225,15 +225,15 @@ pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec
     }
 }
 
-/// What the referee holds against a file that our reader could not read.
-fn opinion(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
+/// Returns the worst finding of the strict validator in a file with a syntax error.
+fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
     let findings = referee::check(input, &limits.read).ok()?;
     let worst = findings.iter().max_by_key(|f| f.level)?;
-    Some(format!("a strict reader says: {}", finding(worst)))
+    Some(format!("the strict validator reports: {}", finding(worst)))
 }
 
-/// A finding on one line.
+/// Formats a finding on one line.
 fn finding(finding: &Diagnostic) -> String {
     let place = finding.line.map(|n| format!("line {n}: ")).unwrap_or_default();
     format!("{place}{}", finding.message.split_whitespace().collect::<Vec<_>>().join(" "))
@@ -251,8 +251,8 @@ fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn Progre
     Ok(report)
 }
 
-/// Writes the report where the file did not go.
-pub(super) fn tell(
+/// Writes the report: text to stderr, JSON to stdout, or to stderr if the file is on stdout.
+pub(super) fn write_report(
     args: &JobArgs,
     report: &Report,
     findings: Option<&[Diagnostic]>,
@@ -265,20 +265,21 @@ pub(super) fn tell(
             let lines: Option<Vec<String>> =
                 findings.map(|all| all.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect());
             let text = summary::text(report, written, lines.as_deref(), Style::stderr());
-            // A closed stderr is no reason to call a finished mesh a failure.
+            // A closed stderr does not make a finished mesh a failure.
             drop(io::stderr().write_all(text.as_bytes()));
             Ok(())
         }
         ReportStyle::Json => {
             let text = json_report(report, findings, written)?;
-            let told = if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
-            told.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
+            let printed =
+                if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
+            printed.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
         }
     }
 }
 
 fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Written<'_>) -> Result<String, CliError> {
-    let failed = |e: serde_json::Error| CliError::Internal(format!("the report is no JSON: {e}"));
+    let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialised: {e}"));
     let mut value = serde_json::to_value(report).map_err(failed)?;
     if let Value::Object(map) = &mut value {
         let output = json!({ "file": written.name, "format": written.format, "bytes": written.bytes });

@@ -1,4 +1,4 @@
-//! Where the mesh goes: stdout, or a file that appears under its name only when it is complete.
+//! Output of a command: stdout, or a file that gets its name only when it is complete.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -12,14 +12,14 @@ use molmesh::surface::CancelToken;
 use super::error::CliError;
 use super::interrupt;
 
-/// An open output. Dropped without [`Output::finish`], it leaves nothing behind.
+/// Open output. Dropping it without [`Output::finish`] removes the partial file.
 pub(crate) struct Output {
     to: To,
     name: String,
     cancel: CancelToken,
     /// Bytes written so far.
     pub(crate) bytes: u64,
-    /// Time spent in the system's writes: what is left of the whole is encoding.
+    /// Time spent in the system's writes, which is no encoding time.
     pub(crate) writing: Duration,
 }
 
@@ -35,7 +35,7 @@ enum To {
 }
 
 impl Output {
-    /// Opens `path`; `-` is stdout. Fails before any work is done where it would fail after it.
+    /// Opens `path`; `-` is stdout. Detects most errors of the final rename before any work is done.
     pub(crate) fn open(path: &Path, cancel: &CancelToken) -> Result<Self, CliError> {
         let name = if is_stdio(path) { "stdout".to_owned() } else { path.display().to_string() };
         let to = if is_stdio(path) { Ok(To::Stdout(io::stdout().lock())) } else { open_file(path) };
@@ -59,12 +59,12 @@ impl Output {
         self.bytes = bytes;
     }
 
-    /// Whether the mesh goes to stdout.
+    /// Returns true if the output is stdout.
     pub(crate) fn is_stdout(&self) -> bool {
         matches!(self.to, To::Stdout(_))
     }
 
-    /// Gives the file its name.
+    /// Renames the file to its final name.
     pub(crate) fn finish(mut self) -> Result<(), CliError> {
         let done = self.flush().and_then(|()| match &self.to {
             To::Staged { target, .. } => interrupt::commit(target),
@@ -73,7 +73,7 @@ impl Output {
         done.map_err(|source| self.failure(source))
     }
 
-    /// What a failed write means: a signal, or a failed write.
+    /// Returns the error for a failed write: an interrupt if there was a signal.
     pub(crate) fn failure(&self, source: io::Error) -> CliError {
         if self.cancel.is_cancelled() {
             CliError::Interrupted
@@ -111,7 +111,7 @@ impl PlaceBytes for Placer<'_> {
 impl Write for Output {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         if self.cancel.is_cancelled() {
-            // Not `Interrupted`: callers repeat a write that ends with that.
+            // Not `ErrorKind::Interrupted`, after which callers repeat the write.
             return Err(io::Error::other("interrupted"));
         }
         let start = Instant::now();
@@ -131,20 +131,20 @@ impl Write for Output {
     }
 }
 
-/// Whether `path` means stdin or stdout.
+/// Returns true if `path` means stdin or stdout.
 pub(crate) fn is_stdio(path: &Path) -> bool {
     path.as_os_str() == "-"
 }
 
 fn open_file(path: &Path) -> io::Result<To> {
-    // A link is followed, so that the file that it points to is replaced, not the link.
+    // Follow links, so that the file is replaced and not the link.
     let target = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let existing = fs::metadata(&target).ok();
     match &existing {
         Some(meta) if meta.is_dir() => return Err(io::ErrorKind::IsADirectory.into()),
         Some(meta) if !meta.is_file() => return Ok(To::Device(OpenOptions::new().write(true).open(&target)?)),
         Some(_) => {
-            // A file that may not be written is not to be replaced through its directory either.
+            // Do not replace a read-only file through its directory.
             OpenOptions::new().write(true).open(&target)?;
         }
         None => {}
@@ -152,11 +152,11 @@ fn open_file(path: &Path) -> io::Result<To> {
     let Some(file_name) = target.file_name() else { return Err(io::ErrorKind::InvalidInput.into()) };
     let mut staged_name = std::ffi::OsString::from(".");
     staged_name.push(file_name);
-    // The time makes it unique where every process has the same id, as in containers that share a volume.
+    // The time makes the name unique among containers that share a volume and use the same process id.
     let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos();
     staged_name.push(format!(".{}-{now:x}.part", std::process::id()));
     let staged = target.with_file_name(staged_name);
-    // Before it exists, so that no interrupt comes between.
+    // Registered before the file exists, so that an interrupt cannot miss it.
     interrupt::stage(&staged);
     let created = OpenOptions::new().write(true).create_new(true).open(&staged).and_then(|file| {
         existing.map_or(Ok(()), |meta| file.set_permissions(meta.permissions()))?;
@@ -169,9 +169,9 @@ fn open_file(path: &Path) -> io::Result<To> {
 mod tests {
     use super::*;
 
-    // One test, as the staged file is one for the process.
+    // A single test, as a process has only one staged file.
     #[test]
-    fn a_file_appears_when_it_is_finished_and_only_then() {
+    fn file_appears_only_when_it_is_finished() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.glb");
         let entries = || fs::read_dir(dir.path()).unwrap().count();
