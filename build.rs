@@ -1,8 +1,8 @@
-//! Assembles the shaders, checks them all, and writes down what the host must match.
+//! Build script: assembles and validates the shaders, and generates the tables of shaders and of web page files.
 //!
-//! Every `shaders/<stage>.wgsl` gets the fragments that it names in `#include` lines, is parsed and validated with
-//! exactly the capabilities that the device code asks for (none beyond WebGPU's), and reflected: bindings by name, and
-//! the layout of every struct that lies in a buffer. All broken shaders are reported at once.
+//! Fragments replace the `#include` lines of each `shaders/<stage>.wgsl`. The result is validated with the capabilities
+//! that the device code requests (none beyond WebGPU's). The table of shaders lists the bindings by name and the
+//! layouts of all structs in buffers. All broken shaders are reported at once.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
@@ -13,12 +13,12 @@ fn main() {
     shaders::build();
 }
 
-/// Notes the target and the compiler, for `molmesh doctor`.
+/// Passes the target and the compiler version to the crate, for `molmesh doctor`.
 fn built_by() {
     let target = std::env::var("TARGET").unwrap_or_default();
     let compiler = std::env::var_os("RUSTC").and_then(|rustc| {
-        let said = std::process::Command::new(rustc).arg("--version").output().ok()?;
-        Some(String::from_utf8(said.stdout).ok()?.trim().to_owned())
+        let output = std::process::Command::new(rustc).arg("--version").output().ok()?;
+        Some(String::from_utf8(output.stdout).ok()?.trim().to_owned())
     });
     println!("cargo::rustc-env=MOLMESH_TARGET={target}");
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
@@ -32,7 +32,7 @@ mod page {
 
     pub(super) fn build() {
         let dist = Path::new("web/dist");
-        // A path that is not there would have this script run each time; the folder around it is there.
+        // Cargo runs the script on every build if a watched path does not exist.
         let watched = if dist.is_dir() { dist } else { Path::new("web") };
         println!("cargo::rerun-if-changed={}", watched.display());
         let root = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets CARGO_MANIFEST_DIR"));
@@ -41,17 +41,18 @@ mod page {
         found.sort();
         let mut table = String::from("static FILES: &[(&str, &[u8])] = &[\n");
         for file in &found {
-            let name = file.strip_prefix(dist).expect("it lies there").to_string_lossy().replace('\\', "/");
+            let name =
+                file.strip_prefix(dist).expect("the file is below web/dist").to_string_lossy().replace('\\', "/");
             let path = name.trim_end_matches(".gz");
             let file = root.join(file).display().to_string();
-            writeln!(table, "    ({path:?}, include_bytes!({file:?})),").expect("a string takes it");
+            writeln!(table, "    ({path:?}, include_bytes!({file:?})),").expect("writing to a string cannot fail");
         }
         table.push_str("];\n");
         let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
         fs::write(out.join("page.rs"), table).expect("OUT_DIR can be written");
     }
 
-    /// The packed files below `folder`; none where there is no such folder.
+    /// Adds the compressed files below `folder` to `found`. Adds none if the folder does not exist.
     fn files(folder: &Path, found: &mut Vec<PathBuf>) {
         for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
             let path = entry.path();
@@ -112,8 +113,7 @@ mod shaders {
             }
             generated.push_str("];\n\n");
             if !layouts.is_empty() {
-                generated
-                    .push_str("/// Name, size, and (field, offset, size) of every struct that lies in a buffer.\n");
+                generated.push_str("/// Name, size, and (field, offset, size) of every struct in a buffer.\n");
                 writeln!(generated, "#[cfg(test)]\npub(super) static {layouts_table}: &[Layout] = &[")
                     .expect("a string takes it");
                 generated.extend(layouts);
@@ -124,7 +124,7 @@ mod shaders {
         fs::write(out.join("shaders.rs"), generated).expect("OUT_DIR can be written");
     }
 
-    /// The text of `name` with every `#include` line replaced by the fragment that it names, each once.
+    /// Returns the text of `name` with each `#include` line replaced by its fragment. Includes each fragment once.
     fn assemble(folder: &Path, name: &str, seen: &mut BTreeSet<String>) -> Result<String, String> {
         let text = fs::read_to_string(folder.join(name)).map_err(|e| format!("{name}: {e}"))?;
         let mut assembled = String::with_capacity(text.len());
@@ -150,7 +150,7 @@ mod shaders {
             .map_err(|e| e.emit_to_string(source))?;
         match &module.entry_points[..] {
             [entry] if entry.name == "main" => Ok(module),
-            others => Err(format!("{} entry points; one named main is wanted", others.len())),
+            others => Err(format!("{} entry points; expected one named `main`", others.len())),
         }
     }
 

@@ -1,8 +1,9 @@
-//! molmesh: molecules in, proven surface meshes out.
+//! Watertight molecular-surface meshes from PDB, mmCIF and BinaryCIF files.
 //!
-//! The crate is a meshing core ([`surface`]) with rooms around it: [`structure`] reads files into spheres,
-//! [`formats`] writes meshes, [`picture`] draws them, [`pipeline`] ties these together, and the `server` feature
-//! adds the HTTP service. `ARCHITECTURE.md` is the map; lengths are ångström everywhere.
+//! [`surface`] is the meshing core: spheres in, mesh out. [`structure`] reads files into spheres, [`formats`] encodes
+//! meshes, [`picture`] renders them, and [`pipeline`] runs one job from bytes to report. The `gpu` feature adds the GPU
+//! backend and the `server` feature the HTTP service. All lengths are ångström. `ARCHITECTURE.md` describes the
+//! folders.
 
 pub mod formats;
 pub mod picture;

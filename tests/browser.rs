@@ -12,7 +12,7 @@ use std::process::Command;
 
 use cli_support::{Folder, Service};
 
-/// Where Chromium is, under the names that it has in distributions.
+/// Finds Chromium under the names of its executable in distributions.
 fn chromium() -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let names = ["chromium", "chromium-browser", "google-chrome"];
@@ -20,14 +20,14 @@ fn chromium() -> Option<PathBuf> {
     places.find(|place| place.is_file())
 }
 
-/// A service with the samples as its archive, small enough that a fine resolution is refused.
+/// Starts a service with the samples as its archive and with a limit that a fine resolution exceeds.
 fn service(folder: &Folder, more: &[&str]) -> Service {
     let samples = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples");
     let all = ["--devices", "cpu", "--archive", samples.to_str().unwrap(), "--set", "limits.grid_samples=4000000"];
     Service::start(folder, &[&all, more].concat())
 }
 
-/// Runs a script of `tests/browser` against a service; it fails with what it said.
+/// Runs a script of `tests/browser` against a service. Panics with its output if it fails.
 fn drive(script: &str, more: &[&str], variables: &[(&str, &str)]) {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     if !molmesh::http::has_viewer() {
@@ -35,7 +35,7 @@ fn drive(script: &str, more: &[&str], variables: &[(&str, &str)]) {
     }
     let modules = root.join("target/test-tools/node");
     let Some(chromium) = chromium().filter(|_| modules.join(".stamp").is_file()) else {
-        return tools::missing("Chromium, or what drives it,").unwrap_or_default();
+        return tools::missing("Chromium, or its driver,").unwrap_or_default();
     };
     let folder = Folder::new();
     let service = service(&folder, more);
@@ -48,23 +48,23 @@ fn drive(script: &str, more: &[&str], variables: &[(&str, &str)]) {
         .envs(variables.iter().copied())
         .output()
         .unwrap();
-    let said = [done.stdout, done.stderr].concat();
-    let said = String::from_utf8_lossy(&said);
-    assert!(done.status.success() && said.contains("ok "), "{script}:\n{said}");
+    let output = [done.stdout, done.stderr].concat();
+    let output = String::from_utf8_lossy(&output);
+    assert!(done.status.success() && output.contains("ok "), "{script}:\n{output}");
 }
 
 #[test]
-fn the_page_does_what_it_promises() {
+fn page_works() {
     drive("page.mjs", &[], &[]);
 }
 
 #[test]
-fn a_failed_request_leaves_the_former_surface_and_its_description() {
+fn failed_request_keeps_the_previous_surface() {
     drive("former.mjs", &[], &[]);
 }
 
 #[test]
-fn the_component_follows_jobs_and_shows_its_fallback() {
+fn component_polls_jobs_and_shows_its_fallback() {
     drive("component.mjs", &[], &[]);
 }
 
@@ -74,29 +74,29 @@ fn long_meshes_are_followed_as_jobs() {
 }
 
 #[test]
-fn a_key_is_asked_for_where_one_is_needed() {
+fn page_asks_for_a_required_key() {
     let keys = access_support::Keys::new(&[("page", "mesh,read", "")]);
     let set = format!("access.keys_file={}", keys.path().display());
     drive("keys.mjs", &["--set", &set], &[("MOLMESH_KEY", keys.text("page"))]);
 }
 
 #[test]
-fn without_webgl_there_is_a_message_and_a_picture() {
+fn page_without_webgl_shows_a_message_and_a_picture() {
     drive("plain.mjs", &[], &[]);
 }
 
 #[test]
-fn every_flavour_is_loaded_by_other_viewers() {
+fn other_viewers_load_all_glb_variants() {
     drive("flavours.mjs", &[], &[]);
 }
 
 #[test]
-fn the_examples_work_on_pages_elsewhere() {
+fn examples_work_from_another_origin() {
     drive("examples.mjs", &[], &[]);
 }
 
 #[test]
-fn the_python_example_measures_what_the_service_reports() {
+fn python_example_agrees_with_the_report() {
     let Some(python) = tools::python_interpreter() else {
         return tools::missing("the Python for examples/measure.py").unwrap_or_default();
     };
@@ -109,18 +109,18 @@ fn the_python_example_measures_what_the_service_reports() {
         Command::new(&python).arg(script).arg(file).arg(server).env("PYTHONDONTWRITEBYTECODE", "1").output().unwrap()
     };
     let done = run(&root.join("samples/1crn.cif"));
-    let said = String::from_utf8_lossy(&done.stdout);
-    assert!(done.status.success(), "{said}{}", String::from_utf8_lossy(&done.stderr));
-    assert!(said.contains("closed True, the service says true"), "{said}");
+    let output = String::from_utf8_lossy(&done.stdout);
+    assert!(done.status.success(), "{output}{}", String::from_utf8_lossy(&done.stderr));
+    assert!(output.contains("closed True, the service says true"), "{output}");
     let mut n = 0;
-    for line in said.lines().filter(|line| !line.starts_with("closed")) {
+    for line in output.lines().filter(|line| !line.starts_with("closed")) {
         let numbers: Vec<f64> = line.split([' ', ',']).filter_map(|word| word.parse().ok()).collect();
         let [ours, theirs] = numbers[..] else { panic!("{line}") };
         assert!((ours - theirs).abs() <= 2e-3 * theirs, "{line}");
         n += 1;
     }
-    assert_eq!(n, 3, "{said}");
-    // What is no structure is refused in the service's words.
+    assert_eq!(n, 3, "{output}");
+    // The example shows the error message of the service.
     let poem = folder.file("poem.txt", "Whose woods these are I think I know");
     let refused = run(&poem);
     assert!(!refused.status.success());
@@ -128,7 +128,7 @@ fn the_python_example_measures_what_the_service_reports() {
 }
 
 #[test]
-fn the_notices_name_what_the_viewer_bundles() {
+fn notices_cover_the_dependencies_of_the_viewer() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let lock: serde_json::Value =
         serde_json::from_str(&std::fs::read_to_string(root.join("web/package-lock.json")).unwrap()).unwrap();

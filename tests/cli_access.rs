@@ -8,23 +8,23 @@ use std::process::Command;
 
 use cli_support::{Folder, Service, assert_code, molmesh, run, stderr, stdout};
 
-/// Makes a key: its text, and its lines.
+/// Creates a key. Returns the key and its entry for the keys file.
 fn key(args: &[&str]) -> (String, String) {
-    let made = run(["key", "new"].iter().chain(args));
-    assert_code(&made, 0);
-    (stderr(&made).lines().last().unwrap().to_owned(), stdout(&made))
+    let created = run(["key", "new"].iter().chain(args));
+    assert_code(&created, 0);
+    (stderr(&created).lines().last().unwrap().to_owned(), stdout(&created))
 }
 
-/// curl: the status, and the body.
+/// Runs curl. Returns the status and the body.
 fn curl(args: &[&str]) -> (String, String) {
     let done = Command::new("curl").args(["-sS", "-w", "\n%{http_code}"]).args(args).output().unwrap();
-    let said = String::from_utf8_lossy(&done.stdout).into_owned();
-    let (body, status) = said.rsplit_once('\n').unwrap_or_else(|| panic!("{args:?}: {done:?}"));
+    let reply = String::from_utf8_lossy(&done.stdout).into_owned();
+    let (body, status) = reply.rsplit_once('\n').unwrap_or_else(|| panic!("{args:?}: {done:?}"));
     (status.to_owned(), body.to_owned())
 }
 
 #[test]
-fn what_is_printed_opens_and_no_log_has_it() {
+fn keys_and_signed_urls_work_and_are_not_logged() {
     let folder = Folder::new();
     let (text, lines) = key(&["--id", "viewer-1", "--requests", "100", "--window", "1h", "--note", "a \"test\""]);
     assert!(text.starts_with("mm_viewer-1_") && !lines.contains(&text), "{text}\n{lines}");
@@ -76,12 +76,12 @@ fn what_is_printed_opens_and_no_log_has_it() {
     let (_, hidden) = secret.split_once(':').unwrap();
     for private in [&text[12..], &reader[10..], "chocolate", signature, hidden] {
         let leak = log.lines().find(|line| line.contains(private));
-        assert_eq!(leak, None, "the log has {private}");
+        assert_eq!(leak, None, "the log contains {private}");
     }
 }
 
 #[test]
-fn a_hangup_means_that_the_keys_are_read_again() {
+fn hangup_reloads_the_keys() {
     let folder = Folder::new();
     let (text, lines) = key(&["--id", "a"]);
     let file = folder.file("keys.toml", "");
@@ -94,7 +94,7 @@ fn a_hangup_means_that_the_keys_are_read_again() {
     service.signal("HUP");
     let start = std::time::Instant::now();
     while curl(&["-H", &header, &address]).0 != "200" {
-        assert!(start.elapsed().as_secs() < 60, "the key is not known after a minute");
+        assert!(start.elapsed().as_secs() < 60, "the key is still unknown after a minute");
         std::thread::sleep(std::time::Duration::from_millis(50));
     }
     let (code, log) = service.stop("TERM");
@@ -103,10 +103,10 @@ fn a_hangup_means_that_the_keys_are_read_again() {
 }
 
 #[test]
-fn what_cannot_be_made_or_signed_says_why() {
+fn invalid_keys_and_urls_are_rejected_with_a_reason() {
     for (args, why) in [
         (&["--id", "A b"][..], "lower-case letters"),
-        (&["--id", "a", "--scopes", "admin"], "there are mesh and read"),
+        (&["--id", "a", "--scopes", "admin"], "expected mesh, read"),
         (&["--id", "a", "--work", "long"], "parameter `work`"),
         (&["--id", "a", "--window", "1ms"], "parameter `window`"),
         (&["--id", "a", "--expires", "soon"], "parameter `expires`"),

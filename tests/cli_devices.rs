@@ -15,7 +15,7 @@ fn report(flags: &[&str]) -> serde_json::Value {
 }
 
 #[test]
-fn devices_that_cannot_be_meant_are_bad_usage() {
+fn rejects_invalid_devices() {
     for devices in ["", "gpu", "-1", "0,", "cpu,0", "0 1"] {
         let flag = format!("--devices={devices}");
         for command in [&["mesh", "a.pdb", "-o", "b.glb", &flag][..], &["doctor", &flag]] {
@@ -32,7 +32,7 @@ fn devices_that_cannot_be_meant_are_bad_usage() {
 }
 
 #[test]
-fn the_environment_is_read_and_flags_win() {
+fn flags_override_the_environment() {
     let bad = molmesh().env("MOLMESH__DEVICES__USE", "abacus").args(["doctor"]).output().unwrap();
     assert_eq!(bad.status.code(), Some(2), "{}", stderr(&bad));
     let folder = Folder::new();
@@ -48,8 +48,8 @@ fn the_environment_is_read_and_flags_win() {
 }
 
 #[test]
-fn the_cpu_is_taken_when_asked_for_and_the_reason_says_which_way() {
-    for (flags, reason) in [(&["--devices", "cpu"][..], "--devices cpu"), (&["--backend", "cpu"], "asked for")] {
+fn reason_names_the_flag_that_requested_the_cpu() {
+    for (flags, reason) in [(&["--devices", "cpu"][..], "--devices cpu"), (&["--backend", "cpu"], "requested")] {
         let report = report(flags);
         assert_eq!((&report["backend"], &report["backend_reason"]), (&"cpu".into(), &reason.into()), "{flags:?}");
     }
@@ -57,7 +57,7 @@ fn the_cpu_is_taken_when_asked_for_and_the_reason_says_which_way() {
 
 #[test]
 #[cfg(feature = "gpu")]
-fn a_device_that_is_asked_for_and_not_there_is_not_replaced_in_silence() {
+fn missing_device_is_an_error_without_fallback() {
     let folder = Folder::new();
     let input = folder.file("in.pdb", rod());
     for flags in [&["--devices", "77"][..], &["--backend", "gpu", "--devices", "77"]] {
@@ -81,9 +81,9 @@ fn doctor_lists_every_device_with_its_reason() {
         assert!(text.contains("device 0"), "CI has software Vulkan:\n{text}");
     }
     for line in text.lines().filter(|line| line.trim_start().starts_with("device ")) {
-        let (_, said) = line.split_once("device ").unwrap();
-        assert!(said.contains("yes ") || said.contains("no "), "{line}");
-        assert!(said.contains(": "), "no reason: {line}");
+        let (_, device) = line.split_once("device ").unwrap();
+        assert!(device.contains("yes ") || device.contains("no "), "{line}");
+        assert!(device.contains(": "), "no reason: {line}");
     }
     let cpu = doctor(&["--devices", "cpu"]);
     for line in stdout(&cpu).lines().filter(|line| line.trim_start().starts_with("device ")) {
@@ -92,7 +92,7 @@ fn doctor_lists_every_device_with_its_reason() {
 }
 
 #[test]
-fn a_service_says_which_devices_it_found() {
+fn banner_names_the_devices() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--devices", "cpu"]);
     assert!(service.banner.contains("cpu: ") && service.banner.contains("(--devices cpu)"), "{}", service.banner);

@@ -11,24 +11,24 @@ use std::process::Output;
 use cli_support::{Folder, Service, molmesh, run, stderr, stdout};
 use serde_json::Value;
 
-/// Runs `doctor` on the processor with data in `folder`, as far as `more` does not say otherwise.
+/// Runs `doctor` for the CPU with data in `folder`, unless `more` has other values.
 fn doctor(folder: &Folder, more: &[&str]) -> Output {
     let data = folder.path("data");
     let mut command = molmesh();
     command.arg("doctor").args(more);
-    let usual = [
+    let defaults = [
         ("--report", "json"),
         ("--devices", "cpu"),
         ("--listen", "127.0.0.1:0"),
         ("--data-dir", data.to_str().unwrap()),
     ];
-    for (flag, value) in usual.iter().filter(|(flag, _)| !more.contains(flag)) {
+    for (flag, value) in defaults.iter().filter(|(flag, _)| !more.contains(flag)) {
         command.args([flag, value]);
     }
     command.output().unwrap()
 }
 
-/// The state and the words of a check.
+/// Returns the state and the detail of a check.
 #[track_caller]
 fn check(done: &Output, name: &str) -> (String, String) {
     let document: Value = serde_json::from_slice(&done.stdout).unwrap_or_else(|e| panic!("{e}: {done:?}"));
@@ -39,7 +39,7 @@ fn check(done: &Output, name: &str) -> (String, String) {
     (text("state"), text("detail"))
 }
 
-/// Asserts that a check failed, with these words, and that the exit code and the line on stderr say so.
+/// Asserts that a check failed with this text, and that the exit code and the line on stderr report it.
 #[track_caller]
 fn fails(done: &Output, name: &str, words: &str, code: i32) {
     let (state, detail) = check(done, name);
@@ -48,7 +48,7 @@ fn fails(done: &Output, name: &str, words: &str, code: i32) {
     assert!(stderr(done).starts_with("molmesh: ") && stderr(done).contains(name), "{}", stderr(done));
 }
 
-/// Asserts that a check warns, with these words, and that nothing fails.
+/// Asserts that a check warns with this text, and that no check fails.
 #[track_caller]
 fn warns(done: &Output, name: &str, words: &str) {
     let (state, detail) = check(done, name);
@@ -56,13 +56,13 @@ fn warns(done: &Output, name: &str, words: &str) {
     assert_eq!(done.status.code(), Some(0), "{}", stderr(done));
 }
 
-/// An address on which nobody listens.
-fn nobody() -> String {
+/// Returns an address without a listener.
+fn closed_address() -> String {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string()
 }
 
 #[test]
-fn a_machine_on_which_all_is_well() {
+fn all_checks_pass() {
     let folder = Folder::new();
     let done = doctor(&folder, &["--set", "jobs.queue=7"]);
     assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
@@ -77,7 +77,7 @@ fn a_machine_on_which_all_is_well() {
     assert!(document["machine"]["cores"].as_u64().unwrap() >= 1);
     assert_eq!((&document["config"]["jobs"]["queue"], &document["backend"]["name"]), (&7.into(), &"cpu".into()));
     assert_eq!(document["sources"]["jobs"]["queue"]["source"], "command line");
-    // It leaves nothing behind, and what was there stays.
+    // The command leaves no files, and existing folders stay.
     assert_eq!(folder.entries(), Vec::<String>::new());
     std::fs::create_dir_all(folder.path("data/store/results")).unwrap();
     assert_eq!(doctor(&folder, &[]).status.code(), Some(0));
@@ -85,7 +85,7 @@ fn a_machine_on_which_all_is_well() {
 }
 
 #[test]
-fn the_page_has_every_group_of_limits_and_every_check() {
+fn text_has_all_sections_and_checks() {
     let folder = Folder::new();
     let data = folder.path("data");
     let done = run([
@@ -113,7 +113,7 @@ fn the_page_has_every_group_of_limits_and_every_check() {
 }
 
 #[test]
-fn addresses_that_are_taken() {
+fn addresses_in_use_fail() {
     let folder = Folder::new();
     let service = Service::start(&Folder::new(), &["--devices", "cpu"]);
     fails(&doctor(&folder, &["--listen", &service.addr]), "listen", &service.addr, 1);
@@ -121,7 +121,7 @@ fn addresses_that_are_taken() {
 }
 
 #[test]
-fn a_store_that_cannot_be_used() {
+fn unusable_store_fails() {
     let folder = Folder::new();
     let file = folder.file("data", "not a folder");
     fails(&doctor(&folder, &[]), "store", file.to_str().unwrap(), 1);
@@ -129,12 +129,12 @@ fn a_store_that_cannot_be_used() {
 }
 
 #[test]
-fn a_store_that_does_not_answer_and_whose_key_stays_secret() {
+fn unreachable_store_fails_without_showing_its_key() {
     let folder = Folder::new();
-    // Lets everybody in and says nothing.
+    // Accepts connections and sends nothing.
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
     for (endpoint, words) in
-        [(nobody(), ""), (silent.local_addr().unwrap().to_string(), "does not answer within 500 ms")]
+        [(closed_address(), ""), (silent.local_addr().unwrap().to_string(), "does not answer within 500 ms")]
     {
         let endpoint = format!("store.endpoint=http://{endpoint}");
         let mut args = vec!["--timeout", if words.is_empty() { "30" } else { "0.5" }];
@@ -172,19 +172,19 @@ fn a_store_that_is_silent_is_given_up() {
 }
 
 #[test]
-fn a_log_that_cannot_be_set_up() {
+fn invalid_log_filter_fails() {
     fails(&doctor(&Folder::new(), &["--set", "log.filter=molmesh=loud"]), "log", "molmesh=loud", 1);
 }
 
 #[test]
-fn a_backend_that_is_not_there() {
+fn missing_backend_fails() {
     fails(&doctor(&Folder::new(), &["--backend", "gpu", "--devices", "77"]), "devices", "no backend `gpu`", 6);
     let usage = doctor(&Folder::new(), &["--backend", "gpu"]);
     assert_eq!(usage.status.code(), Some(2), "{}", stderr(&usage));
 }
 
 #[test]
-fn a_configuration_that_cannot_be_used_is_the_callers() {
+fn invalid_configuration_is_bad_usage() {
     let folder = Folder::new();
     for more in
         [&["--set", "limits.atomz=1"][..], &["--config", "/no/such/file"], &["--timeout", "0"], &["--report", "xml"]]
@@ -195,7 +195,7 @@ fn a_configuration_that_cannot_be_used_is_the_callers() {
 }
 
 #[test]
-fn budgets_larger_than_the_machine() {
+fn budgets_above_the_memory_are_a_warning() {
     let (state, detail) = check(&doctor(&Folder::new(), &["--set", "limits.memory_bytes=1000000GiB"]), "memory");
     let known = cfg!(target_os = "linux");
     assert_eq!(state, if known { "warning" } else { "ok" }, "{detail}");
@@ -203,7 +203,7 @@ fn budgets_larger_than_the_machine() {
 }
 
 #[test]
-fn secrets_that_others_can_read() {
+fn readable_secrets_are_a_warning() {
     use std::os::unix::fs::PermissionsExt as _;
     let folder = Folder::new();
     let secret = folder.file("secret", "hush");
@@ -214,33 +214,33 @@ fn secrets_that_others_can_read() {
 }
 
 #[test]
-fn folders_of_structures() {
+fn archive_folder_is_checked() {
     let folder = Folder::new();
     let pdb = folder.path("pdb");
-    let look = |folder: &Folder| doctor(folder, &["--archive", pdb.to_str().unwrap()]);
-    warns(&look(&folder), "archive", "cannot be listed");
+    let check_archive = |folder: &Folder| doctor(folder, &["--archive", pdb.to_str().unwrap()]);
+    warns(&check_archive(&folder), "archive", "cannot be listed");
     std::fs::create_dir_all(pdb.join("pt")).unwrap();
-    warns(&look(&folder), "archive", "holds no entry");
+    warns(&check_archive(&folder), "archive", "contains no entry");
     for name in ["pt/4pti.cif.gz", "1crn.cif", "1crn.pdb", "notes.txt"] {
         std::fs::write(pdb.join(name), "").unwrap();
     }
-    let (state, detail) = check(&look(&folder), "archive");
+    let (state, detail) = check(&check_archive(&folder), "archive");
     assert!(state == "ok" && detail.contains("2 entries"), "{state}: {detail}");
-    // A link that leads out of the folder is no entry.
+    // A link that leads out of the folder is not an entry.
     std::fs::remove_file(pdb.join("1crn.cif")).unwrap();
     std::fs::remove_file(pdb.join("1crn.pdb")).unwrap();
     std::os::unix::fs::symlink("/etc/hostname", pdb.join("1crn.cif")).unwrap();
-    warns(&look(&folder), "archive", "1crn");
+    warns(&check_archive(&folder), "archive", "1crn");
     let file = folder.file("file", "");
     warns(&doctor(&folder, &["--archive", file.to_str().unwrap()]), "archive", "cannot be listed");
 }
 
 #[test]
-fn remote_archives() {
+fn remote_archive_is_checked() {
     let folder = Folder::new();
     let server = TcpListener::bind("127.0.0.1:0").unwrap();
     let addr = server.local_addr().unwrap();
-    // The status that is asked for in the path.
+    // The path contains the status of the response.
     std::thread::spawn(move || {
         for mut stream in server.incoming().map_while(Result::ok) {
             let mut head = [0; 4096];
@@ -259,11 +259,11 @@ fn remote_archives() {
         assert!(state == "ok" && detail.contains(status), "{state}: {detail}");
     }
     warns(&ask(&format!("http://{addr}/503/{{id}}")), "remote", "503");
-    warns(&ask(&format!("http://{}/{{id}}", nobody())), "remote", "cannot be asked");
+    warns(&ask(&format!("http://{}/{{id}}", closed_address())), "remote", "failed");
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("archive.url=http://{}/{{id}}", silent.local_addr().unwrap());
     warns(&doctor(&folder, &["--timeout", "0.3", "--set", &url]), "remote", "no answer within 300 ms");
-    // Nobody is asked where nobody is named.
+    // Without a remote archive there is no such check.
     let document: Value = serde_json::from_slice(&doctor(&folder, &[]).stdout).unwrap();
     assert!(document["checks"].as_array().unwrap().iter().all(|check| check["name"] != "remote"));
 }

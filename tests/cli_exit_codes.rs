@@ -8,7 +8,7 @@ use std::path::Path;
 
 use cli_support::{Folder, assert_code, mesh, molmesh, pdb, piped, rod, run, stderr, stdout};
 
-/// Runs a mesh that must fail with `code`, and must leave nothing but its input.
+/// Runs a mesh that must fail with `code` and leave no file. Returns stderr.
 #[track_caller]
 fn fails(input: impl AsRef<[u8]>, flags: &[&str], code: i32) -> String {
     let folder = Folder::new();
@@ -21,7 +21,7 @@ fn fails(input: impl AsRef<[u8]>, flags: &[&str], code: i32) -> String {
 }
 
 #[test]
-fn two_is_bad_usage() {
+fn bad_parameters_exit_with_2() {
     let cases: [(&[&str], &str); 16] = [
         (&["--resolution", "0"], "resolution"),
         (&["--resolution", "-1"], "resolution"),
@@ -41,13 +41,13 @@ fn two_is_bad_usage() {
         (&["--isovalue", "900000"], "isovalue"),
     ];
     for (flags, part) in cases {
-        let said = fails(rod(), flags, 2);
-        assert!(said.contains(part), "{flags:?}: {said}");
+        let message = fails(rod(), flags, 2);
+        assert!(message.contains(part), "{flags:?}: {message}");
     }
 }
 
 #[test]
-fn two_is_also_what_clap_refuses() {
+fn bad_flags_exit_with_2() {
     let cases: [&[&str]; 6] = [
         &["mesh"],
         &["mesh", "a.pdb"],
@@ -68,7 +68,7 @@ fn two_is_also_what_clap_refuses() {
 }
 
 #[test]
-fn two_is_an_output_without_a_known_format() {
+fn unknown_output_formats_exit_with_2() {
     let folder = Folder::new();
     let input = folder.file("in.pdb", rod());
     for name in ["out", "out.pdf", "out.glb.gz"] {
@@ -84,7 +84,7 @@ fn two_is_an_output_without_a_known_format() {
 }
 
 #[test]
-fn three_is_an_input_that_cannot_be_read() {
+fn unreadable_inputs_exit_with_3() {
     let folder = Folder::new();
     let done = mesh(&folder.path("nowhere.pdb"), &folder.path("out.glb"), &[]);
     assert_code(&done, 3);
@@ -95,43 +95,43 @@ fn three_is_an_input_that_cannot_be_read() {
 }
 
 #[test]
-fn four_is_a_structure_that_is_refused() {
+fn invalid_structures_exit_with_4() {
     for bytes in [&b""[..], b"\n\n", b"hello", b"\x00\x01\x02\xff", b"END\n", b"HEADER    X\nREMARK   1\nEND\n"] {
         fails(bytes, &[], 4);
     }
     fails(rod().replace("   0.250", "     nan"), &[], 4);
     fails(pdb(&[[0.0; 3]]).replace("   0.000   0.000", " 9999999   0.000"), &[], 4);
-    let said = fails(rod(), &["--chains", "Z"], 4);
-    assert!(said.contains('Z') && said.contains('A'), "{said}");
-    let said = fails(rod(), &["--model", "7"], 4);
-    assert!(said.contains("model 7"), "{said}");
-    let said = fails(rod(), &["--select", "water"], 4);
-    assert!(said.contains("polymer"), "what the file holds is said: {said}");
+    let message = fails(rod(), &["--chains", "Z"], 4);
+    assert!(message.contains('Z') && message.contains('A'), "{message}");
+    let message = fails(rod(), &["--model", "7"], 4);
+    assert!(message.contains("model 7"), "{message}");
+    let message = fails(rod(), &["--select", "water"], 4);
+    assert!(message.contains("polymer"), "the error lists the content of the file: {message}");
     assert_code(&piped(&["mesh", "-", "-o", "-"], b"nothing"), 4);
 }
 
 #[test]
-fn five_is_a_limit_and_says_the_numbers() {
-    let said = fails(rod(), &["--max-atoms", "9"], 5);
-    assert!(said.contains('9') && said.contains("hint: raise it with --max-atoms"), "{said}");
-    let said = fails(rod(), &["--max-samples", "100"], 5);
-    assert!(said.contains("limit is 100") && said.contains("hint: try --resolution "), "{said}");
-    let said = fails(rod(), &["--max-mesh-bytes", "1000"], 5);
-    assert!(said.contains("limit is 1000") && said.contains("hint: try --resolution "), "{said}");
-    let said = fails(rod(), &["--max-input-bytes", "100"], 5);
-    assert!(said.contains("100 bytes"), "{said}");
+fn exceeded_limits_exit_with_5_and_are_named() {
+    let message = fails(rod(), &["--max-atoms", "9"], 5);
+    assert!(message.contains('9') && message.contains("hint: raise it with --max-atoms"), "{message}");
+    let message = fails(rod(), &["--max-samples", "100"], 5);
+    assert!(message.contains("limit is 100") && message.contains("hint: try --resolution "), "{message}");
+    let message = fails(rod(), &["--max-mesh-bytes", "1000"], 5);
+    assert!(message.contains("limit is 1000") && message.contains("hint: try --resolution "), "{message}");
+    let message = fails(rod(), &["--max-input-bytes", "100"], 5);
+    assert!(message.contains("100 bytes"), "{message}");
     assert_code(&piped(&["mesh", "-", "-o", "-", "--max-input-bytes", "100"], rod().as_bytes()), 5);
 }
 
 #[test]
-fn the_suggested_resolution_fits() {
+fn suggested_resolution_is_accepted() {
     let folder = Folder::new();
     let input = folder.file("in.pdb", rod());
     let limit = ["--max-samples", "50000"];
     let done = mesh(&input, &folder.path("out.glb"), &[limit[0], limit[1], "--resolution", "0.1"]);
     assert_code(&done, 5);
-    let said = stderr(&done);
-    let suggested = said.split("--resolution ").nth(1).unwrap().split(',').next().unwrap();
+    let message = stderr(&done);
+    let suggested = message.split("--resolution ").nth(1).unwrap().split(',').next().unwrap();
     assert_code(&mesh(&input, &folder.path("out.glb"), &[limit[0], limit[1], "--resolution", suggested]), 0);
 }
 
@@ -142,7 +142,7 @@ fn six_is_a_backend_that_is_not_here_and_why() {
 }
 
 #[test]
-fn seven_is_an_output_that_cannot_be_written() {
+fn unwritable_outputs_exit_with_7() {
     let folder = Folder::new();
     let input = folder.file("in.pdb", rod());
     let done = mesh(&input, &folder.path("no/such/folder/out.glb"), &[]);
@@ -155,7 +155,7 @@ fn seven_is_an_output_that_cannot_be_written() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn seven_is_also_a_full_disk() {
+fn full_disk_exits_with_7() {
     let folder = Folder::new();
     let input = folder.file("in.pdb", rod());
     let done = mesh(&input, Path::new("/dev/full"), &["--format", "glb"]);
@@ -165,7 +165,7 @@ fn seven_is_also_a_full_disk() {
 
 #[cfg(unix)]
 #[test]
-fn seven_is_also_a_reader_that_went_away() {
+fn closed_pipe_exits_with_7() {
     use std::process::Stdio;
     let folder = Folder::new();
     let input = folder.file("in.pdb", rod());
@@ -177,7 +177,7 @@ fn seven_is_also_a_reader_that_went_away() {
 }
 
 #[test]
-fn a_failure_leaves_the_old_file() {
+fn failure_keeps_the_old_file() {
     let folder = Folder::new();
     let input = folder.file("in.pdb", "no structure");
     let output = folder.file("out.glb", "old");
@@ -187,7 +187,7 @@ fn a_failure_leaves_the_old_file() {
 }
 
 #[test]
-fn one_is_a_service_that_does_not_answer() {
+fn unreachable_service_exits_with_1() {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("http://{}/readyz", listener.local_addr().unwrap());
     drop(listener);

@@ -14,22 +14,22 @@ fn signal(child: &Child, name: &str) {
     assert!(sent.success());
 }
 
-/// Waits until `folder` holds a file beside the input: the output is open, the work has begun.
+/// Waits until `folder` contains a file beside the input: the output is open and the job has started.
 fn wait_for_work(folder: &Folder, child: &mut Child) {
     let start = Instant::now();
     while folder.entries().len() < 2 {
-        assert!(child.try_wait().unwrap().is_none(), "it ended before it was interrupted");
-        assert!(start.elapsed() < Duration::from_secs(20), "it never began");
+        assert!(child.try_wait().unwrap().is_none(), "the command ended before the interrupt");
+        assert!(start.elapsed() < Duration::from_secs(20), "the job did not start");
         std::thread::sleep(Duration::from_millis(2));
     }
     std::thread::sleep(Duration::from_millis(100));
 }
 
 #[test]
-fn an_interrupted_mesh_leaves_nothing() {
+fn interrupted_mesh_leaves_no_file() {
     for name in ["INT", "TERM"] {
         let folder = Folder::new();
-        // Far more work than the test will wait for.
+        // Much more work than can finish during the test.
         let input = folder.file("block.pdb", block(20));
         let mut command = molmesh();
         command.arg("mesh").arg(&input).arg("-o").arg(folder.path("out.glb")).args(["--resolution", "0.03"]);
@@ -46,7 +46,7 @@ fn an_interrupted_mesh_leaves_nothing() {
 }
 
 #[test]
-fn waiting_for_stdin_can_be_interrupted() {
+fn reading_stdin_can_be_interrupted() {
     let folder = Folder::new();
     let mut child = molmesh()
         .args(["mesh", "-", "-o"])
@@ -58,7 +58,7 @@ fn waiting_for_stdin_can_be_interrupted() {
     let stdin = child.stdin.take();
     let start = Instant::now();
     while folder.entries().is_empty() {
-        assert!(start.elapsed() < Duration::from_secs(20), "it never began");
+        assert!(start.elapsed() < Duration::from_secs(20), "the job did not start");
         std::thread::sleep(Duration::from_millis(2));
     }
     signal(&child, "INT");

@@ -10,7 +10,7 @@ use std::path::Path;
 use cli_support::{Folder, assert_code, mesh, pdb, piped, rod, run, stderr, stdout};
 use serde_json::Value;
 
-/// How the files of a format begin.
+/// Returns the first bytes of files of a format.
 fn magic(format: &str) -> &'static [u8] {
     match format {
         "glb" => b"glTF",
@@ -23,7 +23,7 @@ fn magic(format: &str) -> &'static [u8] {
 }
 
 #[test]
-fn the_extension_says_the_format() {
+fn extension_selects_the_format() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     for format in ["glb", "gltf", "ply", "stl", "obj"] {
@@ -36,7 +36,7 @@ fn the_extension_says_the_format() {
 }
 
 #[test]
-fn the_flag_overrides_the_extension() {
+fn format_flag_overrides_the_extension() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let output = folder.path("rod.bin");
@@ -45,7 +45,7 @@ fn the_flag_overrides_the_extension() {
 }
 
 #[test]
-fn stdin_to_stdout_gives_the_bytes_of_a_file() {
+fn stdout_gets_the_same_bytes_as_a_file() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let output = folder.path("rod.glb");
@@ -59,12 +59,13 @@ fn stdin_to_stdout_gives_the_bytes_of_a_file() {
     assert!(ply.stdout.starts_with(magic("ply")));
 }
 
-/// A GLB that goes into a file is written out of order while it is meshed; one that goes through a pipe is not.
+/// A GLB file is written out of order while it is meshed; a GLB for a pipe is not.
 #[test]
-fn a_file_has_the_bytes_that_a_pipe_gets() {
+fn glb_is_the_same_in_a_file_and_in_a_pipe() {
     let folder = Folder::new();
     let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
-    // Vertices without a gradient, a small buffer, a large one, 16-bit indices and 32-bit ones; then the longest report that there is.
+    // Vertices without a gradient, small and large buffers, 16-bit and 32-bit indices; then the longest possible
+    // report.
     let long = folder.file("long.cif", long_report());
     for (input, resolution) in [
         (Path::new(sample), "8"),
@@ -87,9 +88,9 @@ fn a_file_has_the_bytes_that_a_pipe_gets() {
     }
 }
 
-/// The step is known before the mesh is, so a file written out of order has the bytes of one written in order.
+/// The step is known before the mesh, so a file written out of order has the same bytes as one written in order.
 #[test]
-fn a_quantised_file_has_the_bytes_that_a_pipe_gets() {
+fn quantised_glb_is_the_same_in_a_file_and_in_a_pipe() {
     let folder = Folder::new();
     let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
     let long = folder.file("long.cif", long_report());
@@ -107,17 +108,18 @@ fn a_quantised_file_has_the_bytes_that_a_pipe_gets() {
         let json_bytes = u32::from_le_bytes(file[12..16].try_into().unwrap()) as usize;
         let document = json(std::str::from_utf8(&file[20..20 + json_bytes]).unwrap());
         let vertices = document["asset"]["extras"]["vertices"].as_u64().unwrap();
-        // The heads differ by a few words, or not at all.
+        // The headers differ by a few words at most.
         assert!(saved.abs_diff(12 * vertices) < 1000, "{saved} bytes saved on {vertices} vertices");
         assert_eq!(json_bytes + 28 == 16_384, file.len() > 1 << 20, "{resolution}: {json_bytes} bytes of JSON");
     }
-    let told = mesh(Path::new(sample), &folder.path("out.gltf"), &["--compress", "quantize"]);
-    assert!(stderr(&told).contains("quantised in steps of 0.0009765625 Å"), "{}", stderr(&told));
+    let done = mesh(Path::new(sample), &folder.path("out.gltf"), &["--compress", "quantize"]);
+    assert!(stderr(&done).contains("quantised in steps of 0.0009765625 Å"), "{}", stderr(&done));
 }
 
-/// Levels of detail, units and normals are known before the mesh is; a bound on triangles is not, and takes the other way.
+/// Levels of detail, units and normals are known before the mesh and allow writing out of order; a limit on triangles
+/// does not.
 #[test]
-fn files_have_the_bytes_of_pipes_however_they_are_stored() {
+fn stored_forms_are_the_same_in_a_file_and_in_a_pipe() {
     let folder = Folder::new();
     let sample = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
     let mut seen = Vec::new();
@@ -134,13 +136,13 @@ fn files_have_the_bytes_of_pipes_however_they_are_stored() {
         assert_code(&piped, 0);
         let file = fs::read(&output).unwrap();
         assert!(piped.stdout == file, "{flags:?}: {} and {} bytes", piped.stdout.len(), file.len());
-        assert!(!seen.contains(&file), "{flags:?} changes the file");
+        assert!(!seen.contains(&file), "{flags:?} does not change the file");
         seen.push(file);
     }
 }
 
 #[test]
-fn the_spacing_can_follow_from_a_level_or_from_a_bound() {
+fn level_or_triangle_limit_sets_the_spacing() {
     let folder = Folder::new();
     let sample = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
     let output = folder.path("out.ply");
@@ -155,8 +157,8 @@ fn the_spacing_can_follow_from_a_level_or_from_a_bound() {
     assert!(bounded["tries"].as_u64().is_some_and(|n| n >= 2), "{bounded}");
     let level = report(&["--detail", "1"]);
     assert_eq!((&level["resolution"], &level["detail"]), (&1.4.into(), &1.into()));
-    let told = stderr(&mesh(sample, &output, &["--detail", "1", "--units", "nanometer", "--normals", "none"]));
-    assert!(told.contains("1.4 Å (detail 1)") && told.contains("in nanometers, without normals"), "{told}");
+    let summary = stderr(&mesh(sample, &output, &["--detail", "1", "--units", "nanometer", "--normals", "none"]));
+    assert!(summary.contains("1.4 Å (detail 1)") && summary.contains("in nanometers, without normals"), "{summary}");
 
     fs::remove_file(&output).unwrap();
     let refused = mesh(sample, &output, &["--max-triangles", "20"]);
@@ -172,10 +174,10 @@ fn the_spacing_can_follow_from_a_level_or_from_a_bound() {
     ] {
         assert_code(&mesh(sample, &output, flags), 2);
     }
-    assert!(!output.exists(), "what is refused leaves no file");
+    assert!(!output.exists(), "a rejected request leaves no file");
 }
 
-/// More components than a report lists, and the longest title.
+/// Returns a structure with more components than a report lists, and with the longest title.
 fn long_report() -> String {
     let names = ["group_PDB", "id", "type_symbol", "label_atom_id", "label_comp_id", "label_asym_id", "label_seq_id"];
     let columns = names.into_iter().chain(["Cartn_x", "Cartn_y", "Cartn_z", "occupancy"]);
@@ -191,13 +193,13 @@ fn json(text: &str) -> Value {
 }
 
 #[test]
-fn the_json_report_has_its_fields() {
+fn json_report_has_its_fields() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let output = folder.path("rod.glb");
     let done = mesh(&input, &output, &["--report", "json"]);
     assert_code(&done, 0);
-    assert_eq!(stderr(&done), "", "the report went to stdout");
+    assert_eq!(stderr(&done), "", "the report is on stdout");
     let report = json(&stdout(&done));
     for field in ["vertices", "triangles", "bricks", "samples"] {
         assert!(report[field].as_u64().unwrap() > 0, "{field}: {report}");
@@ -206,10 +208,10 @@ fn the_json_report_has_its_fields() {
     assert_eq!([&report["closed"], &report["manifold"], &report["oriented"]], [&Value::Bool(true); 3]);
     assert_eq!((&report["euler"], &report["components"]), (&2.into(), &1.into()));
     assert_eq!((&report["kernel"], &report["resolution"]), (&"gaussian".into(), &0.5.into()));
-    // So small a job does not pay for the start of a GPU, whether or not the machine has one.
+    // The start of a GPU would take longer than this job.
     assert_eq!(report["backend"], "cpu");
     let reason = report["backend_reason"].as_str().unwrap();
-    assert!(reason.starts_with("auto: no GPU was looked for (estimated "), "{report}");
+    assert!(reason.starts_with("auto: no GPU discovery (estimated "), "{report}");
     assert!(report["area"].as_f64().unwrap() > 100.0 && report["volume"].as_f64().unwrap() > 50.0, "{report}");
     for stage in ["read", "field", "emit", "measure", "encode", "write"] {
         assert!(report["timings_ms"][stage].as_f64().is_some_and(|ms| ms >= 0.0), "{stage}: {report}");
@@ -220,7 +222,7 @@ fn the_json_report_has_its_fields() {
 }
 
 #[test]
-fn the_report_leaves_stdout_to_the_mesh() {
+fn json_report_moves_to_stderr_if_the_mesh_is_on_stdout() {
     let done = piped(&["mesh", "-", "-o", "-", "--report", "json"], rod().as_bytes());
     assert_code(&done, 0);
     assert!(done.stdout.starts_with(magic("glb")));
@@ -230,7 +232,7 @@ fn the_report_leaves_stdout_to_the_mesh() {
 }
 
 #[test]
-fn the_summary_fits_a_screen_and_has_no_colour_here() {
+fn summary_fits_a_screen_and_has_no_colour_without_a_terminal() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let done = mesh(&input, &folder.path("rod.glb"), &[]);
@@ -253,7 +255,7 @@ fn the_summary_fits_a_screen_and_has_no_colour_here() {
 }
 
 #[test]
-fn the_same_input_gives_the_same_bytes_on_any_number_of_threads() {
+fn output_does_not_depend_on_the_number_of_threads() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let bytes = ["1", "2", "7"].map(|threads| {
@@ -266,7 +268,7 @@ fn the_same_input_gives_the_same_bytes_on_any_number_of_threads() {
 }
 
 #[test]
-fn the_reference_backend_agrees_on_the_topology() {
+fn reference_backend_has_the_same_topology() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let [cpu, reference] = ["cpu", "reference"].map(|backend| {
@@ -278,7 +280,7 @@ fn the_reference_backend_agrees_on_the_topology() {
     for field in ["vertices", "triangles", "euler", "components"] {
         assert_eq!(cpu[field], reference[field], "{field}");
     }
-    assert_eq!(cpu["backend_reason"], "asked for");
+    assert_eq!(cpu["backend_reason"], "requested");
 }
 
 #[test]
@@ -302,7 +304,7 @@ fn parameters_reach_the_mesh() {
 }
 
 #[test]
-fn atom_ids_come_with_the_mesh_on_request() {
+fn atom_ids_are_stored_on_request() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let output = folder.path("x.gltf");
@@ -313,7 +315,7 @@ fn atom_ids_come_with_the_mesh_on_request() {
 }
 
 #[test]
-fn an_existing_file_is_replaced_and_keeps_its_permissions() {
+fn replaced_file_keeps_its_permissions() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let output = folder.file("rod.glb", "old");
@@ -331,7 +333,7 @@ fn an_existing_file_is_replaced_and_keeps_its_permissions() {
 
 #[cfg(unix)]
 #[test]
-fn a_link_is_followed_and_a_device_is_not_replaced() {
+fn links_are_followed_and_devices_are_not_replaced() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let target = folder.file("target.glb", "old");
@@ -346,7 +348,7 @@ fn a_link_is_followed_and_a_device_is_not_replaced() {
 }
 
 #[test]
-fn version_and_doctor_answer_on_stdout() {
+fn version_and_doctor_write_to_stdout() {
     let version = run(["version"]);
     assert_code(&version, 0);
     assert!(stdout(&version).starts_with(concat!("molmesh ", env!("CARGO_PKG_VERSION"))));
@@ -359,8 +361,8 @@ fn version_and_doctor_answer_on_stdout() {
 }
 
 #[test]
-fn a_mesh_with_many_voids_is_written_while_it_is_made() {
-    // A lattice of atoms with a void in each of its 6³ cells: as many entries as the report lists, and more.
+fn report_lists_at_most_100_voids() {
+    // A lattice of atoms with a void in each of its 6³ cells: more than the report lists.
     let at = |i: usize| [i % 7, i / 7 % 7, i / 49].map(|c| 3.2 * f64::from(u32::try_from(c).unwrap()));
     let folder = Folder::new();
     let input = folder.file("lattice.pdb", pdb(&(0..343).map(at).collect::<Vec<_>>()));

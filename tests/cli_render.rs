@@ -16,7 +16,7 @@ fn render(input: &Path, output: &Path, more: &[&str]) -> Output {
     run(["render", input, "-o", output, "--backend", "cpu"].iter().chain(more))
 }
 
-/// Width and height, from the head of a PNG.
+/// Returns width and height from the header of a PNG.
 fn size(bytes: &[u8]) -> (u32, u32) {
     assert_eq!(bytes[..8], *b"\x89PNG\r\n\x1a\n");
     let number = |at: usize| u32::from_be_bytes(bytes[at..at + 4].try_into().unwrap());
@@ -24,24 +24,24 @@ fn size(bytes: &[u8]) -> (u32, u32) {
 }
 
 #[test]
-fn a_picture_is_a_file_with_a_summary() {
+fn writes_a_file_and_a_summary() {
     let folder = Folder::new();
     let (input, output) = (folder.file("rod.pdb", rod()), folder.path("rod.PNG"));
     let done = render(&input, &output, &["--width", "80", "--height", "60", "--view", "top", "--azimuth", "-30"]);
     assert_code(&done, 0);
     assert_eq!(size(&fs::read(&output).unwrap()), (80, 60));
-    let said = stderr(&done);
+    let summary = stderr(&done);
     for part in
-        ["80 × 60, top view, azimuth -30°", "Å a pixel", "cpu: CPU rasteriser", "another backend than the GPU", "png"]
+        ["80 × 60, top view, azimuth -30°", "Å per pixel", "cpu: CPU rasteriser", "a backend other than the GPU", "png"]
     {
-        assert!(said.contains(part), "no `{part}` in\n{said}");
+        assert!(summary.contains(part), "no `{part}` in\n{summary}");
     }
-    assert!(said.lines().count() <= 40, "one screen:\n{said}");
+    assert!(summary.lines().count() <= 40, "one screen:\n{summary}");
     assert_eq!(stdout(&done), "");
 }
 
 #[test]
-fn streams_and_files_hold_the_same_bytes_and_flags_change_them() {
+fn flags_change_the_picture_and_streams_equal_files() {
     let folder = Folder::new();
     let (input, output) = (folder.file("rod.pdb", rod()), folder.path("a.png"));
     let of = |more: &[&str]| {
@@ -69,7 +69,7 @@ fn streams_and_files_hold_the_same_bytes_and_flags_change_them() {
 }
 
 #[test]
-fn the_report_says_who_drew_it() {
+fn report_names_the_renderer() {
     let folder = Folder::new();
     let (input, output) = (folder.file("rod.pdb", rod()), folder.path("a.png"));
     let done = render(&input, &output, &["--report", "json", "--quiet", "--background", "#102030"]);
@@ -83,7 +83,7 @@ fn the_report_says_who_drew_it() {
 }
 
 #[test]
-fn what_is_no_picture_is_refused() {
+fn rejects_mesh_formats_and_bad_sizes() {
     let folder = Folder::new();
     let input = folder.file("rod.pdb", rod());
     let glb = render(&input, &folder.path("a.glb"), &[]);

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 use cli_support::{Folder, Service, assert_code, run, stderr};
 
 #[test]
-fn the_banner_is_small_and_its_line_works_as_pasted() {
+fn example_command_of_the_banner_works() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--devices", "cpu"]);
     assert!(service.banner.lines().count() <= 10 && !service.banner.contains('\x1b'), "{}", service.banner);
@@ -27,7 +27,7 @@ fn the_banner_is_small_and_its_line_works_as_pasted() {
 }
 
 #[test]
-fn it_stops_when_told_and_says_nothing_bad() {
+fn stops_on_signals_without_warnings() {
     for signal in ["TERM", "INT"] {
         let folder = Folder::new();
         let (code, log) = Service::start(&folder, &["--log", "json"]).stop(signal);
@@ -40,7 +40,7 @@ fn it_stops_when_told_and_says_nothing_bad() {
 }
 
 #[test]
-fn lines_of_the_log_say_whose_they_are() {
+fn log_lines_name_their_request_and_job() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--log", "json", "--set", "log.filter=info"]);
     let pdb = folder.file("rod.pdb", cli_support::rod());
@@ -54,7 +54,7 @@ fn lines_of_the_log_say_whose_they_are() {
         serde_json::from_slice::<serde_json::Value>(&answer.unwrap().stdout).unwrap()
     };
     let job = ask(
-        "asked-for-it",
+        "submits",
         &[
             "-H",
             "Prefer: respond-async",
@@ -64,24 +64,24 @@ fn lines_of_the_log_say_whose_they_are() {
         ],
     );
     let job = job["jobID"].as_str().unwrap().to_owned();
-    let done = ask("looked-at-it", &[&format!("http://{}/v1/jobs/{job}?wait=30", service.addr)]);
+    let done = ask("polls", &[&format!("http://{}/v1/jobs/{job}?wait=30", service.addr)]);
     assert_eq!(done["status"], "successful", "{done}");
     let (code, log) = service.stop("TERM");
     assert_eq!(code, Some(0), "{log}");
 
     let lines: Vec<serde_json::Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let of = |key: &str, value: &str| -> Vec<_> { lines.iter().filter(|l| l["span"][key] == value).collect() };
-    for id in ["asked-for-it", "looked-at-it"] {
+    for id in ["submits", "polls"] {
         let answered: Vec<_> = of("request_id", id).into_iter().filter(|l| l["message"] == "answered").collect();
-        assert_eq!(answered.len(), 1, "one line a request\n{log}");
+        assert_eq!(answered.len(), 1, "one line per request\n{log}");
         assert_eq!(answered[0]["span"]["trace_id"], trace, "{log}");
         assert!(answered[0]["ms"].is_number() && answered[0]["status"].is_u64(), "{}", answered[0]);
     }
-    // The job's own lines name the request that asked for it, not the one that looked.
+    // The lines of the job name the request that submitted it, not the one that polled it.
     let of_job = of("job_id", &job);
     assert!(!of_job.is_empty(), "no line of the job\n{log}");
     for line in of_job {
-        assert_eq!((&line["span"]["request_id"], &line["span"]["trace_id"]), (&"asked-for-it".into(), &trace.into()));
+        assert_eq!((&line["span"]["request_id"], &line["span"]["trace_id"]), (&"submits".into(), &trace.into()));
     }
 }
 
@@ -99,7 +99,7 @@ fn flags_reach_the_service() {
 }
 
 #[test]
-fn a_data_folder_has_one_service_at_a_time() {
+fn second_service_on_a_data_folder_is_refused() {
     let folder = Folder::new();
     let first = Service::start(&folder, &[]);
     let data = folder.path("data");
@@ -107,17 +107,17 @@ fn a_data_folder_has_one_service_at_a_time() {
     let serve = ["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir"];
     let refused = run(serve.iter().copied().chain([data.to_str().unwrap()]));
     assert_code(&refused, 8);
-    let said = stderr(&refused);
+    let message = stderr(&refused);
     for part in [data.to_str().unwrap(), "server.data_dir", &format!("pid {}", first.pid()), &first.addr, "--data-dir"]
     {
-        assert!(said.contains(part), "no `{part}` in {said}");
+        assert!(message.contains(part), "no `{part}` in {message}");
     }
-    assert_eq!(std::fs::read(data.join("lock")).unwrap(), before, "the second changes nothing");
+    assert_eq!(std::fs::read(data.join("lock")).unwrap(), before, "the second service changes nothing");
     let doctor = run(["doctor", "--report", "json", "--listen", "127.0.0.1:0", "--data-dir", data.to_str().unwrap()]);
     assert!(cli_support::stdout(&doctor).contains(&format!("pid {}", first.pid())), "{}", stderr(&doctor));
-    // Another folder is another matter.
+    // Another folder is allowed.
     drop(Service::start(&Folder::new(), &[]));
-    // The lock ends with the process, however it ends.
+    // The lock ends with the process, even if it is killed.
     assert_eq!(first.stop("KILL").0, None);
     let third = Service::start(&folder, &[]);
     assert_eq!(third.stop("TERM").0, Some(0));
@@ -125,12 +125,12 @@ fn a_data_folder_has_one_service_at_a_time() {
 }
 
 #[test]
-fn what_cannot_start_says_why() {
+fn failed_starts_exit_with_a_reason() {
     let folder = Folder::new();
     let service = Service::start(&folder, &[]);
-    let taken = run(["serve", "--listen", &service.addr, "--set", "server.metrics_listen=none"]);
-    assert_code(&taken, 1);
-    assert!(stderr(&taken).contains(&service.addr), "{}", stderr(&taken));
+    let in_use = run(["serve", "--listen", &service.addr, "--set", "server.metrics_listen=none"]);
+    assert_code(&in_use, 1);
+    assert!(stderr(&in_use).contains(&service.addr), "{}", stderr(&in_use));
     for set in ["limits.atomz=5", "atoms", "limits.atoms=many", "limits.atoms=0"] {
         let refused = run(["serve", "--listen", "127.0.0.1:0", "--set", set]);
         assert_code(&refused, 2);
@@ -139,7 +139,7 @@ fn what_cannot_start_says_why() {
     assert_code(&run(["serve", "--config", "/no/such/file.toml"]), 2);
 }
 
-/// The document that `curl` gets for these arguments.
+/// Runs `curl` and parses its JSON output.
 #[cfg(target_os = "linux")]
 fn curl(args: &[&str]) -> serde_json::Value {
     let answer = Command::new("curl").arg("-sS").args(args).output().unwrap();
@@ -148,7 +148,7 @@ fn curl(args: &[&str]) -> serde_json::Value {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn identical_atoms_are_refused_before_they_take_memory() {
+fn identical_atoms_are_rejected_before_allocation() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--devices", "cpu"]);
     let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 300_000]));
@@ -162,11 +162,11 @@ fn identical_atoms_are_refused_before_they_take_memory() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn memory_of_a_cancelled_job_goes_back_to_the_system() {
+fn cancelled_job_returns_its_memory() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--devices", "cpu"]);
     let before = service.memory("VmRSS");
-    // Most of their candidate lists are long enough to be freed when their tile is finished.
+    // Most candidate lists are long enough to be freed when their tile is finished.
     let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 80_000]));
     let body = format!("@{}", input.display());
     let url = format!("http://{}/v1/meshes?radius_scale=10", service.addr);
@@ -179,8 +179,8 @@ fn memory_of_a_cancelled_job_goes_back_to_the_system() {
             std::thread::sleep(Duration::from_millis(50));
         }
     };
-    wait("it takes memory", Duration::from_mins(1), &|| service.memory("VmRSS") > before + 60);
+    wait("the job allocates memory", Duration::from_mins(1), &|| service.memory("VmRSS") > before + 60);
     assert_eq!(curl(&["-X", "DELETE", &job])["status"], "dismissed");
     // 10 s on an idle machine.
-    wait("its memory goes back", Duration::from_secs(20), &|| service.memory("VmRSS") < before + 35);
+    wait("the memory is returned", Duration::from_secs(20), &|| service.memory("VmRSS") < before + 35);
 }

@@ -17,16 +17,16 @@ use cli_support::{Folder, assert_code, mesh, molmesh, stderr, stdout};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-/// The newest change below `path`.
+/// Returns the time of the newest change below `path`.
 fn changed(path: &Path) -> SystemTime {
     let own = fs::metadata(path).unwrap();
     let below =
         if own.is_dir() { fs::read_dir(path).unwrap().map(|e| changed(&e.unwrap().path())).max() } else { None };
-    // A folder changes with its entries' names.
+    // The time of a folder changes with the names of its entries.
     below.map_or(own.modified().unwrap(), |below| below.max(own.modified().unwrap()))
 }
 
-/// The static executable, if it was built from what is here.
+/// Returns the static executable, if it is newer than the sources.
 fn tool() -> Option<PathBuf> {
     let root = Path::new(ROOT);
     let tool = root.join("dist/molmesh");
@@ -35,7 +35,7 @@ fn tool() -> Option<PathBuf> {
     if built.is_some() && built >= sources {
         return Some(tool);
     }
-    let why = if built.is_some() { "is older than the sources" } else { "is not there" };
+    let why = if built.is_some() { "is older than the sources" } else { "does not exist" };
     println!("SKIPPED: dist/molmesh {why}; make static builds it");
     None
 }
@@ -44,7 +44,7 @@ fn run(tool: &Path, args: &[&str]) -> Output {
     Command::new(tool).args(args).current_dir(ROOT).output().unwrap()
 }
 
-/// The program headers' types of a 64-bit little-endian ELF file.
+/// Returns the types of the program headers of a 64-bit little-endian ELF file.
 fn segments(elf: &[u8]) -> Vec<u32> {
     assert_eq!(&elf[..6], b"\x7fELF\x02\x01");
     let word = |at: usize| u32::from_le_bytes(elf[at..at + 4].try_into().unwrap());
@@ -54,18 +54,18 @@ fn segments(elf: &[u8]) -> Vec<u32> {
 }
 
 #[test]
-fn it_needs_no_loader() {
+fn needs_no_loader() {
     const PT_LOAD: u32 = 1;
     const PT_INTERP: u32 = 3;
     let Some(tool) = tool() else { return };
     let static_one = segments(&fs::read(&tool).unwrap());
     assert!(static_one.contains(&PT_LOAD) && !static_one.contains(&PT_INTERP), "{static_one:?}");
-    // The usual one does, so the question can be answered either way.
+    // Control: the usual executable has a loader.
     assert!(segments(&fs::read(env!("CARGO_BIN_EXE_molmesh")).unwrap()).contains(&PT_INTERP));
 }
 
 #[test]
-fn it_writes_the_same_bytes() {
+fn writes_the_same_bytes_as_the_usual_executable() {
     let Some(tool) = tool() else { return };
     let folder = Folder::new();
     let (ours, theirs) = (folder.path("static"), folder.path("usual"));
@@ -92,7 +92,7 @@ fn it_writes_the_same_bytes() {
 }
 
 #[test]
-fn it_draws_and_refuses_as_the_usual_one() {
+fn renders_and_rejects_like_the_usual_executable() {
     let Some(tool) = tool() else { return };
     let folder = Folder::new();
     let (ours, theirs) = (folder.path("static.png"), folder.path("usual.png"));
@@ -115,7 +115,7 @@ fn it_draws_and_refuses_as_the_usual_one() {
 }
 
 #[test]
-fn it_says_what_it_has_not() {
+fn names_missing_features() {
     let Some(tool) = tool() else { return };
     let folder = Folder::new();
     let version = run(&tool, &["version"]);
@@ -124,7 +124,7 @@ fn it_says_what_it_has_not() {
 
     let serve = run(&tool, &["serve"]);
     assert_eq!(serve.status.code(), Some(2));
-    assert!(stderr(&serve).contains("This build is the command line alone"), "{}", stderr(&serve));
+    assert!(stderr(&serve).contains("This build has no service"), "{}", stderr(&serve));
 
     let output = folder.path("4pti.glb");
     let gpu = run(&tool, &["mesh", "samples/4pti.pdb", "-o", output.to_str().unwrap(), "--backend", "gpu"]);

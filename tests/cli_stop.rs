@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use cli_support::{Folder, Service};
 use http_support::{SAMPLE, connect, read_reply, sample, send};
 
-/// Waits for something to become true, for as long as a loaded machine may take.
+/// Waits until a condition holds, for at most a minute, as the machine may be busy.
 #[track_caller]
 fn eventually(what: &str, mut is: impl FnMut() -> bool) {
     let end = Instant::now() + Duration::from_mins(1);
@@ -28,7 +28,7 @@ fn addr(service: &Service) -> SocketAddr {
     service.addr.parse().unwrap()
 }
 
-/// One request on a connection that is kept; the status, and whether the server keeps the connection.
+/// Sends one request on a persistent connection. Returns the status and whether the server keeps the connection.
 fn ask(stream: &mut TcpStream, body: &[u8]) -> (u16, bool) {
     let head = format!("POST /v1/meshes?resolution=1.5 HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
     stream.write_all(&[head.as_bytes(), body].concat()).unwrap();
@@ -59,7 +59,7 @@ fn no_request_fails_under_load() {
                     let mut kept = None;
                     for n in 0.. {
                         let late = noticed.load(Ordering::SeqCst);
-                        // A load balancer sends no more once it has noticed; these go on for a while, and are served.
+                        // Late requests, before load balancers stop sending any, are still served.
                         if late && behind.load(Ordering::SeqCst) >= 30 {
                             return;
                         }
@@ -71,7 +71,7 @@ fn no_request_fails_under_load() {
                         } else {
                             let mut stream = kept.take().unwrap_or_else(|| connect(addr));
                             let (status, keeps) = ask(&mut stream, &body);
-                            assert!(!(late && keeps), "it keeps connections after its notice");
+                            assert!(!(late && keeps), "connections are kept after the notice");
                             kept = keeps.then_some(stream);
                             status
                         };
@@ -82,8 +82,8 @@ fn no_request_fails_under_load() {
                 })
             })
             .collect();
-        eventually("the load is on", || answered.load(Ordering::SeqCst) >= 30);
-        // Requests whose bodies come slowly are under way through all of it.
+        eventually("the clients have started", || answered.load(Ordering::SeqCst) >= 30);
+        // Requests with slow bodies are in progress all the time.
         let mut slow = [0, 1].map(|n| {
             let mut stream = connect(addr);
             let body = sample(77_000_000 + n);
@@ -92,7 +92,7 @@ fn no_request_fails_under_load() {
             (stream, body)
         });
         service.signal("TERM");
-        eventually("it is not ready", || send(addr, "GET", "/readyz", &[], b"").status == 503);
+        eventually("the service is not ready", || send(addr, "GET", "/readyz", &[], b"").status == 503);
         noticed.store(true, Ordering::SeqCst);
         for client in clients {
             client.join().unwrap();
@@ -112,7 +112,7 @@ fn no_request_fails_under_load() {
 }
 
 #[test]
-fn a_further_signal_cuts_the_drain_short() {
+fn second_signal_ends_the_drain() {
     for signals in [["TERM", "TERM"], ["INT", "TERM"], ["TERM", "INT"]] {
         let folder = Folder::new();
         let service = Service::start(
@@ -129,8 +129,8 @@ fn a_further_signal_cuts_the_drain_short() {
         let mut stream = connect(addr(&service));
         stream.write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: 5000\r\n\r\n").unwrap();
         stream.write_all(&SAMPLE[..1000]).unwrap();
-        // An answer to a later connection says that this one was let in.
-        eventually("it is under way", || send(addr(&service), "GET", "/livez", &[], b"").status == 200);
+        // A response to a later connection shows that this one was accepted.
+        eventually("the service responds", || send(addr(&service), "GET", "/livez", &[], b"").status == 200);
         let at = addr(&service);
         service.signal(signals[0]);
         eventually("the listener is gone", || TcpStream::connect(at).is_err());
@@ -141,12 +141,12 @@ fn a_further_signal_cuts_the_drain_short() {
 }
 
 #[test]
-fn promised_jobs_outlive_a_stop() {
+fn durable_jobs_survive_a_stop() {
     let folder = Folder::new();
     let args = ["--devices", "cpu", "--set", "server.drain_timeout_ms=300", "--set", "jobs.attempts=1"];
     let service = Service::start(&folder, &args);
-    // Seconds of work, of which the drain has room for a part.
-    let promised: Vec<String> = (0..6)
+    // Seconds of work, of which only a part fits into the drain.
+    let jobs: Vec<String> = (0..6)
         .map(|n| {
             let reply =
                 send(addr(&service), "POST", "/v1/meshes?resolution=0.15", &[("prefer", "respond-async")], &sample(n));
@@ -156,9 +156,9 @@ fn promised_jobs_outlive_a_stop() {
         .collect();
     let (code, log) = service.stop("TERM");
     assert_eq!(code, Some(0), "{log}");
-    // One attempt is all that they have: a stop does not count.
+    // Each job has one attempt; a stop does not count as one.
     let service = Service::start(&folder, &args);
-    for job in &promised {
+    for job in &jobs {
         let status = || send(addr(&service), "GET", &format!("{job}?wait=10"), &[], b"").json()["status"].clone();
         eventually("the job is done", || status() == "successful");
     }

@@ -75,7 +75,7 @@ fn every_value_is_printed_with_its_source() {
         "queue = 5 # MOLMESH__JOBS__QUEUE".to_owned(),
         "deliveries = 8 # command line".to_owned(),
         "attempts = 3 # default".to_owned(),
-        "# Not a matter of this file: --backend cpu".to_owned(),
+        "# Not part of this file: --backend cpu".to_owned(),
     ] {
         assert!(text.lines().any(|l| l == line), "no `{line}` in\n{text}");
     }

@@ -14,12 +14,12 @@ use deploy_support::{Recipe, at, bytes, kinds, only, read, root, sections, strin
 use molmesh::config::{Config, load};
 use serde_json::{Value, json};
 
-/// Who the service is in a container.
+/// User id of the service in a container.
 const USER: u64 = 65532;
-/// Seconds that are left between the end of the drain and SIGKILL.
+/// Seconds between the end of the drain and SIGKILL.
 const MARGIN: u64 = 5;
-/// Memory of the process beside the budgets of its configuration.
-const BESIDE: u64 = 1 << 30;
+/// Memory of the process in addition to its configured budgets, bytes.
+const OTHER_MEMORY: u64 = 1 << 30;
 
 const CONFIGURATIONS: [&str; 2] = ["deploy/container/molmesh.toml", "deploy/kubernetes/base/molmesh.toml"];
 
@@ -31,23 +31,23 @@ fn config(path: &str) -> Config {
     load(Some(&root().join(path)), [], &[]).unwrap_or_else(|e| panic!("{path}: {e}"))
 }
 
-/// The ports of the service and of its metrics.
+/// Returns the ports of the service and of its metrics.
 fn ports(config: &Config) -> [u16; 2] {
     let address = |a: SocketAddr| {
-        assert!(a.ip().is_unspecified(), "{a} is not reached from outside of a container");
+        assert!(a.ip().is_unspecified(), "{a} cannot be reached from outside the container");
         a.port()
     };
     [address(config.server.listen), address(config.server.metrics_listen.unwrap())]
 }
 
-// ------------------------------------------------------------------------------------------------------- the image
+// ------------------------------------------------------------------------------------------------------- image
 
 #[test]
-fn the_recipe_and_its_configuration_agree() {
+fn dockerfile_matches_its_configuration() {
     let recipe = recipe();
     let stages = ["cpu", "gpu"].map(|name| recipe.stage(name));
     for stage in &stages {
-        assert_eq!(stage.last("USER"), Some(&format!("{USER}:{USER}")), "who {} runs as", stage.name);
+        assert_eq!(stage.last("USER"), Some(&format!("{USER}:{USER}")), "user of {}", stage.name);
     }
     let [cpu, gpu] = stages;
     assert_eq!(gpu.from, "cpu");
@@ -59,18 +59,18 @@ fn the_recipe_and_its_configuration_agree() {
     assert_eq!(cpu.last("CMD").unwrap(), r#"["serve"]"#);
     assert_eq!(cpu.last("ENV").unwrap(), "MOLMESH_CONFIG=/etc/molmesh/molmesh.toml");
     assert_eq!(cpu.last("ENTRYPOINT").unwrap(), r#"["molmesh"]"#);
-    // The check asks the address that the configuration listens at, unless told otherwise.
+    // The default address of the check is that of the configuration.
     assert!(cpu.last("HEALTHCHECK").unwrap().ends_with(r#"CMD ["molmesh", "healthcheck"]"#));
     let help = cli_support::stdout(&cli_support::run(["healthcheck", "--help"]));
     assert!(help.contains(&format!("http://127.0.0.1:{}/readyz", config.server.listen.port())), "{help}");
-    // Shells would stand between the signal and the program.
+    // A shell would not forward signals to the program.
     for name in ["CMD", "ENTRYPOINT"] {
         assert!(cpu.all(name).chain(gpu.all(name)).all(|line| line.starts_with('[')), "{name} starts a shell");
     }
 }
 
 #[test]
-fn the_recipe_builds_with_the_compiler_that_the_package_asks_for() {
+fn dockerfile_uses_the_compiler_of_the_package() {
     let manifest: toml::Table = read("Cargo.toml").parse().unwrap();
     let version = manifest["package"]["rust-version"].as_str().unwrap();
     let image = recipe().argument("RUST_IMAGE").unwrap();
@@ -78,11 +78,11 @@ fn the_recipe_builds_with_the_compiler_that_the_package_asks_for() {
     assert!(tag.starts_with(&format!("{version}-")), "{image} is not Rust {version}");
     let base = recipe().argument("BASE_IMAGE").unwrap();
     let suite = base.rsplit_once(':').unwrap().1.strip_suffix("-slim").unwrap().to_owned();
-    assert!(tag.ends_with(&suite), "what is built on {image} may not run on {base}");
+    assert!(tag.ends_with(&suite), "a build on {image} may not run on {base}");
 }
 
-/// Files that the build reads, relative to the root: sources, shaders, what sources name by a path of their own (`"../web/…"`),
-/// and the targets of the package, without which cargo refuses it.
+/// Returns the files that the build reads, relative to the root: sources, shaders, files that sources name by a
+/// relative path (`"../web/…"`), and the targets of the package, without which cargo rejects it.
 fn read_by_the_build() -> BTreeSet<PathBuf> {
     let mut files: BTreeSet<PathBuf> = ["src", "shaders"].into_iter().flat_map(deploy_support::files).collect();
     let named: Vec<PathBuf> = files
@@ -96,7 +96,7 @@ fn read_by_the_build() -> BTreeSet<PathBuf> {
         })
         .filter(|path| root().join(path).is_file())
         .collect();
-    assert!(named.iter().any(|path| path.starts_with("web")), "no page is named in {named:?}");
+    assert!(named.iter().any(|path| path.starts_with("web")), "no web page in {named:?}");
     let manifest: toml::Table = read("Cargo.toml").parse().unwrap();
     let benches = manifest["bench"].as_array().unwrap().iter();
     let benches = benches.map(|bench| PathBuf::from(format!("benches/{}.rs", bench["name"].as_str().unwrap())));
@@ -105,7 +105,7 @@ fn read_by_the_build() -> BTreeSet<PathBuf> {
 }
 
 #[test]
-fn the_build_sees_every_file_that_it_reads() {
+fn all_files_of_the_build_are_sent_to_the_builder() {
     let ignore = read(".dockerignore");
     let mut files = read_by_the_build();
     assert!(files.len() > 100, "only {} files are said to be read", files.len());
@@ -122,7 +122,7 @@ fn the_build_sees_every_file_that_it_reads() {
     ];
     files.extend(more.into_iter().chain([CONFIGURATIONS[0], "deploy/notices.py"]).map(PathBuf::from));
     let left_out: Vec<_> = files.iter().filter(|path| !deploy_support::sent(&ignore, path)).collect();
-    assert!(left_out.is_empty(), "left out of the build: {left_out:?}");
+    assert!(left_out.is_empty(), "not sent to the builder: {left_out:?}");
     for other in [
         ".git/config",
         "target/release/molmesh",
@@ -136,7 +136,7 @@ fn the_build_sees_every_file_that_it_reads() {
 }
 
 #[test]
-fn every_file_that_the_recipe_copies_is_there_and_sent() {
+fn copied_files_exist_and_are_sent() {
     let ignore = read(".dockerignore");
     let mut n = 0;
     for stage in &recipe().stages {
@@ -155,7 +155,7 @@ fn every_file_that_the_recipe_copies_is_there_and_sent() {
 // ------------------------------------------------------------------------------------------------- configurations
 
 #[test]
-fn configurations_load_and_listen_to_everybody() {
+fn configurations_load_and_listen_on_all_addresses() {
     for path in CONFIGURATIONS {
         let config = config(path);
         assert_eq!(ports(&config), [8080, 9090], "{path}");
@@ -166,7 +166,7 @@ fn configurations_load_and_listen_to_everybody() {
 // --------------------------------------------------------------------------------------------------------- Compose
 
 #[test]
-fn compose_agrees_with_the_image() {
+fn compose_matches_the_image() {
     let Some(found) = yaml(&["deploy/compose.yaml"]) else { return };
     assert_eq!(found[0].errors, [""; 0]);
     let compose = &found[0].documents[0];
@@ -184,7 +184,7 @@ fn compose_agrees_with_the_image() {
         let inside: Vec<u16> =
             strings(&service["ports"]).iter().map(|p| p.rsplit_once(':').unwrap().1.parse().unwrap()).collect();
         assert_eq!(inside, ports(&config));
-        // The metrics are for this machine.
+        // The metrics are published on the loopback address only.
         assert!(strings(&service["ports"])[1].starts_with("127.0.0.1:"));
         assert_eq!(service["secrets"][0]["target"], json!("/etc/molmesh/molmesh.toml"));
         let grace = service["stop_grace_period"].as_str().unwrap().strip_suffix('s').unwrap().parse::<u64>().unwrap();
@@ -195,15 +195,15 @@ fn compose_agrees_with_the_image() {
     }
     let gpu = &services["gpu"]["deploy"]["resources"]["reservations"]["devices"][0];
     let capabilities: BTreeSet<_> = strings(&gpu["capabilities"]).into_iter().collect();
-    assert!(capabilities.contains("graphics"), "without it no Vulkan driver is mounted");
+    assert!(capabilities.contains("graphics"), "the Vulkan driver needs this capability");
     let secret = compose["secrets"]["configuration"]["file"].as_str().unwrap();
     let default = secret.trim_end_matches('}').rsplit_once(":-").unwrap().1;
     assert_eq!(Path::new("deploy").join(default), Path::new("deploy/./container/molmesh.toml"));
 }
 
-/// Memory that a configuration lets the process take.
+/// Returns the memory that a configuration allows, bytes.
 fn budget(config: &Config) -> u64 {
-    config.limits.memory_bytes + config.store.memory_bytes + BESIDE
+    config.limits.memory_bytes + config.store.memory_bytes + OTHER_MEMORY
 }
 
 // ------------------------------------------------------------------------------------------------------ Kubernetes
@@ -211,7 +211,7 @@ fn budget(config: &Config) -> u64 {
 const BASE: &str = "deploy/kubernetes/base";
 
 #[test]
-fn manifests_satisfy_the_schemas_of_kubernetes() {
+fn manifests_match_the_schemas_of_kubernetes() {
     let resources = under("deploy/kubernetes", |kustomization, folder| {
         strings(&kustomization["resources"]).into_iter().map(|file| folder.join(file)).collect()
     });
@@ -235,8 +235,8 @@ fn manifests_satisfy_the_schemas_of_kubernetes() {
 }
 
 #[test]
-fn kustomizations_name_what_is_there() {
-    let everything = under("deploy/kubernetes", |kustomization, folder| {
+fn kustomizations_name_existing_files() {
+    let listed = under("deploy/kubernetes", |kustomization, folder| {
         let generated = kustomization["configMapGenerator"].as_array().into_iter().flatten();
         let patches = kustomization["patches"].as_array().into_iter().flatten();
         let mut files: Vec<String> = strings(&kustomization["resources"]);
@@ -244,25 +244,25 @@ fn kustomizations_name_what_is_there() {
         files.extend(patches.map(|patch| patch["path"].as_str().unwrap().to_owned()));
         files.into_iter().map(|file| folder.join(file)).collect()
     });
-    let Some(everything) = everything else { return };
-    for path in &everything {
+    let Some(listed) = listed else { return };
+    for path in &listed {
         assert!(root().join(path).exists(), "{}", path.display());
     }
-    // Each file belongs to somebody.
+    // Every file is listed in a kustomization.
     let mut n = 0;
     for folder in ["base", "scaled", "gpu"].map(|name| root().join("deploy/kubernetes").join(name)) {
         for file in std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()) {
             let path = file.strip_prefix(root()).unwrap().to_owned();
             assert!(
-                path.ends_with("kustomization.yaml") || everything.contains(&path),
-                "{} is nobody's",
+                path.ends_with("kustomization.yaml") || listed.contains(&path),
+                "{} is in no kustomization",
                 path.display()
             );
             n += 1;
         }
     }
     assert!(n >= 15, "{n} files");
-    // Patches change what the base has.
+    // Patches change resources of the base.
     let Some(base) = kinds(BASE) else { return };
     for overlay in ["scaled", "gpu"] {
         let folder = format!("deploy/kubernetes/{overlay}");
@@ -275,7 +275,7 @@ fn kustomizations_name_what_is_there() {
 }
 
 #[test]
-fn the_pod_agrees_with_the_image_and_its_configuration() {
+fn pod_matches_the_image_and_its_configuration() {
     let Some(found) = yaml(&["deployment", "storage", "service", "network"].map(|f| format!("{BASE}/{f}.yaml"))) else {
         return;
     };
@@ -283,8 +283,8 @@ fn the_pod_agrees_with_the_image_and_its_configuration() {
     let config = config(CONFIGURATIONS[1]);
     let pod = &deployment["spec"]["template"]["spec"];
     let container = &pod["containers"][0];
-    for who in ["runAsUser", "runAsGroup", "fsGroup"] {
-        assert_eq!(pod["securityContext"][who], json!(USER), "{who}");
+    for field in ["runAsUser", "runAsGroup", "fsGroup"] {
+        assert_eq!(pod["securityContext"][field], json!(USER), "{field}");
     }
     let security = &container["securityContext"];
     assert_eq!(
@@ -308,25 +308,25 @@ fn the_pod_agrees_with_the_image_and_its_configuration() {
     let pause = container["lifecycle"]["preStop"]["sleep"]["seconds"].as_u64().unwrap();
     let drain = config.server.drain_timeout().as_secs();
     assert!(grace >= pause + drain + MARGIN, "{grace} s to stop, of which {pause} s pause and {drain} s drain");
-    // Room: memory, the volume.
+    // Memory and volume.
     let memory = container["resources"]["limits"]["memory"].as_str().unwrap();
     assert!(bytes(memory) >= budget(&config), "{memory} of memory for {} bytes", budget(&config));
     let volume = storage["spec"]["resources"]["requests"]["storage"].as_str().unwrap();
     assert!(bytes(volume) > config.store.max_bytes + config.archive.cache_bytes, "{volume} on the volume");
-    // Probes ask for what is there.
+    // Paths of the probes exist.
     let described = read("openapi.yaml");
     for (probe, path) in [("startupProbe", "/readyz"), ("readinessProbe", "/readyz"), ("livenessProbe", "/livez")] {
         assert_eq!(container[probe]["httpGet"], json!({ "path": path, "port": "http" }), "{probe}");
         assert!(described.contains(&format!("\n  {path}:\n")), "{path} is not described");
     }
-    // Mounts: where the configuration and the data are looked for.
+    // Mounts of the configuration and the data.
     let mounts: Vec<_> =
         container["volumeMounts"].as_array().unwrap().iter().map(|m| m["mountPath"].as_str().unwrap()).collect();
     assert_eq!(mounts, [config.server.data_dir.to_str().unwrap(), "/etc/molmesh", "/tmp"]);
 }
 
 #[test]
-fn many_pods_promise_nothing_that_only_one_of_them_keeps() {
+fn scaled_pods_fit_their_ephemeral_storage() {
     let Some(found) = yaml(&["deployment", "autoscaler"].map(|f| format!("deploy/kubernetes/scaled/{f}.yaml"))) else {
         return;
     };
@@ -345,7 +345,7 @@ fn many_pods_promise_nothing_that_only_one_of_them_keeps() {
     let ephemeral = bytes(pod["containers"][0]["resources"]["limits"]["ephemeral-storage"].as_str().unwrap());
     assert!(ephemeral > room, "{ephemeral} bytes of ephemeral storage for {room}");
     assert_eq!(autoscaler["spec"]["scaleTargetRef"]["name"], patch["metadata"]["name"]);
-    assert_eq!(patch["spec"]["replicas"], Value::Null, "the autoscaler decides");
+    assert_eq!(patch["spec"]["replicas"], Value::Null, "the autoscaler sets the replicas");
 }
 
 // -------------------------------------------------------------------------------------------------- documentation
@@ -368,17 +368,17 @@ fn the_documentation_names_what_is_there() {
         n += 1;
     }
     assert!(n >= 10, "{n} names");
-    // Sections of the configuration that it speaks of, as keys that exist.
+    // Configuration keys in the text exist.
     let defaults = serde_json::to_value(Config::default()).unwrap();
     for key in sections(&text, &defaults) {
-        assert!(at(&defaults, &key).is_some(), "`{key}` is no key of the configuration");
+        assert!(at(&defaults, &key).is_some(), "the configuration has no key `{key}`");
     }
 }
 
 // ------------------------------------------------------------------------------------------------ negative controls
 
 #[test]
-fn control_patterns_decide_what_is_sent() {
+fn control_ignore_patterns_are_applied() {
     let sent = |path: &str| {
         deploy_support::sent("# all\n*\n!src\n!web\nweb/node_modules\n!deploy/container\n", Path::new(path))
     };
@@ -387,7 +387,7 @@ fn control_patterns_decide_what_is_sent() {
 }
 
 #[test]
-fn control_a_recipe_is_taken_apart() {
+fn control_dockerfiles_are_parsed() {
     let text = "ARG A=x:1\n# note\nFROM ${A} AS one\nRUN a \\\n    # why\n    && b\nFROM one AS two\nUSER 1\nUSER 2\n";
     let recipe = Recipe::parse(text);
     assert_eq!(recipe.argument("A").as_deref(), Some("x:1"));
@@ -397,7 +397,7 @@ fn control_a_recipe_is_taken_apart() {
 }
 
 #[test]
-fn control_sizes_and_keys_are_read() {
+fn control_sizes_and_keys_are_parsed() {
     assert_eq!(
         [bytes("1Ki"), bytes("5376Mi"), bytes("2Gi"), bytes("10G")],
         [1 << 10, 5376 << 20, 2 << 30, 10_000_000_000]
@@ -408,7 +408,7 @@ fn control_sizes_and_keys_are_read() {
 }
 
 #[test]
-fn control_schemas_refuse_what_is_wrong() {
+fn control_schemas_reject_invalid_manifests() {
     let folder = cli_support::Folder::new();
     let broken = |path: &str, from: &str, to: &str| {
         let text = read(path);

@@ -11,40 +11,42 @@ use std::path::{Path, PathBuf};
 
 use cli_support::{Folder, assert_code, run};
 
-/// Bytes that all pictures together may have: everybody who clones the repository has them.
+/// Maximum size of all pictures in bytes, as they are part of every clone.
 const MOST: u64 = 1_500_000;
 
 fn docs() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("docs")
 }
 
-/// The pictures that a page shows.
+/// Returns the pictures that a page shows.
 fn shown(page: &str) -> BTreeSet<String> {
     let links = page.split("](../gallery/").skip(1).filter_map(|rest| rest.split(')').next());
     links.map(str::to_owned).collect()
 }
 
-/// The flags behind the name of a picture in its command.
+/// Returns the flags after the name of a picture in its command.
 fn flags<'a>(page: &'a str, picture: &str) -> Option<Vec<&'a str>> {
     let command = page.split(&format!("`molmesh render FILE -o {picture} ")).nth(1)?.split('`').next()?;
     Some(command.split(' ').collect())
 }
 
-/// What is wrong with a page.
+/// Returns the faults of a page.
 fn faults(page: &str) -> Vec<String> {
     let named = shown(page);
-    let there: BTreeSet<String> = fs::read_dir(docs().join("gallery"))
+    let existing: BTreeSet<String> = fs::read_dir(docs().join("gallery"))
         .unwrap()
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .filter(|name| Path::new(name).extension().is_some_and(|extension| extension == "png"))
         .collect();
-    let mut faults: Vec<String> =
-        named.symmetric_difference(&there).map(|name| format!("{name}: on one side")).collect();
+    let mut faults: Vec<String> = named
+        .symmetric_difference(&existing)
+        .map(|name| format!("{name}: on the page or in the folder only"))
+        .collect();
     faults.extend(named.iter().filter(|name| flags(page, name).is_none()).map(|name| format!("{name}: no command")));
     faults
 }
 
-/// Width, height, bytes of all pixels.
+/// Returns width, height and pixels.
 fn pixels(path: &Path) -> (u32, u32, Vec<u8>) {
     let mut reader = png::Decoder::new(BufReader::new(File::open(path).unwrap())).read_info().unwrap();
     let mut bytes = vec![0; reader.output_buffer_size().unwrap()];
@@ -85,9 +87,9 @@ fn the_command_beside_a_picture_draws_it() {
         let sum: f64 = kept.2.iter().zip(&drawn).map(|(a, b)| f64::from(a.abs_diff(*b))).sum();
         sum / drawn.len() as f64
     };
-    // Processors with other vectors round a mesh's last bits otherwise: hardly a level in a hundred.
+    // Processors with other vector extensions round differently: about one level in a hundred channels.
     let same = difference("4pti-gaussian.png");
-    assert!(same < 0.05, "{same} levels a channel");
+    assert!(same < 0.05, "{same} levels per channel");
     let other = difference("4pti-inverse-square.png");
-    assert!(other > 20.0 * same.max(0.05), "{other} levels a channel");
+    assert!(other > 20.0 * same.max(0.05), "{other} levels per channel");
 }

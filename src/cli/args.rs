@@ -1,5 +1,5 @@
-//! The flags. Values of parameters stay text here: [`molmesh::pipeline::params`] reads them, for the command line
-//! and HTTP alike, so that both refuse them with the same words.
+//! Command-line flags. Parameter values stay text here. [`molmesh::pipeline::params`] parses them for the command line
+//! and for HTTP, so that both reject a value with the same message.
 
 #[cfg(feature = "server")]
 mod keys;
@@ -28,7 +28,7 @@ Examples:
   molmesh mesh 1gbt.cif.gz -o - --format ply --resolution 0.3 > 1gbt.ply
   curl -s http://127.0.0.1:8080/sample.pdb | molmesh mesh - -o 4pti.stl --report json";
 
-/// Molecules in, proven surface meshes out.
+/// Watertight molecular-surface meshes from PDB, mmCIF and BinaryCIF files.
 #[derive(Debug, Parser)]
 #[command(name = "molmesh", version, arg_required_else_help = true, disable_help_subcommand = true)]
 #[command(max_term_width = 100, after_help = EXIT_CODES)]
@@ -37,59 +37,59 @@ pub(crate) struct Args {
     pub(crate) command: Command,
 }
 
-/// What to do.
+/// Commands.
 #[derive(Debug, Subcommand)]
-// The flags of the command at hand are described, not those of the others: that took longer than reading a small structure.
-// What a command is for is said here alone, then: a docstring of the type of its flags, or of a part of them, would replace it.
+// `defer` builds the flags of the chosen command only; building all takes longer than reading a small structure.
+// A docstring on a struct of flags would replace the description of its command, so those structs have plain comments.
 #[command(defer = true)]
 pub(crate) enum Command {
     /// Mesh the surface of one structure
     Mesh(Box<MeshArgs>),
-    /// Draw the surface of one structure as a PNG
+    /// Render the surface of one structure as a PNG
     Render(Box<RenderArgs>),
     /// Serve meshes over HTTP
     #[cfg(feature = "server")]
     Serve(Box<ServeArgs>),
-    /// Say what this machine has, what of it is used, and whether a service would start and be ready
+    /// List devices, show which are used, and check that a service would start and be ready
     #[cfg(feature = "server")]
     Doctor(Box<DoctorArgs>),
-    /// Print the configuration of the service, or describe it
+    /// Print the configuration of the service or its schema
     #[cfg(feature = "server")]
     #[command(subcommand)]
     Config(ConfigCommand),
-    /// Ask a running service whether it is ready; exit code 0 if so
+    /// Check that a running service is ready; exit code 0 if it is
     #[cfg(feature = "server")]
     Healthcheck(HealthcheckArgs),
-    /// Make keys for the service
+    /// Create keys for the service
     #[cfg(feature = "server")]
     #[command(subcommand)]
     Key(KeyCommand),
-    /// Sign an address of the service, so that it opens without a key until it expires
+    /// Sign a URL of the service, which then works without a key until it expires
     #[cfg(feature = "server")]
     Sign(SignArgs),
     /// Print the version
     Version,
 }
 
-/// Which backend runs.
+/// Values of `--backend`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum BackendName {
-    /// A service takes a GPU if one can be used, else the CPU; a command takes the one estimated to finish first
+    /// A GPU if one can be used, else the CPU; for a single mesh, the one with the shorter estimated time
     Auto,
-    /// Every core, with the widest vectors that the processor has
+    /// All cores, with the widest vector instructions of the processor
     Cpu,
-    /// Plain, sequential, brute force: what the others are compared with
+    /// Sequential brute force, for comparison
     Reference,
-    /// The GPU or nothing
+    /// The GPU, without a fallback
     Gpu,
 }
 
-/// How the report is written.
+/// Values of `--report`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum ReportStyle {
     /// A summary on stderr
     Text,
-    /// JSON on stdout (on stderr when the file goes to stdout)
+    /// JSON on stdout (on stderr if the file is written to stdout)
     Json,
 }
 
@@ -97,32 +97,32 @@ pub(crate) enum ReportStyle {
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{MESH_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct MeshArgs {
-    /// Structure file, PDB, mmCIF or BinaryCIF, plain or compressed with gzip or zstd; `-` is stdin
+    /// Structure file: PDB, mmCIF or BinaryCIF, optionally compressed with gzip or zstd; `-` is stdin
     pub(crate) input: PathBuf,
     /// Mesh file; `-` is stdout
     #[arg(short, long)]
     pub(crate) output: PathBuf,
-    /// glb, gltf, ply, stl or obj; by default what the output's extension says, glb on stdout
+    /// glb, gltf, ply, stl or obj [default: by the extension of the output, glb on stdout]
     #[arg(long, value_name = "FORMAT")]
     pub(crate) format: Option<String>,
-    /// How glb and gltf store vertices: none, or quantize (12 bytes instead of 24: 16-bit positions, 8-bit normals)
+    /// Vertex compression of glb and gltf: none, or quantize (12 bytes instead of 24: 16-bit positions, 8-bit normals)
     /// [default: none]
-    #[arg(long, value_name = "HOW")]
+    #[arg(long, value_name = "METHOD")]
     pub(crate) compress: Option<String>,
-    /// Whether vertices have normals: smooth, or none (smaller files, flat shading) [default: smooth]
-    #[arg(long, value_name = "HOW")]
+    /// Vertex normals: smooth, or none (smaller files, flat shading) [default: smooth]
+    #[arg(long, value_name = "NORMALS")]
     pub(crate) normals: Option<String>,
-    /// What 1 stands for in the mesh file: angstrom, nanometer, or meter (glb and gltf only) [default: angstrom]
-    #[arg(long, value_name = "UNITS")]
+    /// Unit of lengths in the mesh file: angstrom, nanometer, or meter (glb and gltf only) [default: angstrom]
+    #[arg(long, value_name = "UNIT")]
     pub(crate) units: Option<String>,
     #[command(flatten)]
     pub(crate) job: JobArgs,
 }
 
-// What every job has, whatever becomes of its mesh.
+// Flags of every job.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct JobArgs {
-    /// What runs the meshing
+    /// Meshing backend
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: BackendName,
     #[command(flatten)]
@@ -130,13 +130,13 @@ pub(crate) struct JobArgs {
     /// Threads of the CPU backend; one per core by default
     #[arg(long, value_name = "N")]
     pub(crate) threads: Option<usize>,
-    /// How the report is written
+    /// Format of the report
     #[arg(long, value_enum, default_value = "text")]
     pub(crate) report: ReportStyle,
-    /// No summary and no progress bar
+    /// Do not print the summary and the progress bar
     #[arg(short, long)]
     pub(crate) quiet: bool,
-    /// Refuse a file in which a second, strict reader finds errors, and report what else it finds
+    /// Reject a file in which the strict validator finds errors, and report its other findings
     #[arg(long)]
     pub(crate) check: bool,
     /// Check that the mesh is watertight: checksum (of its edges, fast) or exact (edge by edge) [default: checksum]
@@ -150,56 +150,55 @@ pub(crate) struct JobArgs {
     pub(crate) limits: LimitArgs,
 }
 
-/// Builds without the service have no `doctor`.
+/// Returns the help of `--devices`. Builds without the service have no `doctor`.
 fn devices_help() -> String {
-    let doctor = if cfg!(feature = "server") { "; `molmesh doctor` numbers them" } else { "" };
-    format!(
-        "Which devices may be used: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software{doctor}"
-    )
+    let doctor = if cfg!(feature = "server") { "; `molmesh doctor` lists the numbers" } else { "" };
+    format!("Devices to use: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software{doctor}")
 }
 
-// Which devices.
+// Devices.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct DeviceArgs {
-    /// Which devices may be used
-    #[arg(long, help = devices_help(), value_name = "WHICH", default_value = "auto", env = "MOLMESH__DEVICES__USE", hide_env_values = true)]
+    /// Devices to use
+    #[arg(long, help = devices_help(), value_name = "DEVICES", default_value = "auto")]
+    #[arg(env = "MOLMESH__DEVICES__USE", hide_env_values = true)]
     pub(crate) devices: DeviceChoice,
 }
 
-// Which surface.
+// Surface parameters.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Surface")]
 pub(crate) struct SurfaceArgs {
     /// Density of an atom: gaussian, soft-object or inverse-square [default: gaussian]
     #[arg(long, value_name = "KERNEL")]
     pub(crate) kernel: Option<String>,
-    /// Values for what is not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like` approximates
-    /// the solvent-excluded surface: -6.5 to +6.0 % off in area and -0.6 to +5.1 % in volume over eight proteins, worse
-    /// for small structures (area +13.5 % for a DNA dodecamer)
+    /// Values of parameters that are not given: default, ses-like, vdw-like, molstar, blinn or quicksurf. `ses-like`
+    /// approximates the solvent-excluded surface: its area is off by -6.5 to +6.0 % and its volume by -0.6 to +5.1 %
+    /// over eight proteins, more for small structures (area +13.5 % for a DNA dodecamer)
     #[arg(long, value_name = "PRESET")]
     pub(crate) preset: Option<String>,
     /// Grid spacing in Å [default: 0.5]
     #[arg(long, value_name = "Å")]
     pub(crate) resolution: Option<String>,
-    /// Grid spacing by level instead, 0 (2 Å) to 6 (0.25 Å); structures of more than 10,000 atoms get coarser ones
+    /// Level of detail instead of a grid spacing: 0 (2 Å) to 6 (0.25 Å), coarser for more than 10,000 atoms
     #[arg(long, value_name = "LEVEL")]
     pub(crate) detail: Option<String>,
-    /// Instead of a spacing: the finest one, down to 0.25 Å, whose mesh has at most N triangles
+    /// Use the finest grid spacing, down to 0.25 Å, whose mesh has at most N triangles
     #[arg(long, value_name = "N")]
     pub(crate) max_triangles: Option<String>,
-    /// Level of the density that is the surface [default: 1, an isolated atom's radius]
+    /// Density at the surface [default: 1, the density of an isolated atom at its radius]
     #[arg(long, value_name = "LEVEL")]
     pub(crate) isovalue: Option<String>,
-    /// How closely the gaussian follows the atoms; higher is less smooth [default: 1.25]
+    /// Steepness of the gaussian; a higher value gives a less smooth surface [default: 1.25]
     #[arg(long, value_name = "A")]
     pub(crate) smoothness: Option<String>,
-    /// Radii are multiplied by this [default: 1]
+    /// Factor of all radii [default: 1]
     #[arg(long, value_name = "FACTOR")]
     pub(crate) radius_scale: Option<String>,
-    /// Then this is added, in Å [default: 0]
+    /// Length added to all scaled radii, in Å [default: 0]
     #[arg(long, value_name = "Å")]
     pub(crate) radius_offset: Option<String>,
-    /// Where the gaussian is cut off, relative to its value at the radius [default: 0.01]
+    /// Value at which the gaussian is cut off, relative to its value at the radius [default: 0.01]
     #[arg(long, value_name = "FRACTION")]
     pub(crate) cutoff_tolerance: Option<String>,
     /// Raw parameter a of the 2010 paper (gaussian: decay in Å⁻²; soft object: height)
@@ -216,20 +215,20 @@ pub(crate) struct SurfaceArgs {
     pub(crate) atom_ids: bool,
 }
 
-// Which atoms.
+// Atom selection.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Atoms")]
 pub(crate) struct SelectionArgs {
-    /// Comma-separated: polymer, ligand, water, hydrogens, all [default: polymer]
-    #[arg(long, value_name = "WHAT")]
+    /// Comma-separated classes of atoms: polymer, ligand, water, hydrogens, all [default: polymer]
+    #[arg(long, value_name = "CLASSES")]
     pub(crate) select: Option<String>,
-    /// Take ligands too
+    /// Include ligands
     #[arg(long)]
     pub(crate) ligands: bool,
-    /// Take waters too
+    /// Include waters
     #[arg(long)]
     pub(crate) waters: bool,
-    /// Take hydrogens of whatever is taken
+    /// Include hydrogens of the selected residues
     #[arg(long)]
     pub(crate) hydrogens: bool,
     /// Comma-separated chains, by author name [default: all]
@@ -238,12 +237,12 @@ pub(crate) struct SelectionArgs {
     /// Model number [default: the first]
     #[arg(long, value_name = "N")]
     pub(crate) model: Option<String>,
-    /// One alternative location instead of the best occupied of each residue
+    /// Alternative location [default: the one with the highest occupancy in each residue]
     #[arg(long, value_name = "X")]
     pub(crate) altloc: Option<String>,
 }
 
-// What is too much.
+// Limits.
 #[expect(clippy::struct_field_names, reason = "the fields are named like their flags")]
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Limits")]
@@ -254,10 +253,10 @@ pub(crate) struct LimitArgs {
     /// Bytes of the input after decompression [default: 4 GiB]
     #[arg(long, value_name = "BYTES")]
     pub(crate) max_input_bytes: Option<u64>,
-    /// Grid samples in occupied bricks [default: 4294967296]
+    /// Grid points in occupied bricks [default: 4294967296]
     #[arg(long, value_name = "N")]
     pub(crate) max_samples: Option<u64>,
-    /// Pairs of an atom and a grid brick within its reach [default: 1073741824]
+    /// Pairs of an atom and a brick that its support reaches [default: 1073741824]
     #[arg(long, value_name = "N")]
     pub(crate) max_candidates: Option<u64>,
     /// Bytes of vertices and triangles [default: 8 GiB]

@@ -1,4 +1,4 @@
-//! The only place that picks a backend, and gives the reason in words.
+//! Selection of the backend, with the reason.
 
 use std::num::NonZero;
 #[cfg(feature = "gpu")]
@@ -17,12 +17,12 @@ use super::args::{BackendName, JobArgs};
 use super::error::CliError;
 use super::estimate::Estimate;
 
-/// What was asked for.
+/// Requested backend and devices.
 #[derive(Debug)]
 pub(crate) struct Asked<'a> {
-    /// The backend.
+    /// Backend.
     pub(crate) backend: BackendName,
-    /// Which devices it may use.
+    /// Devices that it may use.
     pub(crate) devices: &'a DeviceChoice,
     /// Threads of the CPU backend.
     pub(crate) threads: Option<usize>,
@@ -31,7 +31,7 @@ pub(crate) struct Asked<'a> {
 }
 
 impl<'a> Asked<'a> {
-    /// Flags of a command with a single job, whose work is not known yet.
+    /// Creates the request of a command with a single job of unknown work.
     pub(crate) fn once(args: &'a JobArgs) -> Self {
         let (backend, devices, threads) = (args.backend, &args.devices.devices, args.threads);
         Self { backend, devices, threads, work: None }
@@ -43,30 +43,30 @@ impl<'a> Asked<'a> {
     }
 }
 
-/// A backend and why it was taken.
+/// Selected backend with the reason.
 pub(crate) struct Picked {
-    /// The backend.
+    /// Backend.
     pub(crate) backend: Box<dyn Backend>,
-    /// Why, in words.
+    /// Reason of the selection.
     pub(crate) reason: String,
-    /// What draws pictures, and why it was taken; the CPU where no pictures are wanted.
+    /// Renderer of pictures with its reason; the CPU if no pictures are needed.
     pub(crate) drawer: Drawer,
-    /// Every device that was found on the way, taken or not.
+    /// All discovered devices, used or not.
     #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) devices: Vec<FoundDevice>,
-    /// Why no GPU runs, if none does.
+    /// Reason for not using a GPU, if none is used.
     #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) no_gpu: Option<String>,
 }
 
-/// What a backend is picked for.
+/// Purpose of a backend.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) enum Use {
-    /// One mesh, by the calling thread.
+    /// One mesh.
     Once,
-    /// One mesh and its picture, likewise.
+    /// One mesh and its picture.
     Picture,
-    /// Many, by the threads of a service.
+    /// A service.
     #[cfg(feature = "server")]
     Service(DevicesConfig),
 }
@@ -74,7 +74,7 @@ pub(crate) enum Use {
 /// Rejects flags that contradict each other.
 ///
 /// # Errors
-/// [`CliError::Usage`].
+/// Returns [`CliError::Usage`] if they do.
 pub(crate) fn check(asked: &Asked<'_>) -> Result<(), CliError> {
     if asked.threads == Some(0) {
         return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
@@ -85,19 +85,19 @@ pub(crate) fn check(asked: &Asked<'_>) -> Result<(), CliError> {
     Ok(())
 }
 
-/// Picks a backend.
+/// Selects and starts a backend.
 ///
 /// # Errors
-/// [`CliError::Usage`] for flags that contradict each other; [`CliError::NoBackend`] says why the backend that was asked
-/// for is not there.
+/// Returns [`CliError::Usage`] if flags contradict each other, and [`CliError::NoBackend`] with the reason if the
+/// requested backend is not available.
 pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     check(asked)?;
     let unasked = |backend: Box<dyn Backend>| Picked {
         backend,
-        reason: "asked for".to_owned(),
-        drawer: Drawer::cpu("as another backend than the GPU was asked for"),
+        reason: "requested".to_owned(),
+        drawer: Drawer::cpu("a backend other than the GPU was requested"),
         devices: Vec::new(),
-        no_gpu: Some("not looked for, as another backend was asked for".to_owned()),
+        no_gpu: Some("no discovery: another backend was requested".to_owned()),
     };
     match asked.backend {
         BackendName::Cpu => Ok(unasked(cpu(asked, use_)?)),
@@ -106,17 +106,17 @@ pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     }
 }
 
-/// The estimate of a command whose backend and devices are left to this program.
+/// Returns the estimate for a command if both backend and devices are `auto`.
 fn estimate(asked: &Asked<'_>) -> Option<Estimate> {
     let free = asked.backend == BackendName::Auto && *asked.devices == DeviceChoice::Auto;
     asked.work.filter(|_| free).map(|work| Estimate::new(work, asked.n_threads()))
 }
 
-/// A GPU, or the CPU where any backend will do.
+/// Selects a GPU, or the CPU if the request allows any backend.
 fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
     let estimate = estimate(asked);
     if let Some(estimate) = estimate.filter(|estimate| !estimate.favours_gpu()) {
-        let why = format!("no GPU was looked for ({estimate})");
+        let why = format!("no GPU discovery ({estimate})");
         let reason = format!("auto: {why}");
         let drawer = Drawer::cpu(&reason);
         return Ok(Picked { backend: cpu(asked, use_)?, reason, drawer, devices: Vec::new(), no_gpu: Some(why) });
@@ -129,18 +129,18 @@ fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
                 Some(estimate) => format!("auto: {reason}, {estimate}"),
                 None => format!("auto: {reason}"),
             },
-            _ => "asked for".to_owned(),
+            _ => "requested".to_owned(),
         };
         return Ok(Picked { backend, reason, drawer, devices, no_gpu: None });
     }
     let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
-    // Whoever asks for a device by name does not want to learn from a report that it was not used.
+    // A request for a specific device fails instead of falling back to the CPU.
     if asked.backend != BackendName::Auto || matches!(asked.devices, DeviceChoice::These(_)) {
         return Err(CliError::NoBackend { asked: "gpu", why: format!("no GPU can be used: {why}") });
     }
     let reason = match asked.devices {
         DeviceChoice::Cpu => "--devices cpu".to_owned(),
-        _ => format!("auto: no GPU, as {why}"),
+        _ => format!("auto: no GPU: {why}"),
     };
     let drawer = Drawer::cpu(&reason);
     Ok(Picked { backend: cpu(asked, use_)?, reason, drawer, devices, no_gpu: Some(why) })
@@ -156,12 +156,12 @@ fn cpu(asked: &Asked<'_>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
     Ok(Box::new(backend))
 }
 
-/// What came of looking for GPUs.
+/// Result of GPU discovery.
 struct Gpu {
     backend: Option<Box<dyn Backend>>,
     drawer: Option<Drawer>,
     devices: Vec<FoundDevice>,
-    /// Why it is taken, or why there is none.
+    /// Reason of the selection, or reason for not using a GPU.
     state: Result<String, String>,
 }
 
@@ -174,7 +174,7 @@ fn gpu(_asked: &Asked<'_>, _use: &Use) -> Gpu {
 fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
     use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, discover};
 
-    // One mesh is not worth asking drivers that have nothing to drive; who asks for a GPU wants to know of all.
+    // For a single mesh, skip drivers without a device, unless a GPU was requested.
     let once = matches!(use_, Use::Once | Use::Picture);
     let look = if once && asked.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
     let discovery = discover(asked.devices, look);
@@ -197,7 +197,7 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
             ..PoolSettings::default()
         },
     };
-    // Whoever asked for the GPU gets it or nothing.
+    // A request for the GPU has no fallback.
     let fallback = match asked.backend {
         BackendName::Auto => CpuBackend::new(asked.threads).ok().map(|cpu| Box::new(cpu) as Box<dyn Backend>),
         _ => None,
@@ -229,28 +229,28 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
                 error => error.to_string(),
             };
             for device in devices.iter_mut().filter(|device| device.taken) {
-                (device.taken, device.reason) = (false, format!("the stages could not be built: {why}"));
+                (device.taken, device.reason) = (false, format!("the pipelines could not be built: {why}"));
             }
             none(devices, why)
         }
     }
 }
 
-/// What draws where a GPU makes the meshes: that GPU. Where it cannot and another backend would do, the CPU, with the reason.
+/// Starts the renderer on the GPUs that make the meshes. With `--backend auto`, falls back to the CPU with the reason.
 #[cfg(feature = "gpu")]
 fn drawer(asked: &Asked<'_>, use_: &Use, discovery: &molmesh::gpu::Discovery) -> Result<Drawer, String> {
     use molmesh::gpu::GpuRenderer;
 
     if *use_ == Use::Once {
-        return Ok(Drawer::cpu("no pictures are wanted"));
+        return Ok(Drawer::cpu("no pictures were requested"));
     }
     let auto = asked.backend == BackendName::Auto;
     match GpuRenderer::start(discovery, auto.then(CpuRenderer::default)) {
         Ok(renderer) => {
-            let reason = "the device that makes meshes draws them".to_owned();
+            let reason = "the device that makes the meshes".to_owned();
             Ok(Drawer { renderer: Arc::new(renderer), reason })
         }
-        Err(error) if auto => Ok(Drawer::cpu(&format!("the GPU cannot draw: {error}"))),
-        Err(error) => Err(format!("it cannot draw: {error}")),
+        Err(error) if auto => Ok(Drawer::cpu(&format!("the GPU cannot render: {error}"))),
+        Err(error) => Err(format!("it cannot render: {error}")),
     }
 }

@@ -1,39 +1,39 @@
-//! What a service says when it starts: where it is, how to try it, what it runs on and why not on something else.
+//! Banner of a service at its start: addresses, an example command, the backend, and the reasons against the others.
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use super::page::Page;
 use super::style::Style;
-use super::survey::Candidate;
+use super::survey::Availability;
 
-/// What the banner knows of the machine.
+/// Facts that the banner shows.
 pub(crate) struct Facts {
-    /// The backend that runs, and what it runs on.
+    /// Selected backend and its hardware.
     pub(crate) device: String,
-    /// Why it was taken.
+    /// Reason of the selection.
     pub(crate) reason: String,
-    /// Every backend and its state.
-    pub(crate) others: Vec<Candidate>,
-    /// A key is asked for.
+    /// All backends with their states.
+    pub(crate) others: Vec<Availability>,
+    /// True if requests need a key.
     pub(crate) keys: bool,
-    /// The page is the viewer.
+    /// True if the build contains the viewer.
     pub(crate) viewer: bool,
 }
 
-/// The banner of a service that listens on `addr`.
+/// Returns the banner of a service that listens on `addr`.
 pub(crate) fn text(addr: SocketAddr, metrics: Option<SocketAddr>, facts: &Facts, style: Style) -> String {
     let base = format!("http://{}", reachable(addr));
     let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
     page.row("viewer", &style.cyan(&format!("{base}/")));
     if !facts.viewer {
-        page.row("", &style.dim("not in this build: make web, then build again (make run does both)"));
+        page.row("", &style.dim("not in this build: run `make web` and build again (`make run` does both)"));
     }
     page.row("docs", &style.cyan(&format!("{base}/docs")));
     if let Some(metrics) = metrics {
         page.row("metrics", &style.cyan(&format!("http://{}/metrics", reachable(metrics))));
     }
     page.row("device", &format!("{} ({})", facts.device, facts.reason));
-    for Candidate { name, state } in &facts.others {
+    for Availability { name, state } in &facts.others {
         if let Err(why) = state {
             page.row("", &style.dim(&format!("not {name}: {why}")));
         }
@@ -46,7 +46,7 @@ pub(crate) fn text(addr: SocketAddr, metrics: Option<SocketAddr>, facts: &Facts,
     page.finish()
 }
 
-/// An address that works as pasted: the unspecified one is for listening, not for asking.
+/// Replaces the unspecified address, to which clients cannot connect, by the loopback address.
 fn reachable(addr: SocketAddr) -> SocketAddr {
     let ip = match addr.ip() {
         IpAddr::V4(ip) if ip.is_unspecified() => IpAddr::V4(Ipv4Addr::LOCALHOST),
@@ -61,13 +61,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_says_where_and_why() {
+    fn shows_addresses_and_reasons() {
         let facts = Facts {
             device: "cpu: 2 threads".into(),
             reason: "auto".into(),
             others: vec![
-                Candidate { name: "cpu".into(), state: Ok("2 threads".into()) },
-                Candidate { name: "gpu".into(), state: Err("none found".into()) },
+                Availability { name: "cpu".into(), state: Ok("2 threads".into()) },
+                Availability { name: "gpu".into(), state: Err("none found".into()) },
             ],
             keys: false,
             viewer: true,
@@ -83,10 +83,10 @@ mod tests {
         ] {
             assert!(text.contains(part), "no `{part}` in\n{text}");
         }
-        let asking = Facts { keys: true, ..facts };
-        let closed = super::text("0.0.0.0:81".parse().unwrap(), None, &asking, Style::PLAIN);
-        assert!(closed.contains("curl -sS -H \"X-Api-Key: $MOLMESH_KEY\" --data-binary"), "{closed}");
-        let bare = Facts { keys: false, viewer: false, ..asking };
+        let with_keys = Facts { keys: true, ..facts };
+        let keyed = super::text("0.0.0.0:81".parse().unwrap(), None, &with_keys, Style::PLAIN);
+        assert!(keyed.contains("curl -sS -H \"X-Api-Key: $MOLMESH_KEY\" --data-binary"), "{keyed}");
+        let bare = Facts { keys: false, viewer: false, ..with_keys };
         let bare = super::text("0.0.0.0:81".parse().unwrap(), None, &bare, Style::PLAIN);
         assert!(bare.contains("make web") && !text.contains("make web"), "{bare}");
         assert!(!text.contains("not cpu") && text.lines().count() <= 8, "{text}");

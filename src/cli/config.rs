@@ -1,4 +1,4 @@
-//! `molmesh config`: what the configuration is, and what it may be. Flags become keys here, for every command that takes them.
+//! `molmesh config`: prints the configuration and its schema. Also maps flags to configuration keys for all commands.
 
 use std::path::Path;
 
@@ -18,7 +18,7 @@ pub(super) fn run(command: &ConfigCommand) -> Result<(), CliError> {
     }
 }
 
-/// A document as it is printed.
+/// Formats a document for output.
 pub(super) fn pretty(document: &Value) -> String {
     format!("{document:#}\n")
 }
@@ -31,8 +31,8 @@ fn print(args: &PrintArgs) -> Result<String, CliError> {
         ConfigStyle::Toml => {
             let warnings = warnings.iter().map(|warning| ["# Warning: ", warning, "\n"].concat()).collect::<String>();
             format!(
-                "# The effective configuration of molmesh {}; behind each value, where it is from.\n\
-                 # Not a matter of this file: --backend {backend}\n{warnings}\n{}",
+                "# Effective configuration of molmesh {}, with the source of each value.\n\
+                 # Not part of this file: --backend {backend}\n{warnings}\n{}",
                 env!("CARGO_PKG_VERSION"),
                 loaded.to_toml()
             )
@@ -46,7 +46,7 @@ fn print(args: &PrintArgs) -> Result<String, CliError> {
     })
 }
 
-/// Defaults, then the file, then the environment, then `--set`, then the flags that have names of their own.
+/// Loads the configuration: defaults, file, environment, `--set`, named flags. Later sources override earlier ones.
 pub(super) fn load(args: &ServeArgs) -> Result<Loaded, CliError> {
     let path = |p: &std::path::PathBuf| p.to_string_lossy().into_owned();
     let log = args.log.map(|style| match style {
@@ -65,7 +65,7 @@ pub(super) fn load(args: &ServeArgs) -> Result<Loaded, CliError> {
     of(args.config.as_deref(), &args.set, named)
 }
 
-/// The configuration of a file, the environment, `--set`, and flags as pairs of a key and a value.
+/// Loads the configuration from a file, the environment, `--set` and `named` pairs of key and value.
 pub(super) fn of(
     file: Option<&Path>,
     set: &[String],

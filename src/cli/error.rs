@@ -1,4 +1,4 @@
-//! Why a command failed, its exit code, and the one line (with a hint where there is one) that says so.
+//! Errors of commands, with their exit codes, one-line messages and hints.
 
 use std::io::{self, Write};
 
@@ -13,15 +13,15 @@ use super::style::Style;
 
 /// Exit codes. They are documented in `--help` and in the README and do not change meaning.
 pub(crate) mod code {
-    /// Done.
+    /// Success.
     pub(crate) const OK: i32 = 0;
-    /// Something that should not happen, or an unhealthy service.
+    /// Internal error, or an unhealthy service.
     pub(crate) const INTERNAL: i32 = 1;
     /// Bad usage or a bad parameter.
     pub(crate) const USAGE: i32 = 2;
     /// The input cannot be read from disk or stdin.
     pub(crate) const INPUT: i32 = 3;
-    /// The structure is refused: unreadable, no atoms, empty selection.
+    /// The structure is rejected: unreadable, no atoms, empty selection.
     pub(crate) const STRUCTURE: i32 = 4;
     /// A limit is exceeded.
     pub(crate) const LIMIT: i32 = 5;
@@ -36,7 +36,7 @@ pub(crate) mod code {
     pub(crate) const INTERRUPTED: i32 = 130;
 }
 
-/// The table of exit codes for `--help`; the README has the same words.
+/// Table of exit codes for `--help`. The README has the same text.
 pub(crate) const EXIT_CODES: &str = "\
 Exit codes:
     0  ok
@@ -50,18 +50,18 @@ Exit codes:
     8  another service uses the data folder
   130  interrupted; no partial file is left";
 
-/// Where a hint about backends ends.
-const DOCTOR: &str = if cfg!(feature = "server") { ", and `molmesh doctor` for what there is" } else { "" };
+/// End of hints about backends.
+const DOCTOR: &str = if cfg!(feature = "server") { "; `molmesh doctor` lists the backends" } else { "" };
 
-/// Why a command failed.
+/// Error of a command.
 #[derive(Debug, Error)]
 pub(crate) enum CliError {
-    /// The flags do not make sense together.
+    /// The flags are invalid or contradict each other.
     #[error("{message}")]
     Usage {
-        /// What is wrong.
+        /// Description of the error.
         message: String,
-        /// What would be right.
+        /// Suggestion.
         hint: Option<String>,
     },
     /// The input cannot be read.
@@ -69,7 +69,7 @@ pub(crate) enum CliError {
     Input {
         /// Path, or `stdin`.
         name: String,
-        /// The system's words.
+        /// Error of the system.
         source: io::Error,
     },
     /// The input has more bytes than allowed.
@@ -85,30 +85,30 @@ pub(crate) enum CliError {
     Job {
         /// The input.
         name: String,
-        /// Why.
+        /// Cause.
         source: JobError,
-        /// What a strict reader says of the same file.
+        /// Worst finding of the strict validator in the same file.
         opinion: Option<String>,
     },
-    /// A strict check was asked for, and the referee found errors.
+    /// The requested strict check found errors.
     #[error("{name}: the strict check found {errors} errors")]
     Strict {
         /// The input.
         name: String,
-        /// How many.
+        /// Number of errors.
         errors: usize,
-        /// The first of them.
+        /// First error.
         first: String,
     },
     /// The format cannot hold the mesh, or the mesh is broken.
     #[error(transparent)]
     Format(#[from] FormatError),
-    /// The backend that was asked for is not there.
+    /// The requested backend is not available.
     #[error("no backend `{asked}` on this machine: {why}")]
     NoBackend {
-        /// What was asked for.
+        /// Requested backend.
         asked: &'static str,
-        /// Why it is not there.
+        /// Reason.
         why: String,
     },
     /// The output cannot be written.
@@ -116,10 +116,10 @@ pub(crate) enum CliError {
     Output {
         /// Path, or `stdout`.
         name: String,
-        /// The system's words.
+        /// Error of the system.
         source: io::Error,
     },
-    /// Ctrl-C.
+    /// Interrupted by a signal.
     #[error("interrupted; nothing was written")]
     Interrupted,
     /// The service could not start, or is not healthy.
@@ -134,36 +134,36 @@ pub(crate) enum CliError {
     #[cfg(feature = "server")]
     #[error("a service would not start or not be ready: {}", failed.join(", "))]
     Unfit {
-        /// The checks that failed.
+        /// Names of the failed checks.
         failed: Vec<&'static str>,
-        /// Whether it is for want of a backend.
+        /// True if the backend check failed.
         backend: bool,
     },
-    /// A defect of ours.
+    /// Defect of the program.
     #[error("internal error: {0}")]
     Internal(String),
 }
 
-/// The system's words without its error number.
+/// Returns the system's message without its error number.
 fn reason(error: &io::Error) -> String {
     let text = error.to_string();
-    let words = text.split(" (os error").next().unwrap_or(&text);
-    match words.split_once(' ') {
+    let message = text.split(" (os error").next().unwrap_or(&text);
+    match message.split_once(' ') {
         // "No such file" reads better as "no such file" behind a colon; "I/O error" keeps its capitals.
         Some((first, rest)) if first.chars().skip(1).all(char::is_lowercase) => {
             format!("{} {rest}", first.to_lowercase())
         }
-        _ => words.to_owned(),
+        _ => message.to_owned(),
     }
 }
 
 impl CliError {
-    /// A usage error without a hint.
+    /// Creates a usage error without a hint.
     pub(crate) fn usage(message: impl Into<String>) -> Self {
         Self::Usage { message: message.into(), hint: None }
     }
 
-    /// The exit code.
+    /// Returns the exit code.
     pub(crate) fn code(&self) -> i32 {
         match self {
             Self::Usage { .. } => code::USAGE,
@@ -187,7 +187,7 @@ impl CliError {
         }
     }
 
-    /// What would help, if we know.
+    /// Returns a suggestion, if there is one.
     pub(crate) fn hint(&self) -> Option<String> {
         match self {
             Self::Usage { hint, .. } => hint.clone(),
@@ -213,7 +213,7 @@ impl CliError {
     pub(crate) fn print(&self, style: Style) {
         let hint = self.hint().map(|hint| format!("{} {hint}\n", style.dim("   hint:"))).unwrap_or_default();
         let text = format!("{} {self}\n{hint}", style.red("molmesh:"));
-        // Nobody is left to tell when stderr is closed; the exit code still speaks.
+        // A closed stderr is ignored; the exit code still reports the failure.
         drop(io::stderr().write_all(text.as_bytes()));
     }
 }
@@ -228,7 +228,7 @@ fn structure_code(error: &StructureError) -> i32 {
 fn surface_code(error: &SurfaceError) -> i32 {
     match error {
         SurfaceError::NoSpheres | SurfaceError::BadSphere { .. } => code::STRUCTURE,
-        // An isovalue that the density never reaches is the caller's parameter.
+        // The isovalue is above the highest density.
         SurfaceError::BadParameter { .. } | SurfaceError::NoSurface { .. } => code::USAGE,
         SurfaceError::GridTooLarge { .. }
         | SurfaceError::TooManyCandidates { .. }
@@ -257,7 +257,7 @@ fn format_code(error: &FormatError) -> i32 {
         | FormatError::GlbTooLarge { .. }
         | FormatError::AtomIndexTooLarge { .. }
         | FormatError::CoordinateTooLarge { .. } => code::LIMIT,
-        // A mesh that is broken is our defect, not the caller's.
+        // A broken mesh is a defect of the program.
         FormatError::ColumnLength { .. }
         | FormatError::IndexOutOfRange { .. }
         | FormatError::NotFinite { .. }
@@ -300,7 +300,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_kind_of_failure_has_its_code() {
+    fn every_error_has_its_exit_code() {
         let job = |source: JobError| CliError::Job { name: "x".into(), source, opinion: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
         let cases: [(CliError, i32); 19] = [
@@ -330,12 +330,12 @@ mod tests {
     }
 
     #[test]
-    fn the_systems_words_lose_their_number() {
+    fn system_messages_lose_their_number() {
         assert_eq!(reason(&io::Error::from_raw_os_error(2)), "no such file or directory");
     }
 
     #[test]
-    fn a_grid_that_is_too_large_comes_with_a_resolution() {
+    fn grid_limit_suggests_a_resolution() {
         let error = SurfaceError::GridTooLarge { samples: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
         let hint = CliError::Job { name: "x".into(), source: error.into(), opinion: None }.hint();
         assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-samples"));

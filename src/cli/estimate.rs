@@ -1,17 +1,16 @@
-//! Estimated time of one command on the CPU and on a GPU that has not been started: decides what `--backend auto`
-//! takes.
+//! Estimated time of one command on the CPU and on a GPU that is not started yet. `--backend auto` compares them.
 //!
-//! The constants are medians of one host with an H200 and 16 processors, and of one with two processors.
+//! The constants are medians of a host with an H200 and 16 cores and of a host with 2 cores.
 
 use std::fmt;
 
-/// Start of a GPU: its driver, its device and the pipelines, s.
+/// Start of a GPU: driver, device and pipelines, s.
 const GPU_START: f64 = 0.3;
-/// Time of a unit of work (an atom at 0.5 Å) on a GPU: reading on one processor, transfer, first use of the memory, s.
+/// Time of a unit of work (an atom at 0.5 Å) on a GPU: reading on one core, transfer, first use of the memory, s.
 const GPU_UNIT: f64 = 2.5e-6;
-/// The part of a unit's time on the CPU that does not shrink with the number of threads, s.
+/// Serial part of the time of a unit on the CPU, s.
 const CPU_UNIT: f64 = 1.5e-6;
-/// The part that is shared by the threads, s.
+/// Parallel part of the time of a unit on the CPU, s.
 const CPU_UNIT_SHARED: f64 = 5e-6;
 
 /// Estimated time of a command on either backend, s.
@@ -28,7 +27,7 @@ impl Estimate {
         Self { cpu, gpu: GPU_START + work * GPU_UNIT }
     }
 
-    /// Returns whether a GPU is expected to finish first.
+    /// Returns true if a GPU is expected to finish first.
     pub(super) fn favours_gpu(self) -> bool {
         self.gpu < self.cpu
     }
@@ -36,7 +35,12 @@ impl Estimate {
 
 impl fmt::Display for Estimate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "estimated {:.0} ms on the CPU, {:.0} ms on a GPU with its start", self.cpu * 1e3, self.gpu * 1e3)
+        write!(
+            f,
+            "estimated {:.0} ms on the CPU, {:.0} ms on a GPU including its start",
+            self.cpu * 1e3,
+            self.gpu * 1e3
+        )
     }
 }
 
@@ -53,8 +57,8 @@ mod tests {
     }
 
     #[test]
-    fn both_estimates_are_named() {
+    fn shows_both_estimates() {
         let text = Estimate::new(1e6, 2).to_string();
-        assert_eq!(text, "estimated 4000 ms on the CPU, 2800 ms on a GPU with its start");
+        assert_eq!(text, "estimated 4000 ms on the CPU, 2800 ms on a GPU including its start");
     }
 }

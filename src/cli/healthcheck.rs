@@ -1,4 +1,4 @@
-//! `molmesh healthcheck`: one GET to a running service, for containers that have no curl.
+//! `molmesh healthcheck`: sends one GET to a running service, for containers without curl.
 
 use std::io::{Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
@@ -7,22 +7,22 @@ use std::time::Duration;
 use super::args::HealthcheckArgs;
 use super::error::CliError;
 
-/// Enough for a status line, the headers and a short body.
-const MAX_ANSWER: u64 = 64 << 10;
+/// Maximum size of a response in bytes: status line, headers and a short body.
+const MAX_RESPONSE: u64 = 64 << 10;
 
-/// Runs the command: prints the answer's status, fails unless it is 200.
+/// Runs the command: prints the status, and fails unless it is 200.
 pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
     let url = Url::parse(&args.url)?;
     let timeout = timeout(args.timeout)?;
-    let answer = get(&url, timeout).map_err(|e| CliError::Service(format!("{} does not answer: {e}", args.url)))?;
-    match status(&answer) {
+    let response = get(&url, timeout).map_err(|e| CliError::Service(format!("{} does not answer: {e}", args.url)))?;
+    match status(&response) {
         Some(200) => super::say("200 ok\n"),
-        Some(code) => Err(CliError::Service(format!("{} answers {code}", args.url))),
-        None => Err(CliError::Service(format!("{} does not speak HTTP", args.url))),
+        Some(code) => Err(CliError::Service(format!("{} responds with status {code}", args.url))),
+        None => Err(CliError::Service(format!("{} does not respond with HTTP", args.url))),
     }
 }
 
-/// The time that was asked for.
+/// Parses `--timeout`, in seconds.
 pub(super) fn timeout(seconds: f64) -> Result<Duration, CliError> {
     Some(seconds)
         .filter(|seconds| (0.001..=3600.0).contains(seconds))
@@ -52,7 +52,7 @@ impl<'a> Url<'a> {
         Ok(Self { authority, path: if path.is_empty() { "/readyz" } else { path } })
     }
 
-    /// Host and port, port 80 if none is given. Brackets around an IPv6 address stay, as the resolver wants them.
+    /// Returns host and port, by default port 80. Keeps the brackets of an IPv6 address, which the resolver needs.
     fn socket(&self) -> String {
         let after_host = self.authority.rfind(']').map_or(0, |i| i + 1);
         if self.authority[after_host..].contains(':') {
@@ -72,9 +72,9 @@ fn get(url: &Url<'_>, timeout: Duration) -> std::io::Result<Vec<u8>> {
                 stream.set_write_timeout(Some(timeout))?;
                 let (path, host) = (url.path, url.authority);
                 write!(stream, "GET {path} HTTP/1.1\r\nHost: {host}\r\nAccept: */*\r\nConnection: close\r\n\r\n")?;
-                let mut answer = Vec::new();
-                stream.take(MAX_ANSWER).read_to_end(&mut answer)?;
-                return Ok(answer);
+                let mut response = Vec::new();
+                stream.take(MAX_RESPONSE).read_to_end(&mut response)?;
+                return Ok(response);
             }
             Err(error) => last = error,
         }
@@ -82,12 +82,12 @@ fn get(url: &Url<'_>, timeout: Duration) -> std::io::Result<Vec<u8>> {
     Err(last)
 }
 
-/// The status code of an HTTP/1 answer.
-fn status(answer: &[u8]) -> Option<u16> {
-    let line = answer.split(|&b| b == b'\r').next()?;
-    let mut words = std::str::from_utf8(line).ok()?.split(' ');
-    words.next().filter(|version| version.starts_with("HTTP/1."))?;
-    words.next()?.parse().ok()
+/// Returns the status code of an HTTP/1 response.
+fn status(response: &[u8]) -> Option<u16> {
+    let line = response.split(|&b| b == b'\r').next()?;
+    let mut fields = std::str::from_utf8(line).ok()?.split(' ');
+    fields.next().filter(|version| version.starts_with("HTTP/1."))?;
+    fields.next()?.parse().ok()
 }
 
 #[cfg(test)]
@@ -95,7 +95,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn addresses_are_taken_apart() {
+    fn parses_urls() {
         let url = |text| Url::parse(text).map(|u| (u.socket(), u.path.to_owned()));
         let is = |socket: &str, path: &str| (socket.to_owned(), path.to_owned());
         assert_eq!(url("http://127.0.0.1:8080/livez").unwrap(), is("127.0.0.1:8080", "/livez"));
@@ -108,7 +108,7 @@ mod tests {
     }
 
     #[test]
-    fn only_a_status_line_has_a_status() {
+    fn reads_the_status_of_a_status_line_only() {
         assert_eq!(status(b"HTTP/1.1 503 Service Unavailable\r\n\r\n"), Some(503));
         for bad in [&b""[..], b"hello", b"HTTP/1.1", b"HTTP/1.1 ok\r\n", b"\xff\xfe\r\n"] {
             assert_eq!(status(bad), None, "{bad:?}");

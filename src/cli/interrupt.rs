@@ -1,4 +1,4 @@
-//! Ctrl-C: cancels the job, removes the half-written file, exits with 130.
+//! Ctrl-C: cancels the job, removes the partial file and exits with code 130.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,15 +8,15 @@ use molmesh::surface::CancelToken;
 
 use super::error::CliError;
 
-/// The file that must not outlive a command that did not finish. The lock is held while it gets its final name,
-/// so an interrupt either finds it unfinished and removes it, or finds it done.
+/// Partial file of a running command. The lock is held during the rename to the final name, so that an interrupt either
+/// removes the partial file or comes after the rename.
 static STAGED: Mutex<Option<PathBuf>> = Mutex::new(None);
 
 fn staged() -> MutexGuard<'static, Option<PathBuf>> {
     STAGED.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Remembers a file that is to be removed unless [`commit`] gives it its name.
+/// Registers a file that is removed unless [`commit`] renames it.
 pub(crate) fn stage(path: &Path) {
     *staged() = Some(path.to_owned());
 }
@@ -24,7 +24,7 @@ pub(crate) fn stage(path: &Path) {
 /// Renames the staged file to `target`.
 ///
 /// # Errors
-/// Those of the rename; the file is then still staged.
+/// Returns the error of the rename. The file stays staged.
 pub(crate) fn commit(target: &Path) -> std::io::Result<()> {
     let mut staged = staged();
     if let Some(path) = staged.as_ref() {
@@ -37,17 +37,17 @@ pub(crate) fn commit(target: &Path) -> std::io::Result<()> {
 /// Removes the staged file, if there is one.
 pub(crate) fn discard() {
     if let Some(path) = staged().take() {
-        // It may be gone already; and a failure here must not hide why we are giving up.
+        // The file may be gone already, and an error here must not hide the original one.
         drop(fs::remove_file(path));
     }
 }
 
-/// From now on SIGINT and SIGTERM cancel `token`. A job that does not notice within half a second (it may be
-/// waiting for stdin) is ended, as it is by a second signal; the staged file is removed in any case.
-#[cfg(unix)]
+/// Cancels `token` on SIGINT and SIGTERM. Half a second later (the job may be waiting for stdin) or on a second signal,
+/// the process exits. The staged file is removed in all cases.
 ///
 /// # Errors
-/// [`CliError::Internal`] where the system does not let the process watch.
+/// Returns [`CliError::Internal`] if the signals cannot be watched.
+#[cfg(unix)]
 pub(crate) fn watch(token: &CancelToken) -> Result<(), CliError> {
     use std::time::Duration;
 
@@ -86,7 +86,7 @@ pub(crate) fn watch(token: &CancelToken) -> Result<(), CliError> {
     if rayon::current_thread_index().is_none() || rayon::current_num_threads() < 2 {
         return start();
     }
-    // To start a thread takes as long as to read a small structure: another thread of the pool has nothing to do yet.
+    // Starting a thread takes as long as reading a small structure, so an idle thread of the pool does it.
     rayon::spawn(move || {
         if let Err(error) = start() {
             discard();
@@ -97,13 +97,13 @@ pub(crate) fn watch(token: &CancelToken) -> Result<(), CliError> {
     Ok(())
 }
 
-/// What it means that signals cannot be watched.
+/// Returns the error for signals that cannot be watched.
 #[cfg(unix)]
 fn unwatched(error: &std::io::Error) -> CliError {
     CliError::Internal(format!("cannot watch for signals: {error}"))
 }
 
-/// Without signals nothing is watched: the system ends the process, and may leave the staged file behind.
+/// Does nothing without signals. The system ends the process and may leave the staged file.
 #[cfg(not(unix))]
 pub(crate) fn watch(_token: &CancelToken) -> Result<(), CliError> {
     Ok(())

@@ -1,4 +1,4 @@
-//! `molmesh key`: makes keys and prints what goes where. Nothing is kept: whoever loses a key gets another one.
+//! `molmesh key`: creates and prints keys. Nothing is stored; a lost key must be replaced.
 
 use std::io::{self, Write as _};
 use std::sync::Arc;
@@ -17,13 +17,12 @@ pub(super) fn run(command: &KeyCommand) -> Result<(), CliError> {
     }
 }
 
-/// The key goes to stderr for whoever is to have it, its lines to stdout, so that `>> keys.toml` keeps the one apart from
-/// the other.
+/// Prints the key to stderr and its entry to stdout, so that `>> keys.toml` stores the entry only.
 fn new(args: &NewKeyArgs) -> Result<(), CliError> {
     let id = id(&args.id)?;
     let scope = |name: &str| {
-        let known = Scope::ALL.map(Scope::name).join(" and ");
-        let message = format!("parameter `scopes`: `{name}` is not allowed; there are {known}");
+        let known = Scope::ALL.map(Scope::name).join(", ");
+        let message = format!("parameter `scopes`: `{name}` is not allowed; expected {known}");
         Scope::named(name.trim()).ok_or_else(|| CliError::usage(message))
     };
     let mut scopes = args.scopes.split(',').map(scope).collect::<Result<Vec<_>, _>>()?;
@@ -40,7 +39,7 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
     let key =
         Key { id: id.to_owned(), hash: minted.hash, scopes, quota: Arc::new(quota), expires, note: args.note.clone() };
     super::say(&access::entry(&key))?;
-    let text = format!("\nThe key, which is not shown again:\n{}\n", minted.text);
+    let text = format!("\nThe key (shown only once):\n{}\n", minted.text);
     io::stderr().write_all(text.as_bytes()).map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
 }
 
@@ -56,7 +55,7 @@ fn id(id: &str) -> Result<&str, CliError> {
     Some(id).filter(|id| access::is_id(id)).ok_or_else(|| CliError::usage(message()))
 }
 
-/// A time such as `1h`, whole seconds of it, at least one.
+/// Parses a time such as `1h` into whole seconds, at least one.
 pub(super) fn seconds(parameter: &str, text: &str) -> Result<u64, CliError> {
     let seconds = humantime::parse_duration(text).map(|time| time.as_secs()).ok().filter(|seconds| *seconds >= 1);
     let message =
@@ -64,7 +63,7 @@ pub(super) fn seconds(parameter: &str, text: &str) -> Result<u64, CliError> {
     seconds.ok_or_else(|| CliError::usage(message()))
 }
 
-/// When something ends: a time from now, or a date.
+/// Parses an expiry: a time from now, or a date.
 pub(super) fn end(text: &str) -> Result<SystemTime, CliError> {
     let message = || {
         let expected = "expected a time from now such as 1h or 90d, or a date such as 2030-01-31T00:00:00Z";
@@ -77,7 +76,7 @@ pub(super) fn end(text: &str) -> Result<SystemTime, CliError> {
     SystemTime::now().checked_add(Duration::from_secs(from_now)).filter(is_a_date).ok_or_else(message)
 }
 
-/// Whether a time can be written: years have four digits.
+/// Returns true if the year of a time has at most four digits.
 fn is_a_date(time: &SystemTime) -> bool {
     const YEAR_10000_S: u64 = 253_402_300_800;
     time.duration_since(SystemTime::UNIX_EPOCH).is_ok_and(|since| since.as_secs() < YEAR_10000_S)

@@ -1,4 +1,4 @@
-//! `molmesh mesh`: converts one structure to one mesh file.
+//! `molmesh mesh`: meshes one structure into one file.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -30,7 +30,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     if format.is_picture() {
         return Err(CliError::Usage {
             message: format!("{format} is a picture, not a mesh"),
-            hint: Some("molmesh render draws pictures".to_owned()),
+            hint: Some("molmesh render writes pictures".to_owned()),
         });
     }
     request::settle(&mut job, format)?;
@@ -73,7 +73,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
 
     let name = if to_stdout { "stdout".to_owned() } else { output_path.display().to_string() };
     let written = Written { name: &name, format: format.extension(), bytes };
-    tell(args, &report, findings.as_deref(), &written, to_stdout)
+    write_report(args, &report, findings.as_deref(), &written, to_stdout)
 }
 
 /// Format of an output by its file extension; GLB on stdout.
@@ -91,7 +91,7 @@ fn format(output: &Path) -> Result<Format, CliError> {
     }
 }
 
-/// Reads the input, at most `limit` bytes. Inflating does not make it smaller, so the limit holds for compressed files.
+/// Reads the input. `limit` is that of the decompressed bytes, which are not fewer.
 pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
     let stdin = is_stdio(path);
     let name = || name_of(path);
@@ -101,7 +101,7 @@ pub(super) fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
         }
         let file = File::open(path)?;
         let size = file.metadata()?.len();
-        // One extra byte, so that the end is detected without growing the buffer.
+        // The spare byte lets the reader detect the end of the file without growing the buffer.
         take(file, if size > limit { 0 } else { size + 1 }, limit)
     };
     let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
@@ -117,12 +117,12 @@ fn take(source: impl Read, capacity: u64, limit: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Name of the input in messages.
+/// Returns the name of the input in messages.
 fn name_of(input: &Path) -> String {
     if is_stdio(input) { "stdin".to_owned() } else { input.display().to_string() }
 }
 
-/// Input and settings of the job.
+/// One job with its input.
 struct Work<'a> {
     path: &'a Path,
     job: &'a Job,
@@ -158,12 +158,12 @@ impl Work<'_> {
     }
 }
 
-/// Error of the command for that of a job.
+/// Converts the error of a job.
 pub(super) fn failure(path: &Path, input: &[u8], limits: &JobLimits, source: JobError) -> CliError {
     match source {
         JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
         source => {
-            let (name, opinion) = (name_of(path), opinion(&source, input, limits));
+            let (name, opinion) = (name_of(path), worst_finding(&source, input, limits));
             CliError::Job { name, opinion, source }
         }
     }
@@ -179,7 +179,7 @@ fn sink_failure(output: &Output, cause: Option<GlbSinkError>) -> CliError {
     }
 }
 
-/// Runs the strict check. Returns its findings, or an error if one of them is an error.
+/// Returns the findings of the strict validator, or an error if there are errors among them.
 pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
     let name = || name_of(path);
     let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
@@ -194,15 +194,15 @@ pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec
     }
 }
 
-/// Worst finding of the strict check in a file with a syntax error.
-fn opinion(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
+/// Returns the worst finding of the strict validator in a file with a syntax error.
+fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
     let findings = referee::check(input, &limits.read).ok()?;
     let worst = findings.iter().max_by_key(|f| f.level)?;
-    Some(format!("a strict reader says: {}", finding(worst)))
+    Some(format!("the strict validator reports: {}", finding(worst)))
 }
 
-/// A finding on one line.
+/// Formats a finding on one line.
 fn finding(finding: &Diagnostic) -> String {
     let place = finding.line.map(|n| format!("line {n}: ")).unwrap_or_default();
     format!("{place}{}", finding.message.split_whitespace().collect::<Vec<_>>().join(" "))
@@ -218,8 +218,8 @@ fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn Progre
     Ok(encoding.as_secs_f64() * 1e3)
 }
 
-/// Writes the report to the stream that the mesh does not use.
-pub(super) fn tell(
+/// Writes the report: text to stderr, JSON to stdout, or to stderr if the file is on stdout.
+pub(super) fn write_report(
     args: &JobArgs,
     report: &Report,
     findings: Option<&[Diagnostic]>,
@@ -238,14 +238,15 @@ pub(super) fn tell(
         }
         ReportStyle::Json => {
             let text = json_report(report, findings, written)?;
-            let told = if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
-            told.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
+            let printed =
+                if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
+            printed.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
         }
     }
 }
 
 fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Written<'_>) -> Result<String, CliError> {
-    let failed = |e: serde_json::Error| CliError::Internal(format!("the report is no JSON: {e}"));
+    let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialised: {e}"));
     let mut value = serde_json::to_value(report).map_err(failed)?;
     if let Value::Object(map) = &mut value {
         let output = json!({ "file": written.name, "format": written.format, "bytes": written.bytes });

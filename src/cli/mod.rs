@@ -1,6 +1,6 @@
-//! The command line: flags in, one line of error or one screen of summary out, exit codes that scripts can trust.
+//! Command line: flags, commands, summaries, error messages and exit codes.
 //!
-//! Nothing is started that a command does not need: `mesh` has no async runtime and no log.
+//! A command starts only what it needs: `mesh` has no async runtime and no log.
 
 mod args;
 mod backend;
@@ -42,10 +42,10 @@ use args::{Args, Command};
 use error::{CliError, code};
 use style::Style;
 
-/// Runs the command that the process's arguments name. Returns the exit code.
+/// Runs the command in the arguments of the process. Returns the exit code.
 pub(crate) fn main() -> i32 {
     let status = run();
-    // Standard output may still hold the end of what was printed, and nobody looks after it once the process leaves.
+    // `leave` does not flush standard output.
     if io::stdout().flush().is_err() && status == code::OK { code::OUTPUT } else { status }
 }
 
@@ -90,14 +90,14 @@ pub(crate) fn leave(status: i32) -> ! {
     std::process::exit(status);
 }
 
-/// What may help where a command is not known.
+/// Hint for an unknown command in a build without the service.
 const NO_SERVICE: &str = if cfg!(feature = "server") {
     ""
 } else {
-    "\nThis build is the command line alone; `serve`, `doctor` and what else belongs to the service are in one with the feature `server`.\n"
+    "\nThis build has no service; `serve`, `doctor` and related commands need the feature `server`.\n"
 };
 
-/// Prints what clap has to say: help is an answer, anything else is a mistake of the caller.
+/// Prints help to stdout and usage errors to stderr. Returns the exit code.
 fn usage(error: &clap::Error) -> i32 {
     let text = error.render().to_string();
     let (written, code) = match error.kind() {
@@ -109,7 +109,7 @@ fn usage(error: &clap::Error) -> i32 {
             (write!(io::stderr(), "molmesh: {text}{hint}"), code::USAGE)
         }
     };
-    // Whoever closed the stream does not want to read it.
+    // A closed stream is ignored.
     drop(written);
     code
 }
@@ -119,13 +119,13 @@ fn version() -> Result<(), CliError> {
     say(&format!("molmesh {} (features: {})\n", env!("CARGO_PKG_VERSION"), features().join(", ")))
 }
 
-/// The features of this build.
+/// Returns the features of this build.
 fn features() -> Vec<&'static str> {
     let features = [("cli", true), ("server", cfg!(feature = "server")), ("gpu", cfg!(feature = "gpu"))];
     features.into_iter().filter_map(|(name, on)| on.then_some(name)).collect()
 }
 
-/// Writes `text` to stdout at once.
+/// Prints `text` to stdout and flushes it.
 fn say(text: &str) -> Result<(), CliError> {
     let mut out = io::stdout().lock();
     out.write_all(text.as_bytes())

@@ -150,9 +150,9 @@ fn open_file(path: &Path) -> io::Result<To> {
 mod tests {
     use super::*;
 
-    // One test, as the staged file is one for the process.
+    // A single test, as a process has only one staged file.
     #[test]
-    fn a_file_appears_when_it_is_finished_and_only_then() {
+    fn file_appears_only_when_it_is_finished() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.glb");
         let entries = || fs::read_dir(dir.path()).unwrap().count();

@@ -1,6 +1,4 @@
-//! A defect of ours ends a command with one line and exit code 1, not with a backtrace.
-//!
-//! `RUST_BACKTRACE` brings the usual report back for whoever hunts the defect.
+//! Panics end a command with one line and exit code 1. With `RUST_BACKTRACE`, the usual report is printed as well.
 
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::{Mutex, PoisonError};
@@ -9,16 +7,16 @@ use molmesh::structure::referee;
 
 use super::error::CliError;
 
-/// Where and why the last panic happened.
+/// Message and location of the last panic.
 static LAST: Mutex<Option<String>> = Mutex::new(None);
 
-/// Runs `command`; a panic in it becomes [`CliError::Internal`].
+/// Runs `command` and turns a panic into [`CliError::Internal`].
 pub(crate) fn contained(command: impl FnOnce() -> Result<(), CliError>) -> Result<(), CliError> {
     if std::env::var_os("RUST_BACKTRACE").is_none() {
         panic::set_hook(Box::new(|info| {
             let place = info.location().map_or_else(String::new, |l| format!(" ({}:{})", l.file(), l.line()));
-            let what = info.payload_as_str().unwrap_or("panic");
-            *LAST.lock().unwrap_or_else(PoisonError::into_inner) = Some(format!("{what}{place}"));
+            let message = info.payload_as_str().unwrap_or("panic");
+            *LAST.lock().unwrap_or_else(PoisonError::into_inner) = Some(format!("{message}{place}"));
         }));
     }
     referee::quiet_panics();

@@ -1,6 +1,6 @@
-//! A progress bar for work that takes long: it appears after 300 ms, and only on a terminal.
+//! Progress bar for long work: appears after 300 ms, only on a terminal.
 //!
-//! Workers store fractions; a thread of its own draws. Without a terminal there is neither.
+//! Workers store fractions, and a separate thread draws the bar. Without a terminal there is neither.
 
 use std::io::IsTerminal;
 use std::sync::mpsc::{RecvTimeoutError, SyncSender, sync_channel};
@@ -11,31 +11,31 @@ use std::{io, sync::Arc};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use molmesh::pipeline::{ProgressSink, Tracker};
 
-/// Work that is shorter shows no bar.
-const PATIENCE: Duration = Duration::from_millis(300);
-/// Between two drawings.
-const FRAME: Duration = Duration::from_millis(80);
+/// Delay before the bar appears.
+const DELAY: Duration = Duration::from_millis(300);
+/// Interval between updates.
+const INTERVAL: Duration = Duration::from_millis(80);
 /// Steps of the bar.
 const STEPS: u64 = 1000;
 
-/// The bar. It is gone when this is dropped.
+/// Progress bar. Dropping it removes it from the terminal.
 pub(crate) struct Progress {
     tracker: Arc<Tracker>,
-    painter: Option<(SyncSender<()>, JoinHandle<()>)>,
+    thread: Option<(SyncSender<()>, JoinHandle<()>)>,
 }
 
 impl Progress {
-    /// A bar on stderr, if that is a terminal and `wanted`.
+    /// Creates a bar on stderr if that is a terminal and `wanted` is true.
     pub(crate) fn new(wanted: bool) -> Self {
         let tracker = Arc::new(Tracker::default());
-        let painter = (wanted && io::stderr().is_terminal()).then(|| paint(Arc::clone(&tracker))).flatten();
-        Self { tracker, painter }
+        let thread = (wanted && io::stderr().is_terminal()).then(|| paint(Arc::clone(&tracker))).flatten();
+        Self { tracker, thread }
     }
 }
 
 impl ProgressSink for Progress {
     fn progress(&self, stage: &'static str, fraction: f64) {
-        if self.painter.is_some() {
+        if self.thread.is_some() {
             self.tracker.progress(stage, fraction);
         }
     }
@@ -43,20 +43,20 @@ impl ProgressSink for Progress {
 
 impl Drop for Progress {
     fn drop(&mut self) {
-        if let Some((stop, painter)) = self.painter.take() {
+        if let Some((stop, thread)) = self.thread.take() {
             drop(stop);
-            // A painter that panicked has nothing to say about the work.
-            drop(painter.join());
+            // A panic of this thread does not affect the work.
+            drop(thread.join());
         }
     }
 }
 
-/// Starts the thread that draws; it ends when the sender is dropped.
+/// Starts the thread that draws the bar. It ends when the sender is dropped.
 fn paint(tracker: Arc<Tracker>) -> Option<(SyncSender<()>, JoinHandle<()>)> {
     let (stop, stopped) = sync_channel::<()>(0);
     let draw = move || {
         let over = |wait| !matches!(stopped.recv_timeout(wait), Err(RecvTimeoutError::Timeout));
-        if over(PATIENCE) {
+        if over(DELAY) {
             return;
         }
         let bar = ProgressBar::with_draw_target(Some(STEPS), ProgressDrawTarget::stderr());
@@ -69,12 +69,12 @@ fn paint(tracker: Arc<Tracker>) -> Option<(SyncSender<()>, JoinHandle<()>)> {
             #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "between 0 and 1000")]
             bar.set_position((overall * STEPS as f64) as u64);
             bar.tick();
-            if over(FRAME) {
+            if over(INTERVAL) {
                 break;
             }
         }
         bar.finish_and_clear();
     };
-    let painter = std::thread::Builder::new().name("progress".to_owned()).spawn(draw).ok()?;
-    Some((stop, painter))
+    let thread = std::thread::Builder::new().name("progress".to_owned()).spawn(draw).ok()?;
+    Some((stop, thread))
 }

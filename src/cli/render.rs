@@ -1,4 +1,4 @@
-//! `molmesh render`: one structure to one picture.
+//! `molmesh render`: renders one structure as one picture.
 
 use std::io::Write as _;
 use std::path::Path;
@@ -18,10 +18,10 @@ use super::progress::Progress;
 use super::summary::Written;
 use super::{interrupt, mesh, request};
 
-/// Runs the command, in the order of `mesh`.
+/// Runs the command, with the steps in the order of `mesh`.
 pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     let Request { job, strict, .. } = request::of_render(args)?;
-    of_name(&args.output)?;
+    require_png(&args.output)?;
     let (output_path, input_path, args) = (&args.output, &args.input, &args.job);
     let limits = request::limits(&args.limits);
     backend::check(&Asked::once(args))?;
@@ -53,15 +53,15 @@ pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     report.add_timing("write", start.elapsed().as_secs_f64() * 1e3);
     let name = if to_stdout { "stdout".to_owned() } else { output_path.display().to_string() };
     let written = Written { name: &name, format: Format::Png.extension(), bytes };
-    mesh::tell(args, &report, findings.as_deref(), &written, to_stdout)
+    mesh::write_report(args, &report, findings.as_deref(), &written, to_stdout)
 }
 
-/// Refuses an output whose name says that it is something else.
-fn of_name(output: &Path) -> Result<(), CliError> {
+/// Rejects an output file without the extension `png`.
+fn require_png(output: &Path) -> Result<(), CliError> {
     let png = output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png"));
     if png || is_stdio(output) {
         return Ok(());
     }
-    let message = format!("`{}` is no picture's name: it does not end in .png", output.display());
+    let message = format!("`{}` does not end in .png", output.display());
     Err(CliError::Usage { message, hint: Some("molmesh mesh writes meshes".to_owned()) })
 }

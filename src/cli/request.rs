@@ -1,4 +1,4 @@
-//! Flags to a job: the same names and values that a query has, read by the same reader.
+//! Turns flags into a request. Names and values are those of an HTTP query and have the same parser.
 
 use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError, Request};
@@ -7,14 +7,14 @@ use molmesh::pipeline::{Job, JobLimits};
 use super::args::{JobArgs, LimitArgs, MeshArgs, PictureArgs, RenderArgs};
 use super::error::CliError;
 
-/// What the flags of `mesh` ask for.
+/// Parses the flags of `mesh`.
 pub(super) fn of_mesh(args: &MeshArgs) -> Result<Request, CliError> {
     let own =
         [("format", &args.format), ("compress", &args.compress), ("normals", &args.normals), ("units", &args.units)];
     parse(&own, &args.job)
 }
 
-/// What the flags of `render` ask for.
+/// Parses the flags of `render`.
 pub(super) fn of_render(args: &RenderArgs) -> Result<Request, CliError> {
     let PictureArgs { width, height, view, azimuth, elevation, background, style } = &args.picture;
     let own = [
@@ -35,7 +35,7 @@ fn parse(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Result<Requ
     params::parse(pairs(own, args)).map_err(|error| refusal(&error))
 }
 
-/// Makes the job one for the format that the output's name says.
+/// Adapts the job to the output format.
 pub(super) fn settle(job: &mut Job, format: Format) -> Result<(), CliError> {
     params::settle(job, format).map_err(|error| refusal(&error))
 }
@@ -47,7 +47,7 @@ fn refusal(error: &ParamError) -> CliError {
     }
 }
 
-/// The limits, with what the flags change.
+/// Returns the default limits, changed by the flags.
 pub(super) fn limits(args: &LimitArgs) -> JobLimits {
     let mut limits = JobLimits::default();
     let set = |limit: &mut u64, flag: Option<u64>| *limit = flag.unwrap_or(*limit);
@@ -59,7 +59,7 @@ pub(super) fn limits(args: &LimitArgs) -> JobLimits {
     limits
 }
 
-/// Names and values, as a query would have them.
+/// Returns names and values as in a query.
 fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'static str, String)> {
     let (surface, atoms) = (&args.surface, &args.selection);
     let given = [
@@ -89,7 +89,7 @@ fn pairs(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Vec<(&'stat
     if args.check {
         pairs.push(("check", "strict".to_owned()));
     }
-    // The short flags add to what is selected; alone they add to the default.
+    // The short flags add to `--select` or to its default.
     let mut select = atoms.select.clone();
     for (flag, class) in [(atoms.ligands, "ligand"), (atoms.waters, "water"), (atoms.hydrogens, "hydrogens")] {
         if flag {
@@ -161,7 +161,7 @@ mod tests {
             let ask = if pictures { drawn } else { request };
             let changed = ask(&value).unwrap_or_else(|e| panic!("{value:?}: {e}"));
             assert_ne!(key(&changed), key(&ask(&[]).unwrap()), "{flag} changes nothing");
-            // Whatever makes another mesh makes another picture.
+            // A parameter that changes the mesh changes the picture.
             if !["format", "compress", "normals", "units"].contains(&parameter.name) {
                 assert_ne!(key(&drawn(&value).unwrap()), key(&drawn(&[]).unwrap()), "{flag} changes no picture");
             }
@@ -169,12 +169,12 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_value_is_bad_usage() {
+    fn rejects_bad_values() {
         let both = request(&["--detail", "3", "--resolution", "0.6"]).unwrap_err();
-        let said = both.to_string();
+        let message = both.to_string();
         let default = request(&["--detail", "3", "--resolution", "0.5"]).unwrap();
         assert_eq!(params::canonical(&default.job), params::canonical(&request(&["--detail", "3"]).unwrap().job));
-        assert!(both.code() == 2 && said.contains("`detail`") && said.contains("`resolution`"), "{said}");
+        assert!(both.code() == 2 && message.contains("`detail`") && message.contains("`resolution`"), "{message}");
         for flags in [["--detail", "7"], ["--max-triangles", "7"], ["--normals", "flat"], ["--units", "inch"]] {
             assert_eq!(request(&flags).unwrap_err().code(), 2, "{flags:?}");
         }

@@ -1,4 +1,4 @@
-//! `molmesh serve`: flags to a configuration, a runtime, a banner, and the service until it is told to stop.
+//! `molmesh serve`: starts the service and runs it until a shutdown signal.
 
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -18,13 +18,13 @@ use super::error::CliError;
 use super::style::Style;
 use super::survey;
 
-/// How much nicer threads that compute are than those that answer: their share of a busy core is a third.
+/// Nice value of compute threads. They get a third of a core that they share with an HTTP thread.
 #[cfg(target_os = "linux")]
-const COMPUTING: i32 = 5;
-/// Threads of the runtime: they read and write sockets; meshing has its own.
+const COMPUTE_NICE: i32 = 5;
+/// Threads of the async runtime, which serve sockets. Meshing has other threads.
 const RUNTIME_THREADS: usize = 2;
 
-/// Runs the command: returns when the service was stopped and has finished what it was doing.
+/// Runs the service until it has been stopped and drained.
 pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     let Loaded { config, warnings, .. } = super::config::load(args)?;
     telemetry::init_logs(&config.log).map_err(|e| CliError::usage(e.to_string()))?;
@@ -53,22 +53,22 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         .enable_all()
         .build()
         .map_err(failed)?;
-    give_way();
+    lower_compute_priority();
     let server = runtime.block_on(Server::bind(config, Chosen { backend, reason, drawer, devices })).map_err(
         |error| match error {
-            // Keys and secrets are the caller's, as the rest of the configuration is.
+            // Keys and secrets are part of the configuration.
             ServeError::Access(error) => CliError::usage(error.to_string()),
             ServeError::Lock(error @ LockError::Held { .. }) => CliError::InUse(error.to_string()),
             error => CliError::Service(error.to_string()),
         },
     )?;
     let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
-    // The service runs whether or not somebody reads its banner.
+    // A closed stderr does not stop the service.
     drop(io::stderr().write_all(text.as_bytes()));
 
     let drained =
         runtime.block_on(async { server.run(shutdown_signals()).await }).map_err(|e| CliError::Service(e.to_string()));
-    // What still reads a file or computes after the drain timeout is not waited for.
+    // Do not wait for file reads and jobs that outlast the drain timeout.
     runtime.shutdown_timeout(Duration::from_millis(100));
     if drained? { Ok(()) } else { Err(CliError::Service("stopped before every request was finished".to_owned())) }
 }
@@ -80,20 +80,20 @@ fn raise_open_files() {
         use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
         let maximum = getrlimit(Resource::Nofile).maximum;
         if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum }) {
-            tracing::warn!(%error, "the limit of open files stays as it was");
+            tracing::warn!(%error, "cannot raise the limit of open files");
         }
     }
 }
 
-/// Lets computing give way to answering: a refusal, a cached mesh and a probe are due in milliseconds also while every
-/// core meshes. Threads take their priority from the one that starts them: those of the runtime are there already, those that
-/// compute are not.
-fn give_way() {
+/// Lowers the priority of compute threads, so that rejections, cached meshes and probes take milliseconds even while
+/// all cores are meshing. Threads inherit their priority: the runtime's threads exist already, the compute threads do
+/// not.
+fn lower_compute_priority() {
     #[cfg(target_os = "linux")]
-    if let Err(error) = rustix::process::nice(COMPUTING) {
-        tracing::debug!(%error, "computing has the priority of answering");
+    if let Err(error) = rustix::process::nice(COMPUTE_NICE) {
+        tracing::debug!(%error, "compute threads keep the default priority");
     }
     if let Err(error) = rayon::ThreadPoolBuilder::new().build_global() {
-        tracing::debug!(%error, "the threads that compute were there already");
+        tracing::debug!(%error, "the compute threads exist already");
     }
 }

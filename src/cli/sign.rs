@@ -1,4 +1,4 @@
-//! `molmesh sign`: an address that opens by itself until it expires, signed with the service's own key.
+//! `molmesh sign`: signs a URL with a key of the service. The URL works without an API key until it expires.
 
 use std::time::SystemTime;
 
@@ -9,7 +9,7 @@ use super::args::SignArgs;
 use super::error::CliError;
 use super::key;
 
-/// Runs the command: prints the signed address.
+/// Runs the command: prints the signed URL.
 pub(super) fn run(args: &SignArgs) -> Result<(), CliError> {
     let keys = keys(&super::config::of(args.config.as_deref(), &args.set, [])?.config)?;
     let (origin, target) = split(&args.url)?;
@@ -22,13 +22,15 @@ pub(super) fn run(args: &SignArgs) -> Result<(), CliError> {
 
 fn keys(config: &Config) -> Result<SigningKeys, CliError> {
     let secret = config.access.signing_secret.as_ref().ok_or_else(|| CliError::Usage {
-        message: "there is no key that signs: access.signing_secret is not set".to_owned(),
-        hint: Some("molmesh key signing makes one; give it by --config or MOLMESH__ACCESS__SIGNING_SECRET".to_owned()),
+        message: "no signing key: access.signing_secret is not set".to_owned(),
+        hint: Some(
+            "create one with `molmesh key signing`; set it in --config or MOLMESH__ACCESS__SIGNING_SECRET".to_owned(),
+        ),
     })?;
     SigningKeys::parse(secret.reveal()).map_err(|why| CliError::usage(format!("access.signing_secret: {why}")))
 }
 
-/// An address as its origin, which is not signed, and the rest; of a path the origin is empty.
+/// Splits a URL into its origin, which is not signed, and the rest. The origin of a path is empty.
 fn split(url: &str) -> Result<(&str, &str), CliError> {
     let Some((scheme, rest)) = url.split_once("://").filter(|(scheme, _)| !scheme.contains('/')) else {
         return Ok(("", url));
@@ -44,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_address_is_split_before_its_path() {
+    fn splits_a_url_before_its_path() {
         for (url, parts) in [
             ("https://h:8080/v1/x?a=b", Some(("https://h:8080", "/v1/x?a=b"))),
             ("/v1/x?next=http://h/", Some(("", "/v1/x?next=http://h/"))),

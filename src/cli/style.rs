@@ -1,50 +1,50 @@
-//! Colour: only on a terminal, never when `NO_COLOR` is set.
+//! Colours of text: only on a terminal, and not if `NO_COLOR` is set.
 
 use std::io::IsTerminal;
 
-/// Whether to colour.
+/// Style of text, with or without colours.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Style {
     coloured: bool,
 }
 
 impl Style {
-    /// Never any colour.
+    /// Style without colours.
     #[cfg(test)]
     pub(crate) const PLAIN: Self = Self { coloured: false };
 
-    /// For text on stderr.
+    /// Returns the style of stderr.
     pub(crate) fn stderr() -> Self {
         Self { coloured: std::io::stderr().is_terminal() && wanted() }
     }
 
-    /// For text on stdout.
+    /// Returns the style of stdout.
     #[cfg(feature = "server")]
     pub(crate) fn stdout() -> Self {
         Self { coloured: std::io::stdout().is_terminal() && wanted() }
     }
 
-    /// Titles.
+    /// Formats a title.
     pub(crate) fn bold(self, text: &str) -> String {
         self.wrap("1", text)
     }
 
-    /// Side notes.
+    /// Formats a side note.
     pub(crate) fn dim(self, text: &str) -> String {
         self.wrap("2", text)
     }
 
-    /// Failures.
+    /// Formats a failure.
     pub(crate) fn red(self, text: &str) -> String {
         self.wrap("1;31", text)
     }
 
-    /// Successes.
+    /// Formats a success.
     pub(crate) fn green(self, text: &str) -> String {
         self.wrap("32", text)
     }
 
-    /// Links and bars.
+    /// Formats a link or a bar.
     pub(crate) fn cyan(self, text: &str) -> String {
         self.wrap("36", text)
     }
@@ -54,7 +54,7 @@ impl Style {
     }
 }
 
-/// `NO_COLOR` counts when it is set and not empty; a dumb terminal has no colour either.
+/// Returns false if `NO_COLOR` is set and not empty, or if the terminal is dumb.
 fn wanted() -> bool {
     std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()) && std::env::var_os("TERM").is_none_or(|v| v != "dumb")
 }
@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn colour_wraps_and_plain_does_not() {
+    fn only_coloured_text_has_escapes() {
         assert_eq!(Style::PLAIN.red("x"), "x");
         assert_eq!(Style { coloured: true }.red("x"), "\x1b[1;31mx\x1b[0m");
     }

@@ -1,4 +1,4 @@
-//! The report of a mesh on one screen, for people. Pure: a report in, text out.
+//! Summary of a report, as text of at most one screen.
 
 use molmesh::pipeline::{LeftOutReport, PictureReport, Report};
 use molmesh::surface::Validation;
@@ -6,10 +6,10 @@ use molmesh::surface::Validation;
 use super::page::Page;
 use super::style::Style;
 
-/// Cells of the longest bar.
+/// Characters of the longest bar.
 const BAR: f64 = 24.0;
 
-/// What was written where.
+/// Written file.
 pub(crate) struct Written<'a> {
     /// Path, or `stdout`.
     pub(crate) name: &'a str,
@@ -19,7 +19,7 @@ pub(crate) struct Written<'a> {
     pub(crate) bytes: u64,
 }
 
-/// The summary; `findings` are what a strict second reader says of the file, if it was asked.
+/// Formats the summary. `findings` are those of the strict validator, if it ran.
 pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[String]>, style: Style) -> String {
     let mut page = Page::new(style, report.id.as_deref().unwrap_or("structure"), &title(report));
     let (atoms, in_file) = (grouped(report.atoms), grouped(report.atoms_in_file));
@@ -33,7 +33,10 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     page.row("surface", &surface(report));
     let [bricks, with_surface, samples, dense] =
         [report.bricks, report.surface_bricks, report.samples, report.box_cells].map(grouped);
-    page.row("grid", &format!("{bricks} bricks ({with_surface} with surface), {samples} samples; box: {dense} cells"));
+    page.row(
+        "grid",
+        &format!("{bricks} bricks ({with_surface} with surface), {samples} grid points; box: {dense} cells"),
+    );
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
     if let Some(quantization) = report.quantization {
         page.row("vertices", &format!("quantised in steps of {} Å", quantization.step));
@@ -55,13 +58,13 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     page.row("backend", &format!("{}: {} ({})", report.backend, report.device, report.backend_reason));
     page.row("wrote", &format!("{} ({}, {} bytes)", written.name, written.format, grouped(written.bytes)));
     if let Some(findings) = findings {
-        second_opinion(&mut page, findings);
+        add_findings(&mut page, findings);
     }
     timings(&mut page, report);
     page.finish()
 }
 
-/// The structure's title, cut to one line.
+/// Returns the structure's title, cut to one line.
 fn title(report: &Report) -> String {
     let title = report.title.as_deref().unwrap_or_default();
     let mut chars = title.chars();
@@ -75,14 +78,14 @@ fn surface(report: &Report) -> String {
     let from = match (report.detail, report.max_triangles) {
         (Some(level), _) => format!(" (detail {level})"),
         (None, Some(most)) => {
-            format!(" (for {} triangles at most, {} tries)", grouped(most), report.tries.unwrap_or_default())
+            format!(" (for at most {} triangles, {} tries)", grouped(most), report.tries.unwrap_or_default())
         }
         (None, None) => String::new(),
     };
     format!("{}, {} Å{from}, isovalue {}{smoothness}{preset}", report.kernel, report.resolution, report.isovalue)
 }
 
-/// The atoms that were not meshed, by residue name and reason.
+/// Formats the numbers of atoms that were left out, by residue name and reason.
 fn left_out(left_out: &LeftOutReport) -> String {
     let LeftOutReport { total, other_chains, virtual_sites, residues, other_residues, hydrogens, alternatives } =
         left_out;
@@ -104,7 +107,7 @@ fn drawn(picture: &PictureReport) -> String {
         (0.0, 0.0) => String::new(),
         (azimuth, elevation) => format!(", azimuth {azimuth}°, elevation {elevation}°"),
     };
-    format!("{width} × {height}, {view} view{turned}, {style}, {background} background, {pixel:.4} Å a pixel")
+    format!("{width} × {height}, {view} view{turned}, {style}, {background} background, {pixel:.4} Å per pixel")
 }
 
 fn validation(report: &Report, style: Style) -> String {
@@ -128,16 +131,16 @@ fn parts(report: &Report) -> String {
     }
 }
 
-/// The first findings: a damaged file has one a line, and this is one screen.
-fn second_opinion(page: &mut Page, findings: &[String]) {
+/// Adds the first findings only, as a damaged file can have one in each line.
+fn add_findings(page: &mut Page, findings: &[String]) {
     let of = if findings.len() == 1 { "finding" } else { "findings" };
-    page.row("check", &format!("{} {of} of a strict reader", findings.len()));
+    page.row("check", &format!("{} {of} of the strict validator", findings.len()));
     for finding in findings.iter().take(5) {
         page.line(format!("    {}", finding.chars().take(110).collect::<String>()));
     }
 }
 
-/// A bar per stage, the longest stage the longest bar.
+/// Adds a bar for each stage, relative to the longest stage.
 fn timings(page: &mut Page, report: &Report) {
     let stages: Vec<(&str, f64)> =
         report.timings_ms.iter().filter_map(|(name, ms)| Some((name.as_str(), ms.as_f64()?))).collect();
@@ -150,7 +153,7 @@ fn timings(page: &mut Page, report: &Report) {
     }
 }
 
-/// A bar in eighths of a cell.
+/// Returns a bar with a resolution of an eighth of a character.
 fn bar(fraction: f64) -> String {
     const EIGHTHS: [&str; 8] = ["", "▏", "▎", "▍", "▌", "▋", "▊", "▉"];
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0..=192")]
@@ -158,7 +161,7 @@ fn bar(fraction: f64) -> String {
     format!("{}{}", "█".repeat(eighths / 8), EIGHTHS[eighths % 8])
 }
 
-/// `1234567` as `1,234,567`.
+/// Formats `1234567` as `1,234,567`.
 fn grouped(n: u64) -> String {
     let digits = n.to_string();
     let mut out = String::with_capacity(digits.len() + digits.len() / 3);
@@ -171,7 +174,7 @@ fn grouped(n: u64) -> String {
     out
 }
 
-/// With as many decimals as are worth reading: one from 100 on, two below, three below 1.
+/// Formats a number with one decimal from 100, two from 1 and three below 1.
 fn decimal(value: f64) -> String {
     let digits = match value.abs() {
         v if v >= 100.0 => 1,
@@ -196,14 +199,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_read_well() {
+    fn formats_numbers() {
         assert_eq!([0, 999, 1000, 1_234_567].map(grouped), ["0", "999", "1,000", "1,234,567"]);
         assert_eq!([0.0123, 3.1234, -1234.56, 99.999].map(decimal), ["0.012", "3.12", "-1,234.6", "100.00"]);
         assert_eq!(decimal(f64::NAN), "NaN");
     }
 
     #[test]
-    fn bars_grow_with_time_and_never_vanish() {
+    fn bars_are_proportional_and_never_empty() {
         let cells = [0.0, 0.1, 0.5, 1.0].map(|f| bar(f).chars().count());
         assert_eq!(cells, [1, 3, 12, 24]);
         assert_eq!(bar(2.0), bar(1.0));
@@ -259,7 +262,7 @@ mod tests {
             backend: "cpu",
             arithmetic: String::new(),
             device: "2 threads".into(),
-            backend_reason: "asked for".into(),
+            backend_reason: "requested".into(),
             fallback: None,
             picture: Some(PictureReport {
                 width: 640,
@@ -281,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn it_says_everything_on_one_screen() {
+    fn summary_is_complete_and_fits_one_screen() {
         let text = text(&report(), &Written { name: "a.glb", format: "glb", bytes: 720_000 }, None, Style::PLAIN);
         for part in [
             "4PTI TRYPSIN INHIBITOR",
@@ -289,8 +292,8 @@ mod tests {
             "60 atoms: HOH 53, hydrogens 5, virtual sites 2",
             "warning    line 9, column 55: found `   inf`; read as 1",
             "300 bricks",
-            "153,600 samples",
-            "0.5 Å (for 40,000 triangles at most, 2 tries)",
+            "153,600 grid points",
+            "0.5 Å (for at most 40,000 triangles, 2 tries)",
             "in nanometers, without normals",
             "20,000 vertices",
             "steps of 0.0009765625 Å",
@@ -299,9 +302,9 @@ mod tests {
             "2 components, of which 1 void",
             "3,200.0 Å²",
             "7,100.0 Å³",
-            "cpu: 2 threads (asked for)",
+            "cpu: 2 threads (requested)",
             "a.glb (glb, 720,000 bytes)",
-            "640 × 480, principal view, azimuth 30°, elevation 0°, surface, transparent background, 0.1235 Å a pixel",
+            "640 × 480, principal view, azimuth 30°, elevation 0°, surface, transparent background, 0.1235 Å per pixel",
             "cpu: CPU rasteriser, 2 threads (auto: no GPU)",
             "2.75 ms",
             "field",

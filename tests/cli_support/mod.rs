@@ -12,7 +12,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-/// A folder that is gone afterwards.
+/// Temporary folder.
 pub struct Folder(tempfile::TempDir);
 
 impl Folder {
@@ -30,7 +30,7 @@ impl Folder {
         path
     }
 
-    /// Names of everything in it, hidden files too, sorted.
+    /// Returns the sorted names of all entries, including hidden files.
     pub fn entries(&self) -> Vec<String> {
         let name = |e: std::io::Result<std::fs::DirEntry>| e.unwrap().file_name().into_string().unwrap();
         let mut names: Vec<_> = std::fs::read_dir(self.0.path()).unwrap().map(name).collect();
@@ -39,15 +39,15 @@ impl Folder {
     }
 }
 
-/// The binary, with an environment that does not change what it prints.
+/// Returns a command of the binary, without the environment variables that change its output.
 pub fn molmesh() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_molmesh"));
     for name in ["RUST_BACKTRACE", "RUST_LOG", "MOLMESH__DEVICES__USE", "COLUMNS", "CLICOLOR_FORCE"] {
         command.env_remove(name);
     }
-    // A layer of Mesa's complains on stderr where there is no desktop.
+    // Without a desktop, a layer of Mesa prints errors to stderr.
     command.env("NODEVICE_SELECT", "1");
-    // Tests stay on this machine, and there is no load balancer that would have to notice the end of a service.
+    // Tests use no network, and no load balancer needs notice of a shutdown.
     command.env("MOLMESH__ARCHIVE__URL", "none");
     command.env("MOLMESH__SERVER__TERMINATION_NOTICE_MS", "none");
     command.stdin(Stdio::null());
@@ -59,7 +59,7 @@ pub fn run<S: AsRef<std::ffi::OsStr>>(args: impl IntoIterator<Item = S>) -> Outp
     molmesh().args(args).output().unwrap()
 }
 
-/// Runs `molmesh doctor` for a service on a free port with a folder of its own.
+/// Runs `molmesh doctor` for a service on a free port with its own folder.
 pub fn doctor(more: &[&str]) -> Output {
     let folder = Folder::new();
     let data = folder.path("data");
@@ -71,7 +71,7 @@ pub fn mesh(input: &Path, output: &Path, more: &[&str]) -> Output {
     molmesh().arg("mesh").arg(input).arg("-o").arg(output).args(more).output().unwrap()
 }
 
-/// Runs `molmesh` with `args`, `bytes` on stdin.
+/// Runs `molmesh` with `args` and with `bytes` on stdin.
 pub fn piped(args: &[&str], bytes: &[u8]) -> Output {
     let mut child =
         molmesh().args(args).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -87,46 +87,46 @@ pub fn stdout(output: &Output) -> String {
     String::from_utf8(output.stdout.clone()).unwrap()
 }
 
-/// Asserts an exit code, and that a failure is one line with at most a hint behind it.
+/// Asserts an exit code. Asserts that a failure prints one line and at most a hint.
 #[track_caller]
 pub fn assert_code(output: &Output, code: i32) {
-    let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(code), "{said}");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(code), "{stderr}");
     if code != 0 {
-        assert!(said.starts_with("molmesh: "), "{said}");
-        assert!(said.lines().count() <= 2, "{said}");
-        assert!(!said.contains("panicked") && !said.contains("\x1b["), "{said}");
+        assert!(stderr.starts_with("molmesh: "), "{stderr}");
+        assert!(stderr.lines().count() <= 2, "{stderr}");
+        assert!(!stderr.contains("panicked") && !stderr.contains("\x1b["), "{stderr}");
     }
 }
 
-/// One carbon a residue, at these places, Å.
-pub fn pdb(places: &[[f64; 3]]) -> String {
+/// Returns a PDB file with one carbon atom per residue at these positions, Å.
+pub fn pdb(positions: &[[f64; 3]]) -> String {
     let line = |(i, [x, y, z]): (usize, &[f64; 3])| {
         let n = i % 9999 + 1;
         format!("ATOM  {n:>5}  CA  ALA A{n:>4}    {x:>8.3}{y:>8.3}{z:>8.3}  1.00  0.00           C  \n")
     };
-    places.iter().enumerate().map(line).chain(["END\n".to_owned()]).collect()
+    positions.iter().enumerate().map(line).chain(["END\n".to_owned()]).collect()
 }
 
-/// Ten overlapping atoms in a row.
+/// Returns a PDB file with ten overlapping atoms in a row.
 pub fn rod() -> String {
     pdb(&std::array::from_fn::<_, 10, _>(|i| [f64::from(u32::try_from(i).unwrap()) * 1.5, 0.25, -0.75]))
 }
 
-/// A cube of `n`³ atoms, 2 Å apart: work that takes long at a fine resolution.
+/// Returns a PDB file with a cube of `n`³ atoms, 2 Å apart, for long jobs at a fine resolution.
 pub fn block(n: u32) -> String {
     let at = |i: u32| f64::from(i) * 2.0;
-    let places: Vec<[f64; 3]> =
+    let positions: Vec<[f64; 3]> =
         (0..n).flat_map(|x| (0..n).flat_map(move |y| (0..n).map(move |z| [at(x), at(y), at(z)]))).collect();
-    pdb(&places)
+    pdb(&positions)
 }
 
-/// A running `molmesh serve`. Killed when dropped, unless it was stopped.
+/// Running `molmesh serve`. Dropping it kills the process, unless it was stopped.
 pub struct Service {
     child: std::process::Child,
-    /// Its address, such as `127.0.0.1:41234`.
+    /// Address, such as `127.0.0.1:41234`.
     pub addr: String,
-    /// Its banner.
+    /// Banner.
     pub banner: String,
     log: Option<std::thread::JoinHandle<String>>,
 }
@@ -145,32 +145,32 @@ impl Service {
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
         let mut banner = String::new();
         loop {
-            let line = lines.next().unwrap_or_else(|| panic!("it ended after\n{banner}")).unwrap();
+            let line = lines.next().unwrap_or_else(|| panic!("the service ended after\n{banner}")).unwrap();
             banner.push_str(&line);
             banner.push('\n');
             if line.trim_start().starts_with("try ") {
                 break;
             }
         }
-        // The log has to be read on, or the service waits for somebody to do it.
+        // Read the rest of the log, as a full pipe would block the service.
         let log = std::thread::spawn(move || lines.map_while(Result::ok).collect::<Vec<_>>().join("\n"));
         let viewer = banner.lines().find(|l| l.contains("viewer")).unwrap();
         let addr = viewer.split("http://").nth(1).unwrap().trim_end_matches('/').to_owned();
         let service = Self { child, addr, banner, log: Some(log) };
         let start = std::time::Instant::now();
         while !service.ready() {
-            assert!(start.elapsed().as_secs() < 30, "it is not ready after 30 s");
+            assert!(start.elapsed().as_secs() < 30, "the service is not ready after 30 s");
             std::thread::sleep(std::time::Duration::from_millis(20));
         }
         service
     }
 
-    /// Whether `molmesh healthcheck` says that it is ready.
+    /// Returns true if `molmesh healthcheck` succeeds.
     pub fn ready(&self) -> bool {
         run(["healthcheck", "--url", &format!("http://{}/readyz", self.addr)]).status.success()
     }
 
-    /// A field of its `/proc/<pid>/status`, such as `VmRSS` or `VmHWM`, MiB.
+    /// Returns a field of `/proc/<pid>/status`, such as `VmRSS` or `VmHWM`, MiB.
     #[cfg(target_os = "linux")]
     pub fn memory(&self, field: &str) -> u64 {
         let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
@@ -178,24 +178,24 @@ impl Service {
         line.split_whitespace().next().unwrap().parse::<u64>().unwrap() >> 10
     }
 
-    /// Its process id.
+    /// Returns the process id.
     pub fn pid(&self) -> u32 {
         self.child.id()
     }
 
-    /// Sends it a signal; returns its exit code and its log.
+    /// Sends a signal and waits. Returns the exit code and the log.
     pub fn stop(self, signal: &str) -> (Option<i32>, String) {
         self.signal(signal);
         self.wait()
     }
 
-    /// Sends it a signal.
+    /// Sends a signal.
     pub fn signal(&self, signal: &str) {
         let id = self.child.id().to_string();
         assert!(Command::new("kill").args([&format!("-{signal}"), &id]).status().unwrap().success());
     }
 
-    /// Waits for its end; returns its exit code and its log.
+    /// Waits for the process. Returns the exit code and the log.
     pub fn wait(mut self) -> (Option<i32>, String) {
         let code = self.child.wait().unwrap().code();
         (code, self.log.take().unwrap().join().unwrap())
@@ -204,7 +204,7 @@ impl Service {
 
 impl Drop for Service {
     fn drop(&mut self) {
-        // After a stop there is nothing to kill, and that is no error.
+        // After a stop there is no process to kill.
         drop(self.child.kill());
         drop(self.child.wait());
     }

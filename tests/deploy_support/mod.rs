@@ -1,4 +1,4 @@
-//! Reads what is deployed: the image's recipe, what is sent to its builder, manifests, sizes.
+//! Parsers of the deployment: Dockerfile, `.dockerignore`, manifests, sizes.
 
 use std::path::{Component, Path, PathBuf};
 
@@ -11,19 +11,19 @@ pub(crate) fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// A file of the repository.
+/// Reads a file of the repository.
 #[track_caller]
 pub(crate) fn read(path: &str) -> String {
     std::fs::read_to_string(root().join(path)).unwrap_or_else(|e| panic!("{path}: {e}"))
 }
 
-/// A Dockerfile: arguments before the first stage, then stages.
+/// Dockerfile: arguments before the first stage, then stages.
 pub(crate) struct Recipe {
     arguments: Vec<String>,
     pub(crate) stages: Vec<Stage>,
 }
 
-/// A stage and its instructions, continued lines joined.
+/// Stage with its instructions, continued lines joined.
 pub(crate) struct Stage {
     pub(crate) name: String,
     pub(crate) from: String,
@@ -51,7 +51,7 @@ impl Recipe {
         recipe
     }
 
-    /// The default of an argument before the first stage.
+    /// Returns the default of an argument before the first stage.
     pub(crate) fn argument(&self, name: &str) -> Option<String> {
         let pair = self.arguments.iter().find_map(|pair| pair.split_once('=').filter(|(n, _)| *n == name));
         pair.map(|(_, value)| value.to_owned())
@@ -64,7 +64,7 @@ impl Recipe {
 }
 
 impl Stage {
-    /// What stands behind each instruction of this name.
+    /// Returns the arguments of all instructions with this name.
     pub(crate) fn all<'a>(&'a self, name: &'a str) -> impl Iterator<Item = &'a String> {
         self.instructions.iter().filter(move |(n, _)| n == name).map(|(_, rest)| rest)
     }
@@ -74,7 +74,8 @@ impl Stage {
     }
 }
 
-/// Whether a `.dockerignore` lets a file through: the last pattern that is the path or a folder above it decides.
+/// Returns true if a `.dockerignore` does not exclude a file. The last pattern that matches the path or a parent
+/// applies.
 pub(crate) fn sent(ignore: &str, path: &Path) -> bool {
     let mut sent = true;
     for line in ignore.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#')) {
@@ -86,7 +87,7 @@ pub(crate) fn sent(ignore: &str, path: &Path) -> bool {
     sent
 }
 
-/// Every file below a folder, by its path from the root.
+/// Returns all files below a folder, relative to the root.
 pub(crate) fn files(folder: &str) -> Vec<PathBuf> {
     let mut found = Vec::new();
     let mut folders = vec![PathBuf::from(folder)];
@@ -99,7 +100,7 @@ pub(crate) fn files(folder: &str) -> Vec<PathBuf> {
     found
 }
 
-/// A path without `..`.
+/// Resolves `..` in a path.
 pub(crate) fn plain(path: &Path) -> PathBuf {
     let mut plain = PathBuf::new();
     for part in path.components() {
@@ -112,14 +113,14 @@ pub(crate) fn plain(path: &Path) -> PathBuf {
     plain
 }
 
-/// A YAML file and what its schema has against it.
+/// Documents of a YAML file and the errors of its schema.
 #[derive(Debug, Deserialize)]
 pub(crate) struct Manifest {
     pub(crate) documents: Vec<Value>,
     pub(crate) errors: Vec<String>,
 }
 
-/// The one document of each file.
+/// Returns the single document of each file.
 #[track_caller]
 pub(crate) fn only<const N: usize>(found: &[Manifest]) -> [&Value; N] {
     assert!(found.iter().all(|manifest| manifest.documents.len() == 1), "{found:?}");
@@ -127,13 +128,13 @@ pub(crate) fn only<const N: usize>(found: &[Manifest]) -> [&Value; N] {
     documents.try_into().unwrap()
 }
 
-/// Reads YAML files, by their paths from the root.
+/// Reads YAML files by their paths relative to the root.
 pub(crate) fn yaml(paths: &[impl AsRef<Path>]) -> Option<Vec<Manifest>> {
     let paths: Vec<PathBuf> = paths.iter().map(|path| root().join(path)).collect();
     tools::python("check_manifest.py", &paths)
 }
 
-/// What `files` finds in each kustomization of the folders below `folder`, as paths from the root.
+/// Returns the results of `files` for the kustomizations of all folders below `folder`.
 pub(crate) fn under(folder: &str, files: impl Fn(&Value, &Path) -> Vec<PathBuf>) -> Option<Vec<PathBuf>> {
     let mut folders: Vec<PathBuf> =
         std::fs::read_dir(root().join(folder)).unwrap().map(|e| e.unwrap().path()).filter(|p| p.is_dir()).collect();
@@ -146,7 +147,7 @@ pub(crate) fn under(folder: &str, files: impl Fn(&Value, &Path) -> Vec<PathBuf>)
     Some(each.collect())
 }
 
-/// Kind and name of every document in a folder, kustomizations aside.
+/// Returns kind and name of every document in a folder, except kustomizations.
 pub(crate) fn kinds(folder: &str) -> Option<Vec<(String, String)>> {
     let files: Vec<PathBuf> = std::fs::read_dir(root().join(folder)).unwrap().map(|e| e.unwrap().path()).collect();
     let files: Vec<PathBuf> = files
@@ -158,12 +159,12 @@ pub(crate) fn kinds(folder: &str) -> Option<Vec<(String, String)>> {
     Some(found.iter().flat_map(|m| &m.documents).map(|d| (text(&d["kind"]), text(&d["metadata"]["name"]))).collect())
 }
 
-/// The strings of a list; nothing where there is none.
+/// Returns the strings of a list, or none if the value is not a list.
 pub(crate) fn strings(value: &Value) -> Vec<String> {
     value.as_array().into_iter().flatten().map(|v| v.as_str().unwrap().to_owned()).collect()
 }
 
-/// A quantity as Kubernetes and Compose write it: `5376Mi`, `10G`.
+/// Parses a quantity of Kubernetes or Compose such as `5376Mi` or `10G`.
 #[track_caller]
 pub(crate) fn bytes(text: &str) -> u64 {
     let at = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
@@ -172,19 +173,19 @@ pub(crate) fn bytes(text: &str) -> u64 {
         "Mi" => 1 << 20,
         "Gi" => 1 << 30,
         "G" => 1_000_000_000,
-        other => panic!("{text}: no such unit: {other}"),
+        other => panic!("{text}: unknown unit {other}"),
     };
     text[..at].parse::<u64>().unwrap() * unit
 }
 
-/// Words in code marks that look like keys of the configuration: `section.key`, with a section that exists.
+/// Returns the words in backticks that look like configuration keys: `section.key` with an existing section.
 pub(crate) fn sections(text: &str, defaults: &Value) -> Vec<String> {
     let marked = text.split('`').skip(1).step_by(2).filter(|word| !word.contains(['/', ' ', '\n']));
     let keys = marked.filter(|word| word.split_once('.').is_some_and(|(section, _)| defaults.get(section).is_some()));
     keys.map(str::to_owned).collect()
 }
 
-/// The value under `section.key`.
+/// Returns the value of `section.key`.
 pub(crate) fn at<'a>(defaults: &'a Value, key: &str) -> Option<&'a Value> {
     let (section, key) = key.split_once('.')?;
     defaults.get(section)?.get(key)

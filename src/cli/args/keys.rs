@@ -1,4 +1,4 @@
-//! The flags of the commands that make keys and sign addresses.
+//! Flags of the commands that create keys and sign URLs.
 
 use std::path::PathBuf;
 
@@ -17,9 +17,9 @@ Examples:
 // `molmesh key`.
 #[derive(Debug, Subcommand)]
 pub(crate) enum KeyCommand {
-    /// Make a key: the lines for the file of keys go to stdout, the key itself, once, to stderr
+    /// Create a key: prints its entry for the keys file to stdout, and the key itself, only once, to stderr
     New(Box<NewKeyArgs>),
-    /// Make a key that signs addresses, as `access.signing_secret` takes it
+    /// Create a key that signs URLs, for `access.signing_secret`
     Signing(SigningKeyArgs),
 }
 
@@ -27,25 +27,25 @@ pub(crate) enum KeyCommand {
 #[derive(Debug, ClapArgs)]
 #[command(after_help = KEY_EXAMPLES)]
 pub(crate) struct NewKeyArgs {
-    /// Its name, which stands in logs: lower-case letters, digits and hyphens
+    /// Name of the key in logs: lower-case letters, digits and hyphens
     #[arg(long, value_name = "NAME")]
     pub(crate) id: String,
-    /// What it is for: mesh (to compute), read (to read what there is), or both
+    /// Permissions: mesh (compute meshes), read (read existing objects), or both
     #[arg(long, value_name = "A,B", default_value = "mesh,read")]
     pub(crate) scopes: String,
-    /// When it ends: a time from now such as 90d, or a date; never by default
-    #[arg(long, value_name = "WHEN")]
+    /// Expiry: a time from now such as 90d, or a date [default: never]
+    #[arg(long, value_name = "TIME")]
     pub(crate) expires: Option<String>,
-    /// For whom reads the file
+    /// Comment in the keys file
     #[arg(long, value_name = "TEXT")]
     pub(crate) note: Option<String>,
-    /// Requests in a window; any number by default
+    /// Requests per window [default: unlimited]
     #[arg(long, value_name = "N", help_heading = "Quota", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) requests: Option<u64>,
-    /// Time in a window that workers spend on its jobs, such as 10m; any time by default
+    /// Worker time per window, such as 10m [default: unlimited]
     #[arg(long, value_name = "TIME", help_heading = "Quota")]
     pub(crate) work: Option<String>,
-    /// Requests at once; any number by default
+    /// Concurrent requests [default: unlimited]
     #[arg(long, value_name = "N", help_heading = "Quota", value_parser = clap::value_parser!(u64).range(1..))]
     pub(crate) concurrent: Option<u64>,
     /// Length of a window
@@ -56,7 +56,7 @@ pub(crate) struct NewKeyArgs {
 /// `molmesh key signing`.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct SigningKeyArgs {
-    /// Its name, which stands in addresses: lower-case letters, digits and hyphens
+    /// Name of the key in URLs: lower-case letters, digits and hyphens
     #[arg(long, value_name = "NAME")]
     pub(crate) id: String,
 }
@@ -65,15 +65,15 @@ pub(crate) struct SigningKeyArgs {
 #[derive(Debug, ClapArgs)]
 #[command(after_help = SIGN_EXAMPLES)]
 pub(crate) struct SignArgs {
-    /// What to sign: an address, or its path and query; as the service sees it, where a proxy changes paths
+    /// URL, or its path and query; behind a proxy that changes paths, the one that the service receives
     pub(crate) url: String,
-    /// When it ends: a time from now such as 1h, or a date such as 2030-01-31T00:00:00Z
-    #[arg(long, value_name = "WHEN", default_value = "1h")]
+    /// Expiry: a time from now such as 1h, or a date such as 2030-01-31T00:00:00Z
+    #[arg(long, value_name = "TIME", default_value = "1h")]
     pub(crate) expires: String,
-    /// Which key signs; the first one of `access.signing_secret` by default
+    /// Name of the signing key [default: the first in `access.signing_secret`]
     #[arg(long, value_name = "NAME")]
     pub(crate) key_id: Option<String>,
-    /// Configuration file (TOML), the service's own
+    /// Configuration file (TOML) of the service
     #[arg(long, value_name = "FILE", env = "MOLMESH_CONFIG", hide_env_values = true)]
     pub(crate) config: Option<PathBuf>,
     /// Set one value of the configuration; may be repeated

@@ -1,4 +1,4 @@
-//! The flags of `molmesh render`.
+//! Flags of `molmesh render`.
 
 use std::path::PathBuf;
 
@@ -16,7 +16,7 @@ Examples:
 #[derive(Debug, ClapArgs)]
 #[command(after_help = format!("{RENDER_EXAMPLES}\n\n{EXIT_CODES}"), allow_negative_numbers = true)]
 pub(crate) struct RenderArgs {
-    /// Structure file, PDB, mmCIF or BinaryCIF, plain or compressed with gzip or zstd; `-` is stdin
+    /// Structure file: PDB, mmCIF or BinaryCIF, optionally compressed with gzip or zstd; `-` is stdin
     pub(crate) input: PathBuf,
     /// PNG file; `-` is stdout
     #[arg(short, long)]
@@ -27,30 +27,30 @@ pub(crate) struct RenderArgs {
     pub(crate) job: JobArgs,
 }
 
-// What the picture is to look like.
+// Picture parameters.
 #[derive(Debug, ClapArgs)]
 #[command(next_help_heading = "Picture")]
 pub(crate) struct PictureArgs {
-    /// Pixels of a row [default: 512]
+    /// Width in pixels [default: 512]
     #[arg(long, value_name = "PIXELS")]
     pub(crate) width: Option<String>,
-    /// Rows [default: 512]
+    /// Height in pixels [default: 512]
     #[arg(long, value_name = "PIXELS")]
     pub(crate) height: Option<String>,
-    /// From where: principal (the longest axis lies, the shortest points at the viewer), or front, back, left, right, top,
-    /// bottom along the file's axes [default: principal]
+    /// View: principal (the longest axis is horizontal, the shortest points at the viewer), or front, back, left,
+    /// right, top, bottom along the axes of the file [default: principal]
     #[arg(long, value_name = "VIEW")]
     pub(crate) view: Option<String>,
-    /// How far the viewer walks around to the right from there, in degrees [default: 0]
+    /// Rotation of the viewer to the right, in degrees [default: 0]
     #[arg(long, value_name = "DEGREES")]
     pub(crate) azimuth: Option<String>,
-    /// How far the viewer climbs then, in degrees [default: 0]
+    /// Rotation of the viewer upwards after that, in degrees [default: 0]
     #[arg(long, value_name = "DEGREES")]
     pub(crate) elevation: Option<String>,
-    /// What is behind: transparent, white, black, RRGGBB or RRGGBBAA [default: transparent]
+    /// Background: transparent, white, black, RRGGBB or RRGGBBAA [default: transparent]
     #[arg(long, value_name = "COLOR")]
     pub(crate) background: Option<String>,
-    /// How the surface is shaded: surface (with ambient occlusion and a soft outline), or gouraud [default: surface]
+    /// Shading: surface (with ambient occlusion and a soft outline), or gouraud [default: surface]
     #[arg(long, value_name = "STYLE")]
     pub(crate) style: Option<String>,
 }

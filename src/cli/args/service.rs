@@ -1,4 +1,4 @@
-//! The flags of the commands around the service.
+//! Flags of the commands of the service.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -17,13 +17,13 @@ Exit codes:
 // `molmesh serve`.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct ServeArgs {
-    /// Address of the service; port 0 takes a free one [default: 127.0.0.1:8080]
+    /// Address of the service; port 0 selects a free port [default: 127.0.0.1:8080]
     #[arg(long, value_name = "ADDR")]
     pub(crate) listen: Option<SocketAddr>,
-    /// Address of the metrics; none by default
+    /// Address of the metrics [default: none]
     #[arg(long, value_name = "ADDR")]
     pub(crate) metrics_listen: Option<SocketAddr>,
-    /// Where the service keeps its data
+    /// Data folder of the service
     #[arg(long, value_name = "DIR")]
     pub(crate) data_dir: Option<PathBuf>,
     /// Folder of structure files, flat or in the `divided` layout of the wwPDB
@@ -35,13 +35,13 @@ pub(crate) struct ServeArgs {
     /// Set one value of the configuration, such as `limits.atoms=100000`; may be repeated
     #[arg(long, value_name = "SECTION.KEY=VALUE")]
     pub(crate) set: Vec<String>,
-    /// What runs the meshing
+    /// Meshing backend
     #[arg(long, value_enum, default_value = "auto")]
     pub(crate) backend: BackendName,
-    /// Which devices may be used: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software
-    #[arg(long, value_name = "WHICH")]
+    /// Devices to use: auto (the best kind of GPU), all, cpu, or a list such as 0,2 or software
+    #[arg(long, value_name = "DEVICES")]
     pub(crate) devices: Option<String>,
-    /// How to log
+    /// Log format
     #[arg(long, value_enum)]
     pub(crate) log: Option<LogStyle>,
 }
@@ -49,29 +49,29 @@ pub(crate) struct ServeArgs {
 // `molmesh healthcheck`.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct HealthcheckArgs {
-    /// What to ask
+    /// URL to request
     #[arg(long, default_value = "http://127.0.0.1:8080/readyz")]
     pub(crate) url: String,
-    /// Seconds to wait for the answer
+    /// Seconds to wait for the response
     #[arg(long, value_name = "SECONDS", default_value_t = 3.0)]
     pub(crate) timeout: f64,
 }
 
-/// How the service logs.
+/// Values of `--log`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum LogStyle {
-    /// For people
+    /// Text
     Pretty,
-    /// One JSON object a line
+    /// One JSON object per line
     Json,
 }
 
-/// How `doctor` reports.
+/// Values of `doctor --report`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum DoctorStyle {
-    /// A page for people
+    /// Text
     Text,
-    /// JSON for programs
+    /// JSON
     Json,
 }
 
@@ -79,10 +79,10 @@ pub(crate) enum DoctorStyle {
 #[derive(Debug, ClapArgs)]
 #[command(after_help = DOCTOR_CODES)]
 pub(crate) struct DoctorArgs {
-    /// How the report is written, on stdout
+    /// Format of the report on stdout
     #[arg(long, value_enum, default_value = "text", visible_alias = "format")]
     pub(crate) report: DoctorStyle,
-    /// Seconds for an answer of the store, and of the remote archive
+    /// Seconds to wait for the store and for the remote archive
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0)]
     pub(crate) timeout: f64,
     #[command(flatten)]
@@ -98,19 +98,19 @@ pub(crate) enum ConfigCommand {
     Schema,
 }
 
-/// How the configuration is written.
+/// Values of `config print --format`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum ConfigStyle {
-    /// A configuration file, sources in comments
+    /// Configuration file with the sources in comments
     Toml,
-    /// `config` and `sources`
+    /// JSON object with `config` and `sources`
     Json,
 }
 
 /// `molmesh config print`.
 #[derive(Debug, ClapArgs)]
 pub(crate) struct PrintArgs {
-    /// How it is written
+    /// Output format
     #[arg(long, value_enum, default_value = "toml")]
     pub(crate) format: ConfigStyle,
     #[command(flatten)]

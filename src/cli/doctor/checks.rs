@@ -1,4 +1,4 @@
-//! Checks that look at nothing outside the process, and what a check is.
+//! [`Check`], and the checks that access nothing outside the process.
 
 use std::path::Path;
 use std::time::Instant;
@@ -10,22 +10,22 @@ use molmesh::telemetry;
 use super::machine::Machine;
 use super::page::size;
 
-/// The check of the backend: where it fails, the exit code is another one.
+/// Name of the backend check, whose failure has its own exit code.
 pub(super) const DEVICES: &str = "devices";
 
-/// How a check ended.
+/// Result of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum State {
-    /// As it should be.
+    /// Passed.
     Ok,
-    /// A service would start and be ready, but somebody should know.
+    /// A service would start and be ready, but the operator should know.
     Warning,
-    /// It would not.
+    /// A service would not start or not be ready.
     Failed,
 }
 
 impl State {
-    /// Its name, for programs.
+    /// Returns the name in JSON.
     pub(super) const fn name(self) -> &'static str {
         match self {
             Self::Ok => "ok",
@@ -35,25 +35,25 @@ impl State {
     }
 }
 
-/// Something that was looked at.
+/// A check with its result.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Check {
-    /// Its name.
+    /// Name.
     pub(super) name: &'static str,
-    /// How it ended.
+    /// Result.
     pub(super) state: State,
-    /// What was found, in words.
+    /// Finding as text.
     pub(super) detail: String,
 }
 
 impl Check {
-    /// A check.
+    /// Creates a check.
     pub(super) fn new(name: &'static str, state: State, detail: impl Into<String>) -> Self {
         Self { name, state, detail: detail.into() }
     }
 }
 
-/// Where the configuration is from. One that cannot be used has ended the command before.
+/// Reports the sources of the configuration. An invalid configuration has already ended the command.
 pub(super) fn sources(file: Option<&Path>, loaded: &Loaded) -> Check {
     let (mut from_file, mut variables, mut flags) = (0, Vec::new(), 0);
     for (_, source) in loaded.sources() {
@@ -69,12 +69,12 @@ pub(super) fn sources(file: Option<&Path>, loaded: &Loaded) -> Check {
     Check::new("config", State::Ok, format!("{file}; {variables}; {flags} from the command line"))
 }
 
-/// Files of secrets that others can read.
+/// Warns about secret files that other users can read.
 pub(super) fn secrets(loaded: &Loaded) -> impl Iterator<Item = Check> {
     loaded.warnings.iter().map(|warning| Check::new("secrets", State::Warning, warning.clone()))
 }
 
-/// Whether logs could be set up.
+/// Checks the log filter.
 pub(super) fn log(config: &Config) -> Check {
     match telemetry::check_logs(&config.log) {
         Ok(()) => Check::new("log", State::Ok, format!("`{}`, to stderr", config.log.filter)),
@@ -82,7 +82,7 @@ pub(super) fn log(config: &Config) -> Check {
     }
 }
 
-/// Whether the backend makes a mesh, as a service does before it is ready.
+/// Makes a first mesh, as a service does before it is ready.
 pub(super) fn first_mesh(backend: &dyn Backend) -> Check {
     let start = Instant::now();
     match backend.warm() {
@@ -94,7 +94,7 @@ pub(super) fn first_mesh(backend: &dyn Backend) -> Check {
     }
 }
 
-/// Whether what may be held in memory fits into it.
+/// Checks that the memory budgets fit into the memory.
 pub(super) fn memory(machine: &Machine, config: &Config, workers: usize) -> Check {
     let (limits, archive) = (&config.limits, &config.archive);
     let workers = u64::try_from(workers).unwrap_or(u64::MAX);
@@ -103,19 +103,18 @@ pub(super) fn memory(machine: &Machine, config: &Config, workers: usize) -> Chec
         ("limits.memory_bytes", limits.memory_bytes),
         ("meshes of running jobs", limits.mesh_bytes.saturating_mul(workers)),
         ("store.memory_bytes", config.store.memory_bytes),
-        ("entries that are fetched", archive.max_bytes.saturating_mul(fetches)),
+        ("fetched entries", archive.max_bytes.saturating_mul(fetches)),
     ];
     let most = parts.iter().fold(0_u64, |sum, (_, bytes)| sum.saturating_add(*bytes));
     let sum: Vec<String> = parts.iter().map(|(name, bytes)| format!("{} {name}", size(*bytes))).collect();
     let budget = format!("{} at most ({})", size(most), sum.join(", "));
     match machine.memory() {
-        None => Check::new("memory", State::Ok, format!("{budget}; how much there is is not known")),
-        Some((bytes, whose)) if most > bytes => {
-            let detail =
-                format!("{budget} do not fit into the {} of {whose}: the system may end the process", size(bytes));
+        None => Check::new("memory", State::Ok, format!("{budget}; the memory size is unknown")),
+        Some((bytes, owner)) if most > bytes => {
+            let detail = format!("{budget} exceed the {} of {owner}: the system may kill the process", size(bytes));
             Check::new("memory", State::Warning, detail)
         }
-        Some((bytes, whose)) => Check::new("memory", State::Ok, format!("{budget}, of {} of {whose}", size(bytes))),
+        Some((bytes, owner)) => Check::new("memory", State::Ok, format!("{budget}, of {} of {owner}", size(bytes))),
     }
 }
 
@@ -149,7 +148,7 @@ mod tests {
     }
 
     #[test]
-    fn budgets_that_do_not_fit_are_a_warning() {
+    fn budgets_above_the_memory_are_a_warning() {
         let mut config = Config::default();
         config.limits.memory_bytes = 1 << 30;
         config.limits.mesh_bytes = 1 << 20;
@@ -161,7 +160,7 @@ mod tests {
         assert_eq!(state(Some((enough, "this control group"))), State::Ok);
         assert_eq!(state(Some((enough - 1, "this control group"))), State::Warning);
         assert_eq!(state(None), State::Ok);
-        let said = memory(&machine(Some((enough - 1, "this control group"))), &config, 2).detail;
-        assert!(said.contains("1027MiB at most") && said.contains("this control group"), "{said}");
+        let detail = memory(&machine(Some((enough - 1, "this control group"))), &config, 2).detail;
+        assert!(detail.contains("1027MiB at most") && detail.contains("this control group"), "{detail}");
     }
 }

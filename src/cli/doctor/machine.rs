@@ -1,33 +1,33 @@
-//! The machine: processors and their extensions, memory and what of it this process may take.
+//! Facts about the machine: processors and their extensions, memory, limits, GPU drivers.
 
 use std::fs;
 use std::path::Path;
 
 use serde_json::{Value, json};
 
-/// What this binary was built for.
+/// Target triple of this binary.
 pub(super) const TARGET: &str = env!("MOLMESH_TARGET");
-/// The compiler that built it.
+/// Compiler of this binary.
 pub(super) const COMPILER: &str = env!("MOLMESH_COMPILER");
 
-/// A machine.
+/// Facts about a machine.
 #[derive(Debug, Default)]
 pub(super) struct Machine {
     /// Cores for this process.
     pub(super) cores: Option<usize>,
-    /// Bytes of memory, where the system says so.
+    /// Memory in bytes, if known.
     pub(super) bytes: Option<u64>,
-    /// Bytes that this process may take, and by whose word, where there is a limit.
+    /// Memory limit of this process in bytes with its owner, if there is one.
     pub(super) limit: Option<(u64, &'static str)>,
     /// Limits of open files: the current one, and the hard limit to which a service raises it.
     pub(super) files: Option<[u64; 2]>,
-    /// What announces itself as a Vulkan driver, whether or not it starts; a sentence where nothing does.
+    /// Installed Vulkan drivers, working or not; a sentence if there are none.
     pub(super) drivers: Vec<String>,
 }
 
 impl Machine {
-    /// This one.
-    pub(super) fn look() -> Self {
+    /// Collects the facts about this machine.
+    pub(super) fn detect() -> Self {
         Self {
             cores: std::thread::available_parallelism().ok().map(std::num::NonZero::get),
             bytes: fs::read_to_string("/proc/meminfo").ok().and_then(|text| total(&text)),
@@ -37,13 +37,13 @@ impl Machine {
         }
     }
 
-    /// Bytes that this process may take at most, and by whose word.
+    /// Returns the memory available to this process in bytes, with the owner of the limit.
     pub(super) fn memory(&self) -> Option<(u64, &'static str)> {
         let machine = self.bytes.map(|bytes| (bytes, "this machine"));
         [machine, self.limit].into_iter().flatten().min()
     }
 
-    /// The machine, for programs.
+    /// Returns the facts as JSON.
     pub(super) fn document(&self) -> Value {
         let vectors: Vec<&str> = vectors().collect();
         json!({
@@ -63,7 +63,7 @@ fn drivers() -> Vec<String> {
     let found = molmesh::gpu::manifests();
     if found.is_empty() {
         return vec![
-            "no manifest of a Vulkan driver is where a loader looks (/usr/share/vulkan/icd.d and the like)".to_owned(),
+            "no manifest of a Vulkan driver was found (in /usr/share/vulkan/icd.d and similar folders)".to_owned(),
         ];
     }
     found.iter().map(ToString::to_string).collect()
@@ -86,13 +86,13 @@ fn files() -> Option<[u64; 2]> {
     None
 }
 
-/// The total of `/proc/meminfo`, bytes.
+/// Parses the total memory in `/proc/meminfo`, bytes.
 fn total(text: &str) -> Option<u64> {
     let line = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()?.checked_mul(1024)
 }
 
-/// The limit of this process's control group and of those above it, bytes; both versions of control groups.
+/// Returns the smallest memory limit of this process's control group and its ancestors, bytes. Supports both versions.
 fn limit(root: &Path) -> Option<u64> {
     let groups = fs::read_to_string(root.join("proc/self/cgroup")).ok()?;
     let mut least: Option<u64> = None;
@@ -107,18 +107,18 @@ fn limit(root: &Path) -> Option<u64> {
             _ => continue,
         };
         let mount = root.join(mount);
-        // In a container the path may be that of the host, and the mount the container's own.
+        // In a container, the path may be the host's while the mount is the container's.
         for group in Path::new(path.trim_start_matches('/')).ancestors() {
-            let said = fs::read_to_string(mount.join(group).join(file)).ok();
-            // `max`, and what the first version says for no limit, are none.
-            let bytes = said.and_then(|said| said.trim().parse::<u64>().ok()).filter(|bytes| *bytes < 1 << 60);
+            let text = fs::read_to_string(mount.join(group).join(file)).ok();
+            // `max`, and a huge number in version 1, mean no limit.
+            let bytes = text.and_then(|text| text.trim().parse::<u64>().ok()).filter(|bytes| *bytes < 1 << 60);
             least = [least, bytes].into_iter().flatten().min();
         }
     }
     least
 }
 
-/// The extensions that the inner loops care about and that are there, by the name that compilers give them.
+/// Returns the available vector extensions that the inner loops can use, by their compiler names.
 pub(super) fn vectors() -> impl Iterator<Item = &'static str> {
     detected().into_iter().filter_map(|(name, on)| on.then_some(name))
 }
@@ -160,14 +160,14 @@ mod tests {
     }
 
     #[test]
-    fn the_tightest_group_counts_in_both_versions() {
+    fn smallest_cgroup_limit_applies_in_both_versions() {
         let group = ("proc/self/cgroup", "0::/a/b\n");
         assert_eq!(limit_of(&[]), None);
         assert_eq!(limit_of(&[group]), None);
         assert_eq!(limit_of(&[group, ("sys/fs/cgroup/a/b/memory.max", "max\n")]), None);
         let outer = ("sys/fs/cgroup/a/memory.max", "4096\n");
         assert_eq!(limit_of(&[group, ("sys/fs/cgroup/a/b/memory.max", "8192\n"), outer]), Some(4096));
-        // As a container sees it.
+        // Inside a container.
         assert_eq!(limit_of(&[("proc/self/cgroup", "0::/\n"), ("sys/fs/cgroup/memory.max", "777\n")]), Some(777));
         let first = ("proc/self/cgroup", "5:cpu,cpuacct:/x\n4:memory:/docker/7\n");
         let file = "sys/fs/cgroup/memory/memory.limit_in_bytes";
@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn the_systems_memory_is_read_and_the_least_counts() {
+    fn smaller_of_memory_and_limit_applies() {
         assert_eq!(total("MemTotal:       16 kB\nMemFree: 1 kB\n"), Some(16 << 10));
         assert_eq!(total("MemFree: 1 kB\n"), None);
         let machine = Machine { bytes: Some(10), limit: Some((7, "a group")), ..Machine::default() };

@@ -1,10 +1,10 @@
-//! `molmesh doctor`: what this machine has, what of it is used and why the rest is not, and whether a service with this
+//! `molmesh doctor`: reports the machine and its devices, which are used and why, and checks that a service with this
 //! configuration would start and be ready.
 
 mod checks;
+mod external;
 mod machine;
 mod page;
-mod places;
 
 use std::time::Duration;
 
@@ -16,17 +16,17 @@ use super::args::{DoctorArgs, DoctorStyle};
 use super::backend::{self, Asked, Picked, Use};
 use super::error::CliError;
 use super::style::Style;
-use super::survey::{self, Candidate};
+use super::survey::{self, Availability};
 use checks::{Check, State};
 use machine::Machine;
 
-/// What was found.
+/// Results of the command.
 struct Findings {
     machine: Machine,
     loaded: Loaded,
-    backends: Vec<Candidate>,
+    backends: Vec<Availability>,
     devices: Vec<FoundDevice>,
-    /// What would run: its name and why.
+    /// Name of the selected backend and the reason.
     taken: Option<(&'static str, String)>,
     checks: Vec<Check>,
 }
@@ -48,7 +48,7 @@ pub(super) fn run(args: &DoctorArgs) -> Result<(), CliError> {
 }
 
 fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Findings, CliError> {
-    let machine = Machine::look();
+    let machine = Machine::detect();
     let config: Config = loaded.config.clone();
     let mut checks = vec![checks::sources(args.serve.config.as_deref(), &loaded), checks::log(&config)];
     checks.extend(checks::secrets(&loaded));
@@ -71,22 +71,22 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
         Err(error) => return Err(error),
     }
     checks.extend(checks::files(&machine, &config));
-    checks.extend(places::listeners(&config));
-    checks.extend(places::data_dir(&config));
+    checks.extend(external::listeners(&config));
+    checks.extend(external::data_dir(&config));
     let failed = |e: std::io::Error| CliError::Service(format!("cannot start the runtime: {e}"));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().map_err(failed)?;
-    checks.push(runtime.block_on(places::store(&config, limit)));
-    checks.push(places::archive(&config));
-    checks.extend(runtime.block_on(places::remote(&config, limit)));
-    // What has not answered by now is not waited for.
+    checks.push(runtime.block_on(external::store(&config, limit)));
+    checks.push(external::archive(&config));
+    checks.extend(runtime.block_on(external::remote(&config, limit)));
+    // Do not wait for requests that are still unanswered.
     runtime.shutdown_background();
     Ok(Findings { machine, loaded, backends, devices, taken, checks })
 }
 
 impl Findings {
-    /// What was found, for programs.
+    /// Returns the findings as JSON.
     fn document(&self) -> Value {
-        let backend = |candidate: &Candidate| {
+        let backend = |candidate: &Availability| {
             let (ok, detail) = match &candidate.state {
                 Ok(device) => (true, device),
                 Err(why) => (false, why),

@@ -1,4 +1,4 @@
-//! The findings on a page, for people.
+//! Text form of the findings.
 
 use molmesh::config::Source;
 use molmesh::structure::radii;
@@ -10,10 +10,10 @@ use super::machine::{self, COMPILER, TARGET};
 use crate::cli::page::Page;
 use crate::cli::style::Style;
 
-/// Columns that values take before a row is wrapped.
+/// Columns after which a row of values is wrapped.
 const WIDTH: usize = 100;
 
-/// The page.
+/// Formats the findings.
 pub(super) fn text(findings: &Findings, style: Style) -> String {
     let mut page = Page::new(style, "molmesh", env!("CARGO_PKG_VERSION"));
     let machine = &findings.machine;
@@ -22,21 +22,21 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     let cores = machine.cores.map_or("an unknown number".to_owned(), |cores| cores.to_string());
     page.row("cores", &format!("{cores} for this process"));
     let vectors: Vec<&str> = machine::vectors().collect();
-    page.row("vectors", &if vectors.is_empty() { "none that is known here".to_owned() } else { vectors.join(" ") });
+    page.row("vectors", &if vectors.is_empty() { "none".to_owned() } else { vectors.join(" ") });
     let memory = machine.bytes.map_or("unknown".to_owned(), size);
     let limit = machine
         .limit
-        .map_or("no limit of a control group".to_owned(), |(bytes, whose)| format!("{} for {whose}", size(bytes)));
+        .map_or("no control group limit".to_owned(), |(bytes, owner)| format!("{} for {owner}", size(bytes)));
     page.row("memory", &format!("{memory}, {limit}"));
     if let Some([now, most]) = machine.files {
         page.row("open files", &format!("{now}, raised to {most} by a service"));
     }
     for candidate in findings.backends.iter().filter(|candidate| !candidate.is_device()) {
-        let said = match &candidate.state {
+        let state = match &candidate.state {
             Ok(device) => format!("{} {device}", style.green("yes")),
             Err(why) => format!("{} {why}", style.dim("no ")),
         };
-        page.row(&candidate.name, &said);
+        page.row(&candidate.name, &state);
     }
     for device in &findings.devices {
         let facts = &device.facts;
@@ -65,7 +65,7 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     page.finish()
 }
 
-/// Every number of the configuration, a star behind those that somebody has set.
+/// Adds all numbers of the configuration. A star marks those that are not defaults.
 fn limits(page: &mut Page, findings: &Findings) {
     let document = findings.loaded.to_json();
     for (section, keys) in document["config"].as_object().into_iter().flatten() {
@@ -90,7 +90,7 @@ fn limits(page: &mut Page, findings: &Findings) {
     }
 }
 
-/// Bytes, with a binary suffix; rounded where that would take many digits.
+/// Formats bytes with a binary suffix. Rounds a number that would have many digits.
 pub(super) fn size(bytes: u64) -> String {
     let suffixes = [("GiB", 30), ("MiB", 20), ("KiB", 10)];
     let exact = suffixes.iter().find(|(_, shift)| bytes >= 1 << shift && bytes.trailing_zeros() >= *shift);
@@ -102,14 +102,14 @@ pub(super) fn size(bytes: u64) -> String {
     }
 }
 
-/// What of a device matters to the stages.
+/// Formats the limits and features of a device.
 fn abilities(facts: &DeviceFacts) -> String {
     let mib = |bytes: u64| format!("{} MiB", bytes >> 20);
-    let subgroups = facts.subgroups.map_or("no subgroups".to_owned(), |[least, most]| {
-        if least == most { format!("subgroups of {least}") } else { format!("subgroups of {least} to {most}") }
+    let subgroups = facts.subgroups.map_or("no subgroups".to_owned(), |[min, max]| {
+        if min == max { format!("subgroups of {min}") } else { format!("subgroups of {min} to {max}") }
     });
     format!(
-        "bindings to {}, buffers to {}, {} KiB a workgroup, {}, {subgroups}",
+        "bindings to {}, buffers to {}, {} KiB per workgroup, {}, {subgroups}",
         mib(facts.binding_bytes),
         mib(facts.buffer_bytes),
         facts.workgroup_bytes >> 10,

@@ -1,4 +1,4 @@
-//! Checks of what lies outside the process: addresses, the store, the folder of structures, the remote archive.
+//! Checks outside the process: addresses, store, folder of structures, remote archive.
 
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
@@ -13,12 +13,12 @@ use molmesh::structure::{self, EntryId};
 use super::checks::{Check, State};
 use super::page::size;
 
-/// Entries that are counted at most: several times the whole archive.
-const MOST_ENTRIES: usize = 1_000_000;
-/// The entry that a remote archive is asked for.
+/// Maximum number of entries to count: several times the whole archive.
+const MAX_ENTRIES: usize = 1_000_000;
+/// Entry that is requested from a remote archive.
 const ENTRY: &str = "4pti";
 
-/// Whether the addresses can be listened on. Both are held at once, so that one that is given twice is found out.
+/// Checks that the addresses can be listened on. Both stay bound until the end, which detects an address given twice.
 pub(super) fn listeners(config: &Config) -> Vec<Check> {
     let mut held = Vec::new();
     let mut check = |name: &'static str, addr: SocketAddr| match TcpListener::bind(addr) {
@@ -27,7 +27,7 @@ pub(super) fn listeners(config: &Config) -> Vec<Check> {
             let port = if addr.port() == 0 { ", any port" } else { "" };
             Check::new(name, State::Ok, format!("{addr} is free{port}"))
         }
-        Err(error) => Check::new(name, State::Failed, format!("{addr} cannot be listened on (server.{name}): {error}")),
+        Err(error) => Check::new(name, State::Failed, format!("cannot listen on {addr} (server.{name}): {error}")),
     };
     let service = check("listen", config.server.listen);
     let metrics = config.server.metrics_listen.map(|addr| check("metrics_listen", addr));
@@ -40,9 +40,9 @@ pub(super) fn data_dir(config: &Config) -> Option<Check> {
     Some(Check::new("data_dir", State::Failed, error.to_string()))
 }
 
-/// Whether the store can be opened, written, read and listed, and what it holds.
+/// Checks that the store can be opened, written, read and listed, and reports its content.
 pub(super) async fn store(config: &Config, limit: Duration) -> Check {
-    let made = Made::before(config.store.url.is_none().then_some(config.server.data_dir.as_path()));
+    let created = CreatedFolders::before(config.store.url.is_none().then_some(config.server.data_dir.as_path()));
     let opened = tokio::time::timeout(limit, Store::open(&config.store, &config.server.data_dir)).await;
     let check = match opened {
         Ok(Ok(store)) => {
@@ -60,22 +60,22 @@ pub(super) async fn store(config: &Config, limit: Duration) -> Check {
             Check::new("store", State::Failed, format!("{place} does not answer within {} ms", limit.as_millis()))
         }
     };
-    drop(made);
+    drop(created);
     check
 }
 
-/// Folders that a check makes are gone behind it, unless somebody has put something into them.
-struct Made(Option<PathBuf>);
+/// Guard that removes the folders that a check created, if they are still empty.
+struct CreatedFolders(Option<PathBuf>);
 
-impl Made {
-    /// Notes what of `path` is not there yet.
+impl CreatedFolders {
+    /// Records the part of `path` that does not exist yet.
     fn before(path: Option<&Path>) -> Self {
         let missing = |path: &&Path| !path.as_os_str().is_empty() && !path.exists();
         Self(path.and_then(|path| path.ancestors().take_while(missing).last().map(Path::to_owned)))
     }
 }
 
-impl Drop for Made {
+impl Drop for CreatedFolders {
     fn drop(&mut self) {
         if let Some(path) = &self.0 {
             remove_empty(path);
@@ -83,7 +83,7 @@ impl Drop for Made {
     }
 }
 
-/// Removes folders that hold nothing but such folders. What cannot be removed stays: it was no part of the question.
+/// Removes a folder that contains nothing but empty folders. Ignores errors.
 fn remove_empty(path: &Path) {
     for entry in std::fs::read_dir(path).into_iter().flatten().flatten() {
         if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
@@ -93,48 +93,51 @@ fn remove_empty(path: &Path) {
     drop(std::fs::remove_dir(path));
 }
 
-/// What the folder of structures holds.
+/// Checks the folder of structures and counts its entries.
 pub(super) fn archive(config: &Config) -> Check {
     let dir = config.archive_dir();
     let name = dir.display();
     if config.archive.dir.is_none() && !dir.exists() {
         return Check::new("archive", State::Ok, format!("none: there is no folder {name}"));
     }
-    let survey = match structure::survey(&dir, MOST_ENTRIES) {
+    let survey = match structure::survey(&dir, MAX_ENTRIES) {
         Ok(survey) => survey,
         Err((path, error)) => {
-            let detail = format!("{} cannot be listed, so that entries are missing: {error}", path.display());
+            let detail = format!("{} cannot be listed, so entries are missing: {error}", path.display());
             return Check::new("archive", State::Warning, detail);
         }
     };
     let Some(first) = &survey.first else {
-        return Check::new("archive", State::Warning, format!("{name} holds no entry: no file is named like 4pti.cif"));
+        return Check::new(
+            "archive",
+            State::Warning,
+            format!("{name} contains no entry: no file has a name like 4pti.cif"),
+        );
     };
     let more = if survey.more { "or more " } else { "" };
     match structure::Archive::new(&dir).stamp(first) {
-        Ok(Some(_)) => Check::new("archive", State::Ok, format!("{name} holds {} {more}entries", survey.entries)),
+        Ok(Some(_)) => Check::new("archive", State::Ok, format!("{name} contains {} {more}entries", survey.entries)),
         Ok(None) => {
-            let why = "it lies where it is not looked for, or its link leads out of the folder";
-            Check::new("archive", State::Warning, format!("{name} holds {}, but {why}", first.as_str()))
+            let why = "its path has no supported layout, or it is a link that leads out of the folder";
+            Check::new("archive", State::Warning, format!("{name} contains {}, but {why}", first.as_str()))
         }
         Err(error) => {
             let why = std::error::Error::source(&error).map_or_else(|| error.to_string(), ToString::to_string);
-            Check::new("archive", State::Warning, format!("{name} holds {first}, which cannot be opened: {why}"))
+            Check::new("archive", State::Warning, format!("{name} contains {first}, which cannot be opened: {why}"))
         }
     }
 }
 
-/// Whether every host of the remote archive answers.
+/// Checks that every host of the remote archive answers.
 pub(super) async fn remote(config: &Config, limit: Duration) -> Vec<Check> {
     let Ok(id) = ENTRY.parse::<EntryId>() else { return Vec::new() };
     let check = |(host, answer): (String, Result<u16, String>)| match answer {
-        // Any host that is sound may lack one entry, or the method.
+        // A working host may lack the entry or reject the method.
         Ok(status @ (200..=399 | 404 | 405 | 410)) => {
             Check::new("remote", State::Ok, format!("{host} answers ({status} for {id})"))
         }
         Ok(status) => Check::new("remote", State::Warning, format!("{host} answers {status} for {id}")),
-        Err(why) => Check::new("remote", State::Warning, format!("{host} cannot be asked: {why}")),
+        Err(why) => Check::new("remote", State::Warning, format!("the request to {host} failed: {why}")),
     };
-    // Heads are asked for, no bytes.
     Archive::new(config, Arc::new(Uncounted)).reach(&id, limit).await.into_iter().map(check).collect()
 }
