@@ -24,7 +24,7 @@ fn built_by() {
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
 }
 
-/// The page, if it was built: a table of what lies in `web/dist`.
+/// Table of the files of the web page in `web/dist`, empty if the page was not built.
 mod page {
     use std::fmt::Write as _;
     use std::path::{Path, PathBuf};
@@ -92,7 +92,7 @@ mod shaders {
             let by_enum = table == "SHADERS";
             let buffer = if by_enum { "BufferId" } else { "&str" };
             writeln!(generated, "pub(super) static {table}: [Shader<{buffer}>; {}] = [", names.len())
-                .expect("a string takes it");
+                .expect("writing to a string cannot fail");
             for name in names {
                 match assemble(Path::new("shaders"), &format!("{folder}{name}.wgsl"), &mut BTreeSet::new())
                     .and_then(|source| checked(&source).map(|module| (source, module)))
@@ -105,7 +105,7 @@ mod shaders {
                             generated,
                             "Shader {{ stage: {name:?}, source: include_str!({file:?}), bindings: &[{bindings}] }},"
                         )
-                        .expect("a string takes it");
+                        .expect("writing to a string cannot fail");
                         layouts.extend(structs(&module));
                     }
                     Err(why) => broken.push(format!("shaders/{folder}{name}.wgsl: {why}")),
@@ -115,7 +115,7 @@ mod shaders {
             if !layouts.is_empty() {
                 generated.push_str("/// Name, size, and (field, offset, size) of every struct in a buffer.\n");
                 writeln!(generated, "#[cfg(test)]\npub(super) static {layouts_table}: &[Layout] = &[")
-                    .expect("a string takes it");
+                    .expect("writing to a string cannot fail");
                 generated.extend(layouts);
                 generated.push_str("];\n\n");
             }
@@ -184,7 +184,7 @@ mod shaders {
         name.split('_').map(capitalized).collect()
     }
 
-    /// The structs of the buffers' types.
+    /// Returns the layouts of all structs in buffers.
     fn structs(module: &Module) -> Vec<String> {
         let mut found = Vec::new();
         for (_, global) in module.global_variables.iter().filter(|(_, global)| global.binding.is_some()) {

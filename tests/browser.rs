@@ -1,7 +1,6 @@
-//! The viewer and the examples in a real browser: Debian's Chromium, driven by the scripts of `tests/browser`, against the
-//! built server.
+//! The viewer and the examples in a real browser: scripts of `tests/browser` drive Chromium against the built server.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod access_support;
 mod cli_support;
@@ -69,7 +68,7 @@ fn component_polls_jobs_and_shows_its_fallback() {
 }
 
 #[test]
-fn long_meshes_are_followed_as_jobs() {
+fn page_polls_long_jobs() {
     drive("jobs.mjs", &[], &[]);
 }
 

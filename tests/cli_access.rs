@@ -1,6 +1,6 @@
-//! Keys and signed addresses from the command line to the service: what is printed works as pasted, and no log has it.
+//! Keys and signed URLs from the command line to the service: they work as printed and are not logged.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod cli_support;
 

@@ -1,6 +1,6 @@
-//! `--devices` and what is said of devices, through the binary.
+//! `--devices` and the reports on devices, through the binary.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod cli_support;
 

@@ -1,6 +1,6 @@
-//! `molmesh doctor`: what it says, its exit codes, and every check made to fail.
+//! `molmesh doctor`: reports, exit codes, and a failure of every check.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod cli_support;
 

@@ -1,4 +1,4 @@
-//! Every exit code that the help promises, the line that comes with it, and that a failure leaves no file.
+//! Every exit code of the help with its error message. A failure leaves no file.
 #![cfg(all(feature = "cli", feature = "server"))]
 
 mod cli_support;
@@ -136,9 +136,9 @@ fn suggested_resolution_is_accepted() {
 }
 
 #[test]
-fn six_is_a_backend_that_is_not_here_and_why() {
-    let said = fails(rod(), &["--backend", "gpu", "--devices", "77"], 6);
-    assert!(said.contains("no backend `gpu`") && said.contains("GPU"), "{said}");
+fn missing_backends_exit_with_6() {
+    let message = fails(rod(), &["--backend", "gpu", "--devices", "77"], 6);
+    assert!(message.contains("no backend `gpu`") && message.contains("GPU"), "{message}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
-//! The help is a promise: it changes only on purpose. After a change on purpose: `MOLMESH_BLESS=1 cargo test --test
-//! cli_help`, and read the difference.
+//! Comparison of the help with files. After an intended change, run the test with `MOLMESH_BLESS=1` and read the
+//! difference.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
+#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
 mod cli_support;
 

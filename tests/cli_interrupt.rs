@@ -1,6 +1,6 @@
-//! Ctrl-C and its kin: exit code 130, and no file is left.
+//! SIGINT and SIGTERM: exit code 130, and no file is left.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
+#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
 mod cli_support;
 

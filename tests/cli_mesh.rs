@@ -1,6 +1,6 @@
-//! `molmesh mesh` where it succeeds: formats, stdin and stdout, reports, where files go.
+//! Successful `molmesh mesh`: formats, stdin and stdout, reports, output files.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![expect(clippy::panic, reason = "tests say what they expect by panicking")]
+#![expect(clippy::panic, reason = "tests fail by panicking")]
 
 mod cli_support;
 

@@ -1,6 +1,6 @@
-//! `molmesh render`: files, streams, summaries, refusals.
+//! `molmesh render`: files, streams, summaries, errors.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
+#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
 mod cli_support;
 

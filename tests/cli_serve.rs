@@ -1,6 +1,6 @@
-//! `molmesh serve` as a process: its banner, its addresses, its end.
+//! `molmesh serve` as a process: banner, addresses, log, memory, stop.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod cli_support;
 

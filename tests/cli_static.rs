@@ -1,10 +1,6 @@
-//! The command line alone, as one static file: what `make static` builds.
+//! The static executable of `make static`, without the service.
 #![cfg(all(target_os = "linux", feature = "cli", feature = "server"))]
-#![expect(
-    clippy::unwrap_used,
-    clippy::print_stdout,
-    reason = "tests say what they expect by panicking, and what they skip"
-)]
+#![expect(clippy::unwrap_used, clippy::print_stdout, reason = "tests fail by panicking and print what they skip")]
 
 mod cli_support;
 

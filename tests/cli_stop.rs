@@ -1,7 +1,7 @@
-//! The end of `molmesh serve` under load, by signals: no request that was sent while it was served fails, promised jobs are kept,
-//! and every further signal ends the step that is under way.
+//! Stop of `molmesh serve` under load by signals: no accepted request fails, durable jobs are kept, and each further
+//! signal ends the current step.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod cli_support;
 mod http_support;

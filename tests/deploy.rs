@@ -1,6 +1,6 @@
-//! What is deployed agrees with itself and with the program: the image's recipe, Compose, Kubernetes, their configuration.
+//! Consistency of the deployment with itself and the program: Dockerfile, Compose, Kubernetes, configurations.
 #![cfg(all(unix, feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![expect(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod cli_support;
 mod deploy_support;
@@ -108,7 +108,7 @@ fn read_by_the_build() -> BTreeSet<PathBuf> {
 fn all_files_of_the_build_are_sent_to_the_builder() {
     let ignore = read(".dockerignore");
     let mut files = read_by_the_build();
-    assert!(files.len() > 100, "only {} files are said to be read", files.len());
+    assert!(files.len() > 100, "only {} files", files.len());
     let more = [
         "Cargo.toml",
         "Cargo.lock",
@@ -340,10 +340,10 @@ fn scaled_pods_fit_their_ephemeral_storage() {
         .collect();
     assert!(environment.iter().all(|(name, _)| name.starts_with("MOLMESH__")));
     let config = load(Some(&root().join(CONFIGURATIONS[1])), environment, &[]).unwrap();
-    let room = bytes(pod["volumes"][0]["emptyDir"]["sizeLimit"].as_str().unwrap());
-    assert!(room > config.store.max_bytes + config.archive.cache_bytes, "{room} bytes of room");
+    let volume = bytes(pod["volumes"][0]["emptyDir"]["sizeLimit"].as_str().unwrap());
+    assert!(volume > config.store.max_bytes + config.archive.cache_bytes, "{volume} bytes on the volume");
     let ephemeral = bytes(pod["containers"][0]["resources"]["limits"]["ephemeral-storage"].as_str().unwrap());
-    assert!(ephemeral > room, "{ephemeral} bytes of ephemeral storage for {room}");
+    assert!(ephemeral > volume, "{ephemeral} bytes of ephemeral storage for {volume}");
     assert_eq!(autoscaler["spec"]["scaleTargetRef"]["name"], patch["metadata"]["name"]);
     assert_eq!(patch["spec"]["replicas"], Value::Null, "the autoscaler sets the replicas");
 }
@@ -351,7 +351,7 @@ fn scaled_pods_fit_their_ephemeral_storage() {
 // -------------------------------------------------------------------------------------------------- documentation
 
 #[test]
-fn the_documentation_names_what_is_there() {
+fn documentation_names_existing_files_targets_and_keys() {
     let text = ["container", "kubernetes", "gpu"].map(|page| read(&format!("docs/operate/{page}.md"))).join("\n");
     let makefile = read("Makefile");
     let mut n = 0;

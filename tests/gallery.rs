@@ -1,6 +1,6 @@
-//! The gallery: its page names pictures that are there and all of them, they are small, and the command beside one draws it.
+//! The gallery: its page shows all pictures, they are small, and the command of a picture renders it.
 #![cfg(all(feature = "cli", feature = "server"))]
-#![expect(clippy::unwrap_used, reason = "tests say what they expect by panicking")]
+#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
 mod cli_support;
 
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use cli_support::{Folder, assert_code, run};
 
 /// Maximum size of all pictures in bytes, as they are part of every clone.
-const MOST: u64 = 1_500_000;
+const MAX_BYTES: u64 = 1_500_000;
 
 fn docs() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("docs")
@@ -55,20 +55,20 @@ fn pixels(path: &Path) -> (u32, u32, Vec<u8>) {
 }
 
 #[test]
-fn the_page_shows_the_pictures_that_there_are() {
+fn page_shows_exactly_the_existing_pictures() {
     let page = fs::read_to_string(docs().join("research/gallery.md")).unwrap();
     assert_eq!(faults(&page), Vec::<String>::new());
     let named = shown(&page);
     assert!(named.len() >= 12, "{named:?}");
     let bytes: u64 = named.iter().map(|name| fs::metadata(docs().join("gallery").join(name)).unwrap().len()).sum();
-    assert!(bytes <= MOST, "{bytes} bytes");
-    // The controls: a picture that is not there, one that nobody shows, one without its command.
+    assert!(bytes <= MAX_BYTES, "{bytes} bytes");
+    // Controls: a missing picture, a picture on no page, a picture without a command.
     assert_eq!(faults(&page.replace("](../gallery/4pti-gaussian.png)", "](../gallery/none.png)")).len(), 3);
     assert_eq!(faults(&page.replace("FILE -o 4pti-gaussian.png", "FILE -o it")).len(), 1);
 }
 
 #[test]
-fn the_command_beside_a_picture_draws_it() {
+fn command_on_the_page_renders_the_picture() {
     let page = fs::read_to_string(docs().join("research/gallery.md")).unwrap();
     let folder = Folder::new();
     let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples/4pti.pdb");

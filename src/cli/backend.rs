@@ -19,7 +19,7 @@ use super::estimate::Estimate;
 
 /// Requested backend and devices.
 #[derive(Debug)]
-pub(crate) struct Asked<'a> {
+pub(crate) struct BackendRequest<'a> {
     /// Backend.
     pub(crate) backend: BackendName,
     /// Devices that it may use.
@@ -30,7 +30,7 @@ pub(crate) struct Asked<'a> {
     pub(crate) work: Option<f64>,
 }
 
-impl<'a> Asked<'a> {
+impl<'a> BackendRequest<'a> {
     /// Creates the request of a command with a single job of unknown work.
     pub(crate) fn once(args: &'a JobArgs) -> Self {
         let (backend, devices, threads) = (args.backend, &args.devices.devices, args.threads);
@@ -44,7 +44,7 @@ impl<'a> Asked<'a> {
 }
 
 /// Selected backend with the reason.
-pub(crate) struct Picked {
+pub(crate) struct SelectedBackend {
     /// Backend.
     pub(crate) backend: Box<dyn Backend>,
     /// Reason of the selection.
@@ -75,11 +75,11 @@ pub(crate) enum Use {
 ///
 /// # Errors
 /// Returns [`CliError::Usage`] if they do.
-pub(crate) fn check(asked: &Asked<'_>) -> Result<(), CliError> {
-    if asked.threads == Some(0) {
+pub(crate) fn check(requested: &BackendRequest<'_>) -> Result<(), CliError> {
+    if requested.threads == Some(0) {
         return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
     }
-    if asked.backend == BackendName::Gpu && *asked.devices == DeviceChoice::Cpu {
+    if requested.backend == BackendName::Gpu && *requested.devices == DeviceChoice::Cpu {
         return Err(CliError::usage("parameter `devices`: cpu is not allowed with --backend gpu; expected a GPU"));
     }
     Ok(())
@@ -90,69 +90,75 @@ pub(crate) fn check(asked: &Asked<'_>) -> Result<(), CliError> {
 /// # Errors
 /// Returns [`CliError::Usage`] if flags contradict each other, and [`CliError::NoBackend`] with the reason if the
 /// requested backend is not available.
-pub(crate) fn pick(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
-    check(asked)?;
-    let unasked = |backend: Box<dyn Backend>| Picked {
+pub(crate) fn pick(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBackend, CliError> {
+    check(requested)?;
+    let without_gpu = |backend: Box<dyn Backend>| SelectedBackend {
         backend,
         reason: "requested".to_owned(),
         drawer: Drawer::cpu("a backend other than the GPU was requested"),
         devices: Vec::new(),
         no_gpu: Some("no discovery: another backend was requested".to_owned()),
     };
-    match asked.backend {
-        BackendName::Cpu => Ok(unasked(cpu(asked, use_)?)),
-        BackendName::Reference => Ok(unasked(Box::new(ReferenceBackend))),
-        BackendName::Auto | BackendName::Gpu => gpu_or_cpu(asked, use_),
+    match requested.backend {
+        BackendName::Cpu => Ok(without_gpu(cpu(requested, use_)?)),
+        BackendName::Reference => Ok(without_gpu(Box::new(ReferenceBackend))),
+        BackendName::Auto | BackendName::Gpu => gpu_or_cpu(requested, use_),
     }
 }
 
 /// Returns the estimate for a command if both backend and devices are `auto`.
-fn estimate(asked: &Asked<'_>) -> Option<Estimate> {
-    let free = asked.backend == BackendName::Auto && *asked.devices == DeviceChoice::Auto;
-    asked.work.filter(|_| free).map(|work| Estimate::new(work, asked.n_threads()))
+fn estimate(requested: &BackendRequest<'_>) -> Option<Estimate> {
+    let free = requested.backend == BackendName::Auto && *requested.devices == DeviceChoice::Auto;
+    requested.work.filter(|_| free).map(|work| Estimate::new(work, requested.n_threads()))
 }
 
 /// Selects a GPU, or the CPU if the request allows any backend.
-fn gpu_or_cpu(asked: &Asked<'_>, use_: &Use) -> Result<Picked, CliError> {
-    let estimate = estimate(asked);
+fn gpu_or_cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBackend, CliError> {
+    let estimate = estimate(requested);
     if let Some(estimate) = estimate.filter(|estimate| !estimate.favours_gpu()) {
         let why = format!("no GPU discovery ({estimate})");
         let reason = format!("auto: {why}");
         let drawer = Drawer::cpu(&reason);
-        return Ok(Picked { backend: cpu(asked, use_)?, reason, drawer, devices: Vec::new(), no_gpu: Some(why) });
+        return Ok(SelectedBackend {
+            backend: cpu(requested, use_)?,
+            reason,
+            drawer,
+            devices: Vec::new(),
+            no_gpu: Some(why),
+        });
     }
-    let Gpu { backend, drawer, devices, mut state } = gpu(asked, use_);
+    let Gpu { backend, drawer, devices, mut state } = gpu(requested, use_);
     if let (Some(backend), Some(drawer), Ok(reason)) = (backend, drawer, &state) {
-        let reason = match (asked.backend, asked.devices) {
-            (_, DeviceChoice::These(_)) => format!("--devices {}", asked.devices),
+        let reason = match (requested.backend, requested.devices) {
+            (_, DeviceChoice::These(_)) => format!("--devices {}", requested.devices),
             (BackendName::Auto, _) => match estimate {
                 Some(estimate) => format!("auto: {reason}, {estimate}"),
                 None => format!("auto: {reason}"),
             },
             _ => "requested".to_owned(),
         };
-        return Ok(Picked { backend, reason, drawer, devices, no_gpu: None });
+        return Ok(SelectedBackend { backend, reason, drawer, devices, no_gpu: None });
     }
     let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
     // A request for a specific device fails instead of falling back to the CPU.
-    if asked.backend != BackendName::Auto || matches!(asked.devices, DeviceChoice::These(_)) {
-        return Err(CliError::NoBackend { asked: "gpu", why: format!("no GPU can be used: {why}") });
+    if requested.backend != BackendName::Auto || matches!(requested.devices, DeviceChoice::These(_)) {
+        return Err(CliError::NoBackend { requested: "gpu", why: format!("no GPU can be used: {why}") });
     }
-    let reason = match asked.devices {
+    let reason = match requested.devices {
         DeviceChoice::Cpu => "--devices cpu".to_owned(),
         _ => format!("auto: no GPU: {why}"),
     };
     let drawer = Drawer::cpu(&reason);
-    Ok(Picked { backend: cpu(asked, use_)?, reason, drawer, devices, no_gpu: Some(why) })
+    Ok(SelectedBackend { backend: cpu(requested, use_)?, reason, drawer, devices, no_gpu: Some(why) })
 }
 
-fn cpu(asked: &Asked<'_>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
+fn cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
     let backend = match use_ {
-        Use::Once | Use::Picture => CpuBackend::new(Some(asked.n_threads())),
+        Use::Once | Use::Picture => CpuBackend::new(Some(requested.n_threads())),
         #[cfg(feature = "server")]
-        Use::Service(_) => CpuBackend::new(asked.threads),
+        Use::Service(_) => CpuBackend::new(requested.threads),
     };
-    let backend = backend.map_err(|why| CliError::NoBackend { asked: "cpu", why })?;
+    let backend = backend.map_err(|why| CliError::NoBackend { requested: "cpu", why })?;
     Ok(Box::new(backend))
 }
 
@@ -166,20 +172,20 @@ struct Gpu {
 }
 
 #[cfg(not(feature = "gpu"))]
-fn gpu(_asked: &Asked<'_>, _use: &Use) -> Gpu {
+fn gpu(_asked: &BackendRequest<'_>, _use: &Use) -> Gpu {
     Gpu { backend: None, drawer: None, devices: Vec::new(), state: Err("this build has no GPU support".to_owned()) }
 }
 
 #[cfg(feature = "gpu")]
-fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
+fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
     use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, discover};
 
     // For a single mesh, skip drivers without a device, unless a GPU was requested.
     let once = matches!(use_, Use::Once | Use::Picture);
-    let look = if once && asked.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
-    let discovery = discover(asked.devices, look);
+    let look = if once && requested.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
+    let discovery = discover(requested.devices, look);
     let none = |devices, why| Gpu { backend: None, drawer: None, devices, state: Err(why) };
-    let missing = discovery.missing(asked.devices);
+    let missing = discovery.missing(requested.devices);
     if !missing.is_empty() {
         let there = discovery.why_none().map(|why| format!(" ({why})")).unwrap_or_default();
         return none(discovery.devices, format!("{}{there}", missing.join(", ")));
@@ -198,12 +204,12 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
         },
     };
     // A request for the GPU has no fallback.
-    let fallback = match asked.backend {
-        BackendName::Auto => CpuBackend::new(asked.threads).ok().map(|cpu| Box::new(cpu) as Box<dyn Backend>),
+    let fallback = match requested.backend {
+        BackendName::Auto => CpuBackend::new(requested.threads).ok().map(|cpu| Box::new(cpu) as Box<dyn Backend>),
         _ => None,
     };
     let started = GpuBackend::start(&discovery, &settings, fallback);
-    let drawer = match drawer(asked, use_, &discovery) {
+    let drawer = match drawer(requested, use_, &discovery) {
         Ok(drawer) => drawer,
         Err(why) => return none(discovery.devices, why),
     };
@@ -238,13 +244,13 @@ fn gpu(asked: &Asked<'_>, use_: &Use) -> Gpu {
 
 /// Starts the renderer on the GPUs that make the meshes. With `--backend auto`, falls back to the CPU with the reason.
 #[cfg(feature = "gpu")]
-fn drawer(asked: &Asked<'_>, use_: &Use, discovery: &molmesh::gpu::Discovery) -> Result<Drawer, String> {
+fn drawer(requested: &BackendRequest<'_>, use_: &Use, discovery: &molmesh::gpu::Discovery) -> Result<Drawer, String> {
     use molmesh::gpu::GpuRenderer;
 
     if *use_ == Use::Once {
         return Ok(Drawer::cpu("no pictures were requested"));
     }
-    let auto = asked.backend == BackendName::Auto;
+    let auto = requested.backend == BackendName::Auto;
     match GpuRenderer::start(discovery, auto.then(CpuRenderer::default)) {
         Ok(renderer) => {
             let reason = "the device that makes the meshes".to_owned();

@@ -13,8 +13,8 @@ use super::error::CliError;
 /// Runs the command.
 pub(super) fn run(command: &ConfigCommand) -> Result<(), CliError> {
     match command {
-        ConfigCommand::Print(args) => super::say(&print(args)?),
-        ConfigCommand::Schema => super::say(&pretty(&config::schema())),
+        ConfigCommand::Print(args) => super::print(&print(args)?),
+        ConfigCommand::Schema => super::print(&pretty(&config::schema())),
     }
 }
 
@@ -62,11 +62,11 @@ pub(super) fn load(args: &ServeArgs) -> Result<Loaded, CliError> {
         ("log.format", log),
     ];
     let named = named.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?)));
-    of(args.config.as_deref(), &args.set, named)
+    load_with(args.config.as_deref(), &args.set, named)
 }
 
 /// Loads the configuration from a file, the environment, `--set` and `named` pairs of key and value.
-pub(super) fn of(
+pub(super) fn load_with(
     file: Option<&Path>,
     set: &[String],
     named: impl IntoIterator<Item = (String, String)>,

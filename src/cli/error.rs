@@ -88,7 +88,7 @@ pub(crate) enum CliError {
         /// Cause.
         source: JobError,
         /// Worst finding of the strict validator in the same file.
-        opinion: Option<String>,
+        strict_finding: Option<String>,
     },
     /// The requested strict check found errors.
     #[error("{name}: the strict check found {errors} errors")]
@@ -104,10 +104,10 @@ pub(crate) enum CliError {
     #[error(transparent)]
     Format(#[from] FormatError),
     /// The requested backend is not available.
-    #[error("no backend `{asked}` on this machine: {why}")]
+    #[error("no backend `{requested}` on this machine: {why}")]
     NoBackend {
         /// Requested backend.
-        asked: &'static str,
+        requested: &'static str,
         /// Reason.
         why: String,
     },
@@ -194,10 +194,10 @@ impl CliError {
             Self::Strict { first, .. } => Some(format!("the first: {first}")),
             Self::InputTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
             Self::Job { source: JobError::Surface(error), .. } => surface_hint(error),
-            Self::Job { source: JobError::Structure(error), opinion, .. } => match error {
+            Self::Job { source: JobError::Structure(error), strict_finding, .. } => match error {
                 StructureError::TooManyAtoms { .. } => Some("raise it with --max-atoms".to_owned()),
                 StructureError::InflatedTooLarge { .. } => Some("raise it with --max-input-bytes".to_owned()),
-                _ => opinion.clone(),
+                _ => strict_finding.clone(),
             },
             Self::NoBackend { .. } => Some(format!("try --backend auto{DOCTOR}")),
             #[cfg(feature = "server")]
@@ -301,7 +301,7 @@ mod tests {
 
     #[test]
     fn every_error_has_its_exit_code() {
-        let job = |source: JobError| CliError::Job { name: "x".into(), source, opinion: None };
+        let job = |source: JobError| CliError::Job { name: "x".into(), source, strict_finding: None };
         let missing = || io::Error::from(io::ErrorKind::NotFound);
         let cases: [(CliError, i32); 19] = [
             (CliError::Internal(String::new()), 1),
@@ -318,7 +318,7 @@ mod tests {
             (job(SurfaceError::Deadline.into()), 5),
             (job(SurfaceError::Device { why: String::new() }.into()), 6),
             (FormatError::GlbTooLarge { bytes: 2, limit: 1 }.into(), 5),
-            (CliError::NoBackend { asked: "gpu", why: String::new() }, 6),
+            (CliError::NoBackend { requested: "gpu", why: String::new() }, 6),
             (CliError::InUse(String::new()), 8),
             (CliError::Output { name: "x".into(), source: missing() }, 7),
             (job(SurfaceError::Cancelled.into()), 130),
@@ -337,7 +337,7 @@ mod tests {
     #[test]
     fn grid_limit_suggests_a_resolution() {
         let error = SurfaceError::GridTooLarge { samples: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
-        let hint = CliError::Job { name: "x".into(), source: error.into(), opinion: None }.hint();
+        let hint = CliError::Job { name: "x".into(), source: error.into(), strict_finding: None }.hint();
         assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-samples"));
     }
 }

@@ -16,7 +16,7 @@ pub(super) fn run(args: &HealthcheckArgs) -> Result<(), CliError> {
     let timeout = timeout(args.timeout)?;
     let response = get(&url, timeout).map_err(|e| CliError::Service(format!("{} does not answer: {e}", args.url)))?;
     match status(&response) {
-        Some(200) => super::say("200 ok\n"),
+        Some(200) => super::print("200 ok\n"),
         Some(code) => Err(CliError::Service(format!("{} responds with status {code}", args.url))),
         None => Err(CliError::Service(format!("{} does not respond with HTTP", args.url))),
     }

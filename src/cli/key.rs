@@ -38,7 +38,7 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
     let expires = args.expires.as_deref().map(end).transpose()?;
     let key =
         Key { id: id.to_owned(), hash: minted.hash, scopes, quota: Arc::new(quota), expires, note: args.note.clone() };
-    super::say(&access::entry(&key))?;
+    super::print(&access::entry(&key))?;
     let text = format!("\nThe key (shown only once):\n{}\n", minted.text);
     io::stderr().write_all(text.as_bytes()).map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
 }
@@ -46,7 +46,7 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
 fn signing(args: &SigningKeyArgs) -> Result<(), CliError> {
     let id = id(&args.id)?;
     let secret = access::new_secret().map_err(|error| CliError::Internal(error.to_string()))?;
-    super::say(&format!("{id}:{secret}\n"))
+    super::print(&format!("{id}:{secret}\n"))
 }
 
 fn id(id: &str) -> Result<&str, CliError> {

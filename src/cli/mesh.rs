@@ -15,7 +15,7 @@ use molmesh::surface::{CancelToken, SurfaceError};
 use serde_json::{Value, json};
 
 use super::args::{JobArgs, MeshArgs, ReportStyle};
-use super::backend::{self, Asked, Picked};
+use super::backend::{self, BackendRequest, SelectedBackend};
 use super::error::CliError;
 use super::output::{Output, is_stdio};
 use super::progress::Progress;
@@ -25,8 +25,8 @@ use super::{interrupt, request};
 
 /// Runs the command. Cheap steps come first: flags, output, input, backend, mesh.
 pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
-    let Request { mut job, format: asked, strict, .. } = request::of_mesh(args)?;
-    let format = asked.map_or_else(|| format(&args.output), Ok)?;
+    let Request { mut job, format: requested, strict, .. } = request::of_mesh(args)?;
+    let format = requested.map_or_else(|| format(&args.output), Ok)?;
     if format.is_picture() {
         return Err(CliError::Usage {
             message: format!("{format} is a picture, not a mesh"),
@@ -36,13 +36,13 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     request::settle(&mut job, format)?;
     let (output_path, input_path, args) = (&args.output, &args.input, &args.job);
     let limits = request::limits(&args.limits);
-    backend::check(&Asked::once(args))?;
+    backend::check(&BackendRequest::once(args))?;
     let cancel = CancelToken::default();
     interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = read(input_path, limits.read.max_inflated_bytes)?;
-    let asked = Asked { work: Some(pipeline::work(&input, &job)), ..Asked::once(args) };
-    let picked = backend::pick(&asked, &backend::Use::Once)?;
+    let requested = BackendRequest { work: Some(pipeline::work(&input, &job)), ..BackendRequest::once(args) };
+    let picked = backend::pick(&requested, &backend::Use::Once)?;
 
     let progress = Progress::new(!args.quiet);
     let findings = if strict { Some(check(input_path, &input, &limits)?) } else { None };
@@ -127,7 +127,7 @@ struct Work<'a> {
     path: &'a Path,
     job: &'a Job,
     limits: &'a JobLimits,
-    picked: &'a Picked,
+    picked: &'a SelectedBackend,
     input: &'a [u8],
     cancel: &'a CancelToken,
 }
@@ -163,8 +163,8 @@ pub(super) fn failure(path: &Path, input: &[u8], limits: &JobLimits, source: Job
     match source {
         JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
         source => {
-            let (name, opinion) = (name_of(path), worst_finding(&source, input, limits));
-            CliError::Job { name, opinion, source }
+            let (name, strict_finding) = (name_of(path), worst_finding(&source, input, limits));
+            CliError::Job { name, strict_finding, source }
         }
     }
 }
@@ -185,7 +185,7 @@ pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec
     let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
         name: name(),
         source: source.into(),
-        opinion: None,
+        strict_finding: None,
     })?;
     let errors = findings.iter().filter(|f| f.level == Level::Error);
     match errors.clone().next() {
@@ -239,7 +239,7 @@ pub(super) fn write_report(
         ReportStyle::Json => {
             let text = json_report(report, findings, written)?;
             let printed =
-                if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::say(&text) };
+                if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::print(&text) };
             printed.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
         }
     }

@@ -80,9 +80,8 @@ fn run() -> i32 {
     }
 }
 
-/// Ends the process as it is. Not by returning: freeing a mesh of a few hundred megabytes that nobody will look at again
-/// takes longer than writing it. Nor by `exit`, which runs what drivers have registered for the end: with NVIDIA's, a
-/// service that had stopped in order ended by a segmentation fault now and then, and never since this is left out.
+/// Ends the process without freeing memory, which would take longer than writing a large mesh. Runs no exit handlers:
+/// those of NVIDIA's driver caused occasional segmentation faults after an orderly stop.
 pub(crate) fn leave(status: i32) -> ! {
     #[cfg(unix)]
     signal_hook::low_level::exit(status);
@@ -116,7 +115,7 @@ fn usage(error: &clap::Error) -> i32 {
 
 /// `molmesh version`.
 fn version() -> Result<(), CliError> {
-    say(&format!("molmesh {} (features: {})\n", env!("CARGO_PKG_VERSION"), features().join(", ")))
+    print(&format!("molmesh {} (features: {})\n", env!("CARGO_PKG_VERSION"), features().join(", ")))
 }
 
 /// Returns the features of this build.
@@ -126,7 +125,7 @@ fn features() -> Vec<&'static str> {
 }
 
 /// Prints `text` to stdout and flushes it.
-fn say(text: &str) -> Result<(), CliError> {
+fn print(text: &str) -> Result<(), CliError> {
     let mut out = io::stdout().lock();
     out.write_all(text.as_bytes())
         .and_then(|()| out.flush())

@@ -11,7 +11,7 @@ use molmesh::pipeline::{self, Choice};
 use molmesh::surface::CancelToken;
 
 use super::args::RenderArgs;
-use super::backend::{self, Asked, Use};
+use super::backend::{self, BackendRequest, Use};
 use super::error::CliError;
 use super::output::{Output, is_stdio};
 use super::progress::Progress;
@@ -24,13 +24,13 @@ pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     require_png(&args.output)?;
     let (output_path, input_path, args) = (&args.output, &args.input, &args.job);
     let limits = request::limits(&args.limits);
-    backend::check(&Asked::once(args))?;
+    backend::check(&BackendRequest::once(args))?;
     let cancel = CancelToken::default();
     interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = mesh::read(input_path, limits.read.max_inflated_bytes)?;
-    let asked = Asked { work: Some(pipeline::work(&input, &job)), ..Asked::once(args) };
-    let picked = backend::pick(&asked, &Use::Picture)?;
+    let requested = BackendRequest { work: Some(pipeline::work(&input, &job)), ..BackendRequest::once(args) };
+    let picked = backend::pick(&requested, &Use::Picture)?;
 
     let progress = Progress::new(!args.quiet);
     let findings = if strict { Some(mesh::check(input_path, &input, &limits)?) } else { None };

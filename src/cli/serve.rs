@@ -12,7 +12,7 @@ use molmesh::surface::Backend;
 use molmesh::telemetry;
 
 use super::args::ServeArgs;
-use super::backend::{self, Asked, Picked};
+use super::backend::{self, BackendRequest, SelectedBackend};
 use super::banner::{self, Facts};
 use super::error::CliError;
 use super::style::Style;
@@ -32,10 +32,11 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         tracing::warn!("{warning}");
     }
     referee::quiet_panics();
-    let asked = Asked { backend: args.backend, devices: &config.devices.choice, threads: None, work: None };
-    let picked = backend::pick(&asked, &backend::Use::Service(config.devices.clone()))?;
+    let requested =
+        BackendRequest { backend: args.backend, devices: &config.devices.choice, threads: None, work: None };
+    let picked = backend::pick(&requested, &backend::Use::Service(config.devices.clone()))?;
     let others = survey::survey(&picked);
-    let Picked { backend, reason, drawer, devices, .. } = picked;
+    let SelectedBackend { backend, reason, drawer, devices, .. } = picked;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();
     let facts = Facts {

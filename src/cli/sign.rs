@@ -11,13 +11,13 @@ use super::key;
 
 /// Runs the command: prints the signed URL.
 pub(super) fn run(args: &SignArgs) -> Result<(), CliError> {
-    let keys = keys(&super::config::of(args.config.as_deref(), &args.set, [])?.config)?;
+    let keys = keys(&super::config::load_with(args.config.as_deref(), &args.set, [])?.config)?;
     let (origin, target) = split(&args.url)?;
     let end = key::end(&args.expires)?;
     let expires = end.duration_since(SystemTime::UNIX_EPOCH).map(|since| since.as_secs()).unwrap_or_default();
     let signed = keys.sign(args.key_id.as_deref(), target, expires);
     let signed = signed.map_err(|why| CliError::usage(format!("cannot sign `{}`: {why}", args.url)))?;
-    super::say(&format!("{origin}{signed}\n"))
+    super::print(&format!("{origin}{signed}\n"))
 }
 
 fn keys(config: &Config) -> Result<SigningKeys, CliError> {

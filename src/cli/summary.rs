@@ -111,13 +111,13 @@ fn drawn(picture: &PictureReport) -> String {
 }
 
 fn validation(report: &Report, style: Style) -> String {
-    let says = |holds: bool, yes: &str, no: &str| if holds { style.green(yes) } else { style.red(no) };
+    let status = |holds: bool, yes: &str, no: &str| if holds { style.green(yes) } else { style.red(no) };
     let method = if report.validation == Validation::Exact.name() { "exact edge matching" } else { "edge checksum" };
     format!(
         "{} (by {method}), {}, {}, Euler number {}",
-        says(report.closed, "watertight", "NOT watertight"),
-        says(report.oriented, "oriented", "NOT oriented"),
-        says(report.manifold, "manifold", "NOT manifold"),
+        status(report.closed, "watertight", "NOT watertight"),
+        status(report.oriented, "oriented", "NOT oriented"),
+        status(report.manifold, "manifold", "NOT manifold"),
         report.euler
     )
 }

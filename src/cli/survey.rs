@@ -4,7 +4,7 @@ use molmesh::surface::Backend;
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::reference::ReferenceBackend;
 
-use super::backend::Picked;
+use super::backend::SelectedBackend;
 
 /// State of a backend or of one of its devices.
 pub(crate) struct Availability {
@@ -27,7 +27,7 @@ pub(crate) fn describe(backend: &dyn Backend) -> String {
 }
 
 /// Returns all backends and the unused devices, with their states.
-pub(crate) fn survey(picked: &Picked) -> Vec<Availability> {
+pub(crate) fn survey(picked: &SelectedBackend) -> Vec<Availability> {
     let candidate = |name: &str, state| Availability { name: name.to_owned(), state };
     let gpu = picked.no_gpu.clone().map_or_else(|| Ok(picked.backend.describe()), Err);
     let mut survey = vec![

@@ -1,11 +1,11 @@
-//! Drives the built binary: made-up structures in, exit codes and files out.
+//! Runs the built binary with synthetic structures.
 #![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
     clippy::missing_panics_doc,
     unreachable_pub,
-    reason = "tests say what they expect by panicking"
+    reason = "tests fail by panicking"
 )]
 
 use std::io::Write;

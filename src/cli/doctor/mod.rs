@@ -13,7 +13,7 @@ use molmesh::surface::FoundDevice;
 use serde_json::{Value, json};
 
 use super::args::{DoctorArgs, DoctorStyle};
-use super::backend::{self, Asked, Picked, Use};
+use super::backend::{self, BackendRequest, SelectedBackend, Use};
 use super::error::CliError;
 use super::style::Style;
 use super::survey::{self, Availability};
@@ -36,7 +36,7 @@ pub(super) fn run(args: &DoctorArgs) -> Result<(), CliError> {
     let limit = super::healthcheck::timeout(args.timeout)?;
     let loaded = super::config::load(&args.serve)?;
     let findings = examine(args, loaded, limit)?;
-    super::say(&match args.report {
+    super::print(&match args.report {
         DoctorStyle::Text => page::text(&findings, Style::stdout()),
         DoctorStyle::Json => super::config::pretty(&findings.document()),
     })?;
@@ -52,13 +52,14 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     let config: Config = loaded.config.clone();
     let mut checks = vec![checks::sources(args.serve.config.as_deref(), &loaded), checks::log(&config)];
     checks.extend(checks::secrets(&loaded));
-    // As a service would do it: every driver is asked, the stages are built on what is taken, and a mesh is made.
-    let asked = Asked { backend: args.serve.backend, devices: &config.devices.choice, threads: None, work: None };
+    // The same steps as in a service: query all drivers, build the pipelines of the selected devices, make a mesh.
+    let requested =
+        BackendRequest { backend: args.serve.backend, devices: &config.devices.choice, threads: None, work: None };
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
-    match backend::pick(&asked, &Use::Service(config.devices.clone())) {
+    match backend::pick(&requested, &Use::Service(config.devices.clone())) {
         Ok(picked) => {
             backends = survey::survey(&picked);
-            let Picked { backend, reason, devices: found, .. } = picked;
+            let SelectedBackend { backend, reason, devices: found, .. } = picked;
             checks.push(checks::first_mesh(backend.as_ref()));
             let workers = config.jobs.workers.max(config.devices.jobs * backend.devices().len());
             checks.push(checks::memory(&machine, &config, workers));
