@@ -1,7 +1,7 @@
 //! The HTTP service. axum, hyper and tower are used here and nowhere else.
 //!
 //! Nothing here computes a mesh or blocks the runtime: work goes to [`crate::jobs`], files are parsed on blocking
-//! threads. A file uses only files of earlier groups in the list below; `tests/architecture.rs` checks this order.
+//! threads. A file uses only files of earlier groups in the list below; `tests/core/architecture.rs` checks this order.
 
 // Protocol rules that use no other file.
 mod conditional;

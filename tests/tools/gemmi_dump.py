@@ -1,4 +1,4 @@
-"""Prints the atoms that gemmi reads from a structure file. tests/structure_real.rs compares them.
+"""Prints the atoms that gemmi reads from a structure file. tests/core/structure_real.rs compares them.
 
 Usage: gemmi_dump.py FILE. First line: `models N N N…` (atoms of each model). Then one line per atom of the first model:
 chain, residue number, insertion code, residue, atom name, altloc, atomic number, x, y, z, occupancy, B, hetero, selected.

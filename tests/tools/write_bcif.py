@@ -1,4 +1,4 @@
-"""Writes the atoms of an mmCIF file as BinaryCIF with biotite, for tests/bcif_oracles.rs and benches/read.rs.
+"""Writes the atoms of an mmCIF file as BinaryCIF with biotite, for tests/core/bcif_oracles.rs and benches/read.rs.
 
 Usage: write_bcif.py VARIANT INPUT.cif[.gz] OUTPUT.bcif. Variants:
 

@@ -1,0 +1,196 @@
+//! Every exit code of the help with its error message. A failure leaves no file.
+
+use crate::cli_support;
+
+use std::fs;
+use std::path::Path;
+
+use cli_support::{Folder, assert_code, mesh, molmesh, pdb, piped, rod, run, stderr, stdout};
+
+/// Runs a mesh that must fail with `code` and leave no file. Returns stderr.
+#[track_caller]
+fn fails(input: impl AsRef<[u8]>, flags: &[&str], code: i32) -> String {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", input);
+    let done = mesh(&input, &folder.path("out.glb"), flags);
+    assert_code(&done, code);
+    assert_eq!(folder.entries(), ["in.pdb"], "{flags:?}");
+    assert_eq!(stdout(&done), "", "{flags:?}");
+    stderr(&done)
+}
+
+#[test]
+fn bad_parameters_exit_with_2() {
+    let cases: [(&[&str], &str); 16] = [
+        (&["--resolution", "0"], "resolution"),
+        (&["--resolution", "-1"], "resolution"),
+        (&["--resolution", "fine"], "`fine`"),
+        (&["--resolution", "NaN"], "resolution"),
+        (&["--resolution", "0.000001"], "resolution"),
+        (&["--kernel", "sphere"], "gaussian, soft-object, inverse-square"),
+        (&["--preset", "best"], "preset"),
+        (&["--isovalue", "1e300"], "isovalue"),
+        (&["--kernel", "soft-object", "--smoothness", "2"], "smoothness"),
+        (&["--paper-a", "1"], "paper_b"),
+        (&["--altloc", "AB"], "altloc"),
+        (&["--select", "everything"], "select"),
+        (&["--threads", "0"], "threads"),
+        (&["--compress", "zip"], "none, quantize"),
+        (&["--compress", "quantize", "--format", "stl"], "glb, gltf"),
+        (&["--isovalue", "900000"], "isovalue"),
+    ];
+    for (flags, part) in cases {
+        let message = fails(rod(), flags, 2);
+        assert!(message.contains(part), "{flags:?}: {message}");
+    }
+}
+
+#[test]
+fn bad_flags_exit_with_2() {
+    let cases: [&[&str]; 6] = [
+        &["mesh"],
+        &["mesh", "a.pdb"],
+        &["mesh", "a.pdb", "-o", "b.glb", "--no-such-flag"],
+        &["mesh", "a.pdb", "-o", "b.glb", "--backend", "abacus"],
+        &["mesh", "a.pdb", "-o", "b.glb", "--threads", "many"],
+        &["fold"],
+    ];
+    for args in cases {
+        let done = run(args);
+        assert_eq!(done.status.code(), Some(2), "{args:?}");
+        assert!(stderr(&done).starts_with("molmesh: "), "{args:?}: {}", stderr(&done));
+        assert_eq!(stdout(&done), "", "{args:?}");
+    }
+    let bare = molmesh().output().unwrap();
+    assert_eq!(bare.status.code(), Some(2));
+    assert!(stderr(&bare).contains("Usage: molmesh"));
+}
+
+#[test]
+fn unknown_output_formats_exit_with_2() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    for name in ["out", "out.pdf", "out.glb.gz"] {
+        let done = mesh(&input, &folder.path(name), &[]);
+        assert_code(&done, 2);
+        assert!(stderr(&done).contains("hint: name the format with --format"), "{}", stderr(&done));
+    }
+    assert_code(&mesh(&input, &folder.path("out.glb"), &["--format", "pdf"]), 2);
+    let packed = mesh(&input, &folder.path("out.ply"), &["--compress", "quantize"]);
+    assert_code(&packed, 2);
+    assert!(stderr(&packed).contains("`quantize` with ply"), "{}", stderr(&packed));
+    assert_eq!(folder.entries(), ["in.pdb"]);
+}
+
+#[test]
+fn unreadable_inputs_exit_with_3() {
+    let folder = Folder::new();
+    let done = mesh(&folder.path("nowhere.pdb"), &folder.path("out.glb"), &[]);
+    assert_code(&done, 3);
+    assert!(stderr(&done).contains("nowhere.pdb: no such file or directory"), "{}", stderr(&done));
+    fs::create_dir(folder.path("folder")).unwrap();
+    assert_code(&mesh(&folder.path("folder"), &folder.path("out.glb"), &[]), 3);
+    assert_eq!(folder.entries(), ["folder"]);
+}
+
+#[test]
+fn invalid_structures_exit_with_4() {
+    for bytes in [&b""[..], b"\n\n", b"hello", b"\x00\x01\x02\xff", b"END\n", b"HEADER    X\nREMARK   1\nEND\n"] {
+        fails(bytes, &[], 4);
+    }
+    fails(rod().replace("   0.250", "     nan"), &[], 4);
+    fails(pdb(&[[0.0; 3]]).replace("   0.000   0.000", " 9999999   0.000"), &[], 4);
+    let message = fails(rod(), &["--chains", "Z"], 4);
+    assert!(message.contains('Z') && message.contains('A'), "{message}");
+    let message = fails(rod(), &["--model", "7"], 4);
+    assert!(message.contains("model 7"), "{message}");
+    let message = fails(rod(), &["--select", "water"], 4);
+    assert!(message.contains("polymer"), "the error lists the content of the file: {message}");
+    assert_code(&piped(&["mesh", "-", "-o", "-"], b"nothing"), 4);
+}
+
+#[test]
+fn exceeded_limits_exit_with_5_and_are_named() {
+    let message = fails(rod(), &["--max-atoms", "9"], 5);
+    assert!(message.contains('9') && message.contains("hint: raise it with --max-atoms"), "{message}");
+    let message = fails(rod(), &["--max-samples", "100"], 5);
+    assert!(message.contains("limit is 100") && message.contains("hint: try --resolution "), "{message}");
+    let message = fails(rod(), &["--max-mesh-bytes", "1000"], 5);
+    assert!(message.contains("limit is 1000") && message.contains("hint: try --resolution "), "{message}");
+    let message = fails(rod(), &["--max-input-bytes", "100"], 5);
+    assert!(message.contains("100 bytes"), "{message}");
+    assert_code(&piped(&["mesh", "-", "-o", "-", "--max-input-bytes", "100"], rod().as_bytes()), 5);
+}
+
+#[test]
+fn suggested_resolution_is_accepted() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let limit = ["--max-samples", "50000"];
+    let done = mesh(&input, &folder.path("out.glb"), &[limit[0], limit[1], "--resolution", "0.1"]);
+    assert_code(&done, 5);
+    let message = stderr(&done);
+    let suggested = message.split("--resolution ").nth(1).unwrap().split(',').next().unwrap();
+    assert_code(&mesh(&input, &folder.path("out.glb"), &[limit[0], limit[1], "--resolution", suggested]), 0);
+}
+
+#[test]
+fn missing_backends_exit_with_6() {
+    let message = fails(rod(), &["--backend", "gpu", "--devices", "77"], 6);
+    assert!(message.contains("no backend `gpu`") && message.contains("GPU"), "{message}");
+}
+
+#[test]
+fn unwritable_outputs_exit_with_7() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let done = mesh(&input, &folder.path("no/such/folder/out.glb"), &[]);
+    assert_code(&done, 7);
+    assert!(stderr(&done).contains("hint: the directory must exist"), "{}", stderr(&done));
+    fs::create_dir(folder.path("out.glb")).unwrap();
+    assert_code(&mesh(&input, &folder.path("out.glb"), &[]), 7);
+    assert_eq!(folder.entries(), ["in.pdb", "out.glb"]);
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn full_disk_exits_with_7() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let done = mesh(&input, Path::new("/dev/full"), &["--format", "glb"]);
+    assert_code(&done, 7);
+    assert!(stderr(&done).contains("no space left"), "{}", stderr(&done));
+}
+
+#[cfg(unix)]
+#[test]
+fn closed_pipe_exits_with_7() {
+    use std::process::Stdio;
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", rod());
+    let mut child = molmesh();
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let child = child.arg("mesh").arg(input).args(["-o", "-", "--resolution", "0.1"]).stdout(writer);
+    assert_code(&child.stderr(Stdio::piped()).spawn().unwrap().wait_with_output().unwrap(), 7);
+}
+
+#[test]
+fn failure_keeps_the_old_file() {
+    let folder = Folder::new();
+    let input = folder.file("in.pdb", "no structure");
+    let output = folder.file("out.glb", "old");
+    assert_code(&mesh(&input, &output, &[]), 4);
+    assert_eq!(fs::read(&output).unwrap(), b"old");
+    assert_eq!(folder.entries(), ["in.pdb", "out.glb"]);
+}
+
+#[test]
+fn unreachable_service_exits_with_1() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("http://{}/readyz", listener.local_addr().unwrap());
+    drop(listener);
+    assert_code(&run(["healthcheck", "--url", &url, "--timeout", "1"]), 1);
+    assert_code(&run(["healthcheck", "--url", "ftp://x"]), 2);
+    assert_code(&run(["healthcheck", "--timeout=-1"]), 2);
+}

@@ -1,0 +1,185 @@
+//! `molmesh serve` as a process: banner, addresses, log, memory, stop.
+#![cfg(unix)]
+
+use crate::cli_support;
+
+use std::process::Command;
+#[cfg(target_os = "linux")]
+use std::time::{Duration, Instant};
+
+use cli_support::{Folder, Service, assert_code, run, stderr};
+
+#[test]
+fn example_command_of_the_banner_works() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--devices", "cpu"]);
+    assert!(service.banner.lines().count() <= 10 && !service.banner.contains('\x1b'), "{}", service.banner);
+    for part in ["viewer", "/docs", "metrics", "device", "cpu: ", "not gpu: "] {
+        assert!(service.banner.contains(part), "no `{part}` in\n{}", service.banner);
+    }
+    let line = service.banner.lines().last().unwrap().trim().strip_prefix("try").unwrap().trim();
+    let elsewhere = Folder::new();
+    let pasted = Command::new("sh").args(["-c", line]).current_dir(elsewhere.path("")).output().unwrap();
+    assert!(pasted.status.success(), "{line}: {}", String::from_utf8_lossy(&pasted.stderr));
+    let mesh = std::fs::read(elsewhere.path("4pti.glb")).unwrap();
+    assert!(mesh.starts_with(b"glTF") && mesh.len() > 100_000, "{line}: {}", String::from_utf8_lossy(&mesh));
+}
+
+#[test]
+fn stops_on_signals_without_warnings() {
+    for signal in ["TERM", "INT"] {
+        let folder = Folder::new();
+        let (code, log) = Service::start(&folder, &["--log", "json"]).stop(signal);
+        assert_eq!(code, Some(0), "{log}");
+        for line in log.lines() {
+            let value: serde_json::Value = serde_json::from_str(line).unwrap_or_else(|e| panic!("{e}: {line}"));
+            assert!(!["WARN", "ERROR"].contains(&value["level"].as_str().unwrap()), "{line}");
+        }
+    }
+}
+
+#[test]
+fn log_lines_name_their_request_and_job() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--log", "json", "--set", "log.filter=info"]);
+    let pdb = folder.file("rod.pdb", cli_support::rod());
+    let trace = "0af7651916cd43dd8448eb211c80319c";
+    let ask = |id: &str, more: &[&str]| {
+        let answer = Command::new("curl")
+            .args(["-sS", "-H", &format!("X-Request-Id: {id}")])
+            .args(["-H", &format!("traceparent: 00-{trace}-b7ad6b7169203331-01")])
+            .args(more)
+            .output();
+        serde_json::from_slice::<serde_json::Value>(&answer.unwrap().stdout).unwrap()
+    };
+    let job = ask(
+        "submits",
+        &[
+            "-H",
+            "Prefer: respond-async",
+            "--data-binary",
+            &format!("@{}", pdb.display()),
+            &format!("http://{}/v1/meshes", service.addr),
+        ],
+    );
+    let job = job["jobID"].as_str().unwrap().to_owned();
+    let done = ask("polls", &[&format!("http://{}/v1/jobs/{job}?wait=30", service.addr)]);
+    assert_eq!(done["status"], "successful", "{done}");
+    let (code, log) = service.stop("TERM");
+    assert_eq!(code, Some(0), "{log}");
+
+    let lines: Vec<serde_json::Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let of = |key: &str, value: &str| -> Vec<_> { lines.iter().filter(|l| l["span"][key] == value).collect() };
+    for id in ["submits", "polls"] {
+        let answered: Vec<_> = of("request_id", id).into_iter().filter(|l| l["message"] == "answered").collect();
+        assert_eq!(answered.len(), 1, "one line per request\n{log}");
+        assert_eq!(answered[0]["span"]["trace_id"], trace, "{log}");
+        assert!(answered[0]["ms"].is_number() && answered[0]["status"].is_u64(), "{}", answered[0]);
+    }
+    // The lines of the job name the request that submitted it, not the one that polled it.
+    let of_job = of("job_id", &job);
+    assert!(!of_job.is_empty(), "no line of the job\n{log}");
+    for line in of_job {
+        assert_eq!((&line["span"]["request_id"], &line["span"]["trace_id"]), (&"submits".into(), &trace.into()));
+    }
+}
+
+#[test]
+fn flags_reach_the_service() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--set", "limits.atoms=5", "--backend", "reference"]);
+    assert!(service.banner.contains("reference: "), "{}", service.banner);
+    let pdb = folder.file("rod.pdb", cli_support::rod());
+    let url = format!("http://{}/v1/meshes", service.addr);
+    let answer =
+        Command::new("curl").args(["-sS", "--data-binary"]).arg(format!("@{}", pdb.display())).arg(url).output();
+    let problem: serde_json::Value = serde_json::from_slice(&answer.unwrap().stdout).unwrap();
+    assert_eq!(problem["limit"], 5, "{problem}");
+}
+
+#[test]
+fn second_service_on_a_data_folder_is_refused() {
+    let folder = Folder::new();
+    let first = Service::start(&folder, &[]);
+    let data = folder.path("data");
+    let before = std::fs::read(data.join("lock")).unwrap();
+    let serve = ["serve", "--listen", "127.0.0.1:0", "--metrics-listen", "127.0.0.1:0", "--data-dir"];
+    let refused = run(serve.iter().copied().chain([data.to_str().unwrap()]));
+    assert_code(&refused, 8);
+    let message = stderr(&refused);
+    for part in [data.to_str().unwrap(), "server.data_dir", &format!("pid {}", first.pid()), &first.addr, "--data-dir"]
+    {
+        assert!(message.contains(part), "no `{part}` in {message}");
+    }
+    assert_eq!(std::fs::read(data.join("lock")).unwrap(), before, "the second service changes nothing");
+    let doctor = run(["doctor", "--report", "json", "--listen", "127.0.0.1:0", "--data-dir", data.to_str().unwrap()]);
+    assert!(cli_support::stdout(&doctor).contains(&format!("pid {}", first.pid())), "{}", stderr(&doctor));
+    // Another folder is allowed.
+    drop(Service::start(&Folder::new(), &[]));
+    // The lock ends with the process, even if it is killed.
+    assert_eq!(first.stop("KILL").0, None);
+    let third = Service::start(&folder, &[]);
+    assert_eq!(third.stop("TERM").0, Some(0));
+    assert_eq!(Service::start(&folder, &[]).stop("TERM").0, Some(0));
+}
+
+#[test]
+fn failed_starts_exit_with_a_reason() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &[]);
+    let in_use = run(["serve", "--listen", &service.addr, "--set", "server.metrics_listen=none"]);
+    assert_code(&in_use, 1);
+    assert!(stderr(&in_use).contains(&service.addr), "{}", stderr(&in_use));
+    for set in ["limits.atomz=5", "atoms", "limits.atoms=many", "limits.atoms=0"] {
+        let refused = run(["serve", "--listen", "127.0.0.1:0", "--set", set]);
+        assert_code(&refused, 2);
+    }
+    assert_code(&run(["serve", "--listen", "127.0.0.1:0", "--backend", "gpu", "--devices", "77"]), 6);
+    assert_code(&run(["serve", "--config", "/no/such/file.toml"]), 2);
+}
+
+/// Runs `curl` and parses its JSON output.
+#[cfg(target_os = "linux")]
+fn curl(args: &[&str]) -> serde_json::Value {
+    let answer = Command::new("curl").arg("-sS").args(args).output().unwrap();
+    serde_json::from_slice(&answer.stdout).unwrap_or_else(|e| panic!("{e}: {}", stderr(&answer)))
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn identical_atoms_are_rejected_before_allocation() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 300_000]));
+    let body = format!("@{}", input.display());
+    let url = format!("http://{}/v1/meshes?radius_scale=10", service.addr);
+    let problem = curl(&["--data-binary", &body, &url]);
+    assert_eq!(problem["type"], "/problems/too-many-candidates", "{problem}");
+    assert!(problem["actual"].as_u64() > problem["limit"].as_u64(), "{problem}");
+    assert!(service.memory("VmHWM") < 300, "{} MiB", service.memory("VmHWM"));
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn cancelled_job_returns_its_memory() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--devices", "cpu"]);
+    let before = service.memory("VmRSS");
+    // Most candidate lists are long enough to be freed when their tile is finished.
+    let input = folder.file("same.pdb", cli_support::pdb(&vec![[0.0; 3]; 80_000]));
+    let body = format!("@{}", input.display());
+    let url = format!("http://{}/v1/meshes?radius_scale=10", service.addr);
+    let job = curl(&["-H", "Prefer: respond-async", "--data-binary", &body, &url]);
+    let job = format!("http://{}/v1/jobs/{}", service.addr, job["jobID"].as_str().unwrap());
+    let wait = |what: &str, limit: Duration, done: &dyn Fn() -> bool| {
+        let end = Instant::now() + limit;
+        while !done() {
+            assert!(Instant::now() < end, "{what}: {} MiB, {before} before", service.memory("VmRSS"));
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    };
+    wait("the job allocates memory", Duration::from_mins(1), &|| service.memory("VmRSS") > before + 60);
+    assert_eq!(curl(&["-X", "DELETE", &job])["status"], "dismissed");
+    // 10 s on an idle machine.
+    wait("the memory is returned", Duration::from_secs(20), &|| service.memory("VmRSS") < before + 35);
+}

@@ -1,0 +1,885 @@
+//! Checks of the repository's structure and language: references between layers, the map in `ARCHITECTURE.md`, the
+//! index of decision records, file lengths, the parts of each stage, unfinished work, and the form of comments and
+//! prose. Every checker has a negative control with bad input that it must report.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::iter::Peekable;
+use std::path::{Path, PathBuf};
+use std::str::Chars;
+
+/// A text file: its path relative to the repository root, separated by `/`, and its text.
+struct Source {
+    path: String,
+    text: String,
+}
+
+/// A layer of the library and the references that it may contain.
+struct Layer {
+    name: &'static str,
+    /// Layers that it may reference, with the permitted items.
+    layers: &'static [(&'static str, Items)],
+    /// External crates that it must not reference.
+    crates: &'static [&'static str],
+}
+
+enum Items {
+    Any,
+    Only(&'static [&'static str]),
+}
+use Items::{Any, Only};
+
+/// Crates that no layer below the service may reference.
+const SERVICE: &[&str] =
+    &["tokio", "axum", "tower", "tower_http", "hyper", "hyper_util", "tracing", "metrics", "toml", "clap", "indicatif"];
+/// Crates that the core may not reference: those of the service, serialisation, file formats and graphics APIs.
+const NOT_CORE: &[&str] = &[
+    "tokio",
+    "axum",
+    "tower",
+    "tower_http",
+    "hyper",
+    "hyper_util",
+    "tracing",
+    "metrics",
+    "toml",
+    "clap",
+    "indicatif",
+    "serde",
+    "serde_json",
+    "pdbtbx",
+    "gltf_json",
+    "wgpu",
+    "flate2",
+    "ruzstd",
+];
+
+/// The layers in order: each may reference only layers that precede it.
+const LAYERS: &[Layer] = &[
+    Layer { name: "surface", layers: &[], crates: NOT_CORE },
+    Layer { name: "picture", layers: &[("surface", Any)], crates: NOT_CORE },
+    Layer { name: "gpu", layers: &[("surface", Any), ("picture", Any)], crates: SERVICE },
+    Layer {
+        name: "structure",
+        layers: &[("surface", Only(&["Spheres", "SurfaceError", "spheres"]))],
+        crates: &["tokio", "axum", "tower", "hyper", "tracing", "wgpu", "gltf_json", "clap"],
+    },
+    Layer {
+        name: "formats",
+        layers: &[("surface", Only(&["Mesh", "MeshPart", "MeshSink", "SinkFailed", "Vertices", "quantize"]))],
+        crates: &["tokio", "axum", "tower", "hyper", "tracing", "wgpu", "pdbtbx", "clap"],
+    },
+    Layer {
+        name: "pipeline",
+        layers: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any)],
+        crates: SERVICE,
+    },
+    Layer {
+        name: "config",
+        layers: &[("surface", Any), ("structure", Any), ("formats", Any), ("picture", Any), ("pipeline", Any)],
+        crates: &["axum", "tower", "tower_http", "hyper", "wgpu", "clap"],
+    },
+    Layer { name: "tls", layers: &[], crates: SERVICE },
+    Layer {
+        name: "telemetry",
+        layers: &[("config", Any), ("tls", Any)],
+        crates: &["axum", "tower", "hyper", "wgpu", "clap"],
+    },
+    Layer {
+        name: "access",
+        layers: &[("pipeline", Only(&["nearest"])), ("config", Any)],
+        crates: &[
+            "tokio",
+            "axum",
+            "tower",
+            "tower_http",
+            "hyper",
+            "hyper_util",
+            "tracing",
+            "metrics",
+            "wgpu",
+            "clap",
+            "reqwest",
+        ],
+    },
+    Layer {
+        name: "single_flight",
+        layers: &[],
+        crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
+    },
+    Layer {
+        name: "store",
+        layers: &[("config", Any), ("telemetry", Any), ("tls", Any)],
+        crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap", "reqwest"],
+    },
+    Layer {
+        name: "archive",
+        layers: &[
+            ("structure", Any),
+            ("config", Any),
+            ("telemetry", Any),
+            ("single_flight", Any),
+            ("tls", Any),
+            ("store", Any),
+        ],
+        crates: &["axum", "tower", "tower_http", "wgpu", "clap"],
+    },
+    Layer {
+        name: "jobs",
+        layers: &[
+            ("surface", Any),
+            ("structure", Any),
+            ("formats", Any),
+            ("picture", Any),
+            ("pipeline", Any),
+            ("config", Any),
+            ("telemetry", Any),
+            ("single_flight", Any),
+            ("store", Any),
+        ],
+        crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap"],
+    },
+    Layer {
+        name: "http",
+        layers: &[
+            ("surface", Any),
+            ("structure", Any),
+            ("formats", Any),
+            ("picture", Any),
+            ("pipeline", Any),
+            ("config", Any),
+            ("telemetry", Any),
+            ("single_flight", Any),
+            ("store", Any),
+            ("archive", Any),
+            ("jobs", Any),
+            ("access", Any),
+        ],
+        crates: &["wgpu", "clap", "rayon"],
+    },
+];
+
+/// The crate root and the binary, which may reference every layer.
+const ABOVE: &[&str] = &["lib", "main", "cli"];
+
+/// Limit for the lines of `ARCHITECTURE.md`.
+const MAX_MAP_LINES: usize = 150;
+
+/// Limit for the columns of prose and comments.
+const MAX_COLUMNS: usize = 120;
+/// Folders and files with code.
+const CODE: &[&str] = &["build.rs", "src", "shaders", "tests", "bench", "benches", "examples"];
+/// Documentation comments that still begin with a question word. The aim is 0.
+const MAX_QUESTION_DOCS: usize = 990;
+/// Comment lines in Rust that are still too long. The aim is 0.
+const MAX_LONG_COMMENTS: usize = 298;
+/// Lines of Markdown prose that are still too long. The aim is 0.
+const MAX_LONG_PROSE: usize = 441;
+
+const STAGES: &[&str] = &["bin", "field", "classify", "scan", "interpolate", "emit"];
+/// Limit for the lines of a source file, without its tests.
+const MAX_LINES: usize = 400;
+/// Data tables, which may exceed [`MAX_LINES`].
+const TABLES: &[&str] = &["src/surface/cases.rs", "src/structure/radii.rs", "src/structure/residues.rs"];
+
+// ---------------------------------------------------------------------------------------------- reading sources
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Collects the files below `path` (or `path` itself) with one of the `extensions`. Skips build output and packages.
+fn walk(path: &Path, extensions: &[&str], found: &mut Vec<PathBuf>) {
+    const SKIPPED: [&str; 3] = ["target", "node_modules", "dist"];
+    let Ok(entries) = fs::read_dir(path) else {
+        let matches = path.extension().is_some_and(|e| extensions.iter().any(|wanted| e == *wanted));
+        found.extend((matches && path.is_file()).then(|| path.to_owned()));
+        return;
+    };
+    for entry in entries.map(|e| e.expect("a folder can be listed")) {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if !name.starts_with('.') && !SKIPPED.contains(&name.as_str()) {
+            walk(&entry.path(), extensions, found);
+        }
+    }
+}
+
+/// Reads the files below `places` (folders or files below the root) with one of the `extensions`, sorted by path.
+fn files(places: &[&str], extensions: &[&str]) -> Vec<Source> {
+    let mut found = Vec::new();
+    for place in places {
+        walk(&root().join(place), extensions, &mut found);
+    }
+    found.sort();
+    let relative = |p: &Path| p.strip_prefix(root()).expect("below the root").to_string_lossy().replace('\\', "/");
+    found
+        .iter()
+        .map(|p| Source { path: relative(p), text: fs::read_to_string(p).expect("a source is UTF-8") })
+        .collect()
+}
+
+fn sources_under(folder: &str) -> Vec<Source> {
+    files(&[folder], &["rs"])
+}
+
+/// Returns the code without comments and without the content of literals. Line numbers stay the same.
+fn code(text: &str) -> String {
+    let mut out = String::with_capacity(text.len());
+    let mut chars = text.chars().peekable();
+    while let Some(c) = chars.next() {
+        match c {
+            '/' if chars.peek() == Some(&'/') => while chars.next_if(|&c| c != '\n').is_some() {},
+            '/' if chars.peek() == Some(&'*') => {
+                let mut last = ' ';
+                for c in chars.by_ref() {
+                    out.extend((c == '\n').then_some('\n'));
+                    if last == '*' && c == '/' {
+                        break;
+                    }
+                    last = c;
+                }
+            }
+            '"' => {
+                // A raw string ends at a quote with as many hashes, a plain one at the first unescaped quote.
+                let hashes = out.chars().rev().take_while(|&c| c == '#').count();
+                let raw = out.trim_end_matches('#').ends_with('r');
+                out.push('"');
+                skip_string(&mut chars, &mut out, raw.then_some(hashes));
+                out.push('"');
+            }
+            '\'' => skip_character(&mut chars),
+            c => out.push(c),
+        }
+    }
+    out
+}
+
+fn skip_string(chars: &mut Peekable<Chars<'_>>, out: &mut String, raw: Option<usize>) {
+    while let Some(c) = chars.next() {
+        match (c, raw) {
+            ('\n', _) => out.push('\n'),
+            ('\\', None) => out.extend(chars.next().filter(|&c| c == '\n')),
+            ('"', None) => return,
+            ('"', Some(hashes)) => {
+                let mut ahead = chars.clone();
+                if (0..hashes).all(|_| ahead.next() == Some('#')) {
+                    return;
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Called after a single quote: skips a character literal, keeps a lifetime.
+fn skip_character(chars: &mut Peekable<Chars<'_>>) {
+    let mut ahead = chars.clone();
+    let (first, second) = (ahead.next(), ahead.next());
+    if first == Some('\\') {
+        chars.nth(1);
+        chars.by_ref().find(|&c| c == '\'');
+    } else if second == Some('\'') {
+        chars.nth(1);
+    }
+}
+
+/// Returns the layer of a source: `src/http/x.rs` and `src/http.rs` belong to `http`.
+fn layer_of(path: &str) -> &str {
+    let rest = path.strip_prefix("src/").unwrap_or(path);
+    rest.split('/').next().unwrap_or(rest).trim_end_matches(".rs")
+}
+
+/// Returns the depth of the file's module: 1 for `src/http.rs` and `src/http/mod.rs`, 2 for `src/http/x.rs`.
+fn depth_of(path: &str) -> usize {
+    let rest = path.trim_start_matches("src/").trim_end_matches(".rs").trim_end_matches("/mod");
+    rest.split('/').count()
+}
+
+fn is_ident(c: char) -> bool {
+    c.is_alphanumeric() || c == '_'
+}
+
+/// Returns `(layer, item)` for each reference `crate::layer::item`, including use trees and paths through `super`. The
+/// item is empty for a reference to the layer itself.
+fn references(source: &Source) -> BTreeSet<(String, String)> {
+    const SUPER: &str = "super::";
+    let code = code(&source.text);
+    let starts_a_path = |at: usize| !code[..at].chars().next_back().is_some_and(|c| is_ident(c) || c == ':');
+    let mut found = BTreeSet::new();
+    for (at, start) in code.match_indices("crate::").filter(|(at, _)| starts_a_path(*at)) {
+        found.extend(paths(&code[at + start.len()..]));
+    }
+    let tests_from = tests_start(&source.text);
+    for (at, _) in code.match_indices(SUPER).filter(|(at, _)| starts_a_path(*at)) {
+        let rest = code[at..].trim_start_matches(SUPER);
+        let n_supers = (code.len() - at - rest.len()) / SUPER.len();
+        // Inside the test module every path is one level deeper.
+        let in_tests = tests_from.is_some_and(|from| code[..at].matches('\n').count() >= from);
+        if n_supers >= depth_of(&source.path) + usize::from(in_tests) {
+            found.extend(paths(rest));
+        }
+    }
+    found
+}
+
+fn segment(text: &str) -> String {
+    text.chars().take_while(|&c| is_ident(c)).collect()
+}
+
+/// Returns the first two segments of every path in a use tree, or of a plain path.
+fn paths(text: &str) -> Vec<(String, String)> {
+    match text.strip_prefix('{') {
+        Some(tree) => top_level(tree).iter().flat_map(|part| layer_and_items(part)).collect(),
+        None => layer_and_items(text),
+    }
+}
+
+fn layer_and_items(text: &str) -> Vec<(String, String)> {
+    let layer = segment(text);
+    let items = match text[layer.len()..].strip_prefix("::") {
+        None => vec![String::new()],
+        Some(rest) => match rest.strip_prefix('{') {
+            Some(tree) => top_level(tree).iter().map(|part| segment(part)).collect(),
+            None => vec![segment(rest)],
+        },
+    };
+    items.into_iter().map(|item| (layer.clone(), item)).collect()
+}
+
+/// Splits the inside of a brace group, given without its opening brace, at its top-level commas.
+fn top_level(tree: &str) -> Vec<String> {
+    let (mut depth, mut parts) = (0_u32, vec![String::new()]);
+    for c in tree.chars() {
+        match c {
+            '{' => depth += 1,
+            '}' if depth == 0 => break,
+            '}' => depth -= 1,
+            ',' if depth == 0 => {
+                parts.push(String::new());
+                continue;
+            }
+            _ => {}
+        }
+        parts.last_mut().expect("there is one").push(c);
+    }
+    parts.into_iter().map(|p| p.trim().to_owned()).filter(|p| !p.is_empty()).collect()
+}
+
+/// Returns the line (from 0) at which the test module begins. The test module is the last item of a file.
+fn tests_start(text: &str) -> Option<usize> {
+    let lines: Vec<&str> = text.lines().collect();
+    (0..lines.len()).find(|&i| {
+        lines[i].trim() == "#[cfg(test)]"
+            && lines[i + 1..].iter().find(|l| !l.trim_start().starts_with("#[")).is_some_and(|l| l.starts_with("mod "))
+    })
+}
+
+// --------------------------------------------------------------------------------------------------- the checkers
+
+/// Returns forbidden references to layers and crates, and sources that belong to no layer.
+fn forbidden_references(sources: &[Source]) -> Vec<String> {
+    let mut wrong = Vec::new();
+    for source in sources.iter().filter(|s| !ABOVE.contains(&layer_of(&s.path))) {
+        let (path, layer) = (&source.path, layer_of(&source.path));
+        let Some(rules) = LAYERS.iter().find(|l| l.name == layer) else {
+            wrong.push(format!("{path}: there is no layer `{layer}`"));
+            continue;
+        };
+        for (other, item) in references(source) {
+            let allowed = |(name, items): &(&str, Items)| {
+                *name == other
+                    && match items {
+                        Any => true,
+                        Only(items) => items.contains(&item.as_str()),
+                    }
+            };
+            if other != layer && !rules.layers.iter().any(allowed) {
+                wrong.push(format!("{path}: `{layer}` must not reference crate::{other}::{item}"));
+            }
+        }
+        let code = code(&source.text);
+        for krate in rules.crates {
+            let start = format!("{krate}::");
+            let begins = |at: usize| !code[..at].chars().next_back().is_some_and(|c| is_ident(c) || c == ':');
+            if code.match_indices(&start).any(|(at, _)| begins(at)) {
+                wrong.push(format!("{path}: `{layer}` must not reference the crate {krate}"));
+            }
+        }
+    }
+    wrong
+}
+
+type Edges = BTreeMap<String, BTreeSet<String>>;
+
+/// Returns a reference cycle between layers, if there is one.
+fn cycle(sources: &[Source]) -> Option<Vec<String>> {
+    fn visit(at: &str, edges: &Edges, trail: &mut Vec<String>, done: &mut BTreeSet<String>) -> bool {
+        if done.contains(at) {
+            return false;
+        }
+        let seen = trail.iter().any(|t| t == at);
+        trail.push(at.to_owned());
+        if seen || edges.get(at).is_some_and(|next| next.iter().any(|n| visit(n, edges, trail, done))) {
+            return true;
+        }
+        trail.pop();
+        done.insert(at.to_owned());
+        false
+    }
+    let mut edges = Edges::new();
+    for source in sources {
+        let layer = layer_of(&source.path);
+        if !ABOVE.contains(&layer) {
+            let others = references(source).into_iter().map(|(other, _)| other).filter(|other| other != layer);
+            edges.entry(layer.to_owned()).or_default().extend(others);
+        }
+    }
+    let mut done = BTreeSet::new();
+    edges.keys().find_map(|layer| {
+        let mut trail = Vec::new();
+        visit(layer, &edges, &mut trail, &mut done).then_some(trail)
+    })
+}
+
+/// Returns the modules of a layer without their tests, as if the layer were the root of the crate. [`cycle`] then finds
+/// cycles between modules.
+fn modules_of(sources: &[Source], layer: &str) -> Vec<Source> {
+    let (folder, path) = (format!("src/{layer}/"), format!("crate::{layer}::"));
+    let modules = sources.iter().filter(|s| s.path.starts_with(&folder) && s.path != format!("{folder}mod.rs"));
+    modules
+        .map(|s| {
+            let lines = s.text.lines().take(tests_start(&s.text).unwrap_or(usize::MAX));
+            // References to other layers must not count as references to modules of the same name.
+            let text = lines.collect::<Vec<_>>().join("\n").replace(&path, "super::super::super::");
+            let text = text.replace("crate::", "outside::").replace("super::super::super::", "crate::");
+            Source { path: s.path.replacen(&folder, "src/", 1), text }
+        })
+        .collect()
+}
+
+fn too_long(sources: &[Source]) -> Vec<String> {
+    let length = |s: &Source| tests_start(&s.text).unwrap_or_else(|| s.text.lines().count());
+    sources
+        .iter()
+        .filter(|s| !TABLES.contains(&s.path.as_str()) && length(s) > MAX_LINES)
+        .map(|s| format!("{}: {} lines without its tests, {MAX_LINES} are allowed", s.path, length(s)))
+        .collect()
+}
+
+fn without_doc(sources: &[Source]) -> Vec<String> {
+    let bare = |s: &&Source| !s.text.starts_with("//!") && !s.text.starts_with("#!");
+    sources.iter().filter(bare).map(|s| format!("{}: has no module documentation", s.path)).collect()
+}
+
+/// Returns the missing parts of stages. A part is required once its folder or file exists.
+fn missing_parts(files: &[String], stage_tests: Option<&str>) -> Vec<String> {
+    let has = |path: &str| files.iter().any(|f| f == path);
+    let any = |prefix: &str, suffix: &str| files.iter().any(|f| f.starts_with(prefix) && f.ends_with(suffix));
+    let mut missing = Vec::new();
+    for stage in STAGES {
+        if any("src/surface/cpu/", ".rs") && !has(&format!("src/surface/cpu/{stage}.rs")) {
+            missing.push(format!("src/surface/cpu/{stage}.rs"));
+        }
+        if any("shaders/", ".wgsl") && !has(&format!("shaders/{stage}.wgsl")) {
+            missing.push(format!("shaders/{stage}.wgsl"));
+        }
+        if stage_tests.is_some_and(|text| !text.contains(&format!("fn {stage}_"))) {
+            missing.push(format!("tests/gpu/stages.rs::{stage}_*"));
+        }
+    }
+    missing
+}
+
+/// Returns marks of unfinished work and lint switches without a reason.
+fn unfinished(sources: &[Source]) -> Vec<String> {
+    const MARKS: [&str; 6] = ["todo!", "unimplemented!", "dbg!", "#[ignore", "#[allow(", "#![allow("];
+    let mut found = Vec::new();
+    for source in sources {
+        let code = code(&source.text);
+        for mark in MARKS {
+            for (at, _) in code.match_indices(mark) {
+                // A switch with a reason is permitted.
+                let attribute = code[at..].split(']').next().unwrap_or_default();
+                if !(mark.contains("allow") && attribute.contains("reason =")) {
+                    found.push(format!("{}:{}: {mark}", source.path, code[..at].matches('\n').count() + 1));
+                }
+            }
+        }
+    }
+    found
+}
+
+/// Returns the folders of `src` that `map` does not show, and the length of a map that is too long.
+fn map_faults(map: &str, folders: &[String]) -> Vec<String> {
+    let mut faults: Vec<String> = folders
+        .iter()
+        .filter(|folder| !map.contains(&format!("src/{folder}/")))
+        .map(|folder| format!("ARCHITECTURE.md: src/{folder}/ is missing"))
+        .collect();
+    let n_lines = map.lines().count();
+    faults.extend((n_lines > MAX_MAP_LINES).then(|| format!("ARCHITECTURE.md: {n_lines} lines of {MAX_MAP_LINES}")));
+    faults
+}
+
+/// Returns the decision records (file names) that `index` does not link, and numbers that are missing or used twice.
+fn record_faults(index: &str, records: &[String]) -> Vec<String> {
+    let unlisted = records.iter().filter(|name| !index.contains(&format!("({name})")));
+    let mut faults: Vec<String> = unlisted.map(|name| format!("docs/adr/README.md: {name} is missing")).collect();
+    let misnumbered = records.iter().zip(1..).filter(|(name, number)| !name.starts_with(&format!("{number:04}-")));
+    faults.extend(misnumbered.map(|(name, number)| format!("docs/adr/{name}: expected the number {number:04}")));
+    faults
+}
+
+/// Returns the marker of a documentation comment and its text. WGSL has no such comments: every comment counts there.
+fn doc_line<'a>(path: &str, line: &'a str) -> Option<(&'static str, &'a str)> {
+    let line = line.trim_start();
+    let markers: &[&str] = if path.ends_with(".wgsl") { &["//"] } else { &["//!", "///"] };
+    let (marker, text) = markers.iter().find_map(|marker| Some((*marker, line.strip_prefix(marker)?)))?;
+    (!text.starts_with('/')).then_some((marker, text))
+}
+
+/// Returns documentation comments that begin with a question word instead of a verb or a noun phrase.
+fn question_docs(sources: &[Source]) -> Vec<String> {
+    const WORDS: [&str; 9] = ["What", "How", "Whether", "Where", "Who", "Whose", "When", "Which", "Why"];
+    let mut found = Vec::new();
+    for source in sources {
+        let mut previous = None;
+        for (i, line) in source.text.lines().enumerate() {
+            let doc = doc_line(&source.path, line);
+            if let Some((marker, text)) = doc
+                && previous != Some(marker)
+            {
+                let word: String =
+                    text.chars().skip_while(|c| !c.is_alphanumeric()).take_while(|c| c.is_alphabetic()).collect();
+                if WORDS.contains(&word.as_str()) {
+                    found.push(format!("{}:{}: begins with `{word}`", source.path, i + 1));
+                }
+            }
+            previous = doc.map(|(marker, _)| marker);
+        }
+    }
+    found
+}
+
+/// Returns true if a line exceeds [`MAX_COLUMNS`] and could be wrapped: a bare link, with or without a label, cannot.
+fn is_overlong(line: &str) -> bool {
+    let text = line.trim_start_matches(|c: char| c.is_whitespace() || "/!#*->".contains(c));
+    let text = text.split_once("]: ").map_or(text, |(label, link)| if label.starts_with('[') { link } else { text });
+    let bare_link = text.contains("://") && !text.trim().contains(' ');
+    line.chars().count() > MAX_COLUMNS && !bare_link
+}
+
+/// Returns comment lines of Rust sources that exceed [`MAX_COLUMNS`].
+fn long_comments(sources: &[Source]) -> Vec<String> {
+    let lines = sources.iter().flat_map(|s| s.text.lines().enumerate().map(move |(i, line)| (s, i, line)));
+    lines
+        .filter(|(_, _, line)| line.trim_start().starts_with("//") && is_overlong(line))
+        .map(|(s, i, line)| format!("{}:{}: {} columns", s.path, i + 1, line.chars().count()))
+        .collect()
+}
+
+/// Returns lines of Markdown prose that exceed [`MAX_COLUMNS`]. Tables and fenced code blocks are exempt.
+fn long_prose(documents: &[Source]) -> Vec<String> {
+    let mut found = Vec::new();
+    for document in documents {
+        let mut fence = None;
+        for (i, line) in document.text.lines().enumerate() {
+            let start = line.trim_start();
+            let marker = ["```", "~~~"].into_iter().find(|marker| start.starts_with(marker));
+            if marker.is_some() && (fence.is_none() || fence == marker) {
+                fence = if fence.is_none() { marker } else { None };
+            } else if fence.is_none() && !start.starts_with('|') && is_overlong(line) {
+                found.push(format!("{}:{}: {} columns", document.path, i + 1, line.chars().count()));
+            }
+        }
+    }
+    found
+}
+
+// ------------------------------------------------------------------------------------------------------ the tests
+
+fn assert_none(found: &[String]) {
+    assert_at_most(0, found);
+}
+
+fn assert_at_most(limit: usize, found: &[String]) {
+    assert!(found.len() <= limit, "{} found, {limit} permitted:\n{}", found.len(), found.join("\n"));
+}
+
+/// Returns the names in a folder for which `wanted` holds, sorted.
+fn names_in(folder: &str, wanted: impl Fn(&Path) -> bool) -> Vec<String> {
+    let entries = fs::read_dir(root().join(folder)).expect("the folder can be listed").flatten();
+    let mut names: Vec<String> = entries
+        .filter(|entry| wanted(&entry.path()))
+        .map(|entry| entry.file_name().to_string_lossy().into_owned())
+        .collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn layers_reference_only_permitted_layers() {
+    let sources = sources_under("src");
+    assert!(sources.len() > 20, "only {} sources found: wrong folder?", sources.len());
+    assert_none(&forbidden_references(&sources));
+}
+
+#[test]
+fn layers_have_no_reference_cycle() {
+    assert_eq!(cycle(&sources_under("src")), None);
+}
+
+#[test]
+fn modules_of_a_layer_have_no_reference_cycle() {
+    for layer in ["gpu", "http"] {
+        assert_eq!(cycle(&modules_of(&sources_under("src"), layer)), None);
+    }
+}
+
+#[test]
+fn layers_are_listed_in_order() {
+    for (i, layer) in LAYERS.iter().enumerate() {
+        for (other, _) in layer.layers {
+            let at = LAYERS.iter().position(|l| l.name == *other).expect("a known layer");
+            assert!(at < i, "{} precedes {other}, which it references", layer.name);
+        }
+    }
+}
+
+#[test]
+fn files_are_short() {
+    assert_none(&too_long(&files(&["src", "bench/src"], &["rs"])));
+}
+
+#[test]
+fn files_have_module_documentation() {
+    assert_none(&without_doc(&files(&["src", "tests", "bench"], &["rs"])));
+}
+
+#[test]
+fn stages_have_all_their_parts() {
+    let mut files: Vec<String> = sources_under("src").into_iter().map(|s| s.path).collect();
+    if let Ok(entries) = fs::read_dir(root().join("shaders")) {
+        files.extend(entries.flatten().map(|e| format!("shaders/{}", e.file_name().to_string_lossy())));
+    }
+    let stage_tests = fs::read_to_string(root().join("tests/gpu/stages.rs")).ok();
+    assert_none(&missing_parts(&files, stage_tests.as_deref()));
+}
+
+#[test]
+fn no_unfinished_work_remains() {
+    assert_none(&unfinished(&files(CODE, &["rs"])));
+}
+
+#[test]
+fn the_map_shows_every_folder() {
+    let folders = names_in("src", Path::is_dir);
+    assert!(folders.len() > 10, "only {} folders found: wrong folder?", folders.len());
+    let map = fs::read_to_string(root().join("ARCHITECTURE.md")).expect("the map is there");
+    assert_none(&map_faults(&map, &folders));
+}
+
+#[test]
+fn the_index_lists_every_decision_record() {
+    let records = names_in("docs/adr", |path| path.file_name().is_some_and(|name| name != "README.md"));
+    assert!(records.len() > 20, "only {} records found: wrong folder?", records.len());
+    let index = fs::read_to_string(root().join("docs/adr/README.md")).expect("the index is there");
+    assert_none(&record_faults(&index, &records));
+}
+
+#[test]
+fn documentation_comments_do_not_begin_with_question_words() {
+    assert_at_most(MAX_QUESTION_DOCS, &question_docs(&files(CODE, &["rs", "wgsl"])));
+}
+
+#[test]
+fn comments_fit_the_line() {
+    assert_at_most(MAX_LONG_COMMENTS, &long_comments(&files(CODE, &["rs"])));
+}
+
+#[test]
+fn prose_fits_the_line() {
+    let documents = files(&["."], &["md"]);
+    assert!(documents.len() > 10, "only {} documents found: wrong folder?", documents.len());
+    assert_at_most(MAX_LONG_PROSE, &long_prose(&documents));
+}
+
+// -------------------------------------------------------------------------------------------- negative controls
+
+fn source(path: &str, text: &str) -> Vec<Source> {
+    vec![Source { path: path.to_owned(), text: text.to_owned() }]
+}
+
+#[test]
+fn control_forbidden_references_are_reported() {
+    let bad = [
+        ("src/surface/grid.rs", "use crate::structure::Structure;"),
+        ("src/surface/grid.rs", "fn f() { crate::pipeline::run() }"),
+        ("src/surface/grid.rs", "use super::super::formats::Format;"),
+        ("src/surface/mod.rs", "use super::formats;"),
+        ("src/surface/grid.rs", "use serde::Serialize;"),
+        ("src/surface/grid.rs", "use std::fmt;\nuse crate::{surface::Mesh, http};"),
+        ("src/surface/grid.rs", "fn f() {}\n\n#[cfg(test)]\nmod tests {\n    use super::super::super::http;\n}"),
+        ("src/structure/read.rs", "use crate::surface::{Spheres, Mesh};"),
+        ("src/formats/glb.rs", "use crate::surface::Backend;"),
+        ("src/formats/glb.rs", "use crate::surface::{\n    Mesh,\n    Measures,\n};"),
+        ("src/jobs/pool.rs", "use crate::gpu::Device;"),
+        ("src/picture/cpu.rs", "use crate::formats::Format;"),
+        ("src/picture/cpu.rs", "fn f(_: wgpu::Device) {}"),
+        ("src/jobs/pool.rs", "use crate::http::problem;"),
+        ("src/jobs/pool.rs", "fn f() -> axum::Router { loop {} }"),
+        ("src/http/router.rs", "let x = r#\"a \"quoted\" b\"#; let x = crate::gpu::unavailable();"),
+        ("src/attic/old.rs", "fn f() {}"),
+    ];
+    for (path, text) in bad {
+        assert_eq!(forbidden_references(&source(path, text)).len(), 1, "{path}: {text}");
+    }
+}
+
+#[test]
+fn control_permitted_references_are_not_reported() {
+    let good = [
+        ("src/surface/grid.rs", "use super::mesh::Mesh; // crate::http\nlet s = \"crate::http::x\";"),
+        ("src/surface/cpu/bin.rs", "use super::super::mesh::Mesh; use crate::surface::Spheres;"),
+        (
+            "src/surface/grid.rs",
+            "/// [`crate::http::Server`] and 'a'\nfn f<'a>(c: char) -> bool { c == '\"' || c == '\\'' }",
+        ),
+        ("src/surface/grid.rs", "/* crate::http */ fn f() { r#\"crate::http\"#; \"a \\\" crate::http\" }"),
+        ("src/surface/grid.rs", "fn f() {}\n\n#[cfg(test)]\nmod tests {\n    use super::super::mesh::Mesh;\n}"),
+        ("src/structure/select.rs", "use crate::surface::{Spheres, SurfaceError};"),
+        ("src/http/router.rs", "use crate::{jobs::Pool, surface::Kernel}; use axum::Router;"),
+    ];
+    for (path, text) in good {
+        assert_eq!(forbidden_references(&source(path, text)), Vec::<String>::new(), "{path}: {text}");
+    }
+}
+
+#[test]
+fn control_a_cycle_is_reported() {
+    let one = |path: &str, text: &str| source(path, text).remove(0);
+    let mut sources = vec![one("src/a/mod.rs", "use crate::b::X;"), one("src/b.rs", "use crate::c::Y;")];
+    assert_eq!(cycle(&sources), None);
+    sources.push(one("src/c/deep/er.rs", "fn f() { crate::a::f() }"));
+    assert_eq!(cycle(&sources), Some(["a", "b", "c", "a"].map(String::from).to_vec()));
+}
+
+#[test]
+fn control_a_cycle_of_modules_is_reported() {
+    let one = |path: &str, text: &str| source(path, text).remove(0);
+    let mut sources = vec![
+        one("src/gpu/mod.rs", "mod a; use a::X;"),
+        one("src/gpu/a.rs", "use super::b::X;\n#[cfg(test)]\nmod tests {\n    use crate::gpu::c::Y;\n}"),
+        one("src/gpu/b/deep.rs", "use super::super::c::Y;"),
+        one("src/gpu/c.rs", "use crate::a::Mesh;"),
+    ];
+    assert_eq!(cycle(&modules_of(&sources, "gpu")), None);
+    sources.push(one("src/gpu/c/other.rs", "use crate::gpu::a::Z;"));
+    assert_eq!(cycle(&modules_of(&sources, "gpu")), Some(["a", "b", "c", "a"].map(String::from).to_vec()));
+}
+
+#[test]
+fn control_a_long_file_is_reported_without_its_tests() {
+    let long = "//! Doc.\n".to_owned() + &"fn f() {}\n".repeat(MAX_LINES);
+    assert_eq!(too_long(&source("src/http/long.rs", &long)).len(), 1);
+    assert_eq!(too_long(&source(TABLES[0], &long)).len(), 0);
+    let tested = "//! Doc.\n#[cfg(test)]\n#[expect(clippy::panic)]\nmod tests {\n".to_owned() + &long;
+    assert_eq!(too_long(&source("src/http/tested.rs", &tested)).len(), 0);
+}
+
+#[test]
+fn control_a_file_without_documentation_is_reported() {
+    assert_eq!(without_doc(&source("src/http/x.rs", "use std::fmt;\n//! late")).len(), 1);
+}
+
+#[test]
+fn control_missing_parts_are_reported() {
+    let whole = |folder: &str, suffix: &str| -> Vec<String> {
+        STAGES.iter().map(|s| format!("{folder}/{s}.{suffix}")).collect()
+    };
+    let mut files = whole("src/surface/cpu", "rs");
+    assert_eq!(missing_parts(&files, None).len(), 0);
+    files.push("shaders/field.wgsl".to_owned());
+    assert_eq!(missing_parts(&files, None).len(), STAGES.len() - 1);
+    files.extend(whole("shaders", "wgsl"));
+    files.retain(|f| f != "src/surface/cpu/scan.rs");
+    assert_eq!(missing_parts(&files, None), ["src/surface/cpu/scan.rs"]);
+    let tests = "fn bin_x() {} fn field_x() {} fn classify_x() {} fn scan_x() {} fn emit_x() {}";
+    assert_eq!(missing_parts(&[], Some(tests)), ["tests/gpu/stages.rs::interpolate_*"]);
+}
+
+#[test]
+fn control_unfinished_work_is_reported() {
+    let bad = ["fn f() { todo!() }", "#[ignore = \"slow\"]\nfn f() {}", "#[allow(dead_code)]\nfn f() {}", "dbg!(1);"];
+    for text in bad {
+        assert_eq!(unfinished(&source("src/x.rs", text)).len(), 1, "{text}");
+        let reasoned = "#![allow(\n    dead_code,\n    reason = \"a (good) one\"\n)]\nfn f() {}";
+        assert_eq!(unfinished(&source("tests/x.rs", reasoned)).len(), 0);
+        let comment = format!("// {}", text.replace('\n', "\n// "));
+        assert_eq!(unfinished(&source("src/x.rs", &comment)).len(), 0, "{text}");
+    }
+}
+
+#[test]
+fn control_an_incomplete_map_is_reported() {
+    let folders = ["surface", "http"].map(String::from);
+    assert_eq!(map_faults("src/surface/ src/http/", &folders).len(), 0);
+    assert_eq!(map_faults("src/surface/", &folders), ["ARCHITECTURE.md: src/http/ is missing"]);
+    let long = "src/surface/ src/http/\n".repeat(MAX_MAP_LINES + 1);
+    assert_eq!(map_faults(&long, &folders).len(), 1);
+}
+
+#[test]
+fn control_an_incomplete_index_is_reported() {
+    let records = ["0001-a.md", "0002-b.md"].map(String::from);
+    assert_eq!(record_faults("[A](0001-a.md) [B](0002-b.md)", &records).len(), 0);
+    assert_eq!(record_faults("[A](0001-a.md)", &records), ["docs/adr/README.md: 0002-b.md is missing"]);
+    let gap = ["0001-a.md", "0003-c.md"].map(String::from);
+    assert_eq!(record_faults("(0001-a.md) (0003-c.md)", &gap), ["docs/adr/0003-c.md: expected the number 0002"]);
+}
+
+#[test]
+fn control_question_words_are_reported() {
+    let bad = [
+        ("src/x.rs", "/// What it is.\nfn f() {}"),
+        ("src/x.rs", "//! **How** it works."),
+        ("src/x.rs", "//! Layers.\n/// Which one.\nfn f() {}"),
+        ("shaders/x.wgsl", "// Where a vertex lies."),
+    ];
+    for (path, text) in bad {
+        assert_eq!(question_docs(&source(path, text)).len(), 1, "{path}: {text}");
+    }
+    let good = [
+        ("src/x.rs", "/// Returns the layer.\n/// Which one depends on the path.\nfn f() {}"),
+        ("src/x.rs", "// What follows is an ordinary comment.\n//// Why not.\nfn f() {}"),
+        ("src/x.rs", "/// Whatever.\nfn f() {}"),
+        ("shaders/x.wgsl", "fn f() {}\n// Density at one grid point.\n// What follows is the second line."),
+    ];
+    for (path, text) in good {
+        assert_eq!(question_docs(&source(path, text)), Vec::<String>::new(), "{path}: {text}");
+    }
+}
+
+#[test]
+fn control_long_lines_are_reported() {
+    let words = "å ".repeat(MAX_COLUMNS / 2);
+    let long = format!("// {words}");
+    assert_eq!(long_comments(&source("src/x.rs", &format!("{long}\n    ///! {words}"))).len(), 2);
+    assert_eq!(long_comments(&source("src/x.rs", &format!("// {}", &words[..MAX_COLUMNS]))).len(), 0);
+    assert_eq!(long_comments(&source("src/x.rs", &format!("let x = \"{words}\";"))).len(), 0);
+    let link = format!("https://example.org/{}", "x".repeat(MAX_COLUMNS));
+    assert_eq!(long_comments(&source("src/x.rs", &format!("/// {link}"))).len(), 0);
+
+    for bad in [format!("- {words}a"), format!("[a]: {link} {words}"), format!("```\n{words}a\n```\n{words}a")] {
+        assert_eq!(long_prose(&source("x.md", &bad)).len(), 1, "{bad}");
+    }
+    let exempt = [
+        format!("| {words} |"),
+        format!("```\n{words}a\n~~~\n{words}a\n```"),
+        format!("- {link}"),
+        format!("[a]: {link}"),
+    ];
+    for good in exempt {
+        assert_eq!(long_prose(&source("x.md", &good)), Vec::<String>::new(), "{good}");
+    }
+}

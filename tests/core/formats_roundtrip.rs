@@ -1,0 +1,450 @@
+//! What is written can be read again by small strict readers, to the bit where the format allows; lengths are
+//! known beforehand; broken meshes are refused before the first byte.
+
+#![expect(clippy::cast_possible_truncation, reason = "meshes are single precision")]
+
+use crate::tools;
+
+use std::io::{self, Cursor, ErrorKind, Seek, SeekFrom, Write};
+
+use molmesh::formats::{self, Encoder, Format, FormatError, GlbSink, GlbSinkError, Meta};
+use molmesh::surface::{Mesh, MeshPart, MeshSink};
+use proptest::prelude::*;
+use serde_json::{Value, json};
+use tools::files::write_parts;
+use tools::readers::{
+    Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_stl, split_glb, split_gltf, u32_at,
+};
+use tools::shapes::{FAR, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres};
+
+fn meta() -> Meta {
+    let Value::Object(extras) = json!({
+        "atoms": 454, "kernel": "gaussian", "resolution": 0.5, "closed": true, "radii": "Bondi; 2.0 Å elsewhere",
+        "component_list": [{"area": 1.5}], "units": "not ours",
+    }) else {
+        unreachable!()
+    };
+    Meta { name: Some("4PTI".into()), extras }
+}
+
+fn encode(format: Format, mesh: &Mesh, meta: &Meta) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    formats::write(format, mesh, meta, &mut bytes).unwrap();
+    bytes
+}
+
+/// Meshes of every kind and around every boundary of the index types.
+fn cases() -> Vec<(&'static str, Mesh)> {
+    let far = |mesh: Mesh| Mesh { centre: FAR, ..mesh };
+    let coloured = Mesh { atom_ids: None, ..dressed(icosphere(2, 3.0, [0.0; 3], false), 0) };
+    let mut glassy = coloured.clone();
+    glassy.colors.as_mut().unwrap()[7][3] = 100;
+    vec![
+        ("empty", far(Mesh::default())),
+        ("empty with columns", dressed(Mesh::default(), 0)),
+        ("one triangle", triangle()),
+        ("icosphere", far(icosphere(3, 10.0, [0.0; 3], false))),
+        ("two spheres", far(two_spheres())),
+        ("sphere with cavity", sphere_with_cavity()),
+        ("255 vertices", torus(15, 17)),
+        ("256 vertices", torus(16, 16)),
+        ("257 vertices, dressed", far(dressed(torus(257, 3), 500))),
+        ("65535 vertices", torus(255, 257)),
+        ("65536 vertices, dressed", far(dressed(torus(256, 256), 65_535))),
+        ("large atom indices", dressed(torus(31, 7), 16_777_216)),
+        ("coloured", coloured),
+        ("translucent", glassy),
+    ]
+}
+
+/// A vertex in the file's own coordinates, rounded once.
+fn absolute(mesh: &Mesh) -> Vec<[f32; 3]> {
+    let add = |p: &[f32; 3]| std::array::from_fn(|k| (mesh.centre[k] + f64::from(p[k])) as f32);
+    mesh.positions.iter().map(add).collect()
+}
+
+fn assert_gltf(name: &str, mesh: &Mesh, json: &Value, bin: &[u8]) {
+    let found = gltf_contents(json, bin);
+    let nothing = mesh.triangles.is_empty();
+    let expected = Contents {
+        translation: mesh.centre,
+        positions: mesh.positions.to_vec(),
+        normals: mesh.normals.to_vec(),
+        triangles: mesh.triangles.to_vec(),
+        atoms: mesh.atom_ids.as_deref().map(<[_]>::to_vec).filter(|_| !nothing),
+        colors: found.colors.clone(),
+    };
+    assert!(found == expected, "{name}");
+    assert_eq!(found.colors.is_some(), mesh.colors.is_some() && !nothing, "{name}");
+    for (linear, srgb) in found.colors.iter().flatten().zip(mesh.colors.iter().flatten()) {
+        assert_eq!((linear[3], linear[0] == 255, linear[1] <= srgb[1]), (srgb[3], srgb[0] == 255, true), "{name}");
+        assert_eq!(linear[2], 55, "{name}: sRGB 128 is 21.6 % of full light");
+    }
+    let asset = &json["asset"];
+    assert_eq!(asset["version"], "2.0");
+    assert_eq!(asset["generator"], concat!("molmesh ", env!("CARGO_PKG_VERSION")));
+    assert_eq!((&asset["extras"]["units"], &asset["extras"]["unit_scale"]), (&json!("angstrom"), &json!(1.0)));
+    assert_eq!((&asset["extras"]["atoms"], &asset["extras"]["kernel"]), (&json!(454), &json!("gaussian")));
+    assert_eq!((&json["nodes"][0]["name"], &json["scene"]), (&json!("4PTI"), &json!(0)));
+    if nothing {
+        return;
+    }
+    assert_eq!(json["meshes"][0]["name"], "4PTI");
+    let position = accessor_of(json, &json["meshes"][0]["primitives"][0]["attributes"]["POSITION"]);
+    for (row, bound) in mesh.bounds().iter().zip(["min", "max"]) {
+        // Through f32, as `serde_json` reads doubles to within one unit of the last place.
+        let stored: Vec<f32> = position[bound].as_array().unwrap().iter().map(|v| v.as_f64().unwrap() as f32).collect();
+        assert_eq!(stored, row, "{name}");
+    }
+    let material = &json["materials"][0];
+    assert_eq!(
+        (&material["doubleSided"], &material["pbrMetallicRoughness"]["metallicFactor"]),
+        (&json!(false), &json!(0.0))
+    );
+    assert_eq!(material["alphaMode"], if name == "translucent" { "BLEND" } else { "OPAQUE" });
+    let index_type = accessor_of(json, &json["meshes"][0]["primitives"][0]["indices"])["componentType"].as_u64();
+    let smallest = match mesh.n_vertices() {
+        ..=255 => 5121,
+        256..=65_535 => 5123,
+        _ => 5125,
+    };
+    assert_eq!(index_type, Some(smallest), "{name}");
+}
+
+#[test]
+fn glb_and_gltf_give_every_column_back() {
+    for (name, mesh) in cases() {
+        let glb = split_glb(&encode(Format::Glb, &mesh, &meta()));
+        assert_gltf(name, &mesh, &glb.json, &glb.bin);
+        let (json, bin) = split_gltf(&encode(Format::Gltf, &mesh, &meta()));
+        assert_gltf(name, &mesh, &json, &bin);
+        assert_eq!(bin, glb.bin[..bin.len()], "{name}: one buffer, two wrappings");
+    }
+}
+
+#[test]
+fn atom_indices_are_16_bit_integers_or_exact_floats() {
+    for (max_atom, component) in [(65_535, 5123), (65_536, 5126), (16_777_216, 5126)] {
+        let glb = split_glb(&encode(Format::Glb, &dressed(torus(9, 5), max_atom), &meta()));
+        let accessor = accessor_of(&glb.json, &glb.json["meshes"][0]["primitives"][0]["attributes"]["_ATOM"]);
+        assert_eq!(accessor["componentType"], component, "{max_atom}");
+    }
+}
+
+#[test]
+fn ply_gives_every_column_back() {
+    for (name, mesh) in cases() {
+        let bytes = encode(Format::Ply, &mesh, &meta());
+        let expected = Contents {
+            translation: [0.0; 3],
+            positions: absolute(&mesh),
+            normals: mesh.normals.to_vec(),
+            triangles: mesh.triangles.to_vec(),
+            atoms: mesh.atom_ids.as_deref().map(<[_]>::to_vec),
+            colors: mesh.colors.as_deref().map(<[_]>::to_vec),
+        };
+        assert!(read_ply(&bytes) == expected, "{name}");
+        let (header, _) = ply_header(&bytes);
+        for fact in ["comment units angstrom", "comment name 4PTI", "comment kernel gaussian", "comment atoms 454"] {
+            assert!(header.iter().any(|line| line == fact), "{name}: {fact} in {header:#?}");
+        }
+    }
+}
+
+#[test]
+fn stl_holds_the_corners_of_every_triangle_and_its_normal() {
+    for (name, mesh) in cases() {
+        let positions = absolute(&mesh);
+        let records = read_stl(&encode(Format::Stl, &mesh, &meta()));
+        assert_eq!(records.len(), mesh.n_triangles(), "{name}");
+        for ([normal, corners @ ..], triangle) in records.iter().zip(&mesh.triangles) {
+            assert_eq!(*corners, triangle.map(|v| positions[v as usize]), "{name}");
+            let length = normal.iter().map(|v| v * v).sum::<f32>().sqrt();
+            assert!((length - 1.0).abs() < 1e-6, "{name}: {normal:?}");
+            // On these shapes every face looks the same way as the vertex normals at its corners.
+            let at = mesh.normals[triangle[0] as usize];
+            assert!((0..3).map(|k| at[k] * normal[k]).sum::<f32>() > 0.2, "{name}");
+        }
+    }
+}
+
+#[test]
+fn obj_gives_coordinates_back_to_its_decimals() {
+    for (name, mesh) in cases() {
+        let found = read_obj(&encode(Format::Obj, &mesh, &meta()));
+        assert_eq!(found.triangles, mesh.triangles, "{name}");
+        let close = |found: &[[f32; 3]], expected: &[[f32; 3]]| {
+            assert_eq!(found.len(), expected.len(), "{name}");
+            for (f, e) in found.as_flattened().iter().zip(expected.as_flattened()) {
+                // Half a unit of the last decimal, and the rounding of 1000.25 to a float when it is read.
+                assert!((f64::from(*f) - f64::from(*e)).abs() < 0.5e-4 + 3.1e-5, "{name}: {f} for {e}");
+            }
+        };
+        close(&found.positions, &absolute(&mesh));
+        close(&found.normals, &mesh.normals);
+    }
+}
+
+#[test]
+fn lengths_are_known_before_a_byte_is_written() {
+    for (name, mesh) in cases() {
+        for format in Format::MESHES {
+            let len = encode(format, &mesh, &meta()).len() as u64;
+            let (exact, bound) = (
+                formats::encoded_len(format, &mesh, &meta()),
+                formats::encoded_len_bound(format, &mesh, &meta()).unwrap(),
+            );
+            if format == Format::Obj {
+                assert_eq!(exact, None);
+                assert!(len <= bound && bound <= len + len / 2, "{name}: {len} bytes, bound {bound}");
+            } else {
+                assert_eq!((exact, bound), (Some(len), len), "{name} as {format}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_glb_written_out_of_order_has_the_same_bytes() {
+    let plain = cases().into_iter().filter(|(_, mesh)| mesh.colors.is_none() && mesh.atom_ids.is_none());
+    let mut large = 0;
+    for (name, mesh) in plain {
+        let in_order = encode(Format::Glb, &mesh, &meta());
+        large += usize::from(in_order.len() > 1 << 20);
+        for n_parts in [1, 3] {
+            let mut file = Cursor::new(vec![0xee; in_order.len()]);
+            let sink = GlbSink::new(&mut file);
+            write_parts(&sink, &mesh, n_parts);
+            let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).unwrap();
+            drop(sink);
+            let placed = file.into_inner();
+            assert_eq!(len, in_order.len() as u64, "{name}");
+            assert!(placed == in_order, "{name} in {n_parts}");
+        }
+    }
+    assert!(large > 0, "a large buffer was among them");
+}
+
+/// A file on a full disk.
+struct Full;
+
+impl Write for Full {
+    fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+        Err(ErrorKind::StorageFull.into())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Seek for Full {
+    fn seek(&mut self, _: SeekFrom) -> io::Result<u64> {
+        Ok(0)
+    }
+}
+
+#[test]
+fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
+    let mesh = torus(255, 257);
+    let mut file = Cursor::new(Vec::new());
+    let sink = GlbSink::new(&mut file);
+    write_parts(&sink, &mesh, 2);
+    let mut long = meta();
+    long.extras.insert("title".to_owned(), json!("x".repeat(20_000)));
+    assert!(sink.finish(&long, mesh.centre, mesh.bounds()).is_err());
+    assert!(matches!(sink.failure(), Some(GlbSinkError::HeadTooLong { bytes: 32_768 })));
+
+    let mut full = Full;
+    let sink = GlbSink::new(&mut full);
+    sink.begin(mesh.n_vertices(), mesh.n_triangles()).unwrap();
+    assert!(sink.part(&MeshPart::whole(&mesh)).is_err());
+    assert!(matches!(sink.failure(), Some(GlbSinkError::Io(e)) if e.kind() == ErrorKind::StorageFull));
+
+    let mut full = Full;
+    let sink = GlbSink::new(&mut full);
+    assert!(sink.begin(90_000_000, 180_000_000).is_err());
+    assert!(matches!(sink.failure(), Some(GlbSinkError::Format(FormatError::GlbTooLarge { .. }))));
+}
+
+#[test]
+fn bytes_do_not_depend_on_the_number_of_threads() {
+    // More vertices and triangles than one task looks at.
+    let mesh = dressed(icosphere(7, 20.0, [0.0; 3], false), 100_000);
+    for format in Format::MESHES {
+        let with = |threads: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| encode(format, &mesh, &meta()))
+        };
+        let once = with(1);
+        assert!(once == with(2) && once == with(7) && once == encode(format, &mesh, &meta()), "{format}");
+    }
+}
+
+/// Counts calls, fails after so many bytes.
+struct Meter {
+    room: usize,
+    calls: Vec<usize>,
+}
+
+impl Write for Meter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if bytes.len() > self.room {
+            return Err(ErrorKind::StorageFull.into());
+        }
+        self.room -= bytes.len();
+        self.calls.push(bytes.len());
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn columns_go_out_whole_and_conversions_in_large_blocks() {
+    let mesh = icosphere(7, 20.0, [0.0; 3], false);
+    for format in Format::MESHES {
+        let mut meter = Meter { room: usize::MAX, calls: Vec::new() };
+        formats::write(format, &mesh, &meta(), &mut meter).unwrap();
+        let (total, largest) = (meter.calls.iter().sum::<usize>(), *meter.calls.iter().max().unwrap());
+        if format == Format::Glb {
+            assert!(
+                meter.calls.contains(&(12 * mesh.n_vertices())) && meter.calls.contains(&(12 * mesh.n_triangles()))
+            );
+        } else {
+            assert!(largest <= 1 << 20, "{format}: {largest} bytes at once");
+            assert!(meter.calls.len() <= 8 + total / (400 << 10), "{format}: {:?}", meter.calls);
+        }
+    }
+}
+
+#[test]
+fn a_full_disk_is_an_error_wherever_it_happens() {
+    let mesh = dressed(torus(20, 20), 900);
+    for format in Format::MESHES {
+        let whole = encode(format, &mesh, &meta()).len();
+        for room in [0, 10, 500, whole / 2, whole - 1] {
+            let mut meter = Meter { room, calls: Vec::new() };
+            let error = formats::write(format, &mesh, &meta(), &mut meter).unwrap_err();
+            assert_eq!(error.kind(), ErrorKind::StorageFull, "{format} with room for {room}");
+        }
+        formats::write(format, &mesh, &meta(), &mut Meter { room: whole, calls: Vec::new() }).unwrap();
+    }
+}
+
+#[test]
+fn broken_meshes_are_refused_before_the_first_byte() {
+    let good = dressed(torus(4, 5), 9);
+    let broken = |change: fn(&mut Mesh)| {
+        let mut mesh = good.clone();
+        change(&mut mesh);
+        mesh
+    };
+    let cases: [(&str, Mesh); 9] = [
+        ("20 positions but 19 normals", broken(|m| m.normals.edit().truncate(19))),
+        ("20 positions but 0 normals", broken(|m| m.normals.edit().clear())),
+        ("20 positions but 21 atom_ids", broken(|m| m.atom_ids.as_mut().unwrap().edit().push(3))),
+        ("20 positions but 1 colors", broken(|m| m.colors = Some(vec![[0; 4]].into()))),
+        ("triangle 7 names vertex 20, but the mesh has 20", broken(|m| m.triangles[7][1] = 20)),
+        ("names vertex 4294967295", broken(|m| m.triangles[0][0] = u32::MAX)),
+        ("position 3 holds NaN", broken(|m| m.positions[3][2] = f32::NAN)),
+        ("normal 4 holds inf", broken(|m| m.normals[4][0] = f32::INFINITY)),
+        ("centre 1 holds inf", broken(|m| m.centre[1] = f64::INFINITY)),
+    ];
+    for format in Format::MESHES {
+        for (words, mesh) in &cases {
+            let mut bytes = Vec::new();
+            let error = formats::write(format, mesh, &meta(), &mut bytes).unwrap_err();
+            assert_eq!((error.kind(), bytes.len()), (ErrorKind::InvalidInput, 0), "{format}: {words}");
+            assert!(error.to_string().contains(words), "{format}: {error}");
+            assert!(error.get_ref().unwrap().is::<FormatError>());
+            assert_eq!(formats::encoded_len(format, mesh, &meta()), None);
+            assert_eq!(formats::encoded_len_bound(format, mesh, &meta()), None);
+        }
+    }
+}
+
+#[test]
+fn only_gltf_refuses_atom_indices_that_floats_cannot_hold() {
+    let mesh = dressed(torus(4, 5), 16_777_217);
+    for format in Format::MESHES {
+        let encoder = Encoder::new(format, &mesh, &meta());
+        match format {
+            Format::Glb | Format::Gltf => {
+                let refusal = FormatError::AtomIndexTooLarge { atom: 16_777_217, limit: 16_777_216 };
+                assert_eq!(encoder.unwrap_err(), refusal);
+            }
+            _ => assert!(encoder.is_ok()),
+        }
+    }
+}
+
+#[test]
+fn vertices_without_triangles_make_an_empty_but_valid_gltf() {
+    let mesh = Mesh { triangles: Vec::new().into(), ..torus(4, 5) };
+    let glb = split_glb(&encode(Format::Glb, &mesh, &meta()));
+    assert_eq!(gltf_contents(&glb.json, &glb.bin).positions.len(), 0);
+    assert_eq!(read_ply(&encode(Format::Ply, &mesh, &meta())).positions.len(), 20);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
+
+    /// Names and extras come from files of strangers: they cannot break out of where they stand.
+    #[test]
+    fn any_name_and_extra_leave_the_file_readable(name in "\\PC{0,40}|[ -~\r\n\t\"\\\\]{0,300}", key in ".{0,12}", text in ".{0,400}") {
+        let mesh = triangle();
+        let meta = Meta { name: Some(name.clone()), extras: [(key.clone(), Value::from(text.clone()))].into_iter().collect() };
+        let glb = split_glb(&encode(Format::Glb, &mesh, &meta));
+        prop_assert_eq!(glb.json["nodes"][0]["name"].as_str().unwrap_or(""), name);
+        if !["units", "unit_scale", "centre"].contains(&key.as_str()) {
+            prop_assert_eq!(glb.json["asset"]["extras"][&key].as_str().unwrap(), text);
+        }
+        let (json, bin) = split_gltf(&encode(Format::Gltf, &mesh, &meta));
+        prop_assert_eq!(&gltf_contents(&json, &bin).positions, &mesh.positions);
+        prop_assert_eq!(&read_ply(&encode(Format::Ply, &mesh, &meta)).positions, &mesh.positions);
+        prop_assert_eq!(&read_obj(&encode(Format::Obj, &mesh, &meta)).positions, &mesh.positions);
+        let stl = encode(Format::Stl, &mesh, &meta);
+        prop_assert_eq!((stl.len(), u32_at(&stl, 80), stl[..80].is_ascii()), (134, 1, true));
+    }
+}
+
+#[test]
+fn trusted_meshes_give_the_same_bytes() {
+    for (name, mesh) in cases() {
+        for format in Format::MESHES {
+            let mut bytes = Vec::new();
+            Encoder::trusting(format, &mesh, &meta()).unwrap().write(&mut bytes).unwrap();
+            assert!(bytes == encode(format, &mesh, &meta()), "{name} as {format}");
+        }
+    }
+}
+
+#[test]
+fn trust_in_a_broken_mesh_never_panics() {
+    for n in [4, 300] {
+        let mut far_index = torus(n, 300);
+        far_index.triangles[1][1] = u32::MAX;
+        let mut long_normal = torus(n, 300);
+        long_normal.normals[1] = [f32::NAN, f32::MAX, f32::INFINITY];
+        let mut not_finite = torus(n, 300);
+        not_finite.positions[1][2] = f32::NAN;
+        let mut short = torus(n, 300);
+        short.normals.edit().pop();
+        for format in Format::MESHES {
+            let refused = |mesh: &Mesh| {
+                let encoder = Encoder::trusting(format, mesh, &meta());
+                if let Ok(encoder) = &encoder {
+                    encoder.write(&mut io::sink()).unwrap();
+                }
+                encoder.is_err()
+            };
+            let narrow = matches!(format, Format::Glb | Format::Gltf) && n == 4;
+            assert_eq!(refused(&far_index), narrow || format == Format::Stl, "{format}");
+            assert_eq!(refused(&long_normal), format == Format::Obj, "{format}");
+            assert!(refused(&not_finite) && refused(&short), "{format}");
+        }
+    }
+}

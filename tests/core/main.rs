@@ -1,0 +1,29 @@
+//! Tests of the core: structures, surfaces, formats and pictures, and of the source tree itself.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
+
+#[path = "../bcif_support/mod.rs"]
+mod bcif_support;
+#[path = "../tools/mod.rs"]
+mod tools;
+
+mod architecture;
+mod bcif_oracles;
+mod formats_oracles;
+mod formats_quantized;
+mod formats_roundtrip;
+mod formats_storage;
+mod links;
+mod peers;
+mod picture;
+mod real_structures;
+mod spacing;
+mod structure_archive;
+mod structure_bcif;
+mod structure_hostile;
+mod structure_kinds;
+mod structure_mmcif;
+mod structure_pdb;
+mod structure_real;
+mod structure_select;
+mod surface;

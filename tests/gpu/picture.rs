@@ -1,0 +1,108 @@
+//! Pictures of a device compared with those of the CPU: equal up to rounding. The device is software Vulkan.
+
+use crate::tools;
+
+use molmesh::gpu::{GpuRenderer, Look, discover};
+use molmesh::picture::{CpuRenderer, Image, PictureError, PictureParams, Renderer, Style, View};
+use molmesh::surface::{CancelToken, Control, DeviceChoice, Mesh, Step};
+use tools::shapes::{icosphere, union};
+
+/// Renderer on the software Vulkan device (`mesa-vulkan-drivers`). CI has it; elsewhere the test is skipped without it.
+fn gpu(fallback: bool) -> Option<GpuRenderer> {
+    let choice: DeviceChoice = "software".parse().unwrap();
+    let found = discover(&choice, Look::Thorough);
+    if found.taken().next().is_none() {
+        assert!(std::env::var_os("CI").is_none(), "no software Vulkan: install mesa-vulkan-drivers. {found:?}");
+        #[expect(clippy::print_stderr, reason = "a skipped test is reported")]
+        {
+            eprintln!("SKIPPED: no software Vulkan on this machine; install mesa-vulkan-drivers");
+        }
+        return None;
+    }
+    Some(GpuRenderer::start(&found, fallback.then(CpuRenderer::default)).unwrap())
+}
+
+fn params(style: Style, view: View) -> PictureParams {
+    PictureParams { width: 200, height: 150, style, view, ..PictureParams::default() }
+}
+
+/// Balls that occlude, touch and contain each other.
+fn balls() -> Mesh {
+    let parts = [(3.0, [0.0, 0.0, 0.0]), (2.0, [4.0, 1.0, 1.0]), (1.5, [-2.0, 2.5, 4.0]), (1.0, [7.0, 0.0, 0.0])];
+    let ball = |(radius, at): (f64, [f64; 3])| icosphere(4, radius, at, false);
+    parts.into_iter().map(ball).reduce(|all, part| union(&all, &part)).unwrap()
+}
+
+fn of(renderer: &dyn Renderer, mesh: &Mesh, params: &PictureParams) -> Image {
+    let rendered = renderer.render(mesh, params, &Control::default()).unwrap();
+    assert_eq!(rendered.served, None);
+    rendered.image
+}
+
+/// Number of pixels whose alpha differs, and of other pixels with a channel that differs by more than two levels.
+fn differences(a: &Image, b: &Image) -> (usize, usize) {
+    assert_eq!((a.width, a.height, a.pixels.len()), (b.width, b.height, b.pixels.len()));
+    let pairs = || a.pixels.iter().zip(&b.pixels);
+    let alpha = pairs().filter(|(a, b)| a[3] != b[3]).count();
+    let color = pairs().filter(|(a, b)| a[3] == b[3] && a.iter().zip(*b).any(|(a, b)| a.abs_diff(*b) > 2)).count();
+    (alpha, color)
+}
+
+#[test]
+fn a_device_draws_the_picture_of_the_cpu() {
+    let Some(gpu) = gpu(false) else { return };
+    assert_eq!(gpu.name(), "gpu");
+    assert!(gpu.describe().contains("software"), "{}", gpu.describe());
+    let (cpu, mesh) = (CpuRenderer::default(), balls());
+    for (style, view, background) in [
+        (Style::Gouraud, View::Front, "transparent"),
+        (Style::Surface, View::Principal, "transparent"),
+        (Style::Surface, View::Top, "#20406080"),
+    ] {
+        let params = PictureParams { background: background.parse().unwrap(), ..params(style, view) };
+        let expected = of(&cpu, &mesh, &params);
+        let covered = expected.pixels.iter().filter(|p| p[3] == 255).count();
+        assert!(covered > 3_000, "{covered}");
+        let (alpha, color) = differences(&expected, &of(&gpu, &mesh, &params));
+        // Rounding decides samples very near to an edge: about one pixel in a hundred of the outline. Half precision of
+        // the interpolated values is below one level, but a sample of another triangle also changes its neighbours.
+        assert!(alpha <= 12, "{style:?} {view:?}: {alpha} pixels of another alpha");
+        assert!(color <= covered / 100, "{style:?} {view:?}: {color} of {covered} pixels of another colour");
+        // Negative controls: another style, another view and an inverted mesh.
+        let other_style = if style == Style::Surface { Style::Gouraud } else { Style::Surface };
+        let other = of(&gpu, &mesh, &PictureParams { style: other_style, ..params });
+        assert!(differences(&expected, &other).1 > covered / 20);
+        let other = of(&gpu, &mesh, &PictureParams { azimuth: 5.0, ..params });
+        assert!(differences(&expected, &other).0 > 100);
+        let mut wrong = mesh.clone();
+        wrong.triangles = wrong.triangles.iter().map(|[a, b, c]| [*a, *c, *b]).collect();
+        assert!(differences(&expected, &of(&gpu, &wrong, &params)).1 > covered / 4);
+    }
+    // The bytes do not depend on earlier pictures.
+    let params = params(Style::Surface, View::Front);
+    assert_eq!(of(&gpu, &mesh, &params), of(&gpu, &mesh, &params));
+}
+
+#[test]
+fn the_cpu_is_the_fallback_and_is_reported() {
+    let (Some(without), Some(with)) = (gpu(false), gpu(true)) else { return };
+    // Wider than any texture.
+    let wide = PictureParams { width: 100_000, height: 1, ..params(Style::Gouraud, View::Front) };
+    let mesh = icosphere(2, 1.0, [0.0; 3], false);
+    let refused = without.render(&mesh, &wide, &Control::default()).unwrap_err();
+    assert!(matches!(&refused, PictureError::Device { why } if why.contains("a texture side")), "{refused}");
+    let rendered = with.render(&mesh, &wide, &Control::default()).unwrap();
+    let served = rendered.served.unwrap();
+    assert_eq!(served.backend, "cpu");
+    assert!(served.fallback_reason.unwrap().contains("the GPU could not draw it"));
+    assert_eq!(rendered.image, of(&CpuRenderer::default(), &mesh, &wide));
+    // Errors of the request are not passed to the fallback.
+    let cancel = CancelToken::default();
+    cancel.cancel();
+    let control = Control { cancel, ..Control::default() };
+    let small = params(Style::Surface, View::Front);
+    assert_eq!(with.render(&mesh, &small, &control), Err(PictureError::Cancelled));
+    let mut packed = mesh.clone();
+    packed.quantize(Step::covering(2.0));
+    assert_eq!(with.render(&packed, &small, &Control::default()), Err(PictureError::Quantized));
+}

@@ -1,0 +1,94 @@
+//! Device pool with real engines on software Vulkan: discovery, shared submissions, loss and rebuilding.
+
+use crate::gpu_support;
+
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use molmesh::gpu::{DevicePool, Engine, Executor, GpuBackend, GpuError, Look, PoolDevice, PoolSettings, discover};
+use molmesh::surface::{Backend, Control, CpuBackend, MeshOutput, SurfaceError, SurfaceLimits, SurfaceParams};
+
+fn run(backend: &dyn Backend) -> Result<MeshOutput, SurfaceError> {
+    let params = SurfaceParams::default();
+    backend.run(&gpu_support::sample("4pti.pdb"), &params, &SurfaceLimits::default(), &Control::default())
+}
+
+#[test]
+fn a_discovered_device_gives_the_mesh_of_the_cpu() {
+    let choice = "software".parse().unwrap();
+    let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
+    backend.warm().unwrap();
+    let (cpu, gpu) = (run(&CpuBackend::new(None).unwrap()).unwrap(), run(&backend).unwrap());
+    assert_eq!(gpu.mesh.n_triangles(), cpu.mesh.n_triangles());
+    let served = gpu.served.unwrap();
+    assert_eq!((served.backend, served.fallback_reason), ("gpu", None));
+    assert_eq!(served.device, backend.describe());
+    let status = backend.devices().remove(0);
+    assert_eq!((status.finished, status.failed, status.down), (2, 0, None));
+    assert!(status.held_bytes > 0);
+}
+
+#[test]
+fn callers_share_submissions_and_get_the_mesh_of_a_single_job() {
+    let choice = "software".parse().unwrap();
+    let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
+    let alone = run(&backend).unwrap().mesh;
+    std::thread::scope(|scope| {
+        for _ in 0..12 {
+            scope.spawn(|| assert!(run(&backend).unwrap().mesh == alone, "another mesh"));
+        }
+    });
+    let status = backend.devices().remove(0);
+    assert_eq!(status.finished, 13);
+    assert!(status.shared > 0, "{status:?}");
+}
+
+/// Starts a backend whose device is destroyed before each of the first `n_losses` jobs.
+fn losing(n_losses: usize, fallback: Option<Box<dyn Backend>>) -> GpuBackend {
+    /// Engine whose device is destroyed before its next job.
+    struct LosingEngine(Engine, Mutex<Option<wgpu::Device>>);
+    impl Executor for LosingEngine {
+        fn run(&mut self, jobs: &[molmesh::gpu::GpuJob]) -> Vec<Result<molmesh::gpu::Finished, GpuError>> {
+            if let Some(device) = self.1.lock().unwrap().take() {
+                device.destroy();
+            }
+            self.0.run(jobs)
+        }
+        fn held_bytes(&self) -> u64 {
+            self.0.held_bytes()
+        }
+    }
+    let builds = AtomicUsize::new(0);
+    let build = move || {
+        let loses = builds.fetch_add(1, Ordering::SeqCst) < n_losses;
+        let (device, queue) = gpu_support::device();
+        let engine = Engine::new(device.clone(), queue)?;
+        Ok(Box::new(LosingEngine(engine, Mutex::new(loses.then_some(device)))) as Box<dyn Executor>)
+    };
+    let device = PoolDevice { number: 0, name: "losing".to_owned(), build: Box::new(build) };
+    GpuBackend::with_pool(DevicePool::start(vec![device], &PoolSettings::default()).unwrap(), fallback)
+}
+
+#[test]
+fn a_lost_device_is_rebuilt_and_gives_the_same_mesh() {
+    let working = losing(0, None);
+    let expected = run(&working).unwrap().mesh;
+    assert_eq!(working.devices()[0].rebuilds, 0);
+    let backend = losing(1, None);
+    assert!(run(&backend).unwrap().mesh == expected, "another mesh");
+    let status = backend.devices().remove(0);
+    assert_eq!((status.finished, status.failed, status.rebuilds, status.down), (1, 1, 1, None));
+}
+
+#[test]
+fn the_cpu_replaces_a_device_that_is_lost_permanently() {
+    let cpu = run(&CpuBackend::new(None).unwrap()).unwrap().mesh;
+    let backend = losing(usize::MAX, Some(Box::new(CpuBackend::new(None).unwrap())));
+    for _ in 0..3 {
+        let meshed = run(&backend).unwrap();
+        assert!(meshed.mesh == cpu, "not the CPU's mesh");
+        assert!(meshed.served.unwrap().fallback_reason.unwrap().contains("the GPU failed"));
+    }
+    let why = backend.devices().remove(0).down.unwrap();
+    assert!(why.contains("given up after 3 rebuilds") && !why.contains('\n'), "{why}");
+}

@@ -1,0 +1,301 @@
+//! Rounded vertices from end to end: made on a device, on the CPU or after the reference, in a file or through a pipe, by
+//! the command line and over HTTP. What the report says is measured in the file that the client gets.
+
+use crate::cli_support;
+use crate::gpu_support;
+use crate::tools;
+
+use std::fs;
+use std::io::{Cursor, Read, Write};
+use std::net::TcpStream;
+
+use cli_support::{Folder, Service, assert_code, mesh, run, stdout};
+use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Packing, Step};
+use molmesh::gpu::{DevicePool, Executor, GpuBackend, PoolDevice, PoolSettings};
+use molmesh::pipeline::{self, Choice, Job, JobLimits, Product, params};
+use molmesh::surface::{
+    Backend, CancelToken, Control, CpuBackend, Mesh, ReferenceBackend, SurfaceLimits, SurfaceParams, Validation,
+};
+use serde_json::Value;
+use tools::files::Files;
+use tools::readers::{gltf_contents, split_glb};
+
+const SAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
+
+fn sample() -> Vec<u8> {
+    fs::read(SAMPLE).unwrap()
+}
+
+fn job(more: &[(&'static str, &'static str)]) -> Job {
+    let pairs = [("compress", "quantize")].iter().chain(more).copied();
+    params::parse(pairs).unwrap().job
+}
+
+/// `n` devices of the software adapter, as one backend.
+fn devices(n: usize) -> GpuBackend {
+    let device = |number| {
+        let build = || Ok(Box::new(gpu_support::engine_with(|_| ())) as Box<dyn Executor>);
+        PoolDevice { number, name: format!("device {number}"), build: Box::new(build) }
+    };
+    let settings = PoolSettings { min_partition_bricks: Some(1), ..PoolSettings::default() };
+    GpuBackend::with_pool(DevicePool::start((0..n).map(device).collect(), &settings).unwrap(), None)
+}
+
+fn made(backend: &dyn Backend, job: &Job) -> Product {
+    let choice = Choice { backend, reason: "told" };
+    pipeline::run(&sample(), job, &JobLimits::default(), &choice, &CancelToken::default(), &(), None).unwrap()
+}
+
+fn glb(product: &Product) -> Vec<u8> {
+    let encoder = Encoder::stored(Format::Glb, product.storage, &product.mesh, &product.meta()).unwrap();
+    let mut bytes = Vec::new();
+    encoder.write(&mut bytes).unwrap();
+    bytes
+}
+
+/// Area and volume of what a GLB holds.
+fn measured(glb: &[u8]) -> [f64; 2] {
+    let file = split_glb(glb);
+    let contents = gltf_contents(&file.json, &file.bin);
+    let corner = |v: u32| contents.positions[v as usize].map(f64::from);
+    contents.triangles.iter().fold([0.0; 2], |[area, volume], t| {
+        let [a, b, c] = t.map(corner);
+        let [u, v]: [[f64; 3]; 2] = [b, c].map(|p| std::array::from_fn(|k| p[k] - a[k]));
+        let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+        let length = n.iter().map(|x| x * x).sum::<f64>().sqrt();
+        [area + 0.5 * length, volume + (0..3).map(|k| a[k] * n[k]).sum::<f64>() / 6.0]
+    })
+}
+
+fn near(a: f64, b: f64, bound: f64) -> bool {
+    (a / b - 1.0).abs() < bound
+}
+
+#[test]
+fn every_backend_hands_integers_on_and_reports_what_they_measure() {
+    let job = job(&[("resolution", "0.8")]);
+    let plain = params::parse([("resolution", "0.8")]).unwrap().job;
+    let (one, cpu) = (devices(1), CpuBackend::new(Some(2)).unwrap());
+    for backend in [&one as &dyn Backend, &cpu, &ReferenceBackend] {
+        let product = made(backend, &job);
+        let name = backend.name();
+        assert!(product.mesh.quantized.is_some() && product.mesh.positions.is_empty(), "{name}");
+        assert_eq!(Packing::of(&product.mesh), product.storage.packing, "{name}");
+        let [area, volume] = measured(&glb(&product));
+        assert!(near(product.report.area, area, 3e-6) && near(product.report.volume, volume, 3e-6), "{name}");
+        assert!(product.report.closed && product.report.manifold, "{name}");
+        // Without the parameter vertices are single-precision numbers.
+        let plain = made(backend, &plain);
+        assert!(plain.mesh.quantized.is_none() && plain.storage.packing == Packing::Full, "{name}");
+        assert_eq!(
+            (plain.report.vertices, plain.report.triangles),
+            (product.report.vertices, product.report.triangles)
+        );
+        // Other formats do not take them for something else.
+        let refused = Encoder::new(Format::Ply, &product.mesh, &product.meta()).unwrap_err();
+        assert_eq!(refused, FormatError::NotQuantized { format: "ply" });
+    }
+}
+
+#[test]
+fn the_exact_validation_measures_the_same_vertices() {
+    for backend in [&devices(1) as &dyn Backend, &CpuBackend::new(Some(2)).unwrap()] {
+        let [quick, exact] = ["checksum", "exact"]
+            .map(|validation| made(backend, &job(&[("validation", validation), ("resolution", "1")])));
+        assert_eq!((quick.report.validation, exact.report.validation), ("checksum", "exact"));
+        assert!(quick.mesh == exact.mesh);
+        assert!(near(quick.report.area, exact.report.area, 2e-6) && exact.report.manifold);
+    }
+}
+
+/// Rounding to a coarse step changes area and volume: what is reported is what is left.
+#[test]
+fn a_coarse_step_shows_in_the_measures() {
+    let spheres = gpu_support::sample("4pti.pdb");
+    let single = SurfaceParams::default();
+    let coarse = SurfaceParams { quantize: Some(Step::covering(8000.0)), ..single.clone() };
+    let cpu = CpuBackend::new(Some(2)).unwrap();
+    let of = |params: &SurfaceParams| {
+        cpu.run(&spheres, params, &SurfaceLimits::default(), &Control::default()).unwrap().measures.unwrap()
+    };
+    let (fine, found) = (of(&single), of(&coarse));
+    let device = devices(1);
+    let meshed = device.run(&spheres, &coarse, &SurfaceLimits::default(), &Control::default()).unwrap();
+    let theirs = molmesh::surface::Measures::of(&meshed.mesh, Validation::Checksum, &Control::default()).unwrap();
+    assert!(near(found.area, theirs.area, 1e-4) && near(found.volume, theirs.volume, 1e-4), "{found:?} {theirs:?}");
+    assert!(!near(found.area, fine.area, 1e-3), "{} {}", found.area, fine.area);
+}
+
+/// What a file says of its mesh but for its sums, whose last digits depend on where the mesh falls into parts.
+fn said(glb: &[u8]) -> Value {
+    let mut document = split_glb(glb).json;
+    let extras = document["asset"]["extras"].as_object_mut().unwrap();
+    for sum in ["area", "volume", "component_list"] {
+        assert!(extras.remove(sum).is_some(), "{sum}");
+    }
+    document
+}
+
+#[test]
+fn one_device_and_two_make_the_same_file_in_order_and_out_of_order() {
+    let job = job(&[("resolution", "0.4")]);
+    let [one, two] = [1, 2].map(devices);
+    let (alone, spread) = (made(&one, &job), made(&two, &job));
+    assert!(spread.report.device.starts_with("2 devices"), "{}", spread.report.device);
+    let expected = [&alone, &spread].map(glb);
+    assert_eq!(said(&expected[0]), said(&expected[1]));
+    assert!(contents(&expected[0]).1 == contents(&expected[1]).1, "every byte of the mesh");
+    let sums = [&alone, &spread].map(|product| (product.report.area, product.report.volume));
+    assert!(near(sums[0].0, sums[1].0, 1e-12) && near(sums[0].1, sums[1].1, 1e-12), "{sums:?}");
+    for (backend, expected) in [(&one as &dyn Backend, &expected[0]), (&two, &expected[1])] {
+        let mut file = Cursor::new(Vec::new());
+        let sink = GlbSink::new(&mut file);
+        let (choice, limits) = (Choice { backend, reason: "told" }, JobLimits::default());
+        let cancel = CancelToken::default();
+        let product = pipeline::run(&sample(), &job, &limits, &choice, &cancel, &(), Some(&sink)).unwrap();
+        drop(sink);
+        assert!(product.mesh.positions.is_empty() && product.streamed_bytes == Some(expected.len() as u64));
+        assert!(file.into_inner() == *expected);
+    }
+    // Control: another spacing is another file.
+    let other = glb(&made(&one, &self::job(&[("resolution", "0.45")])));
+    assert!(contents(&other).1 != contents(&expected[0]).1 && said(&other) != said(&expected[0]));
+}
+
+/// A backend's mesh may have a vertex out of reach: the file is refused, whoever rounded.
+#[test]
+fn a_step_that_does_not_reach_is_refused_when_the_file_is_made() {
+    let spheres = gpu_support::sample("1crn.cif");
+    let short = SurfaceParams { quantize: Some(Step::covering(4.0)), ..SurfaceParams::default() };
+    for backend in [&devices(1) as &dyn Backend, &CpuBackend::new(Some(2)).unwrap()] {
+        let meshed = backend.run(&spheres, &short, &SurfaceLimits::default(), &Control::default()).unwrap();
+        let packing = Packing::of(&meshed.mesh);
+        let refusal = Encoder::stored(Format::Glb, packing, &meshed.mesh, &molmesh::formats::Meta::default());
+        assert!(matches!(refusal, Err(FormatError::BeyondStep { .. })), "{}", backend.name());
+    }
+}
+
+#[test]
+fn readers_take_what_a_device_rounded() {
+    let (mut files, mut reports) = (Files::new(), Vec::new());
+    let two = devices(2);
+    for (name, more) in [
+        ("gaussian", vec![("resolution", "0.5")]),
+        ("soft", vec![("kernel", "soft-object"), ("resolution", "0.6")]),
+        ("inverse", vec![("kernel", "inverse-square"), ("resolution", "0.6"), ("atom_ids", "true")]),
+    ] {
+        let product = made(&two, &job(&more));
+        files.add(&format!("{name}.glb"), &glb(&product));
+        reports.push(product.report);
+    }
+    // Control: a normal that is none, and a bound that is passed.
+    let mut broken = fs::read(&files.paths[0]).unwrap();
+    let file = split_glb(&broken);
+    let attributes = &file.json["meshes"][0]["primitives"][0]["attributes"];
+    let at = |name: &str| file.bin_at + tools::readers::accessor_offset(&file.json, &attributes[name]);
+    let (position, normal) = (at("POSITION"), at("NORMAL"));
+    broken[position + 1] = 0x7f;
+    broken[normal..normal + 3].fill(30);
+    files.add("broken.glb", &broken);
+    if let Some(mut found) = tools::gltf_validate(&files.paths) {
+        let broken = found.pop().unwrap();
+        assert!(broken.errors >= 2 && broken.codes.contains_key("ACCESSOR_VECTOR3_NON_UNIT"), "{broken:#?}");
+        for (found, report) in found.iter().zip(&reports) {
+            found.assert_clean();
+            assert_eq!((found.vertices, found.triangles), (report.vertices, report.triangles));
+        }
+    }
+    if let Some(found) = tools::trimesh(&files.paths[..3]) {
+        for (found, report) in found.iter().zip(&reports) {
+            assert_eq!(found.error, None, "{found:#?}");
+            assert!(found.watertight && found.winding_consistent && found.is_volume, "{found:#?}");
+            let counts = (found.vertices, found.faces, found.bodies, found.euler, found.nan_count, found.bad_edges);
+            let expected = (report.vertices, report.triangles, report.components, report.euler, 0, 0);
+            assert_eq!(counts, expected, "{found:#?}");
+            assert!(near(found.area, report.area, 1e-5) && near(found.volume, report.volume, 1e-5), "{found:#?}");
+            assert!(found.max_normal_error.unwrap() < 0.006_74, "{found:#?}");
+        }
+    }
+}
+
+/// What the software device makes for the command line: the file's own words, and its mesh without them.
+fn contents(glb: &[u8]) -> (Value, Vec<u8>) {
+    let file = split_glb(glb);
+    (file.json["asset"]["extras"].clone(), file.bin)
+}
+
+const ON_SOFTWARE: [&str; 4] = ["--backend", "gpu", "--devices", "software"];
+
+#[test]
+fn the_command_line_has_a_device_round() {
+    let folder = Folder::new();
+    let output = folder.path("out.glb");
+    let flags = [&ON_SOFTWARE[..], &["--compress", "quantize", "--resolution", "0.5", "--report", "json"]].concat();
+    let done = mesh(SAMPLE.as_ref(), &output, &flags);
+    assert_code(&done, 0);
+    let report: Value = serde_json::from_str(&stdout(&done)).unwrap();
+    assert_eq!(report["backend"], "gpu");
+    let file = fs::read(&output).unwrap();
+    let (extras, bin) = contents(&file);
+    assert_eq!((&extras["quantization"], &extras["backend"]), (&report["quantization"], &"gpu".into()));
+    let [area, volume] = measured(&file);
+    assert!(
+        near(report["area"].as_f64().unwrap(), area, 3e-6) && near(report["volume"].as_f64().unwrap(), volume, 3e-6)
+    );
+    let quiet = [&ON_SOFTWARE[..], &["--compress", "quantize", "--resolution", "0.5", "--quiet"]].concat();
+    let piped = run(["mesh", SAMPLE, "-o", "-"].iter().chain(&quiet));
+    assert_code(&piped, 0);
+    assert!(piped.stdout == file, "a file has the bytes that a pipe gets");
+    // It is what the library makes on the same device.
+    assert!(contents(&glb(&made(&devices(1), &job(&[("resolution", "0.5")])))).1 == bin);
+    let text = mesh(SAMPLE.as_ref(), &folder.path("out.gltf"), &quiet);
+    assert_code(&text, 0);
+    let ply = mesh(SAMPLE.as_ref(), &folder.path("out.ply"), &quiet);
+    assert_code(&ply, 2);
+}
+
+/// POSTs the sample to a running service; returns the answer's body.
+fn post(addr: &str, query: &str) -> Vec<u8> {
+    let body = sample();
+    let mut stream = TcpStream::connect(addr).unwrap();
+    let head = format!(
+        "POST /v1/meshes?{query} HTTP/1.1\r\nhost: {addr}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n",
+        body.len()
+    );
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    assert!(answer.starts_with(b"HTTP/1.1 200"), "{}", String::from_utf8_lossy(&answer[..answer.len().min(2000)]));
+    let end = answer.windows(4).position(|w| w == b"\r\n\r\n").unwrap();
+    answer.split_off(end + 4)
+}
+
+#[test]
+fn a_service_has_a_device_round() {
+    let folder = Folder::new();
+    let service = Service::start(&folder, &ON_SOFTWARE);
+    let query = "compress=quantize&resolution=0.5";
+    let file = post(&service.addr, query);
+    let (extras, bin) = contents(&file);
+    assert_eq!(extras["backend"], "gpu");
+    let expected = made(&devices(1), &job(&[("resolution", "0.5")]));
+    assert!(contents(&glb(&expected)).1 == bin);
+    let report: Value = serde_json::from_slice(&post(&service.addr, &format!("{query}&report=json"))).unwrap();
+    let [area, volume] = measured(&file);
+    assert!(
+        near(report["area"].as_f64().unwrap(), area, 3e-6) && near(report["volume"].as_f64().unwrap(), volume, 3e-6)
+    );
+    // The same job without the parameter is another result.
+    let plain = post(&service.addr, "resolution=0.5");
+    assert!(plain.len() as u64 > file.len() as u64 + 11 * expected.report.vertices);
+}
+
+/// The mesh of a product is never half of one and half of the other.
+#[test]
+fn an_empty_mesh_rounds_to_an_empty_mesh() {
+    let mut mesh = Mesh::default();
+    assert!(mesh.quantize(Step::covering(1.0)));
+    assert_eq!((mesh.n_vertices(), mesh.bounds()), (0, [[0.0; 3]; 2]));
+    assert!(Encoder::new(Format::Glb, &mesh, &molmesh::formats::Meta::default()).is_ok());
+}

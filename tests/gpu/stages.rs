@@ -1,0 +1,499 @@
+//! Single stages of a device, run on the results of the CPU's previous stages and compared with the CPU's stage: `bin`,
+//! `classify`, `scan` and `emit` bit by bit, `field` and `interpolate` within bounds. Outputs are poisoned before a
+//! stage runs.
+
+use crate::gpu_support;
+
+use std::collections::HashMap;
+
+use bytemuck::{Pod, pod_collect_to_vec};
+use gpu_support::{KERNELS, Random, engine_with, job, params, sample, spheres};
+use molmesh::gpu::GpuJob;
+use molmesh::gpu::plan::Plan;
+use molmesh::gpu::plan::layout::{Counters, GROUP, NONE, Record};
+use molmesh::gpu::probe::{BufferId, StageProbe};
+use molmesh::surface::cpu::probe::{Probe, ProbedBrick, ProbedSurface, probe};
+use molmesh::surface::lattice::LatticeAtom;
+use molmesh::surface::quantize::{BEYOND, normal};
+use molmesh::surface::{Kernel, Spheres, Stage, Step, SurfaceLimits};
+
+/// Maximum relative difference of densities; of densities below 0.1, relative to 0.1.
+const FIELD_BOUND: f32 = 1e-5;
+/// Maximum distance of vertices, Å.
+const POSITION_BOUND: f32 = 1e-4;
+/// Maximum difference of normals, per component.
+const NORMAL_BOUND: f32 = 1e-3;
+
+/// Job with the results of the CPU and its buffers on the device.
+struct Setup {
+    job: GpuJob,
+    probe: Probe,
+    stages: StageProbe,
+    /// Bricks of the CPU in the order of the plan; `None` for a brick of the plan that the CPU does not have.
+    bricks: Vec<Option<ProbedBrick>>,
+    surface: Vec<Option<ProbedSurface>>,
+}
+
+fn halves(word: u64) -> [u32; 2] {
+    [word & 0xffff_ffff, word >> 32].map(|half| u32::try_from(half).unwrap())
+}
+
+fn u32_of(n: usize) -> u32 {
+    u32::try_from(n).unwrap()
+}
+
+/// Coordinates of each brick, in bricks.
+fn coords(plan: &Plan) -> Vec<Vec<i32>> {
+    let coord = |&brick: &u32| {
+        let tile = plan.tiles[(brick >> 9) as usize].coord;
+        let local = [0, 3, 6].map(|shift| i32::try_from(brick >> shift & 7).unwrap());
+        local.iter().zip(tile).map(|(b, t)| 8 * t + b).collect()
+    };
+    plan.bricks.iter().map(coord).collect()
+}
+
+impl Setup {
+    fn new(spheres: &Spheres, kernel: Kernel, resolution: f64) -> Self {
+        let params = params(kernel, resolution);
+        let job = job(spheres, &params);
+        let probe = probe(&job.prepared.lattice, &params, &SurfaceLimits::default()).unwrap();
+        let rows = [probe.mesh.n_vertices(), probe.mesh.n_triangles()].map(u32_of);
+        let stages = StageProbe::new(engine_with(|_| ()), &job, rows[0], rows[1]).unwrap();
+        let plan = &job.prepared.plan;
+        let coords = coords(plan);
+        let mut bricks: HashMap<Vec<i32>, ProbedBrick> =
+            probe.bricks.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
+        let mut surface: HashMap<Vec<i32>, ProbedSurface> =
+            probe.surface.iter().map(|b| (b.coord.to_vec(), b.clone())).collect();
+        let bricks_in_order = coords.iter().map(|c| bricks.remove(c)).collect();
+        let surface_in_order = coords.iter().map(|c| surface.remove(c)).collect();
+        assert!(bricks.is_empty() && surface.is_empty(), "the plan has every brick of the CPU");
+        Self { job, probe, stages, bricks: bricks_in_order, surface: surface_in_order }
+    }
+
+    /// Runs `stage` on `inputs` with every output poisoned, and reads the outputs.
+    fn run(&self, stage: Stage, inputs: &[(BufferId, Vec<u8>)], outputs: &[BufferId]) -> Vec<Vec<u8>> {
+        for (id, bytes) in inputs {
+            self.stages.write(*id, bytes);
+        }
+        self.stages.run(stage).unwrap();
+        outputs.iter().map(|&id| self.stages.read(id, self.stages.size(&self.job, id)).unwrap()).collect()
+    }
+
+    fn poison(&self, buffers: &[BufferId]) {
+        for id in buffers {
+            self.stages.poison(*id);
+        }
+    }
+
+    /// Candidate lists of the CPU in the layout of the device: entries, and (start, reaching, all, brick) per brick.
+    fn lists(&self) -> (Vec<u32>, Vec<[u32; 4]>) {
+        let (mut entries, mut heads) = (Vec::new(), Vec::new());
+        for (id, brick) in self.bricks.iter().enumerate() {
+            let start = u32_of(entries.len());
+            let (reaching, gap): (&[u32], &[u32]) = brick.as_ref().map_or((&[], &[]), |b| (&b.reaching, &b.gap_only));
+            entries.extend(reaching.iter().chain(gap));
+            heads.push([start, u32_of(reaching.len()), u32_of(reaching.len() + gap.len()), u32_of(id)]);
+        }
+        (entries, heads)
+    }
+
+    fn samples(&self) -> Vec<f32> {
+        self.bricks.iter().flat_map(|b| b.as_ref().map_or([0.0; 512], |b| b.samples)).collect()
+    }
+
+    fn inside(&self) -> Vec<u32> {
+        self.bricks.iter().flat_map(|b| b.as_ref().map_or([0; 8], |b| b.inside)).flat_map(halves).collect()
+    }
+
+    /// Neighbours of every brick.
+    fn neighbours(&self) -> Vec<[u32; 8]> {
+        let coords: Vec<Vec<i32>> = coords(&self.job.prepared.plan);
+        let ids: HashMap<&[i32], u32> = coords.iter().map(Vec::as_slice).zip(0..).collect();
+        let neighbour = |at: &[i32], n: usize| {
+            let there: Vec<i32> = at.iter().enumerate().map(|(k, c)| c + i32::from(n >> k & 1 == 1)).collect();
+            ids.get(&there[..]).copied().unwrap_or(NONE)
+        };
+        coords.iter().map(|at| std::array::from_fn(|n| neighbour(at, n))).collect()
+    }
+
+    fn records(&self) -> Vec<Record> {
+        let record = |(b, neighbours): (&Option<ProbedSurface>, [u32; 8])| {
+            let mut record = Record { crossing: [0; 48], layers: [0; 8], neighbours };
+            let Some(b) = b else { return record };
+            let words: Vec<u32> = b.crossing.iter().flat_map(|w| halves(*w)).collect();
+            record.crossing.copy_from_slice(&words);
+            for (z, layer) in record.layers.iter_mut().enumerate() {
+                let [x, y] = [3 * z, 3 * z + 1].map(|w| b.crossing[w].count_ones());
+                *layer = u32::from(b.before[3 * z]) | x << 16 | y << 24;
+            }
+            record
+        };
+        self.surface.iter().zip(self.neighbours()).map(record).collect()
+    }
+
+    fn counts(&self) -> Vec<u32> {
+        self.surface.iter().map(|b| b.as_ref().map_or(0, |b| b.count[0] | b.count[1] << 16)).collect()
+    }
+
+    fn groups(&self) -> Vec<[u32; 4]> {
+        let sum = |group: &[Option<ProbedSurface>]| {
+            let there = group.iter().flatten();
+            there.fold([0; 4], |s, b| [s[0] + b.count[0], s[1] + b.count[1], s[2] + 1, 0])
+        };
+        self.surface.chunks(GROUP as usize).map(sum).collect()
+    }
+
+    /// First vertex and first triangle of each brick.
+    fn offsets(&self) -> Vec<[u32; 2]> {
+        let mut at = [0; 2];
+        let mut next = |b: &Option<ProbedSurface>| {
+            let first = at;
+            if let Some(b) = b {
+                assert_eq!(b.first, at, "the CPU numbers bricks in the order of the plan");
+                at = [at[0] + b.count[0], at[1] + b.count[1]];
+            }
+            first
+        };
+        self.surface.iter().map(&mut next).collect()
+    }
+}
+
+fn raw<T: bytemuck::NoUninit>(values: &[T]) -> Vec<u8> {
+    bytemuck::cast_slice(values).to_vec()
+}
+
+fn cast<T: Pod>(bytes: &[u8]) -> Vec<T> {
+    pod_collect_to_vec(bytes)
+}
+
+/// Returns the first difference of two columns.
+fn unequal<T: PartialEq + std::fmt::Debug>(got: &[T], expected: &[T]) -> Option<String> {
+    if got.len() != expected.len() {
+        return Some(format!("{} rows of {}", got.len(), expected.len()));
+    }
+    let at = got.iter().zip(expected).position(|(a, b)| a != b)?;
+    Some(format!("row {at}: {:?}, expected {:?}", got[at], expected[at]))
+}
+
+/// Returns the first difference of two columns of more than `bound` times the expected value, or times `min`.
+fn differs_by(got: &[f32], expected: &[f32], bound: f32, min: f32) -> Option<String> {
+    if got.len() != expected.len() {
+        return Some(format!("{} values of {}", got.len(), expected.len()));
+    }
+    let close = |(a, b): (&f32, &f32)| (a - b).abs() <= bound * b.abs().max(min);
+    let at = got.iter().zip(expected).position(|pair| !close(pair))?;
+    Some(format!("value {at}: {}, expected {}", got[at], expected[at]))
+}
+
+/// Setups for every stage: a structure with each kernel, atoms across bricks and tiles, a dense crowd, one atom.
+fn setups() -> Vec<(String, Setup)> {
+    let mut all: Vec<(String, Setup)> = KERNELS
+        .iter()
+        .map(|&kernel| (format!("4pti {kernel}"), Setup::new(&sample("4pti.pdb"), kernel, 0.7)))
+        .collect();
+    let seams: Vec<[f64; 4]> = (0..60)
+        .map(|i| f64::from(i) * 1.1)
+        .map(|s| [s - 40.0, 0.4 * s - 31.9, 31.7 - 0.7 * s, 1.3 + 0.01 * s])
+        .collect();
+    all.push(("seams".to_owned(), Setup::new(&spheres(&seams), Kernel::Gaussian, 0.5)));
+    // Lists that take a second pass; within one tile, because the CPU assigns atoms to tiles without slack.
+    let crowd: Vec<[f64; 4]> =
+        Random(5).cloud(700, 6.0).iter().map(|[x, y, z, r]| [x + 8.0, y + 8.0, z + 8.0, *r]).collect();
+    all.push(("crowd".to_owned(), Setup::new(&spheres(&crowd), Kernel::Gaussian, 0.5)));
+    all.push(("one atom".to_owned(), Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5)));
+    all
+}
+
+/// Candidate lists by brick, independent of their order in the buffer.
+fn by_brick(entries: &[u32], heads: &[[u32; 4]]) -> Vec<(u32, Vec<u32>)> {
+    let list = |h: &[u32; 4]| (h[1], entries[h[0] as usize..(h[0] + h[2]) as usize].to_vec());
+    heads.iter().map(list).collect()
+}
+
+#[test]
+fn bin_finds_the_same_candidates_in_the_same_order() {
+    for (name, setup) in setups() {
+        let zero = [(BufferId::Counters, raw(&[Counters::default()]))];
+        setup.poison(&[BufferId::Lists, BufferId::Heads]);
+        let out = setup.run(Stage::Bin, &zero, &[BufferId::Lists, BufferId::Heads, BufferId::Counters]);
+        let (entries, heads): (Vec<u32>, Vec<[u32; 4]>) = (cast(&out[0]), cast(&out[1]));
+        let (expected, expected_heads) = setup.lists();
+        let (got, want) = (by_brick(&entries, &heads), by_brick(&expected, &expected_heads));
+        assert_eq!(unequal(&got, &want), None, "{name}");
+        assert!(heads.iter().zip(0..).all(|(h, id)| h[3] == id), "{name}");
+        assert_eq!(cast::<Counters>(&out[2])[0].list_end as usize, expected.len(), "{name}");
+        let plan = &setup.job.prepared.plan;
+        assert_eq!(plan.candidates.iter().sum::<u64>(), expected.len() as u64, "{name}");
+        // Negative controls: a missing atom, and two atoms in another order.
+        let mut wrong = got.clone();
+        let longest = (0..wrong.len()).max_by_key(|&i| wrong[i].1.len()).unwrap();
+        wrong[longest].1.pop();
+        assert!(unequal(&wrong, &want).is_some());
+        if got[longest].1.len() > 1 {
+            wrong[longest].1.clone_from(&got[longest].1);
+            wrong[longest].1.swap(0, 1);
+            assert!(unequal(&wrong, &want).is_some());
+        }
+    }
+}
+
+#[test]
+fn bin_counts_lists_that_do_not_fit_and_writes_nothing_beyond_the_capacity() {
+    let mut setup = Setup::new(&sample("1crn.cif"), Kernel::Gaussian, 0.7);
+    let all = setup.lists().0.len();
+    setup.stages.params.list_capacity = u32_of(all / 2);
+    setup.stages.poison(BufferId::Lists);
+    let zero = [(BufferId::Counters, raw(&[Counters::default()]))];
+    let out = setup.run(Stage::Bin, &zero, &[BufferId::Counters, BufferId::Lists, BufferId::Heads]);
+    assert_eq!(cast::<Counters>(&out[0])[0].list_end as usize, all);
+    assert!(cast::<u32>(&out[1])[all / 2..].iter().all(|&entry| entry == 0xa5a5_a5a5));
+    assert!(cast::<[u32; 4]>(&out[2]).iter().all(|h| h[2] == 0 || (h[0] + h[2]) as usize <= all / 2));
+}
+
+#[test]
+fn field_is_within_its_bound_and_marks_inside_samples() {
+    for (name, setup) in setups() {
+        let (entries, heads) = setup.lists();
+        setup.poison(&[BufferId::Field, BufferId::Inside]);
+        let out = setup.run(
+            Stage::Field,
+            &[(BufferId::Lists, raw(&entries)), (BufferId::Heads, raw(&heads))],
+            &[BufferId::Field, BufferId::Inside],
+        );
+        let (got, expected) = (cast::<f32>(&out[0]), setup.samples());
+        assert_eq!(differs_by(&got, &expected, FIELD_BOUND, 0.1), None, "{name}");
+        let iso = setup.stages.params.isovalue;
+        let bits = |half: &[f32]| (0..).zip(half).fold(0, |word, (i, f)| word | u32::from(*f >= iso) << i);
+        let inside: Vec<u32> = got.chunks(32).map(bits).collect();
+        assert_eq!(unequal(&cast::<u32>(&out[1]), &inside), None, "{name}");
+        // Out of reach the density is exactly 0.
+        assert!(got.iter().zip(&expected).all(|(a, b)| (*b == 0.0) == (*a == 0.0) || *a < 1e-5), "{name}");
+        // Negative control: 2.5 times the bound.
+        let mut wrong = got.clone();
+        let highest = (0..wrong.len()).max_by(|&a, &b| wrong[a].total_cmp(&wrong[b])).unwrap();
+        wrong[highest] *= 1.0 + 2.5 * FIELD_BOUND;
+        assert!(differs_by(&wrong, &expected, FIELD_BOUND, 0.1).is_some());
+    }
+}
+
+#[test]
+fn classify_finds_the_same_edges_and_counts() {
+    for (name, setup) in setups() {
+        setup.poison(&[BufferId::Records, BufferId::Counts]);
+        let inputs = [
+            (BufferId::Inside, raw(&setup.inside())),
+            (BufferId::Groups, raw(&vec![[0_u32; 4]; setup.groups().len()])),
+        ];
+        let out = setup.run(Stage::Classify, &inputs, &[BufferId::Records, BufferId::Counts, BufferId::Groups]);
+        let (records, counts): (Vec<Record>, Vec<u32>) = (cast(&out[0]), cast(&out[1]));
+        assert_eq!(unequal(&records, &setup.records()), None, "{name}");
+        assert_eq!(unequal(&counts, &setup.counts()), None, "{name}");
+        assert_eq!(unequal(&cast::<[u32; 4]>(&out[2]), &setup.groups()), None, "{name}");
+        // Negative control: one inside bit changed.
+        let mut wrong = setup.inside();
+        let some = wrong.iter().position(|w| *w != 0 && *w != u32::MAX).unwrap();
+        wrong[some] ^= 1 << wrong[some].trailing_zeros();
+        let out =
+            setup.run(Stage::Classify, &[(BufferId::Inside, raw(&wrong))], &[BufferId::Records, BufferId::Counts]);
+        assert!(unequal(&cast::<Record>(&out[0]), &setup.records()).is_some());
+    }
+}
+
+#[test]
+fn scan_numbers_bricks_in_order() {
+    for (name, mut setup) in setups() {
+        setup.stages.poison(BufferId::Offsets);
+        let inputs = |s: &Setup| {
+            [
+                (BufferId::Counts, raw(&s.counts())),
+                (BufferId::Groups, raw(&s.groups())),
+                (BufferId::Counters, raw(&[Counters::default()])),
+            ]
+        };
+        let out = setup.run(Stage::Scan, &inputs(&setup), &[BufferId::Offsets, BufferId::Counters]);
+        let want = setup.offsets();
+        assert_eq!(unequal(&cast::<[u32; 2]>(&out[0]), &want), None, "{name}");
+        let tally = cast::<Counters>(&out[1])[0];
+        let mesh = &setup.probe.mesh;
+        assert_eq!((tally.vertices as usize, tally.triangles as usize), (mesh.n_vertices(), mesh.n_triangles()));
+        // Totals of earlier chunks are added. This is also the negative control.
+        (setup.stages.params.first_vertex, setup.stages.params.first_triangle) = (1000, 7);
+        let out = setup.run(Stage::Scan, &inputs(&setup), &[BufferId::Offsets]);
+        let moved: Vec<[u32; 2]> = want.iter().map(|[v, t]| [v + 1000, t + 7]).collect();
+        assert_eq!(unequal(&cast::<[u32; 2]>(&out[0]), &moved), None, "{name}");
+        assert!(unequal(&cast::<[u32; 2]>(&out[0]), &want).is_some());
+    }
+}
+
+#[test]
+fn interpolate_is_within_its_bounds() {
+    for (name, setup) in setups() {
+        setup.poison(&[BufferId::Positions, BufferId::Normals]);
+        let inputs = interpolate_inputs(&setup);
+        let out = setup.run(Stage::Interpolate, &inputs, &[BufferId::Positions, BufferId::Normals, BufferId::Counters]);
+        let mesh = &setup.probe.mesh;
+        let (positions, normals): (Vec<f32>, Vec<f32>) = (cast(&out[0]), cast(&out[1]));
+        let flat = |rows: &[[f32; 3]]| rows.as_flattened().to_vec();
+        let (want, want_normals) = (flat(&mesh.positions), flat(&mesh.normals));
+        let error = |got: &[f32], want: &[f32], bound: f32| {
+            got.iter().zip(want).position(|(a, b)| (a - b).abs() > bound || !a.is_finite())
+        };
+        assert_eq!((positions.len(), error(&positions, &want, POSITION_BOUND)), (want.len(), None), "{name}");
+        assert_eq!(error(&normals, &want_normals, NORMAL_BOUND), None, "{name}");
+        assert_eq!(cast::<Counters>(&out[2])[0].flat, 0, "{name}");
+        // Negative controls.
+        let mut wrong = positions.clone();
+        wrong[positions.len() / 2] += 2.0 * POSITION_BOUND;
+        assert!(error(&wrong, &want, POSITION_BOUND).is_some());
+        wrong.clone_from(&normals);
+        wrong[normals.len() / 3] += 2.0 * NORMAL_BOUND;
+        assert!(error(&wrong, &want_normals, NORMAL_BOUND).is_some());
+    }
+}
+
+/// Inputs of `interpolate`.
+fn interpolate_inputs(setup: &Setup) -> Vec<(BufferId, Vec<u8>)> {
+    let (entries, heads) = setup.lists();
+    vec![
+        (BufferId::Lists, raw(&entries)),
+        (BufferId::Heads, raw(&heads)),
+        (BufferId::Field, raw(&setup.samples())),
+        (BufferId::Records, raw(&setup.records())),
+        (BufferId::Counts, raw(&setup.counts())),
+        (BufferId::Offsets, raw(&setup.offsets())),
+        (BufferId::Counters, raw(&[Counters::default()])),
+    ]
+}
+
+/// Positions and normals of `interpolate` in single precision.
+fn single(setup: &mut Setup) -> [Vec<[f32; 3]>; 2] {
+    setup.stages.params.steps_per_angstrom = 0.0;
+    setup.poison(&[BufferId::Positions, BufferId::Normals]);
+    let out = setup.run(Stage::Interpolate, &interpolate_inputs(setup), &[BufferId::Positions, BufferId::Normals]);
+    [cast(&out[0]), cast(&out[1])]
+}
+
+/// Output of `interpolate` in steps: all bytes that single precision would take.
+fn in_steps(setup: &mut Setup, step: Step) -> [Vec<u8>; 2] {
+    setup.stages.params.steps_per_angstrom = step.per_angstrom();
+    setup.poison(&[BufferId::Positions, BufferId::Normals]);
+    let out = setup.run(Stage::Interpolate, &interpolate_inputs(setup), &[BufferId::Positions, BufferId::Normals]);
+    setup.stages.params.steps_per_angstrom = 0.0;
+    out.try_into().unwrap()
+}
+
+/// Vertices quantized on the host, and poison for the remaining bytes.
+fn rounded(step: Step, positions: &[[f32; 3]], normals: &[[f32; 3]]) -> [Vec<u8>; 2] {
+    let row = |p: &[f32; 3]| {
+        let [x, y, z] = step.position(*p);
+        [x, y, z, 0]
+    };
+    let unit = |n: &[f32; 3]| {
+        let [x, y, z] = normal(*n);
+        [x, y, z, 0]
+    };
+    let mut bytes = [
+        raw(&positions.iter().map(row).collect::<Vec<[i16; 4]>>()),
+        raw(&normals.iter().map(unit).collect::<Vec<[i8; 4]>>()),
+    ];
+    for column in &mut bytes {
+        column.resize(12 * positions.len(), 0xa5);
+    }
+    bytes
+}
+
+#[test]
+fn interpolate_quantizes_like_the_host() {
+    for (name, mut setup) in setups() {
+        let [positions, normals] = single(&mut setup);
+        let extent = positions.as_flattened().iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+        // A step that fits, a coarse one, and one that does not cover the outermost vertices.
+        let steps = [extent, 20_000.0, 0.5 * extent].map(|reach| Step::covering(f64::from(reach)));
+        for (i, step) in steps.into_iter().enumerate() {
+            let got = in_steps(&mut setup, step);
+            let expected = rounded(step, &positions, &normals);
+            assert_eq!(unequal(&got[0], &expected[0]), None, "{name} {step:?}: positions");
+            // A driver that fuses the last product with its rounding may be off by one. Software Vulkan does not.
+            assert_eq!(unequal(&got[1], &expected[1]), None, "{name} {step:?}: normals");
+            let n_beyond = cast::<i16>(&got[0][..8 * positions.len()]).iter().filter(|&&v| v == BEYOND).count();
+            assert_eq!(n_beyond > 0, i == 2, "{name} {step:?}: {n_beyond} beyond");
+            // Negative controls: another step, and a vertex moved by one step.
+            let other = rounded(Step::covering(2.1 * f64::from(step.reach())), &positions, &normals);
+            assert!(unequal(&got[0], &other[0]).is_some());
+            let (mut moved, mut turned) = (positions.clone(), normals.clone());
+            moved[7][1] += step.length();
+            turned[7] = turned[7].map(|c| c + 1.5 / 127.0);
+            let other = rounded(step, &moved, &turned);
+            assert!(unequal(&got[0], &other[0]).is_some() || n_beyond > 0, "{name}");
+            assert!(unequal(&got[1], &other[1]).is_some());
+        }
+    }
+}
+
+#[test]
+fn interpolate_marks_coordinates_that_are_not_numbers() {
+    let mut setup = Setup::new(&spheres(&[[0.0, 0.0, 0.0, 1.7]]), Kernel::Gaussian, 0.5);
+    let spacing = setup.stages.params.spacing;
+    for (bad, marked) in [(f32::NAN, true), (f32::INFINITY, true), (spacing, false)] {
+        setup.stages.params.spacing = bad;
+        let [positions, _] = in_steps(&mut setup, Step::covering(4.0));
+        let n = setup.probe.mesh.n_vertices();
+        let rows: Vec<[i16; 4]> = cast(&positions[..8 * n]);
+        // Infinity times 0 is not a number.
+        let all = |row: &[i16; 4]| row[..3].iter().all(|&v| (v == BEYOND) == marked) && row[3] == 0;
+        assert!(rows.iter().all(all), "{bad}: {rows:?}");
+    }
+}
+
+/// Near one direction and its mirror images, rounding makes a normal too long. The atom is placed so that one vertex
+/// has that direction.
+#[test]
+fn interpolate_shortens_the_same_normals_as_the_host() {
+    let mut setup = Setup::new(&spheres(&[[0.3, 0.1, 0.2, 1.7]]), Kernel::Gaussian, 0.5);
+    let [positions, _] = single(&mut setup);
+    let (h, centre) = (f64::from(setup.stages.params.spacing), setup.stages.params.centre);
+    let atom = setup.job.prepared.lattice.atoms[0];
+    let steep = [66.5_f64, 75.5, 77.5];
+    let length = steep.iter().map(|c| c * c).sum::<f64>().sqrt();
+    let orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
+    let mut shortened = 0;
+    for (signs, order) in (0..8).flat_map(|signs| orders.map(|order| (signs, order))) {
+        let sign = |k: usize| if signs >> k & 1 == 1 { -1.0 } else { 1.0 };
+        let way: [f64; 3] = std::array::from_fn(|k| sign(k) * steep[order[k]] / length);
+        // Position of the atom three spacings from the vertex.
+        let at: [f64; 3] =
+            std::array::from_fn(|k| f64::from(positions[9][k]) / h + f64::from(centre[k]) - 3.0 * way[k]);
+        #[expect(clippy::cast_possible_truncation, reason = "a few spacings, and a fraction of one")]
+        let moved =
+            LatticeAtom { cell: at.map(|c| c.round() as i32), frac: at.map(|c| (c - c.round()) as f32), ..atom };
+        setup.stages.write(BufferId::Atoms, bytemuck::bytes_of(&moved));
+        let [positions, normals] = single(&mut setup);
+        let step = Step::covering(8.0);
+        let expected = rounded(step, &positions, &normals);
+        let got = in_steps(&mut setup, step);
+        assert_eq!(unequal(&got[1], &expected[1]), None, "{way:?}");
+        let plain = normals[9].map(|c| (127.0 * c).round_ties_even().abs());
+        shortened += usize::from(plain.iter().map(|c| c * c).sum::<f32>() > 16_347.0);
+    }
+    assert!(shortened > 24, "{shortened} of 48 normals were too long");
+}
+
+#[test]
+fn emit_makes_the_same_triangles() {
+    for (name, setup) in setups() {
+        setup.stages.poison(BufferId::Triangles);
+        let inputs = [
+            (BufferId::Inside, raw(&setup.inside())),
+            (BufferId::Records, raw(&setup.records())),
+            (BufferId::Counts, raw(&setup.counts())),
+            (BufferId::Offsets, raw(&setup.offsets())),
+        ];
+        let out = setup.run(Stage::Emit, &inputs, &[BufferId::Triangles]);
+        let got: Vec<[u32; 3]> = cast(&out[0]);
+        assert_eq!(unequal(&got, &setup.probe.mesh.triangles), None, "{name}");
+        let mut wrong = got.clone();
+        wrong[got.len() - 1].rotate_left(1);
+        assert!(unequal(&wrong, &setup.probe.mesh.triangles).is_some());
+    }
+}

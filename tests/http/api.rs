@@ -1,0 +1,685 @@
+//! The service over a socket: every resource, every answer that a client can provoke without reaching a limit.
+
+use crate::bcif_support;
+use crate::http_support;
+
+use std::io::{Read as _, Write};
+use std::sync::{Arc, LazyLock};
+
+use bcif_support::CRAMBIN;
+use http_support::{Fake, Mode, Running, SAMPLE, log_lines, send, start};
+use molmesh::surface::cpu::CpuBackend;
+
+/// One server with the fake backend for all tests here; it is never stopped.
+static SERVER: LazyLock<Running> = LazyLock::new(|| {
+    let server = start(Fake::new(Mode::Octahedra), |_| {});
+    let archive = server.dir.path().join("archive/pt");
+    std::fs::create_dir_all(&archive).unwrap();
+    std::fs::write(archive.join("pdb4pti.ent.gz"), gzip(SAMPLE)).unwrap();
+    std::fs::write(server.dir.path().join("archive/1crn.bcif.gz"), gzip(CRAMBIN)).unwrap();
+    server
+});
+
+fn gzip(bytes: &[u8]) -> Vec<u8> {
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(bytes).unwrap();
+    encoder.finish().unwrap()
+}
+
+fn zstd(bytes: &[u8]) -> Vec<u8> {
+    ruzstd::encoding::compress_to_vec(bytes, ruzstd::encoding::CompressionLevel::Fastest)
+}
+
+const CURL: (&str, &str) = ("content-type", "application/x-www-form-urlencoded");
+
+#[test]
+fn a_pasted_curl_line_works_and_the_real_backend_is_behind_it() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let reply = server.post("/v1/meshes", &[CURL, ("accept", "*/*"), ("x-request-id", "pasted-1")], SAMPLE);
+    assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+    assert_eq!(reply.header("content-type"), Some("model/gltf-binary"));
+    assert_eq!(reply.header("content-length").unwrap().parse::<usize>().unwrap(), reply.body.len());
+    assert_eq!(&reply.body[..4], b"glTF");
+    assert_eq!(reply.header("content-disposition").unwrap().to_ascii_lowercase(), "attachment; filename=\"4pti.glb\"");
+    assert_eq!(reply.header("molmesh-atoms"), Some("454"));
+    assert_eq!(reply.header("molmesh-closed"), Some("true"));
+    assert_eq!(reply.header("molmesh-manifold"), Some("true"));
+    assert_eq!(reply.header("molmesh-resolution"), Some("0.5"));
+    assert_eq!(reply.header("molmesh-backend"), Some("cpu"));
+    assert_eq!(reply.header("molmesh-backend-reason"), Some("a test says so"));
+    let volume: f64 = reply.header("molmesh-volume").unwrap().parse().unwrap();
+    assert!((5_000.0..15_000.0).contains(&volume), "{volume}");
+    assert!(reply.header("vary").unwrap().to_ascii_lowercase().contains("accept"));
+    let timing = reply.header("server-timing").unwrap();
+    for stage in ["receive", "queue", "read", "select", "field", "emit", "measure"] {
+        assert!(timing.contains(&format!("{stage};dur=")), "{timing}");
+    }
+    // One line a request, and nothing to worry about.
+    let lines = log_lines("pasted-1");
+    assert!(lines.iter().any(|line| line.contains("answered") && line.contains("status=200")), "{lines:?}");
+    assert!(lines.iter().all(|line| !line.contains("WARN") && !line.contains("ERROR")), "{lines:?}");
+    // The same again gives the same bytes under the same validator; another parameter gives another.
+    let again = server.post("/v1/meshes", &[CURL], SAMPLE);
+    assert_eq!((again.header("etag"), &again.body), (reply.header("etag"), &reply.body));
+    let coarse = server.post("/v1/meshes?resolution=1", &[CURL], SAMPLE);
+    assert_ne!(coarse.header("etag"), reply.header("etag"));
+    assert!(coarse.body.len() < reply.body.len());
+    assert!(server.metric("molmesh_voxels_processed_total", &[]) > 0.0);
+    assert!(server.join());
+}
+
+#[test]
+fn the_report_can_be_had_instead_of_the_mesh() {
+    let reply =
+        SERVER.post("/v1/meshes?report=json&kernel=soft-object&isovalue=1.5", &[("accept", "text/html")], SAMPLE);
+    assert_eq!(reply.status, 200);
+    assert_eq!(reply.header("content-type"), Some("application/json"));
+    assert_eq!(reply.header("etag"), None);
+    let report = reply.json();
+    for key in [
+        "atoms",
+        "vertices",
+        "triangles",
+        "closed",
+        "manifold",
+        "euler",
+        "components",
+        "area",
+        "volume",
+        "resolution",
+        "kernel",
+        "backend",
+        "timings_ms",
+    ] {
+        assert!(!report[key].is_null(), "{key} in {report}");
+    }
+    assert_eq!((&report["atoms"], &report["triangles"]), (&454.into(), &(454 * 8).into()));
+    assert_eq!((report["kernel"].as_str(), report["isovalue"].as_f64()), (Some("soft-object"), Some(1.5)));
+    assert!(report["timings_ms"]["queue"].as_f64().is_some());
+}
+
+#[test]
+fn formats_are_negotiated() {
+    for (query, accept, status, media_type) in [
+        ("", "", 200, "model/gltf-binary"),
+        ("", "*/*", 200, "model/gltf-binary"),
+        ("", "model/stl", 200, "model/stl"),
+        ("", "model/obj;q=0.5, application/ply;q=0.9", 200, "application/ply"),
+        ("", "model/gltf-binary;q=0, model/*", 200, "model/gltf+json"),
+        ("", "text/html,application/xhtml+xml,*/*;q=0.8", 200, "model/gltf-binary"),
+        ("?format=obj", "model/stl", 200, "model/obj"),
+        ("?format=stl", "text/html", 200, "model/stl"),
+        ("", "image/png", 200, "image/png"),
+        ("?format=png", "model/stl", 200, "image/png"),
+        ("", "image/webp", 406, "application/problem+json"),
+        ("", "application/json", 406, "application/problem+json"),
+    ] {
+        let headers: &[(&str, &str)] = if accept.is_empty() { &[] } else { &[("accept", accept)] };
+        let reply = SERVER.post(&format!("/v1/meshes{query}"), headers, SAMPLE);
+        assert_eq!((reply.status, reply.header("content-type")), (status, Some(media_type)), "{query} {accept}");
+        assert!(reply.complete);
+        if status == 406 {
+            assert_eq!(reply.problem(406, "not-acceptable")["available"].as_array().unwrap().len(), 6);
+        } else {
+            assert!(reply.body.len() > 1000);
+        }
+    }
+}
+
+#[test]
+fn forms_carry_a_file_and_parameters() {
+    let form = |parts: &[(&str, &[u8])]| {
+        let mut body = Vec::new();
+        for (head, content) in parts {
+            write!(body, "--XX\r\ncontent-disposition: form-data; {head}\r\n\r\n").unwrap();
+            body.extend_from_slice(content);
+            body.extend_from_slice(b"\r\n");
+        }
+        body.extend_from_slice(b"--XX--\r\n");
+        body
+    };
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    let binary = form(&[("name=\"file\"; filename=\"x.bcif\"", CRAMBIN), ("name=\"resolution\"", b"1")]);
+    let reply = SERVER.post("/v1/meshes", &[kind], &binary);
+    assert_eq!((reply.status, reply.header("molmesh-atoms")), (200, Some("327")));
+    for name in ["file", "structure"] {
+        let file = format!("name=\"{name}\"; filename=\"x.pdb\"");
+        let body = form(&[(&file, SAMPLE), ("name=\"resolution\"", b"0.75"), ("name=\"format\"", b"ply")]);
+        let reply = SERVER.post("/v1/meshes?isovalue=1.2", &[kind], &body);
+        assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+        assert_eq!(reply.header("content-type"), Some("application/ply"));
+        assert_eq!((reply.header("molmesh-resolution"), reply.header("molmesh-isovalue")), (Some("0.75"), Some("1.2")));
+    }
+    let post = |body: &[u8]| SERVER.post("/v1/meshes", &[kind], body);
+    assert_eq!(post(&form(&[("name=\"resolution\"", b"1")])).problem(400, "bad-request")["expected"], "file");
+    post(&form(&[("name=\"file\"", SAMPLE), ("name=\"file\"", SAMPLE)])).problem(400, "bad-request");
+    post(b"no form at all").problem(400, "bad-request");
+    let unknown = post(&form(&[("name=\"file\"", SAMPLE), ("name=\"resolutoin\"", b"1")]));
+    assert_eq!(unknown.problem(400, "bad-parameter")["nearest"], "resolution");
+    let long = post(&form(&[("name=\"file\"", SAMPLE), ("name=\"chains\"", &[b'A'; 5000])]));
+    assert_eq!(long.problem(400, "bad-parameter")["limit"], 4096);
+    let twice = SERVER.post(
+        "/v1/meshes?resolution=1",
+        &[kind],
+        &form(&[("name=\"file\"", SAMPLE), ("name=\"resolution\"", b"1")]),
+    );
+    assert_eq!(twice.problem(400, "bad-parameter")["parameter"], "resolution");
+    SERVER.post("/v1/meshes", &[("content-type", "multipart/form-data")], b"x").problem(400, "bad-request");
+}
+
+#[test]
+fn compressed_bodies_are_seen_by_their_bytes_and_by_their_header() {
+    let (gz, zst) = (gzip(SAMPLE), zstd(SAMPLE));
+    let post = |headers: &[(&str, &str)], body: &[u8]| SERVER.post("/v1/meshes", headers, body);
+    for (encoding, body) in [("gzip", &gz), ("x-gzip", &gz), ("zstd", &zst), ("GZIP", &gz)] {
+        for headers in [&[][..], &[("content-encoding", encoding)][..]] {
+            let reply = post(headers, body);
+            assert_eq!((reply.status, reply.header("molmesh-atoms")), (200, Some("454")), "{headers:?}");
+        }
+    }
+    assert_eq!(post(&[("content-encoding", "identity")], SAMPLE).status, 200);
+    for (encoding, body) in [("gzip", SAMPLE), ("zstd", &gz), ("br", SAMPLE), ("gzip, gzip", &gz)] {
+        let reply = post(&[("content-encoding", encoding)], body);
+        assert_eq!(reply.problem(415, "unsupported-encoding")["available"][0], "gzip", "{encoding}");
+    }
+    post(&[], &gz[..gz.len() / 2]).problem(422, "unreadable-structure");
+    let json = ("content-type", "application/json");
+    let encoded = SERVER.post("/v1/meshes", &[json, ("content-encoding", "gzip")], br#"{"pdb_id": "4pti"}"#);
+    encoded.problem(415, "unsupported-encoding");
+    let structure = SERVER.post("/v1/structures", &[json], br#"{"pdb_id": "4pti"}"#);
+    let problem = structure.problem(415, "unsupported-media-type");
+    assert!(problem["detail"].as_str().unwrap().contains("/v1/meshes"), "{problem}");
+}
+
+#[test]
+fn a_type_that_contradicts_the_bytes_is_refused() {
+    let png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR";
+    let cif = include_bytes!("../../samples/1crn.cif");
+    for (declared, body, status) in [
+        ("chemical/x-pdb", SAMPLE, 200),
+        ("chemical/x-mmcif", cif, 200),
+        ("text/plain; charset=utf-8", SAMPLE, 200),
+        ("application/octet-stream", cif, 200),
+        // A hint that is wrong about good bytes does no harm.
+        ("image/png", SAMPLE, 200),
+        ("chemical/x-pdb", cif, 415),
+        ("chemical/x-mmcif", SAMPLE, 415),
+        ("application/gzip", SAMPLE, 415),
+        ("image/png", png, 415),
+        ("application/octet-stream", png, 422),
+        ("application/octet-stream", CRAMBIN, 200),
+        ("application/x-www-form-urlencoded", CRAMBIN, 200),
+        ("chemical/x-bcif", CRAMBIN, 200),
+        ("application/vnd.msgpack", CRAMBIN, 200),
+        ("application/vnd.binarycif", SAMPLE, 415),
+        ("chemical/x-bcif", cif, 415),
+        ("chemical/x-mmcif", CRAMBIN, 415),
+        ("chemical/x-pdb", CRAMBIN, 415),
+    ] {
+        let reply = SERVER.post("/v1/meshes", &[("content-type", declared)], body);
+        match status {
+            200 => assert_eq!(reply.status, 200, "{declared}: {}", String::from_utf8_lossy(&reply.body)),
+            415 => {
+                let problem = reply.problem(415, "unsupported-media-type");
+                assert_eq!(problem["declared"], declared.split(';').next().unwrap());
+                assert!(problem["found"].is_string());
+            }
+            _ => drop(reply.problem(422, "unreadable-structure")),
+        }
+    }
+}
+
+#[test]
+fn bad_parameters_are_named_with_what_was_expected() {
+    for (query, parameter, nearest) in [
+        ("resolutoin=1", "resolutoin", Some("resolution")),
+        ("Kernel=gaussian", "Kernel", Some("kernel")),
+        ("isovlaue=1", "isovlaue", Some("isovalue")),
+        ("xyzzyxyzzyxyzzy=1", "xyzzyxyzzyxyzzy", None),
+        ("resolution=1&resolution=1", "resolution", None),
+        ("resolution=", "resolution", None),
+        ("resolution=0", "resolution", None),
+        ("resolution=-1", "resolution", None),
+        ("resolution=1e-6", "resolution", None),
+        ("resolution=nan", "resolution", None),
+        ("resolution=inf", "resolution", None),
+        ("resolution=1%20apple", "resolution", None),
+        ("isovalue=0", "isovalue", None),
+        ("kernel=cubic", "kernel", None),
+        ("preset=nice", "preset", None),
+        ("preset=blinn&kernel=soft-object", "preset", None),
+        ("smoothness=1&kernel=inverse-square", "smoothness", None),
+        ("paper_a=1", "paper_a", None),
+        ("kernel=inverse-square&paper_c=2&paper_b=5", "paper_c", None),
+        ("atom_ids=maybe", "atom_ids", None),
+        ("model=first", "model", None),
+        ("chains=", "chains", None),
+        ("chains=A,,B", "chains", None),
+        ("select=proteins", "select", None),
+        ("select=hydrogens", "select", None),
+        ("altloc=AB", "altloc", None),
+        ("format=usdz", "format", None),
+        ("report=xml", "report", None),
+        ("check=lax", "check", None),
+        ("validation=trust", "validation", None),
+        ("compress=draco", "compress", None),
+        ("compress=quantize&format=ply", "compress", None),
+        ("detial=3", "detial", Some("detail")),
+        ("max_triangle=100", "max_triangle", Some("max_triangles")),
+        ("normal=none", "normal", Some("normals")),
+        ("unit=nanometer", "unit", Some("units")),
+        ("detail=7", "detail", None),
+        ("detail=-1", "detail", None),
+        ("detail=2.5", "detail", None),
+        ("max_triangles=7", "max_triangles", None),
+        ("max_triangles=1e6", "max_triangles", None),
+        ("max_triangles=4294967296", "max_triangles", None),
+        ("normals=flat", "normals", None),
+        ("units=inch", "units", None),
+        ("units=meter&format=ply", "units", None),
+        ("resolution=0.6&detail=3", "detail", None),
+        ("detail=3&resolution=0.6", "resolution", None),
+        ("max_triangles=1000&detail=3", "detail", None),
+        ("detail=3&max_triangles=1000", "max_triangles", None),
+        ("max_triangles=1000&resolution=1", "resolution", None),
+    ] {
+        let problem = SERVER.post(&format!("/v1/meshes?{query}"), &[], SAMPLE).problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], parameter, "{query}");
+        match nearest {
+            Some(nearest) => assert_eq!(problem["nearest"], nearest, "{query}"),
+            None => assert!(problem["nearest"].is_null(), "{query}: {problem}"),
+        }
+        let repeated = query.matches(parameter).count() > 1;
+        let known = !query.starts_with("xyzzy") && nearest.is_none();
+        assert_eq!(problem["expected"].is_string(), known && !repeated, "{query}: {problem}");
+    }
+}
+
+#[test]
+fn quantised_meshes_are_glb_or_gltf() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let archive = server.dir.path().join("archive/pt");
+    std::fs::create_dir_all(&archive).unwrap();
+    std::fs::write(archive.join("pdb4pti.ent.gz"), gzip(SAMPLE)).unwrap();
+    let document = |body: &[u8]| -> serde_json::Value {
+        let json = if body.starts_with(b"glTF") {
+            &body[20..20 + u32::from_le_bytes(body[12..16].try_into().unwrap()) as usize]
+        } else {
+            body
+        };
+        serde_json::from_slice(json).unwrap()
+    };
+    let plain = server.post("/v1/meshes", &[], SAMPLE);
+    let small = server.post("/v1/meshes?compress=quantize", &[], SAMPLE);
+    assert_eq!((plain.status, small.status), (200, 200), "{}", String::from_utf8_lossy(&small.body));
+    let vertices: usize = plain.header("molmesh-vertices").unwrap().parse().unwrap();
+    assert_eq!(small.header("molmesh-vertices"), plain.header("molmesh-vertices"));
+    // Their heads differ by a few words, or not at all.
+    let saved = plain.body.len() - small.body.len();
+    assert!(saved.abs_diff(12 * vertices) < 1000, "{saved} bytes saved on {vertices} vertices");
+    assert_ne!(small.header("etag"), plain.header("etag"));
+    let none = server.post("/v1/meshes?compress=none", &[], SAMPLE);
+    assert!(none.body == plain.body && none.header("etag") == plain.header("etag"));
+    let step = document(&small.body)["asset"]["extras"]["quantization"]["step"].clone();
+    assert!(step.as_f64().is_some_and(|step| step > 0.0 && step < 0.01), "{step}");
+    let text = server.post("/v1/meshes?compress=quantize&format=gltf", &[], SAMPLE);
+    assert_eq!(document(&text.body)["extensionsRequired"][0], "KHR_mesh_quantization");
+    assert_eq!(document(&plain.body).get("extensionsRequired"), None);
+    let report = server.post("/v1/meshes?compress=quantize&report=json", &[], SAMPLE).json();
+    assert_eq!(report["quantization"]["step"], step);
+    let entry = server.get("/v1/pdb/4pti/surface.glb?compress=quantize");
+    assert!(entry.body == small.body);
+
+    // The format may come from elsewhere than the query.
+    let accept = server.post("/v1/meshes?compress=quantize", &[("accept", "model/stl")], SAMPLE);
+    for refused in [accept, server.get("/v1/pdb/4pti/surface.obj?compress=quantize")] {
+        let problem = refused.problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], "compress");
+        assert!(problem["expected"].as_str().unwrap().contains("glb, gltf"), "{problem}");
+    }
+    let form =
+        b"--XX\r\ncontent-disposition: form-data; name=\"compress\"\r\n\r\nquantize\r\n--XX\r\ncontent-disposition: \
+        form-data; name=\"file\"\r\n\r\nx\r\n--XX--\r\n";
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    let refused = server.post("/v1/meshes", &[kind, ("accept", "application/ply")], form);
+    assert_eq!(refused.problem(400, "bad-parameter")["parameter"], "compress");
+    let can = server.get("/v1/capabilities").json();
+    let compress = can["parameters"].as_array().unwrap().iter().find(|p| p["name"] == "compress").unwrap();
+    assert_eq!(compress["values"], serde_json::json!(["none", "quantize"]));
+}
+
+#[test]
+fn what_cannot_be_meshed_is_named_and_the_server_lives_on() {
+    let pdb = |x: &str| {
+        format!("ATOM      1  CA  ALA A   1    {x:>8}   0.000   0.000  1.00  0.00           C  \n").into_bytes()
+    };
+    let long = "x".repeat(100_000).into_bytes();
+    let waters = "HETATM    1  O   HOH A   1       0.000   0.000   0.000  1.00  0.00           O  \n".repeat(3);
+    let cases: Vec<(&str, Vec<u8>, &str)> = vec![
+        ("", Vec::new(), "no-atoms|unreadable-structure"),
+        ("", vec![0; 1000], "unreadable-structure"),
+        ("", b"hello, world\n".to_vec(), "unreadable-structure"),
+        ("", long, "unreadable-structure"),
+        ("", b"\x1f\x8b\x08garbage".to_vec(), "unreadable-structure"),
+        ("", b"\x28\xb5\x2f\xfdgarbage".to_vec(), "unreadable-structure"),
+        ("", pdb("nan"), "unreadable-structure"),
+        ("", pdb("1e30"), "unreadable-structure"),
+        ("", pdb("9999999."), "unreadable-structure"),
+        ("", b"HEADER    EMPTY\nEND\n".to_vec(), "no-atoms"),
+        ("", b"data_x\n_entry.id X\n".to_vec(), "no-atoms"),
+        ("", waters.into_bytes(), "empty-selection"),
+        ("?chains=Z", SAMPLE.to_vec(), "empty-selection"),
+        ("?model=7", SAMPLE.to_vec(), "empty-selection"),
+    ];
+    for (n, (query, body, slugs)) in cases.iter().enumerate() {
+        let reply = SERVER.post(&format!("/v1/meshes{query}"), &[("x-request-id", &format!("hostile-{n}"))], body);
+        let slug = reply.json()["type"].as_str().unwrap().trim_start_matches("/problems/").to_owned();
+        assert!(slugs.split('|').any(|s| s == slug), "case {n}: {slug}: {}", reply.text());
+        reply.problem(422, &slug);
+        let lines = log_lines(&format!("hostile-{n}"));
+        assert!(lines.iter().all(|l| !l.contains("ERROR") && !l.contains("WARN")), "{lines:?}");
+    }
+    let broken = SERVER.post("/v1/meshes", &[], &[SAMPLE, &pdb("oops")[..]].concat());
+    let problem = broken.problem(422, "unreadable-structure");
+    assert!(problem["line"].as_u64().unwrap() > 400, "{problem}");
+    assert!(problem["column"].is_u64() && problem["expected"].is_string(), "{problem}");
+    assert_eq!(SERVER.post("/v1/meshes", &[], SAMPLE).status, 200);
+}
+
+#[test]
+fn a_strict_check_brings_the_referees_findings() {
+    let bad = [b"CRYST1 nonsense line that no strict reader takes\n", SAMPLE].concat();
+    assert_eq!(SERVER.post("/v1/meshes", &[], &bad).status, 200);
+    let problem = SERVER.post("/v1/meshes?check=strict", &[], &bad).problem(422, "unreadable-structure");
+    assert!(!problem["diagnostics"].as_array().unwrap().is_empty(), "{problem}");
+    let cif = include_bytes!("../../samples/1crn.cif");
+    let reply = SERVER.post("/v1/meshes?check=strict&report=json", &[], cif);
+    assert_eq!(reply.status, 200, "{}", reply.text());
+    assert!(reply.json()["diagnostics"].is_array());
+    assert!(SERVER.post("/v1/meshes?report=json", &[], cif).json().get("diagnostics").is_none());
+}
+
+#[test]
+fn binary_files_are_taken_wherever_texts_are() {
+    let text = include_bytes!("../../samples/1crn.cif");
+    // The same atoms make the same mesh, whatever they are wrapped in.
+    let stl = |body: &[u8], headers: &[(&str, &str)]| {
+        let reply = SERVER.post("/v1/meshes?resolution=1&format=stl", headers, body);
+        assert_eq!((reply.status, reply.header("molmesh-atoms")), (200, Some("327")));
+        reply.body
+    };
+    let expected = stl(text, &[]);
+    for body in [CRAMBIN.to_vec(), gzip(CRAMBIN), zstd(CRAMBIN)] {
+        assert!(stl(&body, &[]) == expected);
+    }
+    assert!(stl(&gzip(CRAMBIN), &[("content-encoding", "gzip")]) == expected);
+    // From the archive, and by a document that names the entry.
+    let stored = SERVER.get("/v1/pdb/1crn/surface.stl?resolution=1");
+    assert!(stored.status == 200 && stored.body == expected);
+    let order = br#"{"pdb_id": "1crn", "resolution": 1, "format": "stl"}"#;
+    let reply = SERVER.post("/v1/meshes", &[("content-type", "application/json")], order);
+    assert!(reply.status == 200 && reply.body == expected, "{}", reply.status);
+    assert_eq!(SERVER.get("/v1/pdb/1crn/surface.glb?report=json").json()["source_format"], "bcif");
+    // Uploaded once.
+    let kept = SERVER.post("/v1/structures", &[], CRAMBIN);
+    assert_eq!((kept.status, &kept.json()["format"], &kept.json()["id"]), (201, &"bcif".into(), &"1CRN".into()));
+    // The strict reader does not read it, and says so.
+    let report = SERVER.post("/v1/meshes?check=strict&report=json", &[], CRAMBIN).json();
+    assert!(report.to_string().contains("does not read BinaryCIF"), "{report}");
+    // A broken file: the problem says where.
+    let problem = SERVER.post("/v1/meshes", &[], &CRAMBIN[..CRAMBIN.len() / 2]).problem(422, "unreadable-structure");
+    assert!(problem["place"].as_str().unwrap().starts_with("BinaryCIF, byte "), "{problem}");
+    assert!(problem["found"].is_string() && problem["expected"].is_string());
+}
+
+#[test]
+fn archive_entries_are_cacheable_addresses() {
+    let path = "/v1/pdb/4pti/surface.glb?resolution=1";
+    let reply = SERVER.get(path);
+    assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+    assert_eq!(reply.header("content-type"), Some("model/gltf-binary"));
+    assert!(reply.header("cache-control").unwrap().contains("max-age=86400"));
+    assert!(reply.header("cache-control").unwrap().contains("stale-while-revalidate"));
+    let etag = reply.header("etag").unwrap();
+    assert!(etag.starts_with('"') && etag.len() == 66, "{etag}");
+    // Any way of writing the id is the same entry.
+    for path in ["/v1/pdb/4PTI/surface.glb?resolution=1.0", "/v1/pdb/pdb_00004pti/surface.glb?resolution=1"] {
+        assert_eq!(SERVER.get(path).header("etag"), Some(etag));
+    }
+    for tag in [etag, "*", &format!("W/{etag}"), &format!("\"x\", {etag}")] {
+        let same = send(SERVER.addr, "GET", path, &[("if-none-match", tag)], b"");
+        assert_eq!((same.status, same.body.len(), same.header("etag")), (304, 0, Some(etag)), "{tag}");
+        assert!(same.header("cache-control").is_some());
+    }
+    assert_eq!(send(SERVER.addr, "GET", path, &[("if-none-match", "\"other\"")], b"").status, 200);
+    let head = send(SERVER.addr, "HEAD", path, &[], b"");
+    assert_eq!((head.status, head.body.len(), head.header("etag")), (200, 0, Some(etag)));
+    assert_eq!(head.header("content-type"), Some("model/gltf-binary"));
+    for (ext, media_type) in
+        [("gltf", "model/gltf+json"), ("ply", "application/ply"), ("stl", "model/stl"), ("obj", "model/obj")]
+    {
+        let other = SERVER.get(&format!("/v1/pdb/4pti/surface.{ext}?resolution=1"));
+        assert_eq!((other.status, other.header("content-type")), (200, Some(media_type)));
+        assert_ne!(other.header("etag"), Some(etag));
+    }
+    assert_eq!(SERVER.get("/v1/pdb/4pti/surface.glb?report=json").json()["atoms"], 454);
+    SERVER.get("/v1/pdb/1abc/surface.glb").problem(404, "not-in-archive");
+    SERVER.get("/v1/pdb/4pti/surface.usdz").problem(404, "not-found");
+    SERVER.get("/v1/pdb/4pti/volume.glb").problem(404, "not-found");
+    for id in ["x", "..%2f..%2fetc", "4pti%00", "abcd", "4ptii", "%2e%2e"] {
+        let problem = SERVER.get(&format!("/v1/pdb/{id}/surface.glb")).problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], "id", "{id}");
+    }
+    assert_eq!(SERVER.get("/v1/pdb/4pti/surface.glb?format=stl").problem(400, "bad-parameter")["parameter"], "format");
+    assert_eq!(SERVER.get("/v1/pdb/4pti/surface.glb?q=1").problem(400, "bad-parameter")["parameter"], "q");
+    send(SERVER.addr, "DELETE", path, &[], b"").problem(405, "method-not-allowed");
+}
+
+#[test]
+fn a_server_without_an_archive_says_so() {
+    let server = start(Fake::new(Mode::Octahedra), |_| {});
+    let problem = server.get("/v1/pdb/4pti/surface.glb").problem(404, "not-in-archive");
+    assert!(!problem.to_string().contains(&*server.dir.path().to_string_lossy()), "{problem}");
+}
+
+#[test]
+fn the_libraries_errors_are_problems_too() {
+    let missing = SERVER.get("/v2/meshes").problem(404, "not-found");
+    assert!(missing["detail"].as_str().unwrap().contains("/v2/meshes"));
+    for (method, path, allow) in
+        [("GET", "/v1/meshes", "POST"), ("POST", "/livez", "GET,HEAD"), ("PUT", "/", "GET,HEAD")]
+    {
+        let reply = send(SERVER.addr, method, path, &[], b"");
+        reply.problem(405, "method-not-allowed");
+        assert_eq!(reply.header("allow"), Some(allow));
+    }
+    send(SERVER.metrics, "GET", "/", &[], b"").problem(404, "not-found");
+}
+
+#[test]
+fn every_problem_type_is_explained_at_its_address() {
+    let list = SERVER.get("/problems").json();
+    let list = list.as_array().unwrap();
+    assert!(list.len() >= 20);
+    for problem in list {
+        let address = problem["type"].as_str().unwrap();
+        let one = SERVER.get(address).json();
+        assert_eq!(&one, problem);
+        assert!(one["about"].as_str().unwrap().len() > 30, "{one}");
+    }
+    SERVER.get("/problems/none-such").problem(404, "not-found");
+}
+
+#[test]
+fn health_version_and_capabilities() {
+    assert_eq!(SERVER.get("/livez").json()["status"], "live");
+    assert_eq!(SERVER.get("/readyz").json()["status"], "ready");
+    assert_eq!(SERVER.get("/version").json()["version"], env!("CARGO_PKG_VERSION"));
+    let can = SERVER.get("/v1/capabilities").json();
+    assert_eq!(can["formats"].as_array().unwrap().len(), 6);
+    assert_eq!(can["kernels"].as_array().unwrap().len(), 3);
+    assert_eq!(can["presets"]["ses-like"]["isovalue"], 1.9);
+    assert_eq!(can["backends"][0]["reason"], "a test says so");
+    assert_eq!(can["radii"]["values"]["C"], 1.7);
+    assert_eq!(can["radii"]["values"].as_object().unwrap().len(), 118);
+    assert_eq!(can["limits"]["body_bytes"], 256 << 20);
+    // Whatever the document lists is taken: a form built from it works.
+    for parameter in can["parameters"].as_array().unwrap() {
+        let name = parameter["name"].as_str().unwrap();
+        let problem = SERVER.post(&format!("/v1/meshes?{name}=%01"), &[], SAMPLE).problem(400, "bad-parameter");
+        assert_eq!(problem["parameter"], name);
+        assert!(
+            parameter["doc"].as_str().unwrap().ends_with('.') || parameter["doc"].as_str().unwrap().ends_with(").")
+        );
+    }
+}
+
+#[test]
+fn the_page_needs_nothing_from_elsewhere() {
+    let page = SERVER.get("/");
+    assert_eq!(page.header("content-type"), Some("text/html; charset=utf-8"));
+    let policy = page.header("content-security-policy").unwrap();
+    // WebAssembly is a module of ours, not text that is evaluated.
+    let unsafe_ones = policy.replace("'wasm-unsafe-eval'", "");
+    assert!(policy.contains("default-src 'none'") && !unsafe_ones.contains("unsafe"), "{policy}");
+    let html = page.text();
+    assert!(!html.contains("<style") && !html.contains(" style=") && !html.contains(" onclick"));
+    let mut found = 0;
+    for attribute in ["src=\"", "href=\""] {
+        for link in html.split(attribute).skip(1).map(|rest| rest.split('"').next().unwrap()) {
+            if link.starts_with('#') {
+                continue;
+            }
+            assert!(link.starts_with('/') && !link.starts_with("//"), "{link}");
+            assert_eq!(SERVER.get(link).status, 200, "{link}");
+            found += 1;
+        }
+    }
+    assert!(found >= 4, "{found}");
+    // What it does in a browser is for tests/cli/browser.rs to see.
+    assert!(!html.contains("http://") && !html.contains("https://"));
+    assert_eq!(SERVER.get("/v1/capabilities").json()["viewer"], molmesh::http::has_viewer());
+    assert_eq!(html.contains("/assets/index-"), molmesh::http::has_viewer());
+    assert!(html.contains("/docs") && html.contains("curl"));
+    let component = SERVER.get("/molmesh-viewer.js");
+    assert_eq!(component.header("content-type"), Some("text/javascript; charset=utf-8"));
+    assert_eq!(component.header("cache-control"), Some("no-cache"));
+    SERVER.get("/assets/none.js").problem(404, "not-found");
+    assert_eq!(SERVER.get("/sample.pdb").body, SAMPLE);
+}
+
+#[test]
+fn packed_files_are_unpacked_for_those_who_take_them_plain() {
+    let html = SERVER.get("/").text();
+    let paths = html.split('"').filter(|text| text.starts_with("/assets/"));
+    for path in paths.chain(["/", "/molmesh-viewer.js"]) {
+        let plain = SERVER.get(path);
+        let packed = send(SERVER.addr, "GET", path, &[("accept-encoding", "gzip")], b"");
+        assert_eq!((plain.status, packed.status), (200, 200), "{path}");
+        assert_eq!(plain.header("content-encoding"), None, "{path}");
+        let named = path.contains('-') && path.starts_with("/assets/");
+        assert_eq!(plain.header("cache-control").unwrap().contains("immutable"), named, "{path}");
+        if packed.header("content-encoding").is_some() {
+            let mut unpacked = Vec::new();
+            flate2::read::GzDecoder::new(&packed.body[..]).read_to_end(&mut unpacked).unwrap();
+            assert_eq!(unpacked, plain.body, "{path}");
+            assert!(packed.body.len() < plain.body.len() || plain.body.len() < 500, "{path}");
+        }
+    }
+}
+
+#[test]
+fn atoms_are_listed_as_meshes_count_them() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let reply = server.get(&format!("{structure}/atoms"));
+    assert_eq!(reply.status, 200);
+    let (etag, list) = (reply.header("etag").unwrap().to_owned(), reply.json());
+    let unchanged = send(server.addr, "GET", &format!("{structure}/atoms"), &[("if-none-match", &etag)], b"");
+    assert_eq!(unchanged.status, 304);
+    assert_eq!(list["count"], server.get(&structure).json()["atoms"]);
+    // The rows that a mesh names are those of its polymer: LYS 15 among them, water not.
+    let ply = server.get(&format!("{structure}/surface.ply?atom_ids=true&resolution=1")).body;
+    let head = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let text = std::str::from_utf8(&ply[..head]).unwrap();
+    let n: usize = text.lines().find_map(|l| l.strip_prefix("element vertex ")).unwrap().parse().unwrap();
+    let named: std::collections::BTreeSet<u64> = (0..n)
+        .map(|i| u64::from(u32::from_le_bytes(ply[head + 28 * i + 24..head + 28 * i + 28].try_into().unwrap())))
+        .collect();
+    let rows = |column: &str| list["residues"][column].as_array().unwrap();
+    let residue = |atom: u64| rows("first").iter().rposition(|first| first.as_u64().unwrap() <= atom).unwrap();
+    let others: Vec<u64> = named.iter().copied().filter(|atom| rows("kind")[residue(*atom)] != "polymer").collect();
+    assert!(others.is_empty(), "{others:?} of {named:?}");
+    assert!(named.iter().any(|atom| rows("name")[residue(*atom)] == "LYS" && rows("number")[residue(*atom)] == 15));
+    assert!(rows("kind").iter().any(|kind| kind == "water"));
+}
+
+#[test]
+fn request_ids_are_kept_or_made() {
+    let given = send(SERVER.addr, "GET", "/nowhere", &[("x-request-id", "mine-42")], b"");
+    assert_eq!(given.problem(404, "not-found")["instance"], "mine-42");
+    let made: Vec<String> = (0..2).map(|_| SERVER.get("/livez").header("x-request-id").unwrap().to_owned()).collect();
+    assert_ne!(made[0], made[1]);
+    let insane = send(SERVER.addr, "GET", "/livez", &[("x-request-id", "a b\"c")], b"");
+    assert_ne!(insane.header("x-request-id"), Some("a b\"c"));
+}
+
+#[test]
+fn scripts_of_other_origins_may_read_everything() {
+    let preflight = send(
+        SERVER.addr,
+        "OPTIONS",
+        "/v1/meshes",
+        &[("origin", "http://else.where"), ("access-control-request-method", "POST")],
+        b"",
+    );
+    assert_eq!((preflight.status, preflight.header("access-control-allow-origin")), (200, Some("*")));
+    let error = SERVER.post("/v1/meshes?x=1", &[("origin", "http://else.where")], b"");
+    error.problem(400, "bad-parameter");
+    assert_eq!(error.header("access-control-allow-origin"), Some("*"));
+    assert!(error.header("access-control-expose-headers").unwrap().contains("molmesh-triangles"));
+    assert_eq!(error.header("x-content-type-options"), Some("nosniff"));
+}
+
+#[test]
+fn http2_without_tls_is_spoken() {
+    use http_body_util::{BodyExt as _, Full};
+    use hyper_util::rt::{TokioExecutor, TokioIo};
+    let addr = SERVER.addr;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let (status, body) = runtime.block_on(async move {
+        let stream = tokio::net::TcpStream::connect(addr).await.unwrap();
+        let (mut client, connection) =
+            hyper::client::conn::http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await.unwrap();
+        tokio::spawn(connection);
+        let request = hyper::Request::post(format!("http://{addr}/v1/meshes?format=stl"))
+            .body(Full::new(bytes::Bytes::from_static(SAMPLE)))
+            .unwrap();
+        let reply = client.send_request(request).await.unwrap();
+        assert_eq!(reply.version(), hyper::Version::HTTP_2);
+        (reply.status(), reply.into_body().collect().await.unwrap().to_bytes())
+    });
+    assert_eq!((status.as_u16(), body.len()), (200, 84 + 50 * 454 * 8));
+}
+
+#[test]
+fn metrics_move() {
+    let labels = ["route=\"/v1/meshes\"", "status=\"200\"", "method=\"POST\""];
+    let count = || SERVER.metric("http_server_request_duration_seconds_count", &labels);
+    let before = (count(), SERVER.metric("molmesh_jobs_finished_total", &["successful"]));
+    assert_eq!(SERVER.post("/v1/meshes", &[], &http_support::sample(77)).status, 200);
+    http_support::wait_for("the request is counted", || count() > before.0);
+    assert!(SERVER.metric("molmesh_jobs_finished_total", &["successful"]) > before.1);
+    for name in ["molmesh_triangles_emitted_total", "molmesh_voxels_processed_total", "molmesh_jobs_submitted_total"] {
+        assert!(SERVER.metric(name, &[]) > 0.0, "{name}");
+    }
+    for stage in ["queue", "read", "select", "measure", "encode"] {
+        let label = format!("stage=\"{stage}\"");
+        assert!(SERVER.metric("molmesh_job_stage_duration_seconds_count", &[&label]) > 0.0, "{stage}");
+    }
+    assert!((SERVER.metric("molmesh_build_info", &[env!("CARGO_PKG_VERSION")]) - 1.0).abs() < 1e-9);
+    SERVER.get("/made-up");
+    http_support::wait_for("unmatched", || {
+        SERVER.metric("http_server_request_duration_seconds_count", &["route=\"unmatched\""]) > 0.0
+    });
+}

@@ -1,0 +1,239 @@
+//! Every limit of the configuration has a metric and a test, and is documented.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use serde_json::Value;
+
+/// Key; metric or reason in `molmesh_requests_rejected_total` that counts hits of the limit (empty if nothing is
+/// rejected or lost); test that reaches the limit.
+type Row = (&'static str, &'static str, &'static str);
+
+const ROWS: &[Row] = &[
+    ("server.connections", "too-many-connections", "http_limits::one_connection_too_many_is_told_so"),
+    ("server.header_timeout_ms", "header-timeout", "http_limits::slow_heads_and_silent_connections_are_closed"),
+    ("server.body_timeout_ms", "body-timeout", "http_limits::a_body_that_trickles_is_given_up"),
+    (
+        "server.write_timeout_ms",
+        "write-timeout",
+        "http_limits::a_client_that_takes_nothing_is_given_up_and_its_mesh_freed",
+    ),
+    ("server.write_bytes", "write-timeout", "http_slow_readers::stalled_readers_lose_their_streams_and_nothing_else"),
+    ("server.head_bytes", "head-too-large", "http_limits::heads_are_limited"),
+    ("server.streams", "molmesh_connections", "http_limits::clients_of_http2_are_told_how_much_they_may_ask"),
+    ("server.heartbeat_ms", "", "http_limits::silent_event_streams_give_signs_of_life"),
+    ("server.idle_timeout_ms", "molmesh_connections", "http_limits::an_idle_http2_connection_is_closed"),
+    ("server.termination_notice_ms", "", "http_stop::the_notice_has_an_end_and_can_be_none"),
+    ("server.drain_timeout_ms", "", "http_lifecycle::a_drain_has_a_deadline"),
+    ("limits.body_bytes", "body-too-large", "http_limits::bodies_are_limited_whether_announced_or_not"),
+    ("limits.json_bytes", "body-too-large", "http_limits::json_bodies_are_limited_before_they_are_read"),
+    (
+        "limits.part_head_bytes",
+        "body-too-large",
+        "http_limits::heads_of_parts_are_limited_wherever_they_are_and_however_slowly_they_come",
+    ),
+    ("limits.parts", "body-too-large", "http_limits::parts_of_forms_are_limited"),
+    ("limits.inflated_bytes", "inflated-too-large", "http_limits::compression_bombs_stop_at_the_inflated_limit"),
+    ("limits.atoms", "too-many-atoms", "http_limits::atoms_are_limited"),
+    ("limits.labels", "too-many-atoms", "http_limits::atoms_that_are_listed_are_limited"),
+    ("limits.grid_samples", "grid-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
+    (
+        "limits.candidate_pairs",
+        "too-many-candidates",
+        "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits",
+    ),
+    ("limits.mesh_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
+    ("limits.output_bytes", "mesh-too-large", "http_limits::grids_and_meshes_are_limited_and_what_would_fit_fits"),
+    ("limits.memory_bytes", "memory-full", "http_limits::memory_is_shared_and_limited"),
+    (
+        "limits.picture_side",
+        "picture-too-large",
+        "http_pictures::pictures_are_limited_before_anything_is_done_for_them",
+    ),
+    ("jobs.workers", "molmesh_queue_depth", "http_limits::a_full_queue_refuses_at_once_and_says_when_to_come_back"),
+    ("jobs.queue", "queue-full", "http_limits::a_full_queue_refuses_at_once_and_says_when_to_come_back"),
+    ("jobs.deliveries", "too-many-deliveries", "http_limits::slow_takers_cannot_use_up_the_threads"),
+    ("jobs.deadline_ms", "deadline", "http_limits::the_deadline_counts_waiting_and_stops_the_job"),
+    ("jobs.batch_deadline_ms", "molmesh_jobs_finished_total", "openapi_statuses::jobs"),
+    (
+        "jobs.batch_max_delay_ms",
+        "molmesh_queue_oldest_age_seconds",
+        "http_limits::asynchronous_jobs_yield_for_the_maximum_delay",
+    ),
+    (
+        "jobs.attempts",
+        "molmesh_jobs_finished_total",
+        "jobs_durable::a_job_that_ends_the_process_again_and_again_is_given_up",
+    ),
+    ("jobs.concurrent_saves", "molmesh_results_not_kept_total", "http_limits::concurrent_saves_are_limited"),
+    ("devices.jobs", "molmesh_device_jobs", "http_devices::devices_are_listed_with_their_reasons"),
+    ("devices.batch", "molmesh_device_shared_submissions_total", "gpu_pool::small_jobs_share_a_submission"),
+    (
+        "devices.min_partition_bricks",
+        "molmesh_device_partitions_total",
+        "gpu_multi_device::concurrent_callers_neither_deadlock_nor_mix_partitions",
+    ),
+    ("archive.check_ms", "", "archive_http::digests_are_cached"),
+    ("archive.connect_timeout_ms", "molmesh_archive_requests_total", "archive_http::slow_heads_and_bodies_time_out"),
+    ("archive.first_byte_timeout_ms", "molmesh_archive_requests_total", "archive_http::slow_heads_and_bodies_time_out"),
+    ("archive.timeout_ms", "molmesh_archive_requests_total", "archive_http::slow_heads_and_bodies_time_out"),
+    ("archive.attempts", "molmesh_archive_fetch_seconds", "archive_http::slow_heads_and_bodies_time_out"),
+    ("archive.backoff_ms", "molmesh_archive_fetch_seconds", "archive/remote::pauses_double_and_are_random"),
+    ("archive.retry_after_ms", "molmesh_archive_breaker_open", "archive_http::retry_after_is_respected"),
+    ("archive.max_bytes", "entry-too-large", "archive_http::bodies_are_limited_during_the_transfer"),
+    ("archive.concurrent", "molmesh_archive_fetch_seconds", "archive_http::concurrent_fetches_are_limited"),
+    ("archive.fresh_ms", "molmesh_archive_requests_total", "archive_http::old_copies_are_revalidated"),
+    (
+        "archive.absent_ms",
+        "molmesh_archive_requests_total",
+        "archive_http::missing_entries_are_not_requested_again_for_a_while",
+    ),
+    ("archive.cache_bytes", "molmesh_archive_cache_bytes", "archive_http::least_recently_used_copies_are_evicted"),
+    ("archive.breaker_failures", "molmesh_archive_breaker_open", "archive_http::an_open_circuit_breaker_is_a_metric"),
+    ("archive.breaker_ms", "molmesh_archive_breaker_open", "archive_http::the_circuit_breaker_opens_and_closes"),
+    ("store.timeout_ms", "molmesh_store_errors_total", "cli_doctor::a_store_that_is_silent_is_given_up"),
+    ("store.probe_ms", "molmesh_store_errors_total", "http_ready::the_store_is_not_asked_more_often_than_configured"),
+    ("store.probe_timeout_ms", "molmesh_store_errors_total", "http/probe::a_slow_check_fails_after_its_timeout"),
+    ("store.sweep_ms", "molmesh_store_removed_total", "http_limits::what_is_too_old_is_swept_as_often_as_configured"),
+    ("store.max_bytes", "store-full", "store::objects_over_the_capacity_are_rejected"),
+    (
+        "store.result_ttl_ms",
+        "molmesh_store_removed_total",
+        "store::objects_expire_by_folder_and_use_prolongs_their_life",
+    ),
+    (
+        "store.input_ttl_ms",
+        "molmesh_store_removed_total",
+        "store::objects_expire_by_folder_and_use_prolongs_their_life",
+    ),
+    ("store.job_ttl_ms", "molmesh_store_removed_total", "store::objects_expire_by_folder_and_use_prolongs_their_life"),
+    ("store.memory_bytes", "molmesh_cache_requests_total", "store::memory_cache_is_bounded_and_drops_removed_objects"),
+    (
+        "jobs.store_patience_ms",
+        "molmesh_store_errors_total",
+        "service_s3::while_s3_is_away_the_service_says_so_and_keeps_its_promises",
+    ),
+    ("access.address_requests", "quota-exceeded", "http_access::addresses_have_quotas_also_behind_trusted_proxies"),
+    ("access.address_work_s", "quota-exceeded", "http_access::addresses_have_quotas_of_time_and_concurrency"),
+    ("access.address_concurrent", "quota-exceeded", "http_access::addresses_have_quotas_of_time_and_concurrency"),
+    ("access.window_s", "quota-exceeded", "http_access::addresses_have_quotas_of_time_and_concurrency"),
+    ("access.clients", "molmesh_quota_clients", "access/meter::memory_is_bounded_and_no_usage_is_forgotten"),
+    ("access.hsts_s", "", "http_access::security_headers_are_sent"),
+    ("telemetry.sample_ratio", "molmesh_trace_spans_total", "traces::a_share_of_the_traces_is_recorded"),
+    ("telemetry.timeout_ms", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
+    ("telemetry.queue", "", "traces::collectors_that_take_nothing_disturb_nobody"),
+    ("telemetry.flush_timeout_ms", "molmesh_trace_spans_total", "traces::collectors_that_take_nothing_disturb_nobody"),
+    ("store.memory_object_bytes", "molmesh_cache_requests_total", "store::small_results_are_cached_in_memory"),
+];
+
+fn read(path: &str) -> String {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
+    std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+}
+
+/// Returns the keys and defaults of all numbers in the schema.
+fn numbers() -> Vec<(String, Value)> {
+    let schema = molmesh::config::schema();
+    let mut found = Vec::new();
+    for (section, of_section) in schema["properties"].as_object().unwrap() {
+        for (key, of_key) in of_section["properties"].as_object().unwrap() {
+            if of_key.get("minimum").is_some() {
+                found.push((format!("{section}.{key}"), of_key["default"].clone()));
+            }
+        }
+    }
+    found
+}
+
+/// Returns the errors in a list of rows.
+fn faults(rows: &[Row]) -> Vec<String> {
+    let mut faults = Vec::new();
+    let listed: BTreeSet<String> = rows.iter().map(|(key, ..)| (*key).to_owned()).collect();
+    let known: BTreeSet<String> = numbers().into_iter().map(|(key, _)| key).collect();
+    faults.extend(listed.symmetric_difference(&known).map(|key| format!("{key} is only in one of list and schema")));
+    let (names, kinds) = (read("src/telemetry/names.rs"), read("src/http/kinds.rs") + &read("src/http/accept.rs"));
+    for (key, counted, test) in rows {
+        let quoted = format!("\"{counted}\"");
+        if !counted.is_empty() && !names.contains(&quoted) && !kinds.contains(&quoted) {
+            faults.push(format!("{key}: no metric or reason {counted}"));
+        }
+        let (file, name) = test.split_once("::").unwrap();
+        let folder = if file.contains('/') { "src" } else { "tests" };
+        let source = read(&format!("{folder}/{file}.rs"));
+        let field = key.split_once('.').unwrap().1.trim_end_matches("_ms").trim_end_matches("_s");
+        if !source.contains(&format!("fn {name}(")) || !source.contains(field) && folder == "tests" {
+            faults.push(format!("{key}: {file} has no {name}, or does not contain the key"));
+        }
+    }
+    faults
+}
+
+#[test]
+fn every_limit_has_a_metric_and_a_test() {
+    assert_eq!(faults(ROWS), Vec::<String>::new());
+    // Control: a missing key, an unknown key, an unknown metric and an unknown test.
+    assert!(faults(&ROWS[1..])[0].contains("server.connections"));
+    for bad in [
+        ("server.nothing", "deadline", "http_limits::atoms_are_limited"),
+        ("limits.atoms", "molmesh_nothing", "http_limits::atoms_are_limited"),
+        ("limits.atoms", "too-many-atoms", "http_limits::nothing"),
+        ("store.probe_ms", "", "http_limits::atoms_are_limited"),
+    ] {
+        assert_eq!(faults(&[ROWS, &[bad]].concat()).len(), 1, "{bad:?}");
+    }
+}
+
+/// Returns the differences between a documentation page and the list.
+fn differences(page: &str) -> Vec<String> {
+    let mut rows: Vec<(String, String, String)> = Vec::new();
+    for line in page.lines().filter(|line| line.starts_with("| `")) {
+        let cells: Vec<&str> = line.trim_matches('|').split(" | ").map(|cell| cell.trim_matches([' ', '`'])).collect();
+        if let [key, default, .., counted] = cells[..]
+            && key.contains('.')
+        {
+            rows.push((key.to_owned(), default.to_owned(), counted.replace('`', "")));
+        }
+    }
+    let mut faults = Vec::new();
+    for (key, default) in numbers() {
+        let default = match (default.as_u64(), default.as_str()) {
+            (Some(n), _) => formatted(&key, n),
+            (None, Some(text)) => text.to_owned(),
+            (None, None) => default.to_string(),
+        };
+        let counted = ROWS.iter().find(|row| row.0 == key).map(|row| row.1).unwrap_or_default();
+        let counted = if counted.is_empty() { "–" } else { counted };
+        let of_key: Vec<_> = rows.iter().filter(|row| row.0 == key).collect();
+        match of_key[..] {
+            [(_, documented, by)] if *documented == default && by == counted => {}
+            _ => faults.push(format!("expected `{key}` | {default} | … | `{counted}`, found {of_key:?}")),
+        }
+    }
+    let known: BTreeSet<String> = numbers().into_iter().map(|(key, _)| key).collect();
+    faults.extend(rows.iter().filter(|row| !known.contains(&row.0)).map(|row| format!("{} is not a limit", row.0)));
+    faults
+}
+
+/// Formats a number as in the documentation.
+fn formatted(key: &str, n: u64) -> String {
+    if key.ends_with("_bytes") {
+        let (shift, suffix) = [(30, "GiB"), (20, "MiB"), (10, "KiB")].into_iter().find(|(s, _)| n >= 1 << s).unwrap();
+        assert_eq!(n >> shift << shift, n, "{key}");
+        return format!("{} {suffix}", n >> shift);
+    }
+    let digits = n.to_string();
+    let grouped: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|c| std::str::from_utf8(c).unwrap()).collect();
+    let unit =
+        [("_ms", " ms"), ("_s", " s")].into_iter().find(|(end, _)| key.ends_with(end)).map_or("", |(_, unit)| unit);
+    format!("{}{unit}", grouped.join(","))
+}
+
+#[test]
+fn the_documented_limits_match_the_configuration() {
+    let page = read("docs/operate/limits.md");
+    assert_eq!(differences(&page), Vec::<String>::new());
+    // Control: a different default, a missing row.
+    assert_eq!(differences(&page.replace("| 1,024 |", "| 1,025 |")).len(), 1);
+    let fewer = page.lines().filter(|line| !line.contains("`jobs.queue`")).collect::<Vec<_>>().join("\n");
+    assert_eq!(differences(&fewer).len(), 1);
+}

@@ -1,0 +1,215 @@
+//! Generated clients send every default that the description declares: the answer is that to a request without them.
+
+use crate::http_support;
+
+use std::collections::BTreeMap;
+
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, start};
+use molmesh::formats::Format;
+use molmesh::pipeline::params::{self, ParamError, TABLE};
+use serde_json::{Map, Value};
+
+/// A server with an entry in its folder, and its description.
+fn server() -> (Running, Value) {
+    let server = start(Fake::new(Mode::Octahedra), |_| {});
+    let folder = server.dir.path().join("archive");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("4pti.pdb"), SAMPLE).unwrap();
+    let description = server.get("/openapi.json").json();
+    (server, description)
+}
+
+/// The declared defaults of an operation's query, with `format` in place of the default one.
+fn query(description: &Value, method: &str, path: &str, format: Option<&str>) -> Vec<(String, String)> {
+    let parameters = description["paths"][path][method]["parameters"].as_array().unwrap();
+    let of_query = parameters.iter().filter(|p| p["in"] == "query");
+    let pairs = of_query.filter_map(|p| Some((p["name"].as_str()?.to_owned(), text(p["schema"].get("default")?))));
+    let pairs = pairs.map(|(name, value)| {
+        let value = format.filter(|_| name == "format").map_or(value, str::to_owned);
+        (name, value)
+    });
+    pairs.collect()
+}
+
+/// The declared defaults of a request body.
+fn body(description: &Value, media_type: &str, format: &str) -> Map<String, Value> {
+    let schema = &description["paths"]["/v1/meshes"]["post"]["requestBody"]["content"][media_type]["schema"];
+    let schema = schema["$ref"].as_str().map_or(schema, |at| description.pointer(&at[1..]).unwrap());
+    // A JSON document names an entry or a structure; both have the same parameters.
+    let properties = schema.get("oneOf").map_or(schema, |one_of| &one_of[0])["properties"].as_object().unwrap();
+    let defaults = properties.iter().filter_map(|(name, p)| Some((name.clone(), p.get("default")?.clone())));
+    let mut defaults: Map<String, Value> = defaults.collect();
+    assert!(defaults.len() > 10, "{defaults:?}");
+    defaults.insert("format".to_owned(), format.into());
+    defaults
+}
+
+fn text(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+fn address(path: &str, pairs: &[(String, String)]) -> String {
+    let query: Vec<_> = pairs.iter().map(|(name, value)| format!("{name}={value}")).collect();
+    format!("{path}?{}", query.join("&"))
+}
+
+#[track_caller]
+fn same(found: &Reply, plain: &Reply) {
+    let said = || String::from_utf8_lossy(&found.body[..found.body.len().min(400)]).into_owned();
+    assert_eq!((found.status, plain.status), (200, 200), "{}", said());
+    assert!(plain.header("etag").is_some());
+    assert_eq!(found.header("etag"), plain.header("etag"));
+    assert!(found.body == plain.body, "other bytes");
+}
+
+#[test]
+fn all_defaults_at_once_change_nothing() {
+    let (server, description) = server();
+    let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let json = [("content-type", "application/json")];
+    let form = [("content-type", "multipart/form-data; boundary=b")];
+    for format in Format::ALL.map(Format::extension) {
+        let plain = server.post(&format!("/v1/meshes?format={format}"), &[], SAMPLE);
+        let defaults = query(&description, "post", "/v1/meshes", Some(format));
+        assert!(defaults.len() > 10 && defaults.iter().any(|(name, _)| name == "azimuth"), "{defaults:?}");
+        same(&server.post(&address("/v1/meshes", &defaults), &[], SAMPLE), &plain);
+        for (template, path) in
+            [("/v1/pdb/{id}/{file}", "/v1/pdb/4pti"), ("/v1/structures/{digest}/{file}", &structure)]
+        {
+            let defaults = query(&description, "get", template, None);
+            assert!(defaults.len() > 10, "{defaults:?}");
+            let path = format!("{path}/surface.{format}");
+            same(&server.get(&address(&path, &defaults)), &plain);
+        }
+        let mut document = body(&description, "application/json", format);
+        document.insert("pdb_id".to_owned(), "4pti".into());
+        same(&server.post("/v1/meshes", &json, Value::Object(document).to_string().as_bytes()), &plain);
+        let field = |(name, value): (&str, String)| {
+            format!("--b\r\ncontent-disposition: form-data; name=\"{name}\"\r\n\r\n{value}\r\n")
+        };
+        let fields = body(&description, "multipart/form-data", format);
+        let mut parts: String = fields.iter().map(|(name, value)| field((name, text(value)))).collect();
+        parts.push_str(&field(("file", String::from_utf8(SAMPLE.to_vec()).unwrap())));
+        parts.push_str("--b--\r\n");
+        same(&server.post("/v1/meshes", &form, parts.as_bytes()), &plain);
+        // An estimate has no tag; times differ.
+        let estimate = |path: &str| {
+            let reply = server.post(path, &[], SAMPLE);
+            assert_eq!(reply.status, 200, "{}", reply.text());
+            let mut document: BTreeMap<String, Value> = serde_json::from_slice(&reply.body).unwrap();
+            document.retain(|name, _| !["seconds", "wait_seconds"].contains(&name.as_str()));
+            document
+        };
+        let defaults = query(&description, "post", "/v1/estimate", Some(format));
+        let plain = estimate(&format!("/v1/estimate?format={format}"));
+        assert_eq!(estimate(&address("/v1/estimate", &defaults)), plain);
+    }
+    // The default format is the one without any.
+    let defaults = query(&description, "post", "/v1/meshes", None);
+    same(&server.post(&address("/v1/meshes", &defaults), &[], SAMPLE), &server.post("/v1/meshes", &[], SAMPLE));
+}
+
+/// A request as text: what decides its bytes.
+fn read(pairs: &[(&str, &str)], format: Format) -> Result<String, ParamError> {
+    let mut request = params::parse(pairs.iter().copied())?;
+    params::settle(&mut request.job, format)?;
+    Ok(format!("{} {} {}", params::canonical(&request.job), request.report, request.strict))
+}
+
+#[test]
+fn a_default_goes_with_everything() {
+    let (_server, description) = server();
+    let mut defaults = query(&description, "post", "/v1/meshes", None);
+    // A format decides over `Accept`, so the default one is a choice like any other.
+    defaults.retain(|(name, _)| name != "format");
+    let others: &[&[(&str, &str)]] = &[
+        &[],
+        &[("preset", "ses-like")],
+        &[("kernel", "soft-object")],
+        &[("kernel", "inverse-square")],
+        &[("resolution", "0.7")],
+        &[("detail", "3")],
+        &[("max_triangles", "5000")],
+        &[("smoothness", "2")],
+        &[("isovalue", "2")],
+        &[("radius_scale", "2")],
+        &[("radius_offset", "0.25")],
+        &[("cutoff_tolerance", "0.02")],
+        &[("paper_a", "1"), ("paper_b", "2")],
+        &[("paper_a", "1"), ("paper_b", "2"), ("kernel", "soft-object")],
+        &[("paper_c", "0.5"), ("paper_b", "3"), ("kernel", "inverse-square")],
+        &[("atom_ids", "true")],
+        &[("model", "1")],
+        &[("chains", "A")],
+        &[("select", "ligand")],
+        &[("altloc", "B")],
+        &[("validation", "exact")],
+        &[("check", "strict")],
+        &[("report", "json")],
+        &[("compress", "quantize")],
+        &[("normals", "none")],
+        &[("units", "meter")],
+        &[("width", "40")],
+        &[("height", "40")],
+        &[("view", "top")],
+        &[("azimuth", "20")],
+        &[("elevation", "20")],
+        &[("background", "white")],
+        &[("style", "gouraud")],
+    ];
+    let tried: Vec<&str> = others.iter().flat_map(|other| other.iter().map(|(name, _)| *name)).collect();
+    for parameter in TABLE.iter().filter(|p| p.name != "format") {
+        assert!(tried.contains(&parameter.name), "{} is not tried", parameter.name);
+    }
+    for other in others {
+        let mut formats = 0;
+        for format in Format::ALL {
+            let Ok(plain) = read(other, format) else { continue };
+            formats += 1;
+            let free = |name: &str| other.iter().all(|(given, _)| *given != name);
+            let all: Vec<(&str, &str)> =
+                defaults.iter().filter(|(name, _)| free(name)).map(|(name, value)| (&**name, &**value)).collect();
+            for beside in all.iter().map(std::slice::from_ref).chain([&all[..]]) {
+                for pairs in [[*other, beside].concat(), [beside, *other].concat()] {
+                    assert_eq!(read(&pairs, format), Ok(plain.clone()), "{pairs:?} {format}");
+                }
+            }
+        }
+        assert!(formats > 0, "{other:?} goes with no format");
+    }
+    // Numbers are equal however they are written.
+    for (name, value) in [("azimuth", "-0.0"), ("resolution", "0.50"), ("width", "+512"), ("background", "#00000000")] {
+        assert!(read(&[(name, value), ("detail", "3")], Format::Stl).is_ok(), "{name}={value}");
+    }
+}
+
+#[test]
+fn what_conflicts_is_named_as_it_was_sent() {
+    for (pairs, format, names) in [
+        (&[("resolution", "0.6"), ("detail", "3")][..], Format::Glb, &["`detail`", "`resolution`"][..]),
+        (
+            &[("max_triangles", "500"), ("resolution", "0.5"), ("detail", "3")],
+            Format::Glb,
+            &["`detail`", "`max_triangles`"],
+        ),
+        (&[("kernel", "soft-object"), ("cutoff_tolerance", "0.02")], Format::Glb, &["`cutoff_tolerance`"]),
+        (&[("kernel", "soft-object"), ("preset", "blinn")], Format::Glb, &["`preset`"]),
+        (&[("paper_a", "1"), ("paper_b", "2"), ("radius_scale", "2")], Format::Glb, &["`radius_scale`"]),
+        (&[("width", "512"), ("azimuth", "1")], Format::Stl, &["`azimuth`"]),
+        (&[("azimuth", "0"), ("style", "gouraud")], Format::Obj, &["`style`"]),
+        (&[("compress", "quantize")], Format::Ply, &["`compress`"]),
+    ] {
+        let refused = read(pairs, format).unwrap_err().to_string();
+        for name in names {
+            assert!(refused.contains(name), "no {name} in {refused}");
+        }
+        for parameter in TABLE.iter().filter(|p| pairs.iter().all(|(name, _)| *name != p.name)) {
+            assert!(!refused.contains(&format!("`{}`", parameter.name)), "{} was not sent: {refused}", parameter.name);
+        }
+    }
+    // A value that is no default is still checked, and a repetition is one also of defaults.
+    assert!(read(&[("check", "absent")], Format::Glb).is_err());
+    assert!(read(&[("azimuth", "0"), ("azimuth", "0")], Format::Png).is_err());
+    // Chains and alternative locations have defaults in words, which are names as well.
+    assert_ne!(read(&[("chains", "all")], Format::Glb), read(&[], Format::Glb));
+}

@@ -1,0 +1,262 @@
+//! What got a 202 is done, whatever happens to the process: the server is killed again and again under load.
+
+use crate::http_support;
+
+use std::collections::BTreeMap;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use http_support::{Fake, Mode, SAMPLE, sample, start, wait_for};
+use molmesh::surface::CpuBackend;
+
+/// A server process on a folder.
+struct Process {
+    child: Child,
+    addr: SocketAddr,
+}
+
+impl Process {
+    /// Starts one, and waits until it has said its address.
+    fn start(folder: &Path) -> Self {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_molmesh"))
+            .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--data-dir"])
+            .arg(folder)
+            .args(["--set", "jobs.attempts=1000", "--set", "archive.url=none", "--set", "jobs.queue=500"])
+            .stderr(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+        let addr = lines
+            .by_ref()
+            .map(Result::unwrap)
+            .find_map(|line| {
+                line.split_once("http://").and_then(|(_, rest)| {
+                    rest.split(|c: char| c != '.' && c != ':' && !c.is_ascii_digit()).next()?.parse().ok()
+                })
+            })
+            .expect("the banner says the address");
+        // The pipe must not fill up.
+        std::thread::spawn(move || lines.for_each(drop));
+        Self { child, addr }
+    }
+
+    /// `kill -9`.
+    fn kill(mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+}
+
+/// Sends a request to a server that may die meanwhile: status, `Location`, body if it came whole.
+fn ask(
+    addr: SocketAddr,
+    method: &str,
+    path: &str,
+    headers: &str,
+    body: &[u8],
+) -> Option<(u16, Option<String>, Vec<u8>)> {
+    let mut stream = TcpStream::connect(addr).ok()?;
+    stream.set_read_timeout(Some(Duration::from_secs(30))).ok()?;
+    let length = body.len();
+    let head = format!(
+        "{method} {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: {length}\r\n{headers}\r\n"
+    );
+    stream.write_all(head.as_bytes()).ok()?;
+    stream.write_all(body).ok()?;
+    let mut bytes = Vec::new();
+    stream.read_to_end(&mut bytes).ok()?;
+    let end = bytes.windows(4).position(|w| w == b"\r\n\r\n")?;
+    let head = String::from_utf8_lossy(&bytes[..end]).to_ascii_lowercase();
+    let field = |name: &str| head.lines().find_map(|l| l.strip_prefix(name)).map(|v| v.trim().to_owned());
+    let status = head.split(' ').nth(1)?.parse().ok()?;
+    let body = bytes[end + 4..].to_vec();
+    let whole = field("content-length:").is_none_or(|length| length.parse() == Ok(body.len()));
+    whole.then(|| (status, field("location:"), body))
+}
+
+/// What a job with this number asks for: its own structure, one of a few grids.
+fn order(n: usize) -> (String, Vec<u8>) {
+    (format!("/v1/meshes?format=stl&resolution={}", [0.5, 0.6, 0.8][n % 3]), sample(n))
+}
+
+#[test]
+fn fifty_kills_lose_no_accepted_job_and_no_byte() {
+    let folder = tempfile::tempdir().unwrap();
+    let accepted: Arc<Mutex<BTreeMap<usize, String>>> = Arc::default();
+    let mut next = 0;
+    let mut state = 88_172_645_463_325_252_u64;
+    let mut random = |below: u64| {
+        state ^= state << 13;
+        state ^= state >> 7;
+        state ^= state << 17;
+        state % below
+    };
+    for _ in 0..50 {
+        let server = Process::start(folder.path());
+        let stop = AtomicBool::new(false);
+        let (addr, first) = (server.addr, next);
+        next += 1000;
+        std::thread::scope(|scope| {
+            for client in 0..2 {
+                let (accepted, stop) = (Arc::clone(&accepted), &stop);
+                scope.spawn(move || {
+                    let mut n = first + client;
+                    while !stop.load(Ordering::SeqCst) {
+                        let (path, body) = order(n);
+                        let answer = ask(addr, "POST", &path, "prefer: respond-async\r\n", &body);
+                        if let Some((202, Some(location), _)) = answer {
+                            accepted.lock().unwrap().insert(n, location);
+                        }
+                        n += 2;
+                        std::thread::sleep(Duration::from_millis(15));
+                    }
+                });
+            }
+            std::thread::sleep(Duration::from_millis(20 + random(180)));
+            server.kill();
+            stop.store(true, Ordering::SeqCst);
+        });
+    }
+    let accepted = std::mem::take(&mut *accepted.lock().unwrap());
+    assert!(accepted.len() >= 50, "{} jobs were accepted", accepted.len());
+    let server = Process::start(folder.path());
+    // The right bytes are those of a server that was never killed.
+    let judge = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let expected: Vec<Vec<u8>> = (0..3).map(|n| judge.post(&order(n).0, &[], SAMPLE).body).collect();
+    assert!(expected[0] != expected[1] && expected[1] != expected[2]);
+    let deadline = Instant::now() + Duration::from_mins(2);
+    for (n, job) in &accepted {
+        let path = format!("{job}?wait=20");
+        let status = loop {
+            let (code, _, body) = ask(server.addr, "GET", &path, "", b"").expect("the server answers");
+            assert_eq!(code, 200, "job {n} is lost: {}", String::from_utf8_lossy(&body));
+            let status = serde_json::from_slice::<serde_json::Value>(&body).unwrap();
+            if !["accepted", "running"].contains(&status["status"].as_str().unwrap()) {
+                break status;
+            }
+            assert!(Instant::now() < deadline, "job {n} never ends: {status}");
+        };
+        assert_eq!(status["status"], "successful", "job {n}: {status}");
+        let (code, location, _) = ask(server.addr, "GET", &format!("{job}/result"), "", b"").unwrap();
+        assert_eq!(code, 303);
+        let (code, _, bytes) = ask(server.addr, "GET", &location.unwrap(), "", b"").unwrap();
+        assert_eq!((code, bytes == expected[n % 3]), (200, true), "job {n}");
+    }
+    // Every object in the store is whole: its name is there once its bytes are.
+    for entry in std::fs::read_dir(folder.path().join("store/results")).unwrap().map(Result::unwrap) {
+        if entry.path().extension().is_some_and(|e| e == "stl") {
+            let bytes = std::fs::read(entry.path()).unwrap();
+            assert!(expected.contains(&bytes), "{} is a half-written result", entry.path().display());
+        }
+    }
+    server.kill();
+}
+
+#[test]
+fn a_job_that_ends_the_process_again_and_again_is_given_up() {
+    let folder = tempfile::tempdir().unwrap();
+    let jobs = folder.path().join("store/jobs");
+    let backend = Fake::new(Mode::Slow(Duration::from_secs(30)));
+    let keep = |c: &mut molmesh::config::Config| folder.path().clone_into(&mut c.server.data_dir);
+    let mut location = String::new();
+    for attempt in 1..=3 {
+        let server = start(Arc::clone(&backend) as _, |c| {
+            keep(c);
+            c.server.drain_timeout_ms = 1;
+        });
+        if attempt == 1 {
+            let reply = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
+            assert_eq!(reply.status, 202);
+            reply.header("location").unwrap().clone_into(&mut location);
+        }
+        wait_for("the job to run", || backend.started.load(Ordering::SeqCst) == attempt);
+        let path = std::fs::read_dir(&jobs).unwrap().next().unwrap().unwrap().path();
+        let bytes = std::fs::read(&path).unwrap();
+        let record: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
+        assert_eq!(record["attempts"], attempt, "it is on record before the work begins");
+        assert!(server.join(), "promised jobs are left, no request is cut off");
+        // A stop takes the attempt back; a process that was ended by the job leaves the record as it was.
+        std::fs::write(&path, bytes).unwrap();
+    }
+    backend.set(Mode::Octahedra);
+    let server = start(Arc::clone(&backend) as _, keep);
+    let document = server.get(&format!("{location}?wait=5")).json();
+    assert_eq!(
+        (&document["status"], &document["problem"]["type"]),
+        (&"failed".into(), &"/problems/job-abandoned".into())
+    );
+    assert_eq!(backend.started.load(Ordering::SeqCst), 3, "no fourth time");
+    server.get(&format!("{location}/result")).problem(500, "job-abandoned");
+}
+
+#[test]
+fn a_repeated_key_is_the_same_job_after_a_restart_and_cannot_be_guessed() {
+    let folder = tempfile::tempdir().unwrap();
+    let keep = |c: &mut molmesh::config::Config| folder.path().clone_into(&mut c.server.data_dir);
+    let headers = [("prefer", "respond-async"), ("idempotency-key", "upload-1")];
+    let promise = |server: &http_support::Running| {
+        let reply = server.post("/v1/meshes?format=stl", &headers, SAMPLE);
+        assert_eq!(reply.status, 202);
+        reply.header("location").unwrap().to_owned()
+    };
+    let backend = Fake::new(Mode::Octahedra);
+    let server = start(Arc::clone(&backend) as _, keep);
+    // Requests that race are one job.
+    let jobs: Vec<String> = std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..6).map(|_| scope.spawn(|| promise(&server))).collect();
+        clients.into_iter().map(|client| client.join().unwrap()).collect()
+    });
+    assert!(jobs.iter().all(|job| *job == jobs[0]), "{jobs:?}");
+    let ended = server.get(&format!("{}?wait=20", jobs[0])).json();
+    assert_eq!(ended["status"], "successful");
+    assert!(server.join());
+    let server = start(Arc::clone(&backend) as _, keep);
+    assert_eq!(promise(&server), jobs[0]);
+    assert_eq!(server.get(&jobs[0]).json()["attempts"], ended["attempts"], "it does not run again");
+    // Client and key alone do not say the id: on another store it is another one.
+    let elsewhere = start(backend as _, |_| {});
+    assert_ne!(promise(&elsewhere), jobs[0]);
+}
+
+#[test]
+fn a_restart_takes_up_what_waits_and_leaves_what_has_ended() {
+    let folder = tempfile::tempdir().unwrap();
+    let keep = |c: &mut molmesh::config::Config| {
+        folder.path().clone_into(&mut c.server.data_dir);
+        c.server.drain_timeout_ms = 1;
+        c.jobs.workers = 1;
+    };
+    let backend = Fake::new(Mode::Octahedra);
+    let server = start(Arc::clone(&backend) as _, keep);
+    let later = [("prefer", "respond-async")];
+    let promise = |server: &http_support::Running, n: usize| {
+        let reply = server.post("/v1/meshes?format=stl", &later, &sample(n));
+        assert_eq!(reply.status, 202);
+        reply.header("location").unwrap().to_owned()
+    };
+    let done = promise(&server, 0);
+    assert_eq!(server.get(&format!("{done}?wait=5")).json()["status"], "successful");
+    backend.set(Mode::Slow(Duration::from_secs(30)));
+    let open: Vec<String> = (1..4).map(|n| promise(&server, n)).collect();
+    let dismissed = promise(&server, 4);
+    assert_eq!(http_support::send(server.addr, "DELETE", &dismissed, &[], b"").status, 200);
+    wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 2);
+    assert!(server.join(), "promised jobs are left, no request is cut off");
+    backend.set(Mode::Octahedra);
+    let server = start(Arc::clone(&backend) as _, keep);
+    for job in &open {
+        assert_eq!(server.get(&format!("{job}?wait=5")).json()["status"], "successful");
+        let result = server.get(&format!("{job}/result"));
+        assert_eq!(server.get(result.header("location").unwrap()).status, 200);
+    }
+    assert_eq!(server.get(&done).json()["status"], "successful");
+    assert_eq!(server.get(&dismissed).json()["status"], "dismissed");
+    assert_eq!(backend.started.load(Ordering::SeqCst), 5, "three were taken up, no other");
+    assert!(server.metric("molmesh_jobs_recovered_total", &[]) >= 3.0);
+}

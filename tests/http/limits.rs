@@ -1,0 +1,541 @@
+//! Every limit of the configuration, reached over a socket: the answer, the number, the metric, and a server that lives.
+
+use crate::http_support;
+
+use std::io::{Read, Write};
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Barrier};
+use std::time::{Duration, Instant};
+
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, connect, read_reply, sample, send, start, wait_for};
+use molmesh::config::Config;
+use molmesh::surface::cpu::CpuBackend;
+
+fn fake(change: impl FnOnce(&mut Config)) -> Running {
+    start(Fake::new(Mode::Octahedra), change)
+}
+
+fn rejected(server: &Running, reason: &str) -> f64 {
+    server.metric("molmesh_requests_rejected_total", &[&format!("reason=\"{reason}\"")])
+}
+
+/// Posts with a chunked body, so that no length is announced.
+fn post_chunked(server: &Running, body: &[u8]) -> Reply {
+    let mut stream = connect(server.addr);
+    stream
+        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\r\n")
+        .unwrap();
+    for chunk in body.chunks(16 << 10) {
+        let framed = [format!("{:x}\r\n", chunk.len()).as_bytes(), chunk, b"\r\n"].concat();
+        if stream.write_all(&framed).is_err() {
+            break;
+        }
+    }
+    stream.write_all(b"0\r\n\r\n").unwrap_or(());
+    read_reply(&mut stream, false)
+}
+
+#[test]
+fn bodies_are_limited_whether_announced_or_not() {
+    let server = fake(|c| c.limits.body_bytes = 100_000);
+    let large = vec![b'x'; 5_000_000];
+    let before = rejected(&server, "body-too-large");
+    for reply in [server.post("/v1/meshes", &[], &large), post_chunked(&server, &large)] {
+        assert_eq!(reply.problem(413, "body-too-large")["limit"], 100_000);
+    }
+    let mut form = b"--XX\r\ncontent-disposition: form-data; name=\"file\"\r\n\r\n".to_vec();
+    form.extend_from_slice(&large);
+    form.extend_from_slice(b"\r\n--XX--\r\n");
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    assert_eq!(server.post("/v1/meshes", &[kind], &form).problem(413, "body-too-large")["limit"], 100_000);
+    let mut stream = connect(server.addr);
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-type: multipart/form-data; \
+                boundary=XX\r\ntransfer-encoding: chunked\r\n\r\n";
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(format!("{:x}\r\n", form.len()).as_bytes()).unwrap();
+    stream.write_all(&form).unwrap_or(());
+    read_reply(&mut stream, false).problem(413, "body-too-large");
+    assert!(rejected(&server, "body-too-large") >= before + 4.0);
+    // A length that is a lie about to be told is refused before a byte of it has come.
+    let start = Instant::now();
+    let mut stream = connect(server.addr);
+    stream
+        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 99999999999\r\n\r\n")
+        .unwrap();
+    assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["actual"], 99_999_999_999u64);
+    assert!(start.elapsed() < Duration::from_secs(20));
+    assert_eq!(post_chunked(&server, SAMPLE).status, 200);
+}
+
+#[test]
+fn json_bodies_are_limited_before_they_are_read() {
+    let server = fake(|_| {});
+    let json = ("content-type", "application/json");
+    let before = rejected(&server, "body-too-large");
+    let list = |items: usize| format!("{{\"pdb_id\":\"4pti\",\"chains\":[{}0]}}", "0,".repeat(items)).into_bytes();
+    for path in ["/v1/meshes", "/v1/estimate"] {
+        let problem = server.post(path, &[json], &list(10_000_000)).problem(413, "body-too-large");
+        assert_eq!(problem["limit"], 65_536);
+        assert!(problem["detail"].as_str().unwrap().contains("limits.json_bytes"), "{problem}");
+    }
+    // Without a length it is refused once it is longer.
+    let mut stream = connect(server.addr);
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-type: application/json\r\n\
+                transfer-encoding: chunked\r\n\r\n10001\r\n";
+    stream.write_all(&[head.as_bytes(), &vec![b' '; 0x10001]].concat()).unwrap();
+    assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 65_536);
+    assert!(rejected(&server, "body-too-large") >= before + 3.0);
+    // A document that fits is read: only the entry is missing.
+    server.post("/v1/meshes", &[json], &list(30_000)).problem(404, "not-in-archive");
+}
+
+/// Begins a form in a chunked body.
+fn begin_form(server: &Running) -> std::net::TcpStream {
+    let mut stream = connect(server.addr);
+    let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\
+                content-type: multipart/form-data; boundary=XX\r\n\r\n";
+    stream.write_all(head.as_bytes()).unwrap();
+    stream
+}
+
+fn send_chunk(stream: &mut std::net::TcpStream, bytes: &[u8]) -> std::io::Result<()> {
+    stream.write_all(&[format!("{:x}\r\n", bytes.len()).as_bytes(), bytes, b"\r\n"].concat())
+}
+
+#[test]
+fn heads_of_parts_are_limited_wherever_they_are_and_however_slowly_they_come() {
+    let server = fake(|c| c.limits.part_head_bytes = 2000);
+    let part = |head: &str, content: &str| format!("--XX\r\n{head}\r\n\r\n{content}\r\n");
+    let named = |name: &str| format!("content-disposition: form-data; name=\"{name}\"");
+    let sample = part(&named("file"), std::str::from_utf8(SAMPLE).unwrap());
+    let long = format!("{}\r\nx: {}", named("resolution"), "y".repeat(2000));
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    let before = rejected(&server, "body-too-large");
+    for (what, form) in [
+        ("a preamble", format!("{}{sample}--XX--", "p".repeat(2000))),
+        ("a preamble without end", "p".repeat(1_000_000)),
+        ("a first head", format!("{}{sample}--XX--", part(&long, "1"))),
+        ("a later head", format!("{sample}{}--XX--", part(&long, "1"))),
+        ("a name", format!("{sample}{}--XX--", part(&named(&"n".repeat(2000)), "1"))),
+        ("a head without end", format!("{sample}--XX\r\na: {}", "y".repeat(1_000_000))),
+        ("an epilogue", format!("{sample}--XX--{}", "e".repeat(1_000_000))),
+    ] {
+        let problem = server.post("/v1/meshes", &[kind], form.as_bytes()).problem(413, "body-too-large");
+        assert_eq!(problem["limit"], 2000, "{what}");
+        assert!(problem["detail"].as_str().unwrap().contains("limits.part_head_bytes"), "{what}: {problem}");
+    }
+    // A byte at a time, where the end is never more than a byte away.
+    let mut stream = begin_form(&server);
+    send_chunk(&mut stream, b"--XX\r\na: ").unwrap();
+    for _ in 0..3000 {
+        if send_chunk(&mut stream, b"b").is_err() {
+            break;
+        }
+    }
+    assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 2000);
+    assert!(rejected(&server, "body-too-large") >= before + 8.0);
+    // Heads that fit do, with a preamble, an epilogue, and content that comes in small pieces.
+    let form = format!("hello\r\n{}{sample}--XX--\r\nbye", part(&named("resolution"), "1.5"));
+    let mut stream = begin_form(&server);
+    for piece in form.as_bytes().chunks(777) {
+        send_chunk(&mut stream, piece).unwrap();
+    }
+    stream.write_all(b"0\r\n\r\n").unwrap();
+    assert_eq!(read_reply(&mut stream, false).status, 200);
+    let wide = ("content-type", format!("multipart/form-data; boundary={}", "b".repeat(71)));
+    assert_eq!(server.post("/v1/meshes", &[(wide.0, &wide.1)], b"x").problem(400, "bad-request")["limit"], 70);
+}
+
+#[test]
+fn an_endless_head_of_a_part_takes_no_memory_and_little_time() {
+    let server = fake(|_| {});
+    let mut stream = begin_form(&server);
+    let start = Instant::now();
+    send_chunk(&mut stream, b"--XX\r\nA: ").unwrap();
+    let (mut sent, piece) = (0, vec![b'a'; 64 << 10]);
+    while sent < 60_000_000 && send_chunk(&mut stream, &piece).is_ok() {
+        sent += piece.len();
+    }
+    assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 16_384);
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+    // The parser's buffer is charged: without room for it a form is refused, and a file is not.
+    let server = fake(|c| c.limits.memory_bytes = 60_000);
+    let kind = ("content-type", "multipart/form-data; boundary=XX");
+    server.post("/v1/meshes", &[kind], b"--XX\r\n").problem(503, "memory-full");
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(10)).status, 200);
+}
+
+#[test]
+fn parts_of_forms_are_limited() {
+    let server = fake(|c| c.limits.parts = 3);
+    let form = |parts: usize| {
+        let fields = "--XX\r\ncontent-disposition: form-data; name=\"unknown\"\r\n\r\n\r\n".repeat(parts);
+        server.post(
+            "/v1/meshes",
+            &[("content-type", "multipart/form-data; boundary=XX")],
+            (fields + "--XX--").as_bytes(),
+        )
+    };
+    let problem = form(4).problem(413, "body-too-large");
+    assert_eq!(problem["limit"], 3);
+    assert!(problem["detail"].as_str().unwrap().contains("limits.parts"), "{problem}");
+    form(3).problem(400, "bad-request");
+    form(100_000).problem(413, "body-too-large");
+}
+
+#[test]
+fn compression_bombs_stop_at_the_inflated_limit() {
+    let server = fake(|c| c.limits.inflated_bytes = 1_000_000);
+    let mut encoder = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
+    encoder.write_all(&vec![b' '; 50_000_000]).unwrap();
+    let bomb = encoder.finish().unwrap();
+    let before = rejected(&server, "inflated-too-large");
+    let start = Instant::now();
+    assert_eq!(server.post("/v1/meshes", &[], &bomb).problem(413, "inflated-too-large")["limit"], 1_000_000);
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+    assert!(rejected(&server, "inflated-too-large") > before);
+    let archive = server.dir.path().join("archive");
+    std::fs::create_dir_all(&archive).unwrap();
+    std::fs::write(archive.join("1abc.cif"), vec![b' '; 1_000_001]).unwrap();
+    assert_eq!(server.get("/v1/pdb/1abc/surface.glb").problem(413, "inflated-too-large")["limit"], 1_000_000);
+}
+
+#[test]
+fn atoms_are_limited() {
+    let server = fake(|c| c.limits.atoms = 100);
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).problem(422, "too-many-atoms")["limit"], 100);
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(100)).status, 200);
+    assert!(rejected(&server, "too-many-atoms") >= 1.0);
+}
+
+#[test]
+fn atoms_that_are_listed_are_limited() {
+    let server = fake(|c| c.limits.labels = 100);
+    let listed = |atoms| {
+        let structure = server.post("/v1/structures", &[], &carbons(atoms)).header("location").unwrap().to_owned();
+        server.get(&format!("{structure}/atoms"))
+    };
+    assert_eq!(listed(101).problem(422, "too-many-atoms")["limit"], 100);
+    assert_eq!(listed(100).json()["count"], 100);
+    assert!(rejected(&server, "too-many-atoms") >= 1.0);
+    // Its mesh is made nevertheless.
+    assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).status, 200);
+}
+
+#[test]
+fn grids_and_meshes_are_limited_and_what_would_fit_fits() {
+    for (slug, change) in [
+        ("grid-too-large", Box::new(|c: &mut Config| c.limits.grid_samples = 60_000) as Box<dyn FnOnce(&mut Config)>),
+        ("too-many-candidates", Box::new(|c: &mut Config| c.limits.candidate_pairs = 10_000)),
+        ("mesh-too-large", Box::new(|c: &mut Config| c.limits.mesh_bytes = 300_000)),
+        ("mesh-too-large", Box::new(|c: &mut Config| c.limits.output_bytes = 300_000)),
+    ] {
+        let server = start(Arc::new(CpuBackend::new(None).unwrap()), change);
+        let problem = server.post("/v1/meshes?resolution=0.4", &[], SAMPLE).problem(422, slug);
+        assert!(problem["actual"].as_u64() > problem["limit"].as_u64(), "{problem}");
+        let suggested = problem["suggested_resolution"].as_f64().unwrap();
+        let reply = server.post(&format!("/v1/meshes?resolution={suggested}"), &[], SAMPLE);
+        assert_eq!(reply.status, 200, "{slug} {suggested}: {}", String::from_utf8_lossy(&reply.body));
+        assert!(rejected(&server, slug) >= 1.0);
+    }
+}
+
+#[test]
+fn a_full_queue_refuses_at_once_and_says_when_to_come_back() {
+    let backend = Fake::new(Mode::Slow(Duration::from_millis(600)));
+    let server = start(Arc::clone(&backend) as _, |c| {
+        c.jobs.workers = 1;
+        c.jobs.queue = 2;
+    });
+    let server = &server;
+    std::thread::scope(|scope| {
+        let accepted: Vec<_> =
+            (0..3).map(|n| scope.spawn(move || server.post("/v1/meshes", &[], &sample(n)).status)).collect();
+        wait_for("two jobs to wait", || server.metric("molmesh_queue_depth", &[]) >= 2.0);
+        wait_for("one job to run", || backend.started.load(Ordering::SeqCst) == 1);
+        let start = Instant::now();
+        let refused = server.post("/v1/meshes", &[], &sample(9));
+        assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
+        let problem = refused.problem(503, "queue-full");
+        assert_eq!((&problem["limit"], &problem["actual"]), (&2.into(), &2.into()));
+        assert!(problem["estimated_wait_s"].as_f64().unwrap() > 0.0);
+        let after: u64 = refused.header("retry-after").unwrap().parse().unwrap();
+        assert!((1..=5).contains(&after), "{after}");
+        // Load does not make the service unready.
+        assert_eq!(server.get("/readyz").status, 200);
+        for job in accepted {
+            assert_eq!(job.join().unwrap(), 200);
+        }
+    });
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    assert!(rejected(server, "queue-full") >= 1.0);
+}
+
+#[test]
+fn the_deadline_counts_waiting_and_stops_the_job() {
+    let backend = Fake::new(Mode::Slow(Duration::from_secs(30)));
+    let server = start(Arc::clone(&backend) as _, |c| {
+        c.jobs.workers = 1;
+        c.jobs.deadline_ms = 300;
+    });
+    let server = &server;
+    std::thread::scope(|scope| {
+        let replies: Vec<_> = (0..2).map(|n| scope.spawn(move || server.post("/v1/meshes", &[], &sample(n)))).collect();
+        for reply in replies {
+            let problem = reply.join().unwrap().problem(504, "deadline");
+            let limit = problem["limit"].as_u64().unwrap();
+            assert!((200..=300).contains(&limit), "{limit}");
+        }
+    });
+    // The second one may have got the worker for the moment between the two deadlines.
+    wait_for("every job that started is cancelled", || {
+        let started = backend.started.load(Ordering::SeqCst);
+        started >= 1 && backend.cancelled.load(Ordering::SeqCst) == started
+    });
+    backend.set(Mode::Octahedra);
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+}
+
+#[test]
+fn a_body_that_trickles_is_given_up() {
+    let server = fake(|c| c.server.body_timeout_ms = 300);
+    let mut stream = connect(server.addr);
+    let start = Instant::now();
+    stream
+        .write_all(b"POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 1000\r\n\r\nATOM")
+        .unwrap();
+    assert_eq!(read_reply(&mut stream, false).problem(408, "body-timeout")["limit"], 300);
+    assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
+    assert!(rejected(&server, "body-timeout") >= 1.0);
+}
+
+#[test]
+fn slow_heads_and_silent_connections_are_closed() {
+    let server = fake(|c| c.server.header_timeout_ms = 300);
+    let before = rejected(&server, "header-timeout");
+    for sent in [&b""[..], b"P", b"PRI * HTTP/2.0\r\n", b"GET /livez HTTP/1.1\r\nhost: t\r\nx-slow: "] {
+        let mut stream = connect(server.addr);
+        stream.write_all(sent).unwrap();
+        let start = Instant::now();
+        let mut rest = Vec::new();
+        stream.read_to_end(&mut rest).unwrap_or(0);
+        let time = start.elapsed();
+        assert!(time > Duration::from_millis(200) && time < Duration::from_secs(8), "{sent:?}: {time:?}");
+    }
+    // A connection that has been used and then says nothing is closed as well.
+    let mut stream = connect(server.addr);
+    stream.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+    let start = Instant::now();
+    let reply = read_reply(&mut stream, false);
+    assert!(reply.status == 200 && start.elapsed() < Duration::from_secs(8), "{:?}", start.elapsed());
+    wait_for("they are counted", || rejected(&server, "header-timeout") >= before + 4.0);
+    assert_eq!(server.get("/livez").status, 200);
+}
+
+#[test]
+fn one_connection_too_many_is_told_so() {
+    let server = fake(|c| c.server.connections = 4);
+    wait_for("earlier connections to be gone", || server.metric("molmesh_connections", &[]) >= 0.0);
+    let mut held = Vec::new();
+    let refused = loop {
+        let mut stream = connect(server.addr);
+        stream.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
+        let mut start = [0; 12];
+        stream.read_exact(&mut start).unwrap();
+        if &start[9..] == b"503" {
+            let mut rest = start.to_vec();
+            stream.read_to_end(&mut rest).unwrap();
+            break String::from_utf8(rest).unwrap();
+        }
+        held.push(stream);
+        assert!(held.len() <= 4, "five connections at once");
+    };
+    assert!(refused.contains("retry-after: 1") && refused.contains("/problems/too-many-connections"), "{refused}");
+    assert!(rejected(&server, "too-many-connections") >= 1.0);
+    drop(held);
+    wait_for("there is room again", || send(server.addr, "GET", "/livez", &[], b"").status == 200);
+}
+
+#[test]
+fn a_client_that_takes_nothing_is_given_up_and_its_mesh_freed() {
+    let server = fake(|c| c.server.write_timeout_ms = 400);
+    // Large enough for no socket buffer.
+    let body = carbons(60_000);
+    let before = rejected(&server, "write-timeout");
+    let mut stream = connect(server.addr);
+    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    wait_for("the client is given up", || rejected(&server, "write-timeout") > before);
+    wait_for("the mesh is freed", || server.metric("molmesh_memory_held_bytes", &[]) < 1e6);
+    let mut rest = Vec::new();
+    stream.read_to_end(&mut rest).unwrap_or(0);
+    assert!(rest.len() < 84 + 50 * 60_000 * 8, "the answer was cut off");
+}
+
+#[test]
+fn memory_is_shared_and_limited() {
+    let server = fake(|c| c.limits.memory_bytes = 200_000);
+    let problem = server.post("/v1/meshes", &[], &carbons(3_000)).problem(503, "memory-full");
+    assert_eq!(problem["limit"], 200_000);
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    assert!(rejected(&server, "memory-full") >= 1.0);
+}
+
+#[test]
+fn a_hundred_clients_at_once_are_all_answered() {
+    let server = fake(|_| {});
+    let barrier = Barrier::new(100);
+    let statuses: Vec<u16> = std::thread::scope(|scope| {
+        let clients: Vec<_> = (0..100)
+            .map(|n| {
+                let (server, barrier) = (&server, &barrier);
+                scope.spawn(move || {
+                    barrier.wait();
+                    let reply = server.post("/v1/meshes", &[], &sample(n));
+                    assert!(reply.complete);
+                    reply.status
+                })
+            })
+            .collect();
+        clients.into_iter().map(|client| client.join().unwrap()).collect()
+    });
+    assert!(statuses.iter().all(|status| [200, 503].contains(status)), "{statuses:?}");
+    assert!(statuses.iter().filter(|status| **status == 200).count() >= 60, "{statuses:?}");
+}
+
+#[test]
+fn slow_takers_cannot_use_up_the_threads() {
+    let server = fake(|c| c.jobs.deliveries = 1);
+    let body = carbons(60_000);
+    let mut stream = connect(server.addr);
+    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    stream.write_all(head.as_bytes()).unwrap();
+    stream.write_all(&body).unwrap();
+    let mut some = [0; 1000];
+    stream.read_exact(&mut some).unwrap();
+    let refused = server.post("/v1/meshes", &[], SAMPLE);
+    assert_eq!(refused.problem(503, "too-many-deliveries")["limit"], 1);
+    assert!(refused.header("retry-after").is_some());
+    drop(stream);
+    wait_for("the place is free", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
+}
+
+#[test]
+fn an_idle_http2_connection_is_closed() {
+    use hyper_util::rt::{TokioExecutor, TokioIo};
+    let server = fake(|c| {
+        c.server.header_timeout_ms = 300;
+        c.server.idle_timeout_ms = 300;
+    });
+    let addr = server.addr;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let time = runtime.block_on(async move {
+        let stream = tokio::net::TcpStream::connect(addr).await.unwrap();
+        let (mut client, connection) =
+            hyper::client::conn::http2::handshake(TokioExecutor::new(), TokioIo::new(stream)).await.unwrap();
+        let request = hyper::Request::get(format!("http://{addr}/livez"))
+            .body(http_body_util::Empty::<bytes::Bytes>::new())
+            .unwrap();
+        let start = Instant::now();
+        let driven = tokio::spawn(connection);
+        assert_eq!(client.send_request(request).await.unwrap().status().as_u16(), 200);
+        tokio::time::timeout(Duration::from_secs(20), driven).await.expect("closed").unwrap().unwrap();
+        start.elapsed()
+    });
+    assert!(time > Duration::from_millis(250), "{time:?}");
+}
+
+#[test]
+fn heads_are_limited() {
+    let server = fake(|c| c.server.head_bytes = 8 << 10);
+    let with = |n: usize| send(server.addr, "GET", "/livez", &[("x-long", &"x".repeat(n))], b"").status;
+    let before = rejected(&server, "head-too-large");
+    assert_eq!((with(7000), with(9000)), (200, 431));
+    wait_for("it is counted", || rejected(&server, "head-too-large") > before);
+    assert_eq!(fake(|_| {}).get(&format!("/livez?{}", "x".repeat(9000))).status, 200, "the default allows more");
+}
+
+#[test]
+fn clients_of_http2_are_told_how_much_they_may_ask() {
+    let server = fake(|c| (c.server.streams, c.server.head_bytes) = (7, 9000));
+    let mut stream = connect(server.addr);
+    // The preface and empty settings; the server's settings are its first frame (RFC 9113, 3.4).
+    stream.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").unwrap();
+    let mut head = [0; 9];
+    stream.read_exact(&mut head).unwrap();
+    assert_eq!(head[3], 4, "a frame of settings");
+    let mut settings = vec![0; usize::from(u16::from_be_bytes([head[1], head[2]]))];
+    stream.read_exact(&mut settings).unwrap();
+    let value = |id: u8| settings.chunks(6).find(|s| s[1] == id).map(|s| u32::from_be_bytes([s[2], s[3], s[4], s[5]]));
+    // Streams at once, and bytes of a head.
+    assert_eq!((value(3), value(6)), (Some(7), Some(9000)));
+}
+
+#[test]
+fn silent_event_streams_give_signs_of_life() {
+    let server = start(Fake::new(Mode::Held), |c| {
+        (c.server.heartbeat_ms, c.server.drain_timeout_ms) = (20, 100);
+    });
+    let promised = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
+    assert_eq!(promised.status, 202);
+    let mut stream = connect(server.addr);
+    write!(stream, "GET {}/events HTTP/1.1\r\nhost: t\r\n\r\n", promised.header("location").unwrap()).unwrap();
+    let mut text = String::new();
+    let mut some = [0; 1024];
+    // Comments: lines that begin with a colon.
+    while text.matches("\n:\n").count() + text.matches("\n: \n").count() < 3 {
+        let n = stream.read(&mut some).unwrap();
+        assert!(n > 0, "it ended: {text}");
+        text.push_str(&String::from_utf8_lossy(&some[..n]));
+    }
+}
+
+#[test]
+fn asynchronous_jobs_yield_for_the_maximum_delay() {
+    for (batch_max_delay_ms, order) in [(1, [2, 3, 4]), (3_600_000, [2, 4, 3])] {
+        let backend = Fake::new(Mode::Held);
+        let server =
+            start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.jobs.batch_max_delay_ms) = (1, batch_max_delay_ms));
+        let server = &server;
+        std::thread::scope(|scope| {
+            let running = scope.spawn(|| server.post("/v1/meshes", &[], &carbons(2)).status);
+            wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 1);
+            assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], &carbons(3)).status, 202);
+            let waiting = scope.spawn(|| server.post("/v1/meshes", &[], &carbons(4)).status);
+            wait_for("two to wait", || server.metric("molmesh_queue_depth", &[]) >= 2.0);
+            std::thread::sleep(Duration::from_millis(5));
+            backend.set(Mode::Octahedra);
+            assert_eq!((running.join().unwrap(), waiting.join().unwrap()), (200, 200));
+        });
+        wait_for("all to have begun", || backend.started.load(Ordering::SeqCst) == 3);
+        assert_eq!(*backend.begun.lock().unwrap(), order, "maximum delay of {batch_max_delay_ms} ms");
+    }
+}
+
+#[test]
+fn concurrent_saves_are_limited() {
+    let server = fake(|c| (c.jobs.concurrent_saves, c.jobs.queue) = (1, 100));
+    let (server, busy) = (&server, || server.metric("molmesh_results_not_kept_total", &["reason=\"busy\""]));
+    let (before, end) = (busy(), Instant::now() + Duration::from_mins(1));
+    for round in 0.. {
+        std::thread::scope(|scope| {
+            for n in 0..6 {
+                scope.spawn(move || server.post("/v1/meshes", &[], &carbons(5_000 + 10 * round + n)).status);
+            }
+        });
+        if busy() > before {
+            break;
+        }
+        assert!(Instant::now() < end, "all six concurrent results were stored");
+    }
+}
+
+#[test]
+fn what_is_too_old_is_swept_as_often_as_configured() {
+    let server = fake(|c| (c.store.sweep_ms, c.store.result_ttl_ms) = (20, 1));
+    let removed = || server.metric("molmesh_store_removed_total", &["reason=\"ttl\""]);
+    let before = removed();
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    wait_for("the result is gone", || removed() > before);
+}

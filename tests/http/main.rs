@@ -1,0 +1,45 @@
+//! Tests of the HTTP service, its store, jobs, archive and OpenAPI document.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
+
+#[path = "../access_support/mod.rs"]
+mod access_support;
+#[path = "../archive_support/mod.rs"]
+mod archive_support;
+#[path = "../bcif_support/mod.rs"]
+mod bcif_support;
+#[path = "../cli_support/mod.rs"]
+mod cli_support;
+#[path = "../http_support/mod.rs"]
+mod http_support;
+#[path = "../openapi_support/mod.rs"]
+mod openapi_support;
+#[path = "../store_support/mod.rs"]
+mod store_support;
+#[path = "../tools/mod.rs"]
+mod tools;
+
+mod access;
+mod api;
+mod archive_http;
+mod bad_input;
+mod config;
+mod config_limits;
+mod config_schema;
+mod defaults;
+mod devices;
+mod jobs;
+mod jobs_durable;
+mod lifecycle;
+mod limits;
+mod openapi;
+mod openapi_statuses;
+mod pictures;
+mod ready;
+mod results;
+mod schemathesis;
+mod service_s3;
+mod slow_readers;
+mod spacing;
+mod stop;
+mod store;

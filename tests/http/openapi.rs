@@ -1,0 +1,174 @@
+//! The description of the interface: it is the committed one, it has the routes that there are and the parameters that are
+//! read, and the page that shows it needs nobody else. `MOLMESH_BLESS=1 cargo test --test http openapi` writes it anew.
+
+use crate::http_support;
+use crate::openapi_support;
+
+use std::collections::BTreeSet;
+use std::io::Read as _;
+use std::path::Path;
+use std::sync::LazyLock;
+
+use http_support::{Fake, Mode, Running, send, start};
+use molmesh::pipeline::params::TABLE;
+use openapi_support::operations;
+use serde_json::{Value, json};
+
+static SERVER: LazyLock<Running> = LazyLock::new(|| start(Fake::new(Mode::Octahedra), |_| {}));
+static DESCRIPTION: LazyLock<Value> = LazyLock::new(|| SERVER.get("/openapi.json").json());
+
+const ROUTER: &str = include_str!("../../src/http/router.rs");
+
+/// The operations of the table of contents: `.route("path", get(…).delete(…))`.
+fn routes(source: &str) -> BTreeSet<String> {
+    let mut found = BTreeSet::new();
+    for line in source.lines().filter_map(|line| line.trim().strip_prefix(".route(\"")) {
+        let (path, handlers) = line.split_once("\", ").unwrap_or_else(|| panic!("a route in one line: {line}"));
+        for method in ["get", "post", "put", "patch", "delete"] {
+            let named = |start: &str| handlers.contains(&format!("{start}{method}("));
+            if handlers.starts_with(&format!("{method}(")) || named(".") {
+                found.insert(format!("{} {path}", method.to_uppercase()));
+            }
+        }
+    }
+    found
+}
+
+fn described(description: &Value) -> BTreeSet<String> {
+    operations(description).into_keys().collect()
+}
+
+#[test]
+fn the_committed_description_is_what_the_code_says() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("openapi.yaml");
+    let reply = SERVER.get("/openapi.yaml");
+    assert_eq!((reply.status, reply.header("content-type")), (200, Some("application/yaml")));
+    let served = reply.text();
+    if std::env::var_os("MOLMESH_BLESS").is_some() {
+        std::fs::write(&path, &served).unwrap();
+    }
+    let committed = std::fs::read_to_string(&path).unwrap();
+    let first = committed.lines().zip(served.lines()).position(|(a, b)| a != b);
+    assert!(
+        committed == served,
+        "openapi.yaml differs from line {} on; MOLMESH_BLESS=1 cargo test --test http openapi writes it anew",
+        first.map_or_else(|| committed.lines().count().min(served.lines().count()) + 1, |n| n + 1)
+    );
+    assert!(served.starts_with("openapi: 3.1.0\n"), "{}", &served[..40]);
+    assert_eq!(DESCRIPTION["openapi"], "3.1.0");
+    assert_eq!(DESCRIPTION["info"]["version"], env!("CARGO_PKG_VERSION"));
+}
+
+#[test]
+fn the_description_has_the_routes_that_there_are() {
+    let routes = routes(ROUTER);
+    assert!(routes.len() > 20, "{routes:?}");
+    assert_eq!(described(&DESCRIPTION), routes);
+    // The control: a route or a method that only one of the two has.
+    let more = ROUTER.replace("get(jobs::show).delete(jobs::dismiss)", "get(jobs::show).patch(jobs::dismiss)");
+    let more = self::routes(&more);
+    let differing: Vec<_> = more.symmetric_difference(&described(&DESCRIPTION)).cloned().collect();
+    assert_eq!(differing, ["DELETE /v1/jobs/{id}", "PATCH /v1/jobs/{id}"]);
+    // And the router says the same of itself.
+    for (path, item) in DESCRIPTION["paths"].as_object().unwrap() {
+        let allow = send(SERVER.addr, "TRACE", &path.replace(['{', '}'], ""), &[], b"");
+        let allow: BTreeSet<_> = allow.header("allow").unwrap().split(',').map(str::to_lowercase).collect();
+        let allow: BTreeSet<_> = allow.iter().map(String::as_str).filter(|method| *method != "head").collect();
+        assert_eq!(item.as_object().unwrap().keys().map(String::as_str).collect::<BTreeSet<_>>(), allow, "{path}");
+    }
+}
+
+#[test]
+fn the_parameters_are_those_of_the_table() {
+    let names = |method: &str, path: &str| -> Vec<String> {
+        let parameters = DESCRIPTION["paths"][path][method]["parameters"].as_array().unwrap().clone();
+        let of_query = parameters.iter().filter(|p| p["in"] == "query");
+        of_query.map(|p| p["name"].as_str().unwrap().to_owned()).collect()
+    };
+    let all: Vec<&str> = TABLE.iter().map(|p| p.name).collect();
+    let without_format: Vec<&str> = all.iter().copied().filter(|name| *name != "format").collect();
+    assert_eq!(names("post", "/v1/meshes"), all);
+    assert_eq!(names("post", "/v1/estimate"), all);
+    assert_eq!(names("get", "/v1/pdb/{id}/{file}"), without_format);
+    assert_eq!(names("get", "/v1/structures/{digest}/{file}"), without_format);
+    let parameters = DESCRIPTION["paths"]["/v1/meshes"]["post"]["parameters"].as_array().unwrap();
+    let schema = |name: &str| &parameters.iter().find(|p| p["name"] == name).unwrap()["schema"];
+    assert_eq!((&schema("resolution")["type"], &schema("resolution")["default"]), (&json!("number"), &json!(0.5)));
+    assert_eq!(schema("format")["enum"].as_array().unwrap().len(), 6);
+}
+
+#[test]
+fn every_reference_leads_somewhere_and_every_response_says_what_it_is() {
+    fn references(value: &Value, found: &mut BTreeSet<String>) {
+        match value {
+            Value::Object(members) => {
+                found.extend(members.get("$ref").and_then(Value::as_str).map(str::to_owned));
+                members.values().for_each(|member| references(member, found));
+            }
+            Value::Array(items) => items.iter().for_each(|item| references(item, found)),
+            _ => {}
+        }
+    }
+    let mut found = BTreeSet::new();
+    references(&DESCRIPTION, &mut found);
+    assert!(found.len() > 15, "{found:?}");
+    for reference in &found {
+        assert!(DESCRIPTION.pointer(reference.trim_start_matches('#')).is_some(), "{reference}");
+    }
+    let mut ids = BTreeSet::new();
+    for (operation, responses) in operations(&DESCRIPTION) {
+        let (method, path) = operation.split_once(' ').unwrap();
+        let id = &DESCRIPTION["paths"][path][method.to_lowercase()]["operationId"];
+        assert!(ids.insert(id.as_str().unwrap()), "{operation}: {id} is another's");
+        for (status, response) in responses {
+            assert!(response["description"].as_str().is_some_and(|d| !d.is_empty()), "{operation} {status}");
+            let content = response["content"].as_object();
+            let problem = content.is_some_and(|c| c.contains_key("application/problem+json"));
+            assert_eq!(problem, status >= 400, "{operation} {status}");
+        }
+    }
+}
+
+#[test]
+fn the_page_that_shows_it_needs_nothing_from_elsewhere() {
+    let page = SERVER.get("/docs");
+    assert_eq!(page.header("content-type"), Some("text/html; charset=utf-8"));
+    let policy = page.header("content-security-policy").unwrap();
+    assert!(policy.contains("default-src 'none'") && !policy.contains("unsafe"), "{policy}");
+    let html = page.text();
+    assert!(!html.contains("<style") && !html.contains("<script>") && html.contains("/swagger-ui-bundle.js"));
+    let attributes = ["src=\"", "href=\""];
+    let links = attributes.iter().flat_map(|attribute| html.split(attribute).skip(1));
+    let links: Vec<&str> = links.map(|rest| rest.split('"').next().unwrap()).collect();
+    assert!(links.len() >= 6, "{links:?}");
+    for link in links {
+        assert!(link.starts_with('/') && !link.starts_with("//"), "{link}");
+        assert_eq!(SERVER.get(link).status, 200, "{link}");
+    }
+    assert!(SERVER.get("/").text().contains("href=\"/docs\""));
+}
+
+#[test]
+fn swagger_ui_is_what_its_note_says_packed_or_not() {
+    let note = include_str!("../../web/swagger/README.md");
+    for file in ["swagger-ui-bundle.js", "swagger-ui.css"] {
+        let path = format!("/{file}");
+        let plain = SERVER.get(&path);
+        assert_eq!((plain.status, plain.header("content-encoding")), (200, None));
+        let digest = molmesh::store::Digest::of(&plain.body).to_string();
+        assert!(note.contains(&format!("{digest}  {file}\n")), "{file} is {digest}");
+        for (accept, coding) in
+            [("gzip, br", Some("gzip")), ("br;q=1, *;q=0.1", Some("gzip")), ("gzip;q=0", None), ("identity", None)]
+        {
+            let reply = send(SERVER.addr, "GET", &path, &[("accept-encoding", accept)], b"");
+            assert_eq!(reply.header("content-encoding"), coding, "{accept}");
+            let mut inflated = Vec::new();
+            if coding.is_some() {
+                flate2::read::GzDecoder::new(&reply.body[..]).read_to_end(&mut inflated).unwrap();
+            } else {
+                inflated = reply.body;
+            }
+            assert!(inflated == plain.body, "{file} {accept}");
+        }
+    }
+}

@@ -1,0 +1,354 @@
+//! Every status that the description lists is given by the server, and no other: each scenario drives a server into one
+//! corner, and in the end nothing that is described may be left unseen.
+
+use crate::access_support;
+use crate::archive_support;
+use crate::http_support;
+use crate::openapi_support;
+
+use std::io::Write as _;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use archive_support::{Remote, status};
+use http_support::{
+    Fake, Mode, Reply, Running, SAMPLE, connect, read_reply, sample, send, start, start_cold, wait_for,
+};
+use molmesh::config::Config;
+use molmesh::surface::CpuBackend;
+use openapi_support::Seen;
+
+const LATER: (&str, &str) = ("prefer", "respond-async");
+const JSON: (&str, &str) = ("content-type", "application/json");
+/// Addresses that no service gives.
+const NO_JOB: &str = "/v1/jobs/00000000000000000000000000000000";
+const ZERO: &str = "0000000000000000000000000000000000000000000000000000000000000000";
+
+fn fake(mode: Mode, change: impl FnOnce(&mut Config)) -> Running {
+    let server = start(Fake::new(mode), change);
+    archive(server.dir.path(), "4pti", SAMPLE);
+    server
+}
+
+/// Puts an entry into a server's folder of structures.
+fn archive(dir: &Path, id: &str, bytes: &[u8]) {
+    let folder = dir.join("archive");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join(format!("{id}.pdb")), bytes).unwrap();
+}
+
+/// The uploads: each operation that takes a structure.
+const UPLOADS: [&str; 3] = ["/v1/meshes", "/v1/estimate", "/v1/structures"];
+
+fn location(reply: &Reply) -> String {
+    reply.header("location").unwrap().to_owned()
+}
+
+/// Promises a job, and waits for its end.
+fn ended(seen: &Seen, server: &Running, body: &[u8]) -> String {
+    let job = location(&seen.expect(202, server.addr, ("POST", "/v1/meshes"), &[LATER], body));
+    let reply = seen.expect(200, server.addr, ("GET", &format!("{job}?wait=20")), &[], b"");
+    assert!(!reply.json()["finished"].is_null(), "{}", reply.text());
+    job
+}
+
+/// What needs no parameter, and paths that are no text.
+fn plain(seen: &Seen, server: &Running) {
+    let paths: Vec<_> = seen.described().filter(|(m, p)| *m == "GET" && !p.contains('{')).collect();
+    assert!(paths.len() > 10, "{paths:?}");
+    for (method, path) in paths {
+        seen.expect(200, server.addr, (method, path), &[], b"");
+    }
+    for (method, path) in seen.described().filter(|(_, path)| path.contains('{')) {
+        let path = path.replace("{file}", "%ff").replace("{id}", "%ff").replace("{digest}", "%ff");
+        let path = path.replace("{slug}", "%ff").replace("{key}", "%ff");
+        seen.expect(400, server.addr, (method, &path), &[], b"");
+    }
+    seen.expect(200, server.addr, ("GET", "/problems/internal"), &[], b"");
+    seen.expect(404, server.addr, ("GET", "/problems/none"), &[], b"");
+    seen.expect(200, server.addr, ("GET", "/assets/icon.svg"), &[], b"");
+    seen.expect(404, server.addr, ("GET", "/assets/none.js"), &[], b"");
+}
+
+/// Uploads, good and bad.
+fn uploads(seen: &Seen, server: &Running) {
+    let addr = server.addr;
+    seen.expect(201, addr, ("POST", "/v1/structures"), &[], SAMPLE);
+    let form = ("content-type", "multipart/form-data; boundary=XX");
+    for path in UPLOADS {
+        seen.expect(200, addr, ("POST", path), &[], SAMPLE);
+        seen.expect(400, addr, ("POST", path), &[form], b"--XX--\r\n");
+        seen.expect(415, addr, ("POST", path), &[("content-encoding", "br")], SAMPLE);
+        seen.expect(422, addr, ("POST", path), &[], b"nothing");
+    }
+    let post = ("POST", "/v1/meshes");
+    seen.expect(200, addr, ("POST", "/v1/meshes?report=json"), &[], SAMPLE);
+    seen.expect(202, addr, post, &[LATER], SAMPLE);
+    seen.expect(406, addr, post, &[("accept", "image/webp")], SAMPLE);
+    // An estimate is no mesh: whatever is asked for, it is JSON.
+    seen.expect(200, addr, ("POST", "/v1/estimate"), &[("accept", "application/json")], SAMPLE);
+    for path in &UPLOADS[..2] {
+        seen.expect(404, addr, ("POST", path), &[JSON], br#"{"pdb_id": "9xyz"}"#);
+    }
+}
+
+/// Meshes under addresses.
+fn surfaces(seen: &Seen, server: &Running) {
+    let structure = location(&seen.ask(server.addr, "POST", "/v1/structures", &[], SAMPLE));
+    for base in [structure.as_str(), "/v1/pdb/4pti"] {
+        let path = format!("{base}/surface.glb");
+        let get = |path: &str, headers: &[(&str, &str)], status: u16| {
+            seen.expect(status, server.addr, ("GET", path), headers, b"")
+        };
+        get(&path, &[LATER], 202);
+        let whole = get(&path, &[], 200);
+        get(&path, &[("if-none-match", whole.header("etag").unwrap())], 304);
+        let kept = whole.header("content-location").unwrap();
+        get(kept, &[], 200);
+        get(&path, &[("range", "bytes=0-9")], 206);
+        get(&path, &[("range", "bytes=99999999-")], 416);
+        get(&format!("{path}?report=json"), &[], 200);
+        get(&format!("{base}/surface.exe"), &[], 404);
+        get(&format!("{path}?x=1"), &[], 400);
+        get(&format!("{path}?chains=Z"), &[], 422);
+        // And what was made, under its own address.
+        get(kept, &[("range", "bytes=0-9")], 206);
+        get(kept, &[("range", "bytes=99999999-")], 416);
+        get(kept, &[("if-none-match", "*")], 304);
+        let atoms = format!("{base}/atoms");
+        let tag = get(&atoms, &[], 200).header("etag").unwrap().to_owned();
+        get(&atoms, &[("if-none-match", &tag)], 304);
+        let report = kept.replace(".glb", "/report.json");
+        let tag = get(&report, &[], 200).header("etag").unwrap().to_owned();
+        get(&report, &[("if-none-match", &tag)], 304);
+    }
+    let get =
+        |path: &str, headers: &[(&str, &str)], status| seen.expect(status, server.addr, ("GET", path), headers, b"");
+    let etag = get(&structure, &[], 200).header("etag").unwrap().to_owned();
+    get(&structure, &[("if-none-match", &etag)], 304);
+    get(&format!("/v1/structures/{ZERO}"), &[], 404);
+    get(&format!("/v1/structures/{ZERO}/atoms"), &[], 404);
+    get("/v1/pdb/9xyz/atoms", &[], 404);
+    get(&format!("/v1/results/{ZERO}.glb"), &[], 404);
+    get(&format!("/v1/results/{ZERO}/report.json"), &[], 404);
+}
+
+/// Jobs and their ends.
+fn jobs(seen: &Seen) {
+    let backend = Fake::new(Mode::Octahedra);
+    let server = start(Arc::clone(&backend) as _, |c| c.limits.inflated_bytes = 100_000);
+    let get = |path: &str, status| seen.expect(status, server.addr, ("GET", path), &[], b"");
+    let result = |job: &str, status| get(&format!("{job}/result"), status);
+    let job = ended(seen, &server, SAMPLE);
+    result(&job, 303);
+    seen.expect(409, server.addr, ("DELETE", &job), &[], b"");
+    let events = get(&format!("{job}/events"), 200).text();
+    let last = events.lines().find_map(|line| line.strip_prefix("id: ")).unwrap().to_owned();
+    let events = format!("{job}/events");
+    seen.expect(204, server.addr, ("GET", &events), &[("last-event-id", &last)], b"");
+    for path in [NO_JOB, &format!("{NO_JOB}/events"), &format!("{NO_JOB}/result")] {
+        get(path, 404);
+    }
+    seen.expect(404, server.addr, ("DELETE", NO_JOB), &[], b"");
+    get(&format!("{NO_JOB}?wait=1000"), 400);
+    // Ends without a result are told as a synchronous request would be.
+    result(&ended(seen, &server, &vec![b' '; 100_001]), 413);
+    result(&ended(seen, &server, b"nothing"), 422);
+    backend.set(Mode::Panic);
+    result(&ended(seen, &server, &sample(1)), 500);
+    backend.set(Mode::Slow(Duration::from_secs(30)));
+    let job = location(&seen.expect(202, server.addr, ("POST", "/v1/meshes"), &[LATER], &sample(2)));
+    result(&job, 404);
+    seen.expect(200, server.addr, ("DELETE", &job), &[], b"");
+    result(&job, 410);
+    let late = fake(Mode::Slow(Duration::from_secs(30)), |c| c.jobs.batch_deadline_ms = 200);
+    let job = ended(seen, &late, SAMPLE);
+    seen.expect(504, late.addr, ("GET", &format!("{job}/result")), &[], b"");
+}
+
+/// Limits of bodies, and of what archives send.
+fn sizes(seen: &Seen) {
+    let small = fake(Mode::Octahedra, |c| {
+        c.limits.body_bytes = 100;
+        c.limits.inflated_bytes = 100;
+        c.server.body_timeout_ms = 200;
+    });
+    for path in UPLOADS {
+        seen.expect(413, small.addr, ("POST", path), &[], SAMPLE);
+        let mut stream = connect(small.addr);
+        let head = format!("POST {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 10\r\n\r\nATOM");
+        stream.write_all(head.as_bytes()).unwrap();
+        let late = read_reply(&mut stream, false);
+        assert_eq!(late.status, 408);
+        seen.note("POST", path, &late).unwrap();
+    }
+    seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
+    seen.expect(413, small.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
+    let remote = Remote::saying(status(500));
+    let away = fake(Mode::Octahedra, |c| {
+        c.archive.url = Some(remote.url("/{id}.cif").parse().unwrap());
+        c.archive.allow_private = true;
+        c.archive.attempts = 1;
+    });
+    seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/surface.glb"), &[], b"");
+    seen.expect(424, away.addr, ("GET", "/v1/pdb/9xyz/atoms"), &[], b"");
+    let few = fake(Mode::Octahedra, |c| c.limits.labels = 10);
+    seen.expect(422, few.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
+    for path in &UPLOADS[..2] {
+        seen.expect(424, away.addr, ("POST", path), &[JSON], br#"{"pdb_id": "9xyz"}"#);
+    }
+}
+
+/// Backends that panic or do not end, queues that are full.
+fn failures(seen: &Seen) {
+    for (mode, status) in [(Mode::Panic, 500), (Mode::Slow(Duration::from_secs(30)), 504)] {
+        let server = fake(mode, |c| c.jobs.deadline_ms = 300);
+        let structure = location(&seen.ask(server.addr, "POST", "/v1/structures", &[], SAMPLE));
+        for path in &UPLOADS[..2] {
+            seen.expect(status, server.addr, ("POST", path), &[], SAMPLE);
+        }
+        for path in [format!("{structure}/surface.glb"), "/v1/pdb/4pti/surface.stl".to_owned()] {
+            seen.expect(status, server.addr, ("GET", &path), &[], b"");
+        }
+    }
+    let backend = Fake::new(Mode::Slow(Duration::from_secs(2)));
+    let full = start(Arc::clone(&backend) as _, |c| (c.jobs.workers, c.jobs.queue) = (1, 1));
+    archive(full.dir.path(), "4pti", SAMPLE);
+    let busy = |n| seen.expect(202, full.addr, ("POST", "/v1/meshes"), &[LATER], &sample(n));
+    busy(1);
+    wait_for("it runs", || backend.started.load(Ordering::SeqCst) == 1);
+    std::thread::scope(|scope| {
+        scope.spawn(|| full.post("/v1/meshes", &[], &sample(2)));
+        wait_for("one waits", || full.metric("molmesh_queue_depth", &[]) >= 1.0);
+        seen.expect(503, full.addr, ("POST", "/v1/meshes"), &[], &sample(3));
+        seen.expect(503, full.addr, ("GET", "/v1/pdb/4pti/surface.glb"), &[], b"");
+    });
+    let crowded = fake(Mode::Octahedra, |c| c.limits.memory_bytes = 1_000);
+    seen.expect(503, crowded.addr, ("GET", "/v1/pdb/4pti/atoms"), &[], b"");
+    for path in UPLOADS {
+        seen.expect(503, crowded.addr, ("POST", path), &[], SAMPLE);
+    }
+}
+
+/// What was kept under other limits, and a store that breaks.
+fn restarts(seen: &Seen) {
+    let folder = tempfile::tempdir().unwrap();
+    let begin = |change: fn(&mut Config)| {
+        start(Fake::new(Mode::Octahedra), |c| {
+            folder.path().clone_into(&mut c.server.data_dir);
+            c.store.memory_bytes = 0;
+            change(c);
+        })
+    };
+    let server = begin(|_| {});
+    let structure = location(&seen.ask(server.addr, "POST", "/v1/structures", &[], SAMPLE));
+    let surface = format!("{structure}/surface.glb");
+    let job = ended(seen, &server, SAMPLE);
+    let reply = seen.ask(server.addr, "GET", &format!("{job}/result"), &[], b"");
+    let result = location(&reply);
+    assert!(server.join());
+
+    let get = |server: &Running, path: &str, status| seen.expect(status, server.addr, ("GET", path), &[], b"");
+    let server = begin(|c| c.limits.inflated_bytes = 1_000);
+    get(&server, &structure, 413);
+    get(&server, &format!("{structure}/atoms"), 413);
+    get(&server, &format!("{surface}?resolution=2"), 413);
+    assert!(server.join());
+    let server = begin(|c| c.limits.atoms = 10);
+    get(&server, &structure, 422);
+    get(&server, &format!("{structure}/atoms"), 422);
+    assert!(server.join());
+    let server = begin(|c| c.limits.memory_bytes = 1_000);
+    get(&server, &structure, 503);
+    get(&server, &format!("{structure}/atoms"), 503);
+    get(&server, &format!("{surface}?resolution=2"), 503);
+    assert!(server.join());
+
+    let server = begin(|_| {});
+    break_store(folder.path());
+    let report = result.replace(".glb", "/report.json");
+    for path in [&job, &format!("{job}/events"), &format!("{job}/result"), &result, &report] {
+        get(&server, path, 503);
+    }
+    seen.expect(503, server.addr, ("DELETE", &job), &[], b"");
+}
+
+/// Keys and quotas: every operation that takes a key, without one, with another one's, and beyond its quota.
+fn rights(seen: &Seen) {
+    let keys = access_support::Keys::new(&[
+        ("reads", "read", ""),
+        ("makes", "mesh", ""),
+        ("once", "mesh,read", "requests = 1\nwindow_s = 86400"),
+    ]);
+    let server = fake(Mode::Octahedra, |c| c.access.keys_file = Some(keys.path()));
+    let once = [("x-api-key", keys.text("once"))];
+    assert_eq!(send(server.addr, "GET", "/v1/capabilities", &once, b"").status, 200);
+    let operations: Vec<_> = seen.described().filter(|(_, path)| path.starts_with("/v1/")).collect();
+    assert!(operations.len() > 10, "{operations:?}");
+    for (method, path) in operations {
+        let path = path.replace("{file}", "surface.glb").replace(['{', '}'], "");
+        let ask = |status, headers: &[(&str, &str)]| seen.expect(status, server.addr, (method, &path), headers, b"");
+        ask(401, &[]);
+        let others =
+            ["reads", "makes"].map(|id| send(server.addr, method, &path, &[("x-api-key", keys.text(id))], b""));
+        let refused = others.iter().filter(|reply| reply.status == 403).inspect(|reply| {
+            seen.note(method, &path, reply).unwrap_or_else(|wrong| panic!("{wrong}"));
+        });
+        assert_eq!(refused.count(), 1, "{method} {path} needs one scope");
+        ask(429, &once);
+    }
+}
+
+/// Puts files in the place of the store's folders.
+fn break_store(dir: &Path) {
+    for folder in ["inputs", "jobs", "results"].map(|name| dir.join("store").join(name)) {
+        std::fs::rename(&folder, folder.with_extension("away")).unwrap();
+        std::fs::write(&folder, b"no folder").unwrap();
+    }
+}
+
+#[test]
+fn every_described_status_is_given_and_no_other() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    archive(server.dir.path(), "4pti", SAMPLE);
+    let seen = Seen::of(&server.get("/openapi.json").json());
+    plain(&seen, &server);
+    uploads(&seen, &server);
+    surfaces(&seen, &server);
+    jobs(&seen);
+    sizes(&seen);
+    failures(&seen);
+    restarts(&seen);
+    rights(&seen);
+    let cold = Fake::new(Mode::NoSurface);
+    cold.also_warm.store(true, Ordering::SeqCst);
+    let cold = start_cold(cold, |_| {});
+    wait_for("the listener", || cold.get("/livez").status == 200);
+    seen.expect(503, cold.addr, ("GET", "/readyz"), &[], b"");
+    assert_eq!(seen.unseen(), Vec::<String>::new(), "described, and never given");
+}
+
+#[test]
+fn what_is_not_described_or_never_seen_is_noticed() {
+    let server = fake(Mode::Octahedra, |_| {});
+    let mut description = server.get("/openapi.json").json();
+    let live = server.get("/livez");
+    let seen = Seen::of(&description);
+    assert!(seen.note("GET", "/livez", &live).is_ok());
+    assert!(
+        seen.unseen().contains(&"GET /version: 200".to_owned())
+            && !seen.unseen().contains(&"GET /livez: 200".to_owned())
+    );
+    assert!(seen.note("GET", "/nowhere", &live).unwrap_err().contains("is not described"));
+    let gone = server.get(NO_JOB);
+    assert!(seen.note("GET", NO_JOB, &gone).is_ok());
+    let responses = &mut description["paths"]["/v1/jobs/{id}"]["get"]["responses"];
+    responses["404"]["content"]["application/problem+json"]["schema"]["allOf"][1]["properties"]["type"]["enum"] =
+        serde_json::json!(["/problems/not-found"]);
+    assert!(Seen::of(&description).note("GET", NO_JOB, &gone).unwrap_err().contains("not one of"));
+    let responses = &mut description["paths"]["/v1/jobs/{id}"]["get"]["responses"];
+    responses.as_object_mut().unwrap().remove("404");
+    assert!(Seen::of(&description).note("GET", NO_JOB, &gone).unwrap_err().contains("404 is not described"));
+}

@@ -1,0 +1,197 @@
+//! What was made once: found again under its key, in parts, unchanged; structures that are uploaded once; estimates.
+
+use crate::http_support;
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, carbons, sample, send, start, wait_for};
+use molmesh::surface::CpuBackend;
+
+fn real(change: impl FnOnce(&mut molmesh::config::Config)) -> Running {
+    start(Arc::new(CpuBackend::new(None).unwrap()), change)
+}
+
+#[test]
+fn a_synchronous_result_is_found_at_its_content_location() {
+    let backend = Fake::new(Mode::Octahedra);
+    let server = start(Arc::clone(&backend) as _, |_| {});
+    let made = server.post("/v1/meshes?format=ply", &[], SAMPLE);
+    let location = made.header("content-location").unwrap().to_owned();
+    let etag = made.header("etag").unwrap().to_owned();
+    let found = server.get(&location);
+    assert_eq!((found.status, found.complete), (200, true));
+    assert_eq!(found.body, made.body);
+    for name in ["etag", "content-type", "molmesh-atoms", "molmesh-area", "molmesh-closed", "molmesh-radii"] {
+        assert_eq!(found.header(name), made.header(name), "{name}");
+    }
+    assert!(found.header("cache-control").unwrap().contains("immutable"));
+    assert_eq!(found.header("accept-ranges"), Some("bytes"));
+    let unchanged = send(server.addr, "GET", &location, &[("if-none-match", &etag)], b"");
+    assert_eq!((unchanged.status, unchanged.body.len()), (304, 0));
+    let head = send(server.addr, "HEAD", &location, &[], b"");
+    assert_eq!(head.header("content-length"), Some(made.body.len().to_string().as_str()));
+    // The same request is answered without meshing.
+    let again = server.post("/v1/meshes?format=ply", &[], SAMPLE);
+    assert_eq!((again.body == made.body, backend.started.load(Ordering::SeqCst)), (true, 1));
+    assert!(again.header("server-timing").unwrap().contains("hit"));
+    assert!(again.header("cache-control").is_none(), "a POST's answer belongs to it alone");
+    let report = location.replace(".ply", "/report.json");
+    assert_eq!(server.get(&report).json()["atoms"], 454);
+    let etag = server.get(&report).header("etag").unwrap().to_owned();
+    assert_eq!(send(server.addr, "GET", &report, &[("if-none-match", &etag)], b"").status, 304);
+    let key = location.split('/').next_back().unwrap().split('.').next().unwrap();
+    let other = key.replace(&key[..4], "0000");
+    for missing in [
+        format!("{other}.ply"),
+        format!("{key}.glb"),
+        format!("{key}.exe"),
+        "x.glb".to_owned(),
+        format!("{other}/report.json"),
+    ] {
+        server.get(&format!("/v1/results/{missing}")).problem(404, "not-found");
+    }
+}
+
+#[test]
+fn a_result_is_kept_once_however_many_ask_for_it() {
+    let server = start(Fake::new(Mode::Octahedra), |c| c.jobs.concurrent_saves = 1);
+    for round in 0..20 {
+        let input = carbons(2_000 + round);
+        let replies: Vec<Reply> = std::thread::scope(|scope| {
+            let ask = || scope.spawn(|| server.post("/v1/meshes?format=stl", &[], &input));
+            [(); 6].map(|()| ask()).map(|reply| reply.join().unwrap()).into()
+        });
+        // One place is enough for six answers, and is free when the result is found.
+        for reply in &replies {
+            let location = reply.header("content-location");
+            assert!(location.is_some() && location == replies[0].header("content-location"), "{location:?}");
+        }
+        assert!(server.get(replies[0].header("content-location").unwrap()).body == replies[0].body);
+    }
+}
+
+#[test]
+fn parts_of_a_result_add_up_to_it() {
+    let server = start(Fake::new(Mode::Octahedra), |c| c.store.memory_object_bytes = 1000);
+    // One that stays in memory and one that lies on disk.
+    for atoms in [2, 2_000] {
+        let made = server.post("/v1/meshes?format=stl", &[], &carbons(atoms));
+        let location = made.header("content-location").unwrap();
+        let n = made.body.len();
+        let etag = made.header("etag").unwrap();
+        let get = |range: &str| send(server.addr, "GET", location, &[("range", range)], b"");
+        let (a, b) = (get("bytes=0-99"), get("bytes=100-"));
+        assert_eq!((a.status, b.status), (206, 206));
+        assert_eq!([a.body.clone(), b.body].concat(), made.body);
+        assert_eq!(a.header("content-range"), Some(format!("bytes 0-99/{n}").as_str()));
+        assert_eq!(a.header("content-length"), Some("100"));
+        assert_eq!(get("bytes=-50").body, made.body[n - 50..]);
+        assert_eq!(get("bytes=0-5,9-10").status, 200);
+        let outside = get(&format!("bytes={n}-"));
+        outside.problem(416, "range-not-satisfiable");
+        assert_eq!(outside.header("content-range"), Some(format!("bytes */{n}").as_str()));
+        let same = send(server.addr, "GET", location, &[("range", "bytes=0-9"), ("if-range", etag)], b"");
+        let other = send(server.addr, "GET", location, &[("range", "bytes=0-9"), ("if-range", "\"x\"")], b"");
+        assert_eq!((same.status, other.status), (206, 200));
+    }
+}
+
+#[test]
+fn a_result_that_no_place_is_left_for_has_no_location() {
+    let server = start(Fake::new(Mode::Octahedra), |c| c.store.max_bytes = 3_000);
+    let before = server.metric("molmesh_results_not_kept_total", &["failed"]);
+    let made = server.post("/v1/meshes", &[], SAMPLE);
+    assert_eq!((made.status, made.complete), (200, true), "the answer does not depend on the store");
+    wait_for("it is told", || server.metric("molmesh_results_not_kept_total", &["failed"]) > before);
+    server.get(made.header("content-location").unwrap()).problem(404, "not-found");
+    // What must be kept before it is promised is refused.
+    let refused = server.post("/v1/meshes", &[("prefer", "respond-async")], &sample(1));
+    assert_eq!(refused.problem(503, "store-full")["limit"], 3_000);
+    server.post("/v1/structures", &[], SAMPLE).problem(503, "store-full");
+}
+
+#[test]
+fn a_structure_is_uploaded_once_and_meshed_many_times() {
+    let server = real(|_| {});
+    let made = server.post("/v1/structures", &[], SAMPLE);
+    assert_eq!(made.status, 201);
+    let summary = made.json();
+    assert_eq!((&summary["atoms"], &summary["format"], &summary["id"]), (&514.into(), &"pdb".into(), &"4PTI".into()));
+    assert_eq!(summary["chains"][0]["name"], "A");
+    let location = made.header("location").unwrap().to_owned();
+    assert_eq!(location, format!("/v1/structures/{}", summary["digest"].as_str().unwrap()));
+    assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 200, "it was there");
+    assert_eq!(server.get(&location).json(), summary);
+    let surface = |query: &str| server.get(&format!("{location}/surface.glb{query}"));
+    let (coarse, fine) = (surface("?resolution=1"), surface("?resolution=0.6"));
+    assert_eq!((coarse.status, fine.status), (200, 200));
+    assert!(fine.body.len() > coarse.body.len());
+    assert_eq!(server.post("/v1/meshes?resolution=1", &[], SAMPLE).body, coarse.body);
+    let etag = coarse.header("etag").unwrap();
+    let path = format!("{location}/surface.glb?resolution=1");
+    assert_eq!(send(server.addr, "GET", &path, &[("if-none-match", etag)], b"").status, 304);
+    let named = format!("{{\"structure\": \"{}\", \"resolution\": 1}}", summary["digest"].as_str().unwrap());
+    let json = [("content-type", "application/json")];
+    assert_eq!(server.post("/v1/meshes", &json, named.as_bytes()).body, coarse.body);
+    surface("?resolution=x").problem(400, "bad-parameter");
+    server.get(&format!("{location}/surface.exe")).problem(404, "not-found");
+    let other = location.replace(&location[location.len() - 4..], "0000");
+    for missing in [other.as_str(), "/v1/structures/x"] {
+        server.get(missing).problem(404, "no-such-structure");
+        server.get(&format!("{missing}/surface.glb")).problem(404, "no-such-structure");
+    }
+    server.post("/v1/structures", &[], b"no structure at all").problem(422, "unreadable-structure");
+    let contradicted = [("content-type", "chemical/x-mmcif")];
+    server.post("/v1/structures", &contradicted, SAMPLE).problem(415, "unsupported-media-type");
+}
+
+#[test]
+fn json_names_what_is_to_be_meshed() {
+    let server = real(|_| {});
+    let json = [("content-type", "application/json")];
+    let folder = server.dir.path().join("archive");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("4pti.pdb"), SAMPLE).unwrap();
+    let named = server.post("/v1/meshes", &json, br#"{"pdb_id": "4PTI", "resolution": 1.0, "chains": ["A"]}"#);
+    assert_eq!(named.status, 200, "{}", String::from_utf8_lossy(&named.body));
+    assert_eq!(named.body, server.get("/v1/pdb/4pti/surface.glb?resolution=1&chains=A").body);
+    server.post("/v1/meshes", &json, br#"{"pdb_id": "9xyz"}"#).problem(404, "not-in-archive");
+    for (bad, slug) in [
+        (&b"{\"pdb_id\": \"4pti\", \"resolutoin\": 1}"[..], "bad-parameter"),
+        (b"{\"pdb_id\": \"../x\"}", "bad-parameter"),
+        (b"{\"resolution\": 1}", "bad-request"),
+        (b"{\"pdb_id\": ", "bad-request"),
+        (b"[1]", "bad-request"),
+        (b"{\"pdb_id\": \"4pti\", \"structure\": \"x\"}", "no-such-structure"),
+    ] {
+        let reply = server.post("/v1/meshes", &json, bad);
+        let status = if slug == "no-such-structure" { 404 } else { 400 };
+        reply.problem(status, slug);
+    }
+}
+
+#[test]
+fn an_estimate_says_what_a_mesh_would_cost_and_what_would_fit() {
+    let server = real(|c| c.limits.mesh_bytes = 2_000_000);
+    let estimate = |query: &str| {
+        let reply = server.post(&format!("/v1/estimate{query}"), &[], SAMPLE);
+        assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+        reply.json()
+    };
+    let fits = estimate("?resolution=1");
+    let report = server.post("/v1/meshes?resolution=1&report=json", &[], SAMPLE).json();
+    assert_eq!((&fits["accepted"], &fits["samples"]), (&true.into(), &report["samples"]));
+    let ratio = fits["triangles"].as_f64().unwrap() / report["triangles"].as_f64().unwrap();
+    assert!((0.8..1.25).contains(&ratio), "{ratio}");
+    assert!(fits["seconds"].as_f64().unwrap() > 0.0);
+    let refused = estimate("?resolution=0.3");
+    assert_eq!(
+        (&refused["accepted"], &refused["problem"]["type"]),
+        (&false.into(), &"/problems/mesh-too-large".into())
+    );
+    let suggested = refused["problem"]["suggested_resolution"].as_f64().unwrap();
+    assert_eq!(estimate(&format!("?resolution={suggested}"))["accepted"], true);
+    server.post("/v1/estimate", &[], b"nothing").problem(422, "unreadable-structure");
+    server.post("/v1/estimate?x=1", &[], SAMPLE).problem(400, "bad-parameter");
+}

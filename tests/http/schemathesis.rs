@@ -1,0 +1,88 @@
+//! Schemathesis reads the description and asks the server for everything that it says, allowed and not: what comes back has
+//! to be what is described. The requests are the same in every run; the settings are in `tests/tools/schemathesis.toml`.
+
+use crate::http_support;
+use crate::tools;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Arc;
+
+use http_support::{Running, SAMPLE, start};
+use molmesh::surface::CpuBackend;
+use serde_json::Value;
+
+/// A server that refuses soon what would take long, as made-up requests come by the hundred.
+fn server() -> Running {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |c| {
+        c.limits.grid_samples = 1 << 20;
+        c.limits.mesh_bytes = 16 << 20;
+        c.limits.output_bytes = 16 << 20;
+        c.jobs.queue = 1000;
+    });
+    let folder = server.dir.path().join("archive");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("4pti.pdb"), SAMPLE).unwrap();
+    // The settings name it by its digest.
+    assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 201);
+    server
+}
+
+/// Runs Schemathesis on a description: whether it found nothing, and what it said. None where it is not installed.
+fn schemathesis(server: &Running, description: &Path, more: &[&str]) -> Option<(bool, String)> {
+    let Some(python) = tools::python_interpreter() else { return tools::missing("Schemathesis") };
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let output = Command::new(python.with_file_name("st"))
+        .args(["--config-file", "schemathesis.toml", "--no-color", "run"])
+        .arg(description)
+        .args(["--url", &format!("http://{}", server.addr)])
+        .args(more)
+        .current_dir(root.join("tests/tools"))
+        .env("PYTHONDONTWRITEBYTECODE", "1")
+        .output()
+        .unwrap();
+    let said = [output.stdout, output.stderr].concat();
+    Some((output.status.success(), String::from_utf8_lossy(&said).into_owned()))
+}
+
+#[test]
+fn the_server_does_what_its_description_says() {
+    let server = server();
+    let file = server.dir.path().join("openapi.json");
+    std::fs::write(&file, server.get("/openapi.json").body).unwrap();
+    let Some((good, said)) = schemathesis(&server, &file, &[]) else { return };
+    assert!(good, "{said}");
+    for phase in ["Coverage", "Fuzzing", "Stateful"] {
+        assert!(said.contains(phase), "no phase {phase}: {said}");
+    }
+    assert_eq!(server.get("/livez").status, 200);
+}
+
+#[test]
+fn a_description_that_is_wrong_is_noticed() {
+    let server = server();
+    let description = server.get("/openapi.json").json();
+    let doctored = |change: &dyn Fn(&mut Value)| {
+        let mut description = description.clone();
+        change(&mut description["paths"]["/v1/jobs/{id}"]["get"]["responses"]);
+        let file = server.dir.path().join("doctored.json");
+        std::fs::write(&file, description.to_string()).unwrap();
+        schemathesis(&server, &file, &["--include-operation-id", "showJob", "--phases", "coverage,fuzzing"])
+    };
+    let Some((good, said)) = doctored(&|_| {}) else { return };
+    assert!(good, "the control's control: {said}");
+    let (good, said) = doctored(&|responses| drop(responses.as_object_mut().unwrap().remove("404"))).unwrap();
+    assert!(!good && said.contains("404"), "a status is missing: {said}");
+    let (good, said) = doctored(&|responses| {
+        let content = &mut responses["404"]["content"];
+        *content = serde_json::json!({ "application/json": content["application/problem+json"] });
+    })
+    .unwrap();
+    assert!(!good && said.contains("application/problem+json"), "a media type is wrong: {said}");
+    let (good, said) = doctored(&|responses| {
+        let schema = &mut responses["404"]["content"]["application/problem+json"]["schema"];
+        schema["allOf"][1]["properties"]["type"]["enum"] = serde_json::json!(["/problems/no-such-thing"]);
+    })
+    .unwrap();
+    assert!(!good && said.contains("no-such-thing"), "a schema is wrong: {said}");
+}

@@ -1,0 +1,355 @@
+//! The whole service on S3: what it promises there, what it serves from there, and what it says while S3 is away.
+
+use crate::http_support;
+use crate::store_support;
+
+use std::io::{BufRead as _, BufReader};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use http_support::{Fake, Mode, Reply, SAMPLE, log_lines, sample, send, start};
+use molmesh::store::{Folder, Store};
+use molmesh::surface::{
+    Backend, Control, CpuBackend, MeshOutput, MeshSink, ReferenceBackend, Spheres, SurfaceError, SurfaceLimits,
+    SurfaceParams,
+};
+use serde_json::Value;
+use store_support::Service;
+
+const LATER: (&str, &str) = ("prefer", "respond-async");
+const PATIENCE: Duration = Duration::from_mins(2);
+
+/// Waits for something to become true.
+#[track_caller]
+fn until(what: &str, mut is: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !is() {
+        assert!(begun.elapsed() < PATIENCE, "{what} did not come");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[track_caller]
+fn get(addr: SocketAddr, path: &str) -> Reply {
+    send(addr, "GET", path, &[], b"")
+}
+
+/// Promises a job and gives its address.
+#[track_caller]
+fn promise(addr: SocketAddr, path: &str, body: &[u8]) -> String {
+    let reply = send(addr, "POST", path, &[LATER], body);
+    assert_eq!(reply.status, 202, "{}", String::from_utf8_lossy(&reply.body));
+    reply.header("location").unwrap().to_owned()
+}
+
+/// The document of a job that ends well.
+#[track_caller]
+fn successful(addr: SocketAddr, job: &str) -> Value {
+    let mut document = Value::Null;
+    until("the job's end", || {
+        let reply = get(addr, &format!("{job}?wait=5"));
+        assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+        document = reply.json();
+        document["finished"].is_string()
+    });
+    assert_eq!(document["status"], "successful", "{document}");
+    document
+}
+
+/// The address of its result, and the result.
+#[track_caller]
+fn result(addr: SocketAddr, job: &str) -> (String, Reply) {
+    successful(addr, job);
+    let way = get(addr, &format!("{job}/result"));
+    assert_eq!(way.status, 303, "{}", String::from_utf8_lossy(&way.body));
+    let address = way.header("location").unwrap().to_owned();
+    let reply = get(addr, &address);
+    assert_eq!((reply.status, reply.complete), (200, true), "{address}");
+    (address, reply)
+}
+
+/// Checks that a result can be had in parts, known by a strong `ETag`.
+#[track_caller]
+fn in_parts(addr: SocketAddr, address: &str, whole: &Reply) {
+    let etag = whole.header("etag").unwrap();
+    assert!(etag.starts_with('"') && etag.len() == 66, "{etag}");
+    let length = whole.body.len();
+    for (range, from, to) in [("bytes=100-299", 100, 300), ("bytes=-50", length - 50, length)] {
+        let part = send(addr, "GET", address, &[("range", range), ("if-range", etag)], b"");
+        let expected = format!("bytes {from}-{}/{length}", to - 1);
+        assert_eq!((part.status, part.header("content-range")), (206, Some(&*expected)));
+        assert_eq!((part.header("etag"), part.body == whole.body[from..to]), (Some(etag), true), "{range}");
+    }
+    let other = send(addr, "GET", address, &[("range", "bytes=0-9"), ("if-range", "\"other\"")], b"");
+    assert_eq!((other.status, other.body == whole.body), (200, true));
+    let beyond = [("range", &*format!("bytes={length}-"))];
+    send(addr, "GET", address, &beyond, b"").problem(416, "range-not-satisfiable");
+    assert_eq!(send(addr, "GET", address, &[("if-none-match", etag)], b"").status, 304);
+}
+
+/// A server process whose store is on S3, and everything that it says.
+struct Process {
+    child: Child,
+    addr: SocketAddr,
+    log: Arc<Mutex<String>>,
+}
+
+fn command(service: &Service, prefix: &str, data_dir: &Path) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_molmesh"));
+    command
+        .args(["serve", "--listen", "127.0.0.1:0", "--backend", "reference", "--data-dir"])
+        .arg(data_dir)
+        .args(["--set", "archive.url=none", "--set", "jobs.workers=1", "--set", "jobs.attempts=1000"])
+        .args(["--set", "server.metrics_listen=none", "--set", "log.filter=debug", "--set", "store.allow_http=true"])
+        .args(["--set", &format!("store.url=s3://meshes/{prefix}"), "--set", "store.region=us-east-1"])
+        .args(["--set", &format!("store.endpoint={}", service.access.endpoint)])
+        .env("AWS_ACCESS_KEY_ID", &service.access.id)
+        .env("AWS_SECRET_ACCESS_KEY", &service.access.secret)
+        .stderr(Stdio::piped())
+        .stdout(Stdio::null());
+    command
+}
+
+impl Process {
+    fn start(service: &Service, prefix: &str, data_dir: &Path) -> Self {
+        let mut child = command(service, prefix, data_dir).spawn().unwrap();
+        let log: Arc<Mutex<String>> = Arc::default();
+        let (lines, kept) = (BufReader::new(child.stderr.take().unwrap()).lines(), Arc::clone(&log));
+        std::thread::spawn(move || {
+            for line in lines.map_while(Result::ok) {
+                *kept.lock().unwrap() += &(line + "\n");
+            }
+        });
+        let mut addr = None;
+        until("the banner", || {
+            let log = log.lock().unwrap();
+            addr = log.lines().find_map(|line| {
+                let (_, rest) = line.trim_start().strip_prefix("viewer")?.split_once("http://")?;
+                rest.split(|c: char| c != '.' && c != ':' && !c.is_ascii_digit()).next()?.parse().ok()
+            });
+            assert!(addr.is_some() || child.try_wait().unwrap().is_none(), "it ended: {log}");
+            addr.is_some()
+        });
+        Self { child, addr: addr.unwrap(), log }
+    }
+
+    /// `kill -9`; what it said until then.
+    fn kill(mut self) -> String {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+        self.log.lock().unwrap().clone()
+    }
+}
+
+/// Whether there is the record of a job that has not ended.
+fn any_open(service: &Service, prefix: &str, data_dir: &Path) -> bool {
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
+    runtime.block_on(async {
+        let store = Store::open(&service.config(prefix), data_dir).await.unwrap();
+        let mut open = false;
+        for (name, _) in store.list(Folder::Jobs).await.unwrap() {
+            let record = store.get(&name).await.unwrap().unwrap();
+            open |= serde_json::from_slice::<Value>(&record.bytes).unwrap()["finished_ms"].is_null();
+        }
+        open
+    })
+}
+
+#[test]
+fn what_was_promised_on_s3_survives_kill_nine() {
+    let service = Service::start(&["--guarded"]);
+    let folder = tempfile::tempdir().unwrap();
+    let query = "/v1/meshes?format=stl&resolution=1";
+    let mut log = String::new();
+    let mut jobs: Vec<(usize, String)> = Vec::new();
+    // The jobs of a round take the only worker much longer than it takes to kill it; one that is left over is enough.
+    let open = (0..5).any(|round| {
+        // Nothing of a process is left to the next one but what is on S3.
+        let data_dir = folder.path().join(round.to_string());
+        let server = Process::start(&service, "killed", &data_dir);
+        for n in 3 * round..3 * round + 3 {
+            jobs.push((n, promise(server.addr, query, &sample(n))));
+        }
+        log += &server.kill();
+        any_open(&service, "killed", folder.path())
+    });
+    assert!(open, "no job was left undone");
+    let server = Process::start(&service, "killed", &folder.path().join("last"));
+    let judge = start(Arc::new(ReferenceBackend), |_| {});
+    let (_, expected) = result(judge.addr, &promise(judge.addr, query, &sample(jobs[0].0)));
+    let mut etags = Vec::new();
+    for (n, job) in &jobs {
+        let (address, reply) = result(server.addr, job);
+        assert!(reply.body == expected.body, "job {n} has other bytes than on a folder");
+        etags.push(reply.header("etag").unwrap().to_owned());
+        if *n == jobs[0].0 {
+            assert_eq!(reply.header("etag"), expected.header("etag"));
+            in_parts(server.addr, &address, &reply);
+        }
+    }
+    etags.dedup();
+    assert_eq!(etags.len(), jobs.len(), "every input has a result of its own");
+    log += &server.kill();
+    // It says a lot, and where it keeps things; not what lets it in.
+    assert!(log.contains("s3://meshes/killed") && log.contains("DEBUG"), "{log}");
+    assert!(!log.contains(&service.access.secret), "the secret is in the log");
+}
+
+#[test]
+fn what_s3_keeps_is_what_a_folder_keeps() {
+    let service = Service::start(&[]);
+    let on_s3 = |c: &mut molmesh::config::Config| {
+        c.store = service.config("same");
+        c.store.memory_bytes = 0;
+    };
+    let backend = || -> Arc<dyn Backend> { Arc::new(CpuBackend::new(None).unwrap()) };
+    let (server, judge) = (start(backend(), on_s3), start(backend(), |_| {}));
+    let upload = |addr| send(addr, "POST", "/v1/structures", &[], SAMPLE);
+    let created = upload(server.addr);
+    assert_eq!((created.status, upload(server.addr).status, upload(judge.addr).status), (201, 200, 201));
+    let structure = created.header("location").unwrap();
+    assert!(server.join());
+    // Another process, which has been sent nothing.
+    let server = start(backend(), on_s3);
+    let mut seen = Vec::new();
+    // The last one goes to S3 in parts: it is larger than one.
+    for file in [
+        "surface.glb?resolution=1",
+        "surface.stl?resolution=1",
+        "surface.ply?resolution=0.7",
+        "surface.stl?resolution=0.24",
+    ] {
+        let path = format!("{structure}/{file}");
+        let (fresh, expected) = (get(server.addr, &path), get(judge.addr, &path));
+        assert_eq!((fresh.status, fresh.complete, expected.status), (200, true, 200), "{file}");
+        assert!(fresh.body == expected.body && fresh.header("etag") == expected.header("etag"), "{file}");
+        let address = fresh.header("content-location").unwrap();
+        let kept = get(server.addr, address);
+        assert_eq!((kept.status, kept.body == expected.body), (200, true), "{file}");
+        in_parts(server.addr, address, &kept);
+        let again = get(server.addr, &path);
+        assert!(again.header("server-timing").unwrap().starts_with("cache;desc=hit"), "{file}");
+        assert!(again.body == expected.body, "{file}");
+        seen.push(kept.body);
+    }
+    assert!(seen.last().unwrap().len() > 8 << 20, "{}", seen.last().unwrap().len());
+    seen.dedup();
+    assert_eq!(seen.len(), 4, "four files, four contents");
+}
+
+/// A backend that begins when it is let.
+struct Gated {
+    fake: Arc<Fake>,
+    open: AtomicBool,
+    waiting: AtomicUsize,
+}
+
+impl Backend for Gated {
+    fn name(&self) -> &'static str {
+        "gated"
+    }
+
+    fn describe(&self) -> String {
+        self.fake.describe()
+    }
+
+    fn write(
+        &self,
+        spheres: &Spheres,
+        params: &SurfaceParams,
+        limits: &SurfaceLimits,
+        control: &Control<'_>,
+        sink: Option<&dyn MeshSink>,
+    ) -> Result<MeshOutput, SurfaceError> {
+        self.waiting.fetch_add(1, Ordering::SeqCst);
+        while !self.open.load(Ordering::SeqCst) {
+            control.check()?;
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        self.waiting.fetch_sub(1, Ordering::SeqCst);
+        self.fake.write(spheres, params, limits, control, sink)
+    }
+}
+
+#[test]
+fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
+    let mut service = Service::start(&["--guarded"]);
+    let fake = Fake::new(Mode::Octahedra);
+    let backend =
+        Arc::new(Gated { fake: Arc::clone(&fake), open: AtomicBool::new(true), waiting: AtomicUsize::new(0) });
+    let server = start(Arc::clone(&backend) as _, |c| {
+        c.store = service.config("away");
+        c.store.memory_bytes = 0;
+        c.jobs.workers = 2;
+        c.jobs.store_patience_ms = 600_000;
+    });
+    let addr = server.addr;
+    let mesh = |n| send(addr, "POST", "/v1/meshes?format=stl", &[], &sample(n));
+
+    // What there is before: a structure, a result.
+    let structure = send(addr, "POST", "/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
+    let before = get(addr, &format!("{structure}/surface.stl"));
+    let kept = before.header("content-location").unwrap().to_owned();
+    assert_eq!((before.status, get(addr, &kept).status), (200, 200));
+
+    // Two jobs are in the house when it goes away: one that somebody waits for, one that was promised.
+    backend.open.store(false, Ordering::SeqCst);
+    let promised = promise(addr, "/v1/meshes?format=stl", &sample(1));
+    let waiting = std::thread::spawn(move || send(addr, "POST", "/v1/meshes?format=stl", &[], &sample(2)));
+    until("both jobs", || backend.waiting.load(Ordering::SeqCst) == 2);
+    service.away();
+    backend.open.store(true, Ordering::SeqCst);
+    let reply = waiting.join().unwrap();
+    assert_eq!((reply.status, reply.complete, reply.body == before.body), (200, true, true));
+    until("an attempt to keep the result", || !log_lines("the store rejected a write; retrying").is_empty());
+    assert_eq!(get(addr, &promised).json()["status"], "running");
+
+    // What needs the store is refused, in words for clients; what does not is done.
+    let refused = || {
+        [
+            send(addr, "POST", "/v1/meshes?format=stl", &[LATER], &sample(3)),
+            send(addr, "POST", "/v1/structures", &[], &sample(4)),
+            get(addr, &structure),
+            get(addr, &format!("{structure}/surface.stl?resolution=2")),
+            get(addr, &kept),
+        ]
+    };
+    for reply in refused() {
+        reply.problem(503, "store-failed");
+        assert!(reply.header("retry-after").is_some_and(|seconds| seconds.parse::<u64>().unwrap() >= 1), "{reply:?}");
+        let text = reply.text();
+        assert!(!text.contains("s3://") && !text.contains(&service.access.endpoint), "{text}");
+    }
+    let reply = mesh(5);
+    assert_eq!((reply.status, reply.complete, reply.body == before.body), (200, true, true));
+    assert_eq!((get(addr, "/livez").status, get(addr, "/readyz").status), (200, 200));
+    assert!(server.metric("molmesh_store_errors_total", &[]) >= 1.0);
+
+    // It comes back: the promise is kept with the mesh that was made then.
+    let made = fake.finished.load(Ordering::SeqCst);
+    service.back();
+    let document = successful(addr, &promised);
+    assert_eq!((&document["attempts"], fake.finished.load(Ordering::SeqCst)), (&1.into(), made));
+    let (address, reply) = result(addr, &promised);
+    assert!(reply.body == before.body);
+    in_parts(addr, &address, &reply);
+    assert_eq!(refused().map(|reply| reply.status), [202, 201, 200, 200, 200]);
+
+    // It goes away for good: nothing new is begun on it.
+    let place = service.config("away");
+    let access = service.access.clone();
+    let elsewhere = tempfile::tempdir().unwrap();
+    let mut starting = command(&service, "away", elsewhere.path());
+    drop(service);
+    send(addr, "POST", "/v1/meshes?format=stl", &[LATER], &sample(6)).problem(503, "store-failed");
+    let refused = starting.output().unwrap();
+    let words = String::from_utf8(refused.stderr).unwrap();
+    assert!(!refused.status.success() && words.contains("store.url"), "{words}");
+    assert!(words.contains(place.url.as_deref().unwrap()) && !words.contains(&access.secret), "{words}");
+    assert!(!log_lines("s3://meshes/away").is_empty(), "the log says where");
+    assert!(log_lines(&access.secret).is_empty(), "the secret is in the log");
+}

@@ -1,0 +1,365 @@
+//! Every metric of the service, moved: a row for each says what moves it. The table of `docs/operate/monitoring.md` is made of the same
+//! descriptions (`MOLMESH_BLESS=1` writes it).
+
+use crate::archive_support;
+use crate::http_support;
+use crate::metrics_support;
+use crate::tools;
+use crate::trace_support;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::path::Path;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use http_support::{Fake, Mode, Running, SAMPLE, carbons, connect, sample, start};
+use metrics_support::{Devices, Held, Scrape, check, queries, until};
+use molmesh::surface::CpuBackend;
+use molmesh::telemetry::{self as t, Kind, METRICS, Metric, recorder};
+
+/// What is done to move metrics; the look in the end, or in the middle, waits until they have.
+type Mover = fn(look: &dyn Fn());
+
+/// A metric, the labels of the series that is looked at, and what moves it.
+type Row = (&'static str, &'static [&'static str], Mover);
+
+const ROWS: &[Row] = &[
+    (t::HTTP_DURATION, &["method=\"POST\"", "route=\"/v1/meshes\"", "status=\"200\""], meshes),
+    (t::HTTP_ACTIVE, &["method=\"POST\""], held),
+    (t::HTTP_REQUEST_SIZE, &["method=\"POST\"", "route=\"/v1/meshes\"", "status=\"200\""], meshes),
+    (t::HTTP_RESPONSE_SIZE, &["method=\"POST\"", "route=\"/v1/meshes\"", "status=\"200\""], meshes),
+    (t::CONNECTIONS, &[], held),
+    (t::REJECTED, &["reason=\"body-too-large\""], refusals),
+    (t::BODIES_OPEN, &[], unread),
+    (t::QUOTA_CLIENTS, &[], quotas),
+    (t::JOBS_SUBMITTED, &["mode=\"sync\"", "dedup=\"no\""], meshes),
+    (t::JOBS_FINISHED, &["outcome=\"successful\""], meshes),
+    (t::JOBS_OPEN, &[], held),
+    (t::JOBS_RECOVERED, &[], restart),
+    (t::JOBS_FALLBACK, &[], devices),
+    (t::STAGE_DURATION, &["stage=\"field\""], meshes),
+    (t::RESULTS_NOT_KEPT, &["reason=\"failed\""], tiny_store),
+    (t::QUEUE_DEPTH, &[], held),
+    (t::QUEUE_AGE, &[], held),
+    (t::QUEUE_WAIT, &[], held),
+    (t::MEMORY_HELD, &[], held),
+    (t::VOXELS, &[], meshes),
+    (t::TRIANGLES, &[], meshes),
+    (t::DEVICE_UP, &["device=\"0\""], devices),
+    (t::DEVICE_BUSY, &["device=\"0\""], devices),
+    (t::DEVICE_LOST, &["device=\"0\""], devices),
+    (t::DEVICE_REBUILDS, &["device=\"0\""], devices),
+    (t::DEVICE_MEMORY, &["device=\"0\""], devices),
+    (t::DEVICE_WAITING, &["device=\"0\""], devices),
+    (t::DEVICE_JOBS, &["device=\"0\"", "outcome=\"failed\""], devices),
+    (t::DEVICE_SHARED, &["device=\"0\""], devices),
+    (t::DEVICE_PARTITIONS, &["device=\"0\""], devices),
+    (t::CACHE_REQUESTS, &["tier=\"memory\"", "result=\"hit\""], meshes),
+    (t::STORE_BYTES, &["folder=\"results\""], meshes),
+    (t::STORE_OBJECTS, &["folder=\"results\""], meshes),
+    (t::STORE_REMOVED, &["reason=\"cap\""], full_store),
+    (t::STORE_ERRORS, &["op="], broken_store),
+    (t::ARCHIVE_REQUESTS, &["source=\"remote\"", "result=\"found\""], archive),
+    (t::ARCHIVE_FETCH, &["result=\"found\""], archive),
+    (t::ARCHIVE_BREAKER, &["host=\"127.0.0.1\""], dead_archive),
+    (t::ARCHIVE_KEPT, &[], archive),
+    (t::TRACE_SPANS, &["result=\"exported\""], traces),
+    (t::PANICS, &["place=\"job\""], panics),
+    (t::BUILD_INFO, &[concat!("version=\"", env!("CARGO_PKG_VERSION"), "\"")], nothing),
+    (t::PROCESS_CPU, &[], nothing),
+    (t::PROCESS_RESIDENT, &[], nothing),
+    (t::PROCESS_VIRTUAL, &[], nothing),
+    (t::PROCESS_FDS, &[], nothing),
+    (t::PROCESS_MAX_FDS, &[], nothing),
+    (t::PROCESS_THREADS, &[], nothing),
+    (t::PROCESS_START, &[], nothing),
+];
+
+/// A real mesh, made once and asked for until it comes from memory.
+fn meshes(look: &dyn Fn()) {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let ask = || server.post("/v1/meshes", &[], SAMPLE);
+    assert_eq!(ask().status, 200);
+    until("it is kept", || ask().header("server-timing").unwrap().contains("hit"));
+    look();
+}
+
+/// One job runs, two wait, one of them promised.
+fn held(look: &dyn Fn()) {
+    let backend = Held::new();
+    let server = start(Arc::clone(&backend) as _, |config| {
+        config.jobs.workers = 1;
+        config.jobs.deadline_ms = 600_000;
+    });
+    std::thread::scope(|scope| {
+        let running = scope.spawn(|| server.post("/v1/meshes", &[], &sample(1)));
+        until("it runs", || backend.holds.load(Ordering::SeqCst));
+        let later = [("prefer", "respond-async")];
+        assert_eq!(server.post("/v1/meshes", &later, &sample(2)).status, 202);
+        assert_eq!(server.post("/v1/meshes", &later, &sample(3)).status, 202);
+        look();
+        backend.let_go();
+        assert_eq!(running.join().unwrap().status, 200);
+    });
+}
+
+/// A client that does not read its mesh.
+fn unread(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |_| {});
+    let (mut client, body) = (connect(server.addr), carbons(60_000));
+    let head = format!("POST /v1/meshes?format=stl HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
+    client.write_all(&[head.as_bytes(), &body].concat()).unwrap();
+    look();
+}
+
+fn refusals(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |config| config.limits.body_bytes = 1000);
+    server.post("/v1/meshes", &[], SAMPLE).problem(413, "body-too-large");
+    look();
+}
+
+fn quotas(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |config| config.access.address_requests = Some(100));
+    assert_eq!(server.get("/v1/capabilities").status, 200);
+    look();
+}
+
+/// A job that outlives its server.
+fn restart(look: &dyn Fn()) {
+    let folder = tempfile::tempdir().unwrap();
+    let keep = |config: &mut molmesh::config::Config| {
+        folder.path().clone_into(&mut config.server.data_dir);
+        config.server.drain_timeout_ms = 1;
+    };
+    let backend = Held::new();
+    let server = start(Arc::clone(&backend) as _, keep);
+    assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE).status, 202);
+    until("it runs", || backend.holds.load(Ordering::SeqCst));
+    let _drained = server.join();
+    let _server = start(Fake::new(Mode::Octahedra), keep);
+    look();
+}
+
+/// Devices with a past, and something that stands in for them.
+fn devices(look: &dyn Fn()) {
+    let server = start(Devices::new(), |_| {});
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    look();
+}
+
+/// The folder of results is none any more.
+fn broken_store(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |_| {});
+    let folder = server.dir.path().join("store/results");
+    std::fs::remove_dir_all(&folder).unwrap();
+    std::fs::write(&folder, "").unwrap();
+    // Who waits gets a mesh that cannot be kept.
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    look();
+}
+
+/// Room for no mesh.
+fn tiny_store(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |config| config.store.max_bytes = 3000);
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
+    look();
+}
+
+/// Room for two meshes, and five are made.
+fn full_store(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Octahedra), |config| config.store.max_bytes = 500_000);
+    for n in 0..5 {
+        let made = server.post("/v1/meshes?format=stl", &[], &sample(n));
+        // Asking for it waits until it is kept.
+        server.get(made.header("content-location").unwrap());
+    }
+    look();
+}
+
+fn archive(look: &dyn Fn()) {
+    let remote = archive_support::Remote::saying(archive_support::ok(SAMPLE));
+    let server = archived(&remote.url("/{id}.pdb"));
+    assert_eq!(server.get("/v1/pdb/4pti/surface.glb").status, 200);
+    look();
+}
+
+fn dead_archive(look: &dyn Fn()) {
+    let remote = archive_support::Remote::saying(archive_support::status(500));
+    let server = archived(&remote.url("/{id}.pdb"));
+    assert_eq!(server.get("/v1/pdb/4pti/surface.glb").status, 424);
+    look();
+}
+
+fn archived(url: &str) -> Running {
+    start(Fake::new(Mode::Octahedra), |config| {
+        config.archive.url = Some(url.parse().unwrap());
+        config.archive.breaker_failures = 1;
+        config.archive.attempts = 1;
+    })
+}
+
+fn traces(look: &dyn Fn()) {
+    let collector = trace_support::Collector::start(trace_support::Manner::Takes);
+    let _server = start(Fake::new(Mode::Octahedra), |config| {
+        config.telemetry.endpoint = Some(serde_json::from_value(collector.url().into()).unwrap());
+    });
+    look();
+}
+
+fn panics(look: &dyn Fn()) {
+    let server = start(Fake::new(Mode::Panic), |_| {});
+    assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 500);
+    look();
+}
+
+/// It is there as soon as there is a process.
+fn nothing(look: &dyn Fn()) {
+    look();
+}
+
+/// The recorder is the process's: where tests share one, those that count take turns.
+static ALONE: Mutex<()> = Mutex::new(());
+
+fn scrape() -> Scrape {
+    Scrape::of(&recorder().unwrap().render())
+}
+
+/// Values that only are: they are looked for, not for their movement.
+fn is_fixed(name: &str) -> bool {
+    name == t::BUILD_INFO || name.starts_with("process_")
+}
+
+#[test]
+fn every_metric_has_a_row_and_moves() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let rows: BTreeSet<&str> = ROWS.iter().map(|(name, ..)| *name).collect();
+    let known: BTreeSet<&str> = METRICS.iter().map(|metric| metric.name).collect();
+    assert_eq!(rows, known, "one row for every metric, and none for what is no metric");
+    let mut movers: Vec<(Mover, Vec<&Row>)> = Vec::new();
+    for row in ROWS {
+        match movers.iter_mut().find(|(mover, _)| std::ptr::fn_addr_eq(*mover, row.2)) {
+            Some((_, rows)) => rows.push(row),
+            None => movers.push((row.2, vec![row])),
+        }
+    }
+    for (mover, rows) in movers {
+        let before = scrape();
+        // The control: what has not happened has not moved anything.
+        let moved = |now: &Scrape, (name, labels, _): &Row| {
+            let value = |scrape: &Scrape| scrape.moves(name, labels);
+            if is_fixed(name) { value(now) > 0.0 } else { (value(now) - value(&before)).abs() > 1e-12 }
+        };
+        for row in rows.iter().filter(|row| !is_fixed(row.0)) {
+            assert!(!moved(&before, row), "{}", row.0);
+        }
+        mover(&|| {
+            let missing = || {
+                let now = scrape();
+                rows.iter().filter(|row| !moved(&now, row)).map(|row| row.0).collect::<Vec<_>>()
+            };
+            until(&format!("{:?}", rows.iter().map(|row| row.0).collect::<Vec<_>>()), || missing().is_empty());
+        });
+        let faults = check(&scrape(), METRICS);
+        assert_eq!(faults, Vec::<String>::new());
+    }
+    // By now everything is exposed that can be: what dashboards and alerts ask for is among it.
+    let Some(files) = tools::queries(&queries::FILES.map(queries::path)) else { return };
+    for (file, found) in queries::FILES.iter().zip(&files) {
+        assert_eq!(queries::faults(found, &scrape()), Vec::<String>::new(), "{file}");
+    }
+    // No metric is exposed that nobody looks at.
+    let asked: BTreeSet<&str> = files.iter().flat_map(queries::metrics).collect();
+    let unseen: Vec<&&str> = known.difference(&asked).collect();
+    assert_eq!(unseen, Vec::<&&str>::new());
+}
+
+#[test]
+fn a_scrape_that_is_not_as_described_is_found_out() {
+    let faults = |line: &str| {
+        let name = line.split(['{', ' ']).next().unwrap();
+        let kind = METRICS.iter().find(|metric| metric.name == name).map_or("gauge", |metric| metric.kind.name());
+        check(&Scrape::of(&format!("# HELP {name} x\n# TYPE {name} {kind}\n{line}\n")), METRICS)
+    };
+    assert!(faults("molmesh_queue_depth 3").iter().all(|fault| !fault.contains("molmesh_queue_depth")));
+    for (line, said) in [
+        ("molmesh_nobody_knows_this 1", "is not described"),
+        ("molmesh_queue_depth{job=\"1\"} 1", "labels"),
+        ("molmesh_jobs_finished_total{outcome=\"vanished\"} 1", "vanished"),
+        ("molmesh_jobs_finished_total 1", "labels"),
+    ] {
+        assert!(faults(line).iter().any(|fault| fault.contains(said)), "{line}: {:?}", faults(line));
+    }
+    let wrong = "# HELP molmesh_queue_depth x\n# TYPE molmesh_queue_depth counter\nmolmesh_queue_depth 1\n";
+    assert!(check(&Scrape::of(wrong), METRICS).iter().any(|fault| fault.contains("counter")));
+}
+
+/// Whoever walks through the service with made-up names makes no new series.
+#[test]
+fn what_clients_make_up_is_no_label() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let server = start(Fake::new(Mode::Octahedra), |_| {});
+    let series = || {
+        let scrape = scrape();
+        let of = |name: &str| scrape.series(name).len();
+        [t::HTTP_DURATION, t::HTTP_ACTIVE, t::HTTP_REQUEST_SIZE, t::REJECTED].map(of)
+    };
+    let walk = |n: usize| {
+        server.get(&format!("/nowhere/{n}"));
+        server.get(&format!("/v1/jobs/{n:032x}"));
+        server.get(&format!("/v1/results/{n:064x}.glb"));
+        server.get(&format!("/v1/pdb/{n:04}/surface.glb"));
+        server.post(&format!("/v1/meshes?parameter{n}=1"), &[], SAMPLE);
+        http_support::send(server.addr, &format!("METHOD{n}"), "/livez", &[], b"");
+        http_support::send(server.addr, "GET", "/livez", &[("x-request-id", &format!("id-{n}"))], b"");
+    };
+    let before = series();
+    (0..40).for_each(walk);
+    // An answer's books are closed when its last byte is gone.
+    until("the last request is counted", || {
+        let scrape = scrape();
+        scrape.moves(t::HTTP_DURATION, &["route=\"unmatched\""]) >= 40.0
+    });
+    // Each kind of request may make one series; forty of a kind would make forty.
+    for (before, now) in before.into_iter().zip(series()) {
+        assert!(now <= before + 12, "{now} after {before}");
+    }
+}
+
+/// The table of metrics, as the documentation shows it.
+fn table() -> String {
+    let mut text = "| metric | kind | labels | what |\n| --- | --- | --- | --- |\n".to_owned();
+    for metric in METRICS {
+        let label = |label: &t::Label| match label.closed() {
+            Some(values) => format!("`{}`: {}", label.name, values.collect::<Vec<_>>().join(", ")),
+            None => format!("`{}`: {}", label.name, label.values),
+        };
+        let Metric { name, labels, .. } = metric;
+        let labels = labels.iter().map(label).collect::<Vec<_>>().join("; ");
+        writeln!(text, "| `{name}` | {} | {labels} | {} |", metric.kind.name(), metric.help()).unwrap();
+    }
+    text
+}
+
+#[test]
+fn the_documentation_lists_every_metric() {
+    const MARKS: [&str; 2] = ["<!-- metrics -->\n", "<!-- end of metrics -->"];
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/operate/monitoring.md");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let (before, rest) = text.split_once(MARKS[0]).unwrap();
+    let (listed, after) = rest.split_once(MARKS[1]).unwrap();
+    if std::env::var_os("MOLMESH_BLESS").is_some() {
+        std::fs::write(&path, [before, MARKS[0], &table(), MARKS[1], after].concat()).unwrap();
+        return;
+    }
+    assert_eq!(listed, table(), "MOLMESH_BLESS=1 writes it anew");
+}
+
+#[test]
+fn counters_of_seconds_are_called_counters() {
+    let text = recorder().unwrap().render();
+    assert!(text.contains("# TYPE process_cpu_seconds_total counter\n"), "{text}");
+    let kinds: BTreeMap<&str, Kind> = METRICS.iter().map(|metric| (metric.name, metric.kind)).collect();
+    assert_eq!(kinds[t::DEVICE_BUSY], Kind::Seconds);
+}

@@ -1,0 +1,379 @@
+//! Traces: contexts in and out, spans as a collector gets them, collectors that do not want them.
+
+use crate::archive_support;
+use crate::http_support;
+use crate::metrics_support;
+use crate::trace_support;
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+use http_support::{Fake, Mode, Reply, Running, SAMPLE, log_lines, sample, send, start, start_on};
+use metrics_support::{Held, until};
+use molmesh::config::Config;
+use molmesh::surface::{Backend, CpuBackend};
+use opentelemetry_proto::tonic::trace::v1::Span;
+use opentelemetry_proto::tonic::trace::v1::span::SpanKind;
+use trace_support::{Collector, Manner, attribute, below, hex, named};
+
+const TRACE: &str = "0af7651916cd43dd8448eb211c80319c";
+const PARENT: &str = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
+
+/// A request that is made once more.
+type Ask<'a> = Box<dyn Fn() -> Reply + 'a>;
+
+/// A server whose spans go to `collector`.
+fn traced(backend: Arc<dyn Backend>, collector: &Collector, change: impl FnOnce(&mut Config)) -> Running {
+    start(backend, |config| {
+        config.telemetry.endpoint = Some(serde_json::from_value(collector.url().into()).unwrap());
+        // Nothing here measures how fast the machine is.
+        config.telemetry.flush_timeout_ms = 60_000;
+        change(config);
+    })
+}
+
+/// Number that rises once a service has noticed how its collector behaves.
+type Sign = dyn Fn(&Running) -> f64;
+
+/// The trace and the span that an answer names.
+#[track_caller]
+fn place(reply: &Reply) -> (String, String) {
+    let text = reply.header("traceparent").unwrap();
+    let parts: Vec<&str> = text.split('-').collect();
+    assert_eq!((parts.len(), parts[0], parts[1].len(), parts[2].len()), (4, "00", 32, 16), "{text}");
+    (parts[1].to_owned(), parts[2].to_owned())
+}
+
+fn kind(span: &Span) -> SpanKind {
+    SpanKind::try_from(span.kind).unwrap()
+}
+
+/// Panics unless `span` lies within `around`.
+#[track_caller]
+fn lies_within(span: &Span, around: &Span) {
+    let inside = around.start_time_unix_nano <= span.start_time_unix_nano
+        && span.start_time_unix_nano <= span.end_time_unix_nano
+        && span.end_time_unix_nano <= around.end_time_unix_nano;
+    assert!(inside, "{span:?} in {around:?}");
+}
+
+#[test]
+fn answers_name_their_span_whether_or_not_anybody_collects() {
+    let server = start(Fake::new(Mode::Octahedra), |_| {});
+    let get = |headers: &[(&str, &str)]| send(server.addr, "GET", "/livez", headers, b"");
+    let (trace, span) = place(&get(&[("traceparent", PARENT)]));
+    assert_eq!(trace, TRACE);
+    assert_ne!(span, &PARENT[36..52]);
+    // The flag of whoever is above is passed on; who begins a trace that nobody collects says so.
+    assert!(get(&[("traceparent", PARENT)]).header("traceparent").unwrap().ends_with("-01"));
+    assert!(get(&[]).header("traceparent").unwrap().ends_with("-00"));
+    // What is wrong is ignored, and a new trace begins.
+    for bad in [PARENT.to_uppercase(), PARENT.replace("00-0", "ff-0"), format!("{PARENT}-x"), String::new()] {
+        assert_ne!(place(&get(&[("traceparent", &bad)])).0, TRACE, "{bad}");
+    }
+    assert_ne!(place(&get(&[("traceparent", PARENT), ("traceparent", PARENT)])).0, TRACE, "twice is wrong");
+    let (one, other) = (place(&get(&[])), place(&get(&[])));
+    assert!(one.0 != other.0 && one.1 != other.1);
+    // Problems and answers that a layer gives have one too, and scripts of other origins may read it.
+    assert_eq!(place(&send(server.addr, "GET", "/nowhere", &[("traceparent", PARENT)], b"")).0, TRACE);
+    let cors = get(&[("origin", "http://elsewhere")]);
+    assert!(cors.header("access-control-expose-headers").unwrap().contains("traceparent"));
+}
+
+#[test]
+fn a_request_its_job_and_every_stage_are_one_tree() {
+    let collector = Collector::start(Manner::Takes);
+    let secret = "authorization=Bearer sesame-8731";
+    let server = traced(Arc::new(CpuBackend::new(None).unwrap()), &collector, |config| {
+        config.telemetry.service_name = "surfaces".to_owned();
+        config.telemetry.secret_headers = Some(serde_json::from_value(secret.into()).unwrap());
+    });
+    let headers = [("traceparent", PARENT), ("tracestate", "rojo=1, congo=2"), ("x-request-id", "tree-1")];
+    let reply = server.post("/v1/meshes?check=strict", &headers, SAMPLE);
+    assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
+    // Asking for what is kept waits until it is.
+    assert_eq!(server.get(reply.header("content-location").unwrap()).status, 200);
+    // Somebody who does not want to be recorded is not.
+    let other = PARENT.replace(TRACE, "11111111111111111111111111111111").replace("-01", "-00");
+    assert_eq!(send(server.addr, "GET", "/version", &[("traceparent", &other)], b"").status, 200);
+    assert!(server.join());
+    let spans = collector.trace(TRACE);
+    let request = named(&spans, "POST /v1/meshes");
+    assert_eq!((hex(&request.span_id), hex(&request.parent_span_id)), (place(&reply).1, PARENT[36..52].to_owned()));
+    assert_eq!((kind(request), request.flags), (SpanKind::Server, 0x301));
+    assert_eq!(request.trace_state, "rojo=1,congo=2");
+    for (key, value) in [
+        ("http.request.method", "POST"),
+        ("http.route", "/v1/meshes"),
+        ("url.path", "/v1/meshes"),
+        ("http.response.status_code", "200"),
+        ("http.request.body.size", &SAMPLE.len().to_string()),
+        ("http.response.body.size", &reply.body.len().to_string()),
+        ("molmesh.request.id", "tree-1"),
+        ("molmesh.complete", "true"),
+    ] {
+        assert_eq!(attribute(request, key).as_deref(), Some(value), "{key}");
+    }
+    let parts: Vec<&str> = below(&spans, request).iter().map(|span| span.name.as_str()).collect();
+    for part in ["receive", "job", "encode", "keep"] {
+        assert!(parts.contains(&part), "{part} among {parts:?}");
+    }
+    for part in ["receive", "job", "encode"] {
+        lies_within(named(&spans, part), request);
+    }
+    let job = named(&spans, "job");
+    assert_eq!((kind(job), attribute(job, "molmesh.job.outcome").as_deref()), (SpanKind::Internal, Some("successful")));
+    assert_eq!(attribute(job, "molmesh.atoms").as_deref(), Some("454"));
+    let stages = below(&spans, job);
+    for stage in ["queue", "check", "read", "select", "field", "classify", "emit", "measure"] {
+        assert!(stages.iter().any(|span| span.name == stage), "{stage} among {stages:?}");
+    }
+    let mut taken = 0;
+    for stage in &stages {
+        lies_within(stage, job);
+        taken += stage.end_time_unix_nano - stage.start_time_unix_nano;
+    }
+    assert!(taken <= job.end_time_unix_nano - job.start_time_unix_nano, "stages follow one another");
+    // Each span once, all of one process, and nobody's else.
+    let mut ids: Vec<&[u8]> = spans.iter().map(|span| &span.span_id[..]).collect();
+    ids.sort_unstable();
+    ids.dedup();
+    assert_eq!(ids.len(), spans.len());
+    assert!(collector.trace(&other[3..35]).is_empty());
+    let requests = collector.requests();
+    let resource = requests[0].resource_spans[0].resource.as_ref().unwrap();
+    let service = Span { attributes: resource.attributes.clone(), ..Span::default() };
+    assert_eq!(attribute(&service, "service.name").as_deref(), Some("surfaces"));
+    assert_eq!(attribute(&service, "service.version").as_deref(), Some(env!("CARGO_PKG_VERSION")));
+    for head in collector.heads() {
+        assert!(head.starts_with("post /v1/traces http/1.1") && head.contains("application/x-protobuf"), "{head}");
+        assert!(head.contains("authorization: bearer sesame-8731"), "{head}");
+    }
+    assert_eq!(log_lines("sesame-8731"), Vec::<String>::new());
+}
+
+#[test]
+fn what_fails_says_so_in_its_spans_and_lines() {
+    let collector = Collector::start(Manner::Takes);
+    let backend = Fake::new(Mode::Panic);
+    let server = traced(Arc::clone(&backend) as _, &collector, |_| {});
+    assert_eq!(server.post("/v1/meshes", &[("traceparent", PARENT)], SAMPLE).status, 500);
+    let other = PARENT.replace(TRACE, "22222222222222222222222222222222");
+    assert_eq!(server.post("/v1/meshes", &[("traceparent", &other)], b"nothing to read").status, 422);
+    assert!(server.join());
+    let spans = collector.trace(TRACE);
+    let (request, job) = (named(&spans, "POST /v1/meshes"), named(&spans, "job"));
+    assert_eq!(attribute(job, "molmesh.job.outcome").as_deref(), Some("panicked"));
+    for span in [request, job] {
+        assert_eq!(span.status.as_ref().unwrap().code, 2, "{span:?}");
+    }
+    assert!(below(&spans, job).iter().any(|span| span.name == "read"), "stages before the end are there");
+    let spans = collector.trace("22222222222222222222222222222222");
+    assert_eq!(named(&spans, "job").status.as_ref().unwrap().code, 2);
+    let status = named(&spans, "POST /v1/meshes").status.as_ref();
+    assert_eq!(status.map(|status| status.code), Some(0), "4xx are not errors of the server");
+}
+
+#[test]
+fn a_promised_job_keeps_its_place_in_the_trace() {
+    let collector = Collector::start(Manner::Takes);
+    let server = traced(Fake::new(Mode::Octahedra), &collector, |_| {});
+    let headers = [("prefer", "respond-async"), ("traceparent", PARENT), ("x-request-id", "later-1")];
+    let reply = server.post("/v1/meshes", &headers, SAMPLE);
+    assert_eq!(reply.status, 202);
+    let id = reply.json()["jobID"].as_str().unwrap().to_owned();
+    let failing = [("prefer", "respond-async"), ("x-request-id", "later-2")];
+    let failed = server.post("/v1/meshes", &failing, b"nothing to read");
+    for location in [reply.header("location").unwrap(), failed.header("location").unwrap()] {
+        until("the job ends", || !server.get(&format!("{location}?wait=20")).json()["finished"].is_null());
+    }
+    assert!(server.join());
+    let spans = collector.trace(TRACE);
+    let (request, job) = (named(&spans, "POST /v1/meshes"), named(&spans, "job"));
+    assert_eq!((&job.parent_span_id, kind(job)), (&request.span_id, SpanKind::Consumer));
+    assert_eq!(attribute(job, "molmesh.job.id"), Some(id));
+    assert_eq!(named(&spans, "keep").parent_span_id, request.span_id);
+    // A job's lines name the request, the trace and the job.
+    let lines = log_lines("a job failed");
+    let (trace, _) = place(&failed);
+    let job = failed.json()["jobID"].as_str().unwrap().to_owned();
+    let named = |line: &&String| ["later-2", &trace, &job].iter().all(|id| line.contains(*id));
+    assert_eq!(lines.iter().filter(named).count(), 1, "{lines:?}");
+}
+
+#[test]
+fn a_restart_does_not_tear_a_trace_apart() {
+    let held = Held::new();
+    let (before, after) = (Collector::start(Manner::Takes), Collector::start(Manner::Takes));
+    let folder = tempfile::tempdir().unwrap();
+    let keep = |config: &mut Config| {
+        folder.path().clone_into(&mut config.server.data_dir);
+        config.server.drain_timeout_ms = 1;
+    };
+    let server = traced(Arc::clone(&held) as _, &before, keep);
+    let headers = [("prefer", "respond-async"), ("traceparent", PARENT), ("tracestate", "rojo=1")];
+    let reply = server.post("/v1/meshes", &headers, SAMPLE);
+    assert_eq!(reply.status, 202);
+    let location = reply.header("location").unwrap().to_owned();
+    until("it runs", || held.holds.load(Ordering::SeqCst));
+    // The job is left to the next start; whether the listener's last answer was out in a millisecond is not the question.
+    let _drained = server.join();
+
+    let server = traced(Fake::new(Mode::Octahedra), &after, keep);
+    until("the job ends", || server.get(&format!("{location}?wait=20")).json()["status"] == "successful");
+    assert!(server.join());
+    let (_, request) = place(&reply);
+    let spans = after.trace(TRACE);
+    let job = named(&spans, "job");
+    assert_eq!((hex(&job.parent_span_id), kind(job), &job.trace_state[..]), (request, SpanKind::Consumer, "rojo=1"));
+    assert!(below(&spans, job).iter().any(|span| span.name == "read"));
+}
+
+#[test]
+fn work_that_two_requests_share_is_linked() {
+    let (held, collector) = (Held::new(), Collector::start(Manner::Takes));
+    let server = traced(Arc::clone(&held) as _, &collector, |config| config.jobs.deadline_ms = 600_000);
+    let other = PARENT.replace(TRACE, "33333333333333333333333333333333");
+    let joined = || server.metric("molmesh_jobs_submitted_total", &["dedup=\"yes\""]);
+    let timing = std::thread::scope(|scope| {
+        let first = scope.spawn(|| server.post("/v1/meshes", &[("traceparent", PARENT)], SAMPLE));
+        until("it runs", || held.holds.load(Ordering::SeqCst));
+        let second = scope.spawn(|| server.post("/v1/meshes", &[("traceparent", &other)], SAMPLE));
+        until("the second takes part", || joined() > 0.0);
+        held.let_go();
+        assert_eq!(first.join().unwrap().status, 200);
+        second.join().unwrap().header("server-timing").unwrap().to_owned()
+    });
+    assert!(timing.contains("joined;dur=") && !timing.contains("queue;dur="), "{timing}");
+    assert!(server.join());
+    let (mine, theirs) = (collector.trace(TRACE), collector.trace("33333333333333333333333333333333"));
+    let (job, request) = (named(&mine, "job"), named(&theirs, "POST /v1/meshes"));
+    assert!(!theirs.iter().any(|span| span.name == "job"), "the work was done once");
+    let links = |span: &Span| -> Vec<(String, String)> {
+        span.links.iter().map(|link| (hex(&link.trace_id), hex(&link.span_id))).collect()
+    };
+    assert_eq!(links(job), [(hex(&request.trace_id), hex(&request.span_id))]);
+    assert_eq!(links(request), [(hex(&job.trace_id), hex(&job.span_id))]);
+}
+
+#[test]
+fn who_is_asked_is_told_the_trace() {
+    let collector = Collector::start(Manner::Takes);
+    let archive = archive_support::Remote::saying(archive_support::ok(SAMPLE));
+    let url = archive.url("/d/{id}.pdb");
+    let server = traced(Fake::new(Mode::Octahedra), &collector, |config| {
+        config.archive.url = Some(url.parse().unwrap());
+    });
+    let headers = [("traceparent", PARENT), ("tracestate", "rojo=1,congo=2")];
+    let reply = send(server.addr, "GET", "/v1/pdb/4pti/surface.glb", &headers, b"");
+    assert_eq!(reply.status, 200);
+    assert!(server.join());
+    let spans = collector.trace(TRACE);
+    let (request, fetch) = (named(&spans, "GET /v1/pdb/{id}/{file}"), named(&spans, "GET"));
+    assert_eq!((&fetch.parent_span_id, kind(fetch)), (&request.span_id, SpanKind::Client));
+    assert_eq!(attribute(fetch, "http.response.status_code").as_deref(), Some("200"));
+    assert_eq!(attribute(fetch, "server.address").as_deref(), Some("127.0.0.1"));
+    let asked = archive.asked();
+    let told = asked.iter().map(|a| (a.header("traceparent"), a.header("tracestate"))).collect::<Vec<_>>();
+    let expected = format!("00-{TRACE}-{}-01", hex(&fetch.span_id));
+    assert_eq!(told, [(Some(expected.as_str()), Some("rojo=1,congo=2"))]);
+}
+
+#[test]
+fn a_share_of_the_traces_is_recorded() {
+    let collector = Collector::start(Manner::Takes);
+    let server = traced(Fake::new(Mode::Octahedra), &collector, |config| {
+        config.telemetry.sample_ratio = serde_json::from_value(0.0.into()).unwrap();
+    });
+    assert!(server.get("/version").header("traceparent").unwrap().ends_with("-00"));
+    // Who is above decides for those below.
+    assert_eq!(send(server.addr, "GET", "/version", &[("traceparent", PARENT)], b"").status, 200);
+    assert!(server.join());
+    let spans = collector.spans();
+    assert_eq!(spans.len(), 1, "{spans:?}");
+    assert_eq!(hex(&spans[0].trace_id), TRACE);
+}
+
+#[test]
+fn collectors_that_take_nothing_disturb_nobody() {
+    let exported = |result: &'static str| {
+        let label = format!("result=\"{result}\"");
+        Box::new(move |server: &Running| server.metric("molmesh_trace_spans_total", &[&label])) as Box<Sign>
+    };
+    let logged = |text: &'static str| Box::new(move |_: &Running| log_lines(text).len() as f64) as Box<Sign>;
+    // Nothing listens there any more.
+    let gone = Collector::start(Manner::Takes).url();
+    for (manner, sign, queue, timeout_ms) in [
+        (None, exported("failed"), 4096, 500),
+        (Some(Manner::Status(503)), exported("failed"), 4096, 500),
+        (Some(Manner::Status(400)), exported("failed"), 4096, 10_000),
+        (Some(Manner::Status(400)), logged("status code: 400"), 4096, 10_000),
+        (Some(Manner::Refuses(1)), logged("rejected_spans=1"), 4096, 10_000),
+        (Some(Manner::Silent), exported("failed"), 4096, 500),
+        (Some(Manner::Silent), logged("dropped a Span due to queue full"), 1, 600_000),
+        (Some(Manner::Takes), exported("exported"), 4096, 10_000),
+    ] {
+        let collector = manner.map(Collector::start);
+        let url = collector.as_ref().map_or_else(|| gone.clone(), Collector::url);
+        let server = start_on(Fake::new(Mode::Octahedra), Vec::new(), |config| {
+            config.telemetry.endpoint = Some(serde_json::from_value(url.into()).unwrap());
+            config.telemetry.queue = queue;
+            config.telemetry.timeout_ms = timeout_ms;
+            config.telemetry.flush_timeout_ms = 100;
+        });
+        let before = sign(&server);
+        until(&format!("{manner:?}"), || {
+            assert_eq!(server.post("/v1/meshes?format=stl", &[], &sample(1)).status, 200);
+            sign(&server) > before
+        });
+        // A collector that does not answer delays the stop by the flush timeout at most.
+        assert!(server.join(), "{manner:?}");
+    }
+}
+
+#[test]
+fn server_timing_adds_up_to_the_time_that_the_answer_took() {
+    let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let archive = server.dir.path().join("archive");
+    std::fs::create_dir_all(&archive).unwrap();
+    std::fs::write(archive.join("4pti.pdb"), SAMPLE).unwrap();
+    let stored = server.post("/v1/structures", &[], &sample(9)).json()["digest"].as_str().unwrap().to_owned();
+    let sums = |timing: &str| -> (f64, f64) {
+        let entries = timing.split(", ").map(|entry| entry.split_once(";dur=").unwrap());
+        let entries: Vec<(&str, f64)> = entries.map(|(name, ms)| (name, ms.parse().unwrap())).collect();
+        let of = |is_total: bool| entries.iter().filter(|e| (e.0 == "total") == is_total).map(|e| e.1).sum();
+        (of(false), of(true))
+    };
+    for n in 0..3 {
+        let asked: [(&str, Ask); 4] = [
+            ("an upload", Box::new(|| server.post("/v1/meshes?resolution=0.4", &[], &sample(n)))),
+            ("a report", Box::new(|| server.post("/v1/meshes?report=json&check=strict", &[], &sample(n)))),
+            ("an entry", Box::new(|| server.get(&format!("/v1/pdb/4pti/surface.glb?resolution=0.{}", n + 5)))),
+            (
+                "a structure",
+                Box::new(|| server.get(&format!("/v1/structures/{stored}/surface.glb?resolution=0.{}", n + 5))),
+            ),
+        ];
+        for (what, ask) in asked {
+            let begun = Instant::now();
+            let reply = ask();
+            let outside = begun.elapsed().as_secs_f64() * 1e3;
+            assert_eq!(reply.status, 200, "{what}: {}", String::from_utf8_lossy(&reply.body));
+            let timing = reply.header("server-timing").unwrap();
+            let (parts, total) = sums(timing);
+            for entry in ["receive", "queue", "read", "field", "emit", "measure", "encode", "other", "total"] {
+                assert!(timing.contains(&format!("{entry};dur=")), "{what}, {entry}: {timing}");
+            }
+            // A microsecond an entry for how they are written.
+            assert!((parts - total).abs() < 0.05, "{what}: {parts} of {total}: {timing}");
+            assert!(total <= outside, "{what}: {total} in {outside}");
+            // The control: the stage that takes longest is missed.
+            let (without, _) = sums(&timing.replace("field;dur=", "field;dur=-"));
+            assert!(without < parts, "{what}: {timing}");
+        }
+    }
+    let again = server.get("/v1/pdb/4pti/surface.glb?resolution=0.5");
+    let timing = again.header("server-timing").unwrap();
+    assert!(timing.starts_with("cache;desc=hit, total;dur="), "{timing}");
+}
