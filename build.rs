@@ -24,7 +24,7 @@ fn built_by() {
     println!("cargo::rustc-env=MOLMESH_COMPILER={}", compiler.unwrap_or_default());
 }
 
-/// Table of the files of the web page in `web/dist`, empty if the page was not built.
+/// Generates the table of the files of the web page in `web/dist`. It is empty if the page was not built.
 mod page {
     use std::fmt::Write as _;
     use std::path::{Path, PathBuf};
@@ -42,7 +42,7 @@ mod page {
         let mut table = String::from("static FILES: &[(&str, &[u8])] = &[\n");
         for file in &found {
             let name =
-                file.strip_prefix(dist).expect("the file is below web/dist").to_string_lossy().replace('\\', "/");
+                file.strip_prefix(dist).expect("all files are below web/dist").to_string_lossy().replace('\\', "/");
             let path = name.trim_end_matches(".gz");
             let file = root.join(file).display().to_string();
             writeln!(table, "    ({path:?}, include_bytes!({file:?})),").expect("writing to a string cannot fail");
@@ -75,8 +75,7 @@ mod shaders {
     use naga::valid::{Capabilities, ValidationFlags, Validator};
     use naga::{AddressSpace, Module, StorageAccess, TypeInner};
 
-    /// What is generated of a folder of shaders: the table's name, its layouts' name, the folder, and the shaders in
-    /// the order in which they run.
+    /// Generated tables: names of the table and its layouts, folder of the shaders, and shaders in execution order.
     const TABLES: [(&str, &str, &str, &[&str]); 2] = [
         ("SHADERS", "LAYOUTS", "", &["bin", "field", "classify", "scan", "interpolate", "emit"]),
         ("PICTURE", "PICTURE_LAYOUTS", "picture/", &["vertex", "fragment", "resolve", "finish"]),
@@ -154,7 +153,7 @@ mod shaders {
         }
     }
 
-    /// Bindings by number. The buffer is the variable's name, or with `by_enum` the variant of `BufferId` of that name.
+    /// Formats the bindings, sorted by number. The buffer is the name of the variable, or with `by_enum` a `BufferId`.
     fn bindings(module: &Module, by_enum: bool) -> String {
         let mut rows: Vec<(u32, String)> = module
             .global_variables
@@ -178,7 +177,7 @@ mod shaders {
         rows.into_iter().map(|(_, row)| row).collect::<Vec<_>>().join(", ")
     }
 
-    /// `first_atoms` as `FirstAtoms`.
+    /// Converts `first_atoms` to `FirstAtoms`.
     fn camel_case(name: &str) -> String {
         let capitalized = |word: &str| word[..1].to_uppercase() + &word[1..];
         name.split('_').map(capitalized).collect()

@@ -1,4 +1,4 @@
-//! GPUs to measure: selection, and the few operations that the benchmarks run on wgpu directly.
+//! GPUs to measure: selection, and direct use of wgpu by the benchmarks.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -8,17 +8,17 @@ use wgpu::{Buffer, BufferUsages, BufferView, CommandEncoder, ComputePass, Comput
 
 use crate::error::{Error, Result};
 
-/// Workgroups along the first dimension of a dispatch. Every device supports as many, and powers of two divide evenly.
+/// Workgroups along the first dimension of a dispatch. All devices support this number.
 const MAX_WORKGROUPS: u32 = 1 << 15;
 
-/// A device that was selected for measurements.
+/// Device selected for measurements.
 #[derive(Debug)]
 pub(crate) struct Selected {
-    /// The adapter's name.
+    /// Name of the adapter.
     pub(crate) name: String,
     /// Driver and graphics API.
     pub(crate) driver: String,
-    /// Whether a processor emulates the device: its speed says nothing about GPUs.
+    /// True if a processor emulates the device, whose speed is then not that of a GPU.
     pub(crate) software: bool,
     number: usize,
     discovery: Discovery,
@@ -28,7 +28,7 @@ impl Selected {
     /// Selects the first device of `choice`.
     ///
     /// # Errors
-    /// [`Error::NoDevice`] if there is none.
+    /// Returns [`Error::NoDevice`] if there is none.
     pub(crate) fn new(choice: &DeviceChoice) -> Result<Self> {
         let discovery = discover(choice, Look::Thorough);
         let Some(device) = discovery.taken().next() else {
@@ -44,10 +44,10 @@ impl Selected {
         })
     }
 
-    /// Opens the device and compiles molmesh's stages there.
+    /// Opens the device and compiles the stages of molmesh.
     ///
     /// # Errors
-    /// [`Error::Failed`] if the driver refuses.
+    /// Returns [`Error::Failed`] if the driver reports an error.
     pub(crate) fn engine(&self) -> Result<Engine> {
         let (device, queue) = self.discovery.open(self.number).map_err(Error::failed)?;
         Engine::new(device, queue).map_err(Error::failed)
@@ -56,13 +56,13 @@ impl Selected {
     /// Opens the device for the benchmarks' own shaders.
     ///
     /// # Errors
-    /// As [`Self::engine`].
+    /// Returns the errors of [`Self::engine`].
     pub(crate) fn gpu(&self) -> Result<Gpu> {
         self.discovery.open(self.number).map(Gpu::new).map_err(Error::failed)
     }
 }
 
-/// A device with its queue. Errors that wgpu reports asynchronously appear at the next [`Self::check`].
+/// Open device with its queue. The next [`Self::check`] returns errors that wgpu reports asynchronously.
 #[derive(Debug)]
 pub(crate) struct Gpu {
     pub(crate) device: Device,
@@ -74,23 +74,23 @@ impl Gpu {
     /// Wraps an open device.
     pub(crate) fn new((device, queue): (Device, Queue)) -> Self {
         let error = Arc::new(Mutex::new(None));
-        let noted = Arc::clone(&error);
+        let first = Arc::clone(&error);
         device.on_uncaptured_error(Arc::new(move |e: wgpu::Error| {
-            noted.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(e.to_string());
+            first.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(e.to_string());
         }));
         Self { device, queue, error }
     }
 
-    /// Bytes of the largest storage buffer binding.
+    /// Returns the size of the largest storage buffer binding, bytes.
     pub(crate) fn max_binding(&self) -> u64 {
         let limits = self.device.limits();
         limits.max_storage_buffer_binding_size.min(limits.max_buffer_size)
     }
 
-    /// Returns the first error since the last call.
+    /// Checks for asynchronous errors.
     ///
     /// # Errors
-    /// [`Error::Failed`], as wgpu describes it.
+    /// Returns the first error since the last call as [`Error::Failed`].
     pub(crate) fn check(&self) -> Result<()> {
         self.error.lock().unwrap_or_else(PoisonError::into_inner).take().map_or(Ok(()), |e| Err(Error::Failed(e)))
     }
@@ -101,7 +101,7 @@ impl Gpu {
         self.device.create_buffer(&descriptor)
     }
 
-    /// Creates a buffer that results are copied to and the host reads.
+    /// Creates a readback buffer.
     pub(crate) fn readback(&self, bytes: u64) -> Buffer {
         self.buffer("readback", bytes, BufferUsages::COPY_DST | BufferUsages::MAP_READ)
     }
@@ -117,7 +117,7 @@ impl Gpu {
             entry_point: Some("main"),
             compilation_options: wgpu::PipelineCompilationOptions {
                 constants,
-                // Every shader writes the workgroup memory that it reads.
+                // All shaders write workgroup memory before they read it.
                 zero_initialize_workgroup_memory: false,
             },
             cache: None,
@@ -152,14 +152,14 @@ impl Gpu {
         self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default())
     }
 
-    /// Submits commands, waits for them, and maps the first bytes of `readback`. The view must be dropped before the
-    /// buffer is unmapped.
+    /// Submits commands, waits for them, and maps the first bytes of `readback`. Drop the view before unmapping the
+    /// buffer.
     ///
     /// # Errors
-    /// [`Error::Failed`], as wgpu describes it.
+    /// Returns the errors of wgpu as [`Error::Failed`].
     pub(crate) fn submit(&self, encoder: CommandEncoder, readback: &Buffer, bytes: u64) -> Result<BufferView> {
         let index = self.queue.submit([encoder.finish()]);
-        // A failure to map appears in `get_mapped_range`.
+        // `get_mapped_range` reports failures to map.
         readback.slice(..bytes).map_async(wgpu::MapMode::Read, |_| {});
         let waited = self.device.poll(wgpu::PollType::Wait { submission_index: Some(index), timeout: None });
         self.check()?;
@@ -168,18 +168,18 @@ impl Gpu {
     }
 }
 
-/// Timestamps around the steps of a computation.
+/// Timer of the steps of a computation, by timestamp queries.
 #[derive(Debug)]
 pub(crate) struct Timer {
     queries: QuerySet,
     resolved: Buffer,
     readback: Buffer,
-    /// Seconds of a tick.
+    /// Seconds per tick.
     period: f64,
 }
 
 impl Timer {
-    /// Creates a timer of at most 16 steps; `None` if the device has no timestamps.
+    /// Creates a timer of at most 16 steps. Returns `None` if the device does not support timestamps.
     pub(crate) fn new(gpu: &Gpu) -> Option<Self> {
         gpu.device.features().contains(wgpu::Features::TIMESTAMP_QUERY).then(|| Self {
             queries: gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
@@ -193,7 +193,7 @@ impl Timer {
         })
     }
 
-    /// Returns the timestamps of a pass that begins the step `begins`, ends the step `ends`, or both.
+    /// Returns the timestamp writes of a pass that begins the step `begins`, ends the step `ends`, or both.
     pub(crate) fn writes(&self, begins: Option<u32>, ends: Option<u32>) -> wgpu::ComputePassTimestampWrites<'_> {
         wgpu::ComputePassTimestampWrites {
             query_set: &self.queries,
@@ -202,10 +202,10 @@ impl Timer {
         }
     }
 
-    /// Reads the seconds of the first `N` steps, all of which were submitted.
+    /// Returns the durations of the first `N` steps, s. All of them must have been submitted.
     ///
     /// # Errors
-    /// [`Error::Failed`], as wgpu describes it.
+    /// Returns the errors of wgpu as [`Error::Failed`].
     pub(crate) fn seconds<const N: usize>(&self, gpu: &Gpu) -> Result<[f64; N]> {
         let (bytes, mut encoder) = (16 * N as u64, gpu.encoder());
         encoder.resolve_query_set(&self.queries, 0..u32::try_from(2 * N).unwrap_or(u32::MAX), &self.resolved, 0);

@@ -1,30 +1,30 @@
-//! The errors of the program, and its exit codes.
+//! Errors of the program, and its exit codes.
 
 use std::fmt::Display;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// The result of everything that can fail here.
+/// Result with an [`Error`].
 pub(crate) type Result<T> = std::result::Result<T, Error>;
 
-/// An error, for the person who runs the benchmark.
+/// Error of a benchmark.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum Error {
-    /// An argument that cannot be used.
+    /// An argument is invalid.
     #[error("{0}")]
     Usage(String),
-    /// A file or folder that cannot be read or written.
+    /// A file or folder cannot be read or written.
     #[error("{}: {source}", path.display())]
     File {
-        /// Its path.
+        /// Path.
         path: PathBuf,
-        /// The cause.
+        /// Cause.
         source: io::Error,
     },
-    /// No GPU that can be measured.
+    /// No GPU can be used.
     #[error("no GPU can be used: {0}")]
     NoDevice(String),
-    /// A measurement that failed.
+    /// A measurement failed.
     #[error("{0}")]
     Failed(String),
 }
@@ -35,13 +35,13 @@ impl Error {
         Self::Failed(error.to_string())
     }
 
-    /// Returns the conversion of I/O errors at `path`.
+    /// Returns a function that converts I/O errors at `path`.
     pub(crate) fn file(path: impl AsRef<Path>) -> impl FnOnce(io::Error) -> Self {
         let path = path.as_ref().to_owned();
         move |source| Self::File { path, source }
     }
 
-    /// The exit code: 2 for arguments, as clap has it, and 1 for everything else.
+    /// Returns the exit code: 2 for arguments, like clap, and 1 for other errors.
     pub(crate) const fn code(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,

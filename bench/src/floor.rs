@@ -1,8 +1,7 @@
-//! The least time that a stage can take on a device: the bytes that it must move at the rate of memory, or its arithmetic at
-//! the rate of multiply-adds, whichever takes longer.
+//! Lower bound of the time of a stage on a device: the longer of memory traffic and arithmetic at the measured rates.
 //!
-//! Every byte counts once, as if caches were perfect. Arithmetic counts only the necessary pairs of grid point and atom:
-//! those in bricks that the atom reaches.
+//! Each byte counts once, as with perfect caches. Arithmetic counts only the pairs of a grid point and an atom in
+//! bricks that the atom reaches.
 //!
 //! | stage | reads | writes | arithmetic |
 //! |---|---|---|---|
@@ -18,16 +17,17 @@ use molmesh::surface::{MeshOutput, Stage};
 
 use crate::rates::Rates;
 
-/// The least work of a stage.
+/// Minimum work of a stage.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Work {
+    /// Bytes read and written.
     pub(crate) bytes: f64,
-    /// Multiply-adds.
+    /// Number of multiply-adds.
     pub(crate) fmas: f64,
 }
 
 impl Work {
-    /// The work of `stage` in a finished job.
+    /// Computes the work of `stage` in a finished job.
     pub(crate) fn of(stage: Stage, job: &Prepared, meshed: &MeshOutput) -> Self {
         let atoms = job.lattice.atoms.len() as f64;
         let (bricks, tiles) = (job.plan.bricks.len() as f64, job.plan.tiles.len() as f64);
@@ -52,7 +52,7 @@ impl Work {
         Self { bytes, fmas }
     }
 
-    /// The least time, s.
+    /// Returns the lower bound of the time, s.
     pub(crate) fn seconds(self, rates: &Rates) -> f64 {
         (self.bytes / rates.memory).max(self.fmas / rates.fma)
     }

@@ -1,25 +1,25 @@
-//! The grid spacing at which a dense program visits a given number of cubes.
+//! Search for the grid spacing at which a dense program visits a given number of cubes.
 
 use crate::error::{Error, Result};
 
-/// The largest relative error of the number of cubes.
+/// Maximum relative error of the number of cubes.
 pub(crate) const TOLERANCE: f64 = 0.01;
-/// The error at which the search ends.
+/// Relative error at which the search ends.
 const CLOSE: f64 = 0.002;
 
-/// A spacing, and the number of cubes at it.
+/// Grid spacing and its number of cubes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Grid {
-    /// Å.
+    /// Grid spacing, Å.
     pub(crate) spacing: f64,
     pub(crate) cubes: u64,
 }
 
-/// Finds the spacing at which `cubes_at` comes closest to `cubes`. `cubes_at` falls with the spacing in steps, since whole
-/// layers of cubes come and go.
+/// Finds the spacing at which `cubes_at` is closest to `cubes`. `cubes_at` decreases with the spacing in steps, since
+/// whole layers of cubes disappear.
 ///
 /// # Errors
-/// [`Error::Failed`] if no spacing comes within 1 %, and the errors of `cubes_at`.
+/// Returns [`Error::Failed`] if no spacing is within 1 %, or an error of `cubes_at`.
 pub(crate) fn for_cubes(cubes: u64, cubes_at: &dyn Fn(f64) -> Result<u64>) -> Result<Grid> {
     let (mut fine, mut coarse) = (0.05, 5.0);
     for _ in 0..20 {
@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_spacing_is_found_where_there_is_one() {
+    fn finds_the_spacing_or_fails() {
         let cells = |side: f64, h: f64| (1..u64::MAX).take_while(|n| *n as f64 * h < side).count() as u64;
         let boxed = |h: f64| Ok(cells(30.0, h) * cells(34.1, h) * cells(41.7, h));
         for cubes in [100_000, 346_580, 7_229_120] {

@@ -1,4 +1,4 @@
-//! `molmesh-bench`: benchmarks of molmesh on GPUs, and the tables and figures of the 2010 paper on today's hardware.
+//! `molmesh-bench`: benchmarks of molmesh on GPUs, and the tables and figures of the 2010 paper on current hardware.
 
 mod device;
 mod error;
@@ -29,13 +29,13 @@ struct Args {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Time the stages on GPUs, and compare them with the least time that each device needs
+    /// Time the stages on GPUs and compare them with lower bounds for each device
     Gpu(Box<gpu::GpuArgs>),
     /// Measure the tables of Dias, Bora and Gomes (HPDC 2010) on this machine
     Paper(Box<paper::PaperArgs>),
     /// Download the structures of the 2010 paper
     Fetch(paper::fetch::FetchArgs),
-    /// Draw the figures of the 2010 paper, and update the tables of a Markdown page, from stored results
+    /// Draw the figures of the 2010 paper and update the tables of a Markdown page from stored results
     Figures(paper::redraw::FiguresArgs),
 }
 
@@ -56,12 +56,12 @@ fn main() -> ExitCode {
 }
 
 /// Writes `text` to standard output.
-fn say(text: &str) -> Result<()> {
+fn print(text: &str) -> Result<()> {
     let mut out = std::io::stdout().lock();
     out.write_all(text.as_bytes()).and_then(|()| out.flush()).map_err(Error::file("standard output"))
 }
 
-/// Writes a line to standard error: progress and errors. Nobody is left to tell if that fails.
+/// Writes a line of progress or an error to standard error. Ignores failures, which cannot be reported.
 fn note(line: &str) {
     drop(writeln!(std::io::stderr().lock(), "{line}"));
 }

@@ -1,10 +1,11 @@
-//! The GPU program of Dias, Bora and Gomes (HPDC 2010) as its paper describes it: the baseline of the stages.
+//! GPU program of Dias, Bora and Gomes (HPDC 2010), implemented from its paper as a baseline for the stages.
 //!
-//! A dense grid; one thread per atom adds its density to the grid points within its support (20³ in the paper; about as
-//! many at the spacings here); one thread per cube finds its case; a prefix sum; the list of active cubes; one thread per
-//! active cube writes triangles that share no vertices; normals from central differences. Kernels and their cut-off are
-//! molmesh's own, so that the surface is the same. Grid points beyond an atom's support are visited but not added to,
-//! which favours the baseline over the paper's program.
+//! The grid is dense. One thread per atom adds its density to the grid points within its support: 20³ in the paper,
+//! about as many at the spacings here. One thread per cube finds its case. A prefix sum gives the list of active cubes.
+//! One thread per active cube writes triangles that share no vertices, and normals from central differences.
+//!
+//! Kernels and cut-off are those of molmesh, so the surface is the same. Grid points beyond the support of an atom are
+//! visited but not written, so the baseline is faster than the paper's program.
 
 #[cfg(test)]
 mod tests;
@@ -27,7 +28,7 @@ macro_rules! shader {
     };
 }
 
-/// The shaders in execution order; `add` is the second half of the scan.
+/// Shaders in execution order. `add` is the second half of the scan.
 pub(crate) const SHADERS: [(&str, &str); 7] = [
     shader!("field"),
     shader!("classify"),
@@ -37,15 +38,15 @@ pub(crate) const SHADERS: [(&str, &str); 7] = [
     shader!("vertices"),
     shader!("normals"),
 ];
-/// The steps that are timed.
+/// Timed steps.
 const STEPS: [&str; 6] = ["field", "classify", "scan", "map", "vertices", "normals"];
-/// Fixed-point units of the isovalue, as in `grid.wgsl`. Rounding a term moves a density by less than 3·10⁻⁷ of the
-/// isovalue, and the program detects densities of 1024 isovalues, before they overflow.
+/// Isovalue in fixed-point units, as in `grid.wgsl`. Rounding of a term changes a density by less than 3·10⁻⁷ of the
+/// isovalue. The program detects densities above 1024 isovalues, before they overflow.
 const ISO: f64 = (1 << 21) as f64;
-/// Values that a workgroup of the prefix sum takes.
+/// Values per workgroup of the prefix sum.
 const BLOCK: u64 = 512;
 
-/// The grid as the shaders declare it.
+/// Uniform buffer of the grid, in the layout of the shaders.
 #[derive(Debug, Clone, Copy, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 struct Grid {
@@ -72,7 +73,7 @@ fn bounds(lattice: &Lattice, k: usize) -> (f64, f64) {
     let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max);
     let cells = || lattice.atoms.iter().map(move |atom| atom.position(k));
     let (lo, hi) = (cells().fold(f64::MAX, f64::min), cells().fold(f64::MIN, f64::max));
-    // Two points beyond the reach, for the central differences.
+    // Central differences need two more points.
     ((lo - reach).floor() - 2.0, (hi + reach).ceil() + 2.0)
 }
 
@@ -84,18 +85,18 @@ pub(crate) fn cubes(lattice: &Lattice) -> [u64; 3] {
     })
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate, as wanted")]
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
 const fn whole(v: f64) -> u64 {
     v as u64
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "rounding to single precision is the point")]
+#[expect(clippy::cast_possible_truncation, reason = "the shaders use single precision")]
 const fn single(v: f64) -> f32 {
     v as f32
 }
 
 impl Grid {
-    /// The grid of a job, of at most `limit` points.
+    /// Creates the grid of a job, with at most `limit` points.
     fn new(job: &Prepared, limit: u64) -> Result<Self> {
         let (lattice, params) = (&job.lattice, job.plan.params(&job.lattice, &job.params));
         let bounds = [0, 1, 2].map(|k| bounds(lattice, k));
@@ -103,13 +104,14 @@ impl Grid {
         let samples = sides.iter().product::<f64>();
         if samples > limit as f64 {
             let spacing = lattice.spacing * 1.05 * (samples / limit as f64).cbrt();
-            let why =
-                format!("a grid of {samples:.0} points, the device holds {limit}; a spacing of {spacing:.2} Å fits");
+            let why = format!(
+                "the grid has {samples:.0} points, the device supports {limit}; a spacing of {spacing:.2} Å fits"
+            );
             return Err(Error::Failed(why));
         }
         let n = sides.map(|n| u32::try_from(whole(n)).unwrap_or(u32::MAX));
         let origin = std::array::from_fn(|k| {
-            // Relative to the lowest cell, which is a whole number.
+            // Relative to the lowest cell, which is an integer.
             let first = lattice.atoms.iter().map(|atom| atom.cell[k]).min().unwrap_or_default();
             let below = whole((f64::from(first) - bounds[k].0).max(0.0));
             first - i32::try_from(below).unwrap_or(i32::MAX)
@@ -134,25 +136,25 @@ impl Grid {
     }
 }
 
-/// The program on a device.
+/// Compiled program on a device.
 #[derive(Debug)]
 pub(crate) struct Program2010 {
     gpu: Gpu,
     timer: Option<Timer>,
-    /// By shader; `field` has one pipeline for each kernel.
+    /// Pipelines by shader. `field` has one for each kernel.
     pipelines: BTreeMap<&'static str, Vec<ComputePipeline>>,
-    /// Kept from run to run.
+    /// Buffers, reused by later runs.
     buffers: BTreeMap<&'static str, Buffer>,
 }
 
-/// The first bytes of a buffer.
+/// Buffer and the number of its first bytes that are bound.
 type Bound = (Buffer, u64);
 
 impl Program2010 {
     /// Compiles the program.
     ///
     /// # Errors
-    /// [`Error::Failed`], as the device reports it.
+    /// Returns the errors of the device as [`Error::Failed`].
     pub(crate) fn new(gpu: Gpu) -> Result<Self> {
         let compile = |(name, source)| {
             let kernels: &[f64] = if name == "field" { &[0.0, 1.0, 2.0] } else { &[] };
@@ -164,15 +166,15 @@ impl Program2010 {
         Ok(Self { timer: Timer::new(&gpu), pipelines, buffers: BTreeMap::new(), gpu })
     }
 
-    /// Bytes of the device's memory that the program holds.
+    /// Returns the device memory that the program holds, bytes.
     pub(crate) fn held_bytes(&self) -> u64 {
         self.buffers.values().map(Buffer::size).sum()
     }
 
-    /// Device time of the steps of the last run, s; `None` if the device has no timestamps.
+    /// Returns the device time of the steps of the last run, s; `None` if the device does not support timestamps.
     ///
     /// # Errors
-    /// [`Error::Failed`], as the device reports it.
+    /// Returns the errors of the device as [`Error::Failed`].
     pub(crate) fn steps(&self) -> Result<Option<[(&'static str, f64); STEPS.len()]>> {
         let Some(timer) = &self.timer else { return Ok(None) };
         let seconds: [f64; STEPS.len()] = timer.seconds(&self.gpu)?;
@@ -182,7 +184,7 @@ impl Program2010 {
     /// Meshes a job.
     ///
     /// # Errors
-    /// [`Error::Failed`] if the grid or the mesh does not fit, or as the device reports it.
+    /// Returns [`Error::Failed`] if the grid or the mesh does not fit, or if the device fails.
     pub(crate) fn run(&mut self, job: &Prepared) -> Result<Soup<'_>> {
         // A binding holds two words per grid point.
         let mut grid = Grid::new(job, self.gpu.max_binding() / 8)?;
@@ -200,7 +202,7 @@ impl Program2010 {
         Ok(Soup { n_triangles: n_triangles as usize, readback })
     }
 
-    /// Returns a buffer of at least `bytes` bytes, of which as many are bound.
+    /// Returns a buffer of at least `bytes` bytes, with its first `bytes` bytes bound.
     fn bound(&mut self, name: &'static str, bytes: u64) -> Bound {
         let fits = self.buffers.get(name).is_some_and(|buffer| buffer.size() >= bytes);
         if !fits {
@@ -209,14 +211,14 @@ impl Program2010 {
                 "soup" | "counters" => BufferUsages::MAP_READ | BufferUsages::COPY_DST,
                 _ => BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC,
             };
-            // The old one goes first: both may not fit.
+            // Free the old buffer first, as both may not fit.
             self.buffers.remove(name);
             self.buffers.insert(name, self.gpu.buffer(name, bytes.next_multiple_of(16), usage));
         }
         (self.buffers[name].clone(), bytes)
     }
 
-    /// Adds a pass of one dispatch, which begins and ends the given timed steps.
+    /// Adds a pass with one dispatch, which begins and ends the given timed steps.
     fn pass(
         &self,
         encoder: &mut CommandEncoder,
@@ -242,7 +244,7 @@ impl Program2010 {
         let cases = self.bound("cases", 4 * table.len() as u64);
         let [field, flags] = ["field", "flags"].map(|name| self.bound(name, 4 * n));
         let dense = self.bound("dense", 4);
-        // Each level of the prefix sum holds the sums of the blocks of the level before.
+        // Each level of the prefix sum holds the sums of the blocks of the previous level.
         let mut levels = vec![self.bound("counts", 8 * n)];
         for name in ["sums 0", "sums 1", "sums 2", "sums 3"] {
             let blocks = levels.last().map_or(1, |(_, bytes)| (bytes / 8).div_ceil(BLOCK));
@@ -285,13 +287,13 @@ impl Program2010 {
         counters.unmap();
         if read[2] != 0 {
             return Err(Error::Failed(
-                "atoms lie too densely for the fixed-point numbers of the 2010 program".to_owned(),
+                "atoms are too dense for the fixed-point numbers of the 2010 program".to_owned(),
             ));
         }
         Ok([read[0], read[1]])
     }
 
-    /// Runs the last three steps. Positions and normals, `column` bytes each, lie mapped in `soup` afterwards.
+    /// Runs the last three steps. Maps positions and normals, `column` bytes each, in `soup`.
     fn output(&mut self, grid: &Grid, column: u64) -> Result<()> {
         let (n, active) = (u64::from(grid.n_samples), u64::from(grid.n_active));
         let grid_buffer = self.bound("grid", size_of::<Grid>() as u64);
@@ -315,7 +317,7 @@ impl Program2010 {
     }
 }
 
-/// A mesh of triangles that share no vertices, in memory that the host reads in place.
+/// Triangles that share no vertices, in a mapped readback buffer.
 #[derive(Debug)]
 pub(crate) struct Soup<'a> {
     pub(crate) n_triangles: usize,

@@ -1,4 +1,4 @@
-//! The rates of a device: memory, arithmetic, and transfers to the host. The least time of every stage follows from them.
+//! Measured rates of a device: memory, arithmetic, and transfers to the host.
 
 use std::time::Instant;
 
@@ -17,22 +17,22 @@ pub(crate) struct Rates {
     pub(crate) fma: f64,
     /// Bytes per second from the device to memory that the host reads in place.
     pub(crate) to_host: f64,
-    /// Seconds of a submission that copies 256 bytes, from submitting to reading.
+    /// Time of a submission that copies 256 bytes, from submission to readback, s.
     pub(crate) round_trip: f64,
 }
 
-/// Multiply-adds of a thread of `fma.wgsl`.
+/// Multiply-adds per thread of `fma.wgsl`.
 const FMAS: f64 = 8.0 * 1024.0;
-/// Repetitions; the fastest counts, since the rates are upper bounds.
+/// Number of repetitions. The fastest one counts, since the rates are upper bounds.
 const REPEATS: usize = 8;
 
-/// Measures a device; `None` if it has no timestamps.
+/// Measures a device. Returns `None` if it does not support timestamps.
 ///
 /// # Errors
-/// Those of the device.
+/// Returns the errors of the device.
 pub(crate) fn measure(gpu: &Gpu, software: bool) -> Result<Option<Rates>> {
     let Some(timer) = Timer::new(gpu) else { return Ok(None) };
-    // More than caches hold, and workgroups for a few milliseconds.
+    // Larger than caches, and enough workgroups for a few milliseconds.
     let (bytes, workgroups) = if software { (16 << 20, 64) } else { (1 << 30, 1 << 16) };
     let bytes = gpu.max_binding().min(bytes) & !255;
     let storage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
@@ -63,7 +63,7 @@ pub(crate) fn measure(gpu: &Gpu, software: bool) -> Result<Option<Rates>> {
     }))
 }
 
-/// The least seconds to bring `bytes` bytes to the host.
+/// Returns the minimum time to transfer `bytes` bytes to the host, s.
 fn transfer(gpu: &Gpu, source: &Buffer, bytes: u64) -> Result<f64> {
     let readback = gpu.readback(bytes);
     let mut best = f64::MAX;

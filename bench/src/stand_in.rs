@@ -1,10 +1,11 @@
-//! Generated replacements of structures that are not available: as many atoms, in a box of the same size.
+//! Generated stand-ins for unavailable structures, with the same number of atoms in a box of the same size.
 //!
-//! The paper's grid is known from the four of its structures whose coordinates are at hand: 0.4 Å cubes over the box of the
-//! centres with a margin of 5 Å, whole cubes only, give its number of cubes exactly. So a number of cubes is a product of
-//! three whole numbers. Of all such triples the most even one is taken, and it determines the box of the centres. The atoms lie
-//! in the box on a perturbed cubic lattice as dense as the heavy atoms of proteins, those nearest to the diagonal first:
-//! few atoms in a large box form a rod, like the filaments and chains among the paper's structures.
+//! The grid of the paper consists of whole cubes of 0.4 Å over the bounding box of the atom centres plus a margin of 5
+//! Å. This gives the exact number of cubes for the four structures with known coordinates. A number of cubes is
+//! therefore a product of three integers. The most even factorisation determines the box of the centres.
+//!
+//! The atoms are on a perturbed cubic lattice as dense as the heavy atoms of proteins, those nearest to the diagonal
+//! first. Few atoms in a large box form a rod, like the filaments and chains among the paper's structures.
 
 use molmesh::surface::Spheres;
 
@@ -13,16 +14,16 @@ use crate::structures::{self, ATOM_DISTANCE, Random};
 
 /// Side of the paper's cubes, Å.
 const CUBE: f64 = 0.4;
-/// The margin of the paper's box around the centres, Å.
+/// Margin of the paper's box around the centres, Å.
 const MARGIN: f64 = 5.0;
-/// Where the box lies, Å. Its offset from the grid differs along the axes, so that layers of cubes do not appear or vanish
-/// along all of them at once.
+/// Lowest corner of the box, Å. The offset from the grid differs by axis, so that layers of cubes do not appear along
+/// all axes at once.
 const ORIGIN: [f64; 3] = [11.313, 23.976, 37.149];
 
 /// Generates `n` atoms whose grid has `cubes` cubes. The same arguments give the same atoms.
 ///
 /// # Errors
-/// [`Error::Failed`] if `cubes` has no suitable factors, or the box is too small for so many atoms.
+/// Returns [`Error::Failed`] if `cubes` has no suitable factors, or the box is too small for the atoms.
 pub(crate) fn generate(n: usize, cubes: u64) -> Result<Spheres> {
     let sides = sides(cubes).ok_or_else(|| Error::Failed(format!("{cubes} is not the product of three sides")))?;
     spheres(n, sides)
@@ -30,7 +31,7 @@ pub(crate) fn generate(n: usize, cubes: u64) -> Result<Spheres> {
 
 /// Returns the sides of the box of the centres for a number of cubes, Å.
 fn sides(cubes: u64) -> Option<[f64; 3]> {
-    // The margin alone takes 25 cubes along each axis.
+    // The margin alone has 25 cubes along each axis.
     const MIN: u64 = 26;
     let mut best: Option<[u64; 3]> = None;
     for x in (MIN..).take_while(|x| x.pow(3) <= cubes).filter(|x| cubes.is_multiple_of(*x)) {
@@ -42,11 +43,11 @@ fn sides(cubes: u64) -> Option<[f64; 3]> {
             }
         }
     }
-    // The middle of the lengths that give this number of whole cubes.
+    // Middle of the range of lengths with this number of whole cubes.
     best.map(|n| n.map(|n| (n as f64 + 0.5) * CUBE - 2.0 * MARGIN))
 }
 
-/// Generates `n` atoms in a box, one in the first and one in the last corner.
+/// Generates `n` atoms in a box. The first two are in opposite corners.
 fn spheres(n: usize, sides: [f64; 3]) -> Result<Spheres> {
     let rows = sides.map(|side| (0_u32..).map(|i| f64::from(i) * ATOM_DISTANCE).take_while(move |x| *x <= side));
     let mut places: Vec<(f64, [f64; 3])> = Vec::new();
@@ -56,9 +57,9 @@ fn spheres(n: usize, sides: [f64; 3]) -> Result<Spheres> {
         }
     }
     if places.len() + 2 < n {
-        return Err(Error::Failed(format!("a box of {sides:.1?} Å has no room for {n} atoms")));
+        return Err(Error::Failed(format!("a box of {sides:.1?} Å is too small for {n} atoms")));
     }
-    // Stable: places at the same distance keep their order.
+    // The sort is stable: places at the same distance keep their order.
     places.sort_by(|a, b| a.0.total_cmp(&b.0));
     let mut random = Random::new(n as u64);
     let corners = [[0.0; 3], sides].into_iter();
@@ -84,7 +85,7 @@ mod tests {
     use super::*;
     use crate::paper::entries::ENTRIES;
 
-    /// Cubes of the paper's grid over a box of centres.
+    /// Returns the number of cubes of the paper's grid over a box of centres.
     fn cubes(sides: [f64; 3]) -> u64 {
         let whole =
             |side: f64| (1..u32::MAX).take_while(|n| f64::from(*n) * CUBE <= side + 2.0 * MARGIN).count() as u64;
@@ -92,7 +93,7 @@ mod tests {
     }
 
     #[test]
-    fn the_papers_grid_is_that_of_the_structures_at_hand() {
+    fn known_structures_have_the_papers_number_of_cubes() {
         // Sides of the boxes of the centres in the files of these entries.
         for (id, sides) in [
             ("110D", [16.379, 15.183, 24.499]),
@@ -107,14 +108,14 @@ mod tests {
     }
 
     #[test]
-    fn every_entry_has_a_stand_in_with_its_atoms_and_its_box() {
+    fn stand_ins_have_the_atoms_and_box_of_their_entries() {
         for entry in &ENTRIES {
             let sides = sides(entry.cubes[0]).unwrap();
             assert_eq!(cubes(sides), entry.cubes[0], "{}", entry.id);
             let made = spheres(entry.atoms, sides).unwrap();
             let corners = [ORIGIN, [0, 1, 2].map(|k| ORIGIN[k] + sides[k])];
             assert_eq!((made.len(), made.bounds().unwrap()), (entry.atoms, corners), "{}", entry.id);
-            assert_eq!(made, spheres(entry.atoms, sides).unwrap(), "the same every time");
+            assert_eq!(made, spheres(entry.atoms, sides).unwrap(), "generation is deterministic");
             assert_ne!(made, spheres(entry.atoms + 1, sides).unwrap());
         }
     }
@@ -128,13 +129,13 @@ mod tests {
             (0..made.len()).filter(|j| *j != i && d2(*j) < r * r).count()
         };
         let mean = |r: f64| (0..made.len()).map(|i| near(i, r)).sum::<usize>() as f64 / made.len() as f64;
-        // None on top of another; within 6 Å of an atom of a protein are some 30 to 45 others, fewer at its surface.
+        // Atoms do not overlap. In proteins, 30 to 45 atoms are within 6 Å of an atom, fewer at the surface.
         assert!(mean(0.5) < 0.01 && (20.0..47.0).contains(&mean(6.0)), "{} {}", mean(0.5), mean(6.0));
     }
 
     #[test]
-    fn what_does_not_fit_is_refused() {
-        assert!(spheres(1000, [5.0; 3]).unwrap_err().to_string().contains("no room for 1000"));
+    fn impossible_stand_ins_are_rejected() {
+        assert!(spheres(1000, [5.0; 3]).unwrap_err().to_string().contains("too small for 1000"));
         // A prime.
         assert!(generate(10, 1_000_003).unwrap_err().to_string().contains("1000003"));
     }

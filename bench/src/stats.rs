@@ -10,7 +10,7 @@ pub(crate) struct Summary {
 }
 
 impl Summary {
-    /// Summarises `values`; zeros if there are none.
+    /// Summarises `values`. Both results are 0 if there are none.
     pub(crate) fn of(values: impl IntoIterator<Item = f64>) -> Self {
         let mut values: Vec<f64> = values.into_iter().collect();
         values.sort_by(f64::total_cmp);
@@ -20,7 +20,7 @@ impl Summary {
         Self { median, min: at(0) }
     }
 
-    /// The same with five significant digits: more are noise, and make files longer.
+    /// Rounds both values to five significant digits; more would be noise.
     pub(crate) fn rounded(self) -> Self {
         Self { median: digits(self.median), min: digits(self.min) }
     }
@@ -43,8 +43,8 @@ mod tests {
     }
 
     #[test]
-    #[expect(clippy::float_cmp, reason = "the rounded numbers are exact")]
-    fn five_digits_are_kept() {
+    #[expect(clippy::float_cmp, reason = "the rounded numbers are parsed from the same digits")]
+    fn numbers_are_rounded_to_five_digits() {
         assert_eq!(
             [digits(0.0), digits(1.0), digits(123.456_789), digits(1.234_567e-9)],
             [0.0, 1.0, 123.46, 1.2346e-9]

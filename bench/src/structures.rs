@@ -1,4 +1,4 @@
-//! The structures that are measured: files, the built-in sample, copies side by side, and generated atoms.
+//! Structures to measure: files, the built-in sample, tiled copies, and generated atoms.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -8,17 +8,17 @@ use molmesh::surface::Spheres;
 
 use crate::error::{Error, Result};
 
-/// 4PTI, which is built in.
+/// Built-in sample, 4PTI.
 pub(crate) const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
-/// Extensions of structure files, the preferred first.
+/// Extensions of structure files, preferred ones first.
 const EXTENSIONS: [&str; 4] = ["pdb", "ent", "cif", "bcif"];
-/// Å between atoms on a cubic lattice as dense as the heavy atoms of proteins, one in 19.3 Å³.
+/// Spacing of atoms on a cubic lattice as dense as the heavy atoms of proteins (one per 19.3 Å³), Å.
 pub(crate) const ATOM_DISTANCE: f64 = 2.683;
 
 /// Finds the file of an entry: `1abc`, `pdb1abc` or `pdb_00001abc`, in any case, plain or with `.gz` or `.zst`.
 ///
 /// # Errors
-/// [`Error::File`] if the folder cannot be read.
+/// Returns [`Error::File`] if the folder cannot be read.
 pub(crate) fn find(folder: &Path, id: &str) -> Result<Option<PathBuf>> {
     let id = id.to_lowercase();
     let stems = [id.clone(), format!("pdb{id}"), format!("pdb_0000{id}")];
@@ -41,10 +41,10 @@ pub(crate) fn file_name(path: &Path) -> String {
     path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// Reads the atoms of a file: those of the kinds that are named, or the default selection.
+/// Reads the atoms of a file: those of the given kinds, or the default selection.
 ///
 /// # Errors
-/// [`Error::File`] if it cannot be read, [`Error::Failed`] if it holds no structure.
+/// Returns [`Error::File`] if it cannot be read, and [`Error::Failed`] if it contains no structure.
 pub(crate) fn read(path: &Path, kinds: Option<&str>) -> Result<Spheres> {
     let bytes = fs::read(path).map_err(Error::file(path))?;
     atoms(&bytes, kinds).map_err(|why| Error::Failed(format!("{}: {why}", path.display())))
@@ -53,7 +53,7 @@ pub(crate) fn read(path: &Path, kinds: Option<&str>) -> Result<Spheres> {
 /// Returns the atoms of the built-in sample.
 ///
 /// # Errors
-/// [`Error::Failed`], as for any other file.
+/// Returns [`Error::Failed`] if it cannot be parsed.
 pub(crate) fn sample() -> Result<Spheres> {
     atoms(SAMPLE, None)
 }
@@ -79,11 +79,11 @@ pub(crate) fn spheres(atoms: impl IntoIterator<Item = ([f64; 3], f32)>) -> Resul
     Spheres::new(x, y, z, radii).map_err(Error::failed)
 }
 
-/// Repeats a structure until there are `n` atoms: `columns` copies along x and y, then layers along z, with 3 Å between
-/// the boxes of the centres.
+/// Tiles copies of a structure until there are `n` atoms: `columns` copies along x and y, then layers along z, with 3 Å
+/// between the bounding boxes of the centres.
 ///
 /// # Errors
-/// [`Error::Failed`] if the structure has no atoms.
+/// Returns [`Error::Failed`] if the structure has no atoms.
 pub(crate) fn tiled(one: &Spheres, n: usize, columns: [usize; 2]) -> Result<Spheres> {
     let [lo, hi] = one.bounds().ok_or_else(|| Error::failed("no atoms"))?;
     spheres((0..n).map(|i| {
@@ -94,10 +94,10 @@ pub(crate) fn tiled(one: &Spheres, n: usize, columns: [usize; 2]) -> Result<Sphe
     }))
 }
 
-/// Repeats the built-in sample in a cube of boxes until there are `n` atoms.
+/// Tiles the built-in sample in a cube until there are `n` atoms.
 ///
 /// # Errors
-/// As [`tiled`].
+/// Returns the errors of [`tiled`].
 pub(crate) fn tiled_sample(n: usize) -> Result<Spheres> {
     let sample = sample()?;
     let copies = n.div_ceil(sample.len());
@@ -105,11 +105,11 @@ pub(crate) fn tiled_sample(n: usize) -> Result<Spheres> {
     tiled(&sample, n, [edge, edge])
 }
 
-/// Generates `n` atoms in a ball, as dense as the heavy atoms of proteins, on a perturbed cubic lattice. The same `n` and
-/// `seed` give the same atoms.
+/// Generates `n` atoms in a ball on a perturbed cubic lattice, as dense as the heavy atoms of proteins. The same `n`
+/// and `seed` give the same atoms.
 ///
 /// # Errors
-/// [`Error::Failed`] for 0 atoms.
+/// Returns [`Error::Failed`] for 0 atoms.
 pub(crate) fn ball(n: usize, seed: u64) -> Result<Spheres> {
     let mut random = Random::new(seed);
     let half = (1_i32..2000).find(|h| 4.0 * f64::from(*h).powi(3) > n as f64).unwrap_or(1) + 1;
@@ -122,7 +122,7 @@ pub(crate) fn ball(n: usize, seed: u64) -> Result<Spheres> {
     }))
 }
 
-/// Pseudorandom numbers that are the same for the same seed.
+/// Seeded pseudorandom numbers.
 #[derive(Debug)]
 pub(crate) struct Random(u64);
 
@@ -131,13 +131,13 @@ impl Random {
         Self(seed)
     }
 
-    /// A number of [−½, ½).
+    /// Returns a number in [−½, ½).
     pub(crate) fn next(&mut self) -> f64 {
         self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (self.0 >> 11) as f64 / (1_u64 << 53) as f64 - 0.5
     }
 
-    /// A radius, Å: of carbon, nitrogen and oxygen in the proportions of proteins.
+    /// Returns the radius of carbon, nitrogen or oxygen, Å, in the proportions of proteins.
     pub(crate) fn radius(&mut self) -> f32 {
         match self.next() + 0.5 {
             element if element < 0.63 => 1.7,
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn copies_stand_side_by_side() {
+    fn copies_are_placed_side_by_side() {
         let one = ball(100, 1).unwrap();
         let four = tiled(&one, 400, [2, 2]).unwrap();
         assert_eq!(four.len(), 400);
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn files_are_found_by_id_and_must_hold_a_structure() {
+    fn files_are_found_by_id_and_must_contain_a_structure() {
         let folder = tempfile::tempdir().unwrap();
         let found = |id: &str| find(folder.path(), id).unwrap().map(|path| file_name(&path));
         for name in ["2hhb.cif.txt", "1ql2_old.pdb", "pdb1BK2.ent.gz", "1bk2.cif", "pdb_00004pti.bcif.zst"] {

@@ -1,5 +1,5 @@
-//! `molmesh-bench` through the binary.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+//! Tests of the `molmesh-bench` binary.
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 #[path = "../../tests/archive_support/mod.rs"]
 mod archive_support;
@@ -18,7 +18,7 @@ fn command() -> Command {
     Command::new(env!("CARGO_BIN_EXE_molmesh-bench"))
 }
 
-/// Runs the program, which must end with this exit code. Returns its standard output and standard error.
+/// Runs the program and checks its exit code. Returns its standard output and standard error.
 fn run(code: i32, command: &mut Command) -> [String; 2] {
     let Output { status, stdout, stderr } = command.output().unwrap();
     let said = [stdout, stderr].map(|bytes| String::from_utf8(bytes).unwrap());
@@ -79,7 +79,7 @@ fn runs_beyond_the_limit_are_skipped() {
 
 #[test]
 #[cfg(target_os = "linux")]
-fn on_a_software_device_all_programs_make_the_same_triangles() {
+fn all_programs_create_the_same_triangles_on_a_software_device() {
     let folder = tempfile::tempdir().unwrap();
     let [data, out] = ["data", "out"].map(|name| folder.path().join(name));
     fs::create_dir(&data).unwrap();
@@ -126,7 +126,7 @@ fn stages_jobs_and_callers_are_measured_on_a_software_device() {
 }
 
 #[test]
-fn bad_requests_are_rejected_before_anything_runs() {
+fn invalid_arguments_are_rejected_before_any_work() {
     let folder = tempfile::tempdir().unwrap();
     let missing = folder.path().join("none");
     let missing = missing.to_str().unwrap();
@@ -152,7 +152,7 @@ fn bad_requests_are_rejected_before_anything_runs() {
     let other = folder.path().join("other.json");
     fs::write(&other, "{\"cases\": []}").unwrap();
     let [_, stderr] = run(1, command().arg("figures").arg(&other).args(["--out", missing]));
-    assert!(stderr.contains("is no result of"), "{stderr}");
+    assert!(stderr.contains("is not a result of"), "{stderr}");
 }
 
 #[test]
@@ -183,13 +183,13 @@ fn structures_are_fetched_once_and_replace_stand_ins() {
 }
 
 #[test]
-fn without_a_network_the_error_says_what_to_do() {
-    // Nobody listens there any more.
+fn network_errors_suggest_copying_the_files() {
+    // No server listens at this address any more.
     let addr = Remote::saying(status(404)).addr;
     let folder = tempfile::tempdir().unwrap();
     let url = format!("archive.url=http://{addr}/{{id}}.cif");
     let flags = ["fetch", "--set", &url, "--set", "archive.backoff_ms=1", "--data"];
     let [_, stderr] = run(1, command().args(flags).arg(folder.path()));
     assert!(stderr.contains("cannot be connected to") && stderr.contains("copy the files"), "{stderr}");
-    assert_eq!(names(folder.path()), Vec::<String>::new(), "nothing is left behind");
+    assert_eq!(names(folder.path()), Vec::<String>::new(), "no file remains");
 }

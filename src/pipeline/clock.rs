@@ -1,4 +1,4 @@
-//! The clock that the core does not have: wall time per stage, and progress for whoever watches.
+//! Wall time and progress of stages. The core itself has no clock.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -6,14 +6,16 @@ use std::time::{Duration, Instant};
 
 use crate::surface::{Observer, Stage};
 
-/// Told of progress: the stage's name and a fraction from 0 to 1 within it.
+/// Receiver of progress.
 pub trait ProgressSink: Sync {
-    /// Called from several threads, at most a few thousand times a job.
+    /// Reports the fraction of a stage that is done, from 0 to 1. Several threads call it, at most a few thousand times
+    /// a job.
     fn progress(&self, stage: &'static str, fraction: f64) {
         let _ = (stage, fraction);
     }
 
-    /// Told of a stage that is over: when it began, and its wall time. Stages that ran interleaved are laid one after another.
+    /// Reports the start and the wall time of a completed stage. Interleaved stages are reported as if they ran in
+    /// turn.
     fn ended(&self, stage: &'static str, begun: Instant, time: Duration) {
         let _ = (stage, begun, time);
     }
@@ -21,11 +23,12 @@ pub trait ProgressSink: Sync {
 
 impl ProgressSink for () {}
 
-/// Measures stages. Stages that run interleaved on several threads (the backend's) share the wall time of
-/// their pass in proportion to the threads' time in each, so the stages add up to the wall time. Where a device told
-/// the times of its stages they stand as told, and what is left of the pass is its `roundtrip`: waiting for the
-/// device, transfers, everything that is no stage. Devices that worked side by side may tell more than the pass took; then
-/// their stages share its wall time too.
+/// Measures the wall time of stages.
+///
+/// The stages of a backend run interleaved on several threads. They share the wall time of their pass in proportion to
+/// the time of the threads in each stage, so they add up to the wall time. Times that a device reports remain
+/// unchanged. The rest of the pass is `roundtrip`: transfers and waiting for the device. Devices that run in parallel
+/// may report more than the wall time; their stages are then scaled to it.
 pub struct StageClock<'a> {
     sink: &'a dyn ProgressSink,
     busy_ns: [AtomicU64; Stage::ALL.len()],
@@ -34,7 +37,7 @@ pub struct StageClock<'a> {
 }
 
 impl<'a> StageClock<'a> {
-    /// A clock that reports to `sink`.
+    /// Creates a clock that reports to `sink`.
     #[must_use]
     pub fn new(sink: &'a dyn ProgressSink) -> Self {
         Self { sink, busy_ns: Default::default(), device_ns: Default::default(), wall_ms: Mutex::default() }
@@ -49,7 +52,7 @@ impl<'a> StageClock<'a> {
         value
     }
 
-    /// Times a backend's pass, whose stages were reported through [`Observer::span`] and [`Observer::elapsed`].
+    /// Times a pass of a backend, whose stages are reported through [`Observer::span`] and [`Observer::elapsed`].
     pub fn pass<T>(&self, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let value = work();
@@ -57,10 +60,10 @@ impl<'a> StageClock<'a> {
         let take =
             |ns: &[AtomicU64; Stage::ALL.len()]| ns.each_ref().map(|ns| ns.swap(0, Ordering::Relaxed) as f64 / 1e6);
         let (busy, device) = (take(&self.busy_ns), take(&self.device_ns));
-        let told: f64 = busy.iter().chain(&device).sum();
+        let reported: f64 = busy.iter().chain(&device).sum();
         let by_device = device.iter().any(|ms| *ms > 0.0);
-        // The host's threads share the pass; what a device tells stands, as long as the pass has room for it.
-        let scale = if by_device && told <= wall { 1.0 } else { wall / told };
+        // Times of host threads are scaled to the pass. Times of devices are kept if they fit into it.
+        let scale = if by_device && reported <= wall { 1.0 } else { wall / reported };
         let mut begun = start;
         let mut push = |name, ms: f64| {
             self.push(name, begun, ms);
@@ -72,18 +75,18 @@ impl<'a> StageClock<'a> {
             }
         }
         if by_device {
-            push("roundtrip", (wall - told * scale).max(0.0));
+            push("roundtrip", (wall - reported * scale).max(0.0));
         }
         value
     }
 
-    /// Wall time in ms per stage, in the order in which they ran.
+    /// Returns the wall time of each stage, ms, in execution order.
     #[must_use]
     pub fn finish(self) -> Vec<(&'static str, f64)> {
         self.wall_ms.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
-    /// A stage that runs more than once has the time of all its runs.
+    /// Adds a run of a stage. The runs of a stage are summed.
     fn push(&self, name: &'static str, begun: Instant, ms: f64) {
         self.sink.ended(name, begun, duration(ms));
         let mut times = self.wall_ms.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
@@ -120,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_devices_stages_stand_as_told_and_the_rest_is_the_roundtrip() {
+    fn device_times_are_kept_and_the_rest_is_the_roundtrip() {
         let clock = StageClock::new(&());
         clock.pass(|| {
             clock.span(Stage::Bin, &mut || {});
@@ -135,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stage_that_runs_twice_has_the_time_of_both() {
+    fn runs_of_a_stage_are_summed() {
         let clock = StageClock::new(&());
         for _ in 0..2 {
             clock.pass(|| {
@@ -149,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn devices_that_worked_side_by_side_share_the_wall_time() {
+    fn parallel_devices_share_the_wall_time() {
         let clock = StageClock::new(&());
         let start = Instant::now();
         clock.pass(|| {
@@ -163,25 +166,25 @@ mod tests {
     }
 
     #[test]
-    fn whoever_watches_is_told_when_stages_began() {
-        struct Watch(Mutex<Vec<(&'static str, Instant, Duration)>>);
-        impl ProgressSink for Watch {
+    fn the_sink_receives_the_start_of_each_stage() {
+        struct Recorder(Mutex<Vec<(&'static str, Instant, Duration)>>);
+        impl ProgressSink for Recorder {
             fn ended(&self, stage: &'static str, begun: Instant, time: Duration) {
                 self.0.lock().unwrap().push((stage, begun, time));
             }
         }
-        let (watch, start) = (Watch(Mutex::default()), Instant::now());
-        let clock = StageClock::new(&watch);
+        let (recorder, start) = (Recorder(Mutex::default()), Instant::now());
+        let clock = StageClock::new(&recorder);
         clock.time("read", || ());
         clock.pass(|| {
             clock.elapsed(Stage::Field, 1000);
             clock.elapsed(Stage::Emit, 1000);
             std::thread::sleep(Duration::from_millis(1));
         });
-        let told = watch.0.into_inner().unwrap();
-        assert_eq!(told.iter().map(|(name, ..)| *name).collect::<Vec<_>>(), ["read", "field", "emit", "roundtrip"]);
-        for pair in told.windows(2) {
-            assert!(pair[0].1 >= start && pair[0].1 + pair[0].2 <= pair[1].1, "{told:?}");
+        let stages = recorder.0.into_inner().unwrap();
+        assert_eq!(stages.iter().map(|(name, ..)| *name).collect::<Vec<_>>(), ["read", "field", "emit", "roundtrip"]);
+        for pair in stages.windows(2) {
+            assert!(pair[0].1 >= start && pair[0].1 + pair[0].2 <= pair[1].1, "{stages:?}");
         }
     }
 

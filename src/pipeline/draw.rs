@@ -1,14 +1,15 @@
-//! The picture of a finished mesh: drawn, packed, and put in the mesh's place.
+//! Pictures of finished meshes.
 
 use super::report::{PictureReport, Report};
 use super::{JobError, Product, ProgressSink, StageClock};
 use crate::picture::{Drawer, PictureParams, png};
 use crate::surface::{CancelToken, Control, Mesh};
 
-/// Draws the mesh of `product`, which gets the PNG and gives the mesh away: nobody asked for it.
+/// Draws the mesh of `product` and replaces it with the PNG.
 ///
 /// # Errors
-/// [`JobError::Picture`], and [`JobError::Surface`] where somebody stopped it or no device could.
+/// Returns [`JobError::Picture`] if the picture cannot be drawn, and [`JobError::Surface`] if the job was cancelled or
+/// a device failed.
 pub fn draw(
     product: &mut Product,
     params: &PictureParams,
@@ -19,12 +20,12 @@ pub fn draw(
     let clock = StageClock::new(progress);
     let mut mesh = std::mem::take(&mut product.mesh);
     let drawn = clock.time("draw", || {
-        // The renderer needs random access to the corners.
+        // The renderer needs random access to vertices.
         mesh.make_contiguous();
         let control = Control { cancel: cancel.clone(), deadline: None, observer: &clock };
         drawer.renderer.render(&mesh, params, &control)
     })?;
-    // Before more memory is asked for.
+    // Free the mesh before the PNG is allocated.
     drop::<Mesh>(mesh);
     let bytes = clock.time("png", || png::encode(&drawn.image))?;
     product.report.picture = Some(PictureReport::new(params, drawer, &drawn));

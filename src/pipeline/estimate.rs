@@ -1,45 +1,46 @@
-//! What a job would come to, without its mesh: the grid to the sample, the mesh by its area.
+//! Estimate of a job's size without its mesh: exact counts for the grid, estimates from the area for the mesh.
 //!
-//! A surface of area A that lies in a grid of spacing h in no direction of its own crosses 1.5 A/h² grid edges: the mean
-//! of |nx| + |ny| + |nz| over the sphere of normals. Each crossing is a vertex, and a closed mesh has about two triangles a
-//! vertex. The area is that of a coarser mesh.
+//! A surface of area A with random orientation crosses 1.5 A/h² edges of a grid of spacing h, as the mean of
+//! |nx| + |ny| + |nz| over all normals is 1.5. Each crossing is a vertex, and a closed mesh has about two triangles per
+//! vertex. A coarser mesh gives the area.
 
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock, fit};
 use crate::surface::lattice::Lattice;
 use crate::surface::occupancy::Occupancy;
 use crate::surface::{CancelToken, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
 
-/// Spacing of the coarser mesh, as a multiple of the job's, and at least so much, Å.
+/// Spacing of the coarser mesh as a multiple of the job's.
 const COARSER: f64 = 2.0;
+/// Minimum spacing of the coarser mesh, Å.
 const COARSE: f64 = 1.0;
 
-/// What a job would come to.
+/// Estimated size of a job.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Estimate {
     /// Atoms that would be meshed.
     pub atoms: u64,
     /// Atoms in the file, all models.
     pub atoms_in_file: u64,
-    /// Grid spacing, Å: a guess where it would be found by making meshes, else exact.
+    /// Grid spacing, Å. It is an estimate if the job would search for it, else exact.
     pub resolution: f64,
-    /// Cells that a dense grid would have had.
+    /// Cells of a dense grid.
     pub box_cells: u64,
-    /// The grid and the mesh, or why there would be none.
+    /// Estimate of the grid and the mesh, or the error that the job would return.
     pub mesh: Result<MeshEstimate, SurfaceError>,
 }
 
-/// A grid, counted, and the mesh on it, estimated.
+/// Counts of a grid, and estimates of its mesh.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeshEstimate {
-    /// Bricks that some atom reaches.
+    /// Occupied bricks.
     pub bricks: u64,
-    /// Samples that would be evaluated.
+    /// Grid points that would be evaluated.
     pub samples: u64,
     /// Area, Å².
     pub area: f64,
-    /// Vertices.
+    /// Number of vertices.
     pub vertices: u64,
-    /// Triangles.
+    /// Number of triangles.
     pub triangles: u64,
     /// Bytes of the mesh in memory, and of the binary part of a GLB.
     pub bytes: u64,
@@ -48,7 +49,7 @@ pub struct MeshEstimate {
 /// Estimates a job.
 ///
 /// # Errors
-/// Any [`JobError`] of reading and selecting; cancellation.
+/// Returns a [`JobError`] if reading or selecting fails, or the job is cancelled.
 pub fn estimate(
     bytes: &[u8],
     job: &Job,
@@ -86,7 +87,7 @@ pub fn estimate(
 }
 
 impl MeshEstimate {
-    /// With no more triangles than there will be in any case.
+    /// Limits the numbers of triangles and vertices to those of at most `most` triangles.
     fn at_most(self, most: u64, params: &SurfaceParams) -> Self {
         let triangles = self.triangles.min(most);
         let vertices = self.vertices.min(most.div_ceil(2));
@@ -107,16 +108,12 @@ fn of_mesh(
     let single = SurfaceParams { atom_ids: false, quantize: None, ..params.clone() };
     let coarse = SurfaceParams { resolution: (COARSER * h).max(COARSE).max(h), ..single.clone() };
     let mesh = match choice.backend.run(spheres, &coarse, limits, control) {
-        // Single small spheres fall through a coarse grid: then the grid itself is taken.
+        // A coarse grid can miss single small spheres: use the job's grid then.
         Err(SurfaceError::NoSurface { .. }) => choice.backend.run(spheres, &single, limits, control)?.mesh,
         meshed => meshed?.mesh,
     };
     let area = area(&mesh);
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "float-to-int casts saturate, as wanted"
-    )]
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "float-to-int casts saturate")]
     let vertices = (1.5 * area / (h * h)).round() as u64;
     let triangles = 2 * vertices;
     let bytes = params.mesh_bytes(vertices, triangles);
@@ -129,7 +126,7 @@ fn of_mesh(
     Ok(estimate)
 }
 
-/// A mesh's area, Å².
+/// Returns the area of a mesh, Å².
 fn area(mesh: &Mesh) -> f64 {
     let corner = |i: u32| glam::Vec3::from(mesh.positions[i as usize]);
     let doubled = |t: &[u32; 3]| {
@@ -148,7 +145,7 @@ mod tests {
     const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 
     #[test]
-    fn the_grid_is_exact_and_the_mesh_is_near() {
+    fn grid_counts_are_exact_and_mesh_counts_are_close() {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
         for resolution in ["0.3", "0.5", "1", "2"] {
@@ -164,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn rounded_vertices_are_estimated_at_half_the_bytes() {
+    fn quantized_vertices_need_half_the_bytes() {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
         let of = |compress: &str| {
@@ -177,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn what_would_be_refused_is_said_with_what_would_fit() {
+    fn rejections_suggest_a_resolution_that_fits() {
         let backend = CpuBackend::new(None).unwrap();
         let choice = Choice { backend: &backend, reason: "" };
         let small = SurfaceLimits { max_mesh_bytes: 100_000, ..SurfaceLimits::default() };

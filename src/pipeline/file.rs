@@ -1,24 +1,24 @@
-//! What becomes of a product in a format: a mesh file that is laid out, or the picture that was drawn.
+//! Output file of a product: a mesh file or a picture.
 
 use std::io::{self, Write};
 
 use super::Product;
 use crate::formats::{Encoder, Format, FormatError};
 
-/// A file that is known and not yet written.
+/// Output file that is planned but not yet written.
 #[derive(Debug)]
 pub enum File<'a> {
-    /// A mesh.
+    /// Mesh file.
     Mesh(Encoder<'a>),
-    /// A picture.
+    /// PNG of a picture.
     Picture(&'a [u8]),
 }
 
 impl Product {
-    /// The file of this product in `format`.
+    /// Plans the file of this product in `format`.
     ///
     /// # Errors
-    /// Any [`FormatError`]; [`FormatError::NotAMesh`] for a picture that nobody has drawn.
+    /// Returns a [`FormatError`]; [`FormatError::NotAMesh`] for a picture that was not drawn.
     pub fn file(&self, format: Format) -> Result<File<'_>, FormatError> {
         match &self.picture {
             Some(picture) if format.is_picture() => Ok(File::Picture(picture)),
@@ -28,7 +28,7 @@ impl Product {
 }
 
 impl File<'_> {
-    /// Bytes of the file, exactly; `None` where they are known only afterwards.
+    /// Returns the exact size of the file, bytes; `None` if it is known only after writing.
     #[must_use]
     pub fn bytes(&self) -> Option<u64> {
         match self {
@@ -37,7 +37,7 @@ impl File<'_> {
         }
     }
 
-    /// Bytes of the file at most; exact where [`Self::bytes`] is.
+    /// Returns an upper bound of the size of the file, bytes. It is exact if [`Self::bytes`] is known.
     #[must_use]
     pub fn bytes_bound(&self) -> u64 {
         match self {
@@ -49,7 +49,7 @@ impl File<'_> {
     /// Writes the file and flushes `out`.
     ///
     /// # Errors
-    /// Those of `out`.
+    /// Returns the errors of `out`.
     pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
         match self {
             Self::Mesh(encoder) => encoder.write(out),

@@ -1,78 +1,79 @@
-//! The finest spacing whose mesh has at most so many triangles: found by making meshes and counting.
+//! Search for the finest spacing whose mesh does not exceed a number of triangles.
 //!
-//! Triangles go with about the inverse square of the spacing, but not exactly: finer grids find more surface, and where a
-//! neck closes is anybody's guess. So the law only proposes; what counts is the count of a mesh that was made. The number of
-//! meshes is bounded, and the first is a coarse one that costs little.
+//! The number of triangles is approximately proportional to the inverse square of the spacing: finer grids find more
+//! surface, and narrow necks close or open. The search therefore computes meshes and counts their triangles. The number
+//! of meshes is bounded, and the first one is coarse, so it is cheap.
 
 use super::clock::StageClock;
 use super::spacing::{COARSEST, FINEST, Spacing};
 use super::{Choice, Job};
 use crate::surface::{Control, MeshOutput, Observer, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams};
 
-/// Meshes that are made at most, the first coarse one and a last one again included.
-pub(super) const MOST_TRIES: u32 = 8;
-/// Tries after which the coarsest spacing is taken if none has fitted.
-const PATIENCE: u32 = 4;
-/// A mesh with this part of the triangles that it may have is fine enough.
+/// Maximum number of meshes, including the first coarse one and a repetition of the best one.
+const MAX_TRIES: u32 = 8;
+/// Number of tries after which the coarsest spacing is tried if no mesh has fitted.
+const TRIES_BEFORE_COARSEST: u32 = 4;
+/// Fraction of the limit from which a mesh is fine enough.
 const FULL: f64 = 0.95;
-/// The part of the triangles that is aimed at: a little less than allowed, as the law is not exact.
+/// Fraction of the limit that the search aims at. It is below 1, as the power law is not exact.
 const AIM: f64 = 0.98;
-/// Spacing of the first mesh, in spacings that are expected, and at least so much, Å.
+/// Spacing of the first mesh as a multiple of the expected one.
 const COARSER: f64 = 2.0;
+/// Minimum spacing of the first mesh, Å.
 const COARSE: f64 = 1.0;
 
-/// What to do next.
+/// Next step of the search.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Next {
-    /// Make a mesh at this spacing and tell how many triangles it has.
+    /// Mesh at this spacing and record the number of triangles.
     Try(f64),
-    /// This spacing, which was tried, is it.
+    /// Use this spacing, which was tried.
     Take(f64),
-    /// No spacing fits: the mesh with the fewest triangles was this one.
+    /// No spacing fits. The fields describe the mesh with the fewest triangles.
     Refuse {
-        /// Its spacing.
+        /// Spacing, Å.
         resolution: f64,
-        /// Its triangles.
+        /// Number of triangles.
         triangles: u64,
     },
 }
 
-/// The search: counts come in, spacings go out. Pure, so what it finds is a function of the counts.
+/// State of a search. It is pure, so the result depends only on the counts.
 #[derive(Debug, Clone)]
 pub(super) struct Search {
     limit: u64,
     first: f64,
-    /// What was tried: spacings with their triangles, none where there was no surface.
-    told: Vec<(f64, Option<u64>)>,
+    /// Spacings that were tried, Å, with their triangles; `None` if there was no surface.
+    tried: Vec<(f64, Option<u64>)>,
 }
 
 impl Search {
-    /// For at most `limit` triangles of so many atoms.
+    /// Creates a search for at most `limit` triangles.
     pub(super) fn new(limit: u64, params: &SurfaceParams, atoms: usize) -> Self {
         let expected = Spacing::MaxTriangles(limit).expected(params, atoms as f64);
         let first = rounded((COARSER * expected).clamp(COARSE, COARSEST));
-        Self { limit, first, told: Vec::new() }
+        Self { limit, first, tried: Vec::new() }
     }
 
-    /// Meshes that were made.
+    /// Returns the number of computed meshes.
     pub(super) fn tries(&self) -> u32 {
-        u32::try_from(self.told.len()).unwrap_or(u32::MAX)
+        u32::try_from(self.tried.len()).unwrap_or(u32::MAX)
     }
 
-    /// Whether some mesh fitted.
-    pub(super) fn fitted(&self) -> bool {
+    /// Returns true if any mesh fitted.
+    pub(super) fn has_fit(&self) -> bool {
         self.fits().is_some()
     }
 
-    /// A mesh at `spacing` had so many triangles; `None` if it had no surface.
-    pub(super) fn tell(&mut self, spacing: f64, triangles: Option<u64>) {
-        self.told.push((spacing, triangles));
+    /// Records the number of triangles at `spacing`; `None` if there was no surface.
+    pub(super) fn record(&mut self, spacing: f64, triangles: Option<u64>) {
+        self.tried.push((spacing, triangles));
     }
 
-    /// What to do next.
+    /// Returns the next step.
     pub(super) fn next(&self) -> Next {
-        // The last mesh may have to be made again, which is a try as well.
-        let spent = self.tries() + 1 >= MOST_TRIES;
+        // The best mesh may have to be computed again, which counts as a try.
+        let spent = self.tries() + 1 >= MAX_TRIES;
         if let Some((h, n)) = self.fits() {
             let enough = spent || h <= FINEST || n as f64 >= FULL * self.limit as f64;
             return self.finer((h, n)).filter(|_| !enough).map_or(Next::Take(h), Next::Try);
@@ -81,7 +82,7 @@ impl Search {
         let next = match (coarsest, self.finest_hollow(0.0)) {
             (None, None) => Some(self.first),
             (Some(exceeds), _) => self.coarser(exceeds),
-            // Nothing but air so far: finer, to where there is something, or to the end.
+            // No surface yet: try finer spacings.
             (None, Some(h)) => Some(rounded((0.5 * h).max(FINEST))),
         };
         if let Some(next) = next.filter(|next| !spent && self.is_new(*next)) {
@@ -91,33 +92,33 @@ impl Search {
         Next::Refuse { resolution, triangles }
     }
 
-    /// Spacings with their triangles.
+    /// Returns the spacings that had a surface, with their triangles.
     fn counts(&self) -> impl Iterator<Item = (f64, u64)> {
-        self.told.iter().filter_map(|(h, n)| n.map(|n| (*h, n)))
+        self.tried.iter().filter_map(|(h, n)| n.map(|n| (*h, n)))
     }
 
-    /// The finest spacing that fitted, with its triangles.
+    /// Returns the finest spacing that fitted, with its triangles.
     fn fits(&self) -> Option<(f64, u64)> {
         self.counts().filter(|(_, n)| *n <= self.limit).min_by(|a, b| a.0.total_cmp(&b.0))
     }
 
-    /// The finest spacing above `floor` at which atoms fell through the grid.
+    /// Returns the finest spacing above `floor` that had no surface.
     fn finest_hollow(&self, floor: f64) -> Option<f64> {
-        let hollow = self.told.iter().filter(|(h, n)| n.is_none() && *h > floor);
+        let hollow = self.tried.iter().filter(|(h, n)| n.is_none() && *h > floor);
         hollow.map(|(h, _)| *h).min_by(f64::total_cmp)
     }
 
     fn is_new(&self, spacing: f64) -> bool {
-        self.told.iter().all(|(h, _)| h.total_cmp(&spacing).is_ne())
+        self.tried.iter().all(|(h, _)| h.total_cmp(&spacing).is_ne())
     }
 
-    /// A spacing below one that fits that should fit as well, if there is one worth a try.
+    /// Returns a finer spacing than one that fits, if another one is likely to fit.
     fn finer(&self, (h, n): (f64, u64)) -> Option<f64> {
         let aim = AIM * self.limit as f64;
         let below = self.counts().filter(|(x, _)| *x < h).max_by(|a, b| a.0.total_cmp(&b.0));
         let guess = match below {
             None => h * (n as f64 / aim).sqrt(),
-            // Between two counts the law's exponent is known.
+            // Two counts determine the exponent of the power law.
             Some((x, m)) => {
                 let part = ((aim / n as f64).ln() / (m as f64 / n as f64).ln()).clamp(0.1, 0.9);
                 h * (x / h).powf(part)
@@ -127,39 +128,39 @@ impl Search {
         (guess < h && below.is_none_or(|(x, _)| guess > x) && self.is_new(guess)).then_some(guess)
     }
 
-    /// A spacing above one that had too many triangles, below any that had no surface.
+    /// Returns a coarser spacing than one with too many triangles, below any without a surface.
     fn coarser(&self, (x, m): (f64, u64)) -> Option<f64> {
         let ceiling = self.finest_hollow(x);
         let law = rounded(x * (m as f64 / (AIM * self.limit as f64)).sqrt()).max(rounded(1.01 * x));
         let next = match ceiling {
             Some(h) if law >= h => rounded((x * h).sqrt()),
             Some(_) => law,
-            None if self.tries() >= PATIENCE => COARSEST,
+            None if self.tries() >= TRIES_BEFORE_COARSEST => COARSEST,
             None => law.min(COARSEST),
         };
         (next > x && ceiling.is_none_or(|h| next < h)).then_some(next)
     }
 }
 
-/// To a thousandth of an ångström, up: short in keys and reports, and never finer than was meant.
+/// Rounds up to a thousandth of an ångström, which keeps keys and reports short.
 fn rounded(spacing: f64) -> f64 {
-    // A thousandth that floats just miss is itself.
+    // Tolerate rounding errors of exact thousandths.
     (spacing * 1000.0 - 1e-6).ceil() / 1000.0
 }
 
-/// A mesh whose spacing was searched for.
+/// Mesh at the spacing that the search found.
 pub(super) struct Fitted {
     pub(super) output: MeshOutput,
     pub(super) resolution: f64,
-    /// Meshes that were made.
+    /// Number of computed meshes.
     pub(super) tries: u32,
 }
 
-/// Meshes `spheres` as finely as `limit` triangles allow.
+/// Meshes `spheres` at the finest spacing that has at most `limit` triangles.
 ///
 /// # Errors
-/// [`SurfaceError::TooManyTriangles`] if no spacing is coarse enough; any other error of a mesh on the way, but that it has
-/// no surface, unless none has.
+/// Returns [`SurfaceError::TooManyTriangles`] if no spacing is coarse enough, [`SurfaceError::NoSurface`] if no mesh
+/// has a surface, or another error of meshing.
 pub(super) fn mesh(
     spheres: &Spheres,
     job: &Job,
@@ -170,54 +171,58 @@ pub(super) fn mesh(
     control: &Control<'_>,
 ) -> Result<Fitted, SurfaceError> {
     let mut search = Search::new(limit, &job.params, spheres.len());
-    // What was made last, and who made it.
     let mut last: Option<(f64, MeshOutput)> = None;
+    // Name of the backend that computed the meshes.
     let mut served = None;
     let mut restarted = false;
     loop {
         let (spacing, again) = match search.next() {
             Next::Try(spacing) => (spacing, false),
             Next::Take(spacing) => match last.take().filter(|(made, _)| made.total_cmp(&spacing).is_eq()) {
-                Some((resolution, meshed)) => return Ok(Fitted { output: meshed, resolution, tries: search.tries() }),
+                Some((resolution, output)) => return Ok(Fitted { output, resolution, tries: search.tries() }),
                 None => (spacing, true),
             },
-            Next::Refuse { resolution, triangles } => return Err(refusal(&job.params, limit, resolution, triangles)),
+            Next::Refuse { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
         };
-        // One mesh at a time is held.
+        // Hold only one mesh at a time.
         last = None;
         let mut params = SurfaceParams { resolution: spacing, ..job.params.clone() };
         let _storage = super::storage(job, &mut params, spheres);
-        let quiet = Quiet(clock);
-        let observer: &dyn Observer = if search.tries() == 0 { &quiet } else { clock };
+        let without_progress = WithoutProgress(clock);
+        let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { clock };
         let control = Control { observer, ..control.clone() };
-        let made = some(clock.pass(|| choice.backend.run(spheres, &params, limits, &control)))?;
+        let made = unless_empty(clock.pass(|| choice.backend.run(spheres, &params, limits, &control)))?;
         let by = made.as_ref().map(|m| m.served.as_ref().map_or(choice.backend.name(), |s| s.backend));
         if by.is_some() && served.is_some() && by != served {
-            // Another backend's counts may differ in a triangle, and the spacing with them: a result's name says one
-            // backend, so all counts are to be its own.
+            // Counts of different backends may differ slightly, and with them the spacing. The content key names one
+            // backend, so all counts must come from it.
             if std::mem::replace(&mut restarted, true) {
-                return Err(SurfaceError::Device { why: "backends took turns while the spacing was searched".into() });
+                return Err(SurfaceError::Device {
+                    why: "different backends ran during the search for the grid spacing".into(),
+                });
             }
             (search, served) = (Search::new(limit, &job.params, spheres.len()), None);
             continue;
         }
         served = by.or(served);
         let triangles = made.as_ref().map(|m| m.mesh.n_triangles() as u64);
-        search.tell(spacing, triangles);
+        search.record(spacing, triangles);
         if again {
-            // The same input gives the same mesh: it fits as it did.
+            // The same input gives the same mesh, so it fits again.
             let meshed = made.filter(|_| triangles.is_some_and(|n| n <= limit));
-            let meshed = meshed.ok_or_else(|| SurfaceError::Device { why: "two runs gave two meshes".into() })?;
+            let meshed = meshed.ok_or_else(|| SurfaceError::Device {
+                why: "two runs on the same input returned different meshes".into(),
+            })?;
             return Ok(Fitted { output: meshed, resolution: spacing, tries: search.tries() });
         }
         last = made.map(|meshed| (spacing, meshed));
     }
 }
 
-/// The spacing that [`mesh`] would probably find: that of the first mesh that fits, refined once without looking.
+/// Returns the spacing that [`mesh`] would probably find: the first one that fits, refined once without a mesh.
 ///
 /// # Errors
-/// Those of [`mesh`].
+/// Returns the errors of [`mesh`].
 pub(super) fn expected(
     spheres: &Spheres,
     job: &Job,
@@ -229,36 +234,37 @@ pub(super) fn expected(
     let mut search = Search::new(limit, &job.params, spheres.len());
     loop {
         match search.next() {
-            Next::Try(spacing) if !search.fitted() => {
+            Next::Try(spacing) if !search.has_fit() => {
                 let params = SurfaceParams { resolution: spacing, atom_ids: false, ..job.params.clone() };
-                let made = some(choice.backend.run(spheres, &params, limits, control))?;
-                search.tell(spacing, made.map(|m| m.mesh.n_triangles() as u64));
+                let made = unless_empty(choice.backend.run(spheres, &params, limits, control))?;
+                search.record(spacing, made.map(|m| m.mesh.n_triangles() as u64));
             }
             Next::Try(spacing) | Next::Take(spacing) => return Ok(spacing),
-            Next::Refuse { resolution, triangles } => return Err(refusal(&job.params, limit, resolution, triangles)),
+            Next::Refuse { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
         }
     }
 }
 
-/// A mesh, or none where atoms fell through the grid.
-fn some(made: Result<MeshOutput, SurfaceError>) -> Result<Option<MeshOutput>, SurfaceError> {
+/// Converts [`SurfaceError::NoSurface`] to `None`.
+fn unless_empty(made: Result<MeshOutput, SurfaceError>) -> Result<Option<MeshOutput>, SurfaceError> {
     match made {
         Err(SurfaceError::NoSurface { .. }) => Ok(None),
         made => made.map(Some),
     }
 }
 
-fn refusal(params: &SurfaceParams, limit: u64, resolution: f64, triangles: u64) -> SurfaceError {
+/// Returns the error for a search without a result.
+fn no_fit(params: &SurfaceParams, limit: u64, resolution: f64, triangles: u64) -> SurfaceError {
     match triangles {
         0 => SurfaceError::NoSurface { isovalue: params.isovalue },
         _ => SurfaceError::TooManyTriangles { triangles, limit, resolution },
     }
 }
 
-/// Times stages and keeps their progress to itself: a coarse mesh that is looked at first is not how far a job is.
-struct Quiet<'a>(&'a StageClock<'a>);
+/// Observer that times stages but hides their progress: the first, coarse mesh does not advance the job.
+struct WithoutProgress<'a>(&'a StageClock<'a>);
 
-impl Observer for Quiet<'_> {
+impl Observer for WithoutProgress<'_> {
     fn span(&self, stage: Stage, work: &mut dyn FnMut()) {
         self.0.span(stage, work);
     }
@@ -272,7 +278,7 @@ impl Observer for Quiet<'_> {
 mod tests {
     use super::*;
 
-    /// Searches for at most `limit` triangles of something that has `count` of them at a spacing: how it ends, what was tried.
+    /// Searches with the triangle counts of `count`. Returns the last step and the spacings that were tried.
     fn search(limit: u64, atoms: usize, count: impl Fn(f64) -> Option<u64>) -> (Next, Vec<f64>) {
         let mut search = Search::new(limit, &SurfaceParams::default(), atoms);
         let mut tried = Vec::new();
@@ -281,8 +287,8 @@ mod tests {
                 Next::Try(h) => {
                     assert!((FINEST..=COARSEST).contains(&h) && !tried.contains(&h), "{h} after {tried:?}");
                     tried.push(h);
-                    search.tell(h, count(h));
-                    assert!(tried.len() < MOST_TRIES as usize, "{tried:?}");
+                    search.record(h, count(h));
+                    assert!(tried.len() < MAX_TRIES as usize, "{tried:?}");
                 }
                 end => return (end, tried),
             }
@@ -295,11 +301,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_taken_fits_and_is_nearly_full_or_the_finest() {
+    fn results_fit_and_use_most_of_the_limit_or_the_finest_spacing() {
         for exponent in [1.6, 2.0, 2.2, 2.6] {
             for area in [40.0, 3400.0, 8e4, 6e6] {
                 for limit in [1000, 20_000, 333_333, 5_000_000] {
-                    // As many atoms as expected, and far too many or too few.
+                    // The expected number of atoms, and far too many or too few.
                     for atoms in [area / 75.0, area / 7.5, area] {
                         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "as above")]
                         let (end, tried) = search(limit, atoms as usize, law(area, exponent));
@@ -326,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_that_obey_no_law_are_never_exceeded() {
+    fn irregular_counts_never_exceed_the_limit() {
         let mut bits = 1_u64;
         let mut random = || {
             bits = bits.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -335,7 +341,7 @@ mod tests {
         let (mut taken, mut refused) = (0, 0);
         for _ in 0..5000 {
             let seed = random();
-            // A count that jumps, with holes, but the same at the same spacing.
+            // Irregular counts, sometimes without a surface, but constant for a spacing.
             let count = |h: f64| {
                 let mixed = (h.to_bits() ^ seed).wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40;
                 (!mixed.is_multiple_of(5)).then_some(mixed % 20_000)
@@ -349,15 +355,15 @@ mod tests {
                     refused += 1;
                     assert!(triangles == 0 || (count(resolution) == Some(triangles) && triangles > 3000));
                 }
-                Next::Try(_) => panic!("it does not end"),
+                Next::Try(_) => panic!("the search does not end"),
             }
         }
         assert!(taken > 1000 && refused > 10, "{taken} {refused}");
     }
 
     #[test]
-    fn where_atoms_fall_through_the_grid_it_looks_between() {
-        // One atom: nothing above 1.8 Å, eight triangles at the least.
+    fn spacings_without_a_surface_bound_the_search() {
+        // One atom: no surface above 1.8 Å, and at least eight triangles.
         let atom = |h: f64| (h < 1.8).then(|| law(36.0, 2.0)(h).unwrap().max(8));
         let (end, _) = search(100, 1, atom);
         assert!(matches!(end, Next::Take(h) if atom(h).unwrap() <= 100), "{end:?}");

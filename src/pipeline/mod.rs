@@ -1,4 +1,4 @@
-//! One job from end to end: structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
+//! Complete run of one job: structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
 mod clock;
 mod draw;
@@ -61,13 +61,13 @@ impl Job {
     /// Checks the size of the picture before any other work.
     ///
     /// # Errors
-    /// [`JobError::Picture`].
+    /// Returns [`JobError::Picture`] if it exceeds the limits.
     pub fn check(&self, limits: &JobLimits) -> Result<(), JobError> {
         self.picture.map_or(Ok(()), |picture| picture.check(limits.picture)).map_err(JobError::Picture)
     }
 
-    /// Returns true if the mesh can be written without being held as a whole. Atoms by vertex, the exact validation and a
-    /// bound on triangles need the whole mesh.
+    /// Returns true if the mesh can be written while it is computed. Atom ids, the exact validation, a limit on
+    /// triangles and pictures need the whole mesh in memory.
     fn can_stream(&self) -> bool {
         !self.params.atom_ids
             && self.validation == Validation::Checksum
@@ -75,7 +75,7 @@ impl Job {
             && self.picture.is_none()
     }
 
-    /// Parameters for a number of atoms, unless the resolution depends on the mesh.
+    /// Returns the parameters for a number of atoms. With [`Spacing::MaxTriangles`], the resolution is not final.
     fn params_for(&self, atoms: usize) -> SurfaceParams {
         let resolution = match self.spacing {
             Spacing::Detail(level) => spacing::of_detail(level, atoms as f64),
@@ -115,14 +115,14 @@ pub struct Product {
     pub storage: Storage,
     /// Report of the job.
     pub report: Report,
-    /// The PNG, once it is drawn; the mesh is then dropped.
+    /// PNG of the mesh, if one was drawn. The mesh is empty then.
     pub picture: Option<Vec<u8>>,
-    /// Length of the GLB that the mesh was written to instead of `mesh`, whose columns are then empty.
+    /// Length of the GLB, bytes, if the mesh was streamed into a sink. The columns of `mesh` are empty then.
     pub streamed_bytes: Option<u64>,
 }
 
 impl Product {
-    /// Metadata for a mesh file.
+    /// Returns the metadata for a mesh file.
     #[must_use]
     pub fn meta(&self) -> Meta {
         Meta { name: self.report.id.clone(), extras: self.report.extras() }
@@ -146,7 +146,7 @@ pub enum JobError {
 impl From<PictureError> for JobError {
     fn from(error: PictureError) -> Self {
         match error {
-            // Cancellation has a single error, whatever the stage.
+            // Cancellation is the same error in all stages.
             PictureError::Cancelled => Self::Surface(SurfaceError::Cancelled),
             PictureError::Device { why } => Self::Surface(SurfaceError::Device { why }),
             error => Self::Picture(error),
@@ -156,11 +156,11 @@ impl From<PictureError> for JobError {
 
 /// Runs a job: reads `bytes`, selects atoms, meshes them on the chosen backend and measures the mesh.
 ///
-/// A mesh for a GLB file goes straight into `sink`, if there is one and the job does not need the whole mesh in memory;
-/// [`Product::streamed_bytes`] is set in that case.
+/// With a `sink`, the mesh is streamed into it as GLB unless the job needs the whole mesh in memory.
+/// [`Product::streamed_bytes`] is set then.
 ///
 /// # Errors
-/// Any [`JobError`]; [`SurfaceError::Sink`] if `sink` failed.
+/// Returns a [`JobError`]; with [`SurfaceError::Sink`] if `sink` failed.
 pub fn run(
     bytes: &[u8],
     job: &Job,
@@ -176,8 +176,8 @@ pub fn run(
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, observer: &clock };
     let mut params = job.params_for(spheres.len());
     let sink = sink.filter(|_| job.can_stream());
-    let (output, tries, storage) = if let Spacing::MaxTriangles(most) = job.spacing {
-        let fitted = fit::mesh(&spheres, job, most, &limits.surface, choice, &clock, &control)?;
+    let (output, tries, storage) = if let Spacing::MaxTriangles(limit) = job.spacing {
+        let fitted = fit::mesh(&spheres, job, limit, &limits.surface, choice, &clock, &control)?;
         params.resolution = fitted.resolution;
         let storage = storage(job, &mut params, &spheres);
         (fitted.output, Some(fitted.tries), storage)
@@ -192,7 +192,7 @@ pub fn run(
     let [n_vertices, n_triangles] = output.size();
     let MeshOutput { mut mesh, streamed, grid, measures, served } = output;
     if let Some(ids) = &mut mesh.atom_ids {
-        // The core numbers spheres; the result numbers atoms of the file.
+        // Convert indices of spheres to indices of atoms in the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
     }
     let measures = match measures.filter(|measures| measures.validation == job.validation) {
@@ -216,7 +216,7 @@ pub fn run(
     Ok(product)
 }
 
-/// Storage of the mesh of `spheres`; also sets the vertex encoding in `params`. Known before the mesh is computed.
+/// Returns the storage options of the mesh of `spheres`, and sets the vertex encoding in `params`.
 fn storage(job: &Job, params: &mut SurfaceParams, spheres: &Spheres) -> Storage {
     params.quantize = match job.compress {
         Compress::None => None,

@@ -1,7 +1,7 @@
-//! The known name nearest to an unknown one, for refusals that help: edit distance over short ASCII names.
+//! Search for the known name most similar to an unknown one, for error messages. Uses the edit distance.
 
-/// The candidate with the fewest edits (insertions, deletions, replacements, swaps of neighbours) from `name`,
-/// if that is at most a third of the longer of the two plus one; the first of equals.
+/// Returns the candidate with the fewest edits (insertions, deletions, replacements, swaps of adjacent bytes) from
+/// `name`, and the first of several. Returns `None` if it differs by more than a third of the longer name plus one.
 #[must_use]
 pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let name = name.to_ascii_lowercase();
@@ -13,7 +13,7 @@ pub fn nearest<'a>(name: &str, candidates: impl IntoIterator<Item = &'a str>) ->
         .map(|(_, candidate)| candidate)
 }
 
-/// Optimal string alignment distance, in bytes. Names longer than 64 bytes are cut: they are nobody's typo.
+/// Returns the optimal string alignment distance in bytes. Compares at most 64 bytes, since longer names are not typos.
 fn distance(a: &str, b: &str) -> usize {
     let (a, b) = (&a.as_bytes()[..a.len().min(64)], &b.as_bytes()[..b.len().min(64)]);
     let mut before = vec![0; b.len() + 1];
@@ -46,7 +46,7 @@ mod tests {
     }
 
     #[test]
-    fn finds_typos_and_refuses_strangers() {
+    fn finds_typos_and_ignores_unrelated_names() {
         let names = ["resolution", "radius_scale", "chains"];
         assert_eq!(nearest("resolutoin", names), Some("resolution"));
         assert_eq!(nearest("Chain", names), Some("chains"));

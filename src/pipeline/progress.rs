@@ -1,13 +1,13 @@
-//! How far a job is: fractions of stages in, one fraction of the whole out. It never goes back.
+//! Progress of a job: combines the fractions of its stages into one fraction, which never decreases.
 
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use super::ProgressSink;
 
-/// Parts of a stage's fraction.
+/// Resolution of a stage's fraction.
 const UNIT: f64 = 1000.0;
 
-/// Stages with their usual share of the time, in the order in which they run.
+/// Stages with their typical shares of the time, in execution order.
 const STAGES: [(&str, f64); 13] = [
     ("read", 0.10),
     ("select", 0.02),
@@ -24,24 +24,24 @@ const STAGES: [(&str, f64); 13] = [
     ("encode", 0.04),
 ];
 
-/// Stages of which several run at a time, on different bricks.
+/// Stages that run at the same time on different bricks.
 const INTERLEAVED: [&str; 5] = ["field", "classify", "interpolate", "emit", "write"];
 
-/// How far each stage is. Told from several threads, read from another.
+/// Progress of each stage. Several threads may update and read it.
 #[derive(Debug, Default)]
 pub struct Tracker {
     fractions: [AtomicU32; STAGES.len()],
-    /// Index of the stage that spoke last.
+    /// Index of the latest stage that has begun.
     current: AtomicU32,
 }
 
 impl Tracker {
-    /// The stage that runs, and how much of the whole is done, from 0 to 1.
+    /// Returns the current stage and the progress of the whole job, from 0 to 1.
     #[must_use]
     pub fn now(&self) -> (&'static str, f64) {
         let current = self.current.load(Ordering::Relaxed) as usize;
         let part = |ix: usize| match ix {
-            // Stages of one pass run interleaved, so that an earlier one may not be done; the others are.
+            // Earlier stages are complete, except those that run interleaved.
             _ if ix < current && !INTERLEAVED.contains(&STAGES[ix].0) => 1.0,
             _ => f64::from(self.fractions[ix].load(Ordering::Relaxed)) / UNIT,
         };
@@ -55,7 +55,7 @@ impl ProgressSink for Tracker {
         let Some(ix) = STAGES.iter().position(|(name, _)| *name == stage) else { return };
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 0..=1000")]
         let parts = (fraction.clamp(0.0, 1.0) * UNIT) as u32;
-        // A stage that begins ends those before it, whether they reported it or not.
+        // The start of a stage completes the stages before it.
         if self.fractions[ix].load(Ordering::Relaxed) == 0 {
             self.current.fetch_max(u32::try_from(ix).unwrap_or(0), Ordering::Relaxed);
         }
@@ -68,13 +68,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shares_add_up_to_the_whole() {
+    fn shares_add_up_to_one() {
         let sum: f64 = STAGES.iter().map(|(_, share)| share).sum();
         assert!((sum - 1.0).abs() < 1e-9, "{sum}");
     }
 
     #[test]
-    fn it_never_goes_back_and_ends_at_one() {
+    fn progress_never_decreases_and_ends_at_one() {
         let tracker = Tracker::default();
         let mut last = 0.0;
         for (name, _) in STAGES {

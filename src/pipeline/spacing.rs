@@ -1,38 +1,38 @@
-//! How the grid's spacing is chosen: it is given, or follows from a level of detail, or from how many triangles there may be.
+//! Choice of the grid spacing: a given value, a level of detail, or a maximum number of triangles.
 
 use crate::surface::SurfaceParams;
 
-/// The finest spacing that is chosen for somebody, Å: finer ones show how spheres are blended, nothing of a molecule. Whoever
-/// names a spacing may go below.
+/// Finest automatic spacing, Å. Finer grids show the blending of spheres, not more of the molecule. A given spacing may
+/// be finer.
 pub const FINEST: f64 = 0.25;
-/// The coarsest spacing that is chosen for somebody, Å: beyond it atoms fall through the grid.
+/// Coarsest automatic spacing, Å. Coarser grids miss whole atoms.
 pub const COARSEST: f64 = 4.0;
-/// Spacings by level of detail, Å: each has about twice the triangles of the one before.
+/// Spacings by level of detail, Å. Each level has about twice the triangles of the level before.
 pub const DETAILS: [f64; 7] = [2.0, 1.4, 1.0, 0.7, 0.5, 0.35, FINEST];
-/// Atoms up to which [`DETAILS`] holds as it stands.
+/// Number of atoms up to which [`DETAILS`] applies unchanged.
 pub const DETAIL_ATOMS: f64 = 10_000.0;
-/// The least bound on triangles: no closed mesh on a grid has fewer.
+/// Smallest limit on triangles: no closed mesh on a grid has fewer.
 pub const LEAST_TRIANGLES: u32 = 8;
-/// The largest bound on triangles.
+/// Largest limit on triangles.
 pub const MOST_TRIANGLES: u32 = u32::MAX;
 
-/// Area of a surface per atom, Å², about: heavy atoms of a protein with the default parameters.
+/// Approximate surface area per atom, Å²: heavy atoms of a protein with the default parameters.
 const AREA_PER_ATOM: f64 = 7.5;
 
-/// What decides the grid's spacing.
+/// Method that chooses the grid spacing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Spacing {
-    /// [`SurfaceParams::resolution`], as it stands.
+    /// [`SurfaceParams::resolution`], unchanged.
     #[default]
     Given,
-    /// A level from 0 to 6, and how many atoms there are.
+    /// Level of detail from 0 to 6, adapted to the number of atoms.
     Detail(u8),
-    /// The finest spacing whose mesh has at most so many triangles.
+    /// Finest spacing whose mesh has at most this many triangles.
     MaxTriangles(u64),
 }
 
 impl Spacing {
-    /// The parameter that asked for it.
+    /// Returns the name of the parameter that selects this method.
     #[must_use]
     pub const fn parameter(self) -> &'static str {
         match self {
@@ -42,7 +42,7 @@ impl Spacing {
         }
     }
 
-    /// The level of detail, if one was asked for.
+    /// Returns the level of detail, if one is set.
     #[must_use]
     pub const fn detail(self) -> Option<u8> {
         match self {
@@ -51,28 +51,28 @@ impl Spacing {
         }
     }
 
-    /// The bound on triangles, if one was set.
+    /// Returns the limit on triangles, if one is set.
     #[must_use]
     pub const fn max_triangles(self) -> Option<u64> {
         match self {
-            Self::MaxTriangles(most) => Some(most),
+            Self::MaxTriangles(limit) => Some(limit),
             Self::Given | Self::Detail(_) => None,
         }
     }
 
-    /// The spacing that so many atoms will have, about, Å: exact where it does not hang on the mesh.
+    /// Returns the expected spacing for a number of atoms, Å. It is exact unless it depends on the mesh.
     #[must_use]
     pub fn expected(self, params: &SurfaceParams, atoms: f64) -> f64 {
         match self {
             Self::Given => params.resolution,
             Self::Detail(level) => of_detail(level, atoms),
-            Self::MaxTriangles(most) => of_area(AREA_PER_ATOM * atoms, most).clamp(FINEST, COARSEST),
+            Self::MaxTriangles(limit) => of_area(AREA_PER_ATOM * atoms, limit).clamp(FINEST, COARSEST),
         }
     }
 }
 
-/// The spacing of a level of detail, Å, a multiple of 0.01. Up to [`DETAIL_ATOMS`] it is that of [`DETAILS`]; beyond, it
-/// grows with the structure's length, the cube root of its atoms, so that a level means as many cells across, whatever the size.
+/// Returns the spacing of a level of detail, Å, a multiple of 0.01. Beyond [`DETAIL_ATOMS`] it grows with the cube root
+/// of the number of atoms, so that a level has the same number of cells across large structures.
 #[must_use]
 pub fn of_detail(level: u8, atoms: f64) -> f64 {
     let base = DETAILS[usize::from(level).min(DETAILS.len() - 1)];
@@ -80,18 +80,18 @@ pub fn of_detail(level: u8, atoms: f64) -> f64 {
     ((spacing * 100.0).round() / 100.0).min(COARSEST)
 }
 
-/// The spacing at which a surface of so much area, Å², has so many triangles, Å: about 3 A/h² of them.
+/// Returns the spacing h, Å, at which a surface of the given area A, Å², has about 3 A/h² = `triangles` triangles.
 pub(super) fn of_area(area: f64, triangles: u64) -> f64 {
     (3.0 * area / triangles as f64).sqrt()
 }
 
 #[cfg(test)]
-#[expect(clippy::float_cmp, reason = "hundredths are rounded to the same number")]
+#[expect(clippy::float_cmp, reason = "equal hundredths round to equal numbers")]
 mod tests {
     use super::*;
 
     #[test]
-    fn details_are_the_tables_up_to_ten_thousand_atoms_and_grow_with_the_cube_root() {
+    fn detail_levels_grow_with_the_cube_root_beyond_ten_thousand_atoms() {
         for (level, spacing) in (0..).zip(DETAILS) {
             for atoms in [1.0, 454.0, 10_000.0] {
                 assert_eq!(of_detail(level, atoms), spacing);
@@ -102,7 +102,7 @@ mod tests {
     }
 
     #[test]
-    fn finer_levels_are_finer_and_larger_structures_are_no_finer() {
+    fn spacing_falls_with_the_level_and_never_falls_with_size() {
         for atoms in [1.0, 9e3, 3e4, 2e5, 1e6] {
             let levels: Vec<f64> = (0..7).map(|level| of_detail(level, atoms)).collect();
             assert!(levels.is_sorted_by(|a, b| a > b || *a == COARSEST && *b == COARSEST), "{levels:?}");

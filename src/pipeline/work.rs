@@ -1,30 +1,30 @@
-//! Estimated work of a job from its input's size, before anything is read.
+//! Estimate of a job's work from the size of its input, before the input is read.
 
 use super::Job;
 
-/// Bytes of text per atom, about: a line of a PDB file has 81, one of an mmCIF file 90 to 110.
+/// Approximate bytes of text per atom. A line of a PDB file has 81, a line of an mmCIF file 90 to 110.
 const BYTES_PER_ATOM: f64 = 90.0;
 /// Approximate compression ratio of structure files.
 const COMPRESSION: f64 = 4.0;
-/// Approximate size ratio of atoms in text and in BinaryCIF. Not applied to compressed input, whose format is only known
-/// after inflating; compressed, the two differ less.
+/// Approximate size ratio of atoms in text and in BinaryCIF. Does not apply to compressed input, whose format is
+/// unknown and where the two differ less.
 const BINARY: f64 = 5.0;
-/// Bytes of an archive's BinaryCIF that describe the columns of all its categories, about: as many for a small entry as
-/// for a large one.
+/// Approximate bytes of an archive's BinaryCIF that describe columns. The number does not depend on the size of the
+/// entry.
 const DESCRIPTION: f64 = 150e3;
 /// Work of the smallest job, in atoms.
 const MIN_WORK: f64 = 2_000.0;
-/// Time of a mesh whose spacing is searched for, relative to the final one: a coarse mesh precedes it, and sometimes a
-/// third is needed.
+/// Time of the search for a spacing, relative to the final mesh. A coarse mesh precedes it, and sometimes a third is
+/// needed.
 const TRIES: f64 = 1.5;
-/// Work of a picture's pixel, in atoms: 100 ns of one core, on a machine whose atoms take 4 µs of two.
+/// Work of a pixel of a picture, in atoms: 100 ns on one core, where an atom takes 4 µs on two cores.
 const PIXEL: f64 = 0.0125;
 
 /// Estimates the work of a job, in atoms at 0.5 Å.
 #[must_use]
 pub fn work(input: &[u8], job: &Job) -> f64 {
     let compressed = input.starts_with(&[0x1f, 0x8b]) || input.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]);
-    // A MessagePack map, which no text begins with.
+    // First byte of a MessagePack map; no text begins with it.
     let binary = matches!(input.first(), Some(0x80..=0x8F | 0xDE | 0xDF));
     let len = input.len() as f64;
     let bytes = match (compressed, binary) {
@@ -33,7 +33,8 @@ pub fn work(input: &[u8], job: &Job) -> f64 {
         (false, false) => len,
     };
     let atoms = bytes / BYTES_PER_ATOM;
-    // Samples go with the inverse cube of the spacing, the surface with its square, reading with neither.
+    // Grid points scale with the inverse cube of the spacing, the surface with the inverse square, reading with
+    // neither.
     let fineness = 0.5 / job.spacing.expected(&job.params, atoms);
     let again = if job.spacing.max_triangles().is_some() { TRIES } else { 1.0 };
     let pixels = job.picture.map_or(0.0, |picture| f64::from(picture.width) * f64::from(picture.height));
@@ -66,7 +67,7 @@ mod tests {
     }
 
     #[test]
-    fn a_spacing_that_is_not_given_is_guessed_from_the_bytes() {
+    fn automatic_spacing_is_estimated_from_the_input_size() {
         let of = |name: &str, value: &str| params::parse([(name, value)]).unwrap().job;
         let [small, large] = [90_000, 90_000_000].map(|n| vec![b'A'; n]);
         assert!((work(&small, &of("detail", "4")) / work(&small, &of("resolution", "0.5")) - 1.0).abs() < 1e-9);

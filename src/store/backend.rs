@@ -26,7 +26,7 @@ use crate::telemetry::STORE_ERRORS;
 const S3_PART: usize = 8 << 20;
 /// Size of a write to a file, bytes: large enough to make waking a thread worthwhile.
 const FILE_PART: usize = 1 << 20;
-/// The folder of [`Backend::probe`].
+/// Folder of the objects of [`Backend::probe`].
 const PROBE: &str = "probe";
 
 enum Kind {
@@ -46,8 +46,8 @@ impl Backend {
     /// Opens the configured store. The default is a folder in `data_dir`.
     pub(super) async fn open(config: &StoreConfig, data_dir: &FilePath) -> Result<Self, StoreError> {
         if let Some(url) = &config.url {
-            let refuse = |reason| StoreError::Open { key: "store.url", place: url.clone(), reason };
-            let (objects, bucket) = s3::connect(config, url).map_err(refuse)?;
+            let failed = |reason| StoreError::Open { key: "store.url", place: url.clone(), reason };
+            let (objects, bucket) = s3::connect(config, url).map_err(failed)?;
             return Ok(Self { objects, kind: Kind::S3(bucket), place: url.trim_end_matches('/').to_owned() });
         }
         let root = data_dir.join("store");
@@ -60,8 +60,8 @@ impl Backend {
             LocalFileSystem::new_with_prefix(&folder).map(|files| files.with_fsync(true)).map_err(|e| e.to_string())
         });
         let opened = opened.await.unwrap_or_else(|e| Err(e.to_string()));
-        let refuse = |reason| StoreError::Open { key: "server.data_dir", place: place.clone(), reason };
-        Ok(Self { objects: Arc::new(opened.map_err(refuse)?), kind: Kind::Local(root), place })
+        let failed = |reason| StoreError::Open { key: "server.data_dir", place: place.clone(), reason };
+        Ok(Self { objects: Arc::new(opened.map_err(failed)?), kind: Kind::Local(root), place })
     }
 
     /// Creates a backend over a folder with injected behaviour, for tests.
@@ -76,8 +76,8 @@ impl Backend {
         &self.place
     }
 
-    /// Converts an error of opening: adds the configuration key of the location.
-    pub(super) fn refuse(&self, error: &StoreError) -> StoreError {
+    /// Converts an error to [`StoreError::Open`], with the configuration key of the location.
+    pub(super) fn open_error(&self, error: &StoreError) -> StoreError {
         let key = if self.is_local() { "server.data_dir" } else { "store.url" };
         StoreError::Open { key, place: self.place.clone(), reason: error.to_string() }
     }
@@ -98,7 +98,7 @@ impl Backend {
     /// Classifies and counts an error. `at` is a path relative to the root of the store.
     pub(super) fn fail(&self, op: &'static str, at: &str, error: &(dyn std::error::Error + 'static)) -> StoreError {
         counter!(STORE_ERRORS, "op" => op).increment(1);
-        StoreError::sort(op, &format!("{}/{at}", self.place), error)
+        StoreError::classify(op, &format!("{}/{at}", self.place), error)
     }
 
     fn fail_at<'a>(&'a self, op: &'static str, name: &'a Name) -> impl Fn(object_store::Error) -> StoreError + 'a {
@@ -156,10 +156,10 @@ impl Backend {
     /// Lists the objects of a folder in name order. Ignores files with other names.
     pub(super) async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
         let listed = self.objects.list(Some(&Path::from(folder.as_str())));
-        let ours = |meta: ObjectMeta| Some((Name::at(meta.location.as_ref())?, Meta::from(&meta)));
+        let parsed = |meta: ObjectMeta| Some((Name::at(meta.location.as_ref())?, Meta::from(&meta)));
         let fail = |e| self.fail("list", folder.as_str(), &e);
         let mut names: Vec<_> =
-            listed.try_filter_map(|meta| std::future::ready(Ok(ours(meta)))).try_collect().await.map_err(fail)?;
+            listed.try_filter_map(|meta| std::future::ready(Ok(parsed(meta)))).try_collect().await.map_err(fail)?;
         names.sort_by(|(a, _), (b, _)| a.cmp(b));
         Ok(names)
     }
@@ -171,14 +171,14 @@ impl Backend {
         let file = format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
         let path = Path::from_iter([PROBE, &file]);
         let fail = |e: object_store::Error| self.fail("probe", path.as_ref(), &e);
-        let wrote = Bytes::from(file.into_bytes());
-        self.objects.put(&path, wrote.clone().into()).await.map_err(fail)?;
+        let written = Bytes::from(file.into_bytes());
+        self.objects.put(&path, written.clone().into()).await.map_err(fail)?;
         let read = self.objects.get(&path).await.map_err(fail)?.bytes().await.map_err(fail)?;
         self.objects.delete(&path).await.map_err(fail)?;
-        if read == wrote {
+        if read == written {
             return Ok(());
         }
-        Err(self.fail("probe", path.as_ref(), &std::io::Error::other("what was read is not what was written")))
+        Err(self.fail("probe", path.as_ref(), &std::io::Error::other("the bytes read differ from the bytes written")))
     }
 
     /// Reads the secret of the store, or creates it.
@@ -193,7 +193,7 @@ impl Backend {
                 secret::in_bucket(self.objects.as_ref()).await.map_err(|e| self.fail("secret", "secret", &e))
             }
         };
-        outcome.map_err(|error| self.refuse(&error))
+        outcome.map_err(|error| self.open_error(&error))
     }
 
     /// Removes leftovers of crashed processes: staged files, unfinished uploads, probes. Returns their number.
@@ -221,7 +221,7 @@ impl Backend {
 /// Converts a "not found" error to `None`.
 fn found<T>(answer: object_store::Result<T>) -> object_store::Result<Option<T>> {
     match answer {
-        Ok(there) => Ok(Some(there)),
+        Ok(found) => Ok(Some(found)),
         Err(object_store::Error::NotFound { .. }) => Ok(None),
         Err(e) => Err(e),
     }

@@ -25,7 +25,7 @@ pub enum StoreError {
     TooLarge {
         /// Size of the object, bytes, as far as known.
         bytes: u64,
-        /// The cap.
+        /// Capacity of the store, bytes.
         max_bytes: u64,
     },
     /// The store is full, and all its objects are in use.
@@ -35,27 +35,27 @@ pub enum StoreError {
         bytes: u64,
         /// Bytes of objects in use and of reservations.
         held: u64,
-        /// The cap.
+        /// Capacity of the store, bytes.
         max_bytes: u64,
     },
     /// The disk is full, or a quota is used up.
     #[error("no space left at {place} ({op}): {reason}")]
     NoSpace {
-        /// What was done.
+        /// Failed operation.
         op: &'static str,
-        /// Where.
+        /// Location.
         place: String,
-        /// The system's words.
+        /// Message of the system or the service.
         reason: String,
     },
     /// The system or the storage service denies access.
     #[error("not permitted at {place} ({op}): {reason}")]
     Denied {
-        /// What was done.
+        /// Failed operation.
         op: &'static str,
-        /// Where.
+        /// Location.
         place: String,
-        /// The system's words.
+        /// Message of the system or the service.
         reason: String,
     },
     /// The range is empty or begins after the end.
@@ -85,9 +85,9 @@ pub enum StoreError {
     /// Any other error of the disk or the storage service.
     #[error("the store at {place} failed ({op}): {reason}")]
     Failed {
-        /// What was done.
+        /// Failed operation.
         op: &'static str,
-        /// Where.
+        /// Location.
         place: String,
         /// Message of the system or the service.
         reason: String,
@@ -102,7 +102,7 @@ impl StoreError {
     }
 
     /// Classifies an error of the backend at `place`.
-    pub(super) fn sort(op: &'static str, place: &str, error: &(dyn StdError + 'static)) -> Self {
+    pub(super) fn classify(op: &'static str, place: &str, error: &(dyn StdError + 'static)) -> Self {
         use object_store::Error as Os;
         let (place, reason) = (place.to_owned(), error.to_string());
         let denied = |e: &Os| matches!(e, Os::PermissionDenied { .. } | Os::Unauthenticated { .. });

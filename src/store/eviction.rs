@@ -68,7 +68,7 @@ impl Store {
         if now.duration_since(*cleared).is_ok_and(|age| age >= STALE) {
             match self.0.backend.clear_stale(now).await {
                 Ok(stale) => (swept.stale, *cleared) = (stale, now),
-                Err(error) => tracing::warn!(%error, "what crashed processes left in the store was not removed"),
+                Err(error) => tracing::warn!(%error, "leftovers of crashed processes were not removed from the store"),
             }
         }
         if swept != Swept::default() {
@@ -130,7 +130,7 @@ impl Store {
     async fn remove_all(&self, candidates: &[EvictionCandidate], reason: &'static str, failed: &mut u64) -> (u64, u64) {
         let (mut objects, mut bytes) = (0, 0);
         for candidate in candidates {
-            match self.remove_victim(candidate.clone()).await {
+            match self.remove_candidate(candidate.clone()).await {
                 Ok(true) => (objects, bytes) = (objects + 1, bytes + candidate.bytes),
                 Ok(false) => {}
                 Err(error) => {
@@ -143,15 +143,15 @@ impl Store {
         (objects, bytes)
     }
 
-    async fn remove_victim(&self, candidate: EvictionCandidate) -> Result<bool, StoreError> {
+    async fn remove_candidate(&self, candidate: EvictionCandidate) -> Result<bool, StoreError> {
         let store = self.clone();
-        self.finished(async move {
+        self.run_to_completion(async move {
             let _lock = store.stripe(&candidate.name).lock().await;
-            let goes = store.index().begin_removal(&candidate);
-            if goes {
+            let begun = store.index().begin_removal(&candidate);
+            if begun {
                 store.remove(&candidate.name).await?;
             }
-            Ok(goes)
+            Ok(begun)
         })
         .await
     }

@@ -50,7 +50,7 @@ impl Faults {
         *self.silent.lock().unwrap() = Some((folder, false));
     }
 
-    fn answers(&self, at: &Path, reading: bool) -> Result<()> {
+    fn check_silence(&self, at: &Path, reading: bool) -> Result<()> {
         let silent = *self.silent.lock().unwrap();
         if silent.is_some_and(|(folder, all)| at.as_ref().starts_with(folder.as_str()) && (all || !reading)) {
             self.unanswered.fetch_add(1, Ordering::SeqCst);
@@ -103,18 +103,18 @@ impl MultipartUpload for FaultyUpload {
 #[async_trait::async_trait]
 impl ObjectStore for Faulty {
     async fn put_opts(&self, at: &Path, payload: PutPayload, options: PutOptions) -> Result<PutResult> {
-        self.faults.answers(at, false)?;
+        self.faults.check_silence(at, false)?;
         self.faults.check_space()?;
         self.files.put_opts(at, payload, options).await
     }
 
     async fn put_multipart_opts(&self, at: &Path, options: PutMultipartOptions) -> Result<Box<dyn MultipartUpload>> {
-        self.faults.answers(at, false)?;
+        self.faults.check_silence(at, false)?;
         Ok(Box::new(FaultyUpload(self.files.put_multipart_opts(at, options).await?, Arc::clone(&self.faults))))
     }
 
     async fn get_opts(&self, at: &Path, options: GetOptions) -> Result<GetResult> {
-        self.faults.answers(at, true)?;
+        self.faults.check_silence(at, true)?;
         self.files.get_opts(at, options).await
     }
 

@@ -1,4 +1,4 @@
-//! The store: atomic, durable objects by name.
+//! Store of atomic, durable objects by name.
 
 use std::collections::hash_map::DefaultHasher;
 use std::fmt;
@@ -65,22 +65,22 @@ impl Store {
 
     /// Opens a store over `backend`; see [`open`](Self::open).
     pub(super) async fn over(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
-        backend.probe().await.map_err(|e| backend.refuse(&e))?;
+        backend.probe().await.map_err(|e| backend.open_error(&e))?;
         let now = SystemTime::now();
         // Not fatal: credentials may permit uploads without permitting their listing.
         let cleared = match backend.clear_stale(now).await {
             Ok(cleared) => cleared,
             Err(error) => {
-                tracing::warn!(%error, "what crashed processes left in the store was not removed");
+                tracing::warn!(%error, "leftovers of crashed processes were not removed from the store");
                 0
             }
         };
         let mut index = Index::default();
         for folder in Folder::ALL {
-            for (name, meta) in backend.list(folder).await.map_err(|e| backend.refuse(&e))? {
+            for (name, meta) in backend.list(folder).await.map_err(|e| backend.open_error(&e))? {
                 index.commit(&name, meta.size, meta.modified);
             }
-            index.show(folder);
+            index.update_metrics(folder);
         }
         let [inputs, jobs, results] = Folder::ALL.map(|folder| index.total(folder).1);
         tracing::info!(place = backend.place(), inputs, jobs, results, cleared, "store opened");
@@ -100,7 +100,7 @@ impl Store {
     /// # Errors
     /// Returns a [`StoreError`]. An existing object is unchanged then, unless it was evicted.
     pub async fn put(&self, name: &Name, bytes: Bytes) -> Result<(), StoreError> {
-        self.keep(name, bytes, false).await.map(|_| ())
+        self.write(name, bytes, false).await.map(|_| ())
     }
 
     /// Stores `bytes` under `name` unless an object exists, and returns true if it was stored. The object is durable on
@@ -113,25 +113,25 @@ impl Store {
             self.touch(name, SystemTime::now());
             return Ok(false);
         }
-        self.keep(name, bytes, true).await
+        self.write(name, bytes, true).await
     }
 
-    async fn keep(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
+    async fn write(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
         let (store, name) = (self.clone(), name.clone());
-        self.finished(async move {
+        self.run_to_completion(async move {
             let reservation = store.reserve_for(&name, bytes.len() as u64).await?;
             let _lock = store.stripe(&name).lock().await;
             // Content-addressed objects are equal anyway; only job documents need an atomic check.
             if new && name.folder() != Folder::Jobs && store.0.backend.head(&name).await?.is_some() {
                 return Ok(false);
             }
-            let kept =
+            let written =
                 upload::put(&store.0.backend, &name, bytes.clone(), new && name.folder() == Folder::Jobs).await?;
-            if kept {
+            if written {
                 store.commit(&name, bytes.len() as u64, Some(&bytes));
             }
             drop(reservation);
-            Ok(kept)
+            Ok(written)
         })
         .await
     }
@@ -142,7 +142,7 @@ impl Store {
     /// # Errors
     /// Returns a [`StoreError`]. A missing object is `None`, not an error, since objects may be removed at any time.
     pub async fn get(&self, name: &Name) -> Result<Option<Stored>, StoreError> {
-        if let Some((meta, bytes)) = self.recall(name) {
+        if let Some((meta, bytes)) = self.get_from_memory(name) {
             return Ok(Some(Stored { bytes, meta }));
         }
         let Some(seen) = self.begin_read(name) else { return Ok(None) };
@@ -164,7 +164,7 @@ impl Store {
     /// stream fails if the object is deleted during the read.
     pub async fn read(&self, name: &Name, range: Option<Range<u64>>) -> Result<Option<(Meta, ByteStream)>, StoreError> {
         let pin = self.pin(name);
-        let known = self.recall(name).map(|(meta, _)| meta);
+        let known = self.get_from_memory(name).map(|(meta, _)| meta);
         if known.is_none() && !self.0.backend.is_local() {
             return self.read_remote(name, range).await;
         }
@@ -230,7 +230,7 @@ impl Store {
     /// Returns a [`StoreError`]. The object still exists then.
     pub async fn delete(&self, name: &Name) -> Result<(), StoreError> {
         let (store, name) = (self.clone(), name.clone());
-        self.finished(async move {
+        self.run_to_completion(async move {
             let _lock = store.stripe(&name).lock().await;
             store.index().mark_removed(&name);
             store.remove(&name).await
@@ -324,7 +324,7 @@ impl Store {
     }
 
     /// Runs an operation to its end, even if the caller stops waiting.
-    pub(super) async fn finished<T: Send + 'static>(
+    pub(super) async fn run_to_completion<T: Send + 'static>(
         &self,
         work: impl Future<Output = Result<T, StoreError>> + Send + 'static,
     ) -> Result<T, StoreError> {
@@ -333,7 +333,7 @@ impl Store {
     }
 
     /// Returns a result from memory.
-    fn recall(&self, name: &Name) -> Option<(Meta, Bytes)> {
+    fn get_from_memory(&self, name: &Name) -> Option<(Meta, Bytes)> {
         if name.folder() != Folder::Results {
             return None;
         }

@@ -50,7 +50,7 @@ pub(super) struct Index {
     by_use: BTreeMap<Use, Name>,
     pins: BTreeMap<Name, usize>,
     /// Objects being removed: no longer readable, but still on disk.
-    leaving: BTreeSet<Name>,
+    removing: BTreeSet<Name>,
     /// Bytes and objects by folder, including objects being removed.
     totals: [(u64, u64); Folder::ALL.len()],
     /// Bytes reserved by writers, in folders that count against the capacity.
@@ -73,7 +73,7 @@ impl Index {
         self.entries.insert(name.clone(), Entry { bytes, used, version });
         let total = &mut self.totals[name.folder() as usize];
         *total = (total.0 + bytes, total.1 + 1);
-        self.show(name.folder());
+        self.update_metrics(name.folder());
     }
 
     /// Removes an object that no longer exists. Returns true if it was in the index.
@@ -83,7 +83,7 @@ impl Index {
         self.removals += 1;
         let total = &mut self.totals[name.folder() as usize];
         *total = (total.0 - entry.bytes, total.1 - 1);
-        self.show(name.folder());
+        self.update_metrics(name.folder());
         true
     }
 
@@ -99,18 +99,18 @@ impl Index {
     /// Starts a read. Returns `None` if the object is being removed.
     pub(super) fn begin_read(&self, name: &Name) -> Option<Seen> {
         let version = self.entries.get(name).map(|entry| entry.version);
-        (!self.leaving.contains(name)).then_some(Seen { version, removals: self.removals })
+        (!self.removing.contains(name)).then_some(Seen { version, removals: self.removals })
     }
 
     /// Returns true if the object exists and was not written since the read started.
     pub(super) fn is_current(&self, name: &Name, seen: Seen) -> bool {
         let version = self.entries.get(name).map(|entry| entry.version);
-        version.is_some() && version == seen.version && !self.leaving.contains(name)
+        version.is_some() && version == seen.version && !self.removing.contains(name)
     }
 
     /// Adds an object that a read found, because another process wrote it.
     pub(super) fn adopt(&mut self, name: &Name, seen: Seen, bytes: u64, used: SystemTime) {
-        let unknown = !self.entries.contains_key(name) && !self.leaving.contains(name);
+        let unknown = !self.entries.contains_key(name) && !self.removing.contains(name);
         if unknown && seen.version.is_none() && seen.removals == self.removals {
             self.commit(name, bytes, used);
         }
@@ -129,8 +129,8 @@ impl Index {
         }
     }
 
-    fn may_go(&self, name: &Name) -> bool {
-        !self.pins.contains_key(name) && !self.leaving.contains(name)
+    fn is_removable(&self, name: &Name) -> bool {
+        !self.pins.contains_key(name) && !self.removing.contains(name)
     }
 
     /// Returns the objects whose time to live has expired, oldest first.
@@ -138,7 +138,7 @@ impl Index {
         self.by_use
             .iter()
             .filter(|((used, _), name)| now.duration_since(*used).is_ok_and(|age| age >= ttl(name.folder())))
-            .filter(|(_, name)| self.may_go(name))
+            .filter(|(_, name)| self.is_removable(name))
             .filter_map(|(used, name)| self.candidate(name, *used))
             .collect()
     }
@@ -147,7 +147,7 @@ impl Index {
     pub(super) fn reserve(&mut self, bytes: u64, cap: u64) -> Result<(), ReserveError> {
         let (candidates, missing) = self.excess(bytes, cap);
         if missing > 0 {
-            let taken = self.taken() - candidates.iter().map(|candidate| candidate.bytes).sum::<u64>();
+            let taken = self.used_bytes() - candidates.iter().map(|candidate| candidate.bytes).sum::<u64>();
             return Err(ReserveError::Held(taken));
         }
         if !candidates.is_empty() {
@@ -160,13 +160,13 @@ impl Index {
     /// Returns the least recently used objects to evict so that `bytes` more fit into `cap`, and the bytes that are
     /// missing even then.
     pub(super) fn excess(&self, bytes: u64, cap: u64) -> (Vec<EvictionCandidate>, u64) {
-        let mut missing = self.taken().saturating_add(bytes).saturating_sub(cap);
+        let mut missing = self.used_bytes().saturating_add(bytes).saturating_sub(cap);
         let mut candidates = Vec::new();
         for (used, name) in &self.by_use {
             if missing == 0 {
                 break;
             }
-            if name.folder().is_capped() && self.may_go(name) {
+            if name.folder().is_capped() && self.is_removable(name) {
                 let Some(candidate) = self.candidate(name, *used) else { continue };
                 missing = missing.saturating_sub(candidate.bytes);
                 candidates.push(candidate);
@@ -176,7 +176,7 @@ impl Index {
     }
 
     /// Returns the bytes that count against the capacity: on disk and reserved.
-    fn taken(&self) -> u64 {
+    fn used_bytes(&self) -> u64 {
         let capped = Folder::ALL.into_iter().filter(|folder| folder.is_capped());
         capped.map(|folder| self.total(folder).0).sum::<u64>() + self.reserved
     }
@@ -192,18 +192,18 @@ impl Index {
 
     /// Marks an object as being removed, unconditionally.
     pub(super) fn mark_removed(&mut self, name: &Name) {
-        self.leaving.insert(name.clone());
+        self.removing.insert(name.clone());
     }
 
     /// Marks a candidate as being removed, unless it was used, written or pinned since it was chosen.
     pub(super) fn begin_removal(&mut self, candidate: &EvictionCandidate) -> bool {
         let unchanged = self.entries.get(&candidate.name).is_some_and(|entry| entry.used == candidate.used);
-        unchanged && self.may_go(&candidate.name) && self.leaving.insert(candidate.name.clone())
+        unchanged && self.is_removable(&candidate.name) && self.removing.insert(candidate.name.clone())
     }
 
     /// Ends a removal. If it failed, the object becomes readable again.
     pub(super) fn end_removal(&mut self, name: &Name, gone: bool) {
-        self.leaving.remove(name);
+        self.removing.remove(name);
         if gone {
             self.forget(name);
         }
@@ -215,7 +215,7 @@ impl Index {
     }
 
     /// Updates the metrics of a folder.
-    pub(super) fn show(&self, folder: Folder) {
+    pub(super) fn update_metrics(&self, folder: Folder) {
         let (bytes, objects) = self.total(folder);
         gauge!(STORE_BYTES, "folder" => folder.as_str()).set(bytes as f64);
         gauge!(STORE_OBJECTS, "folder" => folder.as_str()).set(objects as f64);
@@ -235,24 +235,24 @@ mod tests {
     }
 
     #[test]
-    fn a_read_is_current_until_somebody_writes_or_removes() {
+    fn a_read_is_current_until_a_write_or_removal() {
         let mut index = Index::default();
         index.commit(&name("a"), 5, at(1));
         let seen = index.begin_read(&name("a")).unwrap();
         assert!(index.is_current(&name("a"), seen));
         index.touch(&name("a"), at(2));
-        assert!(index.is_current(&name("a"), seen), "a use changes nothing");
+        assert!(index.is_current(&name("a"), seen), "a use does not outdate a read");
         index.commit(&name("a"), 5, at(3));
         assert!(!index.is_current(&name("a"), seen));
         let seen = index.begin_read(&name("a")).unwrap();
         index.mark_removed(&name("a"));
         assert!(!index.is_current(&name("a"), seen) && index.begin_read(&name("a")).is_none());
         index.end_removal(&name("a"), false);
-        assert!(index.is_current(&name("a"), seen), "it could not be removed");
+        assert!(index.is_current(&name("a"), seen), "the removal failed");
     }
 
     #[test]
-    fn what_was_removed_during_a_read_is_not_adopted() {
+    fn a_removal_during_a_read_prevents_adoption() {
         let mut index = Index::default();
         let seen = index.begin_read(&name("a")).unwrap();
         index.adopt(&name("a"), seen, 7, at(1));
@@ -264,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn a_victim_that_is_used_or_pinned_stays() {
+    fn used_or_pinned_candidates_are_not_evicted() {
         let mut index = Index::default();
         for (id, used) in [("a", 1), ("b", 2), ("c", 3)] {
             index.commit(&name(id), 10, at(used));

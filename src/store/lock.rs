@@ -1,7 +1,7 @@
-//! The lock of a data folder: one service at a time writes to it.
+//! Lock of a data folder, so that only one service writes to it.
 //!
 //! The operating system holds the lock for the open file and releases it when the process ends, however it ends. The
-//! text in the file only says who holds it.
+//! text in the file only describes the holder.
 
 use std::fmt;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -43,7 +43,7 @@ pub enum LockError {
 #[derive(Debug, Serialize, Deserialize)]
 struct Holder {
     pid: u32,
-    /// Absent where the operating system does not say.
+    /// Host name; absent if the operating system does not provide it.
     host: Option<String>,
     address: SocketAddr,
     /// Start time, RFC 3339.

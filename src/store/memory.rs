@@ -33,7 +33,7 @@ impl Memory {
         Self { cache: Cache::with_weighter(items, bytes, Weight), largest }
     }
 
-    fn takes(&self, name: &Name, bytes: u64) -> bool {
+    fn accepts(&self, name: &Name, bytes: u64) -> bool {
         name.folder() == Folder::Results && bytes <= self.largest
     }
 
@@ -43,7 +43,7 @@ impl Memory {
 
     /// Caches a result if it is small enough. Drops an existing entry in any case.
     pub(super) fn put(&self, name: &Name, meta: Meta, bytes: &Bytes) {
-        if self.takes(name, bytes.len() as u64) {
+        if self.accepts(name, bytes.len() as u64) {
             self.cache.insert(name.clone(), (meta, bytes.clone()));
         } else {
             self.remove(name);

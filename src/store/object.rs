@@ -49,7 +49,7 @@ pub struct Usage {
 
 /// Protects an object from eviction; see [`Store::pin`].
 #[derive(Debug)]
-#[must_use = "the name is let go when the pin is dropped"]
+#[must_use = "dropping the pin releases the name"]
 pub struct Pin {
     store: Store,
     name: Name,

@@ -140,7 +140,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn urls_name_a_bucket_and_perhaps_a_prefix() {
+    fn urls_have_a_bucket_and_an_optional_prefix() {
         let of = |url| split(url).map(|(bucket, prefix)| (bucket, prefix.to_string()));
         assert_eq!(of("s3://meshes"), Some(("meshes", String::new())));
         assert_eq!(of("s3://meshes/"), Some(("meshes", String::new())));
@@ -153,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn uploads_are_read_and_what_is_broken_is_left_alone() {
+    fn uploads_are_parsed_and_malformed_ones_ignored() {
         let upload = |key: &str, time: &str| {
             format!("<Upload>\n<Key>{key}</Key><UploadId> x1 </UploadId><Initiated>{time}</Initiated></Upload>")
         };

@@ -78,12 +78,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_keeps_its_secret_for_its_owner_alone() {
+    fn a_folder_keeps_its_secret_readable_only_by_its_owner() {
         let [dir, other] = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
         let first = in_folder(dir.path()).unwrap();
         assert_eq!(in_folder(dir.path()).unwrap(), first);
         assert_ne!(in_folder(other.path()).unwrap(), first);
-        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "nothing staged is left");
+        assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "no staged file remains");
         #[cfg(unix)]
         {
             use std::os::unix::fs::PermissionsExt as _;

@@ -1,4 +1,4 @@
-//! Tests with injected disk faults, and of the classification of errors.
+//! Tests of disk faults and of the classification of errors.
 
 use std::io;
 use std::path::PathBuf;
@@ -25,7 +25,7 @@ fn files(dir: &TempDir) -> Vec<PathBuf> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_full_disk_is_named_and_nothing_is_lost() {
+async fn a_full_disk_is_reported_and_stored_objects_remain() {
     let (dir, faults, store) = faulty(8 << 20).await;
     store.put(&name(1), body(1000)).await.unwrap();
     faults.full.store(true, Ordering::Relaxed);
@@ -53,7 +53,7 @@ async fn a_full_disk_is_named_and_nothing_is_lost() {
 }
 
 #[tokio::test]
-async fn what_cannot_be_removed_stays_and_counts() {
+async fn objects_that_cannot_be_removed_still_count() {
     let (_dir, faults, store) = faulty(1000).await;
     store.put(&name(1), body(600)).await.unwrap();
     faults.stuck.store(true, Ordering::Relaxed);
@@ -72,8 +72,8 @@ async fn what_cannot_be_removed_stays_and_counts() {
 }
 
 #[test]
-fn errors_are_sorted_by_what_is_to_be_done() {
-    let of = |error: &object_store::Error| StoreError::sort("put", "here", error);
+fn errors_are_classified() {
+    let of = |error: &object_store::Error| StoreError::classify("put", "here", error);
     for kind in [io::ErrorKind::StorageFull, io::ErrorKind::QuotaExceeded] {
         assert!(matches!(of(&error(kind)), StoreError::NoSpace { .. }), "{kind}");
     }

@@ -9,7 +9,7 @@ use super::backend::Backend;
 use super::error::StoreError;
 use super::name::Name;
 
-/// Concurrent parts: enough to use a connection with latency, and a bound of the memory.
+/// Concurrent parts. Hides the latency of a connection and bounds the memory.
 const PARTS: usize = 3;
 
 /// Multipart upload in progress.
@@ -53,7 +53,7 @@ impl<'a> Upload<'a> {
     pub(super) async fn abort(self) {
         if let Err(error) = self.parts.abort().await {
             let error = self.backend.fail("abort", &self.name.to_string(), &error);
-            tracing::warn!(%error, "an unfinished object was left behind; it is removed when it is an hour old");
+            tracing::warn!(%error, "an unfinished object was not removed; it will be removed when it is one hour old");
         }
     }
 }

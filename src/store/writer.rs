@@ -1,4 +1,4 @@
-//! Writers for blocking threads: an encoder writes, the runtime stores, with little buffering in between.
+//! Writers for blocking threads. The runtime stores the bytes that an encoder writes, with little buffering in between.
 
 use std::io;
 
@@ -41,7 +41,7 @@ impl Store {
         let (store, name) = (self.clone(), name.clone());
         self.0.runtime.spawn(async move {
             // The receiver is gone if the writer was dropped.
-            let _unheard = done.send(receive(&store, &name, length, from).await);
+            let _sent = done.send(receive(&store, &name, length, from).await);
         });
         Writer { filling: BytesMut::new(), part: self.0.backend.part(), to: Some(to), outcome: Some(outcome) }
     }

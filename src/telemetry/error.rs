@@ -1,4 +1,4 @@
-//! Errors of setting up logs, metrics and traces.
+//! Error of setting up logs, metrics and traces.
 
 use thiserror::Error;
 

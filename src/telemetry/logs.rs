@@ -1,4 +1,4 @@
-//! The log subscriber and the panic hook.
+//! Log subscriber and panic hook.
 
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::util::SubscriberInitExt as _;
@@ -6,10 +6,10 @@ use tracing_subscriber::util::SubscriberInitExt as _;
 use super::TelemetryError;
 use crate::config::{LogConfig, LogFormat};
 
-/// Whether logs could be set up so.
+/// Checks the log configuration.
 ///
 /// # Errors
-/// [`TelemetryError::Filter`].
+/// Returns [`TelemetryError::Filter`] if the filter is invalid.
 pub fn check_logs(config: &LogConfig) -> Result<(), TelemetryError> {
     filter(config).map(|_filter| ())
 }
@@ -19,10 +19,10 @@ fn filter(config: &LogConfig) -> Result<EnvFilter, TelemetryError> {
         .map_err(|e| TelemetryError::Filter { filter: config.filter.clone(), reason: e.to_string() })
 }
 
-/// Sends logs to standard error and panics to the log.
+/// Installs the logger, which writes to standard error, and a panic hook that logs panics.
 ///
 /// # Errors
-/// [`TelemetryError`].
+/// Returns a [`TelemetryError`] if the filter is invalid or another logger is installed.
 pub fn init_logs(config: &LogConfig) -> Result<(), TelemetryError> {
     let filter = filter(config)?;
     let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);

@@ -1,20 +1,20 @@
-//! What a metric is: name, kind, labels with what bounds them, and the sentence that is its documentation and its help text.
+//! Description of a metric: name, kind, labels and help text.
 
-/// How a metric moves.
+/// Kind of a metric.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// It only rises, by whole numbers.
+    /// Counter of integers.
     Counter,
-    /// It only rises, by fractions: seconds.
+    /// Counter of seconds, with fractions.
     Seconds,
-    /// It rises and falls.
+    /// Value that rises and falls.
     Gauge,
-    /// It counts values in buckets.
+    /// Counts of values by bucket.
     Histogram,
 }
 
 impl Kind {
-    /// Its name in the exposition format.
+    /// Returns the name of the kind in the exposition format.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -25,31 +25,32 @@ impl Kind {
     }
 }
 
-/// A label: its name, and what bounds its values. A closed list is written as `a|b|c`, anything else in words.
+/// Label of a metric.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Label {
-    /// Its name.
+    /// Name.
     pub name: &'static str,
-    /// Its values, or what bounds them.
+    /// Allowed values: a closed list such as `a|b|c`, or a description.
     pub values: &'static str,
 }
 
 impl Label {
-    /// The values, where they are a closed list.
+    /// Returns the values if they are a closed list.
     #[must_use]
     pub fn closed(&self) -> Option<impl Iterator<Item = &'static str>> {
         (!self.values.contains(' ')).then(|| self.values.split('|'))
     }
 }
 
-/// A metric as it is described to people and to Prometheus.
+/// Description of a metric.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Metric {
-    /// Its name: prefix `molmesh_` but for those that are named alike everywhere, base units, `_total` on counters.
+    /// Name with the base unit, and `_total` for counters. The prefix is `molmesh_`, except for names that are
+    /// standard.
     pub name: &'static str,
-    /// How it moves.
+    /// Kind.
     pub kind: Kind,
-    /// Its labels. Ids are never among them.
+    /// Labels. Ids are never labels.
     pub labels: &'static [Label],
     help: &'static [&'static str],
 }
@@ -64,7 +65,7 @@ impl Metric {
         Self { name, kind, labels, help }
     }
 
-    /// What it says, in a sentence or two.
+    /// Returns the help text.
     #[must_use]
     pub fn help(&self) -> String {
         self.help.iter().map(|line| line.trim()).collect::<Vec<_>>().join(" ")

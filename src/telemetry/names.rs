@@ -1,7 +1,7 @@
-//! Every metric of the service. The comment of each is its help text too.
+//! All metrics of the service. The doc comment of a metric is also its help text.
 //!
-//! Names follow Prometheus: prefix `molmesh_`, base units, `_total` on counters, no ids as labels. Those of HTTP are named as
-//! OpenTelemetry names them, those of the process as every exporter does.
+//! Names follow the conventions of Prometheus: prefix `molmesh_`, base units, `_total` for counters, no ids as labels.
+//! HTTP metrics have the names of OpenTelemetry, process metrics those of the Prometheus client libraries.
 
 use super::metrics::{Kind, Label, Metric};
 
@@ -9,7 +9,7 @@ macro_rules! metrics {
     ($($(#[doc = $help:literal])+ $constant:ident = $name:literal, $kind:ident $(, $label:ident: $values:literal)*;)+) => {
         $($(#[doc = $help])+ pub const $constant: &str = $name;)+
 
-        /// Every metric, in the order in which they are documented.
+        /// All metrics, in the order of the documentation.
         pub const METRICS: &[Metric] = &[$(
             Metric::new(
                 $name,
@@ -22,53 +22,53 @@ macro_rules! metrics {
 }
 
 metrics! {
-    /// Time of a request until its answer is sent, to the last byte.
+    /// Time from a request to the last byte of its response.
     HTTP_DURATION = "http_server_request_duration_seconds", Histogram,
         method: "GET|HEAD|POST|OPTIONS|PUT|DELETE|PATCH|other", route: "paths of the interface, or `unmatched`",
         status: "HTTP statuses, or `none` where the client left first";
-    /// Requests that are being answered.
+    /// Requests in progress.
     HTTP_ACTIVE = "http_server_active_requests", Gauge,
         method: "GET|HEAD|POST|OPTIONS|PUT|DELETE|PATCH|other";
-    /// Bytes of a request's body that were read.
+    /// Bytes read of a request body.
     HTTP_REQUEST_SIZE = "http_server_request_body_size_bytes", Histogram,
         method: "GET|HEAD|POST|OPTIONS|PUT|DELETE|PATCH|other", route: "paths of the interface, or `unmatched`",
         status: "HTTP statuses, or `none` where the client left first";
-    /// Bytes of an answer's body that were sent.
+    /// Bytes sent of a response body.
     HTTP_RESPONSE_SIZE = "http_server_response_body_size_bytes", Histogram,
         method: "GET|HEAD|POST|OPTIONS|PUT|DELETE|PATCH|other", route: "paths of the interface, or `unmatched`",
         status: "HTTP statuses, or `none` where the client left first";
     /// Open connections.
     CONNECTIONS = "molmesh_connections", Gauge;
-    /// Requests refused by a limit, by the slug of the problem's type, or by the timeout that has none.
+    /// Requests rejected by a limit, by the slug of the problem type, or by the timeout.
     REJECTED = "molmesh_requests_rejected_total", Counter, reason: "slugs of problem types, `header-timeout`, `write-timeout`";
     /// Response bodies that are being sent.
     BODIES_OPEN = "molmesh_response_bodies_open", Gauge;
-    /// Clients whose quotas are counted one by one.
+    /// Clients with a quota of their own.
     QUOTA_CLIENTS = "molmesh_quota_clients", Gauge;
-    /// Jobs accepted, by mode and by whether they took part in work that was in the house.
+    /// Accepted jobs, by mode and by whether they joined an identical running job.
     JOBS_SUBMITTED = "molmesh_jobs_submitted_total", Counter, mode: "sync|async", dedup: "yes|no";
-    /// Jobs that ended.
+    /// Completed jobs, by outcome.
     JOBS_FINISHED = "molmesh_jobs_finished_total", Counter, outcome: "successful|failed|dismissed|panicked";
-    /// Promised jobs that have not ended.
+    /// Asynchronous jobs that have not ended.
     JOBS_OPEN = "molmesh_jobs_open", Gauge;
-    /// Promised jobs of earlier processes that were taken up again.
+    /// Asynchronous jobs of earlier processes that were resumed.
     JOBS_RECOVERED = "molmesh_jobs_recovered_total", Counter;
-    /// Jobs that another backend served in place of the chosen one.
+    /// Jobs that a fallback backend ran instead of the selected one.
     JOBS_FALLBACK = "molmesh_jobs_fallback_total", Counter;
-    /// Time per stage of a job.
+    /// Time of each stage of a job.
     STAGE_DURATION = "molmesh_job_stage_duration_seconds", Histogram,
         stage: "queue|check|read|select|bin|field|classify|scan|interpolate|emit|write|measure|roundtrip|encode";
-    /// Results of synchronous requests that were not kept.
+    /// Results of synchronous requests that were not stored.
     RESULTS_NOT_KEPT = "molmesh_results_not_kept_total", Counter, reason: "busy|failed";
-    /// Jobs that wait.
+    /// Jobs waiting in the queue.
     QUEUE_DEPTH = "molmesh_queue_depth", Gauge;
-    /// How long the oldest job has waited.
+    /// Time for which the oldest job in the queue has waited.
     QUEUE_AGE = "molmesh_queue_oldest_age_seconds", Gauge;
-    /// How long a job that is accepted now would wait.
+    /// Estimated time that a new job would wait in the queue.
     QUEUE_WAIT = "molmesh_queue_estimated_wait_seconds", Gauge;
     /// Bytes of uploads and meshes held in memory.
     MEMORY_HELD = "molmesh_memory_held_bytes", Gauge;
-    /// Samples at which the density was evaluated.
+    /// Grid points at which the density was evaluated.
     VOXELS = "molmesh_voxels_processed_total", Counter;
     /// Triangles of finished meshes.
     TRIANGLES = "molmesh_triangles_emitted_total", Counter;
@@ -90,44 +90,45 @@ metrics! {
     DEVICE_SHARED = "molmesh_device_shared_submissions_total", Counter, device: "numbers of devices in use";
     /// Partitions of multi-device jobs that a device finished.
     DEVICE_PARTITIONS = "molmesh_device_partitions_total", Counter, device: "numbers of devices in use";
-    /// Results asked for: of those that memory misses, the store is asked.
+    /// Lookups of results. The store is asked if the memory cache misses.
     CACHE_REQUESTS = "molmesh_cache_requests_total", Counter, tier: "memory|store", result: "hit|miss";
-    /// Bytes kept in the store.
+    /// Bytes in the store.
     STORE_BYTES = "molmesh_store_bytes", Gauge, folder: "folders of the store";
-    /// Objects kept in the store.
+    /// Objects in the store.
     STORE_OBJECTS = "molmesh_store_objects", Gauge, folder: "folders of the store";
-    /// Objects that the store removed by itself.
+    /// Objects that the store evicted or that expired.
     STORE_REMOVED = "molmesh_store_removed_total", Counter, reason: "ttl|cap";
-    /// Operations of the store that failed.
+    /// Failed operations of the store.
     STORE_ERRORS = "molmesh_store_errors_total", Counter, op: "operations of a store";
-    /// Questions for an entry of the archive.
+    /// Lookups of archive entries.
     ARCHIVE_REQUESTS = "molmesh_archive_requests_total", Counter, source: "local|cache|remote",
         result: "known|found|absent|unchanged|stale|corrupt|failed|too-large|unavailable";
-    /// Time of fetching an entry from the remote archive, every attempt and pause included.
+    /// Time to fetch an entry from the remote archive, including all attempts and pauses.
     ARCHIVE_FETCH = "molmesh_archive_fetch_seconds", Histogram, result: "found|unchanged|absent|too-large|unavailable";
-    /// 1 while a host of the remote archive is left alone, else 0.
+    /// 1 while the circuit breaker of a host of the remote archive is open, else 0.
     ARCHIVE_BREAKER = "molmesh_archive_breaker_open", Gauge, host: "hosts of `archive.url`";
-    /// Bytes of copies of archive entries on disk.
+    /// Bytes of cached archive entries on disk.
     ARCHIVE_KEPT = "molmesh_archive_cache_bytes", Gauge;
-    /// Spans sent to the trace collector, by the result of their batch. Spans dropped from a full queue are logged instead.
+    /// Spans sent to the trace collector, by the result of their batch. Spans dropped from a full queue are logged
+    /// instead.
     TRACE_SPANS = "molmesh_trace_spans_total", Counter, result: "exported|failed";
-    /// Panics that were caught.
+    /// Caught panics.
     PANICS = "molmesh_panics_total", Counter, place: "job|http";
-    /// 1, labelled with the version.
+    /// Always 1; the label is the version.
     BUILD_INFO = "molmesh_build_info", Gauge, version: "the version of this process";
-    /// Processor time of the process, of all its threads.
+    /// Processor time of all threads of the process.
     PROCESS_CPU = "process_cpu_seconds_total", Seconds;
-    /// Memory of the process that is in RAM.
+    /// Resident memory of the process.
     PROCESS_RESIDENT = "process_resident_memory_bytes", Gauge;
-    /// Address space of the process.
+    /// Virtual memory of the process.
     PROCESS_VIRTUAL = "process_virtual_memory_bytes", Gauge;
     /// Open file descriptors.
     PROCESS_FDS = "process_open_fds", Gauge;
-    /// File descriptors that may be open.
+    /// Maximum number of open file descriptors.
     PROCESS_MAX_FDS = "process_max_fds", Gauge;
     /// Threads of the process.
     PROCESS_THREADS = "process_threads", Gauge;
-    /// When the process was started, in seconds since 1970.
+    /// Start time of the process, in seconds since 1970.
     PROCESS_START = "process_start_time_seconds", Gauge;
 }
 

@@ -1,6 +1,6 @@
-//! What the system knows of this process, looked up whenever somebody asks for the metrics. Linux alone tells.
+//! Metrics of this process, read from the system on every scrape. Only available on Linux.
 
-/// Publishes memory, processor time, descriptors and threads.
+/// Updates memory, processor time, file descriptors and threads.
 pub(super) fn publish() {
     #[cfg(target_os = "linux")]
     linux::publish();
@@ -19,10 +19,10 @@ mod linux {
         PROCESS_CPU, PROCESS_FDS, PROCESS_MAX_FDS, PROCESS_RESIDENT, PROCESS_START, PROCESS_THREADS, PROCESS_VIRTUAL,
     };
 
-    /// When the process was started: its age by the clock that sleeps with the machine, subtracted once.
+    /// Start time of the process, in seconds since 1970: the current time minus its age by the boot-time clock.
     static STARTED: LazyLock<Option<f64>> = LazyLock::new(|| {
         let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
-        // The name of the process, in parentheses, may hold anything; what follows it is counted from the third field on.
+        // The process name, in parentheses, may contain any character. The fields after it start with the third.
         let ticks: u64 = stat.rsplit_once(')')?.1.split_whitespace().nth(19)?.parse().ok()?;
         let since_boot = Duration::try_from_secs_f64(ticks as f64 / rustix::param::clock_ticks_per_second() as f64);
         let age = Duration::try_from(clock_gettime(ClockId::Boottime)).ok()?.saturating_sub(since_boot.ok()?);
@@ -51,11 +51,11 @@ mod linux {
             }
         }
         if let Ok(open) = std::fs::read_dir("/proc/self/fd") {
-            // Reading the folder opens one.
+            // Reading the folder opens a descriptor itself.
             gauge!(PROCESS_FDS).set(open.count().saturating_sub(1) as f64);
         }
-        if let Some(most) = getrlimit(Resource::Nofile).current {
-            gauge!(PROCESS_MAX_FDS).set(most as f64);
+        if let Some(limit) = getrlimit(Resource::Nofile).current {
+            gauge!(PROCESS_MAX_FDS).set(limit as f64);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The recorder of metrics, and the text that Prometheus reads.
+//! Metrics recorder and the text format of Prometheus.
 
 use std::sync::OnceLock;
 
@@ -11,10 +11,10 @@ use super::names::{
 };
 use super::{TelemetryError, process};
 
-/// Buckets of durations, seconds: from a cached answer to the deadline, about three a decade.
+/// Buckets of durations, seconds: from a cached response to the deadline, about three per decade.
 const SECONDS: [f64; 16] =
     [0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0];
-/// Buckets of sizes, bytes: from a problem to the largest mesh, in powers of four.
+/// Buckets of sizes, bytes: from a problem document to the largest mesh, in powers of four.
 const BYTES: [f64; 12] = [
     0.0,
     1024.0,
@@ -30,33 +30,33 @@ const BYTES: [f64; 12] = [
     1_073_741_824.0,
 ];
 
-/// The recorder of this process.
+/// Metrics recorder of this process.
 #[derive(Clone)]
 pub struct Recorder(PrometheusHandle);
 
 impl Recorder {
-    /// Everything that is measured, in Prometheus' text format. Looks at the process, which takes system calls.
+    /// Returns all metrics in the text format of Prometheus. Reads the process metrics with system calls.
     #[must_use]
     pub fn render(&self) -> String {
         process::publish();
         let text = self.0.render();
-        // Counters hold whole numbers; those of seconds are gauges that only rise, and are called what they are.
+        // The recorder's counters are integers, so counters of seconds are recorded as gauges. Correct their type.
         METRICS.iter().filter(|metric| metric.kind == Kind::Seconds).fold(text, |text, metric| {
             let line = |kind: &str| format!("# TYPE {} {kind}\n", metric.name);
             text.replace(&line("gauge"), &line(metric.kind.name()))
         })
     }
 
-    /// Tidies up histograms; to be called every few seconds.
+    /// Drains the buffers of histograms. Call it every few seconds.
     pub fn run_upkeep(&self) {
         self.0.run_upkeep();
     }
 }
 
-/// The recorder of this process, installed by the first caller.
+/// Returns the recorder of this process. The first call installs it.
 ///
 /// # Errors
-/// [`TelemetryError::Install`] if somebody else installed another one.
+/// Returns [`TelemetryError::Install`] if another recorder is installed.
 pub fn recorder() -> Result<Recorder, TelemetryError> {
     static RECORDER: OnceLock<Result<Recorder, String>> = OnceLock::new();
     let installed = RECORDER.get_or_init(|| {
@@ -77,8 +77,8 @@ pub fn recorder() -> Result<Recorder, TelemetryError> {
     installed.clone().map_err(|reason| TelemetryError::Install { what: "the metrics recorder", reason })
 }
 
-/// Gives a metric its help text, and a value where all of its series are known beforehand: whoever asks how fast something
-/// rises must have seen it at zero.
+/// Sets the help text of a metric. If all its series are known, also sets their initial value: rates are only correct
+/// if the first scrape contains a zero.
 fn describe(metric: &Metric) {
     let (name, help) = (metric.name, metric.help());
     let unit = if name.contains("_seconds") {
@@ -112,7 +112,7 @@ fn describe(metric: &Metric) {
         match metric.kind {
             Kind::Counter => metrics::counter!(name, labels).increment(0),
             Kind::Gauge => metrics::gauge!(name, labels).set(0.0),
-            // A bucket that was never filled says nothing, and seconds belong to devices and processes that exist.
+            // Empty histograms are not useful, and counters of seconds belong to existing devices and processes.
             Kind::Histogram | Kind::Seconds => {}
         }
     }

@@ -1,4 +1,4 @@
-//! Trace spans: those of the OpenTelemetry SDK, together with the request id that log lines name.
+//! Trace spans of the OpenTelemetry SDK, with the request id that log lines contain.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -173,8 +173,8 @@ impl TraceSpan {
     }
 }
 
-/// Reads `traceparent` and `tracestate` of W3C Trace Context. Returns `None` for an invalid `traceparent` and ignores an
-/// invalid `tracestate`.
+/// Reads `traceparent` and `tracestate` of W3C Trace Context. Returns `None` for an invalid `traceparent` and ignores
+/// an invalid `tracestate`.
 #[must_use]
 pub fn read_trace_context(traceparent: &str, tracestate: &str) -> Option<SpanContext> {
     let headers = [("traceparent", traceparent), ("tracestate", tracestate)];

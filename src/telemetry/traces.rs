@@ -45,7 +45,7 @@ impl Traces {
     /// Sets up the tracer provider and starts the export thread if the configuration names a collector.
     ///
     /// # Errors
-    /// [`TelemetryError::Install`] if the HTTP client cannot be built.
+    /// Returns [`TelemetryError::Install`] if the HTTP client cannot be built.
     pub fn start(config: &TelemetryConfig) -> Result<Self, TelemetryError> {
         let Some(endpoint) = &config.endpoint else { return Ok(Self::off()) };
         let batch = BatchConfigBuilder::default()
@@ -87,7 +87,7 @@ impl Traces {
     }
 }
 
-/// Starts a provider that samples this part of the traces that begin here; for others, the parent decides.
+/// Returns a builder that samples this fraction of new traces. Otherwise, the parent decides.
 fn provider(sample_ratio: f64) -> TracerProviderBuilder {
     let sampler = Sampler::ParentBased(Box::new(Sampler::TraceIdRatioBased(sample_ratio)));
     SdkTracerProvider::builder().with_sampler(sampler)

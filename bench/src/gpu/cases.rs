@@ -1,4 +1,4 @@
-//! The cases: structures at grid spacings.
+//! Benchmark cases: structures at grid spacings.
 
 use std::path::Path;
 
@@ -8,40 +8,40 @@ use molmesh::surface::{Spheres, SurfaceOptions, SurfaceParams};
 use crate::error::{Error, Result};
 use crate::{grid, structures};
 
-/// Cubes of the 2010 paper's largest structure, 1BIJ, which 2HHB replaces.
+/// Number of cubes of the largest structure of the 2010 paper, 1BIJ, which 2HHB replaces.
 const PAPER_CUBES: u64 = 7_267_456;
 
-/// A source of atoms.
+/// Source of atoms.
 #[derive(Debug, Clone, Copy)]
 enum Source {
-    /// The atoms of these kinds of an entry, repeated `copies` times along x and y.
+    /// Atoms of these kinds of an entry, with `copies` copies along x and y.
     File { id: &'static str, kinds: &'static str, copies: usize },
-    /// A ball of this many generated atoms.
+    /// Ball of this number of generated atoms.
     Ball(usize),
 }
 
-/// A grid spacing.
+/// Choice of the grid spacing.
 #[derive(Debug, Clone, Copy)]
 enum Spacing {
-    /// Å.
+    /// Given spacing, Å.
     Is(f64),
-    /// The spacing at which the box has this many cells.
+    /// Spacing at which the bounding box has this number of cells.
     Cells(u64),
 }
 
-/// A structure at a spacing.
+/// Structure at a grid spacing.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Case {
-    /// Its name, for `--only`.
+    /// Name, for `--only`.
     pub(super) name: &'static str,
     source: Source,
     spacing: Spacing,
 }
 
-/// Makes gigabytes of mesh.
+/// Case with gigabytes of mesh.
 const HUGE: &str = "7cgo-x9-0.5";
 
-/// Returns the cases whose names contain `only`, [`HUGE`] only by its whole name; the generated case has `atoms` atoms.
+/// Returns the cases whose names contain `only`; [`HUGE`] must be named in full. The generated case has `atoms` atoms.
 pub(super) fn selected(atoms: usize, only: &str) -> Vec<Case> {
     let file = |name, id, kinds, copies, spacing| Case { name, source: Source::File { id, kinds, copies }, spacing };
     let all = [
@@ -58,10 +58,10 @@ pub(super) fn selected(atoms: usize, only: &str) -> Vec<Case> {
 }
 
 impl Case {
-    /// Loads the spheres, and the default surface at the case's spacing.
+    /// Loads the spheres. Returns them with the default parameters at the case's spacing.
     ///
     /// # Errors
-    /// [`Error`] if the file is missing or holds no structure.
+    /// Returns an [`Error`] if the file is missing or contains no structure.
     pub(super) fn load(&self, folder: Option<&Path>) -> Result<(Spheres, SurfaceParams)> {
         let spheres = match self.source {
             Source::Ball(n) => structures::ball(n, 1)?,
@@ -93,7 +93,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn gigabytes_are_measured_only_by_name() {
+    fn the_huge_case_is_measured_only_by_name() {
         let names = |only| selected(1, only).iter().map(|case| case.name).collect::<Vec<_>>();
         assert_eq!(names("x9"), ["7cgo-x9-1.0"]);
         assert_eq!(names(HUGE), [HUGE]);
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_file_is_named() {
+    fn missing_files_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let [case] = selected(1, "2hhb")[..] else { panic!("one case") };
         assert!(case.load(Some(folder.path())).unwrap_err().to_string().contains("no file 2hhb"));

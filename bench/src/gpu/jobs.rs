@@ -1,4 +1,4 @@
-//! Many small jobs on one device: one per submission, and several together.
+//! Throughput of small jobs on one device, alone and in batches.
 
 use std::time::Instant;
 
@@ -9,16 +9,16 @@ use serde_json::{Value, json};
 
 use super::prepare;
 use crate::error::{Error, Result};
-use crate::{say, structures};
+use crate::{print, structures};
 
-/// Atoms of a job.
+/// Atoms per job.
 const ATOMS: usize = 600;
-/// Different structures, which the jobs take in turn.
+/// Number of different structures, used in turn.
 const STRUCTURES: u64 = 32;
 /// Jobs per call of the engine.
 const BATCHES: [usize; 4] = [1, 8, 32, 128];
 
-/// The rate at one batch size.
+/// Throughput at one batch size.
 #[derive(Debug, Serialize)]
 struct Rate {
     batch: usize,
@@ -35,8 +35,8 @@ pub(super) fn run(engine: &mut Engine, n: usize) -> Result<Value> {
         .map(|seed| prepare(&structures::ball(ATOMS, seed)?, &SurfaceParams::default()))
         .collect::<Result<_>>()?;
     let prepare_ms = start.elapsed().as_secs_f64() * 1e3 / STRUCTURES as f64;
-    say(&format!("jobs of {ATOMS} atoms at 0.5 Å, prepared in advance ({prepare_ms:.2} ms each on one thread)\n"))?;
-    say("     batch    jobs         s      jobs/s   triangles/job\n")?;
+    print(&format!("jobs of {ATOMS} atoms at 0.5 Å, prepared in advance ({prepare_ms:.2} ms each on one thread)\n"))?;
+    print("     batch    jobs         s      jobs/s   triangles/job\n")?;
     let jobs: Vec<GpuJob> = prepared.iter().cycle().take(n).cloned().collect();
     let mut rates = Vec::new();
     for batch in BATCHES {
@@ -50,7 +50,7 @@ pub(super) fn run(engine: &mut Engine, n: usize) -> Result<Value> {
         let triangles = jobs.chunks(batch).map(run).sum::<Result<usize>>()?;
         let seconds = start.elapsed().as_secs_f64();
         let jobs_per_second = n as f64 / seconds;
-        say(&format!("{batch:>10}{n:>8}{seconds:>10.3}{jobs_per_second:>12.0}{:>16}\n", triangles / n))?;
+        print(&format!("{batch:>10}{n:>8}{seconds:>10.3}{jobs_per_second:>12.0}{:>16}\n", triangles / n))?;
         rates.push(Rate { batch, jobs: n, seconds, jobs_per_second, triangles });
     }
     Ok(json!({ "prepare_ms": prepare_ms, "jobs": rates }))

@@ -1,4 +1,4 @@
-//! One case on one device: every stage, and the whole request.
+//! Times of one case on one device: all stages, and the complete request.
 
 use std::fmt::Write as _;
 use std::time::Instant;
@@ -16,20 +16,21 @@ use crate::floor::Work;
 use crate::rates::Rates;
 use crate::stats::Summary;
 
-/// The times of a stage.
+/// Times of a stage.
 #[derive(Debug, Serialize)]
 struct StageRow {
     stage: &'static str,
     /// Device time, ms.
     ms: Summary,
-    /// The least work: bytes and multiply-adds.
+    /// Minimum memory traffic, bytes.
     bytes: f64,
+    /// Minimum number of multiply-adds.
     fmas: f64,
-    /// The least time, ms.
+    /// Lower bound of the time, ms.
     floor_ms: Option<f64>,
 }
 
-/// The measurements of a case. Times are in ms.
+/// Measurements of a case. Times are in ms.
 #[derive(Debug, Serialize)]
 pub(super) struct Row {
     resolution: f64,
@@ -37,37 +38,37 @@ pub(super) struct Row {
     box_cells: u64,
     bricks: usize,
     surface_bricks: u64,
-    /// Pairs of a brick and an atom that reaches one of its grid points.
+    /// Pairs of a brick and an atom that reaches a grid point of it.
     pairs: u64,
     vertices: usize,
     triangles: usize,
     /// Quantisation step of the vertices, Å.
     step: Option<f32>,
-    /// Bytes of the mesh.
+    /// Size of the mesh, bytes.
     bytes: u64,
     stages: Vec<StageRow>,
-    /// The sum of the stages.
+    /// Sum of the stages.
     stages_ms: Summary,
     floor_ms: Option<f64>,
-    /// On the host, before the device: lattice and plan.
+    /// Preparation on the host: lattice and plan.
     prepare_ms: Summary,
-    /// From spheres to a mesh in host memory.
+    /// Time from spheres to a mesh in host memory.
     ready_ms: Summary,
-    /// The same, until every byte was read.
+    /// Time from spheres until all bytes of the mesh were read.
     read_ms: Summary,
-    /// The least time to transfer the mesh.
+    /// Lower bound of the time to transfer the mesh.
     transfer_floor_ms: Option<f64>,
     check: Option<Check>,
 }
 
-/// The differences from the CPU's mesh.
+/// Differences from the mesh of the CPU.
 #[derive(Debug, Serialize)]
 struct Check {
-    /// Triangles here minus those of the CPU.
+    /// Difference in triangles.
     triangles: i64,
-    /// Area here over the CPU's, minus 1.
+    /// Relative difference in area.
     area: f64,
-    /// Volume likewise.
+    /// Relative difference in volume.
     volume: f64,
     closed: bool,
 }
@@ -85,7 +86,7 @@ pub(super) fn measure(
     let mut stages: Vec<(Stage, Vec<f64>)> = Vec::new();
     let mut last = None;
     for run in 0..WARM_UP + runs {
-        // The previous mesh goes first: its memory is reused.
+        // Drop the previous mesh first, so that its memory is reused.
         drop(last.take());
         let start = Instant::now();
         let elapsed = || start.elapsed().as_secs_f64() * 1e3;
@@ -141,7 +142,7 @@ pub(super) fn measure(
     })
 }
 
-/// Adds up every byte of a mesh, as words.
+/// Sums all bytes of a mesh, as 64-bit words.
 fn sum_of_bytes(mesh: &Mesh) -> u64 {
     let words = |part: &[u8]| {
         let (words, rest) = part.as_chunks::<8>();
@@ -152,7 +153,7 @@ fn sum_of_bytes(mesh: &Mesh) -> u64 {
     byte_columns(mesh).into_iter().map(sum).fold(0, u64::wrapping_add)
 }
 
-/// Returns the bytes of a mesh, piece by piece.
+/// Returns the bytes of a mesh in chunks.
 pub(super) fn byte_columns(mesh: &Mesh) -> Vec<&[u8]> {
     let floats = mesh.positions.pieces().chain(mesh.normals.pieces()).map(bytemuck::cast_slice);
     let quantized = mesh.quantized.iter().flat_map(|q| {
@@ -210,7 +211,7 @@ pub(super) fn table(name: &str, row: &Row) -> String {
     line("request to read", row.read_ms, None, None);
     if let Some(Check { triangles, area, volume, closed }) = &row.check {
         let differences = format!("{triangles:+} triangles, area {area:+.2e}, volume {volume:+.2e}, closed: {closed}");
-        _ = writeln!(text, "  against the CPU: {differences}");
+        _ = writeln!(text, "  difference from the CPU: {differences}");
     }
     text + "\n"
 }
@@ -244,7 +245,7 @@ mod tests {
             CpuBackend::new(None).unwrap().run(&spheres, &params, &LIMITS, &Control::default()).unwrap().mesh;
         let same = compare(&mesh, &spheres, &params).unwrap();
         assert!(same.triangles == 0 && same.area.abs() < 1e-12 && same.closed, "{same:?}");
-        // They no longer tell where the triangles are.
+        // The parts no longer match the triangles.
         mesh.parts.clear();
         mesh.triangles = mesh.triangles[1..].to_vec().into();
         mesh.positions[0][0] += 0.1;

@@ -1,4 +1,4 @@
-//! `molmesh-bench gpu`: the stages on GPUs, small jobs, many callers, and several devices.
+//! `molmesh-bench gpu`: benchmarks of stages, small jobs, many callers, and several devices.
 
 mod cases;
 mod jobs;
@@ -18,57 +18,57 @@ use serde_json::{Value, json};
 
 use crate::device::Selected;
 use crate::error::{Error, Result};
-use crate::{rates, say};
+use crate::{print, rates};
 use cases::Case;
 
-/// Limits of the benchmarks, which have the machine to themselves.
+/// Limits of the benchmarks.
 pub(crate) const LIMITS: SurfaceLimits =
     SurfaceLimits { max_samples: 1 << 40, max_mesh_bytes: 64 << 30, max_candidates: 1 << 31 };
-/// Runs before the measured ones.
+/// Number of unmeasured runs.
 const WARM_UP: usize = 3;
 
 /// Arguments of `molmesh-bench gpu`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct GpuArgs {
-    /// The device: auto, software, or a number that `molmesh doctor` prints; hardware comes first
+    /// Device: auto, software, or a number printed by `molmesh doctor`; hardware comes first
     #[arg(long, value_name = "WHICH", default_value = "0")]
     device: DeviceChoice,
-    /// Measured runs of each case, after three unmeasured ones
+    /// Number of measured runs of each case, after three unmeasured ones
     #[arg(long, value_name = "N", default_value_t = 20)]
     runs: usize,
     /// Folder with 2hhb, 1aon and 7cgo, as PDB or mmCIF, plain or compressed
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Only the cases whose name contains this; 7cgo-x9-0.5, which makes gigabytes, only by its whole name
+    /// Measure only cases whose name contains this text; 7cgo-x9-0.5 (gigabytes of mesh) only by its full name
     #[arg(long, value_name = "NAME")]
     only: Option<String>,
-    /// Atoms of the generated case, which needs no file
+    /// Number of atoms of the generated case, which needs no file
     #[arg(long, value_name = "N", default_value_t = 60_000)]
     atoms: usize,
-    /// How vertices are stored: none (single precision, 24 bytes each), or quantize (12 bytes)
+    /// Encoding of vertices: none (single precision, 24 bytes each) or quantize (12 bytes)
     #[arg(long, value_name = "HOW", default_value = Compress::None.name(), conflicts_with_all = ["jobs", "pool"],
         value_parser = [Compress::None.name(), Compress::Quantize.name()])]
     compress: String,
-    /// Compare each mesh with the CPU's
+    /// Compare each mesh with that of the CPU
     #[arg(long)]
     check: bool,
-    /// Measure this many jobs of 600 atoms instead, one by one and in batches
+    /// Measure this number of jobs of 600 atoms instead, one by one and in batches
     #[arg(long, value_name = "N")]
     jobs: Option<usize>,
-    /// Measure this many jobs of 600 atoms, and fewer large ones, on 1, 2, … devices from many callers instead
+    /// Measure this number of jobs of 600 atoms, and fewer large ones, from many callers on 1, 2, … devices instead
     #[arg(long, value_name = "N", conflicts_with_all = ["jobs", "device"])]
     pool: Option<usize>,
-    /// Callers of --pool per device
+    /// Number of callers per device, for --pool
     #[arg(long, value_name = "N", requires = "pool", default_value_t = 8)]
     callers: usize,
-    /// Measure each case on 1, 2, 4, … devices together instead, each with at least this many bricks
+    /// Measure each case divided among 1, 2, 4, … devices instead, with at least this number of bricks per device
     #[arg(long, value_name = "BRICKS", conflicts_with_all = ["jobs", "device", "pool", "check"],
         num_args = 0..=1, default_missing_value = "32768")]
     spread: Option<u64>,
-    /// Devices of --pool and --spread: all, software, or numbers
+    /// Devices for --pool and --spread: all, software, or numbers
     #[arg(long, value_name = "WHICH", default_value = "all", conflicts_with = "device")]
     devices: DeviceChoice,
-    /// Write the results to this file too, as JSON
+    /// Also write the results to this file, as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
@@ -84,7 +84,7 @@ pub(crate) fn run(args: &GpuArgs) -> Result<()> {
         several::run(&args.devices, min_bricks, &loaded(args)?, args.runs)?
     } else {
         let selected = Selected::new(&args.device)?;
-        say(&format!("{}, {}\n", selected.name, selected.driver))?;
+        print(&format!("{}, {}\n", selected.name, selected.driver))?;
         match args.jobs {
             Some(n) => jobs::run(&mut selected.engine()?, n)?,
             None => stages(args, &selected)?,
@@ -94,7 +94,7 @@ pub(crate) fn run(args: &GpuArgs) -> Result<()> {
     std::fs::write(path, format!("{results:#}\n")).map_err(Error::file(path))
 }
 
-/// Loads the selected cases. Prints which of them cannot be measured.
+/// Loads the selected cases. Prints the ones that cannot be measured.
 fn loaded(args: &GpuArgs) -> Result<Vec<(Case, Spheres, SurfaceParams)>> {
     let mut loaded = Vec::new();
     for case in cases::selected(args.atoms, args.only.as_deref().unwrap_or_default()) {
@@ -104,16 +104,16 @@ fn loaded(args: &GpuArgs) -> Result<Vec<(Case, Spheres, SurfaceParams)>> {
                 let quantize = quantized.then(|| Step::covering(lattice::extent(&spheres, &params)));
                 loaded.push((case, spheres, SurfaceParams { quantize, ..params }));
             }
-            Err(why) => say(&format!("{}: not measured: {why}\n", case.name))?,
+            Err(why) => print(&format!("{}: not measured: {why}\n", case.name))?,
         }
     }
     Ok(loaded)
 }
 
-/// Measures the stages of every case. Each has an engine of its own, with empty buffers.
+/// Measures the stages of all cases, each on a new engine with empty buffers.
 fn stages(args: &GpuArgs, selected: &Selected) -> Result<Value> {
     let rates = rates::measure(&selected.gpu()?, selected.software)?;
-    say(&match &rates {
+    print(&match &rates {
         Some(r) => format!(
             "measured: memory {:.3} TB/s (read + written), {:.2} T multiply-adds/s, to the host {:.1} GB/s, round trip {:.0} µs\n\n",
             r.memory * 1e-12,
@@ -121,18 +121,18 @@ fn stages(args: &GpuArgs, selected: &Selected) -> Result<Value> {
             r.to_host * 1e-9,
             r.round_trip * 1e6,
         ),
-        None => "no timestamps on this device: no times of stages\n\n".to_owned(),
+        None => "this device does not support timestamps: stages are not timed\n\n".to_owned(),
     })?;
     let mut rows = Vec::new();
     for (case, spheres, params) in loaded(args)? {
         let row = measure::measure(&mut selected.engine()?, &spheres, &params, args.runs, rates.as_ref(), args.check);
         rows.push(match row {
             Ok(row) => {
-                say(&measure::table(case.name, &row))?;
+                print(&measure::table(case.name, &row))?;
                 json!({ "case": case.name, "measured": row })
             }
             Err(why) => {
-                say(&format!("{}: not measured: {why}\n", case.name))?;
+                print(&format!("{}: not measured: {why}\n", case.name))?;
                 json!({ "case": case.name, "not_measured": why.to_string() })
             }
         });
@@ -147,8 +147,8 @@ fn prepare(spheres: &Spheres, params: &SurfaceParams) -> Result<GpuJob> {
     Ok(GpuJob { prepared: prepared.into(), cancel: CancelToken::default(), deadline: None })
 }
 
-/// Starts backends on the first, the first two, four, … and all devices of `choice`, and calls `measure` with each and its
-/// number of devices.
+/// Starts backends on 1, 2, 4, … and all devices of `choice`. Calls `measure` with each backend and its number of
+/// devices.
 fn on_more_devices(
     choice: &DeviceChoice,
     settings: &PoolSettings,

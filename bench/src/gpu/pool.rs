@@ -1,4 +1,4 @@
-//! Many jobs from many callers, on one device, two, and so on.
+//! Throughput of jobs from many callers on 1, 2, … devices.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
@@ -11,12 +11,12 @@ use serde_json::{Value, json};
 
 use super::{LIMITS, on_more_devices};
 use crate::error::{Error, Result};
-use crate::{say, structures};
+use crate::{print, structures};
 
-/// Atoms of a job, and the number of such jobs for every hundred small ones: each size takes about as long.
+/// Atoms per job, and jobs per hundred small ones. All sizes take about the same time.
 const SIZES: [(usize, usize); 3] = [(600, 100), (6000, 50), (60_000, 20)];
 
-/// The rate of jobs of one size.
+/// Throughput of jobs of one size.
 #[derive(Debug, Serialize)]
 struct Rate {
     devices: usize,
@@ -25,16 +25,16 @@ struct Rate {
     callers: usize,
     seconds: f64,
     jobs_per_second: f64,
-    /// Processor time of the whole process per job, ms: callers, device threads, driver. Only on Linux.
+    /// Processor time of the process per job, ms: callers, device threads, driver. Only on Linux.
     cpu_ms: Option<f64>,
-    /// Submissions that several jobs shared.
+    /// Number of submissions shared by several jobs.
     shared: u64,
 }
 
 /// Runs `n` small jobs and fewer large ones on 1, 2, … devices of `choice`, with `callers` callers per device.
 pub(super) fn run(choice: &DeviceChoice, n: usize, callers: usize) -> Result<Value> {
-    say("jobs at 0.5 Å, prepared by their callers, to a mesh in memory\n")?;
-    say("   devices   atoms    jobs  callers         s    jobs/s  CPU ms/job  shared\n")?;
+    print("jobs at 0.5 Å, prepared by their callers, to a mesh in memory\n")?;
+    print("   devices   atoms    jobs  callers         s    jobs/s  CPU ms/job  shared\n")?;
     let mut rates = Vec::new();
     on_more_devices(choice, &PoolSettings::default(), |backend, devices| {
         for (atoms, share) in SIZES {
@@ -56,7 +56,7 @@ pub(super) fn run(choice: &DeviceChoice, n: usize, callers: usize) -> Result<Val
                 shared: shared() - before,
             };
             let cpu = rate.cpu_ms.map_or_else(|| "–".to_owned(), |ms| format!("{ms:.3}"));
-            say(&format!(
+            print(&format!(
                 "{devices:>10}{atoms:>8}{jobs:>8}{callers:>9}{seconds:>10.3}{:>10.0}{cpu:>12}{:>8}\n",
                 rate.jobs_per_second, rate.shared
             ))?;
@@ -67,7 +67,7 @@ pub(super) fn run(choice: &DeviceChoice, n: usize, callers: usize) -> Result<Val
     Ok(json!({ "pool": rates }))
 }
 
-/// Returns the processor time of this process so far, s.
+/// Returns the processor time used by this process, s.
 fn processor_seconds() -> Option<f64> {
     #[cfg(target_os = "linux")]
     let seconds = {
@@ -79,7 +79,7 @@ fn processor_seconds() -> Option<f64> {
     seconds
 }
 
-/// Runs `jobs` jobs from `callers` threads, each of which prepares its own.
+/// Runs `jobs` jobs from `callers` threads, which also prepare them.
 fn run_jobs(backend: &GpuBackend, atoms: usize, jobs: usize, callers: usize) -> Result<()> {
     let next = AtomicUsize::new(0);
     let call = |seed: u64| -> Result<()> {

@@ -1,4 +1,4 @@
-//! One structure at a time on several devices together.
+//! Times of jobs that are divided among several devices.
 
 use std::fmt::Write as _;
 use std::time::Instant;
@@ -13,10 +13,10 @@ use super::cases::Case;
 use super::measure::byte_columns;
 use super::{WARM_UP, on_more_devices, prepare};
 use crate::error::{Error, Result};
-use crate::say;
+use crate::print;
 use crate::stats::Summary;
 
-/// A case on several devices. Times are in ms.
+/// Measurements of a case on several devices. Times are in ms.
 #[derive(Debug, Serialize)]
 struct Row {
     case: &'static str,
@@ -26,19 +26,19 @@ struct Row {
     triangles: usize,
     /// Quantisation step of the vertices, Å.
     step: Option<f32>,
-    /// Bytes of the mesh.
+    /// Size of the mesh, bytes.
     bytes: u64,
-    /// On the host, before the devices: lattice and plan.
+    /// Preparation on the host: lattice and plan.
     prepare_ms: Summary,
-    /// From spheres to a mesh in host memory.
+    /// Time from spheres to a mesh in host memory.
     ready_ms: Summary,
-    /// The part of each device.
+    /// Parts by device.
     by: Vec<Part>,
-    /// Whether the mesh has the same bytes as on a single device.
+    /// True if the mesh has the same bytes as on a single device.
     same: bool,
 }
 
-/// The part of one device.
+/// Part of one device.
 #[derive(Debug, Serialize)]
 struct Part {
     device: String,
@@ -54,7 +54,7 @@ pub(super) fn run(
     cases: &[(Case, Spheres, SurfaceParams)],
     runs: usize,
 ) -> Result<Value> {
-    say("one structure at a time; ms, medians (minima)\n")?;
+    print("one structure at a time; ms, medians (minima)\n")?;
     let (mut rows, mut digests) = (Vec::new(), vec![None; cases.len()]);
     let settings = PoolSettings { min_partition_bricks: Some(min_bricks), ..PoolSettings::default() };
     on_more_devices(choice, &settings, |backend, devices| {
@@ -62,7 +62,7 @@ pub(super) fn run(
             let (row, digest) = measure(backend, spheres, params, runs)?;
             let same = *first.get_or_insert_with(|| digest.clone()) == digest;
             let row = Row { case: case.name, devices, same, ..row };
-            say(&text(&row))?;
+            print(&text(&row))?;
             rows.push(row);
         }
         Ok(())
@@ -70,13 +70,13 @@ pub(super) fn run(
     Ok(json!({ "spread": rows, "runs": runs }))
 }
 
-/// Measures a case on the devices of `backend`. The SHA-256 of its mesh comes back too.
+/// Measures a case on the devices of `backend`. Also returns the SHA-256 digest of its mesh.
 fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs: usize) -> Result<(Row, Vec<u8>)> {
     let [mut prepare_ms, mut ready_ms] = [const { Vec::new() }; 2];
     let mut all: Vec<CompletedJob> = Vec::with_capacity(runs);
     let mut last = None;
     for run in 0..WARM_UP + runs {
-        // The previous mesh goes first: its memory is reused.
+        // Drop the previous mesh first, so that its memory is reused.
         drop(last.take());
         let start = Instant::now();
         let job = prepare(spheres, params)?;
@@ -109,7 +109,7 @@ fn measure(backend: &GpuBackend, spheres: &Spheres, params: &SurfaceParams, runs
     Ok((row, digest.finalize().to_vec()))
 }
 
-/// Summarises each part over all runs: parts are the same in every run, and idle devices take them in turn.
+/// Summarises each part over all runs. The parts are the same in all runs, but idle devices take them in any order.
 fn parts(all: &[CompletedJob]) -> Vec<Part> {
     let n = all.iter().map(|ran| ran.devices.len()).min().unwrap_or_default();
     let part = |k: usize| {

@@ -1,34 +1,35 @@
-//! The tables of Dias, Bora and Gomes (HPDC 2010): Table 1 (a Core 2 Quad Q9550, one thread) and Table 2 (a `GeForce` GTX
-//! 280), seconds for each of the three kernels; and the raw parameters of the kernels.
+//! Tables of Dias, Bora and Gomes (HPDC 2010), and raw kernel parameters.
 //!
-//! The paper gives formulas and ranges of its parameters, not their values. Here, an atom reaches 4 Å, half of the 20 grid
-//! points of 0.4 Å that the paper's program visits along each axis, and the surface of a single atom has a radius of 1.7 Å.
+//! Table 1 (Core 2 Quad Q9550, one thread) and Table 2 (`GeForce` GTX 280) list seconds for each of the three kernels.
+//! The paper gives formulas and ranges of the kernel parameters, but no values. Here, the support of an atom is 4 Å,
+//! half of the 20 grid points of 0.4 Å that the paper's program visits along each axis. The surface of a single atom
+//! has a radius of 1.7 Å.
 
 use molmesh::surface::{Kernel, SurfaceOptions, SurfaceParams};
 
 use crate::error::{Error, Result};
 
-/// A row of both tables, with seconds by kernel in the order of [`KERNELS`].
+/// Row of both tables, with seconds by kernel in the order of [`KERNELS`].
 #[derive(Debug)]
 pub(crate) struct Entry {
     /// PDB id.
     pub(crate) id: &'static str,
-    /// Atoms (ATOM records) by the paper.
+    /// Number of atoms (ATOM records) according to the paper.
     pub(crate) atoms: usize,
-    /// Cubes on the CPU and on the GPU.
+    /// Numbers of cubes on the CPU and on the GPU.
     pub(crate) cubes: [u64; 2],
     pub(crate) cpu: [f64; 3],
     pub(crate) gpu: [f64; 3],
 }
 
-/// The kernels in the order of the tables.
+/// Kernels in the order of the tables.
 pub(crate) const KERNELS: [Kernel; 3] = [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare];
 
 const fn entry(id: &'static str, atoms: usize, cubes: [u64; 2], cpu: [f64; 3], gpu: [f64; 3]) -> Entry {
     Entry { id, atoms, cubes, cpu, gpu }
 }
 
-/// Every row, sorted by atoms.
+/// All rows, sorted by atoms.
 pub(crate) const ENTRIES: [Entry; 16] = [
     entry("110D", 120, [346_580, 352_000], [0.68, 0.45, 0.43], [0.13, 0.13, 0.13]),
     entry("200D", 259, [603_520, 610_176], [1.90, 1.40, 1.20], [0.27, 0.27, 0.26]),
@@ -48,10 +49,10 @@ pub(crate) const ENTRIES: [Entry; 16] = [
     entry("1BIJ", 4387, [7_229_120, 7_267_456], [250.50, 240.20, 179.10], [15.00, 14.40, 14.20]),
 ];
 
-/// Returns the surface by a kernel's raw parameters at a grid spacing, Å.
+/// Returns surface parameters with the raw parameters of a kernel, at a grid spacing in Å.
 ///
 /// # Errors
-/// [`Error::Failed`] if the spacing is out of range.
+/// Returns [`Error::Failed`] if the spacing is out of range.
 pub(crate) fn surface(kernel: Kernel, spacing: f64) -> Result<SurfaceParams> {
     let (a, b, c, isovalue) = match kernel {
         // 2.75·exp(−0.35·1.7²) is 1; the cut-off of 1 % is reached at 4.0 Å.
@@ -74,13 +75,13 @@ pub(crate) fn surface(kernel: Kernel, spacing: f64) -> Result<SurfaceParams> {
 }
 
 #[cfg(test)]
-#[expect(clippy::float_cmp, reason = "the same numbers are meant")]
+#[expect(clippy::float_cmp, reason = "the numbers must be identical")]
 mod tests {
     use super::*;
     use molmesh::surface::kernel::Profile;
 
     #[test]
-    fn the_tables_are_those_of_the_paper() {
+    fn tables_have_the_column_sums_of_the_paper() {
         assert_eq!(ENTRIES.len(), 16);
         assert!(ENTRIES.is_sorted_by_key(|e| e.atoms));
         // Sums over the columns of the printed tables.
@@ -98,7 +99,7 @@ mod tests {
     }
 
     #[test]
-    fn raw_parameters_give_an_atom_its_radius_and_end_at_four_angstroms() {
+    fn raw_parameters_give_the_radius_and_support_of_an_atom() {
         for kernel in KERNELS {
             let params = surface(kernel, 0.4).unwrap();
             let profile = Profile::new(&params);

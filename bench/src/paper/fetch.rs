@@ -1,4 +1,4 @@
-//! `molmesh-bench fetch`: downloads the paper's structures from the archive of the service's configuration.
+//! `molmesh-bench fetch`: downloads the paper's structures from the configured archive.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,21 +10,21 @@ use molmesh::structure::{self, EntryId, ReadLimits, SourceFormat};
 
 use super::{replace, selected_entries};
 use crate::error::{Error, Result};
-use crate::{say, structures};
+use crate::{print, structures};
 
 /// Arguments of `molmesh-bench fetch`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct FetchArgs {
-    /// Folder for the files; created if missing
+    /// Folder for the files, created if missing
     #[arg(long, value_name = "DIR", default_value = "structures")]
     data: PathBuf,
-    /// Only these structures
+    /// Download only these structures
     #[arg(long, value_name = "IDS", value_delimiter = ',')]
     only: Vec<String>,
-    /// Configuration file of the service, which names the archive
+    /// Configuration file of the service, which specifies the archive
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Set one key of the configuration, such as archive.url=https://host/{id}.cif
+    /// Set a configuration key, such as archive.url=https://host/{id}.cif
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
@@ -41,7 +41,7 @@ pub(crate) fn run(args: &FetchArgs) -> Result<()> {
         return Err(Error::Usage("no archive is configured: set archive.url".to_owned()));
     }
     fs::create_dir_all(&args.data).map_err(Error::file(&args.data))?;
-    // The archive keeps its own copies in a temporary folder.
+    // Copies of the archive are stored in a temporary folder.
     let temporary = Temporary::new(&args.data)?;
     config.archive.dir = Some(temporary.0.join("none"));
     config.server.data_dir.clone_from(&temporary.0);
@@ -50,7 +50,7 @@ pub(crate) fn run(args: &FetchArgs) -> Result<()> {
     let archive = Archive::new(&config, Arc::new(Uncounted));
     for entry in entries {
         if let Some(path) = structures::find(&args.data, entry.id)? {
-            say(&format!("{}: {} exists\n", entry.id, path.display()))?;
+            print(&format!("{}: {} exists\n", entry.id, path.display()))?;
             continue;
         }
         let id: EntryId =
@@ -58,9 +58,9 @@ pub(crate) fn run(args: &FetchArgs) -> Result<()> {
         match runtime.block_on(archive.fetch(&id)) {
             Ok(found) => {
                 let path = keep(&args.data, entry.id, &found.bytes, &config)?;
-                say(&format!("{}: {}, {} bytes\n", entry.id, path.display(), found.bytes.len()))?;
+                print(&format!("{}: {}, {} bytes\n", entry.id, path.display(), found.bytes.len()))?;
             }
-            Err(error @ FetchError::NotFound { .. }) => say(&format!("{}: {error}\n", entry.id))?,
+            Err(error @ FetchError::NotFound { .. }) => print(&format!("{}: {error}\n", entry.id))?,
             Err(error) => {
                 let folder = args.data.display();
                 return Err(Error::Failed(format!("{error}; without a network, copy the files to {folder} yourself")));
@@ -86,7 +86,7 @@ fn keep(folder: &Path, id: &str, bytes: &[u8], config: &Config) -> Result<PathBu
     Ok(path)
 }
 
-/// A folder that is removed on drop.
+/// Temporary folder, removed on drop.
 struct Temporary(PathBuf);
 
 impl Temporary {
@@ -99,7 +99,7 @@ impl Temporary {
 
 impl Drop for Temporary {
     fn drop(&mut self) {
-        // What cannot be removed is hidden and small.
+        // A folder that cannot be removed is hidden and small.
         drop(fs::remove_dir_all(&self.0));
     }
 }

@@ -1,26 +1,28 @@
-//! Power laws, fitted to times against atoms by least squares over logarithms.
+//! Fits of power laws to times against atoms, by least squares of logarithms.
 
 use super::result::{Series, Timed};
 
-/// A fitted power law.
+/// Fitted power law.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Fit {
     pub(super) exponent: f64,
     pub(super) factor: f64,
-    /// The range of the points, and their number.
+    /// Smallest x of the points.
     pub(super) from: f64,
+    /// Largest x of the points.
     pub(super) to: f64,
+    /// Number of points.
     pub(super) points: usize,
 }
 
 impl Fit {
-    /// The value at `x`.
+    /// Returns the value at `x`.
     pub(super) fn at(&self, x: f64) -> f64 {
         self.factor * x.powf(self.exponent)
     }
 }
 
-/// Fits the points with `x ≥ from`; `None` for fewer than three.
+/// Fits the points with `x ≥ from`. Returns `None` for fewer than three.
 fn fit(points: &[(f64, f64)], from: f64) -> Option<Fit> {
     let logs: Vec<(f64, f64)> =
         points.iter().filter(|(x, y)| *x >= from && *y > 0.0).map(|(x, y)| (x.ln(), y.ln())).collect();
@@ -37,8 +39,8 @@ fn fit(points: &[(f64, f64)], from: f64) -> Option<Fit> {
     exponent.is_finite().then(|| Fit { exponent, factor: (y - exponent * x).exp(), from, to, points: n })
 }
 
-/// Returns the number of atoms from which a series is fitted: 10,000, from where on fixed costs no longer matter, or that
-/// of its last three points if fewer are as large.
+/// Returns the number of atoms from which a series is fitted: 10,000, where fixed costs become negligible, or the start
+/// of the last three points if fewer are as large.
 fn from(points: &[(f64, f64)]) -> f64 {
     const LARGE: f64 = 10_000.0;
     let large = points.iter().filter(|(x, _)| *x >= LARGE).count();
@@ -48,7 +50,7 @@ fn from(points: &[(f64, f64)]) -> f64 {
     points.iter().rev().nth(2).map_or(0.0, |(x, _)| *x)
 }
 
-/// Fits the time of a series, and its time on the device, by name.
+/// Fits the time and the device time of a series. Returns the fits with their names.
 pub(super) fn fits(series: &Series) -> Vec<(&'static str, Fit)> {
     let named =
         [("time", series.points(&|t| Some(t.seconds.median))), ("device time", series.points(&Timed::device_median))];
@@ -76,7 +78,7 @@ mod tests {
     }
 
     #[test]
-    fn fixed_costs_are_left_out_where_the_series_is_long_enough() {
+    fn fixed_costs_are_excluded_from_long_series() {
         let time = |x: f64| 1e-3 + 1e-6 * x;
         let points: Vec<_> = [1e2, 1e3, 1e4, 1e5, 1e6, 3e6].map(|x| (x, time(x))).to_vec();
         assert!(fit(&points, 0.0).unwrap().exponent < 0.85);

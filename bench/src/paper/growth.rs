@@ -1,4 +1,4 @@
-//! Time and memory against atoms, for each program as far as it gets.
+//! Time and memory against atoms, for each program up to its limit.
 
 use std::time::Instant;
 
@@ -12,13 +12,13 @@ use crate::{note, structures};
 
 /// Numbers of atoms.
 const SIZES: [usize; 10] = [100, 300, 1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000];
-/// The measured runs of one size take about this long at most, unless a single run takes longer, s.
+/// Approximate maximum time of the measured runs of one size, s. A single run may take longer.
 const TIME_PER_SIZE: f64 = 4.0;
 
 /// Measures every program up to `most` atoms, and passes the results to `done` after each size.
 ///
 /// # Errors
-/// [`Error`] if a program cannot be started, and the errors of `done`.
+/// Returns an [`Error`] if a program cannot be started, or an error of `done`.
 pub(super) fn measure(plan: &Plan, most: usize, done: &mut dyn FnMut(&Growth) -> Result<()>) -> Result<()> {
     let options = SurfaceOptions { resolution: Some(plan.growth_spacing), ..SurfaceOptions::default() };
     let params = SurfaceParams::new(&options).map_err(|e| Error::Usage(e.to_string()))?;
@@ -50,7 +50,7 @@ pub(super) fn measure(plan: &Plan, most: usize, done: &mut dyn FnMut(&Growth) ->
     done(&growth)
 }
 
-/// Measures one size of one program. `before` has atoms and seconds of the previous size.
+/// Measures one size of one program. `before` contains atoms and seconds of the previous size.
 fn size(
     plan: &Plan,
     program: Program,
@@ -63,7 +63,7 @@ fn size(
         let cells = reference::cells(spheres, params).map_err(Error::failed)?;
         reference_estimate(spheres, params, cells.iter().product())
     } else {
-        // Time grows at least linearly.
+        // Time grows at least linearly with atoms.
         before.map_or(0.0, |(atoms, seconds)| seconds * spheres.len() as f64 / atoms as f64)
     };
     plan.within_limit(expected)?;

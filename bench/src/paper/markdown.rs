@@ -1,4 +1,4 @@
-//! The results as Markdown: the paper's tables with its seconds beside the measured ones.
+//! Results as Markdown: the paper's tables with published and measured times.
 
 use std::fmt::Write as _;
 
@@ -35,8 +35,8 @@ fn sections(document: &Document) -> Vec<(&'static str, String)> {
     sections
 }
 
-/// Formats a part of a page: the section of every document that has it, each under its machine. `None` if no part has the
-/// name.
+/// Formats a part of a page: the section of each document that has it, with a description of the machine. Returns
+/// `None` for an unknown name.
 pub(super) fn part(name: &str, documents: &[Document]) -> Option<String> {
     let (_, title) = PARTS.iter().find(|(known, _)| *known == name)?;
     let mut text = String::new();
@@ -52,7 +52,7 @@ pub(super) fn part(name: &str, documents: &[Document]) -> Option<String> {
     Some(text + "\n")
 }
 
-/// The names of the parts of pages, and the titles of their sections.
+/// Names of the parts of pages, and titles of their sections.
 const PARTS: [(&str, &str); 5] = [
     ("table-1", "Table 1: on the CPU"),
     ("table-2", "Table 2: on the GPU"),
@@ -61,7 +61,7 @@ const PARTS: [(&str, &str); 5] = [
     ("stages", "Stages against the device"),
 ];
 
-/// Whether a program ran in this part of a document.
+/// Returns true if any program ran in this part of a document.
 fn has(name: &str, document: &Document) -> bool {
     let ran = |cell: &Cell| cell.timed.is_some();
     let any =
@@ -76,7 +76,7 @@ fn has(name: &str, document: &Document) -> bool {
 /// Describes machine, device, and date.
 fn machine(document: &Document) -> String {
     let m = &document.machine;
-    let cpu = if m.cpu.is_empty() { "a processor without a name" } else { &m.cpu };
+    let cpu = if m.cpu.is_empty() { "unknown processor" } else { &m.cpu };
     let memory = m.memory_bytes.map(|bytes| format!(", {:.0} GB of memory", bytes as f64 * 1e-9)).unwrap_or_default();
     let device = match &document.device {
         Some(d) if d.software => format!("GPU: none; its programs ran on software ({}, {})", d.name, d.driver),
@@ -173,7 +173,7 @@ fn triangles(rows: &[Row]) -> String {
     for row in rows {
         for (side, table) in [(&row.cpu, "Table 1"), (&row.gpu, "Table 2")] {
             let made = [&side.baseline, &side.ours].iter().filter(|c| c.timed.is_some()).count();
-            // Without the CPU backend, ours is the reference of the comparison.
+            // Without the CPU backend, the comparison is with ours.
             compared += if side.triangles.is_some() { made } else { made.saturating_sub(1) };
             let off = side.disagreements().into_iter();
             wrong.extend(off.map(|off| format!("{} {} {table}: {off}", row.id, row.kernel)));
@@ -236,7 +236,7 @@ fn roofline(all: &[Roofline]) -> String {
             text,
             "{}.\nMeasured rates of the device: {:.2} TB/s of memory, {:.2} T multiply-adds/s.\n\
              wgpu does not report registers and workgroups in flight.\n\n\
-             | program | stage | threads a workgroup | shared memory | workgroups | time | bytes at least | multiply-adds at least | of the memory rate | of the arithmetic |\n\
+             | program | stage | threads per workgroup | shared memory | workgroups | time | minimum bytes | minimum multiply-adds | share of memory rate | share of arithmetic rate |\n\
              |---|---|---|---|---|---|---|---|---|---|",
             one.structure,
             one.memory_rate * 1e-12,
@@ -300,7 +300,7 @@ mod tests {
     }
 
     #[test]
-    fn every_row_marks_stand_ins_and_has_the_papers_seconds() {
+    fn rows_mark_stand_ins_and_contain_the_papers_seconds() {
         let page = page(&made_up(true));
         let rows: Vec<&str> = page.lines().filter(|line| line.starts_with("| 1BIJ")).collect();
         assert_eq!(rows.len(), 2, "{page}");
@@ -327,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_come_from_every_document_that_has_them() {
+    fn parts_include_all_documents_with_results() {
         let both = [made_up(false), made_up(true)];
         let count = |name: &str| part(name, &both).unwrap().matches("Measured with").count();
         assert_eq!(["table-1", "table-2", "growth", "stages"].map(count), [2, 1, 2, 1]);

@@ -1,7 +1,7 @@
-//! `molmesh-bench paper`: the tables and figures of Dias, Bora and Gomes (HPDC 2010) on this machine.
+//! `molmesh-bench paper`: measures the tables of Dias, Bora and Gomes (HPDC 2010) on this machine.
 //!
-//! Four programs: the sequential reference, the CPU backend, the paper's GPU program on today's device, and molmesh's stages
-//! on that device. All get the same spheres and parameters. Times are from spheres to a mesh in host memory.
+//! Compares four programs: the sequential reference, the CPU backend, the paper's GPU program, and the GPU stages of
+//! molmesh. All have the same spheres and parameters. Times are from spheres to a mesh in host memory.
 
 pub(crate) mod entries;
 pub(crate) mod fetch;
@@ -23,7 +23,7 @@ use molmesh::surface::{CpuBackend, DeviceChoice, Kernel};
 
 use crate::device::Selected;
 use crate::error::{Error, Result};
-use crate::{machine, note, say};
+use crate::{machine, note, print};
 use entries::{ENTRIES, Entry, KERNELS};
 use programs::{Program, Runner};
 use result::{Device, Document};
@@ -31,29 +31,29 @@ use result::{Device, Document};
 /// Arguments of `molmesh-bench paper`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct PaperArgs {
-    /// The GPU: auto (hardware only), cpu (none), software, or a number that `molmesh doctor` prints
+    /// GPU: auto (hardware only), cpu (none), software, or a number printed by `molmesh doctor`
     #[arg(long, value_name = "WHICH", default_value = "auto")]
     device: DeviceChoice,
-    /// Folder with structures of the paper, named by their PDB ids (.pdb, .ent, .cif, .bcif, plain or compressed); the
-    /// others are replaced by generated stand-ins, which the tables mark
+    /// Folder with structures of the paper, named by PDB id (.pdb, .ent, .cif, .bcif, plain or compressed); generated
+    /// stand-ins, marked in the tables, replace missing ones
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
     /// Programs to run
     #[arg(long, value_name = "LIST", value_enum, value_delimiter = ',', default_value = "reference,cpu,paper,gpu")]
     programs: Vec<Program>,
-    /// Only these structures
+    /// Measure only these structures
     #[arg(long, value_name = "IDS", value_delimiter = ',')]
     only: Vec<String>,
-    /// Only these kernels: gaussian, soft-object, inverse-square
+    /// Measure only these kernels: gaussian, soft-object, inverse-square
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     kernels: Vec<Kernel>,
-    /// Measured runs of each program on each structure; of the reference three, or one if it takes long
+    /// Number of measured runs of each program on each structure; at most three of the reference, or one if it is slow
     #[arg(long, value_name = "N", default_value_t = 7)]
     runs: usize,
-    /// Skip runs that would take longer by an estimate, s
+    /// Skip runs with a longer estimated time, s
     #[arg(long, value_name = "SECONDS", default_value_t = 300.0)]
     reference_limit: f64,
-    /// Measure time and memory against the number of atoms too, up to this many
+    /// Also measure time and memory against the number of atoms, up to this number
     #[arg(long, value_name = "ATOMS", num_args = 0..=1, default_missing_value = "3000000")]
     growth: Option<usize>,
     /// Grid spacing of --growth, Å
@@ -62,10 +62,10 @@ pub(crate) struct PaperArgs {
     /// Skip the tables
     #[arg(long, requires = "growth", conflicts_with_all = ["only", "kernels"])]
     growth_only: bool,
-    /// Three structures, one kernel, three runs, and no run of more than ten seconds
+    /// Measure three structures with one kernel, at most three runs each, and skip runs of more than ten seconds
     #[arg(long)]
     quick: bool,
-    /// Threads of the CPU backend; every core by default
+    /// Number of threads of the CPU backend; all cores by default
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
     /// Write paper.json and paper.md to this folder
@@ -73,22 +73,22 @@ pub(crate) struct PaperArgs {
     out: Option<PathBuf>,
 }
 
-/// What is measured.
+/// Selected measurements.
 struct Plan {
     programs: Vec<Program>,
-    /// The device, or why there is none.
+    /// Device, or the reason why there is none.
     device: std::result::Result<Selected, String>,
     data: Option<PathBuf>,
     entries: Vec<&'static Entry>,
     kernels: Vec<Kernel>,
     runs: usize,
-    /// Longest run, s.
+    /// Maximum estimated time of a run, s.
     limit: f64,
     growth_spacing: f64,
     threads: Option<usize>,
 }
 
-/// A program that is ready to run, or why it does not run.
+/// Program that is ready to run, or the reason why it does not run.
 type Opened = std::result::Result<Box<dyn Runner>, String>;
 
 impl Plan {
@@ -140,14 +140,14 @@ impl Plan {
         }
     }
 
-    /// Rejects a run that would take longer than the limit.
+    /// Returns an error if a run would take longer than the limit.
     fn within_limit(&self, seconds: f64) -> Result<()> {
         let within = seconds <= self.limit;
         if within { Ok(()) } else { Err(Error::Failed(format!("about {}", markdown::seconds(seconds)))) }
     }
 }
 
-/// Why a program did not run that `--programs` leaves out. Stored results contain these words.
+/// Reason for programs that `--programs` excludes. Stored results contain this text.
 const NOT_SELECTED: &str = "not asked for";
 
 /// Returns the entries with these ids, or all if there are no ids.
@@ -184,7 +184,7 @@ pub(crate) fn run(args: &PaperArgs) -> Result<()> {
         growth: None,
         roofline: Vec::new(),
     };
-    // Saved after every measurement: the command takes long, and may be interrupted.
+    // Results are saved after each measurement, as the command takes long and may be interrupted.
     if !args.growth_only {
         rows::measure(&plan, &mut |row| {
             document.rows.push(row);
@@ -205,7 +205,7 @@ pub(crate) fn run(args: &PaperArgs) -> Result<()> {
         })?;
     }
     save(args.out.as_deref(), &document)?;
-    say(&markdown::page(&document))
+    print(&markdown::page(&document))
 }
 
 /// Writes the files.
@@ -216,7 +216,7 @@ fn save(folder: Option<&Path>, document: &Document) -> Result<()> {
     replace(&folder.join("paper.md"), markdown::page(document).as_bytes())
 }
 
-/// Writes a file that is never seen half written.
+/// Writes a file atomically.
 fn replace(path: &Path, bytes: &[u8]) -> Result<()> {
     let mut staged = path.as_os_str().to_owned();
     staged.push(".part");

@@ -1,4 +1,4 @@
-//! The four programs, timed alike: from spheres to a mesh in host memory.
+//! Runners of the four programs, timed from spheres to a mesh in host memory.
 
 use std::time::Instant;
 
@@ -16,23 +16,23 @@ use crate::machine::peak_memory;
 use crate::program_2010::Program2010;
 use crate::stats::Summary;
 
-/// A program of the comparison.
+/// Program of the comparison.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Program {
-    /// One thread, every atom at every grid point, double precision: the paper's CPU program
+    /// Paper's CPU program: one thread, all atoms at all grid points, double precision
     Reference,
-    /// The CPU backend, on every core
+    /// CPU backend, on all cores
     Cpu,
-    /// The paper's GPU program on today's device
+    /// Paper's GPU program
     Paper,
-    /// The stages on the device
+    /// GPU stages of molmesh
     Gpu,
 }
 
 impl Program {
     pub(super) const ALL: [Self; 4] = [Self::Reference, Self::Cpu, Self::Paper, Self::Gpu];
 
-    /// Its name, as in `--programs` and in stored results.
+    /// Returns the name in `--programs` and in stored results.
     pub(super) const fn name(self) -> &'static str {
         match self {
             Self::Reference => "reference",
@@ -42,15 +42,15 @@ impl Program {
         }
     }
 
-    /// Whether it needs a device.
+    /// Returns true if the program needs a device.
     pub(super) const fn on_device(self) -> bool {
         matches!(self, Self::Paper | Self::Gpu)
     }
 
-    /// Prepares a program of the CPU.
+    /// Prepares a CPU program.
     ///
     /// # Errors
-    /// [`Error::Failed`] if its threads cannot be started.
+    /// Returns [`Error::Failed`] if its threads cannot be started.
     pub(super) fn on_cpu(self, threads: Option<usize>) -> Result<Box<dyn Runner>> {
         let backend: Box<dyn Backend> = match self {
             Self::Reference => Box::new(ReferenceBackend),
@@ -59,10 +59,10 @@ impl Program {
         Ok(Box::new(backend))
     }
 
-    /// Prepares a program of the GPU.
+    /// Prepares a GPU program.
     ///
     /// # Errors
-    /// [`Error::Failed`] if the driver refuses.
+    /// Returns [`Error::Failed`] if the driver reports an error.
     pub(super) fn on(self, selected: &Selected) -> Result<Box<dyn Runner>> {
         Ok(match self {
             Self::Paper => Box::new(Program2010::new(selected.gpu()?)?),
@@ -71,35 +71,35 @@ impl Program {
     }
 }
 
-/// One run.
+/// Measurements of one run.
 #[derive(Debug)]
 pub(super) struct Sample {
     seconds: f64,
-    /// Whether the times of the stages are device times.
+    /// True if the times of the stages are device times.
     on_device: bool,
-    /// s.
+    /// Time of each stage, s.
     stages: Vec<(&'static str, f64)>,
     pub(super) triangles: usize,
 }
 
-/// A program that can be timed.
+/// Program that can be timed.
 pub(super) trait Runner {
     /// Meshes once.
     ///
     /// # Errors
-    /// Those of the program.
+    /// Returns the errors of the program.
     fn once(&mut self, spheres: &Spheres, params: &SurfaceParams) -> Result<Sample>;
 
-    /// Device memory that it holds.
+    /// Returns the device memory that the program holds, bytes.
     fn device_bytes(&self) -> Option<u64> {
         None
     }
 }
 
-/// Runs `runner` a few times unmeasured and `runs` times measured.
+/// Runs `runner` `warm_up` times unmeasured and `runs` times measured.
 ///
 /// # Errors
-/// Those of the runner.
+/// Returns the errors of the runner.
 pub(super) fn timed(
     runner: &mut dyn Runner,
     spheres: &Spheres,
@@ -173,9 +173,9 @@ impl Runner for Program2010 {
     }
 }
 
-/// Estimates the seconds that the reference takes for `cubes` cubes, from its rate at some points of the box.
+/// Estimates the time of the reference for `cubes` cubes, s, from its rate at some points of the box.
 pub(super) fn reference_estimate(spheres: &Spheres, params: &SurfaceParams, cubes: u64) -> f64 {
-    /// Pairs of the trial, which takes some ten milliseconds.
+    /// Pairs of the trial, which takes about ten milliseconds.
     const PAIRS: usize = 4_000_000;
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
     let density = Density::new(spheres, params);

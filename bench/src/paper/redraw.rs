@@ -1,4 +1,4 @@
-//! `molmesh-bench figures`: figures and tables from stored results, of this machine or others.
+//! `molmesh-bench figures`: figures and tables from stored results.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -7,18 +7,18 @@ use std::path::PathBuf;
 use super::result::Document;
 use super::{figures, markdown, replace};
 use crate::error::{Error, Result};
-use crate::say;
+use crate::print;
 
 /// Arguments of `molmesh-bench figures`.
 #[derive(Debug, clap::Args)]
 pub(crate) struct FiguresArgs {
-    /// Results of `molmesh-bench paper --out`: JSON files, or folders with such files
+    /// Results of `molmesh-bench paper --out`: JSON files or folders of them
     #[arg(value_name = "RESULTS", default_value = "docs/results/paper")]
     results: Vec<PathBuf>,
     /// Folder for the figures
     #[arg(long, value_name = "DIR", default_value = "docs/figures")]
     out: PathBuf,
-    /// A Markdown page whose parts from `<!-- measured: NAME -->` to `<!-- end -->` are replaced by tables
+    /// Markdown page in which tables replace the parts from `<!-- measured: NAME -->` to `<!-- end -->`
     #[arg(long, value_name = "FILE")]
     page: Option<PathBuf>,
 }
@@ -36,7 +36,7 @@ pub(crate) fn run(args: &FiguresArgs) -> Result<()> {
     fs::create_dir_all(&args.out).map_err(Error::file(&args.out))?;
     for (path, text) in &files {
         replace(path, text.as_bytes())?;
-        say(&format!("{}\n", path.display()))?;
+        print(&format!("{}\n", path.display()))?;
     }
     Ok(())
 }
@@ -57,19 +57,20 @@ fn read(paths: &[PathBuf]) -> Result<Vec<Document>> {
         }
     }
     if files.is_empty() {
-        return Err(Error::Usage("no results: `molmesh-bench paper --out` writes some".to_owned()));
+        return Err(Error::Usage("no results found; create them with `molmesh-bench paper --out`".to_owned()));
     }
     files.sort();
     let document = |path: &PathBuf| {
         let text = fs::read_to_string(path).map_err(Error::file(path))?;
-        let why = |e| Error::Failed(format!("{} is no result of `molmesh-bench paper`: {e}", path.display()));
+        let why = |e| Error::Failed(format!("{} is not a result of `molmesh-bench paper`: {e}", path.display()));
         serde_json::from_str(&text).map_err(why)
     };
     files.iter().map(document).collect()
 }
 
-/// The marks around a part of a page.
+/// Mark before the name of a part of a page.
 const OPEN: &str = "<!-- measured: ";
+/// Mark at the end of a part.
 const CLOSE: &str = "<!-- end -->";
 
 /// Replaces the marked parts of a page.
@@ -95,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn marked_parts_are_replaced_every_time() {
+    fn marked_parts_are_replaced_repeatedly() {
         let page = "before\n<!-- measured: table-1 -->\nold\n<!-- end -->\nafter\n";
         let once = filled(page, &[made_up(false)]).unwrap();
         assert!(once.starts_with("before\n<!-- measured: table-1 -->\n") && once.ends_with("<!-- end -->\nafter\n"));

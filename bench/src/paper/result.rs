@@ -1,94 +1,93 @@
-//! The results as data, stored as JSON: tables and figures are made from them.
+//! Results as stored in JSON, the source of tables and figures.
 
 use serde::{Deserialize, Serialize};
 
 use crate::stats::Summary;
 
-/// The results of one command on one machine.
+/// Results of one command on one machine.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Document {
-    /// The version of molmesh.
+    /// Version of molmesh.
     pub(crate) version: String,
-    /// The start, RFC 3339.
+    /// Start time, RFC 3339.
     pub(crate) date: String,
     pub(crate) machine: Machine,
-    /// The GPU, if one was used.
+    /// GPU, if one was used.
     pub(crate) device: Option<Device>,
-    /// The rows of the paper's tables.
+    /// Rows of the paper's tables.
     pub(crate) rows: Vec<Row>,
     /// Time and memory against atoms.
     pub(crate) growth: Option<Growth>,
-    /// The device's stages against its rates.
+    /// Stages against the rates of the device.
     pub(crate) roofline: Vec<Roofline>,
 }
 
-/// A machine.
+/// Description of a machine.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Machine {
-    /// The processor's name; empty if the system does not tell it.
+    /// Name of the processor; empty if unknown.
     pub(crate) cpu: String,
-    /// Cores for this process.
+    /// Number of cores available to this process.
     pub(crate) cores: usize,
-    /// Threads of the CPU backend.
+    /// Number of threads of the CPU backend.
     pub(crate) threads: usize,
     pub(crate) memory_bytes: Option<u64>,
     pub(crate) os: String,
 }
 
-/// A device.
+/// Description of a device.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Device {
     pub(crate) name: String,
     pub(crate) driver: String,
-    /// Whether a processor emulates it: its speed says nothing about GPUs.
+    /// True if a processor emulates the device, whose speed is then not that of a GPU.
     pub(crate) software: bool,
 }
 
-/// One structure with one kernel.
+/// Results of one structure with one kernel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Row {
     pub(crate) id: String,
     pub(crate) kernel: String,
-    /// Atoms by the paper.
+    /// Number of atoms according to the paper.
     pub(crate) paper_atoms: usize,
-    /// Atoms that were meshed.
+    /// Number of meshed atoms.
     pub(crate) atoms: usize,
     pub(crate) source: String,
-    /// Whether another structure replaces the paper's.
+    /// True if another structure replaces the paper's.
     pub(crate) stand_in: bool,
-    /// The paper's Table 1.
+    /// Part for the paper's Table 1.
     pub(crate) cpu: Side,
-    /// The paper's Table 2.
+    /// Part for the paper's Table 2.
     pub(crate) gpu: Side,
 }
 
-/// The part of a row that belongs to one of the paper's tables.
+/// Part of a row that belongs to one of the paper's tables.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Side {
     pub(crate) paper_seconds: f64,
     pub(crate) paper_cubes: u64,
-    /// Cubes that the dense program visits: the reference, or the 2010 program.
+    /// Number of cubes that the dense program visits (the reference or the 2010 program).
     pub(crate) cubes: u64,
-    /// Å.
+    /// Grid spacing, Å.
     pub(crate) spacing: f64,
-    /// The dense program.
+    /// Dense program.
     pub(crate) baseline: Cell,
-    /// The CPU backend, or the stages.
+    /// CPU backend or GPU stages.
     pub(crate) ours: Cell,
-    /// Triangles of the CPU backend on this grid, if it ran.
+    /// Number of triangles of the CPU backend on this grid, if it ran.
     pub(crate) triangles: Option<usize>,
 }
 
 impl Side {
-    /// Returns the speed of ours relative to the baseline: by device time if both have it.
+    /// Returns the speedup of ours over the baseline, by device time if both have it.
     pub(crate) fn speedup(&self) -> Option<f64> {
         let device = self.baseline.device_seconds().zip(self.ours.device_seconds());
         let (baseline, ours) = device.or_else(|| self.baseline.seconds().zip(self.ours.seconds()))?;
         Some(baseline / ours)
     }
 
-    /// Lists the programs whose numbers of triangles differ from the CPU backend's, or from each other's if that did not
-    /// run.
+    /// Lists the programs whose number of triangles differs from that of the CPU backend, or of ours if it did not run.
     pub(crate) fn disagreements(&self) -> Vec<String> {
         let of = |cell: &Cell| cell.timed.as_ref().map(|t| t.triangles);
         let expected = self.triangles.or_else(|| of(&self.ours));
@@ -100,47 +99,47 @@ impl Side {
     }
 }
 
-/// One program on one structure.
+/// Results of one program on one structure.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Cell {
     pub(crate) program: String,
     pub(crate) timed: Option<Timed>,
-    /// Why it did not run.
+    /// Reason why it did not run.
     pub(crate) not_run: Option<String>,
 }
 
 impl Cell {
-    /// Median time from spheres to a mesh in host memory, s.
+    /// Returns the median time from spheres to a mesh in host memory, s.
     pub(crate) fn seconds(&self) -> Option<f64> {
         self.timed.as_ref().map(|t| t.seconds.median)
     }
 
-    /// As [`Timed::device_median`].
+    /// Returns the median device time; see [`Timed::device_median`].
     pub(crate) fn device_seconds(&self) -> Option<f64> {
         self.timed.as_ref().and_then(Timed::device_median)
     }
 }
 
-/// The measurements of a program on a structure.
+/// Measurements of a program on a structure.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Timed {
-    /// Measured runs.
+    /// Number of measured runs.
     pub(crate) runs: usize,
-    /// From spheres to a mesh in host memory.
+    /// Time from spheres to a mesh in host memory, s.
     pub(crate) seconds: Summary,
-    /// The sum of the stages on the device; `None` on the CPU, and on a device without timestamps.
+    /// Sum of the stages on the device, s; `None` on the CPU and on devices without timestamps.
     pub(crate) device_seconds: Option<Summary>,
     /// Medians by stage, s: device time on a device, wall time on the CPU.
     pub(crate) stages: Vec<(String, f64)>,
     pub(crate) triangles: usize,
-    /// Peak memory of the process during a run, where the system tells it.
+    /// Peak memory of the process during a run, if the system reports it.
     pub(crate) host_bytes: Option<u64>,
-    /// Device memory that the program holds afterwards.
+    /// Device memory held after the run.
     pub(crate) device_bytes: Option<u64>,
 }
 
 impl Timed {
-    /// Median sum of the stages on the device, s.
+    /// Returns the median of the sum of the stages on the device, s.
     pub(crate) fn device_median(&self) -> Option<f64> {
         self.device_seconds.map(|s| s.median)
     }
@@ -149,19 +148,19 @@ impl Timed {
 /// Time and memory against atoms.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Growth {
-    /// The structure that grows.
+    /// Description of the structure.
     pub(crate) structure: String,
-    /// Å.
+    /// Grid spacing, Å.
     pub(crate) spacing: f64,
     pub(crate) series: Vec<Series>,
 }
 
-/// The series of one program.
+/// Series of one program.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Series {
     pub(crate) program: String,
     pub(crate) points: Vec<Point>,
-    /// Why it ends before the others.
+    /// Reason why it ends early.
     pub(crate) ends: Option<String>,
 }
 
@@ -172,40 +171,40 @@ impl Series {
     }
 }
 
-/// One size.
+/// Measurements of one size.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Point {
     pub(crate) atoms: usize,
     pub(crate) timed: Timed,
 }
 
-/// The device's stages against its rates.
+/// Stages against the rates of the device.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Roofline {
-    /// The structure that was meshed.
+    /// Description of the meshed structure.
     pub(crate) structure: String,
-    /// Bytes per second of a copying shader.
+    /// Bytes per second, measured by a copying shader.
     pub(crate) memory_rate: f64,
     /// Multiply-adds per second.
     pub(crate) fma_rate: f64,
     pub(crate) stages: Vec<StageFacts>,
 }
 
-/// One stage.
+/// Measurements of one stage.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct StageFacts {
     /// `gpu` or `paper`.
     pub(crate) program: String,
     pub(crate) stage: String,
-    /// Threads of a workgroup.
+    /// Threads per workgroup.
     pub(crate) workgroup_size: u32,
-    /// Bytes that a workgroup shares.
+    /// Shared memory per workgroup, bytes.
     pub(crate) workgroup_bytes: u32,
-    /// Workgroups of the run; `None` for the baseline.
+    /// Number of workgroups; `None` for the baseline.
     pub(crate) workgroups: Option<u64>,
-    /// The least work, bytes; `None` for the baseline.
+    /// Minimum memory traffic, bytes; `None` for the baseline.
     pub(crate) bytes: Option<f64>,
-    /// The least work, multiply-adds; `None` for the baseline.
+    /// Minimum number of multiply-adds; `None` for the baseline.
     pub(crate) fmas: Option<f64>,
     /// Median device time, s.
     pub(crate) seconds: f64,
@@ -237,7 +236,7 @@ pub(crate) mod tests {
         Cell { program: program.to_owned(), timed, not_run }
     }
 
-    /// Results for tests, not measured.
+    /// Creates artificial results for tests.
     pub(crate) fn made_up(device: bool) -> Document {
         let row = |entry: &super::super::entries::Entry| {
             let n = entry.atoms as f64;
@@ -306,7 +305,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn results_are_the_same_after_they_were_stored() {
+    fn results_survive_storage() {
         for document in [made_up(true), made_up(false)] {
             let text = serde_json::to_string_pretty(&document).unwrap();
             assert_eq!(serde_json::from_str::<Document>(&text).unwrap(), document);

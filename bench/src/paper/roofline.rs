@@ -1,7 +1,7 @@
-//! The device's stages against its rates, in place of the paper's table of one vendor's occupancy calculator.
+//! Stages against the rates of the device. Replaces the paper's table of a vendor's occupancy calculator.
 //!
-//! wgpu tells neither the registers of a stage nor the workgroups in flight. The table has the workgroups, the memory that
-//! they share, the least bytes and multiply-adds, and the time.
+//! wgpu reports neither registers nor concurrent workgroups of a stage. The table contains workgroups, shared memory,
+//! minimum bytes and multiply-adds, and time.
 
 use std::collections::BTreeMap;
 
@@ -26,10 +26,11 @@ const LARGE: usize = 300_000;
 /// Unmeasured runs.
 const WARM_UP: usize = 2;
 
-/// Measures the paper's largest structure, and a large one on hardware; nothing if the device has no timestamps.
+/// Measures the largest selected structure of the paper and, on hardware, a larger one. Returns nothing if the device
+/// does not support timestamps.
 ///
 /// # Errors
-/// [`Error`] if the device or a file cannot be used.
+/// Returns an [`Error`] if the device or a file cannot be used.
 pub(super) fn measure(selected: &Selected, plan: &Plan) -> Result<Vec<Roofline>> {
     let Some(rates) = rates::measure(&selected.gpu()?, selected.software)? else { return Ok(Vec::new()) };
     let entry = plan.entries.last().copied().unwrap_or(&ENTRIES[ENTRIES.len() - 1]);
@@ -53,7 +54,7 @@ pub(super) fn measure(selected: &Selected, plan: &Plan) -> Result<Vec<Roofline>>
     Ok(all)
 }
 
-/// Measures molmesh's stages on a structure.
+/// Measures the GPU stages on a structure.
 fn stages(
     selected: &Selected,
     spheres: &Spheres,
@@ -90,7 +91,7 @@ fn stages(
     Ok(Roofline { structure, memory_rate: digits(rates.memory), fma_rate: digits(rates.fma), stages })
 }
 
-/// The facts of a stage without its work.
+/// Creates the facts of a stage, without its work.
 fn facts(program: Program, shapes: &BTreeMap<&str, [u32; 2]>, (stage, seconds): (String, f64)) -> StageFacts {
     let [workgroup_size, workgroup_bytes] = shapes.get(stage.as_str()).copied().unwrap_or_default();
     StageFacts {
@@ -105,7 +106,7 @@ fn facts(program: Program, shapes: &BTreeMap<&str, [u32; 2]>, (stage, seconds): 
     }
 }
 
-/// Reads from shaders how many threads a workgroup has, and how many bytes they share.
+/// Returns the threads and the bytes of shared memory per workgroup of each shader.
 fn shapes(shaders: impl IntoIterator<Item = (&'static str, &'static str)>) -> Result<BTreeMap<&'static str, [u32; 2]>> {
     let shape = |(name, source): (&'static str, &str)| {
         let module = naga::front::wgsl::parse_str(source).map_err(Error::failed)?;
@@ -122,9 +123,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shapes_are_those_of_the_shaders() {
+    fn shapes_are_read_from_the_shaders() {
         let paper = shapes(program_2010::SHADERS).unwrap();
-        // As field.wgsl, classify.wgsl and scan.wgsl declare them.
+        // Declared in field.wgsl, classify.wgsl and scan.wgsl.
         assert_eq!([paper["field"], paper["classify"], paper["scan"]], [[64, 0], [256, 0], [256, 2048]]);
         let ours = shapes(stage_shaders()).unwrap();
         let names: Vec<&str> = stage_shaders().map(|(name, _)| name).collect();

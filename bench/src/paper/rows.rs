@@ -1,4 +1,4 @@
-//! The rows of the paper's tables: each structure with each kernel on each program.
+//! Rows of the paper's tables: all structures, kernels and programs.
 
 use molmesh::surface::lattice::Lattice;
 use molmesh::surface::{Kernel, Spheres, SurfaceParams, reference};
@@ -11,25 +11,25 @@ use crate::error::{Error, Result};
 use crate::grid::{self, Grid};
 use crate::{note, program_2010, stand_in, structures};
 
-/// Unmeasured runs of everything but the reference.
+/// Number of unmeasured runs of programs other than the reference.
 const WARM_UP: usize = 2;
 /// The reference runs once if a run takes longer than this, s.
 const SHORT: f64 = 2.0;
 
-/// A structure of the tables, or its replacement.
+/// Structure of the tables, or its stand-in.
 #[derive(Debug)]
 pub(super) struct Found {
     pub(super) spheres: Spheres,
-    /// Where it comes from, in words.
+    /// Description of the source.
     pub(super) source: String,
-    /// Whether it replaces the paper's structure.
+    /// True if it replaces the paper's structure.
     pub(super) stand_in: bool,
 }
 
 /// Finds the structure of a row: its file in `data`, the built-in sample, or a stand-in.
 ///
 /// # Errors
-/// [`Error`] if a file holds no structure, or the folder cannot be read.
+/// Returns an [`Error`] if a file contains no structure, or the folder cannot be read.
 pub(super) fn find(entry: &Entry, plan: &Plan) -> Result<Found> {
     let file = |id: &str| plan.data.as_ref().map_or(Ok(None), |folder| structures::find(folder, id));
     if let Some(path) = file(entry.id)? {
@@ -39,7 +39,7 @@ pub(super) fn find(entry: &Entry, plan: &Plan) -> Result<Found> {
     if entry.id == "4PTI" {
         return Ok(Found { spheres: structures::sample()?, source: "the built-in sample".to_owned(), stand_in: false });
     }
-    // Haemoglobin too, with three atoms fewer.
+    // 2HHB is also haemoglobin, with three atoms fewer.
     if entry.id == "1BIJ"
         && let Some(path) = file("2HHB")?
     {
@@ -53,7 +53,7 @@ pub(super) fn find(entry: &Entry, plan: &Plan) -> Result<Found> {
 /// Measures the rows of `plan`, and passes each to `done`.
 ///
 /// # Errors
-/// [`Error`] if a file or a program cannot be used, and the errors of `done`.
+/// Returns an [`Error`] if a file or a program cannot be used, or an error of `done`.
 pub(super) fn measure(plan: &Plan, done: &mut dyn FnMut(Row) -> Result<()>) -> Result<()> {
     let mut programs =
         Program::ALL.into_iter().map(|program| Ok((program, plan.open(program)?))).collect::<Result<Vec<_>>>()?;
@@ -79,7 +79,7 @@ pub(super) fn measure(plan: &Plan, done: &mut dyn FnMut(Row) -> Result<()>) -> R
     Ok(())
 }
 
-/// A structure with a kernel.
+/// Structure with a kernel.
 struct Case<'a> {
     found: &'a Found,
     kernel: Kernel,
@@ -125,10 +125,10 @@ impl Case<'_> {
     }
 }
 
-/// Returns the grids of both tables: the spacings at which their dense programs visit as many cubes as the paper's.
+/// Returns the grids of both tables, at which their dense programs visit the same number of cubes as in the paper.
 ///
 /// # Errors
-/// [`Error::Failed`] if no spacing comes within 1 %.
+/// Returns [`Error::Failed`] if no spacing is within 1 %.
 pub(super) fn grids(entry: &Entry, spheres: &Spheres, kernel: Kernel) -> Result<[Grid; 2]> {
     let cpu = |spacing| {
         let cells = reference::cells(spheres, &surface(kernel, spacing)?).map_err(Error::failed)?;
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn every_row_has_the_papers_number_of_cubes_in_both_tables() {
+    fn grids_have_the_papers_number_of_cubes() {
         for entry in &ENTRIES {
             let found = find(entry, &plan(None)).unwrap();
             for kernel in KERNELS {
@@ -172,7 +172,7 @@ mod tests {
                 for (grid, cubes) in grids.iter().zip(entry.cubes) {
                     let off = (grid.cubes as f64 / cubes as f64 - 1.0).abs();
                     assert!(off <= grid::TOLERANCE, "{} {kernel}: {grid:?} for {cubes}", entry.id);
-                    // The paper's cubes have 0.4 Å; the programs here have other margins around the atoms.
+                    // The paper's cubes have 0.4 Å. Margins around the atoms differ here.
                     assert!((0.36..0.44).contains(&grid.spacing), "{} {kernel}: {grid:?}", entry.id);
                 }
             }
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn files_come_before_the_sample_and_the_sample_before_stand_ins() {
+    fn files_are_preferred_to_the_sample_and_the_sample_to_stand_ins() {
         let folder = tempfile::tempdir().unwrap();
         let found = |id: &str| {
             let entry = ENTRIES.iter().find(|entry| entry.id == id).unwrap();

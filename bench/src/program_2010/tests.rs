@@ -1,4 +1,4 @@
-//! The 2010 program against the CPU backend, on the software device: the same surface without shared vertices.
+//! Comparison of the 2010 program on the software device with the CPU backend.
 
 use std::collections::HashSet;
 use std::mem::offset_of;
@@ -82,7 +82,7 @@ fn difference(here: &Mesh, there: &Mesh) -> Vec<String> {
     let places: HashSet<[i64; 3]> = here.positions.iter().map(key).collect();
     let missing = there.positions.iter().filter(|p| !near(&places, p)).count();
     if missing > 0 {
-        wrong.push(format!("{missing} vertices of {} are not there", there.n_vertices()));
+        wrong.push(format!("{missing} vertices of {} are missing", there.n_vertices()));
     }
     // Central differences are not the gradient, but they do not point inwards.
     let inward = here.triangles.iter().filter(|t| {
@@ -98,7 +98,7 @@ fn difference(here: &Mesh, there: &Mesh) -> Vec<String> {
     wrong
 }
 
-/// Signed volume: [`Measures`] would take each triangle for a component.
+/// Returns the signed volume. [`Measures`] would treat each triangle as a component.
 fn volume(mesh: &Mesh) -> f64 {
     let of = |t: &[u32; 3]| {
         let corner = mesh.positions[t[0] as usize].map(f64::from);
@@ -124,7 +124,7 @@ fn cpu(spheres: &Spheres, params: &SurfaceParams) -> Mesh {
 }
 
 #[test]
-fn the_soup_is_the_surface_of_the_cpu_with_every_kernel() {
+fn surfaces_equal_those_of_the_cpu_for_all_kernels() {
     let crambin = crambin();
     for kernel in [Kernel::Gaussian, Kernel::SoftObject, Kernel::InverseSquare] {
         let params = of(kernel, 0.5);
@@ -139,7 +139,7 @@ fn the_soup_is_the_surface_of_the_cpu_with_every_kernel() {
 }
 
 #[test]
-fn the_kernels_raw_parameters_are_the_cpus() {
+fn raw_kernel_parameters_give_the_surface_of_the_cpu() {
     let crambin = crambin();
     let raw = |kernel, [a, b, c]: [Option<f64>; 3], iso| {
         params(&SurfaceOptions {
@@ -163,7 +163,7 @@ fn the_kernels_raw_parameters_are_the_cpus() {
 }
 
 #[test]
-fn another_surface_differs() {
+fn different_surfaces_are_detected() {
     let crambin = crambin();
     let at = |isovalue| params(&SurfaceOptions { isovalue: Some(isovalue), ..SurfaceOptions::default() });
     let soup = run(&crambin, &at(1.0)).unwrap();
@@ -175,7 +175,7 @@ fn another_surface_differs() {
 }
 
 #[test]
-fn single_atoms_and_odd_sizes() {
+fn single_atoms_and_odd_sizes_are_meshed() {
     for (n, spacing) in [(1, 0.5), (2, 0.31), (65, 0.47)] {
         let rows: Vec<[f64; 4]> = (0..n).map(|i| [1.3 * f64::from(i), 0.1, -7.7, 1.6]).collect();
         let (spheres, params) = (spheres(&rows), of(Kernel::SoftObject, spacing));
@@ -188,11 +188,11 @@ fn unsuitable_jobs_are_rejected() {
     let far = spheres(&[[0.0, 0.0, 0.0, 1.5], [900.0, 900.0, 900.0, 1.5]]);
     let rejected = run(&far, &of(Kernel::Gaussian, 0.5)).unwrap_err().to_string();
     assert!(rejected.contains("points") && rejected.contains("fits"), "{rejected}");
-    // A hundred atoms at one place.
+    // A hundred atoms at the same position.
     let heap = spheres(&[[0.0, 0.0, 0.0, 1.5]; 100]);
     let steep = params(&SurfaceOptions { smoothness: Some(20.0), ..SurfaceOptions::default() });
     let rejected = run(&heap, &steep).unwrap_err().to_string();
-    assert!(rejected.contains("densely"), "{rejected}");
+    assert!(rejected.contains("too dense"), "{rejected}");
 }
 
 #[test]

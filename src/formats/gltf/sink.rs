@@ -38,10 +38,11 @@ pub enum GlbSinkError {
     },
 }
 
-/// Blocks that may wait for the output before a thread waits with them.
+/// Blocks that may wait for the output before a thread waits, too.
 const MAX_WAITING: usize = 48;
-/// Rows of a block.
-const BLOCK_ROWS: usize = 1 << 14;
+
+/// Locked output of a sink.
+type Output<'l, 'a> = MutexGuard<'l, &'a mut dyn RandomAccess>;
 
 /// Sink that writes a GLB.
 pub struct GlbSink<'a> {
@@ -100,11 +101,11 @@ impl<'a> GlbSink<'a> {
         }
         let mut out = lock(&self.out);
         self.drain(&mut **out, head)?;
-        place(&mut **out, 0, plan.head())?;
+        write_at(&mut **out, 0, plan.head())?;
         if let Some(layout) = layout {
             let end = head + layout.len;
             let padding = usize::try_from(plan.len() - end).unwrap_or(0);
-            place(&mut **out, end, &[0; 3][..padding])?;
+            write_at(&mut **out, end, &[0; 3][..padding])?;
         }
         Ok(plan.len())
     }
@@ -125,59 +126,57 @@ impl<'a> GlbSink<'a> {
     fn try_part(&self, part: &MeshPart<'_>) -> Result<(), GlbSinkError> {
         let Some(layout) = self.layout.get().copied().flatten() else { return Ok(()) };
         let packing = layout.storage.packing;
-        let large = layout.len >= LARGE_BUFFER_BYTES;
-        let positions = (layout.positions.offset, packing.position_bytes());
-        let normals = layout.normals.map(|normals| (normals.offset, packing.normal_bytes()));
+        let mut out = if layout.len >= LARGE_BUFFER_BYTES { self.output() } else { None };
+        if let Some(out) = &mut out {
+            // Waiting rows are older than these, which may replace them.
+            self.drain(&mut ***out, HEAD_BYTES)?;
+        }
+        let row = part.first_vertex as u64;
+        let positions = layout.positions.offset + packing.position_bytes() * row;
+        let normals = layout.normals.map(|normals| normals.offset + packing.normal_bytes() * row);
         match part.vertices {
             Vertices::Single { positions: rows, normals: units } => {
-                let write = |out: &mut Vec<u8>, rows: &[_]| write_positions(out, packing, rows);
-                self.column(positions, part.first_vertex, rows, large, write)?;
+                self.place(&mut out, positions, |out| write_positions(out, packing, rows))?;
                 if let Some(normals) = normals {
-                    let write = |out: &mut Vec<u8>, rows: &[_]| write_normals(out, packing, rows);
-                    self.column(normals, part.first_vertex, units, large, write)?;
+                    self.place(&mut out, normals, |out| write_normals(out, packing, units))?;
                 }
             }
             Vertices::Quantized { step, positions: rows, normals: units } if packing.step() == Some(step) => {
-                self.column(positions, part.first_vertex, rows, large, |out, rows| write_shorts(out, rows))?;
+                self.place(&mut out, positions, |out| write_shorts(out, rows))?;
                 if let Some(normals) = normals {
-                    self.column(normals, part.first_vertex, units, large, |out, rows| write_bytes(out, rows))?;
+                    self.place(&mut out, normals, |out| write_bytes(out, units))?;
                 }
             }
             Vertices::Quantized { step, .. } => return Err(FormatError::OtherPacking { step: step.length() }.into()),
         }
         let (index_type, indices) = layout.indices;
-        let write = |out: &mut Vec<u8>, rows: &[[u32; 3]]| write_indices(out, index_type, rows.as_flattened());
-        self.column((indices.offset, 3 * index_type.bytes()), part.first_triangle, part.triangles, large, write)?;
+        let indices = indices.offset + 3 * index_type.bytes() * part.first_triangle as u64;
+        self.place(&mut out, indices, |out| write_indices(out, index_type, part.triangles.as_flattened()))?;
+        if let Some(out) = &mut out {
+            self.drain(&mut ***out, HEAD_BYTES)?;
+        }
         Ok(())
     }
 
-    /// Encodes rows of a column, which begins at a byte of the buffer and has rows of so many bytes. Writes them if the
-    /// buffer is `large` and no other thread is writing.
-    fn column<T>(
+    /// The output, or `None` if another thread is writing and not too many blocks are waiting.
+    fn output(&self) -> Option<Output<'_, 'a>> {
+        if lock(&self.waiting).len() > MAX_WAITING { Some(lock(&self.out)) } else { self.out.try_lock().ok() }
+    }
+
+    /// Writes rows from byte `offset` of a large buffer to the output, if there is one, or into a block that waits for it.
+    fn place(
         &self,
-        (offset, row_bytes): (u64, u64),
-        first_row: usize,
-        rows: &[T],
-        large: bool,
-        write: impl Fn(&mut Vec<u8>, &[T]) -> io::Result<()>,
+        out: &mut Option<Output<'_, 'a>>,
+        offset: u64,
+        write: impl Fn(&mut dyn Write) -> io::Result<()>,
     ) -> io::Result<()> {
-        let mut at = offset + row_bytes * first_row as u64;
-        for rows in rows.chunks(BLOCK_ROWS) {
-            let mut block = Vec::with_capacity(usize::try_from(row_bytes).unwrap_or(0) * rows.len());
-            write(&mut block, rows)?;
-            let next = at + block.len() as u64;
-            let mut waiting = lock(&self.waiting);
-            waiting.push((at, block));
-            let many = waiting.len() > MAX_WAITING;
-            drop(waiting);
-            at = next;
-            if large {
-                let out = if many { Some(lock(&self.out)) } else { self.out.try_lock().ok() };
-                if let Some(mut out) = out {
-                    self.drain(&mut **out, HEAD_BYTES)?;
-                }
-            }
+        if let Some(out) = out {
+            out.seek(SeekFrom::Start(HEAD_BYTES + offset))?;
+            return write(&mut **out);
         }
+        let mut block = Vec::new();
+        write(&mut block)?;
+        lock(&self.waiting).push((offset, block));
         Ok(())
     }
 
@@ -189,7 +188,7 @@ impl<'a> GlbSink<'a> {
                 return Ok(());
             }
             for (offset, block) in blocks {
-                place(out, base + offset, &block)?;
+                write_at(out, base + offset, &block)?;
             }
         }
     }
@@ -213,7 +212,7 @@ impl MeshSink for GlbSink<'_> {
 }
 
 /// Writes `bytes` at `offset`.
-fn place(out: &mut dyn RandomAccess, offset: u64, bytes: &[u8]) -> io::Result<()> {
+fn write_at(out: &mut dyn RandomAccess, offset: u64, bytes: &[u8]) -> io::Result<()> {
     out.seek(SeekFrom::Start(offset))?;
     out.write_all(bytes)
 }

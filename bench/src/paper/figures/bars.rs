@@ -1,4 +1,4 @@
-//! Bar charts: time by stage, and the stages' share of the device's rates.
+//! Bar charts: time by stage, and shares of the device rates by stage.
 
 use kuva::backend::svg::SvgBackend;
 use kuva::plot::BarPlot;
@@ -10,12 +10,12 @@ use super::super::result::{Document, Point, StageFacts};
 use super::lines::{framed, text};
 use super::{grown, label};
 
-/// Colours of the stages, from the bottom.
+/// Colours of the stages, from bottom to top.
 const COLOURS: [&str; 8] = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999", "#117733"];
-/// Fewest atoms of a bar: below, latency dominates, which another figure shows.
+/// Minimum number of atoms of a bar. Latency dominates smaller structures.
 const MIN_ATOMS: usize = 10_000;
 
-/// Draws the time per atom by stage, for each size of a program's series: of the last results that have one.
+/// Draws the time per atom by stage, for each size of a program's series in the last results that have one.
 pub(super) fn stages(documents: &[&Document], program: &str) -> Option<String> {
     let (document, series) = grown(documents)
         .filter_map(|(d, growth)| Some((d, growth.series.iter().find(|s| s.program == program)?)))
@@ -39,8 +39,8 @@ pub(super) fn stages(documents: &[&Document], program: &str) -> Option<String> {
         bars = bars.with_group(thousands(point.atoms), parts);
     }
     let plots = vec![Plot::Bar(bars.with_stacked())];
-    let title = format!("Time an atom by stage: {}", label(program, document));
-    let layout = framed(Layout::auto_from_plots(&plots), &title).with_x_label("atoms").with_y_label("µs an atom");
+    let title = format!("Time per atom by stage: {}", label(program, document));
+    let layout = framed(Layout::auto_from_plots(&plots), &title).with_x_label("atoms").with_y_label("µs per atom");
     let computed = ComputedLayout::from_layout(&layout);
     let mut scene = render_multiple(plots, layout);
     let last = points.last()?;
@@ -55,10 +55,10 @@ pub(super) fn stages(documents: &[&Document], program: &str) -> Option<String> {
     Some(SvgBackend::new().render_scene(&scene))
 }
 
-/// Draws the share of the device's rates that each stage reaches, for the last structure of the results.
+/// Draws the shares of the device rates that each stage reaches, for the last structure of the results.
 pub(super) fn roofline(document: &Document) -> Option<String> {
     let roofline = document.roofline.last()?;
-    // Of memory, and of arithmetic.
+    // Shares of memory and arithmetic rates.
     let reached = |s: &StageFacts| {
         let share = |work: Option<f64>, rate: f64| work.map(|work| 100.0 * work / s.seconds.max(1e-12) / rate);
         Some([share(s.bytes, roofline.memory_rate)?, share(s.fmas, roofline.fma_rate)?])
@@ -73,8 +73,8 @@ pub(super) fn roofline(document: &Document) -> Option<String> {
         bars = bars.with_group(stage.stage.clone(), reached.iter().copied().zip(colours));
     }
     let plots = vec![Plot::Bar(bars)];
-    let title = format!("What of the device's rates stages reach: {}", label("gpu", document));
-    let y = "% of the rate measured";
+    let title = format!("Share of device rates by stage: {}", label("gpu", document));
+    let y = "% of the measured rate";
     let layout =
         framed(Layout::auto_from_plots(&plots), &title).with_x_label(roofline.structure.clone()).with_y_label(y);
     let computed = ComputedLayout::from_layout(&layout);
@@ -90,7 +90,7 @@ pub(super) fn roofline(document: &Document) -> Option<String> {
     Some(SvgBackend::new().render_scene(&scene))
 }
 
-/// Formats a number with the units k and M.
+/// Formats a number with the suffixes k and M.
 fn thousands(n: usize) -> String {
     match n {
         n if n >= 1_000_000 && n.is_multiple_of(1_000_000) => format!("{} M", n / 1_000_000),

@@ -10,26 +10,28 @@ use std::sync::Arc;
 
 use super::super::fit::Fit;
 
-/// Pixels of a figure, and of the names at its right.
+/// Width and height of a figure, pixels.
 const SIZE: [f64; 2] = [860.0, 460.0];
+/// Width of the names on the right, pixels.
 const NAMES: f64 = 300.0;
+/// Font size, pixels.
 const TEXT: u32 = 12;
 
-/// A chart over atoms.
+/// Chart over the number of atoms.
 pub(super) struct Chart {
     pub(super) title: String,
-    /// The label of the y axis.
+    /// Label of the y axis.
     pub(super) y: &'static str,
     pub(super) lines: Vec<Line>,
 }
 
-/// A series.
+/// Line of a chart.
 pub(super) struct Line {
     pub(super) name: String,
     pub(super) colour: &'static str,
     pub(super) points: Vec<(f64, f64)>,
     pub(super) fit: Option<Fit>,
-    /// The pattern of its dashes; `None` for a solid line.
+    /// Dash pattern; `None` for a solid line.
     pub(super) dash: Option<&'static str>,
 }
 
@@ -38,13 +40,13 @@ impl Line {
         Self { name, colour, points, fit: None, dash: None }
     }
 
-    /// Makes the line dashed if `others` have a solid one of its colour: that of another machine.
+    /// Makes the line dashed if `others` contain a solid one of its colour, which is that of another machine.
     pub(super) fn beside(self, others: &[Self]) -> Self {
         let again = others.iter().any(|other| other.colour == self.colour && other.dash.is_none());
         Self { dash: again.then_some("7 4"), ..self }
     }
 
-    /// Makes the line dotted: it shows a part of the time.
+    /// Makes the line dotted, for a part of the time.
     pub(super) fn dotted(self) -> Self {
         Self { dash: Some("2 3"), ..self }
     }
@@ -95,16 +97,16 @@ impl Chart {
             .with_y_tick_format(TickFormat::Custom(Arc::new(power)));
         let computed = ComputedLayout::from_layout(&layout);
         let mut scene = render_multiple(plots, layout);
-        // Names stand beside the ends of the lines, pushed apart where they would overlap.
+        // Names are beside the ends of the lines, moved apart if they would overlap.
         let mut names: Vec<(f64, &Line)> =
             self.lines.iter().filter_map(|line| Some((computed.map_y(line.points.last()?.1), line))).collect();
         names.sort_by(|a, b| a.0.total_cmp(&b.0));
         let step = f64::from(TEXT) + 3.0;
-        let room = step * (names.len().saturating_sub(1)) as f64;
+        let height = step * (names.len().saturating_sub(1)) as f64;
         let mut next = f64::MIN;
         for (i, (y, line)) in names.iter().enumerate() {
             let left_below = step * (names.len() - 1 - i) as f64;
-            let y = y.max(next).min((SIZE[1] - 50.0).max(room) - left_below);
+            let y = y.max(next).min((SIZE[1] - 50.0).max(height) - left_below);
             next = y + step;
             let end = line.points.last().copied().unwrap_or_default();
             let from = [computed.map_x(end.0), computed.map_y(end.1)];
@@ -143,7 +145,7 @@ pub(super) fn text([x, y]: [f64; 2], content: &str, colour: &str, anchor: TextAn
     Primitive::Text { x, y, content, size: TEXT, anchor, rotate: None, bold: false, color }
 }
 
-/// Formats a power of ten; the labels of other numbers are empty.
+/// Formats a power of ten. Returns an empty text for other numbers.
 fn power(value: f64) -> String {
     let exponent = value.log10().round();
     if (value / 10_f64.powf(exponent) - 1.0).abs() > 1e-6 {
@@ -168,7 +170,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn powers_are_written_as_such() {
+    fn powers_of_ten_are_formatted() {
         assert_eq!([1.0, 10.0, 1e-6, 1e4, 1e12, 300.0].map(power), ["1", "10", "10⁻⁶", "10⁴", "10¹²", ""]);
     }
 }

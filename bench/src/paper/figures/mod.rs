@@ -1,7 +1,7 @@
-//! The figures, drawn from stored results.
+//! Figures, drawn from stored results.
 //!
-//! They have a white background, so that they are readable on dark pages, and colours for the colour-blind (Okabe and Ito).
-//! The name of a series stands where the series ends.
+//! They have a white background, to be readable on dark pages, and colours that colour-blind readers can distinguish
+//! (Okabe and Ito). The name of a series is at its end.
 
 mod bars;
 mod lines;
@@ -11,13 +11,13 @@ use super::fit::{Fit, fits};
 use super::result::{Cell, Document, Growth, Row, Side, Timed};
 use lines::{Chart, Line};
 
-/// The colour of the paper's own numbers.
+/// Colour of the paper's own numbers.
 const PAPER_COLOUR: &str = "#555555";
-/// The colours of the programs.
+/// Colours of the programs.
 const COLOURS: [(&str, &str); 4] =
     [("reference", "#D55E00"), ("cpu", "#0072B2"), ("paper", "#AA4499"), ("gpu", "#009E73")];
 
-/// Draws every figure that there are results for. Returns file names and SVG texts.
+/// Draws all figures that have results. Returns file names and SVG texts.
 pub(super) fn all(documents: &[Document]) -> Vec<(&'static str, String)> {
     let documents = &representative(documents)[..];
     let charts = [
@@ -35,7 +35,7 @@ pub(super) fn all(documents: &[Document]) -> Vec<(&'static str, String)> {
     charts.chain(stages).chain(roofline).collect()
 }
 
-/// Returns the results, without those of emulated GPUs if there are some of hardware.
+/// Returns the results, without those of emulated GPUs if there are results of hardware.
 fn representative(documents: &[Document]) -> Vec<&Document> {
     let software = |d: &Document| d.device.as_ref().is_some_and(|device| device.software);
     let hardware = documents.iter().any(|d| d.device.is_some() && !software(d));
@@ -47,7 +47,7 @@ fn colour(program: &str) -> &'static str {
     COLOURS.iter().find(|(name, _)| *name == program).map_or(PAPER_COLOUR, |(_, colour)| colour)
 }
 
-/// Returns a program's name in the figures, with the hardware it ran on.
+/// Returns the name of a program in the figures, with its hardware.
 fn label(program: &str, document: &Document) -> String {
     let device =
         document.device.as_ref().map_or("no device", |d| if d.software { "software" } else { d.name.as_str() });
@@ -59,7 +59,7 @@ fn label(program: &str, document: &Document) -> String {
     }
 }
 
-/// The paper's Figures 2 and 3: the structures of its tables.
+/// Creates the paper's Figure 2 or 3: time against atoms for the structures of its tables.
 fn tables(documents: &[&Document], gpu: bool) -> Chart {
     fn rows(document: &Document) -> impl Iterator<Item = &Row> {
         document.rows.iter().filter(|row| row.kernel == "gaussian")
@@ -94,7 +94,7 @@ fn tables(documents: &[&Document], gpu: bool) -> Chart {
     Chart { title: format!("{title}, Gaussian"), y: "seconds", lines }
 }
 
-/// Time against atoms, with fitted exponents.
+/// Creates the chart of time against atoms, with fitted exponents.
 fn growth(documents: &[&Document], gpu: bool) -> Chart {
     let mut lines: Vec<Line> = Vec::new();
     for (document, growth) in grown(documents) {
@@ -118,7 +118,7 @@ fn growth(documents: &[&Document], gpu: bool) -> Chart {
     Chart { title: format!("Time against atoms {on}, {spacing} Å"), y: "seconds", lines }
 }
 
-/// Memory against atoms.
+/// Creates the chart of memory against atoms.
 fn memory(documents: &[&Document]) -> Chart {
     let mut lines: Vec<Line> = Vec::new();
     for (document, growth) in grown(documents) {
@@ -130,7 +130,7 @@ fn memory(documents: &[&Document]) -> Chart {
             lines.extend(nonempty(Line::new(format!("{name}: device"), colour, mega(&|t| t.device_bytes)).dotted()));
         }
     }
-    Chart { title: "Memory against atoms: host at its peak, device as held".to_owned(), y: "MB", lines }
+    Chart { title: "Memory against atoms: host peak, device held".to_owned(), y: "MB", lines }
 }
 
 fn grown<'a>(documents: &'a [&Document]) -> impl Iterator<Item = (&'a Document, &'a Growth)> {
@@ -155,7 +155,7 @@ mod tests {
     use super::super::result::tests::made_up;
     use super::*;
 
-    /// Returns the first error of a text as XML: tags that do not match, attributes without quotes, bare ampersands.
+    /// Returns the first XML error of a text: mismatched tags, unquoted attributes, or bare ampersands.
     fn ill_formed(text: &str) -> Option<String> {
         let (mut open, mut rest) = (Vec::new(), text);
         while let Some((before, tag)) = rest.split_once('<') {
@@ -199,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn every_figure_is_well_formed_and_has_every_series() {
+    fn figures_are_well_formed_and_contain_all_series() {
         let figures = all(&[made_up(true)]);
         let names: Vec<&str> = figures.iter().map(|(name, _)| *name).collect();
         assert_eq!(
@@ -242,7 +242,7 @@ mod tests {
         ] {
             assert!(has(figure, series), "{figure} has no {series:?}");
         }
-        assert!(!has("growth-cpu.svg", "A Card") && !has("paper-cpu.svg", "nobody"));
+        assert!(!has("growth-cpu.svg", "A Card") && !has("paper-cpu.svg", "A Card"));
     }
 
     #[test]
@@ -251,12 +251,12 @@ mod tests {
         let names: Vec<&str> = figures.iter().map(|(name, _)| *name).collect();
         assert_eq!(names, ["paper-cpu.svg", "paper-gpu.svg", "growth-cpu.svg", "memory.svg", "stages-cpu.svg"]);
         let (_, gpu) = &figures[1];
-        assert!(gpu.contains("GTX 280") && !gpu.contains("ours"), "only the line of the paper");
+        assert!(gpu.contains("GTX 280") && !gpu.contains("ours"), "only the paper has a line");
         assert!(all(&[]).is_empty());
     }
 
     #[test]
-    fn emulated_gpus_are_left_out_beside_hardware() {
+    fn emulated_gpus_are_omitted_if_there_is_hardware() {
         let (hardware, mut software) = (made_up(true), made_up(true));
         software.device.as_mut().unwrap().software = true;
         assert_eq!(representative(&[software.clone(), hardware.clone()]), [&hardware]);
