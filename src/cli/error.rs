@@ -36,19 +36,19 @@ pub(crate) mod code {
     pub(crate) const INTERRUPTED: i32 = 130;
 }
 
-/// Table of exit codes for `--help`. The README has the same text.
+/// Table of exit codes for `--help`. `docs/start/cli.md` has the same text.
 pub(crate) const EXIT_CODES: &str = "\
 Exit codes:
-    0  ok
-    1  internal error, or an unhealthy service
-    2  bad usage or a bad parameter
+    0  success
+    1  internal error, or the checked service is unhealthy
+    2  wrong usage or invalid parameter
     3  the input cannot be read
-    4  the structure is refused: unreadable, no atoms, empty selection
+    4  the structure is rejected: unreadable, no atoms, empty selection
     5  a limit is exceeded: input, atoms, grid, mesh
-    6  no such backend or device on this machine
+    6  the backend or device does not exist on this machine
     7  the output cannot be written
     8  another service uses the data folder
-  130  interrupted; no partial file is left";
+  130  interrupted; no partial file remains";
 
 /// End of hints about backends.
 const DOCTOR: &str = if cfg!(feature = "server") { "; `molmesh doctor` lists the backends" } else { "" };

@@ -70,7 +70,7 @@ fn dockerfile_matches_its_configuration() {
 #[test]
 fn dockerfile_uses_the_compiler_of_the_package() {
     let manifest: toml::Table = read("Cargo.toml").parse().unwrap();
-    let version = manifest["package"]["rust-version"].as_str().unwrap();
+    let version = manifest["workspace"]["package"]["rust-version"].as_str().unwrap();
     let image = recipe().argument("RUST_IMAGE").unwrap();
     let (_, tag) = image.rsplit_once(':').unwrap();
     assert!(tag.starts_with(&format!("{version}-")), "{image} is not Rust {version}");

@@ -36,28 +36,28 @@ fn help_is_stable() {
 }
 
 #[test]
-fn help_and_readme_agree_on_exit_codes() {
+fn help_and_guide_list_the_same_exit_codes() {
     let help = stdout(&run(["--help"]));
-    let readme = include_str!("../../README.md");
+    let guide = include_str!("../../docs/start/cli.md");
     let codes: Vec<&str> = help.split("Exit codes:\n").nth(1).unwrap().lines().collect();
     assert_eq!(codes.len(), 10, "{help}");
     for line in codes {
         let (code, meaning) = line.trim().split_once("  ").unwrap();
         let row = format!("| {code} | {} |", meaning.trim());
-        assert!(readme.contains(&row), "the README has no row `{row}`");
+        assert!(guide.contains(&row), "docs/start/cli.md has no row `{row}`");
     }
 }
 
 #[test]
-fn every_flag_of_mesh_is_in_the_readme() {
+fn the_guide_mentions_every_flag_of_mesh() {
     let help = stdout(&run(["mesh", "--help"]));
-    let readme = include_str!("../../README.md");
+    let guide = include_str!("../../docs/start/cli.md");
     let flags: Vec<&str> = help.split_whitespace().filter(|w| w.starts_with("--") && w.len() > 2).collect();
     assert!(flags.len() > 20, "{flags:?}");
     for flag in flags {
         let flag = flag.trim_end_matches([',', '.', ')', ']', ':']);
         if flag != "--help" {
-            assert!(readme.contains(flag), "the README does not mention {flag}");
+            assert!(guide.contains(flag), "docs/start/cli.md does not mention {flag}");
         }
     }
 }

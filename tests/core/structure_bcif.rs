@@ -413,7 +413,7 @@ fn rejects_inconsistent_encodings() {
     };
     let nest = string_array("AB", &[0, 1, 2], vec![string_array("AB", &[0, 1, 2], vec![byte_array(3)])]);
     let cases: Vec<(Pack, &str)> = vec![
-        (number(&two, vec![]), "auth_seq_id: found no encoding, expected ByteArray at least"),
+        (number(&two, vec![]), "auth_seq_id: found no encoding, expected at least ByteArray"),
         (number(&two, vec![delta(0)]), "auth_seq_id, Delta (encoding 1 of 1): found it at the end of its chain"),
         (
             number(&two, vec![byte_array(3), byte_array(3)]),

@@ -102,7 +102,7 @@ fn rejects_invalid_lists_of_kinds() {
         "`` is not a kind of atoms; expected a list of polymer, ligand, water, hydrogens, all"
     );
     assert!(refused("").contains("expected a list of"));
-    assert!(refused("hydrogens").contains("expected polymer, ligand or water beside it"));
+    assert!(refused("hydrogens").contains("expected polymer, ligand or water as well"));
     assert!(refused(&"x".repeat(10_000)).len() < 200);
 }
 

@@ -158,10 +158,10 @@ fn faults(rows: &[Row]) -> Vec<String> {
             faults.push(format!("{key}: no metric or reason {counted}"));
         }
         let (file, name) = test.split_once("::").unwrap();
-        let folder = if file.contains('/') { "src" } else { "tests" };
-        let source = read(&format!("{folder}/{file}.rs"));
+        let unit_test = file.starts_with("src/");
+        let source = read(&if unit_test { format!("{file}.rs") } else { format!("tests/{file}.rs") });
         let field = key.split_once('.').unwrap().1.trim_end_matches("_ms").trim_end_matches("_s");
-        if !source.contains(&format!("fn {name}(")) || !source.contains(field) && folder == "tests" {
+        if !source.contains(&format!("fn {name}(")) || !source.contains(field) && !unit_test {
             faults.push(format!("{key}: {file} has no {name}, or does not contain the key"));
         }
     }

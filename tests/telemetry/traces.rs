@@ -116,7 +116,7 @@ fn a_request_its_job_and_every_stage_are_one_tree() {
         assert_eq!(attribute(request, key).as_deref(), Some(value), "{key}");
     }
     let parts: Vec<&str> = below(&spans, request).iter().map(|span| span.name.as_str()).collect();
-    for part in ["receive", "job", "encode", "keep"] {
+    for part in ["receive", "job", "encode", "save"] {
         assert!(parts.contains(&part), "{part} among {parts:?}");
     }
     for part in ["receive", "job", "encode"] {
@@ -193,7 +193,7 @@ fn a_promised_job_keeps_its_place_in_the_trace() {
     let (request, job) = (named(&spans, "POST /v1/meshes"), named(&spans, "job"));
     assert_eq!((&job.parent_span_id, kind(job)), (&request.span_id, SpanKind::Consumer));
     assert_eq!(attribute(job, "molmesh.job.id"), Some(id));
-    assert_eq!(named(&spans, "keep").parent_span_id, request.span_id);
+    assert_eq!(named(&spans, "save").parent_span_id, request.span_id);
     // A job's lines name the request, the trace and the job.
     let lines = log_lines("a job failed");
     let (trace, _) = place(&failed);
