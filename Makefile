@@ -39,8 +39,9 @@ fmt: ## Format
 fmt-check:
 	$(CARGO) fmt --all -- --check
 
-lint: ## Clippy on everything, warnings are errors
+lint: ## Clippy and documentation of everything; warnings are errors
 	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
+	RUSTDOCFLAGS="-D warnings" $(CARGO) doc --locked --workspace --no-deps --quiet
 
 # `lint` checks all features together. No code of the library depends on `cli`, so that `cli,gpu` and `cli,server` check
 # the library with `gpu` and with `server` alone as well.

@@ -1,5 +1,18 @@
 //! Watertight molecular-surface meshes from PDB, mmCIF and BinaryCIF files.
 //!
+//! [`mesh()`] turns the bytes of a structure file into a triangle mesh:
+//!
+//! ```
+//! let bytes = std::fs::read("samples/4pti.pdb")?;
+//! let mesh = molmesh::mesh(&bytes, &molmesh::Options::default())?;
+//! println!("{} vertices, {} triangles", mesh.n_vertices(), mesh.n_triangles());
+//! # assert!(mesh.n_triangles() > 10_000);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! [`Options`] selects atoms and the surface; [`formats::Encoder`] writes the mesh as GLB, glTF, PLY, STL or OBJ, and
+//! [`pipeline::run`] also returns a report with area, volume and components.
+//!
 //! [`surface`] is the meshing core: spheres in, mesh out. [`structure`] reads files into spheres, [`formats`] encodes
 //! meshes, [`picture`] renders them, and [`pipeline`] runs one job from bytes to report. The `gpu` feature adds the GPU
 //! backend and the `server` feature the HTTP service. All lengths are ångström. `ARCHITECTURE.md` describes the
@@ -31,3 +44,22 @@ pub mod store;
 pub mod telemetry;
 #[cfg(feature = "server")]
 mod tls;
+
+pub use pipeline::{Job as Options, JobError as Error};
+pub use surface::Mesh;
+
+/// Meshes a structure file on the CPU.
+///
+/// `bytes` is a PDB, mmCIF or BinaryCIF file, plain or compressed with gzip or zstd. Positions of the mesh are in Å and
+/// relative to [`Mesh::centre`].
+///
+/// # Errors
+/// Returns an [`Error`] if the file cannot be read, the selection is empty, a limit is exceeded, or the density never
+/// reaches the isovalue.
+pub fn mesh(bytes: &[u8], options: &Options) -> Result<Mesh, Error> {
+    let choice = pipeline::Choice { backend: &surface::CpuBackend::default(), reason: "library" };
+    let (limits, cancel) = (pipeline::JobLimits::default(), surface::CancelToken::default());
+    let mut product = pipeline::run(bytes, options, &limits, &choice, &cancel, &(), None)?;
+    product.mesh.make_contiguous();
+    Ok(product.mesh)
+}

@@ -10,7 +10,7 @@ use molmesh::formats::{Encoder, Format, GlbSink, GlbSinkError};
 use molmesh::pipeline::params::Request;
 use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, ProgressSink, Report};
 use molmesh::structure::StructureError;
-use molmesh::structure::referee::{self, Diagnostic, Level};
+use molmesh::structure::strict_validator::{self, Diagnostic, Level};
 use molmesh::surface::{CancelToken, SurfaceError};
 use serde_json::{Value, json};
 
@@ -182,7 +182,7 @@ fn sink_failure(output: &Output, cause: Option<GlbSinkError>) -> CliError {
 /// Returns the findings of the strict validator, or an error if there are errors among them.
 pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
     let name = || name_of(path);
-    let findings = referee::check(input, &limits.read).map_err(|source| CliError::Job {
+    let findings = strict_validator::check(input, &limits.read).map_err(|source| CliError::Job {
         name: name(),
         source: source.into(),
         strict_finding: None,
@@ -197,7 +197,7 @@ pub(super) fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec
 /// Returns the worst finding of the strict validator in a file with a syntax error.
 fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
     let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
-    let findings = referee::check(input, &limits.read).ok()?;
+    let findings = strict_validator::check(input, &limits.read).ok()?;
     let worst = findings.iter().max_by_key(|f| f.level)?;
     Some(format!("the strict validator reports: {}", finding(worst)))
 }

@@ -3,7 +3,7 @@
 use std::panic::{self, AssertUnwindSafe};
 use std::sync::{Mutex, PoisonError};
 
-use molmesh::structure::referee;
+use molmesh::structure::strict_validator;
 
 use super::error::CliError;
 
@@ -19,7 +19,7 @@ pub(crate) fn contained(command: impl FnOnce() -> Result<(), CliError>) -> Resul
             *LAST.lock().unwrap_or_else(PoisonError::into_inner) = Some(format!("{message}{place}"));
         }));
     }
-    referee::quiet_panics();
+    strict_validator::quiet_panics();
     panic::catch_unwind(AssertUnwindSafe(command)).unwrap_or_else(|_| {
         let last = LAST.lock().unwrap_or_else(PoisonError::into_inner).take();
         Err(CliError::Internal(last.unwrap_or_else(|| "panic".to_owned())))

@@ -7,7 +7,7 @@ use std::time::Duration;
 use molmesh::config::Loaded;
 use molmesh::http::{Chosen, ServeError, Server, has_viewer, shutdown_signals};
 use molmesh::store::LockError;
-use molmesh::structure::referee;
+use molmesh::structure::strict_validator;
 use molmesh::surface::Backend;
 use molmesh::telemetry;
 
@@ -31,7 +31,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     for warning in warnings {
         tracing::warn!("{warning}");
     }
-    referee::quiet_panics();
+    strict_validator::quiet_panics();
     let requested =
         BackendRequest { backend: args.backend, devices: &config.devices.choice, threads: None, work: None };
     let picked = backend::pick(&requested, &backend::Use::Service(config.devices.clone()))?;

@@ -14,7 +14,7 @@ use crate::pipeline::JobError;
 use crate::pipeline::params::ParamError;
 use crate::store::StoreError;
 use crate::structure::StructureError;
-use crate::structure::referee::Diagnostic;
+use crate::structure::strict_validator::Diagnostic;
 use crate::surface::SurfaceError;
 
 /// Finding of the strict parser.

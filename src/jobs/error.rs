@@ -7,7 +7,7 @@ use thiserror::Error;
 use super::{Exhausted, SaveError};
 use crate::pipeline::JobError;
 use crate::store::StoreError;
-use crate::structure::referee::{Diagnostic, Level};
+use crate::structure::strict_validator::{Diagnostic, Level};
 
 /// Error of a task that the queue does not accept.
 #[derive(Debug, Clone, PartialEq, Error)]

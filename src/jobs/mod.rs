@@ -44,7 +44,7 @@ use bytes::Bytes;
 
 use crate::pipeline::{Job, Product};
 use crate::store::Digest;
-use crate::structure::referee::Diagnostic;
+use crate::structure::strict_validator::Diagnostic;
 use crate::telemetry::SpanParent;
 
 /// Work for the pool.

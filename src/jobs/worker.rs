@@ -11,7 +11,7 @@ use super::coalesced_job::Entry;
 use super::pool::Shared;
 use super::{Failure, Finished, JobId, Outcome};
 use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report};
-use crate::structure::referee::{self, Diagnostic, Level};
+use crate::structure::strict_validator::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, SurfaceError};
 use crate::telemetry::{JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan, VOXELS};
@@ -140,7 +140,7 @@ impl Trace {
 
 /// Runs the strict parser. Fails if it finds errors.
 fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
-    let diagnostics = referee::check(input, &shared.limits.read)
+    let diagnostics = strict_validator::check(input, &shared.limits.read)
         .map_err(|error| Failure::Job { error: error.into(), diagnostics: Vec::new() })?;
     if diagnostics.iter().any(|d| d.level == Level::Error) {
         return Err(Failure::Check { diagnostics });
@@ -154,7 +154,7 @@ fn explained(shared: &Shared, input: &[u8], error: JobError) -> Failure {
         matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
     let limits = ReadLimits { max_inflated_bytes: MAX_EXPLAINED, ..shared.limits.read };
     // If the strict parser fails as well, there are no findings.
-    let diagnostics = if unreadable { referee::check(input, &limits).unwrap_or_default() } else { Vec::new() };
+    let diagnostics = if unreadable { strict_validator::check(input, &limits).unwrap_or_default() } else { Vec::new() };
     Failure::Job { error, diagnostics }
 }
 

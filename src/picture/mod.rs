@@ -15,6 +15,7 @@ pub mod finish;
 mod layers;
 pub mod light;
 mod params;
+#[cfg(feature = "png")]
 pub mod png;
 mod raster;
 

@@ -1,6 +1,7 @@
 //! Complete run of one job: structure file to spheres, mesh and report. Independent of HTTP, paths and queues.
 
 mod clock;
+#[cfg(feature = "png")]
 mod draw;
 mod estimate;
 mod file;
@@ -17,6 +18,7 @@ use std::time::Instant;
 use thiserror::Error;
 
 pub use clock::{ProgressSink, StageClock};
+#[cfg(feature = "png")]
 pub use draw::draw;
 pub use estimate::{Estimate, MeshEstimate, estimate};
 pub use file::File;

@@ -5,6 +5,7 @@ use serde_json::{Map, Value};
 
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
+#[cfg(feature = "png")]
 use crate::picture::{Drawer, PictureParams, Rendered};
 use crate::structure::{LeftOut, Selected, Structure, radii};
 use crate::surface::{Component, GridStats, Measures, Served};
@@ -138,6 +139,7 @@ pub struct PictureReport {
     pub fallback: Option<String>,
 }
 
+#[cfg(feature = "png")]
 impl PictureReport {
     pub(super) fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
         let served = drawn.served.clone().unwrap_or_else(|| Served {

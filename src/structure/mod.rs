@@ -3,7 +3,7 @@
 //! The module does not depend on grids, meshes or HTTP. Only [`archive`] reads files from disk.
 //!
 //! [`read()`] parses bytes into columns. [`Selection`] chooses the atoms to mesh, and [`Contents`] lists what can be
-//! selected. [`radii`] assigns a van der Waals radius to every element. [`referee`] checks a file with a second, strict
+//! selected. [`radii`] assigns a van der Waals radius to every element. [`strict_validator`] checks a file with a second, strict
 //! reader.
 
 mod altloc;
@@ -23,12 +23,13 @@ mod number;
 mod pdb;
 pub mod radii;
 pub mod read;
-pub mod referee;
 mod residue;
 mod scan;
 pub mod select;
 mod sites;
 mod sniff;
+#[cfg(feature = "strict")]
+pub mod strict_validator;
 mod survey;
 mod text;
 mod texts;

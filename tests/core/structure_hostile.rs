@@ -10,7 +10,7 @@
 use std::io::Write;
 use std::time::{Duration, Instant};
 
-use molmesh::structure::referee::{self, Level};
+use molmesh::structure::strict_validator::{self, Level};
 use molmesh::structure::{Contents, ReadLimits, Selection, StructureError, read, select};
 
 const ATOM: &str = "ATOM      2  CA  ALA A  12      11.104  -6.134   0.500  1.00 20.25           C  \n";
@@ -273,28 +273,28 @@ fn counts_ambiguous_atoms_before_allocation() {
 
 #[test]
 fn strict_validator_reports_and_never_panics() {
-    referee::quiet_panics();
+    strict_validator::quiet_panics();
     let sound = std::fs::read("samples/4pti.pdb").unwrap();
-    let findings = referee::check(&sound, &limits()).unwrap();
+    let findings = strict_validator::check(&sound, &limits()).unwrap();
     assert!(findings.iter().all(|d| d.level < Level::Error), "{findings:?}");
 
-    let short = referee::check(&ATOM.as_bytes()[..60], &limits()).unwrap();
+    let short = strict_validator::check(&ATOM.as_bytes()[..60], &limits()).unwrap();
     assert!(short.iter().any(|d| d.level == Level::Error && d.line == Some(1)), "{short:?}");
 
     // pdbtbx panics on this space group.
     let panics = format!("CRYST1   28.070   28.070   53.350  90.00  90.00  90.00 Q 99 99 9   8\n{ATOM}");
-    let findings = referee::check(panics.as_bytes(), &limits()).unwrap();
+    let findings = strict_validator::check(panics.as_bytes(), &limits()).unwrap();
     assert_eq!(findings.len(), 1);
     assert!(findings[0].message.contains("failed on this file") && findings[0].message.contains("space group"), "{findings:?}");
 
     let packed = gzip(&sound);
-    assert_eq!(referee::check(&packed, &limits()), referee::check(&sound, &limits()));
-    let large = ATOM.repeat(1 + (referee::MAX_BYTES as usize) / ATOM.len());
-    let findings = referee::check(large.as_bytes(), &limits()).unwrap();
+    assert_eq!(strict_validator::check(&packed, &limits()), strict_validator::check(&sound, &limits()));
+    let large = ATOM.repeat(1 + (strict_validator::MAX_BYTES as usize) / ATOM.len());
+    let findings = strict_validator::check(large.as_bytes(), &limits()).unwrap();
     assert!(findings[0].message.starts_with("not checked: the text is larger than"), "{findings:?}");
-    assert!(matches!(referee::check(b"hello", &limits()), Err(StructureError::UnknownFormat { .. })));
-    let many = referee::check("ATOM\n".repeat(5000).as_bytes(), &limits()).unwrap();
-    assert!(many.len() <= referee::MAX_DIAGNOSTICS + 1);
+    assert!(matches!(strict_validator::check(b"hello", &limits()), Err(StructureError::UnknownFormat { .. })));
+    let many = strict_validator::check("ATOM\n".repeat(5000).as_bytes(), &limits()).unwrap();
+    assert!(many.len() <= strict_validator::MAX_DIAGNOSTICS + 1);
 }
 
 // ---- any bytes ----

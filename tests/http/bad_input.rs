@@ -24,8 +24,8 @@ const SHOWN: usize = 8;
 static QUIET: Once = Once::new();
 
 fn server() -> Running {
-    // As `molmesh serve` does: the referee panics at some rows, which is caught and says nothing.
-    QUIET.call_once(molmesh::structure::referee::quiet_panics);
+    // As `molmesh serve` does: the strict validator panics at some rows, which is caught and silent.
+    QUIET.call_once(molmesh::structure::strict_validator::quiet_panics);
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |c| {
         c.limits.body_bytes = BODY_BYTES;
         c.limits.inflated_bytes = INFLATED_BYTES;
