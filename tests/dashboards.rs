@@ -1,7 +1,7 @@
-//! The dashboard and the alerts of `deploy/`: what is wrong with one is found out. That what they ask for is exposed is looked at
-//! where everything is (tests/metrics.rs).
+//! Dashboard and alerts of `deploy/`: errors in queries and layout are detected. tests/metrics.rs checks that the
+//! queried metrics exist.
 #![cfg(feature = "server")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 mod http_support;
 mod metrics_support;
@@ -27,13 +27,13 @@ fn every_query_parses() {
         assert!(queries.expressions.len() > 10, "{file}");
         for expression in queries.expressions {
             assert_eq!(expression.error, None, "{file}: {}", expression.place);
-            assert!(!expression.selectors.is_empty(), "{file}: {} asks for nothing", expression.place);
+            assert!(!expression.selectors.is_empty(), "{file}: {}: no selectors", expression.place);
         }
     }
 }
 
 #[test]
-fn queries_that_are_wrong_are_found_out() {
+fn wrong_queries_are_detected() {
     let folder = tempfile::tempdir().unwrap();
     let rule = |n: usize, expression: &str, says: &str| {
         let path = folder.path().join(format!("{n}.yaml"));
@@ -72,7 +72,7 @@ fn queries_that_are_wrong_are_found_out() {
 }
 
 #[test]
-fn the_dashboard_is_laid_out() {
+fn dashboard_panels_do_not_overlap() {
     let text = std::fs::read_to_string(path("deploy/grafana.json")).unwrap();
     let dashboard: Value = serde_json::from_str(&text).unwrap();
     let panels = dashboard["panels"].as_array().unwrap();
@@ -85,7 +85,7 @@ fn the_dashboard_is_laid_out() {
         assert!(side("x") + side("w") <= 24, "{panel}");
         for y in side("y")..side("y") + side("h") {
             for x in side("x")..side("x") + side("w") {
-                assert!(places.insert((x, y)), "{panel} lies on another one");
+                assert!(places.insert((x, y)), "{panel} overlaps another panel");
             }
         }
     }
@@ -98,7 +98,7 @@ fn run(tool: &Path, arguments: &[&str]) -> (bool, String) {
 }
 
 #[test]
-fn prometheus_takes_the_rules_and_they_fire_when_they_should() {
+fn promtool_accepts_the_rules_and_they_fire_in_time() {
     let Some(promtool) = tools::promtool() else { return };
     let rules = path("deploy/alerts.yaml");
     let (good, said) = run(&promtool, &["check", "rules", &rules.to_string_lossy()]);
@@ -114,7 +114,7 @@ fn prometheus_takes_the_rules_and_they_fire_when_they_should() {
     let text = std::fs::read_to_string(&rules).unwrap();
     let (good, said) = with("good.yaml", &text);
     assert!(good, "{said}");
-    // The control: rules that would fire too late, or that are none.
+    // Control: rules that fire too late, and invalid rules.
     let (good, said) = with("late.yaml", &text.replace("for: 2m", "for: 20m"));
     assert!(!good && said.contains("MolmeshDown"), "{said}");
     let broken = folder.path().join("broken.yaml");
@@ -123,7 +123,7 @@ fn prometheus_takes_the_rules_and_they_fire_when_they_should() {
 }
 
 #[test]
-fn what_prometheus_reads_is_as_it_wants_it() {
+fn promtool_accepts_the_exposition() {
     let Some(promtool) = tools::promtool() else { return };
     let lint = |text: &str| {
         use std::io::Write as _;

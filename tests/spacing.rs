@@ -1,6 +1,6 @@
-//! The grid's spacing where it is not given: levels of detail, and a bound on triangles that holds for whatever is meshed.
+//! Automatic grid spacing: levels of detail, and a limit on triangles that holds for every structure.
 
-#![expect(clippy::unwrap_used, reason = "a test says what it expects by panicking")]
+#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
 use molmesh::pipeline::spacing::{COARSEST, FINEST};
 use molmesh::pipeline::{Choice, Estimate, JobError, JobLimits, Product, Report, estimate, params, run};
@@ -9,7 +9,7 @@ use molmesh::surface::{CancelToken, CpuBackend, SurfaceError, SurfaceLimits};
 const PTI: &[u8] = include_bytes!("../samples/4pti.pdb");
 const CRAMBIN: &[u8] = include_bytes!("../samples/1crn.cif");
 
-/// One carbon a residue, at these places, Å.
+/// Returns one carbon per residue at these positions, Å.
 fn carbons(places: impl IntoIterator<Item = [f64; 3]>) -> Vec<u8> {
     let line = |(i, [x, y, z]): (usize, [f64; 3])| {
         let n = i % 9999 + 1;
@@ -18,13 +18,13 @@ fn carbons(places: impl IntoIterator<Item = [f64; 3]>) -> Vec<u8> {
     places.into_iter().enumerate().map(line).collect::<String>().into_bytes()
 }
 
-/// `n`³ carbons on a grid.
+/// Returns `n`³ carbons on a grid.
 fn cube(n: u32, distance: f64) -> Vec<u8> {
     let at = move |i: u32| f64::from(i) * distance;
     carbons((0..n).flat_map(move |x| (0..n).flat_map(move |y| (0..n).map(move |z| [at(x), at(y), at(z)]))))
 }
 
-/// Compact, hollow, long, scattered, and one alone.
+/// Structures of different shapes: compact, hollow, long, scattered, a single atom.
 fn structures() -> Vec<(&'static str, Vec<u8>)> {
     vec![
         ("4pti", PTI.to_vec()),
@@ -59,7 +59,7 @@ fn expected(input: &[u8], pairs: &[(&str, &str)]) -> Estimate {
 }
 
 #[test]
-fn the_bound_holds_for_every_structure_and_kernel() {
+fn the_limit_holds_for_every_structure_and_kernel() {
     let (mut fitted, mut finest, mut refused) = (0, 0, 0);
     for (name, input) in structures() {
         for kernel in ["gaussian", "soft-object", "inverse-square"] {
@@ -71,7 +71,8 @@ fn the_bound_holds_for_every_structure_and_kernel() {
                     Ok(product) => product,
                     Err(JobError::Surface(SurfaceError::TooManyTriangles { triangles, limit: told, resolution })) => {
                         refused += 1;
-                        // It is as it says: there the mesh has so many, and lone atoms apart no spacing is coarser.
+                        // The error is correct: its spacing gives this number of triangles, and it is the coarsest one
+                        // except for separate atoms.
                         assert!(told == limit && triangles > limit, "{said}: {triangles}");
                         assert!(name == "scattered" || resolution.total_cmp(&COARSEST).is_eq(), "{said}: {resolution}");
                         let text = resolution.to_string();
@@ -90,12 +91,12 @@ fn the_bound_holds_for_every_structure_and_kernel() {
                 assert!((FINEST..=COARSEST).contains(&report.resolution), "{said}: {}", report.resolution);
                 if report.resolution > FINEST {
                     fitted += 1;
-                    // Nor is the bound held by meshes far coarser than need be. Small ones come in lumps.
+                    // The mesh uses most of the limit. The triangle counts of small meshes change in larger steps.
                     assert!(n * 10 >= limit * 8 || limit < 1000, "{said}: {n} at {}", report.resolution);
                 } else {
                     finest += 1;
                 }
-                // The same spacing, said outright, is the same mesh: nothing else is different about it.
+                // The same spacing as an explicit parameter gives the same mesh.
                 let resolution = report.resolution.to_string();
                 let same = product(&input, &[("kernel", kernel), ("resolution", &resolution)]).unwrap().mesh;
                 assert!(same.positions[..] == mesh.positions[..] && same.triangles[..] == mesh.triangles[..], "{said}");
@@ -106,7 +107,7 @@ fn the_bound_holds_for_every_structure_and_kernel() {
 }
 
 #[test]
-fn the_same_bound_gives_the_same_mesh_and_a_report_without_surprises() {
+fn the_same_limit_gives_the_same_mesh_and_report() {
     let [one, two] = [(); 2].map(|()| product(PTI, &[("max_triangles", "20000")]).unwrap());
     assert_eq!(one.report.extras(), two.report.extras());
     assert!(one.mesh.positions[..] == two.mesh.positions[..]);
@@ -120,18 +121,18 @@ fn the_same_bound_gives_the_same_mesh_and_a_report_without_surprises() {
 }
 
 #[test]
-fn the_other_limits_hold_as_well() {
+fn the_other_limits_apply_too() {
     let narrow = SurfaceLimits { max_samples: 40_000, ..SurfaceLimits::default() };
     let refused = with(PTI, &[("max_triangles", "1000000")], narrow).unwrap_err();
     assert!(matches!(refused, JobError::Surface(SurfaceError::GridTooLarge { .. })), "{refused}");
     assert!(with(PTI, &[("max_triangles", "2000")], narrow).is_ok());
-    // An isovalue that nothing reaches is that at any spacing.
+    // An isovalue above the maximum fails at any spacing.
     let nothing = product(PTI, &[("max_triangles", "1000"), ("isovalue", "100000")]).unwrap_err();
     assert!(matches!(nothing, JobError::Surface(SurfaceError::NoSurface { .. })), "{nothing}");
 }
 
 #[test]
-fn levels_of_detail_are_what_is_written() {
+fn levels_of_detail_have_the_documented_spacings() {
     let mut last = 0;
     for (level, resolution) in ["2", "1.4", "1", "0.7", "0.5", "0.35", "0.25"].into_iter().enumerate() {
         let text = level.to_string();
@@ -141,20 +142,20 @@ fn levels_of_detail_are_what_is_written() {
         assert!(by_level.mesh.positions[..] == given.mesh.positions[..], "{level}");
         let said = (by_level.report.resolution_from, by_level.report.detail.map(usize::from));
         assert_eq!(said, ("detail", Some(level)));
-        assert!(by_level.report.triangles > last + last / 2, "{level} is finer than the one before");
+        assert!(by_level.report.triangles > last + last / 2, "{level} is not finer than the level before");
         last = by_level.report.triangles;
     }
     // 27,000 atoms: three times as long as 1,000, and 1.39 times as long as 10,000.
     let large = cube(30, 2.0);
     assert_eq!(report(&large, &[("detail", "1")]).resolution.to_string(), "1.95");
-    // Of the atoms that are meshed, not of those in the file.
+    // Counts selected atoms, not those in the file.
     let small = String::from_utf8(cube(8, 2.0)).unwrap().replace("ALA A", "ALA B");
     let both = [&large[..], small.as_bytes()].concat();
     assert_eq!(report(&both, &[("detail", "1"), ("chains", "B")]).resolution.to_string(), "1.4");
 }
 
 #[test]
-fn estimates_know_them() {
+fn estimates_use_the_chosen_spacing() {
     for limit in ["3000", "30000"] {
         let (guess, made) = (expected(PTI, &[("max_triangles", limit)]), report(PTI, &[("max_triangles", limit)]));
         assert!((guess.resolution / made.resolution - 1.0).abs() < 0.1, "{} {}", guess.resolution, made.resolution);

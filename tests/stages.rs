@@ -2,7 +2,7 @@
 //! `classify`, `scan` and `emit` bit by bit, `field` and `interpolate` within bounds. Outputs are poisoned before a
 //! stage runs.
 #![cfg(feature = "gpu")]
-#![expect(clippy::unwrap_used, reason = "a test may panic")]
+#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
 mod gpu_support;
 

@@ -1,6 +1,6 @@
 //! Writer of BinaryCIF files for tests, including invalid ones. `1crn.bcif` was made from `samples/1crn.cif` by
 //! `tests/tools/write_bcif.py compressed`.
-#![allow(dead_code, reason = "each test binary uses only a part of this file")]
+#![allow(dead_code, reason = "each test binary uses a part")]
 #![allow(clippy::unwrap_used, unreachable_pub, reason = "tests fail by panicking")]
 
 /// Crambin as biotite wrote it.
