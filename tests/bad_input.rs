@@ -162,14 +162,14 @@ fn exit_codes_match_the_answers_of_the_server() {
     for row in rows() {
         let Some(exit) = row.exit else { continue };
         let done = mesh(&row);
-        let said = String::from_utf8_lossy(&done.stderr).into_owned();
+        let stderr = String::from_utf8_lossy(&done.stderr).into_owned();
         if done.status.code() != Some(exit) {
-            wrong.push(format!("{}: {:?} instead of {exit}: {said}", row.name, done.status.code()));
+            wrong.push(format!("{}: {:?} instead of {exit}: {stderr}", row.name, done.status.code()));
         }
         let mesh = done.stdout.starts_with(b"glTF");
-        let quiet = if exit == 0 { mesh } else { done.stdout.is_empty() && said.starts_with("molmesh: ") };
-        if !quiet || said.contains("panicked") || said.chars().any(|c| c.is_control() && c != '\n') {
-            wrong.push(format!("{}: {} bytes of output, and {said}", row.name, done.stdout.len()));
+        let quiet = if exit == 0 { mesh } else { done.stdout.is_empty() && stderr.starts_with("molmesh: ") };
+        if !quiet || stderr.contains("panicked") || stderr.chars().any(|c| c.is_control() && c != '\n') {
+            wrong.push(format!("{}: {} bytes of output, and {stderr}", row.name, done.stdout.len()));
         }
         seen[usize::try_from(exit).unwrap()] += 1;
     }
@@ -186,19 +186,19 @@ fn control_wrong_expectations_are_detected() {
     assert_eq!(drive(&server, &good).0, Vec::<String>::new());
     let named = |named| Row { named, ..good.clone() };
     let one = |name, is| named(vec![(name, is)]);
-    for (wrong, said) in [
+    for (wrong, expected) in [
         (Row { status: 400, ..good.clone() }, "status 422 instead of 400"),
         (Row { slug: "no-atoms", ..good.clone() }, "instead of /problems/no-atoms"),
         (Row { slug: "", status: 200, ..good.clone() }, "not a GLB"),
         (one("line", Is::Equal(10.into())), "`line` is 9"),
         (one("column", Is::Above(11.0)), "`column` is 11"),
-        (one("expected", Is::Saying("Cartn_z")), "`expected` is"),
-        (one("limit", Is::Saying("")), "`limit` is null"),
+        (one("expected", Is::Contains("Cartn_z")), "`expected` is"),
+        (one("limit", Is::Contains("")), "`limit` is null"),
         (Row { slug: "unreadable-structure", status: 422, ..of("Latin-1") }, "status 200 instead of 422"),
         (Row { named: vec![("molmesh-atoms", Is::Equal(2.into()))], ..of("Latin-1") }, "`molmesh-atoms` is 1"),
     ] {
         let (faults, _) = drive(&server, &wrong);
-        assert!(faults.iter().any(|fault| fault.contains(said)), "{said}: {faults:?}");
+        assert!(faults.iter().any(|fault| fault.contains(expected)), "{expected}: {faults:?}");
     }
     let reply = ask(&server, &good);
     let late = faults(&good, &reply, IN_TIME + Duration::from_millis(1));

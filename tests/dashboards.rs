@@ -72,12 +72,12 @@ fn wrong_queries_are_detected() {
 }
 
 #[test]
-fn dashboard_panels_do_not_overlap() {
+fn dashboard_panels_have_titles_and_do_not_overlap() {
     let text = std::fs::read_to_string(path("deploy/grafana.json")).unwrap();
     let dashboard: Value = serde_json::from_str(&text).unwrap();
     let panels = dashboard["panels"].as_array().unwrap();
     let mut ids = BTreeSet::new();
-    let mut places = BTreeSet::new();
+    let mut occupied = BTreeSet::new();
     for panel in panels {
         assert!(ids.insert(panel["id"].as_u64().unwrap()), "{panel}");
         assert!(panel["title"].as_str().is_some_and(|title| !title.is_empty()), "{panel}");
@@ -85,7 +85,7 @@ fn dashboard_panels_do_not_overlap() {
         assert!(side("x") + side("w") <= 24, "{panel}");
         for y in side("y")..side("y") + side("h") {
             for x in side("x")..side("x") + side("w") {
-                assert!(places.insert((x, y)), "{panel} overlaps another panel");
+                assert!(occupied.insert((x, y)), "{panel} overlaps another panel");
             }
         }
     }
@@ -101,8 +101,8 @@ fn run(tool: &Path, arguments: &[&str]) -> (bool, String) {
 fn promtool_accepts_the_rules_and_they_fire_in_time() {
     let Some(promtool) = tools::promtool() else { return };
     let rules = path("deploy/alerts.yaml");
-    let (good, said) = run(&promtool, &["check", "rules", &rules.to_string_lossy()]);
-    assert!(good && said.contains("rules found"), "{said}");
+    let (good, printed) = run(&promtool, &["check", "rules", &rules.to_string_lossy()]);
+    assert!(good && printed.contains("rules found"), "{printed}");
     let folder = tempfile::tempdir().unwrap();
     let tests = std::fs::read_to_string(path("tests/tools/alerts_test.yaml")).unwrap();
     let with = |name: &str, rules: &str| {
@@ -112,11 +112,11 @@ fn promtool_accepts_the_rules_and_they_fire_in_time() {
         run(&promtool, &["test", "rules", &test_file.to_string_lossy()])
     };
     let text = std::fs::read_to_string(&rules).unwrap();
-    let (good, said) = with("good.yaml", &text);
-    assert!(good, "{said}");
+    let (good, printed) = with("good.yaml", &text);
+    assert!(good, "{printed}");
     // Control: rules that fire too late, and invalid rules.
-    let (good, said) = with("late.yaml", &text.replace("for: 2m", "for: 20m"));
-    assert!(!good && said.contains("MolmeshDown"), "{said}");
+    let (good, printed) = with("late.yaml", &text.replace("for: 2m", "for: 20m"));
+    assert!(!good && printed.contains("MolmeshDown"), "{printed}");
     let broken = folder.path().join("broken.yaml");
     std::fs::write(&broken, text.replace("== 0", "=== 0")).unwrap();
     assert!(!run(&promtool, &["check", "rules", &broken.to_string_lossy()]).0);
@@ -140,8 +140,8 @@ fn promtool_accepts_the_exposition() {
         (output.status.success(), String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned())
     };
     let text = molmesh::telemetry::recorder().unwrap().render();
-    let (good, said) = lint(&text);
-    assert!(good && said.is_empty(), "{said}");
-    let (good, said) = lint("# HELP x_total x\n# TYPE x_total gauge\nx_total 1\n");
-    assert!(!good, "{said}");
+    let (good, printed) = lint(&text);
+    assert!(good && printed.is_empty(), "{printed}");
+    let (good, printed) = lint("# HELP x_total x\n# TYPE x_total gauge\nx_total 1\n");
+    assert!(!good, "{printed}");
 }

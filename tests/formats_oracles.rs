@@ -45,7 +45,7 @@ fn closed() -> Vec<(&'static str, Mesh, u64, i64)> {
 }
 
 #[test]
-fn the_gltf_validator_accepts_our_files() {
+fn the_gltf_validator_accepts_written_files() {
     let mut files = Files::new();
     let mut expected = Vec::new();
     let mut meshes: Vec<(&str, Mesh)> = closed().into_iter().map(|(name, mesh, ..)| (name, mesh)).collect();

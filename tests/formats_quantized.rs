@@ -272,7 +272,7 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
 }
 
 #[test]
-fn the_gltf_validator_accepts_our_files() {
+fn the_gltf_validator_accepts_written_files() {
     let (mut files, mut expected) = (Files::new(), Vec::new());
     let meshes = cases().into_iter().map(|(name, mesh, ..)| (name, mesh));
     for (name, mesh) in meshes.chain([("triangle", triangle())]) {

@@ -246,7 +246,7 @@ impl Seek for Full {
 }
 
 #[test]
-fn headers_that_do_not_fit_are_rejected_and_write_errors_are_returned() {
+fn oversized_headers_are_rejected_and_write_errors_are_kept() {
     let mesh = torus(255, 257);
     let mut file = Cursor::new(Vec::new());
     let sink = GlbSink::new(&mut file);
@@ -395,7 +395,7 @@ proptest! {
 
     /// Names and extras come from untrusted files and must be escaped.
     #[test]
-    fn any_name_and_extra_is_escaped(name in "\\PC{0,40}|[ -~\r\n\t\"\\\\]{0,300}", key in ".{0,12}", text in ".{0,400}") {
+    fn all_names_and_extras_are_escaped(name in "\\PC{0,40}|[ -~\r\n\t\"\\\\]{0,300}", key in ".{0,12}", text in ".{0,400}") {
         let mesh = triangle();
         let meta = Meta { name: Some(name.clone()), extras: [(key.clone(), Value::from(text.clone()))].into_iter().collect() };
         let glb = split_glb(&encode(Format::Glb, &mesh, &meta));

@@ -150,8 +150,8 @@ fn files_declare_their_units() {
         for format in [Format::Ply, Format::Stl, Format::Obj] {
             let bytes = encode(format, Storage { units, ..Storage::default() }, &mesh);
             let head = String::from_utf8_lossy(&bytes[..bytes.len().min(400)]).into_owned();
-            let said = if format == Format::Stl { "units=" } else { "units " };
-            assert!(head.contains(&format!("{said}{}", units.name())), "{format}: {head}");
+            let declaration = if format == Format::Stl { "units=" } else { "units " };
+            assert!(head.contains(&format!("{declaration}{}", units.name())), "{format}: {head}");
         }
     }
 }
@@ -194,7 +194,7 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
 }
 
 #[test]
-fn the_gltf_validator_accepts_our_files() {
+fn the_gltf_validator_accepts_written_files() {
     let (mut files, mut expected) = (Files::new(), Vec::new());
     for (name, mesh) in cases() {
         for format in [Format::Glb, Format::Gltf] {

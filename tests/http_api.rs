@@ -155,7 +155,7 @@ fn forms_contain_a_file_and_parameters() {
     let post = |body: &[u8]| SERVER.post("/v1/meshes", &[kind], body);
     assert_eq!(post(&form(&[("name=\"resolution\"", b"1")])).problem(400, "bad-request")["expected"], "file");
     post(&form(&[("name=\"file\"", SAMPLE), ("name=\"file\"", SAMPLE)])).problem(400, "bad-request");
-    post(b"no form at all").problem(400, "bad-request");
+    post(b"not a form").problem(400, "bad-request");
     let unknown = post(&form(&[("name=\"file\"", SAMPLE), ("name=\"resolutoin\"", b"1")]));
     assert_eq!(unknown.problem(400, "bad-parameter")["nearest"], "resolution");
     let long = post(&form(&[("name=\"file\"", SAMPLE), ("name=\"chains\"", &[b'A'; 5000])]));
@@ -390,7 +390,7 @@ fn errors_of_unusable_structures_are_specific_and_the_server_keeps_running() {
 
 #[test]
 fn a_strict_check_reports_the_findings_of_the_strict_validator() {
-    let bad = [b"CRYST1 nonsense line that no strict reader takes\n", SAMPLE].concat();
+    let bad = [b"CRYST1 nonsense line that strict readers reject\n", SAMPLE].concat();
     assert_eq!(SERVER.post("/v1/meshes", &[], &bad).status, 200);
     let problem = SERVER.post("/v1/meshes?check=strict", &[], &bad).problem(422, "unreadable-structure");
     assert!(!problem["diagnostics"].as_array().unwrap().is_empty(), "{problem}");

@@ -106,7 +106,7 @@ fn sending_all_defaults_changes_nothing() {
         let plain = estimate(&format!("/v1/estimate?format={format}"));
         assert_eq!(estimate(&address("/v1/estimate", &defaults)), plain);
     }
-    // The default format gives the same path as none.
+    // The default of `format` gives the same answer as none.
     let defaults = query(&description, "post", "/v1/meshes", None);
     same(&server.post(&address("/v1/meshes", &defaults), &[], SAMPLE), &server.post("/v1/meshes", &[], SAMPLE));
 }

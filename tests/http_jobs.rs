@@ -146,7 +146,7 @@ fn queued_and_running_jobs_are_cancelled() {
     let backend = slow(30_000);
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.workers = 1);
     let running = submit(&server, "/v1/meshes", &[], &sample(1));
-    wait_for("it runs", || backend.started.load(Ordering::SeqCst) == 1);
+    wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
     let waiting = submit(&server, "/v1/meshes", &[], &sample(2));
     assert_eq!(server.get(&waiting).json()["status"], "accepted");
     for job in [&waiting, &running] {
@@ -188,7 +188,7 @@ fn asynchronous_jobs_join_running_work() {
     let server = start(Arc::clone(&backend) as _, |_| {});
     std::thread::scope(|scope| {
         let waiting = scope.spawn(|| server.post("/v1/meshes", &[], SAMPLE));
-        wait_for("it runs", || backend.started.load(Ordering::SeqCst) == 1);
+        wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
         let jobs: Vec<String> = (0..4).map(|_| submit(&server, "/v1/meshes", &[], SAMPLE)).collect();
         assert_eq!(backend.finished.load(Ordering::SeqCst), 0, "no request waits for the job");
         for job in &jobs {
@@ -209,7 +209,7 @@ fn a_coalesced_job_survives_a_client_that_disconnects() {
     let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
     first_client.write_all(head.as_bytes()).unwrap();
     first_client.write_all(SAMPLE).unwrap();
-    wait_for("it runs", || backend.started.load(Ordering::SeqCst) == 1);
+    wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
     std::thread::scope(|scope| {
         let second_client = scope.spawn(|| server.post("/v1/meshes", &[], SAMPLE));
         std::thread::sleep(Duration::from_millis(100));

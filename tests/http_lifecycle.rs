@@ -178,7 +178,7 @@ fn a_drain_has_a_deadline() {
 }
 
 #[test]
-fn a_backend_that_cannot_be_cancelled_does_not_hold_up_the_answer() {
+fn a_backend_that_cannot_be_cancelled_does_not_delay_the_answer() {
     let backend = Fake::new(Mode::Uncancellable(Duration::from_secs(6)));
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.deadline_ms = 200);
     let start = Instant::now();

@@ -220,7 +220,7 @@ fn listed_atoms_are_limited() {
     assert_eq!(listed(101).problem(422, "too-many-atoms")["limit"], 100);
     assert_eq!(listed(100).json()["count"], 100);
     assert!(rejected(&server, "too-many-atoms") >= 1.0);
-    // Its mesh is within the limit.
+    // The limit does not apply to meshes.
     assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).status, 200);
 }
 
@@ -355,7 +355,7 @@ fn excess_connections_are_rejected_with_503() {
     assert!(refused.contains("retry-after: 1") && refused.contains("/problems/too-many-connections"), "{refused}");
     assert!(rejected(&server, "too-many-connections") >= 1.0);
     drop(held);
-    wait_for("there is room again", || send(server.addr, "GET", "/livez", &[], b"").status == 200);
+    wait_for("a connection is accepted", || send(server.addr, "GET", "/livez", &[], b"").status == 200);
 }
 
 #[test]
@@ -539,5 +539,5 @@ fn expired_objects_are_swept_at_the_configured_interval() {
     let removed = || server.metric("molmesh_store_removed_total", &["reason=\"ttl\""]);
     let before = removed();
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
-    wait_for("the result is gone", || removed() > before);
+    wait_for("the result is removed", || removed() > before);
 }

@@ -25,9 +25,9 @@ const END_STREAM: u8 = 1;
 const STREAMS: u32 = 64;
 
 /// Serialises the tests, because metrics and file descriptors belong to the process.
-fn alone() -> MutexGuard<'static, ()> {
-    static ALONE: Mutex<()> = Mutex::new(());
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+fn serialize() -> MutexGuard<'static, ()> {
+    static SERIAL: Mutex<()> = Mutex::new(());
+    SERIAL.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn serve(change: impl FnOnce(&mut Config)) -> Running {
@@ -41,7 +41,7 @@ fn serve(change: impl FnOnce(&mut Config)) -> Running {
 fn result(server: &Running, atoms: usize) -> String {
     let path =
         server.post("/v1/meshes?format=stl", &[], &carbons(atoms)).header("content-location").unwrap().to_owned();
-    wait_for("it is kept", || server.get(&path).status == 200);
+    wait_for("the result is stored", || server.get(&path).status == 200);
     path
 }
 
@@ -145,7 +145,7 @@ impl H2 {
 }
 
 /// Connects with small kernel buffers, as on a slow line.
-fn thin(addr: SocketAddr) -> TcpStream {
+fn connect_with_small_buffers(addr: SocketAddr) -> TcpStream {
     let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
     socket.set_recv_buffer_size(16 << 10).unwrap();
     socket.connect(&addr.into()).unwrap();
@@ -154,7 +154,7 @@ fn thin(addr: SocketAddr) -> TcpStream {
 
 #[test]
 fn stalled_readers_lose_only_their_streams() {
-    let _alone = alone();
+    let _serial = serialize();
     let server = serve(|c| (c.server.write_timeout_ms, c.server.write_bytes) = (3000, 8 << 10));
     // From a file, from memory, and one that fits into the send buffer with its last frame.
     let paths = [result(&server, 20_000), result(&server, 2000), result(&server, 50)];
@@ -198,7 +198,7 @@ fn stalled_readers_lose_only_their_streams() {
 
 #[test]
 fn readers_above_the_minimum_rate_get_the_whole_body() {
-    let _alone = alone();
+    let _serial = serialize();
     let server = serve(|_| {});
     let path = result(&server, 2000);
     let (length, before) = (server.get(&path).body.len(), cut_off(&server));
@@ -216,7 +216,7 @@ fn readers_above_the_minimum_rate_get_the_whole_body() {
         });
         // Over HTTP/1.1 the kernel hides progress from the server until its buffer has space.
         scope.spawn(|| {
-            let mut reader = thin(server.addr);
+            let mut reader = connect_with_small_buffers(server.addr);
             write!(reader, "GET {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\n\r\n").unwrap();
             let (mut some, mut bytes) = (vec![0; 32 << 10], 0);
             loop {
@@ -234,11 +234,11 @@ fn readers_above_the_minimum_rate_get_the_whole_body() {
 
 #[test]
 fn http1_readers_below_the_minimum_rate_are_disconnected() {
-    let _alone = alone();
+    let _serial = serialize();
     let server = serve(|_| {});
     let path = result(&server, 20_000);
     let before = cut_off(&server);
-    let mut reader = thin(server.addr);
+    let mut reader = connect_with_small_buffers(server.addr);
     write!(reader, "GET {path} HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
     let start = Instant::now();
     let mut byte = [0; 1];
@@ -257,7 +257,7 @@ fn http1_readers_below_the_minimum_rate_are_disconnected() {
 
 #[test]
 fn event_streams_have_no_minimum_rate() {
-    let _alone = alone();
+    let _serial = serialize();
     let server = start(Fake::new(Mode::Held), |c| {
         (c.server.write_timeout_ms, c.server.drain_timeout_ms) = (300, 100);
     });

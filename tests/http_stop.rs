@@ -18,7 +18,7 @@ use serde_json::Value;
 /// Longer than any test.
 const NEVER_MS: u64 = 3_600_000;
 
-fn patient(config: &mut Config) {
+fn with_long_timeouts(config: &mut Config) {
     (config.server.termination_notice_ms, config.server.drain_timeout_ms) = (Some(NEVER_MS), NEVER_MS);
     config.jobs.deadline_ms = NEVER_MS;
 }
@@ -47,7 +47,7 @@ fn record(server: &Running, id: &str) -> Value {
 
 #[test]
 fn all_requests_are_served_during_the_notice() {
-    let server = start(Fake::new(Mode::Octahedra), patient);
+    let server = start(Fake::new(Mode::Octahedra), with_long_timeouts);
     // Opened before the notice, used during it.
     let mut old = connect(server.addr);
     old.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
@@ -85,11 +85,11 @@ fn the_notice_is_limited_and_optional() {
 
 #[test]
 fn requests_that_started_before_the_drain_are_answered() {
-    let mut server = start(Fake::new(Mode::Octahedra), patient);
+    let mut server = start(Fake::new(Mode::Octahedra), with_long_timeouts);
     let mut upload = begin(&server);
     wait_for("the upload has begun", || server.metric("molmesh_memory_held_bytes", &[]) > 0.0);
     server.request_stop(Stop::Drain);
-    wait_for("the listener is gone", || TcpStream::connect(server.addr).is_err());
+    wait_for("the listener is closed", || TcpStream::connect(server.addr).is_err());
     upload.write_all(&SAMPLE[1000..]).unwrap();
     let reply = read_reply(&mut upload, false);
     assert_eq!((reply.status, reply.complete, reply.header("connection")), (200, true, Some("close")));
@@ -99,12 +99,12 @@ fn requests_that_started_before_the_drain_are_answered() {
 #[test]
 fn an_interrupted_drain_is_reported() {
     let backend = Fake::new(Mode::Slow(Duration::from_hours(1)));
-    let mut server = start(Arc::clone(&backend) as _, patient);
+    let mut server = start(Arc::clone(&backend) as _, with_long_timeouts);
     let mut upload = begin(&server);
     upload.write_all(&SAMPLE[1000..]).unwrap();
     wait_for("the job runs", || backend.started.load(Ordering::SeqCst) == 1);
     server.request_stop(Stop::Drain);
-    wait_for("the listener is gone", || TcpStream::connect(server.addr).is_err());
+    wait_for("the listener is closed", || TcpStream::connect(server.addr).is_err());
     server.request_stop(Stop::Now);
     assert!(!server.wait(), "a request was cut off");
     wait_for("the job is cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
@@ -132,7 +132,7 @@ fn asynchronous_jobs_resume_at_the_next_start_without_a_counted_attempt() {
 fn a_running_asynchronous_job_is_finished_within_the_drain() {
     let backend = Fake::new(Mode::Slow(Duration::from_millis(500)));
     let mut server = start(Arc::clone(&backend) as _, |c| {
-        patient(c);
+        with_long_timeouts(c);
         c.jobs.workers = 1;
     });
     let jobs = [submit(&server, 1), submit(&server, 2)];
@@ -145,7 +145,7 @@ fn a_running_asynchronous_job_is_finished_within_the_drain() {
 
 #[test]
 fn asynchronous_jobs_are_accepted_during_the_drain() {
-    let mut server = start(Fake::new(Mode::Octahedra), patient);
+    let mut server = start(Fake::new(Mode::Octahedra), with_long_timeouts);
     let mut upload = connect(server.addr);
     let head = format!(
         "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nprefer: respond-async\r\ncontent-length: {}\r\n\r\n",
@@ -155,7 +155,7 @@ fn asynchronous_jobs_are_accepted_during_the_drain() {
     upload.write_all(&SAMPLE[..1000]).unwrap();
     wait_for("the upload has begun", || server.metric("molmesh_memory_held_bytes", &[]) > 0.0);
     server.request_stop(Stop::Drain);
-    wait_for("the listener is gone", || TcpStream::connect(server.addr).is_err());
+    wait_for("the listener is closed", || TcpStream::connect(server.addr).is_err());
     upload.write_all(&SAMPLE[1000..]).unwrap();
     let reply = read_reply(&mut upload, false);
     assert_eq!((reply.status, reply.complete), (202, true), "{}", String::from_utf8_lossy(&reply.body));

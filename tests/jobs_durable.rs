@@ -129,8 +129,8 @@ fn accepted_jobs_survive_fifty_kills_without_loss() {
     assert!(accepted.len() >= 50, "{} jobs were accepted", accepted.len());
     let server = Process::start(folder.path());
     // Expected bytes come from a server that was not killed.
-    let judge = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
-    let expected: Vec<Vec<u8>> = (0..3).map(|n| judge.post(&job_request(n).0, &[], SAMPLE).body).collect();
+    let reference = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let expected: Vec<Vec<u8>> = (0..3).map(|n| reference.post(&job_request(n).0, &[], SAMPLE).body).collect();
     assert!(expected[0] != expected[1] && expected[1] != expected[2]);
     let deadline = Instant::now() + Duration::from_mins(2);
     for (n, job) in &accepted {

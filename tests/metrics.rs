@@ -97,7 +97,7 @@ fn held(look: &dyn Fn()) {
     });
     std::thread::scope(|scope| {
         let running = scope.spawn(|| server.post("/v1/meshes", &[], &sample(1)));
-        until("it runs", || backend.holds.load(Ordering::SeqCst));
+        until("the job runs", || backend.holds.load(Ordering::SeqCst));
         let later = [("prefer", "respond-async")];
         assert_eq!(server.post("/v1/meshes", &later, &sample(2)).status, 202);
         assert_eq!(server.post("/v1/meshes", &later, &sample(3)).status, 202);
@@ -138,7 +138,7 @@ fn restart(look: &dyn Fn()) {
     let backend = Held::new();
     let server = start(Arc::clone(&backend) as _, keep);
     assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE).status, 202);
-    until("it runs", || backend.holds.load(Ordering::SeqCst));
+    until("the job runs", || backend.holds.load(Ordering::SeqCst));
     let _drained = server.join();
     let _server = start(Fake::new(Mode::Octahedra), keep);
     look();
@@ -222,7 +222,7 @@ fn nothing(look: &dyn Fn()) {
 }
 
 /// Serialises the tests that count, because the recorder belongs to the process.
-static ALONE: Mutex<()> = Mutex::new(());
+static SERIAL: Mutex<()> = Mutex::new(());
 
 fn scrape() -> Scrape {
     Scrape::of(&recorder().unwrap().render())
@@ -235,7 +235,7 @@ fn is_fixed(name: &str) -> bool {
 
 #[test]
 fn every_metric_has_a_row_and_changes() {
-    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let _serial = SERIAL.lock().unwrap_or_else(PoisonError::into_inner);
     let rows: BTreeSet<&str> = ROWS.iter().map(|(name, ..)| *name).collect();
     let known: BTreeSet<&str> = METRICS.iter().map(|metric| metric.name).collect();
     assert_eq!(rows, known, "exactly one row for each metric");
@@ -300,7 +300,7 @@ fn deviations_from_descriptions_are_detected() {
 /// Names made up by clients do not create series.
 #[test]
 fn unknown_names_of_clients_are_not_labels() {
-    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let _serial = SERIAL.lock().unwrap_or_else(PoisonError::into_inner);
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let series = || {
         let scrape = scrape();

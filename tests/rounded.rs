@@ -44,7 +44,7 @@ fn devices(n: usize) -> GpuBackend {
 }
 
 fn made(backend: &dyn Backend, job: &Job) -> Product {
-    let choice = Choice { backend, reason: "told" };
+    let choice = Choice { backend, reason: "set by a test" };
     pipeline::run(&sample(), job, &JobLimits::default(), &choice, &CancelToken::default(), &(), None).unwrap()
 }
 
@@ -152,7 +152,7 @@ fn one_and_two_devices_make_the_same_file_in_any_write_order() {
     for (backend, expected) in [(&one as &dyn Backend, &expected[0]), (&two, &expected[1])] {
         let mut file = Cursor::new(Vec::new());
         let sink = GlbSink::new(&mut file);
-        let (choice, limits) = (Choice { backend, reason: "told" }, JobLimits::default());
+        let (choice, limits) = (Choice { backend, reason: "set by a test" }, JobLimits::default());
         let cancel = CancelToken::default();
         let product = pipeline::run(&sample(), &job, &limits, &choice, &cancel, &(), Some(&sink)).unwrap();
         drop(sink);
@@ -296,7 +296,7 @@ fn a_service_quantises_on_a_device() {
     assert!(plain.len() as u64 > file.len() as u64 + 11 * expected.report.vertices);
 }
 
-/// An empty product is consistent.
+/// The mesh of a product is quantised completely or not at all.
 #[test]
 fn an_empty_mesh_stays_empty_when_quantised() {
     let mut mesh = Mesh::default();

@@ -43,8 +43,8 @@ fn schemathesis(server: &Running, description: &Path, more: &[&str]) -> Option<(
         .env("PYTHONDONTWRITEBYTECODE", "1")
         .output()
         .unwrap();
-    let said = [output.stdout, output.stderr].concat();
-    Some((output.status.success(), String::from_utf8_lossy(&said).into_owned()))
+    let printed = [output.stdout, output.stderr].concat();
+    Some((output.status.success(), String::from_utf8_lossy(&printed).into_owned()))
 }
 
 #[test]
@@ -52,10 +52,10 @@ fn the_server_conforms_to_its_description() {
     let server = server();
     let file = server.dir.path().join("openapi.json");
     std::fs::write(&file, server.get("/openapi.json").body).unwrap();
-    let Some((good, said)) = schemathesis(&server, &file, &[]) else { return };
-    assert!(good, "{said}");
+    let Some((good, printed)) = schemathesis(&server, &file, &[]) else { return };
+    assert!(good, "{printed}");
     for phase in ["Coverage", "Fuzzing", "Stateful"] {
-        assert!(said.contains(phase), "no phase {phase}: {said}");
+        assert!(printed.contains(phase), "no phase {phase}: {printed}");
     }
     assert_eq!(server.get("/livez").status, 200);
 }
@@ -71,20 +71,20 @@ fn wrong_descriptions_are_detected() {
         std::fs::write(&file, description.to_string()).unwrap();
         schemathesis(&server, &file, &["--include-operation-id", "showJob", "--phases", "coverage,fuzzing"])
     };
-    let Some((good, said)) = doctored(&|_| {}) else { return };
-    assert!(good, "the unchanged description passes: {said}");
-    let (good, said) = doctored(&|responses| drop(responses.as_object_mut().unwrap().remove("404"))).unwrap();
-    assert!(!good && said.contains("404"), "missing status: {said}");
-    let (good, said) = doctored(&|responses| {
+    let Some((good, printed)) = doctored(&|_| {}) else { return };
+    assert!(good, "the unchanged description passes: {printed}");
+    let (good, printed) = doctored(&|responses| drop(responses.as_object_mut().unwrap().remove("404"))).unwrap();
+    assert!(!good && printed.contains("404"), "missing status: {printed}");
+    let (good, printed) = doctored(&|responses| {
         let content = &mut responses["404"]["content"];
         *content = serde_json::json!({ "application/json": content["application/problem+json"] });
     })
     .unwrap();
-    assert!(!good && said.contains("application/problem+json"), "wrong media type: {said}");
-    let (good, said) = doctored(&|responses| {
+    assert!(!good && printed.contains("application/problem+json"), "wrong media type: {printed}");
+    let (good, printed) = doctored(&|responses| {
         let schema = &mut responses["404"]["content"]["application/problem+json"]["schema"];
         schema["allOf"][1]["properties"]["type"]["enum"] = serde_json::json!(["/problems/no-such-thing"]);
     })
     .unwrap();
-    assert!(!good && said.contains("no-such-thing"), "wrong schema: {said}");
+    assert!(!good && printed.contains("no-such-thing"), "wrong schema: {printed}");
 }

@@ -182,8 +182,8 @@ fn asynchronous_jobs_on_s3_survive_kill() {
     });
     assert!(open, "no job was open");
     let server = Process::start(&service, "killed", &folder.path().join("last"));
-    let judge = start(Arc::new(ReferenceBackend), |_| {});
-    let (_, expected) = result(judge.addr, &submit(judge.addr, query, &sample(jobs[0].0)));
+    let reference = start(Arc::new(ReferenceBackend), |_| {});
+    let (_, expected) = result(reference.addr, &submit(reference.addr, query, &sample(jobs[0].0)));
     let mut etags = Vec::new();
     for (n, job) in &jobs {
         let (address, reply) = result(server.addr, job);
@@ -210,10 +210,10 @@ fn s3_and_a_local_store_have_the_same_objects() {
         c.store.memory_bytes = 0;
     };
     let backend = || -> Arc<dyn Backend> { Arc::new(CpuBackend::new(None).unwrap()) };
-    let (server, judge) = (start(backend(), on_s3), start(backend(), |_| {}));
+    let (server, reference) = (start(backend(), on_s3), start(backend(), |_| {}));
     let upload = |addr| send(addr, "POST", "/v1/structures", &[], SAMPLE);
     let created = upload(server.addr);
-    assert_eq!((created.status, upload(server.addr).status, upload(judge.addr).status), (201, 200, 201));
+    assert_eq!((created.status, upload(server.addr).status, upload(reference.addr).status), (201, 200, 201));
     let structure = created.header("location").unwrap();
     assert!(server.join());
     // Another process on the same bucket.
@@ -227,7 +227,7 @@ fn s3_and_a_local_store_have_the_same_objects() {
         "surface.stl?resolution=0.24",
     ] {
         let path = format!("{structure}/{file}");
-        let (fresh, expected) = (get(server.addr, &path), get(judge.addr, &path));
+        let (fresh, expected) = (get(server.addr, &path), get(reference.addr, &path));
         assert_eq!((fresh.status, fresh.complete, expected.status), (200, true, 200), "{file}");
         assert!(fresh.body == expected.body && fresh.header("etag") == expected.header("etag"), "{file}");
         let address = fresh.header("content-location").unwrap();

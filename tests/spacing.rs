@@ -39,7 +39,7 @@ fn structures() -> Vec<(&'static str, Vec<u8>)> {
 fn with(input: &[u8], pairs: &[(&str, &str)], surface: SurfaceLimits) -> Result<Product, JobError> {
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     let backend = CpuBackend::new(None).unwrap();
-    let choice = Choice { backend: &backend, reason: "asked for" };
+    let choice = Choice { backend: &backend, reason: "set by a test" };
     run(input, &job, &JobLimits { surface, ..JobLimits::default() }, &choice, &CancelToken::default(), &(), None)
 }
 
@@ -54,7 +54,7 @@ fn report(input: &[u8], pairs: &[(&str, &str)]) -> Report {
 fn expected(input: &[u8], pairs: &[(&str, &str)]) -> Estimate {
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     let backend = CpuBackend::new(None).unwrap();
-    let choice = Choice { backend: &backend, reason: "asked for" };
+    let choice = Choice { backend: &backend, reason: "set by a test" };
     estimate(input, &job, &JobLimits::default(), &choice, &CancelToken::default()).unwrap()
 }
 
@@ -65,41 +65,45 @@ fn the_limit_holds_for_every_structure_and_kernel() {
         for kernel in ["gaussian", "soft-object", "inverse-square"] {
             for limit in [40_u64, 700, 9000, 60_000] {
                 let text = limit.to_string();
-                let said = format!("{name} {kernel} {limit}");
+                let case = format!("{name} {kernel} {limit}");
                 let bounded = product(&input, &[("kernel", kernel), ("max_triangles", &text)]);
                 let Product { mesh, report, .. } = match bounded {
                     Ok(product) => product,
-                    Err(JobError::Surface(SurfaceError::TooManyTriangles { triangles, limit: told, resolution })) => {
+                    Err(JobError::Surface(SurfaceError::TooManyTriangles {
+                        triangles,
+                        limit: reported,
+                        resolution,
+                    })) => {
                         refused += 1;
                         // The error is correct: its spacing gives this number of triangles, and it is the coarsest one
                         // except for separate atoms.
-                        assert!(told == limit && triangles > limit, "{said}: {triangles}");
-                        assert!(name == "scattered" || resolution.total_cmp(&COARSEST).is_eq(), "{said}: {resolution}");
+                        assert!(reported == limit && triangles > limit, "{case}: {triangles}");
+                        assert!(name == "scattered" || resolution.total_cmp(&COARSEST).is_eq(), "{case}: {resolution}");
                         let text = resolution.to_string();
-                        let there = report(&input, &[("kernel", kernel), ("resolution", &text)]);
-                        assert_eq!(there.triangles, triangles, "{said}");
+                        let at_resolution = report(&input, &[("kernel", kernel), ("resolution", &text)]);
+                        assert_eq!(at_resolution.triangles, triangles, "{case}");
                         continue;
                     }
-                    Err(other) => panic!("{said}: {other}"),
+                    Err(other) => panic!("{case}: {other}"),
                 };
                 let n = mesh.n_triangles() as u64;
-                assert!(n <= limit && n == report.triangles && n > 0, "{said}: {n}");
-                assert!(report.closed && report.manifold, "{said}");
+                assert!(n <= limit && n == report.triangles && n > 0, "{case}: {n}");
+                assert!(report.closed && report.manifold, "{case}");
                 let tries = report.tries.unwrap();
-                assert!((1..=8).contains(&tries), "{said}: {tries} tries");
+                assert!((1..=8).contains(&tries), "{case}: {tries} tries");
                 assert_eq!((report.resolution_from, report.max_triangles), ("max_triangles", Some(limit)));
-                assert!((FINEST..=COARSEST).contains(&report.resolution), "{said}: {}", report.resolution);
+                assert!((FINEST..=COARSEST).contains(&report.resolution), "{case}: {}", report.resolution);
                 if report.resolution > FINEST {
                     fitted += 1;
                     // The mesh uses most of the limit. The triangle counts of small meshes change in larger steps.
-                    assert!(n * 10 >= limit * 8 || limit < 1000, "{said}: {n} at {}", report.resolution);
+                    assert!(n * 10 >= limit * 8 || limit < 1000, "{case}: {n} at {}", report.resolution);
                 } else {
                     finest += 1;
                 }
                 // The same spacing as an explicit parameter gives the same mesh.
                 let resolution = report.resolution.to_string();
                 let same = product(&input, &[("kernel", kernel), ("resolution", &resolution)]).unwrap().mesh;
-                assert!(same.positions[..] == mesh.positions[..] && same.triangles[..] == mesh.triangles[..], "{said}");
+                assert!(same.positions[..] == mesh.positions[..] && same.triangles[..] == mesh.triangles[..], "{case}");
             }
         }
     }
@@ -140,8 +144,8 @@ fn levels_of_detail_have_the_documented_spacings() {
         let given = product(PTI, &[("resolution", resolution)]).unwrap();
         assert_eq!(by_level.report.resolution.to_string(), resolution);
         assert!(by_level.mesh.positions[..] == given.mesh.positions[..], "{level}");
-        let said = (by_level.report.resolution_from, by_level.report.detail.map(usize::from));
-        assert_eq!(said, ("detail", Some(level)));
+        let case = (by_level.report.resolution_from, by_level.report.detail.map(usize::from));
+        assert_eq!(case, ("detail", Some(level)));
         assert!(by_level.report.triangles > last + last / 2, "{level} is not finer than the level before");
         last = by_level.report.triangles;
     }

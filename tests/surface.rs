@@ -334,7 +334,7 @@ fn shifts_by_whole_spacings_shift_the_mesh() {
     let moved: Vec<[f64; 4]> = rows.iter().map(|r| [r[0] + 512.5, r[1] - 100.0, r[2] + 33.0, r[3]]).collect();
     let (a, b) =
         (run(&spheres(&rows), &params(Kernel::Gaussian, 0.5)), run(&spheres(&moved), &params(Kernel::Gaussian, 0.5)));
-    let (m, n) = (assert_sound(&a, "here"), assert_sound(&b, "there"));
+    let (m, n) = (assert_sound(&a, "original"), assert_sound(&b, "shifted"));
     assert_eq!(
         (m.euler, a.mesh.n_vertices(), a.mesh.n_triangles()),
         (n.euler, b.mesh.n_vertices(), b.mesh.n_triangles())

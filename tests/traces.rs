@@ -223,7 +223,7 @@ fn a_trace_continues_after_a_restart() {
     let reply = server.post("/v1/meshes", &headers, SAMPLE);
     assert_eq!(reply.status, 202);
     let location = reply.header("location").unwrap().to_owned();
-    until("it runs", || held.holds.load(Ordering::SeqCst));
+    until("the job runs", || held.holds.load(Ordering::SeqCst));
     // The job is left to the next start. The result of `join` is ignored, because the last response may miss the drain.
     let _drained = server.join();
 
@@ -245,9 +245,9 @@ fn requests_are_linked_to_a_coalesced_job() {
     let joined = || server.metric("molmesh_jobs_submitted_total", &["dedup=\"yes\""]);
     let timing = std::thread::scope(|scope| {
         let first = scope.spawn(|| server.post("/v1/meshes", &[("traceparent", PARENT)], SAMPLE));
-        until("it runs", || held.holds.load(Ordering::SeqCst));
+        until("the job runs", || held.holds.load(Ordering::SeqCst));
         let second = scope.spawn(|| server.post("/v1/meshes", &[("traceparent", &other)], SAMPLE));
-        until("the second takes part", || joined() > 0.0);
+        until("the second request joins the job", || joined() > 0.0);
         held.release();
         assert_eq!(first.join().unwrap().status, 200);
         second.join().unwrap().header("server-timing").unwrap().to_owned()
@@ -281,7 +281,7 @@ fn archives_receive_the_trace_context() {
     assert_eq!((&fetch.parent_span_id, kind(fetch)), (&request.span_id, SpanKind::Client));
     assert_eq!(attribute(fetch, "http.response.status_code").as_deref(), Some("200"));
     assert_eq!(attribute(fetch, "server.address").as_deref(), Some("127.0.0.1"));
-    let asked = archive.asked();
+    let asked = archive.requests();
     let told = asked.iter().map(|a| (a.header("traceparent"), a.header("tracestate"))).collect::<Vec<_>>();
     let expected = format!("00-{TRACE}-{}-01", hex(&fetch.span_id));
     assert_eq!(told, [(Some(expected.as_str()), Some("rojo=1,congo=2"))]);

@@ -98,7 +98,7 @@ fn damaged(name: &'static str, body: impl AsRef<[u8]>, encoding: &str) -> Row {
     Row { named, ..upload(name, body, 422, "unreadable-structure", 4) }
 }
 
-/// A structure without atoms.
+/// Structure without atoms.
 fn atomless(name: &'static str, body: impl AsRef<[u8]>, found: &'static str) -> Row {
     Row { named: vec![("found", Is::Contains(found))], ..upload(name, body, 422, "no-atoms", 4) }
 }
@@ -195,7 +195,7 @@ fn not_structures() -> Vec<Row> {
         not_a_structure("ZIP", b"PK\x03\x04rest", "ZIP"),
         not_a_structure("UTF-16", b"\xff\xfeA\0T\0O\0M\0", "UTF-16"),
         not_a_structure("MMTF", b"\xde\x00\x20\xabmmtfVersion\xa51.0.0", "MMTF"),
-        not_a_structure("END alone", "END\n", "`END`"),
+        not_a_structure("END only", "END\n", "`END`"),
         not_a_structure("gzip in gzip", gzip(&gzip(ATOM.as_bytes())), "gzip inside a compressed file"),
         not_a_structure("gzip of nothing", gzip(b""), "nothing (0 bytes)"),
     ]
@@ -209,10 +209,10 @@ fn compressed() -> Vec<Row> {
     flipped[crc] ^= 1;
     vec![
         damaged("truncated gzip", &packed[..packed.len() / 2], "gzip"),
-        damaged("gzip magic alone", b"\x1f\x8b", "gzip"),
+        damaged("gzip magic number only", b"\x1f\x8b", "gzip"),
         damaged("gzip with another checksum", flipped, "gzip"),
-        damaged("gzip with plain text behind it", [&packed[..], b"hello"].concat(), "gzip"),
-        damaged("zstd magic alone", b"\x28\xb5\x2f\xfd", "zstd"),
+        damaged("gzip followed by plain text", [&packed[..], b"hello"].concat(), "gzip"),
+        damaged("zstd magic number only", b"\x28\xb5\x2f\xfd", "zstd"),
         damaged("zstd with a window of 2 TiB", zstd_bomb(0xf8, 1), "zstd"),
         damaged("zstd skippable frame of 4 GiB", b"\x50\x2a\x4d\x18\xff\xff\xff\xff", "zstd"),
         beyond("gzip bomb", gzip(&vec![b' '; 256 << 20]), 413, "inflated-too-large", INFLATED_BYTES),
@@ -240,11 +240,11 @@ fn pdb() -> Vec<Row> {
         broken("1e30", x("    1e30"), [1, 31], X),
         broken("one atom at 1e9", format!("{ATOM}{}", x("     1e9")), [2, 31], X),
         broken("no x", x("        "), [1, 31], X),
-        broken("stars for an overflow", x("********"), [1, 31], X),
+        broken("asterisks for an overflow", x("********"), [1, 31], X),
         broken("a NUL in a number", x("  11\x00104"), [1, 31], X),
         legal("NaN as occupancy", ATOM.replace("  1.00", "   NaN"), 1),
         legal("1e999 as B-factor", ATOM.replace(" 20.25", " 1e999"), 1),
-        broken("a residue number of stars", ATOM.replace("  12 ", "**** "), [1, 23], "a residue number"),
+        broken("a residue number of asterisks", ATOM.replace("  12 ", "**** "), [1, 23], "a residue number"),
         broken("3 MB in one ATOM line", format!("ATOM{}", " ".repeat(3 << 20)), [1, 31], X),
         legal("a bad space group in CRYST1", format!("{cryst}{ATOM}"), 1),
         legal("NaN in CRYST1", format!("{}{ATOM}", cryst.replace("28.070", "   NaN")), 1),
@@ -284,7 +284,7 @@ fn mmcif() -> Vec<Row> {
         broken("mmCIF truncated in a row", cif("A . 1 1.0 2.0"), [9, 14], "value 6 of the 6 in a row of atom_site"),
         broken("loop_ and again", "data_x\nloop_\nloop_\n_atom_site.id\n1\n", [3, 1], "a tag after loop_"),
         broken("100,000 times loop_", format!("data_x\n{}", "loop_\n".repeat(100_000)), [3, 1], "a tag after loop_"),
-        legal("loop_ behind the atoms", cif("A . 1 1 2 3\nloop_\nloop_\n"), 1),
+        legal("loop_ after the atoms", cif("A . 1 1 2 3\nloop_\nloop_\n"), 1),
         broken("an open quote", "data_x\n_a.b 'open\n", [2, 6], "a closing '"),
         broken("an open text field", "data_x\n_a.b\n;open\n", [3, 1], "a line that begins with ;"),
         atomless("mmCIF without coordinates", "data_x\n_entry.id X\n_cell.length_a 1\n", "categories entry, cell"),
@@ -357,7 +357,7 @@ fn chains() -> String {
 fn parameters() -> Vec<Row> {
     let mut far_too_fine = Row {
         query: "resolution=0.01".to_owned(),
-        ..beyond("a grid far too fine", SAMPLE, 422, "grid-too-large", 1 << 30)
+        ..beyond("a grid that is far too fine", SAMPLE, 422, "grid-too-large", 1 << 30)
     };
     far_too_fine.named.extend([
         ("actual", Is::Above(1_073_741_824.0)),
@@ -372,15 +372,15 @@ fn parameters() -> Vec<Row> {
         parameter("a resolution of zero", "resolution=0", "resolution", "0"),
         parameter("a resolution below zero", "resolution=-1", "resolution", "-1"),
         parameter("a resolution of minus zero", "resolution=-0.0", "resolution", "-0"),
-        parameter("a resolution of a millionth", "resolution=1e-6", "resolution", "0.000001"),
+        parameter("a resolution of 1e-6", "resolution=1e-6", "resolution", "0.000001"),
         parameter("a resolution of NaN", "resolution=NaN", "resolution", "NaN"),
         parameter("a resolution of inf", "resolution=inf", "resolution", "inf"),
         parameter("a resolution of 1e400", "resolution=1e400", "resolution", "1e400"),
-        parameter("a resolution of a light year", "resolution=1e26", "resolution", "100000000000000000000000000"),
+        parameter("a resolution of 1e26", "resolution=1e26", "resolution", "100000000000000000000000000"),
         parameter("no resolution", "resolution=", "resolution", ""),
         parameter("a resolution that is not a number", "resolution=fine", "resolution", "fine"),
         parameter("a resolution with a comma", "resolution=0,5", "resolution", "0,5"),
-        parameter("a resolution that is no UTF-8", "resolution=%ff", "resolution", "\u{fffd}").http_only(),
+        parameter("a resolution that is not UTF-8", "resolution=%ff", "resolution", "\u{fffd}").http_only(),
         parameter("a resolution of 8 KB", &format!("resolution={}", "9".repeat(8192)), "resolution", "9".repeat(64)),
         parameter("an isovalue of 1e300", "isovalue=1e300", "isovalue", format!("1{}", "0".repeat(300))),
         parameter("an isovalue of zero", "isovalue=0", "isovalue", "0"),
@@ -394,9 +394,9 @@ fn parameters() -> Vec<Row> {
         parameter("an unknown kind of atoms", "select=everything", "select", "everything"),
         parameter("an unknown format", "format=exe", "format", "exe"),
         Row { named: misspelt, ..parameter("a misspelt parameter", "resolutoin=1", "", "") },
-        Row { named: twice, ..parameter("a parameter given twice", "resolution=1&resolution=2", "", "") },
-        empty_selection("a chain that is not there", "chains=Z", "chains", "Z", "A"),
-        empty_selection("a model that is not there", "model=7", "model", "7", "1"),
+        Row { named: twice, ..parameter("a repeated parameter", "resolution=1&resolution=2", "", "") },
+        empty_selection("an unknown chain", "chains=Z", "chains", "Z", "A"),
+        empty_selection("an unknown model", "model=7", "model", "7", "1"),
         Row {
             named: no_water,
             query: "select=water".to_owned(),
@@ -405,7 +405,7 @@ fn parameters() -> Vec<Row> {
         Row {
             named: vec![("parameter", Is::Equal("isovalue".into())), ("isovalue", Is::Equal(json!(1000.0)))],
             query: "isovalue=1000".to_owned(),
-            ..upload("an isovalue that nothing reaches", ATOM, 422, "no-surface", 2)
+            ..upload("an isovalue above the maximum", ATOM, 422, "no-surface", 2)
         },
     ]
 }
@@ -425,7 +425,7 @@ fn http() -> Vec<Row> {
     let formed = |name, body: String| upload(name, body, 400, "bad-request", 0).header(FORM.0, FORM.1);
     vec![
         with(
-            bytes("an encoding that is a lie", 415, "unsupported-encoding").header("content-encoding", "gzip"),
+            bytes("a wrong encoding", 415, "unsupported-encoding").header("content-encoding", "gzip"),
             says("detail", "gzip"),
         ),
         with(
@@ -442,7 +442,7 @@ fn http() -> Vec<Row> {
             says("declared", "image/png"),
         ),
         with(
-            bytes("nothing that could be made", 406, "not-acceptable").header("accept", "text/html"),
+            bytes("an unsupported media type", 406, "not-acceptable").header("accept", "text/html"),
             vec![("available", Is::Equal(json!(MEDIA_TYPES)))],
         ),
         with(formed("a form without a file", form("resolution", "1")), says("expected", "file")),
@@ -459,7 +459,7 @@ fn http() -> Vec<Row> {
             vec![("parameter", Is::Equal("resolution".into())), ("limit", Is::Equal(4096.into()))],
         ),
         with(
-            request("a method that is not there", "DELETE", "/v1/meshes", 405, "method-not-allowed"),
+            request("an unsupported method", "DELETE", "/v1/meshes", 405, "method-not-allowed"),
             says("detail", "/v1/meshes"),
         ),
         with(request("an unknown path", "GET", "/v2/meshes", 404, "not-found"), says("detail", "/v2/meshes")),
@@ -468,13 +468,13 @@ fn http() -> Vec<Row> {
         with(surface("an id of 10,000 letters", &"a".repeat(10_000), 400, "bad-parameter"), says("parameter", "id")),
         with(surface("an id that is not UTF-8", "%ff", 400, "bad-request"), says("detail", "UTF-8 in `id`")),
         with(
-            request("a problem that is no UTF-8", "GET", "/problems/%ff", 400, "bad-request"),
+            request("a problem that is not UTF-8", "GET", "/problems/%ff", 400, "bad-request"),
             says("detail", "UTF-8"),
         ),
         with(surface("a missing entry", "9zzz", 404, "not-in-archive"), says("detail", "9zzz")),
         with(surface("an entry that is noise", "1bad", 422, "unreadable-structure"), says("found", "`noise`")),
         with(
-            request("an extension that is not there", "GET", "/v1/pdb/1bad/surface.exe", 404, "not-found"),
+            request("an unknown extension", "GET", "/v1/pdb/1bad/surface.exe", 404, "not-found"),
             vec![("available", Is::Equal(json!(FILES)))],
         ),
     ]

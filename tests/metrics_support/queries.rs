@@ -22,7 +22,7 @@ pub(crate) fn path(file: &str) -> PathBuf {
 pub(crate) fn faults(queries: &Queries, scrape: &Scrape) -> Vec<String> {
     let mut faults: Vec<String> = queries.error.iter().cloned().collect();
     if queries.error.is_none() && queries.expressions.is_empty() {
-        faults.push("there are no queries".to_owned());
+        faults.push("no queries".to_owned());
     }
     for expression in &queries.expressions {
         let place = &expression.place;
