@@ -16,6 +16,6 @@ fn main() -> Result<(), Box<dyn Error>> {
     let measures = Measures::of(&mesh, Validation::Exact, &Control::default())?;
     println!("{:.1} Å², {:.1} Å³, watertight: {}", measures.area, measures.volume, measures.closed);
     let encoder = Encoder::new(Format::Ply, &mesh, &Meta::default())?;
-    encoder.write_to(&mut BufWriter::new(File::create(output)?))?;
+    encoder.write(&mut BufWriter::new(File::create(output)?))?;
     Ok(())
 }

@@ -46,12 +46,12 @@ pub(crate) fn tagged(tag: &str, body: &[u8]) -> Response {
 
 /// Received request.
 #[derive(Debug, Clone)]
-pub(crate) struct Asked {
+pub(crate) struct ReceivedRequest {
     pub(crate) path: String,
     pub(crate) head: String,
 }
 
-impl Asked {
+impl ReceivedRequest {
     pub(crate) fn header(&self, name: &str) -> Option<&str> {
         self.head.lines().find_map(|line| {
             let (n, value) = line.split_once(':')?;
@@ -60,46 +60,49 @@ impl Asked {
     }
 }
 
-type Script = Box<dyn FnMut(&Asked, usize) -> Response + Send>;
+type Script = Box<dyn FnMut(&ReceivedRequest, usize) -> Response + Send>;
 
 /// Running archive, stopped on drop.
 pub(crate) struct Remote {
     pub(crate) addr: SocketAddr,
-    asked: Arc<Mutex<Vec<Asked>>>,
+    received: Arc<Mutex<Vec<ReceivedRequest>>>,
     stop: Arc<AtomicBool>,
 }
 
 impl Remote {
     /// Starts an archive. `script` maps a request and the number of earlier requests to the response.
-    pub(crate) fn start(script: impl FnMut(&Asked, usize) -> Response + Send + 'static) -> Self {
+    pub(crate) fn start(script: impl FnMut(&ReceivedRequest, usize) -> Response + Send + 'static) -> Self {
         Self::start_on("127.0.0.1:0".parse().unwrap(), script)
     }
 
     /// Starts an archive on a given address.
-    pub(crate) fn start_on(addr: SocketAddr, script: impl FnMut(&Asked, usize) -> Response + Send + 'static) -> Self {
+    pub(crate) fn start_on(
+        addr: SocketAddr,
+        script: impl FnMut(&ReceivedRequest, usize) -> Response + Send + 'static,
+    ) -> Self {
         let listener = TcpListener::bind(addr).unwrap();
         let addr = listener.local_addr().unwrap();
-        let asked = Arc::new(Mutex::new(Vec::new()));
+        let received = Arc::new(Mutex::new(Vec::new()));
         let stop = Arc::new(AtomicBool::new(false));
-        let (requests, stopped) = (Arc::clone(&asked), Arc::clone(&stop));
+        let (requests, stopped) = (Arc::clone(&received), Arc::clone(&stop));
         let script: Arc<Mutex<Script>> = Arc::new(Mutex::new(Box::new(script)));
         std::thread::spawn(move || {
             for stream in listener.incoming().map_while(Result::ok) {
                 if stopped.load(Ordering::SeqCst) {
                     return;
                 }
-                let (asked, script) = (Arc::clone(&requests), Arc::clone(&script));
-                std::thread::spawn(move || answer(stream, &asked, &script));
+                let (received, script) = (Arc::clone(&requests), Arc::clone(&script));
+                std::thread::spawn(move || answer(stream, &received, &script));
             }
         });
-        Self { addr, asked, stop }
+        Self { addr, received, stop }
     }
 
     /// Starts an archive with the same response to every request.
     pub(crate) fn saying(response: Response) -> Self {
-        Self::start(move |asked, _| match &response {
+        Self::start(move |received, _| match &response {
             Response::Whole(200, headers, _)
-                if headers.iter().any(|(n, v)| *n == "etag" && asked.header("if-none-match") == Some(v)) =>
+                if headers.iter().any(|(n, v)| *n == "etag" && received.header("if-none-match") == Some(v)) =>
             {
                 status(304)
             }
@@ -113,13 +116,13 @@ impl Remote {
     }
 
     /// Returns all requests.
-    pub(crate) fn asked(&self) -> Vec<Asked> {
-        self.asked.lock().unwrap().clone()
+    pub(crate) fn requests(&self) -> Vec<ReceivedRequest> {
+        self.received.lock().unwrap().clone()
     }
 
     /// Returns the number of requests.
     pub(crate) fn count(&self) -> usize {
-        self.asked.lock().unwrap().len()
+        self.received.lock().unwrap().len()
     }
 }
 
@@ -131,7 +134,7 @@ impl Drop for Remote {
     }
 }
 
-fn answer(mut stream: TcpStream, asked: &Mutex<Vec<Asked>>, script: &Mutex<Script>) {
+fn answer(mut stream: TcpStream, received: &Mutex<Vec<ReceivedRequest>>, script: &Mutex<Script>) {
     let mut head = Vec::new();
     let mut byte = [0];
     while !head.ends_with(b"\r\n\r\n") {
@@ -142,11 +145,11 @@ fn answer(mut stream: TcpStream, asked: &Mutex<Vec<Asked>>, script: &Mutex<Scrip
     }
     let head = String::from_utf8(head).unwrap();
     let path = head.split(' ').nth(1).unwrap().to_owned();
-    let request = Asked { path, head };
+    let request = ReceivedRequest { path, head };
     let n = {
-        let mut asked = asked.lock().unwrap();
-        asked.push(request.clone());
-        asked.len() - 1
+        let mut received = received.lock().unwrap();
+        received.push(request.clone());
+        received.len() - 1
     };
     let response = script.lock().unwrap()(&request, n);
     // The client may disconnect early.

@@ -1,12 +1,12 @@
 //! Writer of BinaryCIF files for tests, including invalid ones. `1crn.bcif` was made from `samples/1crn.cif` by
 //! `tests/tools/write_bcif.py compressed`.
-#![allow(dead_code, reason = "each test binary uses only a part of this file")]
+#![allow(dead_code, reason = "each test binary uses a part")]
 #![allow(clippy::unwrap_used, unreachable_pub, reason = "tests fail by panicking")]
 
-/// Crambin as biotite wrote it.
+/// Crambin written by biotite.
 pub const CRAMBIN: &[u8] = include_bytes!("1crn.bcif");
 
-/// A value of MessagePack.
+/// MessagePack value.
 #[derive(Debug, Clone)]
 pub enum Pack {
     Nil,
@@ -27,7 +27,7 @@ fn length(out: &mut Vec<u8>, head: u8, n: usize) {
 }
 
 impl Pack {
-    /// Encodes the value, in forms of 32 or 64 bits.
+    /// Encodes the value with numbers of 32 or 64 bits.
     pub fn write(&self, out: &mut Vec<u8>) {
         match self {
             Nil => out.push(0xC0),
@@ -79,7 +79,7 @@ impl Pack {
         Map(entries)
     }
 
-    /// Returns a column of the file by name.
+    /// Returns true if this is the column or category of that name.
     pub fn is_named(&self, name: &str) -> bool {
         matches!(self, Map(entries) if entries.iter().any(|(k, v)| *k == "name" && matches!(v, Text(t) if t == name)))
     }
@@ -93,7 +93,7 @@ fn encoding(kind: &str, fields: Vec<(&'static str, Pack)>) -> Pack {
     Map([vec![("kind", text(kind))], fields].concat())
 }
 
-/// Types: 1, 2, 3 signed and 4, 5, 6 unsigned integers of 8, 16, 32 bits; 32 and 33 real numbers.
+/// Types: 1, 2, 3 are signed and 4, 5, 6 unsigned integers of 8, 16, 32 bits; 32 and 33 are real numbers.
 pub fn byte_array(code: i64) -> Pack {
     encoding("ByteArray", vec![("type", Int(code))])
 }
@@ -144,7 +144,7 @@ fn encoded(data: Vec<u8>, chain: Vec<Pack>) -> Pack {
     Map(vec![("data", Bytes(data)), ("encoding", Array(chain))])
 }
 
-/// A column without a mask.
+/// Returns a column without a mask.
 pub fn column(name: &str, data: Vec<u8>, chain: Vec<Pack>) -> Pack {
     Map(vec![("name", text(name)), ("data", encoded(data, chain)), ("mask", Nil)])
 }
@@ -157,7 +157,7 @@ pub fn reals(name: &str, values: &[f64]) -> Pack {
     column(name, values.iter().flat_map(|v| v.to_le_bytes()).collect(), vec![byte_array(33)])
 }
 
-/// Texts of a column, one for each row.
+/// Returns a column of strings.
 pub fn texts(name: &str, values: &[&str]) -> Pack {
     let ends = values.iter().scan(0, |end, value| {
         *end += i32::try_from(value.encode_utf16().count()).unwrap();
@@ -168,7 +168,7 @@ pub fn texts(name: &str, values: &[&str]) -> Pack {
     column(name, i32s(&ids), vec![string_array(&values.concat(), &offsets, vec![byte_array(3)])])
 }
 
-/// The column with a mask, a byte a row.
+/// Adds a mask with one byte per row to a column.
 pub fn masked(column: Pack, mask: &[u8]) -> Pack {
     column.with("mask", encoded(mask.to_vec(), vec![byte_array(4)]))
 }
@@ -188,7 +188,7 @@ pub fn file(blocks: Vec<Pack>) -> Vec<u8> {
     out
 }
 
-/// Coordinates of `n` atoms.
+/// Returns columns with the coordinates of `n` atoms.
 pub fn places(n: usize) -> Vec<Pack> {
     let along = |step: f64| (0..n).map(|i| step * f64::from(u32::try_from(i % 1000).unwrap())).collect::<Vec<_>>();
     vec![reals("Cartn_x", &along(1.5)), reals("Cartn_y", &along(0.0)), reals("Cartn_z", &along(-0.25))]

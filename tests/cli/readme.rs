@@ -1,5 +1,5 @@
-//! The documentation is true: the README opens with the two commands, the shell and Python blocks of all pages run, and
-//! the page of errors lists every error type.
+//! Checks of the documentation: the README begins with the two commands, the shell and Python blocks of all pages run,
+//! and the page of errors lists every error type.
 //!
 //! Blocks marked `sh` and `python` run; blocks marked `console` (docker, kubectl, make, endless commands) do not.
 #![cfg(unix)]
@@ -20,7 +20,7 @@ fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// README.md and the pages below `docs`, each with its text, sorted by path.
+/// Returns README.md and the pages below `docs` with their texts, sorted by path.
 fn pages() -> Vec<(PathBuf, String)> {
     let mut folders = vec![root().join("docs")];
     let mut paths = vec![root().join("README.md")];
@@ -42,7 +42,7 @@ fn pages() -> Vec<(PathBuf, String)> {
     paths.into_iter().map(read).collect()
 }
 
-/// All blocks of `language` of a page as one script, continued lines joined. Empty if there are none.
+/// Returns all blocks of `language` in a page as one script with continued lines joined. Empty if there are none.
 fn script(page: &str, language: &str) -> String {
     let start = format!("```{language}");
     let mut lines = page.lines();
@@ -58,20 +58,20 @@ fn script(page: &str, language: &str) -> String {
     found
 }
 
-/// Files that a script writes: the words after `-o` and `>` that are plain names.
+/// Returns the files that a script writes: words after `-o` and `>` that are plain names.
 fn outputs(script: &str) -> Vec<&str> {
     let words: Vec<&str> = script.split_whitespace().collect();
     let written = words.windows(2).filter(|w| ["-o", ">"].contains(&w[0])).map(|w| w[1]);
     written.filter(|name| name.contains('.') && !name.contains(['"', '$'])).collect()
 }
 
-/// Tells whether `bytes` are a problem document.
+/// Returns true if `bytes` are a problem document.
 fn is_problem(bytes: &[u8]) -> bool {
     let document = serde_json::from_slice::<Value>(bytes).unwrap_or_default();
     document["type"].as_str().is_some_and(|kind| kind.starts_with("/problems/"))
 }
 
-/// Tells whether the content of a file agrees with its name. A problem document belongs into a file with that name only.
+/// Returns true if the content of a file matches its name. Problem documents require a matching name.
 fn agrees_with_name(name: &str, bytes: &[u8]) -> bool {
     let extension = Path::new(name).extension().and_then(|e| e.to_str()).unwrap_or_default();
     let well_formed = match extension {
@@ -93,7 +93,7 @@ fn agrees_with_name(name: &str, bytes: &[u8]) -> bool {
     well_formed && is_problem(bytes) == name.contains("problem")
 }
 
-/// A folder with the samples, as the pages expect.
+/// Creates a folder with the samples.
 fn folder_with_samples() -> Folder {
     let folder = Folder::new();
     std::os::unix::fs::symlink(root().join("samples"), folder.path("samples")).unwrap();
@@ -137,7 +137,7 @@ fn service(folder: &Folder) -> Service {
     Service::start(folder, &["--archive", root().join("samples").to_str().unwrap()])
 }
 
-/// Rows of the table of errors that a page lacks.
+/// Returns the rows that are missing in a page's table of errors.
 fn missing_rows(page: &str, types: &Value) -> Vec<String> {
     let row = |kind: &Value| {
         let slug = kind["type"].as_str().unwrap().trim_start_matches("/problems/");
@@ -147,7 +147,7 @@ fn missing_rows(page: &str, types: &Value) -> Vec<String> {
 }
 
 #[test]
-fn it_opens_with_the_two_commands() {
+fn the_readme_begins_with_the_two_commands() {
     let readme = std::fs::read_to_string(root().join("README.md")).unwrap();
     let code: Vec<&str> = readme.lines().filter(|l| !l.starts_with("```") && !l.is_empty()).take(2).collect();
     assert_eq!(code, ["make run", "make test"]);
@@ -169,7 +169,7 @@ fn every_shell_block_runs() {
     for page in ["README.md", "docs/start/cli.md", "docs/start/web.md", "docs/api/meshes.md", "docs/api/jobs.md"] {
         assert!(ran.iter().any(|path| path == page), "{page} has no block that runs: {ran:?}");
     }
-    // The controls: an error of the service, a command that fails, a file that is not what its name says.
+    // Controls: an error of the service, a failing command, a file whose content does not match its name.
     let url = format!("http://{ADDRESS}/v1/pdb/4pti");
     assert!(run(&service, &format!("curl -s --fail-with-body {url}/surface.glb -o a.glb\n")).is_ok());
     assert!(run(&service, &format!("curl -s --fail-with-body {url}/surface.xyz -o a.glb\n")).is_err());
@@ -195,7 +195,7 @@ fn the_python_examples_run() {
     let done = python(&program);
     assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
     assert!(agrees_with_name("4pti.glb", &std::fs::read(here.path("4pti.glb")).unwrap()));
-    // The control: a parameter that does not exist.
+    // Control: an unknown parameter.
     assert!(!python(&program.replace("max_triangles=", "max_triangle=")).status.success());
 }
 
@@ -209,12 +209,12 @@ fn the_page_of_errors_lists_every_type() {
     assert!(types.as_array().unwrap().len() > 40, "{types}");
     let page = std::fs::read_to_string(root().join("docs/api/errors.md")).unwrap();
     assert_eq!(missing_rows(&page, &types), Vec::<String>::new());
-    // The control: another status.
+    // Control: a different status.
     assert_eq!(missing_rows(&page.replace("| `deadline` | 504 |", "| `deadline` | 503 |"), &types).len(), 1);
 }
 
 #[test]
-fn control_blocks_and_files_are_told_apart() {
+fn control_blocks_and_files_are_distinguished() {
     let page =
         "```sh\ncurl -o a.glb \\\n  http://x\nls\n```\n```console\ncurl no\n```\n```sh\ncurl http://y > b.ply\n```\n";
     let script = script(page, "sh");

@@ -40,7 +40,7 @@ fn beside(name: &str) -> Option<PathBuf> {
     let path = Path::new(FOLDER).join(name);
     let there = path.is_file();
     if !there {
-        eprintln!("SKIPPED: {} is not there", path.display());
+        eprintln!("SKIPPED: {} is missing", path.display());
     }
     there.then_some(path)
 }

@@ -1,5 +1,5 @@
-//! What others say of our files: the Khronos glTF validator and trimesh. Every checker is shown broken files too,
-//! and must see what is wrong with them.
+//! Checks of written files by the Khronos glTF validator and trimesh. Each checker must also detect faults in broken
+//! files.
 
 use crate::tools;
 
@@ -11,7 +11,7 @@ use tools::shapes::{
     FAR, area_and_volume, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres, union,
 };
 
-/// Writes a mesh in a format.
+/// Adds a mesh in a format to the files.
 fn add(files: &mut Files, name: &str, format: Format, mesh: &Mesh) {
     files.add(&format!("{name}.{format}"), &encode(format, mesh));
 }
@@ -24,7 +24,7 @@ fn encode(format: Format, mesh: &Mesh) -> Vec<u8> {
     bytes
 }
 
-/// Closed surfaces with the number of bodies and the Euler number that they have.
+/// Closed surfaces with their number of bodies and Euler characteristic.
 fn closed() -> Vec<(&'static str, Mesh, u64, i64)> {
     let far = |mesh: Mesh| Mesh { centre: FAR, ..mesh };
     let mut glassy = dressed(icosphere(2, 3.0, [0.0; 3], false), 99);
@@ -43,7 +43,7 @@ fn closed() -> Vec<(&'static str, Mesh, u64, i64)> {
 }
 
 #[test]
-fn the_gltf_validator_has_nothing_to_say() {
+fn the_gltf_validator_accepts_written_files() {
     let mut files = Files::new();
     let mut expected = Vec::new();
     let mut meshes: Vec<(&str, Mesh)> = closed().into_iter().map(|(name, mesh, ..)| (name, mesh)).collect();
@@ -59,14 +59,14 @@ fn the_gltf_validator_has_nothing_to_say() {
     let Some(reports) = tools::gltf_validate(&files.paths) else { return };
     for (report, expected) in reports.iter().zip(expected) {
         report.assert_clean();
-        // The only thing worth a remark is an empty file's node, which draws nothing, and our own attribute's name.
+        // Accepted remarks: the unused node of an empty file, and the name of the custom attribute.
         assert_eq!((report.infos, report.hints), (u64::from(expected.0 == 0), 0), "{report:#?}");
         assert_eq!((report.vertices, report.triangles), expected, "{report:#?}");
     }
 }
 
 #[test]
-fn the_gltf_validator_sees_what_is_broken() {
+fn the_gltf_validator_detects_faults() {
     let mesh = torus(15, 17); // 255 vertices, indices of one byte
     let good = encode(Format::Glb, &mesh);
     let glb = split_glb(&good);
@@ -105,7 +105,7 @@ fn the_gltf_validator_sees_what_is_broken() {
 }
 
 #[test]
-fn trimesh_sees_the_same_surface_in_every_format() {
+fn trimesh_measures_the_same_surface_in_every_format() {
     let mut files = Files::new();
     let mut expected = Vec::new();
     for (name, mesh, bodies, euler) in closed() {
@@ -121,7 +121,7 @@ fn trimesh_sees_the_same_surface_in_every_format() {
         assert_eq!(counts, (mesh.n_vertices() as u64, mesh.n_triangles() as u64, bodies, euler), "{report:#?}");
         assert_eq!((report.welded, report.unused_vertices), (format == Format::Stl, 0));
         let (area, volume) = area_and_volume(&mesh);
-        // Coordinates far from the origin are rounded to 6e-5 Å, OBJ's to 5e-5: a few parts in 1e5 of these shapes.
+        // Coordinates far from the origin are rounded to 6e-5 Å, in OBJ to 5e-5 Å: a few parts in 1e5 of these shapes.
         assert!((report.area / area - 1.0).abs() < 5e-5, "{area}: {report:#?}");
         assert!((report.volume / volume - 1.0).abs() < 5e-5, "{volume}: {report:#?}");
         for (found, bound) in report.bounds.iter().zip(mesh.bounds()) {
@@ -144,7 +144,7 @@ fn trimesh_sees_the_same_surface_in_every_format() {
 }
 
 #[test]
-fn trimesh_takes_empty_and_tiny_files() {
+fn trimesh_reads_empty_and_tiny_files() {
     let mut files = Files::new();
     for format in Format::MESHES {
         add(&mut files, "triangle", format, &triangle());
@@ -163,7 +163,7 @@ fn trimesh_takes_empty_and_tiny_files() {
     }
 }
 
-/// Each fault with what must be said of it.
+/// Name of a fault, its cause, and the expected result of trimesh.
 type Fault = (&'static str, fn(&mut Mesh), fn(&tools::TrimeshReport) -> bool);
 
 const FAULTS: [Fault; 9] = [
@@ -190,7 +190,7 @@ fn with_loose_vertex(mesh: &Mesh) -> Mesh {
 }
 
 #[test]
-fn trimesh_sees_what_is_broken() {
+fn trimesh_detects_faults() {
     let mut files = Files::new();
     for (name, break_it, _) in FAULTS {
         let mut mesh = icosphere(2, 4.0, [0.0; 3], false);
@@ -206,14 +206,14 @@ fn trimesh_sees_what_is_broken() {
             assert!(seen(report), "{name}: {report:#?}");
         }
     }
-    // What `assert_proper` is for: it must not let any fault of the surface itself pass.
+    // `assert_proper` must reject every fault of the surface itself.
     for report in reports.chunks(2).take(5).flatten() {
         assert!(std::panic::catch_unwind(|| report.assert_proper()).is_err(), "{report:#?}");
     }
 }
 
 #[test]
-fn trimesh_sees_corrupted_bytes() {
+fn trimesh_detects_corrupted_bytes() {
     let mesh = icosphere(2, 4.0, [0.0; 3], false);
     let mut files = Files::new();
     let mut ply = encode(Format::Ply, &mesh);
@@ -221,8 +221,8 @@ fn trimesh_sees_corrupted_bytes() {
     ply[data + 24..data + 28].fill(0xff);
     files.add("nan.ply", &ply);
     let mut stl = encode(Format::Stl, &mesh);
-    stl[84 + 11] ^= 0x80; // the sign of the first normal's z
-    stl[84 + 50 + 12 + 3] ^= 0x01; // the exponent of a corner's x
+    stl[84 + 11] ^= 0x80; // sign of z of the first normal
+    stl[84 + 50 + 12 + 3] ^= 0x01; // exponent of x of a corner
     files.add("bits.stl", &stl);
     files.add("short.stl", &stl[..stl.len() - 25]);
     let glb = encode(Format::Glb, &mesh);

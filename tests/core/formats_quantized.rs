@@ -1,5 +1,5 @@
-//! Quantised glTF: what is decoded lies within half a step of what was computed, whichever way it was written, and
-//! the Khronos validator and trimesh read it. Every comparison is shown something that it must refuse.
+//! Quantised glTF: decoded vertices are within half a step of the computed ones for every way of writing, and the
+//! Khronos validator and trimesh read the files. Each comparison has a negative control.
 
 use crate::tools;
 
@@ -16,7 +16,7 @@ fn meta() -> Meta {
     Meta { name: Some("4PTI".into()), extras: [("kernel".to_owned(), "gaussian".into())].into_iter().collect() }
 }
 
-/// The smallest step for a mesh.
+/// Returns the smallest step for a mesh.
 fn step(mesh: &Mesh) -> Step {
     let largest = mesh.bounds().as_flattened().iter().fold(0.0_f32, |most, v| most.max(v.abs()));
     Step::covering(f64::from(largest))
@@ -33,7 +33,7 @@ fn quantized(format: Format, mesh: &Mesh) -> Vec<u8> {
     packed(format, Packing::Quantized(step(mesh)), mesh)
 }
 
-/// Closed surfaces with bodies and Euler number, index types and columns of every kind.
+/// Closed surfaces with bodies and Euler characteristic, for all index types and columns.
 fn cases() -> Vec<(&'static str, Mesh, u64, i64)> {
     let far = |mesh: Mesh| Mesh { centre: FAR, ..mesh };
     let mut glassy = dressed(icosphere(2, 3.0, [0.0; 3], false), 99);
@@ -51,7 +51,7 @@ fn cases() -> Vec<(&'static str, Mesh, u64, i64)> {
     ]
 }
 
-/// How far positions (in steps) and normals of a file are from those of a mesh, at most, along any axis.
+/// Returns the largest differences between a file and a mesh along any axis: of positions (in steps) and of normals.
 fn worst(found: &Contents, mesh: &Mesh, step: Step) -> (f64, f64) {
     assert_eq!((found.positions.len(), found.normals.len()), (mesh.n_vertices(), mesh.n_vertices()));
     let most = |a: &[[f32; 3]], b: &[[f32; 3]]| {
@@ -62,24 +62,24 @@ fn worst(found: &Contents, mesh: &Mesh, step: Step) -> (f64, f64) {
 }
 
 #[test]
-fn vertices_come_back_within_half_a_step_and_all_else_as_it_was() {
+fn vertices_round_trip_within_half_a_step_and_other_columns_exactly() {
     for (name, mesh, ..) in cases() {
         let step = step(&mesh);
         let glb = split_glb(&quantized(Format::Glb, &mesh));
         let (text, bin) = split_gltf(&quantized(Format::Gltf, &mesh));
-        assert!(bin == glb.bin[..bin.len()], "{name}: one buffer, two wrappings");
+        assert!(bin == glb.bin[..bin.len()], "{name}: the same buffer");
         let full = split_glb(&packed(Format::Glb, Packing::Full, &mesh));
         let expected = gltf_contents(&full.json, &full.bin);
         for found in [gltf_contents(&glb.json, &glb.bin), gltf_contents(&text, &bin)] {
             let (positions, normals) = worst(&found, &mesh, step);
             assert!(positions <= 0.5 && normals <= 0.5 / 127.0 + 1e-4, "{name}: {positions} steps, {normals}");
-            // Coordinates of curved surfaces fall anywhere between two steps: a decoder that is off would be seen.
+            // Coordinates of curved surfaces are spread between two steps, so an inexact decoder fails.
             assert!(positions > 0.4 || mesh.n_vertices() < 300, "{name}: {positions}");
             assert_eq!(found.translation.map(f64::to_bits), mesh.centre.map(f64::to_bits), "{name}");
             let same = |c: &Contents| (c.triangles.clone(), c.atoms.clone(), c.colors.clone());
             assert!(same(&found) == same(&expected), "{name}");
         }
-        // The comparison sees one vertex that is two steps away, and one normal of another direction.
+        // Control: a vertex moved by two steps, and a normal with a different direction.
         let mut moved = glb.bin.clone();
         let attributes = &glb.json["meshes"][0]["primitives"][0]["attributes"];
         let at = accessor_offset(&glb.json, &attributes["POSITION"]) + 8 * 7 + 4;
@@ -93,7 +93,7 @@ fn vertices_come_back_within_half_a_step_and_all_else_as_it_was() {
 }
 
 #[test]
-fn the_document_says_what_was_done() {
+fn the_document_declares_the_quantisation() {
     for (name, mesh, ..) in cases() {
         let Glb { json, bin, .. } = split_glb(&quantized(Format::Glb, &mesh));
         let length = step(&mesh).length();
@@ -106,7 +106,7 @@ fn the_document_says_what_was_done() {
             .iter()
             .map(|p| {
                 p.map(|v| {
-                    #[expect(clippy::cast_possible_truncation, reason = "a whole number of 16 bits")]
+                    #[expect(clippy::cast_possible_truncation, reason = "16-bit integer")]
                     let q = (v / length) as i64;
                     q
                 })
@@ -117,7 +117,7 @@ fn the_document_says_what_was_done() {
             let bounds = [values().min(), values().max()];
             assert_eq!([&position["min"], &position["max"]].map(|b| b[axis].as_i64()), bounds, "{name}");
         }
-        // Without the parameter nothing of this is there.
+        // Not quantised by default.
         let full = split_glb(&packed(Format::Glb, Packing::Full, &mesh)).json;
         let absent =
             [full.get("extensionsUsed"), full["nodes"][0].get("scale"), full["asset"]["extras"].get("quantization")];
@@ -125,7 +125,7 @@ fn the_document_says_what_was_done() {
     }
 }
 
-/// A mesh whose vertices are integers already.
+/// Returns the mesh with vertices rounded to integers.
 fn rounded(mesh: &Mesh) -> Mesh {
     let mut rounded = mesh.clone();
     assert!(rounded.quantize(step(mesh)));
@@ -133,13 +133,13 @@ fn rounded(mesh: &Mesh) -> Mesh {
 }
 
 #[test]
-fn vertices_that_are_integers_already_are_written_as_they_lie() {
+fn integer_vertices_are_written_unchanged() {
     for (name, mesh, ..) in cases() {
         let small = rounded(&mesh);
         for format in [Format::Glb, Format::Gltf] {
             let expected = quantized(format, &mesh);
             assert!(packed(format, Packing::Quantized(step(&mesh)), &small) == expected, "{name} {format}");
-            // Nobody has to say so: the mesh does. This way looks at everything.
+            // The integers are detected from the mesh.
             let mut looked_at = Vec::new();
             Encoder::new(format, &small, &meta()).unwrap().write(&mut looked_at).unwrap();
             assert!(looked_at == expected, "{name} {format}");
@@ -155,17 +155,17 @@ fn vertices_that_are_integers_already_are_written_as_they_lie() {
         }
         let mut moved = small.clone();
         moved.quantized.as_mut().unwrap().positions[7 % mesh.n_vertices()][1] ^= 1;
-        assert!(quantized_as(&moved, &mesh) != quantized(Format::Glb, &mesh), "{name}: one integer");
+        assert!(quantized_as(&moved, &mesh) != quantized(Format::Glb, &mesh), "{name}: one moved vertex");
     }
 }
 
-/// The GLB of a mesh of integers, by the step of the mesh that it was.
+/// Returns the GLB of an integer mesh with the step of the original mesh.
 fn quantized_as(small: &Mesh, mesh: &Mesh) -> Vec<u8> {
     packed(Format::Glb, Packing::Quantized(step(mesh)), small)
 }
 
 #[test]
-fn integers_are_neither_rounded_again_nor_made_longer() {
+fn integer_vertices_are_neither_rounded_nor_widened() {
     let mesh = icosphere(2, 10.0, [0.0; 3], false);
     let small = rounded(&mesh);
     let own = FormatError::OtherPacking { step: step(&mesh).length() };
@@ -191,7 +191,7 @@ fn integers_are_neither_rounded_again_nor_made_longer() {
 }
 
 #[test]
-fn integers_out_of_reach_and_numbers_that_were_none_are_refused() {
+fn integers_out_of_range_and_nan_are_rejected() {
     let mesh = icosphere(2, 10.0, [0.0; 3], false);
     let sizes = [f32::NAN, f32::INFINITY, 40.0, -40.0];
     for (row, bad) in sizes.into_iter().enumerate() {
@@ -209,10 +209,10 @@ fn integers_out_of_reach_and_numbers_that_were_none_are_refused() {
 }
 
 #[test]
-fn a_vertex_takes_half_the_bytes() {
+fn quantised_vertices_take_half_the_bytes() {
     let mesh = torus(300, 300);
     let [full, small] = [Packing::Full, Packing::Quantized(step(&mesh))].map(|p| packed(Format::Glb, p, &mesh).len());
-    assert_eq!(full - small, 12 * mesh.n_vertices(), "both begin at the same place");
+    assert_eq!(full - small, 12 * mesh.n_vertices(), "the buffers begin at the same offset");
     assert_eq!(small, 16_384 + 12 * mesh.n_vertices() + 12 * mesh.n_triangles());
 }
 
@@ -224,7 +224,7 @@ fn an_empty_mesh_needs_no_extension() {
 }
 
 #[test]
-fn what_a_step_does_not_reach_and_other_formats_are_refused() {
+fn vertices_out_of_range_and_other_formats_are_rejected() {
     let mesh = icosphere(2, 10.0, [0.0; 3], false);
     let small = Packing::Quantized(Step::covering(9.0 / 2.0));
     for format in [Format::Glb, Format::Gltf] {
@@ -239,7 +239,7 @@ fn what_a_step_does_not_reach_and_other_formats_are_refused() {
     assert!(matches!(placed(small, &mesh, 2), Err(GlbSinkError::Format(FormatError::BeyondStep { .. }))));
 }
 
-/// The GLB of a mesh that is written out of order.
+/// Returns the GLB of a mesh that is written out of order.
 fn placed(packing: Packing, mesh: &Mesh, n_parts: usize) -> Result<Vec<u8>, GlbSinkError> {
     let mut file = Cursor::new(Vec::new());
     let sink = GlbSink::new(&mut file);
@@ -264,13 +264,13 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
             let placed = placed(Packing::Quantized(step(&mesh)), &mesh, n_parts).unwrap();
             assert!(placed == in_order, "{name} in {n_parts}");
         }
-        assert!(placed(Packing::Full, &mesh, 3).unwrap() != in_order, "{name}: the sink packs only when told to");
+        assert!(placed(Packing::Full, &mesh, 3).unwrap() != in_order, "{name}: the sink does not pack by default");
     }
-    assert!(large > 0, "a large buffer was among them");
+    assert!(large > 0, "no large buffer");
 }
 
 #[test]
-fn the_gltf_validator_has_nothing_to_say() {
+fn the_gltf_validator_accepts_written_files() {
     let (mut files, mut expected) = (Files::new(), Vec::new());
     let meshes = cases().into_iter().map(|(name, mesh, ..)| (name, mesh));
     for (name, mesh) in meshes.chain([("triangle", triangle())]) {
@@ -288,7 +288,7 @@ fn the_gltf_validator_has_nothing_to_say() {
 }
 
 #[test]
-fn the_gltf_validator_sees_what_is_broken() {
+fn the_gltf_validator_detects_faults() {
     let good = quantized(Format::Glb, &torus(15, 17));
     let glb = split_glb(&good);
     let attributes = &glb.json["meshes"][0]["primitives"][0]["attributes"];
@@ -305,7 +305,7 @@ fn the_gltf_validator_sees_what_is_broken() {
     broken("beyond-max.glb", "ACCESSOR_ELEMENT_OUT_OF_MAX_BOUND", &|b| b[position + 1] = 0x7f);
     broken("normal.glb", "ACCESSOR_VECTOR3_NON_UNIT", &|b| b[normal..normal + 3].fill(30));
     broken("undeclared.glb", "MESH_PRIMITIVE_ATTRIBUTES_ACCESSOR_INVALID_FORMAT", &|b| {
-        // Both places where the extension is named.
+        // Both members that name the extension.
         for at in
             [undeclared, undeclared + 1 + String::from_utf8_lossy(&b[undeclared + 1..glb.bin_at]).find("KHR_").unwrap()]
         {
@@ -319,7 +319,7 @@ fn the_gltf_validator_sees_what_is_broken() {
 }
 
 #[test]
-fn trimesh_sees_the_same_surface() {
+fn trimesh_measures_the_same_surface() {
     let (mut files, mut expected) = (Files::new(), Vec::new());
     for (name, mesh, bodies, euler) in cases() {
         for format in [Format::Glb, Format::Gltf] {
@@ -327,7 +327,7 @@ fn trimesh_sees_the_same_surface() {
             expected.push((mesh.clone(), bodies, euler));
         }
     }
-    // Negative control: a vertex far away, and a normal that looks the other way.
+    // Negative control: a distant vertex and a reversed normal.
     let mesh = icosphere(3, 10.0, [0.0; 3], false);
     let mut wrong = quantized(Format::Glb, &mesh);
     let glb = split_glb(&wrong);

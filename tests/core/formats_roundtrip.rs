@@ -1,5 +1,5 @@
-//! What is written can be read again by small strict readers, to the bit where the format allows; lengths are
-//! known beforehand; broken meshes are refused before the first byte.
+//! Strict readers read written files back, bit by bit if the format allows it. Lengths are known in advance. Invalid
+//! meshes are rejected before the first byte.
 
 #![expect(clippy::cast_possible_truncation, reason = "meshes are single precision")]
 
@@ -33,7 +33,7 @@ fn encode(format: Format, mesh: &Mesh, meta: &Meta) -> Vec<u8> {
     bytes
 }
 
-/// Meshes of every kind and around every boundary of the index types.
+/// Meshes of all kinds, including the limits of the index types.
 fn cases() -> Vec<(&'static str, Mesh)> {
     let far = |mesh: Mesh| Mesh { centre: FAR, ..mesh };
     let coloured = Mesh { atom_ids: None, ..dressed(icosphere(2, 3.0, [0.0; 3], false), 0) };
@@ -57,7 +57,7 @@ fn cases() -> Vec<(&'static str, Mesh)> {
     ]
 }
 
-/// A vertex in the file's own coordinates, rounded once.
+/// Returns vertices in the coordinates of the file, rounded once.
 fn absolute(mesh: &Mesh) -> Vec<[f32; 3]> {
     let add = |p: &[f32; 3]| std::array::from_fn(|k| (mesh.centre[k] + f64::from(p[k])) as f32);
     mesh.positions.iter().map(add).collect()
@@ -78,7 +78,7 @@ fn assert_gltf(name: &str, mesh: &Mesh, json: &Value, bin: &[u8]) {
     assert_eq!(found.colors.is_some(), mesh.colors.is_some() && !nothing, "{name}");
     for (linear, srgb) in found.colors.iter().flatten().zip(mesh.colors.iter().flatten()) {
         assert_eq!((linear[3], linear[0] == 255, linear[1] <= srgb[1]), (srgb[3], srgb[0] == 255, true), "{name}");
-        assert_eq!(linear[2], 55, "{name}: sRGB 128 is 21.6 % of full light");
+        assert_eq!(linear[2], 55, "{name}: sRGB 128 is 21.6 % in linear light");
     }
     let asset = &json["asset"];
     assert_eq!(asset["version"], "2.0");
@@ -92,7 +92,7 @@ fn assert_gltf(name: &str, mesh: &Mesh, json: &Value, bin: &[u8]) {
     assert_eq!(json["meshes"][0]["name"], "4PTI");
     let position = accessor_of(json, &json["meshes"][0]["primitives"][0]["attributes"]["POSITION"]);
     for (row, bound) in mesh.bounds().iter().zip(["min", "max"]) {
-        // Through f32, as `serde_json` reads doubles to within one unit of the last place.
+        // Converted through f32, because `serde_json` reads doubles to within one unit of the last place.
         let stored: Vec<f32> = position[bound].as_array().unwrap().iter().map(|v| v.as_f64().unwrap() as f32).collect();
         assert_eq!(stored, row, "{name}");
     }
@@ -112,13 +112,13 @@ fn assert_gltf(name: &str, mesh: &Mesh, json: &Value, bin: &[u8]) {
 }
 
 #[test]
-fn glb_and_gltf_give_every_column_back() {
+fn glb_and_gltf_round_trip_every_column() {
     for (name, mesh) in cases() {
         let glb = split_glb(&encode(Format::Glb, &mesh, &meta()));
         assert_gltf(name, &mesh, &glb.json, &glb.bin);
         let (json, bin) = split_gltf(&encode(Format::Gltf, &mesh, &meta()));
         assert_gltf(name, &mesh, &json, &bin);
-        assert_eq!(bin, glb.bin[..bin.len()], "{name}: one buffer, two wrappings");
+        assert_eq!(bin, glb.bin[..bin.len()], "{name}: the same buffer");
     }
 }
 
@@ -132,7 +132,7 @@ fn atom_indices_are_16_bit_integers_or_exact_floats() {
 }
 
 #[test]
-fn ply_gives_every_column_back() {
+fn ply_round_trips_every_column() {
     for (name, mesh) in cases() {
         let bytes = encode(Format::Ply, &mesh, &meta());
         let expected = Contents {
@@ -152,7 +152,7 @@ fn ply_gives_every_column_back() {
 }
 
 #[test]
-fn stl_holds_the_corners_of_every_triangle_and_its_normal() {
+fn stl_contains_corners_and_normals_of_all_triangles() {
     for (name, mesh) in cases() {
         let positions = absolute(&mesh);
         let records = read_stl(&encode(Format::Stl, &mesh, &meta()));
@@ -161,7 +161,7 @@ fn stl_holds_the_corners_of_every_triangle_and_its_normal() {
             assert_eq!(*corners, triangle.map(|v| positions[v as usize]), "{name}");
             let length = normal.iter().map(|v| v * v).sum::<f32>().sqrt();
             assert!((length - 1.0).abs() < 1e-6, "{name}: {normal:?}");
-            // On these shapes every face looks the same way as the vertex normals at its corners.
+            // Face normals of these shapes point to the same side as the vertex normals at their corners.
             let at = mesh.normals[triangle[0] as usize];
             assert!((0..3).map(|k| at[k] * normal[k]).sum::<f32>() > 0.2, "{name}");
         }
@@ -169,14 +169,14 @@ fn stl_holds_the_corners_of_every_triangle_and_its_normal() {
 }
 
 #[test]
-fn obj_gives_coordinates_back_to_its_decimals() {
+fn obj_round_trips_coordinates_to_its_decimals() {
     for (name, mesh) in cases() {
         let found = read_obj(&encode(Format::Obj, &mesh, &meta()));
         assert_eq!(found.triangles, mesh.triangles, "{name}");
         let close = |found: &[[f32; 3]], expected: &[[f32; 3]]| {
             assert_eq!(found.len(), expected.len(), "{name}");
             for (f, e) in found.as_flattened().iter().zip(expected.as_flattened()) {
-                // Half a unit of the last decimal, and the rounding of 1000.25 to a float when it is read.
+                // Half a unit of the last decimal, and rounding of 1000.25 to a float by the reader.
                 assert!((f64::from(*f) - f64::from(*e)).abs() < 0.5e-4 + 3.1e-5, "{name}: {f} for {e}");
             }
         };
@@ -186,7 +186,7 @@ fn obj_gives_coordinates_back_to_its_decimals() {
 }
 
 #[test]
-fn lengths_are_known_before_a_byte_is_written() {
+fn lengths_are_known_before_writing() {
     for (name, mesh) in cases() {
         for format in Format::MESHES {
             let len = encode(format, &mesh, &meta()).len() as u64;
@@ -222,10 +222,10 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
             assert!(placed == in_order, "{name} in {n_parts}");
         }
     }
-    assert!(large > 0, "a large buffer was among them");
+    assert!(large > 0, "no large buffer");
 }
 
-/// A file on a full disk.
+/// Writer of a full disk.
 struct Full;
 
 impl Write for Full {
@@ -245,7 +245,7 @@ impl Seek for Full {
 }
 
 #[test]
-fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
+fn oversized_headers_are_rejected_and_write_errors_are_kept() {
     let mesh = torus(255, 257);
     let mut file = Cursor::new(Vec::new());
     let sink = GlbSink::new(&mut file);
@@ -269,7 +269,7 @@ fn a_header_that_does_not_fit_is_refused_and_a_failed_write_is_kept() {
 
 #[test]
 fn bytes_do_not_depend_on_the_number_of_threads() {
-    // More vertices and triangles than one task looks at.
+    // More vertices and triangles than one task handles.
     let mesh = dressed(icosphere(7, 20.0, [0.0; 3], false), 100_000);
     for format in Format::MESHES {
         let with = |threads: usize| {
@@ -281,7 +281,7 @@ fn bytes_do_not_depend_on_the_number_of_threads() {
     }
 }
 
-/// Counts calls, fails after so many bytes.
+/// Writer that counts calls and fails after a number of bytes.
 struct Meter {
     room: usize,
     calls: Vec<usize>,
@@ -303,7 +303,7 @@ impl Write for Meter {
 }
 
 #[test]
-fn columns_go_out_whole_and_conversions_in_large_blocks() {
+fn columns_are_written_whole_and_conversions_in_large_blocks() {
     let mesh = icosphere(7, 20.0, [0.0; 3], false);
     for format in Format::MESHES {
         let mut meter = Meter { room: usize::MAX, calls: Vec::new() };
@@ -321,21 +321,21 @@ fn columns_go_out_whole_and_conversions_in_large_blocks() {
 }
 
 #[test]
-fn a_full_disk_is_an_error_wherever_it_happens() {
+fn a_full_disk_is_an_error_at_every_offset() {
     let mesh = dressed(torus(20, 20), 900);
     for format in Format::MESHES {
         let whole = encode(format, &mesh, &meta()).len();
         for room in [0, 10, 500, whole / 2, whole - 1] {
             let mut meter = Meter { room, calls: Vec::new() };
             let error = formats::write(format, &mesh, &meta(), &mut meter).unwrap_err();
-            assert_eq!(error.kind(), ErrorKind::StorageFull, "{format} with room for {room}");
+            assert_eq!(error.kind(), ErrorKind::StorageFull, "{format} after {room} bytes");
         }
         formats::write(format, &mesh, &meta(), &mut Meter { room: whole, calls: Vec::new() }).unwrap();
     }
 }
 
 #[test]
-fn broken_meshes_are_refused_before_the_first_byte() {
+fn invalid_meshes_are_rejected_before_the_first_byte() {
     let good = dressed(torus(4, 5), 9);
     let broken = |change: fn(&mut Mesh)| {
         let mut mesh = good.clone();
@@ -367,7 +367,7 @@ fn broken_meshes_are_refused_before_the_first_byte() {
 }
 
 #[test]
-fn only_gltf_refuses_atom_indices_that_floats_cannot_hold() {
+fn only_gltf_rejects_atom_indices_beyond_exact_floats() {
     let mesh = dressed(torus(4, 5), 16_777_217);
     for format in Format::MESHES {
         let encoder = Encoder::new(format, &mesh, &meta());
@@ -382,7 +382,7 @@ fn only_gltf_refuses_atom_indices_that_floats_cannot_hold() {
 }
 
 #[test]
-fn vertices_without_triangles_make_an_empty_but_valid_gltf() {
+fn vertices_without_triangles_give_an_empty_but_valid_gltf() {
     let mesh = Mesh { triangles: Vec::new().into(), ..torus(4, 5) };
     let glb = split_glb(&encode(Format::Glb, &mesh, &meta()));
     assert_eq!(gltf_contents(&glb.json, &glb.bin).positions.len(), 0);
@@ -392,9 +392,9 @@ fn vertices_without_triangles_make_an_empty_but_valid_gltf() {
 proptest! {
     #![proptest_config(ProptestConfig { cases: 64, ..ProptestConfig::default() })]
 
-    /// Names and extras come from files of strangers: they cannot break out of where they stand.
+    /// Names and extras come from untrusted files and must be escaped.
     #[test]
-    fn any_name_and_extra_leave_the_file_readable(name in "\\PC{0,40}|[ -~\r\n\t\"\\\\]{0,300}", key in ".{0,12}", text in ".{0,400}") {
+    fn all_names_and_extras_are_escaped(name in "\\PC{0,40}|[ -~\r\n\t\"\\\\]{0,300}", key in ".{0,12}", text in ".{0,400}") {
         let mesh = triangle();
         let meta = Meta { name: Some(name.clone()), extras: [(key.clone(), Value::from(text.clone()))].into_iter().collect() };
         let glb = split_glb(&encode(Format::Glb, &mesh, &meta));
@@ -423,7 +423,7 @@ fn trusted_meshes_give_the_same_bytes() {
 }
 
 #[test]
-fn trust_in_a_broken_mesh_never_panics() {
+fn trusted_invalid_meshes_never_panic() {
     for n in [4, 300] {
         let mut far_index = torus(n, 300);
         far_index.triangles[1][1] = u32::MAX;

@@ -1,5 +1,5 @@
-//! Files without normals and in other units: what is left out is left out and nothing else, coordinates are scaled and
-//! nothing else, and the Khronos validator and trimesh read it all. Every comparison is shown something that it must refuse.
+//! Files without normals and in other units: only normals are omitted and only coordinates are scaled. The Khronos
+//! validator and trimesh read the files. Each comparison has a negative control.
 
 use crate::tools;
 
@@ -16,7 +16,7 @@ fn meta() -> Meta {
     Meta { name: Some("4PTI".into()), extras: [("kernel".to_owned(), "gaussian".into())].into_iter().collect() }
 }
 
-/// Every way in which a format can store a mesh within 32 Å of its centre.
+/// Returns all ways in which a format can store a mesh within 32 Å of its centre.
 fn ways(format: Format) -> Vec<Storage> {
     let packings = [Packing::Full, Packing::Quantized(Step::covering(31.0))];
     let mut ways = Vec::new();
@@ -72,32 +72,32 @@ fn cases() -> Vec<(&'static str, Mesh)> {
 }
 
 #[test]
-fn without_normals_everything_else_is_as_it_was() {
+fn without_normals_all_other_columns_are_unchanged() {
     for (name, mesh) in cases() {
         for format in Format::MESHES {
             for bare in ways(format).into_iter().filter(|w| w.normals == Normals::None) {
                 let smooth = Storage { normals: Normals::Smooth, ..bare };
                 let [with, without] = [smooth, bare].map(|storage| encode(format, storage, &mesh));
                 if format == Format::Stl {
-                    assert!(with == without, "{name}: normals of triangles stay");
+                    assert!(with == without, "{name}: triangle normals remain");
                     continue;
                 }
                 let (mut expected, found) = (contents(format, &with), contents(format, &without));
                 assert_eq!(expected.normals.len(), mesh.n_vertices(), "{name} {format}");
-                assert!(expected != found, "{name} {format}: the comparison sees normals");
+                assert!(expected != found, "{name} {format}: control: the comparison includes normals");
                 expected.normals.clear();
                 assert!(expected == found, "{name} {format} {bare:?}");
                 assert!(without.len() < with.len() || bare.packing != Packing::Full, "{name} {format}");
             }
         }
     }
-    // To the byte: 12 a vertex, in quantised files 4.
+    // Savings per vertex: 12 bytes, in quantised files 4.
     let mesh = icosphere(7, 20.0, [0.0; 3], false);
     let n = mesh.n_vertices();
     for (packing, saved) in [(Packing::Full, 12), (Packing::Quantized(Step::covering(31.0)), 4)] {
         let [with, without] = Normals::ALL
             .map(|normals| encode(Format::Glb, Storage { packing, normals, ..Storage::default() }, &mesh).len());
-        assert_eq!(with - without, saved * n, "the head of a large file has one length");
+        assert_eq!(with - without, saved * n, "savings per vertex");
     }
 }
 
@@ -107,13 +107,13 @@ fn units_scale_coordinates_and_nothing_else() {
         for format in [Format::Ply, Format::Obj, Format::Stl] {
             let [plain, nano] = [Units::Angstrom, Units::Nanometer]
                 .map(|units| contents(format, &encode(format, Storage { units, ..Storage::default() }, &mesh)));
-            // OBJ's last decimal is 1e-4 Å; floats far from the origin have 6e-5 Å.
+            // The last decimal of OBJ is 1e-4 Å; floats far from the origin have 6e-5 Å.
             let worst = |scale: f64| {
                 let pairs = plain.positions.as_flattened().iter().zip(nano.positions.as_flattened());
                 pairs.map(|(a, b)| (f64::from(*a) - scale * f64::from(*b)).abs()).fold(0.0, f64::max)
             };
             assert!(worst(10.0) < 2e-4, "{name} {format}: {}", worst(10.0));
-            assert!(worst(10.01) > 2e-4, "{name} {format}: a wrong factor would be seen");
+            assert!(worst(10.01) > 2e-4, "{name} {format}: control: a wrong factor");
             assert!((&plain.normals, &plain.triangles) == (&nano.normals, &nano.triangles), "{name} {format}");
             assert!((&plain.atoms, &plain.colors) == (&nano.atoms, &nano.colors), "{name} {format}");
         }
@@ -126,7 +126,7 @@ fn units_scale_coordinates_and_nothing_else() {
             let numbers =
                 |value: &Value| -> Vec<f64> { value.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect() };
             let near = |found: &[f64], expected: [f64; 3]| {
-                // The test's reader of JSON may miss the last bit.
+                // `serde_json` may read the last bit inexactly.
                 let off = |(a, b): (&f64, f64)| (a - b).abs() > 1e-15 * b.abs();
                 assert!(!found.iter().zip(expected).any(off), "{name} {storage:?}: {found:?} {expected:?}");
             };
@@ -142,20 +142,20 @@ fn units_scale_coordinates_and_nothing_else() {
 }
 
 #[test]
-fn files_say_their_units() {
+fn files_declare_their_units() {
     let mesh = icosphere(1, 3.0, [0.0; 3], false);
     for units in [Units::Angstrom, Units::Nanometer] {
         for format in [Format::Ply, Format::Stl, Format::Obj] {
             let bytes = encode(format, Storage { units, ..Storage::default() }, &mesh);
             let head = String::from_utf8_lossy(&bytes[..bytes.len().min(400)]).into_owned();
-            let said = if format == Format::Stl { "units=" } else { "units " };
-            assert!(head.contains(&format!("{said}{}", units.name())), "{format}: {head}");
+            let declaration = if format == Format::Stl { "units=" } else { "units " };
+            assert!(head.contains(&format!("{declaration}{}", units.name())), "{format}: {head}");
         }
     }
 }
 
 #[test]
-fn metres_are_for_formats_with_a_node() {
+fn metres_require_a_format_with_a_node() {
     let mesh = triangle();
     let meters = Storage { units: Units::Meter, ..Storage::default() };
     for format in Format::MESHES {
@@ -167,7 +167,7 @@ fn metres_are_for_formats_with_a_node() {
 }
 
 #[test]
-fn a_glb_that_is_written_out_of_order_has_the_same_bytes() {
+fn a_glb_written_out_of_order_has_the_same_bytes() {
     let mut large = 0;
     for (name, mesh) in cases().into_iter().filter(|(_, m)| m.colors.is_none() && m.atom_ids.is_none()) {
         for storage in ways(Format::Glb) {
@@ -188,11 +188,11 @@ fn a_glb_that_is_written_out_of_order_has_the_same_bytes() {
             assert_eq!(place(false) == in_order, storage == Storage::default(), "{name} {storage:?}");
         }
     }
-    assert!(large > 0, "a large buffer was among them");
+    assert!(large > 0, "no large buffer");
 }
 
 #[test]
-fn the_gltf_validator_has_nothing_to_say() {
+fn the_gltf_validator_accepts_written_files() {
     let (mut files, mut expected) = (Files::new(), Vec::new());
     for (name, mesh) in cases() {
         for format in [Format::Glb, Format::Gltf] {
@@ -202,7 +202,7 @@ fn the_gltf_validator_has_nothing_to_say() {
             }
         }
     }
-    // The control: an accessor for normals that are not there.
+    // Control: a missing accessor of normals.
     let mesh = icosphere(1, 3.0, [0.0; 3], false);
     let bare = Storage { normals: Normals::None, ..Storage::default() };
     let (mut document, bin) = split_gltf(&encode(Format::Gltf, bare, &mesh));
@@ -220,11 +220,11 @@ fn the_gltf_validator_has_nothing_to_say() {
 }
 
 #[test]
-fn trimesh_sees_scaled_surfaces_with_and_without_normals() {
+fn trimesh_reads_scaled_surfaces_with_and_without_normals() {
     let (mut files, mut expected) = (Files::new(), Vec::new());
     for (name, mesh) in cases().into_iter().filter(|(name, _)| *name != "triangle" && *name != "large") {
         for format in Format::MESHES {
-            // Trimesh takes triangles of 1e-20 m² for none, so metres are the validator's and the document's to prove.
+            // Trimesh drops triangles of 1e-20 m², so only the validator and the document check metres.
             for (n, storage) in ways(format).into_iter().enumerate().filter(|(_, w)| w.units != Units::Meter) {
                 files.add(&format!("{name}-{n}.{format}"), &encode(format, storage, &mesh));
                 expected.push((format, storage, mesh.clone()));
@@ -234,7 +234,7 @@ fn trimesh_sees_scaled_surfaces_with_and_without_normals() {
     let Some(reports) = tools::trimesh(&files.paths) else { return };
     for (report, (format, storage, mesh)) in reports.iter().zip(expected) {
         let quantized = storage.packing != Packing::Full;
-        // Normals of 8 bits are as long as 1 to 0.68 %.
+        // The length of 8-bit normals is exact to 0.68 %.
         let exact = report.max_normal_error.filter(|error| !quantized || *error > 0.0068);
         tools::TrimeshReport { max_normal_error: exact, ..report.clone() }.assert_proper();
         assert_eq!(
@@ -255,7 +255,7 @@ fn trimesh_sees_scaled_surfaces_with_and_without_normals() {
             pairs.map(worst).fold(0.0, f64::max)
         };
         assert!(off(scale) < 6e-4 * scale, "{storage:?}: {report:#?}");
-        // The control: bounds in the other unit are nowhere near.
+        // Control: bounds in the other unit differ clearly.
         let other = if storage.units == Units::Angstrom { Units::Nanometer } else { Units::Angstrom };
         assert!(off(other.scale()) > 0.1, "{report:#?}");
         let with = storage.normals == Normals::Smooth && format != Format::Stl;

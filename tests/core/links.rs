@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, HashMap};
 use std::fs;
 use std::path::{Component, Path, PathBuf};
 
-/// Folders without documents of the project. Names that begin with `target` are build folders.
+/// Folders without documents of the project. Build folders, whose names begin with `target`, are skipped too.
 const SKIPPED: [&str; 4] = [".git", "node_modules", "dist", "build"];
 
-/// All Markdown files below `root`, with their texts, by path.
+/// Returns the text of each Markdown file below `root` by path.
 fn documents(root: &Path) -> BTreeMap<PathBuf, String> {
     let mut found = BTreeMap::new();
     let mut folders = vec![root.to_owned()];
@@ -28,7 +28,7 @@ fn documents(root: &Path) -> BTreeMap<PathBuf, String> {
     found
 }
 
-/// Lines of a document outside fenced code blocks, each with its number.
+/// Returns the lines of a document outside fenced code blocks with their numbers.
 fn prose(text: &str) -> impl Iterator<Item = (usize, &str)> {
     let mut is_code = false;
     text.lines().enumerate().filter_map(move |(index, line)| {
@@ -38,14 +38,14 @@ fn prose(text: &str) -> impl Iterator<Item = (usize, &str)> {
     })
 }
 
-/// Targets of the inline links and images in a line. Code spans are skipped.
+/// Returns the targets of the inline links and images in a line. Skips code spans.
 fn targets(line: &str) -> Vec<&str> {
     let spans = line.split('`').step_by(2);
     let after = spans.flat_map(|span| span.split("](").skip(1));
     after.filter_map(|rest| rest.split(')').next()?.split_whitespace().next()).collect()
 }
 
-/// Anchors of the headings of a document, as GitHub makes them.
+/// Returns the anchors of a document's headings as GitHub generates them.
 fn anchors(text: &str) -> Vec<String> {
     let mut seen: HashMap<String, u32> = HashMap::new();
     let headings = prose(text).filter(|(_, line)| line.starts_with('#'));
@@ -76,7 +76,7 @@ fn normal(path: &Path) -> PathBuf {
     result
 }
 
-/// Links below `root` without a file or heading. Links to other sites are not checked.
+/// Returns the broken links below `root`. Links to other sites are not checked.
 fn broken(root: &Path) -> Vec<String> {
     let documents = documents(root);
     let anchors: HashMap<&Path, Vec<String>> =
@@ -106,7 +106,7 @@ fn broken(root: &Path) -> Vec<String> {
 }
 
 #[test]
-fn every_link_leads_somewhere() {
+fn every_link_has_a_target() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     assert!(documents(root).len() >= 20, "documents are missing");
     assert_eq!(broken(root), Vec::<String>::new());

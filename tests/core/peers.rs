@@ -1,4 +1,4 @@
-//! The comparison with other programs (`benches/peers`): its mesh checker, its tables and its runs, with our binary alone.
+//! Comparison with other programs (`benches/peers`): its mesh checker, tables and runs, with molmesh only.
 
 use crate::tools;
 
@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::Command;
 
 #[test]
-fn the_comparison_measures_what_it_says() {
+fn the_tests_of_the_comparison_pass() {
     let Some(python) = tools::python_interpreter() else {
         tools::missing::<()>("the Python of the comparison's tests");
         return;

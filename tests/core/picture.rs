@@ -1,5 +1,5 @@
-//! Pictures against truths from outside: the disc that a sphere is seen as, Lambert's law on it, rods that lie, another
-//! program's reader of PNG.
+//! Pictures compared with independent results: the silhouette of a sphere, Lambert's law, the orientation of rods, and
+//! a PNG reader of another program.
 
 #![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "pixels of small pictures")]
 
@@ -26,14 +26,14 @@ fn image(mesh: &Mesh, params: &PictureParams) -> Image {
     render(mesh, params).image
 }
 
-/// Mean difference of all channels, levels.
+/// Returns the mean difference of all channels, in levels.
 fn difference(a: &Image, b: &Image) -> f64 {
     assert_eq!((a.width, a.height), (b.width, b.height));
     let of = |(a, b): (&[u8; 4], &[u8; 4])| a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>();
     a.pixels.iter().zip(&b.pixels).map(of).sum::<f64>() / (4.0 * a.pixels.len() as f64)
 }
 
-/// Covered pixels, and the middle of what is covered, by alpha.
+/// Returns the area and centroid of covered pixels, by alpha.
 fn silhouette(image: &Image) -> (f64, [f64; 2]) {
     let (mut area, mut sum) = (0.0, [0.0; 2]);
     for y in 0..image.height {
@@ -46,7 +46,7 @@ fn silhouette(image: &Image) -> (f64, [f64; 2]) {
     (area, sum.map(|s| s / area))
 }
 
-/// Width and height of what is covered, pixels.
+/// Returns width and height of the covered area, in pixels.
 fn extent(image: &Image) -> [u32; 2] {
     let covered = |x: &u32, y: &u32| image.pixel(*x, *y)[3] > 127;
     let columns = (0..image.width).filter(|x| (0..image.height).any(|y| covered(x, &y))).count();
@@ -54,7 +54,7 @@ fn extent(image: &Image) -> [u32; 2] {
     [columns, rows].map(|n| u32::try_from(n).unwrap())
 }
 
-/// Rows of a rotation, from the rows of a quaternion's matrix.
+/// Returns the rotation matrix of a quaternion.
 fn rotation([w, x, y, z]: [f64; 4]) -> [[f64; 3]; 3] {
     let n = 2.0 / (w * w + x * x + y * y + z * z);
     [
@@ -72,7 +72,7 @@ fn turned(mesh: &Mesh, rows: [[f64; 3]; 3]) -> Mesh {
     mesh
 }
 
-/// A lump without any symmetry, longest along x, shortest along z.
+/// Asymmetric shape, longest along x, shortest along z.
 fn lump() -> Mesh {
     let ball = |radius: f64, at: [f64; 3]| icosphere(4, radius, at, false);
     let parts = [
@@ -84,7 +84,7 @@ fn lump() -> Mesh {
     parts.iter().skip(1).fold(parts[0].clone(), |all, part| union(&all, part))
 }
 
-/// As if seen from within: every triangle and normal turned around.
+/// Reverses all triangles and normals.
 fn inside_out(mesh: &Mesh) -> Mesh {
     let mut mesh = mesh.clone();
     mesh.normals = mesh.normals.iter().map(|n| n.map(|c| -c)).collect();
@@ -93,7 +93,7 @@ fn inside_out(mesh: &Mesh) -> Mesh {
 }
 
 #[test]
-fn a_sphere_is_a_disc_of_its_radius_in_the_middle() {
+fn a_sphere_is_a_centred_disc_of_its_radius() {
     for style in Style::ALL {
         let params = params(style, View::Front);
         let Rendered { image, pixel, .. } = render(&icosphere(6, 4.0, [5.0, -3.0, 1.0], false), &params);
@@ -107,7 +107,7 @@ fn a_sphere_is_a_disc_of_its_radius_in_the_middle() {
 }
 
 #[test]
-fn a_spheres_light_is_lamberts() {
+fn a_sphere_follows_lamberts_law() {
     let radius = 92.0;
     let image = image(&icosphere(6, 4.0, [0.0; 3], false), &params(Style::Gouraud, View::Front));
     let mut seen = std::collections::BTreeSet::new();
@@ -119,16 +119,19 @@ fn a_spheres_light_is_lamberts() {
         let found = image.pixel(x, y);
         for (k, level) in COLOR.into_iter().enumerate() {
             let expected = srgb(linear(level) * light);
-            assert!((f64::from(found[k]) - expected).abs() < 1.5, "({x}, {y}) {found:?}: {k} should be {expected}");
+            assert!(
+                (f64::from(found[k]) - expected).abs() < 1.5,
+                "({x}, {y}) {found:?}: expected {expected} for channel {k}"
+            );
         }
         assert_eq!(found[3], 255);
         seen.insert(found);
     }
-    assert_eq!(seen.len(), 8, "places of different light");
+    assert_eq!(seen.len(), 8, "pixels of equal light");
 }
 
 #[test]
-fn a_rod_lies_and_its_broad_side_is_seen() {
+fn the_principal_view_shows_a_rod_horizontally_from_its_broad_side() {
     let mut rod = icosphere(5, 1.0, [0.0; 3], false);
     rod.positions = rod.positions.iter().map(|[x, y, z]| [*z, 2.0 * x, 6.0 * y]).collect();
     for quaternion in [[1.0, 0.0, 0.0, 0.0], [0.3, -0.5, 0.7, 0.2], [0.1, 0.9, -0.2, 0.4]] {
@@ -137,13 +140,13 @@ fn a_rod_lies_and_its_broad_side_is_seen() {
         // 12 × 4 Å over 92 % of 240 pixels; the third axis, 2 Å, is along the view.
         assert!(width.abs_diff(221) <= 1 && height.abs_diff(74) <= 1, "{width} × {height}");
     }
-    // The control: from the front its end is seen, 2 × 4 Å.
+    // Control: from the front the end is visible, 2 × 4 Å.
     let [width, height] = extent(&image(&rod, &params(Style::Gouraud, View::Front)));
     assert!(width.abs_diff(92) <= 1 && height.abs_diff(184) <= 1, "{width} × {height}");
 }
 
 #[test]
-fn a_turned_molecule_is_seen_from_the_same_side() {
+fn the_principal_view_is_independent_of_rotation() {
     let lump = lump();
     let params = |view| PictureParams { view, ..params(Style::Surface, View::Principal) };
     let straight = image(&lump, &params(View::Principal));
@@ -151,14 +154,14 @@ fn a_turned_molecule_is_seen_from_the_same_side() {
         let turned = turned(&lump, rotation(quaternion));
         let same = difference(&straight, &image(&turned, &params(View::Principal)));
         assert!(same < 0.25, "{quaternion:?}: {same}");
-        // The control: along the file's axes it is another picture.
+        // Control: along the axes of the file the picture differs.
         let other = difference(&image(&lump, &params(View::Front)), &image(&turned, &params(View::Front)));
         assert!(other > 10.0 * same && other > 5.0, "{quaternion:?}: {other}");
     }
 }
 
 #[test]
-fn walking_around_is_turning_the_molecule_the_other_way() {
+fn azimuth_and_elevation_equal_a_rotation_of_the_molecule() {
     let (lump, front) = (lump(), params(Style::Surface, View::Front));
     let (sin, cos) = (-40.0_f64).to_radians().sin_cos();
     let turn = [[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]];
@@ -172,7 +175,7 @@ fn walking_around_is_turning_the_molecule_the_other_way() {
 }
 
 #[test]
-fn what_is_behind_shows_where_nothing_is_and_through_edges() {
+fn the_background_is_visible_around_the_surface_and_blended_at_edges() {
     let mesh = icosphere(5, 4.0, [0.0; 3], false);
     let on = |background: &str| {
         let background: Background = background.parse().unwrap();
@@ -189,7 +192,7 @@ fn what_is_behind_shows_where_nothing_is_and_through_edges() {
         let picture = on(name);
         assert_eq!(picture.pixel(0, 0), corner, "{name}");
         assert_eq!(picture.pixel(120, 100), clear.pixel(120, 100), "{name}: the surface is opaque");
-        // A clear picture laid over the same colour, in linear light, is the same picture.
+        // The transparent picture, blended over the colour in linear light, equals this picture.
         for (found, [r, g, b, a]) in picture.pixels.iter().zip(&clear.pixels).map(|(f, c)| (*f, *c)) {
             let (over, under) = (f64::from(a) / 255.0, f64::from(corner[3]) / 255.0);
             let alpha = over + under * (1.0 - over);
@@ -200,7 +203,7 @@ fn what_is_behind_shows_where_nothing_is_and_through_edges() {
             }
         }
     }
-    // Edges are in between: all five shares of four samples are met, and only they.
+    // Edge pixels have the five coverages of four samples.
     let mut shares: Vec<u8> = clear.pixels.iter().map(|p| p[3]).collect();
     shares.sort_unstable();
     shares.dedup();
@@ -208,7 +211,7 @@ fn what_is_behind_shows_where_nothing_is_and_through_edges() {
 }
 
 #[test]
-fn a_surface_seen_from_within_is_another_picture() {
+fn an_inverted_surface_gives_a_different_picture() {
     for style in Style::ALL {
         let params = params(style, View::Front);
         for mesh in [lump(), icosphere(5, 4.0, [0.0; 3], false)] {
@@ -233,8 +236,8 @@ fn the_same_pixels_on_any_number_of_threads() {
 }
 
 #[test]
-fn pockets_are_darker_and_rims_are_drawn() {
-    // Two spheres that touch, side by side.
+fn pockets_are_darker_and_silhouette_lines_are_drawn() {
+    // Two touching spheres side by side.
     let mesh = union(&icosphere(5, 3.0, [-3.0, 0.0, 0.0], false), &icosphere(5, 3.0, [3.0, 0.0, 0.0], false));
     let [plain, shaded] = [Style::Gouraud, Style::Surface].map(|style| image(&mesh, &params(style, View::Front)));
     let light = |image: &Image, x: u32, y: u32| f64::from(image.pixel(x, y)[1]);
@@ -244,10 +247,10 @@ fn pockets_are_darker_and_rims_are_drawn() {
     let (middle, pocket) = (ratio(65, 100), ratio(115, 100));
     assert!(middle > 0.97, "{middle}");
     assert!(pocket < 0.9 && rim < 0.8, "{pocket} {rim}");
-    // Shading takes light and leaves the silhouette alone.
+    // Shading darkens pixels and keeps the silhouette.
     let alphas = |image: &Image| image.pixels.iter().map(|p| p[3]).collect::<Vec<_>>();
     assert_eq!(alphas(&plain), alphas(&shaded));
-    // One sphere in front of the other: the step between them is a line.
+    // One sphere in front of the other: the depth step between them is drawn as a line.
     let behind = union(&icosphere(5, 2.0, [0.0, 0.0, 9.0], false), &icosphere(5, 5.0, [0.0; 3], false));
     let [plain, shaded] = [Style::Gouraud, Style::Surface].map(|style| image(&behind, &params(style, View::Front)));
     let ratio = |x: u32, y: u32| light(&shaded, x, y) / light(&plain, x, y);
@@ -256,21 +259,21 @@ fn pockets_are_darker_and_rims_are_drawn() {
 }
 
 #[test]
-fn pictures_of_any_shape_are_whole() {
+fn pictures_of_any_size_are_complete() {
     let mesh = two_spheres();
     for (width, height) in [(1, 1), (1, 50), (50, 1), (63, 15), (65, 17), (300, 20)] {
         let params = PictureParams { width, height, background: Background::WHITE, ..PictureParams::default() };
         let image = image(&mesh, &params);
         assert_eq!(image.pixels.len(), (width * height) as usize);
         assert!(image.pixels.iter().all(|p| p[3] == 255));
-        // A molecule in a picture of one column may lie between its samples.
+        // In a picture of one column the molecule may lie between the samples.
         let seen = image.pixels.iter().any(|p| *p != [255; 4]);
         assert!(seen || width.min(height) < 10, "{width} × {height}");
     }
 }
 
 #[test]
-fn who_stops_it_is_heeded_and_what_cannot_be_drawn_is_said() {
+fn cancelled_runs_and_quantised_meshes_are_errors() {
     let (mesh, cancel) = (lump(), CancelToken::default());
     cancel.cancel();
     let control = Control { cancel, ..Control::default() };

@@ -72,7 +72,7 @@ fn cases() -> Vec<Case> {
         }
     }
     cases.sort_by_key(|case| case.spheres.len());
-    assert!(cases.len() >= 2, "the samples are there");
+    assert!(cases.len() >= 2, "the samples are missing");
     cases
 }
 
@@ -97,7 +97,7 @@ fn gcd(a: usize, b: usize) -> usize {
 }
 
 #[test]
-fn every_structure_and_kernel_yields_a_closed_oriented_manifold() {
+fn every_structure_and_kernel_gives_a_closed_oriented_manifold() {
     let dir = tempfile::tempdir().unwrap();
     for case in cases() {
         let mut files = Vec::new();
@@ -178,7 +178,7 @@ fn the_same_bytes_with_1_2_and_7_threads_and_the_same_surface_permuted() {
 }
 
 #[test]
-fn every_structure_yields_valid_gltf() {
+fn every_structure_gives_valid_gltf() {
     let dir = tempfile::tempdir().unwrap();
     let mut paths = Vec::new();
     for case in cases() {

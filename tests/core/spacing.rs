@@ -1,4 +1,4 @@
-//! The grid's spacing where it is not given: levels of detail, and a bound on triangles that holds for whatever is meshed.
+//! Automatic grid spacing: levels of detail, and a limit on triangles that holds for every structure.
 
 use molmesh::pipeline::spacing::{COARSEST, FINEST};
 use molmesh::pipeline::{Choice, Estimate, JobError, JobLimits, Product, Report, estimate, params, run};
@@ -7,7 +7,7 @@ use molmesh::surface::{CancelToken, CpuBackend, SurfaceError, SurfaceLimits};
 const PTI: &[u8] = include_bytes!("../../samples/4pti.pdb");
 const CRAMBIN: &[u8] = include_bytes!("../../samples/1crn.cif");
 
-/// One carbon a residue, at these places, Å.
+/// Returns one carbon per residue at these positions, Å.
 fn carbons(places: impl IntoIterator<Item = [f64; 3]>) -> Vec<u8> {
     let line = |(i, [x, y, z]): (usize, [f64; 3])| {
         let n = i % 9999 + 1;
@@ -16,13 +16,13 @@ fn carbons(places: impl IntoIterator<Item = [f64; 3]>) -> Vec<u8> {
     places.into_iter().enumerate().map(line).collect::<String>().into_bytes()
 }
 
-/// `n`³ carbons on a grid.
+/// Returns `n`³ carbons on a grid.
 fn cube(n: u32, distance: f64) -> Vec<u8> {
     let at = move |i: u32| f64::from(i) * distance;
     carbons((0..n).flat_map(move |x| (0..n).flat_map(move |y| (0..n).map(move |z| [at(x), at(y), at(z)]))))
 }
 
-/// Compact, hollow, long, scattered, and one alone.
+/// Structures of different shapes: compact, hollow, long, scattered, a single atom.
 fn structures() -> Vec<(&'static str, Vec<u8>)> {
     vec![
         ("4pti", PTI.to_vec()),
@@ -37,7 +37,7 @@ fn structures() -> Vec<(&'static str, Vec<u8>)> {
 fn with(input: &[u8], pairs: &[(&str, &str)], surface: SurfaceLimits) -> Result<Product, JobError> {
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     let backend = CpuBackend::new(None).unwrap();
-    let choice = Choice { backend: &backend, reason: "asked for" };
+    let choice = Choice { backend: &backend, reason: "set by a test" };
     run(input, &job, &JobLimits { surface, ..JobLimits::default() }, &choice, &CancelToken::default(), &(), None)
 }
 
@@ -52,51 +52,56 @@ fn report(input: &[u8], pairs: &[(&str, &str)]) -> Report {
 fn expected(input: &[u8], pairs: &[(&str, &str)]) -> Estimate {
     let job = params::parse(pairs.iter().copied()).unwrap().job;
     let backend = CpuBackend::new(None).unwrap();
-    let choice = Choice { backend: &backend, reason: "asked for" };
+    let choice = Choice { backend: &backend, reason: "set by a test" };
     estimate(input, &job, &JobLimits::default(), &choice, &CancelToken::default()).unwrap()
 }
 
 #[test]
-fn the_bound_holds_for_every_structure_and_kernel() {
+fn the_limit_holds_for_every_structure_and_kernel() {
     let (mut fitted, mut finest, mut refused) = (0, 0, 0);
     for (name, input) in structures() {
         for kernel in ["gaussian", "soft-object", "inverse-square"] {
             for limit in [40_u64, 700, 9000, 60_000] {
                 let text = limit.to_string();
-                let said = format!("{name} {kernel} {limit}");
+                let case = format!("{name} {kernel} {limit}");
                 let bounded = product(&input, &[("kernel", kernel), ("max_triangles", &text)]);
                 let Product { mesh, report, .. } = match bounded {
                     Ok(product) => product,
-                    Err(JobError::Surface(SurfaceError::TooManyTriangles { triangles, limit: told, resolution })) => {
+                    Err(JobError::Surface(SurfaceError::TooManyTriangles {
+                        triangles,
+                        limit: reported,
+                        resolution,
+                    })) => {
                         refused += 1;
-                        // It is as it says: there the mesh has so many, and lone atoms apart no spacing is coarser.
-                        assert!(told == limit && triangles > limit, "{said}: {triangles}");
-                        assert!(name == "scattered" || resolution.total_cmp(&COARSEST).is_eq(), "{said}: {resolution}");
+                        // The error is correct: its spacing gives this number of triangles, and it is the coarsest one
+                        // except for separate atoms.
+                        assert!(reported == limit && triangles > limit, "{case}: {triangles}");
+                        assert!(name == "scattered" || resolution.total_cmp(&COARSEST).is_eq(), "{case}: {resolution}");
                         let text = resolution.to_string();
-                        let there = report(&input, &[("kernel", kernel), ("resolution", &text)]);
-                        assert_eq!(there.triangles, triangles, "{said}");
+                        let at_resolution = report(&input, &[("kernel", kernel), ("resolution", &text)]);
+                        assert_eq!(at_resolution.triangles, triangles, "{case}");
                         continue;
                     }
-                    Err(other) => panic!("{said}: {other}"),
+                    Err(other) => panic!("{case}: {other}"),
                 };
                 let n = mesh.n_triangles() as u64;
-                assert!(n <= limit && n == report.triangles && n > 0, "{said}: {n}");
-                assert!(report.closed && report.manifold, "{said}");
+                assert!(n <= limit && n == report.triangles && n > 0, "{case}: {n}");
+                assert!(report.closed && report.manifold, "{case}");
                 let tries = report.tries.unwrap();
-                assert!((1..=8).contains(&tries), "{said}: {tries} tries");
+                assert!((1..=8).contains(&tries), "{case}: {tries} tries");
                 assert_eq!((report.resolution_from, report.max_triangles), ("max_triangles", Some(limit)));
-                assert!((FINEST..=COARSEST).contains(&report.resolution), "{said}: {}", report.resolution);
+                assert!((FINEST..=COARSEST).contains(&report.resolution), "{case}: {}", report.resolution);
                 if report.resolution > FINEST {
                     fitted += 1;
-                    // Nor is the bound held by meshes far coarser than need be. Small ones come in lumps.
-                    assert!(n * 10 >= limit * 8 || limit < 1000, "{said}: {n} at {}", report.resolution);
+                    // The mesh uses most of the limit. The triangle counts of small meshes change in larger steps.
+                    assert!(n * 10 >= limit * 8 || limit < 1000, "{case}: {n} at {}", report.resolution);
                 } else {
                     finest += 1;
                 }
-                // The same spacing, said outright, is the same mesh: nothing else is different about it.
+                // The same spacing as an explicit parameter gives the same mesh.
                 let resolution = report.resolution.to_string();
                 let same = product(&input, &[("kernel", kernel), ("resolution", &resolution)]).unwrap().mesh;
-                assert!(same.positions[..] == mesh.positions[..] && same.triangles[..] == mesh.triangles[..], "{said}");
+                assert!(same.positions[..] == mesh.positions[..] && same.triangles[..] == mesh.triangles[..], "{case}");
             }
         }
     }
@@ -104,7 +109,7 @@ fn the_bound_holds_for_every_structure_and_kernel() {
 }
 
 #[test]
-fn the_same_bound_gives_the_same_mesh_and_a_report_without_surprises() {
+fn the_same_limit_gives_the_same_mesh_and_report() {
     let [one, two] = [(); 2].map(|()| product(PTI, &[("max_triangles", "20000")]).unwrap());
     assert_eq!(one.report.extras(), two.report.extras());
     assert!(one.mesh.positions[..] == two.mesh.positions[..]);
@@ -118,18 +123,18 @@ fn the_same_bound_gives_the_same_mesh_and_a_report_without_surprises() {
 }
 
 #[test]
-fn the_other_limits_hold_as_well() {
+fn the_other_limits_apply_too() {
     let narrow = SurfaceLimits { max_samples: 40_000, ..SurfaceLimits::default() };
     let refused = with(PTI, &[("max_triangles", "1000000")], narrow).unwrap_err();
     assert!(matches!(refused, JobError::Surface(SurfaceError::GridTooLarge { .. })), "{refused}");
     assert!(with(PTI, &[("max_triangles", "2000")], narrow).is_ok());
-    // An isovalue that nothing reaches is that at any spacing.
+    // An isovalue above the maximum fails at any spacing.
     let nothing = product(PTI, &[("max_triangles", "1000"), ("isovalue", "100000")]).unwrap_err();
     assert!(matches!(nothing, JobError::Surface(SurfaceError::NoSurface { .. })), "{nothing}");
 }
 
 #[test]
-fn levels_of_detail_are_what_is_written() {
+fn levels_of_detail_have_the_documented_spacings() {
     let mut last = 0;
     for (level, resolution) in ["2", "1.4", "1", "0.7", "0.5", "0.35", "0.25"].into_iter().enumerate() {
         let text = level.to_string();
@@ -137,22 +142,22 @@ fn levels_of_detail_are_what_is_written() {
         let given = product(PTI, &[("resolution", resolution)]).unwrap();
         assert_eq!(by_level.report.resolution.to_string(), resolution);
         assert!(by_level.mesh.positions[..] == given.mesh.positions[..], "{level}");
-        let said = (by_level.report.resolution_from, by_level.report.detail.map(usize::from));
-        assert_eq!(said, ("detail", Some(level)));
-        assert!(by_level.report.triangles > last + last / 2, "{level} is finer than the one before");
+        let case = (by_level.report.resolution_from, by_level.report.detail.map(usize::from));
+        assert_eq!(case, ("detail", Some(level)));
+        assert!(by_level.report.triangles > last + last / 2, "{level} is not finer than the level before");
         last = by_level.report.triangles;
     }
     // 27,000 atoms: three times as long as 1,000, and 1.39 times as long as 10,000.
     let large = cube(30, 2.0);
     assert_eq!(report(&large, &[("detail", "1")]).resolution.to_string(), "1.95");
-    // Of the atoms that are meshed, not of those in the file.
+    // Counts selected atoms, not those in the file.
     let small = String::from_utf8(cube(8, 2.0)).unwrap().replace("ALA A", "ALA B");
     let both = [&large[..], small.as_bytes()].concat();
     assert_eq!(report(&both, &[("detail", "1"), ("chains", "B")]).resolution.to_string(), "1.4");
 }
 
 #[test]
-fn estimates_know_them() {
+fn estimates_use_the_chosen_spacing() {
     for limit in ["3000", "30000"] {
         let (guess, made) = (expected(PTI, &[("max_triangles", limit)]), report(PTI, &[("max_triangles", limit)]));
         assert!((guess.resolution / made.resolution - 1.0).abs() < 0.1, "{} {}", guess.resolution, made.resolution);

@@ -285,7 +285,10 @@ fn strict_validator_reports_and_never_panics() {
     let panics = format!("CRYST1   28.070   28.070   53.350  90.00  90.00  90.00 Q 99 99 9   8\n{ATOM}");
     let findings = strict_validator::check(panics.as_bytes(), &limits()).unwrap();
     assert_eq!(findings.len(), 1);
-    assert!(findings[0].message.contains("failed on this file") && findings[0].message.contains("space group"), "{findings:?}");
+    assert!(
+        findings[0].message.contains("failed on this file") && findings[0].message.contains("space group"),
+        "{findings:?}"
+    );
 
     let packed = gzip(&sound);
     assert_eq!(strict_validator::check(&packed, &limits()), strict_validator::check(&sound, &limits()));

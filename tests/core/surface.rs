@@ -1,11 +1,11 @@
-//! The meshing core against truths from outside it: analytic spheres, a brute-force field in double precision,
-//! the sequential reference, and its own promises (closed, deterministic, indifferent to order).
+//! The meshing core compared with analytic spheres, a brute-force field in double precision and the sequential
+//! reference. Meshes are closed, deterministic and independent of the order of atoms.
 
 #![expect(
     clippy::unwrap_used,
     clippy::cast_possible_truncation,
     clippy::float_cmp,
-    reason = "a test may panic, and means exact equality where it asks for it"
+    reason = "tests fail by panicking, and exact equality is intended"
 )]
 
 use molmesh::surface::reference::Density;
@@ -57,9 +57,9 @@ fn assert_sound(meshed: &MeshOutput, what: &str) -> Measures {
     m
 }
 
-/// Whether two measures are of one mesh, up to rounding. Components of equal size may be listed in any order. Positions
-/// are single precision: far from the mesh's centre they are rounded to a visible part of an ångström, which measures
-/// taken on the way do not see.
+/// Returns true if two measures belong to the same mesh, up to rounding. Components of equal size may be in any order.
+/// Positions have single precision, whose rounding is visible far from the centre of the mesh; measures during meshing
+/// are taken before this rounding.
 fn agree(a: &Measures, b: &Measures, mesh: &Mesh) -> bool {
     let furthest = mesh.bounds().as_flattened().iter().fold(0.0_f64, |far, c| far.max(f64::from(c.abs())));
     let tolerance = 2e-5 + furthest * 1.2e-7;
@@ -74,7 +74,7 @@ fn agree(a: &Measures, b: &Measures, mesh: &Mesh) -> bool {
         volumes.sort_by(f64::total_cmp);
         volumes
     };
-    // Single precision leaves no digits of the moment of a small component, or of one beyond 10⁴ Å from the centre.
+    // Single precision has no digits for the moment of a small component, or of one beyond 10⁴ Å from the centre.
     let near = |x: &Component, y: &Component| {
         let off = |k: usize| (x.centroid()[k] - y.centroid()[k]).abs();
         x.triangles == y.triangles && (0..3).all(|k| off(k) < 0.05)
@@ -90,15 +90,15 @@ fn agree(a: &Measures, b: &Measures, mesh: &Mesh) -> bool {
 }
 
 #[test]
-fn measures_taken_on_the_way_are_those_of_the_mesh() {
-    // Cavities, several sheets in a brick, cells with two sheets, components across tiles.
+fn measures_during_meshing_are_those_of_the_mesh() {
+    // Voids, several sheets in a brick, cells with two sheets, components across tiles.
     let crowd = spheres(&Random(11).cloud(4000, 70.0));
     for (h, kernel) in [(0.5, Kernel::Gaussian), (1.3, Kernel::SoftObject), (2.5, Kernel::InverseSquare)] {
         let meshed = run(&crowd, &params(kernel, h));
         let m = assert_sound(&meshed, &format!("{h} {kernel}"));
         assert!(m.components.len() > 1 && meshed.measures.is_some(), "{h} {kernel}: {}", m.components.len());
     }
-    // One atom more or less is seen.
+    // Control: one atom more or less.
     let fewer = spheres(&Random(11).cloud(3999, 70.0));
     let [all, fewer] = [&crowd, &fewer].map(|at| run(at, &params(Kernel::Gaussian, 1.0)));
     let measured = exact(&all);
@@ -106,7 +106,7 @@ fn measures_taken_on_the_way_are_those_of_the_mesh() {
     assert!(agree(&measured, all.measures.as_ref().unwrap(), &all.mesh));
 }
 
-/// A small deterministic generator: tests must fail the same way twice.
+/// Small deterministic random number generator.
 struct Random(u64);
 
 impl Random {
@@ -120,14 +120,14 @@ impl Random {
     }
 }
 
-/// Slope of log(error) over log(spacing) between the coarsest and the finest spacing.
+/// Returns the slope of log(error) over log(spacing) between the coarsest and the finest spacing.
 fn order(errors: &[(f64, f64)]) -> f64 {
     let (first, last) = (errors[0], errors[errors.len() - 1]);
     (first.1 / last.1).ln() / (first.0 / last.0).ln()
 }
 
 #[test]
-fn a_lone_sphere_has_its_analytic_area_and_volume() {
+fn a_single_sphere_has_its_analytic_area_and_volume() {
     let r = 1.7_f64;
     let at = spheres(&[[0.123, -4.321, 7.007, r]]);
     for kernel in KERNELS {
@@ -153,8 +153,8 @@ fn a_lone_sphere_has_its_analytic_area_and_volume() {
     }
 }
 
-/// Area and volume of the body of revolution that two overlapping atoms make, by integrating the profile that a
-/// root finder gets from the double-precision density.
+/// Returns area and volume of the body of revolution around two overlapping atoms by integrating the profile. A root
+/// finder computes the profile from the double-precision density.
 fn two_atom_truth(density: &Density, iso: f64, half_length: f64) -> (f64, f64) {
     let n = 4000;
     let radius = |x: f64| {
@@ -168,7 +168,7 @@ fn two_atom_truth(density: &Density, iso: f64, half_length: f64) -> (f64, f64) {
         }
         lo
     };
-    // x = L·sin(θ) makes the profile's square-root ends smooth in θ.
+    // x = L·sin(θ) makes the square-root ends of the profile smooth in θ.
     let (mut lo, mut hi) = (0.0, 2.0 * half_length);
     for _ in 0..60 {
         let mid = 0.5 * (lo + hi);
@@ -185,7 +185,7 @@ fn two_atom_truth(density: &Density, iso: f64, half_length: f64) -> (f64, f64) {
         .collect();
     for pair in points.windows(2) {
         let ((x0, r0), (x1, r1)) = (pair[0], pair[1]);
-        // Frustums: second order in the step, far below the mesh's error.
+        // Frustums: second order in the step, far below the error of the mesh.
         area += std::f64::consts::PI * (r0 + r1) * ((x1 - x0).powi(2) + (r1 - r0).powi(2)).sqrt();
         volume += std::f64::consts::PI / 3.0 * (x1 - x0) * (r0 * r0 + r0 * r1 + r1 * r1);
     }
@@ -209,8 +209,7 @@ fn two_overlapping_atoms_converge_to_the_integrated_truth() {
     }
 }
 
-/// Every vertex lies where the straight line between its edge's two exact densities crosses the isovalue, and its
-/// normal is the exact gradient's.
+/// Each vertex is at the linear interpolation of the exact densities of its edge, and its normal is the exact gradient.
 #[test]
 fn vertices_and_normals_agree_with_the_brute_force_field() {
     let rows = Random(7).cloud(300, 18.0);
@@ -252,7 +251,7 @@ fn fraction(v: f64) -> f64 {
 }
 
 #[test]
-fn the_gradient_is_the_fields_derivative() {
+fn the_gradient_is_the_derivative_of_the_field() {
     let rows = Random(11).cloud(60, 9.0);
     let at = spheres(&rows);
     let mut random = Random(5);
@@ -291,7 +290,7 @@ fn the_native_backend_agrees_with_the_sequential_reference() {
             "{kernel} {a:?} {b:?}"
         );
         assert_eq!(native.mesh.centre, reference.mesh.centre);
-        // The two number vertices differently: compare them in the order of their grid edges.
+        // The backends number vertices differently, so they are compared in the order of their grid edges.
         let sorted = |m: &MeshOutput| {
             let ids = m.mesh.atom_ids.as_ref().unwrap();
             let mut rows: Vec<_> =
@@ -303,7 +302,7 @@ fn the_native_backend_agrees_with_the_sequential_reference() {
         let same = x.iter().filter(|row| y.binary_search(row).is_ok()).count();
         assert!(same * 100 >= x.len() * 97, "{kernel}: {same} of {} rows equal", x.len());
     }
-    // Negative control: another isovalue must not pass for the same mesh.
+    // Negative control: another isovalue.
     let other = SurfaceParams { isovalue: 1.01, ..params(Kernel::Gaussian, 0.6) };
     let (a, b) = (exact(&run(&at, &params(Kernel::Gaussian, 0.6))), exact(&run(&at, &other)));
     assert!((a.volume / b.volume - 1.0).abs() > 1e-4, "{} {}", a.volume, b.volume);
@@ -330,12 +329,12 @@ fn the_same_bytes_with_any_number_of_threads_and_any_order_of_atoms() {
 }
 
 #[test]
-fn shifting_by_whole_steps_shifts_the_mesh() {
+fn shifts_by_whole_spacings_shift_the_mesh() {
     let rows = Random(77).cloud(200, 15.0);
     let moved: Vec<[f64; 4]> = rows.iter().map(|r| [r[0] + 512.5, r[1] - 100.0, r[2] + 33.0, r[3]]).collect();
     let (a, b) =
         (run(&spheres(&rows), &params(Kernel::Gaussian, 0.5)), run(&spheres(&moved), &params(Kernel::Gaussian, 0.5)));
-    let (m, n) = (assert_sound(&a, "here"), assert_sound(&b, "there"));
+    let (m, n) = (assert_sound(&a, "original"), assert_sound(&b, "shifted"));
     assert_eq!(
         (m.euler, a.mesh.n_vertices(), a.mesh.n_triangles()),
         (n.euler, b.mesh.n_vertices(), b.mesh.n_triangles())
@@ -346,7 +345,7 @@ fn shifting_by_whole_steps_shifts_the_mesh() {
 }
 
 #[test]
-fn a_union_never_shrinks() {
+fn adding_atoms_never_shrinks_the_volume() {
     let rows = Random(99).cloud(120, 12.0);
     for kernel in KERNELS {
         let part = exact(&run(&spheres(&rows[..60]), &params(kernel, 0.5)));
@@ -356,28 +355,28 @@ fn a_union_never_shrinks() {
 }
 
 #[test]
-fn atoms_everywhere_around_tile_and_brick_borders() {
-    // One atom at a time, swept across a tile's corner in steps that hit samples, faces and halves exactly.
+fn atoms_at_tile_and_brick_borders_have_sound_meshes() {
+    // One atom at a time, moved across the corner of a tile in steps that hit grid points, faces and half spacings.
     for step in 0..24 {
         let x = 31.0 + f64::from(step) * 0.125;
         for at in [[x, 0.0, 0.0], [x, x, 0.25], [x, x, x], [-x, x, -x]] {
             let m =
                 assert_sound(&run(&spheres(&[[at[0], at[1], at[2], 1.7]]), &params(Kernel::Gaussian, 0.5)), "swept");
             assert_eq!((m.euler, m.components.len()), (2, 1), "{at:?}");
-            // Chords cut a few per cent off a sphere of 3.4 spacings.
+            // Chords reduce a sphere of 3.4 spacings by a few per cent.
             assert!((m.volume - 20.58).abs() < 0.8, "{at:?} {}", m.volume);
         }
     }
 }
 
 #[test]
-fn ties_are_inside_and_stay_manifold() {
-    // The soft object's density is 1 exactly at half its support: put that on grid points.
+fn densities_equal_to_the_isovalue_are_inside_and_manifold() {
+    // The density of the soft object is exactly 1 at half its support, which is placed on grid points.
     let at = spheres(&[[0.0, 0.0, 0.0, 1.5], [6.0, 0.0, 0.0, 1.5], [3.0, 0.0, 0.0, 1.5]]);
     for h in [0.5, 0.25, 0.75, 1.5] {
         assert_sound(&run(&at, &params(Kernel::SoftObject, h)), "ties");
     }
-    // A block of equal atoms on a lattice gives saddles where the gradient vanishes.
+    // Equal atoms on a lattice give saddles with zero gradient.
     let rows: Vec<[f64; 4]> = (0..125)
         .map(|i| [i % 5, i / 5 % 5, i / 25].map(|c| f64::from(c) * 3.0))
         .map(|c| [c[0], c[1], c[2], 1.5])
@@ -409,7 +408,7 @@ fn a_hollow_shell_has_a_void() {
     assert_eq!(m.components.len(), 2, "{volumes:?}");
     assert!(volumes[0] > 4000.0 && volumes[1] < -1000.0, "{volumes:?}");
     for component in &m.components {
-        // Both surfaces of the shell have its centre.
+        // Both surfaces have the centre of the shell.
         let off = (0..3)
             .map(|k| (component.centroid()[k] + mesh.centre[k] - [40.0, -20.0, 7.0][k]).abs())
             .fold(0.0, f64::max);
@@ -418,7 +417,7 @@ fn a_hollow_shell_has_a_void() {
 }
 
 #[test]
-fn the_nearest_atom_of_each_vertex_is_the_nearest() {
+fn atom_indices_name_the_nearest_atom_of_each_vertex() {
     let rows = Random(13).cloud(400, 20.0);
     let at = spheres(&rows);
     let params = SurfaceParams { atom_ids: true, ..params(Kernel::Gaussian, 0.5) };
@@ -434,7 +433,7 @@ fn the_nearest_atom_of_each_vertex_is_the_nearest() {
     assert_eq!(right, ids.len());
 }
 
-/// The grid spacing that an error suggests.
+/// Returns the grid spacing that an error suggests.
 fn suggestion(error: &SurfaceError) -> Option<f64> {
     match error {
         SurfaceError::GridTooLarge { suggested_resolution, .. }
@@ -445,7 +444,7 @@ fn suggestion(error: &SurfaceError) -> Option<f64> {
 }
 
 #[test]
-fn limits_are_checked_and_their_suggestions_fit() {
+fn limits_are_checked_and_suggested_spacings_fit() {
     let at = spheres(&Random(1).cloud(500, 40.0));
     let backend = CpuBackend::new(Some(2)).unwrap();
     for limits in [
@@ -457,8 +456,8 @@ fn limits_are_checked_and_their_suggestions_fit() {
             let started = std::time::Instant::now();
             let error = backend.run(&at, &params(Kernel::Gaussian, h), &limits, &Control::default()).unwrap_err();
             let mut h = suggestion(&error).unwrap_or_else(|| panic!("{error}"));
-            assert!(started.elapsed().as_secs_f64() < 60.0, "refused late");
-            // An extrapolation from a part of the tiles may need another step.
+            assert!(started.elapsed().as_secs_f64() < 60.0, "rejected late");
+            // An extrapolation from some of the tiles may need another step.
             for attempt in 0.. {
                 match backend.run(&at, &params(Kernel::Gaussian, h), &limits, &Control::default()) {
                     Ok(_) => break,
@@ -474,8 +473,8 @@ fn limits_are_checked_and_their_suggestions_fit() {
 }
 
 #[test]
-fn a_hopeless_grid_is_refused_before_it_is_begun() {
-    // 10⁴ times the samples that fit: the field of what fits alone would take seconds here.
+fn far_too_large_grids_are_rejected_before_evaluation() {
+    // 10⁴ times the allowed grid points: even the field of the allowed ones would take seconds here.
     let at = spheres(&Random(1).cloud(3000, 40.0));
     let limits = SurfaceLimits { max_samples: 1 << 28, ..SurfaceLimits::default() };
     let seen = Stages::default();
@@ -485,12 +484,12 @@ fn a_hopeless_grid_is_refused_before_it_is_begun() {
     let SurfaceError::GridTooLarge { samples, limit, suggested_resolution, .. } = error.unwrap_err() else { panic!() };
     assert!(samples > limit && (0.05..1.0).contains(&suggested_resolution), "{samples} {suggested_resolution}");
     assert_eq!(seen.all(), [Stage::Bin], "nothing was evaluated");
-    // The same watch sees the later stages of a grid that fits.
+    // Control: a grid within the limit reaches later stages.
     backend.run(&at, &params(Kernel::Gaussian, 1.0), &limits, &control).unwrap();
     assert!(seen.all().contains(&Stage::Field));
 }
 
-/// The stages that a run went through.
+/// Records the stages of a run.
 #[derive(Default)]
 struct Stages(Mutex<BTreeSet<Stage>>);
 
@@ -507,14 +506,14 @@ impl Observer for Stages {
     }
 }
 
-/// A mesh put together from parts that come in any order, and how many vertices came.
+/// Mesh collected from parts in any order, and the number of received vertices.
 #[derive(Default)]
 struct Collected(Mutex<(Mesh, usize)>);
 
 impl MeshSink for Collected {
     fn begin(&self, n_vertices: usize, n_triangles: usize) -> Result<(), SinkFailed> {
         let (mesh, _) = &mut *self.0.lock().unwrap();
-        // Which of the two are filled is seen when the first part comes.
+        // The first part decides which vertex columns are used.
         mesh.positions = vec![[f32::NAN; 3]; n_vertices].into();
         mesh.normals = vec![[f32::NAN; 3]; n_vertices].into();
         mesh.triangles = vec![[u32::MAX; 3]; n_triangles].into();
@@ -522,8 +521,8 @@ impl MeshSink for Collected {
     }
 
     fn part(&self, part: &MeshPart<'_>) -> Result<(), SinkFailed> {
-        let (mesh, came) = &mut *self.0.lock().unwrap();
-        *came += part.vertices.len();
+        let (mesh, received) = &mut *self.0.lock().unwrap();
+        *received += part.vertices.len();
         let (v, t) = (part.first_vertex..part.first_vertex + part.vertices.len(), part.first_triangle);
         match part.vertices {
             Vertices::Single { positions, normals } => {
@@ -547,9 +546,9 @@ impl MeshSink for Collected {
 }
 
 #[test]
-fn a_sink_gets_the_rows_that_a_mesh_in_memory_has() {
-    // Tiles side by side; and a spacing so wide that vertices lie where no atom reaches. There is no gradient there, and
-    // normals are taken from the triangles: every row comes a second time.
+fn a_sink_gets_the_same_mesh_as_memory() {
+    // Adjacent tiles; and a spacing so wide that no atom reaches some vertices. These have no gradient, so normals are
+    // computed from the triangles and every vertex is written twice.
     let lone = spheres(&[[0.0, 0.0, 0.0, 1.7]]);
     let (many, wide) = (spheres(&Random(5).cloud(900, 60.0)), 8.0);
     for (at, h, times, quantized) in
@@ -563,8 +562,8 @@ fn a_sink_gets_the_rows_that_a_mesh_in_memory_has() {
             let backend = CpuBackend::new(Some(threads)).unwrap();
             let limits = SurfaceLimits::default();
             let output = backend.write(at, &p, &limits, &Control::default(), Some(&sink)).unwrap();
-            let (mut mesh, came) = sink.0.into_inner().unwrap();
-            assert_eq!(came, times * mesh.n_vertices(), "{h} Å");
+            let (mut mesh, received) = sink.0.into_inner().unwrap();
+            assert_eq!(received, times * mesh.n_vertices(), "{h} Å");
             assert_eq!(mesh.quantized.is_some(), quantized);
             if quantized {
                 (mesh.positions, mesh.normals) = Default::default();
@@ -581,19 +580,19 @@ fn a_sink_gets_the_rows_that_a_mesh_in_memory_has() {
     }
 }
 
-/// The same parameters, with vertices rounded to the smallest step that reaches them all.
+/// Returns the parameters with vertices rounded to the smallest step that covers them.
 fn rounded(spheres: &Spheres, params: &SurfaceParams) -> SurfaceParams {
     SurfaceParams { quantize: Some(Step::covering(lattice::extent(spheres, params))), ..params.clone() }
 }
 
 #[test]
-fn rounded_vertices_are_the_computed_ones_rounded_and_are_what_is_measured() {
+fn quantised_vertices_are_rounded_once_and_measured_after_rounding() {
     let relative = |a: f64, b: f64| (a / b - 1.0).abs();
     for (at, h) in [(spheres(&Random(5).cloud(400, 50.0)), 0.5), (spheres(&[[900.0, 0.0, -77.0, 1.7]]), 0.3)] {
         for kernel in Kernel::ALL {
             let single = params(*kernel, h);
             let whole = run(&at, &single);
-            // The smallest step, and one so coarse that rounding shows in area and volume.
+            // The smallest step, and one so coarse that it changes area and volume.
             for step in [rounded(&at, &single).quantize.unwrap(), Step::covering(4000.0)] {
                 let meshed = run(&at, &SurfaceParams { quantize: Some(step), ..single.clone() });
                 let mut expected = whole.mesh.clone();
@@ -605,7 +604,7 @@ fn rounded_vertices_are_the_computed_ones_rounded_and_are_what_is_measured() {
                 assert_eq!((taken.euler, taken.components.len()), (found.euler, found.components.len()));
                 assert!(relative(taken.area, found.area) < 2e-6, "{kernel} {step:?}: {taken:?} {found:?}");
                 assert!(relative(taken.volume, found.volume) < 1e-5, "{kernel} {step:?}: {taken:?} {found:?}");
-                // Control: what was computed before rounding is not what is measured.
+                // Control: measures before rounding differ.
                 if step == Step::covering(4000.0) {
                     assert!(relative(taken.area, unrounded.area) > 1e-4, "{kernel}: {taken:?} {unrounded:?}");
                 }
@@ -615,7 +614,7 @@ fn rounded_vertices_are_the_computed_ones_rounded_and_are_what_is_measured() {
 }
 
 #[test]
-fn a_limit_counts_the_bytes_of_the_vertices_that_are_delivered() {
+fn the_byte_limit_counts_delivered_vertices() {
     let at = spheres(&Random(5).cloud(100, 30.0));
     let single = params(Kernel::Gaussian, 0.5);
     let small = rounded(&at, &single);
@@ -631,14 +630,14 @@ fn a_limit_counts_the_bytes_of_the_vertices_that_are_delivered() {
 }
 
 #[test]
-fn every_vertex_lies_within_the_extent_that_is_known_before() {
+fn every_vertex_is_within_the_extent_known_in_advance() {
     let far = spheres(&[[900.0, -70.0, 3.3, 1.7], [930.2, -64.0, 3.4, 2.9]]);
     for at in [spheres(&[[0.3, 0.2, 0.1, 1.7]]), spheres(&Random(8).cloud(60, 25.0)), far] {
         for kernel in Kernel::ALL {
             for h in [0.31, 1.0] {
                 let mut options =
                     SurfaceOptions { kernel: Some(*kernel), resolution: Some(h), ..SurfaceOptions::default() };
-                // At a low level the surface comes closest to where densities end.
+                // At a low level the surface is closest to the support of the densities.
                 for isovalue in [None, Some(0.001)] {
                     options.isovalue = isovalue;
                     let params = SurfaceParams::new(&options).unwrap();
@@ -647,7 +646,7 @@ fn every_vertex_lies_within_the_extent_that_is_known_before() {
                         let bounds = run_on(backend, &at, &params).mesh.bounds();
                         let furthest = bounds.as_flattened().iter().fold(0.0_f64, |far, c| far.max(f64::from(c.abs())));
                         assert!(furthest <= extent, "{kernel} {h} {isovalue:?}: {furthest} beyond {extent}");
-                        // It is no wild guess: at the lowest level hardly more than its margin is left.
+                        // The extent is tight: at the lowest level little more than its margin remains.
                         assert!(
                             isovalue.is_none() || extent - furthest < 4.0 * h + 1.0,
                             "{kernel} {h}: {furthest} of {extent}"
@@ -681,7 +680,7 @@ fn a_sink_that_fails_ends_the_run() {
 }
 
 #[test]
-fn nothing_to_see_is_said() {
+fn empty_and_invalid_input_is_rejected() {
     let backend = CpuBackend::new(Some(1)).unwrap();
     let limits = SurfaceLimits::default();
     let empty = Spheres::new(vec![], vec![], vec![], vec![]).unwrap();
@@ -721,7 +720,7 @@ fn a_cancelled_run_stops() {
 }
 
 #[test]
-fn far_apart_atoms_cost_what_they_occupy() {
+fn distant_atoms_cost_only_their_own_bricks() {
     let rows: Vec<[f64; 4]> = (0..8)
         .map(|i| [i & 1, i >> 1 & 1, i >> 2].map(|c| f64::from(c) * 180_000.0 - 90_000.0))
         .map(|c| [c[0], c[1], c[2], 1.7])
@@ -733,7 +732,7 @@ fn far_apart_atoms_cost_what_they_occupy() {
 }
 
 #[test]
-fn the_papers_raw_parameters_mesh() {
+fn raw_parameters_of_the_paper_give_a_mesh() {
     let rows = Random(31).cloud(100, 12.0);
     let raw = |kernel, a, b, c, iso| SurfaceOptions {
         kernel: Some(kernel),
@@ -751,7 +750,7 @@ fn the_papers_raw_parameters_mesh() {
         let params = SurfaceParams::new(&options).unwrap();
         let m = assert_sound(&run(&spheres(&rows), &params), "raw");
         assert!(m.volume > 0.0);
-        // Radii are out of play: other radii, same mesh.
+        // Radii do not matter: the mesh is the same with other radii.
         let other: Vec<[f64; 4]> = rows.iter().map(|r| [r[0], r[1], r[2], 1.0]).collect();
         assert_eq!(run(&spheres(&rows), &params).mesh.positions, run(&spheres(&other), &params).mesh.positions);
     }

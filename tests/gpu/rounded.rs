@@ -1,5 +1,5 @@
-//! Rounded vertices from end to end: made on a device, on the CPU or after the reference, in a file or through a pipe, by
-//! the command line and over HTTP. What the report says is measured in the file that the client gets.
+//! Quantised vertices from end to end: by devices, the CPU and the reference backend, in files and through pipes, by
+//! the command line and over HTTP. The report must agree with measurements of the received file.
 
 use crate::cli_support;
 use crate::gpu_support;
@@ -31,7 +31,7 @@ fn job(more: &[(&'static str, &'static str)]) -> Job {
     params::parse(pairs).unwrap().job
 }
 
-/// `n` devices of the software adapter, as one backend.
+/// Returns a backend of `n` software devices.
 fn devices(n: usize) -> GpuBackend {
     let device = |number| {
         let build = || Ok(Box::new(gpu_support::engine_with(|_| ())) as Box<dyn Executor>);
@@ -42,7 +42,7 @@ fn devices(n: usize) -> GpuBackend {
 }
 
 fn made(backend: &dyn Backend, job: &Job) -> Product {
-    let choice = Choice { backend, reason: "told" };
+    let choice = Choice { backend, reason: "set by a test" };
     pipeline::run(&sample(), job, &JobLimits::default(), &choice, &CancelToken::default(), &(), None).unwrap()
 }
 
@@ -53,7 +53,7 @@ fn glb(product: &Product) -> Vec<u8> {
     bytes
 }
 
-/// Area and volume of what a GLB holds.
+/// Returns area and volume of the mesh in a GLB.
 fn measured(glb: &[u8]) -> [f64; 2] {
     let file = split_glb(glb);
     let contents = gltf_contents(&file.json, &file.bin);
@@ -72,7 +72,7 @@ fn near(a: f64, b: f64, bound: f64) -> bool {
 }
 
 #[test]
-fn every_backend_hands_integers_on_and_reports_what_they_measure() {
+fn every_backend_returns_integers_and_reports_their_measures() {
     let job = job(&[("resolution", "0.8")]);
     let plain = params::parse([("resolution", "0.8")]).unwrap().job;
     let (one, cpu) = (devices(1), CpuBackend::new(Some(2)).unwrap());
@@ -84,14 +84,14 @@ fn every_backend_hands_integers_on_and_reports_what_they_measure() {
         let [area, volume] = measured(&glb(&product));
         assert!(near(product.report.area, area, 3e-6) && near(product.report.volume, volume, 3e-6), "{name}");
         assert!(product.report.closed && product.report.manifold, "{name}");
-        // Without the parameter vertices are single-precision numbers.
+        // Without the parameter vertices have single precision.
         let plain = made(backend, &plain);
         assert!(plain.mesh.quantized.is_none() && plain.storage.packing == Packing::Full, "{name}");
         assert_eq!(
             (plain.report.vertices, plain.report.triangles),
             (product.report.vertices, product.report.triangles)
         );
-        // Other formats do not take them for something else.
+        // Other formats get unquantised vertices.
         let refused = Encoder::new(Format::Ply, &product.mesh, &product.meta()).unwrap_err();
         assert_eq!(refused, FormatError::NotQuantized { format: "ply" });
     }
@@ -108,9 +108,9 @@ fn the_exact_validation_measures_the_same_vertices() {
     }
 }
 
-/// Rounding to a coarse step changes area and volume: what is reported is what is left.
+/// Rounding to a coarse step changes area and volume, and the report contains the changed values.
 #[test]
-fn a_coarse_step_shows_in_the_measures() {
+fn a_coarse_step_changes_the_measures() {
     let spheres = gpu_support::sample("4pti.pdb");
     let single = SurfaceParams::default();
     let coarse = SurfaceParams { quantize: Some(Step::covering(8000.0)), ..single.clone() };
@@ -126,8 +126,8 @@ fn a_coarse_step_shows_in_the_measures() {
     assert!(!near(found.area, fine.area, 1e-3), "{} {}", found.area, fine.area);
 }
 
-/// What a file says of its mesh but for its sums, whose last digits depend on where the mesh falls into parts.
-fn said(glb: &[u8]) -> Value {
+/// Returns the document without its sums, whose last digits depend on the partition of the mesh.
+fn document_without_sums(glb: &[u8]) -> Value {
     let mut document = split_glb(glb).json;
     let extras = document["asset"]["extras"].as_object_mut().unwrap();
     for sum in ["area", "volume", "component_list"] {
@@ -137,34 +137,37 @@ fn said(glb: &[u8]) -> Value {
 }
 
 #[test]
-fn one_device_and_two_make_the_same_file_in_order_and_out_of_order() {
+fn one_and_two_devices_make_the_same_file_in_any_write_order() {
     let job = job(&[("resolution", "0.4")]);
     let [one, two] = [1, 2].map(devices);
     let (alone, spread) = (made(&one, &job), made(&two, &job));
     assert!(spread.report.device.starts_with("2 devices"), "{}", spread.report.device);
     let expected = [&alone, &spread].map(glb);
-    assert_eq!(said(&expected[0]), said(&expected[1]));
-    assert!(contents(&expected[0]).1 == contents(&expected[1]).1, "every byte of the mesh");
+    assert_eq!(document_without_sums(&expected[0]), document_without_sums(&expected[1]));
+    assert!(contents(&expected[0]).1 == contents(&expected[1]).1, "the meshes differ");
     let sums = [&alone, &spread].map(|product| (product.report.area, product.report.volume));
     assert!(near(sums[0].0, sums[1].0, 1e-12) && near(sums[0].1, sums[1].1, 1e-12), "{sums:?}");
     for (backend, expected) in [(&one as &dyn Backend, &expected[0]), (&two, &expected[1])] {
         let mut file = Cursor::new(Vec::new());
         let sink = GlbSink::new(&mut file);
-        let (choice, limits) = (Choice { backend, reason: "told" }, JobLimits::default());
+        let (choice, limits) = (Choice { backend, reason: "set by a test" }, JobLimits::default());
         let cancel = CancelToken::default();
         let product = pipeline::run(&sample(), &job, &limits, &choice, &cancel, &(), Some(&sink)).unwrap();
         drop(sink);
         assert!(product.mesh.positions.is_empty() && product.streamed_bytes == Some(expected.len() as u64));
         assert!(file.into_inner() == *expected);
     }
-    // Control: another spacing is another file.
+    // Control: another spacing gives another file.
     let other = glb(&made(&one, &self::job(&[("resolution", "0.45")])));
-    assert!(contents(&other).1 != contents(&expected[0]).1 && said(&other) != said(&expected[0]));
+    assert!(
+        contents(&other).1 != contents(&expected[0]).1
+            && document_without_sums(&other) != document_without_sums(&expected[0])
+    );
 }
 
-/// A backend's mesh may have a vertex out of reach: the file is refused, whoever rounded.
+/// A file is rejected if a vertex of the mesh is out of range, for every backend.
 #[test]
-fn a_step_that_does_not_reach_is_refused_when_the_file_is_made() {
+fn vertices_beyond_the_step_are_rejected_when_writing() {
     let spheres = gpu_support::sample("1crn.cif");
     let short = SurfaceParams { quantize: Some(Step::covering(4.0)), ..SurfaceParams::default() };
     for backend in [&devices(1) as &dyn Backend, &CpuBackend::new(Some(2)).unwrap()] {
@@ -176,7 +179,7 @@ fn a_step_that_does_not_reach_is_refused_when_the_file_is_made() {
 }
 
 #[test]
-fn readers_take_what_a_device_rounded() {
+fn external_readers_accept_vertices_quantised_by_devices() {
     let (mut files, mut reports) = (Files::new(), Vec::new());
     let two = devices(2);
     for (name, more) in [
@@ -188,7 +191,7 @@ fn readers_take_what_a_device_rounded() {
         files.add(&format!("{name}.glb"), &glb(&product));
         reports.push(product.report);
     }
-    // Control: a normal that is none, and a bound that is passed.
+    // Control: an invalid normal, and a vertex out of bounds.
     let mut broken = fs::read(&files.paths[0]).unwrap();
     let file = split_glb(&broken);
     let attributes = &file.json["meshes"][0]["primitives"][0]["attributes"];
@@ -218,7 +221,7 @@ fn readers_take_what_a_device_rounded() {
     }
 }
 
-/// What the software device makes for the command line: the file's own words, and its mesh without them.
+/// Returns the extras of a GLB and the bytes of its mesh.
 fn contents(glb: &[u8]) -> (Value, Vec<u8>) {
     let file = split_glb(glb);
     (file.json["asset"]["extras"].clone(), file.bin)
@@ -227,7 +230,7 @@ fn contents(glb: &[u8]) -> (Value, Vec<u8>) {
 const ON_SOFTWARE: [&str; 4] = ["--backend", "gpu", "--devices", "software"];
 
 #[test]
-fn the_command_line_has_a_device_round() {
+fn the_command_line_quantises_on_a_device() {
     let folder = Folder::new();
     let output = folder.path("out.glb");
     let flags = [&ON_SOFTWARE[..], &["--compress", "quantize", "--resolution", "0.5", "--report", "json"]].concat();
@@ -245,8 +248,8 @@ fn the_command_line_has_a_device_round() {
     let quiet = [&ON_SOFTWARE[..], &["--compress", "quantize", "--resolution", "0.5", "--quiet"]].concat();
     let piped = run(["mesh", SAMPLE, "-o", "-"].iter().chain(&quiet));
     assert_code(&piped, 0);
-    assert!(piped.stdout == file, "a file has the bytes that a pipe gets");
-    // It is what the library makes on the same device.
+    assert!(piped.stdout == file, "file and pipe differ");
+    // The library makes the same mesh on the same device.
     assert!(contents(&glb(&made(&devices(1), &job(&[("resolution", "0.5")])))).1 == bin);
     let text = mesh(SAMPLE.as_ref(), &folder.path("out.gltf"), &quiet);
     assert_code(&text, 0);
@@ -254,7 +257,7 @@ fn the_command_line_has_a_device_round() {
     assert_code(&ply, 2);
 }
 
-/// POSTs the sample to a running service; returns the answer's body.
+/// POSTs the sample to a running service and returns the body of the response.
 fn post(addr: &str, query: &str) -> Vec<u8> {
     let body = sample();
     let mut stream = TcpStream::connect(addr).unwrap();
@@ -272,7 +275,7 @@ fn post(addr: &str, query: &str) -> Vec<u8> {
 }
 
 #[test]
-fn a_service_has_a_device_round() {
+fn a_service_quantises_on_a_device() {
     let folder = Folder::new();
     let service = Service::start(&folder, &ON_SOFTWARE);
     let query = "compress=quantize&resolution=0.5";
@@ -286,14 +289,14 @@ fn a_service_has_a_device_round() {
     assert!(
         near(report["area"].as_f64().unwrap(), area, 3e-6) && near(report["volume"].as_f64().unwrap(), volume, 3e-6)
     );
-    // The same job without the parameter is another result.
+    // Without the parameter the result is different.
     let plain = post(&service.addr, "resolution=0.5");
     assert!(plain.len() as u64 > file.len() as u64 + 11 * expected.report.vertices);
 }
 
-/// The mesh of a product is never half of one and half of the other.
+/// The mesh of a product is quantised completely or not at all.
 #[test]
-fn an_empty_mesh_rounds_to_an_empty_mesh() {
+fn an_empty_mesh_stays_empty_when_quantised() {
     let mut mesh = Mesh::default();
     assert!(mesh.quantize(Step::covering(1.0)));
     assert_eq!((mesh.n_vertices(), mesh.bounds()), (0, [[0.0; 3]; 2]));

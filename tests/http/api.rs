@@ -1,4 +1,4 @@
-//! The service over a socket: every resource, every answer that a client can provoke without reaching a limit.
+//! The service over a socket: every resource, and every error below the limits.
 
 use crate::bcif_support;
 use crate::http_support;
@@ -10,7 +10,7 @@ use bcif_support::CRAMBIN;
 use http_support::{Fake, Mode, Running, SAMPLE, log_lines, send, start};
 use molmesh::surface::cpu::CpuBackend;
 
-/// One server with the fake backend for all tests here; it is never stopped.
+/// Server with the fake backend that all tests share. It is never stopped.
 static SERVER: LazyLock<Running> = LazyLock::new(|| {
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let archive = server.dir.path().join("archive/pt");
@@ -33,7 +33,7 @@ fn zstd(bytes: &[u8]) -> Vec<u8> {
 const CURL: (&str, &str) = ("content-type", "application/x-www-form-urlencoded");
 
 #[test]
-fn a_pasted_curl_line_works_and_the_real_backend_is_behind_it() {
+fn a_plain_curl_upload_is_meshed_by_the_real_backend() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let reply = server.post("/v1/meshes", &[CURL, ("accept", "*/*"), ("x-request-id", "pasted-1")], SAMPLE);
     assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
@@ -46,7 +46,7 @@ fn a_pasted_curl_line_works_and_the_real_backend_is_behind_it() {
     assert_eq!(reply.header("molmesh-manifold"), Some("true"));
     assert_eq!(reply.header("molmesh-resolution"), Some("0.5"));
     assert_eq!(reply.header("molmesh-backend"), Some("cpu"));
-    assert_eq!(reply.header("molmesh-backend-reason"), Some("a test says so"));
+    assert_eq!(reply.header("molmesh-backend-reason"), Some("set by a test"));
     let volume: f64 = reply.header("molmesh-volume").unwrap().parse().unwrap();
     assert!((5_000.0..15_000.0).contains(&volume), "{volume}");
     assert!(reply.header("vary").unwrap().to_ascii_lowercase().contains("accept"));
@@ -54,11 +54,11 @@ fn a_pasted_curl_line_works_and_the_real_backend_is_behind_it() {
     for stage in ["receive", "queue", "read", "select", "field", "emit", "measure"] {
         assert!(timing.contains(&format!("{stage};dur=")), "{timing}");
     }
-    // One line a request, and nothing to worry about.
+    // One line per request, without warnings.
     let lines = log_lines("pasted-1");
     assert!(lines.iter().any(|line| line.contains("answered") && line.contains("status=200")), "{lines:?}");
     assert!(lines.iter().all(|line| !line.contains("WARN") && !line.contains("ERROR")), "{lines:?}");
-    // The same again gives the same bytes under the same validator; another parameter gives another.
+    // The same request gives the same bytes and ETag; another parameter gives different ones.
     let again = server.post("/v1/meshes", &[CURL], SAMPLE);
     assert_eq!((again.header("etag"), &again.body), (reply.header("etag"), &reply.body));
     let coarse = server.post("/v1/meshes?resolution=1", &[CURL], SAMPLE);
@@ -69,7 +69,7 @@ fn a_pasted_curl_line_works_and_the_real_backend_is_behind_it() {
 }
 
 #[test]
-fn the_report_can_be_had_instead_of_the_mesh() {
+fn the_report_is_returned_instead_of_the_mesh() {
     let reply =
         SERVER.post("/v1/meshes?report=json&kernel=soft-object&isovalue=1.5", &[("accept", "text/html")], SAMPLE);
     assert_eq!(reply.status, 200);
@@ -127,7 +127,7 @@ fn formats_are_negotiated() {
 }
 
 #[test]
-fn forms_carry_a_file_and_parameters() {
+fn forms_contain_a_file_and_parameters() {
     let form = |parts: &[(&str, &[u8])]| {
         let mut body = Vec::new();
         for (head, content) in parts {
@@ -153,7 +153,7 @@ fn forms_carry_a_file_and_parameters() {
     let post = |body: &[u8]| SERVER.post("/v1/meshes", &[kind], body);
     assert_eq!(post(&form(&[("name=\"resolution\"", b"1")])).problem(400, "bad-request")["expected"], "file");
     post(&form(&[("name=\"file\"", SAMPLE), ("name=\"file\"", SAMPLE)])).problem(400, "bad-request");
-    post(b"no form at all").problem(400, "bad-request");
+    post(b"not a form").problem(400, "bad-request");
     let unknown = post(&form(&[("name=\"file\"", SAMPLE), ("name=\"resolutoin\"", b"1")]));
     assert_eq!(unknown.problem(400, "bad-parameter")["nearest"], "resolution");
     let long = post(&form(&[("name=\"file\"", SAMPLE), ("name=\"chains\"", &[b'A'; 5000])]));
@@ -168,7 +168,7 @@ fn forms_carry_a_file_and_parameters() {
 }
 
 #[test]
-fn compressed_bodies_are_seen_by_their_bytes_and_by_their_header() {
+fn compressed_bodies_are_detected_by_content_and_header() {
     let (gz, zst) = (gzip(SAMPLE), zstd(SAMPLE));
     let post = |headers: &[(&str, &str)], body: &[u8]| SERVER.post("/v1/meshes", headers, body);
     for (encoding, body) in [("gzip", &gz), ("x-gzip", &gz), ("zstd", &zst), ("GZIP", &gz)] {
@@ -192,7 +192,7 @@ fn compressed_bodies_are_seen_by_their_bytes_and_by_their_header() {
 }
 
 #[test]
-fn a_type_that_contradicts_the_bytes_is_refused() {
+fn a_media_type_that_contradicts_the_content_is_rejected() {
     let png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR";
     let cif = include_bytes!("../../samples/1crn.cif");
     for (declared, body, status) in [
@@ -200,7 +200,7 @@ fn a_type_that_contradicts_the_bytes_is_refused() {
         ("chemical/x-mmcif", cif, 200),
         ("text/plain; charset=utf-8", SAMPLE, 200),
         ("application/octet-stream", cif, 200),
-        // A hint that is wrong about good bytes does no harm.
+        // A wrong hint about valid content is ignored.
         ("image/png", SAMPLE, 200),
         ("chemical/x-pdb", cif, 415),
         ("chemical/x-mmcif", SAMPLE, 415),
@@ -230,7 +230,7 @@ fn a_type_that_contradicts_the_bytes_is_refused() {
 }
 
 #[test]
-fn bad_parameters_are_named_with_what_was_expected() {
+fn errors_name_bad_parameters_and_expected_values() {
     for (query, parameter, nearest) in [
         ("resolutoin=1", "resolutoin", Some("resolution")),
         ("Kernel=gaussian", "Kernel", Some("kernel")),
@@ -296,7 +296,7 @@ fn bad_parameters_are_named_with_what_was_expected() {
 }
 
 #[test]
-fn quantised_meshes_are_glb_or_gltf() {
+fn only_glb_and_gltf_are_quantised() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let archive = server.dir.path().join("archive/pt");
     std::fs::create_dir_all(&archive).unwrap();
@@ -314,7 +314,7 @@ fn quantised_meshes_are_glb_or_gltf() {
     assert_eq!((plain.status, small.status), (200, 200), "{}", String::from_utf8_lossy(&small.body));
     let vertices: usize = plain.header("molmesh-vertices").unwrap().parse().unwrap();
     assert_eq!(small.header("molmesh-vertices"), plain.header("molmesh-vertices"));
-    // Their heads differ by a few words, or not at all.
+    // Their headers differ by a few bytes at most.
     let saved = plain.body.len() - small.body.len();
     assert!(saved.abs_diff(12 * vertices) < 1000, "{saved} bytes saved on {vertices} vertices");
     assert_ne!(small.header("etag"), plain.header("etag"));
@@ -330,7 +330,7 @@ fn quantised_meshes_are_glb_or_gltf() {
     let entry = server.get("/v1/pdb/4pti/surface.glb?compress=quantize");
     assert!(entry.body == small.body);
 
-    // The format may come from elsewhere than the query.
+    // The format need not come from the query.
     let accept = server.post("/v1/meshes?compress=quantize", &[("accept", "model/stl")], SAMPLE);
     for refused in [accept, server.get("/v1/pdb/4pti/surface.obj?compress=quantize")] {
         let problem = refused.problem(400, "bad-parameter");
@@ -349,7 +349,7 @@ fn quantised_meshes_are_glb_or_gltf() {
 }
 
 #[test]
-fn what_cannot_be_meshed_is_named_and_the_server_lives_on() {
+fn errors_of_unusable_structures_are_specific_and_the_server_keeps_running() {
     let pdb = |x: &str| {
         format!("ATOM      1  CA  ALA A   1    {x:>8}   0.000   0.000  1.00  0.00           C  \n").into_bytes()
     };
@@ -387,8 +387,8 @@ fn what_cannot_be_meshed_is_named_and_the_server_lives_on() {
 }
 
 #[test]
-fn a_strict_check_brings_the_referees_findings() {
-    let bad = [b"CRYST1 nonsense line that no strict reader takes\n", SAMPLE].concat();
+fn a_strict_check_reports_the_findings_of_the_strict_validator() {
+    let bad = [b"CRYST1 nonsense line that strict readers reject\n", SAMPLE].concat();
     assert_eq!(SERVER.post("/v1/meshes", &[], &bad).status, 200);
     let problem = SERVER.post("/v1/meshes?check=strict", &[], &bad).problem(422, "unreadable-structure");
     assert!(!problem["diagnostics"].as_array().unwrap().is_empty(), "{problem}");
@@ -400,9 +400,9 @@ fn a_strict_check_brings_the_referees_findings() {
 }
 
 #[test]
-fn binary_files_are_taken_wherever_texts_are() {
+fn binarycif_is_accepted_wherever_text_is() {
     let text = include_bytes!("../../samples/1crn.cif");
-    // The same atoms make the same mesh, whatever they are wrapped in.
+    // The same atoms give the same mesh in every format.
     let stl = |body: &[u8], headers: &[(&str, &str)]| {
         let reply = SERVER.post("/v1/meshes?resolution=1&format=stl", headers, body);
         assert_eq!((reply.status, reply.header("molmesh-atoms")), (200, Some("327")));
@@ -413,27 +413,27 @@ fn binary_files_are_taken_wherever_texts_are() {
         assert!(stl(&body, &[]) == expected);
     }
     assert!(stl(&gzip(CRAMBIN), &[("content-encoding", "gzip")]) == expected);
-    // From the archive, and by a document that names the entry.
+    // From the archive, and by a JSON document that names the entry.
     let stored = SERVER.get("/v1/pdb/1crn/surface.stl?resolution=1");
     assert!(stored.status == 200 && stored.body == expected);
     let order = br#"{"pdb_id": "1crn", "resolution": 1, "format": "stl"}"#;
     let reply = SERVER.post("/v1/meshes", &[("content-type", "application/json")], order);
     assert!(reply.status == 200 && reply.body == expected, "{}", reply.status);
     assert_eq!(SERVER.get("/v1/pdb/1crn/surface.glb?report=json").json()["source_format"], "bcif");
-    // Uploaded once.
+    // As an uploaded structure.
     let kept = SERVER.post("/v1/structures", &[], CRAMBIN);
     assert_eq!((kept.status, &kept.json()["format"], &kept.json()["id"]), (201, &"bcif".into(), &"1CRN".into()));
-    // The strict reader does not read it, and says so.
+    // The strict reader does not support the format, and reports it.
     let report = SERVER.post("/v1/meshes?check=strict&report=json", &[], CRAMBIN).json();
     assert!(report.to_string().contains("does not read BinaryCIF"), "{report}");
-    // A broken file: the problem says where.
+    // An invalid file: the problem contains the position.
     let problem = SERVER.post("/v1/meshes", &[], &CRAMBIN[..CRAMBIN.len() / 2]).problem(422, "unreadable-structure");
     assert!(problem["place"].as_str().unwrap().starts_with("BinaryCIF, byte "), "{problem}");
     assert!(problem["found"].is_string() && problem["expected"].is_string());
 }
 
 #[test]
-fn archive_entries_are_cacheable_addresses() {
+fn archive_entries_are_cacheable_by_url() {
     let path = "/v1/pdb/4pti/surface.glb?resolution=1";
     let reply = SERVER.get(path);
     assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
@@ -442,7 +442,7 @@ fn archive_entries_are_cacheable_addresses() {
     assert!(reply.header("cache-control").unwrap().contains("stale-while-revalidate"));
     let etag = reply.header("etag").unwrap();
     assert!(etag.starts_with('"') && etag.len() == 66, "{etag}");
-    // Any way of writing the id is the same entry.
+    // All spellings of the id name the same entry.
     for path in ["/v1/pdb/4PTI/surface.glb?resolution=1.0", "/v1/pdb/pdb_00004pti/surface.glb?resolution=1"] {
         assert_eq!(SERVER.get(path).header("etag"), Some(etag));
     }
@@ -476,14 +476,14 @@ fn archive_entries_are_cacheable_addresses() {
 }
 
 #[test]
-fn a_server_without_an_archive_says_so() {
+fn a_server_without_an_archive_reports_it() {
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let problem = server.get("/v1/pdb/4pti/surface.glb").problem(404, "not-in-archive");
     assert!(!problem.to_string().contains(&*server.dir.path().to_string_lossy()), "{problem}");
 }
 
 #[test]
-fn the_libraries_errors_are_problems_too() {
+fn errors_of_the_http_library_are_problems() {
     let missing = SERVER.get("/v2/meshes").problem(404, "not-found");
     assert!(missing["detail"].as_str().unwrap().contains("/v2/meshes"));
     for (method, path, allow) in
@@ -497,7 +497,7 @@ fn the_libraries_errors_are_problems_too() {
 }
 
 #[test]
-fn every_problem_type_is_explained_at_its_address() {
+fn every_problem_type_is_documented_at_its_url() {
     let list = SERVER.get("/problems").json();
     let list = list.as_array().unwrap();
     assert!(list.len() >= 20);
@@ -519,11 +519,11 @@ fn health_version_and_capabilities() {
     assert_eq!(can["formats"].as_array().unwrap().len(), 6);
     assert_eq!(can["kernels"].as_array().unwrap().len(), 3);
     assert_eq!(can["presets"]["ses-like"]["isovalue"], 1.9);
-    assert_eq!(can["backends"][0]["reason"], "a test says so");
+    assert_eq!(can["backends"][0]["reason"], "set by a test");
     assert_eq!(can["radii"]["values"]["C"], 1.7);
     assert_eq!(can["radii"]["values"].as_object().unwrap().len(), 118);
     assert_eq!(can["limits"]["body_bytes"], 256 << 20);
-    // Whatever the document lists is taken: a form built from it works.
+    // All listed parameters are accepted in a form.
     for parameter in can["parameters"].as_array().unwrap() {
         let name = parameter["name"].as_str().unwrap();
         let problem = SERVER.post(&format!("/v1/meshes?{name}=%01"), &[], SAMPLE).problem(400, "bad-parameter");
@@ -535,11 +535,11 @@ fn health_version_and_capabilities() {
 }
 
 #[test]
-fn the_page_needs_nothing_from_elsewhere() {
+fn the_page_loads_nothing_from_other_hosts() {
     let page = SERVER.get("/");
     assert_eq!(page.header("content-type"), Some("text/html; charset=utf-8"));
     let policy = page.header("content-security-policy").unwrap();
-    // WebAssembly is a module of ours, not text that is evaluated.
+    // WebAssembly is a module of the page, not evaluated text.
     let unsafe_ones = policy.replace("'wasm-unsafe-eval'", "");
     assert!(policy.contains("default-src 'none'") && !unsafe_ones.contains("unsafe"), "{policy}");
     let html = page.text();
@@ -556,7 +556,7 @@ fn the_page_needs_nothing_from_elsewhere() {
         }
     }
     assert!(found >= 4, "{found}");
-    // What it does in a browser is for tests/cli/browser.rs to see.
+    // tests/cli/browser.rs tests the page in a browser.
     assert!(!html.contains("http://") && !html.contains("https://"));
     assert_eq!(SERVER.get("/v1/capabilities").json()["viewer"], molmesh::http::has_viewer());
     assert_eq!(html.contains("/assets/index-"), molmesh::http::has_viewer());
@@ -569,7 +569,7 @@ fn the_page_needs_nothing_from_elsewhere() {
 }
 
 #[test]
-fn packed_files_are_unpacked_for_those_who_take_them_plain() {
+fn compressed_assets_are_decompressed_for_clients_without_support() {
     let html = SERVER.get("/").text();
     let paths = html.split('"').filter(|text| text.starts_with("/assets/"));
     for path in paths.chain(["/", "/molmesh-viewer.js"]) {
@@ -589,7 +589,7 @@ fn packed_files_are_unpacked_for_those_who_take_them_plain() {
 }
 
 #[test]
-fn atoms_are_listed_as_meshes_count_them() {
+fn atoms_are_listed_with_the_indices_of_meshes() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
     let reply = server.get(&format!("{structure}/atoms"));
@@ -598,7 +598,7 @@ fn atoms_are_listed_as_meshes_count_them() {
     let unchanged = send(server.addr, "GET", &format!("{structure}/atoms"), &[("if-none-match", &etag)], b"");
     assert_eq!(unchanged.status, 304);
     assert_eq!(list["count"], server.get(&structure).json()["atoms"]);
-    // The rows that a mesh names are those of its polymer: LYS 15 among them, water not.
+    // Meshes use the polymer atoms only: LYS 15 but not water.
     let ply = server.get(&format!("{structure}/surface.ply?atom_ids=true&resolution=1")).body;
     let head = ply.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let text = std::str::from_utf8(&ply[..head]).unwrap();
@@ -615,7 +615,7 @@ fn atoms_are_listed_as_meshes_count_them() {
 }
 
 #[test]
-fn request_ids_are_kept_or_made() {
+fn request_ids_are_kept_or_generated() {
     let given = send(SERVER.addr, "GET", "/nowhere", &[("x-request-id", "mine-42")], b"");
     assert_eq!(given.problem(404, "not-found")["instance"], "mine-42");
     let made: Vec<String> = (0..2).map(|_| SERVER.get("/livez").header("x-request-id").unwrap().to_owned()).collect();
@@ -625,7 +625,7 @@ fn request_ids_are_kept_or_made() {
 }
 
 #[test]
-fn scripts_of_other_origins_may_read_everything() {
+fn other_origins_may_read_all_responses() {
     let preflight = send(
         SERVER.addr,
         "OPTIONS",
@@ -642,7 +642,7 @@ fn scripts_of_other_origins_may_read_everything() {
 }
 
 #[test]
-fn http2_without_tls_is_spoken() {
+fn http2_without_tls_is_supported() {
     use http_body_util::{BodyExt as _, Full};
     use hyper_util::rt::{TokioExecutor, TokioIo};
     let addr = SERVER.addr;
@@ -663,7 +663,7 @@ fn http2_without_tls_is_spoken() {
 }
 
 #[test]
-fn metrics_move() {
+fn requests_change_the_metrics() {
     let labels = ["route=\"/v1/meshes\"", "status=\"200\"", "method=\"POST\""];
     let count = || SERVER.metric("http_server_request_duration_seconds_count", &labels);
     let before = (count(), SERVER.metric("molmesh_jobs_finished_total", &["successful"]));

@@ -95,7 +95,7 @@ async fn fetches_compressed_and_plain_entries() {
         assert_eq!((&entry.bytes[..], entry.digest, entry.source), (&body[..], Digest::of(&body), Source::Remote));
         let again = archive.fetch(&id("pdb_00004pti")).await.unwrap();
         assert_eq!((again.bytes, again.digest, again.source), (entry.bytes, entry.digest, Source::Cache));
-        let asked = remote.asked();
+        let asked = remote.requests();
         assert_eq!((asked.len(), asked[0].path.as_str()), (1, path.replace("{id}", "4pti").as_str()));
         assert!(asked[0].header("user-agent").unwrap().starts_with("molmesh/"), "{asked:?}");
         assert_eq!(asked[0].header("accept-encoding"), None);
@@ -173,7 +173,7 @@ async fn old_copies_are_revalidated() {
     assert_eq!(fetch().await, ("first".to_owned(), Source::Remote));
     pause(1100).await;
     assert_eq!(fetch().await, ("first".to_owned(), Source::Cache));
-    assert_eq!(remote.asked()[1].header("if-none-match"), Some("\"a\""));
+    assert_eq!(remote.requests()[1].header("if-none-match"), Some("\"a\""));
     // The confirmation renews the copy.
     assert_eq!((fetch().await.1, remote.count()), (Source::Cache, 2));
     pause(1100).await;
@@ -184,7 +184,7 @@ async fn old_copies_are_revalidated() {
     config.archive.url = Some(other.url(CIF).parse().unwrap());
     pause(1100).await;
     assert_eq!(&Archive::new(&config, Arc::new(Uncounted)).fetch(&id("4pti")).await.unwrap().bytes[..], b"third");
-    assert_eq!(other.asked()[0].header("if-none-match"), None);
+    assert_eq!(other.requests()[0].header("if-none-match"), None);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -210,7 +210,7 @@ async fn tries_the_second_url_if_the_first_fails() {
         let urls = format!("{} {}", first.url(CIF), second.url("/{middle}/{id_upper}"));
         let entry = once(&urls, |c| c.archive.attempts = 1).await.unwrap();
         assert_eq!((&entry.bytes[..], first.count()), (&b"x"[..], 1));
-        assert_eq!(second.asked()[0].path, "/pt/4PTI");
+        assert_eq!(second.requests()[0].path, "/pt/4PTI");
     }
     // The unavailable URL may have the entry, so the error is not "not found".
     let (dead, without) = (Remote::saying(status(500)), Remote::saying(status(404)));
@@ -470,7 +470,7 @@ async fn a_configured_proxy_is_used() {
     let named = format!("http://{}", proxy.addr);
     let set = |c: &mut Config| c.archive.proxy = Some(serde_json::from_value(named.into()).unwrap());
     assert_eq!(&once(&url, set).await.unwrap().bytes[..], b"x");
-    assert_eq!(proxy.asked()[0].path, "http://archive.invalid/d/4pti.cif");
+    assert_eq!(proxy.requests()[0].path, "http://archive.invalid/d/4pti.cif");
     assert_eq!(why(once(&url, |_| {}).await).0, Why::Connect);
 }
 

@@ -1,5 +1,5 @@
-//! Bad input over a real socket: every row of one table gets its status, its problem and the number that was wrong, in
-//! time, and the server lives; the same rows through the command line get their exit code.
+//! Bad input over a real socket: every row of a table gets the expected status, problem and number within a time limit,
+//! and the server keeps running. The command line exits with the expected code on the same rows.
 
 mod rows;
 
@@ -16,9 +16,9 @@ use molmesh::surface::cpu::CpuBackend;
 use rows::{ATOMS, BODY_BYTES, INFLATED_BYTES, Is, Row, rows};
 use serde_json::Value;
 
-/// A release build answers in this time; an unoptimised one on a busy machine gets more.
+/// Time limit of an answer. Unoptimised builds are slower.
 const IN_TIME: Duration = Duration::from_millis(if cfg!(debug_assertions) { 3000 } else { 100 });
-/// How many of the slowest rows are printed.
+/// Number of slowest rows to print.
 const SHOWN: usize = 8;
 
 static QUIET: Once = Once::new();
@@ -42,7 +42,7 @@ fn ask(server: &Running, row: &Row) -> Reply {
     send(server.addr, row.method, &path, &row.headers, &row.body)
 }
 
-/// Compares an answer with its row: everything that is wrong with it.
+/// Returns the differences between an answer and its row.
 fn faults(row: &Row, reply: &Reply, time: Duration) -> Vec<String> {
     let mut faults = Vec::new();
     let mut check = |right: bool, what: String| {
@@ -51,11 +51,11 @@ fn faults(row: &Row, reply: &Reply, time: Duration) -> Vec<String> {
         }
     };
     let text = String::from_utf8_lossy(&reply.body[..reply.body.len().min(2000)]).into_owned();
-    check(reply.complete, "the answer broke off".to_owned());
+    check(reply.complete, "the answer is incomplete".to_owned());
     check(time <= IN_TIME, format!("took {time:?}, {IN_TIME:?} are allowed"));
     check(reply.status == row.status, format!("status {} instead of {}: {text}", reply.status, row.status));
     if row.slug.is_empty() {
-        check(reply.body.starts_with(b"glTF"), "the answer is no GLB".to_owned());
+        check(reply.body.starts_with(b"glTF"), "the answer is not a GLB".to_owned());
     } else {
         let kind = reply.header("content-type");
         check(kind == Some("application/problem+json"), format!("the answer is {kind:?}"));
@@ -78,7 +78,7 @@ fn faults(row: &Row, reply: &Reply, time: Duration) -> Vec<String> {
     faults
 }
 
-/// Sends a row and judges the answer. What a busy machine does once it does not do three times.
+/// Sends a row and checks the answer. Repeats slow rows up to twice, as other load may cause a delay.
 fn drive(server: &Running, row: &Row) -> (Vec<String>, Duration) {
     let mut fastest = Duration::MAX;
     let mut last = Vec::new();
@@ -88,7 +88,7 @@ fn drive(server: &Running, row: &Row) -> (Vec<String>, Duration) {
         fastest = fastest.min(start.elapsed());
         last = faults(row, &reply, fastest);
         if server.get("/livez").status != 200 {
-            last.push(format!("{}: the server is dead", row.name));
+            last.push(format!("{}: the server is down", row.name));
         }
         if fastest <= IN_TIME {
             break;
@@ -98,7 +98,7 @@ fn drive(server: &Running, row: &Row) -> (Vec<String>, Duration) {
 }
 
 #[test]
-fn every_row_gets_its_answer_in_time_and_the_server_lives() {
+fn every_row_gets_its_answer_in_time_and_the_server_keeps_running() {
     let server = server();
     let good = || {
         let reply = server.post("/v1/meshes?resolution=1", &[], SAMPLE);
@@ -111,12 +111,12 @@ fn every_row_gets_its_answer_in_time_and_the_server_lives() {
     let mut names: Vec<&str> = rows.iter().map(|row| row.name).collect();
     names.sort_unstable();
     names.dedup();
-    assert_eq!(names.len(), rows.len(), "two rows have one name");
+    assert_eq!(names.len(), rows.len(), "two rows have the same name");
 
     let mut wrong = Vec::new();
     let mut times = Vec::new();
     for row in &rows {
-        assert!(!row.named.is_empty(), "{}: what is to be named?", row.name);
+        assert!(!row.named.is_empty(), "{}: no expected member", row.name);
         let (faults, time) = drive(&server, row);
         wrong.extend(faults);
         times.push((time, row.name));
@@ -127,17 +127,17 @@ fn every_row_gets_its_answer_in_time_and_the_server_lives() {
         eprintln!("{:9.2} ms  {name}", time.as_secs_f64() * 1e3);
     }
     assert!(wrong.is_empty(), "{} faults:\n{}", wrong.len(), wrong.join("\n"));
-    assert!(good() == before, "the same file gives another mesh than before");
+    assert!(good() == before, "the same file gives a different mesh");
     assert!(server.metric("molmesh_panics_total", &[]) == 0.0, "something panicked");
 }
 
-/// A row's parameters as flags.
+/// Converts the parameters of a row to flags.
 fn flags(query: &str) -> Vec<String> {
     let pairs = query.split('&').filter_map(|pair| pair.split_once('='));
     pairs.map(|(name, value)| format!("--{}={value}", name.replace('_', "-"))).collect()
 }
 
-/// `molmesh mesh - -o -` with the server's limits. A command that refuses its flags need not read its input.
+/// Runs `molmesh mesh - -o -` with the server's limits. The command may exit before it reads its input.
 fn mesh(row: &Row) -> Output {
     let mut command = cli_support::molmesh();
     let limits = [
@@ -152,20 +152,20 @@ fn mesh(row: &Row) -> Output {
 }
 
 #[test]
-fn the_command_line_exits_as_the_server_answers() {
+fn exit_codes_match_the_answers_of_the_server() {
     let mut wrong = Vec::new();
     let mut seen = [0; 8];
     for row in rows() {
         let Some(exit) = row.exit else { continue };
         let done = mesh(&row);
-        let said = String::from_utf8_lossy(&done.stderr).into_owned();
+        let stderr = String::from_utf8_lossy(&done.stderr).into_owned();
         if done.status.code() != Some(exit) {
-            wrong.push(format!("{}: {:?} instead of {exit}: {said}", row.name, done.status.code()));
+            wrong.push(format!("{}: {:?} instead of {exit}: {stderr}", row.name, done.status.code()));
         }
         let mesh = done.stdout.starts_with(b"glTF");
-        let quiet = if exit == 0 { mesh } else { done.stdout.is_empty() && said.starts_with("molmesh: ") };
-        if !quiet || said.contains("panicked") || said.chars().any(|c| c.is_control() && c != '\n') {
-            wrong.push(format!("{}: {} bytes of output, and {said}", row.name, done.stdout.len()));
+        let quiet = if exit == 0 { mesh } else { done.stdout.is_empty() && stderr.starts_with("molmesh: ") };
+        if !quiet || stderr.contains("panicked") || stderr.chars().any(|c| c.is_control() && c != '\n') {
+            wrong.push(format!("{}: {} bytes of output, and {stderr}", row.name, done.stdout.len()));
         }
         seen[usize::try_from(exit).unwrap()] += 1;
     }
@@ -175,26 +175,26 @@ fn the_command_line_exits_as_the_server_answers() {
 }
 
 #[test]
-fn control_a_wrong_expectation_is_seen() {
+fn control_wrong_expectations_are_detected() {
     let server = server();
     let of = |name: &str| rows().into_iter().find(|row| row.name == name).unwrap();
     let good = of("mmCIF with NaN");
     assert_eq!(drive(&server, &good).0, Vec::<String>::new());
     let named = |named| Row { named, ..good.clone() };
     let one = |name, is| named(vec![(name, is)]);
-    for (wrong, said) in [
+    for (wrong, expected) in [
         (Row { status: 400, ..good.clone() }, "status 422 instead of 400"),
         (Row { slug: "no-atoms", ..good.clone() }, "instead of /problems/no-atoms"),
-        (Row { slug: "", status: 200, ..good.clone() }, "no GLB"),
+        (Row { slug: "", status: 200, ..good.clone() }, "not a GLB"),
         (one("line", Is::Equal(10.into())), "`line` is 9"),
         (one("column", Is::Above(11.0)), "`column` is 11"),
-        (one("expected", Is::Saying("Cartn_z")), "`expected` is"),
-        (one("limit", Is::Saying("")), "`limit` is null"),
+        (one("expected", Is::Contains("Cartn_z")), "`expected` is"),
+        (one("limit", Is::Contains("")), "`limit` is null"),
         (Row { slug: "unreadable-structure", status: 422, ..of("Latin-1") }, "status 200 instead of 422"),
         (Row { named: vec![("molmesh-atoms", Is::Equal(2.into()))], ..of("Latin-1") }, "`molmesh-atoms` is 1"),
     ] {
         let (faults, _) = drive(&server, &wrong);
-        assert!(faults.iter().any(|fault| fault.contains(said)), "{said}: {faults:?}");
+        assert!(faults.iter().any(|fault| fault.contains(expected)), "{expected}: {faults:?}");
     }
     let reply = ask(&server, &good);
     let late = faults(&good, &reply, IN_TIME + Duration::from_millis(1));

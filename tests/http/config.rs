@@ -1,4 +1,4 @@
-//! The configuration's layers, and what they refuse; the table of parameters against the core's own ranges.
+//! Layers of the configuration and their errors; the parameter table compared with the ranges of the core.
 
 use std::path::Path;
 
@@ -30,7 +30,7 @@ fn the_example_is_the_default_and_complete() {
 }
 
 #[test]
-fn later_layers_win() {
+fn later_layers_override_earlier_ones() {
     let file = file("[jobs]\nworkers = 3\nqueue = 5\ndeadline_ms = 7\n[log]\nformat = \"json\"\n");
     let env = pairs(&[
         ("MOLMESH__JOBS__QUEUE", "6"),
@@ -49,7 +49,7 @@ fn later_layers_win() {
 }
 
 #[test]
-fn archives_are_named_as_text_or_as_a_list() {
+fn archives_are_configured_as_text_or_as_a_list() {
     let urls = |config: &Config| config.archive.url.as_ref().map(ToString::to_string);
     let both = Some("http://a/{id} http://b/{middle}/{id_upper}".to_owned());
     let list = file("[archive]\nurl = [\"http://a/{id}\", \"http://b/{middle}/{id_upper}\"]\nallow_private = true\n");
@@ -68,7 +68,7 @@ fn archives_are_named_as_text_or_as_a_list() {
 }
 
 #[test]
-fn unknown_keys_name_the_nearest_and_where_they_came_from() {
+fn errors_of_unknown_keys_name_the_nearest_key_and_the_source() {
     for (text, env, flag, key, near, from) in [
         ("[limits]\nbody_byte = 1", None, None, "limits.body_byte", "limits.body_bytes", ".tmp"),
         ("[limit]\natoms = 1", None, None, "limit.atoms", "limits.atoms", ".tmp"),
@@ -93,7 +93,7 @@ fn unknown_keys_name_the_nearest_and_where_they_came_from() {
 }
 
 #[test]
-fn bad_values_name_the_key_the_value_and_what_was_expected() {
+fn errors_of_bad_values_name_key_value_and_expected_range() {
     for (key, value) in [
         ("jobs.workers", "many"),
         ("jobs.workers", "0"),
@@ -131,7 +131,7 @@ fn bad_values_name_the_key_the_value_and_what_was_expected() {
 }
 
 #[test]
-fn a_number_that_may_be_absent_is_cleared_by_none_and_set_again() {
+fn optional_numbers_are_cleared_by_none_and_set_again() {
     let spread = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().devices.min_partition_bricks;
     assert_eq!(spread(&[]), Some(molmesh::surface::devices::MIN_PARTITION_BRICKS));
     assert_eq!(spread(&[("devices.min_partition_bricks", "none")]), None);
@@ -142,7 +142,7 @@ fn a_number_that_may_be_absent_is_cleared_by_none_and_set_again() {
 }
 
 #[test]
-fn counts_that_are_absent_by_default_are_read_from_every_layer() {
+fn optional_counts_are_read_from_every_layer() {
     let requests = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().access.address_requests;
     assert_eq!(requests(&[]), None);
     assert_eq!(requests(&[("access.address_requests", "1_000")]), Some(1000));
@@ -157,7 +157,7 @@ fn counts_that_are_absent_by_default_are_read_from_every_layer() {
     assert!(config.server.trusted_proxies.unwrap().contains("10.9.9.9".parse().unwrap()));
     let off = load(None, [], &pairs(&[("access.cors_origins", "none")])).unwrap();
     assert_eq!(off.access.cors_origins, None);
-    // A secret is nowhere to be seen.
+    // The secret is not printed.
     let config = load(None, pairs(&[("MOLMESH__ACCESS__SIGNING_SECRET", "a:geheim")]), &[]).unwrap();
     assert_eq!(config.access.signing_secret.as_ref().unwrap().reveal(), "a:geheim");
     assert!(!format!("{config:?}").contains("geheim"));
@@ -192,7 +192,7 @@ fn the_table_and_the_core_agree_on_every_range() {
         }
     }
     assert_eq!(integers, 5);
-    // The paper's ranges hang on the kernel: the table gives their hull.
+    // The ranges of the paper depend on the kernel: the table contains their union.
     let hull = |name: &str| TABLE.iter().find(|p| p.name == name).unwrap().domain;
     for (kernel, a, b) in [("gaussian", [1e-3, 100.0], [1e-2, 1e6]), ("soft-object", [1e-2, 1e6], [0.1, 50.0])] {
         for (x, y) in [(a[0], b[0]), (a[1], b[1])] {
@@ -207,10 +207,10 @@ fn the_table_and_the_core_agree_on_every_range() {
 }
 
 #[test]
-fn canonical_texts_tell_jobs_apart_and_nothing_else() {
+fn canonical_texts_differ_exactly_if_the_jobs_differ() {
     let text = |list: &[(&str, &str)]| canonical(&parse(list.iter().copied()).unwrap().job);
     let plain = text(&[]);
-    // The same job, said otherwise.
+    // The same job with equivalent parameters.
     for same in [
         &[("resolution", "0.50")][..],
         &[("kernel", "gaussian"), ("preset", "default")],
@@ -240,7 +240,7 @@ fn canonical_texts_tell_jobs_apart_and_nothing_else() {
         &[("normals", "none")],
         &[("units", "nanometer")],
         &[("units", "meter")],
-        // The same spacing for a small structure, and others for a large one.
+        // The same spacing for a small structure, different ones for a large one.
         &[("detail", "4")],
         &[("detail", "3")],
         &[("max_triangles", "40000")],

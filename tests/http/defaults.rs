@@ -1,4 +1,4 @@
-//! Generated clients send every default that the description declares: the answer is that to a request without them.
+//! Generated clients send every default of the API description. The answer must equal that without them.
 
 use crate::http_support;
 
@@ -9,7 +9,7 @@ use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError, TABLE};
 use serde_json::{Map, Value};
 
-/// A server with an entry in its folder, and its description.
+/// Starts a server with an archive entry. Returns it with its API description.
 fn server() -> (Running, Value) {
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let folder = server.dir.path().join("archive");
@@ -19,7 +19,7 @@ fn server() -> (Running, Value) {
     (server, description)
 }
 
-/// The declared defaults of an operation's query, with `format` in place of the default one.
+/// Returns the declared defaults of an operation's query, with `format` instead of the default format.
 fn query(description: &Value, method: &str, path: &str, format: Option<&str>) -> Vec<(String, String)> {
     let parameters = description["paths"][path][method]["parameters"].as_array().unwrap();
     let of_query = parameters.iter().filter(|p| p["in"] == "query");
@@ -31,11 +31,11 @@ fn query(description: &Value, method: &str, path: &str, format: Option<&str>) ->
     pairs.collect()
 }
 
-/// The declared defaults of a request body.
+/// Returns the declared defaults of a request body.
 fn body(description: &Value, media_type: &str, format: &str) -> Map<String, Value> {
     let schema = &description["paths"]["/v1/meshes"]["post"]["requestBody"]["content"][media_type]["schema"];
     let schema = schema["$ref"].as_str().map_or(schema, |at| description.pointer(&at[1..]).unwrap());
-    // A JSON document names an entry or a structure; both have the same parameters.
+    // A JSON document names an entry or a structure; both schemas have the same parameters.
     let properties = schema.get("oneOf").map_or(schema, |one_of| &one_of[0])["properties"].as_object().unwrap();
     let defaults = properties.iter().filter_map(|(name, p)| Some((name.clone(), p.get("default")?.clone())));
     let mut defaults: Map<String, Value> = defaults.collect();
@@ -59,11 +59,11 @@ fn same(found: &Reply, plain: &Reply) {
     assert_eq!((found.status, plain.status), (200, 200), "{}", said());
     assert!(plain.header("etag").is_some());
     assert_eq!(found.header("etag"), plain.header("etag"));
-    assert!(found.body == plain.body, "other bytes");
+    assert!(found.body == plain.body, "the bodies differ");
 }
 
 #[test]
-fn all_defaults_at_once_change_nothing() {
+fn sending_all_defaults_changes_nothing() {
     let (server, description) = server();
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
     let json = [("content-type", "application/json")];
@@ -92,7 +92,7 @@ fn all_defaults_at_once_change_nothing() {
         parts.push_str(&field(("file", String::from_utf8(SAMPLE.to_vec()).unwrap())));
         parts.push_str("--b--\r\n");
         same(&server.post("/v1/meshes", &form, parts.as_bytes()), &plain);
-        // An estimate has no tag; times differ.
+        // An estimate has no ETag; times differ.
         let estimate = |path: &str| {
             let reply = server.post(path, &[], SAMPLE);
             assert_eq!(reply.status, 200, "{}", reply.text());
@@ -104,12 +104,12 @@ fn all_defaults_at_once_change_nothing() {
         let plain = estimate(&format!("/v1/estimate?format={format}"));
         assert_eq!(estimate(&address("/v1/estimate", &defaults)), plain);
     }
-    // The default format is the one without any.
+    // The default of `format` gives the same answer as none.
     let defaults = query(&description, "post", "/v1/meshes", None);
     same(&server.post(&address("/v1/meshes", &defaults), &[], SAMPLE), &server.post("/v1/meshes", &[], SAMPLE));
 }
 
-/// A request as text: what decides its bytes.
+/// Reads a request as the canonical text of its parameters.
 fn read(pairs: &[(&str, &str)], format: Format) -> Result<String, ParamError> {
     let mut request = params::parse(pairs.iter().copied())?;
     params::settle(&mut request.job, format)?;
@@ -117,10 +117,10 @@ fn read(pairs: &[(&str, &str)], format: Format) -> Result<String, ParamError> {
 }
 
 #[test]
-fn a_default_goes_with_everything() {
+fn a_default_is_valid_with_every_parameter() {
     let (_server, description) = server();
     let mut defaults = query(&description, "post", "/v1/meshes", None);
-    // A format decides over `Accept`, so the default one is a choice like any other.
+    // A format takes precedence over `Accept`, so the default format counts as a choice.
     defaults.retain(|(name, _)| name != "format");
     let others: &[&[(&str, &str)]] = &[
         &[],
@@ -159,7 +159,7 @@ fn a_default_goes_with_everything() {
     ];
     let tried: Vec<&str> = others.iter().flat_map(|other| other.iter().map(|(name, _)| *name)).collect();
     for parameter in TABLE.iter().filter(|p| p.name != "format") {
-        assert!(tried.contains(&parameter.name), "{} is not tried", parameter.name);
+        assert!(tried.contains(&parameter.name), "{} is not tested", parameter.name);
     }
     for other in others {
         let mut formats = 0;
@@ -175,16 +175,16 @@ fn a_default_goes_with_everything() {
                 }
             }
         }
-        assert!(formats > 0, "{other:?} goes with no format");
+        assert!(formats > 0, "{other:?} is valid for no format");
     }
-    // Numbers are equal however they are written.
+    // Numbers are compared by value.
     for (name, value) in [("azimuth", "-0.0"), ("resolution", "0.50"), ("width", "+512"), ("background", "#00000000")] {
         assert!(read(&[(name, value), ("detail", "3")], Format::Stl).is_ok(), "{name}={value}");
     }
 }
 
 #[test]
-fn what_conflicts_is_named_as_it_was_sent() {
+fn errors_of_conflicts_name_the_sent_parameters() {
     for (pairs, format, names) in [
         (&[("resolution", "0.6"), ("detail", "3")][..], Format::Glb, &["`detail`", "`resolution`"][..]),
         (
@@ -207,9 +207,9 @@ fn what_conflicts_is_named_as_it_was_sent() {
             assert!(!refused.contains(&format!("`{}`", parameter.name)), "{} was not sent: {refused}", parameter.name);
         }
     }
-    // A value that is no default is still checked, and a repetition is one also of defaults.
+    // Other values are still checked, and repeated parameters are rejected even if they are defaults.
     assert!(read(&[("check", "absent")], Format::Glb).is_err());
     assert!(read(&[("azimuth", "0"), ("azimuth", "0")], Format::Png).is_err());
-    // Chains and alternative locations have defaults in words, which are names as well.
+    // The defaults of chains and alternative locations are words that may also be names.
     assert_ne!(read(&[("chains", "all")], Format::Glb), read(&[], Format::Glb));
 }

@@ -1,4 +1,4 @@
-//! Devices over HTTP: what is found is listed, what fails is said and counted, what stands in is named.
+//! Devices over HTTP: detected devices are listed, failures are reported and counted, fallbacks are named.
 
 use crate::http_support;
 
@@ -12,17 +12,17 @@ use molmesh::surface::{
     SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
-/// A backend with two devices, of which the second can be taken down.
+/// Backend with two devices, the second of which can fail.
 struct Devices {
     fake: Arc<Fake>,
-    /// Serves by another backend, and why.
+    /// Reason of a fallback to another backend.
     fallback_reason: Mutex<Option<&'static str>>,
-    /// The arithmetic of the first device, and of the one that serves if that is another.
+    /// Arithmetic of the first device, and of the serving device if it is another one.
     arithmetic: Mutex<&'static str>,
     served: Mutex<Option<&'static str>>,
     error: Mutex<Option<SurfaceError>>,
     second_is_down: AtomicBool,
-    /// The warm-up has to wait for this.
+    /// The warm-up waits for this.
     warm: AtomicBool,
 }
 
@@ -82,7 +82,7 @@ impl Backend for Devices {
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {
-        let down = self.second_is_down.load(Ordering::SeqCst).then(|| "it fell over".to_owned());
+        let down = self.second_is_down.load(Ordering::SeqCst).then(|| "device lost by a test".to_owned());
         let device = |number: usize, down: Option<String>| DeviceStatus {
             number,
             name: format!("card {number}"),
@@ -138,22 +138,22 @@ fn devices_are_listed_with_their_reasons() {
     assert_eq!(member("reason"), ["discrete", "discrete", "not in --devices 0,1"]);
     assert_eq!(can["devices"][0]["binding_bytes"], 2_u64 << 30);
     assert_eq!(can["devices"][0]["subgroups"], serde_json::json!([32, 32]));
-    // Five jobs at once for each of the two, as only jobs that are there can share a submission.
+    // Five concurrent jobs per device, because only queued jobs share a submission.
     assert_eq!(can["limits"]["workers"], 10);
     backend.second_is_down.store(true, Ordering::SeqCst);
     let device = &server.get("/v1/capabilities").json()["devices"][1];
-    assert_eq!((&device["up"], &device["reason"]), (&false.into(), &"it fell over".into()));
+    assert_eq!((&device["up"], &device["reason"]), (&false.into(), &"device lost by a test".into()));
 }
 
 #[test]
-fn a_service_without_devices_says_so() {
+fn a_service_without_devices_reports_it() {
     let server = http_support::start(Fake::new(Mode::Octahedra), |_| {});
     let can = server.get("/v1/capabilities").json();
     assert_eq!((can["devices"].as_array().unwrap().len(), &can["limits"]["workers"]), (0, &2.into()));
 }
 
 #[test]
-fn it_is_not_ready_before_its_devices_are_warm() {
+fn not_ready_before_the_devices_are_warm() {
     let backend = Devices::new();
     backend.warm.store(false, Ordering::SeqCst);
     let server = start_on(Arc::clone(&backend) as _, found(), |_| {});
@@ -163,7 +163,7 @@ fn it_is_not_ready_before_its_devices_are_warm() {
 }
 
 #[test]
-fn what_stands_in_is_said_in_answer_report_log_and_metrics() {
+fn fallbacks_are_reported_in_response_report_log_and_metrics() {
     let backend = Devices::new();
     let server = start_on(Arc::clone(&backend) as _, found(), |_| {});
     wait_for("ready", || server.get("/readyz").status == 200);
@@ -171,21 +171,21 @@ fn what_stands_in_is_said_in_answer_report_log_and_metrics() {
     let well = server.post("/v1/meshes", &[], SAMPLE);
     assert_eq!(
         (well.header("molmesh-backend"), well.header("molmesh-backend-reason")),
-        (Some("gpu"), Some("a test says so"))
+        (Some("gpu"), Some("set by a test"))
     );
     let report = server.post("/v1/meshes?report=json", &[], SAMPLE).json();
     assert_eq!((&report["device"], report.get("fallback")), (&"card 1".into(), None));
 
     *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
-    // The first result is kept, and would be the answer to the same request.
+    // The first result is stored and would answer the same request.
     let other = http_support::sample(1);
-    let stood_in = server.post("/v1/meshes", &[], &other);
-    assert_eq!(stood_in.header("molmesh-backend"), Some("cpu"));
-    assert_eq!(stood_in.header("molmesh-backend-reason"), Some("a test says so; but the card is on fire 7431"));
+    let fallback = server.post("/v1/meshes", &[], &other);
+    assert_eq!(fallback.header("molmesh-backend"), Some("cpu"));
+    assert_eq!(fallback.header("molmesh-backend-reason"), Some("set by a test; but the card is on fire 7431"));
     *backend.fallback_reason.lock().unwrap() = None;
     let again = server.post("/v1/meshes", &[], &other);
-    assert_eq!(again.header("molmesh-backend"), Some("gpu"), "what stood in is no answer once the devices are back");
-    assert_ne!(stood_in.header("etag"), again.header("etag"), "other bytes under one tag");
+    assert_eq!(again.header("molmesh-backend"), Some("gpu"), "the result of the fallback is not reused");
+    assert_ne!(fallback.header("etag"), again.header("etag"), "different bytes with the same ETag");
     *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
     let report = server.post("/v1/meshes?report=json", &[], &other).json();
     assert_eq!((&report["backend"], &report["fallback"]), (&"cpu".into(), &"the card is on fire 7431".into()));
@@ -195,21 +195,21 @@ fn what_stands_in_is_said_in_answer_report_log_and_metrics() {
 }
 
 #[test]
-fn a_tag_belongs_to_the_device_and_the_driver_that_made_the_bytes() {
+fn etags_depend_on_device_and_driver() {
     let backend = Devices::new();
     let server = start_on(Arc::clone(&backend) as _, found(), |_| {});
     wait_for("ready", || server.get("/readyz").status == 200);
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
     let path = format!("{structure}/surface.glb");
     let tag = |reply: &http_support::Reply| reply.header("etag").unwrap().to_owned();
-    // The result is kept before its own address answers.
+    // The result is stored before its URL is requested.
     let ask = || {
         let reply = server.get(&path);
         assert_eq!(server.get(reply.header("content-location").unwrap()).status, 200);
         tag(&reply)
     };
     let predicted = tag(&send(server.addr, "HEAD", &path, &[], b""));
-    // Another device than the first one serves: its bytes are kept under its own key.
+    // Results of another device are stored under another key.
     *backend.served.lock().unwrap() = Some("card 2, driver 1");
     let second = ask();
     assert_ne!(second, predicted);
@@ -221,7 +221,7 @@ fn a_tag_belongs_to_the_device_and_the_driver_that_made_the_bytes() {
     assert_eq!(ask(), predicted);
     let first = server.post("/v1/meshes?format=ply", &[], SAMPLE);
     assert_ne!(first.header("content-location").unwrap(), of_job);
-    // A new driver makes other bytes: what the old one made is no answer any more, and its tag does not hold.
+    // A new driver makes different bytes, so earlier results and ETags do not match.
     *backend.arithmetic.lock().unwrap() = "card 1, driver 2";
     let again = send(server.addr, "GET", &path, &[("if-none-match", &predicted)], b"");
     assert_eq!(again.status, 200);
@@ -231,18 +231,18 @@ fn a_tag_belongs_to_the_device_and_the_driver_that_made_the_bytes() {
 }
 
 #[test]
-fn devices_are_counted_and_their_end_is_logged_once() {
+fn devices_are_counted_and_their_loss_is_logged_once() {
     let backend = Devices::new();
     let server = start_on(Arc::clone(&backend) as _, found(), |_| {});
     wait_for("ready", || server.get("/readyz").status == 200);
     let value = |name: &str, labels: &[&str]| server.metric(name, labels);
     backend.second_is_down.store(true, Ordering::SeqCst);
-    let lines = log_lines("it fell over").len();
+    let lines = log_lines("device lost by a test").len();
     for _ in 0..3 {
         assert_eq!(server.post("/v1/meshes?report=json", &[], SAMPLE).status, 200);
     }
-    // The answer goes out before the books are closed.
-    wait_for("the log", || log_lines("it fell over").len() > lines);
+    // The response is sent before the job is counted.
+    wait_for("the log", || log_lines("device lost by a test").len() > lines);
     for (name, labels, expected) in [
         ("molmesh_device_jobs_total", &["device=\"0\"", "outcome=\"finished\""][..], 11.0),
         ("molmesh_device_jobs_total", &["device=\"1\"", "outcome=\"failed\""], 2.0),
@@ -253,11 +253,11 @@ fn devices_are_counted_and_their_end_is_logged_once() {
         assert!((value(name, labels) - expected).abs() < 0.5, "{name}: {}", value(name, labels));
     }
     std::thread::sleep(Duration::from_millis(50));
-    assert_eq!(log_lines("it fell over").len(), lines + 1);
+    assert_eq!(log_lines("device lost by a test").len(), lines + 1);
 }
 
 #[test]
-fn failures_of_devices_are_problems_of_their_own() {
+fn device_failures_have_their_own_problem_types() {
     let backend = Devices::new();
     let server = start_on(Arc::clone(&backend) as _, found(), |_| {});
     wait_for("ready", || server.get("/readyz").status == 200);
@@ -271,8 +271,8 @@ fn failures_of_devices_are_problems_of_their_own() {
     let answer = post();
     assert!(answer.header("retry-after").is_some());
     let problem = answer.problem(503, "device-failed");
-    // Not by the number: an id may hold that.
-    assert!(!problem.to_string().contains("burned"), "drivers' words are for the log: {problem}");
+    // Not checked by the number, which a request id may contain.
+    assert!(!problem.to_string().contains("burned"), "messages of drivers belong in the log: {problem}");
     assert_eq!(log_lines("queue family 5512").len(), 1);
     *backend.error.lock().unwrap() = Some(SurfaceError::Deadline);
     post().problem(504, "deadline");

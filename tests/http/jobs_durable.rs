@@ -1,4 +1,4 @@
-//! What got a 202 is done, whatever happens to the process: the server is killed again and again under load.
+//! Accepted asynchronous jobs are completed although the server is killed repeatedly under load.
 
 use crate::http_support;
 
@@ -14,14 +14,14 @@ use std::time::{Duration, Instant};
 use http_support::{Fake, Mode, SAMPLE, sample, start, wait_for};
 use molmesh::surface::CpuBackend;
 
-/// A server process on a folder.
+/// Server process on a data folder.
 struct Process {
     child: Child,
     addr: SocketAddr,
 }
 
 impl Process {
-    /// Starts one, and waits until it has said its address.
+    /// Starts a process and waits until it prints its address.
     fn start(folder: &Path) -> Self {
         let mut child = Command::new(env!("CARGO_BIN_EXE_molmesh"))
             .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--data-dir"])
@@ -40,20 +40,20 @@ impl Process {
                     rest.split(|c: char| c != '.' && c != ':' && !c.is_ascii_digit()).next()?.parse().ok()
                 })
             })
-            .expect("the banner says the address");
-        // The pipe must not fill up.
+            .expect("the banner contains the address");
+        // Drains the pipe, which must not fill up.
         std::thread::spawn(move || lines.for_each(drop));
         Self { child, addr }
     }
 
-    /// `kill -9`.
+    /// Kills the process (`kill -9`).
     fn kill(mut self) {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
     }
 }
 
-/// Sends a request to a server that may die meanwhile: status, `Location`, body if it came whole.
+/// Sends a request to a server that may be killed. Returns status, `Location` and the body if it is complete.
 fn ask(
     addr: SocketAddr,
     method: &str,
@@ -80,13 +80,13 @@ fn ask(
     whole.then(|| (status, field("location:"), body))
 }
 
-/// What a job with this number asks for: its own structure, one of a few grids.
-fn order(n: usize) -> (String, Vec<u8>) {
+/// Returns the request of a job by number: its own structure, one of a few grids.
+fn job_request(n: usize) -> (String, Vec<u8>) {
     (format!("/v1/meshes?format=stl&resolution={}", [0.5, 0.6, 0.8][n % 3]), sample(n))
 }
 
 #[test]
-fn fifty_kills_lose_no_accepted_job_and_no_byte() {
+fn accepted_jobs_survive_fifty_kills_without_loss() {
     let folder = tempfile::tempdir().unwrap();
     let accepted: Arc<Mutex<BTreeMap<usize, String>>> = Arc::default();
     let mut next = 0;
@@ -108,7 +108,7 @@ fn fifty_kills_lose_no_accepted_job_and_no_byte() {
                 scope.spawn(move || {
                     let mut n = first + client;
                     while !stop.load(Ordering::SeqCst) {
-                        let (path, body) = order(n);
+                        let (path, body) = job_request(n);
                         let answer = ask(addr, "POST", &path, "prefer: respond-async\r\n", &body);
                         if let Some((202, Some(location), _)) = answer {
                             accepted.lock().unwrap().insert(n, location);
@@ -126,15 +126,15 @@ fn fifty_kills_lose_no_accepted_job_and_no_byte() {
     let accepted = std::mem::take(&mut *accepted.lock().unwrap());
     assert!(accepted.len() >= 50, "{} jobs were accepted", accepted.len());
     let server = Process::start(folder.path());
-    // The right bytes are those of a server that was never killed.
-    let judge = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
-    let expected: Vec<Vec<u8>> = (0..3).map(|n| judge.post(&order(n).0, &[], SAMPLE).body).collect();
+    // Expected bytes come from a server that was not killed.
+    let reference = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
+    let expected: Vec<Vec<u8>> = (0..3).map(|n| reference.post(&job_request(n).0, &[], SAMPLE).body).collect();
     assert!(expected[0] != expected[1] && expected[1] != expected[2]);
     let deadline = Instant::now() + Duration::from_mins(2);
     for (n, job) in &accepted {
         let path = format!("{job}?wait=20");
         let status = loop {
-            let (code, _, body) = ask(server.addr, "GET", &path, "", b"").expect("the server answers");
+            let (code, _, body) = ask(server.addr, "GET", &path, "", b"").expect("a response");
             assert_eq!(code, 200, "job {n} is lost: {}", String::from_utf8_lossy(&body));
             let status = serde_json::from_slice::<serde_json::Value>(&body).unwrap();
             if !["accepted", "running"].contains(&status["status"].as_str().unwrap()) {
@@ -148,7 +148,7 @@ fn fifty_kills_lose_no_accepted_job_and_no_byte() {
         let (code, _, bytes) = ask(server.addr, "GET", &location.unwrap(), "", b"").unwrap();
         assert_eq!((code, bytes == expected[n % 3]), (200, true), "job {n}");
     }
-    // Every object in the store is whole: its name is there once its bytes are.
+    // Every stored object is complete: objects are published after their last byte.
     for entry in std::fs::read_dir(folder.path().join("store/results")).unwrap().map(Result::unwrap) {
         if entry.path().extension().is_some_and(|e| e == "stl") {
             let bytes = std::fs::read(entry.path()).unwrap();
@@ -159,7 +159,7 @@ fn fifty_kills_lose_no_accepted_job_and_no_byte() {
 }
 
 #[test]
-fn a_job_that_ends_the_process_again_and_again_is_given_up() {
+fn a_job_that_repeatedly_crashes_the_process_fails() {
     let folder = tempfile::tempdir().unwrap();
     let jobs = folder.path().join("store/jobs");
     let backend = Fake::new(Mode::Slow(Duration::from_secs(30)));
@@ -179,9 +179,9 @@ fn a_job_that_ends_the_process_again_and_again_is_given_up() {
         let path = std::fs::read_dir(&jobs).unwrap().next().unwrap().unwrap().path();
         let bytes = std::fs::read(&path).unwrap();
         let record: serde_json::Value = serde_json::from_slice(&bytes).unwrap();
-        assert_eq!(record["attempts"], attempt, "it is on record before the work begins");
-        assert!(server.join(), "promised jobs are left, no request is cut off");
-        // A stop takes the attempt back; a process that was ended by the job leaves the record as it was.
+        assert_eq!(record["attempts"], attempt, "the attempt is recorded before the job starts");
+        assert!(server.join(), "no request is cut off");
+        // A stop takes the attempt back; a process killed by the job leaves the record unchanged.
         std::fs::write(&path, bytes).unwrap();
     }
     backend.set(Mode::Octahedra);
@@ -191,25 +191,25 @@ fn a_job_that_ends_the_process_again_and_again_is_given_up() {
         (&document["status"], &document["problem"]["type"]),
         (&"failed".into(), &"/problems/job-abandoned".into())
     );
-    assert_eq!(backend.started.load(Ordering::SeqCst), 3, "no fourth time");
+    assert_eq!(backend.started.load(Ordering::SeqCst), 3, "no fourth attempt");
     server.get(&format!("{location}/result")).problem(500, "job-abandoned");
 }
 
 #[test]
-fn a_repeated_key_is_the_same_job_after_a_restart_and_cannot_be_guessed() {
+fn idempotency_keys_survive_a_restart_and_ids_are_not_guessable() {
     let folder = tempfile::tempdir().unwrap();
     let keep = |c: &mut molmesh::config::Config| folder.path().clone_into(&mut c.server.data_dir);
     let headers = [("prefer", "respond-async"), ("idempotency-key", "upload-1")];
-    let promise = |server: &http_support::Running| {
+    let submit = |server: &http_support::Running| {
         let reply = server.post("/v1/meshes?format=stl", &headers, SAMPLE);
         assert_eq!(reply.status, 202);
         reply.header("location").unwrap().to_owned()
     };
     let backend = Fake::new(Mode::Octahedra);
     let server = start(Arc::clone(&backend) as _, keep);
-    // Requests that race are one job.
+    // Concurrent requests are one job.
     let jobs: Vec<String> = std::thread::scope(|scope| {
-        let clients: Vec<_> = (0..6).map(|_| scope.spawn(|| promise(&server))).collect();
+        let clients: Vec<_> = (0..6).map(|_| scope.spawn(|| submit(&server))).collect();
         clients.into_iter().map(|client| client.join().unwrap()).collect()
     });
     assert!(jobs.iter().all(|job| *job == jobs[0]), "{jobs:?}");
@@ -217,15 +217,15 @@ fn a_repeated_key_is_the_same_job_after_a_restart_and_cannot_be_guessed() {
     assert_eq!(ended["status"], "successful");
     assert!(server.join());
     let server = start(Arc::clone(&backend) as _, keep);
-    assert_eq!(promise(&server), jobs[0]);
-    assert_eq!(server.get(&jobs[0]).json()["attempts"], ended["attempts"], "it does not run again");
-    // Client and key alone do not say the id: on another store it is another one.
+    assert_eq!(submit(&server), jobs[0]);
+    assert_eq!(server.get(&jobs[0]).json()["attempts"], ended["attempts"], "the job does not run again");
+    // The id depends on the store, not on client and key alone.
     let elsewhere = start(backend as _, |_| {});
-    assert_ne!(promise(&elsewhere), jobs[0]);
+    assert_ne!(submit(&elsewhere), jobs[0]);
 }
 
 #[test]
-fn a_restart_takes_up_what_waits_and_leaves_what_has_ended() {
+fn a_restart_resumes_open_jobs_only() {
     let folder = tempfile::tempdir().unwrap();
     let keep = |c: &mut molmesh::config::Config| {
         folder.path().clone_into(&mut c.server.data_dir);
@@ -235,19 +235,19 @@ fn a_restart_takes_up_what_waits_and_leaves_what_has_ended() {
     let backend = Fake::new(Mode::Octahedra);
     let server = start(Arc::clone(&backend) as _, keep);
     let later = [("prefer", "respond-async")];
-    let promise = |server: &http_support::Running, n: usize| {
+    let submit = |server: &http_support::Running, n: usize| {
         let reply = server.post("/v1/meshes?format=stl", &later, &sample(n));
         assert_eq!(reply.status, 202);
         reply.header("location").unwrap().to_owned()
     };
-    let done = promise(&server, 0);
+    let done = submit(&server, 0);
     assert_eq!(server.get(&format!("{done}?wait=5")).json()["status"], "successful");
     backend.set(Mode::Slow(Duration::from_secs(30)));
-    let open: Vec<String> = (1..4).map(|n| promise(&server, n)).collect();
-    let dismissed = promise(&server, 4);
+    let open: Vec<String> = (1..4).map(|n| submit(&server, n)).collect();
+    let dismissed = submit(&server, 4);
     assert_eq!(http_support::send(server.addr, "DELETE", &dismissed, &[], b"").status, 200);
     wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 2);
-    assert!(server.join(), "promised jobs are left, no request is cut off");
+    assert!(server.join(), "no request is cut off");
     backend.set(Mode::Octahedra);
     let server = start(Arc::clone(&backend) as _, keep);
     for job in &open {
@@ -257,6 +257,6 @@ fn a_restart_takes_up_what_waits_and_leaves_what_has_ended() {
     }
     assert_eq!(server.get(&done).json()["status"], "successful");
     assert_eq!(server.get(&dismissed).json()["status"], "dismissed");
-    assert_eq!(backend.started.load(Ordering::SeqCst), 5, "three were taken up, no other");
+    assert_eq!(backend.started.load(Ordering::SeqCst), 5, "exactly three jobs were resumed");
     assert!(server.metric("molmesh_jobs_recovered_total", &[]) >= 3.0);
 }

@@ -1,4 +1,4 @@
-//! What happens when things go wrong or end: panics, failures, clients that leave, the warm-up, the drain.
+//! Failures and shutdown: panics, errors, disconnecting clients, the warm-up, the drain.
 
 use crate::http_support;
 
@@ -14,7 +14,7 @@ fn running(backend: &Arc<Fake>) -> Running {
     start(Arc::clone(backend) as _, |_| {})
 }
 
-/// Sends an upload and does not wait for the answer.
+/// Sends an upload without waiting for the answer.
 fn begin(server: &Running, body: &[u8]) -> TcpStream {
     let mut stream = connect(server.addr);
     let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", body.len());
@@ -24,7 +24,7 @@ fn begin(server: &Running, body: &[u8]) -> TcpStream {
 }
 
 #[test]
-fn a_panic_is_a_bare_500_and_the_pool_is_whole() {
+fn a_panic_gives_a_500_without_details_and_keeps_the_workers() {
     let backend = Fake::new(Mode::Panic);
     let server = running(&backend);
     let panics = || server.metric("molmesh_panics_total", &["place=\"job\""]);
@@ -32,18 +32,18 @@ fn a_panic_is_a_bare_500_and_the_pool_is_whole() {
     for n in 0..6 {
         let reply = server.post("/v1/meshes", &[("x-request-id", &format!("panic-{n}"))], SAMPLE);
         let problem = reply.problem(500, "internal");
-        assert!(!reply.text().contains("told to"), "{problem}");
+        assert!(!reply.text().contains("panic of a test"), "{problem}");
     }
     assert!(panics() >= before + 6.0);
     let lines = log_lines("panic-3");
-    assert!(lines.iter().any(|line| line.contains("ERROR") && line.contains("told to")), "{lines:?}");
+    assert!(lines.iter().any(|line| line.contains("ERROR") && line.contains("panic of a test")), "{lines:?}");
     backend.set(Mode::Octahedra);
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
     assert!(server.join());
 }
 
 #[test]
-fn failures_of_the_backend_carry_their_numbers() {
+fn errors_of_the_backend_contain_their_numbers() {
     let backend = Fake::new(Mode::GridTooLarge);
     let server = running(&backend);
     let problem = server.post("/v1/meshes?resolution=0.2", &[], SAMPLE).problem(422, "grid-too-large");
@@ -54,7 +54,7 @@ fn failures_of_the_backend_carry_their_numbers() {
 }
 
 #[test]
-fn a_mesh_that_no_writer_takes_is_our_mistake() {
+fn an_invalid_mesh_is_an_internal_error() {
     let backend = Fake::new(Mode::Broken);
     let server = running(&backend);
     let reply = server.post("/v1/meshes", &[("x-request-id", "broken-mesh")], SAMPLE);
@@ -63,7 +63,7 @@ fn a_mesh_that_no_writer_takes_is_our_mistake() {
 }
 
 #[test]
-fn a_client_that_leaves_cancels_its_job() {
+fn a_disconnecting_client_cancels_its_job() {
     let backend = Fake::new(Mode::Slow(Duration::from_secs(30)));
     let server = running(&backend);
     let stream = begin(&server, SAMPLE);
@@ -73,7 +73,7 @@ fn a_client_that_leaves_cancels_its_job() {
     drop(stream);
     wait_for("the job to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
     assert!(start.elapsed() < Duration::from_secs(10), "{:?}", start.elapsed());
-    wait_for("it is told", || !log_lines("the client left before the response").is_empty());
+    wait_for("the log", || !log_lines("the client left before the response").is_empty());
     assert!(server.metric("http_server_request_duration_seconds_count", &["status=\"none\""]) >= 1.0);
     assert!(server.metric("molmesh_jobs_finished_total", &["dismissed"]) >= 1.0);
     backend.set(Mode::Octahedra);
@@ -81,7 +81,7 @@ fn a_client_that_leaves_cancels_its_job() {
 }
 
 #[test]
-fn a_waiting_job_whose_client_leaves_never_runs() {
+fn a_queued_job_of_a_disconnected_client_never_runs() {
     let backend = Fake::new(Mode::Slow(Duration::from_millis(400)));
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.workers = 1);
     let first = begin(&server, SAMPLE);
@@ -96,7 +96,7 @@ fn a_waiting_job_whose_client_leaves_never_runs() {
 }
 
 #[test]
-fn a_client_that_leaves_during_the_answer_frees_the_mesh() {
+fn disconnecting_during_the_answer_frees_the_mesh() {
     let backend = Fake::new(Mode::Octahedra);
     let server = running(&backend);
     let mut stream = begin(&server, &carbons(60_000));
@@ -129,7 +129,7 @@ fn ready_only_after_the_first_mesh() {
 }
 
 #[test]
-fn a_drain_finishes_what_runs_and_what_waits() {
+fn a_drain_finishes_running_and_queued_jobs() {
     let backend = Fake::new(Mode::Slow(Duration::from_millis(500)));
     let mut server = start(Arc::clone(&backend) as _, |c| c.jobs.workers = 1);
     let statuses = std::thread::scope(|scope| {
@@ -142,14 +142,14 @@ fn a_drain_finishes_what_runs_and_what_waits() {
         wait_for("one to run", || backend.started.load(Ordering::SeqCst) == 1);
         wait_for("one to wait", || server.metric("molmesh_queue_depth", &[]) >= 1.0);
         let idle = connect(server.addr);
-        // A request that has begun is finished, even if its body is still under way.
+        // A request that has started is finished, even if its body is incomplete.
         let mut slow = connect(server.addr);
         let head = format!("POST /v1/meshes HTTP/1.1\r\nhost: t\r\ncontent-length: {}\r\n\r\n", SAMPLE.len());
         slow.write_all(head.as_bytes()).unwrap();
         slow.write_all(&SAMPLE[..1000]).unwrap();
         std::thread::sleep(Duration::from_millis(50));
         server.stop();
-        // Nobody new gets in, and idle connections do not hold the server up.
+        // New connections are refused, and idle ones do not delay the server.
         wait_for("the listener to be gone", || TcpStream::connect(server.addr).is_err());
         drop(idle);
         slow.write_all(&SAMPLE[1000..]).unwrap();
@@ -169,15 +169,15 @@ fn a_drain_has_a_deadline() {
     wait_for("the job to run", || backend.started.load(Ordering::SeqCst) == 1);
     let start = Instant::now();
     server.stop();
-    assert!(!server.join(), "it could not finish");
+    assert!(!server.join(), "requests were cut off");
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
     wait_for("the job to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
     drop(stream);
 }
 
 #[test]
-fn a_backend_that_cannot_be_cancelled_does_not_hold_up_the_answer() {
-    let backend = Fake::new(Mode::Deaf(Duration::from_secs(6)));
+fn a_backend_that_cannot_be_cancelled_does_not_delay_the_answer() {
+    let backend = Fake::new(Mode::Uncancellable(Duration::from_secs(6)));
     let server = start(Arc::clone(&backend) as _, |c| c.jobs.deadline_ms = 200);
     let start = Instant::now();
     server.post("/v1/meshes", &[], SAMPLE).problem(504, "deadline");
@@ -202,7 +202,7 @@ fn keep_alive_serves_many_requests_on_one_connection() {
 }
 
 #[test]
-fn an_address_in_use_is_named_with_its_key() {
+fn errors_of_an_address_in_use_name_the_key() {
     let backend = Fake::new(Mode::Octahedra);
     let server = running(&backend);
     let mut config = molmesh::config::Config::default();
@@ -210,7 +210,7 @@ fn an_address_in_use_is_named_with_its_key() {
     let chosen = molmesh::http::Chosen {
         backend,
         reason: String::new(),
-        drawer: molmesh::picture::Drawer::cpu("a test says so"),
+        drawer: molmesh::picture::Drawer::cpu("set by a test"),
         devices: Vec::new(),
     };
     let runtime = tokio::runtime::Runtime::new().unwrap();

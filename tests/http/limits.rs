@@ -1,4 +1,4 @@
-//! Every limit of the configuration, reached over a socket: the answer, the number, the metric, and a server that lives.
+//! Every limit of the configuration, exceeded over a socket: answer, number and metric. The server keeps running.
 
 use crate::http_support;
 
@@ -19,7 +19,7 @@ fn rejected(server: &Running, reason: &str) -> f64 {
     server.metric("molmesh_requests_rejected_total", &[&format!("reason=\"{reason}\"")])
 }
 
-/// Posts with a chunked body, so that no length is announced.
+/// Posts a chunked body, which declares no length.
 fn post_chunked(server: &Running, body: &[u8]) -> Reply {
     let mut stream = connect(server.addr);
     stream
@@ -36,7 +36,7 @@ fn post_chunked(server: &Running, body: &[u8]) -> Reply {
 }
 
 #[test]
-fn bodies_are_limited_whether_announced_or_not() {
+fn bodies_are_limited_with_and_without_a_declared_length() {
     let server = fake(|c| c.limits.body_bytes = 100_000);
     let large = vec![b'x'; 5_000_000];
     let before = rejected(&server, "body-too-large");
@@ -56,7 +56,7 @@ fn bodies_are_limited_whether_announced_or_not() {
     stream.write_all(&form).unwrap_or(());
     read_reply(&mut stream, false).problem(413, "body-too-large");
     assert!(rejected(&server, "body-too-large") >= before + 4.0);
-    // A length that is a lie about to be told is refused before a byte of it has come.
+    // A declared length over the limit is rejected before the body arrives.
     let start = Instant::now();
     let mut stream = connect(server.addr);
     stream
@@ -68,7 +68,7 @@ fn bodies_are_limited_whether_announced_or_not() {
 }
 
 #[test]
-fn json_bodies_are_limited_before_they_are_read() {
+fn json_bodies_are_limited_before_parsing() {
     let server = fake(|_| {});
     let json = ("content-type", "application/json");
     let before = rejected(&server, "body-too-large");
@@ -78,18 +78,18 @@ fn json_bodies_are_limited_before_they_are_read() {
         assert_eq!(problem["limit"], 65_536);
         assert!(problem["detail"].as_str().unwrap().contains("limits.json_bytes"), "{problem}");
     }
-    // Without a length it is refused once it is longer.
+    // Without a declared length, the body is rejected during the transfer.
     let mut stream = connect(server.addr);
     let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-type: application/json\r\n\
                 transfer-encoding: chunked\r\n\r\n10001\r\n";
     stream.write_all(&[head.as_bytes(), &vec![b' '; 0x10001]].concat()).unwrap();
     assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 65_536);
     assert!(rejected(&server, "body-too-large") >= before + 3.0);
-    // A document that fits is read: only the entry is missing.
+    // A document within the limit is read: only the entry is missing.
     server.post("/v1/meshes", &[json], &list(30_000)).problem(404, "not-in-archive");
 }
 
-/// Begins a form in a chunked body.
+/// Starts a form in a chunked body.
 fn begin_form(server: &Running) -> std::net::TcpStream {
     let mut stream = connect(server.addr);
     let head = "POST /v1/meshes HTTP/1.1\r\nhost: t\r\nconnection: close\r\ntransfer-encoding: chunked\r\n\
@@ -103,7 +103,7 @@ fn send_chunk(stream: &mut std::net::TcpStream, bytes: &[u8]) -> std::io::Result
 }
 
 #[test]
-fn heads_of_parts_are_limited_wherever_they_are_and_however_slowly_they_come() {
+fn heads_of_parts_are_limited_at_any_position_and_speed() {
     let server = fake(|c| c.limits.part_head_bytes = 2000);
     let part = |head: &str, content: &str| format!("--XX\r\n{head}\r\n\r\n{content}\r\n");
     let named = |name: &str| format!("content-disposition: form-data; name=\"{name}\"");
@@ -124,7 +124,7 @@ fn heads_of_parts_are_limited_wherever_they_are_and_however_slowly_they_come() {
         assert_eq!(problem["limit"], 2000, "{what}");
         assert!(problem["detail"].as_str().unwrap().contains("limits.part_head_bytes"), "{what}: {problem}");
     }
-    // A byte at a time, where the end is never more than a byte away.
+    // One byte at a time.
     let mut stream = begin_form(&server);
     send_chunk(&mut stream, b"--XX\r\na: ").unwrap();
     for _ in 0..3000 {
@@ -134,7 +134,7 @@ fn heads_of_parts_are_limited_wherever_they_are_and_however_slowly_they_come() {
     }
     assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 2000);
     assert!(rejected(&server, "body-too-large") >= before + 8.0);
-    // Heads that fit do, with a preamble, an epilogue, and content that comes in small pieces.
+    // Heads within the limit are accepted, with a preamble, an epilogue and small chunks.
     let form = format!("hello\r\n{}{sample}--XX--\r\nbye", part(&named("resolution"), "1.5"));
     let mut stream = begin_form(&server);
     for piece in form.as_bytes().chunks(777) {
@@ -147,7 +147,7 @@ fn heads_of_parts_are_limited_wherever_they_are_and_however_slowly_they_come() {
 }
 
 #[test]
-fn an_endless_head_of_a_part_takes_no_memory_and_little_time() {
+fn an_endless_head_of_a_part_uses_little_memory_and_time() {
     let server = fake(|_| {});
     let mut stream = begin_form(&server);
     let start = Instant::now();
@@ -158,7 +158,7 @@ fn an_endless_head_of_a_part_takes_no_memory_and_little_time() {
     }
     assert_eq!(read_reply(&mut stream, false).problem(413, "body-too-large")["limit"], 16_384);
     assert!(start.elapsed() < Duration::from_secs(20), "{:?}", start.elapsed());
-    // The parser's buffer is charged: without room for it a form is refused, and a file is not.
+    // The parser's buffer counts as memory: if it does not fit, a form is rejected and a plain file is not.
     let server = fake(|c| c.limits.memory_bytes = 60_000);
     let kind = ("content-type", "multipart/form-data; boundary=XX");
     server.post("/v1/meshes", &[kind], b"--XX\r\n").problem(503, "memory-full");
@@ -209,7 +209,7 @@ fn atoms_are_limited() {
 }
 
 #[test]
-fn atoms_that_are_listed_are_limited() {
+fn listed_atoms_are_limited() {
     let server = fake(|c| c.limits.labels = 100);
     let listed = |atoms| {
         let structure = server.post("/v1/structures", &[], &carbons(atoms)).header("location").unwrap().to_owned();
@@ -218,12 +218,12 @@ fn atoms_that_are_listed_are_limited() {
     assert_eq!(listed(101).problem(422, "too-many-atoms")["limit"], 100);
     assert_eq!(listed(100).json()["count"], 100);
     assert!(rejected(&server, "too-many-atoms") >= 1.0);
-    // Its mesh is made nevertheless.
+    // The limit does not apply to meshes.
     assert_eq!(server.post("/v1/meshes", &[], &carbons(101)).status, 200);
 }
 
 #[test]
-fn grids_and_meshes_are_limited_and_what_would_fit_fits() {
+fn grids_and_meshes_are_limited_and_suggested_spacings_fit() {
     for (slug, change) in [
         ("grid-too-large", Box::new(|c: &mut Config| c.limits.grid_samples = 60_000) as Box<dyn FnOnce(&mut Config)>),
         ("too-many-candidates", Box::new(|c: &mut Config| c.limits.candidate_pairs = 10_000)),
@@ -241,7 +241,7 @@ fn grids_and_meshes_are_limited_and_what_would_fit_fits() {
 }
 
 #[test]
-fn a_full_queue_refuses_at_once_and_says_when_to_come_back() {
+fn a_full_queue_rejects_with_retry_after() {
     let backend = Fake::new(Mode::Slow(Duration::from_millis(600)));
     let server = start(Arc::clone(&backend) as _, |c| {
         c.jobs.workers = 1;
@@ -261,7 +261,7 @@ fn a_full_queue_refuses_at_once_and_says_when_to_come_back() {
         assert!(problem["estimated_wait_s"].as_f64().unwrap() > 0.0);
         let after: u64 = refused.header("retry-after").unwrap().parse().unwrap();
         assert!((1..=5).contains(&after), "{after}");
-        // Load does not make the service unready.
+        // Load does not affect readiness.
         assert_eq!(server.get("/readyz").status, 200);
         for job in accepted {
             assert_eq!(job.join().unwrap(), 200);
@@ -272,7 +272,7 @@ fn a_full_queue_refuses_at_once_and_says_when_to_come_back() {
 }
 
 #[test]
-fn the_deadline_counts_waiting_and_stops_the_job() {
+fn the_deadline_includes_queueing_and_stops_the_job() {
     let backend = Fake::new(Mode::Slow(Duration::from_secs(30)));
     let server = start(Arc::clone(&backend) as _, |c| {
         c.jobs.workers = 1;
@@ -287,7 +287,7 @@ fn the_deadline_counts_waiting_and_stops_the_job() {
             assert!((200..=300).contains(&limit), "{limit}");
         }
     });
-    // The second one may have got the worker for the moment between the two deadlines.
+    // The second job may get the worker between the two deadlines.
     wait_for("every job that started is cancelled", || {
         let started = backend.started.load(Ordering::SeqCst);
         started >= 1 && backend.cancelled.load(Ordering::SeqCst) == started
@@ -297,7 +297,7 @@ fn the_deadline_counts_waiting_and_stops_the_job() {
 }
 
 #[test]
-fn a_body_that_trickles_is_given_up() {
+fn slow_bodies_time_out() {
     let server = fake(|c| c.server.body_timeout_ms = 300);
     let mut stream = connect(server.addr);
     let start = Instant::now();
@@ -310,7 +310,7 @@ fn a_body_that_trickles_is_given_up() {
 }
 
 #[test]
-fn slow_heads_and_silent_connections_are_closed() {
+fn slow_heads_and_idle_connections_are_closed() {
     let server = fake(|c| c.server.header_timeout_ms = 300);
     let before = rejected(&server, "header-timeout");
     for sent in [&b""[..], b"P", b"PRI * HTTP/2.0\r\n", b"GET /livez HTTP/1.1\r\nhost: t\r\nx-slow: "] {
@@ -322,7 +322,7 @@ fn slow_heads_and_silent_connections_are_closed() {
         let time = start.elapsed();
         assert!(time > Duration::from_millis(200) && time < Duration::from_secs(8), "{sent:?}: {time:?}");
     }
-    // A connection that has been used and then says nothing is closed as well.
+    // A connection that becomes idle after a request is closed too.
     let mut stream = connect(server.addr);
     stream.write_all(b"GET /livez HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
     let start = Instant::now();
@@ -333,7 +333,7 @@ fn slow_heads_and_silent_connections_are_closed() {
 }
 
 #[test]
-fn one_connection_too_many_is_told_so() {
+fn excess_connections_are_rejected_with_503() {
     let server = fake(|c| c.server.connections = 4);
     wait_for("earlier connections to be gone", || server.metric("molmesh_connections", &[]) >= 0.0);
     let mut held = Vec::new();
@@ -348,18 +348,18 @@ fn one_connection_too_many_is_told_so() {
             break String::from_utf8(rest).unwrap();
         }
         held.push(stream);
-        assert!(held.len() <= 4, "five connections at once");
+        assert!(held.len() <= 4, "more than four connections");
     };
     assert!(refused.contains("retry-after: 1") && refused.contains("/problems/too-many-connections"), "{refused}");
     assert!(rejected(&server, "too-many-connections") >= 1.0);
     drop(held);
-    wait_for("there is room again", || send(server.addr, "GET", "/livez", &[], b"").status == 200);
+    wait_for("a connection is accepted", || send(server.addr, "GET", "/livez", &[], b"").status == 200);
 }
 
 #[test]
-fn a_client_that_takes_nothing_is_given_up_and_its_mesh_freed() {
+fn a_client_that_does_not_read_is_disconnected_and_its_mesh_freed() {
     let server = fake(|c| c.server.write_timeout_ms = 400);
-    // Large enough for no socket buffer.
+    // Larger than the socket buffers.
     let body = carbons(60_000);
     let before = rejected(&server, "write-timeout");
     let mut stream = connect(server.addr);
@@ -383,7 +383,7 @@ fn memory_is_shared_and_limited() {
 }
 
 #[test]
-fn a_hundred_clients_at_once_are_all_answered() {
+fn a_hundred_concurrent_clients_are_all_answered() {
     let server = fake(|_| {});
     let barrier = Barrier::new(100);
     let statuses: Vec<u16> = std::thread::scope(|scope| {
@@ -405,7 +405,7 @@ fn a_hundred_clients_at_once_are_all_answered() {
 }
 
 #[test]
-fn slow_takers_cannot_use_up_the_threads() {
+fn slow_readers_cannot_occupy_all_threads() {
     let server = fake(|c| c.jobs.deliveries = 1);
     let body = carbons(60_000);
     let mut stream = connect(server.addr);
@@ -418,7 +418,7 @@ fn slow_takers_cannot_use_up_the_threads() {
     assert_eq!(refused.problem(503, "too-many-deliveries")["limit"], 1);
     assert!(refused.header("retry-after").is_some());
     drop(stream);
-    wait_for("the place is free", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
+    wait_for("the delivery has ended", || server.post("/v1/meshes", &[], SAMPLE).status == 200);
 }
 
 #[test]
@@ -457,36 +457,36 @@ fn heads_are_limited() {
 }
 
 #[test]
-fn clients_of_http2_are_told_how_much_they_may_ask() {
+fn http2_settings_announce_the_limits() {
     let server = fake(|c| (c.server.streams, c.server.head_bytes) = (7, 9000));
     let mut stream = connect(server.addr);
-    // The preface and empty settings; the server's settings are its first frame (RFC 9113, 3.4).
+    // HTTP/2 preface and empty settings. The first frame of the server contains its settings (RFC 9113, 3.4).
     stream.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").unwrap();
     let mut head = [0; 9];
     stream.read_exact(&mut head).unwrap();
-    assert_eq!(head[3], 4, "a frame of settings");
+    assert_eq!(head[3], 4, "not a SETTINGS frame");
     let mut settings = vec![0; usize::from(u16::from_be_bytes([head[1], head[2]]))];
     stream.read_exact(&mut settings).unwrap();
     let value = |id: u8| settings.chunks(6).find(|s| s[1] == id).map(|s| u32::from_be_bytes([s[2], s[3], s[4], s[5]]));
-    // Streams at once, and bytes of a head.
+    // Concurrent streams, and bytes of a header section.
     assert_eq!((value(3), value(6)), (Some(7), Some(9000)));
 }
 
 #[test]
-fn silent_event_streams_give_signs_of_life() {
+fn idle_event_streams_send_heartbeats() {
     let server = start(Fake::new(Mode::Held), |c| {
         (c.server.heartbeat_ms, c.server.drain_timeout_ms) = (20, 100);
     });
-    let promised = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
-    assert_eq!(promised.status, 202);
+    let accepted = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
+    assert_eq!(accepted.status, 202);
     let mut stream = connect(server.addr);
-    write!(stream, "GET {}/events HTTP/1.1\r\nhost: t\r\n\r\n", promised.header("location").unwrap()).unwrap();
+    write!(stream, "GET {}/events HTTP/1.1\r\nhost: t\r\n\r\n", accepted.header("location").unwrap()).unwrap();
     let mut text = String::new();
     let mut some = [0; 1024];
-    // Comments: lines that begin with a colon.
+    // Comments are lines that begin with a colon.
     while text.matches("\n:\n").count() + text.matches("\n: \n").count() < 3 {
         let n = stream.read(&mut some).unwrap();
-        assert!(n > 0, "it ended: {text}");
+        assert!(n > 0, "the stream ended: {text}");
         text.push_str(&String::from_utf8_lossy(&some[..n]));
     }
 }
@@ -532,10 +532,10 @@ fn concurrent_saves_are_limited() {
 }
 
 #[test]
-fn what_is_too_old_is_swept_as_often_as_configured() {
+fn expired_objects_are_swept_at_the_configured_interval() {
     let server = fake(|c| (c.store.sweep_ms, c.store.result_ttl_ms) = (20, 1));
     let removed = || server.metric("molmesh_store_removed_total", &["reason=\"ttl\""]);
     let before = removed();
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
-    wait_for("the result is gone", || removed() > before);
+    wait_for("the result is removed", || removed() > before);
 }

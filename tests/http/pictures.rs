@@ -1,5 +1,5 @@
-//! Pictures over HTTP: every route that gives a mesh gives its picture, cached like one; what goes with a picture and what does
-//! not; limits.
+//! Pictures over HTTP: every route of a mesh also returns a picture, which is cached like a mesh; parameters of
+//! pictures; limits.
 
 use crate::http_support;
 
@@ -9,7 +9,7 @@ use std::sync::atomic::Ordering;
 use http_support::{Fake, Mode, Reply, Running, SAMPLE, send, start};
 use molmesh::config::Config;
 
-/// A server with an entry in its folder.
+/// Starts a server with an archive entry.
 fn server(backend: &Arc<Fake>, change: impl FnOnce(&mut Config)) -> Running {
     let server = start(Arc::clone(backend) as _, change);
     let folder = server.dir.path().join("archive");
@@ -18,7 +18,7 @@ fn server(backend: &Arc<Fake>, change: impl FnOnce(&mut Config)) -> Running {
     server
 }
 
-/// Width, height and whether there is an alpha channel, from the head of a PNG.
+/// Reads width, height and presence of an alpha channel from the header of a PNG.
 #[track_caller]
 fn png(reply: &Reply) -> (u32, u32, bool) {
     assert_eq!((reply.status, reply.complete), (200, true), "{}", String::from_utf8_lossy(&reply.body));
@@ -29,7 +29,7 @@ fn png(reply: &Reply) -> (u32, u32, bool) {
 }
 
 #[test]
-fn every_route_of_a_mesh_gives_its_picture() {
+fn every_route_of_a_mesh_also_returns_a_picture() {
     let backend = Fake::new(Mode::Octahedra);
     let server = server(&backend, |_| {});
     let structure = server.post("/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
@@ -37,7 +37,7 @@ fn every_route_of_a_mesh_gives_its_picture() {
     let named = br#"{"pdb_id": "4pti", "format": "png", "width": 40, "height": 30, "view": "front"}"#;
     let query = "width=40&height=30&view=front";
     let first = server.get(&format!("/v1/pdb/4pti/surface.png?{query}"));
-    // That answer waits until the result is kept.
+    // This answer waits until the result is stored.
     assert_eq!(server.get(first.header("content-location").unwrap()).status, 200);
     let replies = [
         first,
@@ -53,13 +53,13 @@ fn every_route_of_a_mesh_gives_its_picture() {
         assert_eq!(reply.header("content-disposition"), Some("inline; filename=\"4PTI.png\""));
         assert_eq!(reply.header("molmesh-renderer"), Some("cpu"));
         assert!(reply.header("molmesh-renderer-device").unwrap().contains("rasteriser"));
-        assert_eq!(reply.header("molmesh-renderer-reason"), Some("a test says so"));
+        assert_eq!(reply.header("molmesh-renderer-reason"), Some("set by a test"));
         assert!(reply.header("molmesh-pixel").unwrap().parse::<f64>().unwrap() > 0.1);
         assert_eq!(reply.header("molmesh-atoms"), Some("454"));
     }
-    // One was made; the others were there.
+    // One picture was rendered; the others came from the store.
     assert_eq!(backend.started.load(Ordering::SeqCst), 1);
-    // Headers of pictures are not those of meshes.
+    // Headers of meshes are absent.
     let mesh = server.get("/v1/pdb/4pti/surface.glb");
     assert_eq!((mesh.status, mesh.header("molmesh-renderer")), (200, None));
     assert_eq!(mesh.header("content-disposition"), Some("attachment; filename=\"4PTI.glb\""));
@@ -90,7 +90,7 @@ fn pictures_are_cached_like_meshes() {
     assert_eq!((&report["picture"]["width"], &report["picture"]["style"]), (&64.into(), &"surface".into()));
     assert_eq!((&report["picture"]["renderer"], &report["atoms"]), (&"cpu".into(), &454.into()));
     assert!(report["timings_ms"]["draw"].is_number() && report["timings_ms"]["png"].is_number(), "{report}");
-    // Every parameter makes another picture, under another tag.
+    // Every parameter gives another picture with another ETag.
     let mut tags = vec![etag.to_owned()];
     for query in
         ["view=top", "azimuth=20", "elevation=-20", "background=white", "background=%23123456", "style=gouraud"]
@@ -103,19 +103,19 @@ fn pictures_are_cached_like_meshes() {
     tags.sort();
     tags.dedup();
     assert_eq!((tags.len(), backend.started.load(Ordering::SeqCst)), (7, 7));
-    // HEAD tells the tag and does not mesh.
+    // HEAD returns the ETag without meshing.
     let head = send(server.addr, "HEAD", "/v1/pdb/4pti/surface.png?width=65", &[], b"");
     assert_eq!((head.status, head.header("content-type")), (200, Some("image/png")));
     assert_eq!(backend.started.load(Ordering::SeqCst), 7);
 }
 
 #[test]
-fn a_picture_can_be_promised() {
+fn pictures_can_be_rendered_asynchronously() {
     let server = server(&Fake::new(Mode::Octahedra), |_| {});
     let later = ("prefer", "respond-async");
-    let promised = send(server.addr, "GET", "/v1/pdb/4pti/surface.png?width=50&height=20", &[later], b"");
-    assert_eq!(promised.status, 202, "{}", promised.text());
-    let job = promised.header("location").unwrap();
+    let accepted = send(server.addr, "GET", "/v1/pdb/4pti/surface.png?width=50&height=20", &[later], b"");
+    assert_eq!(accepted.status, 202, "{}", accepted.text());
+    let job = accepted.header("location").unwrap();
     let ended = server.get(&format!("{job}?wait=50")).json();
     assert_eq!(ended["status"], "successful", "{ended}");
     let result = server.get(&format!("{job}/result"));
@@ -126,7 +126,7 @@ fn a_picture_can_be_promised() {
 }
 
 #[test]
-fn what_does_not_go_with_a_picture_is_refused_and_what_goes_with_it_alone() {
+fn parameters_that_do_not_apply_to_the_format_are_rejected() {
     let server = server(&Fake::new(Mode::Octahedra), |_| {});
     for (query, parameter) in [
         ("format=png&width=0", "width"),
@@ -152,19 +152,19 @@ fn what_does_not_go_with_a_picture_is_refused_and_what_goes_with_it_alone() {
     assert!(problem["expected"].as_str().unwrap().contains("png"), "{problem}");
     let problem = server.get("/v1/pdb/4pti/surface.jpg").problem(404, "not-found");
     assert!(problem["available"].as_array().unwrap().contains(&"surface.png".into()), "{problem}");
-    // A report of a picture is that of its run.
+    // A report with a picture describes the run of the picture.
     let report = server.post("/v1/meshes?format=png&report=json&width=32", &[], SAMPLE).json();
     assert_eq!(report["picture"]["width"], 32, "{report}");
 }
 
 #[test]
-fn pictures_are_limited_before_anything_is_done_for_them() {
+fn pictures_are_limited_before_any_work() {
     let backend = Fake::new(Mode::Octahedra);
     let server = server(&backend, |c| c.limits.picture_side = 100);
     for (side, query) in [("width", "width=101&height=5"), ("height", "width=5&height=101")] {
         for reply in [
             server.get(&format!("/v1/pdb/4pti/surface.png?{query}")),
-            // Before the body is looked at.
+            // Rejected before the body is read.
             server.post(&format!("/v1/meshes?format=png&{query}"), &[], b"no structure"),
         ] {
             let problem = reply.problem(422, "picture-too-large");
@@ -181,10 +181,10 @@ fn pictures_are_limited_before_anything_is_done_for_them() {
 }
 
 #[test]
-fn drawing_takes_its_memory_from_the_budget() {
+fn drawing_uses_the_memory_budget() {
     let backend = Fake::new(Mode::Octahedra);
     let server = server(&backend, |c| c.limits.memory_bytes = 4 << 20);
-    // 40 bytes a pixel: ten million of them are more than there is, ten thousand are not.
+    // Drawing takes 40 bytes per pixel: ten million pixels exceed the budget, ten thousand do not.
     server.get("/v1/pdb/4pti/surface.png?width=500&height=500").problem(503, "memory-full");
     assert_eq!(backend.started.load(Ordering::SeqCst), 0);
     assert_eq!(server.get("/v1/pdb/4pti/surface.png?width=100&height=100").status, 200);

@@ -1,4 +1,4 @@
-//! `/readyz`: what it looks at, each made to fail and to come back, and that load is none of it.
+//! `/readyz`: each check fails and recovers, and load does not affect it.
 
 use crate::http_support;
 
@@ -13,7 +13,7 @@ use molmesh::surface::{
 };
 use serde_json::Value;
 
-/// Names of the checks that are not as they should be; all three must be there.
+/// Returns the names of failed checks. Asserts that all three checks are present.
 #[track_caller]
 fn failing(document: &Value) -> Vec<String> {
     let checks = document["checks"].as_array().unwrap_or_else(|| panic!("{document}"));
@@ -23,8 +23,8 @@ fn failing(document: &Value) -> Vec<String> {
     checks.iter().filter(|check| check["ok"] == false).map(|check| check["name"].as_str().unwrap().to_owned()).collect()
 }
 
-/// Takes the store away, or gives it back: a file where its folder was. Permissions would not stop everybody.
-fn take_away(server: &Running, away: bool) {
+/// Makes the store unavailable or available. Replaces its folder by a file, because permissions do not apply to root.
+fn set_unavailable(server: &Running, away: bool) {
     let (store, aside) = (server.dir.path().join("store"), server.dir.path().join("aside"));
     if away {
         std::fs::rename(&store, aside).unwrap();
@@ -44,35 +44,35 @@ fn a_ready_service_lists_its_checks() {
 }
 
 #[test]
-fn a_store_that_cannot_be_written_is_seen_and_so_is_its_return() {
+fn failure_and_recovery_of_the_store_are_detected() {
     let server = start(Fake::new(Mode::Octahedra), |c| c.store.probe_ms = 1);
-    take_away(&server, true);
-    wait_for("the store is missed", || server.get("/readyz").status == 503);
+    set_unavailable(&server, true);
+    wait_for("the failure is detected", || server.get("/readyz").status == 503);
     let problem = server.get("/readyz").problem(503, "not-ready");
     assert_eq!(failing(&problem), ["store"]);
     let said = problem["detail"].as_str().unwrap();
     assert!(said.contains("store") && !problem.to_string().contains(server.dir.path().to_str().unwrap()), "{problem}");
     assert_eq!(server.get("/livez").status, 200);
     let logged = || log_lines("the store has failed").len();
-    assert_eq!(logged(), 1, "the log says it once, and why");
+    assert_eq!(logged(), 1, "the failure is logged once");
     assert!(log_lines("the store has failed")[0].contains("error="));
-    take_away(&server, false);
+    set_unavailable(&server, false);
     wait_for("the store is back", || server.get("/readyz").status == 200);
     assert_eq!((logged(), log_lines("the store works again").len()), (1, 1));
 }
 
 #[test]
-fn the_store_is_not_asked_more_often_than_configured() {
+fn the_store_is_not_checked_more_often_than_configured() {
     let server = start(Fake::new(Mode::Octahedra), |c| c.store.probe_ms = 3_600_000);
-    take_away(&server, true);
+    set_unavailable(&server, true);
     for _ in 0..5 {
-        assert_eq!(server.get("/readyz").status, 200, "what was known an hour ago is believed");
+        assert_eq!(server.get("/readyz").status, 200, "the cached result is used");
     }
-    take_away(&server, false);
+    set_unavailable(&server, false);
 }
 
 #[test]
-fn a_full_queue_does_not_make_it_unready() {
+fn a_full_queue_does_not_affect_readiness() {
     let backend = Fake::new(Mode::Slow(Duration::from_mins(5)));
     let server = start(Arc::clone(&backend) as _, |c| {
         (c.jobs.workers, c.jobs.queue, c.store.probe_ms) = (1, 1, 1);
@@ -90,14 +90,14 @@ fn a_full_queue_does_not_make_it_unready() {
             assert_eq!((reply.status, failing(&reply.json())), (200, vec![]));
         }
         backend.set(Mode::Octahedra);
-        server.order(Stop::Now);
+        server.request_stop(Stop::Now);
         for client in clients {
             drop(client.join());
         }
     });
 }
 
-/// A backend on one device that can be taken away.
+/// Backend with one device that can fail.
 struct OneDevice {
     fake: Arc<Fake>,
     down: AtomicBool,
@@ -124,7 +124,7 @@ impl Backend for OneDevice {
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {
-        let down = self.down.load(Ordering::SeqCst).then(|| "it was taken away".to_owned());
+        let down = self.down.load(Ordering::SeqCst).then(|| "device lost by a test".to_owned());
         vec![DeviceStatus {
             number: 0,
             name: "one".to_owned(),
@@ -143,7 +143,7 @@ impl Backend for OneDevice {
 }
 
 #[test]
-fn no_device_left_and_nothing_in_its_place_is_not_ready() {
+fn not_ready_without_devices_and_fallback() {
     let backend = Arc::new(OneDevice { fake: Fake::new(Mode::Octahedra), down: AtomicBool::new(false) });
     let server = start(Arc::clone(&backend) as _, |_| {});
     let document = server.get("/readyz").json();

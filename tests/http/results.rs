@@ -1,4 +1,4 @@
-//! What was made once: found again under its key, in parts, unchanged; structures that are uploaded once; estimates.
+//! Stored results under their keys: complete, in ranges, unchanged; uploaded structures; estimates.
 
 use crate::http_support;
 
@@ -13,7 +13,7 @@ fn real(change: impl FnOnce(&mut molmesh::config::Config)) -> Running {
 }
 
 #[test]
-fn a_synchronous_result_is_found_at_its_content_location() {
+fn a_synchronous_result_is_stored_at_its_content_location() {
     let backend = Fake::new(Mode::Octahedra);
     let server = start(Arc::clone(&backend) as _, |_| {});
     let made = server.post("/v1/meshes?format=ply", &[], SAMPLE);
@@ -31,11 +31,11 @@ fn a_synchronous_result_is_found_at_its_content_location() {
     assert_eq!((unchanged.status, unchanged.body.len()), (304, 0));
     let head = send(server.addr, "HEAD", &location, &[], b"");
     assert_eq!(head.header("content-length"), Some(made.body.len().to_string().as_str()));
-    // The same request is answered without meshing.
+    // The same request is answered from the store.
     let again = server.post("/v1/meshes?format=ply", &[], SAMPLE);
     assert_eq!((again.body == made.body, backend.started.load(Ordering::SeqCst)), (true, 1));
     assert!(again.header("server-timing").unwrap().contains("hit"));
-    assert!(again.header("cache-control").is_none(), "a POST's answer belongs to it alone");
+    assert!(again.header("cache-control").is_none(), "answers to POST are not cached");
     let report = location.replace(".ply", "/report.json");
     assert_eq!(server.get(&report).json()["atoms"], 454);
     let etag = server.get(&report).header("etag").unwrap().to_owned();
@@ -54,7 +54,7 @@ fn a_synchronous_result_is_found_at_its_content_location() {
 }
 
 #[test]
-fn a_result_is_kept_once_however_many_ask_for_it() {
+fn identical_requests_store_one_result() {
     let server = start(Fake::new(Mode::Octahedra), |c| c.jobs.concurrent_saves = 1);
     for round in 0..20 {
         let input = carbons(2_000 + round);
@@ -62,7 +62,7 @@ fn a_result_is_kept_once_however_many_ask_for_it() {
             let ask = || scope.spawn(|| server.post("/v1/meshes?format=stl", &[], &input));
             [(); 6].map(|()| ask()).map(|reply| reply.join().unwrap()).into()
         });
-        // One place is enough for six answers, and is free when the result is found.
+        // One concurrent save suffices for six answers and is released afterwards.
         for reply in &replies {
             let location = reply.header("content-location");
             assert!(location.is_some() && location == replies[0].header("content-location"), "{location:?}");
@@ -72,9 +72,9 @@ fn a_result_is_kept_once_however_many_ask_for_it() {
 }
 
 #[test]
-fn parts_of_a_result_add_up_to_it() {
+fn ranges_of_a_result_add_up_to_the_whole() {
     let server = start(Fake::new(Mode::Octahedra), |c| c.store.memory_object_bytes = 1000);
-    // One that stays in memory and one that lies on disk.
+    // One result in memory, one on disk.
     for atoms in [2, 2_000] {
         let made = server.post("/v1/meshes?format=stl", &[], &carbons(atoms));
         let location = made.header("content-location").unwrap();
@@ -98,14 +98,14 @@ fn parts_of_a_result_add_up_to_it() {
 }
 
 #[test]
-fn a_result_that_no_place_is_left_for_has_no_location() {
+fn a_result_that_exceeds_the_store_is_not_found_later() {
     let server = start(Fake::new(Mode::Octahedra), |c| c.store.max_bytes = 3_000);
     let before = server.metric("molmesh_results_not_kept_total", &["failed"]);
     let made = server.post("/v1/meshes", &[], SAMPLE);
     assert_eq!((made.status, made.complete), (200, true), "the answer does not depend on the store");
-    wait_for("it is told", || server.metric("molmesh_results_not_kept_total", &["failed"]) > before);
+    wait_for("the metric", || server.metric("molmesh_results_not_kept_total", &["failed"]) > before);
     server.get(made.header("content-location").unwrap()).problem(404, "not-found");
-    // What must be kept before it is promised is refused.
+    // Work that requires the store is rejected.
     let refused = server.post("/v1/meshes", &[("prefer", "respond-async")], &sample(1));
     assert_eq!(refused.problem(503, "store-full")["limit"], 3_000);
     server.post("/v1/structures", &[], SAMPLE).problem(503, "store-full");
@@ -121,7 +121,7 @@ fn a_structure_is_uploaded_once_and_meshed_many_times() {
     assert_eq!(summary["chains"][0]["name"], "A");
     let location = made.header("location").unwrap().to_owned();
     assert_eq!(location, format!("/v1/structures/{}", summary["digest"].as_str().unwrap()));
-    assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 200, "it was there");
+    assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 200, "the structure existed");
     assert_eq!(server.get(&location).json(), summary);
     let surface = |query: &str| server.get(&format!("{location}/surface.glb{query}"));
     let (coarse, fine) = (surface("?resolution=1"), surface("?resolution=0.6"));
@@ -141,13 +141,13 @@ fn a_structure_is_uploaded_once_and_meshed_many_times() {
         server.get(missing).problem(404, "no-such-structure");
         server.get(&format!("{missing}/surface.glb")).problem(404, "no-such-structure");
     }
-    server.post("/v1/structures", &[], b"no structure at all").problem(422, "unreadable-structure");
+    server.post("/v1/structures", &[], b"not a structure").problem(422, "unreadable-structure");
     let contradicted = [("content-type", "chemical/x-mmcif")];
     server.post("/v1/structures", &contradicted, SAMPLE).problem(415, "unsupported-media-type");
 }
 
 #[test]
-fn json_names_what_is_to_be_meshed() {
+fn json_documents_name_entries_and_structures() {
     let server = real(|_| {});
     let json = [("content-type", "application/json")];
     let folder = server.dir.path().join("archive");
@@ -172,7 +172,7 @@ fn json_names_what_is_to_be_meshed() {
 }
 
 #[test]
-fn an_estimate_says_what_a_mesh_would_cost_and_what_would_fit() {
+fn estimates_report_the_cost_and_a_spacing_that_fits() {
     let server = real(|c| c.limits.mesh_bytes = 2_000_000);
     let estimate = |query: &str| {
         let reply = server.post(&format!("/v1/estimate{query}"), &[], SAMPLE);

@@ -1,5 +1,5 @@
-//! Schemathesis reads the description and asks the server for everything that it says, allowed and not: what comes back has
-//! to be what is described. The requests are the same in every run; the settings are in `tests/tools/schemathesis.toml`.
+//! Schemathesis sends valid and invalid requests for everything in the API description, and compares the responses with
+//! it. Requests are the same in every run; `tests/tools/schemathesis.toml` contains the settings.
 
 use crate::http_support;
 use crate::tools;
@@ -12,7 +12,7 @@ use http_support::{Running, SAMPLE, start};
 use molmesh::surface::CpuBackend;
 use serde_json::Value;
 
-/// A server that refuses soon what would take long, as made-up requests come by the hundred.
+/// Starts a server with low limits, as generated requests are numerous.
 fn server() -> Running {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |c| {
         c.limits.grid_samples = 1 << 20;
@@ -23,12 +23,12 @@ fn server() -> Running {
     let folder = server.dir.path().join("archive");
     std::fs::create_dir_all(&folder).unwrap();
     std::fs::write(folder.join("4pti.pdb"), SAMPLE).unwrap();
-    // The settings name it by its digest.
+    // The settings name the structure by its digest.
     assert_eq!(server.post("/v1/structures", &[], SAMPLE).status, 201);
     server
 }
 
-/// Runs Schemathesis on a description: whether it found nothing, and what it said. None where it is not installed.
+/// Runs Schemathesis on a description. Returns success and output, or `None` if it is not installed.
 fn schemathesis(server: &Running, description: &Path, more: &[&str]) -> Option<(bool, String)> {
     let Some(python) = tools::python_interpreter() else { return tools::missing("Schemathesis") };
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
@@ -41,25 +41,25 @@ fn schemathesis(server: &Running, description: &Path, more: &[&str]) -> Option<(
         .env("PYTHONDONTWRITEBYTECODE", "1")
         .output()
         .unwrap();
-    let said = [output.stdout, output.stderr].concat();
-    Some((output.status.success(), String::from_utf8_lossy(&said).into_owned()))
+    let printed = [output.stdout, output.stderr].concat();
+    Some((output.status.success(), String::from_utf8_lossy(&printed).into_owned()))
 }
 
 #[test]
-fn the_server_does_what_its_description_says() {
+fn the_server_conforms_to_its_description() {
     let server = server();
     let file = server.dir.path().join("openapi.json");
     std::fs::write(&file, server.get("/openapi.json").body).unwrap();
-    let Some((good, said)) = schemathesis(&server, &file, &[]) else { return };
-    assert!(good, "{said}");
+    let Some((good, printed)) = schemathesis(&server, &file, &[]) else { return };
+    assert!(good, "{printed}");
     for phase in ["Coverage", "Fuzzing", "Stateful"] {
-        assert!(said.contains(phase), "no phase {phase}: {said}");
+        assert!(printed.contains(phase), "no phase {phase}: {printed}");
     }
     assert_eq!(server.get("/livez").status, 200);
 }
 
 #[test]
-fn a_description_that_is_wrong_is_noticed() {
+fn wrong_descriptions_are_detected() {
     let server = server();
     let description = server.get("/openapi.json").json();
     let doctored = |change: &dyn Fn(&mut Value)| {
@@ -69,20 +69,20 @@ fn a_description_that_is_wrong_is_noticed() {
         std::fs::write(&file, description.to_string()).unwrap();
         schemathesis(&server, &file, &["--include-operation-id", "showJob", "--phases", "coverage,fuzzing"])
     };
-    let Some((good, said)) = doctored(&|_| {}) else { return };
-    assert!(good, "the control's control: {said}");
-    let (good, said) = doctored(&|responses| drop(responses.as_object_mut().unwrap().remove("404"))).unwrap();
-    assert!(!good && said.contains("404"), "a status is missing: {said}");
-    let (good, said) = doctored(&|responses| {
+    let Some((good, printed)) = doctored(&|_| {}) else { return };
+    assert!(good, "the unchanged description passes: {printed}");
+    let (good, printed) = doctored(&|responses| drop(responses.as_object_mut().unwrap().remove("404"))).unwrap();
+    assert!(!good && printed.contains("404"), "missing status: {printed}");
+    let (good, printed) = doctored(&|responses| {
         let content = &mut responses["404"]["content"];
         *content = serde_json::json!({ "application/json": content["application/problem+json"] });
     })
     .unwrap();
-    assert!(!good && said.contains("application/problem+json"), "a media type is wrong: {said}");
-    let (good, said) = doctored(&|responses| {
+    assert!(!good && printed.contains("application/problem+json"), "wrong media type: {printed}");
+    let (good, printed) = doctored(&|responses| {
         let schema = &mut responses["404"]["content"]["application/problem+json"]["schema"];
         schema["allOf"][1]["properties"]["type"]["enum"] = serde_json::json!(["/problems/no-such-thing"]);
     })
     .unwrap();
-    assert!(!good && said.contains("no-such-thing"), "a schema is wrong: {said}");
+    assert!(!good && printed.contains("no-such-thing"), "wrong schema: {printed}");
 }

@@ -1,4 +1,4 @@
-//! The whole service on S3: what it promises there, what it serves from there, and what it says while S3 is away.
+//! The service with its store on S3: asynchronous jobs, stored results, and behaviour while S3 is unavailable.
 
 use crate::http_support;
 use crate::store_support;
@@ -21,14 +21,14 @@ use serde_json::Value;
 use store_support::Service;
 
 const LATER: (&str, &str) = ("prefer", "respond-async");
-const PATIENCE: Duration = Duration::from_mins(2);
+const TIMEOUT: Duration = Duration::from_mins(2);
 
-/// Waits for something to become true.
+/// Waits until a condition holds.
 #[track_caller]
 fn until(what: &str, mut is: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !is() {
-        assert!(begun.elapsed() < PATIENCE, "{what} did not come");
+        assert!(begun.elapsed() < TIMEOUT, "timed out waiting for {what}");
         std::thread::sleep(Duration::from_millis(20));
     }
 }
@@ -38,15 +38,15 @@ fn get(addr: SocketAddr, path: &str) -> Reply {
     send(addr, "GET", path, &[], b"")
 }
 
-/// Promises a job and gives its address.
+/// Submits an asynchronous job and returns its URL.
 #[track_caller]
-fn promise(addr: SocketAddr, path: &str, body: &[u8]) -> String {
+fn submit(addr: SocketAddr, path: &str, body: &[u8]) -> String {
     let reply = send(addr, "POST", path, &[LATER], body);
     assert_eq!(reply.status, 202, "{}", String::from_utf8_lossy(&reply.body));
     reply.header("location").unwrap().to_owned()
 }
 
-/// The document of a job that ends well.
+/// Waits for a job to succeed and returns its document.
 #[track_caller]
 fn successful(addr: SocketAddr, job: &str) -> Value {
     let mut document = Value::Null;
@@ -60,7 +60,7 @@ fn successful(addr: SocketAddr, job: &str) -> Value {
     document
 }
 
-/// The address of its result, and the result.
+/// Returns the URL of a job's result, and the result.
 #[track_caller]
 fn result(addr: SocketAddr, job: &str) -> (String, Reply) {
     successful(addr, job);
@@ -72,7 +72,7 @@ fn result(addr: SocketAddr, job: &str) -> (String, Reply) {
     (address, reply)
 }
 
-/// Checks that a result can be had in parts, known by a strong `ETag`.
+/// Asserts that ranges of a result are served with a strong `ETag`.
 #[track_caller]
 fn in_parts(addr: SocketAddr, address: &str, whole: &Reply) {
     let etag = whole.header("etag").unwrap();
@@ -91,7 +91,7 @@ fn in_parts(addr: SocketAddr, address: &str, whole: &Reply) {
     assert_eq!(send(addr, "GET", address, &[("if-none-match", etag)], b"").status, 304);
 }
 
-/// A server process whose store is on S3, and everything that it says.
+/// Server process with its store on S3, and its output.
 struct Process {
     child: Child,
     addr: SocketAddr,
@@ -131,13 +131,13 @@ impl Process {
                 let (_, rest) = line.trim_start().strip_prefix("viewer")?.split_once("http://")?;
                 rest.split(|c: char| c != '.' && c != ':' && !c.is_ascii_digit()).next()?.parse().ok()
             });
-            assert!(addr.is_some() || child.try_wait().unwrap().is_none(), "it ended: {log}");
+            assert!(addr.is_some() || child.try_wait().unwrap().is_none(), "the process ended: {log}");
             addr.is_some()
         });
         Self { child, addr: addr.unwrap(), log }
     }
 
-    /// `kill -9`; what it said until then.
+    /// Kills the process (`kill -9`) and returns its output.
     fn kill(mut self) -> String {
         self.child.kill().unwrap();
         self.child.wait().unwrap();
@@ -145,7 +145,7 @@ impl Process {
     }
 }
 
-/// Whether there is the record of a job that has not ended.
+/// Returns true if a job's record is open.
 fn any_open(service: &Service, prefix: &str, data_dir: &Path) -> bool {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().unwrap();
     runtime.block_on(async {
@@ -160,31 +160,31 @@ fn any_open(service: &Service, prefix: &str, data_dir: &Path) -> bool {
 }
 
 #[test]
-fn what_was_promised_on_s3_survives_kill_nine() {
+fn asynchronous_jobs_on_s3_survive_kill() {
     let service = Service::start(&["--guarded"]);
     let folder = tempfile::tempdir().unwrap();
     let query = "/v1/meshes?format=stl&resolution=1";
     let mut log = String::new();
     let mut jobs: Vec<(usize, String)> = Vec::new();
-    // The jobs of a round take the only worker much longer than it takes to kill it; one that is left over is enough.
+    // The jobs of a round occupy the only worker for much longer than the kill takes; one open job suffices.
     let open = (0..5).any(|round| {
-        // Nothing of a process is left to the next one but what is on S3.
+        // Processes share nothing but S3.
         let data_dir = folder.path().join(round.to_string());
         let server = Process::start(&service, "killed", &data_dir);
         for n in 3 * round..3 * round + 3 {
-            jobs.push((n, promise(server.addr, query, &sample(n))));
+            jobs.push((n, submit(server.addr, query, &sample(n))));
         }
         log += &server.kill();
         any_open(&service, "killed", folder.path())
     });
-    assert!(open, "no job was left undone");
+    assert!(open, "no job was open");
     let server = Process::start(&service, "killed", &folder.path().join("last"));
-    let judge = start(Arc::new(ReferenceBackend), |_| {});
-    let (_, expected) = result(judge.addr, &promise(judge.addr, query, &sample(jobs[0].0)));
+    let reference = start(Arc::new(ReferenceBackend), |_| {});
+    let (_, expected) = result(reference.addr, &submit(reference.addr, query, &sample(jobs[0].0)));
     let mut etags = Vec::new();
     for (n, job) in &jobs {
         let (address, reply) = result(server.addr, job);
-        assert!(reply.body == expected.body, "job {n} has other bytes than on a folder");
+        assert!(reply.body == expected.body, "job {n} has different bytes than with a local store");
         etags.push(reply.header("etag").unwrap().to_owned());
         if *n == jobs[0].0 {
             assert_eq!(reply.header("etag"), expected.header("etag"));
@@ -192,31 +192,31 @@ fn what_was_promised_on_s3_survives_kill_nine() {
         }
     }
     etags.dedup();
-    assert_eq!(etags.len(), jobs.len(), "every input has a result of its own");
+    assert_eq!(etags.len(), jobs.len(), "every input has its own result");
     log += &server.kill();
-    // It says a lot, and where it keeps things; not what lets it in.
+    // The log names the location but not the credentials.
     assert!(log.contains("s3://meshes/killed") && log.contains("DEBUG"), "{log}");
     assert!(!log.contains(&service.access.secret), "the secret is in the log");
 }
 
 #[test]
-fn what_s3_keeps_is_what_a_folder_keeps() {
+fn s3_and_a_local_store_have_the_same_objects() {
     let service = Service::start(&[]);
     let on_s3 = |c: &mut molmesh::config::Config| {
         c.store = service.config("same");
         c.store.memory_bytes = 0;
     };
     let backend = || -> Arc<dyn Backend> { Arc::new(CpuBackend::new(None).unwrap()) };
-    let (server, judge) = (start(backend(), on_s3), start(backend(), |_| {}));
+    let (server, reference) = (start(backend(), on_s3), start(backend(), |_| {}));
     let upload = |addr| send(addr, "POST", "/v1/structures", &[], SAMPLE);
     let created = upload(server.addr);
-    assert_eq!((created.status, upload(server.addr).status, upload(judge.addr).status), (201, 200, 201));
+    assert_eq!((created.status, upload(server.addr).status, upload(reference.addr).status), (201, 200, 201));
     let structure = created.header("location").unwrap();
     assert!(server.join());
-    // Another process, which has been sent nothing.
+    // Another process on the same bucket.
     let server = start(backend(), on_s3);
     let mut seen = Vec::new();
-    // The last one goes to S3 in parts: it is larger than one.
+    // The last result is stored as a multipart upload.
     for file in [
         "surface.glb?resolution=1",
         "surface.stl?resolution=1",
@@ -224,7 +224,7 @@ fn what_s3_keeps_is_what_a_folder_keeps() {
         "surface.stl?resolution=0.24",
     ] {
         let path = format!("{structure}/{file}");
-        let (fresh, expected) = (get(server.addr, &path), get(judge.addr, &path));
+        let (fresh, expected) = (get(server.addr, &path), get(reference.addr, &path));
         assert_eq!((fresh.status, fresh.complete, expected.status), (200, true, 200), "{file}");
         assert!(fresh.body == expected.body && fresh.header("etag") == expected.header("etag"), "{file}");
         let address = fresh.header("content-location").unwrap();
@@ -238,10 +238,10 @@ fn what_s3_keeps_is_what_a_folder_keeps() {
     }
     assert!(seen.last().unwrap().len() > 8 << 20, "{}", seen.last().unwrap().len());
     seen.dedup();
-    assert_eq!(seen.len(), 4, "four files, four contents");
+    assert_eq!(seen.len(), 4, "four different files");
 }
 
-/// A backend that begins when it is let.
+/// Backend that waits until it is opened.
 struct Gated {
     fake: Arc<Fake>,
     open: AtomicBool,
@@ -276,7 +276,7 @@ impl Backend for Gated {
 }
 
 #[test]
-fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
+fn asynchronous_jobs_survive_an_s3_outage() {
     let mut service = Service::start(&["--guarded"]);
     let fake = Fake::new(Mode::Octahedra);
     let backend =
@@ -290,15 +290,15 @@ fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
     let addr = server.addr;
     let mesh = |n| send(addr, "POST", "/v1/meshes?format=stl", &[], &sample(n));
 
-    // What there is before: a structure, a result.
+    // Existing objects: a structure and a result.
     let structure = send(addr, "POST", "/v1/structures", &[], SAMPLE).header("location").unwrap().to_owned();
     let before = get(addr, &format!("{structure}/surface.stl"));
     let kept = before.header("content-location").unwrap().to_owned();
     assert_eq!((before.status, get(addr, &kept).status), (200, 200));
 
-    // Two jobs are in the house when it goes away: one that somebody waits for, one that was promised.
+    // Two jobs run when S3 becomes unavailable: a synchronous and an asynchronous one.
     backend.open.store(false, Ordering::SeqCst);
-    let promised = promise(addr, "/v1/meshes?format=stl", &sample(1));
+    let accepted = submit(addr, "/v1/meshes?format=stl", &sample(1));
     let waiting = std::thread::spawn(move || send(addr, "POST", "/v1/meshes?format=stl", &[], &sample(2)));
     until("both jobs", || backend.waiting.load(Ordering::SeqCst) == 2);
     service.away();
@@ -306,9 +306,9 @@ fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
     let reply = waiting.join().unwrap();
     assert_eq!((reply.status, reply.complete, reply.body == before.body), (200, true, true));
     until("an attempt to keep the result", || !log_lines("the store rejected a write; retrying").is_empty());
-    assert_eq!(get(addr, &promised).json()["status"], "running");
+    assert_eq!(get(addr, &accepted).json()["status"], "running");
 
-    // What needs the store is refused, in words for clients; what does not is done.
+    // Requests that need the store are rejected with a message for clients; others succeed.
     let refused = || {
         [
             send(addr, "POST", "/v1/meshes?format=stl", &[LATER], &sample(3)),
@@ -329,17 +329,17 @@ fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
     assert_eq!((get(addr, "/livez").status, get(addr, "/readyz").status), (200, 200));
     assert!(server.metric("molmesh_store_errors_total", &[]) >= 1.0);
 
-    // It comes back: the promise is kept with the mesh that was made then.
+    // S3 returns: the asynchronous job succeeds without meshing again.
     let made = fake.finished.load(Ordering::SeqCst);
     service.back();
-    let document = successful(addr, &promised);
+    let document = successful(addr, &accepted);
     assert_eq!((&document["attempts"], fake.finished.load(Ordering::SeqCst)), (&1.into(), made));
-    let (address, reply) = result(addr, &promised);
+    let (address, reply) = result(addr, &accepted);
     assert!(reply.body == before.body);
     in_parts(addr, &address, &reply);
     assert_eq!(refused().map(|reply| reply.status), [202, 201, 200, 200, 200]);
 
-    // It goes away for good: nothing new is begun on it.
+    // S3 fails permanently: no new jobs or processes start.
     let place = service.config("away");
     let access = service.access.clone();
     let elsewhere = tempfile::tempdir().unwrap();
@@ -347,9 +347,9 @@ fn while_s3_is_away_the_service_says_so_and_keeps_its_promises() {
     drop(service);
     send(addr, "POST", "/v1/meshes?format=stl", &[LATER], &sample(6)).problem(503, "store-failed");
     let refused = starting.output().unwrap();
-    let words = String::from_utf8(refused.stderr).unwrap();
-    assert!(!refused.status.success() && words.contains("store.url"), "{words}");
-    assert!(words.contains(place.url.as_deref().unwrap()) && !words.contains(&access.secret), "{words}");
-    assert!(!log_lines("s3://meshes/away").is_empty(), "the log says where");
+    let output = String::from_utf8(refused.stderr).unwrap();
+    assert!(!refused.status.success() && output.contains("store.url"), "{output}");
+    assert!(output.contains(place.url.as_deref().unwrap()) && !output.contains(&access.secret), "{output}");
+    assert!(!log_lines("s3://meshes/away").is_empty(), "the log does not name the location");
     assert!(log_lines(&access.secret).is_empty(), "the secret is in the log");
 }

@@ -1,5 +1,5 @@
-//! Clients that take a response body slowly or not at all, over raw HTTP/2 frames and small socket buffers: who is cut
-//! off, who is not, and what it costs meanwhile.
+//! Clients that read a response body slowly or not at all, over raw HTTP/2 frames and small socket buffers: which of
+//! them are disconnected, and their cost for the server.
 #![cfg(target_os = "linux")]
 
 use crate::http_support;
@@ -23,10 +23,10 @@ const END_STREAM: u8 = 1;
 /// Streams on one connection: `server.streams`.
 const STREAMS: u32 = 64;
 
-/// Metrics and descriptors belong to the process: one test at a time.
-fn alone() -> MutexGuard<'static, ()> {
-    static ALONE: Mutex<()> = Mutex::new(());
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+/// Serialises the tests, because metrics and file descriptors belong to the process.
+fn serialize() -> MutexGuard<'static, ()> {
+    static SERIAL: Mutex<()> = Mutex::new(());
+    SERIAL.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn serve(change: impl FnOnce(&mut Config)) -> Running {
@@ -36,11 +36,11 @@ fn serve(change: impl FnOnce(&mut Config)) -> Running {
     })
 }
 
-/// Makes a result of `400 * atoms` bytes and a few more; returns its path.
+/// Computes a result of about `400 * atoms` bytes and returns its path.
 fn result(server: &Running, atoms: usize) -> String {
     let path =
         server.post("/v1/meshes?format=stl", &[], &carbons(atoms)).header("content-location").unwrap().to_owned();
-    wait_for("it is kept", || server.get(&path).status == 200);
+    wait_for("the result is stored", || server.get(&path).status == 200);
     path
 }
 
@@ -65,7 +65,7 @@ struct Seen {
     reset: bool,
 }
 
-/// An HTTP/2 connection in raw frames.
+/// HTTP/2 connection in raw frames.
 struct H2 {
     socket: TcpStream,
     unread: Vec<u8>,
@@ -73,7 +73,7 @@ struct H2 {
 }
 
 impl H2 {
-    /// Asks for every path on a stream of its own, with this window for each.
+    /// Requests each path on a separate stream with this flow-control window.
     fn ask(addr: SocketAddr, window: u32, paths: &[&str]) -> Self {
         let mut socket = connect(addr);
         let setting = [&[0, 4][..], &window.to_be_bytes()].concat();
@@ -82,7 +82,7 @@ impl H2 {
             .unwrap();
         let mut seen = BTreeMap::new();
         for (n, path) in (0..).zip(paths) {
-            // GET, http, and two literals: :path and :authority (RFC 7541).
+            // HPACK (RFC 7541): GET, http, and two literals, `:path` and `:authority`.
             let path = [&[0x04, u8::try_from(path.len()).unwrap()], path.as_bytes()].concat();
             let head = [&[0x82, 0x86][..], &path, b"\x01\x01t"].concat();
             socket.write_all(&frame(HEADERS, 0x4 | END_STREAM, 2 * n + 1, &head)).unwrap();
@@ -101,7 +101,7 @@ impl H2 {
         self.socket.write_all(&frames).unwrap();
     }
 
-    /// Reads what comes within `time`.
+    /// Reads the frames that arrive within `time`.
     fn read(&mut self, time: Duration) {
         let end = Instant::now() + time;
         let mut some = vec![0; 64 << 10];
@@ -143,8 +143,8 @@ impl H2 {
     }
 }
 
-/// A connection whose kernel buffers little, as a phone's line does.
-fn thin(addr: SocketAddr) -> TcpStream {
+/// Connects with small kernel buffers, as on a slow line.
+fn connect_with_small_buffers(addr: SocketAddr) -> TcpStream {
     let socket = Socket::new(Domain::IPV4, Type::STREAM, None).unwrap();
     socket.set_recv_buffer_size(16 << 10).unwrap();
     socket.connect(&addr.into()).unwrap();
@@ -152,10 +152,10 @@ fn thin(addr: SocketAddr) -> TcpStream {
 }
 
 #[test]
-fn stalled_readers_lose_their_streams_and_nothing_else() {
-    let _alone = alone();
+fn stalled_readers_lose_only_their_streams() {
+    let _serial = serialize();
     let server = serve(|c| (c.server.write_timeout_ms, c.server.write_bytes) = (3000, 8 << 10));
-    // From a file, from memory, and one that fits into the send buffer together with its end.
+    // From a file, from memory, and one that fits into the send buffer with its last frame.
     let paths = [result(&server, 20_000), result(&server, 2000), result(&server, 50)];
     let (files, before) = (open_files(), cut_off(&server));
     let asked: Vec<&str> = (0..STREAMS as usize).map(|n| paths[n % 3].as_str()).collect();
@@ -164,12 +164,12 @@ fn stalled_readers_lose_their_streams_and_nothing_else() {
     let begun = Instant::now();
     let mut slowest = Duration::ZERO;
     while !attackers.iter().all(|attacker| attacker.all(|seen| seen.reset)) {
-        assert!(begun.elapsed() < Duration::from_secs(20), "some were not cut off");
+        assert!(begun.elapsed() < Duration::from_secs(20), "some were not disconnected");
         for attacker in &mut attackers {
             attacker.grant(1, false);
             attacker.read(Duration::from_millis(20));
         }
-        // Their memory is charged and small, and they hold no files. Their sockets count twice here.
+        // They hold little memory and no files. Their sockets count twice in this process.
         let held = server.metric("molmesh_memory_held_bytes", &[]);
         let pieces = held / f64::from(4 * STREAMS) / 16_384.0;
         assert!(pieces < 2.5, "{held} bytes");
@@ -189,20 +189,20 @@ fn stalled_readers_lose_their_streams_and_nothing_else() {
         server.metric("molmesh_memory_held_bytes", &[]) < 1.0
             && server.metric("molmesh_response_bodies_open", &[]) < 1.0
     });
-    // The connections serve on.
+    // The connections remain usable.
     for attacker in &mut attackers {
         attacker.read(Duration::from_millis(1));
     }
 }
 
 #[test]
-fn readers_above_the_minimum_rate_get_everything() {
-    let _alone = alone();
+fn readers_above_the_minimum_rate_get_the_whole_body() {
+    let _serial = serialize();
     let server = serve(|_| {});
     let path = result(&server, 2000);
     let (length, before) = (server.get(&path).body.len(), cut_off(&server));
     std::thread::scope(|scope| {
-        // Several bodies at once over HTTP/2, each at four times the least pace.
+        // Several concurrent bodies over HTTP/2, each at four times the minimum rate.
         scope.spawn(|| {
             let mut reader = H2::ask(server.addr, 0, &[path.as_str(); 4]);
             reader.socket.write_all(&frame(WINDOW_UPDATE, 0, 0, &(1_u32 << 30).to_be_bytes())).unwrap();
@@ -213,9 +213,9 @@ fn readers_above_the_minimum_rate_get_everything() {
             }
             assert!(reader.all(|seen| seen.bytes == length), "{:?}", reader.seen);
         });
-        // HTTP/1.1, where the kernel hides from the server what was taken until there is room for more.
+        // Over HTTP/1.1 the kernel hides progress from the server until its buffer has space.
         scope.spawn(|| {
-            let mut reader = thin(server.addr);
+            let mut reader = connect_with_small_buffers(server.addr);
             write!(reader, "GET {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\n\r\n").unwrap();
             let (mut some, mut bytes) = (vec![0; 32 << 10], 0);
             loop {
@@ -232,18 +232,18 @@ fn readers_above_the_minimum_rate_get_everything() {
 }
 
 #[test]
-fn a_byte_now_and_then_is_no_progress_over_http1_either() {
-    let _alone = alone();
+fn http1_readers_below_the_minimum_rate_are_disconnected() {
+    let _serial = serialize();
     let server = serve(|_| {});
     let path = result(&server, 20_000);
     let before = cut_off(&server);
-    let mut reader = thin(server.addr);
+    let mut reader = connect_with_small_buffers(server.addr);
     write!(reader, "GET {path} HTTP/1.1\r\nhost: t\r\n\r\n").unwrap();
     let start = Instant::now();
     let mut byte = [0; 1];
     while cut_off(&server) < before + 1.0 {
-        assert!(start.elapsed() < Duration::from_secs(20), "it was not cut off");
-        // Once it is cut off, there may be nothing more to read.
+        assert!(start.elapsed() < Duration::from_secs(20), "it was not disconnected");
+        // Afterwards there may be no data left to read.
         if reader.read(&mut byte).is_err() {
             break;
         }
@@ -255,13 +255,13 @@ fn a_byte_now_and_then_is_no_progress_over_http1_either() {
 }
 
 #[test]
-fn event_streams_may_be_as_slow_as_they_like() {
-    let _alone = alone();
+fn event_streams_have_no_minimum_rate() {
+    let _serial = serialize();
     let server = start(Fake::new(Mode::Held), |c| {
         (c.server.write_timeout_ms, c.server.drain_timeout_ms) = (300, 100);
     });
-    let promised = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
-    let events = format!("{}/events", promised.header("location").unwrap());
+    let accepted = server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE);
+    let events = format!("{}/events", accepted.header("location").unwrap());
     let mut listener = H2::ask(server.addr, 0, &[&events]);
     listener.read(Duration::from_millis(1500));
     assert!(listener.all(|seen| !seen.reset && seen.bytes == 0), "{:?}", listener.seen);

@@ -1,5 +1,5 @@
-//! Over HTTP: how fine a mesh is by level of detail or by a bound on triangles, files without normals and in other units. The
-//! names are the same in query, form and document.
+//! Grid spacing over HTTP by level of detail or by a limit on triangles; files without normals and in other units.
+//! Names are the same in query, form and JSON document.
 
 use crate::http_support;
 use crate::tools;
@@ -28,7 +28,7 @@ fn mesh(server: &Running, query: &str) -> Reply {
     good(server.post(&format!("/v1/meshes?{query}"), &[], SAMPLE))
 }
 
-/// The same parameter in a query, a form and a document, and under an entry's address.
+/// Sends the same parameter in a query, a form, a JSON document and for an archive entry.
 fn everywhere(server: &Running, name: &str, value: &Value) -> [Reply; 4] {
     let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
     let mut form = format!("--XX\r\ncontent-disposition: form-data; name=\"{name}\"\r\n\r\n{text}\r\n").into_bytes();
@@ -45,7 +45,7 @@ fn everywhere(server: &Running, name: &str, value: &Value) -> [Reply; 4] {
 }
 
 #[test]
-fn every_way_of_asking_gives_the_same_bytes() {
+fn query_form_document_and_entry_give_the_same_bytes() {
     let server = server();
     let plain = mesh(&server, "");
     let mut tags = vec![plain.header("etag").unwrap().to_owned()];
@@ -63,18 +63,18 @@ fn every_way_of_asking_gives_the_same_bytes() {
             assert!(other.body == first.body, "{name}");
             assert_eq!(other.header("etag"), first.header("etag"), "{name}");
             assert_eq!(other.header("molmesh-resolution"), first.header("molmesh-resolution"), "{name}");
-            assert_eq!(other.header("molmesh-resolution-from"), Some(from), "{name}: kept or fresh");
+            assert_eq!(other.header("molmesh-resolution-from"), Some(from), "{name}: stored or computed");
         }
         tags.push(first.header("etag").unwrap().to_owned());
     }
     let n = tags.len();
     tags.sort();
     tags.dedup();
-    assert_eq!(tags.len(), n, "different files have different names");
+    assert_eq!(tags.len(), n, "different files have different ETags");
 }
 
 #[test]
-fn what_was_chosen_is_said() {
+fn responses_report_the_chosen_spacing() {
     let server = server();
     let bounded = mesh(&server, "max_triangles=5000");
     let number = |name: &str| bounded.header(name).unwrap().parse::<f64>().unwrap();
@@ -94,7 +94,7 @@ fn what_was_chosen_is_said() {
 }
 
 #[test]
-fn contradictions_and_what_cannot_be_are_refused_with_numbers() {
+fn contradictory_and_impossible_parameters_are_rejected() {
     let server = server();
     for (query, one, other) in [
         ("detail=3&resolution=1", "resolution", "detail"),
@@ -118,7 +118,7 @@ fn contradictions_and_what_cannot_be_are_refused_with_numbers() {
     assert_eq!(problem["resolution"], 4.0);
     let fewest = problem["actual"].as_u64().unwrap();
     assert!(fewest > 20, "{problem}");
-    // As few as that can be had, and one fewer cannot.
+    // The smallest possible limit on triangles; one less is impossible.
     let least = mesh(&server, &format!("max_triangles={fewest}"));
     assert!(least.header("molmesh-triangles").unwrap().parse::<u64>().unwrap() <= fewest);
     let below = server.post(&format!("/v1/meshes?max_triangles={}", fewest - 1), &[], SAMPLE);
@@ -132,12 +132,12 @@ fn contradictions_and_what_cannot_be_are_refused_with_numbers() {
         let expected = problem["expected"].as_str().unwrap();
         assert!(expected.contains("nanometer") && expected.contains("glb, gltf"), "{problem}");
     }
-    // A report is of no format.
+    // A report has no format.
     mesh(&server, "units=meter&report=json");
 }
 
 #[test]
-fn estimates_and_capabilities_know_them() {
+fn estimates_and_capabilities_support_spacing_parameters() {
     let server = server();
     let estimate = |query: &str| good(server.post(&format!("/v1/estimate?{query}"), &[], SAMPLE)).json();
     let bounded = estimate("max_triangles=5000");
@@ -163,14 +163,14 @@ fn estimates_and_capabilities_know_them() {
     assert_eq!(parameter("units")["values"], json!(["angstrom", "nanometer", "meter"]));
 }
 
-/// A promised job is made from the parameters on record, not from those in memory.
+/// An asynchronous job is run with its recorded parameters.
 #[test]
-fn promised_jobs_keep_them() {
+fn asynchronous_jobs_use_their_recorded_parameters() {
     let server = server();
     let query = "/v1/meshes?max_triangles=3000&normals=none&units=nanometer&format=ply";
-    let promised = server.post(query, &[("prefer", "respond-async")], SAMPLE);
-    assert_eq!(promised.status, 202, "{}", promised.text());
-    let job = promised.header("location").unwrap().to_owned();
+    let accepted = server.post(query, &[("prefer", "respond-async")], SAMPLE);
+    assert_eq!(accepted.status, 202, "{}", accepted.text());
+    let job = accepted.header("location").unwrap().to_owned();
     let end = good(server.get(&format!("{job}?wait=15"))).json();
     assert_eq!(end["status"], "successful", "{end}");
     let result = server.get(&format!("{job}/result"));
@@ -182,7 +182,7 @@ fn promised_jobs_keep_them() {
 }
 
 #[test]
-fn the_oracles_read_what_is_served() {
+fn external_readers_accept_served_files() {
     let server = server();
     let (mut all, mut gltf) = (Files::new(), Files::new());
     let mut expected = Vec::new();
@@ -206,7 +206,7 @@ fn the_oracles_read_what_is_served() {
     let plain = reports[0].bounds;
     for (found, (format, bare, scale)) in reports.iter().zip(expected) {
         assert_eq!(found.error, None);
-        // OBJ's four decimals may make a triangle's corners meet, which is no fault of the surface.
+        // Four decimals of OBJ may make corners of a triangle coincide, which is not a fault of the surface.
         assert!(found.watertight && found.winding_consistent && found.bad_edges == 0, "{found:#?}");
         assert!((found.area / (area * scale * scale) - 1.0).abs() < 1e-3, "{found:#?}");
         assert!((found.volume / (volume * scale * scale * scale) - 1.0).abs() < 1e-3, "{found:#?}");

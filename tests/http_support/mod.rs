@@ -1,8 +1,7 @@
-//! A server in this process, backends that misbehave on command, and a client that speaks HTTP/1.1 by hand, so that it
-//! can misbehave as well.
-#![allow(dead_code, reason = "every test binary uses its own part")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
-#![allow(clippy::format_push_string, reason = "requests read best as they are sent")]
+//! Server in this process, fake backends, and an HTTP/1.1 client that can misbehave.
+#![allow(dead_code, reason = "each test binary uses a part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
+#![allow(clippy::format_push_string, reason = "requests are readable in the order in which they are sent")]
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -19,39 +18,39 @@ use molmesh::surface::{
     SurfaceParams,
 };
 
-/// The sample that ships with the product.
+/// Sample of the product.
 pub(crate) const SAMPLE: &[u8] = include_bytes!("../../samples/4pti.pdb");
 
-/// What a fake backend does with a job.
+/// Behaviour of the fake backend.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Mode {
-    /// An octahedron around every sphere.
+    /// Returns an octahedron for each sphere.
     Octahedra,
-    /// The same after a while, unless it is cancelled.
+    /// Like `Octahedra` after a delay, unless cancelled.
     Slow(Duration),
-    /// The same once another mode is set.
+    /// Like `Octahedra` once another mode is set.
     Held,
-    /// Never looks at the cancel token.
-    Deaf(Duration),
+    /// Ignores the cancel token.
+    Uncancellable(Duration),
     /// Panics.
     Panic,
-    /// Fails as a backend that needs too many samples.
+    /// Fails with too many grid points.
     GridTooLarge,
-    /// Fails for want of a surface.
+    /// Fails without a surface.
     NoSurface,
-    /// A mesh with a normal too few, which no writer takes.
+    /// Returns a mesh with a missing normal, which every writer rejects.
     Broken,
 }
 
-/// A backend that does as it is told, and says what happened to it. The warm-up is always an octahedron, unless
-/// `also_warm` is set.
+/// Backend with a configurable behaviour that counts its jobs. The warm-up is always an octahedron unless `also_warm`
+/// is set.
 pub(crate) struct Fake {
     pub(crate) mode: Mutex<Mode>,
     pub(crate) also_warm: AtomicBool,
     pub(crate) started: AtomicUsize,
     pub(crate) finished: AtomicUsize,
     pub(crate) cancelled: AtomicUsize,
-    /// Atoms of every job, in the order in which they began.
+    /// Number of atoms of each job in the order of their start.
     pub(crate) begun: Mutex<Vec<usize>>,
 }
 
@@ -116,8 +115,8 @@ impl Backend for Fake {
                     std::thread::sleep(Duration::from_millis(5));
                 }
             }
-            Mode::Deaf(time) => std::thread::sleep(time),
-            Mode::Panic => panic!("told to"),
+            Mode::Uncancellable(time) => std::thread::sleep(time),
+            Mode::Panic => panic!("panic of a test"),
             Mode::GridTooLarge => {
                 return Err(SurfaceError::GridTooLarge {
                     samples: 1000,
@@ -165,7 +164,7 @@ fn octahedra(spheres: &Spheres) -> Mesh {
     Mesh { positions: positions.into(), normals: normals.into(), triangles: triangles.into(), ..Mesh::default() }
 }
 
-/// Everything that was logged in this process.
+/// Log of this process.
 static LOG: LazyLock<Arc<Mutex<Vec<u8>>>> = LazyLock::new(|| {
     let log = Arc::new(Mutex::new(Vec::new()));
     let sink = Sink(Arc::clone(&log));
@@ -192,17 +191,17 @@ impl Write for Sink {
     }
 }
 
-/// The log lines that hold `text`.
+/// Returns the log lines that contain `text`.
 pub(crate) fn log_lines(text: &str) -> Vec<String> {
     let log = LOG.lock().unwrap();
     String::from_utf8_lossy(&log).lines().filter(|line| line.contains(text)).map(str::to_owned).collect()
 }
 
-/// A running server.
+/// Running server, stopped on drop.
 pub(crate) struct Running {
     pub(crate) addr: SocketAddr,
     pub(crate) metrics: SocketAddr,
-    orders: tokio::sync::watch::Sender<Stop>,
+    stop_sender: tokio::sync::watch::Sender<Stop>,
     thread: Option<JoinHandle<bool>>,
     pub(crate) dir: tempfile::TempDir,
 }
@@ -219,7 +218,7 @@ pub(crate) fn start_cold(backend: Arc<dyn Backend>, change: impl FnOnce(&mut Con
     start_on(backend, Vec::new(), change)
 }
 
-/// Starts a server that says that it has found these devices.
+/// Starts a server with the given detected devices.
 pub(crate) fn start_on(
     backend: Arc<dyn Backend>,
     found: Vec<FoundDevice>,
@@ -231,21 +230,21 @@ pub(crate) fn start_on(
     config.server.listen = "127.0.0.1:0".parse().unwrap();
     config.server.metrics_listen = Some("127.0.0.1:0".parse().unwrap());
     dir.path().clone_into(&mut config.server.data_dir);
-    // Tests stay on this machine unless they bring an archive of their own.
+    // Tests do not use a remote archive unless they configure one.
     config.archive.url = None;
     change(&mut config);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
-    let drawer = Drawer::cpu("a test says so");
-    let chosen = Chosen { backend, reason: "a test says so".to_owned(), drawer, devices: found };
+    let drawer = Drawer::cpu("set by a test");
+    let chosen = Chosen { backend, reason: "set by a test".to_owned(), drawer, devices: found };
     let server = runtime.block_on(Server::bind(config, chosen)).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
-    let (orders, ordered) = tokio::sync::watch::channel(Stop::Serve);
+    let (stop_sender, stop_receiver) = tokio::sync::watch::channel(Stop::Serve);
     let thread = std::thread::spawn(move || {
-        let drained = runtime.block_on(server.run(ordered)).unwrap();
+        let drained = runtime.block_on(server.run(stop_receiver)).unwrap();
         runtime.shutdown_timeout(Duration::from_secs(1));
         drained
     });
-    Running { addr, metrics, orders, thread: Some(thread), dir }
+    Running { addr, metrics, stop_sender, thread: Some(thread), dir }
 }
 
 impl Running {
@@ -257,7 +256,7 @@ impl Running {
         send(self.addr, "POST", path, headers, body)
     }
 
-    /// The sum of a metric's samples whose line holds all of `labels`.
+    /// Returns the sum of a metric's samples whose labels contain all of `labels`.
     pub(crate) fn metric(&self, name: &str, labels: &[&str]) -> f64 {
         let text = send(self.metrics, "GET", "/metrics", &[], b"").text();
         let of_name =
@@ -269,23 +268,23 @@ impl Running {
             .sum()
     }
 
-    /// Says to stop and to finish what has begun, without waiting.
+    /// Requests a drain without waiting for it.
     pub(crate) fn stop(&mut self) {
-        self.order(Stop::Drain);
+        self.request_stop(Stop::Drain);
     }
 
-    /// Says to come so far to an end, unless it is further already.
-    pub(crate) fn order(&self, stop: Stop) {
-        self.orders.send_if_modified(|now| std::mem::replace(now, (*now).max(stop)) < stop);
+    /// Requests a stop unless a stricter one was requested.
+    pub(crate) fn request_stop(&self, stop: Stop) {
+        self.stop_sender.send_if_modified(|now| std::mem::replace(now, (*now).max(stop)) < stop);
     }
 
-    /// Stops and waits: true if every request was finished.
+    /// Drains and waits. Returns true if every request was finished.
     pub(crate) fn join(mut self) -> bool {
         self.stop();
         self.wait()
     }
 
-    /// Waits for the end that was ordered: true if every request was finished. The folder is still there then.
+    /// Waits for the requested stop. Returns true if every request was finished. The data folder still exists.
     pub(crate) fn wait(&mut self) -> bool {
         self.thread.take().unwrap().join().unwrap()
     }
@@ -300,13 +299,13 @@ impl Drop for Running {
     }
 }
 
-/// An answer.
+/// HTTP response.
 #[derive(Debug)]
 pub(crate) struct Reply {
     pub(crate) status: u16,
     pub(crate) headers: Vec<(String, String)>,
     pub(crate) body: Vec<u8>,
-    /// The body came whole.
+    /// True if the body was received completely.
     pub(crate) complete: bool,
 }
 
@@ -323,7 +322,7 @@ impl Reply {
         serde_json::from_slice(&self.body).unwrap_or_else(|e| panic!("{e}: {self:?}"))
     }
 
-    /// Checks that this is a problem of `status` and `slug`, and gives its document.
+    /// Asserts that this is a problem with `status` and `slug`, and returns its document.
     #[track_caller]
     pub(crate) fn problem(&self, status: u16, slug: &str) -> serde_json::Value {
         assert_eq!(self.status, status, "{}", String::from_utf8_lossy(&self.body));
@@ -338,7 +337,7 @@ impl Reply {
     }
 }
 
-/// Sends one request on a fresh connection and reads the answer.
+/// Sends one request on a new connection and reads the response.
 pub(crate) fn send(addr: SocketAddr, method: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Reply {
     let mut stream = connect(addr);
     let mut head = format!("{method} {path} HTTP/1.1\r\nhost: test\r\nconnection: close\r\n");
@@ -350,7 +349,7 @@ pub(crate) fn send(addr: SocketAddr, method: &str, path: &str, headers: &[(&str,
     }
     head += "\r\n";
     stream.write_all(head.as_bytes()).unwrap();
-    // A server that refuses early may close while the body is still under way.
+    // A server that rejects early may close the connection before the body is sent.
     drop(stream.write_all(body));
     read_reply(&mut stream, method == "HEAD")
 }
@@ -363,7 +362,7 @@ pub(crate) fn connect(addr: SocketAddr) -> TcpStream {
     stream
 }
 
-/// Reads everything until the connection ends, and takes it apart.
+/// Reads and parses the response until the connection ends.
 pub(crate) fn read_reply(stream: &mut TcpStream, head_only: bool) -> Reply {
     let mut bytes = Vec::new();
     let ended = stream.read_to_end(&mut bytes);
@@ -403,7 +402,7 @@ fn unchunk(mut raw: &[u8]) -> (Vec<u8>, bool) {
     }
 }
 
-/// Waits for something to become true, half a minute at most: machines may be busy.
+/// Waits at most half a minute until a condition holds.
 #[track_caller]
 pub(crate) fn wait_for(what: &str, mut is: impl FnMut() -> bool) {
     let end = Instant::now() + Duration::from_secs(30);
@@ -413,12 +412,12 @@ pub(crate) fn wait_for(what: &str, mut is: impl FnMut() -> bool) {
     }
 }
 
-/// The sample with a remark: the same mesh, but not the same work as with another one.
+/// Returns the sample with a distinct remark: the same mesh, but a different input.
 pub(crate) fn sample(n: usize) -> Vec<u8> {
     [SAMPLE, format!("REMARK 900 SAMPLE {n}\n").as_bytes()].concat()
 }
 
-/// A PDB file of `n` carbon atoms, 10 Å apart.
+/// Returns a PDB file of `n` carbon atoms at distances of 10 Å.
 pub(crate) fn carbons(n: usize) -> Vec<u8> {
     let mut text = String::new();
     for i in 0..n {

@@ -1,6 +1,6 @@
-//! What Prometheus reads, taken apart; backends that make it move.
-#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+//! Parser of the Prometheus format; backends that change metrics.
+#![allow(dead_code, reason = "each test binary uses a part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 pub(crate) mod queries;
 
@@ -16,7 +16,7 @@ use molmesh::telemetry::{Kind, Metric};
 
 use crate::http_support::{Fake, Mode};
 
-/// One sample: name, labels as they are written, value.
+/// Sample: name, labels as text, value.
 #[derive(Debug, Clone)]
 pub(crate) struct Sample {
     pub(crate) name: String,
@@ -25,7 +25,7 @@ pub(crate) struct Sample {
     pub(crate) value: f64,
 }
 
-/// What was exposed at a moment.
+/// Metrics at one time.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Scrape {
     pub(crate) samples: Vec<Sample>,
@@ -57,7 +57,7 @@ impl Scrape {
         scrape
     }
 
-    /// The samples of a metric whose labels hold all of `labels`: of a histogram those that count.
+    /// Returns the samples of a metric whose labels contain all of `labels`; for histograms, the counts.
     fn of_metric<'a>(&'a self, name: &str, labels: &'a [&str]) -> impl Iterator<Item = &'a Sample> {
         let count = format!("{name}_count");
         let name = name.to_owned();
@@ -66,19 +66,19 @@ impl Scrape {
         })
     }
 
-    /// The sum of what was counted or is.
+    /// Returns the sum of the values of matching samples.
     pub(crate) fn moves(&self, name: &str, labels: &[&str]) -> f64 {
         self.of_metric(name, labels).map(|sample| sample.value).sum()
     }
 
-    /// The sets of labels of a metric.
+    /// Returns the label sets of a metric.
     pub(crate) fn series(&self, name: &str) -> BTreeSet<String> {
         self.of_metric(name, &[]).map(|sample| sample.text.clone()).collect()
     }
 }
 
 fn labels_of(text: &str) -> BTreeMap<String, String> {
-    // No value of ours holds a quote or a comma.
+    // Label values of the product contain neither quotes nor commas.
     let pairs = text.split("\",").filter(|pair| !pair.is_empty());
     pairs
         .map(|pair| pair.split_once("=\"").unwrap())
@@ -86,7 +86,7 @@ fn labels_of(text: &str) -> BTreeMap<String, String> {
         .collect()
 }
 
-/// What is exposed and not described, or otherwise than described.
+/// Returns the differences between exposed metrics and their descriptions.
 pub(crate) fn check(scrape: &Scrape, metrics: &[Metric]) -> Vec<String> {
     let mut faults = Vec::new();
     for Sample { name, labels, .. } in &scrape.samples {
@@ -123,7 +123,7 @@ pub(crate) fn check(scrape: &Scrape, metrics: &[Metric]) -> Vec<String> {
     faults
 }
 
-/// Waits for something to become true, for as long as a slow machine may need.
+/// Waits with a long timeout until a condition holds.
 #[track_caller]
 pub(crate) fn until(what: &str, mut is: impl FnMut() -> bool) {
     let end = Instant::now() + Duration::from_mins(1);
@@ -133,12 +133,12 @@ pub(crate) fn until(what: &str, mut is: impl FnMut() -> bool) {
     }
 }
 
-/// A backend that holds its jobs until it is let go.
+/// Backend that holds its jobs until they are released.
 pub(crate) struct Held {
     fake: Arc<Fake>,
     open: Mutex<bool>,
     changed: Condvar,
-    /// A job is there.
+    /// True while a job is held.
     pub(crate) holds: AtomicBool,
 }
 
@@ -152,7 +152,7 @@ impl Held {
         })
     }
 
-    pub(crate) fn let_go(&self) {
+    pub(crate) fn release(&self) {
         *self.open.lock().unwrap() = true;
         self.changed.notify_all();
     }
@@ -175,7 +175,7 @@ impl Backend for Held {
         control: &Control<'_>,
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
-        // The warm-up is one sphere.
+        // The warm-up has one sphere.
         if spheres.len() > 1 {
             self.holds.store(true, Ordering::SeqCst);
             let mut open = self.open.lock().unwrap();
@@ -188,7 +188,7 @@ impl Backend for Held {
     }
 }
 
-/// A backend with a device that has seen everything, and that something else stands in for.
+/// Backend with a device whose metrics are all nonzero and that uses a fallback.
 pub(crate) struct Devices(Arc<Fake>);
 
 impl Devices {
@@ -214,7 +214,7 @@ impl Backend for Devices {
         control: &Control<'_>,
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
-        let fallback_reason = Some("as told".to_owned());
+        let fallback_reason = Some("fallback of a test".to_owned());
         let (arithmetic, device) = ("cpu".to_owned(), "the processor".to_owned());
         let served = Some(Served { backend: "cpu", arithmetic, device, fallback_reason });
         Ok(MeshOutput { served, ..self.0.write(spheres, params, limits, control, sink)? })

@@ -1,4 +1,4 @@
-//! Whether what dashboards and alerts ask for is there to be asked.
+//! Checks that dashboards and alerts query existing metrics.
 
 use std::path::{Path, PathBuf};
 
@@ -7,22 +7,22 @@ use molmesh::telemetry::METRICS;
 use super::Scrape;
 use crate::tools::{Queries, Selector};
 
-/// The files that ask.
+/// Files with queries.
 pub(crate) const FILES: [&str; 2] = ["deploy/grafana.json", "deploy/alerts.yaml"];
-/// Labels that Prometheus adds itself, to everything that it reads.
+/// Labels that Prometheus adds to every scraped sample.
 const ADDED: [&str; 2] = ["job", "instance"];
-/// Metrics that Prometheus makes itself.
+/// Metrics that Prometheus generates.
 const MADE: [&str; 1] = ["up"];
 
 pub(crate) fn path(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(file)
 }
 
-/// What is wrong with a file's queries: they cannot be read, or name what `scrape` does not have.
+/// Returns the faults of a file's queries: syntax errors and selectors without a match in `scrape`.
 pub(crate) fn faults(queries: &Queries, scrape: &Scrape) -> Vec<String> {
     let mut faults: Vec<String> = queries.error.iter().cloned().collect();
     if queries.error.is_none() && queries.expressions.is_empty() {
-        faults.push("there are no queries".to_owned());
+        faults.push("no queries".to_owned());
     }
     for expression in &queries.expressions {
         let place = &expression.place;
@@ -53,7 +53,7 @@ fn of_selector(selector: &Selector, scrape: &Scrape) -> Option<String> {
     })
 }
 
-/// The metrics that a file's queries look at; histograms by their own name.
+/// Returns the metrics in a file's queries; histograms by their base name.
 pub(crate) fn metrics(queries: &Queries) -> Vec<&'static str> {
     let selectors = queries.expressions.iter().flat_map(|expression| &expression.selectors);
     let names = selectors.filter_map(|selector| selector.metric.as_deref());

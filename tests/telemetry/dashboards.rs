@@ -1,5 +1,5 @@
-//! The dashboard and the alerts of `deploy/`: what is wrong with one is found out. That what they ask for is exposed is looked at
-//! where everything is (tests/telemetry/metrics.rs).
+//! Dashboard and alerts of `deploy/`: errors in queries and layout are detected. tests/metrics.rs checks that the
+//! queried metrics exist.
 
 use crate::metrics_support;
 use crate::tools;
@@ -24,13 +24,13 @@ fn every_query_parses() {
         assert!(queries.expressions.len() > 10, "{file}");
         for expression in queries.expressions {
             assert_eq!(expression.error, None, "{file}: {}", expression.place);
-            assert!(!expression.selectors.is_empty(), "{file}: {} asks for nothing", expression.place);
+            assert!(!expression.selectors.is_empty(), "{file}: {}: no selectors", expression.place);
         }
     }
 }
 
 #[test]
-fn queries_that_are_wrong_are_found_out() {
+fn wrong_queries_are_detected() {
     let folder = tempfile::tempdir().unwrap();
     let rule = |n: usize, expression: &str, says: &str| {
         let path = folder.path().join(format!("{n}.yaml"));
@@ -69,12 +69,12 @@ fn queries_that_are_wrong_are_found_out() {
 }
 
 #[test]
-fn the_dashboard_is_laid_out() {
+fn dashboard_panels_have_titles_and_do_not_overlap() {
     let text = std::fs::read_to_string(path("deploy/grafana.json")).unwrap();
     let dashboard: Value = serde_json::from_str(&text).unwrap();
     let panels = dashboard["panels"].as_array().unwrap();
     let mut ids = BTreeSet::new();
-    let mut places = BTreeSet::new();
+    let mut occupied = BTreeSet::new();
     for panel in panels {
         assert!(ids.insert(panel["id"].as_u64().unwrap()), "{panel}");
         assert!(panel["title"].as_str().is_some_and(|title| !title.is_empty()), "{panel}");
@@ -82,7 +82,7 @@ fn the_dashboard_is_laid_out() {
         assert!(side("x") + side("w") <= 24, "{panel}");
         for y in side("y")..side("y") + side("h") {
             for x in side("x")..side("x") + side("w") {
-                assert!(places.insert((x, y)), "{panel} lies on another one");
+                assert!(occupied.insert((x, y)), "{panel} overlaps another panel");
             }
         }
     }
@@ -95,11 +95,11 @@ fn run(tool: &Path, arguments: &[&str]) -> (bool, String) {
 }
 
 #[test]
-fn prometheus_takes_the_rules_and_they_fire_when_they_should() {
+fn promtool_accepts_the_rules_and_they_fire_in_time() {
     let Some(promtool) = tools::promtool() else { return };
     let rules = path("deploy/alerts.yaml");
-    let (good, said) = run(&promtool, &["check", "rules", &rules.to_string_lossy()]);
-    assert!(good && said.contains("rules found"), "{said}");
+    let (good, printed) = run(&promtool, &["check", "rules", &rules.to_string_lossy()]);
+    assert!(good && printed.contains("rules found"), "{printed}");
     let folder = tempfile::tempdir().unwrap();
     let tests = std::fs::read_to_string(path("tests/tools/alerts_test.yaml")).unwrap();
     let with = |name: &str, rules: &str| {
@@ -109,18 +109,18 @@ fn prometheus_takes_the_rules_and_they_fire_when_they_should() {
         run(&promtool, &["test", "rules", &test_file.to_string_lossy()])
     };
     let text = std::fs::read_to_string(&rules).unwrap();
-    let (good, said) = with("good.yaml", &text);
-    assert!(good, "{said}");
-    // The control: rules that would fire too late, or that are none.
-    let (good, said) = with("late.yaml", &text.replace("for: 2m", "for: 20m"));
-    assert!(!good && said.contains("MolmeshDown"), "{said}");
+    let (good, printed) = with("good.yaml", &text);
+    assert!(good, "{printed}");
+    // Control: rules that fire too late, and invalid rules.
+    let (good, printed) = with("late.yaml", &text.replace("for: 2m", "for: 20m"));
+    assert!(!good && printed.contains("MolmeshDown"), "{printed}");
     let broken = folder.path().join("broken.yaml");
     std::fs::write(&broken, text.replace("== 0", "=== 0")).unwrap();
     assert!(!run(&promtool, &["check", "rules", &broken.to_string_lossy()]).0);
 }
 
 #[test]
-fn what_prometheus_reads_is_as_it_wants_it() {
+fn promtool_accepts_the_exposition() {
     let Some(promtool) = tools::promtool() else { return };
     let lint = |text: &str| {
         use std::io::Write as _;
@@ -137,8 +137,8 @@ fn what_prometheus_reads_is_as_it_wants_it() {
         (output.status.success(), String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned())
     };
     let text = molmesh::telemetry::recorder().unwrap().render();
-    let (good, said) = lint(&text);
-    assert!(good && said.is_empty(), "{said}");
-    let (good, said) = lint("# HELP x_total x\n# TYPE x_total gauge\nx_total 1\n");
-    assert!(!good, "{said}");
+    let (good, printed) = lint(&text);
+    assert!(good && printed.is_empty(), "{printed}");
+    let (good, printed) = lint("# HELP x_total x\n# TYPE x_total gauge\nx_total 1\n");
+    assert!(!good, "{printed}");
 }

@@ -1,5 +1,5 @@
-//! Every metric of the service, moved: a row for each says what moves it. The table of `docs/operate/monitoring.md` is made of the same
-//! descriptions (`MOLMESH_BLESS=1` writes it).
+//! Every metric of the service is changed by an action of the table `ROWS`. The table of `docs/operate/monitoring.md`
+//! is generated from the same descriptions (`MOLMESH_BLESS=1` writes it).
 
 use crate::archive_support;
 use crate::http_support;
@@ -19,10 +19,10 @@ use metrics_support::{Devices, Held, Scrape, check, queries, until};
 use molmesh::surface::CpuBackend;
 use molmesh::telemetry::{self as t, Kind, METRICS, Metric, recorder};
 
-/// What is done to move metrics; the look in the end, or in the middle, waits until they have.
+/// Action that changes metrics. It calls `look` to wait until they have changed.
 type Mover = fn(look: &dyn Fn());
 
-/// A metric, the labels of the series that is looked at, and what moves it.
+/// Metric, labels of a series, and the action that changes it.
 type Row = (&'static str, &'static [&'static str], Mover);
 
 const ROWS: &[Row] = &[
@@ -77,16 +77,16 @@ const ROWS: &[Row] = &[
     (t::PROCESS_START, &[], nothing),
 ];
 
-/// A real mesh, made once and asked for until it comes from memory.
+/// Requests a mesh until it comes from the memory cache.
 fn meshes(look: &dyn Fn()) {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let ask = || server.post("/v1/meshes", &[], SAMPLE);
     assert_eq!(ask().status, 200);
-    until("it is kept", || ask().header("server-timing").unwrap().contains("hit"));
+    until("the result is cached", || ask().header("server-timing").unwrap().contains("hit"));
     look();
 }
 
-/// One job runs, two wait, one of them promised.
+/// One running and two queued jobs, one of them asynchronous.
 fn held(look: &dyn Fn()) {
     let backend = Held::new();
     let server = start(Arc::clone(&backend) as _, |config| {
@@ -95,17 +95,17 @@ fn held(look: &dyn Fn()) {
     });
     std::thread::scope(|scope| {
         let running = scope.spawn(|| server.post("/v1/meshes", &[], &sample(1)));
-        until("it runs", || backend.holds.load(Ordering::SeqCst));
+        until("the job runs", || backend.holds.load(Ordering::SeqCst));
         let later = [("prefer", "respond-async")];
         assert_eq!(server.post("/v1/meshes", &later, &sample(2)).status, 202);
         assert_eq!(server.post("/v1/meshes", &later, &sample(3)).status, 202);
         look();
-        backend.let_go();
+        backend.release();
         assert_eq!(running.join().unwrap().status, 200);
     });
 }
 
-/// A client that does not read its mesh.
+/// Client that does not read its mesh.
 fn unread(look: &dyn Fn()) {
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let (mut client, body) = (connect(server.addr), carbons(60_000));
@@ -126,7 +126,7 @@ fn quotas(look: &dyn Fn()) {
     look();
 }
 
-/// A job that outlives its server.
+/// Job that outlives its server.
 fn restart(look: &dyn Fn()) {
     let folder = tempfile::tempdir().unwrap();
     let keep = |config: &mut molmesh::config::Config| {
@@ -136,43 +136,43 @@ fn restart(look: &dyn Fn()) {
     let backend = Held::new();
     let server = start(Arc::clone(&backend) as _, keep);
     assert_eq!(server.post("/v1/meshes", &[("prefer", "respond-async")], SAMPLE).status, 202);
-    until("it runs", || backend.holds.load(Ordering::SeqCst));
+    until("the job runs", || backend.holds.load(Ordering::SeqCst));
     let _drained = server.join();
     let _server = start(Fake::new(Mode::Octahedra), keep);
     look();
 }
 
-/// Devices with a past, and something that stands in for them.
+/// Devices with nonzero metrics and a fallback.
 fn devices(look: &dyn Fn()) {
     let server = start(Devices::new(), |_| {});
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
     look();
 }
 
-/// The folder of results is none any more.
+/// Replaces the folder of results by a file.
 fn broken_store(look: &dyn Fn()) {
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let folder = server.dir.path().join("store/results");
     std::fs::remove_dir_all(&folder).unwrap();
     std::fs::write(&folder, "").unwrap();
-    // Who waits gets a mesh that cannot be kept.
+    // The mesh is returned although it cannot be stored.
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
     look();
 }
 
-/// Room for no mesh.
+/// Store without space for a mesh.
 fn tiny_store(look: &dyn Fn()) {
     let server = start(Fake::new(Mode::Octahedra), |config| config.store.max_bytes = 3000);
     assert_eq!(server.post("/v1/meshes", &[], SAMPLE).status, 200);
     look();
 }
 
-/// Room for two meshes, and five are made.
+/// Five results in a store with space for two.
 fn full_store(look: &dyn Fn()) {
     let server = start(Fake::new(Mode::Octahedra), |config| config.store.max_bytes = 500_000);
     for n in 0..5 {
         let made = server.post("/v1/meshes?format=stl", &[], &sample(n));
-        // Asking for it waits until it is kept.
+        // The request waits until the result is stored.
         server.get(made.header("content-location").unwrap());
     }
     look();
@@ -201,7 +201,7 @@ fn archived(url: &str) -> Running {
 }
 
 fn traces(look: &dyn Fn()) {
-    let collector = trace_support::Collector::start(trace_support::Manner::Takes);
+    let collector = trace_support::Collector::start(trace_support::CollectorMode::Accept);
     let _server = start(Fake::new(Mode::Octahedra), |config| {
         config.telemetry.endpoint = Some(serde_json::from_value(collector.url().into()).unwrap());
     });
@@ -214,29 +214,29 @@ fn panics(look: &dyn Fn()) {
     look();
 }
 
-/// It is there as soon as there is a process.
+/// Metrics that exist from the start.
 fn nothing(look: &dyn Fn()) {
     look();
 }
 
-/// The recorder is the process's: where tests share one, those that count take turns.
-static ALONE: Mutex<()> = Mutex::new(());
+/// Serialises the tests that count, because the recorder belongs to the process.
+static SERIAL: Mutex<()> = Mutex::new(());
 
 fn scrape() -> Scrape {
     Scrape::of(&recorder().unwrap().render())
 }
 
-/// Values that only are: they are looked for, not for their movement.
+/// Returns true for constant metrics, for which presence suffices.
 fn is_fixed(name: &str) -> bool {
     name == t::BUILD_INFO || name.starts_with("process_")
 }
 
 #[test]
-fn every_metric_has_a_row_and_moves() {
-    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+fn every_metric_has_a_row_and_changes() {
+    let _serial = SERIAL.lock().unwrap_or_else(PoisonError::into_inner);
     let rows: BTreeSet<&str> = ROWS.iter().map(|(name, ..)| *name).collect();
     let known: BTreeSet<&str> = METRICS.iter().map(|metric| metric.name).collect();
-    assert_eq!(rows, known, "one row for every metric, and none for what is no metric");
+    assert_eq!(rows, known, "exactly one row for each metric");
     let mut movers: Vec<(Mover, Vec<&Row>)> = Vec::new();
     for row in ROWS {
         match movers.iter_mut().find(|(mover, _)| std::ptr::fn_addr_eq(*mover, row.2)) {
@@ -246,7 +246,7 @@ fn every_metric_has_a_row_and_moves() {
     }
     for (mover, rows) in movers {
         let before = scrape();
-        // The control: what has not happened has not moved anything.
+        // Control: the metrics have not changed yet.
         let moved = |now: &Scrape, (name, labels, _): &Row| {
             let value = |scrape: &Scrape| scrape.moves(name, labels);
             if is_fixed(name) { value(now) > 0.0 } else { (value(now) - value(&before)).abs() > 1e-12 }
@@ -264,19 +264,19 @@ fn every_metric_has_a_row_and_moves() {
         let faults = check(&scrape(), METRICS);
         assert_eq!(faults, Vec::<String>::new());
     }
-    // By now everything is exposed that can be: what dashboards and alerts ask for is among it.
+    // All metrics are exposed now, including those that dashboards and alerts query.
     let Some(files) = tools::queries(&queries::FILES.map(queries::path)) else { return };
     for (file, found) in queries::FILES.iter().zip(&files) {
         assert_eq!(queries::faults(found, &scrape()), Vec::<String>::new(), "{file}");
     }
-    // No metric is exposed that nobody looks at.
+    // Every exposed metric is queried.
     let asked: BTreeSet<&str> = files.iter().flat_map(queries::metrics).collect();
     let unseen: Vec<&&str> = known.difference(&asked).collect();
     assert_eq!(unseen, Vec::<&&str>::new());
 }
 
 #[test]
-fn a_scrape_that_is_not_as_described_is_found_out() {
+fn deviations_from_descriptions_are_detected() {
     let faults = |line: &str| {
         let name = line.split(['{', ' ']).next().unwrap();
         let kind = METRICS.iter().find(|metric| metric.name == name).map_or("gauge", |metric| metric.kind.name());
@@ -284,7 +284,7 @@ fn a_scrape_that_is_not_as_described_is_found_out() {
     };
     assert!(faults("molmesh_queue_depth 3").iter().all(|fault| !fault.contains("molmesh_queue_depth")));
     for (line, said) in [
-        ("molmesh_nobody_knows_this 1", "is not described"),
+        ("molmesh_unknown 1", "is not described"),
         ("molmesh_queue_depth{job=\"1\"} 1", "labels"),
         ("molmesh_jobs_finished_total{outcome=\"vanished\"} 1", "vanished"),
         ("molmesh_jobs_finished_total 1", "labels"),
@@ -295,10 +295,10 @@ fn a_scrape_that_is_not_as_described_is_found_out() {
     assert!(check(&Scrape::of(wrong), METRICS).iter().any(|fault| fault.contains("counter")));
 }
 
-/// Whoever walks through the service with made-up names makes no new series.
+/// Names made up by clients do not create series.
 #[test]
-fn what_clients_make_up_is_no_label() {
-    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+fn unknown_names_of_clients_are_not_labels() {
+    let _serial = SERIAL.lock().unwrap_or_else(PoisonError::into_inner);
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let series = || {
         let scrape = scrape();
@@ -316,18 +316,18 @@ fn what_clients_make_up_is_no_label() {
     };
     let before = series();
     (0..40).for_each(walk);
-    // An answer's books are closed when its last byte is gone.
+    // A response is counted after its last byte.
     until("the last request is counted", || {
         let scrape = scrape();
         scrape.moves(t::HTTP_DURATION, &["route=\"unmatched\""]) >= 40.0
     });
-    // Each kind of request may make one series; forty of a kind would make forty.
+    // Each kind of request may create one series, not forty.
     for (before, now) in before.into_iter().zip(series()) {
         assert!(now <= before + 12, "{now} after {before}");
     }
 }
 
-/// The table of metrics, as the documentation shows it.
+/// Returns the table of metrics as in the documentation.
 fn table() -> String {
     let mut text = "| metric | kind | labels | what |\n| --- | --- | --- | --- |\n".to_owned();
     for metric in METRICS {
@@ -353,11 +353,11 @@ fn the_documentation_lists_every_metric() {
         std::fs::write(&path, [before, MARKS[0], &table(), MARKS[1], after].concat()).unwrap();
         return;
     }
-    assert_eq!(listed, table(), "MOLMESH_BLESS=1 writes it anew");
+    assert_eq!(listed, table(), "MOLMESH_BLESS=1 updates it");
 }
 
 #[test]
-fn counters_of_seconds_are_called_counters() {
+fn counters_of_seconds_have_the_type_counter() {
     let text = recorder().unwrap().render();
     assert!(text.contains("# TYPE process_cpu_seconds_total counter\n"), "{text}");
     let kinds: BTreeMap<&str, Kind> = METRICS.iter().map(|metric| (metric.name, metric.kind)).collect();

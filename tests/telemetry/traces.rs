@@ -1,4 +1,4 @@
-//! Traces: contexts in and out, spans as a collector gets them, collectors that do not want them.
+//! Traces: propagated contexts, exported spans, failing collectors.
 
 use crate::archive_support;
 use crate::http_support;
@@ -15,28 +15,28 @@ use molmesh::config::Config;
 use molmesh::surface::{Backend, CpuBackend};
 use opentelemetry_proto::tonic::trace::v1::Span;
 use opentelemetry_proto::tonic::trace::v1::span::SpanKind;
-use trace_support::{Collector, Manner, attribute, below, hex, named};
+use trace_support::{Collector, CollectorMode, attribute, below, hex, named};
 
 const TRACE: &str = "0af7651916cd43dd8448eb211c80319c";
 const PARENT: &str = "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01";
 
-/// A request that is made once more.
+/// Repeatable request.
 type Ask<'a> = Box<dyn Fn() -> Reply + 'a>;
 
-/// A server whose spans go to `collector`.
+/// Starts a server that exports spans to `collector`.
 fn traced(backend: Arc<dyn Backend>, collector: &Collector, change: impl FnOnce(&mut Config)) -> Running {
     start(backend, |config| {
         config.telemetry.endpoint = Some(serde_json::from_value(collector.url().into()).unwrap());
-        // Nothing here measures how fast the machine is.
+        // Tests do not measure the speed of the machine.
         config.telemetry.flush_timeout_ms = 60_000;
         change(config);
     })
 }
 
-/// Number that rises once a service has noticed how its collector behaves.
+/// Number that increases after the service has detected the collector's behaviour.
 type Sign = dyn Fn(&Running) -> f64;
 
-/// The trace and the span that an answer names.
+/// Returns the trace and span ids of a response.
 #[track_caller]
 fn place(reply: &Reply) -> (String, String) {
     let text = reply.header("traceparent").unwrap();
@@ -59,31 +59,35 @@ fn lies_within(span: &Span, around: &Span) {
 }
 
 #[test]
-fn answers_name_their_span_whether_or_not_anybody_collects() {
+fn responses_name_their_span_with_and_without_a_collector() {
     let server = start(Fake::new(Mode::Octahedra), |_| {});
     let get = |headers: &[(&str, &str)]| send(server.addr, "GET", "/livez", headers, b"");
     let (trace, span) = place(&get(&[("traceparent", PARENT)]));
     assert_eq!(trace, TRACE);
     assert_ne!(span, &PARENT[36..52]);
-    // The flag of whoever is above is passed on; who begins a trace that nobody collects says so.
+    // The flag of the parent is passed on. A new trace is not sampled without a collector.
     assert!(get(&[("traceparent", PARENT)]).header("traceparent").unwrap().ends_with("-01"));
     assert!(get(&[]).header("traceparent").unwrap().ends_with("-00"));
-    // What is wrong is ignored, and a new trace begins.
+    // Invalid headers are ignored and a new trace starts.
     for bad in [PARENT.to_uppercase(), PARENT.replace("00-0", "ff-0"), format!("{PARENT}-x"), String::new()] {
         assert_ne!(place(&get(&[("traceparent", &bad)])).0, TRACE, "{bad}");
     }
-    assert_ne!(place(&get(&[("traceparent", PARENT), ("traceparent", PARENT)])).0, TRACE, "twice is wrong");
+    assert_ne!(
+        place(&get(&[("traceparent", PARENT), ("traceparent", PARENT)])).0,
+        TRACE,
+        "a repeated header is invalid"
+    );
     let (one, other) = (place(&get(&[])), place(&get(&[])));
     assert!(one.0 != other.0 && one.1 != other.1);
-    // Problems and answers that a layer gives have one too, and scripts of other origins may read it.
+    // Errors and responses of middleware contain it too, and other origins may read it.
     assert_eq!(place(&send(server.addr, "GET", "/nowhere", &[("traceparent", PARENT)], b"")).0, TRACE);
     let cors = get(&[("origin", "http://elsewhere")]);
     assert!(cors.header("access-control-expose-headers").unwrap().contains("traceparent"));
 }
 
 #[test]
-fn a_request_its_job_and_every_stage_are_one_tree() {
-    let collector = Collector::start(Manner::Takes);
+fn request_job_and_stages_form_one_tree() {
+    let collector = Collector::start(CollectorMode::Accept);
     let secret = "authorization=Bearer sesame-8731";
     let server = traced(Arc::new(CpuBackend::new(None).unwrap()), &collector, |config| {
         config.telemetry.service_name = "surfaces".to_owned();
@@ -92,9 +96,9 @@ fn a_request_its_job_and_every_stage_are_one_tree() {
     let headers = [("traceparent", PARENT), ("tracestate", "rojo=1, congo=2"), ("x-request-id", "tree-1")];
     let reply = server.post("/v1/meshes?check=strict", &headers, SAMPLE);
     assert_eq!(reply.status, 200, "{}", String::from_utf8_lossy(&reply.body));
-    // Asking for what is kept waits until it is.
+    // The request waits until the result is stored.
     assert_eq!(server.get(reply.header("content-location").unwrap()).status, 200);
-    // Somebody who does not want to be recorded is not.
+    // A trace without the sampled flag is not recorded.
     let other = PARENT.replace(TRACE, "11111111111111111111111111111111").replace("-01", "-00");
     assert_eq!(send(server.addr, "GET", "/version", &[("traceparent", &other)], b"").status, 200);
     assert!(server.join());
@@ -134,8 +138,8 @@ fn a_request_its_job_and_every_stage_are_one_tree() {
         lies_within(stage, job);
         taken += stage.end_time_unix_nano - stage.start_time_unix_nano;
     }
-    assert!(taken <= job.end_time_unix_nano - job.start_time_unix_nano, "stages follow one another");
-    // Each span once, all of one process, and nobody's else.
+    assert!(taken <= job.end_time_unix_nano - job.start_time_unix_nano, "stages do not overlap");
+    // Each span is exported once, and unsampled traces are not exported.
     let mut ids: Vec<&[u8]> = spans.iter().map(|span| &span.span_id[..]).collect();
     ids.sort_unstable();
     ids.dedup();
@@ -154,8 +158,8 @@ fn a_request_its_job_and_every_stage_are_one_tree() {
 }
 
 #[test]
-fn what_fails_says_so_in_its_spans_and_lines() {
-    let collector = Collector::start(Manner::Takes);
+fn failures_are_reported_in_spans_and_log_lines() {
+    let collector = Collector::start(CollectorMode::Accept);
     let backend = Fake::new(Mode::Panic);
     let server = traced(Arc::clone(&backend) as _, &collector, |_| {});
     assert_eq!(server.post("/v1/meshes", &[("traceparent", PARENT)], SAMPLE).status, 500);
@@ -168,7 +172,7 @@ fn what_fails_says_so_in_its_spans_and_lines() {
     for span in [request, job] {
         assert_eq!(span.status.as_ref().unwrap().code, 2, "{span:?}");
     }
-    assert!(below(&spans, job).iter().any(|span| span.name == "read"), "stages before the end are there");
+    assert!(below(&spans, job).iter().any(|span| span.name == "read"), "completed stages are exported");
     let spans = collector.trace("22222222222222222222222222222222");
     assert_eq!(named(&spans, "job").status.as_ref().unwrap().code, 2);
     let status = named(&spans, "POST /v1/meshes").status.as_ref();
@@ -176,8 +180,8 @@ fn what_fails_says_so_in_its_spans_and_lines() {
 }
 
 #[test]
-fn a_promised_job_keeps_its_place_in_the_trace() {
-    let collector = Collector::start(Manner::Takes);
+fn an_asynchronous_job_stays_in_the_trace_of_its_request() {
+    let collector = Collector::start(CollectorMode::Accept);
     let server = traced(Fake::new(Mode::Octahedra), &collector, |_| {});
     let headers = [("prefer", "respond-async"), ("traceparent", PARENT), ("x-request-id", "later-1")];
     let reply = server.post("/v1/meshes", &headers, SAMPLE);
@@ -194,7 +198,7 @@ fn a_promised_job_keeps_its_place_in_the_trace() {
     assert_eq!((&job.parent_span_id, kind(job)), (&request.span_id, SpanKind::Consumer));
     assert_eq!(attribute(job, "molmesh.job.id"), Some(id));
     assert_eq!(named(&spans, "save").parent_span_id, request.span_id);
-    // A job's lines name the request, the trace and the job.
+    // Log lines of a job name request, trace and job.
     let lines = log_lines("a job failed");
     let (trace, _) = place(&failed);
     let job = failed.json()["jobID"].as_str().unwrap().to_owned();
@@ -203,9 +207,9 @@ fn a_promised_job_keeps_its_place_in_the_trace() {
 }
 
 #[test]
-fn a_restart_does_not_tear_a_trace_apart() {
+fn a_trace_continues_after_a_restart() {
     let held = Held::new();
-    let (before, after) = (Collector::start(Manner::Takes), Collector::start(Manner::Takes));
+    let (before, after) = (Collector::start(CollectorMode::Accept), Collector::start(CollectorMode::Accept));
     let folder = tempfile::tempdir().unwrap();
     let keep = |config: &mut Config| {
         folder.path().clone_into(&mut config.server.data_dir);
@@ -216,8 +220,8 @@ fn a_restart_does_not_tear_a_trace_apart() {
     let reply = server.post("/v1/meshes", &headers, SAMPLE);
     assert_eq!(reply.status, 202);
     let location = reply.header("location").unwrap().to_owned();
-    until("it runs", || held.holds.load(Ordering::SeqCst));
-    // The job is left to the next start; whether the listener's last answer was out in a millisecond is not the question.
+    until("the job runs", || held.holds.load(Ordering::SeqCst));
+    // The job is left to the next start. The result of `join` is ignored, because the last response may miss the drain.
     let _drained = server.join();
 
     let server = traced(Fake::new(Mode::Octahedra), &after, keep);
@@ -231,17 +235,17 @@ fn a_restart_does_not_tear_a_trace_apart() {
 }
 
 #[test]
-fn work_that_two_requests_share_is_linked() {
-    let (held, collector) = (Held::new(), Collector::start(Manner::Takes));
+fn requests_are_linked_to_a_coalesced_job() {
+    let (held, collector) = (Held::new(), Collector::start(CollectorMode::Accept));
     let server = traced(Arc::clone(&held) as _, &collector, |config| config.jobs.deadline_ms = 600_000);
     let other = PARENT.replace(TRACE, "33333333333333333333333333333333");
     let joined = || server.metric("molmesh_jobs_submitted_total", &["dedup=\"yes\""]);
     let timing = std::thread::scope(|scope| {
         let first = scope.spawn(|| server.post("/v1/meshes", &[("traceparent", PARENT)], SAMPLE));
-        until("it runs", || held.holds.load(Ordering::SeqCst));
+        until("the job runs", || held.holds.load(Ordering::SeqCst));
         let second = scope.spawn(|| server.post("/v1/meshes", &[("traceparent", &other)], SAMPLE));
-        until("the second takes part", || joined() > 0.0);
-        held.let_go();
+        until("the second request joins the job", || joined() > 0.0);
+        held.release();
         assert_eq!(first.join().unwrap().status, 200);
         second.join().unwrap().header("server-timing").unwrap().to_owned()
     });
@@ -249,7 +253,7 @@ fn work_that_two_requests_share_is_linked() {
     assert!(server.join());
     let (mine, theirs) = (collector.trace(TRACE), collector.trace("33333333333333333333333333333333"));
     let (job, request) = (named(&mine, "job"), named(&theirs, "POST /v1/meshes"));
-    assert!(!theirs.iter().any(|span| span.name == "job"), "the work was done once");
+    assert!(!theirs.iter().any(|span| span.name == "job"), "the job ran once");
     let links = |span: &Span| -> Vec<(String, String)> {
         span.links.iter().map(|link| (hex(&link.trace_id), hex(&link.span_id))).collect()
     };
@@ -258,8 +262,8 @@ fn work_that_two_requests_share_is_linked() {
 }
 
 #[test]
-fn who_is_asked_is_told_the_trace() {
-    let collector = Collector::start(Manner::Takes);
+fn archives_receive_the_trace_context() {
+    let collector = Collector::start(CollectorMode::Accept);
     let archive = archive_support::Remote::saying(archive_support::ok(SAMPLE));
     let url = archive.url("/d/{id}.pdb");
     let server = traced(Fake::new(Mode::Octahedra), &collector, |config| {
@@ -274,20 +278,20 @@ fn who_is_asked_is_told_the_trace() {
     assert_eq!((&fetch.parent_span_id, kind(fetch)), (&request.span_id, SpanKind::Client));
     assert_eq!(attribute(fetch, "http.response.status_code").as_deref(), Some("200"));
     assert_eq!(attribute(fetch, "server.address").as_deref(), Some("127.0.0.1"));
-    let asked = archive.asked();
+    let asked = archive.requests();
     let told = asked.iter().map(|a| (a.header("traceparent"), a.header("tracestate"))).collect::<Vec<_>>();
     let expected = format!("00-{TRACE}-{}-01", hex(&fetch.span_id));
     assert_eq!(told, [(Some(expected.as_str()), Some("rojo=1,congo=2"))]);
 }
 
 #[test]
-fn a_share_of_the_traces_is_recorded() {
-    let collector = Collector::start(Manner::Takes);
+fn a_fraction_of_the_traces_is_recorded() {
+    let collector = Collector::start(CollectorMode::Accept);
     let server = traced(Fake::new(Mode::Octahedra), &collector, |config| {
         config.telemetry.sample_ratio = serde_json::from_value(0.0.into()).unwrap();
     });
     assert!(server.get("/version").header("traceparent").unwrap().ends_with("-00"));
-    // Who is above decides for those below.
+    // The parent decides for its children.
     assert_eq!(send(server.addr, "GET", "/version", &[("traceparent", PARENT)], b"").status, 200);
     assert!(server.join());
     let spans = collector.spans();
@@ -296,25 +300,25 @@ fn a_share_of_the_traces_is_recorded() {
 }
 
 #[test]
-fn collectors_that_take_nothing_disturb_nobody() {
+fn failing_collectors_do_not_affect_requests() {
     let exported = |result: &'static str| {
         let label = format!("result=\"{result}\"");
         Box::new(move |server: &Running| server.metric("molmesh_trace_spans_total", &[&label])) as Box<Sign>
     };
     let logged = |text: &'static str| Box::new(move |_: &Running| log_lines(text).len() as f64) as Box<Sign>;
-    // Nothing listens there any more.
-    let gone = Collector::start(Manner::Takes).url();
-    for (manner, sign, queue, timeout_ms) in [
+    // No listener.
+    let gone = Collector::start(CollectorMode::Accept).url();
+    for (mode, sign, queue, timeout_ms) in [
         (None, exported("failed"), 4096, 500),
-        (Some(Manner::Status(503)), exported("failed"), 4096, 500),
-        (Some(Manner::Status(400)), exported("failed"), 4096, 10_000),
-        (Some(Manner::Status(400)), logged("status code: 400"), 4096, 10_000),
-        (Some(Manner::Refuses(1)), logged("rejected_spans=1"), 4096, 10_000),
-        (Some(Manner::Silent), exported("failed"), 4096, 500),
-        (Some(Manner::Silent), logged("dropped a Span due to queue full"), 1, 600_000),
-        (Some(Manner::Takes), exported("exported"), 4096, 10_000),
+        (Some(CollectorMode::Status(503)), exported("failed"), 4096, 500),
+        (Some(CollectorMode::Status(400)), exported("failed"), 4096, 10_000),
+        (Some(CollectorMode::Status(400)), logged("status code: 400"), 4096, 10_000),
+        (Some(CollectorMode::Reject(1)), logged("rejected_spans=1"), 4096, 10_000),
+        (Some(CollectorMode::Silent), exported("failed"), 4096, 500),
+        (Some(CollectorMode::Silent), logged("dropped a Span due to queue full"), 1, 600_000),
+        (Some(CollectorMode::Accept), exported("exported"), 4096, 10_000),
     ] {
-        let collector = manner.map(Collector::start);
+        let collector = mode.map(Collector::start);
         let url = collector.as_ref().map_or_else(|| gone.clone(), Collector::url);
         let server = start_on(Fake::new(Mode::Octahedra), Vec::new(), |config| {
             config.telemetry.endpoint = Some(serde_json::from_value(url.into()).unwrap());
@@ -323,17 +327,17 @@ fn collectors_that_take_nothing_disturb_nobody() {
             config.telemetry.flush_timeout_ms = 100;
         });
         let before = sign(&server);
-        until(&format!("{manner:?}"), || {
+        until(&format!("{mode:?}"), || {
             assert_eq!(server.post("/v1/meshes?format=stl", &[], &sample(1)).status, 200);
             sign(&server) > before
         });
-        // A collector that does not answer delays the stop by the flush timeout at most.
-        assert!(server.join(), "{manner:?}");
+        // A silent collector delays the stop by the flush timeout at most.
+        assert!(server.join(), "{mode:?}");
     }
 }
 
 #[test]
-fn server_timing_adds_up_to_the_time_that_the_answer_took() {
+fn server_timing_adds_up_to_the_response_time() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let archive = server.dir.path().join("archive");
     std::fs::create_dir_all(&archive).unwrap();
@@ -365,10 +369,10 @@ fn server_timing_adds_up_to_the_time_that_the_answer_took() {
             for entry in ["receive", "queue", "read", "field", "emit", "measure", "encode", "other", "total"] {
                 assert!(timing.contains(&format!("{entry};dur=")), "{what}, {entry}: {timing}");
             }
-            // A microsecond an entry for how they are written.
+            // Each entry may be rounded by one microsecond.
             assert!((parts - total).abs() < 0.05, "{what}: {parts} of {total}: {timing}");
             assert!(total <= outside, "{what}: {total} in {outside}");
-            // The control: the stage that takes longest is missed.
+            // Control: the longest stage is missing.
             let (without, _) = sums(&timing.replace("field;dur=", "field;dur=-"));
             assert!(without < parts, "{what}: {timing}");
         }

@@ -1,4 +1,4 @@
-//! A temporary folder of files, and a mesh written to a sink in parts.
+//! Temporary folder of files, and a mesh written to a sink in parts.
 
 use std::fs;
 use std::path::PathBuf;
@@ -7,7 +7,7 @@ use molmesh::formats::GlbSink;
 use molmesh::surface::{Mesh, MeshPart, MeshSink, Vertices};
 use tempfile::TempDir;
 
-/// Files in a folder that goes away.
+/// Files in a temporary folder, which is removed on drop.
 pub struct Files {
     folder: TempDir,
     pub paths: Vec<PathBuf>,

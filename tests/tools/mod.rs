@@ -1,10 +1,9 @@
-//! Outside oracles for integration tests: trimesh and the Khronos glTF validator, installed by `setup.sh`.
+//! External checkers for integration tests: trimesh and the Khronos glTF validator, installed by `setup.sh`.
 //!
-//! A test says `mod tools;` and calls [`trimesh`] or [`gltf_validate`], or [`python`] with a script of its own.
-//! Without the tools these return `None` after a line that begins with `SKIPPED:` on standard error, and panic
-//! where the environment says that they must be there: `CI` or `MOLMESH_REQUIRE_TOOLS`.
-#![allow(dead_code, unreachable_pub, reason = "every test crate compiles this file and uses its own part")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test says what it expects by panicking")]
+//! Tests call [`trimesh`], [`gltf_validate`], or [`python`] with a script. Without the tools these print a line that
+//! begins with `SKIPPED:` to standard error and return `None`. If `CI` or `MOLMESH_REQUIRE_TOOLS` is set, they panic.
+#![allow(dead_code, unreachable_pub, reason = "each test binary uses a part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 pub mod files;
 pub mod readers;
@@ -18,27 +17,27 @@ use std::process::{Command, Stdio};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer};
 
-/// What trimesh says of a file. Only `file` and `error` are set where it could not be read.
+/// Report of trimesh on a file. Only `file` and `error` are set if the file could not be read.
 #[derive(Debug, Clone, Default, Deserialize, PartialEq)]
 #[serde(default)]
-#[allow(clippy::struct_excessive_bools, reason = "the checker's answers are yes or no")]
+#[allow(clippy::struct_excessive_bools, reason = "independent results of the checker")]
 pub struct TrimeshReport {
     pub file: String,
-    /// Why it could not be read.
+    /// Read error.
     pub error: Option<String>,
     pub vertices: u64,
     pub faces: u64,
-    /// No faces: nothing below is set.
+    /// True if there are no faces. Nothing below is set then.
     pub empty: bool,
-    /// STL only: vertices with equal coordinates were made one.
+    /// STL only: vertices with equal coordinates were merged.
     pub welded: bool,
-    /// Every edge belongs to two faces.
+    /// True if every edge belongs to two faces.
     pub watertight: bool,
     pub winding_consistent: bool,
-    /// Watertight, wound consistently, outwards.
+    /// Watertight, with consistent winding and outward normals.
     pub is_volume: bool,
     pub euler: i64,
-    /// NaN where coordinates are not finite; so are volume and bounds.
+    /// NaN if coordinates are not finite, as are volume and bounds.
     #[serde(deserialize_with = "nan_for_null")]
     pub area: f64,
     #[serde(deserialize_with = "nan_for_null")]
@@ -46,18 +45,18 @@ pub struct TrimeshReport {
     pub bodies: u64,
     #[serde(deserialize_with = "nans_for_nulls")]
     pub bounds: [[f64; 3]; 2],
-    /// Coordinates and normal components that are not finite.
+    /// Number of coordinates and normal components that are not finite.
     pub nan_count: u64,
     pub unused_vertices: u64,
     pub duplicate_faces: u64,
     pub degenerate_faces: u64,
-    /// Edges with one face, or more than two.
+    /// Edges with one face or more than two.
     pub bad_edges: u64,
-    /// Largest distance of a written normal's length from 1; `None` in a file without vertex normals.
+    /// Largest difference of a normal's length from 1; `None` for files without vertex normals.
     pub max_normal_error: Option<f64>,
-    /// Least cosine between a written normal and the area-weighted mean of its faces' normals.
+    /// Smallest cosine between a normal and the area-weighted mean normal of its faces.
     pub min_normal_dot: Option<f64>,
-    /// STL only: least cosine between a written face normal and the face, sizeable faces only.
+    /// STL only: smallest cosine between a written face normal and its face, without tiny faces.
     pub min_face_normal_dot: Option<f64>,
     /// Names of custom vertex attributes, such as `_ATOM`.
     pub attributes: Vec<String>,
@@ -72,20 +71,20 @@ fn nans_for_nulls<'de, D: Deserializer<'de>>(deserializer: D) -> Result<[[f64; 3
     Ok(rows.map(|row| row.map(|v| v.unwrap_or(f64::NAN))))
 }
 
-/// What the glTF validator says of a file. Only `file` and `error` are set where it is no glTF.
+/// Report of the glTF validator on a file. Only `file` and `error` are set if the file is not glTF.
 #[derive(Debug, Clone, Default, Deserialize, PartialEq)]
 #[serde(default)]
 pub struct GltfReport {
     pub file: String,
-    /// Why it could not be read.
+    /// Read error.
     pub error: Option<String>,
     pub errors: u64,
     pub warnings: u64,
     pub infos: u64,
     pub hints: u64,
-    /// Issue codes with the number of times each was raised.
+    /// Number of occurrences by issue code.
     pub codes: BTreeMap<String, u64>,
-    /// The first few issues in words.
+    /// Messages of the first few issues.
     pub messages: Vec<String>,
     pub vertices: u64,
     pub triangles: u64,
@@ -106,19 +105,19 @@ impl TrimeshReport {
 }
 
 impl GltfReport {
-    /// Panics unless the validator has nothing to say.
+    /// Panics if the validator reports an error or a warning.
     #[track_caller]
     pub fn assert_clean(&self) {
         assert_eq!((&self.error, self.errors, self.warnings), (&None, 0, 0), "{self:#?}");
     }
 }
 
-/// Looks at mesh files of any format with trimesh, one report per path, in their order.
+/// Checks mesh files of any format with trimesh. Returns one report per path in their order.
 pub fn trimesh(paths: &[impl AsRef<Path>]) -> Option<Vec<TrimeshReport>> {
     python("check_mesh.py", paths)
 }
 
-/// Looks at `.glb` and `.gltf` files with the Khronos validator, one report per path, in their order.
+/// Checks `.glb` and `.gltf` files with the Khronos validator. Returns one report per path in their order.
 pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
     if !installed_here().join("node/.stamp").is_file() {
         return missing("gltf-validator");
@@ -126,30 +125,30 @@ pub fn gltf_validate(paths: &[impl AsRef<Path>]) -> Option<Vec<GltfReport>> {
     Some(ask(Path::new("node"), "validate_gltf.mjs", paths))
 }
 
-/// What a script of `promql.py` says of an expression.
+/// Result of `promql.py` for an expression.
 #[derive(Debug, Clone, Deserialize)]
 pub struct Expression {
-    /// The panel or rule that it stands in.
+    /// Panel or rule of the expression.
     pub place: String,
-    /// Why it is no `PromQL`.
+    /// Syntax error.
     pub error: Option<String>,
     pub selectors: Vec<Selector>,
 }
 
-/// What an expression selects.
+/// Selector of an expression.
 #[derive(Debug, Clone, Deserialize)]
 pub struct Selector {
     pub metric: Option<String>,
-    /// Label, value, and whether the value is a regular expression.
+    /// Label, value, and true if the value is a regular expression.
     pub matchers: Vec<(String, String, bool)>,
-    /// Labels that are named around it: by aggregations, legends, annotations.
+    /// Labels named by enclosing aggregations, legends and annotations.
     pub around: Vec<String>,
 }
 
-/// The queries of a dashboard or a file of rules.
+/// Queries of a dashboard or a file of rules.
 #[derive(Debug, Clone, Deserialize)]
 pub struct Queries {
-    /// Why the file cannot be read.
+    /// Read error of the file.
     pub error: Option<String>,
     pub expressions: Vec<Expression>,
 }
@@ -159,14 +158,14 @@ pub fn queries(paths: &[impl AsRef<Path>]) -> Option<Vec<Queries>> {
     python("promql.py", paths)
 }
 
-/// What Pillow reads in a PNG file.
+/// PNG file as read by Pillow.
 #[derive(Debug, Clone, Deserialize)]
 pub struct Png {
     pub width: u32,
     pub height: u32,
-    /// `RGB` or `RGBA`, as the file has it.
+    /// `RGB` or `RGBA`, as in the file.
     pub mode: String,
-    /// Whether the file says that it is sRGB.
+    /// True if the file declares sRGB.
     pub srgb: bool,
     /// Red, green, blue, alpha, in rows from the top.
     pub pixels: Vec<[u8; 4]>,
@@ -177,14 +176,14 @@ pub fn png(paths: &[impl AsRef<Path>]) -> Option<Vec<Png>> {
     python("read_png.py", paths)
 }
 
-/// Prometheus' own tool for rules, if `setup.sh` could get it.
+/// Returns `promtool` of Prometheus if `setup.sh` installed it.
 pub fn promtool() -> Option<PathBuf> {
     let tool = installed_here().join("promtool");
     if tool.is_file() { Some(tool) } else { missing("promtool") }
 }
 
-/// Gives paths to a script of `tests/tools` run by the Python with the pinned packages, one path per line, and
-/// takes one line of JSON per path.
+/// Runs a script of `tests/tools` in the Python environment with one path per input line. Returns one JSON value per
+/// path.
 pub fn python<T: DeserializeOwned>(script: &str, paths: &[impl AsRef<Path>]) -> Option<Vec<T>> {
     match python_interpreter() {
         Some(python) => Some(ask(&python, script, paths)),
@@ -192,15 +191,15 @@ pub fn python<T: DeserializeOwned>(script: &str, paths: &[impl AsRef<Path>]) -> 
     }
 }
 
-/// The Python with the pinned packages, if `setup.sh` has run.
+/// Returns the interpreter of the Python environment if `setup.sh` has run.
 pub fn python_interpreter() -> Option<PathBuf> {
     let venv = installed_here().join("venv");
     let python = ["bin/python", "Scripts/python.exe"].map(|p| venv.join(p)).into_iter().find(|p| p.is_file());
-    // The stamp is written when every package is in place.
+    // The stamp is written after all packages are installed.
     python.filter(|_| venv.join(".stamp").is_file())
 }
 
-/// Says that a tool is missing: panics where it must not be, else skips loudly.
+/// Reports a missing tool: panics if tools are required, otherwise prints a skip message.
 pub fn missing<T>(tool: &str) -> Option<T> {
     let required =
         ["CI", "MOLMESH_REQUIRE_TOOLS"].into_iter().find(|v| std::env::var_os(v).is_some_and(|v| !v.is_empty()));
@@ -208,7 +207,7 @@ pub fn missing<T>(tool: &str) -> Option<T> {
         panic!("{tool} is not installed and {variable} is set: run tests/tools/setup.sh");
     }
     let test = std::thread::current().name().unwrap_or("a test").to_owned();
-    // Not `eprintln!`: the harness would swallow it while the test passes.
+    // The harness hides the output of `eprintln!` if the test passes.
     let line = format!("SKIPPED: {test}: {tool} is not installed; run tests/tools/setup.sh\n");
     std::io::stderr().write_all(line.as_bytes()).unwrap();
     None
@@ -222,7 +221,7 @@ fn installed_here() -> PathBuf {
     root().join("target/test-tools")
 }
 
-/// Runs a script of this folder on paths; answers are matched with questions by their order and count.
+/// Runs a script of this folder on paths and parses one line of output per path.
 fn ask<T: DeserializeOwned>(interpreter: &Path, script: &str, paths: &[impl AsRef<Path>]) -> Vec<T> {
     let mut child = Command::new(interpreter)
         .arg(root().join("tests/tools").join(script))
@@ -232,7 +231,7 @@ fn ask<T: DeserializeOwned>(interpreter: &Path, script: &str, paths: &[impl AsRe
         .unwrap_or_else(|e| panic!("cannot start {}: {e}", interpreter.display()));
     let list: String = paths.iter().flat_map(|p| [p.as_ref().display().to_string(), "\n".to_owned()]).collect();
     let mut stdin = child.stdin.take().unwrap();
-    // On its own thread: with long lists both pipes could be full at once.
+    // In a separate thread: with long lists both pipes could be full.
     let feeder = std::thread::spawn(move || stdin.write_all(list.as_bytes()));
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success(), "{script} failed with {}", output.status);

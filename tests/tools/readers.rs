@@ -1,13 +1,13 @@
-//! Small readers of the five formats, written from their specifications and strict: they panic on anything that
-//! the product has no reason to write.
+//! Strict readers of the five formats, written from their specifications. They panic on anything that the product does
+//! not write.
 
-#![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "indices that were integers before")]
+#![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "indices are integers")]
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::Value;
 
-/// What a file holds. Positions are as they stand in the file: relative to `translation` in glTF. Without normals there are none.
+/// Content of a file. Positions are as in the file: relative to `translation` in glTF. Missing normals are empty.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Contents {
     pub translation: [f64; 3],
@@ -15,14 +15,14 @@ pub struct Contents {
     pub normals: Vec<[f32; 3]>,
     pub triangles: Vec<[u32; 3]>,
     pub atoms: Option<Vec<u32>>,
-    /// As in the file: linear light in glTF, sRGB in PLY.
+    /// As in the file: linear in glTF, sRGB in PLY.
     pub colors: Option<Vec<[u8; 4]>>,
 }
 
-/// The two chunks of a GLB.
+/// JSON and binary chunk of a GLB.
 pub struct Glb {
     pub json: Value,
-    /// Where the buffer begins in the file; its end if there is none.
+    /// Offset of the buffer in the file; the file length if there is none.
     pub bin_at: usize,
     pub bin: Vec<u8>,
 }
@@ -62,7 +62,7 @@ pub fn split_gltf(bytes: &[u8]) -> (Value, Vec<u8>) {
     (json, bin)
 }
 
-/// The one mesh of a glTF document and its buffer.
+/// Reads the only mesh of a glTF document and its buffer.
 pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
     let node = &json["nodes"][0];
     let translation = std::array::from_fn(|k| node["translation"][k].as_f64().unwrap());
@@ -117,7 +117,7 @@ pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
     contents
 }
 
-/// What the integers of a quantised mesh are multiplied by: the node's scale, one for the three axes.
+/// Returns the scale of the node of a quantised mesh, which is the same for all axes.
 fn quantized_scale(json: &Value) -> Option<f32> {
     let node = &json["nodes"][0];
     let [used, required] = ["extensionsUsed", "extensionsRequired"].map(|key| json.get(key));
@@ -134,7 +134,7 @@ pub fn accessor_of<'a>(json: &'a Value, index: &Value) -> &'a Value {
     &json["accessors"][usize::try_from(index.as_u64().unwrap()).unwrap()]
 }
 
-/// Where an accessor begins in the buffer.
+/// Returns the offset of an accessor in the buffer.
 pub fn accessor_offset(json: &Value, index: &Value) -> usize {
     let view = &json["bufferViews"][usize::try_from(accessor_of(json, index)["bufferView"].as_u64().unwrap()).unwrap()];
     usize::try_from(view["byteOffset"].as_u64().unwrap_or(0)).unwrap()
@@ -149,7 +149,7 @@ fn rows<'a>(json: &Value, bin: &'a [u8], index: &Value, component: u64, shape: &
     let stride = number(&view["byteStride"], bytes as u64);
     let count = number(&accessor["count"], 0);
     assert_eq!((offset % 4, len), (0, stride * count));
-    // 34962 and 34963 are OpenGL's vertex and index buffers; only vertices must keep to multiples of four.
+    // 34962 and 34963 are OpenGL's vertex and index buffers. Only vertices require alignment to four bytes.
     let target = view["target"].as_u64().unwrap();
     assert!((target == 34962 && stride.is_multiple_of(4)) || (target == 34963 && stride == bytes));
     let rows: Vec<&[u8]> = bin[offset..offset + len].chunks(stride).collect();
@@ -157,7 +157,7 @@ fn rows<'a>(json: &Value, bin: &'a [u8], index: &Value, component: u64, shape: &
     rows.into_iter().map(|r| &r[..bytes]).collect()
 }
 
-/// The header lines of a PLY and where its data begins.
+/// Returns the header lines of a PLY and the offset of its data.
 pub fn ply_header(bytes: &[u8]) -> (Vec<String>, usize) {
     let end = b"end_header\n";
     let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
@@ -214,7 +214,7 @@ pub fn read_ply(bytes: &[u8]) -> Contents {
     contents
 }
 
-/// Face normals and corners of an STL.
+/// Returns normal and corners of each face of an STL.
 pub fn read_stl(bytes: &[u8]) -> Vec<[[f32; 3]; 4]> {
     assert!(!bytes.starts_with(b"solid"));
     let (records, rest) = bytes[84..].as_chunks::<50>();

@@ -1,4 +1,4 @@
-//! Meshes whose area, volume and topology are known, for tests of writers and checkers.
+//! Meshes of known area, volume and topology for tests of writers and checkers.
 
 #![allow(clippy::cast_possible_truncation, reason = "meshes are single precision")]
 
@@ -7,10 +7,10 @@ use std::f64::consts::PI;
 
 use molmesh::surface::Mesh;
 
-/// A centre far from the origin, which no 32-bit float holds.
+/// Centre far from the origin that is not representable in single precision.
 pub const FAR: [f64; 3] = [123.456_789, -78.9, 1000.25];
 
-/// A sphere of 20 · 4^`level` triangles around `at`, wound and with normals outwards (or inwards: a cavity).
+/// Returns a sphere of 20 · 4^`level` triangles around `at` with normals outwards or, for a void, inwards.
 pub fn icosphere(level: u32, radius: f64, at: [f64; 3], inwards: bool) -> Mesh {
     let t = f64::midpoint(1.0, 5.0_f64.sqrt());
     let mut unit: Vec<[f64; 3]> = Vec::new();
@@ -60,7 +60,7 @@ pub fn icosphere(level: u32, radius: f64, at: [f64; 3], inwards: bool) -> Mesh {
     }
 }
 
-/// A torus of `around` · `across` vertices and twice as many triangles, radii 5 and 2 Å.
+/// Returns a torus of `around` · `across` vertices and twice as many triangles with radii of 5 and 2 Å.
 pub fn torus(around: u32, across: u32) -> Mesh {
     let mut mesh = Mesh::default();
     for (i, j) in (0..around).flat_map(|i| (0..across).map(move |j| (i, j))) {
@@ -76,7 +76,7 @@ pub fn torus(around: u32, across: u32) -> Mesh {
     mesh
 }
 
-/// Two meshes as one.
+/// Joins two meshes.
 pub fn union(a: &Mesh, b: &Mesh) -> Mesh {
     let shift = u32::try_from(a.n_vertices()).unwrap();
     let mut mesh = a.clone();
@@ -86,17 +86,17 @@ pub fn union(a: &Mesh, b: &Mesh) -> Mesh {
     mesh
 }
 
-/// Two spheres that do not touch.
+/// Returns two separate spheres.
 pub fn two_spheres() -> Mesh {
     union(&icosphere(3, 3.0, [-5.0, 0.0, 0.0], false), &icosphere(2, 2.0, [5.0, 0.0, 0.0], false))
 }
 
-/// A ball of radius 4 with a hole of radius 2 in it.
+/// Returns a ball of radius 4 Å with a void of radius 2 Å.
 pub fn sphere_with_cavity() -> Mesh {
     union(&icosphere(4, 4.0, [0.0; 3], false), &icosphere(3, 2.0, [0.5, 0.0, 0.0], true))
 }
 
-/// One triangle: three vertices, a boundary.
+/// Returns one triangle, which has a boundary.
 pub fn triangle() -> Mesh {
     Mesh {
         positions: vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]].into(),
@@ -106,7 +106,7 @@ pub fn triangle() -> Mesh {
     }
 }
 
-/// With a colour per vertex, and an atom index that grows from 0 to `max_atom`.
+/// Adds a colour per vertex and atom indices that increase from 0 to `max_atom`.
 pub fn dressed(mut mesh: Mesh, max_atom: u32) -> Mesh {
     let n = u32::try_from(mesh.n_vertices()).unwrap();
     let last = u64::from(n.max(2) - 1);
@@ -115,7 +115,7 @@ pub fn dressed(mut mesh: Mesh, max_atom: u32) -> Mesh {
     mesh
 }
 
-/// Area and signed volume, in double precision from the vertices as they are.
+/// Returns area and signed volume in double precision.
 pub fn area_and_volume(mesh: &Mesh) -> (f64, f64) {
     let mut sums = (0.0, 0.0);
     for triangle in &mesh.triangles {

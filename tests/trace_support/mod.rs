@@ -1,6 +1,6 @@
-//! A collector of traces over plain HTTP/1.1 that keeps what it is sent, or misbehaves on command.
-#![allow(dead_code, reason = "every test crate compiles this file and uses its own part")]
-#![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
+//! Collector of traces over plain HTTP/1.1 that records its requests or misbehaves.
+#![allow(dead_code, reason = "each test binary uses a part")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "tests fail by panicking")]
 
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -14,28 +14,28 @@ use opentelemetry_proto::tonic::common::v1::any_value::Value;
 use opentelemetry_proto::tonic::trace::v1::Span;
 use prost::Message as _;
 
-/// What the collector does with a batch.
+/// Behaviour of the collector.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Manner {
-    Takes,
-    /// Takes it, but for so many spans.
-    Refuses(i64),
-    /// Answers with this status.
+pub(crate) enum CollectorMode {
+    Accept,
+    /// Accepts a batch except this number of spans.
+    Reject(i64),
+    /// Responds with this status.
     Status(u16),
-    /// Never answers.
+    /// Never responds.
     Silent,
 }
 
-/// What came.
+/// Received requests.
 #[derive(Default)]
 struct Kept {
     heads: Vec<String>,
     requests: Vec<ExportTraceServiceRequest>,
-    /// Connections of silent answers, held open.
+    /// Connections without a response, held open.
     held: Vec<TcpStream>,
 }
 
-/// A running collector.
+/// Running collector, stopped on drop.
 pub(crate) struct Collector {
     pub(crate) addr: SocketAddr,
     kept: Arc<Mutex<Kept>>,
@@ -43,7 +43,7 @@ pub(crate) struct Collector {
 }
 
 impl Collector {
-    pub(crate) fn start(manner: Manner) -> Self {
+    pub(crate) fn start(mode: CollectorMode) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let addr = listener.local_addr().unwrap();
         let (kept, stop) = (Arc::<Mutex<Kept>>::default(), Arc::<AtomicBool>::default());
@@ -54,7 +54,7 @@ impl Collector {
                     return;
                 }
                 let kept = Arc::clone(&kept_there);
-                std::thread::spawn(move || answer(stream, manner, &kept));
+                std::thread::spawn(move || answer(stream, mode, &kept));
             }
         });
         Self { addr, kept, stop }
@@ -64,7 +64,7 @@ impl Collector {
         format!("http://{}", self.addr)
     }
 
-    /// The heads of all requests.
+    /// Returns the heads of all requests.
     pub(crate) fn heads(&self) -> Vec<String> {
         self.kept.lock().unwrap().heads.clone()
     }
@@ -73,13 +73,13 @@ impl Collector {
         self.kept.lock().unwrap().requests.clone()
     }
 
-    /// Every span, in the order in which they were sent.
+    /// Returns all spans in the order of arrival.
     pub(crate) fn spans(&self) -> Vec<Span> {
         let scopes = self.requests().into_iter().flat_map(|r| r.resource_spans).flat_map(|r| r.scope_spans);
         scopes.flat_map(|scope| scope.spans).collect()
     }
 
-    /// The spans of a trace.
+    /// Returns the spans of a trace.
     pub(crate) fn trace(&self, id: &str) -> Vec<Span> {
         self.spans().into_iter().filter(|span| hex(&span.trace_id) == id).collect()
     }
@@ -92,7 +92,7 @@ impl Drop for Collector {
     }
 }
 
-fn answer(mut stream: TcpStream, manner: Manner, kept: &Mutex<Kept>) {
+fn answer(mut stream: TcpStream, mode: CollectorMode, kept: &Mutex<Kept>) {
     let (mut head, mut byte) = (Vec::new(), [0]);
     while !head.ends_with(b"\r\n\r\n") {
         match stream.read(&mut byte) {
@@ -108,24 +108,24 @@ fn answer(mut stream: TcpStream, manner: Manner, kept: &Mutex<Kept>) {
         let mut kept = kept.lock().unwrap();
         kept.heads.push(head);
         kept.requests.push(ExportTraceServiceRequest::decode(&body[..]).unwrap());
-        if manner == Manner::Silent {
+        if mode == CollectorMode::Silent {
             kept.held.push(stream);
             return;
         }
     }
-    let (status, body) = match manner {
-        Manner::Status(status) => (status, Vec::new()),
-        Manner::Refuses(rejected_spans) => {
-            let partial = ExportTracePartialSuccess { rejected_spans, error_message: "as told".to_owned() };
+    let (status, body) = match mode {
+        CollectorMode::Status(status) => (status, Vec::new()),
+        CollectorMode::Reject(rejected_spans) => {
+            let partial = ExportTracePartialSuccess { rejected_spans, error_message: "rejected by a test".to_owned() };
             (200, ExportTraceServiceResponse { partial_success: Some(partial) }.encode_to_vec())
         }
-        Manner::Takes | Manner::Silent => (200, Vec::new()),
+        CollectorMode::Accept | CollectorMode::Silent => (200, Vec::new()),
     };
     let head = format!("HTTP/1.1 {status} x\r\ncontent-length: {}\r\nconnection: close\r\n\r\n", body.len());
     stream.write_all(&[head.as_bytes(), &body].concat()).unwrap();
 }
 
-/// Bytes as hexadecimal digits.
+/// Formats bytes as hexadecimal digits.
 pub(crate) fn hex(bytes: &[u8]) -> String {
     bytes
         .iter()
@@ -134,7 +134,7 @@ pub(crate) fn hex(bytes: &[u8]) -> String {
         .collect()
 }
 
-/// The span of this name; there is one.
+/// Returns the only span of this name.
 #[track_caller]
 pub(crate) fn named<'a>(spans: &'a [Span], name: &str) -> &'a Span {
     let found: Vec<&Span> = spans.iter().filter(|span| span.name == name).collect();
@@ -143,12 +143,12 @@ pub(crate) fn named<'a>(spans: &'a [Span], name: &str) -> &'a Span {
     found[0]
 }
 
-/// The spans right below one.
+/// Returns the child spans of a span.
 pub(crate) fn below<'a>(spans: &'a [Span], parent: &Span) -> Vec<&'a Span> {
     spans.iter().filter(|span| span.parent_span_id == parent.span_id).collect()
 }
 
-/// An attribute as text.
+/// Returns an attribute as text.
 pub(crate) fn attribute(span: &Span, key: &str) -> Option<String> {
     let pair = span.attributes.iter().find(|pair| pair.key == key)?;
     match pair.value.as_ref()?.value.as_ref()? {

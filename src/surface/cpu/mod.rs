@@ -50,7 +50,7 @@ use super::sink::MeshSink;
 use super::spheres::Spheres;
 
 /// Native CPU backend.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct CpuBackend {
     /// Thread pool, if a number of threads was requested; otherwise the global pool is used.
     pool: Option<rayon::ThreadPool>,
