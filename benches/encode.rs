@@ -1,7 +1,7 @@
-//! How fast meshes are written: MB/s of file per format, to a sink that drops the bytes and to memory.
+//! Encoding speed of meshes in MB/s per format, to a sink that discards the bytes and to memory.
 //!
-//! `MOLMESH_BENCH_SIDE=2738 cargo bench --bench encode` takes a torus of 2738² = 7.5 million vertices and 15 million
-//! triangles, as a structure of some hundred thousand atoms has.
+//! `MOLMESH_BENCH_SIDE=2738 cargo bench --bench encode` uses a torus of 2738² = 7.5 million vertices and 15 million
+//! triangles, like a structure of some hundred thousand atoms.
 
 use std::f64::consts::TAU;
 use std::hint::black_box;
@@ -11,7 +11,7 @@ use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_m
 use molmesh::formats::{self, Encoder, Format, Meta};
 use molmesh::surface::Mesh;
 
-/// A torus of `side`² vertices, far from the origin.
+/// Creates a torus of `side`² vertices, far from the origin.
 #[expect(clippy::cast_possible_truncation, reason = "meshes are single precision")]
 fn torus(side: u32) -> Mesh {
     let mut mesh = Mesh { centre: [123.456, -78.9, 1000.25], ..Mesh::default() };
@@ -43,7 +43,7 @@ fn encode(criterion: &mut Criterion) {
         group.bench_function(BenchmarkId::new("sink", format), |b| {
             b.iter(|| formats::write(format, black_box(&mesh), &meta, &mut io::sink()));
         });
-        // Into memory that is there already, as a buffer from a pool is.
+        // Into allocated memory, like a pooled buffer.
         group.bench_function(BenchmarkId::new("memory", format), |b| {
             b.iter(|| {
                 bytes.clear();
@@ -56,7 +56,7 @@ fn encode(criterion: &mut Criterion) {
     group.bench_function("check only", |b| {
         b.iter(|| Encoder::new(Format::Glb, black_box(&mesh), &meta).map(|e| e.encoded_len()));
     });
-    // What a GLB is compared with: the same columns copied.
+    // Baseline of GLB: copies of the same columns.
     let mut copy = Vec::new();
     group.bench_function("copy of the columns", |b| {
         b.iter(|| {
@@ -66,7 +66,7 @@ fn encode(criterion: &mut Criterion) {
             copy.extend_from_slice(bytemuck::must_cast_slice::<_, u8>(black_box(&mesh.triangles[..])));
         });
     });
-    // Into the same memory: the difference is what checking and laying out cost.
+    // Into the same memory. The difference is the cost of checks and layout.
     group.bench_function("memory, trusting/glb", |b| {
         b.iter(|| {
             copy.clear();

@@ -1,5 +1,6 @@
-//! Time against atoms, and the field stage's time for each pair of a sample and an atom: one table, medians of several
-//! runs. `cargo bench --bench growth`; `-- --most 300000` stops earlier, `RAYON_NUM_THREADS=1` sets the threads.
+//! Time against atoms, and time of the field stage per pair of a grid point and an atom. Prints a table of medians.
+//!
+//! `cargo bench --bench growth -- --max 300000` stops earlier. `RAYON_NUM_THREADS=1` sets the number of threads.
 
 #![expect(clippy::print_stdout, clippy::unwrap_used, reason = "a benchmark prints its table and may panic")]
 
@@ -10,7 +11,7 @@ use molmesh::pipeline::StageClock;
 use molmesh::structure::{self, ReadLimits, Selection};
 use molmesh::surface::{Backend, Control, CpuBackend, Spheres, SurfaceLimits, SurfaceParams};
 
-/// The sample, repeated on a lattice of boxes until there are `n` atoms: density and sparsity stay.
+/// Tiles the sample on a lattice of boxes until there are `n` atoms, which preserves density and sparsity.
 fn tiled(sample: &Spheres, n: usize) -> Spheres {
     let [lo, hi] = sample.bounds().unwrap();
     let side: [f64; 3] = std::array::from_fn(|k| hi[k] - lo[k] + 3.0);
@@ -40,7 +41,7 @@ fn main() {
         let mut arguments = std::env::args().skip_while(|a| a != name);
         arguments.nth(1).map(|v| v.parse::<usize>().unwrap())
     };
-    let most = flag("--most").unwrap_or(1_000_000);
+    let max = flag("--max").unwrap_or(1_000_000);
     let backend = CpuBackend::new(None).unwrap();
     let bytes = std::fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb")).unwrap();
     let sample = structure::read(&bytes, &ReadLimits::default()).unwrap();
@@ -51,7 +52,7 @@ fn main() {
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|");
     let sizes = [1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000];
-    for n in sizes.into_iter().filter(|&n| n <= most) {
+    for n in sizes.into_iter().filter(|&n| n <= max) {
         let spheres = tiled(&sample, n);
         let runs = (300_000 / n).clamp(3, 31);
         let mut stages: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
@@ -84,7 +85,7 @@ fn main() {
             of("emit"),
             of("measure"),
             total * 1e3 / n as f64,
-            // Threads work side by side: one core's time is the wall time times the threads.
+            // Processor time is the wall time times the number of threads.
             field * 1e6 * backend.threads() as f64 / pairs,
         );
     }

@@ -1,7 +1,7 @@
-//! Drawing: time per picture beyond meshing, beside its floor.
+//! Time to draw a picture of a mesh, with a lower bound.
 //!
-//! `MOLMESH_STRUCTURES=FOLDER cargo bench --bench picture` draws 2HHB from `FOLDER`; without it, the bundled 4PTI alone. The floor
-//! is what cannot be left out: every triangle's corners are read once, every pixel of the picture is written once.
+//! `MOLMESH_STRUCTURES=FOLDER cargo bench --bench picture` also draws 2HHB from `FOLDER`; the default is only the
+//! bundled 4PTI. The lower bound reads the corners of all triangles once and writes all pixels once.
 
 use std::hint::black_box;
 use std::path::PathBuf;
@@ -12,7 +12,7 @@ use molmesh::pipeline::{self, Choice, JobLimits, params};
 use molmesh::surface::{CancelToken, Control, CpuBackend, Mesh};
 use rayon::prelude::*;
 
-/// The structures that are there: the bundled one, and 2HHB.
+/// Returns the available structures: the bundled one, and 2HHB.
 fn structures() -> Vec<(&'static str, PathBuf)> {
     let bundled = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb"));
     let mut all = vec![("4pti", bundled)];
@@ -23,7 +23,7 @@ fn structures() -> Vec<(&'static str, PathBuf)> {
     all
 }
 
-#[expect(clippy::unwrap_used, reason = "a benchmark that cannot run says why by panicking")]
+#[expect(clippy::unwrap_used, reason = "a benchmark fails by panicking")]
 fn mesh(path: &PathBuf) -> Mesh {
     let backend = CpuBackend::new(None).unwrap();
     let choice = Choice { backend: &backend, reason: "measured" };
@@ -47,7 +47,7 @@ fn floor(mesh: &Mesh, image: &mut Image) -> f32 {
     sum
 }
 
-#[expect(clippy::unwrap_used, reason = "a benchmark that cannot run says why by panicking")]
+#[expect(clippy::unwrap_used, reason = "a benchmark fails by panicking")]
 fn picture(criterion: &mut Criterion) {
     let renderer = CpuRenderer::default();
     for (name, path) in structures() {

@@ -1,7 +1,7 @@
-//! Preparing a device's job on the host, one thread and all: atoms to the lattice, and the plan of bricks.
+//! Time to prepare a GPU job on the host, on one thread and on all: lattice of atoms, and plan of bricks.
 //!
-//! `cargo bench --bench prepare`. The atoms are made up, at the density of proteins and in the order of files: domain by
-//! domain, so that neighbours in the file are near each other.
+//! Run it with `cargo bench --bench prepare`. The atoms are generated at the density of proteins, domain by domain, so
+//! that consecutive atoms are near each other, as in files.
 
 use std::hint::black_box;
 
@@ -10,7 +10,7 @@ use molmesh::gpu::plan::Plan;
 use molmesh::surface::lattice::Lattice;
 use molmesh::surface::{Control, Spheres, SurfaceLimits, SurfaceParams};
 
-/// Side of a domain, Å, and its atoms other than hydrogen: 20 Å³ an atom.
+/// Side of a domain, Å, and its number of heavy atoms: 20 Å³ per atom.
 const DOMAIN: (f64, usize) = (30.0, 1350);
 
 fn atoms(n: usize) -> Spheres {

@@ -1,8 +1,9 @@
-//! Reading speed in bytes of inflated text per second, one thread and all: `cargo bench --bench read`.
+//! Reading speed in bytes of inflated text per second, on one thread and on all. Run it with `cargo bench --bench
+//! read`.
 //!
-//! Runs over the small files of `samples/`, and over those of the folder in `MOLMESH_STRUCTURES`, if it is set, that are
-//! large enough to time. `6zu5.bcif` is made there from the text: `target/test-tools/venv/bin/python
-//! tests/tools/write_bcif.py compressed 6zu5.cif.gz 6zu5.bcif`; its bytes per second are not those of text, its atoms are.
+//! Reads the small files of `samples/`, and large files of the folder in `MOLMESH_STRUCTURES`, if it is set. Create
+//! `6zu5.bcif` there with `target/test-tools/venv/bin/python tests/tools/write_bcif.py compressed 6zu5.cif.gz
+//! 6zu5.bcif`. For BinaryCIF, compare atoms per second, not bytes.
 
 use std::hint::black_box;
 use std::io::Read;

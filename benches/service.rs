@@ -1,5 +1,7 @@
-//! What the service adds to a synchronous upload of about 1,000 atoms beyond reading, meshing and encoding: over a
-//! socket of this machine, the client's own time included. `cargo bench --bench service`.
+//! Overhead of the service for a synchronous upload of about 1,000 atoms: total time minus reading, meshing and
+//! encoding.
+//!
+//! Uses a local socket; the overhead includes the time of the client. Run it with `cargo bench --bench service`.
 
 #![expect(clippy::print_stdout, clippy::unwrap_used, reason = "a benchmark prints its figures and may panic")]
 
@@ -12,8 +14,8 @@ use std::time::Instant;
 use http_support::{SAMPLE, start};
 use molmesh::surface::CpuBackend;
 
-/// The sample and, 40 Å beside it, its twin: 908 atoms.
-fn twins() -> Vec<u8> {
+/// Returns the sample with a copy at a distance of 40 Å: 908 atoms.
+fn doubled_sample() -> Vec<u8> {
     let text = std::str::from_utf8(SAMPLE).unwrap();
     let atoms = || text.lines().filter(|line| line.starts_with("ATOM"));
     let moved = atoms().map(|line| {
@@ -25,19 +27,19 @@ fn twins() -> Vec<u8> {
 
 fn main() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
-    let twins = twins();
+    let structure = doubled_sample();
     let encode = || server.metric("molmesh_job_stage_duration_seconds_sum", &["stage=\"encode\""]) * 1e3;
     let mut overheads: Vec<f64> = (0..500)
         .map(|n| {
-            // The same upload again would be answered from the store.
-            let body = [format!("REMARK 900 {n}\n").as_bytes(), &twins].concat();
+            // Identical uploads would be answered from the store.
+            let body = [format!("REMARK 900 {n}\n").as_bytes(), &structure].concat();
             let before = encode();
             let start = Instant::now();
             let reply = server.post("/v1/meshes?resolution=1", &[], &body);
             let wall = start.elapsed().as_secs_f64() * 1e3;
             assert_eq!(reply.status, 200);
             let timing = reply.header("server-timing").unwrap();
-            // The service's own; writing the file is what the metric adds up, to its last byte.
+            // Stages of the service. The metric has the time to write the file, to its last byte.
             let own = ["receive", "lookup", "load", "queue", "encode", "other", "total"];
             let stages = timing.split(", ").map(|stage| stage.split_once(";dur=").unwrap());
             let work: f64 =

@@ -1,15 +1,17 @@
 #!/usr/bin/env python3
-"""Thousands of listeners to the events of one job: what each costs, and how late events are.
+"""Measures memory per listener and lag of events with thousands of listeners to the events of one job.
 
     molmesh serve --listen 127.0.0.1:8080 --backend reference --set archive.url=none --set server.connections=4000 --set jobs.workers=1 &
     python3 benches/load/listeners.py http://127.0.0.1:8080 samples/4pti.pdb --pid $!
 
-Long jobs of the slow reference backend, more than there is time for, keep the only worker busy; the listeners watch another one, which waits behind them. Then
-the long ones are cancelled, so that the watched one runs and ends: the lag is the time from its `finished` (by the service's clock, on this machine) to the event.
+Long jobs of the slow reference backend keep the only worker busy. The listeners watch a job that is queued behind them.
+The long jobs are then cancelled, so that the watched job runs and ends. The lag is the time from its `finished` (by the
+clock of the service, on this machine) to the event.
 
-What a listener costs is how much the server's resident memory (VmRSS) rises with the second half of the listeners, by their number: the
-first half takes what earlier work has left free. The long jobs have many atoms on few samples, so that their own memory is small and does not
-move; how far it does move without listeners is printed too.
+The memory per listener is the increase of the resident memory (VmRSS) of the server with the second half of the
+listeners, divided by their number. The first half reuses memory that earlier work has freed. The long jobs have many
+atoms on few grid points, so that their memory is small and constant. The change of the memory without listeners is also
+printed.
 """
 
 import argparse
@@ -29,7 +31,7 @@ def memory(pid):
             return int(line.split()[1]) * 1024
 
 
-def promise(url, structure, query):
+def start_job(url, structure, query):
     request = urllib.request.Request(f"{url}/v1/meshes{query}", structure, {"Prefer": "respond-async"})
     return json.load(urllib.request.urlopen(request))["jobID"]
 
@@ -52,13 +54,13 @@ async def listen(host, port, job, ready, lags):
 
 
 def crowd(structure, times):
-    """The structure's atoms so many times in the same place: much work on a small grid."""
+    """Returns the atoms of the structure, repeated `times` times in place: much work on a small grid."""
     atoms = b"".join(line for line in structure.splitlines(keepends=True) if line.startswith(b"ATOM"))
     return atoms * times
 
 
 async def settled(pid):
-    """Resident memory once it has stayed within 64 KiB for two seconds."""
+    """Returns the resident memory after it has stayed within 64 KiB for two seconds, bytes."""
     seen = [memory(pid)]
     for _ in range(60):
         await asyncio.sleep(0.5)
@@ -78,8 +80,8 @@ async def main():
     parts = urlsplit(args.url)
     structure = open(args.structure, "rb").read()
     crowded = crowd(structure, 200)
-    long = [promise(args.url, crowded + b"REMARK 900 %d\n" % n, "?resolution=0.7") for n in range(24)]
-    watched = promise(args.url, structure, "?resolution=2")
+    long = [start_job(args.url, crowded + b"REMARK 900 %d\n" % n, "?resolution=0.7") for n in range(24)]
+    watched = start_job(args.url, structure, "?resolution=2")
     alone = await settled(args.pid)
     await asyncio.sleep(3)
     before = await settled(args.pid)
@@ -93,7 +95,7 @@ async def main():
     each = (taken[1] - taken[0]) / (args.listeners // 2)
     if lags:
         raise SystemExit("the long jobs were too short")
-    # The last ones first, so that none of them begins.
+    # Cancel the last ones first, so that none of them starts.
     for job in reversed(long):
         try:
             urllib.request.urlopen(urllib.request.Request(f"{args.url}/v1/jobs/{job}", method="DELETE"))

@@ -1,5 +1,7 @@
-"""What the load scripts share: a server that can be stopped and started on its port, and clients that ask for a mixture of
-things, come back when they are told to or cut off, and compare every byte with what the command line makes of the same input.
+"""Server and clients shared by the load scripts.
+
+The server can be restarted on its port. The clients send a mixture of requests, retry when a request is rejected or
+interrupted, and compare all bytes with the output of the command line for the same input.
 """
 
 import http.client
@@ -12,14 +14,14 @@ import threading
 import time
 from collections import Counter
 
-# What goes wrong when a server is away, or goes while it is asked: the client comes again.
+# Errors of a server that is stopped before or during a request. The client retries.
 AWAY = (OSError, http.client.HTTPException)
 RESOLUTIONS = ("0.6", "0.8", "1", "1.5", "2")
 KERNELS = ("gaussian", "soft-object", "inverse-square")
 
 
 class Server:
-    """One service, again and again on the same port and the same data."""
+    """Service that can be restarted on the same port with the same data."""
 
     def __init__(self, binary, folder, port, extra=()):
         self.command = [binary, "serve", "--listen", f"127.0.0.1:{port}", "--metrics-listen", f"127.0.0.1:{port + 1}"]
@@ -27,7 +29,7 @@ class Server:
         self.port, self.log = port, os.path.join(folder, "log.txt")
 
     def start(self):
-        """Starts it; seconds until it is ready."""
+        """Starts the service. Returns the time until it is ready, s."""
         begin = time.perf_counter()
         with open(self.log, "ab") as log:
             self.process = subprocess.Popen(self.command, stdout=log, stderr=log)
@@ -42,19 +44,19 @@ class Server:
             time.sleep(0.01)
 
     def stop(self):
-        """SIGTERM; seconds until it is gone, and its exit code."""
+        """Stops the service with SIGTERM. Returns its exit code and the time until it has ended, s."""
         begin = time.perf_counter()
         self.process.terminate()
         return self.process.wait(), time.perf_counter() - begin
 
     def metric(self, name):
-        """The sum of a metric's series."""
+        """Returns the sum of the series of a metric."""
         text = fetch(self.port + 1, "GET", "/metrics")[2].decode()
         return sum(float(line.rpartition(" ")[2]) for line in text.splitlines() if re.match(rf"{name}[ {{]", line))
 
 
 def fetch(port, method, path, body=None, headers=None, timeout=60):
-    """Status, headers and body of one request on a connection of its own."""
+    """Sends a request on a new connection. Returns status, headers and body."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=timeout)
     try:
         connection.request(method, path, body, {"connection": "close", **(headers or {})})
@@ -65,13 +67,13 @@ def fetch(port, method, path, body=None, headers=None, timeout=60):
 
 
 class Expected:
-    """The bytes that each question must be answered with, made by `molmesh mesh` beforehand."""
+    """Expected responses, computed beforehand with `molmesh mesh`."""
 
     def __init__(self, binary, structures):
         self.inputs, self.files = [], {}
         for number, path in enumerate(structures):
             with open(path, "rb") as file:
-                # A line that says nothing, in the words of the file's format.
+                # A comment line in the format of the file.
                 remark = b"# %032x\n" if ".cif" in path else b"REMARK 900 %032x\n"
                 self.inputs.append((file.read(), remark))
             for resolution in RESOLUTIONS:
@@ -80,26 +82,26 @@ class Expected:
                     made = subprocess.run(command + ["--backend", "cpu"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, check=True)
                     self.files[number, resolution, kernel] = made.stdout
 
-    def question(self, dice):
-        """A structure, its bytes with a remark that makes them new, the query, and the answer."""
+    def next_request(self, dice):
+        """Returns a structure with a unique remark, a query, and the expected bytes."""
         number, resolution, kernel = key = dice.choice(list(self.files))
         structure, remark = self.inputs[number]
         return structure + remark % dice.getrandbits(128), f"resolution={resolution}&kernel={kernel}", self.files[key]
 
 
 class Load:
-    """Clients that ask until they are told to stop. `counts` says what came of it; anything under a name that begins with
-    `bad` must not have happened."""
+    """Clients that send requests until `finish` is called. `counts` has the outcomes; names that begin with `bad` are
+    errors."""
 
     def __init__(self, port, expected, clients, seed=1, every=0.0, later=float("inf")):
         self.port, self.expected = port, expected
-        # Seconds after which jobs are looked at that nobody looked at at once; without end: by `settle`.
+        # Seconds after which deferred jobs are followed; infinite: only by `settle`.
         self.later = later
-        # Seconds between the beginnings of two questions, whoever asks; 0: as fast as they are answered.
+        # Seconds between the starts of two requests of all clients; 0: without pauses.
         self.every, self.turn = every, time.monotonic()
         self.counts, self.lock, self.over = Counter(), threading.Lock(), threading.Event()
-        # Each promise: when, the address of the job, and the answer.
-        self.promised = []
+        # Deferred jobs: time, URL, and expected bytes.
+        self.deferred = []
         self.threads = [threading.Thread(target=self.client, args=(seed + n,)) for n in range(clients)]
 
     def start(self):
@@ -117,23 +119,23 @@ class Load:
 
     def client(self, seed):
         dice = random.Random(seed)
-        kinds = (self.mesh, self.mesh, self.promise, self.promise, self.upload, self.dismiss)
+        kinds = (self.mesh, self.mesh, self.start_job, self.start_job, self.upload, self.dismiss)
         while not self.over.is_set():
             with self.lock:
                 self.turn = turn = max(self.turn + self.every, time.monotonic() - 1)
             if not self.over.wait(turn - time.monotonic() if self.every else 0):
                 dice.choice(kinds)(dice)
-                self.count("questions")
+                self.count("requests")
                 self.settle(time.monotonic() - self.later)
 
     def ask(self, method, path, body=None, headers=None, good=(200,), patience=60.0):
-        """Asks until there is an answer; None if there was none in time."""
+        """Sends a request until it succeeds. Returns None if it does not succeed in time."""
         end = time.monotonic() + patience
         while time.monotonic() < end:
             try:
                 status, heads, answer = fetch(self.port, method, path, body, headers)
             except http.client.IncompleteRead:
-                # An answer had begun: it should have been whole.
+                # A response that has started must be complete.
                 self.count("bad: answers cut off")
                 continue
             except (ConnectionRefusedError, ConnectionResetError, http.client.RemoteDisconnected, BrokenPipeError) as why:
@@ -157,8 +159,8 @@ class Load:
             self.count("bad: wrong bytes")
 
     def mesh(self, dice):
-        """Requests a mesh with a wait. If it takes longer, the answer is a job, which is followed."""
-        fresh, query, want = self.expected.question(dice)
+        """Requests a mesh with a wait. Follows the job if it takes longer."""
+        fresh, query, want = self.expected.next_request(dice)
         answer = self.ask("POST", f"/v1/meshes?{query}", fresh, {"prefer": "wait=10"}, good=(200, 202))
         if answer is None:
             return
@@ -167,21 +169,21 @@ class Load:
         else:
             self.compare("meshes", answer[2], want)
 
-    def promise(self, dice):
-        """A job; half of them are looked at later."""
-        fresh, query, want = self.expected.question(dice)
+    def start_job(self, dice):
+        """Starts a job. Follows half of the jobs later."""
+        fresh, query, want = self.expected.next_request(dice)
         answer = self.ask("POST", f"/v1/meshes?{query}", fresh, {"prefer": "respond-async"}, good=(202,))
         if answer is None:
             return
         self.count("jobs accepted")
         if dice.random() < 0.5:
             with self.lock:
-                self.promised.append((time.monotonic(), answer[1]["location"], want))
+                self.deferred.append((time.monotonic(), answer[1]["location"], want))
         else:
             self.follow(answer[1]["location"], want)
 
     def follow(self, location, want):
-        """The result of a job, by its status and then its bytes, whole or in two ranges."""
+        """Waits for a job and compares its result, which is read in two ranges."""
         end = time.monotonic() + 60
         while time.monotonic() < end:
             answer = self.ask("GET", f"{location}?wait=5")
@@ -203,8 +205,8 @@ class Load:
             self.compare("jobs done", first[2] + rest[2], want)
 
     def upload(self, dice):
-        """A structure that stays, and meshes of it, the second from the cache."""
-        fresh, query, want = self.expected.question(dice)
+        """Uploads a structure and requests a mesh of it twice, the second time from the cache."""
+        fresh, query, want = self.expected.next_request(dice)
         made = self.ask("POST", "/v1/structures", fresh, good=(200, 201))
         if made is None:
             return
@@ -214,19 +216,19 @@ class Load:
                 self.compare("meshes of uploads", answer[2], want)
 
     def dismiss(self, dice):
-        """A job that nobody wants any more."""
-        fresh, query, _ = self.expected.question(dice)
+        """Starts a job and cancels it."""
+        fresh, query, _ = self.expected.next_request(dice)
         answer = self.ask("POST", f"/v1/meshes?{query}", fresh, {"prefer": "respond-async"}, good=(202,))
         if answer and self.ask("DELETE", answer[1]["location"], good=(200, 204, 404, 409, 410)):
             self.count("jobs dismissed")
 
     def settle(self, until=float("inf")):
-        """Follows what was promised until then and not looked at yet."""
+        """Follows the jobs deferred before `until`."""
         while True:
             with self.lock:
-                if not self.promised or self.promised[0][0] > until:
+                if not self.deferred or self.deferred[0][0] > until:
                     return
-                _, location, want = self.promised.pop(0)
+                _, location, want = self.deferred.pop(0)
             self.follow(location, want)
 
     def bad(self):
@@ -237,5 +239,5 @@ class Load:
 
 
 def folder():
-    """Where a server keeps its things while it is measured."""
+    """Creates a temporary data folder for a server."""
     return tempfile.mkdtemp(prefix="molmesh-load-")

@@ -1,16 +1,16 @@
 #!/usr/bin/env python3
-"""What it costs to be watched: requests a second with metrics and traces, and without.
+"""Measures the cost of metrics and traces in requests per second.
 
     python3 benches/load/observed.py target/release/molmesh samples/4pti.pdb --rounds 9 --seconds 4
 
-Three servers of the same binary run side by side on data of their own: `off` (no metrics, no traces), `metrics` (read every
-second), `all` (metrics, and every span sent to a collector that this script plays). They are asked in turn, round by round, one
-at a time, by `--clients` clients on connections that are kept; each figure is the median of the rounds, each ratio the
-median of the ratios within a round. Three kinds of requests: meshes that must be computed at the default grid (a fresh
-remark each), the same at a coarse grid, so that what surrounds the computing counts, and a mesh that lies in memory.
+Three servers of the same binary run in parallel with separate data: `off` (no metrics, no traces), `metrics` (scraped
+every second), and `all` (metrics, and all spans sent to a collector in this script). They are measured in turn, one at
+a time, by `--clients` clients with persistent connections. Figures are medians of the rounds, ratios are medians of the
+ratios within a round. There are three kinds of requests: new meshes at the default grid (each with a new remark), new
+meshes at a coarse grid, where overhead dominates, and a mesh that is cached in memory.
 
-The clients and the collector share the machine with the servers, and cost more than what is looked for. So beside the
-requests a second there is the server's own processor time a request: what a server that has its cores to itself loses.
+The clients and the collector share the machine with the servers, and use more time than the measured difference. The
+script therefore also prints the processor time of the server per request.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from statistics import median
 
 
 class Collector(http.server.BaseHTTPRequestHandler):
-    """Takes every batch, and counts it."""
+    """Collector that counts the bytes of all batches."""
 
     protocol_version = "HTTP/1.1"
     bytes = 0
@@ -73,7 +73,7 @@ class Service:
             time.sleep(1)
 
     def cpu(self):
-        """Processor seconds so far."""
+        """Returns the processor time used by the server, s."""
         with open(f"/proc/{self.process.pid}/stat") as stat:
             fields = stat.read().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
@@ -96,7 +96,7 @@ async def client(port, request, end, counts):
 
 
 async def measure(service, request, seconds, clients):
-    """Requests a second, and the server's microseconds of processor time for each."""
+    """Returns the requests per second, and the processor time of the server per request, µs."""
     counts, cpu, begin = [0], service.cpu(), time.perf_counter()
     await asyncio.gather(*(client(service.port, request, begin + seconds, counts) for _ in range(clients)))
     rate = counts[0] / (time.perf_counter() - begin)
@@ -136,7 +136,7 @@ def main():
     for what, request in (("default grid", fresh(0.5)), ("coarse grid", fresh(3)), ("from memory", lambda: same)):
         rounds = []
         for n in range(args.rounds + 1):
-            # Whoever comes first in one round comes last in the next.
+            # Alternate the order of the servers.
             turn = services if n % 2 else services[::-1]
             took = {s.name: asyncio.run(measure(s, request, args.seconds, args.clients)) for s in turn}
             if n > 0:

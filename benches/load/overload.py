@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Ten times more clients than the service has places for: how fast it refuses, and whether its Retry-After is right.
+"""Measures rejections and the accuracy of Retry-After with ten times more clients than the service can hold.
 
     molmesh serve --listen 127.0.0.1:8080 --set archive.url=none &
     python3 benches/load/overload.py http://127.0.0.1:8080 samples/4pti.pdb --seconds 120
 
-First the peak: as many clients as there are workers, none of them refused. Then `--times` the places (workers and
-queue): every client posts structures of its own, one after another, and comes back when it is told to. A Retry-After of r
-seconds is right if the client's job is accepted after r/2 to 2r seconds (r is a whole second at least: earlier is right
-too). Prints one line a figure.
+The script first measures the peak with one client more than there are workers, none of which is rejected. Then it
+starts `--times` as many clients as the workers and the queue hold. Each client posts unique structures, one after
+another, and retries after Retry-After. A Retry-After of r seconds is accurate if the job is accepted within 2r seconds.
+Since r is at least one second, earlier is accurate, too. Prints one line per figure.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 
 async def post(host, port, path, body):
-    """Status, Retry-After, seconds until the head of the answer."""
+    """Posts a body. Returns status, Retry-After, and the time to the head of the response, s."""
     begin = time.perf_counter()
     reader, writer = await asyncio.open_connection(host, port)
     try:
@@ -51,7 +51,7 @@ class Load:
         self.done, self.refusals, self.ratios, self.told, self.errors = 0, [], [], [], 0
 
     def body(self):
-        """The structure with a remark: the same work, but not the same content."""
+        """Returns the structure with a unique remark: the same work, but different content."""
         self.n += 1
         return self.structure + b"REMARK 900 %d %d\n" % (os.getpid(), self.n)
 
@@ -78,7 +78,7 @@ class Load:
                 elif now < end:
                     self.done += 1
                 if refused is not None:
-                    # The answer came `took` after the job was accepted, at the latest.
+                    # The job was accepted at most `took` before the response.
                     self.ratios.append((now - took - refused) / said)
                 break
 
@@ -90,7 +90,7 @@ def memory(pid):
 
 
 def buckets(url, status):
-    """Requests by the service's own clock: (upper bound in seconds, requests up to it)."""
+    """Returns the histogram of request durations of the service, as (upper bound in s, cumulative requests)."""
     found = {}
     for line in urllib.request.urlopen(f"{url}/metrics").read().decode().splitlines():
         if line.startswith("http_server_request_duration_seconds_bucket") and f'status="{status}"' in line:
@@ -106,8 +106,8 @@ async def main():
     parser.add_argument("--seconds", type=float, default=120)
     parser.add_argument("--times", type=float, default=10)
     parser.add_argument("--resolution", default="0.3")
-    parser.add_argument("--pid", type=int, help="the service's process, for its memory")
-    parser.add_argument("--metrics", help="the service's metrics, for refusals by its own clock")
+    parser.add_argument("--pid", type=int, help="process of the service, to measure its memory")
+    parser.add_argument("--metrics", help="base URL of the metrics listener, to measure rejections by the clock of the service")
     args = parser.parse_args()
     limits = json.load(urllib.request.urlopen(f"{args.url}/v1/capabilities"))["limits"]
     structure = open(args.structure, "rb").read()

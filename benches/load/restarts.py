@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""A minute of mixed load while the service is stopped and started again every ten seconds: is anything lost, is a byte wrong?
+"""Checks that restarts under mixed load lose no jobs and return no wrong bytes.
 
     python3 benches/load/restarts.py target/release/molmesh samples/4pti.pdb samples/1crn.cif --seconds 60 --every 10
 
-Clients ask for meshes, promise themselves jobs, upload structures, dismiss jobs, read results in ranges; all come again where
-the service is away or says so. Every answer is compared with what `molmesh mesh` makes of the same input. SIGTERM comes in the
-midst of it; the service is started again once it is gone. Ends with 1 if anything is bad.
+The clients request meshes, start and cancel jobs, upload structures, and read results in ranges. They retry while the
+service is stopped or asks them to. Each response is compared with the output of `molmesh mesh` for the same input. The
+service is stopped with SIGTERM under load and restarted after it has ended. The exit code is 1 if anything is wrong.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def main():
     print(f"stops: {len(stops)}, exit codes {sorted(set(codes))}, median {median(stops):.2f} s, longest {max(stops):.2f} s")
     print(f"ready again: median {median(starts):.3f} s, longest {max(starts):.3f} s")
     if load.bad() or any(codes):
-        sys.exit("something is bad: see above")
+        sys.exit("errors occurred: see above")
 
 
 main()

@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Half an hour of mixed load at half of what the service can do: does memory grow, does anything leak?
+"""Checks for leaks and growth of memory under half an hour of mixed load at half of the peak rate.
 
     python3 benches/load/soak.py target/release/molmesh samples/4pti.pdb samples/1crn.cif --minutes 30 --warm-up 5
 
-The peak is measured first, by as many clients as can be served. Then questions come at half that pace. Every five seconds the
-process is looked at: resident memory, threads, open files by what they are, and its own gauges of leases, jobs and connections.
-What is kept is forgotten after a minute and a half and bounded to sizes that the warm-up reaches, so that what still grows
-afterwards would grow for ever. The slope is Theil and Sen's: the median of all slopes between two samples. The counts are
-compared with those before the load, after a pause. Ends with 1 if an answer was wrong or a count did not come back.
+The script first measures the peak rate, then sends requests at half of it. Every five seconds it samples resident
+memory, threads, open files by kind, and the gauges of memory, jobs and connections. Stored objects expire after 90
+seconds, and the warm-up reaches the limits of the store, so that any further growth is a leak. The slope is that of
+Theil and Sen: the median of the slopes between all pairs of samples. After a pause, the counts are compared with those
+before the load. The exit code is 1 if a response was wrong or a count has increased.
 """
 
 import argparse
@@ -27,8 +27,8 @@ KEPT += ["store.max_bytes=2GiB", "store.memory_bytes=32MiB"]
 GAUGES = ("molmesh_memory_held_bytes", "molmesh_jobs_open", "molmesh_connections", "molmesh_queue_depth")
 
 
-def look(server):
-    """What the process holds now."""
+def sample_process(server):
+    """Samples memory, threads, files and gauges of the process."""
     process = f"/proc/{server.process.pid}"
     with open(f"{process}/status") as status:
         numbers = dict(re.findall(r"^(VmRSS|Threads):\s+(\d+)", status.read(), re.M))
@@ -44,7 +44,7 @@ def look(server):
 
 
 def slope(samples):
-    """Change of the resident memory a second."""
+    """Returns the change of the resident memory, bytes per second."""
     pairs = itertools.combinations(samples, 2)
     return median((b["rss"] - a["rss"]) / (b["at"] - a["at"]) for a, b in pairs)
 
@@ -57,39 +57,39 @@ def main():
     parser.add_argument("--warm-up", type=float, default=5)
     parser.add_argument("--clients", type=int, default=12)
     parser.add_argument("--port", type=int, default=18490)
-    parser.add_argument("--samples", help="file for every sample, as JSON")
+    parser.add_argument("--samples", help="file for all samples, as JSON")
     args = parser.parse_args()
     server = Server(args.binary, folder(), args.port, ["--backend", "cpu", *itertools.chain(*(("--set", k) for k in KEPT))])
     expected = Expected(args.binary, args.structures)
     server.start()
 
-    # The first requests make threads and connections that stay; what is counted as "before" is after them.
+    # The first requests create threads and connections that remain, so `before` is sampled after them.
     peak = Load(args.port, expected, args.clients, later=20)
     peak.start()
     time.sleep(20)
     peak.finish()
     peak.settle()
-    rate = peak.counts["questions"] / 20
+    rate = peak.counts["requests"] / 20
     time.sleep(10)
-    before = look(server)
-    print(f"peak {rate:.1f} questions/s; now {rate / 2:.1f} for {args.minutes:g} minutes", flush=True)
+    before = sample_process(server)
+    print(f"peak {rate:.1f} requests/s; now {rate / 2:.1f} for {args.minutes:g} minutes", flush=True)
 
     load = Load(args.port, expected, args.clients, seed=1000, every=2 / rate, later=20)
     begin, samples = time.monotonic(), []
     load.start()
     while (at := time.monotonic() - begin) < 60 * args.minutes:
-        samples.append({"at": at, **look(server)})
+        samples.append({"at": at, **sample_process(server)})
         if len(samples) % 60 == 0:
-            print(f"{at / 60:5.1f} min: {samples[-1]['rss'] / 2**20:.1f} MiB, {load.counts['questions']} questions", flush=True)
+            print(f"{at / 60:5.1f} min: {samples[-1]['rss'] / 2**20:.1f} MiB, {load.counts['requests']} requests", flush=True)
         time.sleep(5)
     load.finish()
     load.settle()
-    asked = load.counts["questions"] / (60 * args.minutes)
-    # Everything that was kept is forgotten, every connection closed.
+    asked = load.counts["requests"] / (60 * args.minutes)
+    # Wait until all stored objects have expired and all connections are closed.
     time.sleep(120)
-    # The connection that asked for the metrics may be counted while it closes: a few looks, and what stays has stayed.
+    # The metrics may count their own connection while it closes, so sample several times.
     for _ in range(10):
-        after = look(server)
+        after = sample_process(server)
         if all(after.get(what, 0) <= before.get(what, 0) for what in after.keys() - {"rss"}):
             break
         time.sleep(2)
@@ -101,7 +101,7 @@ def main():
     middle = median(sample["rss"] for sample in warm)
     growth = 100 * 3600 * slope(warm) / middle
     print(load.report())
-    print(f"pace: {asked:.1f} questions/s, {100 * asked / rate:.0f} % of the peak")
+    print(f"pace: {asked:.1f} requests/s, {100 * asked / rate:.0f} % of the peak")
     print(f"resident memory: median {middle / 2**20:.1f} MiB, slope {growth:+.2f} %/h after {args.warm_up:g} minutes")
     leaked = []
     for what in sorted(before.keys() | after.keys()):
@@ -112,7 +112,7 @@ def main():
     code, took = server.stop()
     print(f"stopped in {took:.2f} s with {code}")
     if load.bad() or leaked or code:
-        sys.exit(f"something is bad: see above; more than before: {', '.join(leaked) or 'nothing'}")
+        sys.exit(f"errors occurred: see above; more than before: {', '.join(leaked) or 'nothing'}")
 
 
 main()

@@ -1,4 +1,4 @@
-"""Who is compared: how each is started, and what kind of surface it makes."""
+"""Programs of the comparison: their commands and kinds of surfaces."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,13 +7,13 @@ from typing import Callable
 import install
 
 HERE = Path(__file__).resolve().parent
-# Splashsurf's radius is a particle's; its kernel reaches 1.7 of it. The level gives about as many triangles as ours.
+# The radius is that of a particle, the kernel radius 1.7 times that. The level gives about as many triangles as ours.
 SPLASH = ["-r", "1", "-l", "1.7", "-t", "0.15", "--normals=on", "-q"]
 
 
 @dataclass
 class Job:
-    """One structure, prepared, and what the mesh is to be called (without extension)."""
+    """Prepared structure, and the path of the mesh without extension."""
 
     name: str
     file: Path
@@ -31,11 +31,11 @@ class Job:
 @dataclass
 class Peer:
     name: str
-    #: "same" (our very density), "gaussian" (near it), "ses" (another surface)
+    #: "same" (our density), "gaussian" (similar), "other" (another Gaussian), "ses" (solvent-excluded surface)
     surface: str
     extension: str
     command: Callable[[Job], list]
-    #: Installs it where it is absent and returns its version; raises `install.Missing` with the reason.
+    #: Installs the program if necessary and returns its version; raises `install.Missing` with the reason.
     ready: Callable[[], str]
     environment: Callable[[], dict] = dict
 
@@ -53,7 +53,7 @@ def pymol(kind):
 
 
 def catalog(molmesh):
-    """All of them, ours first; `molmesh` is our binary."""
+    """Returns all programs, ours first. `molmesh` is the path of our binary."""
     def ours(job):
         spacing = ["--resolution", str(job.spacing)]
         return [str(molmesh), "mesh", str(job.file), "--backend", "cpu", "--quiet", *spacing, "-o", job.mesh(".glb")]
@@ -67,7 +67,7 @@ def catalog(molmesh):
         return ["node", "--max-old-space-size=12288", str(HERE / "molstar_peer.cjs"), *arguments]
 
     def edtsurf(job):
-        # -t 1: marching cubes; -s 3: molecular surface; -h 1: cavities too; -f: cells an ångström.
+        # -t 1: marching cubes; -s 3: molecular surface; -h 1: with cavities; -f: cells per ångström.
         options = ["-t", "1", "-s", "3", "-h", "1", "-f", str(1 / job.spacing)]
         return [install.edtsurf(), "-i", job.beside(".edt.pdb"), *options, "-o", str(job.target)]
 

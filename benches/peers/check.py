@@ -1,8 +1,8 @@
-"""Looks at a mesh file with trimesh: `check.py FILE`, one line of JSON.
+"""Checks a mesh file with trimesh: `check.py FILE` prints one line of JSON.
 
-Closed means that every edge belongs to exactly two triangles, by the file's own indices: vertices at the same place stay
-apart. Only where a file has no indices (three vertices a triangle, none shared) vertices with identical coordinates are made
-one first, and `merged` says so. Edges are counted here too, and the two counts must agree.
+A mesh is closed if each edge belongs to exactly two triangles by the indices of the file. Vertices with identical
+coordinates are merged only if the file shares no vertices; `merged` is true then. Edges are also counted here, and both
+results must agree.
 """
 
 import json
@@ -15,7 +15,7 @@ CHUNK = 1 << 20
 
 
 def ascii_ply(data):
-    """Vertices and faces of a text PLY whose first three properties are coordinates and whose faces are triangles."""
+    """Returns vertices and faces of a text PLY of triangles whose first three properties are coordinates."""
     head, body = data.split(b"end_header\n", 1)
     counts, widths, section = {}, {}, None
     for words in (line.split() for line in head.decode().splitlines()):
@@ -35,7 +35,7 @@ def ascii_ply(data):
 
 
 def obj(data):
-    """Vertices and faces of an OBJ of triangles."""
+    """Returns vertices and faces of an OBJ of triangles."""
     lines = data.split(b"\n")
     vertices = b" ".join(line[2:] for line in lines if line.startswith(b"v "))
     corners = [word.split(b"/")[0] for line in lines if line.startswith(b"f ") for word in line.split()[1:]]
@@ -43,8 +43,8 @@ def obj(data):
 
 
 def load(path):
-    """Vertices (N × 3, Å) and faces (M × 3) as they are in the file. Large text files would need many times their size in
-    trimesh's readers; those are read here."""
+    """Returns vertices (N × 3, Å) and faces (M × 3) as in the file. Parses text files itself, as the readers of trimesh
+    need many times their size."""
     if path.endswith(".obj"):
         with open(path, "rb") as file:
             return obj(file.read())
@@ -58,7 +58,7 @@ def load(path):
 
 
 def merge(vertices, faces):
-    """Vertices with identical coordinates become one."""
+    """Merges vertices with identical coordinates."""
     rows = np.ascontiguousarray(vertices + 0.0)  # −0 is 0
     keys = rows.view(np.dtype((np.void, rows.dtype.itemsize * 3))).ravel()
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
@@ -66,7 +66,7 @@ def merge(vertices, faces):
 
 
 def edges(faces, vertices):
-    """How many edges have one triangle, and how many more than two."""
+    """Counts the edges with one triangle, and those with more than two."""
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     keys = np.sort(pairs.min(axis=1) * vertices + pairs.max(axis=1))
     ends = np.flatnonzero(np.diff(keys, append=-1))
@@ -75,7 +75,8 @@ def edges(faces, vertices):
 
 
 def area_and_volume(vertices, faces):
-    """Å² and Å³; the volume is negative where triangles are wound inwards, and means little where the mesh is open."""
+    """Returns area (Å²) and volume (Å³). The volume is negative for inward orientation, and not meaningful for open
+    meshes."""
     area = volume = 0.0
     centre = vertices.mean(axis=0)
     for begin in range(0, len(faces), CHUNK):
@@ -86,7 +87,7 @@ def area_and_volume(vertices, faces):
 
 
 def report(vertices, faces):
-    """What the tables need. Raises ValueError where the two counts of edges disagree."""
+    """Returns the figures for the tables. Raises ValueError if the two checks of edges disagree."""
     soup = len(faces) > 0 and len(vertices) == 3 * len(faces)
     if soup:
         vertices, faces = merge(vertices, faces)

@@ -1,7 +1,7 @@
-"""Our density on a dense grid, by numba: the field that VTK and scikit-image are given to contour.
+"""Computes our density on a dense grid with numba, as input of VTK and scikit-image.
 
-The same kernel, cut-off, lattice and radii as ours, so that those two triangulate the same surface; dense, as their
-contouring needs it. Separable: an atom's exponential is the product of three short tables. Threads own slabs of x.
+Kernel, cut-off, lattice and radii are ours, so the surface is the same. The exponential of an atom is the product of
+three short tables. Each thread computes a slab of x.
 """
 
 import math
@@ -16,7 +16,7 @@ SMOOTHNESS, TOLERANCE = 1.25, 0.01
 
 
 def read(path):
-    """Positions (N × 3, float64, Å) and radii (N, float32, Å) of a structure file's first model."""
+    """Returns positions (N × 3, float64, Å) and radii (N, float32, Å) of the first model of a structure file."""
     structure = gemmi.read_structure(path)
     positions, radii = [], []
     for row in structure[0].all():
@@ -26,12 +26,12 @@ def read(path):
 
 
 def reach(radii):
-    """Where an atom's density ends, Å."""
+    """Returns the radius of the support of an atom, Å."""
     return radii * math.sqrt(1 + math.log(1 / TOLERANCE) / SMOOTHNESS)
 
 
 def dense(positions, radii, spacing):
-    """Density at every point of a grid around the atoms (nx × ny × nz, float32) and the grid's first point, Å."""
+    """Returns the density on a grid around the atoms (nx × ny × nz, float32) and the first grid point, Å."""
     ends = reach(radii)[:, None]
     low = np.floor((positions - ends).min(axis=0) / spacing) - 1
     high = np.ceil((positions + ends).max(axis=0) / spacing) + 1
@@ -45,7 +45,7 @@ def dense(positions, radii, spacing):
 
 @numba.njit(parallel=True, fastmath=True, cache=True)
 def splat(positions, radii, field, slabs):
-    """Adds every atom's density. In units of the spacing, atoms sorted by x; a slab of x belongs to one thread."""
+    """Adds the densities of all atoms, sorted by x, in units of the spacing. Each thread computes a slab of x."""
     a, eps = np.float32(SMOOTHNESS), np.float32(TOLERANCE)
     tail = np.float32(math.log(1 / TOLERANCE))
     end = np.float32(1) + tail / a
@@ -77,7 +77,7 @@ def splat(positions, radii, field, slabs):
                     exy = ex * math.exp(-a * (j - y) * (j - y) * inverse) * scale
                     half = math.sqrt((end - uxy) / inverse)
                     k0, k1 = max(z0, math.ceil(z - half)), min(z1, math.floor(z + half))
-                    # ε(1 + a(end − u)) is what makes value and slope vanish at the end.
+                    # Subtract ε(1 + a(end − u)), so that value and slope are 0 at the end.
                     base, slope = eps * (np.float32(1) + a * (end - uxy)) * scale, eps * a * scale
                     row = field[i, j]
                     for k in range(k0, k1 + 1):

@@ -1,7 +1,7 @@
-"""The density and its marching cubes as whole-array operations: what a user of PyTorch writes, and a check in NumPy.
+"""Density and marching cubes as array operations, in PyTorch, and in NumPy as a check.
 
-The field: every atom's samples at once, added into the grid by index (atomic additions on a device). The surface: masks of
-crossed edges, running sums for vertex numbers, the case table gathered. One code for NumPy and PyTorch.
+The field adds the grid points of all atoms into the grid by index (atomic additions on a device). The surface uses
+masks of crossed edges, prefix sums for vertex numbers, and lookups of the case table. NumPy and PyTorch share the code.
 """
 
 import math
@@ -18,7 +18,7 @@ CASES = Path(__file__).resolve().parents[2] / "src/surface/cases.rs"
 
 
 def case_table():
-    """Our 256 cases: triangles a case (256) and their cell edges (256 × 16), uint8."""
+    """Returns our 256 cases: triangles per case (256) and their cell edges (256 × 16), uint8."""
     rows = re.search(r'ROWS: &str = "(.*?)";', CASES.read_text(), re.S).group(1).split()
     table = np.zeros((256, 16), np.uint8)
     for case, row in enumerate(rows):
@@ -28,7 +28,7 @@ def case_table():
 
 
 class Numpy:
-    """What the array program needs, in NumPy."""
+    """Array operations in NumPy."""
 
     name, device = "numpy", "host"
     int32, int64, float32, uint8 = np.int32, np.int64, np.float32, np.uint8
@@ -71,7 +71,7 @@ class Numpy:
 
 
 class Torch:
-    """The same in PyTorch, on a device."""
+    """Array operations in PyTorch, on a device."""
 
     name = "torch"
 
@@ -119,7 +119,8 @@ class Torch:
 
 
 def pairs(xp, atoms, first, offsets, shape):
-    """Sample numbers and densities of all pairs of an atom (n × 4: x, y, z, 1/r²) and an offset in its cube."""
+    """Returns grid point indices and densities of all pairs of an atom (n × 4: x, y, z, 1/r²) and an offset in its
+    cube."""
     axes = []
     for k in range(3):
         at = first[:, k, None] + offsets
@@ -135,7 +136,8 @@ def pairs(xp, atoms, first, offsets, shape):
 
 
 def scatter_field(xp, atoms, shape, widest, chunk=4096, step=pairs):
-    """Density at every sample (flat, float32). `atoms` on the device; `widest` is the largest support, in spacings."""
+    """Returns the density at all grid points (flat, float32). `atoms` is on the device; `widest` is the largest
+    support, in spacings."""
     grid = xp.zeros(math.prod(shape), xp.float32)
     offsets = xp.arange(math.floor(2 * widest) + 2)
     for begin in range(0, len(atoms), chunk):
@@ -147,7 +149,7 @@ def scatter_field(xp, atoms, shape, widest, chunk=4096, step=pairs):
 
 
 def tables(xp):
-    """The case table and what is looked up with it, on the device."""
+    """Returns the case table and derived tables, on the device."""
     count, table = case_table()
     popcount = np.array([bin(m).count("1") for m in range(8)], np.int32)
     lower = np.array([[popcount[m & ((1 << axis) - 1)] for axis in range(3)] for m in range(8)], np.int32)
@@ -155,7 +157,7 @@ def tables(xp):
 
 
 def surface(xp, field, shape, origin, spacing, lookup):
-    """Vertices and normals by central differences (V × 3 each, Å) and triangles (T × 3) of a flat field at 1."""
+    """Returns the isosurface of a flat field at 1: vertices and normals (V × 3 each, Å) and triangles (T × 3)."""
     count, table, popcount, lower = lookup
     nx, ny, nz = shape
     steps = (ny * nz, nz, 1)

@@ -1,6 +1,6 @@
-"""Atoms of a structure file for `gpu_field.py`, where no reader of structures is: `gpu_atoms.py OUT_FOLDER FILE …`.
+"""Extracts the atoms of structure files for `gpu_field.py`: `gpu_atoms.py OUT_FOLDER FILE …`.
 
-Writes NAME.npz with `positions` (N × 3, float64, Å) and `radii` (N, float32, Å) of what is compared (see prepare.py).
+Writes NAME.npz with `positions` (N × 3, float64, Å) and `radii` (N, float32, Å) of the compared atoms (see prepare.py).
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""The kernels of `gpu_kernels.cu` run by CuPy: atoms to a dense field, field to an indexed mesh."""
+"""Runs the kernels of `gpu_kernels.cu` with CuPy: atoms to a dense field, field to an indexed mesh."""
 
 import math
 from pathlib import Path
@@ -20,7 +20,8 @@ class Kernels:
         self.number, self.table = cupy.asarray(count), cupy.asarray(table)
 
     def field(self, atoms, shape, widest):
-        """Density at every sample (flat, float32); `atoms` is n × 4 float32 on the device: x, y, z, 1/r²."""
+        """Returns the density at all grid points (flat, float32). `atoms` is n × 4 float32 on the device: x, y, z,
+        1/r²."""
         bricks = tuple(side // 8 for side in shape)
         bins = (atoms[:, :3] * np.float32(1 / 8)).astype(np.int32)
         keys = (bins[:, 0] * bricks[1] + bins[:, 1]) * bricks[2] + bins[:, 2]
@@ -34,7 +35,7 @@ class Kernels:
         return out
 
     def surface(self, field, shape, origin, spacing):
-        """Vertices with normals (V × 6, float32) and triangles (T × 3, uint32)."""
+        """Returns vertices with normals (V × 6, float32) and triangles (T × 3, uint32)."""
         sides = tuple(map(np.int32, shape))
         blocks = field.size // 256
         found = [cupy.empty(blocks, np.int32) for _ in range(2)]

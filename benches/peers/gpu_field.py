@@ -1,18 +1,18 @@
-"""The Gaussian field on a dense grid and its marching cubes on a GPU, by PyTorch and by CuPy: baselines for our stages.
+"""Measures baselines for our GPU stages: a Gaussian field on a dense grid and marching cubes with PyTorch and CuPy.
 
     python3 gpu_field.py ATOMS.npz … --spacing 0.5 1.0 --runs 30 > baselines.json
 
-ATOMS.npz is made by gpu_atoms.py. Every baseline samples our density on our lattice, from atoms that lie on the device, and
-its triangles are ours but for rounding; `molmesh-bench gpu` times the same work. The baselines:
+gpu_atoms.py writes ATOMS.npz. All baselines compute our density on our lattice from atoms on the device. Their
+triangles are ours except for rounding. `molmesh-bench gpu` times the same work. The baselines:
 
-* `torch`: whole-array operations (gpu_arrays.py), pairs of atom and sample added by index;
-* `torch.compile`: the same with that step compiled into one kernel, marching cubes as above;
-* `cupy`: kernels in CUDA (gpu_kernels.cu): atoms sorted into bins, a block a brick of samples, then a count, a running sum
+* `torch`: array operations (gpu_arrays.py); pairs of an atom and a grid point are added by index;
+* `torch.compile`: the same with that step compiled into one kernel;
+* `cupy`: CUDA kernels (gpu_kernels.cu): atoms sorted into bins, one block per brick of grid points, then a count, a prefix sum
   and two kernels that write shared vertices with normals, and triangles;
-* `scikit-image (host)`: the field of the best of these copied to the host and contoured there, once: for small grids alone;
-* `numpy (host)`, `torch (host)`: the array program without a device, on request, to test it.
+* `scikit-image (host)`: the field of the last baseline, contoured once on the host; only for small grids;
+* `numpy (host)`, `torch (host)`: the array program without a device, on request, for tests.
 
-Times are by the device's events after three runs; medians in ms. A baseline that cannot run says why.
+Times are medians of device events in ms, after three unmeasured runs. A baseline that cannot run reports the reason.
 """
 
 import argparse
@@ -28,12 +28,12 @@ import numpy as np
 
 import gpu_arrays
 
-# Beyond this many samples scikit-image would take minutes.
+# Beyond this number of grid points, scikit-image would take minutes.
 HOST_SAMPLES = 60_000_000
 
 
 class Case:
-    """Atoms on a lattice: `atoms` (N × 4, float32: x, y, z in spacings from the first sample, 1/r²)."""
+    """Atoms on a lattice: `atoms` (N × 4, float32: x, y, z in spacings from the first grid point, 1/r²)."""
 
     def __init__(self, path, spacing):
         data = np.load(path)
@@ -51,7 +51,7 @@ class Case:
             raise ValueError(f"{self.samples} samples do not fit 31 bits")
 
     def reference(self, index):
-        """Density at some samples (flat numbers), in double precision, atom by atom."""
+        """Computes the density at grid points (flat indices) in double precision, atom by atom."""
         points = np.stack(np.unravel_index(index, self.shape), axis=1).astype(np.float64)
         out = np.empty(len(index))
         for i, point in enumerate(points):
@@ -63,7 +63,7 @@ class Case:
 
 
 class HostClock:
-    """Times by the host's clock."""
+    """Timer with the clock of the host."""
 
     def begin(self):
         self.start = time.perf_counter()
@@ -150,7 +150,7 @@ class CompiledBaseline(TorchBaseline):
     def field(self, case, atoms, chunk=16384):
         grid = self.xp.zeros(case.samples, self.xp.float32)
         offsets = self.xp.arange(math.floor(2 * case.widest) + 2)
-        # Chunks of one length, so that it is compiled once: the last one is filled with atoms too small to reach a sample.
+        # All chunks have the same length, to compile once. Atoms too small to reach a grid point pad the last one.
         for begin in range(0, len(atoms), chunk):
             part = atoms[begin : begin + chunk]
             if len(part) < chunk:
@@ -199,12 +199,12 @@ class CupyBaseline:
         self.cupy.get_default_memory_pool().free_all_blocks()
 
     def peak(self):
-        # The pool gives nothing back while it runs: what it holds is the most that it needed.
+        # The pool frees nothing during a run, so its size is the peak.
         return self.cupy.get_default_memory_pool().total_bytes() / 1e6
 
 
 def open_edges(faces, vertices):
-    """Edges that do not belong to exactly two triangles, counted on the host."""
+    """Counts the edges that do not belong to exactly two triangles, on the host."""
     faces = faces.astype(np.int64)
     pairs = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     keys = np.sort(pairs.min(axis=1) * vertices + pairs.max(axis=1))
@@ -213,13 +213,13 @@ def open_edges(faces, vertices):
 
 
 def area_and_volume(points, faces):
-    """Å² and Å³."""
+    """Returns area (Å²) and volume (Å³)."""
     a, b, c = (points[faces[:, k]].astype(np.float64) for k in range(3))
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2), float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 def timed(baseline, work, warm, runs):
-    """Median ms of `runs` after `warm`, and the last result."""
+    """Returns the median time of `runs` runs after `warm` unmeasured ones, ms, and the last result."""
     times, result = [], None
     for _ in range(warm + runs):
         result = None
@@ -230,7 +230,7 @@ def timed(baseline, work, warm, runs):
 
 
 def measure(baseline, case, warm, runs):
-    """Times, counts, and whether field and mesh are right, of one baseline and case."""
+    """Returns times, counts and errors of one baseline on one case, and its field."""
     if hasattr(baseline, "clear"):
         baseline.clear()
     atoms = baseline.put(case)
@@ -252,7 +252,7 @@ def measure(baseline, case, warm, runs):
 
 
 def on_host(case, values):
-    """scikit-image's marching cubes of a field, once."""
+    """Times the marching cubes of scikit-image on a field, once."""
     if case.samples > HOST_SAMPLES:
         return {"skipped": f"{case.samples} samples; above {HOST_SAMPLES} it would take minutes"}
     from skimage.measure import marching_cubes
@@ -292,7 +292,7 @@ def main():
     for name in given.only:
         try:
             baselines[name] = BASELINES[name]()
-        except Exception as error:  # a baseline that is not to be had is a row, not the end
+        except Exception as error:  # report an unavailable baseline in its row
             baselines[name] = f"{type(error).__name__}: {error}"[:500]
     for file, spacing in ((file, spacing) for file in given.files for spacing in given.spacing):
         case, values = Case(file, spacing), None

@@ -1,15 +1,15 @@
-// The density on a dense grid and its marching cubes, as CUDA kernels for CuPy: a baseline for our stages on the device.
+// CUDA kernels for CuPy: density on a dense grid, and marching cubes. A baseline for our GPU stages.
 //
-// Lengths are in units of the spacing, from the grid's first sample. Samples are numbered with z fastest; the grid's sides are
-// multiples of 8, and its outermost layer is outside. The formulas are ours (smoothness 1.25, cut off at 0.01).
+// Lengths are in units of the spacing, from the first grid point. Grid points are numbered with z fastest. The sides of the
+// grid are multiples of 8, and its outermost layer is outside. The formulas are ours (smoothness 1.25, cut-off at 0.01).
 
 #define A 1.25f
 #define EPS 0.01f
 #define TAIL 4.605170186f                            // ln(1 / EPS)
-#define END (1.0f + TAIL / A)                        // where a density ends, in squared radii
+#define END (1.0f + TAIL / A)                        // end of the support, in squared radii
 #define SCALE (1.0f / (1.0f - EPS * (1.0f + TAIL)))
 #define K (A * 1.442695041f)                         // exp(-A u) is exp2(-K u)
-#define HELD 96                                      // atoms that a block keeps at once
+#define HELD 96                                      // atoms in shared memory of a block
 #define LANES 64
 
 struct Held {
@@ -18,7 +18,7 @@ struct Held {
     float e[HELD][8];
 };
 
-// Adds the held atoms to eight samples along z. All threads of the block.
+// Adds the atoms in shared memory to eight grid points along z. Called by all threads of the block.
 __device__ void add(Held& held, int n, float x, float y, float z, int lane, float* sum) {
     for (int s = lane; s < n * 8; s += LANES) {
         float d = z + (float)(s & 7) - held.atom[s >> 3].z;
@@ -42,8 +42,8 @@ __device__ void add(Held& held, int n, float x, float y, float z, int lane, floa
     __syncthreads();
 }
 
-// One block of 64 threads a brick of 8 x 8 x 8 samples, a thread a column along z. Atoms (x, y, z, 1/r^2) are sorted by bins,
-// which are the bricks; `starts` has the first atom of each, and the number of atoms last. `reach` is in bins.
+// One block of 64 threads per brick of 8 x 8 x 8 grid points, one thread per column along z. Atoms (x, y, z, 1/r^2) are sorted
+// by brick. `starts` has the first atom of each brick, and the number of atoms at the end. `reach` is in bricks.
 extern "C" __global__ void field(const float4* atoms, const int* starts, int bx, int by, int bz, int reach, float* out) {
     __shared__ Held held;
     __shared__ int count;
@@ -90,7 +90,7 @@ struct Grid {
     int x, y, z;
 };
 
-// The case of the cell at sample i, and in `mask` which of the three edges that the sample owns the surface crosses.
+// Returns the case of the cell at grid point i. Sets in `mask` the crossed ones of its three edges.
 __device__ unsigned classify(const float* f, unsigned i, Grid n, unsigned& mask) {
     unsigned z = i % n.z, y = i / n.z % n.y, x = i / n.z / n.y;
     mask = 0;
@@ -104,7 +104,7 @@ __device__ unsigned classify(const float* f, unsigned i, Grid n, unsigned& mask)
     return bits;
 }
 
-// Sum of `value` over the threads before this one, in a block of 256; `total` is the block's.
+// Exclusive prefix sum of `value` over a block of 256 threads; `total` is the sum of the block.
 __device__ unsigned before(unsigned value, unsigned& total) {
     __shared__ unsigned warps[8];
     unsigned lane = threadIdx.x & 31, warp = threadIdx.x >> 5, sum = value;
@@ -124,12 +124,12 @@ __device__ unsigned before(unsigned value, unsigned& total) {
     return base + sum - value;
 }
 
-// Vertices and triangles of 256 samples' edges and cells.
+// Counts the vertices and triangles of 256 grid points.
 extern "C" __global__ void count(const float* f, int nx, int ny, int nz, const unsigned char* triangles_of, int* vertices,
                                  int* triangles) {
     unsigned mask, total;
     unsigned bits = classify(f, blockIdx.x * 256u + threadIdx.x, Grid{nx, ny, nz}, mask);
-    // At most 768 and 1280: both fit.
+    // At most 768 and 1280, so both fit.
     before(__popc(mask) | (unsigned)triangles_of[bits] << 16, total);
     if (threadIdx.x == 0) {
         vertices[blockIdx.x] = total & 0xffff;
@@ -143,8 +143,8 @@ __device__ void gradient(const float* f, unsigned i, unsigned dx, unsigned dy, f
     g[2] = f[i + 1] - f[i - 1];
 }
 
-// Positions (A) and normals by central differences, six floats a vertex; `ids` gets, for each sample that owns vertices, the
-// first one times eight plus the mask. `blocks` are those that `count` found something in, `base` what all blocks begin with.
+// Writes positions (A) and normals by central differences, six floats per vertex. For each grid point with vertices, `ids`
+// receives its first vertex times eight plus the mask. `blocks` lists the non-empty blocks, `base` has the offsets of all.
 extern "C" __global__ void vertices(const float* f, int nx, int ny, int nz, const int* blocks, const int* base, float ox,
                                     float oy, float oz, float h, unsigned* ids, float* out) {
     unsigned mask, total, i = blocks[blockIdx.x] * 256u + threadIdx.x;
@@ -176,8 +176,8 @@ extern "C" __global__ void vertices(const float* f, int nx, int ny, int nz, cons
     }
 }
 
-// Triangles as indices of vertices. `table` has 16 cell edges a case; edge e runs along axis e / 4 from the corner whose two
-// other coordinates are the bits of e % 4, lower axis first.
+// Writes triangles as indices of vertices. `table` has 16 cell edges per case. Edge e is along axis e / 4, from the corner whose
+// two other coordinates are the bits of e % 4, lower axis first.
 extern "C" __global__ void triangles(const float* f, int nx, int ny, int nz, const int* blocks, const int* base,
                                      const unsigned char* triangles_of, const unsigned char* table, const unsigned* ids,
                                      unsigned* out) {

@@ -1,6 +1,6 @@
-"""Gets the peers from their registries into `target/peers`, which git ignores; what is there already is taken as it is.
+"""Installs the peers from their registries into `target/peers`, unless they are present.
 
-Nothing is installed into the system: Debian's packages are unpacked. What cannot be had raises `Missing` with the reason.
+Nothing is installed into the system; Debian packages are only unpacked. Raises `Missing` with the reason on failure.
 """
 
 import functools
@@ -16,29 +16,29 @@ FOLDER = ROOT / "target/peers"
 NODE, VENV, DEBIAN = FOLDER / "node", FOLDER / "venv", FOLDER / "debian"
 PINS = Path(__file__).with_name("requirements.txt")
 SPLASHSURF, MOLSTAR = "0.14.1", "5.11.0"
-# For the copies that all read, and for looking at meshes.
+# For preparing structures and checking meshes.
 BASE = ("gemmi", "numpy", "trimesh", "scipy")
 
 
 class Missing(Exception):
-    """A peer that is not to be had here, and why."""
+    """Reason why a peer is not available."""
 
 
 def call(command, **options):
-    """Runs it silently; its last words are the reason where it fails."""
+    """Runs a command silently. The last line of its output is the reason if it fails."""
     print(f"installing: {' '.join(map(str, command))}", file=sys.stderr, flush=True)
     try:
         done = subprocess.run([*map(str, command)], capture_output=True, text=True, **options)
     except OSError as error:
         raise Missing(str(error)) from error
     if done.returncode != 0:
-        words = (done.stderr.strip() or done.stdout.strip()).splitlines() or ["no word"]
+        words = (done.stderr.strip() or done.stdout.strip()).splitlines() or ["no output"]
         raise Missing(f"{Path(str(command[0])).name} failed: {words[-1].strip()}")
     return done.stdout
 
 
 def said(command, environment=None):
-    """What a command prints, in one line."""
+    """Returns the output of a command without surrounding white space."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **(environment or {})})
     except OSError as error:
@@ -57,7 +57,7 @@ def has(interpreter, names):
 
 
 def python():
-    """The environment that peers in Python run in."""
+    """Returns the Python interpreter of the peers."""
     return str(VENV / "bin/python")
 
 
@@ -69,7 +69,8 @@ def pip(names):
 
 @functools.cache
 def helper():
-    """A Python that prepares structures and checks meshes: this one, that of the tests, or one of our own."""
+    """Returns a Python interpreter to prepare structures and check meshes: this one, that of the tests, or that of the
+    peers."""
     for candidate in (sys.executable, str(ROOT / "target/test-tools/venv/bin/python"), python()):
         if has(candidate, BASE):
             return candidate
@@ -78,7 +79,7 @@ def helper():
 
 
 def packages(*names):
-    """Makes a function that has Python packages ready and says their versions."""
+    """Returns a function that installs Python packages if necessary and returns their versions."""
     def ready():
         wanted = [*names, *BASE]
         if not has(python(), wanted):
@@ -115,7 +116,7 @@ def edtsurf():
 
 
 def pymol_environment():
-    """What PyMOL needs to find itself where it was unpacked; nothing where the system has it."""
+    """Returns the environment of an unpacked PyMOL; empty if the system has it."""
     libraries, modules = DEBIAN / f"usr/lib/{platform.machine()}-linux-gnu", DEBIAN / "usr/lib/python3/dist-packages"
     if not (modules / "pymol").exists():
         return {}
@@ -129,12 +130,12 @@ def pymol_environment():
 
 
 def debian(name):
-    """Makes a function that has a Debian package, and those it needs and the system lacks, unpacked."""
+    """Returns a function that unpacks a Debian package with its missing dependencies and returns its version."""
     def ready():
         stamp = DEBIAN / f".{name}"
         if not stamp.exists():
             if not shutil.which("apt-get"):
-                raise Missing("a Debian package, and there is no apt-get here")
+                raise Missing("a Debian package, but apt-get is not installed")
             plan = call(["apt-get", "--simulate", "--no-install-recommends", "install", name])
             wanted = [line.split()[1] for line in plan.splitlines() if line.startswith("Inst ")]
             DEBIAN.mkdir(parents=True, exist_ok=True)
@@ -154,7 +155,7 @@ def debian(name):
 
 
 def version(name, stamp):
-    """From a package's description."""
+    """Returns name and version from the description of a package."""
     line = next(line for line in stamp.read_text().splitlines() if line.startswith("Version: "))
     return f"{name} {line.removeprefix('Version: ')}"
 

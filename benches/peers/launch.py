@@ -1,9 +1,8 @@
-"""Runs one command and measures it: `python -I -S launch.py LIMIT ERRORS COMMAND …`, one line of JSON.
+"""Runs and measures a command: `python -I -S launch.py LIMIT ERRORS COMMAND …` prints one line of JSON.
 
-A process of its own, as small as can be: what a process had in memory before it became the command counts as the command's
-(`ru_maxrss` is carried over), so nothing large may start it, and it forks, since a fork begins with few pages. Says wall
-seconds from just before the start to the end, the largest resident set of any process of the tree in kB, the exit status, and
-whether it was ended at LIMIT seconds.
+This is a separate, small process that forks, because `ru_maxrss` includes the memory of the process before `exec`.
+Prints the wall time in s, the largest resident set of any process of the tree in kB, the exit status, and whether the
+command was killed after LIMIT seconds.
 """
 
 import contextlib

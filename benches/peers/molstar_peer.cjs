@@ -1,6 +1,6 @@
-// Structure file to PLY by Mol*'s Gaussian surface on the CPU, without a page: `molstar_peer.cjs MODULES IN OUT SPACING`.
-// Its density is Σ exp(−s d²/r²) at exp(−s): ours, with smoothness s; it ends at two radii without being made smooth there.
-// The field is asked for below the function that would coarsen a large structure's grid by itself.
+// Meshes a structure file with the Gaussian surface of Mol* on the CPU: `molstar_peer.cjs MODULES IN OUT SPACING` writes PLY.
+// Its density is Σ exp(−s d²/r²) at exp(−s), which is ours with smoothness s. It is cut off at two radii without smoothing.
+// The script calls an inner function, because the outer one coarsens the grids of large structures.
 "use strict";
 const fs = require("fs");
 const [modules, source, target, spacing] = process.argv.slice(2);

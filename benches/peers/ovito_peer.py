@@ -1,8 +1,9 @@
-"""Structure file to PLY by OVITO's Gaussian density surface: `ovito_peer.py IN OUT SPACING`.
+"""Meshes a structure file with the Gaussian density surface of OVITO: `ovito_peer.py IN OUT SPACING` writes PLY.
 
-OVITO's density is Σ exp(−d²/2σ²) with σ a radius times `radius_scaling`; ours is Σ exp(−a(d²/r² − 1)) at 1. So with our
-radii, σ = r/√(2a) and level exp(−a) it is the same surface, but for the cut-offs. Its grid is given as the number of
-cells along the longest side of the box around the atoms, which it widens by three σ of the largest.
+The density of OVITO is Σ exp(−d²/2σ²), where σ is a radius times `radius_scaling`; ours is Σ exp(−a(d²/r² − 1)) at 1.
+With our radii, σ = r/√(2a) and the isovalue exp(−a), the surface is the same except for the cut-offs. The grid is
+specified by the number of cells along the longest side of the bounding box, which OVITO enlarges by three σ of the
+largest radius.
 """
 
 import math
@@ -22,7 +23,7 @@ pipeline = import_file(source)
 
 
 def prepare(frame, data):
-    """Our radii, no periodic cell."""
+    """Sets our radii and removes the periodic cell."""
     for kind in data.particles_.particle_types_.types:
         data.particles_.particle_types_.type_by_id_(kind.id).radius = RADII[kind.name.upper()]
     if data.cell is not None:

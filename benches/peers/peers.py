@@ -1,12 +1,12 @@
-"""Structure file to mesh file: molmesh and other programs on the same files, in turn, on a RAM disk.
+"""Compares molmesh with other programs on the same structure files, in turn, on a RAM disk.
 
     python3 benches/peers/peers.py                                       # the samples
     python3 benches/peers/peers.py --data FOLDER --publish               # 1UBQ, 1A0Q, 7CTH, 6ZU5 of a folder; writes the page
     python3 benches/peers/peers.py --files A.pdb B.cif --only molmesh,splashsurf --rounds 9
 
-Needs `cargo build --release`, Python 3.11, and what the registries of each program need (cargo, npm, apt-get); programs that
-are absent are installed into target/peers. What cannot be installed, fails or takes too long has its row with the reason.
-Every run is a whole process, from a file to a file. docs/research/peers.md says what is compared with what.
+Requires `cargo build --release`, Python 3.11, and the package managers of the programs (cargo, npm, apt-get). Missing
+programs are installed into target/peers. A program that cannot be installed, fails or takes too long has a row with the
+reason. Each run is a complete process from a file to a file. docs/research/peers.md describes the comparison.
 """
 
 import argparse
@@ -31,15 +31,15 @@ SUFFIXES = (".pdb", ".ent", ".cif", ".pdb.gz", ".ent.gz", ".cif.gz")
 def options():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=ROOT / "samples", help="folder of structures [samples]")
-    parser.add_argument("--files", type=Path, nargs="+", help="these instead: PDB or mmCIF, plain or gzip")
+    parser.add_argument("--files", type=Path, nargs="+", help="structure files instead of --data: PDB or mmCIF, plain or gzip")
     parser.add_argument("--rounds", type=int, default=5, help="timed runs of each program [5]")
-    parser.add_argument("--only", help="programs, comma-separated; molmesh is always among them")
-    parser.add_argument("--limit", type=float, default=120, help="seconds after which a run is ended [120]")
-    parser.add_argument("--spacing", type=float, default=0.5, help="of the grid, Å [0.5]")
-    parser.add_argument("--molmesh", type=Path, default=ROOT / "target/release/molmesh", help="our binary")
-    parser.add_argument("--json", type=Path, help="write the figures there")
-    parser.add_argument("--page", type=Path, help="write the tables there, between its markers")
-    parser.add_argument("--note", default="", help="a sentence for the tables' header: who else used the machine, say")
+    parser.add_argument("--only", help="programs, comma-separated; molmesh is always included")
+    parser.add_argument("--limit", type=float, default=120, help="time limit of a run, s [120]")
+    parser.add_argument("--spacing", type=float, default=0.5, help="grid spacing, Å [0.5]")
+    parser.add_argument("--molmesh", type=Path, default=ROOT / "target/release/molmesh", help="molmesh binary")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--page", type=Path, help="page for the tables, between its markers")
+    parser.add_argument("--note", default="", help="sentence for the header of the tables, such as other load on the machine")
     parser.add_argument("--publish", action="store_true", help="--json docs/results/peers.json --page docs/research/peers.md")
     given = parser.parse_args()
     if given.rounds < 1 or given.limit <= 0 or given.spacing <= 0:
@@ -50,7 +50,7 @@ def options():
 
 
 def chosen_files(given):
-    """What `--files` says, or the default structures of the folder, or all of it where it has none of them."""
+    """Returns the files of `--files`, else the default structures of the folder, else all structures of the folder."""
     if given.files:
         return given.files
     there = sorted(path for path in given.data.iterdir() if path.name.lower().endswith(SUFFIXES))
@@ -59,7 +59,7 @@ def chosen_files(given):
 
 
 def machine():
-    """What the figures were measured on."""
+    """Describes this machine."""
     cpu, memory = platform.processor() or platform.machine(), 0
     for line in Path("/proc/cpuinfo").read_text().splitlines():
         if line.startswith("model name"):
@@ -72,7 +72,7 @@ def machine():
 
 
 def ask(script, *arguments):
-    """Lines of JSON from one of the scripts beside this one."""
+    """Runs a script of this folder and returns its lines of JSON."""
     done = subprocess.run([helper(), str(HERE / script), *map(str, arguments)], capture_output=True, text=True)
     if done.returncode != 0:
         raise RuntimeError(f"{script}: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else 'failed'}")
@@ -80,7 +80,7 @@ def ask(script, *arguments):
 
 
 def launch(peer, job, limit):
-    """One measured run: seconds and kB, or why there are none (`failed`, `limit`)."""
+    """Measures one run. Returns seconds and kB, or the reason for their absence (`failed`, `limit`)."""
     for old in job.folder.glob(job.target.name + "*"):
         old.unlink()
     errors = job.folder / "errors.txt"
@@ -89,7 +89,7 @@ def launch(peer, job, limit):
     done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=job.folder)
     if done.returncode != 0:
         words = done.stderr.strip().splitlines()
-        return {"failed": words[-1] if words else f"what measures it ended with {done.returncode}"}
+        return {"failed": words[-1] if words else f"launch.py ended with {done.returncode}"}
     said = json.loads(done.stdout)
     mesh = Path(job.mesh(peer.extension))
     if said["late"]:
@@ -101,7 +101,7 @@ def launch(peer, job, limit):
 
 
 def first(peer, job, limit):
-    """The round that is not timed: its mesh is looked at."""
+    """Runs a program once without timing and checks its mesh."""
     entry = {"surface": peer.surface}
     outcome = launch(peer, job, limit)
     if "wall" not in outcome:
@@ -113,7 +113,7 @@ def first(peer, job, limit):
 
 
 def compare(peers, absent, job, given):
-    """All programs on one structure; entries by name in the catalogue's order."""
+    """Measures all programs on one structure. Returns their entries by name, in the order of the catalogue."""
     programs = {}
     for peer in peers:
         if peer.name in absent:
@@ -124,7 +124,7 @@ def compare(peers, absent, job, given):
     running = [peer for peer in peers if "runs" in programs[peer.name]]
     for number in range(given.rounds):
         note(f"{job.name}: round {number + 1} of {given.rounds}")
-        # Each round begins with another one, so that none has the same predecessor's traces every time.
+        # Rotate the order, so that the predecessor of a program changes.
         for peer in running[number % len(running) :] + running[: number % len(running)] if running else []:
             entry, outcome = programs[peer.name], launch(peer, job, given.limit)
             if "wall" in outcome:
@@ -140,18 +140,18 @@ def note(words):
 
 
 def same_atoms(molmesh, structure):
-    """Ends where we would not mesh just the atoms that the others are given."""
+    """Exits if molmesh does not mesh the same number of atoms as the other programs."""
     command = [molmesh, "mesh", structure["file"], "--backend", "cpu", "--report", "json", "-o", os.devnull, "--format", "ply"]
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
     if done.returncode != 0:
         sys.exit(done.stderr.strip())
     atoms = json.loads(done.stdout)["atoms"]
     if atoms != structure["atoms"]:
-        sys.exit(f"{structure['name']}: molmesh takes {atoms} atoms, the others {structure['atoms']}")
+        sys.exit(f"{structure['name']}: molmesh meshes {atoms} atoms, the others {structure['atoms']}")
 
 
 def ready(peers):
-    """Versions by name, and why programs are absent."""
+    """Returns versions by name, and the reasons for missing programs."""
     versions, absent = {}, {}
     for peer in peers:
         try:
@@ -186,7 +186,7 @@ def main():
                                      "programs": programs})  # fmt: skip
         title, rows = tables.section(result["structures"][-1])
         print(f"\n{title}\n{tables.terminal(rows)}", flush=True)
-        if given.json:  # after each structure: a run that is ended leaves what it has
+        if given.json:  # after each structure, so that an interrupted run keeps its results
             given.json.parent.mkdir(parents=True, exist_ok=True)
             given.json.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     if given.page:

@@ -1,10 +1,10 @@
-"""Writes a mesh as binary PLY: what the peers that are Python libraries end with."""
+"""Writer of binary PLY, for peers that are Python libraries."""
 
 import numpy as np
 
 
 def write(path, vertices, faces, normals=None):
-    """`vertices` and `normals` are N × 3 (Å), `faces` is M × 3 (indices of vertices); stored as 32-bit values."""
+    """Writes `vertices` and `normals` (N × 3, Å) and `faces` (M × 3, indices of vertices) as 32-bit values."""
     columns = [vertices] if normals is None else [vertices, normals]
     names = ["x", "y", "z", "nx", "ny", "nz"][: 3 * len(columns)]
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]

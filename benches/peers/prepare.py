@@ -1,11 +1,12 @@
-"""Writes the copies that all programs of the comparison read: `prepare.py FOLDER FILE …`, one line of JSON a file.
+"""Writes the input files of the comparison: `prepare.py FOLDER FILE …` prints one line of JSON per file.
 
-Of each structure the first model's ATOM records without hydrogens and with the first alternative alone: what we mesh by
-default, with nothing left to choose. Without a unit cell, so that nobody takes it for periodic. For NAME there are
+The files contain the atoms that molmesh meshes by default: ATOM records of the first model without hydrogens, and only
+the first alternative location. They have no unit cell, so that no program treats them as periodic. The files for NAME
+are
 
-* `NAME.pdb` or `NAME.cif`, as the original was: for every program that reads structures;
-* `NAME.edt.pdb`: for EDTSurf, which reads PDB alone (serial numbers and chains as far as the columns hold them);
-* `NAME.xyz`: 32-bit coordinates for splashsurf, which reads no structures.
+* `NAME.pdb` or `NAME.cif`, in the format of the original, for programs that read structures;
+* `NAME.edt.pdb` for EDTSurf, which reads only PDB (serial numbers and chains wrap around);
+* `NAME.xyz`: 32-bit coordinates for splashsurf, which does not read structures.
 """
 
 import json
@@ -17,7 +18,8 @@ import numpy as np
 
 
 def read(path):
-    """The structure; of PDB files from before 1996, which number their lines where elements are now, the columns before."""
+    """Reads a structure. Ignores the last columns of PDB files from before 1996, which have line numbers instead of
+    elements."""
     try:
         return gemmi.read_structure(str(path))
     except RuntimeError:
@@ -25,7 +27,7 @@ def read(path):
 
 
 def heavy(path):
-    """The structure with what is compared, and nothing else."""
+    """Reads a structure and keeps only the compared atoms."""
     structure = read(path)
     while len(structure) > 1:
         del structure[-1]
@@ -47,7 +49,7 @@ def heavy(path):
 
 
 def pdb_lines(structure):
-    """ATOM records for a reader of columns: serials start again after 99,999, residues after 9,999, chains at 62."""
+    """Formats ATOM records. Serials wrap around after 99,999, residue numbers after 9,999, chains after 62."""
     names = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789"
     serial = 0
     for number, chain in enumerate(structure[0]):

@@ -1,7 +1,7 @@
-"""Structure file to OBJ by PyMOL, run inside it: `pymol -cqk pymol_peer.py -- IN OUT SPACING ses|gaussian`.
+"""Meshes a structure file with PyMOL: `pymol -cqk pymol_peer.py -- IN OUT SPACING ses|gaussian` writes OBJ.
 
-`ses` is what its `surface` shows, at quality 1 (its distance between dots is 0.5 Å then). `gaussian` is the surface of its
-Gaussian map: atomic scattering, blurred to 3 Å with the same B factor for all, at one standard deviation of the map.
+`ses` is the surface of `show surface` at quality 1, with 0.5 Å between dots. `gaussian` is an isosurface of a Gaussian
+map: atomic scattering, blurred to 3 Å with the same B factor for all atoms, at one standard deviation of the map.
 """
 
 import sys

@@ -1,3 +1,3 @@
-"""Our van der Waals radii of the elements that prepared structures have, Å: for the peers that can be told radii."""
+"""Van der Waals radii of molmesh for the elements of prepared structures, Å, for peers that accept radii."""
 
 RADII = {"H": 1.10, "C": 1.70, "N": 1.55, "O": 1.52, "P": 1.80, "S": 1.80, "SE": 1.90}

@@ -1,4 +1,5 @@
-"""Structure file to PLY by numba (the field) and scikit-image's marching cubes: `skimage_peer.py IN OUT SPACING`."""
+"""Meshes a structure file with numba and the marching cubes of scikit-image: `skimage_peer.py IN OUT SPACING` writes
+PLY."""
 
 import sys
 

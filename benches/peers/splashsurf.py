@@ -1,14 +1,14 @@
-"""Structure file to surface file, molmesh against splashsurf, in turn, on a RAM disk, both on the CPU.
+"""Compares molmesh with splashsurf on the CPU, in turn, on a RAM disk.
 
     python3 benches/peers/splashsurf.py FILE [FILE ...] [--runs 7] [--resolution 0.5] [--molmesh PROGRAM ...]
 
-Needs `make static` or `make release` (what is there of the two takes part, in turn), `cargo install splashsurf` and the
-Python package gemmi. splashsurf has no reader of structures: it is given the heavy atoms of the same selection as 32-bit
-coordinates, written beforehand, so its time lacks reading the structure. For a machine without gemmi, `--points` only
-writes those coordinates beside each file, as FILE.xyz; where they lie there they are taken. All programs are copied
-first, as an installation does: a file that a linker had just written took up to a sixth longer for a short run than a
-fresh copy of it. Prints one row a file and program: medians of the wall time, peak memory of the process, triangles, and
-the ratios, per triangle too; last the time of a program that does nothing, `true`, which is in all of them.
+Requires `make static` or `make release` (measures both if both exist), `cargo install splashsurf` and the Python
+package gemmi. splashsurf does not read structures. Its input are the heavy atoms of the same selection as 32-bit
+coordinates, so its time does not include reading a structure. For machines without gemmi, `--points` writes these
+coordinates beside each file, as FILE.xyz. Existing ones are used. All programs are copied first, because short runs of
+a binary that a linker has just written take up to a sixth longer. Prints one row per file and program: medians of wall
+time and peak memory, triangles, and ratios, also per triangle. The last line is the time of `true`, a program that does
+nothing.
 """
 
 import argparse
@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def run(command):
-    """Wall seconds and peak memory (MB) of a command that must succeed."""
+    """Runs a command that must succeed. Returns its wall time (s) and peak memory (MB)."""
     started = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     complaint = process.stderr.read()
@@ -39,8 +39,9 @@ def run(command):
 
 
 def heavy_atoms(path):
-    """Coordinates of what molmesh meshes by default: first model, ATOM records, no hydrogens, one alternative."""
-    import gemmi  # Not needed where coordinates lie beside the structures.
+    """Yields the coordinates that molmesh meshes by default: first model, ATOM records, no hydrogens, one alternative
+    location."""
+    import gemmi  # Not needed if there are files of coordinates.
 
     model = gemmi.read_structure(str(path))[0]
     for residue in (residue for chain in model for residue in chain if residue.het_flag == "A"):
@@ -50,7 +51,7 @@ def heavy_atoms(path):
 
 
 def triangles(path):
-    """Faces of a PLY file, from its header."""
+    """Returns the number of faces in the header of a PLY file."""
     with open(path, "rb") as file:
         for line in file:
             if line.startswith(b"element face"):
@@ -59,12 +60,12 @@ def triangles(path):
 
 
 def named(program):
-    """A program's path, from the repository's root where it lies below that."""
+    """Returns the path of a program, relative to the root of the repository if it is below it."""
     return program.relative_to(ROOT) if program.is_relative_to(ROOT) else program
 
 
 def coordinates(file, structure):
-    """The same as bytes, from beside `file` where they lie there."""
+    """Returns the coordinates as bytes, from the file beside `file` if it exists."""
     beside = file.with_name(file.name + ".xyz")
     if beside.exists():
         return beside.read_bytes()
@@ -93,7 +94,7 @@ def main():
     with tempfile.TemporaryDirectory(dir=ram) as folder, tempfile.TemporaryDirectory() as installed:
         folder = Path(folder)
         splashsurf = shutil.copy(splashsurf, installed)
-        # By the folder that each lies in, as all may have one name.
+        # Copies have unique names, as all programs may have the same name.
         ours = {program: shutil.copy(program, Path(installed) / str(i)) for i, program in enumerate(programs)}
         for file in options.files:
             data = gzip.open(file).read() if file.suffix == ".gz" else file.read_bytes()

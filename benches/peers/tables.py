@@ -1,8 +1,8 @@
-"""Figures of a run to tables: medians, ratios, Markdown. Nothing here measures anything."""
+"""Tables of the results of a run: medians, ratios, Markdown."""
 
 from statistics import median
 
-# Beyond this difference in triangles times are also compared per triangle.
+# Relative difference in triangles above which times are also compared per triangle.
 NEAR = 0.05
 SURFACES = {
     "same": "ours",
@@ -15,7 +15,7 @@ HEAD = ["program", "surface", "s", "× time", "MB", "× memory", "triangles", "a
 
 
 def summary(runs):
-    """Medians of rounds (each with `wall` in s and `kb`); ratios are taken between runs of the same round."""
+    """Adds medians of rounds (each with `wall` in s and `kb`), and medians of ratios between runs of the same round."""
     ours = {run["round"]: run for run in runs["molmesh"]["runs"]} if "runs" in runs.get("molmesh", {}) else {}
     for entry in runs.values():
         if not entry.get("runs"):
@@ -32,7 +32,7 @@ def summary(runs):
 
 
 def near_equal(entry, ours):
-    """Ratios per triangle where the counts differ by more than `NEAR`."""
+    """Adds ratios per triangle if the numbers of triangles differ by more than `NEAR`."""
     theirs = entry.get("mesh")
     if not (ours and theirs and theirs["triangles"] and "times_ours" in entry):
         return
@@ -43,7 +43,7 @@ def near_equal(entry, ours):
 
 
 def late(runs):
-    """What was ended at the limit took more than so many times ours."""
+    """Adds the minimum ratio of programs that exceeded the time limit."""
     ours = runs.get("molmesh", {}).get("seconds")
     for entry in runs.values():
         if "limit" in entry and ours:
@@ -51,7 +51,7 @@ def late(runs):
 
 
 def significant(value, digits=3):
-    """A few digits, without an exponent."""
+    """Formats a number with a few significant digits, without an exponent."""
     if value == 0:
         return "0"
     text = f"{value:.{digits}g}"
@@ -71,11 +71,11 @@ def mesh_cells(mesh):
 
 
 def row(name, entry):
-    """The cells of one program, as `HEAD` names them."""
+    """Returns the cells of one program, in the order of `HEAD`."""
     surface = SURFACES[entry["surface"]]
     triangles, closed, area, volume = mesh_cells(entry.get("mesh"))
     if "missing" in entry or "failed" in entry:
-        why = f"not to be had: {entry['missing']}" if "missing" in entry else f"failed: {entry['failed']}"
+        why = f"not available: {entry['missing']}" if "missing" in entry else f"failed: {entry['failed']}"
         return [name, surface, why.replace("|", "/"), *["–"] * (len(HEAD) - 3)]
     if "limit" in entry:
         ratio = f"> {significant(entry['times_ours_at_least'])}" if "times_ours_at_least" in entry else "–"
@@ -97,7 +97,7 @@ def markdown(rows):
 
 
 def terminal(rows):
-    """Columns of the widths that they need; texts to the left, figures to the right."""
+    """Formats a table for the terminal, with text left-aligned and figures right-aligned."""
     rows = [HEAD, *rows]
     widths = [max(len(cells[k]) for cells in rows if len(cells[2]) < 24 or k < 2) for k in range(len(HEAD))]
     left = {0, 1, HEAD.index("closed")}
@@ -111,13 +111,13 @@ def terminal(rows):
 
 
 def section(structure):
-    """Title and rows of one structure of the run."""
+    """Returns the title and the rows of one structure."""
     title = f"{structure['name'].upper()}: {structure['atoms']:,} atoms"
     return title, [row(name, entry) for name, entry in structure["programs"].items()]
 
 
 def overview(result):
-    """× time of every program and structure, one row a program."""
+    """Formats the relative times of all programs and structures, with one row per program."""
     structures = result["structures"]
     lines = ["| × our time | " + " | ".join(s["name"].upper() for s in structures) + " |",
              "|" + "---|" * (len(structures) + 1)]  # fmt: skip
@@ -137,7 +137,7 @@ def overview(result):
 
 
 def page(result):
-    """All of it as Markdown, machine and versions first."""
+    """Formats all results as Markdown, machine and versions first."""
     machine = result["machine"]
     versions = [version for version in dict.fromkeys(result["versions"].values()) if version]
     loads = [machine["load"], *(s["load"] for s in result["structures"] if "load" in s)]
@@ -157,7 +157,8 @@ def page(result):
 
 
 def between(text, content, begin="<!-- peers: begin -->", end="<!-- peers: end -->"):
-    """`text` with what is between the two markers replaced. Raises ValueError where there are not both, once each."""
+    """Returns `text` with the content between two markers replaced. Raises ValueError unless each marker occurs
+    once."""
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
         raise ValueError(f"the page must have {begin} and {end}, once each and in this order")
     head, rest = text.split(begin)

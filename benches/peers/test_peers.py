@@ -1,6 +1,6 @@
-"""The comparison's own parts, on things whose answer is known: `MOLMESH=BINARY python test_peers.py`.
+"""Tests of the comparison: `MOLMESH=BINARY python test_peers.py`.
 
-Needs what tests/tools/setup.sh installs (gemmi, numpy, trimesh); no peer.
+Requires the packages that tests/tools/setup.sh installs (gemmi, numpy, trimesh), but no peers.
 """
 
 import json
@@ -37,7 +37,7 @@ class Checker(unittest.TestCase):
         self.assertAlmostEqual(report["area"], 1.5 + 3**0.5 / 2)
         self.assertLess(check.report(CORNERS, SIDES[:, ::-1])["volume"], 0)
 
-    def test_a_missing_triangle_opens_it(self):
+    def test_a_missing_triangle_is_detected(self):
         report = check.report(CORNERS, SIDES[1:])
         self.assertEqual((report["closed"], report["open_edges"], report["crowded_edges"]), (False, 3, 0))
 
@@ -45,13 +45,13 @@ class Checker(unittest.TestCase):
         report = check.report(CORNERS, np.concatenate([SIDES, SIDES[:1]]))
         self.assertEqual((report["closed"], report["open_edges"], report["crowded_edges"]), (False, 0, 3))
 
-    def test_only_a_soup_is_merged(self):
+    def test_only_unshared_vertices_are_merged(self):
         soup = CORNERS[SIDES].reshape(-1, 3), np.arange(12).reshape(4, 3)
         report = check.report(*soup)
         self.assertTrue(report["closed"] and report["merged"])
         self.assertEqual(report["vertices"], 4)
         self.assertEqual(check.report(soup[0][:9], soup[1][:3])["open_edges"], 3)
-        # The last triangle has corners of its own at the same places: indices decide.
+        # The last triangle has separate vertices at the same positions, so the mesh is open by its indices.
         report = check.report(np.concatenate([CORNERS, CORNERS[1:]]), np.concatenate([SIDES[:3], [[4, 5, 6]]]))
         self.assertEqual((report["closed"], report["merged"], report["open_edges"]), (False, False, 6))
 
@@ -80,7 +80,7 @@ class Tables(unittest.TestCase):
 
         return tables.summary({
             "molmesh": {"surface": "same", "runs": runs(1, 2, 4), "mesh": mesh},
-            # Ratios 10, 3, 1: their median is 3; that of the medians, 6 and 2, as well; the next one's differ.
+            # Ratios 10, 3, 1 have the median 3, like the ratio of the medians 6 and 2. They differ for `far`.
             "near": {"surface": "same", "runs": runs(10, 6, 4), "mesh": {**mesh, "triangles": 1049}},
             "far": {"surface": "ses", "runs": runs(3, 4, 20), "mesh": {**mesh, "triangles": 500, "closed": False,
                                                                        "open_edges": 3, "merged": True}},
@@ -98,7 +98,7 @@ class Tables(unittest.TestCase):
         self.assertEqual(programs["far"]["times_ours_per_triangle"], 6)
         self.assertEqual(programs["slow"]["times_ours_at_least"], 30)
 
-    def test_nobody_is_left_out(self):
+    def test_all_programs_have_rows(self):
         programs = self.programs()
         structure = {"name": "4pti", "atoms": 454, "programs": programs}
         title, rows = tables.section(structure)
@@ -106,7 +106,7 @@ class Tables(unittest.TestCase):
         self.assertEqual([cells[0] for cells in rows], list(programs))
         self.assertTrue(all(len(cells) == len(tables.HEAD) for cells in rows))
         text = tables.markdown(rows)
-        for words in ("more than 60", "> 30", "failed: status 1, a / b", "not to be had: no such package",
+        for words in ("more than 60", "> 30", "failed: status 1, a / b", "not available: no such package",
                       "no: 3 open edges, 0 with more than two triangles (merged)"):  # fmt: skip
             self.assertIn(words, text)
             if "open edges" not in words:
@@ -115,7 +115,7 @@ class Tables(unittest.TestCase):
         for line in ("| near | 3 |", "| slow | > 30 |", "| absent | – |"):
             self.assertIn(line, overview)
 
-    def test_the_page_is_replaced_between_its_markers(self):
+    def test_page_content_between_markers_is_replaced(self):
         begin, end = "<!-- peers: begin -->", "<!-- peers: end -->"
         self.assertEqual(tables.between(f"a\n{begin}\nold\n{end}\nb", "new"), f"a\n{begin}\n\nnew\n\n{end}\nb")
         for broken in (f"{begin} only", f"{end} {begin}", f"{begin} {begin} {end}"):
@@ -129,14 +129,14 @@ class Runs(unittest.TestCase):
             peer = Peer("x", "same", ".out", lambda job: [*command], lambda: "1")
             return peers.launch(peer, job, limit)
 
-    def test_failures_are_told(self):
+    def test_failures_are_reported(self):
         self.assertEqual(self.launch("sh", "-c", "echo no atoms >&2; exit 4"), {"failed": "status 4, no atoms"})
         self.assertEqual(self.launch("true"), {"failed": "status 0"})
         self.assertIn("failed", self.launch("/no/such/program"))
         self.assertEqual(self.launch("sh", "-c", "sleep 600 & wait", limit=0.2), {"limit": 0.2})
-        self.assertEqual(self.launch("sh", "-c", "kill -9 $PPID"), {"failed": "what measures it ended with -9"})
+        self.assertEqual(self.launch("sh", "-c", "kill -9 $PPID"), {"failed": "launch.py ended with -9"})
 
-    def test_memory_is_the_commands_own(self):
+    def test_memory_is_that_of_the_command(self):
         write = "open('mesh.out', 'w').write('x')"
         small = self.launch("sh", "-c", "echo x > mesh.out")
         large = self.launch("sh", "-c", f"{sys.executable} -S -c \"b = bytearray(200 << 20); {write}\"; true")
@@ -157,7 +157,7 @@ class Runs(unittest.TestCase):
         self.assertTrue(entry["mesh"]["closed"] and not entry["mesh"]["merged"])
         self.assertIn("4PTI: 454 atoms", done.stdout)
 
-    def test_the_array_program_makes_our_mesh(self):
+    def test_the_array_program_computes_our_mesh(self):
         with tempfile.TemporaryDirectory() as folder:
             structure = prepare.heavy(SAMPLE)
             rows = list(structure[0].all())

@@ -1,4 +1,4 @@
-"""Structure file to PLY by numba (the field) and VTK's flying edges: `vtk_peer.py IN OUT SPACING`."""
+"""Meshes a structure file with numba and the flying edges of VTK: `vtk_peer.py IN OUT SPACING` writes PLY."""
 
 import sys
 
@@ -12,7 +12,7 @@ import ply
 source, target, spacing = sys.argv[1], sys.argv[2], float(sys.argv[3])
 density, origin = field.dense(*field.read(source), spacing)
 image = vtkImageData()
-# VTK's x is what runs fastest in memory: our z.
+# The x axis of VTK is the fastest in memory, which is our z axis.
 image.SetDimensions(*density.shape[::-1])
 image.SetSpacing(spacing, spacing, spacing)
 image.SetOrigin(*origin[::-1])
@@ -28,5 +28,5 @@ mesh = edges.GetOutput()
 faces = vtk_to_numpy(mesh.GetPolys().GetConnectivityArray()).reshape(-1, 3)
 vertices = vtk_to_numpy(mesh.GetPoints().GetData())
 normals = vtk_to_numpy(mesh.GetPointData().GetNormals())
-# Back to our order of axes, a mirror: the corners turn around with it.
+# Restore our order of axes. This mirrors the mesh, so the corners are reversed, too.
 ply.write(target, vertices[:, ::-1], faces[:, ::-1], normals[:, ::-1])

@@ -62,8 +62,8 @@ pub fn estimate(
     let control = Control { cancel: cancel.clone(), deadline: limits.deadline, ..Control::default() };
     let mut params = job.params_for(spheres.len());
     let mut refused = None;
-    if let Spacing::MaxTriangles(most) = job.spacing {
-        match fit::expected(&spheres, job, most, &limits.surface, choice, &control) {
+    if let Spacing::MaxTriangles(limit) = job.spacing {
+        match fit::expected(&spheres, job, limit, &limits.surface, choice, &control) {
             Ok(resolution) => params.resolution = resolution,
             Err(error) => {
                 if let SurfaceError::TooManyTriangles { resolution, .. } = error {
@@ -79,7 +79,7 @@ pub fn estimate(
     let mesh = refused.map_or_else(|| of_mesh(&lattice, &spheres, &params, &limits.surface, choice, &control), Err);
     let mesh = match (mesh, job.spacing) {
         (Err(error @ (SurfaceError::Cancelled | SurfaceError::Deadline)), _) => return Err(error.into()),
-        (Ok(mesh), Spacing::MaxTriangles(most)) => Ok(mesh.at_most(most, &params)),
+        (Ok(mesh), Spacing::MaxTriangles(limit)) => Ok(mesh.at_most(limit, &params)),
         (mesh, _) => mesh,
     };
     let (atoms, atoms_in_file) = (selected.atoms.len() as u64, structure.len() as u64);
@@ -87,10 +87,10 @@ pub fn estimate(
 }
 
 impl MeshEstimate {
-    /// Limits the numbers of triangles and vertices to those of at most `most` triangles.
-    fn at_most(self, most: u64, params: &SurfaceParams) -> Self {
-        let triangles = self.triangles.min(most);
-        let vertices = self.vertices.min(most.div_ceil(2));
+    /// Limits the numbers of triangles and vertices to those of at most `limit` triangles.
+    fn at_most(self, limit: u64, params: &SurfaceParams) -> Self {
+        let triangles = self.triangles.min(limit);
+        let vertices = self.vertices.min(limit.div_ceil(2));
         Self { triangles, vertices, bytes: params.mesh_bytes(vertices, triangles), ..self }
     }
 }

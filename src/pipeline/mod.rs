@@ -102,16 +102,16 @@ pub struct JobLimits {
 
 /// Chosen backend and the reason for the choice, for reports and logs.
 pub struct Choice<'a> {
-    /// The backend.
+    /// Backend.
     pub backend: &'a dyn Backend,
     /// Reason for the choice.
     pub reason: &'a str,
 }
 
-/// A finished job.
+/// Finished job.
 #[derive(Debug, Clone)]
 pub struct Product {
-    /// The mesh.
+    /// Mesh.
     pub mesh: Mesh,
     /// Encoding in a file.
     pub storage: Storage,

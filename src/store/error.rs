@@ -63,7 +63,7 @@ pub enum StoreError {
     Range {
         /// First byte.
         start: u64,
-        /// The byte after the last one.
+        /// End of the range, exclusive.
         end: u64,
         /// Size of the object, bytes.
         size: u64,

@@ -24,7 +24,7 @@ pub enum LockError {
     /// Another service holds the lock.
     #[error("the data folder {} (server.data_dir) is in use by {holder}", folder.display())]
     Held {
-        /// The data folder.
+        /// Data folder.
         folder: PathBuf,
         /// Description of the other service.
         holder: String,
@@ -32,14 +32,14 @@ pub enum LockError {
     /// The folder cannot be created, or its lock file cannot be opened or locked.
     #[error("cannot lock the data folder {} (server.data_dir): {error}", folder.display())]
     Io {
-        /// The data folder.
+        /// Data folder.
         folder: PathBuf,
-        /// The operating system's error.
+        /// Error of the operating system.
         error: io::Error,
     },
 }
 
-/// The service that holds a lock, as the lock file describes it.
+/// Service that holds a lock, as described in the lock file.
 #[derive(Debug, Serialize, Deserialize)]
 struct Holder {
     pid: u32,

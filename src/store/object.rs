@@ -26,7 +26,7 @@ impl From<&ObjectMeta> for Meta {
     }
 }
 
-/// An object with its metadata.
+/// Object with its metadata.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Stored {
     /// Content.

@@ -13,7 +13,7 @@ const NAME: &str = "secret";
 /// Bytes of a secret.
 const BYTES: usize = 32;
 
-/// A secret of 256 random bits.
+/// Secret of 256 random bits.
 pub(crate) type Secret = [u8; BYTES];
 
 /// Reads the secret in the folder `root`, or creates it. Only the owner may read the file. Blocks.

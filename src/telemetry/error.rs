@@ -8,7 +8,7 @@ pub enum TelemetryError {
     /// The log filter cannot be read.
     #[error("log.filter `{filter}` is not valid: {reason}")]
     Filter {
-        /// The filter.
+        /// Filter.
         filter: String,
         /// Message of the parser.
         reason: String,

@@ -15,11 +15,11 @@ const SIZES: [usize; 10] = [100, 300, 1_000, 3_000, 10_000, 30_000, 100_000, 300
 /// Approximate maximum time of the measured runs of one size, s. A single run may take longer.
 const TIME_PER_SIZE: f64 = 4.0;
 
-/// Measures every program up to `most` atoms, and passes the results to `done` after each size.
+/// Measures all programs up to `max_atoms` atoms, and passes the results to `done` after each size.
 ///
 /// # Errors
 /// Returns an [`Error`] if a program cannot be started, or an error of `done`.
-pub(super) fn measure(plan: &Plan, most: usize, done: &mut dyn FnMut(&Growth) -> Result<()>) -> Result<()> {
+pub(super) fn measure(plan: &Plan, max_atoms: usize, done: &mut dyn FnMut(&Growth) -> Result<()>) -> Result<()> {
     let options = SurfaceOptions { resolution: Some(plan.growth_spacing), ..SurfaceOptions::default() };
     let params = SurfaceParams::new(&options).map_err(|e| Error::Usage(e.to_string()))?;
     let structure = "the built-in 4PTI, tiled; default surface".to_owned();
@@ -31,7 +31,7 @@ pub(super) fn measure(plan: &Plan, most: usize, done: &mut dyn FnMut(&Growth) ->
         };
         let at = growth.series.len();
         growth.series.push(Series { program: program.name().to_owned(), points: Vec::new(), ends });
-        for n in SIZES.into_iter().filter(|n| *n <= most) {
+        for n in SIZES.into_iter().filter(|n| *n <= max_atoms) {
             let Some(runner) = &mut runner else { break };
             note(&format!("{n} atoms: {}", program.name()));
             let spheres = structures::tiled_sample(n)?;

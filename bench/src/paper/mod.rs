@@ -93,7 +93,7 @@ type Opened = std::result::Result<Box<dyn Runner>, String>;
 
 impl Plan {
     fn new(args: &PaperArgs) -> Result<Self> {
-        if args.runs == 0 || args.growth.is_some_and(|most| most < 100) {
+        if args.runs == 0 || args.growth.is_some_and(|max_atoms| max_atoms < 100) {
             return Err(Error::Usage("--runs must be at least 1, and --growth at least 100 atoms".to_owned()));
         }
         if args.reference_limit.is_nan() || args.reference_limit < 0.0 {
@@ -198,8 +198,8 @@ pub(crate) fn run(args: &PaperArgs) -> Result<()> {
         document.roofline = roofline::measure(selected, &plan)?;
         save(args.out.as_deref(), &document)?;
     }
-    if let Some(most) = args.growth {
-        growth::measure(&plan, most, &mut |growth| {
+    if let Some(max_atoms) = args.growth {
+        growth::measure(&plan, max_atoms, &mut |growth| {
             document.growth = Some(growth.clone());
             save(args.out.as_deref(), &document)
         })?;
