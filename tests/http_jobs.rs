@@ -90,8 +90,8 @@ fn a_request_that_outlasts_its_wait_becomes_a_job_and_no_work_is_lost() {
     ended(&server, &job, "successful");
     assert_eq!(backend.started.load(Ordering::SeqCst), 1, "the job went on");
     assert!(!result(&server, &job).body.is_empty());
-    // A report cannot be promised, so it is waited for.
-    let report = server.post("/v1/meshes?report=json", &[("prefer", "wait=0")], &sample(3));
+    // A report is never a job: the request waits for it.
+    let report = server.post("/v1/report", &[("prefer", "wait=0")], &sample(3));
     assert_eq!((report.status, report.json()["atoms"].as_u64()), (200, Some(454)));
     // Who would wait less is promised earlier.
     let reply = server.post("/v1/meshes", &[("prefer", "wait=0")], &sample(2));

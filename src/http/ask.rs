@@ -30,6 +30,8 @@ pub(super) struct Ask {
     pub(super) pairs: Vec<(String, String)>,
     pub(super) format: Format,
     pub(super) wish: Wish,
+    /// Answer with the report instead of the mesh.
+    pub(super) report: bool,
     /// How long the answer stays good; none: it belongs to this request alone.
     pub(super) cache: Option<HeaderValue>,
     /// Where the time went so far.
@@ -69,7 +71,7 @@ impl Ask {
         headers: &HeaderMap,
     ) -> Result<Option<Response>, Problem> {
         // A check and a report's times are those of a run; a promise has an address of its own.
-        if self.request.strict || self.request.report || self.wish.later {
+        if self.request.strict || self.report || self.wish.later {
             return Ok(None);
         }
         let key = self.key(app);
@@ -97,7 +99,7 @@ impl Ask {
     /// Makes the mesh, or promises to.
     pub(super) async fn make(mut self, app: &Shared, input: Input) -> Result<Response, Problem> {
         app.admit_work(&self.wish.caller)?;
-        if self.wish.later {
+        if self.wish.later && !self.report {
             return self.promise(app, input, None).await;
         }
         let place = app.delivery()?;
@@ -109,8 +111,8 @@ impl Ask {
             scope.link(ticket.scope().context());
         }
         let patience = match self.wish.wait {
-            // A report has no address of its own that could be promised: it is waited for until its deadline.
-            _ if self.request.report => Duration::MAX,
+            // A job has no report of its own to return later, so a report is waited for until the deadline.
+            _ if self.report => Duration::MAX,
             Some(wait) => wait.min(app.config.jobs.sync_wait()),
             None => app.config.jobs.sync_wait(),
         };
@@ -129,7 +131,7 @@ impl Ask {
             self.timing.job(&finished.product.report);
         }
         self.declared.check_format(finished.product.report.source_format)?;
-        if self.request.report {
+        if self.report {
             return delivery::report(&finished, self.timing);
         }
         // Another backend may have stood in for the chosen one, and its bytes are others.
@@ -161,10 +163,6 @@ impl Ask {
 
     /// A job that survives this process, and the answer that says so.
     async fn promise(self, app: &Shared, input: Input, ticket: Option<Ticket>) -> Result<Response, Problem> {
-        if self.request.report {
-            let detail = "a report takes part in the result of a job; ask for the mesh, then for its report.json";
-            return Err(Problem::new(Kind::BadParameter, detail).with("parameter", "report"));
-        }
         let (task, asked) = (self.task(&input), self.wish.later);
         let order =
             Order { task, parameters: self.pairs, format: self.format, idempotency: self.wish.idempotency.clone() };

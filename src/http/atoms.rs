@@ -26,44 +26,46 @@ use crate::structure::{self, Structure, StructureError, element};
 /// Bytes of the document that are set aside for an atom: two numbers, and a tenth of a residue's five.
 const BYTES_PER_ATOM: u64 = 24;
 
-/// The atoms of a structure: every model, in the order of the file, which is what `_ATOM` counts from 0.
+/// Atoms of all models in file order. Row `i` describes the atom with index `i` in `_ATOM` of a mesh.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct AtomsDocument {
-    /// Atoms: rows of `atoms`.
+    /// Number of atoms, the length of each column of `atoms`.
     count: usize,
-    /// The distinct names of atoms.
+    /// Distinct atom names.
     names: Vec<String>,
-    /// The distinct elements; `?` is an unknown one.
+    /// Distinct element symbols; `?` for an unknown element.
     elements: Vec<&'static str>,
+    /// Columns with one row per atom.
     atoms: AtomColumns,
+    /// Columns with one row per residue.
     residues: ResidueColumns,
 }
 
-/// A row for each atom.
+/// Columns with one row per atom.
 #[derive(Debug, Default, Serialize, ToSchema)]
 struct AtomColumns {
-    /// Which of `names`.
+    /// Index into `names`.
     name: Vec<u32>,
-    /// Which of `elements`.
+    /// Index into `elements`.
     element: Vec<u8>,
 }
 
-/// A row for each residue.
+/// Columns with one row per residue.
 #[derive(Debug, Default, Serialize, ToSchema)]
 struct ResidueColumns {
-    /// Its first atom; the last is the one before the next residue's first.
+    /// Index of the first atom. The residue ends before the first atom of the next one.
     first: Vec<usize>,
-    /// Its name.
+    /// Residue name.
     name: Vec<String>,
-    /// Its number, as the author gives it.
+    /// Residue number given by the author.
     number: Vec<i32>,
-    /// Its insertion code; empty where there is none.
+    /// Insertion code; empty if there is none.
     insertion_code: Vec<String>,
-    /// The author's name for its chain; empty where the file leaves it blank.
+    /// Chain name given by the author; empty if the file leaves it blank.
     chain: Vec<String>,
-    /// Its model.
+    /// Model number.
     model: Vec<i32>,
-    /// What its first atom is: `polymer`, `ligand`, `water` or `virtual` (a site that is not an atom).
+    /// Kind of the first atom: `polymer`, `ligand`, `water` or `virtual` (a site that is not an atom).
     kind: Vec<&'static str>,
 }
 
@@ -76,15 +78,15 @@ refusals!(EntryRefusals: [READING, [
     Kind::MemoryFull, Kind::TooManyDeliveries,
 ]]);
 
-/// Who the atoms of a structure are.
+/// List the atoms of a structure
 ///
-/// For meshes with `atom_ids=true`: their `_ATOM` (in PLY `atom`) counts the rows of `atoms` here.
+/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this list.
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
     params(StructurePath, Unchanged),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
-            ("ETag" = String, description = "The digest."),
-            ("Cache-Control" = String, description = "How long the answer stays good."),
+            ("ETag" = String, description = "Strong validator of the document."),
+            ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, StructureRefusals,
     ))]
@@ -104,15 +106,15 @@ pub(super) async fn of_structure(
     Ok((caching, list(&app, input).await?).into_response())
 }
 
-/// Who the atoms of an entry are.
+/// List the atoms of an archive entry
 ///
-/// For meshes with `atom_ids=true`: their `_ATOM` (in PLY `atom`) counts the rows of `atoms` here.
+/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this list.
 #[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
     params(EntryPath, Unchanged),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
-            ("ETag" = String, description = "The digest of the entry's file."),
-            ("Cache-Control" = String, description = "How long the answer stays good."),
+            ("ETag" = String, description = "Strong validator of the document."),
+            ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, EntryRefusals,
     ))]

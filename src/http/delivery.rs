@@ -48,12 +48,12 @@ pub(super) const PICTURE: [(&str, &str); 4] = [
     ("molmesh-pixel", "pixel"),
 ];
 
-/// A report, and what was found on the way to it.
+/// Report of a request, with the findings of the strict validator.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReportDocument {
     #[serde(flatten)]
     report: Report,
-    /// What a second, strict reader says of the file; absent where it was not asked.
+    /// Findings of the strict validator; absent without `check=strict`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     diagnostics: Option<Vec<Finding>>,

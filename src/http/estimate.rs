@@ -17,7 +17,7 @@ use super::ask::Input;
 use super::guard::Caller;
 use super::kinds::Kind;
 use super::meshes::{self, Pairs};
-use super::openapi::bodies::{MeshForm, MeshOrder, StructureFile};
+use super::openapi::bodies::{STRUCTURE_TO_MESH, StructureFile};
 use super::openapi::parameters::{Coding, MeshParameters};
 use super::openapi::problems::{BODY, NAMED, PARAMETERS, ProblemDocument, READING};
 use super::openapi::refusals;
@@ -36,53 +36,61 @@ impl Drop for StopOnDrop {
     }
 }
 
-/// What a mesh would come to. What stands in the grid's part is exact, what stands in the mesh's part is estimated.
+/// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and samples are exact; the size of the mesh and the times
+/// are estimates.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(example = json!({
+    "accepted": true, "problem": null, "atoms": 454, "atoms_in_file": 514, "resolution": 0.5,
+    "resolution_from": "resolution", "kernel": "gaussian", "format": "glb", "box_cells": 464_940, "bricks": 391,
+    "samples": 200_192, "area": 3475.0, "vertices": 20_850, "triangles": 41_700, "mesh_bytes": 1_000_800,
+    "structure": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "seconds": 0.01,
+    "wait_seconds": 0.0, "backend": "cpu",
+}))]
 pub(super) struct EstimateDocument {
-    /// The mesh would be made.
+    /// True if `POST /v1/meshes` would accept the request.
     accepted: bool,
-    /// Why it would not be made.
+    /// Error that `POST /v1/meshes` would return; null if it would accept the request.
     #[schema(required, value_type = Option<ProblemDocument>)]
     problem: Option<Value>,
-    /// Atoms that would be meshed.
+    /// Selected atoms.
     atoms: u64,
-    /// Atoms in the file, all models.
+    /// Atoms in all models of the file.
     atoms_in_file: u64,
-    /// Grid spacing, Å; estimated where it follows from `max_triangles`.
+    /// Grid spacing in Å; an estimate if it follows from `max_triangles`.
     resolution: f64,
-    /// The parameter that the spacing follows from: `resolution`, `detail` or `max_triangles`.
+    /// Parameter that sets the spacing: `resolution`, `detail` or `max_triangles`.
     resolution_from: &'static str,
-    /// Kernel function.
+    /// Density kernel.
     kernel: &'static str,
-    /// The mesh format, as a file name's extension.
+    /// Mesh format, as a file name extension.
     format: &'static str,
-    /// Cells that a dense grid would have.
+    /// Cells of a dense grid over the bounding box.
     box_cells: u64,
-    /// Bricks of the grid that some atom reaches.
+    /// Grid bricks (8 × 8 × 8 points) within reach of an atom; null if the request would be rejected before they are known.
     #[schema(required)]
     bricks: Option<u64>,
-    /// Samples that would be evaluated.
+    /// Grid points to evaluate; null like `bricks`.
     #[schema(required)]
     samples: Option<u64>,
-    /// Å².
+    /// Surface area in Å²; null like `bricks`.
     #[schema(required)]
     area: Option<f64>,
-    /// Vertices.
+    /// Vertices; null like `bricks`.
     #[schema(required)]
     vertices: Option<u64>,
-    /// Triangles.
+    /// Triangles; null like `bricks`.
     #[schema(required)]
     triangles: Option<u64>,
-    /// Bytes of the mesh.
+    /// Size of the mesh file in bytes; null like `bricks`.
     #[schema(required)]
     mesh_bytes: Option<u64>,
-    /// SHA-256 of the structure.
+    /// SHA-256 digest of the structure, in hexadecimal.
     structure: String,
-    /// Time that making it would take, s.
+    /// Computing time in s.
     seconds: f64,
-    /// Time that it would wait, s.
+    /// Time in the queue in s.
     wait_seconds: f64,
-    /// The backend that would make it.
+    /// Backend that would compute the mesh: `cpu` or `gpu`.
     backend: &'static str,
 }
 
@@ -90,15 +98,12 @@ refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
     Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
 ]]);
 
-/// Says what a mesh would come to, without making it.
+/// Estimate a mesh
 ///
-/// Takes what `POST /v1/meshes` takes.
+/// Takes what `POST /v1/meshes` takes and returns the expected size, memory and time of the mesh without computing it.
 #[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",
     params(MeshParameters, Coding),
-    request_body(description = "A structure, or a document that names one.", content(
-        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
-        (StructureFile = "chemical/x-mmcif"), (MeshForm = "multipart/form-data"), (MeshOrder = "application/json"),
-    )),
+    request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
     responses((status = 200, description = "The estimate.", body = EstimateDocument), EstimateRefusals))]
 pub(super) async fn create(
     State(app): State<Shared>,

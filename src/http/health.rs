@@ -16,46 +16,47 @@ use super::state::{Shared, Warm};
 
 const NO_STORE: [(axum::http::HeaderName, &str); 1] = [(CACHE_CONTROL, "no-store")];
 
-/// What a probe is told.
+/// Answer of the liveness probe.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Health {
-    /// `live`.
+    /// Always `live`.
     status: &'static str,
 }
 
-/// What is running.
+/// Name and version of the program.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Version {
-    /// `molmesh`.
+    /// Always `molmesh`.
     name: &'static str,
-    /// The program's version.
+    /// Version of the program.
     version: &'static str,
 }
 
-/// The process answers.
+/// Check that the process is alive
 #[utoipa::path(get, path = "/livez", tag = "service", operation_id = "live",
-    responses((status = 200, description = "The process lives.", body = Health)))]
+    responses((status = 200, description = "The process is alive.", body = Health)))]
 pub(super) async fn live() -> Response {
     (NO_STORE, Json(Health { status: "live" })).into_response()
 }
 
-/// Whether requests should come here, with what was looked at.
+/// Answer of the readiness probe.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReadyDocument {
-    /// `ready`.
+    /// Always `ready`.
     status: &'static str,
-    /// Each check; all are `ok`.
+    /// The readiness checks; all are `ok`.
     checks: Vec<Check>,
 }
 
-/// Something without which the service is not ready.
+/// Readiness check.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ReadinessCheck)]
 pub(super) struct Check {
-    /// `accepting`, `devices` or `store`.
+    /// Name of the check: `accepting`, `devices` or `store`.
     name: &'static str,
-    /// Whether it is as it should be.
+    /// True if the check passed.
     ok: bool,
-    /// What was found, in words.
+    /// Explanation of the outcome.
     detail: String,
 }
 
@@ -71,12 +72,12 @@ impl Check {
 
 refusals!(ReadyRefusals: [[Kind::NotReady]]);
 
-/// Whether requests should come here.
+/// Check that the service is ready for requests
 ///
-/// The service was not told to stop, a mesh was computed and a device (or what stands in for it) takes jobs, and the store
-/// can be written and read. Load does not change the answer. `checks` says each, also in the problem.
+/// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts jobs,
+/// and can write and read the store. The answer does not depend on the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
-    responses((status = 200, description = "The service takes requests.", body = ReadyDocument), ReadyRefusals))]
+    responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyRefusals))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
     let checks = [accepting(&app), devices(&app), store(&app).await];
     let failing = checks.iter().find(|check| !check.ok).map(|check| check.detail.clone());
@@ -124,7 +125,7 @@ async fn store(app: &Shared) -> Check {
     Check::new("store", found)
 }
 
-/// What is running.
+/// Get the version of the program
 #[utoipa::path(get, path = "/version", tag = "service", operation_id = "version",
     responses((status = 200, description = "Name and version.", body = Version)))]
 pub(super) async fn version() -> Response {

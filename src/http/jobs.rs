@@ -31,70 +31,82 @@ pub(super) const MAX_WAIT_S: u64 = 55;
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Poll {
-    /// Seconds to wait for the job's end.
+    /// Seconds to wait for the job to end, 0 to 55. Default: 0.
     #[param(minimum = 0, maximum = 55, nullable = false)]
     wait: Option<u64>,
 }
 
-/// How a job stands; names and statuses are those of OGC API Processes.
+/// Status of a job. Names and statuses follow OGC API Processes.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(example = json!({
+    "jobID": "0123456789abcdef0123456789abcdef", "processID": "surface", "type": "process", "status": "running",
+    "progress": 42, "fraction": 0.42, "stage": "field", "attempts": 1, "created": "2030-01-01T12:00:00.000Z",
+    "started": "2030-01-01T12:00:00.100Z", "finished": null,
+    "structure": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "format": "glb",
+    "parameters": { "resolution": "0.3" }, "problem": null, "result": null,
+    "links": [{ "rel": "self", "href": "/v1/jobs/0123456789abcdef0123456789abcdef", "type": "application/json" }],
+}))]
 pub(super) struct JobDocument {
-    /// The job's id.
+    /// Id of the job.
     #[serde(rename = "jobID")]
     job_id: String,
-    /// `surface`.
+    /// Always `surface`.
     #[serde(rename = "processID")]
     process_id: &'static str,
-    /// `process`.
+    /// Always `process`.
     r#type: &'static str,
+    /// Status of the job. `successful`, `failed` and `dismissed` are final.
     #[schema(value_type = StatusSchema)]
     status: Status,
-    /// Per cent.
+    /// Progress in per cent.
     #[schema(minimum = 0, maximum = 100)]
     progress: u64,
-    /// The same, finer.
+    /// Progress as a fraction.
     #[schema(minimum = 0, maximum = 1)]
     fraction: f64,
-    /// What is being done.
+    /// Current stage; null unless the job is running.
     #[schema(required)]
     stage: Option<&'static str>,
-    /// Times that it was begun.
+    /// Number of times the job was started.
     attempts: u32,
-    /// When it was accepted.
+    /// Time of acceptance.
     #[schema(format = DateTime)]
     created: String,
-    /// When it was begun last.
+    /// Time of the latest start; null before the first.
     #[schema(required, format = DateTime)]
     started: Option<String>,
-    /// When it ended.
+    /// Time of the end; null before it.
     #[schema(required, format = DateTime)]
     finished: Option<String>,
-    /// SHA-256 of the structure.
+    /// SHA-256 digest of the structure, in hexadecimal.
     structure: String,
-    /// The mesh format, as a file name's extension.
+    /// Mesh format, as a file name extension.
     format: String,
-    /// The parameters as they were given.
+    /// Parameters as given in the request.
     #[schema(value_type = std::collections::BTreeMap<String, String>)]
     parameters: Map<String, Value>,
-    /// Why there is no result.
+    /// Error of a failed job; null otherwise.
     #[schema(required, value_type = Option<ProblemDocument>)]
     problem: Option<Value>,
-    /// Where more is found.
+    /// File name of the result, for `GET /v1/results/{file}`; null unless the job has succeeded.
+    #[schema(required)]
+    result: Option<String>,
+    /// Related resources.
     links: Vec<Link>,
 }
 
-/// Where something is found.
+/// Link to a related resource.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Link {
-    /// What it is to this document.
+    /// Relation of the resource to this document.
     rel: &'static str,
-    /// Its address.
+    /// Path of the resource.
     href: String,
-    /// Its media type.
+    /// Media type of the resource.
     r#type: &'static str,
 }
 
-/// How a job stands, as text.
+/// Status of a job.
 #[derive(Debug, Serialize, ToSchema)]
 #[serde(rename_all = "lowercase")]
 #[schema(as = JobStatus)]
@@ -126,11 +138,14 @@ pub(super) fn none(id: &str) -> Problem {
     Problem::new(Kind::NoSuchJob, format!("there is no job `{shown}`: jobs are kept for some time after their end"))
 }
 
-/// How a job stands; with `wait`, once it has ended or the time is over.
+/// Get the status of a job
+///
+/// With `wait`, the response is delayed until the job has ended or the time is over.
 #[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "showJob", params(JobPath, Poll),
     responses(
-        (status = 200, description = "How the job stands.", body = JobDocument,
-            headers(("Retry-After" = u64, description = "Seconds, while the job goes on."))),
+        (status = 200, description = "Status of the job.", body = JobDocument,
+            headers(("Retry-After" = u64, description = "Seconds to wait before the next request, while the job is not finished.")),
+            links(("result" = (operation_id = "showResult", parameters(("file" = "$response.body#/result")))))),
         ShowRefusals,
     ))]
 pub(super) async fn show(
@@ -162,7 +177,7 @@ pub(super) async fn show(
     Ok(answer(StatusCode::OK, &view, None))
 }
 
-/// Cancels a job.
+/// Cancel a job
 #[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "dismissJob", params(JobPath),
     responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissRefusals))]
 pub(super) async fn dismiss(
@@ -178,11 +193,14 @@ pub(super) async fn dismiss(
     Ok(answer(StatusCode::OK, &view, None))
 }
 
-/// The way to a job's result; if it failed, why.
+/// Get the result of a job
+///
+/// Redirects to the mesh of a successful job. For a failed job the response is the error that the synchronous request would
+/// have returned.
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(
-        (status = 303, description = "The job was successful.",
-            headers(("Location" = String, description = "The result: /v1/results/….")),),
+        (status = 303, description = "The job has succeeded.",
+            headers(("Location" = String, description = "Path of the mesh: `/v1/results/{file}`."))),
         ResultRefusals,
     ))]
 pub(super) async fn result(
@@ -263,6 +281,7 @@ pub(super) fn document(view: &View) -> JobDocument {
         format: record.format.clone(),
         parameters,
         problem: record.problem.clone(),
+        result: record.result.as_ref().map(|key| format!("{key}.{}", record.format)),
         links,
     }
 }

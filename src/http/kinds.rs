@@ -1,8 +1,8 @@
-//! The kinds of problems: stable names, statuses and what each means in words. The one table of status codes.
+//! Problem types: names, statuses and explanations. The only table of status codes.
 
 use axum::http::StatusCode;
 
-/// What went wrong, as a stable name.
+/// Problem type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     BadRequest,
@@ -57,16 +57,16 @@ pub(super) enum Kind {
     Deadline,
 }
 
-/// A kind's row.
+/// Row of the table of problem types.
 pub(super) struct Row {
     pub(super) kind: Kind,
     /// Last segment of its `type`: `/problems/{slug}`.
     pub(super) slug: &'static str,
     pub(super) status: StatusCode,
     pub(super) title: &'static str,
-    /// What it means and what to do, for people.
+    /// Meaning and remedy.
     pub(super) about: &'static str,
-    /// A limit was reached, or a right was missing: counted as a rejection.
+    /// Counted as a rejection: a limit was reached, or a right was missing.
     pub(super) limit: bool,
 }
 
@@ -83,113 +83,113 @@ const fn row(
 
 use StatusCode as S;
 
-/// Every kind.
+/// All problem types, in the order of [`Kind`].
 #[rustfmt::skip]
 pub(super) const KINDS: &[Row] = &[
     row(Kind::BadRequest, "bad-request", S::BAD_REQUEST, false, "The request is malformed",
-        "The request could not be understood as HTTP or as multipart/form-data. `detail` says what was found."),
+        "The request is not valid HTTP, JSON or multipart/form-data. `detail` says what is wrong."),
     row(Kind::BadParameter, "bad-parameter", S::BAD_REQUEST, false, "A parameter cannot be used",
-        "A parameter is unknown, given twice, malformed, out of range, or does not go with another one. `parameter` names it, `value` is what was given, `expected` says what is allowed, `nearest` is the known name that is nearest to an unknown one. /v1/capabilities lists all of them."),
-    row(Kind::KeyRequired, "key-required", S::UNAUTHORIZED, true, "A key is needed",
-        "This server asks for a key: `Authorization: Bearer mm_…`, or `X-Api-Key: mm_…`. Its operator gives them out. A GET may have a signed address instead."),
-    row(Kind::KeyInvalid, "key-invalid", S::UNAUTHORIZED, true, "The key is not known",
-        "The key that was sent is none of this server's, was withdrawn, or was cut off when it was copied."),
-    row(Kind::KeyExpired, "key-expired", S::UNAUTHORIZED, true, "The key has expired",
-        "The key was good until `expired`. Ask the operator for another one."),
-    row(Kind::ScopeMissing, "scope-missing", S::FORBIDDEN, true, "The key is not for this",
-        "The key is good, but not for what was asked: it has no scope `scope`. `mesh` is to compute, `read` to read what there is."),
-    row(Kind::SignatureInvalid, "signature-invalid", S::FORBIDDEN, true, "The signature does not hold",
-        "The address has a signature that is not its own. A signed address is used as it was given: path, parameters and their spelling are signed."),
-    row(Kind::SignatureExpired, "signature-expired", S::FORBIDDEN, true, "The signed address has expired",
-        "The address was signed until `expired`. Ask for another one where it came from."),
-    row(Kind::NotFound, "not-found", S::NOT_FOUND, false, "There is nothing here",
-        "No resource has this path. /v1/capabilities and / say what there is."),
+        "A parameter is unknown, repeated, malformed, out of range, or in conflict with another one. `parameter` names it, `value` is the value sent, `expected` describes the allowed values, and `nearest` is the known name closest to an unknown one. /v1/capabilities lists all parameters."),
+    row(Kind::KeyRequired, "key-required", S::UNAUTHORIZED, true, "An API key is required",
+        "This server requires an API key: `Authorization: Bearer mm_…` or `X-Api-Key: mm_…`. Ask the operator for one. A GET request may use a signed URL instead."),
+    row(Kind::KeyInvalid, "key-invalid", S::UNAUTHORIZED, true, "The API key is invalid",
+        "The server does not know the key: it may be mistyped, truncated or revoked."),
+    row(Kind::KeyExpired, "key-expired", S::UNAUTHORIZED, true, "The API key has expired",
+        "The key was valid until `expired`. Ask the operator for a new one."),
+    row(Kind::ScopeMissing, "scope-missing", S::FORBIDDEN, true, "The API key lacks a scope",
+        "The key is valid but lacks the scope `scope`. `mesh` allows computing, `read` allows reading results."),
+    row(Kind::SignatureInvalid, "signature-invalid", S::FORBIDDEN, true, "The signature is invalid",
+        "The signature does not match the URL. Use a signed URL unchanged: the signature covers the path, the parameters and their spelling."),
+    row(Kind::SignatureExpired, "signature-expired", S::FORBIDDEN, true, "The signed URL has expired",
+        "The URL was valid until `expired`. Request a new one from its source."),
+    row(Kind::NotFound, "not-found", S::NOT_FOUND, false, "Not found",
+        "No resource has this path. /openapi.yaml lists the operations of the service."),
     row(Kind::NotInArchive, "not-in-archive", S::NOT_FOUND, false, "The archive has no such entry",
-        "The id is well formed, but neither this server's folder of structures nor the archive that it asks has a file for it. POST the file to /v1/meshes instead."),
+        "The id is well formed, but neither the local folder nor the remote archive has a file for it. Send the file to POST /v1/meshes instead."),
     row(Kind::NoSuchStructure, "no-such-structure", S::NOT_FOUND, false, "There is no such structure",
-        "No structure with this digest is kept. Structures are kept for some time after their last use: upload it again with POST /v1/structures."),
+        "The server has no structure with this digest. Structures are removed some time after their last use. Upload it again with POST /v1/structures."),
     row(Kind::NoSuchJob, "no-such-job", S::NOT_FOUND, false, "There is no such job",
-        "No job with this id is on record. Jobs are kept for some time after their end."),
+        "The server has no job with this id. Jobs are removed some time after their end."),
     row(Kind::NoResultYet, "no-result-yet", S::NOT_FOUND, false, "The job has no result yet",
-        "The job waits or runs. `GET /v1/jobs/{id}?wait=20` waits for its end, `/v1/jobs/{id}/events` tells how far it is."),
-    row(Kind::MethodNotAllowed, "method-not-allowed", S::METHOD_NOT_ALLOWED, false, "The resource has no such method",
-        "The `Allow` header lists the methods that the resource has."),
-    row(Kind::NotAcceptable, "not-acceptable", S::NOT_ACCEPTABLE, false, "No such representation",
-        "None of the media types in `Accept` can be produced. `available` lists those that can; `?format=` names one directly."),
-    row(Kind::BodyTimeout, "body-timeout", S::REQUEST_TIMEOUT, true, "The body came too slowly",
-        "The request's body was not complete within `limit` milliseconds."),
+        "The job is queued or running. `GET /v1/jobs/{id}?wait=20` waits for its end; `/v1/jobs/{id}/events` reports its progress."),
+    row(Kind::MethodNotAllowed, "method-not-allowed", S::METHOD_NOT_ALLOWED, false, "Method not allowed",
+        "The `Allow` header lists the methods of the resource."),
+    row(Kind::NotAcceptable, "not-acceptable", S::NOT_ACCEPTABLE, false, "No acceptable media type",
+        "The server cannot produce any media type in `Accept`. `available` lists the media types of meshes; the parameter `format` selects one directly."),
+    row(Kind::BodyTimeout, "body-timeout", S::REQUEST_TIMEOUT, true, "The request body was too slow",
+        "The request body was not complete within `limit` ms."),
     row(Kind::JobEnded, "job-ended", S::CONFLICT, false, "The job has ended",
-        "A job that has ended cannot be cancelled. Its result stays for some time."),
+        "A job that has ended cannot be cancelled. Its result stays available for some time."),
     row(Kind::JobDismissed, "job-dismissed", S::GONE, false, "The job was cancelled",
-        "The job was cancelled before its end, and has no result."),
-    row(Kind::ResultGone, "result-gone", S::GONE, false, "The result is gone",
-        "The job was successful, but its result was kept for some time only. Ask for the mesh again."),
-    row(Kind::BodyTooLarge, "body-too-large", S::PAYLOAD_TOO_LARGE, true, "The body is too large",
-        "The request's body has more than `limit` bytes, or `detail` names what of it is too large. Compress a structure with gzip or zstd, or ask the operator to raise the limit that `detail` names."),
-    row(Kind::InflatedTooLarge, "inflated-too-large", S::PAYLOAD_TOO_LARGE, true, "The structure inflates to too much",
-        "After decompression the structure has more than `limit` bytes."),
-    row(Kind::EntryTooLarge, "entry-too-large", S::PAYLOAD_TOO_LARGE, true, "The entry is too large",
-        "As the archive sends it, the entry has more than `limit` bytes. Ask the operator to raise archive.max_bytes."),
-    row(Kind::UnsupportedMediaType, "unsupported-media-type", S::UNSUPPORTED_MEDIA_TYPE, false, "The content is not what its type says",
-        "`Content-Type` is only a hint, as the bytes are looked at; but here the two contradict each other. `declared` is what the header said, `found` what the bytes are."),
-    row(Kind::UnsupportedEncoding, "unsupported-encoding", S::UNSUPPORTED_MEDIA_TYPE, false, "The content encoding cannot be used",
-        "`Content-Encoding` may be gzip, zstd or identity, and the bytes must be what it says."),
-    row(Kind::RangeNotSatisfiable, "range-not-satisfiable", S::RANGE_NOT_SATISFIABLE, false, "The range lies outside the file",
-        "`Range` asks for bytes behind the end of the file, which has `actual` bytes."),
+        "The job was cancelled and has no result."),
+    row(Kind::ResultGone, "result-gone", S::GONE, false, "The result has been removed",
+        "The job succeeded, but its result was removed to free space or because it expired. Request the mesh again."),
+    row(Kind::BodyTooLarge, "body-too-large", S::PAYLOAD_TOO_LARGE, true, "The request body is too large",
+        "The request body exceeds `limit` bytes, or `detail` names the part of it that is too large. Compress the structure with gzip or zstd, or ask the operator to raise the limit that `detail` names."),
+    row(Kind::InflatedTooLarge, "inflated-too-large", S::PAYLOAD_TOO_LARGE, true, "The decompressed structure is too large",
+        "The structure exceeds `limit` bytes after decompression."),
+    row(Kind::EntryTooLarge, "entry-too-large", S::PAYLOAD_TOO_LARGE, true, "The archive entry is too large",
+        "The entry exceeds `limit` bytes as sent by the archive. Ask the operator to raise archive.max_bytes."),
+    row(Kind::UnsupportedMediaType, "unsupported-media-type", S::UNSUPPORTED_MEDIA_TYPE, false, "The content does not match its media type",
+        "`Content-Type` is optional, because the server detects the format from the content; but here the two disagree. `declared` is the header, `found` the detected content."),
+    row(Kind::UnsupportedEncoding, "unsupported-encoding", S::UNSUPPORTED_MEDIA_TYPE, false, "Unsupported content encoding",
+        "`Content-Encoding` must be gzip, zstd or identity, and match the content."),
+    row(Kind::RangeNotSatisfiable, "range-not-satisfiable", S::RANGE_NOT_SATISFIABLE, false, "The range is not satisfiable",
+        "`Range` starts after the end of the file, which has `actual` bytes."),
     row(Kind::UnreadableStructure, "unreadable-structure", S::UNPROCESSABLE_ENTITY, false, "The structure cannot be read",
-        "The bytes are no PDB, mmCIF or BinaryCIF file, or a broken one. `line` and `column` give the place in a text and `place` that in a binary file, where there is one, `found` and `expected` what stood there and what should have; `diagnostics` is what a second, strict reader says of the file."),
+        "The body is not a valid PDB, mmCIF or BinaryCIF file. `line` and `column` (text) or `place` (binary) locate the error, `found` and `expected` describe it, and `diagnostics` lists the findings of the strict validator."),
     row(Kind::NoAtoms, "no-atoms", S::UNPROCESSABLE_ENTITY, false, "The structure has no atoms",
-        "The file was read, but holds no atoms with coordinates. `found` says what it holds instead."),
-    row(Kind::EmptySelection, "empty-selection", S::UNPROCESSABLE_ENTITY, false, "The selection holds no atoms",
-        "The file holds atoms, but none that was asked for. `found` says what the file holds and how to select it, or `parameter` and `value` name what it lacks and `expected` what it has."),
+        "The file has no atoms with coordinates. `found` describes its content."),
+    row(Kind::EmptySelection, "empty-selection", S::UNPROCESSABLE_ENTITY, false, "The selection is empty",
+        "No atom of the file matches the selection. `found` describes the content of the file and how to select it, or `parameter` and `value` name the missing item and `expected` the available ones."),
     row(Kind::TooManyAtoms, "too-many-atoms", S::UNPROCESSABLE_ENTITY, true, "The structure has too many atoms",
-        "The file holds more than `limit` atoms."),
+        "The file has more than `limit` atoms."),
     row(Kind::GridTooLarge, "grid-too-large", S::UNPROCESSABLE_ENTITY, true, "The grid would be too large",
-        "At this resolution the surface needs more than `limit` grid samples. `suggested_resolution` is a spacing in ångström that would fit."),
+        "At this resolution the surface needs more than `limit` grid points. `suggested_resolution` is a grid spacing in Å that fits."),
     row(Kind::TooManyCandidates, "too-many-candidates", S::UNPROCESSABLE_ENTITY, true, "The atoms overlap too much",
-        "At this resolution and with these radii, the atoms would reach grid bricks (8 × 8 × 8 samples) more than `limit` times in total. `suggested_resolution` is a spacing in ångström that would fit, if there is one; smaller radii also help."),
+        "At this resolution and with these radii, the pairs of atoms and grid bricks (8 × 8 × 8 points) exceed `limit`. `suggested_resolution` is a grid spacing in Å that fits, if there is one; smaller radii also help."),
     row(Kind::MeshTooLarge, "mesh-too-large", S::UNPROCESSABLE_ENTITY, true, "The mesh would be too large",
-        "The mesh, or its file, would have more than `limit` bytes; `suggested_resolution` is a spacing in ångström that would fit. Or no mesh has as few triangles as `parameter` (`max_triangles`) asks for: `actual` is the fewest, at `resolution`."),
+        "The mesh or its file exceeds `limit` bytes; `suggested_resolution` is a grid spacing in Å that fits. Or no mesh has as few triangles as `max_triangles` requires: `actual` is the smallest number, at `resolution`."),
     row(Kind::PictureTooLarge, "picture-too-large", S::UNPROCESSABLE_ENTITY, true, "The picture would be too large",
-        "The side that `parameter` names (`width` or `height`) would have `actual` pixels, and `limit` are allowed. Ask for a smaller picture, or ask the operator to raise limits.picture_side."),
+        "`parameter` (`width` or `height`) is `actual` pixels and the limit is `limit`. Request a smaller picture, or ask the operator to raise limits.picture_side."),
     row(Kind::DeviceMemory, "device-memory", S::UNPROCESSABLE_ENTITY, true, "The device has too little memory",
-        "At this resolution the surface needs more memory than the device has (`limit` bytes), even piece by piece. `suggested_resolution` is a spacing in ångström that would fit."),
+        "At this resolution the surface needs more memory than the device has (`limit` bytes), even in parts. `suggested_resolution` is a grid spacing in Å that fits."),
     row(Kind::NoSurface, "no-surface", S::UNPROCESSABLE_ENTITY, false, "There is no surface",
-        "The density reaches `isovalue` nowhere on the grid. Take a lower isovalue or a finer resolution."),
-    row(Kind::OtherRequest, "other-request", S::UNPROCESSABLE_ENTITY, false, "The idempotency key is another request's",
-        "`Idempotency-Key` was used before, with another structure, other parameters or another format."),
-    row(Kind::ArchiveUnavailable, "archive-unavailable", S::FAILED_DEPENDENCY, false, "The archive cannot be reached",
-        "This server has no copy of the entry, and the archive at `host` could not be asked for it: `detail` says why, `found` is the status that it answered with, if it did. Try again after `Retry-After` seconds, or POST the file to /v1/meshes."),
-    row(Kind::QuotaExceeded, "quota-exceeded", S::TOO_MANY_REQUESTS, true, "The quota is used up",
-        "`violated-policies` names the quota that this client has used up: `requests` in a window, `work` (seconds of computing in a window), or `concurrency` (requests at once). `RateLimit-Policy` and `RateLimit` say what there is and what is left. Try again after `Retry-After` seconds; what is refused does not count."),
-    row(Kind::Internal, "internal", S::INTERNAL_SERVER_ERROR, false, "Our mistake",
-        "Something failed that should not have. The log has the details under the request id that `instance` gives."),
-    row(Kind::JobAbandoned, "job-abandoned", S::INTERNAL_SERVER_ERROR, false, "The job was given up",
-        "The job was begun several times, and each time the service ended before the job did; or what it needs is not there any more. The log says more."),
-    row(Kind::NotReady, "not-ready", S::SERVICE_UNAVAILABLE, false, "Not ready",
-        "The service has not yet computed its first mesh, could not, or is shutting down."),
+        "The density does not reach `isovalue` at any grid point. Use a lower isovalue or a finer resolution."),
+    row(Kind::OtherRequest, "other-request", S::UNPROCESSABLE_ENTITY, false, "The idempotency key belongs to another request",
+        "The `Idempotency-Key` was used before with another structure, other parameters or another format."),
+    row(Kind::ArchiveUnavailable, "archive-unavailable", S::FAILED_DEPENDENCY, false, "The archive is unavailable",
+        "The server has no copy of the entry, and the request to the archive at `host` failed: `detail` gives the reason and `found` the status of the archive's response, if there was one. Retry after `Retry-After` seconds, or send the file to POST /v1/meshes."),
+    row(Kind::QuotaExceeded, "quota-exceeded", S::TOO_MANY_REQUESTS, true, "The quota is exceeded",
+        "`violated-policies` names the exhausted quotas: `requests` in a window, `work` (seconds of computing in a window) or `concurrency` (simultaneous requests). `RateLimit-Policy` and `RateLimit` give the quotas and what remains. Retry after `Retry-After` seconds; rejected requests are not counted."),
+    row(Kind::Internal, "internal", S::INTERNAL_SERVER_ERROR, false, "Internal server error",
+        "An unexpected error occurred. The server log has the details under the request id in `instance`."),
+    row(Kind::JobAbandoned, "job-abandoned", S::INTERNAL_SERVER_ERROR, false, "The job was abandoned",
+        "The job was started several times and the service ended before the job each time, or the input of the job is missing. The server log has the details."),
+    row(Kind::NotReady, "not-ready", S::SERVICE_UNAVAILABLE, false, "The service is not ready",
+        "The service has not yet computed its first mesh, failed to compute it, or is shutting down."),
     row(Kind::DeviceFailed, "device-failed", S::SERVICE_UNAVAILABLE, false, "No device could run the job",
-        "Every device that could have run the job failed, and nothing stands in for them. It is not the job's fault. Try again after `Retry-After` seconds; the log says what happened."),
+        "All devices that could run the job failed, and there is no fallback. The job is not the cause. Retry after `Retry-After` seconds; the server log has the details."),
     row(Kind::QueueFull, "queue-full", S::SERVICE_UNAVAILABLE, true, "Too many jobs are waiting",
-        "All workers are busy and `limit` jobs wait already. `Retry-After` is the estimated time in seconds until there is room."),
-    row(Kind::MemoryFull, "memory-full", S::SERVICE_UNAVAILABLE, true, "Too much is held in memory",
-        "Uploads and meshes that clients have not taken yet use the memory that is set aside for them (`limit` bytes). Try again after `Retry-After` seconds."),
+        "All workers are busy and `limit` jobs are waiting. `Retry-After` is the estimated time in seconds until there is space."),
+    row(Kind::MemoryFull, "memory-full", S::SERVICE_UNAVAILABLE, true, "The memory limit is reached",
+        "Uploads and unsent meshes use all memory reserved for them (`limit` bytes). Retry after `Retry-After` seconds."),
     row(Kind::StoreFull, "store-full", S::SERVICE_UNAVAILABLE, true, "The store is full",
-        "What the service keeps takes the space that is set aside for it (`limit` bytes), and nothing of it may be removed now. Try again after `Retry-After` seconds."),
-    row(Kind::StoreFailed, "store-failed", S::SERVICE_UNAVAILABLE, false, "The store does not answer",
-        "What must be kept cannot be kept, or what is kept cannot be read. The log says more. Try again after `Retry-After` seconds."),
-    row(Kind::TooManyDeliveries, "too-many-deliveries", S::SERVICE_UNAVAILABLE, true, "Too many meshes are being delivered",
-        "`limit` requests for meshes are in the house, most of them with clients that take their meshes slowly. Try again after `Retry-After` seconds."),
+        "The store uses all space reserved for it (`limit` bytes), and no object may be removed now. Retry after `Retry-After` seconds."),
+    row(Kind::StoreFailed, "store-failed", S::SERVICE_UNAVAILABLE, false, "The store is unavailable",
+        "The store cannot be written or read. The server log has the details. Retry after `Retry-After` seconds."),
+    row(Kind::TooManyDeliveries, "too-many-deliveries", S::SERVICE_UNAVAILABLE, true, "Too many meshes are being sent",
+        "`limit` mesh requests are in progress, most of them waiting for slow clients. Retry after `Retry-After` seconds."),
     row(Kind::ShuttingDown, "shutting-down", S::SERVICE_UNAVAILABLE, false, "The service is shutting down",
-        "The job was not done before the service stopped. Try again: another instance, or this one after its restart, will do it."),
+        "The service stopped before the job was done. Retry: another instance, or this one after its restart, will run it."),
     row(Kind::TooManyConnections, "too-many-connections", S::SERVICE_UNAVAILABLE, true, "Too many connections",
-        "The server holds as many connections as it may. Try again after `Retry-After` seconds."),
-    row(Kind::Deadline, "deadline", S::GATEWAY_TIMEOUT, true, "The deadline passed",
-        "The mesh was not done within `limit` milliseconds, the time in the queue included. A coarser resolution is faster: the work grows with the cube of its inverse."),
+        "The server has reached its limit of connections. Retry after `Retry-After` seconds."),
+    row(Kind::Deadline, "deadline", S::GATEWAY_TIMEOUT, true, "The deadline has passed",
+        "The mesh was not done within `limit` ms, including the time in the queue. A coarser resolution is faster: the work grows with the cube of its inverse."),
 ];
 
 impl Kind {
-    /// The kind's row.
+    /// Returns the row of the kind.
     pub(super) fn row(self) -> &'static Row {
         match KINDS.iter().find(|row| row.kind == self) {
             Some(row) => row,
@@ -197,7 +197,7 @@ impl Kind {
         }
     }
 
-    /// The kind of an answer that a library gave, by its status.
+    /// Returns the kind for the status of an error response that a library made.
     pub(super) fn of_status(status: StatusCode) -> Self {
         match status {
             S::NOT_FOUND => Self::NotFound,

@@ -12,8 +12,8 @@ use axum::response::Response;
 use super::ask::{self, Ask, Input};
 use super::declared::Declared;
 use super::kinds::Kind;
-use super::openapi::bodies::{MeshForm, MeshOrder, StructureFile};
-use super::openapi::meshes::Uploaded;
+use super::openapi::bodies::{STRUCTURE_TO_MESH, StructureFile};
+use super::openapi::meshes::{Reported, Uploaded};
 use super::openapi::parameters::{Coding, MeshParameters, Wishes};
 use super::openapi::problems::{ASKING, BODY, MESHING, NAMED, PARAMETERS, READING};
 use super::openapi::refusals;
@@ -57,16 +57,13 @@ impl Taken {
 
 refusals!(MeshRefusals: [BODY, NAMED, PARAMETERS, READING, MESHING, ASKING, [Kind::NotAcceptable]]);
 
-/// Meshes a structure.
+/// Mesh a structure
 ///
-/// The body is a file, a form with a file, or a JSON document that names a structure. The format is that of `format`, else
-/// what `Accept` prefers, else GLB.
+/// The parameter `format` sets the format of the mesh; without it the server uses the format that `Accept` prefers, or GLB.
+/// `POST /v1/report` returns the report without the mesh.
 #[utoipa::path(post, path = "/v1/meshes", tag = "meshes", operation_id = "createMesh",
     params(MeshParameters, Wishes, Coding),
-    request_body(description = "A structure, or a document that names one.", content(
-        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
-        (StructureFile = "chemical/x-mmcif"), (MeshForm = "multipart/form-data"), (MeshOrder = "application/json"),
-    )),
+    request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
     responses(Uploaded, MeshRefusals))]
 pub(super) async fn create(
     State(app): State<Shared>,
@@ -75,24 +72,62 @@ pub(super) async fn create(
     extensions: Extensions,
     body: Body,
 ) -> Result<Response, Problem> {
+    answer(&app, query, &headers, &extensions, body, false).await
+}
+
+refusals!(ReportRefusals: [
+    BODY, NAMED, PARAMETERS, READING, MESHING, [Kind::QueueFull, Kind::TooManyDeliveries],
+]);
+
+/// Mesh a structure and return the report
+///
+/// Takes what `POST /v1/meshes` takes, computes the mesh and returns its report instead of the file: atoms, grid, area,
+/// volume, components, voids, validation and times.
+#[utoipa::path(post, path = "/v1/report", tag = "meshes", operation_id = "createReport",
+    params(MeshParameters, Coding),
+    request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
+    responses(Reported, ReportRefusals))]
+pub(super) async fn report(
+    State(app): State<Shared>,
+    query: Pairs,
+    mut headers: HeaderMap,
+    extensions: Extensions,
+    body: Body,
+) -> Result<Response, Problem> {
+    // `Accept` applies to the report, not to a mesh format.
+    headers.remove(header::ACCEPT);
+    answer(&app, query, &headers, &extensions, body, true).await
+}
+
+/// Answers an upload with its mesh or its report.
+async fn answer(
+    app: &Shared,
+    query: Pairs,
+    headers: &HeaderMap,
+    extensions: &Extensions,
+    body: Body,
+    report: bool,
+) -> Result<Response, Problem> {
     let mut timing = Timing::start();
-    let wish = Wish::of(&headers, &extensions)?;
-    let taken = take(&app, query, &headers, body).await?;
+    let wish = Wish::of(headers, extensions)?;
+    let taken = take(app, query, headers, body).await?;
     let Taken { request, pairs, format, digest, declared, source } = taken;
     timing.lap("receive");
-    let mut ask = Ask { digest, request, pairs, format, wish, cache: None, timing, declared };
+    let mut ask = Ask { digest, request, pairs, format, wish, report, cache: None, timing, declared };
     // What a type says about the bytes is found out by reading them.
     let known =
-        if ask.declared.is_structure() { None } else { ask.known(&app, &Method::POST, &HeaderMap::new()).await? };
+        if ask.declared.is_structure() { None } else { ask.known(app, &Method::POST, &HeaderMap::new()).await? };
     let mut response = if let Some(response) = known {
         response
     } else {
         ask.timing.lap("lookup");
-        let input = source.input(&app).await?;
+        let input = source.input(app).await?;
         ask.timing.lap("load");
-        ask.make(&app, input).await?
+        ask.make(app, input).await?
     };
-    response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
+    if !report {
+        response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
+    }
     Ok(response)
 }
 
@@ -131,13 +166,9 @@ pub(super) async fn take(app: &Shared, query: Pairs, headers: &HeaderMap, body: 
     Ok(Taken { request, pairs, format, digest, declared, source })
 }
 
-/// The format that is asked for, with a request that goes with it. A report has the default format, of which nothing is written.
+/// Returns the format of the mesh and adapts the request to it.
 fn settled(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Format, Problem> {
-    let format = match (request.format, request.report) {
-        (Some(format), _) => format,
-        (None, true) => Format::default(),
-        (None, false) => negotiate::format(headers)?,
-    };
+    let format = request.format.map_or_else(|| negotiate::format(headers), Ok)?;
     params::settle(&mut request.job, format)?;
     app.accepts(&request.job)?;
     Ok(format)

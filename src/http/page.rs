@@ -8,8 +8,6 @@ use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
 
 use super::kinds::Kind;
-use super::openapi::parameters::AssetPath;
-use super::openapi::refusals;
 use super::packed;
 use super::problem::Problem;
 
@@ -72,9 +70,6 @@ fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Resp
 }
 
 /// The page.
-#[utoipa::path(get, path = "/", tag = "page", operation_id = "page",
-    responses((status = 200, description = "The viewer, or how to get it.", body = String,
-        content_type = "text/html; charset=utf-8")))]
 pub(super) async fn index(request: HeaderMap) -> Result<Response, Problem> {
     answer(&request, "index.html", NONE)
 }
@@ -82,24 +77,11 @@ pub(super) async fn index(request: HeaderMap) -> Result<Response, Problem> {
 /// `<molmesh-viewer>`, for pages elsewhere.
 ///
 /// A module that defines the element; what it needs it loads from beside itself.
-#[utoipa::path(get, path = "/molmesh-viewer.js", tag = "page", operation_id = "component",
-    responses((status = 200, description = "A script.", body = String,
-        content_type = "text/javascript; charset=utf-8")))]
 pub(super) async fn component(request: HeaderMap) -> Result<Response, Problem> {
     answer(&request, "molmesh-viewer.js", NO_COMPONENT)
 }
 
-refusals!(AssetRefusals: [[Kind::BadRequest, Kind::NotFound]]);
-
 /// What the page consists of.
-#[utoipa::path(get, path = "/assets/{file}", tag = "page", operation_id = "asset", params(AssetPath),
-    responses(
-        (status = 200, description = "A script, a style, a picture or a text.", content(
-            (String = "text/javascript; charset=utf-8"), (String = "text/css; charset=utf-8"),
-            (String = "image/svg+xml"), (String = "text/plain; charset=utf-8"),
-        ), headers(("Cache-Control" = String, description = "For ever, where the name says the contents."))),
-        AssetRefusals,
-    ))]
 pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: HeaderMap) -> Result<Response, Problem> {
     let Path(file) = file.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let path = format!("assets/{file}");
@@ -111,9 +93,6 @@ pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: He
 }
 
 /// A structure to try.
-#[utoipa::path(get, path = "/sample.pdb", tag = "page", operation_id = "sample",
-    responses((status = 200, description = "A structure to try.", body = String,
-        content_type = "chemical/x-pdb")))]
 pub(super) async fn sample() -> Response {
     let mut headers = headers("sample.pdb");
     headers[0].1 = "chemical/x-pdb";

@@ -11,8 +11,8 @@ use super::declared::Declared;
 use super::delivery;
 use super::kinds::Kind;
 use super::meshes::{Pairs, pairs};
-use super::openapi::meshes::Addressed;
-use super::openapi::parameters::{EntryPath, Parts, SurfaceParameters, Unchanged, Wishes};
+use super::openapi::meshes::{Addressed, Reported};
+use super::openapi::parameters::{EntryPath, MeshParameters, Parts, SurfaceParameters, Unchanged, Wishes};
 use super::openapi::problems::{ASKING, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
@@ -33,7 +33,9 @@ refusals!(SurfaceRefusals: [PARAMETERS, READING, MESHING, ASKING, [
     Kind::NotFound, Kind::NotInArchive, Kind::EntryTooLarge, Kind::RangeNotSatisfiable, Kind::ArchiveUnavailable,
 ]]);
 
-/// Meshes an entry of the archive.
+/// Mesh an archive entry
+///
+/// The path names the format, so that the response can be cached and linked to.
 #[utoipa::path(
     get,
     path = "/v1/pdb/{id}/{file}",
@@ -50,21 +52,59 @@ pub(super) async fn surface(
     headers: HeaderMap,
     extensions: Extensions,
 ) -> Result<Response, Problem> {
-    let mut timing = Timing::start();
     let Path((id, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let named = named(&app, &file, query)?;
+    let named = named(&app, Some(&file), query)?;
+    answer(&app, &method, &id, named, &headers, &extensions).await
+}
+
+refusals!(ReportRefusals: [PARAMETERS, READING, MESHING, [
+    Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable, Kind::QueueFull, Kind::TooManyDeliveries,
+]]);
+
+/// Mesh an archive entry and return the report
+#[utoipa::path(
+    get,
+    path = "/v1/pdb/{id}/report.json",
+    tag = "meshes",
+    operation_id = "reportEntry",
+    params(EntryPath, MeshParameters),
+    responses(Reported, ReportRefusals)
+)]
+pub(super) async fn report(
+    State(app): State<Shared>,
+    method: Method,
+    path: Result<Path<String>, PathRejection>,
+    query: Pairs,
+    headers: HeaderMap,
+    extensions: Extensions,
+) -> Result<Response, Problem> {
+    let Path(id) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let named = named(&app, None, query)?;
+    answer(&app, &method, &id, named, &headers, &extensions).await
+}
+
+/// Answers a request for the mesh or the report of an entry.
+async fn answer(
+    app: &Shared,
+    method: &Method,
+    id: &str,
+    named: Named,
+    headers: &HeaderMap,
+    extensions: &Extensions,
+) -> Result<Response, Problem> {
+    let mut timing = Timing::start();
     let id: EntryId = id.parse().map_err(|error| of_folder(&error))?;
-    let digest = digest(&app, &id).await?;
-    let wish = Wish::of(&headers, &extensions)?;
+    let digest = digest(app, &id).await?;
+    let wish = Wish::of(headers, extensions)?;
     timing.lap("receive");
     let mut ask = named.ask(digest, wish, timing);
-    if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
+    if let Some(response) = ask.answer_without_work(app, method, headers).await? {
         return Ok(response);
     }
     ask.timing.lap("lookup");
-    let input = input(&app, &id).await?;
+    let input = input(app, &id).await?;
     ask.timing.lap("load");
-    ask.make(&app, input).await
+    ask.make(app, input).await
 }
 
 /// What an address asks for.
@@ -72,22 +112,23 @@ pub(super) struct Named {
     pub(super) request: params::Request,
     pub(super) pairs: Vec<(String, String)>,
     pub(super) format: Format,
+    pub(super) report: bool,
 }
 
 impl Named {
     /// What is asked of the structure with this digest; `timing` says how long that took to be known.
     pub(super) fn ask(self, digest: Digest, wish: Wish, timing: Timing) -> Ask {
-        let Self { request, pairs, format } = self;
-        Ask { digest, request, pairs, format, wish, cache: Some(CACHE), timing, declared: Declared::Neutral }
+        let Self { request, pairs, format, report } = self;
+        Ask { digest, request, pairs, format, wish, report, cache: Some(CACHE), timing, declared: Declared::Neutral }
     }
 }
 
-/// The request behind an address that ends in `surface.{ext}`.
-pub(super) fn named(app: &App, file: &str, query: Pairs) -> Result<Named, Problem> {
-    let format = format_of(file)?;
+/// Parses the request behind a path that ends in `surface.{ext}`, or in `report.json` (`file` is `None`).
+pub(super) fn named(app: &App, file: Option<&str>, query: Pairs) -> Result<Named, Problem> {
+    let format = file.map(format_of).transpose()?;
     let pairs = pairs(query)?;
     let mut request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
-    if let Some(other) = request.format {
+    if let (Some(format), Some(other)) = (format, request.format) {
         let value = other.extension();
         let detail = format!("parameter `format`: the address already says {}", format.extension());
         return Err(Problem::new(Kind::BadParameter, detail)
@@ -95,9 +136,11 @@ pub(super) fn named(app: &App, file: &str, query: Pairs) -> Result<Named, Proble
             .with("value", value)
             .with("expected", format!("no value here, or the address surface.{value}")));
     }
+    let report = format.is_none();
+    let format = format.or(request.format).unwrap_or_default();
     params::settle(&mut request.job, format)?;
     app.accepts(&request.job)?;
-    Ok(Named { request, pairs, format })
+    Ok(Named { request, pairs, format, report })
 }
 
 impl Ask {
@@ -111,7 +154,7 @@ impl Ask {
         if let Some(response) = self.known(app, method, headers).await? {
             return Ok(Some(response));
         }
-        if method != Method::HEAD || self.request.report {
+        if method != Method::HEAD || self.report {
             return Ok(None);
         }
         // What a mesh would say about itself is known only after meshing, which HEAD is not worth.

@@ -177,15 +177,15 @@ fn of_library(status: StatusCode, path: &str) -> Problem {
     Problem::new(Kind::of_status(status), detail)
 }
 
-/// What a second, strict reader found.
+/// Finding of the strict validator.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Finding {
-    /// `note`, `warning` or `error`.
+    /// Severity: `note`, `warning` or `error`.
     level: &'static str,
-    /// Where in the file, from 1.
+    /// Line of the file, from 1; null if the finding has no line.
     #[schema(required)]
     line: Option<u64>,
-    /// What it is.
+    /// Description of the finding.
     message: String,
 }
 

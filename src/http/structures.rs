@@ -14,9 +14,9 @@ use utoipa::ToSchema;
 use super::ask::{self, Input};
 use super::kinds::Kind;
 use super::meshes::Pairs;
-use super::openapi::bodies::{StructureFile, StructureForm};
-use super::openapi::meshes::{Addressed, NotModified};
-use super::openapi::parameters::{Coding, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
+use super::openapi::bodies::StructureFile;
+use super::openapi::meshes::{Addressed, NotModified, Reported};
+use super::openapi::parameters::{Coding, MeshParameters, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
 use super::openapi::problems::{ASKING, BODY, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
@@ -50,58 +50,75 @@ fn none(digest: &str) -> Problem {
     )
 }
 
-/// What a structure holds.
+/// Contents of a structure.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(example = json!({
+    "digest": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "bytes": 71_928, "format": "pdb",
+    "id": "4PTI", "title": "THE GEOMETRY OF THE REACTIVE SITE", "atoms": 514, "models": [1], "model": 1,
+    "atoms_in_model": { "polymer": 454, "ligand": 0, "water": 60, "hydrogens": 0, "virtual_sites": 0 },
+    "alternatives": 0, "unknown_elements": 0, "warnings": [], "chain_count": 1,
+    "chains": [{
+        "name": "A", "atoms": 514,
+        "of": { "polymer": 454, "ligand": 0, "water": 60, "hydrogens": 0, "virtual_sites": 0 },
+    }],
+    "surface": "/v1/structures/edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087/surface.glb",
+}))]
 pub(super) struct StructureDocument {
-    /// SHA-256 of its bytes as they came.
+    /// SHA-256 digest of the bytes as uploaded, in hexadecimal. Identifies the structure.
     digest: String,
-    /// How many these are.
+    /// Size of the file as uploaded, in bytes.
     bytes: usize,
-    /// `pdb`, `mmcif` or `bcif`.
+    /// File format: `pdb`, `mmcif` or `bcif`.
     format: &'static str,
-    /// PDB id or data block name.
+    /// PDB id or data block name; null if the file has none.
     #[schema(required)]
     id: Option<String>,
-    /// Its title.
+    /// Title; null if the file has none.
     #[schema(required)]
     title: Option<String>,
-    /// Atoms, all models.
+    /// Atoms in all models.
     atoms: u64,
-    /// The numbers of its models.
+    /// Model numbers.
     models: Vec<i32>,
-    /// The model that the counts are of.
+    /// Number of the model that the counts below refer to.
     model: i32,
+    /// Atoms of the model by kind.
     atoms_in_model: KindCounts,
     /// Atoms with alternative locations.
     alternatives: u64,
     /// Atoms of unknown elements.
     unknown_elements: u64,
-    /// Values that could not be read and do not matter for a mesh, at most 12.
+    /// Unreadable values that do not affect a mesh, at most 12.
     warnings: Vec<String>,
-    /// Chains.
+    /// Number of chains.
     chain_count: usize,
-    /// The first thousand of them.
+    /// The first 1,000 chains.
     chains: Vec<ChainDocument>,
-    /// A mesh of it.
+    /// Path of the mesh with default parameters.
     surface: String,
 }
 
-/// A chain.
+/// Chain of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 struct ChainDocument {
-    /// The author's name for it.
+    /// Name given by the author.
     name: String,
-    /// Its atoms.
+    /// Number of atoms.
     atoms: u64,
+    /// Atoms by kind.
     of: KindCounts,
 }
 
-/// Atoms by what they belong to.
+/// Numbers of atoms by kind. Hydrogens are counted apart from the heavy atoms of their residues.
 #[derive(Debug, Serialize, ToSchema)]
 struct KindCounts {
+    /// Heavy atoms of polymers.
     polymer: u64,
+    /// Heavy atoms of ligands.
     ligand: u64,
+    /// Heavy atoms of water.
     water: u64,
+    /// Hydrogen atoms.
     hydrogens: u64,
     /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
     virtual_sites: u64,
@@ -125,17 +142,22 @@ refusals!(SurfaceRefusals: [
     PARAMETERS, READING, MESHING, ASKING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
 ]);
 
-/// Takes a structure in, to be meshed many times.
+/// Upload a structure
+///
+/// Stores a structure, so that it can be meshed several times without another upload. Uploading the same bytes again
+/// returns 200 and the same digest.
 #[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure", params(Coding),
-    request_body(description = "The structure.", content(
-        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
-        (StructureFile = "chemical/x-mmcif"), (StructureForm = "multipart/form-data"),
-    )),
+    request_body(
+        content = StructureFile,
+        description = "A structure file, or `multipart/form-data` with the file in the field `file`.",
+        content_type = "application/octet-stream",
+    ),
     responses(
-        (status = 201, description = "It is kept now.", body = StructureDocument,
-            headers(("Location" = String, description = "The structure's address."))),
-        (status = 200, description = "It was there already.", body = StructureDocument,
-            headers(("Location" = String, description = "The structure's address."))),
+        (status = 201, description = "The structure was stored.", body = StructureDocument,
+            headers(("Location" = String, description = "Path of the structure.")),
+            links(("mesh" = (operation_id = "meshStructure", parameters(("digest" = "$response.body#/digest")))))),
+        (status = 200, description = "The structure was already stored.", body = StructureDocument,
+            headers(("Location" = String, description = "Path of the structure."))),
         CreateRefusals,
     ))]
 pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
@@ -156,13 +178,13 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
 }
 
-/// What a structure holds.
+/// Get the contents of a structure
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
     params(StructurePath, Unchanged),
     responses(
-        (status = 200, description = "What the structure holds.", body = StructureDocument, headers(
-            ("ETag" = String, description = "The digest."),
-            ("Cache-Control" = String, description = "How long the answer stays good."),
+        (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(
+            ("ETag" = String, description = "Strong validator of the document."),
+            ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, ShowRefusals,
     ))]
@@ -185,7 +207,9 @@ pub(super) async fn show(
     Ok((caching, Json(summary)).into_response())
 }
 
-/// Meshes a structure that was uploaded.
+/// Mesh an uploaded structure
+///
+/// The path names the format, so that the response can be cached and linked to.
 #[utoipa::path(
     get,
     path = "/v1/structures/{digest}/{file}",
@@ -202,23 +226,62 @@ pub(super) async fn surface(
     headers: HeaderMap,
     extensions: Extensions,
 ) -> Result<Response, Problem> {
-    let mut timing = Timing::start();
     let Path((text, file)) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    let named = pdb::named(&app, &file, query)?;
-    let digest = digest_of(&text)?;
-    let wish = Wish::of(&headers, &extensions)?;
+    let named = pdb::named(&app, Some(&file), query)?;
+    answer(&app, &method, &text, named, &headers, &extensions).await
+}
+
+refusals!(ReportRefusals: [
+    PARAMETERS, READING, MESHING,
+    [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+]);
+
+/// Mesh an uploaded structure and return the report
+#[utoipa::path(
+    get,
+    path = "/v1/structures/{digest}/report.json",
+    tag = "meshes",
+    operation_id = "reportStructure",
+    params(StructurePath, MeshParameters),
+    responses(Reported, ReportRefusals)
+)]
+pub(super) async fn report(
+    State(app): State<Shared>,
+    method: Method,
+    path: Result<Path<String>, PathRejection>,
+    query: Pairs,
+    headers: HeaderMap,
+    extensions: Extensions,
+) -> Result<Response, Problem> {
+    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let named = pdb::named(&app, None, query)?;
+    answer(&app, &method, &text, named, &headers, &extensions).await
+}
+
+/// Answers a request for the mesh or the report of a structure.
+async fn answer(
+    app: &Shared,
+    method: &Method,
+    text: &str,
+    named: pdb::Named,
+    headers: &HeaderMap,
+    extensions: &Extensions,
+) -> Result<Response, Problem> {
+    let mut timing = Timing::start();
+    let digest = digest_of(text)?;
+    let wish = Wish::of(headers, extensions)?;
     timing.lap("receive");
     let mut ask = named.ask(digest, wish, timing);
     if app.store.head(&Name::input(&digest)).await?.is_none() {
-        return Err(none(&text));
+        return Err(none(text));
     }
-    if let Some(response) = ask.answer_without_work(&app, &method, &headers).await? {
+    if let Some(response) = ask.answer_without_work(app, method, headers).await? {
         return Ok(response);
     }
     ask.timing.lap("lookup");
-    let input = input(&app, &digest).await?;
+    let input = input(app, &digest).await?;
     ask.timing.lap("load");
-    ask.make(&app, input).await
+    ask.make(app, input).await
 }
 
 /// The bytes of a structure.
