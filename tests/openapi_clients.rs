@@ -1,5 +1,5 @@
-//! Clients generated from the OpenAPI document: each meshes a file, follows a job to its end, fetches the result, requests a
-//! report and receives a typed error.
+//! Clients generated from the OpenAPI document: each meshes a file, follows a job to its end, fetches the result,
+//! requests a report and receives a typed error.
 #![cfg(feature = "server")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "tests say what they expect by panicking")]
 

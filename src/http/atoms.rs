@@ -80,7 +80,8 @@ refusals!(EntryRefusals: [READING, [
 
 /// List the atoms of a structure
 ///
-/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this list.
+/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
+/// list.
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
     params(StructurePath, Unchanged),
     responses(
@@ -108,7 +109,8 @@ pub(super) async fn of_structure(
 
 /// List the atoms of an archive entry
 ///
-/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this list.
+/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
+/// list.
 #[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
     params(EntryPath, Unchanged),
     responses(

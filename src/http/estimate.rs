@@ -1,4 +1,5 @@
-//! `POST /v1/estimate`: what a mesh would cost, and what would fit if it were refused. Takes what `POST /v1/meshes` takes.
+//! `POST /v1/estimate`: what a mesh would cost, and what would fit if it were refused. Takes what `POST /v1/meshes`
+//! takes.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -36,8 +37,8 @@ impl Drop for StopOnDrop {
     }
 }
 
-/// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and samples are exact; the size of the mesh and the times
-/// are estimates.
+/// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and samples are exact; the size of the mesh and
+/// the times are estimates.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(example = json!({
     "accepted": true, "problem": null, "atoms": 454, "atoms_in_file": 514, "resolution": 0.5,
@@ -66,7 +67,8 @@ pub(super) struct EstimateDocument {
     format: &'static str,
     /// Cells of a dense grid over the bounding box.
     box_cells: u64,
-    /// Grid bricks (8 × 8 × 8 points) within reach of an atom; null if the request would be rejected before they are known.
+    /// Grid bricks (8 × 8 × 8 points) within reach of an atom; null if the request would be rejected before they are
+    /// known.
     #[schema(required)]
     bricks: Option<u64>,
     /// Grid points to evaluate; null like `bricks`.

@@ -1,5 +1,5 @@
-//! `GET /v1/jobs/{id}/events`: a job as it goes on, as server-sent events. Each event is the whole state, so that whoever
-//! comes back with `Last-Event-ID` misses nothing that still matters.
+//! `GET /v1/jobs/{id}/events`: a job as it goes on, as server-sent events. Each event is the whole state, so that
+//! whoever comes back with `Last-Event-ID` misses nothing that still matters.
 
 use std::convert::Infallible;
 
@@ -36,7 +36,8 @@ refusals!(EventsRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::StoreFailed
 
 /// Follow a job as server-sent events
 ///
-/// Each event carries the whole status document of the job as `data` and its status as `event`. The stream ends with the job.
+/// Each event carries the whole status document of the job as `data` and its status as `event`. The stream ends with
+/// the job.
 #[utoipa::path(get, path = "/v1/jobs/{id}/events", tag = "jobs", operation_id = "watchJob",
     params(JobPath, Resumption),
     responses(

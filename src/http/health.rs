@@ -74,8 +74,8 @@ refusals!(ReadyRefusals: [[Kind::NotReady]]);
 
 /// Check that the service is ready for requests
 ///
-/// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts jobs,
-/// and can write and read the store. The answer does not depend on the load.
+/// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
+/// jobs, and can write and read the store. The answer does not depend on the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
     responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyRefusals))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {

@@ -1,5 +1,5 @@
-//! `/v1/jobs/{id}`: how a promised job stands, with a long poll; its result; its end. Names and statuses are those of OGC
-//! API Processes.
+//! `/v1/jobs/{id}`: how a promised job stands, with a long poll; its result; its end. Names and statuses are those of
+//! OGC API Processes.
 
 use std::time::Duration;
 
@@ -144,7 +144,7 @@ pub(super) fn none(id: &str) -> Problem {
 #[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "showJob", params(JobPath, Poll),
     responses(
         (status = 200, description = "Status of the job.", body = JobDocument,
-            headers(("Retry-After" = u64, description = "Seconds to wait before the next request, while the job is not finished.")),
+            headers(("Retry-After" = u64, description = "Seconds to wait before the next request.")),
             links(("result" = (operation_id = "showResult", parameters(("file" = "$response.body#/result")))))),
         ShowRefusals,
     ))]
@@ -195,8 +195,8 @@ pub(super) async fn dismiss(
 
 /// Get the result of a job
 ///
-/// Redirects to the mesh of a successful job. For a failed job the response is the error that the synchronous request would
-/// have returned.
+/// Redirects to the mesh of a successful job. For a failed job the response is the error that the synchronous request
+/// would have returned.
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(
         (status = 303, description = "The job has succeeded.",

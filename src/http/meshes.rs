@@ -59,8 +59,8 @@ refusals!(MeshRefusals: [BODY, NAMED, PARAMETERS, READING, MESHING, ASKING, [Kin
 
 /// Mesh a structure
 ///
-/// The parameter `format` sets the format of the mesh; without it the server uses the format that `Accept` prefers, or GLB.
-/// `POST /v1/report` returns the report without the mesh.
+/// The parameter `format` sets the format of the mesh; without it the server uses the format that `Accept` prefers, or
+/// GLB. `POST /v1/report` returns the report without the mesh.
 #[utoipa::path(post, path = "/v1/meshes", tag = "meshes", operation_id = "createMesh",
     params(MeshParameters, Wishes, Coding),
     request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),

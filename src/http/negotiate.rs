@@ -1,4 +1,5 @@
-//! Content negotiation of meshes (RFC 9110): the most specific range of `Accept` that matches a media type gives its weight.
+//! Content negotiation of meshes (RFC 9110): the most specific range of `Accept` that matches a media type gives its
+//! weight.
 
 use axum::extract::Request;
 use axum::http::header::{ACCEPT, CONTENT_TYPE, VARY};
@@ -30,7 +31,8 @@ pub(super) async fn relabel(request: Request, next: Next) -> Response {
     response
 }
 
-/// Returns the format that `Accept` prefers. Ties go to the range that stands first, then to the order of [`Format::ALL`].
+/// Returns the format that `Accept` prefers. Ties go to the range that stands first, then to the order of
+/// [`Format::ALL`].
 pub(super) fn format(headers: &HeaderMap) -> Result<Format, Problem> {
     let values: Vec<&str> = headers.get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok()).collect();
     choose(&values.join(",")).ok_or_else(|| {

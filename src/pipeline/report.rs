@@ -29,8 +29,8 @@ impl ComponentReport {
     }
 }
 
-/// Void: a closed surface that encloses space outside the molecule. Most voids are gaps between atoms; no probe has tested
-/// whether a solvent molecule fits.
+/// Void: a closed surface that encloses space outside the molecule. Most voids are gaps between atoms; no probe has
+/// tested whether a solvent molecule fits.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct VoidReport {
@@ -380,8 +380,8 @@ impl Report {
         maker(&self.arithmetic, self.picture.as_ref().map(|picture| picture.arithmetic.as_str()))
     }
 
-    /// Returns the report as the extras of a mesh file, without fields that differ between runs (the same input gives the same
-    /// bytes) or describe the input rather than the mesh.
+    /// Returns the report as the extras of a mesh file, without fields that differ between runs (the same input gives
+    /// the same bytes) or describe the input rather than the mesh.
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };

@@ -1,5 +1,6 @@
 // Meshes a file and follows a job with a client that @hey-api/openapi-ts generated, for tests/openapi_clients.rs.
-// Usage: URL FILE. The generated code parses types that it does not know, such as model/gltf-binary, as JSON: hence `parseAs`.
+// Usage: URL FILE. The generated code parses types that it does not know, such as model/gltf-binary, as JSON: hence
+// `parseAs`.
 import { readFileSync } from "node:fs";
 import { createMesh, createReport, showJob, showResult } from "./client";
 import { client } from "./client/client.gen";
@@ -12,7 +13,8 @@ async function main(baseUrl: string, path: string): Promise<void> {
   if (!(mesh.data instanceof Blob)) throw new Error("not a file");
   if ((await mesh.data.slice(0, 4).text()) !== "glTF") throw new Error(await mesh.data.text());
 
-  const accepted = await createMesh({ body, query: { resolution: 0.7 }, headers: { Prefer: "respond-async" }, throwOnError: true });
+  const headers = { Prefer: "respond-async" };
+  const accepted = await createMesh({ body, query: { resolution: 0.7 }, headers, throwOnError: true });
   if (accepted.data instanceof Blob) throw new Error("not a job");
   let job = accepted.data;
   while (job.status !== "successful" && job.status !== "failed") {

@@ -5,7 +5,8 @@ import { Configuration, JobStatus, JobsApi, MeshesApi, ResponseError, ResultsApi
 
 async function main(url: string, path: string): Promise<void> {
   const configuration = new Configuration({ basePath: url });
-  const [meshes, jobs, results] = [new MeshesApi(configuration), new JobsApi(configuration), new ResultsApi(configuration)];
+  const [meshes, jobs] = [new MeshesApi(configuration), new JobsApi(configuration)];
+  const results = new ResultsApi(configuration);
   const body = new Blob([readFileSync(path)]);
   const magic = async (mesh: Blob): Promise<string> => mesh.slice(0, 4).text();
 
@@ -15,7 +16,9 @@ async function main(url: string, path: string): Promise<void> {
   const accepted = await meshes.createMeshRaw({ body, resolution: 0.7, prefer: "respond-async" });
   let job = JSON.parse(await accepted.raw.text());
   const id: string = job.jobID;
-  while (job.status !== JobStatus.Successful && job.status !== JobStatus.Failed) job = await jobs.showJob({ id, wait: 20 });
+  while (job.status !== JobStatus.Successful && job.status !== JobStatus.Failed) {
+    job = await jobs.showJob({ id, wait: 20 });
+  }
   if (job.status !== JobStatus.Successful || !job.result) throw new Error(JSON.stringify(job));
   const smaller = await results.showResult({ file: job.result });
   if ((await magic(smaller)) !== "glTF" || smaller.size >= glb.size) throw new Error(`${smaller.size} bytes`);

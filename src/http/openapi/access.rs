@@ -42,7 +42,7 @@ impl Modify for Rights {
         components.add_security_scheme(API_KEY, SecurityScheme::ApiKey(ApiKey::Header(header)));
         let query = ApiKeyValue::with_description(
             SIGNATURE,
-            "Signature of a URL made by `molmesh sign`, beside `expires` and `key_id`. It replaces a key until it expires.",
+            "Signature of a URL made by `molmesh sign`, beside `expires` and `key_id`. Replaces a key.",
         );
         components.add_security_scheme(SIGNED, SecurityScheme::ApiKey(ApiKey::Query(query)));
         for row in TABLE {

@@ -1,7 +1,7 @@
 //! Request bodies in the OpenAPI document.
 //!
-//! The document declares the bytes of a file alone. The server also accepts forms and JSON, but generators choose one body for an
-//! operation, most of them JSON, and the clients could not send files.
+//! The document declares the bytes of a file alone. The server also accepts forms and JSON, but generators choose one
+//! body for an operation, most of them JSON, and the clients could not send files.
 
 use utoipa::openapi::schema::Type;
 use utoipa::openapi::{KnownFormat, ObjectBuilder, RefOr, Schema, SchemaFormat};
@@ -11,8 +11,9 @@ use utoipa::{PartialSchema, ToSchema};
 pub(in crate::http) const STRUCTURE_TO_MESH: &str = "A structure file. The server detects the format from the content.
 
 Two other bodies are accepted. `application/json` names a structure on the server and holds the parameters: \
-`{\"pdb_id\": \"4pti\", \"resolution\": 0.7}` for an archive entry, `\"structure\"` with a digest instead of `\"pdb_id\"` for an \
-uploaded structure. `multipart/form-data` has the file in the field `file` and the parameters in the other fields.";
+`{\"pdb_id\": \"4pti\", \"resolution\": 0.7}` for an archive entry, `\"structure\"` with a digest instead of \
+`\"pdb_id\"` for an uploaded structure. `multipart/form-data` has the file in the field `file` and the parameters in \
+the other fields.";
 
 /// Returns a schema for bytes.
 pub(super) fn binary(doc: &str) -> ObjectBuilder {

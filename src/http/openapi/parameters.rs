@@ -239,7 +239,7 @@ request_headers!(
         ),
         (
             "Idempotency-Key", Some("^[ -~]{1,255}$"), "upload-1",
-            "Key chosen by the client, 1 to 255 characters. Repeating a request with the same key returns the same job.",
+            "Key chosen by the client, 1 to 255 characters. A repeated request with the same key returns the same job.",
         ),
     ]
 );
@@ -264,7 +264,7 @@ request_headers!(
             "Part of the file to return. Applies to stored results; other responses, and requests for several ranges, \
              return the whole file.",
         ),
-        ("If-Range", None, "\"ba7816bf\"", "`ETag` that the `Range` refers to. If it differs, the whole file is returned."),
+        ("If-Range", None, "\"ba7816bf\"", "`ETag` that the `Range` refers to. If it differs, the whole file is sent."),
     ]
 );
 request_headers!(
