@@ -426,15 +426,6 @@ fn cycle(sources: &[Source]) -> Option<Vec<String>> {
         done.insert(at.to_owned());
         false
     }
-    let mut done = BTreeSet::new();
-    edges.keys().find_map(|node| {
-        let mut trail = Vec::new();
-        visit(node, edges, &mut trail, &mut done).then_some(trail)
-    })
-}
-
-/// A cycle between rooms, if there is one.
-fn cycle(sources: &[Source]) -> Option<Vec<String>> {
     let mut edges = Edges::new();
     for source in sources {
         let layer = layer_of(&source.path);
@@ -454,19 +445,6 @@ fn cycle(sources: &[Source]) -> Option<Vec<String>> {
 /// cycles between modules.
 fn modules_of(sources: &[Source], layer: &str) -> Vec<Source> {
     let (folder, path) = (format!("src/{layer}/"), format!("crate::{layer}::"));
-    let modules = sources.iter().filter(|s| s.path.starts_with(&folder) && s.path != format!("{folder}mod.rs"));
-    modules
-        .map(|s| {
-            let lines = s.text.lines().take(tests_start(&s.text).unwrap_or(usize::MAX));
-            let text = lines.collect::<Vec<_>>().join("\n").replace(&path, "crate::");
-            Source { path: s.path.replacen(&folder, "src/", 1), text }
-        })
-        .collect()
-}
-
-/// Modules of `room` without their tests, as if `room` were the root of the crate: [`cycle`] then finds cycles between them.
-fn modules_of(sources: &[Source], room: &str) -> Vec<Source> {
-    let (folder, path) = (format!("src/{room}/"), format!("crate::{room}::"));
     let modules = sources.iter().filter(|s| s.path.starts_with(&folder) && s.path != format!("{folder}mod.rs"));
     modules
         .map(|s| {

@@ -218,7 +218,6 @@ fn canonical_texts_tell_jobs_apart_and_nothing_else() {
         &[("kernel", "gaussian"), ("preset", "default")],
         &[("select", "polymer")],
         &[("format", "stl")],
-        &[("report", "json")],
         &[("compress", "none")],
         &[("normals", "smooth")],
         &[("units", "angstrom")],

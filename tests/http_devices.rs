@@ -175,7 +175,7 @@ fn what_stands_in_is_said_in_answer_report_log_and_metrics() {
         (well.header("molmesh-backend"), well.header("molmesh-backend-reason")),
         (Some("gpu"), Some("a test says so"))
     );
-    let report = server.post("/v1/meshes?report=json", &[], SAMPLE).json();
+    let report = server.post("/v1/report", &[], SAMPLE).json();
     assert_eq!((&report["device"], report.get("fallback")), (&"card 1".into(), None));
 
     *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
@@ -189,7 +189,7 @@ fn what_stands_in_is_said_in_answer_report_log_and_metrics() {
     assert_eq!(again.header("molmesh-backend"), Some("gpu"), "what stood in is no answer once the devices are back");
     assert_ne!(stood_in.header("etag"), again.header("etag"), "other bytes under one tag");
     *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
-    let report = server.post("/v1/meshes?report=json", &[], &other).json();
+    let report = server.post("/v1/report", &[], &other).json();
     assert_eq!((&report["backend"], &report["fallback"]), (&"cpu".into(), &"the card is on fire 7431".into()));
     assert_eq!(report["device"], "the processor");
     assert_eq!(log_lines("on fire 7431").len(), 2);
@@ -241,7 +241,7 @@ fn devices_are_counted_and_their_end_is_logged_once() {
     backend.second_is_down.store(true, Ordering::SeqCst);
     let lines = log_lines("it fell over").len();
     for _ in 0..3 {
-        assert_eq!(server.post("/v1/meshes?report=json", &[], SAMPLE).status, 200);
+        assert_eq!(server.post("/v1/report", &[], SAMPLE).status, 200);
     }
     // The answer goes out before the books are closed.
     wait_for("the log", || log_lines("it fell over").len() > lines);

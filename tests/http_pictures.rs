@@ -144,7 +144,7 @@ fn what_does_not_go_with_a_picture_is_refused_and_what_goes_with_it_alone() {
         ("width=100", "width"),
         ("width=512&height=30", "height"),
         ("format=stl&view=top", "view"),
-        ("report=json&style=gouraud", "style"),
+        ("format=glb&style=gouraud", "style"),
     ] {
         let problem = server.post(&format!("/v1/meshes?{query}"), &[], SAMPLE).problem(400, "bad-parameter");
         assert_eq!(problem["parameter"], parameter, "{query}: {problem}");
@@ -155,7 +155,7 @@ fn what_does_not_go_with_a_picture_is_refused_and_what_goes_with_it_alone() {
     let problem = server.get("/v1/pdb/4pti/surface.jpg").problem(404, "not-found");
     assert!(problem["available"].as_array().unwrap().contains(&"surface.png".into()), "{problem}");
     // A report of a picture is that of its run.
-    let report = server.post("/v1/meshes?format=png&report=json&width=32", &[], SAMPLE).json();
+    let report = server.post("/v1/report?format=png&width=32", &[], SAMPLE).json();
     assert_eq!(report["picture"]["width"], 32, "{report}");
 }
 

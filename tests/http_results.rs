@@ -182,7 +182,7 @@ fn an_estimate_says_what_a_mesh_would_cost_and_what_would_fit() {
         reply.json()
     };
     let fits = estimate("?resolution=1");
-    let report = server.post("/v1/meshes?resolution=1&report=json", &[], SAMPLE).json();
+    let report = server.post("/v1/report?resolution=1", &[], SAMPLE).json();
     assert_eq!((&fits["accepted"], &fits["samples"]), (&true.into(), &report["samples"]));
     let ratio = fits["triangles"].as_f64().unwrap() / report["triangles"].as_f64().unwrap();
     assert!((0.8..1.25).contains(&ratio), "{ratio}");
