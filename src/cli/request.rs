@@ -132,8 +132,7 @@ mod tests {
 
     #[test]
     fn every_parameter_has_a_flag() {
-        // `report` is how HTTP asks for what `--report json` always gives.
-        for parameter in params::TABLE.iter().filter(|p| p.name != "report") {
+        for parameter in params::TABLE {
             let flag = format!("--{}", parameter.name.replace('_', "-"));
             let value = match parameter.name {
                 "atom_ids" | "check" => vec![flag.as_str()],

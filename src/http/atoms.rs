@@ -22,20 +22,22 @@ use crate::structure::{self, Structure, StructureError, element};
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
 const BYTES_PER_ATOM: u64 = 24;
 
-/// Atoms of a structure: every model, in the order of the file, from 0 as in `_ATOM`.
+/// Atoms of all models in file order. Row `i` describes the atom with index `i` in `_ATOM` of a mesh.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct AtomsDocument {
-    /// Number of atoms, which are the rows of `atoms`.
+    /// Number of atoms, the length of each column of `atoms`.
     count: usize,
-    /// Distinct names of atoms.
+    /// Distinct atom names.
     names: Vec<String>,
-    /// Distinct elements; `?` is an unknown one.
+    /// Distinct element symbols; `?` for an unknown element.
     elements: Vec<&'static str>,
+    /// Columns with one row per atom.
     atoms: AtomColumns,
+    /// Columns with one row per residue.
     residues: ResidueColumns,
 }
 
-/// A row for each atom.
+/// Columns with one row per atom.
 #[derive(Debug, Default, Serialize, ToSchema)]
 struct AtomColumns {
     /// Index into `names`.
@@ -44,22 +46,22 @@ struct AtomColumns {
     element: Vec<u8>,
 }
 
-/// A row for each residue.
+/// Columns with one row per residue.
 #[derive(Debug, Default, Serialize, ToSchema)]
 struct ResidueColumns {
-    /// Its first atom; the last is the one before the next residue's first.
+    /// Index of the first atom. The residue ends before the first atom of the next one.
     first: Vec<usize>,
-    /// Its name.
+    /// Residue name.
     name: Vec<String>,
-    /// Its number, as the author gives it.
+    /// Residue number given by the author.
     number: Vec<i32>,
-    /// Its insertion code; empty where there is none.
+    /// Insertion code; empty if there is none.
     insertion_code: Vec<String>,
-    /// The author's name for its chain; empty where the file leaves it blank.
+    /// Chain name given by the author; empty if the file leaves it blank.
     chain: Vec<String>,
-    /// Its model.
+    /// Model number.
     model: Vec<i32>,
-    /// Kind of its first atom: `polymer`, `ligand`, `water` or `virtual` (a site that is not an atom).
+    /// Kind of the first atom: `polymer`, `ligand`, `water` or `virtual` (a site that is not an atom).
     kind: Vec<&'static str>,
 }
 
@@ -72,15 +74,16 @@ refusals!(EntryRefusals: [READING, [
     Kind::MemoryFull, Kind::TooManyDeliveries,
 ]]);
 
-/// Lists the atoms of a structure.
+/// List the atoms of a structure
 ///
-/// For meshes with `atom_ids=true`: their `_ATOM` (in PLY `atom`) counts the rows of `atoms` here.
+/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
+/// list.
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
     params(StructurePath, Unchanged),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
-            ("ETag" = String, description = "The digest."),
-            ("Cache-Control" = String, description = "How long the answer stays good."),
+            ("ETag" = String, description = "Strong validator of the document."),
+            ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, StructureRefusals,
     ))]
@@ -92,15 +95,16 @@ pub(super) async fn of_structure(
     source.document(&app, &headers, async |input| list(&app, input).await).await
 }
 
-/// Lists the atoms of an entry.
+/// List the atoms of an archive entry
 ///
-/// For meshes with `atom_ids=true`: their `_ATOM` (in PLY `atom`) counts the rows of `atoms` here.
+/// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
+/// list.
 #[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
     params(EntryPath, Unchanged),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
-            ("ETag" = String, description = "The digest of the entry's file."),
-            ("Cache-Control" = String, description = "How long the answer stays good."),
+            ("ETag" = String, description = "Strong validator of the document."),
+            ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, EntryRefusals,
     ))]

@@ -17,186 +17,230 @@ use crate::pipeline::params::{Domain, Parameter, TABLE};
 use crate::structure::{element, radii};
 use crate::surface::{DeviceStatus, FoundDevice, Kernel, Preset, SurfaceOptions, SurfaceParams};
 
-/// Capabilities and limits of the service.
+/// Formats, parameters, limits and devices of the service.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Capabilities {
-    /// `molmesh`.
+    /// Always `molmesh`.
     name: &'static str,
-    /// The program's version.
+    /// Version of the program.
     version: &'static str,
+    /// Units of all lengths, areas and volumes.
     units: Units,
+    /// Accepted uploads.
     inputs: Inputs,
-    /// Formats, the best known first; png is a picture.
+    /// Output formats. `png` is a picture of the mesh.
     formats: Vec<FormatDocument>,
-    /// The format where none is asked for.
+    /// Format of a request that names none.
     default_format: &'static str,
-    /// Kernel functions.
+    /// Density kernels.
     kernels: Vec<&'static str>,
-    /// Smoothness and isovalue of every preset.
+    /// Smoothness and isovalue of each preset.
     #[schema(value_type = std::collections::BTreeMap<String, PresetValues>)]
     presets: Map<String, Value>,
-    /// Every parameter of a mesh.
+    /// Mesh parameters.
     parameters: Vec<ParameterDocument>,
+    /// Configured limits.
     limits: Limits,
-    /// The backend that makes the meshes.
+    /// Backends that compute meshes.
     backends: Vec<BackendDocument>,
-    /// Renderer of pictures.
+    /// Backends that render pictures.
     renderers: Vec<BackendDocument>,
-    /// Every device that was found.
+    /// Devices found at the start of the service.
     devices: Vec<DeviceDocument>,
+    /// Van der Waals radii.
     radii: Radii,
-    /// True if `/` is the viewer; otherwise it is a page that explains how to build it.
+    /// True if the server includes the web page.
     viewer: bool,
-    /// Address of the list of problem types.
+    /// Path of the list of problem types.
     problems: &'static str,
 }
 
-/// The units of everything.
+/// Units of all lengths, areas and volumes.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(as = QuantityUnits)]
 struct Units {
+    /// Unit of lengths.
     length: &'static str,
+    /// Unit of areas.
     area: &'static str,
+    /// Unit of volumes.
     volume: &'static str,
 }
 
-/// Formats and encodings of uploads.
+/// Accepted uploads.
 #[derive(Debug, Serialize, ToSchema)]
 struct Inputs {
     /// Structure formats.
     formats: &'static [&'static str],
     /// Compressions.
     encodings: &'static [&'static str],
+    /// Remark on content types.
     note: &'static str,
 }
 
-/// A format.
+/// Output format.
 #[derive(Debug, Serialize, ToSchema)]
 struct FormatDocument {
-    /// Its file name's extension.
+    /// File name extension.
     name: &'static str,
+    /// Media type.
     media_type: &'static str,
 }
 
-/// Values of a preset.
+/// Parameter values of a preset.
 #[derive(Debug, Serialize, ToSchema)]
 struct PresetValues {
+    /// Smoothness of the gaussian kernel.
     smoothness: f64,
+    /// Isovalue of the density.
     isovalue: f64,
 }
 
-/// A parameter.
+/// Mesh parameter.
 #[derive(Debug, Serialize, ToSchema)]
 struct ParameterDocument {
+    /// Name in queries, forms and JSON.
     name: &'static str,
-    /// Effect.
+    /// Description.
     doc: &'static str,
     /// Allowed values, in words.
     expected: String,
     /// Default value, in words.
     default: &'static str,
-    #[serde(flatten)]
-    domain: DomainDocument,
+    /// Type of the values: `number`, `integer`, `boolean`, `choice` (one of `values`), `set` (one or more of `values`,
+    /// separated by commas) or `text`.
+    r#type: &'static str,
+    /// Smallest value; numbers and integers only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<f64>, nullable = false)]
+    min: Option<Value>,
+    /// Largest value; numbers and integers only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<f64>, nullable = false)]
+    max: Option<Value>,
+    /// Unit, empty if there is none; numbers only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    unit: Option<&'static str>,
+    /// Allowed values; choices and sets only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    values: Option<&'static [&'static str]>,
 }
 
-/// Allowed values of a parameter.
-#[derive(Debug, Serialize, ToSchema)]
-#[serde(tag = "type", rename_all = "lowercase")]
-enum DomainDocument {
-    /// A number within bounds, both included.
-    Number { min: f64, max: f64, unit: &'static str },
-    /// A whole number within bounds, both included.
-    Integer { min: i64, max: i64 },
-    /// `true` or `false`.
-    Boolean,
-    /// One of these words.
-    Choice { values: &'static [&'static str] },
-    /// Words of these, separated by commas.
-    Set { values: &'static [&'static str] },
-    /// Free text.
-    Text,
-}
-
-/// The limits, as they are configured.
+/// Configured limits.
 #[derive(Debug, Serialize, ToSchema)]
 struct Limits {
+    /// Largest request body, in bytes.
     body_bytes: u64,
+    /// Largest JSON body, in bytes.
     json_bytes: u64,
+    /// Largest head of a form part, in bytes.
     part_head_bytes: u64,
+    /// Most parts of a form.
     parts: usize,
+    /// Largest structure after decompression, in bytes.
     inflated_bytes: u64,
+    /// Most atoms of a structure.
     atoms: u64,
+    /// Most atoms of an atom list.
     labels: u64,
+    /// Most grid points of a mesh.
     grid_samples: u64,
+    /// Most pairs of atoms and grid bricks of a mesh.
     candidate_pairs: u64,
+    /// Largest mesh in memory, in bytes.
     mesh_bytes: u64,
+    /// Largest mesh file, in bytes.
     output_bytes: u64,
+    /// Memory for uploads and meshes, in bytes.
     memory_bytes: u64,
+    /// Largest width and height of a picture, in pixels.
     picture_side: u32,
+    /// Jobs computed at the same time.
     workers: usize,
+    /// Most jobs in the queue.
     queue: usize,
+    /// Most mesh responses at the same time.
     deliveries: usize,
+    /// Time limit of a synchronous request, in ms.
     deadline_ms: u64,
+    /// Time limit of a job, in ms.
     batch_deadline_ms: u64,
+    /// Most starts of a job.
     attempts: u32,
+    /// Time limit for a request body, in ms.
     body_timeout_ms: u64,
+    /// Time limit for request headers, in ms.
     header_timeout_ms: u64,
+    /// Period in which a client must read `write_bytes`, in ms.
     write_timeout_ms: u64,
+    /// Bytes that a client must read in each `write_timeout_ms`.
     write_bytes: u64,
+    /// Most connections.
     connections: usize,
 }
 
-/// Backend or renderer.
+/// Backend that computes meshes or renders pictures.
 #[derive(Debug, Serialize, ToSchema)]
 struct BackendDocument {
+    /// Name: `cpu` or `gpu`.
     name: &'static str,
-    /// Processor or device that it uses.
+    /// Device of the backend.
     device: String,
-    /// Reason for its choice.
+    /// Reason for the choice of the backend.
     reason: String,
 }
 
-/// A device that was found.
+/// Device of the machine.
 #[derive(Debug, Serialize, ToSchema)]
 struct DeviceDocument {
-    /// Its number, by which it is chosen.
+    /// Number that selects the device in the configuration.
     number: usize,
+    /// Name.
     name: String,
-    /// Kind of the device.
+    /// Kind of device.
     kind: &'static str,
-    /// The graphics API that offers it.
+    /// Graphics API.
     api: &'static str,
+    /// Driver.
     driver: String,
+    /// Largest storage buffer binding, in bytes.
     binding_bytes: u64,
+    /// Largest buffer, in bytes.
     buffer_bytes: u64,
+    /// Workgroup memory, in bytes.
     workgroup_bytes: u64,
+    /// True if the device measures times.
     timestamps: bool,
-    /// The least and the most threads of a subgroup.
+    /// Smallest and largest number of threads in a subgroup; null if unknown.
     #[schema(required)]
     subgroups: Option<[u32; 2]>,
-    /// It was taken when the service started.
+    /// True if the service uses the device.
     taken: bool,
-    /// It takes jobs now.
+    /// True if the device accepts jobs now.
     up: bool,
-    /// Reason why it is used or not.
+    /// Reason for the state of the device.
     reason: String,
 }
 
 /// Van der Waals radii.
 #[derive(Debug, Serialize, ToSchema)]
 struct Radii {
-    /// Source of the values.
+    /// Source of the radii.
     table: &'static str,
+    /// Unit of the radii.
     unit: &'static str,
-    /// The radius of elements that the table lacks.
+    /// Radius of elements that the table lacks.
     fallback: f32,
-    /// By element symbol.
+    /// Radii by element symbol.
     #[schema(value_type = std::collections::BTreeMap<String, f64>)]
     values: Map<String, Value>,
 }
 
-/// Lists formats, parameters, limits and devices.
+/// List formats, parameters, limits and devices
 #[utoipa::path(get, path = "/v1/capabilities", tag = "service", operation_id = "capabilities",
-    responses((status = 200, description = "Formats, parameters, limits, devices.", body = Capabilities)))]
+    responses((status = 200, description = "Formats, parameters, limits and devices.", body = Capabilities)))]
 pub(super) async fn show(State(app): State<Shared>) -> Response {
     let headers = [(CONTENT_TYPE, "application/json"), (CACHE_CONTROL, "no-cache")];
     let body =
@@ -277,16 +321,17 @@ fn presets() -> Map<String, Value> {
 }
 
 fn parameter(parameter: &Parameter) -> ParameterDocument {
-    let domain = match parameter.domain {
-        Domain::Number { min, max, unit } => DomainDocument::Number { min, max, unit },
-        Domain::Integer { min, max } => DomainDocument::Integer { min, max },
-        Domain::Flag => DomainDocument::Boolean,
-        Domain::Choice(values) => DomainDocument::Choice { values },
-        Domain::Set(values) => DomainDocument::Set { values },
-        Domain::Text { .. } => DomainDocument::Text,
+    let Parameter { name, doc, default, domain } = *parameter;
+    let (r#type, bounds, unit, values) = match domain {
+        Domain::Number { min, max, unit } => ("number", Some([min.into(), max.into()]), Some(unit), None),
+        Domain::Integer { min, max } => ("integer", Some([min.into(), max.into()]), None, None),
+        Domain::Flag => ("boolean", None, None, None),
+        Domain::Choice(values) => ("choice", None, None, Some(values)),
+        Domain::Set(values) => ("set", None, None, Some(values)),
+        Domain::Text { .. } => ("text", None, None, None),
     };
-    let Parameter { name, doc, default, .. } = *parameter;
-    ParameterDocument { name, doc, expected: parameter.domain.expected(), default, domain }
+    let (min, max) = bounds.map(|[min, max]: [Value; 2]| (min, max)).unzip();
+    ParameterDocument { name, doc, expected: domain.expected(), default, r#type, min, max, unit, values }
 }
 
 fn limits(config: &Config, pool: &Pool) -> Limits {

@@ -49,12 +49,12 @@ pub(super) const PICTURE: [(&str, &str); 4] = [
     ("molmesh-pixel", "pixel"),
 ];
 
-/// Report of a run.
+/// Report of a request, with the findings of the strict validator.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReportDocument {
     #[serde(flatten)]
     report: Report,
-    /// Findings of the strict parser; absent without `check=strict`.
+    /// Findings of the strict validator; absent without `check=strict`.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(nullable = false)]
     diagnostics: Option<Vec<Finding>>,

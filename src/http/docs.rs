@@ -31,31 +31,21 @@ fn packed(request: &HeaderMap, media_type: &'static str, bytes: &'static [u8]) -
 }
 
 /// Serves Swagger UI for the OpenAPI document.
-#[utoipa::path(get, path = "/docs", tag = "page", operation_id = "docs",
-    responses((status = 200, description = "A page.", body = String, content_type = "text/html; charset=utf-8")))]
 pub(super) async fn index() -> Response {
     (headers("text/html; charset=utf-8"), include_str!("../../web/docs.html")).into_response()
 }
 
 /// Serves the script that starts the page.
-#[utoipa::path(get, path = "/docs.js", tag = "page", operation_id = "docsStart",
-    responses((status = 200, description = "A script.", body = String,
-        content_type = "text/javascript; charset=utf-8")))]
 pub(super) async fn start() -> Response {
     (headers("text/javascript; charset=utf-8"), include_str!("../../web/docs.js")).into_response()
 }
 
 /// Serves the style of Swagger UI.
-#[utoipa::path(get, path = "/swagger-ui.css", tag = "page", operation_id = "docsStyle",
-    responses((status = 200, description = "A style.", body = String, content_type = "text/css; charset=utf-8")))]
 pub(super) async fn style(headers: HeaderMap) -> Result<Response, Problem> {
     packed(&headers, "text/css; charset=utf-8", STYLE)
 }
 
 /// Serves the script of Swagger UI.
-#[utoipa::path(get, path = "/swagger-ui-bundle.js", tag = "page", operation_id = "docsBundle",
-    responses((status = 200, description = "A script.", body = String,
-        content_type = "text/javascript; charset=utf-8")))]
 pub(super) async fn bundle(headers: HeaderMap) -> Result<Response, Problem> {
     packed(&headers, "text/javascript; charset=utf-8", BUNDLE)
 }

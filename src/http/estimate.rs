@@ -17,7 +17,7 @@ use utoipa::ToSchema;
 use super::errors::file_too_large;
 use super::guard::Caller;
 use super::kinds::Kind;
-use super::openapi::bodies::{MeshForm, MeshOrder, StructureFile};
+use super::openapi::bodies::{STRUCTURE_TO_MESH, StructureFile};
 use super::openapi::parameters::{Coding, MeshParameters};
 use super::openapi::problems::{BODY, NAMED, PARAMETERS, ProblemDocument, READING};
 use super::openapi::refusals;
@@ -38,53 +38,62 @@ impl Drop for CancelOnDrop {
     }
 }
 
-/// Estimate of a mesh. Figures of the grid are exact, those of the mesh are estimated.
+/// Estimated size and cost of a mesh. Counts of atoms, cells, bricks and samples are exact; the size of the mesh and
+/// the times are estimates.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(example = json!({
+    "accepted": true, "problem": null, "atoms": 454, "atoms_in_file": 514, "resolution": 0.5,
+    "resolution_from": "resolution", "kernel": "gaussian", "format": "glb", "box_cells": 464_940, "bricks": 391,
+    "samples": 200_192, "area": 3475.0, "vertices": 20_850, "triangles": 41_700, "mesh_bytes": 1_000_800,
+    "structure": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "seconds": 0.01,
+    "wait_seconds": 0.0, "backend": "cpu",
+}))]
 pub(super) struct EstimateDocument {
-    /// True if the mesh would be accepted.
+    /// True if `POST /v1/meshes` would accept the request.
     accepted: bool,
-    /// Problem of a mesh that would be refused.
+    /// Error that `POST /v1/meshes` would return; null if it would accept the request.
     #[schema(required, value_type = Option<ProblemDocument>)]
     problem: Option<Value>,
-    /// Number of selected atoms.
+    /// Selected atoms.
     atoms: u64,
-    /// Number of atoms in the file, all models.
+    /// Atoms in all models of the file.
     atoms_in_file: u64,
-    /// Grid spacing, Å; estimated where it follows from `max_triangles`.
+    /// Grid spacing in Å; an estimate if it follows from `max_triangles`.
     resolution: f64,
-    /// The parameter that the spacing follows from: `resolution`, `detail` or `max_triangles`.
+    /// Parameter that sets the spacing: `resolution`, `detail` or `max_triangles`.
     resolution_from: &'static str,
-    /// Kernel function.
+    /// Density kernel.
     kernel: &'static str,
-    /// The mesh format, as a file name's extension.
+    /// Mesh format, as a file name extension.
     format: &'static str,
-    /// Cells that a dense grid would have.
+    /// Cells of a dense grid over the bounding box.
     box_cells: u64,
-    /// Bricks of the grid that some atom reaches.
+    /// Grid bricks (8 × 8 × 8 points) within reach of an atom; null if the request would be rejected before they are
+    /// known.
     #[schema(required)]
     bricks: Option<u64>,
-    /// Samples that would be evaluated.
+    /// Grid points to evaluate; null like `bricks`.
     #[schema(required)]
     samples: Option<u64>,
-    /// Å².
+    /// Surface area in Å²; null like `bricks`.
     #[schema(required)]
     area: Option<f64>,
-    /// Vertices.
+    /// Vertices; null like `bricks`.
     #[schema(required)]
     vertices: Option<u64>,
-    /// Triangles.
+    /// Triangles; null like `bricks`.
     #[schema(required)]
     triangles: Option<u64>,
-    /// Bytes of the mesh.
+    /// Size of the mesh file in bytes; null like `bricks`.
     #[schema(required)]
     mesh_bytes: Option<u64>,
-    /// SHA-256 of the structure.
+    /// SHA-256 digest of the structure, in hexadecimal.
     structure: String,
-    /// Estimated duration of the job, s.
+    /// Computing time in s.
     seconds: f64,
-    /// Estimated time in the queue, s.
+    /// Time in the queue in s.
     wait_seconds: f64,
-    /// Backend that would compute it.
+    /// Backend that would compute the mesh: `cpu` or `gpu`.
     backend: &'static str,
 }
 
@@ -92,15 +101,12 @@ refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
     Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
 ]]);
 
-/// Estimates size and duration of a mesh.
+/// Estimate a mesh
 ///
-/// Takes the same requests as `POST /v1/meshes`.
+/// Takes what `POST /v1/meshes` takes and returns the expected size, memory and time of the mesh without computing it.
 #[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",
     params(MeshParameters, Coding),
-    request_body(description = "A structure, or a document that names one.", content(
-        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
-        (StructureFile = "chemical/x-mmcif"), (MeshForm = "multipart/form-data"), (MeshOrder = "application/json"),
-    )),
+    request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
     responses((status = 200, description = "The estimate.", body = EstimateDocument), EstimateRefusals))]
 pub(super) async fn create(
     State(app): State<Shared>,

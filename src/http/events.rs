@@ -34,13 +34,16 @@ struct Listener {
 
 refusals!(EventsRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::StoreFailed]]);
 
-/// The events of a job: each is the whole job, named by its status.
+/// Follow a job as server-sent events
+///
+/// Each event carries the whole status document of the job as `data` and its status as `event`. The stream ends with
+/// the job.
 #[utoipa::path(get, path = "/v1/jobs/{id}/events", tag = "jobs", operation_id = "watchJob",
     params(JobPath, Resumption),
     responses(
-        (status = 200, description = "Server-sent events until the job ends; `data` is the job's document.",
+        (status = 200, description = "Server-sent events until the job ends.",
             body = String, content_type = "text/event-stream"),
-        (status = 204, description = "The last event was seen: there is nothing more to come."),
+        (status = 204, description = "`Last-Event-ID` names the final event; no more events follow."),
         EventsRefusals,
     ))]
 pub(super) async fn show(

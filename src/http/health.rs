@@ -19,43 +19,44 @@ const NO_STORE: [(axum::http::HeaderName, &str); 1] = [(CACHE_CONTROL, "no-store
 /// Answer of the liveness probe.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Health {
-    /// `live`.
+    /// Always `live`.
     status: &'static str,
 }
 
 /// Name and version of the program.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Version {
-    /// `molmesh`.
+    /// Always `molmesh`.
     name: &'static str,
     /// Version of the program.
     version: &'static str,
 }
 
-/// Shows that the process answers.
+/// Check that the process is alive
 #[utoipa::path(get, path = "/livez", tag = "service", operation_id = "live",
-    responses((status = 200, description = "The process lives.", body = Health)))]
+    responses((status = 200, description = "The process is alive.", body = Health)))]
 pub(super) async fn live() -> Response {
     (NO_STORE, Json(Health { status: "live" })).into_response()
 }
 
-/// Answer of the readiness probe, with its checks.
+/// Answer of the readiness probe.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct ReadyDocument {
-    /// `ready`.
+    /// Always `ready`.
     status: &'static str,
-    /// Checks; all are `ok`.
+    /// The readiness checks; all are `ok`.
     checks: Vec<Check>,
 }
 
-/// Check that must succeed for the service to be ready.
+/// Readiness check.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ReadinessCheck)]
 pub(super) struct Check {
-    /// `accepting`, `devices` or `store`.
+    /// Name of the check: `accepting`, `devices` or `store`.
     name: &'static str,
-    /// True if the check succeeded.
+    /// True if the check passed.
     ok: bool,
-    /// Result in words.
+    /// Explanation of the outcome.
     detail: String,
 }
 
@@ -71,12 +72,12 @@ impl Check {
 
 refusals!(ReadyRefusals: [[Kind::NotReady]]);
 
-/// Checks that the service is ready for requests.
+/// Check that the service is ready for requests
 ///
-/// The service is ready if it is not stopping, has computed a first mesh, has a device (or a fallback) in service, and can
-/// write and read the store. Load does not change the answer. `checks` lists each result, also in the problem.
+/// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
+/// jobs, and can write and read the store. The answer does not depend on the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
-    responses((status = 200, description = "The service takes requests.", body = ReadyDocument), ReadyRefusals))]
+    responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyRefusals))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
     let checks = [accepting(&app), devices(&app), store(&app).await];
     let failing = checks.iter().find(|check| !check.ok).map(|check| check.detail.clone());
@@ -124,7 +125,7 @@ async fn store(app: &Shared) -> Check {
     Check::new("store", found)
 }
 
-/// Returns the name and the version of the program.
+/// Get the version of the program
 #[utoipa::path(get, path = "/version", tag = "service", operation_id = "version",
     responses((status = 200, description = "Name and version.", body = Version)))]
 pub(super) async fn version() -> Response {

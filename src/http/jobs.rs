@@ -31,55 +31,67 @@ pub(super) const MAX_WAIT_S: u64 = 55;
 #[serde(deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Poll {
-    /// Seconds to wait for the end of the job.
+    /// Seconds to wait for the job to end, 0 to 55. Default: 0.
     #[param(minimum = 0, maximum = 55, nullable = false)]
     wait: Option<u64>,
 }
 
-/// Status of a job; names and values are those of OGC API Processes.
+/// Status of a job. Names and statuses follow OGC API Processes.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(example = json!({
+    "jobID": "0123456789abcdef0123456789abcdef", "processID": "surface", "type": "process", "status": "running",
+    "progress": 42, "fraction": 0.42, "stage": "field", "attempts": 1, "created": "2030-01-01T12:00:00.000Z",
+    "started": "2030-01-01T12:00:00.100Z", "finished": null,
+    "structure": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "format": "glb",
+    "parameters": { "resolution": "0.3" }, "problem": null, "result": null,
+    "links": [{ "rel": "self", "href": "/v1/jobs/0123456789abcdef0123456789abcdef", "type": "application/json" }],
+}))]
 pub(super) struct JobDocument {
     /// Id of the job.
     #[serde(rename = "jobID")]
     job_id: String,
-    /// `surface`.
+    /// Always `surface`.
     #[serde(rename = "processID")]
     process_id: &'static str,
-    /// `process`.
+    /// Always `process`.
     r#type: &'static str,
+    /// Status of the job. `successful`, `failed` and `dismissed` are final.
     #[schema(value_type = StatusSchema)]
     status: Status,
-    /// Per cent.
+    /// Progress in per cent.
     #[schema(minimum = 0, maximum = 100)]
     progress: u64,
-    /// The same, finer.
+    /// Progress as a fraction.
     #[schema(minimum = 0, maximum = 1)]
     fraction: f64,
-    /// Running stage.
+    /// Current stage; null unless the job is running.
     #[schema(required)]
     stage: Option<&'static str>,
-    /// Number of attempts to run it.
+    /// Number of times the job was started.
     attempts: u32,
     /// Time of acceptance.
     #[schema(format = DateTime)]
     created: String,
-    /// Start of the last attempt.
+    /// Time of the latest start; null before the first.
     #[schema(required, format = DateTime)]
     started: Option<String>,
-    /// End of the job.
+    /// Time of the end; null before it.
     #[schema(required, format = DateTime)]
     finished: Option<String>,
-    /// SHA-256 of the structure.
+    /// SHA-256 digest of the structure, in hexadecimal.
     structure: String,
-    /// The mesh format, as a file name's extension.
+    /// Mesh format, as a file name extension.
     format: String,
-    /// Parameters as the client wrote them.
+    /// Parameters as given in the request.
     #[schema(value_type = std::collections::BTreeMap<String, String>)]
     parameters: Map<String, Value>,
-    /// Problem of a failed job.
+    /// Error of a failed job; null otherwise.
     #[schema(required, value_type = Option<ProblemDocument>)]
     problem: Option<Value>,
-    /// Links to related resources.
+    /// File name of the result, for `GET /v1/results/{file}`; null unless the job has succeeded.
+    #[schema(required)]
+    result: Option<String>,
+    /// Related resources.
     links: Vec<Link>,
 }
 
@@ -88,9 +100,9 @@ pub(super) struct JobDocument {
 pub(super) struct Link {
     /// Relation of the resource to this document.
     rel: &'static str,
-    /// Address.
+    /// Path of the resource.
     href: String,
-    /// Media type.
+    /// Media type of the resource.
     r#type: &'static str,
 }
 
@@ -126,11 +138,14 @@ pub(super) fn none(id: &str) -> Problem {
     Problem::new(Kind::NoSuchJob, format!("there is no job `{shown}`: jobs are removed some time after their end"))
 }
 
-/// Shows the status of a job; with `wait`, as soon as the job has ended or the time is over.
+/// Get the status of a job
+///
+/// With `wait`, the response is delayed until the job has ended or the time is over.
 #[utoipa::path(get, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "showJob", params(JobPath, Poll),
     responses(
-        (status = 200, description = "How the job stands.", body = JobDocument,
-            headers(("Retry-After" = u64, description = "Seconds, while the job goes on."))),
+        (status = 200, description = "Status of the job.", body = JobDocument,
+            headers(("Retry-After" = u64, description = "Seconds to wait before the next request.")),
+            links(("result" = (operation_id = "showResult", parameters(("file" = "$response.body#/result")))))),
         ShowRefusals,
     ))]
 pub(super) async fn show(
@@ -162,7 +177,7 @@ pub(super) async fn show(
     Ok(answer(StatusCode::OK, &view, None))
 }
 
-/// Cancels a job.
+/// Cancel a job
 #[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "dismissJob", params(JobPath),
     responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissRefusals))]
 pub(super) async fn dismiss(
@@ -178,11 +193,14 @@ pub(super) async fn dismiss(
     Ok(answer(StatusCode::OK, &view, None))
 }
 
-/// Redirects to the result of a job, or returns the problem of a failed job.
+/// Get the result of a job
+///
+/// Redirects to the mesh of a successful job. For a failed job the response is the error that the synchronous request
+/// would have returned.
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(
-        (status = 303, description = "The job was successful.",
-            headers(("Location" = String, description = "The result: /v1/results/….")),),
+        (status = 303, description = "The job has succeeded.",
+            headers(("Location" = String, description = "Path of the mesh: `/v1/results/{file}`."))),
         ResultRefusals,
     ))]
 pub(super) async fn result(
@@ -262,6 +280,7 @@ pub(super) fn document(view: &JobView) -> JobDocument {
         format: record.format.clone(),
         parameters,
         problem: record.problem.clone(),
+        result: record.result.as_ref().map(|key| format!("{key}.{}", record.format)),
         links,
     }
 }

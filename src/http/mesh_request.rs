@@ -34,14 +34,14 @@ pub(super) struct MeshRequest {
     timing: Timing,
 }
 
-/// Reads a GET request: the path names the structure and ends in `{file}`, which is `surface.{ext}`.
+/// Reads a GET request: the path names the structure and ends in `surface.{ext}` (`{file}`) or in `report.json`.
 impl FromRequestParts<Shared> for MeshRequest {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
         let timing = Timing::start();
         let path = source::path_parameters(parts, app).await?;
-        let file = path.iter().find_map(|(name, value)| (name == "file").then_some(value)).unwrap_or_default();
+        let file = path.iter().find_map(|(name, value)| (name == "file").then_some(value));
         let query = Query::from_request_parts(parts, app).await;
         let preferences = RequestPreferences::of(&parts.headers, &parts.extensions)?;
         let structure = StructureSource::from_request_parts(parts, app).await?;
@@ -82,10 +82,9 @@ impl MeshRequest {
         method: &Method,
         headers: &HeaderMap,
     ) -> Result<Option<Response>, Problem> {
-        let ParsedRequest { request, format, declared, .. } = &self.parsed;
+        let ParsedRequest { request, format, report, declared, .. } = &self.parsed;
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
-        let is_reusable =
-            !request.strict && !request.report && !declared.is_structure() && !self.preferences.respond_async;
+        let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job));
         let etag = delivery::etag(&key);
         if is_reusable {
@@ -105,7 +104,7 @@ impl MeshRequest {
                 return Ok(Some(self.cached(response)));
             }
         }
-        if method != Method::HEAD || request.report {
+        if method != Method::HEAD || *report {
             return Ok(None);
         }
         // The summary headers would need a run.
@@ -124,12 +123,13 @@ impl MeshRequest {
     /// Computes the mesh, or answers with a job.
     async fn compute(self, app: &Shared, input: Input) -> Result<Response, Problem> {
         app.admit_work(&self.preferences.caller)?;
-        if self.preferences.respond_async {
+        // A job has no report of its own to return later, so a request for a report is never answered with a job.
+        let report = self.parsed.report;
+        if self.preferences.respond_async && !report {
             return self.accept(app, input, None).await;
         }
         let permit = app.delivery()?;
-        // A report has no address of its own, so it cannot be the result of a job.
-        let wait = self.preferences.wait.filter(|_| !self.parsed.request.report);
+        let wait = self.preferences.wait.filter(|_| !report);
         let jobs = &app.config.jobs;
         let allowed = if wait.is_some() { jobs.batch_deadline() } else { jobs.deadline() };
         let ticket = app.pool.submit(self.task(&input), allowed, None);
@@ -162,7 +162,7 @@ impl MeshRequest {
             timing.job(&finished.product.report);
         }
         declared.check_format(finished.product.report.source_format)?;
-        if request.report {
+        if report {
             return delivery::report(&finished, timing);
         }
         // Another backend may have computed the mesh, with other bytes.
@@ -194,10 +194,6 @@ impl MeshRequest {
 
     /// Accepts a durable job and answers with its address.
     async fn accept(self, app: &Shared, input: Input, ticket: Option<Ticket>) -> Result<Response, Problem> {
-        if self.parsed.request.report {
-            let detail = "a job has no report of its own; request the mesh, then `report.json` of its result";
-            return Err(Problem::new(Kind::BadParameter, detail).with("parameter", "report"));
-        }
         let task = self.task(&input);
         let Self { parsed: ParsedRequest { request, pairs, format, .. }, preferences, .. } = self;
         let spec = JobSpec { task, parameters: pairs, format, idempotency_key: preferences.idempotency_key };
@@ -226,6 +222,6 @@ impl MeshRequest {
 
     /// Recommends a job to a client whose request cannot be answered in time.
     fn advise(&self, problem: Problem) -> Problem {
-        if self.parsed.request.report { problem } else { problem.advise("send `Prefer: respond-async` to get a job") }
+        if self.parsed.report { problem } else { problem.advise("send `Prefer: respond-async` to get a job") }
     }
 }

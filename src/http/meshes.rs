@@ -8,8 +8,8 @@ use axum::response::Response;
 
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
-use super::openapi::bodies::{MeshForm, MeshOrder, StructureFile};
-use super::openapi::meshes::Uploaded;
+use super::openapi::bodies::{STRUCTURE_TO_MESH, StructureFile};
+use super::openapi::meshes::{Reported, Uploaded};
 use super::openapi::parameters::{Coding, MeshParameters, Wishes};
 use super::openapi::problems::{ASKING, BODY, MESHING, NAMED, PARAMETERS, READING};
 use super::openapi::refusals;
@@ -21,16 +21,13 @@ use super::timing::Timing;
 
 refusals!(MeshRefusals: [BODY, NAMED, PARAMETERS, READING, MESHING, ASKING, [Kind::NotAcceptable]]);
 
-/// Meshes a structure.
+/// Mesh a structure
 ///
-/// The body is a file, a form with a file, or a JSON document that names a structure. The format is that of `format`,
-/// else what `Accept` prefers, else GLB.
+/// The parameter `format` sets the format of the mesh; without it the server uses the format that `Accept` prefers, or
+/// GLB. `POST /v1/report` returns the report without the mesh.
 #[utoipa::path(post, path = "/v1/meshes", tag = "meshes", operation_id = "createMesh",
     params(MeshParameters, Wishes, Coding),
-    request_body(description = "A structure, or a document that names one.", content(
-        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
-        (StructureFile = "chemical/x-mmcif"), (MeshForm = "multipart/form-data"), (MeshOrder = "application/json"),
-    )),
+    request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
     responses(Uploaded, MeshRefusals))]
 pub(super) async fn create(
     State(app): State<Shared>,
@@ -39,12 +36,50 @@ pub(super) async fn create(
     extensions: Extensions,
     body: Body,
 ) -> Result<Response, Problem> {
+    answer(&app, query, &headers, &extensions, body, false).await
+}
+
+refusals!(ReportRefusals: [
+    BODY, NAMED, PARAMETERS, READING, MESHING, [Kind::QueueFull, Kind::TooManyDeliveries],
+]);
+
+/// Mesh a structure and return the report
+///
+/// Takes what `POST /v1/meshes` takes, computes the mesh and returns its report instead of the file: atoms, grid, area,
+/// volume, components, voids, validation and times.
+#[utoipa::path(post, path = "/v1/report", tag = "meshes", operation_id = "createReport",
+    params(MeshParameters, Coding),
+    request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
+    responses(Reported, ReportRefusals))]
+pub(super) async fn report(
+    State(app): State<Shared>,
+    query: Pairs,
+    mut headers: HeaderMap,
+    extensions: Extensions,
+    body: Body,
+) -> Result<Response, Problem> {
+    // `Accept` applies to the report, not to a mesh format.
+    headers.remove(header::ACCEPT);
+    answer(&app, query, &headers, &extensions, body, true).await
+}
+
+/// Answers an upload with its mesh or its report.
+async fn answer(
+    app: &Shared,
+    query: Pairs,
+    headers: &HeaderMap,
+    extensions: &Extensions,
+    body: Body,
+    report: bool,
+) -> Result<Response, Problem> {
     let timing = Timing::start();
-    let preferences = RequestPreferences::of(&headers, &extensions)?;
-    let parsed = ParsedRequest::from_body(&app, query, &headers, body).await?;
+    let preferences = RequestPreferences::of(headers, extensions)?;
+    let parsed = ParsedRequest { report, ..ParsedRequest::from_body(app, query, headers, body).await? };
     let request = MeshRequest::of_upload(parsed, preferences, timing);
     // Conditions and ranges apply to GET requests only.
-    let mut response = request.answer(&app, &Method::POST, &HeaderMap::new()).await?;
-    response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
+    let mut response = request.answer(app, &Method::POST, &HeaderMap::new()).await?;
+    if !report {
+        response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
+    }
     Ok(response)
 }

@@ -1,13 +1,38 @@
-//! Mesh format from `Accept` (RFC 9110): the most specific matching range determines the weight of a media type.
+//! Content negotiation of meshes (RFC 9110): the most specific range of `Accept` that matches a media type gives its
+//! weight.
 
-use axum::http::HeaderMap;
-use axum::http::header::ACCEPT;
+use axum::extract::Request;
+use axum::http::header::{ACCEPT, CONTENT_TYPE, VARY};
+use axum::http::{HeaderMap, HeaderValue};
+use axum::middleware::Next;
+use axum::response::Response;
 
 use super::kinds::Kind;
-use super::problem::Problem;
+use super::problem::{self, Problem};
 use crate::formats::Format;
 
-/// Returns the preferred format; ties go to the first range, then to the order of [`Format::ALL`].
+/// Media type for clients that treat every mesh as bytes.
+pub(super) const OCTETS: &str = "application/octet-stream";
+
+/// Sends a mesh as `application/octet-stream` if `Accept` prefers that type.
+pub(super) async fn relabel(request: Request, next: Next) -> Response {
+    let values = request.headers().get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok());
+    let accept = values.collect::<Vec<_>>().join(",");
+    let ranges = accept.split(',').enumerate().filter_map(|(place, text)| range(place, text));
+    let preferred = ranges.max_by(|a, b| a.weight.total_cmp(&b.weight).then(b.place.cmp(&a.place)));
+    let is_octets = preferred.is_some_and(|range| range.is(OCTETS));
+    let mut response = next.run(request).await;
+    let headers = response.headers_mut();
+    let is_mesh = |value: &HeaderValue| Format::ALL.iter().any(|format| format.media_type() == value);
+    if is_octets && headers.get(CONTENT_TYPE).is_some_and(is_mesh) {
+        headers.insert(CONTENT_TYPE, HeaderValue::from_static(OCTETS));
+        headers.insert(VARY, HeaderValue::from_static("accept"));
+    }
+    response
+}
+
+/// Returns the format that `Accept` prefers. Ties go to the range that stands first, then to the order of
+/// [`Format::ALL`].
 pub(super) fn format(headers: &HeaderMap) -> Result<Format, Problem> {
     let values: Vec<&str> = headers.get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok()).collect();
     choose(&values.join(",")).ok_or_else(|| {
@@ -26,13 +51,21 @@ struct Range<'a> {
 }
 
 impl Range<'_> {
-    /// Returns 0 without a match; higher is more specific.
+    /// Returns true if the range is this media type, not a wildcard that contains it.
+    fn is(&self, media_type: &str) -> bool {
+        media_type.split_once('/').is_some_and(|(kind, subtype)| {
+            self.kind.eq_ignore_ascii_case(kind) && self.subtype.eq_ignore_ascii_case(subtype)
+        })
+    }
+
+    /// Returns 0 for no match; more specific matches are higher. Every mesh is also `application/octet-stream`.
     fn specificity(&self, media_type: &str) -> u8 {
-        let (kind, subtype) = media_type.split_once('/').unwrap_or_default();
+        let kind = media_type.split('/').next().unwrap_or_default();
         match (self.kind, self.subtype) {
+            _ if self.is(OCTETS) => 1,
             ("*", "*") => 1,
             (k, "*") if k.eq_ignore_ascii_case(kind) => 2,
-            (k, s) if k.eq_ignore_ascii_case(kind) && s.eq_ignore_ascii_case(subtype) => 3,
+            _ if self.is(media_type) => 3,
             _ => 0,
         }
     }
@@ -42,7 +75,13 @@ fn choose(accept: &str) -> Option<Format> {
     if accept.trim().is_empty() {
         return Some(Format::default());
     }
-    let ranges: Vec<Range<'_>> = accept.split(',').enumerate().filter_map(|(place, text)| range(place, text)).collect();
+    let ranges = accept.split(',').enumerate().filter_map(|(place, text)| range(place, text));
+    // Errors and jobs are JSON, whatever the mesh is. Some generated clients send no other type.
+    let is_json = |range: &Range<'_>| range.is("application/json") || range.is(problem::MEDIA_TYPE);
+    let (json, ranges): (Vec<_>, Vec<_>) = ranges.partition(is_json);
+    if ranges.is_empty() && json.iter().any(|range| range.weight > 0.0) {
+        return Some(Format::default());
+    }
     let best = Format::ALL.into_iter().filter_map(|format| {
         let matching = ranges.iter().filter(|range| range.specificity(format.media_type()) > 0);
         let range = matching.max_by_key(|r| (r.specificity(format.media_type()), usize::MAX - r.place))?;
@@ -52,7 +91,7 @@ fn choose(accept: &str) -> Option<Format> {
     best.rev().max_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1))).map(|(_, _, format)| format)
 }
 
-/// Parses one member of the list; malformed ones are ignored.
+/// Parses one member of the list. Malformed ones are ignored.
 fn range(place: usize, text: &str) -> Option<Range<'_>> {
     let mut parts = text.split(';').map(str::trim);
     let (kind, subtype) = parts.next()?.split_once('/')?;
@@ -82,11 +121,19 @@ mod tests {
             ("model/*;q=0.2, model/obj;q=0.8", Some(Format::Obj)),
             ("text/html, application/xhtml+xml, */*;q=0.8", Some(Format::Glb)),
             ("text/html", None),
-            ("application/json", None),
+            ("application/json", Some(Format::Glb)),
+            ("application/json, model/stl", Some(Format::Stl)),
+            ("application/json;q=0", None),
             ("*/*;q=0", None),
             ("nonsense", None),
             ("model/stl;q=2", None),
             ("model/stl; q=1.0", Some(Format::Stl)),
+            ("application/octet-stream", Some(Format::Glb)),
+            ("application/octet-stream, model/stl", Some(Format::Glb)),
+            ("model/stl, application/octet-stream", Some(Format::Stl)),
+            ("application/problem+json", Some(Format::Glb)),
+            ("application/problem+json, model/stl", Some(Format::Stl)),
+            ("application/problem+json, text/html", None),
         ] {
             assert_eq!(choose(accept), expected, "{accept}");
         }

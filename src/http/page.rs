@@ -9,8 +9,6 @@ use axum::response::{IntoResponse, Response};
 
 use super::embedded;
 use super::kinds::Kind;
-use super::openapi::parameters::AssetPath;
-use super::openapi::refusals;
 use super::problem::Problem;
 
 /// Content security policy of the page: scripts and requests of this server only. WebAssembly is allowed for the
@@ -71,9 +69,6 @@ fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Resp
 }
 
 /// Serves the viewer.
-#[utoipa::path(get, path = "/", tag = "page", operation_id = "page",
-    responses((status = 200, description = "The viewer, or how to get it.", body = String,
-        content_type = "text/html; charset=utf-8")))]
 pub(super) async fn index(request: HeaderMap) -> Result<Response, Problem> {
     answer(&request, "index.html", NONE)
 }
@@ -81,24 +76,11 @@ pub(super) async fn index(request: HeaderMap) -> Result<Response, Problem> {
 /// Serves the script of `<molmesh-viewer>` for other pages.
 ///
 /// A module that defines the element and loads its parts from this server.
-#[utoipa::path(get, path = "/molmesh-viewer.js", tag = "page", operation_id = "component",
-    responses((status = 200, description = "A script.", body = String,
-        content_type = "text/javascript; charset=utf-8")))]
 pub(super) async fn component(request: HeaderMap) -> Result<Response, Problem> {
     answer(&request, "molmesh-viewer.js", NO_COMPONENT)
 }
 
-refusals!(AssetRefusals: [[Kind::BadRequest, Kind::NotFound]]);
-
 /// Serves the files of the page.
-#[utoipa::path(get, path = "/assets/{file}", tag = "page", operation_id = "asset", params(AssetPath),
-    responses(
-        (status = 200, description = "A script, a style, a picture or a text.", content(
-            (String = "text/javascript; charset=utf-8"), (String = "text/css; charset=utf-8"),
-            (String = "image/svg+xml"), (String = "text/plain; charset=utf-8"),
-        ), headers(("Cache-Control" = String, description = "For ever, where the name says the contents."))),
-        AssetRefusals,
-    ))]
 pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: HeaderMap) -> Result<Response, Problem> {
     let Path(file) = file.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let path = format!("assets/{file}");
@@ -110,9 +92,6 @@ pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: He
 }
 
 /// Serves a sample structure.
-#[utoipa::path(get, path = "/sample.pdb", tag = "page", operation_id = "sample",
-    responses((status = 200, description = "A structure to try.", body = String,
-        content_type = "chemical/x-pdb")))]
 pub(super) async fn sample() -> Response {
     let mut headers = headers("sample.pdb");
     headers[0].1 = "chemical/x-pdb";

@@ -25,15 +25,22 @@ pub(super) struct ParsedRequest {
     /// Parameters as the client wrote them.
     pub(super) pairs: Vec<(String, String)>,
     pub(super) format: Format,
+    /// Answer with the report instead of the mesh.
+    pub(super) report: bool,
     pub(super) declared: DeclaredType,
 }
 
 impl ParsedRequest {
-    /// Parses an address that ends in `surface.{ext}`.
-    pub(super) fn from_address(app: &App, source: StructureSource, file: &str, query: Pairs) -> Result<Self, Problem> {
-        let format = format_of(file)?;
+    /// Parses an address that ends in `surface.{ext}` (`file`), or in `report.json` (`None`).
+    pub(super) fn from_address(
+        app: &App,
+        source: StructureSource,
+        file: Option<&str>,
+        query: Pairs,
+    ) -> Result<Self, Problem> {
+        let format = file.map(format_of).transpose()?;
         let (pairs, mut request) = parse(query)?;
-        if let Some(other) = request.format {
+        if let (Some(format), Some(other)) = (format, request.format) {
             let value = other.extension();
             let detail = format!("parameter `format`: the address already says {}", format.extension());
             return Err(Problem::new(Kind::BadParameter, detail)
@@ -41,9 +48,11 @@ impl ParsedRequest {
                 .with("value", value)
                 .with("expected", format!("no value here, or the address surface.{value}")));
         }
+        let report = format.is_none();
+        let format = format.or(request.format).unwrap_or_default();
         params::settle(&mut request.job, format)?;
         app.accepts(&request.job)?;
-        Ok(Self { source, request, pairs, format, declared: DeclaredType::Neutral })
+        Ok(Self { source, request, pairs, format, report, declared: DeclaredType::Neutral })
     }
 
     /// Receives a body: a structure file, a form with a file, or a JSON document that names a structure. Invalid
@@ -71,7 +80,7 @@ impl ParsedRequest {
             request = params::parse(pairs.iter().map(|(n, v)| (n, v)))?;
         }
         let format = early.map_or_else(|| finish(app, &mut request, headers), Ok)?;
-        Ok(Self { source, request, pairs, format, declared })
+        Ok(Self { source, request, pairs, format, report: false, declared })
     }
 }
 
@@ -81,14 +90,9 @@ fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {
     Ok((pairs, request))
 }
 
-/// Returns the format of a request and checks the request against it. A report has the default format, which is not
-/// written.
+/// Returns the format of a request and checks the request against it.
 fn finish(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Format, Problem> {
-    let format = match (request.format, request.report) {
-        (Some(format), _) => format,
-        (None, true) => Format::default(),
-        (None, false) => negotiate::format(headers)?,
-    };
+    let format = request.format.map_or_else(|| negotiate::format(headers), Ok)?;
     params::settle(&mut request.job, format)?;
     app.accepts(&request.job)?;
     Ok(format)

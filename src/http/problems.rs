@@ -8,25 +8,26 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::kinds::{KINDS, Kind, Row};
+use super::openapi::parameters::ProblemPath;
 use super::openapi::refusals;
 use super::problem::Problem;
 
 /// Explanation of a problem type.
 #[derive(Debug, Serialize, ToSchema)]
-pub(super) struct ProblemType {
-    /// `type` of such problems, which is the address of this document.
+pub(super) struct ProblemDescription {
+    /// `type` of the problems, and the path of this document.
     r#type: String,
-    /// HTTP status.
+    /// HTTP status of the problems.
     #[schema(minimum = 400, maximum = 599)]
     status: u16,
-    /// Short description.
+    /// Short summary.
     title: &'static str,
-    /// Meaning of the problem, and what the client can do.
+    /// Meaning and remedy.
     about: &'static str,
 }
 
-fn describe(row: &Row) -> ProblemType {
-    ProblemType {
+fn describe(row: &Row) -> ProblemDescription {
+    ProblemDescription {
         r#type: format!("/problems/{}", row.slug),
         status: row.status.as_u16(),
         title: row.title,
@@ -36,17 +37,17 @@ fn describe(row: &Row) -> ProblemType {
 
 refusals!(OneRefusals: [[Kind::BadRequest, Kind::NotFound]]);
 
-/// Lists all problem types.
+/// List all problem types
 #[utoipa::path(get, path = "/problems", tag = "service", operation_id = "listProblems",
-    responses((status = 200, description = "All types.", body = Vec<ProblemType>)))]
+    responses((status = 200, description = "All problem types.", body = Vec<ProblemDescription>)))]
 pub(super) async fn list() -> Response {
     Json(KINDS.iter().map(describe).collect::<Vec<_>>()).into_response()
 }
 
-/// Explains one problem type.
+/// Explain a problem type
 #[utoipa::path(get, path = "/problems/{slug}", tag = "service", operation_id = "showProblem",
-    params(("slug" = String, Path, description = "Last segment of a problem's `type`.", example = "grid-too-large")),
-    responses((status = 200, description = "What it means.", body = ProblemType), OneRefusals))]
+    params(ProblemPath),
+    responses((status = 200, description = "The explanation.", body = ProblemDescription), OneRefusals))]
 pub(super) async fn one(path: Result<Path<String>, PathRejection>) -> Result<Response, Problem> {
     let Path(slug) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
     let row = KINDS.iter().find(|row| row.slug == slug);

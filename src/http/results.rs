@@ -44,7 +44,9 @@ refusals!(ShowRefusals: [[
 ]]);
 refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
 
-/// Returns a stored result.
+/// Get a stored mesh
+///
+/// Results never change. They are kept for some time after their last use.
 #[utoipa::path(
     get,
     path = "/v1/results/{file}",
@@ -71,12 +73,12 @@ pub(super) async fn show(
     stored(&app, &key, format, &method, &headers).await?.ok_or_else(|| no_such_result(&file))
 }
 
-/// Returns the report of the run that computed a result.
+/// Get the report of a stored mesh
 #[utoipa::path(get, path = "/v1/results/{key}/report.json", tag = "results", operation_id = "showReport",
     params(ResultPath, Unchanged),
     responses(
-        (status = 200, description = "The report.", body = Report,
-            headers(("ETag" = String, description = "Of the report: its times are those of one run."))),
+        (status = 200, description = "The report of the run that computed the mesh.", body = Report,
+            headers(("ETag" = String, description = "Strong validator of the document."))),
         NotModified, ReportRefusals,
     ))]
 pub(super) async fn report(

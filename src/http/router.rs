@@ -4,12 +4,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
+use axum::middleware::from_fn;
 use axum::routing::{get, post};
 
 use super::state::Shared;
 use super::{
-    api_document, atoms, capabilities, docs, estimate, events, health, jobs, meshes, middleware, page, pdb, problems,
-    results, structures,
+    api_document, atoms, capabilities, docs, estimate, events, health, jobs, meshes, middleware, negotiate, page, pdb,
+    problems, results, structures,
 };
 
 /// Margin of the backstop timeout over the sum of the regular timeouts.
@@ -23,12 +24,15 @@ pub(super) fn router(app: &Shared) -> Router {
     let router = Router::new()
         // Meshes.
         .route("/v1/meshes", post(meshes::create))
+        .route("/v1/report", post(meshes::report))
         .route("/v1/pdb/{id}/{file}", get(pdb::surface))
+        .route("/v1/pdb/{id}/report.json", get(pdb::report))
         .route("/v1/pdb/{id}/atoms", get(atoms::of_entry))
         .route("/v1/structures", post(structures::create))
         .route("/v1/structures/{digest}", get(structures::show))
         .route("/v1/structures/{digest}/atoms", get(atoms::of_structure))
         .route("/v1/structures/{digest}/{file}", get(structures::surface))
+        .route("/v1/structures/{digest}/report.json", get(structures::report))
         .route("/v1/estimate", post(estimate::create))
         // Jobs and results.
         .route("/v1/jobs/{id}", get(jobs::show).delete(jobs::dismiss))
@@ -54,6 +58,7 @@ pub(super) fn router(app: &Shared) -> Router {
         .route("/assets/{file}", get(page::asset))
         .route("/molmesh-viewer.js", get(page::component))
         .route("/sample.pdb", get(page::sample))
+        .layer(from_fn(negotiate::relabel))
         .with_state(Arc::clone(app));
     middleware::apply(router, timeout, app)
 }

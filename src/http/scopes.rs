@@ -24,12 +24,15 @@ const OPEN: Option<Scope> = None;
 #[rustfmt::skip]
 pub(super) const TABLE: &[Row] = &[
     row(Method::POST, "/v1/meshes", MESH),
+    row(Method::POST, "/v1/report", MESH),
     row(Method::GET, "/v1/pdb/{id}/{file}", MESH),
+    row(Method::GET, "/v1/pdb/{id}/report.json", MESH),
     row(Method::GET, "/v1/pdb/{id}/atoms", MESH),
     row(Method::POST, "/v1/structures", MESH),
     row(Method::GET, "/v1/structures/{digest}", READ),
     row(Method::GET, "/v1/structures/{digest}/atoms", READ),
     row(Method::GET, "/v1/structures/{digest}/{file}", MESH),
+    row(Method::GET, "/v1/structures/{digest}/report.json", MESH),
     row(Method::POST, "/v1/estimate", MESH),
     row(Method::GET, "/v1/jobs/{id}", READ),
     row(Method::DELETE, "/v1/jobs/{id}", MESH),

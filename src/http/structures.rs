@@ -13,9 +13,9 @@ use utoipa::ToSchema;
 use super::delivery;
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
-use super::openapi::bodies::{StructureFile, StructureForm};
-use super::openapi::meshes::{Addressed, NotModified};
-use super::openapi::parameters::{Coding, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
+use super::openapi::bodies::StructureFile;
+use super::openapi::meshes::{Addressed, NotModified, Reported};
+use super::openapi::parameters::{Coding, MeshParameters, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
 use super::openapi::problems::{ASKING, BODY, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
@@ -32,56 +32,73 @@ const MAX_CHAINS: usize = 1000;
 
 /// Contents of a structure.
 #[derive(Debug, Serialize, ToSchema)]
+#[schema(example = json!({
+    "digest": "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087", "bytes": 71_928, "format": "pdb",
+    "id": "4PTI", "title": "THE GEOMETRY OF THE REACTIVE SITE", "atoms": 514, "models": [1], "model": 1,
+    "atoms_in_model": { "polymer": 454, "ligand": 0, "water": 60, "hydrogens": 0, "virtual_sites": 0 },
+    "alternatives": 0, "unknown_elements": 0, "warnings": [], "chain_count": 1,
+    "chains": [{
+        "name": "A", "atoms": 514,
+        "of": { "polymer": 454, "ligand": 0, "water": 60, "hydrogens": 0, "virtual_sites": 0 },
+    }],
+    "surface": "/v1/structures/edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087/surface.glb",
+}))]
 pub(super) struct StructureDocument {
-    /// SHA-256 of the uploaded bytes.
+    /// SHA-256 digest of the bytes as uploaded, in hexadecimal. Identifies the structure.
     digest: String,
-    /// Size of the upload, bytes.
+    /// Size of the file as uploaded, in bytes.
     bytes: usize,
-    /// `pdb`, `mmcif` or `bcif`.
+    /// File format: `pdb`, `mmcif` or `bcif`.
     format: &'static str,
-    /// PDB id or data block name.
+    /// PDB id or data block name; null if the file has none.
     #[schema(required)]
     id: Option<String>,
-    /// Title.
+    /// Title; null if the file has none.
     #[schema(required)]
     title: Option<String>,
-    /// Number of atoms in all models.
+    /// Atoms in all models.
     atoms: u64,
-    /// Numbers of the models.
+    /// Model numbers.
     models: Vec<i32>,
-    /// Model that the counts refer to.
+    /// Number of the model that the counts below refer to.
     model: i32,
+    /// Atoms of the model by kind.
     atoms_in_model: KindCounts,
     /// Number of atoms with alternative locations.
     alternatives: u64,
     /// Number of atoms of unknown elements.
     unknown_elements: u64,
-    /// Unreadable values that do not affect the mesh, at most 12.
+    /// Unreadable values that do not affect a mesh, at most 12.
     warnings: Vec<String>,
     /// Number of chains.
     chain_count: usize,
-    /// First 1000 chains.
+    /// The first 1,000 chains.
     chains: Vec<ChainDocument>,
-    /// Address of a mesh.
+    /// Path of the mesh with default parameters.
     surface: String,
 }
 
 /// Chain of a structure.
 #[derive(Debug, Serialize, ToSchema)]
 struct ChainDocument {
-    /// Name by the author.
+    /// Name given by the author.
     name: String,
     /// Number of atoms.
     atoms: u64,
+    /// Atoms by kind.
     of: KindCounts,
 }
 
-/// Numbers of atoms by kind.
+/// Numbers of atoms by kind. Hydrogens are counted apart from the heavy atoms of their residues.
 #[derive(Debug, Serialize, ToSchema)]
 struct KindCounts {
+    /// Heavy atoms of polymers.
     polymer: u64,
+    /// Heavy atoms of ligands.
     ligand: u64,
+    /// Heavy atoms of water.
     water: u64,
+    /// Hydrogen atoms.
     hydrogens: u64,
     /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
     virtual_sites: u64,
@@ -105,17 +122,22 @@ refusals!(SurfaceRefusals: [
     PARAMETERS, READING, MESHING, ASKING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
 ]);
 
-/// Stores a structure.
+/// Upload a structure
+///
+/// Stores a structure, so that it can be meshed several times without another upload. Uploading the same bytes again
+/// returns 200 and the same digest.
 #[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure", params(Coding),
-    request_body(description = "The structure.", content(
-        (StructureFile = "application/octet-stream"), (StructureFile = "chemical/x-pdb"),
-        (StructureFile = "chemical/x-mmcif"), (StructureForm = "multipart/form-data"),
-    )),
+    request_body(
+        content = StructureFile,
+        description = "A structure file, or `multipart/form-data` with the file in the field `file`.",
+        content_type = "application/octet-stream",
+    ),
     responses(
-        (status = 201, description = "It is kept now.", body = StructureDocument,
-            headers(("Location" = String, description = "The structure's address."))),
-        (status = 200, description = "It was there already.", body = StructureDocument,
-            headers(("Location" = String, description = "The structure's address."))),
+        (status = 201, description = "The structure was stored.", body = StructureDocument,
+            headers(("Location" = String, description = "Path of the structure.")),
+            links(("mesh" = (operation_id = "meshStructure", parameters(("digest" = "$response.body#/digest")))))),
+        (status = 200, description = "The structure was already stored.", body = StructureDocument,
+            headers(("Location" = String, description = "Path of the structure."))),
         CreateRefusals,
     ))]
 pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
@@ -144,13 +166,13 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     Ok((status, [(header::LOCATION, location)], Json(summary)).into_response())
 }
 
-/// Describes a stored structure.
+/// Get the contents of a structure
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
     params(StructurePath, Unchanged),
     responses(
-        (status = 200, description = "What the structure holds.", body = StructureDocument, headers(
-            ("ETag" = String, description = "The digest."),
-            ("Cache-Control" = String, description = "How long the answer stays good."),
+        (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(
+            ("ETag" = String, description = "Strong validator of the document."),
+            ("Cache-Control" = String, description = "Caching rules."),
         )),
         NotModified, ShowRefusals,
     ))]
@@ -163,7 +185,9 @@ pub(super) async fn show(
     source.document(&app, &headers, write).await
 }
 
-/// Meshes a stored structure.
+/// Mesh an uploaded structure
+///
+/// The path names the format, so that the response can be cached and linked to.
 #[utoipa::path(
     get,
     path = "/v1/structures/{digest}/{file}",
@@ -173,6 +197,29 @@ pub(super) async fn show(
     responses(Addressed, SurfaceRefusals)
 )]
 pub(super) async fn surface(
+    State(app): State<Shared>,
+    method: Method,
+    headers: HeaderMap,
+    request: MeshRequest,
+) -> Result<Response, Problem> {
+    request.answer(&app, &method, &headers).await
+}
+
+refusals!(ReportRefusals: [
+    PARAMETERS, READING, MESHING,
+    [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+]);
+
+/// Mesh an uploaded structure and return the report
+#[utoipa::path(
+    get,
+    path = "/v1/structures/{digest}/report.json",
+    tag = "meshes",
+    operation_id = "reportStructure",
+    params(StructurePath, MeshParameters),
+    responses(Reported, ReportRefusals)
+)]
+pub(super) async fn report(
     State(app): State<Shared>,
     method: Method,
     headers: HeaderMap,

@@ -57,8 +57,6 @@ pub struct Request {
     pub job: Job,
     /// The mesh format, if one was named.
     pub format: Option<Format>,
-    /// The report as JSON was asked for.
-    pub report: bool,
     /// A strict check of the file was asked for.
     pub strict: bool,
 }
@@ -228,7 +226,6 @@ fn set(
         "compress" => request.job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
         "normals" => request.job.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
         "units" => request.job.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
-        "report" => request.report = (text == "json").then_some(true).ok_or_else(bad)?,
         _ => return Err(unknown(parameter.name)),
     }
     Ok(())

@@ -1,4 +1,4 @@
-//! The report of a job: what was read, which grid, what the mesh is, how long each stage took.
+//! Report of a job: input, grid, mesh, measures and times.
 
 use serde::Serialize;
 use serde_json::{Map, Value};
@@ -10,17 +10,17 @@ use crate::picture::{Drawer, PictureParams, Rendered};
 use crate::structure::{LeftOut, Selected, Structure, radii};
 use crate::surface::{Component, GridStats, Measures, Served};
 
-/// One connected component.
+/// Connected component of the mesh.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct ComponentReport {
-    /// Its triangles.
+    /// Number of triangles.
     pub triangles: u64,
-    /// Its vertices.
+    /// Number of vertices.
     pub vertices: u64,
-    /// Å².
+    /// Area in Å².
     pub area: f64,
-    /// Å³, negative for a void.
+    /// Volume in Å³, negative for a void.
     pub volume: f64,
 }
 
@@ -30,55 +30,54 @@ impl ComponentReport {
     }
 }
 
-/// A void: a closed surface whose inside is outside the molecule. No probe has tested whether a solvent molecule fits:
-/// most are gaps between atoms.
+/// Void: a closed surface that encloses space outside the molecule. Most voids are gaps between atoms; no probe has
+/// tested whether a solvent molecule fits.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct VoidReport {
-    /// Centroid of its volume in the coordinates of the structure, Å.
+    /// Centroid in the coordinates of the structure, in Å.
     pub center: [f64; 3],
-    /// Å³.
+    /// Volume in Å³.
     pub volume: f64,
-    /// Å².
+    /// Area in Å².
     pub area: f64,
 }
 
 impl VoidReport {
-    /// `centre`: that of the mesh in the coordinates of the structure, Å.
+    /// Converts a component. `centre` is the centre of the mesh in the coordinates of the structure, in Å.
     fn new(void: &Component, centre: [f64; 3]) -> Self {
         let centroid = void.centroid();
         Self { center: std::array::from_fn(|k| centre[k] + centroid[k]), volume: -void.volume, area: void.area }
     }
 }
 
-/// Atoms under one residue name.
+/// Number of atoms with one residue name.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct ResidueCount {
-    /// Name of the residue.
+    /// Residue name.
     pub name: String,
     /// Number of atoms.
     pub atoms: u64,
 }
 
-/// Atoms of the model that are not meshed, each counted under the first reason that applies, in the order of the
-/// fields.
+/// Atoms of the model that are not meshed. Each atom is counted once, under the first field that applies.
 #[derive(Debug, Clone, Default, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct LeftOutReport {
     /// Sum of all counts below.
     pub total: u64,
-    /// Atoms of chains that were not asked for.
+    /// Atoms of chains that are not selected.
     pub other_chains: u64,
     /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
     pub virtual_sites: u64,
-    /// Atoms of kinds that were not asked for, by residue name; the ten most frequent names.
+    /// Atoms of kinds that are not selected, by residue name; the ten most frequent names.
     pub residues: Vec<ResidueCount>,
-    /// Atoms of kinds that were not asked for, under all other residue names.
+    /// Atoms of kinds that are not selected, all other residue names.
     pub other_residues: u64,
-    /// Hydrogen atoms of residues that are meshed.
+    /// Hydrogen atoms of meshed residues.
     pub hydrogens: u64,
-    /// Other alternative locations of residues that are meshed.
+    /// Alternative locations of meshed residues other than the selected one.
     pub alternatives: u64,
 }
 
@@ -97,44 +96,44 @@ impl LeftOutReport {
     }
 }
 
-/// How coarse the file's vertices are.
+/// Quantization of the vertices in the file.
 #[derive(Debug, Clone, Copy, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct Quantization {
-    /// Distance between neighbouring coordinates, Å; a vertex is moved by half of it at most along each axis.
+    /// Step between adjacent coordinates in Å. Rounding moves a vertex by at most half a step along each axis.
     pub step: f32,
 }
 
-/// A picture, and who drew it.
+/// Picture of a mesh and its renderer.
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct PictureReport {
-    /// Pixels of a row.
+    /// Width in pixels.
     pub width: u32,
-    /// Rows.
+    /// Height in pixels.
     pub height: u32,
-    /// From where the molecule is seen.
+    /// Viewing direction.
     pub view: &'static str,
-    /// How far the viewer has walked around from there, degrees.
+    /// Rotation of the camera about the vertical axis in degrees, applied to `view`.
     pub azimuth: f64,
-    /// How far the viewer has climbed then, degrees.
+    /// Elevation of the camera in degrees, applied after `azimuth`.
     pub elevation: f64,
-    /// What is behind the molecule: `transparent`, or a colour.
+    /// Background: `transparent` or a colour.
     pub background: String,
-    /// How the surface is shaded.
+    /// Shading style.
     pub style: &'static str,
-    /// Å that a pixel is wide and high: the projection is orthographic.
+    /// Width and height of a pixel in Å; the projection is orthographic.
     pub pixel: f64,
-    /// What drew it: `cpu` or `gpu`.
+    /// Backend that rendered the picture: `cpu` or `gpu`.
     pub renderer: &'static str,
-    /// Its arithmetic, for the key of the file.
+    /// Arithmetic of the renderer, part of the key of the file.
     #[serde(skip)]
     pub arithmetic: String,
-    /// What that ran on.
+    /// Device of the renderer.
     pub device: String,
-    /// Why it was taken.
+    /// Reason for the choice of the renderer.
     pub reason: String,
-    /// Why `renderer` stood in for the one that was chosen; absent where none had to.
+    /// Reason why `renderer` replaced the chosen one; absent if it did not.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fallback: Option<String>,
 }
@@ -169,123 +168,123 @@ impl PictureReport {
     }
 }
 
-/// A job's report. Field names are the JSON names.
+/// Report of a job: input, grid, mesh, measures and times.
 #[expect(clippy::struct_field_names, reason = "the fields are named like the members of the JSON")]
 #[derive(Debug, Clone, Serialize)]
 #[cfg_attr(feature = "server", derive(utoipa::ToSchema))]
 pub struct Report {
-    /// PDB id or data block name.
+    /// PDB id or data block name; null if the file has none.
     #[cfg_attr(feature = "server", schema(required))]
     pub id: Option<String>,
-    /// Title of the structure.
+    /// Title of the structure; null if the file has none.
     #[cfg_attr(feature = "server", schema(required))]
     pub title: Option<String>,
-    /// `pdb`, `mmcif` or `bcif`.
+    /// Format of the structure file: `pdb`, `mmcif` or `bcif`.
     pub source_format: &'static str,
-    /// Atoms meshed.
+    /// Meshed atoms.
     pub atoms: u64,
-    /// Atoms in the file, all models.
+    /// Atoms in all models of the file.
     pub atoms_in_file: u64,
-    /// The model that was taken.
+    /// Number of the meshed model.
     pub model: i32,
     /// Atoms of the model that are not meshed.
     pub left_out: LeftOutReport,
-    /// Values of the file that could not be read and do not matter for the mesh, at most 12; absent if there are none.
+    /// Unreadable values that do not affect the mesh, at most 12; absent if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "server", schema(required = false))]
     pub warnings: Vec<String>,
-    /// The table of radii.
+    /// Table of van der Waals radii.
     pub radii: &'static str,
-    /// Kernel function.
+    /// Density kernel.
     pub kernel: &'static str,
     /// Preset.
     pub preset: &'static str,
-    /// Grid spacing, Å.
+    /// Grid spacing in Å.
     pub resolution: f64,
-    /// The parameter that the spacing follows from: `resolution` (as given, or its default), `detail` or `max_triangles`.
+    /// Parameter that set the spacing: `resolution` (given or default), `detail` or `max_triangles`.
     pub resolution_from: &'static str,
-    /// The level of detail; absent where none was asked for.
+    /// Level of detail; absent if the request sets none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub detail: Option<u8>,
-    /// Triangles asked for at most; absent where they were not bounded.
+    /// Requested maximum of triangles; absent if the request sets none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_triangles: Option<u64>,
-    /// Meshes that were made to find the spacing; absent where it was known.
+    /// Meshes computed to find the spacing; absent if the spacing was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub tries: Option<u32>,
-    /// Isovalue.
+    /// Isovalue of the density.
     pub isovalue: f64,
-    /// The Gaussian's smoothness; absent for other kernels and raw parameters.
+    /// Smoothness of the gaussian kernel; absent for other kernels and raw parameters.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub smoothness: Option<f64>,
-    /// Bricks that some atom reaches.
+    /// Grid bricks (8 × 8 × 8 points) within reach of an atom.
     pub bricks: u64,
-    /// Bricks with surface.
+    /// Bricks that contain a part of the surface.
     pub surface_bricks: u64,
-    /// Samples evaluated.
+    /// Grid points evaluated.
     pub samples: u64,
-    /// Cells that a dense grid would have had.
+    /// Cells of a dense grid over the bounding box.
     pub box_cells: u64,
-    /// Vertices.
+    /// Vertices of the mesh.
     pub vertices: u64,
-    /// Triangles.
+    /// Triangles of the mesh.
     pub triangles: u64,
-    /// No boundary.
+    /// True if the mesh has no boundary.
     pub closed: bool,
-    /// Consistent winding.
+    /// True if all triangles have consistent winding.
     pub oriented: bool,
-    /// Manifold edges and vertices.
+    /// True if all edges and vertices are manifold.
     pub manifold: bool,
-    /// How the last three were established: `checksum` or `exact`.
+    /// Method that checked `closed`, `oriented` and `manifold`: `checksum` or `exact`.
     pub validation: &'static str,
-    /// V − E + F.
+    /// Euler characteristic: vertices − edges + triangles.
     pub euler: i64,
     /// Number of connected components.
     pub components: u64,
-    /// Number of voids: components with negative volume. No probe has tested them, and most are gaps between atoms, so
-    /// their number changes with the grid spacing.
+    /// Number of voids: components with negative volume. Most are gaps between atoms, so the number depends on the grid
+    /// spacing.
     pub voids: u64,
-    /// The voids of largest volume, at most 100.
+    /// Voids with the largest volumes, at most 100.
     pub void_list: Vec<VoidReport>,
-    /// The components of largest area, at most 100.
+    /// Components with the largest areas, at most 100.
     pub component_list: Vec<ComponentReport>,
-    /// Å².
+    /// Surface area in Å², including the walls of voids.
     pub area: f64,
-    /// Å³.
+    /// Enclosed volume in Å³, voids subtracted.
     pub volume: f64,
-    /// The units of every length, area and volume in this report: `angstrom`.
+    /// Units of all lengths, areas and volumes in this report: `angstrom`.
     pub report_units: &'static str,
-    /// The units of the file's coordinates: `angstrom`, `nanometer` or `meter`.
+    /// Units of the coordinates in the mesh file: `angstrom`, `nanometer` or `meter`.
     pub file_units: &'static str,
-    /// The normals of the file's vertices: `smooth` or `none`.
+    /// Vertex normals in the mesh file: `smooth` or `none`.
     pub normals: &'static str,
-    /// How coarse the file's vertices are; absent where they are not quantised.
+    /// Quantization of the vertices in the mesh file; absent if they are not quantized.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub quantization: Option<Quantization>,
-    /// The backend that ran.
+    /// Backend that computed the mesh: `cpu` or `gpu`.
     pub backend: &'static str,
-    /// Its arithmetic, for the key of the file.
+    /// Arithmetic of the backend, part of the key of the file.
     #[serde(skip)]
     pub arithmetic: String,
-    /// What it ran on.
+    /// Device of the backend.
     pub device: String,
-    /// Why it was taken.
+    /// Reason for the choice of the backend.
     pub backend_reason: String,
-    /// Why `backend` stood in for the one that was chosen; absent where none had to.
+    /// Reason why `backend` replaced the chosen one; absent if it did not.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fallback: Option<String>,
-    /// The picture; absent where the mesh itself was asked for.
+    /// Picture; absent if the request asks for a mesh.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub picture: Option<PictureReport>,
-    /// Wall time per stage, ms.
+    /// Wall-clock time per stage in ms.
     #[cfg_attr(feature = "server", schema(value_type = std::collections::BTreeMap<String, f64>))]
     pub timings_ms: Map<String, Value>,
 }
 
-/// What a report counts, and who made it.
+/// Counts of a report and the backend that ran.
 pub(super) struct Counts {
     pub(super) resolution: f64,
-    /// The mesh's centre in the coordinates of the structure, Å.
+    /// Centre of the mesh in the coordinates of the structure, in Å.
     pub(super) centre: [f64; 3],
     pub(super) tries: Option<u32>,
     pub(super) grid: GridStats,
@@ -371,20 +370,20 @@ impl Report {
         }
     }
 
-    /// Adds time to a stage that ran after the job, or went on after it, such as `encode` and `write`.
+    /// Adds time in ms to a stage that ends after the job, such as `encode` and `write`.
     pub fn add_timing(&mut self, stage: &str, ms: f64) {
         let before = self.timings_ms.get(stage).and_then(Value::as_f64).unwrap_or_default();
         self.timings_ms.insert(stage.to_owned(), Value::from(((before + ms) * 1e3).round() / 1e3));
     }
 
-    /// Arithmetic of the file, as in its key: that of the mesh, followed by that of the picture.
+    /// Returns the arithmetic of the file, as in its key: that of the mesh, followed by that of the picture.
     #[must_use]
     pub fn maker(&self) -> String {
         maker(&self.arithmetic, self.picture.as_ref().map(|picture| picture.arithmetic.as_str()))
     }
 
-    /// The report as a mesh file's extras: without what differs from run to run, so that the same input gives
-    /// the same bytes, and without what describes the input rather than the mesh.
+    /// Returns the report as the extras of a mesh file, without fields that differ between runs (the same input gives
+    /// the same bytes) or describe the input rather than the mesh.
     #[must_use]
     pub fn extras(&self) -> Map<String, Value> {
         let Ok(Value::Object(mut map)) = serde_json::to_value(self) else { return Map::new() };
@@ -395,7 +394,7 @@ impl Report {
     }
 }
 
-/// Arithmetic of a file: that of its mesh, followed by that of its picture.
+/// Returns the arithmetic of a file: that of its mesh, followed by that of its picture.
 #[must_use]
 pub fn maker(mesh: &str, picture: Option<&str>) -> String {
     picture.map_or_else(|| mesh.to_owned(), |picture| format!("{mesh}+{picture}"))

@@ -258,11 +258,11 @@ fn the_command_line_quantises_on_a_device() {
 }
 
 /// POSTs the sample to a running service and returns the body of the response.
-fn post(addr: &str, query: &str) -> Vec<u8> {
+fn post(addr: &str, target: &str) -> Vec<u8> {
     let body = sample();
     let mut stream = TcpStream::connect(addr).unwrap();
     let head = format!(
-        "POST /v1/meshes?{query} HTTP/1.1\r\nhost: {addr}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n",
+        "POST /v1/{target} HTTP/1.1\r\nhost: {addr}\r\ncontent-length: {}\r\nconnection: close\r\n\r\n",
         body.len()
     );
     stream.write_all(head.as_bytes()).unwrap();
@@ -279,18 +279,18 @@ fn a_service_quantises_on_a_device() {
     let folder = Folder::new();
     let service = Service::start(&folder, &ON_SOFTWARE);
     let query = "compress=quantize&resolution=0.5";
-    let file = post(&service.addr, query);
+    let file = post(&service.addr, &format!("meshes?{query}"));
     let (extras, bin) = contents(&file);
     assert_eq!(extras["backend"], "gpu");
     let expected = made(&devices(1), &job(&[("resolution", "0.5")]));
     assert!(contents(&glb(&expected)).1 == bin);
-    let report: Value = serde_json::from_slice(&post(&service.addr, &format!("{query}&report=json"))).unwrap();
+    let report: Value = serde_json::from_slice(&post(&service.addr, &format!("report?{query}"))).unwrap();
     let [area, volume] = measured(&file);
     assert!(
         near(report["area"].as_f64().unwrap(), area, 3e-6) && near(report["volume"].as_f64().unwrap(), volume, 3e-6)
     );
     // Without the parameter the result is different.
-    let plain = post(&service.addr, "resolution=0.5");
+    let plain = post(&service.addr, "meshes?resolution=0.5");
     assert!(plain.len() as u64 > file.len() as u64 + 11 * expected.report.vertices);
 }
 

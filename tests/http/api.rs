@@ -70,8 +70,7 @@ fn a_plain_curl_upload_is_meshed_by_the_real_backend() {
 
 #[test]
 fn the_report_is_returned_instead_of_the_mesh() {
-    let reply =
-        SERVER.post("/v1/meshes?report=json&kernel=soft-object&isovalue=1.5", &[("accept", "text/html")], SAMPLE);
+    let reply = SERVER.post("/v1/report?kernel=soft-object&isovalue=1.5", &[("accept", "text/html")], SAMPLE);
     assert_eq!(reply.status, 200);
     assert_eq!(reply.header("content-type"), Some("application/json"));
     assert_eq!(reply.header("etag"), None);
@@ -112,7 +111,9 @@ fn formats_are_negotiated() {
         ("", "image/png", 200, "image/png"),
         ("?format=png", "model/stl", 200, "image/png"),
         ("", "image/webp", 406, "application/problem+json"),
-        ("", "application/json", 406, "application/problem+json"),
+        ("", "application/json", 200, "model/gltf-binary"),
+        ("", "application/octet-stream", 200, "application/octet-stream"),
+        ("", "application/problem+json", 200, "model/gltf-binary"),
     ] {
         let headers: &[(&str, &str)] = if accept.is_empty() { &[] } else { &[("accept", accept)] };
         let reply = SERVER.post(&format!("/v1/meshes{query}"), headers, SAMPLE);
@@ -259,7 +260,6 @@ fn errors_name_bad_parameters_and_expected_values() {
         ("select=hydrogens", "select", None),
         ("altloc=AB", "altloc", None),
         ("format=usdz", "format", None),
-        ("report=xml", "report", None),
         ("check=lax", "check", None),
         ("validation=trust", "validation", None),
         ("compress=draco", "compress", None),
@@ -325,7 +325,7 @@ fn only_glb_and_gltf_are_quantised() {
     let text = server.post("/v1/meshes?compress=quantize&format=gltf", &[], SAMPLE);
     assert_eq!(document(&text.body)["extensionsRequired"][0], "KHR_mesh_quantization");
     assert_eq!(document(&plain.body).get("extensionsRequired"), None);
-    let report = server.post("/v1/meshes?compress=quantize&report=json", &[], SAMPLE).json();
+    let report = server.post("/v1/report?compress=quantize", &[], SAMPLE).json();
     assert_eq!(report["quantization"]["step"], step);
     let entry = server.get("/v1/pdb/4pti/surface.glb?compress=quantize");
     assert!(entry.body == small.body);
@@ -393,10 +393,10 @@ fn a_strict_check_reports_the_findings_of_the_strict_validator() {
     let problem = SERVER.post("/v1/meshes?check=strict", &[], &bad).problem(422, "unreadable-structure");
     assert!(!problem["diagnostics"].as_array().unwrap().is_empty(), "{problem}");
     let cif = include_bytes!("../../samples/1crn.cif");
-    let reply = SERVER.post("/v1/meshes?check=strict&report=json", &[], cif);
+    let reply = SERVER.post("/v1/report?check=strict", &[], cif);
     assert_eq!(reply.status, 200, "{}", reply.text());
     assert!(reply.json()["diagnostics"].is_array());
-    assert!(SERVER.post("/v1/meshes?report=json", &[], cif).json().get("diagnostics").is_none());
+    assert!(SERVER.post("/v1/report", &[], cif).json().get("diagnostics").is_none());
 }
 
 #[test]
@@ -419,12 +419,12 @@ fn binarycif_is_accepted_wherever_text_is() {
     let order = br#"{"pdb_id": "1crn", "resolution": 1, "format": "stl"}"#;
     let reply = SERVER.post("/v1/meshes", &[("content-type", "application/json")], order);
     assert!(reply.status == 200 && reply.body == expected, "{}", reply.status);
-    assert_eq!(SERVER.get("/v1/pdb/1crn/surface.glb?report=json").json()["source_format"], "bcif");
+    assert_eq!(SERVER.get("/v1/pdb/1crn/report.json").json()["source_format"], "bcif");
     // As an uploaded structure.
     let kept = SERVER.post("/v1/structures", &[], CRAMBIN);
     assert_eq!((kept.status, &kept.json()["format"], &kept.json()["id"]), (201, &"bcif".into(), &"1CRN".into()));
-    // The strict reader does not support the format, and reports it.
-    let report = SERVER.post("/v1/meshes?check=strict&report=json", &[], CRAMBIN).json();
+    // The strict validator does not support the format, and reports it.
+    let report = SERVER.post("/v1/report?check=strict", &[], CRAMBIN).json();
     assert!(report.to_string().contains("does not read BinaryCIF"), "{report}");
     // An invalid file: the problem contains the position.
     let problem = SERVER.post("/v1/meshes", &[], &CRAMBIN[..CRAMBIN.len() / 2]).problem(422, "unreadable-structure");
@@ -462,7 +462,7 @@ fn archive_entries_are_cacheable_by_url() {
         assert_eq!((other.status, other.header("content-type")), (200, Some(media_type)));
         assert_ne!(other.header("etag"), Some(etag));
     }
-    assert_eq!(SERVER.get("/v1/pdb/4pti/surface.glb?report=json").json()["atoms"], 454);
+    assert_eq!(SERVER.get("/v1/pdb/4pti/report.json").json()["atoms"], 454);
     SERVER.get("/v1/pdb/1abc/surface.glb").problem(404, "not-in-archive");
     SERVER.get("/v1/pdb/4pti/surface.usdz").problem(404, "not-found");
     SERVER.get("/v1/pdb/4pti/volume.glb").problem(404, "not-found");

@@ -216,7 +216,6 @@ fn canonical_texts_differ_exactly_if_the_jobs_differ() {
         &[("kernel", "gaussian"), ("preset", "default")],
         &[("select", "polymer")],
         &[("format", "stl")],
-        &[("report", "json")],
         &[("compress", "none")],
         &[("normals", "smooth")],
         &[("units", "angstrom")],

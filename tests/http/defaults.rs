@@ -1,12 +1,14 @@
 //! Generated clients send every default of the API description. The answer must equal that without them.
 
 use crate::http_support;
+use crate::openapi_support;
 
 use std::collections::BTreeMap;
 
 use http_support::{Fake, Mode, Reply, Running, SAMPLE, start};
 use molmesh::formats::Format;
 use molmesh::pipeline::params::{self, ParamError, TABLE};
+use openapi_support::resolved;
 use serde_json::{Map, Value};
 
 /// Starts a server with an archive entry. Returns it with its API description.
@@ -22,8 +24,9 @@ fn server() -> (Running, Value) {
 /// Returns the declared defaults of an operation's query, with `format` instead of the default format.
 fn query(description: &Value, method: &str, path: &str, format: Option<&str>) -> Vec<(String, String)> {
     let parameters = description["paths"][path][method]["parameters"].as_array().unwrap();
-    let of_query = parameters.iter().filter(|p| p["in"] == "query");
-    let pairs = of_query.filter_map(|p| Some((p["name"].as_str()?.to_owned(), text(p["schema"].get("default")?))));
+    let of_query = parameters.iter().map(|p| resolved(description, p)).filter(|p| p["in"] == "query");
+    let default = |schema| resolved(description, schema).get("default");
+    let pairs = of_query.filter_map(|p| Some((p["name"].as_str()?.to_owned(), text(default(&p["schema"])?))));
     let pairs = pairs.map(|(name, value)| {
         let value = format.filter(|_| name == "format").map_or(value, str::to_owned);
         (name, value)
@@ -31,13 +34,10 @@ fn query(description: &Value, method: &str, path: &str, format: Option<&str>) ->
     pairs.collect()
 }
 
-/// Returns the declared defaults of a request body.
-fn body(description: &Value, media_type: &str, format: &str) -> Map<String, Value> {
-    let schema = &description["paths"]["/v1/meshes"]["post"]["requestBody"]["content"][media_type]["schema"];
-    let schema = schema["$ref"].as_str().map_or(schema, |at| description.pointer(&at[1..]).unwrap());
-    // A JSON document names an entry or a structure; both schemas have the same parameters.
-    let properties = schema.get("oneOf").map_or(schema, |one_of| &one_of[0])["properties"].as_object().unwrap();
-    let defaults = properties.iter().filter_map(|(name, p)| Some((name.clone(), p.get("default")?.clone())));
+/// Returns the declared defaults as members of a JSON document.
+fn body(description: &Value, format: &str) -> Map<String, Value> {
+    let schema = |name: &str| resolved(description, &description["components"]["parameters"][name]["schema"]).clone();
+    let defaults = TABLE.iter().filter_map(|p| Some((p.name.to_owned(), schema(p.name).get("default")?.clone())));
     let mut defaults: Map<String, Value> = defaults.collect();
     assert!(defaults.len() > 10, "{defaults:?}");
     defaults.insert("format".to_owned(), format.into());
@@ -81,13 +81,13 @@ fn sending_all_defaults_changes_nothing() {
             let path = format!("{path}/surface.{format}");
             same(&server.get(&address(&path, &defaults)), &plain);
         }
-        let mut document = body(&description, "application/json", format);
+        let mut document = body(&description, format);
         document.insert("pdb_id".to_owned(), "4pti".into());
         same(&server.post("/v1/meshes", &json, Value::Object(document).to_string().as_bytes()), &plain);
         let field = |(name, value): (&str, String)| {
             format!("--b\r\ncontent-disposition: form-data; name=\"{name}\"\r\n\r\n{value}\r\n")
         };
-        let fields = body(&description, "multipart/form-data", format);
+        let fields = body(&description, format);
         let mut parts: String = fields.iter().map(|(name, value)| field((name, text(value)))).collect();
         parts.push_str(&field(("file", String::from_utf8(SAMPLE.to_vec()).unwrap())));
         parts.push_str("--b--\r\n");
@@ -113,7 +113,7 @@ fn sending_all_defaults_changes_nothing() {
 fn read(pairs: &[(&str, &str)], format: Format) -> Result<String, ParamError> {
     let mut request = params::parse(pairs.iter().copied())?;
     params::settle(&mut request.job, format)?;
-    Ok(format!("{} {} {}", params::canonical(&request.job), request.report, request.strict))
+    Ok(format!("{} {}", params::canonical(&request.job), request.strict))
 }
 
 #[test]
@@ -145,7 +145,6 @@ fn a_default_is_valid_with_every_parameter() {
         &[("altloc", "B")],
         &[("validation", "exact")],
         &[("check", "strict")],
-        &[("report", "json")],
         &[("compress", "quantize")],
         &[("normals", "none")],
         &[("units", "meter")],

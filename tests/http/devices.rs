@@ -173,7 +173,7 @@ fn fallbacks_are_reported_in_response_report_log_and_metrics() {
         (well.header("molmesh-backend"), well.header("molmesh-backend-reason")),
         (Some("gpu"), Some("set by a test"))
     );
-    let report = server.post("/v1/meshes?report=json", &[], SAMPLE).json();
+    let report = server.post("/v1/report", &[], SAMPLE).json();
     assert_eq!((&report["device"], report.get("fallback")), (&"card 1".into(), None));
 
     *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
@@ -187,7 +187,7 @@ fn fallbacks_are_reported_in_response_report_log_and_metrics() {
     assert_eq!(again.header("molmesh-backend"), Some("gpu"), "the result of the fallback is not reused");
     assert_ne!(fallback.header("etag"), again.header("etag"), "different bytes with the same ETag");
     *backend.fallback_reason.lock().unwrap() = Some("the card is on fire 7431");
-    let report = server.post("/v1/meshes?report=json", &[], &other).json();
+    let report = server.post("/v1/report", &[], &other).json();
     assert_eq!((&report["backend"], &report["fallback"]), (&"cpu".into(), &"the card is on fire 7431".into()));
     assert_eq!(report["device"], "the processor");
     assert_eq!(log_lines("on fire 7431").len(), 2);
@@ -239,7 +239,7 @@ fn devices_are_counted_and_their_loss_is_logged_once() {
     backend.second_is_down.store(true, Ordering::SeqCst);
     let lines = log_lines("device lost by a test").len();
     for _ in 0..3 {
-        assert_eq!(server.post("/v1/meshes?report=json", &[], SAMPLE).status, 200);
+        assert_eq!(server.post("/v1/report", &[], SAMPLE).status, 200);
     }
     // The response is sent before the job is counted.
     wait_for("the log", || log_lines("device lost by a test").len() > lines);

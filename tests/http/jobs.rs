@@ -89,7 +89,7 @@ fn a_request_that_exceeds_its_wait_becomes_a_job_and_its_work_continues() {
     assert_eq!(backend.started.load(Ordering::SeqCst), 1, "the work continued");
     assert!(!result(&server, &job).body.is_empty());
     // A report cannot be the result of a job, and a mesh in time is returned directly.
-    for (path, wait) in [("/v1/meshes?report=json", "wait=0"), ("/v1/meshes", "wait=50")] {
+    for (path, wait) in [("/v1/report", "wait=0"), ("/v1/meshes", "wait=50")] {
         assert_eq!(server.post(path, &[("prefer", wait)], &sample(3)).status, 200, "{path} {wait}");
     }
 }
@@ -109,7 +109,7 @@ fn a_request_without_a_preference_is_answered_in_time_or_rejected() {
     assert!(detail.contains("`Prefer: respond-async`"), "{detail}");
     wait_for("its work to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 1);
     // A report has no asynchronous form to recommend.
-    let detail = refused("/v1/meshes?report=json");
+    let detail = refused("/v1/report");
     assert!(!detail.contains("Prefer"), "{detail}");
     wait_for("its work to be cancelled", || backend.cancelled.load(Ordering::SeqCst) == 2);
     // A shared job continues.

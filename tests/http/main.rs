@@ -33,6 +33,7 @@ mod jobs_durable;
 mod lifecycle;
 mod limits;
 mod openapi;
+mod openapi_clients;
 mod openapi_statuses;
 mod pictures;
 mod ready;

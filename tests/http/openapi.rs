@@ -1,17 +1,19 @@
-//! The description of the interface: it is the committed one, it has the routes that there are and the parameters that are
-//! read, and the page that shows it needs nobody else. `MOLMESH_BLESS=1 cargo test --test http openapi` writes it anew.
+//! The OpenAPI document: it equals the committed file, lists all routes and parameters, and passes validators.
+//! `MOLMESH_BLESS=1 cargo test --test http openapi` writes the file.
 
 use crate::http_support;
 use crate::openapi_support;
+use crate::tools;
 
 use std::collections::BTreeSet;
 use std::io::Read as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::sync::LazyLock;
 
 use http_support::{Fake, Mode, Running, send, start};
-use molmesh::pipeline::params::TABLE;
-use openapi_support::operations;
+use molmesh::pipeline::params::{Domain, TABLE};
+use openapi_support::{operations, resolved};
 use serde_json::{Value, json};
 
 static SERVER: LazyLock<Running> = LazyLock::new(|| start(Fake::new(Mode::Octahedra), |_| {}));
@@ -19,7 +21,21 @@ static DESCRIPTION: LazyLock<Value> = LazyLock::new(|| SERVER.get("/openapi.json
 
 const ROUTER: &str = include_str!("../../src/http/router.rs");
 
-/// The operations of the table of contents: `.route("path", get(…).delete(…))`.
+/// Routes outside the document: the web page, the document itself and the page that shows it.
+const PAGES: [&str; 10] = [
+    "/",
+    "/assets/{file}",
+    "/docs",
+    "/docs.js",
+    "/molmesh-viewer.js",
+    "/openapi.json",
+    "/openapi.yaml",
+    "/sample.pdb",
+    "/swagger-ui-bundle.js",
+    "/swagger-ui.css",
+];
+
+/// Returns the operations of the router: `.route("path", get(…).delete(…))`.
 fn routes(source: &str) -> BTreeSet<String> {
     let mut found = BTreeSet::new();
     for line in source.lines().filter_map(|line| line.trim().strip_prefix(".route(\"")) {
@@ -51,22 +67,27 @@ fn the_committed_description_is_what_the_code_says() {
     let first = committed.lines().zip(served.lines()).position(|(a, b)| a != b);
     assert!(
         committed == served,
-        "openapi.yaml differs from line {} on; MOLMESH_BLESS=1 cargo test --test http openapi writes it anew",
+        "openapi.yaml differs from line {} on; MOLMESH_BLESS=1 cargo test --test http openapi writes it",
         first.map_or_else(|| committed.lines().count().min(served.lines().count()) + 1, |n| n + 1)
     );
     assert!(served.starts_with("openapi: 3.1.0\n"), "{}", &served[..40]);
+    assert!(served.len() < 160_000, "{} bytes", served.len());
     assert_eq!(DESCRIPTION["openapi"], "3.1.0");
     assert_eq!(DESCRIPTION["info"]["version"], env!("CARGO_PKG_VERSION"));
 }
 
 #[test]
 fn the_description_has_the_routes_that_there_are() {
-    let routes = routes(ROUTER);
-    assert!(routes.len() > 20, "{routes:?}");
+    let mut routes = routes(ROUTER);
+    for page in PAGES {
+        assert!(routes.remove(&format!("GET {page}")), "{page}");
+    }
+    assert!(routes.len() > 15, "{routes:?}");
     assert_eq!(described(&DESCRIPTION), routes);
     // The control: a route or a method that only one of the two has.
     let more = ROUTER.replace("get(jobs::show).delete(jobs::dismiss)", "get(jobs::show).patch(jobs::dismiss)");
-    let more = self::routes(&more);
+    let mut more = self::routes(&more);
+    more.retain(|operation| !PAGES.contains(&operation.trim_start_matches("GET ")));
     let differing: Vec<_> = more.symmetric_difference(&described(&DESCRIPTION)).cloned().collect();
     assert_eq!(differing, ["DELETE /v1/jobs/{id}", "PATCH /v1/jobs/{id}"]);
     // And the router says the same of itself.
@@ -81,20 +102,27 @@ fn the_description_has_the_routes_that_there_are() {
 #[test]
 fn the_parameters_are_those_of_the_table() {
     let names = |method: &str, path: &str| -> Vec<String> {
-        let parameters = DESCRIPTION["paths"][path][method]["parameters"].as_array().unwrap().clone();
-        let of_query = parameters.iter().filter(|p| p["in"] == "query");
+        let parameters = DESCRIPTION["paths"][path][method]["parameters"].as_array().unwrap();
+        let of_query = parameters.iter().map(|p| resolved(&DESCRIPTION, p)).filter(|p| p["in"] == "query");
         of_query.map(|p| p["name"].as_str().unwrap().to_owned()).collect()
     };
     let all: Vec<&str> = TABLE.iter().map(|p| p.name).collect();
     let without_format: Vec<&str> = all.iter().copied().filter(|name| *name != "format").collect();
     assert_eq!(names("post", "/v1/meshes"), all);
     assert_eq!(names("post", "/v1/estimate"), all);
+    assert_eq!(names("post", "/v1/report"), all);
     assert_eq!(names("get", "/v1/pdb/{id}/{file}"), without_format);
     assert_eq!(names("get", "/v1/structures/{digest}/{file}"), without_format);
-    let parameters = DESCRIPTION["paths"]["/v1/meshes"]["post"]["parameters"].as_array().unwrap();
-    let schema = |name: &str| &parameters.iter().find(|p| p["name"] == name).unwrap()["schema"];
+    let parameter = |name: &str| &DESCRIPTION["components"]["parameters"][name];
+    let schema = |name: &str| resolved(&DESCRIPTION, &parameter(name)["schema"]);
     assert_eq!((&schema("resolution")["type"], &schema("resolution")["default"]), (&json!("number"), &json!(0.5)));
     assert_eq!(schema("format")["enum"].as_array().unwrap().len(), 6);
+    // Units and ranges are in the text as well.
+    for p in TABLE {
+        let Domain::Number { min, max, unit } = p.domain else { continue };
+        let range = format!("Range: {}.", format!("{min} to {max} {unit}").trim());
+        assert!(parameter(p.name)["description"].as_str().unwrap().contains(&range), "{}: {range}", p.name);
+    }
 }
 
 #[test]
@@ -127,6 +155,35 @@ fn every_reference_leads_somewhere_and_every_response_says_what_it_is() {
             assert_eq!(problem, status >= 400, "{operation} {status}");
         }
     }
+}
+
+/// Runs the validators on a document: the specification, its examples, and YAML 1.1 against JSON.
+fn validated(name: &str, description: &Value, yaml: &str) -> Option<Result<(), String>> {
+    let Some(python) = tools::python_interpreter() else { return tools::missing("openapi-spec-validator") };
+    let folder = tempfile::tempdir().unwrap();
+    let files: [PathBuf; 2] = ["json", "yaml"].map(|extension| folder.path().join(format!("{name}.{extension}")));
+    std::fs::write(&files[0], description.to_string()).unwrap();
+    std::fs::write(&files[1], yaml).unwrap();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/openapi_clients/validate.py");
+    let output = Command::new(python).arg(script).args(files).output().unwrap();
+    Some(if output.status.success() { Ok(()) } else { Err(String::from_utf8_lossy(&output.stderr).into_owned()) })
+}
+
+#[test]
+fn validators_accept_the_document_its_examples_and_its_yaml() {
+    let yaml = SERVER.get("/openapi.yaml").text();
+    let Some(found) = validated("good", &DESCRIPTION, &yaml) else { return };
+    assert_eq!(found, Ok(()));
+    // The control: three documents with one error each.
+    let refused = |change: &dyn Fn(&mut Value, &mut String), words: &str| {
+        let (mut description, mut yaml) = (DESCRIPTION.clone(), yaml.clone());
+        change(&mut description, &mut yaml);
+        let error = validated("bad", &description, &yaml).unwrap().unwrap_err();
+        assert!(error.contains(words), "{words}: {error}");
+    };
+    refused(&|_, yaml| *yaml = yaml.replace("1.0e-6", "1e-6"), "YAML");
+    refused(&|d, _| d["info"] = json!({}), "title");
+    refused(&|d, _| d["components"]["schemas"]["JobDocument"]["example"]["progress"] = json!(200), "JobDocument");
 }
 
 #[test]

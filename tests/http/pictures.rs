@@ -142,7 +142,7 @@ fn parameters_that_do_not_apply_to_the_format_are_rejected() {
         ("width=100", "width"),
         ("width=512&height=30", "height"),
         ("format=stl&view=top", "view"),
-        ("report=json&style=gouraud", "style"),
+        ("format=glb&style=gouraud", "style"),
     ] {
         let problem = server.post(&format!("/v1/meshes?{query}"), &[], SAMPLE).problem(400, "bad-parameter");
         assert_eq!(problem["parameter"], parameter, "{query}: {problem}");
@@ -153,7 +153,7 @@ fn parameters_that_do_not_apply_to_the_format_are_rejected() {
     let problem = server.get("/v1/pdb/4pti/surface.jpg").problem(404, "not-found");
     assert!(problem["available"].as_array().unwrap().contains(&"surface.png".into()), "{problem}");
     // A report with a picture describes the run of the picture.
-    let report = server.post("/v1/meshes?format=png&report=json&width=32", &[], SAMPLE).json();
+    let report = server.post("/v1/report?format=png&width=32", &[], SAMPLE).json();
     assert_eq!(report["picture"]["width"], 32, "{report}");
 }
 

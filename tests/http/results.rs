@@ -180,7 +180,7 @@ fn estimates_report_the_cost_and_a_spacing_that_fits() {
         reply.json()
     };
     let fits = estimate("?resolution=1");
-    let report = server.post("/v1/meshes?resolution=1&report=json", &[], SAMPLE).json();
+    let report = server.post("/v1/report?resolution=1", &[], SAMPLE).json();
     assert_eq!((&fits["accepted"], &fits["samples"]), (&true.into(), &report["samples"]));
     let ratio = fits["triangles"].as_f64().unwrap() / report["triangles"].as_f64().unwrap();
     assert!((0.8..1.25).contains(&ratio), "{ratio}");

@@ -28,6 +28,11 @@ fn mesh(server: &Running, query: &str) -> Reply {
     good(server.post(&format!("/v1/meshes?{query}"), &[], SAMPLE))
 }
 
+/// Returns the report of the sample.
+fn reported(server: &Running, query: &str) -> Value {
+    good(server.post(&format!("/v1/report?{query}"), &[], SAMPLE)).json()
+}
+
 /// Sends the same parameter in a query, a form, a JSON document and for an archive entry.
 fn everywhere(server: &Running, name: &str, value: &Value) -> [Reply; 4] {
     let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
@@ -80,14 +85,14 @@ fn responses_report_the_chosen_spacing() {
     let number = |name: &str| bounded.header(name).unwrap().parse::<f64>().unwrap();
     assert!(number("molmesh-triangles") <= 5000.0 && number("molmesh-triangles") > 4500.0, "{bounded:?}");
     assert!(number("molmesh-resolution") > 1.0, "{bounded:?}");
-    let report = mesh(&server, "max_triangles=5000&report=json").json();
+    let report = reported(&server, "max_triangles=5000");
     assert_eq!((&report["resolution_from"], &report["max_triangles"]), (&json!("max_triangles"), &json!(5000)));
     assert_eq!(report["resolution"].to_string(), bounded.header("molmesh-resolution").unwrap());
     assert!(report["tries"].as_u64().is_some_and(|tries| (2..=8).contains(&tries)), "{report}");
-    let by_level = mesh(&server, "detail=2&report=json").json();
+    let by_level = reported(&server, "detail=2");
     assert_eq!([&by_level["resolution_from"], &by_level["detail"]], [&json!("detail"), &json!(2)]);
     assert_eq!((&by_level["resolution"], by_level.get("tries")), (&json!(1.0), None));
-    let scaled = mesh(&server, "units=nanometer&normals=none&resolution=1&report=json").json();
+    let scaled = reported(&server, "units=nanometer&normals=none&resolution=1");
     assert_eq!([&scaled["report_units"], &scaled["file_units"]], [&json!("angstrom"), &json!("nanometer")]);
     assert_eq!(scaled["normals"], "none");
     assert_eq!((&scaled["area"], &scaled["volume"]), (&by_level["area"], &by_level["volume"]), "reports stay in Å");
@@ -133,7 +138,7 @@ fn contradictory_and_impossible_parameters_are_rejected() {
         assert!(expected.contains("nanometer") && expected.contains("glb, gltf"), "{problem}");
     }
     // A report has no format.
-    mesh(&server, "units=meter&report=json");
+    reported(&server, "units=meter");
 }
 
 #[test]
@@ -200,7 +205,7 @@ fn external_readers_accept_served_files() {
     if let Some(reports) = tools::gltf_validate(&gltf.paths) {
         reports.iter().for_each(tools::GltfReport::assert_clean);
     }
-    let report = mesh(&server, "detail=2&report=json").json();
+    let report = reported(&server, "detail=2");
     let (area, volume) = (report["area"].as_f64().unwrap(), report["volume"].as_f64().unwrap());
     let Some(reports) = tools::trimesh(&all.paths) else { return };
     let plain = reports[0].bounds;

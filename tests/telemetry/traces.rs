@@ -352,7 +352,7 @@ fn server_timing_adds_up_to_the_response_time() {
     for n in 0..3 {
         let asked: [(&str, Ask); 4] = [
             ("an upload", Box::new(|| server.post("/v1/meshes?resolution=0.4", &[], &sample(n)))),
-            ("a report", Box::new(|| server.post("/v1/meshes?report=json&check=strict", &[], &sample(n)))),
+            ("a report", Box::new(|| server.post("/v1/report?check=strict", &[], &sample(n)))),
             ("an entry", Box::new(|| server.get(&format!("/v1/pdb/4pti/surface.glb?resolution=0.{}", n + 5)))),
             (
                 "a structure",

@@ -28,6 +28,4 @@ ATOM 2 C CA ALA A 2 3.0 0.0 0.0
 
 any_structure = st.one_of(st.sampled_from([PDB, CIF, gzip.compress(PDB, mtime=0)]), st.binary(max_size=200))
 schemathesis.openapi.media_type("application/octet-stream", any_structure)
-schemathesis.openapi.media_type("chemical/x-pdb", st.just(PDB))
-schemathesis.openapi.media_type("chemical/x-mmcif", st.just(CIF))
 schemathesis.openapi.format("binary", any_structure)

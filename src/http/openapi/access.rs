@@ -1,4 +1,4 @@
-//! Rights in the description: how a key is presented, which operations take one, and what they are refused with.
+//! API keys in the OpenAPI document: security schemes, the scopes of each operation and its 401, 403 and 429 responses.
 
 use utoipa::Modify;
 use utoipa::openapi::path::Operation;
@@ -12,18 +12,18 @@ use crate::access::{SIGNATURE, Scope};
 use crate::http::kinds::Kind;
 use crate::http::scopes::TABLE;
 
-/// Names of the schemes.
+/// Names of the security schemes.
 const BEARER: &str = "bearer";
 const API_KEY: &str = "apiKey";
 const SIGNED: &str = "signedAddress";
 
-/// Problems of operations that need a key.
+/// Problems of an operation that requires a scope.
 const REFUSALS: &[Kind] =
     &[Kind::KeyRequired, Kind::KeyInvalid, Kind::KeyExpired, Kind::ScopeMissing, Kind::QuotaExceeded];
-/// Further problems of signed addresses.
+/// Further problems of an operation that accepts signed URLs.
 const OF_ADDRESSES: &[Kind] = &[Kind::SignatureInvalid, Kind::SignatureExpired];
 
-/// Writes rights into the description, from the table that requests are checked with.
+/// Adds the security requirements, from the table that authorizes requests.
 pub(in crate::http) struct Rights;
 
 impl Modify for Rights {
@@ -32,15 +32,17 @@ impl Modify for Rights {
         let bearer = HttpBuilder::new()
             .scheme(HttpAuthScheme::Bearer)
             .bearer_format("mm_ID_SECRET")
-            .description(Some("A key, where the operator asks for one."))
+            .description(Some("API key, if the operator requires one."))
             .build();
         components.add_security_scheme(BEARER, SecurityScheme::Http(bearer));
-        let header =
-            ApiKeyValue::with_description("X-Api-Key", "The same key, for clients whose `Authorization` is taken.");
+        let header = ApiKeyValue::with_description(
+            "X-Api-Key",
+            "The same API key, for clients that cannot set `Authorization`.",
+        );
         components.add_security_scheme(API_KEY, SecurityScheme::ApiKey(ApiKey::Header(header)));
         let query = ApiKeyValue::with_description(
             SIGNATURE,
-            "An address that `molmesh sign` has signed, with `expires` and `key_id`: it opens by itself, until it expires.",
+            "Signature of a URL made by `molmesh sign`, beside `expires` and `key_id`. Replaces a key.",
         );
         components.add_security_scheme(SIGNED, SecurityScheme::ApiKey(ApiKey::Query(query)));
         for row in TABLE {
@@ -62,7 +64,7 @@ impl Modify for Rights {
 fn restrict(operation: &mut Operation, scope: Scope, is_get: bool) {
     let scopes = || [scope.name()];
     let nothing: [&str; 0] = [];
-    // Nothing at all is enough where the operator asks for nothing.
+    // The empty requirement: a server without keys accepts every request.
     let mut security = vec![
         SecurityRequirement::default(),
         SecurityRequirement::new(BEARER, scopes()),

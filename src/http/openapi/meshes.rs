@@ -1,16 +1,19 @@
-//! Answers with meshes in the description.
+//! Mesh responses in the OpenAPI document.
 
 use std::collections::BTreeMap;
 
-use utoipa::openapi::schema::{SchemaType, Type};
+use utoipa::openapi::link::Link;
+use utoipa::openapi::schema::Type;
 use utoipa::openapi::{
-    Content, ContentBuilder, Header, HeaderBuilder, ObjectBuilder, Ref, RefOr, Response, ResponseBuilder, Schema,
+    Content, ContentBuilder, Header, HeaderBuilder, ObjectBuilder, Ref, RefOr, Response, ResponseBuilder,
 };
 use utoipa::{IntoResponses, ToSchema};
 
+use super::bodies::binary;
 use crate::formats::Format;
 use crate::http::delivery::{PICTURE, ReportDocument, SUMMARY};
 use crate::http::jobs::JobDocument;
+use crate::http::negotiate::OCTETS;
 
 fn header(kind: Type, doc: &str) -> Header {
     HeaderBuilder::new().schema(Some(ObjectBuilder::new().schema_type(kind))).description(Some(doc)).build()
@@ -20,143 +23,153 @@ fn text(doc: &str) -> Header {
     header(Type::String, doc)
 }
 
-/// Summary headers with their descriptions, in the order of [`SUMMARY`].
-fn summary() -> impl Iterator<Item = (&'static str, Header)> {
-    let of = |name: &str| match name {
-        "molmesh-atoms" | "molmesh-vertices" | "molmesh-triangles" | "molmesh-components" | "molmesh-euler" => {
-            Type::Integer
+/// Returns the type and description of a header of [`SUMMARY`] or [`PICTURE`].
+fn summary_header(name: &str) -> Header {
+    let (kind, doc) = match name {
+        "molmesh-atoms" => (Type::Integer, "Atoms meshed."),
+        "molmesh-vertices" => (Type::Integer, "Vertices of the mesh."),
+        "molmesh-triangles" => (Type::Integer, "Triangles of the mesh."),
+        "molmesh-area" => (Type::Number, "Surface area in Å², including the walls of voids."),
+        "molmesh-volume" => (Type::Number, "Enclosed volume in Å³, voids subtracted."),
+        "molmesh-closed" => (Type::Boolean, "`true` if the mesh has no boundary."),
+        "molmesh-manifold" => (Type::Boolean, "`true` if all edges and vertices are manifold."),
+        "molmesh-euler" => (Type::Integer, "Euler characteristic: vertices − edges + triangles."),
+        "molmesh-components" => (Type::Integer, "Connected components of the mesh."),
+        "molmesh-kernel" => (Type::String, "Density kernel."),
+        "molmesh-preset" => (Type::String, "Preset."),
+        "molmesh-resolution" => (Type::Number, "Grid spacing in Å."),
+        "molmesh-resolution-from" => {
+            (Type::String, "Parameter that set the spacing: `resolution`, `detail` or `max_triangles`.")
         }
-        "molmesh-area" | "molmesh-volume" | "molmesh-resolution" | "molmesh-isovalue" => Type::Number,
-        "molmesh-closed" | "molmesh-manifold" => Type::Boolean,
-        _ => Type::String,
+        "molmesh-isovalue" => (Type::Number, "Isovalue of the density."),
+        "molmesh-radii" => (Type::String, "Table of van der Waals radii."),
+        "molmesh-backend" => (Type::String, "Backend that computed the mesh: `cpu` or `gpu`."),
+        "molmesh-backend-reason" => (Type::String, "Reason for the choice of the backend."),
+        "molmesh-renderer" => (Type::String, "Backend that rendered the picture: `cpu` or `gpu`. Pictures only."),
+        "molmesh-renderer-device" => (Type::String, "Device that rendered the picture. Pictures only."),
+        "molmesh-renderer-reason" => (Type::String, "Reason for the choice of the renderer. Pictures only."),
+        "molmesh-pixel" => (Type::Number, "Width and height of a pixel in Å. Pictures only."),
+        _ => (Type::String, "Member of the report."),
     };
-    let summary = SUMMARY.into_iter().map(move |name| {
-        let member = name.trim_start_matches("molmesh-").replace('-', "_");
-        (name, header(of(name), &format!("`{member}` of the report.")))
-    });
-    let picture = PICTURE.into_iter().map(|(name, member)| {
-        let kind = if member == "pixel" { Type::Number } else { Type::String };
-        (name, header(kind, &format!("`{member}` of the report's `picture`; a picture alone has it.")))
-    });
-    summary.chain(picture)
+    header(kind, doc)
 }
 
-/// The schema of a mesh file: bytes, of which the format's own standard says more.
-fn file() -> Content {
-    ContentBuilder::new().schema(Some(Schema::from(ObjectBuilder::new().schema_type(SchemaType::AnyValue)))).build()
+/// Adds the headers that summarize the report.
+fn summarized(response: ResponseBuilder) -> ResponseBuilder {
+    let names = SUMMARY.into_iter().chain(PICTURE.into_iter().map(|(name, _)| name));
+    names.fold(response, |response, name| response.header(name, summary_header(name)))
+}
+
+fn timed(response: ResponseBuilder) -> ResponseBuilder {
+    let doc = "Time per stage in ms; the entries add up to `total`. `cache;desc=hit` marks a stored result.";
+    response.header("Server-Timing", text(doc))
 }
 
 fn reference<T: ToSchema>() -> Content {
     ContentBuilder::new().schema(Some(Ref::from_schema_name(T::name()))).build()
 }
 
+/// Returns a response with the bytes of a mesh file. `model/*` stands for the types of GLB, glTF, STL and OBJ:
+/// generators take types that end in `+json` for JSON documents.
 fn mesh(doc: &str) -> ResponseBuilder {
+    let etag = "Strong validator of the file. Equal tags mean equal bytes.";
     let response = ResponseBuilder::new()
         .description(doc)
-        .header("Content-Disposition", text("A file name."))
+        .header("Accept-Ranges", text("`bytes`, for a stored result."))
+        .header("Cache-Control", text("Caching rules. Absent in responses to uploads."))
+        .header("Content-Disposition", text("Suggested file name."))
         .header(
-            "ETag",
-            text(
-                "The strong validator of the file: SHA-256 over input, parameters, format, arithmetic (instruction set, or \
-                 GPU and driver) and version. Equal tags mean equal bytes.",
-            ),
+            "Content-Location",
+            text("Path of the stored result: `/v1/results/{file}`. Absent if it is not stored."),
         )
-        .header(
-            "Server-Timing",
-            text(
-                "Where the time went, ms: entries add up to `total`; `cache;desc=hit` for a file that was made before.",
-            ),
-        );
-    let response = summary().fold(response, |response, (name, header)| response.header(name, header));
-    Format::ALL.iter().fold(response, |response, format| response.content(format.media_type(), file()))
+        .header("ETag", text(etag))
+        .header("Vary", text("`accept`, in responses whose media type depends on `Accept`."));
+    let file = || ContentBuilder::new().schema(Some(binary("Bytes of the file."))).build();
+    let types = Format::ALL.map(Format::media_type).into_iter();
+    let others = types.filter(|media_type| !media_type.starts_with("model/"));
+    let types = [OCTETS, "model/*"].into_iter().chain(others);
+    types.fold(summarized(timed(response)), |response, media_type| response.content(media_type, file()))
 }
 
-fn caching(response: ResponseBuilder) -> ResponseBuilder {
-    response.header("Cache-Control", text("How long the file stays good."))
+/// 200: the whole file.
+fn whole() -> RefOr<Response> {
+    let doc = "The mesh. Its media type follows from the format: `model/gltf-binary` (glb), `model/gltf+json` (gltf), \
+               `application/ply`, `model/stl`, `model/obj` or `image/png`; \
+               `application/octet-stream` if `Accept` prefers it.";
+    RefOr::T(mesh(doc).build())
 }
 
-const LOCATION: &str = "Where the same bytes are found for as long as they are kept: /v1/results/….";
-
-/// 202: a job.
-fn promised() -> RefOr<Response> {
+/// 202: a job, with links to the operations on it.
+fn accepted() -> RefOr<Response> {
+    let link = |operation: &str, doc: &str| {
+        Link::builder().operation_id(operation).parameter("id", "$response.body#/jobID").description(doc).build()
+    };
     let response = ResponseBuilder::new()
         .description("A job was accepted: the request has `Prefer: respond-async`, or `Prefer: wait=` and the mesh takes longer.")
         .content("application/json", reference::<JobDocument>())
-        .header("Location", text("The job."))
-        .header("Retry-After", header(Type::Integer, "Seconds after which asking for the job is worth it."))
-        .header("Preference-Applied", text("`respond-async`, if that was wished for."))
-        .header("Cache-Control", text("`no-store`."));
+        .header("Location", text("Path of the job."))
+        .header("Retry-After", super::problems::retry_after())
+        .header("Preference-Applied", text("`respond-async`, if the request prefers it."))
+        .link("job", link("showJob", "Status of the job."))
+        .link("events", link("watchJob", "Events of the job."))
+        .link("result", link("showJobResult", "Result of the job."))
+        .link("cancel", link("dismissJob", "Cancels the job."));
     RefOr::T(response.build())
 }
 
-/// 206: a part.
+/// 206: a part of the file.
 fn part() -> RefOr<Response> {
-    let response = caching(mesh("The part of the file that was asked for."))
-        .header("Content-Range", text("`bytes FIRST-LAST/LENGTH`."))
-        .header("Accept-Ranges", text("`bytes`."));
-    RefOr::T(response.build())
+    let response = mesh("The requested part of the file.");
+    RefOr::T(response.header("Content-Range", text("`bytes FIRST-LAST/LENGTH`.")).build())
 }
 
-/// 304: nothing.
+/// 304: the client has the current version.
 fn unchanged() -> RefOr<Response> {
     let response = ResponseBuilder::new()
-        .description("The client has it already.")
-        .header("ETag", text("The validator that holds."))
-        .header("Cache-Control", text("How long it stays good."));
+        .description("The client already has the current version.")
+        .header("ETag", text("The validator that matched."))
+        .header("Cache-Control", text("Caching rules."));
     RefOr::T(response.build())
 }
 
-/// The answers to an upload.
-pub(in crate::http) enum Uploaded {}
+/// Declares a type that describes responses by status.
+macro_rules! answers {
+    ($(#[$doc:meta])* $type:ident: $($status:literal: $response:expr),+) => {
+        $(#[$doc])*
+        pub(in crate::http) enum $type {}
 
-impl IntoResponses for Uploaded {
-    fn responses() -> BTreeMap<String, RefOr<Response>> {
-        let whole = mesh("The mesh, or its report with `report=json`.")
-            .content("application/json", reference::<ReportDocument>())
-            .header("Content-Location", text(LOCATION))
-            .header("Vary", text("`accept`."));
-        BTreeMap::from([("200".to_owned(), RefOr::T(whole.build())), ("202".to_owned(), promised())])
-    }
+        impl IntoResponses for $type {
+            fn responses() -> BTreeMap<String, RefOr<Response>> {
+                BTreeMap::from([$(($status.to_owned(), $response)),+])
+            }
+        }
+    };
 }
 
-/// The answers under an address that names a structure.
-pub(in crate::http) enum Addressed {}
+answers!(
+    /// Responses to an upload.
+    Uploaded: "200": whole(), "202": accepted()
+);
+answers!(
+    /// Responses of a path that names a structure.
+    Addressed: "200": whole(), "202": accepted(), "206": part(), "304": unchanged()
+);
+answers!(
+    /// Responses of a stored result.
+    Kept: "200": whole(), "206": part(), "304": unchanged()
+);
+answers!(
+    /// Response of a conditional request for a document.
+    NotModified: "304": unchanged()
+);
+answers!(
+    /// Response with a report.
+    Reported: "200": report()
+);
 
-impl IntoResponses for Addressed {
-    fn responses() -> BTreeMap<String, RefOr<Response>> {
-        let whole = caching(mesh("The mesh, or its report with `report=json`."))
-            .content("application/json", reference::<ReportDocument>())
-            .header("Content-Location", text(LOCATION));
-        BTreeMap::from([
-            ("200".to_owned(), RefOr::T(whole.build())),
-            ("202".to_owned(), promised()),
-            ("206".to_owned(), part()),
-            ("304".to_owned(), unchanged()),
-        ])
-    }
-}
-
-/// The answers under a result's own address.
-pub(in crate::http) enum Kept {}
-
-impl IntoResponses for Kept {
-    fn responses() -> BTreeMap<String, RefOr<Response>> {
-        let whole = caching(mesh("The file, byte for byte as it was made."))
-            .header("Content-Location", text("This address."))
-            .header("Accept-Ranges", text("`bytes`."));
-        BTreeMap::from([
-            ("200".to_owned(), RefOr::T(whole.build())),
-            ("206".to_owned(), part()),
-            ("304".to_owned(), unchanged()),
-        ])
-    }
-}
-
-/// 304, for documents.
-pub(in crate::http) enum NotModified {}
-
-impl IntoResponses for NotModified {
-    fn responses() -> BTreeMap<String, RefOr<Response>> {
-        BTreeMap::from([("304".to_owned(), unchanged())])
-    }
+fn report() -> RefOr<Response> {
+    let response = ResponseBuilder::new()
+        .description("The report. It is not cached, because its times are those of this request.")
+        .content("application/json", reference::<ReportDocument>());
+    RefOr::T(summarized(timed(response)).build())
 }

@@ -3,6 +3,7 @@
 
 pub(super) mod access;
 pub(super) mod bodies;
+pub(super) mod components;
 pub(super) mod meshes;
 pub(super) mod parameters;
 pub(super) mod problems;

@@ -1,64 +1,89 @@
-//! Parameters in the description. Those of meshes are written from the one table that requests are read with.
+//! Parameters in the OpenAPI document. Mesh parameters come from the table that the request parser uses.
 
 use serde_json::Value;
-use utoipa::IntoParams;
 use utoipa::openapi::extensions::Extensions;
 use utoipa::openapi::path::{Parameter, ParameterBuilder, ParameterIn, ParameterStyle};
 use utoipa::openapi::schema::{SchemaFormat, Type};
-use utoipa::openapi::{ArrayBuilder, KnownFormat, ObjectBuilder, Required, Schema};
+use utoipa::openapi::{ArrayBuilder, KnownFormat, ObjectBuilder, OpenApi, Ref, RefOr, Required, Schema};
+use utoipa::{IntoParams, Modify};
 
+use super::components::pascal_case;
 use crate::formats::Format;
 use crate::pipeline::params::{self, Domain, TABLE};
 
-/// Place of a value; only some places have lists.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Place {
-    /// A query, where lists are separated by commas.
-    Query,
-    /// A JSON document.
-    Json,
-    /// A form, where lists are text.
-    Form,
-}
+/// Name of the schema of `surface.{ext}`.
+const SURFACE_FILE: &str = "SurfaceFile";
 
-/// The schema of a parameter's values.
-pub(super) fn schema(parameter: &params::Parameter, place: Place) -> Schema {
-    let doc = format!("{} Default: {}.", parameter.doc, parameter.default);
-    let object = |kind: Type| ObjectBuilder::new().schema_type(kind).description(Some(doc.as_str()));
-    let words = |words: &[&str]| words.iter().map(|word| Value::from(*word)).collect::<Vec<_>>();
-    let number: Option<Value> = parameter.default.parse::<f64>().ok().map(Value::from);
-    // A form has no use for what a query's schema tells front ends.
-    let hints = if place == Place::Query { hints(parameter) } else { None };
-    match parameter.domain {
-        Domain::Number { min, max, .. } => {
-            object(Type::Number).minimum(Some(min)).maximum(Some(max)).default(number).extensions(hints).into()
-        }
-        Domain::Integer { min, max } => {
-            let wide = i32::try_from(min).is_err() || i32::try_from(max).is_err();
-            let format = SchemaFormat::KnownFormat(if wide { KnownFormat::Int64 } else { KnownFormat::Int32 });
-            object(Type::Integer).format(Some(format)).minimum(Some(min)).maximum(Some(max)).extensions(hints).into()
-        }
-        Domain::Flag => object(Type::Boolean).default(parameter.default.parse::<bool>().ok().map(Value::from)).into(),
-        Domain::Choice(values) => {
+/// Adds a named schema for each parameter with a fixed set of values, so that generators make one type of each.
+pub(in crate::http) struct Choices;
+
+impl Modify for Choices {
+    fn modify(&self, api: &mut OpenApi) {
+        let schemas = &mut api.components.get_or_insert_default().schemas;
+        let files = Format::ALL.map(|format| format!("surface.{}", format.extension()));
+        let files = ObjectBuilder::new()
+            .schema_type(Type::String)
+            .description(Some("File name of a mesh: `surface.` and the extension of the format."))
+            .enum_values(Some(files));
+        schemas.insert(SURFACE_FILE.to_owned(), RefOr::T(files.into()));
+        for parameter in TABLE {
+            let (Domain::Choice(values) | Domain::Set(values)) = parameter.domain else { continue };
             let default = values.contains(&parameter.default).then(|| Value::from(parameter.default));
-            object(Type::String).enum_values(Some(words(values))).default(default).extensions(hints).into()
-        }
-        Domain::Set(values) if place == Place::Form => {
-            let one = values.join("|");
-            object(Type::String).pattern(Some(format!("^({one})(,({one}))*$"))).into()
-        }
-        Domain::Set(values) => {
-            let item = ObjectBuilder::new().schema_type(Type::String).enum_values(Some(words(values)));
-            ArrayBuilder::new().items(item).min_items(Some(1)).description(Some(doc)).into()
-        }
-        Domain::Text { expected } => {
-            object(Type::String).min_length(Some(1)).title(Some(expected)).extensions(hints).into()
+            let is_list = matches!(parameter.domain, Domain::Set(_));
+            let object = ObjectBuilder::new()
+                .schema_type(Type::String)
+                .description(Some(parameter.doc))
+                .enum_values(Some(values.iter().map(|value| Value::from(*value))))
+                .default(default.filter(|_| !is_list));
+            schemas.insert(choice_name(parameter), RefOr::T(object.into()));
         }
     }
 }
 
-/// Hints for the controls of front ends, as `x-control`: `unit`, `usual` (the part of the bounds for a slider), `instead_of`
-/// (parameters that cannot stand beside this one), and `format` (the only one that it goes with). One member, as their order would be anybody's.
+fn choice_name(parameter: &params::Parameter) -> String {
+    // Other names are those of their parameters; this one is of an item of a list.
+    if parameter.name == "select" { "AtomKind".to_owned() } else { pascal_case(parameter.name) }
+}
+
+/// Returns the schema of a parameter's values.
+fn schema(parameter: &params::Parameter) -> RefOr<Schema> {
+    let object = |kind: Type| ObjectBuilder::new().schema_type(kind);
+    let choice = || Ref::from_schema_name(choice_name(parameter));
+    match parameter.domain {
+        Domain::Number { min, max, .. } => {
+            let default = parameter.default.parse::<f64>().ok().map(Value::from);
+            object(Type::Number).minimum(Some(min)).maximum(Some(max)).default(default).into()
+        }
+        Domain::Integer { min, max } => {
+            let wide = i32::try_from(min).is_err() || i32::try_from(max).is_err();
+            let format = SchemaFormat::KnownFormat(if wide { KnownFormat::Int64 } else { KnownFormat::Int32 });
+            object(Type::Integer).format(Some(format)).minimum(Some(min)).maximum(Some(max)).into()
+        }
+        Domain::Flag => object(Type::Boolean).default(parameter.default.parse::<bool>().ok().map(Value::from)).into(),
+        Domain::Choice(_) => RefOr::Ref(choice()),
+        Domain::Set(_) => ArrayBuilder::new().items(choice()).min_items(Some(1)).into(),
+        Domain::Text { expected } => object(Type::String).min_length(Some(1)).title(Some(expected)).into(),
+    }
+}
+
+/// Describes a parameter with its unit, range and default.
+fn describe(parameter: &params::Parameter) -> String {
+    let range = match parameter.domain {
+        Domain::Number { min, max, unit: "" } => format!(" Range: {min} to {max}."),
+        Domain::Number { min, max, unit } => format!(" Range: {min} to {max} {unit}."),
+        Domain::Integer { min, max } => format!(" Range: {min} to {max}."),
+        Domain::Text { expected } => format!(" Value: {expected}."),
+        _ => String::new(),
+    };
+    let default = match parameter.default {
+        "absent" => String::new(),
+        default => format!(" Default: {default}."),
+    };
+    format!("{}{range}{default}", parameter.doc)
+}
+
+/// Returns the `x-control` extension, from which front ends build controls: `unit`, `usual` (the range of a slider),
+/// `instead_of` (parameters that exclude this one) and `format` (the only format that this one applies to).
 fn hints(parameter: &params::Parameter) -> Option<Extensions> {
     let mut control = serde_json::Map::new();
     if let Domain::Number { unit, .. } = parameter.domain
@@ -85,14 +110,15 @@ fn query(parameter: &params::Parameter) -> Parameter {
         .name(parameter.name)
         .parameter_in(ParameterIn::Query)
         .required(Required::False)
-        .description(Some(parameter.doc))
-        .schema(Some(schema(parameter, Place::Query)))
+        .description(Some(describe(parameter)))
+        .schema(Some(schema(parameter)))
         .style(lists.then_some(ParameterStyle::Form))
         .explode(lists.then_some(false))
+        .extensions(hints(parameter))
         .build()
 }
 
-/// The parameters of a mesh.
+/// Query parameters of a mesh.
 pub(in crate::http) enum MeshParameters {}
 
 impl IntoParams for MeshParameters {
@@ -101,17 +127,15 @@ impl IntoParams for MeshParameters {
     }
 }
 
-/// The parameters of a mesh whose address names its format.
+/// Parameters of a mesh whose path names the format.
 pub(in crate::http) enum SurfaceParameters {}
 
 impl IntoParams for SurfaceParameters {
     fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
-        let file = ObjectBuilder::new()
-            .schema_type(Type::String)
-            .enum_values(Some(Format::ALL.map(|format| format!("surface.{}", format.extension()))));
-        let file = path("file", "The mesh, by the extension of its format; or `surface.png`, its picture.")
-            .schema(Some(file))
-            .build();
+        let file =
+            path("file", "`surface.` and the extension of the mesh format; `surface.png` is a picture of the mesh.")
+                .schema(Some(Ref::from_schema_name(SURFACE_FILE)))
+                .build();
         std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
     }
 }
@@ -121,12 +145,12 @@ fn path(name: &str, doc: &str) -> ParameterBuilder {
     builder.required(Required::True).description(Some(doc))
 }
 
-/// Text of some pattern, with an example.
+/// Returns a schema for text that matches `pattern`, with an example.
 fn text(pattern: &str, example: &str) -> ObjectBuilder {
     ObjectBuilder::new().schema_type(Type::String).pattern(Some(pattern)).examples([example])
 }
 
-/// Names a type of parameters that are one path segment each.
+/// Declares a type that describes one path segment.
 macro_rules! segment {
     ($(#[$doc:meta])* $type:ident, $name:literal, $words:literal, $pattern:literal, $example:literal) => {
         $(#[$doc])*
@@ -141,27 +165,27 @@ macro_rules! segment {
 }
 
 segment!(
-    /// `{id}` of an entry.
-    EntryPath, "id", "The entry's id, in any case.",
+    /// `{id}` of an archive entry.
+    EntryPath, "id", "PDB id of the entry, in upper or lower case.",
     "^([0-9][A-Za-z0-9]{3}|[Pp][Dd][Bb]_[A-Za-z0-9]{8})$", "4pti"
 );
 segment!(
-    /// `{digest}` of a structure.
-    StructurePath, "digest", "SHA-256 of the structure's bytes as they came.",
-    "^[0-9a-f]{64}$", "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-);
-segment!(
-    /// `{file}` of the page.
-    AssetPath, "file", "The file's name.", "^[A-Za-z0-9._-]{1,100}$", "icon.svg"
+    /// `{digest}` of an uploaded structure.
+    StructurePath, "digest", "SHA-256 digest of the structure's bytes as uploaded, in hexadecimal.",
+    "^[0-9a-f]{64}$", "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087"
 );
 segment!(
     /// `{id}` of a job.
-    JobPath, "id", "The job's id.", "^[0-9a-f]{32}$", "0123456789abcdef0123456789abcdef"
+    JobPath, "id", "Id of the job.", "^[0-9a-f]{32}$", "0123456789abcdef0123456789abcdef"
 );
 segment!(
     /// `{key}` of a result.
-    ResultPath, "key", "The result's key.",
-    "^[0-9a-f]{64}$", "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    ResultPath, "key", "Key of the result.",
+    "^[0-9a-f]{64}$", "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087"
+);
+segment!(
+    /// `{slug}` of a problem type.
+    ProblemPath, "slug", "Last segment of the `type` of a problem.", "^[a-z-]{1,40}$", "grid-too-large"
 );
 
 /// `{file}` of a result.
@@ -171,11 +195,11 @@ impl IntoParams for ResultFile {
     fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
         let extensions = Format::ALL.map(Format::extension).join("|");
         let file = text(&format!("^[0-9a-f]{{64}}\\.({extensions})$"), &format!("{}.glb", "0".repeat(64)));
-        vec![path("file", "The result's key and the extension of its format.").schema(Some(file)).build()]
+        vec![path("file", "Key of the result, followed by the extension of its format.").schema(Some(file)).build()]
     }
 }
 
-/// A header that a request may have: its name, a pattern for it if not any will do, an example, what it does.
+/// Request header: name, pattern (`None`: any text), example, description.
 type Header = (&'static str, Option<&'static str>, &'static str, &'static str);
 
 fn headers(all: &[Header]) -> Vec<Parameter> {
@@ -187,7 +211,7 @@ fn headers(all: &[Header]) -> Vec<Parameter> {
     all.iter().map(one).collect()
 }
 
-/// Names a type of request headers.
+/// Declares a type that describes request headers.
 macro_rules! request_headers {
     ($(#[$doc:meta])* $type:ident: $all:expr) => {
         $(#[$doc])*
@@ -202,50 +226,51 @@ macro_rules! request_headers {
 }
 
 request_headers!(
-    /// Preferences of a request.
+    /// Headers that choose between a mesh and a job.
     Wishes: [
         (
             "Prefer", None, "respond-async",
-            "`respond-async`: a job is promised (202) and the mesh made later. `wait=SECONDS`: how long the answer \
-             may take before a job is promised instead (RFC 7240).",
+            "`respond-async` creates a job and returns 202 at once. `wait=SECONDS` waits at most that long for the \
+             mesh, then returns 202 with a job (RFC 7240).",
         ),
         (
             "Priority", None, "u=3",
-            "`u=0` (urgent) to `u=7`: the order among a client's own jobs (RFC 9218).",
+            "Urgency among the requests of one client, from `u=0` (most urgent) to `u=7` (RFC 9218).",
         ),
         (
             "Idempotency-Key", Some("^[ -~]{1,255}$"), "upload-1",
-            "A key of the client's choice: the same request with the same key is promised the same job.",
+            "Key chosen by the client, 1 to 255 characters. A repeated request with the same key returns the same job.",
         ),
     ]
 );
 request_headers!(
-    /// The compression of an upload.
+    /// Compression of an upload.
     Coding: [(
         "Content-Encoding", Some("^(identity|gzip|x-gzip|zstd)?$"), "gzip",
-        "How the body is compressed. It need not be said: the bytes are looked at.",
+        "Compression of the body. Optional: the server detects gzip and zstd from the content.",
     )]
 );
 request_headers!(
-    /// Validators of the client's copy.
+    /// Conditional request.
     Unchanged: [(
-        "If-None-Match", None, "\"ba7816bf\"", "`ETag`s that the client has: if one still holds, the answer is 304.",
+        "If-None-Match", None, "\"ba7816bf\"", "`ETag`s that the client has. If one matches, the response is 304.",
     )]
 );
 request_headers!(
-    /// Parts of a file that was made before.
+    /// Range request.
     Parts: [
         (
             "Range", None, "bytes=0-1023",
-            "The part that is wanted. It is heeded where the file was made before; otherwise, and for several parts, \
-             the whole is sent.",
+            "Part of the file to return. Applies to stored results; other responses, and requests for several ranges, \
+             return the whole file.",
         ),
-        ("If-Range", None, "\"ba7816bf\"", "The `ETag` of which a part is wanted; of another file all is sent."),
+        ("If-Range", None, "\"ba7816bf\"", "`ETag` that the `Range` refers to. If it differs, the whole file is sent."),
     ]
 );
 request_headers!(
-    /// Last event that the client received.
+    /// Position in an event stream.
     Resumption: [(
-        "Last-Event-ID", None, "3", "The last event that was seen: only newer ones are sent. After the last, 204.",
+        "Last-Event-ID", None, "3",
+        "Id of the last event received. Only later events are sent; after the final event the response is 204.",
     )]
 );

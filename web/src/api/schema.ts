@@ -1,4 +1,4 @@
-/** Parameters of a mesh, read from the OpenAPI document of the service. */
+/** Mesh parameters, read from the OpenAPI document of the service. */
 
 export type Kind = "number" | "integer" | "boolean" | "choice" | "set" | "text";
 
@@ -9,97 +9,108 @@ export interface Parameter {
   /** Bounds of numbers. */
   min: number;
   max: number;
-  /** Range of the slider within the bounds. */
+  /** Range of a slider. */
   usual: [number, number];
   unit: string;
   /** Default value; undefined if it depends on other parameters. */
   fallback: string | undefined;
   /** Default value in words. */
   fallbackWords: string;
-  /** Permitted words of choices and sets. */
+  /** Values of choices and sets. */
   values: string[];
-  /** Description of permitted values. */
+  /** Allowed values, in words. */
   expected: string;
-  /** The only format that it applies to, such as `png`; empty for parameters of the mesh. */
+  /** The only output format that it applies to; empty if it applies to all. */
   format: string;
   /** Parameters that exclude it. */
   insteadOf: string[];
 }
 
-interface Schema {
+interface Reference {
+  $ref?: string;
+}
+
+interface Schema extends Reference {
   type?: string | string[];
   title?: string;
-  description?: string;
   default?: unknown;
   minimum?: number;
   maximum?: number;
   enum?: string[];
-  items?: { enum?: string[] };
-  "x-control"?: { usual?: [number, number]; unit?: string; instead_of?: string[]; format?: string };
+  items?: Schema;
 }
 
-interface Described {
+interface Described extends Reference {
   name: string;
   in: string;
   description?: string;
   schema?: Schema;
+  "x-control"?: { usual?: [number, number]; unit?: string; instead_of?: string[]; format?: string };
 }
 
 export interface OpenApi {
   paths: Record<string, Record<string, { operationId?: string; parameters?: Described[] }>>;
+  components?: Record<string, Record<string, unknown>>;
 }
 
-/** Parameters without a control: the URL determines the format, and the file contains the report. */
-const ELSEWHERE = ["format", "report"];
+/** Follows a reference into `components`. */
+function resolved<T extends Reference>(api: OpenApi, value: T): T {
+  const [kind, name] = value.$ref?.split("/").slice(-2) ?? [];
+  return kind && name ? (api.components?.[kind]?.[name] as T) : value;
+}
 
 function described(api: OpenApi): Described[] {
   const operations = Object.values(api.paths).flatMap((path) => Object.values(path));
   const mesh = operations.find((operation) => operation.operationId === "createMesh");
-  return (mesh?.parameters ?? []).filter((parameter) => parameter.in === "query");
+  return (mesh?.parameters ?? []).map((parameter) => resolved(api, parameter)).filter((parameter) => parameter.in === "query");
 }
 
-/** Returns every parameter, in the order of the document. */
+/** Returns the parameters in document order. `format` is chosen by the buttons that download files. */
 export function parametersOf(api: OpenApi): Parameter[] {
-  return described(api).filter((parameter) => !ELSEWHERE.includes(parameter.name)).map(parameterOf);
+  return described(api).filter((parameter) => parameter.name !== "format").map((parameter) => parameterOf(api, parameter));
 }
 
-/** Returns the available formats by file extension. */
+/** Returns the output formats, by file name extension. */
 export function formatsOf(api: OpenApi): string[] {
-  return described(api).find((parameter) => parameter.name === "format")?.schema?.enum ?? ["glb"];
+  const format = described(api).find((parameter) => parameter.name === "format")?.schema;
+  return (format && resolved(api, format).enum) ?? ["glb"];
 }
 
-function kindOf(schema: Schema): Kind {
+function kindOf(schema: Schema, items: Schema): Kind {
   const type = Array.isArray(schema.type) ? schema.type.find((t) => t !== "null") : schema.type;
-  if (type === "array") return schema.items?.enum ? "set" : "text";
+  if (type === "array") return items.enum ? "set" : "text";
   if (type === "boolean" || type === "number" || type === "integer") return type;
   return schema.enum ? "choice" : "text";
 }
 
-function parameterOf(parameter: Described): Parameter {
-  const schema = parameter.schema ?? {};
+function parameterOf(api: OpenApi, parameter: Described): Parameter {
+  const schema = resolved(api, parameter.schema ?? {});
+  const items = resolved(api, schema.items ?? {});
+  const text = parameter.description ?? "";
   const min = schema.minimum ?? Number.NEGATIVE_INFINITY;
   const max = schema.maximum ?? Number.POSITIVE_INFINITY;
-  const { usual: span, unit, instead_of: insteadOf, format } = schema["x-control"] ?? {};
+  const { usual: span, unit, instead_of: insteadOf, format } = parameter["x-control"] ?? {};
   const value = schema.default;
-  const words = /Default: (.*)\.$/s.exec(schema.description ?? "")?.[1];
+  const words = / Default: (.*)\.$/s.exec(text)?.[1];
   return {
     name: parameter.name,
-    doc: parameter.description ?? "",
-    kind: kindOf(schema),
+    // The form shows the range and the default beside the control.
+    doc: text.replace(/ (Range|Value|Default): .*$/s, ""),
+    kind: kindOf(schema, items),
     min,
     max,
     usual: span ?? usual(min, max, Number(value)),
     unit: unit ?? "",
     fallback: value === undefined || value === null ? undefined : String(value),
     fallbackWords: words ?? (value === undefined ? "absent" : String(value)),
-    values: schema.enum ?? schema.items?.enum ?? [],
+    values: schema.enum ?? items.enum ?? [],
     expected: schema.title ?? "",
     format: format ?? "",
     insteadOf: insteadOf ?? [],
   };
 }
 
-/** Returns the range of a slider if the document does not state one: three octaves around the default. */
+/** Returns the range of a slider without `usual`: the bounds, or three octaves around the default if they are wide. */
 function usual(min: number, max: number, value: number): [number, number] {
   const wide = !Number.isFinite(min) || !Number.isFinite(max) || (min > 0 ? max / min > 100 : max - min > 1000);
   if (!wide) return [min, max];

@@ -1,0 +1,133 @@
+//! Post-processing of the OpenAPI document: moves repeated parameters, responses and headers to `components`.
+
+use serde_json::{Map, Value, json};
+
+/// Replaces inline parameters, headers, error responses and mesh responses by references into `components`.
+pub(in crate::http) fn share(document: &mut Value) {
+    let mut shared = Shared::default();
+    let operations = members(document, "paths").flat_map(|(path, item)| {
+        let operations = item.as_object_mut().into_iter().flat_map(Map::values_mut);
+        operations.map(move |operation| (path, operation))
+    });
+    for (path, operation) in operations {
+        let parameters = operation.get_mut("parameters").and_then(Value::as_array_mut);
+        for parameter in parameters.into_iter().flatten() {
+            shared.replace("parameters", &parameter_name(path, parameter), parameter);
+        }
+        for (status, response) in members(operation, "responses") {
+            for (name, header) in members(response, "headers") {
+                shared.replace("headers", name, header);
+            }
+            if let Some(name) = response_name(status, response) {
+                shared.replace("responses", &name, response);
+            }
+        }
+    }
+    if let Some(Value::Object(components)) = document.get_mut("components") {
+        components.append(&mut shared.0);
+    }
+}
+
+/// Returns the members of an object below `value`; none if it is absent.
+fn members<'a>(value: &'a mut Value, name: &str) -> impl Iterator<Item = (&'a String, &'a mut Value)> {
+    value.get_mut(name).and_then(Value::as_object_mut).into_iter().flatten()
+}
+
+/// Component objects by kind and name.
+#[derive(Default)]
+struct Shared(Map<String, Value>);
+
+impl Shared {
+    /// Replaces `value` by a reference to a component. A number tells different values with one name apart.
+    fn replace(&mut self, kind: &str, name: &str, value: &mut Value) {
+        let Value::Object(of_kind) = self.0.entry(kind).or_insert_with(|| json!({})) else { return };
+        let mut key = name.to_owned();
+        let mut number = 1;
+        while of_kind.get(&key).is_some_and(|other| other != value) {
+            number += 1;
+            key = format!("{name}-{number}");
+        }
+        let reference = json!({ "$ref": format!("#/components/{kind}/{key}") });
+        of_kind.insert(key, std::mem::replace(value, reference));
+    }
+}
+
+/// Returns a parameter's own name; for a path parameter, preceded by the first segment after the version: `jobs-id`.
+/// A component with the name `file` would hide the type `File` of TypeScript.
+fn parameter_name(path: &str, parameter: &Value) -> String {
+    let name = parameter["name"].as_str().unwrap_or_default();
+    let segment = path.trim_start_matches("/v1").split('/').nth(1).unwrap_or_default();
+    if parameter["in"] == "path" { format!("{segment}-{name}") } else { name.to_owned() }
+}
+
+/// Returns the component name of a response; `None` if the response stays with its operation.
+fn response_name(status: &str, response: &Value) -> Option<String> {
+    let Some(types) = response["x-problem-types"].as_array() else {
+        return match status {
+            "200" if response["content"].get("application/octet-stream").is_some() => Some("Mesh".to_owned()),
+            "202" => Some("JobAccepted".to_owned()),
+            "206" => Some("PartialMesh".to_owned()),
+            "304" => Some("NotModified".to_owned()),
+            _ => None,
+        };
+    };
+    let types: Vec<String> = types.iter().filter_map(Value::as_str).map(pascal_case).collect();
+    Some(if types.len() <= 2 { types.join("Or") } else { format!("Error{status}") })
+}
+
+/// Converts `no-such-job` or `max_triangles` to `NoSuchJob` or `MaxTriangles`.
+pub(super) fn pascal_case(name: &str) -> String {
+    let words = name.split(['-', '_']);
+    words.map(|word| word[..1].to_ascii_uppercase() + &word[1..]).collect()
+}
+
+/// Serializes a document as YAML that version 1.1 reads as 1.2 does: floats in exponent notation get a point and a sign
+/// (`1.0e-6`; `1e-6` would be a string), and times get quotes.
+pub(in crate::http) fn to_yaml(document: &Value) -> Result<String, yaml_serde::Error> {
+    let line = |line: &str| {
+        let (key, value) = line.rsplit_once(' ').filter(|(key, _)| key.ends_with([':', '-']))?;
+        if value.len() >= 20 && value.starts_with(|c: char| c.is_ascii_digit()) && value.ends_with('Z') {
+            return Some(format!("{key} '{value}'"));
+        }
+        value.parse::<f64>().ok()?;
+        let (digits, exponent) = value.split_once('e')?;
+        let point = if digits.contains('.') { "" } else { ".0" };
+        let sign = if exponent.starts_with('-') { "" } else { "+" };
+        Some(format!("{key} {digits}{point}e{sign}{exponent}"))
+    };
+    let yaml = yaml_serde::to_string(document)?;
+    Ok(yaml.lines().flat_map(|text| [line(text).unwrap_or_else(|| text.to_owned()), "\n".to_owned()]).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn yaml_1_1_reads_floats_and_times() {
+        let document = json!({ "a": 1e-6, "b": [1e20, 1.5e-7, 0.5, 3], "c": "at 1e-6", "d": "2030-01-01T12:00:00Z" });
+        let expected = "a: 1.0e-6\nb:\n- 1.0e+20\n- 1.5e-7\n- 0.5\n- 3\nc: at 1e-6\nd: '2030-01-01T12:00:00Z'\n";
+        assert_eq!(to_yaml(&document).unwrap(), expected);
+    }
+
+    #[test]
+    fn different_values_with_one_name_get_numbers() {
+        let operation =
+            |doc: &str| json!({ "get": { "parameters": [{ "name": "id", "in": "path", "description": doc }] } });
+        let mut document = json!({
+            "paths": { "/jobs/{id}": operation("a"), "/jobs/{id}/x": operation("a"), "/jobs/{id}/y": operation("b") },
+            "components": {},
+        });
+        share(&mut document);
+        let parameter = |path: &str| &document["paths"][path]["get"]["parameters"][0];
+        for path in ["/jobs/{id}", "/jobs/{id}/x"] {
+            assert_eq!(parameter(path), &json!({ "$ref": "#/components/parameters/jobs-id" }));
+        }
+        assert_eq!(parameter("/jobs/{id}/y"), &json!({ "$ref": "#/components/parameters/jobs-id-2" }));
+        let shared = &document["components"]["parameters"];
+        assert_eq!(
+            (&shared["jobs-id"]["description"], &shared["jobs-id-2"]["description"]),
+            (&json!("a"), &json!("b"))
+        );
+    }
+}
