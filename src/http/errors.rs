@@ -20,12 +20,12 @@ use crate::surface::SurfaceError;
 /// Finding of the strict parser.
 #[derive(Debug, Serialize, ToSchema)]
 pub(super) struct Finding {
-    /// `note`, `warning` or `error`.
+    /// Severity: `note`, `warning` or `error`.
     level: &'static str,
-    /// Line in the file, from 1.
+    /// Line of the file, from 1; null if the finding has no line.
     #[schema(required)]
     line: Option<u64>,
-    /// Description.
+    /// Description of the finding.
     message: String,
 }
 
