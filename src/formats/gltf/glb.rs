@@ -13,18 +13,18 @@ const MAGIC: u32 = u32::from_le_bytes(*b"glTF");
 const VERSION: u32 = 2;
 const JSON: u32 = u32::from_le_bytes(*b"JSON");
 const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
-/// Bytes of the file header, and of a chunk's.
+/// Length of the file header and of a chunk header, bytes.
 const HEADER_BYTES: u64 = 12;
 const CHUNK_HEADER_BYTES: u64 = 8;
 
-/// From so many bytes on a buffer begins at a multiple of [`HEAD_BYTES`]: it can be written, mapped or asked for by
+/// Buffer size from which the buffer begins at a multiple of [`HEAD_BYTES`]: it can be written, mapped or requested by
 /// range before the JSON is known.
 pub(super) const LARGE_BUFFER_BYTES: u64 = 1 << 20;
 /// The longest report takes 15,500 bytes: a hundred components of 105 bytes, a title of a thousand characters of four
 /// bytes, and a thousand more.
 pub(super) const HEAD_BYTES: u64 = 16 << 10;
 
-/// A GLB that is laid out.
+/// Layout of a GLB file.
 #[derive(Debug)]
 pub(in crate::formats) struct GlbPlan {
     /// Everything before the buffer.
@@ -43,7 +43,7 @@ impl GlbPlan {
         Self::placed(Layout::of(mesh, storage, summary)?, storage, mesh.centre, summary, meta)
     }
 
-    /// The same for a mesh of which only this is known.
+    /// Returns the layout of a mesh of which only the summary is known.
     pub(super) fn placed(
         layout: Option<Layout>,
         storage: Storage,
@@ -82,7 +82,7 @@ impl GlbPlan {
         Ok(Self { head, layout, len })
     }
 
-    /// The length of a file as the header says it.
+    /// Returns the file length as the header stores it.
     pub(super) fn check_len(bytes: u64) -> Result<u32, FormatError> {
         u32::try_from(bytes).map_err(|_overflow| FormatError::GlbTooLarge { bytes, limit: u64::from(u32::MAX) })
     }

@@ -1,4 +1,4 @@
-//! GLB sink: writes the rows of a mesh to their final place as they arrive, and the header last.
+//! GLB sink: writes the rows of a mesh to their final offset as they arrive, and the header last.
 //!
 //! The bytes are those of [`GlbPlan::write`]. A large buffer begins at a fixed place, so its rows can be written before
 //! the header is known; a small one waits in memory.
@@ -38,7 +38,7 @@ pub enum GlbSinkError {
     },
 }
 
-/// Blocks that may wait for the output before a thread waits with them.
+/// Blocks that may be queued for the output before threads block.
 const MAX_WAITING: usize = 48;
 /// Rows of a block.
 const BLOCK_ROWS: usize = 1 << 14;
@@ -151,8 +151,8 @@ impl<'a> GlbSink<'a> {
         Ok(())
     }
 
-    /// Encodes rows of a column, which begins at a byte of the buffer and has rows of so many bytes. Writes them if the
-    /// buffer is `large` and no other thread is writing.
+    /// Encodes rows of a column, given its offset in the buffer and its row length. Writes them if the buffer is
+    /// `large` and no other thread is writing.
     fn column<T>(
         &self,
         (offset, row_bytes): (u64, u64),
@@ -218,7 +218,7 @@ fn place(out: &mut dyn RandomAccess, offset: u64, bytes: &[u8]) -> io::Result<()
     out.write_all(bytes)
 }
 
-/// Locks a mutex; a panic of another thread ends the run there and leaves the data usable.
+/// Locks a mutex and ignores poisoning: a panic of another thread leaves the data valid.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
