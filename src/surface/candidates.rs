@@ -21,7 +21,7 @@ pub(super) fn limit(limits: &SurfaceLimits) -> u64 {
     limits.max_candidates.min(MAX_LIMIT)
 }
 
-/// Refuses a run that is certain to exceed the limit, by one pass over the radii and before anything is allocated.
+/// Rejects a run that is certain to exceed the limit, by one pass over the radii and before anything is allocated.
 ///
 /// # Errors
 /// [`SurfaceError::TooManyCandidates`].
@@ -39,7 +39,7 @@ pub(crate) fn check(spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceL
     Err(error(least, limit(limits), spheres.len(), longest, params.resolution))
 }
 
-/// The error of a run on `lattice` that has `candidates` pairs or more.
+/// Returns the error of a run on `lattice` that has at least `candidates` pairs.
 pub(super) fn exceeded(lattice: &Lattice, candidates: u64, limits: &SurfaceLimits) -> SurfaceError {
     let longest = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
     error(candidates, limit(limits), lattice.atoms.len(), longest, lattice.spacing)
@@ -50,7 +50,8 @@ fn error(candidates: u64, limit: u64, n_spheres: usize, reach: f64, resolution: 
     SurfaceError::TooManyCandidates { candidates, limit, resolution, suggested_resolution }
 }
 
-/// Spacing (Å) at which a sphere that reaches `reach` Å has no more than `pairs` candidate pairs, if there is one.
+/// Returns a spacing (Å) at which a sphere that reaches `reach` Å has no more than `pairs` candidate pairs, if there is
+/// one.
 fn fitting(pairs: f64, reach: f64) -> Option<f64> {
     // A sphere touches at most 2·reach/brick + 2 bricks along each axis.
     let along = pairs.cbrt() - 2.0;

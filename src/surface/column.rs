@@ -1,7 +1,7 @@
 //! Column of a mesh: a slice of plain rows.
 //!
-//! Large columns are mapped with huge pages if the system has them: page faults of 4 KiB for 350 MB took half as long as
-//! meshing.
+//! Large columns are mapped with huge pages if the system has them: page faults of 4 KiB for 350 MB took half as long
+//! as meshing.
 
 use std::fmt;
 use std::ops::{Deref, DerefMut, Range};
