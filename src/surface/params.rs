@@ -1,4 +1,4 @@
-//! Parameters of a surface: what a caller may ask for, and the validated form that the core uses.
+//! Parameters of a surface: the caller's options, and the validated form that the core uses.
 
 use std::fmt;
 use std::str::FromStr;
@@ -112,7 +112,7 @@ pub enum PaperParams {
     },
 }
 
-/// What a caller may ask for; `None` takes the preset's or the default value.
+/// Options of a surface; `None` selects the value of the preset or the default.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SurfaceOptions {
     /// Kernel function; Gaussian by default.
@@ -123,11 +123,11 @@ pub struct SurfaceOptions {
     pub isovalue: Option<f64>,
     /// The Gaussian's `a` (Blinn's blobbiness without its sign); 1.25 by default. Gaussian only.
     pub smoothness: Option<f64>,
-    /// Radii are multiplied by this first; 1 by default.
+    /// Factor of the radii, applied first; 1 by default.
     pub radius_scale: Option<f64>,
-    /// Then this is added, Å; 0 by default.
+    /// Offset added to the scaled radii, Å; 0 by default.
     pub radius_offset: Option<f64>,
-    /// Where the Gaussian is cut off, as a fraction of its value at the radius; 0.01 by default. Gaussian only.
+    /// Cut-off of the Gaussian, as a fraction of its value at the radius; 0.01 by default. Gaussian only.
     pub cutoff_tolerance: Option<f64>,
     /// Values for the parameters that are not given.
     pub preset: Option<Preset>,
@@ -152,11 +152,11 @@ pub struct SurfaceParams {
     pub isovalue: f64,
     /// The Gaussian's `a`.
     pub smoothness: f64,
-    /// Radii are multiplied by this first.
+    /// Factor of the radii, applied first.
     pub radius_scale: f64,
-    /// Then this is added, Å.
+    /// Offset added to the scaled radii, Å.
     pub radius_offset: f64,
-    /// Where the Gaussian is cut off, as a fraction of its value at the radius.
+    /// Cut-off of the Gaussian, as a fraction of its value at the radius.
     pub cutoff_tolerance: f64,
     /// The preset that filled in the values that were not given.
     pub preset: Preset,
@@ -279,7 +279,7 @@ impl SurfaceParams {
         if self.quantize.is_some() { 12 * (n_vertices + n_triangles) } else { Mesh::bytes_for(n_vertices, n_triangles) }
     }
 
-    /// Whether scale and offset leave the smallest radius usable.
+    /// Returns true if scale and offset leave the smallest radius usable.
     ///
     /// # Errors
     /// [`SurfaceError::BadParameter`] names `radius_offset`.

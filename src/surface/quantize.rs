@@ -1,17 +1,18 @@
 //! Vertices in 12 bytes instead of 24: positions as 16-bit integers times a step, normals as 8-bit ones.
 //!
 //! The step is a power of two, so multiplying by it and dividing by it are exact in single precision: a position is
-//! rounded once, and whoever rounds to the nearest integer, ties to even, gets these very integers, WGSL's `round`
-//! included. A step that used all 16 bits would be up to half as large, and its division would differ between devices.
+//! rounded once, and every implementation that rounds to nearest, ties to even, gets the same integers, including
+//! WGSL's `round`. A step that used all 16 bits would be up to half as large, and its division would differ between
+//! devices.
 
 /// Largest integer of a position. Symmetric, as the structure's middle is 0.
 const POSITION_MAX: f32 = 32_767.0;
-/// What stands for a coordinate that no integer is near, or that is no number: one more than the largest wraps around to
-/// it, as does one less than the lowest.
+/// Marker of a coordinate that is out of range or not finite: one more than the largest integer wraps around to it, as
+/// does one less than the lowest.
 pub const BEYOND: i16 = i16::MIN;
 /// Largest integer of a normal.
 const NORMAL_MAX: f32 = 127.0;
-/// The largest square of a normal's length, in units of 1/127, that glTF's validator takes for 1: 0.674 % too long.
+/// Largest squared length of a normal, in units of 1/127, that glTF's validator accepts: 0.674 % too long.
 const NORMAL_MAX_SQUARE: i32 = 16_347;
 /// Exponent of the smallest step, 1.5e-5 Å: 32,767 of them are half an ångström, less than any atom's radius.
 const MIN_EXPONENT: i32 = -16;
@@ -23,34 +24,34 @@ pub struct Step {
 }
 
 impl Step {
-    /// The smallest step with which 32,767 of them reach `extent`, Å.
+    /// Returns the smallest step whose 32,767 multiples reach `extent`, Å.
     #[must_use]
     pub fn covering(extent: f64) -> Self {
         let reaches = |exponent: &i32| f64::from(POSITION_MAX) * 2.0_f64.powi(*exponent) >= extent;
         let exponent = (MIN_EXPONENT..=f32::MAX_EXP - 16).find(reaches);
-        // What no step covers is refused when the mesh's bounds are looked at.
+        // Larger extents are rejected when the mesh's bounds are checked.
         Self { exponent: exponent.unwrap_or(MIN_EXPONENT) }
     }
 
-    /// Its length, Å. No decoded coordinate is further than half of it from the computed one.
+    /// Length of the step, Å. A decoded coordinate differs from the computed one by at most half of it.
     #[must_use]
     pub fn length(self) -> f32 {
         2.0_f32.powi(self.exponent)
     }
 
-    /// What a coordinate is multiplied by to be counted in steps, 1/Å: a power of two, too.
+    /// Factor from a coordinate to steps, 1/Å: also a power of two.
     #[must_use]
     pub fn per_angstrom(self) -> f32 {
         2.0_f32.powi(-self.exponent)
     }
 
-    /// The largest coordinate that it reaches, Å.
+    /// Returns the largest coordinate that can be stored, Å.
     #[must_use]
     pub fn reach(self) -> f32 {
         POSITION_MAX * self.length()
     }
 
-    /// Whether all of `bounds` can be stored: lowest and highest relative position, Å.
+    /// Returns true if all of `bounds` can be stored: lowest and highest relative position, Å.
     #[must_use]
     pub fn holds(self, bounds: &[[f32; 3]; 2]) -> bool {
         let half = 0.5 * self.length();
@@ -67,7 +68,7 @@ impl Step {
         position.map(|v| nearest(v * inverse, POSITION_MAX + 1.0))
     }
 
-    /// The position that such integers stand for, Å: exactly.
+    /// Returns the exact position that the integers represent, Å.
     #[inline]
     #[must_use]
     pub fn decoded(self, position: [i16; 3]) -> [f32; 3] {
@@ -78,8 +79,8 @@ impl Step {
 
 /// A unit normal as multiples of 1/127: 127 times each component, the nearest, ties to even.
 ///
-/// Near one direction, (66.5, 75.5, 77.5) and its mirror images, all three components are rounded up by half of a unit, and
-/// the vector comes out by a hair longer than what passes for a unit vector. There the largest component is rounded down.
+/// Near one direction, (66.5, 75.5, 77.5) and its mirror images, all three components are rounded up by half a unit,
+/// and the vector slightly exceeds the accepted length. Its largest component is rounded down there.
 #[inline]
 #[must_use]
 pub fn normal(normal: [f32; 3]) -> [i8; 3] {

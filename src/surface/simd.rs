@@ -1,4 +1,4 @@
-//! Small SIMD-friendly pieces. They inline into `multiversion` functions, which compile them per instruction set.
+//! SIMD-friendly primitives, inlined into `multiversion` functions, which compile them per instruction set.
 
 /// Compiles a function once per instruction set and picks the best one at run time, so that a portable build runs
 /// at native speed.
