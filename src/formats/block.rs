@@ -84,7 +84,7 @@ impl Place {
     /// Returns a vertex in the structure file's coordinates and the file's units: computed in double precision and
     /// rounded once.
     #[inline]
-    #[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what the file formats ask for")]
+    #[expect(clippy::cast_possible_truncation, reason = "the file formats require f32")]
     pub(super) fn absolute(self, position: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|k| ((self.centre[k] + f64::from(position[k])) * self.scale) as f32)
     }

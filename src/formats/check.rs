@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_is_not_finite_is_found_wherever_it_is() {
+    fn non_finite_numbers_are_found_in_any_row() {
         for n in [1, 5, 2 * CHUNK_ROWS + 3] {
             for row in [0, n / 2, n - 1] {
                 for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
@@ -240,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_of_different_lengths_are_refused() {
+    fn columns_of_different_lengths_are_rejected() {
         let whole =
             Mesh { positions: vec![[0.0; 3]; 2].into(), normals: vec![[0.0, 0.0, 1.0]; 2].into(), ..Mesh::default() };
         assert!(check(&whole, Depth::All).is_ok());

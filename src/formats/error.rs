@@ -18,7 +18,7 @@ pub enum FormatError {
         vertices: u64,
     },
     /// A triangle has the index of a vertex that does not exist.
-    #[error("triangle {triangle} names vertex {index}, but the mesh has {vertices} vertices")]
+    #[error("triangle {triangle} refers to vertex {index}, but the mesh has {vertices} vertices")]
     IndexOutOfRange {
         /// Number of the triangle, from 0.
         triangle: u64,
@@ -102,13 +102,13 @@ pub enum FormatError {
         units: &'static str,
     },
     /// The format is a picture, which is rendered, not encoded.
-    #[error("{format} is a picture of a mesh, and holds none")]
+    #[error("{format} is a picture format and cannot hold a mesh")]
     NotAMesh {
         /// The format's name.
         format: &'static str,
     },
     /// The vertices are already quantized and cannot be stored with another step or as floats.
-    #[error("the mesh's vertices are quantised in steps of {step} Å, and can be stored in no other way")]
+    #[error("the mesh's vertices are quantised in steps of {step} Å and cannot be stored differently")]
     OtherPacking {
         /// The mesh's step, Å.
         step: f32,

@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_format_is_found_by_its_own_name_and_media_type() {
+    fn every_format_parses_its_own_name_and_media_type() {
         for format in Format::ALL {
             assert_eq!(format.to_string().to_uppercase().parse(), Ok(format));
             assert_eq!(Format::from_media_type(format.media_type()), Some(format));

@@ -230,7 +230,7 @@ impl Line<'_> {
 /// Copies a short slice.
 #[inline(always)]
 fn copy_short(to: &mut [u8], from: &[u8]) {
-    // Musl's `memcpy` takes longer for a few bytes than the rest of the line does; glibc's is as fast as what follows.
+    // Musl's `memcpy` is slower for a few bytes than the rest of the line; glibc's is as fast as this code.
     if !cfg!(target_env = "musl") {
         return to.copy_from_slice(from);
     }
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longest_lines_have_room() {
+    fn the_longest_lines_fit() {
         let mut bytes = [0; LINE_BYTES];
         let mut line = Line { bytes: &mut bytes, used: 0 };
         line.face([u32::MAX; 3]);
@@ -332,12 +332,12 @@ mod tests {
     }
 
     #[test]
-    fn coordinates_without_room_are_refused() {
+    fn too_large_coordinates_are_rejected() {
         let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]].into(), ..Mesh::default() };
         let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: None, translucent: false };
         let plan = |storage: Storage| ObjPlan::new(&mesh, storage, &summary, &Meta::default());
-        let refusal = plan(Storage::default()).unwrap_err();
-        assert_eq!(refusal, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });
+        let error = plan(Storage::default()).unwrap_err();
+        assert_eq!(error, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });
         assert!(plan(Storage { units: Units::Nanometer, ..Storage::default() }).is_ok());
     }
 }

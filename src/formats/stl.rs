@@ -63,7 +63,7 @@ impl StlPlan {
 
 /// Returns the unit normal of a triangle by the right-hand rule; zero without area, as STL readers expect.
 #[inline]
-#[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what STL asks for")]
+#[expect(clippy::cast_possible_truncation, reason = "STL requires f32")]
 fn face_normal(corners: [[f32; 3]; 3]) -> [f32; 3] {
     // Double precision: the cross product of two edges of 1e-10 Å would underflow in single precision.
     let [a, b, c] = corners.map(|p| p.map(f64::from));
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn the_header_never_says_text_or_colours() {
+    fn the_header_never_marks_text_or_colours() {
         for name in ["solid", "COLOR=rgba", "a very long name ".repeat(20).as_str(), ""] {
             let meta = Meta { name: Some(name.to_owned()), ..Meta::default() };
             let plan = StlPlan::new(&Mesh::default(), Units::Nanometer, &meta).unwrap();

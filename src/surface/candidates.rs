@@ -89,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn identical_spheres_are_refused_at_the_exact_limit_and_the_suggestion_fits() {
+    fn identical_spheres_are_rejected_at_the_exact_limit_and_the_suggestion_fits() {
         let (spheres, params) = (same_place(100), params(0.4, 3.0));
         let exact = pairs(&spheres, &params);
         let backend = CpuBackend::new(Some(2)).unwrap();
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn the_lower_bound_holds_and_refuses_a_hopeless_run_at_once() {
+    fn the_lower_bound_holds_and_rejects_an_excessive_run_early() {
         for (resolution, scale) in [(0.2, 1.0), (0.5, 1.0), (0.5, 8.0), (4.0, 0.5)] {
             let (spheres, params) = (same_place(20), params(resolution, scale));
             let exact = pairs(&spheres, &params);
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn no_spacing_is_suggested_where_none_fits() {
+    fn no_spacing_is_suggested_if_none_fits() {
         assert_eq!(fitting(8.0, 3.0), None);
         assert_eq!(fitting(27.0, 4.0), Some(1.01));
         assert_eq!(fitting(27.0, 400.0), None);

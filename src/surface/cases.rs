@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_is_what_the_topology_gives() {
+    fn the_table_matches_the_generated_cases() {
         for case in 0..=255_u8 {
             let triangles: Vec<_> = loops(case).iter().flat_map(|l| best_triangulation(l).1).collect();
             assert_eq!(CASES.of(case), triangles, "case {case}");

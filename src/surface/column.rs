@@ -56,7 +56,7 @@ impl<T: Pod> Column<T> {
     }
 }
 
-/// Maps zeroed memory; `None` if the column is small or the system refuses.
+/// Maps zeroed memory; `None` if the column is small or the system fails to.
 fn mapped(bytes: usize) -> Option<MmapMut> {
     let map = MmapMut::map_anon(bytes).ok().filter(|_| bytes >= MAP_FROM)?;
     // Advice only: kernels without huge pages ignore it.

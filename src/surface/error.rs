@@ -87,7 +87,7 @@ pub enum SurfaceError {
         isovalue: f64,
     },
     /// The sink of the mesh failed. It keeps the cause.
-    #[error("the mesh could not be handed on")]
+    #[error("the mesh sink failed")]
     Sink,
     /// The device has too little memory for the mesh, even piece by piece.
     #[error("the device would need {needed} bytes of memory, it has {available}; {suggested_resolution} Å would fit")]

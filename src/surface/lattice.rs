@@ -284,7 +284,7 @@ impl TileRanks {
 }
 
 /// The tile that a sample belongs to.
-// Written out, here and below: `map` is a call where it is not inlined, and these are looked at for every atom.
+// Written out, here and below: `map` may not be inlined, and these run for every atom.
 #[inline(always)]
 #[must_use]
 pub fn tile_of([x, y, z]: [i32; 3]) -> [i32; 3] {
@@ -304,7 +304,7 @@ pub(super) fn roomier(spacing: f64) -> f64 {
 }
 
 /// Converts `v` to f32, rounding.
-#[expect(clippy::cast_possible_truncation, reason = "rounding to single precision is the point")]
+#[expect(clippy::cast_possible_truncation, reason = "rounding to single precision is intended")]
 pub(crate) fn to_f32(v: f64) -> f32 {
     v as f32
 }

@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn defects_are_seen_by_both_validations() {
+    fn both_validations_detect_defects() {
         let mut whole = Mesh::default();
         tetrahedron(&mut whole, [0.0; 3], false);
         let mut hole = whole.clone();

@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mesh_is_rounded_once_and_says_what_it_is() {
+    fn a_mesh_is_rounded_once_and_reports_its_packing() {
         let (mut mesh, step) = (fan(0.3), Step::covering(1.0));
         let single = mesh.clone();
         assert_eq!((mesh.bytes(), mesh.n_vertices()), (5 * 24 + 4 * 12, 5));
@@ -285,7 +285,7 @@ mod tests {
             assert_eq!(found, step.decoded(step.position(*position)));
         }
         assert_eq!(mesh.bounds(), single.bounds().map(|row| step.decoded(step.position(row))));
-        // A coarser step takes the integers for what they are.
+        // A coarser step rounds the decoded integers.
         let coarse = Step::covering(100.0);
         assert!(mesh.quantize(coarse));
         assert_eq!(mesh.position(1)[0], 1.0, "a multiple of both");
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn bounds_of_integers_are_found_in_any_row_of_any_piece() {
+    fn integer_bounds_include_every_row_of_every_chunk() {
         let step = Step::covering(1.0);
         for n in [1, 5, ROWS, 2 * ROWS + 3] {
             for row in [0, n / 2, n - 1] {

@@ -192,7 +192,7 @@ impl Default for SurfaceParams {
     fn default() -> Self {
         match Self::new(&SurfaceOptions::default()) {
             Ok(params) => params,
-            Err(_) => unreachable!("the defaults are valid: a test says so"),
+            Err(_) => unreachable!("a test checks that the defaults are valid"),
         }
     }
 }
@@ -305,21 +305,21 @@ fn paper_params(kernel: Kernel, options: &SurfaceOptions) -> Result<Option<Paper
         let missing = || format!("`{name}` beside it: the paper's {kernel} kernel needs both");
         value.map_or_else(|| Err(bad(given, given_value, missing())), |value| within(name, value, lo, hi))
     };
-    let refuse = |name: &'static str, value: Option<f64>| match value {
+    let reject = |name: &'static str, value: Option<f64>| match value {
         Some(value) => Err(bad(name, value, format!("no value: the paper's {kernel} kernel has no such parameter"))),
         None => Ok(()),
     };
     Ok(Some(match kernel {
         Kernel::Gaussian => {
-            refuse("paper_c", c)?;
+            reject("paper_c", c)?;
             PaperParams::Gaussian { a: need("paper_a", a, 1e-3, 100.0)?, b: need("paper_b", b, 1e-2, 1e6)? }
         }
         Kernel::SoftObject => {
-            refuse("paper_c", c)?;
+            reject("paper_c", c)?;
             PaperParams::SoftObject { a: need("paper_a", a, 1e-2, 1e6)?, b: need("paper_b", b, 0.1, 50.0)? }
         }
         Kernel::InverseSquare => {
-            refuse("paper_a", a)?;
+            reject("paper_a", a)?;
             PaperParams::InverseSquare { c: need("paper_c", c, 1e-6, 1.0)?, b: need("paper_b", b, 0.1, 50.0)? }
         }
     }))

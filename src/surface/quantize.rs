@@ -60,7 +60,7 @@ impl Step {
 
     /// A position relative to the mesh's centre, Å, as multiples of the step: the nearest, ties to even. The position is
     /// the single-precision number that `interpolate` writes (spacings from the centre times the spacing, rounded once).
-    /// A coordinate that [`Self::holds`] refuses becomes [`BEYOND`].
+    /// A coordinate that [`Self::holds`] rejects becomes [`BEYOND`].
     #[inline]
     #[must_use]
     pub fn position(self, position: [f32; 3]) -> [i16; 3] {
@@ -104,8 +104,8 @@ fn shorten(normal: &mut [i16; 3]) {
     normal[largest] -= normal[largest].signum();
 }
 
-/// The low 16 bits of the integer nearest to `v`, ties to even, within ±`max`, which is 2¹⁵ at most; what is no number
-/// becomes `max`.
+/// The low 16 bits of the integer nearest to `v`, ties to even, within ±`max`, which is 2¹⁵ at most; NaN becomes
+/// `max`.
 ///
 /// Adding 1.5 · 2²³ leaves no bits for a fraction, and the integer in the low ones; unlike a rounding instruction every
 /// processor has that for whole vectors.
@@ -142,13 +142,13 @@ mod tests {
         for nonsense in [f64::NAN, f64::INFINITY] {
             assert!(
                 !Step::covering(nonsense).holds(&[[0.0; 3], [1.0; 3]]),
-                "{nonsense} is not covered, and is refused"
+                "{nonsense} is not covered, and is rejected"
             );
         }
     }
 
     #[test]
-    fn the_outermost_coordinates_are_held_and_those_beyond_are_not() {
+    fn outermost_coordinates_fit_and_larger_ones_do_not() {
         let step = Step::covering(20.0);
         let reach = step.reach();
         assert_eq!(step.position([reach, -reach, 0.0]), [32_767, -32_767, 0]);
@@ -158,13 +158,13 @@ mod tests {
         let (inside, half) = (reach + 0.49 * step.length(), reach + 0.5 * step.length());
         assert!(step.holds(&[[-inside; 3], [inside; 3]]));
         assert_eq!(step.position([inside, -inside, -0.0]), [32_767, -32_767, 0]);
-        // What is refused by its size is what is marked, to the last bit.
+        // `holds` rejects exactly the coordinates that are marked.
         for beyond in [half, -half, reach + step.length(), f32::MAX, f32::INFINITY, f32::NEG_INFINITY, -1e9] {
             assert!(!step.holds(&[[beyond, 0.0, 0.0]; 2]), "{beyond}");
             assert_eq!(step.position([beyond, 0.0, beyond]), [BEYOND, 0, BEYOND], "{beyond}");
         }
         assert_eq!(step.position([f32::NAN; 3]), [BEYOND; 3]);
-        assert!(!step.holds(&[step.decoded([BEYOND, 0, 0]), [0.0; 3]]), "a marked coordinate is refused when decoded");
+        assert!(!step.holds(&[step.decoded([BEYOND, 0, 0]), [0.0; 3]]), "a marked coordinate is rejected when decoded");
         assert_eq!(step.decoded([32_767, -32_767, 1]), [reach, -reach, step.length()]);
     }
 
@@ -178,7 +178,7 @@ mod tests {
             assert_eq!(f32::from(nearest(v, POSITION_MAX + 1.0)), v.round_ties_even(), "{v}");
         }
         assert_eq!((nearest(0.5, 127.0), nearest(1.5, 127.0), nearest(-2.5, 127.0)), (0, 2, -2));
-        assert_eq!(normal([f32::NAN, 0.0, f32::NEG_INFINITY]), [126, 0, -127], "what is no normal at all");
+        assert_eq!(normal([f32::NAN, 0.0, f32::NEG_INFINITY]), [126, 0, -127], "not a normal");
     }
 
     /// Looks at every integer vector that some unit vector is rounded to.

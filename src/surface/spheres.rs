@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::error::SurfaceError;
 
-/// Centres beyond this distance from the origin (Å, per axis) are refused: 32-bit vertex coordinates would
+/// Centres beyond this distance from the origin (Å, per axis) are rejected: 32-bit vertex coordinates would
 /// lose more than a hundredth of an ångström there, and no structure file's columns reach that far.
 pub const MAX_COORDINATE: f64 = 100_000.0;
 

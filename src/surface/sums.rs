@@ -61,7 +61,7 @@ impl<'a> From<&'a Mesh> for Positions<'a> {
     }
 }
 
-/// Triangles whose geometry is computed together: enough that what was gathered lane by lane has left the store
+/// Triangles whose geometry is computed together: enough that values gathered lane by lane have left the store
 /// buffer when it is read back as vectors.
 const LANES: usize = 128;
 

@@ -111,26 +111,26 @@ mod tests {
     use crate::formats::Packing;
 
     #[test]
-    fn a_glb_of_four_gibibytes_is_refused_with_numbers() {
+    fn rejects_a_glb_of_four_gibibytes() {
         // 24 bytes per vertex and 12 per triangle, two triangles per vertex: 48 bytes a vertex.
         let fits = Layout::plain([89_000_000, 178_000_000], Packing::Full).unwrap();
         assert_eq!(GlbPlan::wrap(vec![b' '; 1000], fits).unwrap().len(), 48 * 89_000_000 + HEAD_BYTES);
         let large = Layout::plain([90_000_000, 180_000_000], Packing::Full).unwrap();
-        let refusal = GlbPlan::wrap(vec![b' '; 1000], large).unwrap_err();
-        assert_eq!(refusal, FormatError::GlbTooLarge { bytes: 4_320_016_384, limit: 4_294_967_295 });
-        assert!(refusal.to_string().contains("4320016384"));
-        assert_eq!(io::Error::from(refusal).kind(), io::ErrorKind::InvalidInput);
+        let error = GlbPlan::wrap(vec![b' '; 1000], large).unwrap_err();
+        assert_eq!(error, FormatError::GlbTooLarge { bytes: 4_320_016_384, limit: 4_294_967_295 });
+        assert!(error.to_string().contains("4320016384"));
+        assert_eq!(io::Error::from(error).kind(), io::ErrorKind::InvalidInput);
     }
 
     #[test]
-    fn the_limit_is_met_to_the_byte() {
+    fn glb_limit_is_exact() {
         // A GLB's length is a multiple of 4: the largest is 4,294,967,292 bytes.
         assert_eq!(GlbPlan::check_len(4_294_967_295).unwrap(), u32::MAX);
         assert!(GlbPlan::check_len(4_294_967_296).is_err());
     }
 
     #[test]
-    fn a_large_buffer_begins_at_a_fixed_place() {
+    fn a_large_buffer_begins_at_a_fixed_offset() {
         let head = |json: usize, vertices: u64| {
             let layout = Layout::plain([vertices, 1], Packing::Full).unwrap();
             GlbPlan::wrap(vec![b' '; json], layout).unwrap().head().len() as u64

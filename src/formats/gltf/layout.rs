@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn atom_indices_are_exact_or_refused() {
+    fn atom_indices_are_exact_or_rejected() {
         assert_eq!(AtomType::for_largest(0), Ok(AtomType::U16));
         assert_eq!(AtomType::for_largest(65_535), Ok(AtomType::U16));
         assert_eq!(AtomType::for_largest(65_536), Ok(AtomType::F32));

@@ -67,7 +67,7 @@ impl Tiles {
         let mut index: FxHashMap<[i32; 3], u32> = FxHashMap::default();
         let (mut pairs, mut unchecked) = (0_u64, 0_u64);
         // Every tile in reach holds at least one occupied brick. A tile in reach of an atom holds at least one of its
-        // candidate pairs, except where the atom reaches a corner alone. Both bound what is allocated below.
+        // candidate pairs, except where the atom reaches a corner alone. Both bound the allocations below.
         let max_tiles = limits.max_samples / 512 + 1;
         let max_pairs = candidates::limit(limits).max(8 * lattice.atoms.len() as u64);
         // Tiles in the order of their first atoms, and every pair of an atom and such a tile.

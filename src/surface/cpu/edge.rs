@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_edge_is_where_it_was_made() {
+    fn edges_return_their_coordinates() {
         for (z, y, x, axis) in (0..8 * 8 * 8 * 3).map(|i| (i / 192, i / 24 % 8, i / 3 % 8, i % 3)) {
             let edge = Edge::new(z, 8 * y + x, axis);
             assert_eq!([edge.x(), edge.y(), edge.z(), edge.axis()].map(usize::from), [x, y, z, axis]);

@@ -57,7 +57,7 @@ fn shared_edges(crossing: &[u64; 24], n: usize, mut each: impl FnMut(usize, usiz
         4 => [0, 1].iter().for_each(|&axis| bits(crossing[axis], |b| each(0, b, axis))),
         5 => bits(crossing[1] & X0, |b| each(0, b, 1)),
         6 => bits(crossing[0] & Y0, |b| each(0, b, 0)),
-        // What all eight share is a sample; no edge lies on it.
+        // All eight share a single sample and no edge.
         _ => {}
     }
 }

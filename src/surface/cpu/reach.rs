@@ -99,7 +99,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn who_reaches_a_vertex_reaches_its_box(
+        fn atoms_that_reach_a_vertex_reach_its_box(
             atoms in prop::collection::vec((prop::array::uniform3(-12.0_f32..20.0), 2.0_f32..5.0), 0..70),
             vertices in prop::array::uniform3(prop::array::uniform16(0.0_f32..8.0)),
             support in 0.5_f32..5.0,
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_far_away_is_left_out() {
+    fn distant_atoms_are_omitted() {
         let atoms = [atom([0.0; 3], 2.0), atom([30.0, 0.0, 0.0], 2.0), atom([7.0; 3], 2.0)];
         let mut around = Around::default();
         around.fill(&atoms, &[0, 1, 2], [0; 3]);

@@ -93,7 +93,7 @@ mod tests {
     use crate::surface::spheres::Spheres;
 
     #[test]
-    fn a_tile_is_cut_where_it_is_more_than_a_threads_share() {
+    fn tiles_above_a_threads_share_are_split() {
         // A single tile; a quarter of all atoms; hardly any.
         assert_eq!([1, 2, 3, 16].map(|threads| pieces(100, 100, threads)), [1, 4, 4, 4]);
         assert_eq!([1, 4, 5, 8, 16].map(|threads| pieces(25, 100, threads)), [1, 1, 2, 4, 4]);
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn what_slabs_find_is_what_the_tile_finds() {
+    fn slabs_find_the_same_as_the_whole_tile() {
         let told = |scanned: &Scanned| (format!("{:?}", scanned.done), format!("{:?}", scanned.grid));
         let whole = scanned(1);
         let expected = told(&whole);
