@@ -1,11 +1,10 @@
-//! Columns to little-endian bytes: as they lie in memory where that is what the file holds, else through one
+//! Writers of columns as little-endian bytes: copied from memory if the layouts agree, otherwise converted through one
 //! reused block of fixed-size records.
 
 use std::io::{self, Write};
 use std::ops::Range;
 
-/// Bytes converted before they are written in one call: fits the second-level cache, and is large enough for
-/// the cost of a call not to matter.
+/// Bytes converted per write call: fits the second-level cache and makes the cost of a call negligible.
 pub(super) const BLOCK_BYTES: usize = 512 << 10;
 
 /// Writes `n` records of `N` bytes; `fill` converts a range of rows into as many records.
@@ -72,26 +71,26 @@ pub(super) fn convert_words<const N: usize, T: Copy>(
     })
 }
 
-/// What turns a vertex into the structure file's coordinates.
+/// Transformation of a vertex into the coordinates of the structure file.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Place {
-    /// The mesh's centre, Å.
+    /// Centre of the mesh, Å.
     pub(super) centre: [f64; 3],
-    /// What Å are multiplied by.
+    /// Scale factor: file units per Å.
     pub(super) scale: f64,
 }
 
 impl Place {
-    /// A vertex in the structure file's coordinates and the file's units: added and scaled in double precision, then
+    /// Returns a vertex in the structure file's coordinates and the file's units: computed in double precision and
     /// rounded once.
     #[inline]
-    #[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what the file formats ask for")]
+    #[expect(clippy::cast_possible_truncation, reason = "the file formats require f32")]
     pub(super) fn absolute(self, position: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|k| ((self.centre[k] + f64::from(position[k])) * self.scale) as f32)
     }
 }
 
-/// Puts three floats into `bytes`.
+/// Writes three floats to `bytes`.
 #[inline]
 pub(super) fn put_floats(bytes: &mut [u8; 12], row: [f32; 3]) {
     let (words, _) = bytes.as_chunks_mut::<4>();

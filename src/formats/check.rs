@@ -1,7 +1,7 @@
-//! One look at a mesh before it is written: refuses what no format can hold, and finds the bounds.
+//! Checks a mesh before it is written: rejects meshes that no format can hold, and computes the bounds.
 //!
-//! Everything is read once, in chunks on rayon's pool, because the mesh of a large structure has hundreds of
-//! megabytes and a file that turns out to be wrong halfway cannot be taken back.
+//! The columns are read once, in chunks on rayon's pool: the mesh of a large structure has hundreds of megabytes, and a
+//! file cannot be withdrawn halfway.
 
 use rayon::prelude::*;
 
@@ -9,28 +9,29 @@ use super::error::FormatError;
 use super::format::Format;
 use crate::surface::Mesh;
 
-/// Rows looked at by one task: below that a mesh is checked on the calling thread.
+/// Rows per task; smaller meshes are checked on the calling thread.
 const CHUNK_ROWS: usize = 1 << 16;
 
-/// No component of a unit vector is larger, rounding included.
+/// Maximum component of a unit vector, with tolerance for rounding.
 const MAX_NORMAL: f32 = 1.001;
 
-/// How much of a mesh is looked at.
+/// Extent of the check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Depth {
-    /// Everything.
+    /// All columns.
     All,
-    /// Only what the writer of the format relies on. A writer that copies a column does not rely on its values.
+    /// Only the values that the writer of the format relies on; a writer that copies a column does not rely on its
+    /// values.
     Needed(Format),
 }
 
 impl Depth {
-    /// OBJ has lines of bounded length, so numbers must be.
+    /// Returns true if normals are checked: OBJ lines, and hence numbers, have bounded length.
     fn normals(self) -> bool {
         matches!(self, Self::All | Self::Needed(Format::Obj))
     }
 
-    /// STL looks vertices up, and glTF narrows indices where they fit into 16 bits.
+    /// Returns true if indices are checked: STL looks vertices up, and glTF narrows indices that fit into 16 bits.
     fn indices(self, n_vertices: usize) -> bool {
         match self {
             Self::All | Self::Needed(Format::Stl) => true,
@@ -40,18 +41,18 @@ impl Depth {
     }
 }
 
-/// What the formats need to know of a mesh that they can hold.
+/// Properties of a valid mesh that the formats need.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Summary {
     /// Lowest and highest relative position per axis, Å; zeros without vertices.
     pub(super) bounds: [[f32; 3]; 2],
     /// Largest atom index, if the mesh has atom indices.
     pub(super) max_atom: Option<u32>,
-    /// Whether some colour is not opaque.
+    /// True if a colour is not opaque.
     pub(super) translucent: bool,
 }
 
-/// Checks that columns have one length, numbers are finite and indices in range.
+/// Checks that all columns have the same length, numbers are finite and indices in range.
 pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
     let n = mesh.n_vertices();
     let n_normals = mesh.quantized.as_ref().map_or(mesh.normals.len(), |quantized| quantized.normals.len());
@@ -69,7 +70,7 @@ pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
         return Err(FormatError::NotFinite { column: "centre", row: axis as u64, value });
     }
     let bounds = match &mesh.quantized {
-        // A coordinate out of reach, or one that was no number, lies beyond the step: whoever writes the file refuses it.
+        // A coordinate out of range or not finite lies beyond the step, which the encoder rejects.
         Some(_) => mesh.bounds().map(|row| row.map(|v| v + 0.0)),
         None => extent("position", &mesh.positions[..])?.unwrap_or_default(),
     };
@@ -86,10 +87,10 @@ pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
     })
 }
 
-/// Refuses normals that are longer than unit vectors.
+/// Rejects normals that are longer than unit vectors.
 fn normals(mesh: &Mesh) -> Result<(), FormatError> {
     let longest = match &mesh.quantized {
-        // The lowest integer is the only one that is too large.
+        // Only the lowest integer is too large.
         Some(quantized) => {
             let lowest = quantized.normals.iter().flatten().min().copied().unwrap_or_default();
             [[f32::from(lowest) / 127.0; 3]; 2]
@@ -100,7 +101,7 @@ fn normals(mesh: &Mesh) -> Result<(), FormatError> {
     beyond.map_or(Ok(()), |&value| Err(FormatError::NotUnit { value }))
 }
 
-/// Lowest and highest value per axis; `None` without rows. Refuses numbers that are not finite.
+/// Returns the lowest and highest value per axis; `None` without rows. Rejects numbers that are not finite.
 fn extent(column: &'static str, rows: &[[f32; 3]]) -> Result<Option<[[f32; 3]; 2]>, FormatError> {
     let join = |a: Extent, b: Extent| a.join(&b);
     let all = if rows.len() <= CHUNK_ROWS {
@@ -113,11 +114,12 @@ fn extent(column: &'static str, rows: &[[f32; 3]]) -> Result<Option<[[f32; 3]; 2
         let (row, value) = found.unwrap_or((0, f32::NAN));
         return Err(FormatError::NotFinite { column, row: row as u64, value: f64::from(value) });
     }
-    // Adding zero turns −0 into 0, which JSON would tell apart.
+    // Adding zero turns −0 into 0; JSON would distinguish them.
     Ok((!rows.is_empty()).then(|| [all.low.map(|v| v + 0.0), all.high.map(|v| v + 0.0)]))
 }
 
-/// Running extremes of three axes. `poison` is NaN as soon as one value was not finite: 0 · ∞ and 0 · NaN are.
+/// Running extremes of three axes. `poison` is NaN as soon as one value is not finite, because 0 · ∞ and 0 · NaN are
+/// NaN.
 #[derive(Debug, Clone, Copy)]
 struct Extent {
     low: [f32; 3],
@@ -132,7 +134,7 @@ impl Default for Extent {
 }
 
 impl Extent {
-    /// Four rows at a time: twelve lanes are three vectors, with the axes always in the same lanes.
+    /// Reads four rows at a time: twelve lanes are three vectors, with each axis always in the same lanes.
     fn of(rows: &[[f32; 3]]) -> Self {
         let (quads, rest) = rows.as_chunks::<4>();
         let (mut low, mut high, mut poison) = ([f32::INFINITY; 12], [f32::NEG_INFINITY; 12], [0.0_f32; 12]);
@@ -169,7 +171,7 @@ fn maximum(values: &[u32]) -> Option<u32> {
     if values.len() <= CHUNK_ROWS { of(values) } else { values.par_chunks(CHUNK_ROWS).map(of).max().flatten() }
 }
 
-/// Refuses triangles that name vertices which do not exist.
+/// Rejects triangles with the index of a vertex that does not exist.
 fn in_range(triangles: &[[u32; 3]], n_vertices: usize) -> Result<(), FormatError> {
     let beyond = |index: u32| index as usize >= n_vertices;
     if !maximum(triangles.as_flattened()).is_some_and(beyond) {
@@ -186,7 +188,7 @@ mod tests {
     use super::*;
     use crate::formats::Step;
 
-    /// Rows whose extremes are known: a ramp with one low and one high outlier.
+    /// Rows with known extremes: a ramp with one low and one high outlier.
     fn rows(n: usize) -> Vec<[f32; 3]> {
         let mut rows: Vec<[f32; 3]> = (0..n).map(|i| [i as f32, -(i as f32), 0.5]).collect();
         rows[n / 3][2] = -7.0;
@@ -204,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_number_that_is_not_finite_is_found_wherever_it_is() {
+    fn non_finite_numbers_are_found_in_any_row() {
         for n in [1, 5, 2 * CHUNK_ROWS + 3] {
             for row in [0, n / 2, n - 1] {
                 for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
@@ -238,7 +240,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_of_different_lengths_are_refused() {
+    fn columns_of_different_lengths_are_rejected() {
         let whole =
             Mesh { positions: vec![[0.0; 3]; 2].into(), normals: vec![[0.0, 0.0, 1.0]; 2].into(), ..Mesh::default() };
         assert!(check(&whole, Depth::All).is_ok());

@@ -1,33 +1,33 @@
-//! Why a mesh cannot be written. Every refusal comes before the first byte.
+//! Errors of writing a mesh. All are returned before the first byte is written.
 
 use std::io;
 
 use thiserror::Error;
 
-/// The mesh is broken, or the format cannot hold it.
+/// Error of a mesh that is invalid or that the format cannot hold.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum FormatError {
-    /// A column of the mesh is not as long as its positions.
+    /// A column of the mesh has another length than its positions.
     #[error("the mesh has {vertices} positions but {len} {column}")]
     ColumnLength {
         /// `normals`, `atom_ids` or `colors`.
         column: &'static str,
-        /// Its length.
+        /// Length of the column.
         len: u64,
         /// Number of positions.
         vertices: u64,
     },
-    /// A triangle names a vertex that does not exist.
-    #[error("triangle {triangle} names vertex {index}, but the mesh has {vertices} vertices")]
+    /// A triangle has the index of a vertex that does not exist.
+    #[error("triangle {triangle} refers to vertex {index}, but the mesh has {vertices} vertices")]
     IndexOutOfRange {
-        /// The triangle, from 0.
+        /// Number of the triangle, from 0.
         triangle: u64,
-        /// The vertex that it names.
+        /// Index of the vertex.
         index: u32,
         /// Number of vertices.
         vertices: u64,
     },
-    /// A number that is infinite or none.
+    /// A number is infinite or NaN.
     #[error("{column} {row} holds {value}; only finite numbers can be written")]
     NotFinite {
         /// `position`, `normal` or `centre`.
@@ -37,30 +37,30 @@ pub enum FormatError {
         /// The number.
         value: f64,
     },
-    /// A normal that is far too long.
+    /// A normal is longer than a unit vector.
     #[error("a normal has a component of {value}; normals have length 1")]
     NotUnit {
         /// The component.
         value: f32,
     },
-    /// More vertices or triangles than the format can count.
+    /// The mesh has more vertices or triangles than the format can hold.
     #[error("{format} counts {limit} {what} at most, the mesh has {count}")]
     TooMany {
         /// The format's name.
         format: &'static str,
         /// `vertices` or `triangles`.
         what: &'static str,
-        /// How many there are.
+        /// Number in the mesh.
         count: u64,
-        /// How many the format can hold.
+        /// Maximum of the format.
         limit: u64,
     },
-    /// The length of a GLB is 32 bits wide.
+    /// The GLB exceeds the 32-bit length field.
     #[error("the GLB would take {bytes} bytes, the format's limit is {limit}; use a coarser resolution or PLY")]
     GlbTooLarge {
-        /// Bytes that it would take.
+        /// Length of the file.
         bytes: u64,
-        /// Bytes that a GLB can hold.
+        /// Maximum length of a GLB.
         limit: u64,
     },
     /// glTF attributes are 16-bit integers or 32-bit floats: larger atom indices would be rounded.
@@ -68,10 +68,10 @@ pub enum FormatError {
     AtomIndexTooLarge {
         /// The largest atom index of the mesh.
         atom: u32,
-        /// The largest that is exact.
+        /// Largest index that is exact.
         limit: u32,
     },
-    /// A coordinate with more digits before the point than OBJ lines have room for.
+    /// A coordinate has too many digits for an OBJ line.
     #[error("a coordinate of {value} cannot be written to OBJ, the limit is ±{limit}")]
     CoordinateTooLarge {
         /// The coordinate, in the file's units.
@@ -79,7 +79,7 @@ pub enum FormatError {
         /// The limit, in the file's units.
         limit: f64,
     },
-    /// A position that no 16-bit multiple of the step is near.
+    /// A position is out of the range of 16-bit multiples of the step.
     #[error("a vertex lies beyond {reach} Å from the mesh's centre, the largest coordinate with a step of {step} Å")]
     BeyondStep {
         /// The largest coordinate that can be stored, Å.
@@ -93,7 +93,7 @@ pub enum FormatError {
         /// The format's name.
         format: &'static str,
     },
-    /// Only glTF and GLB hold coordinates that small.
+    /// Only glTF and GLB hold coordinates in units this large.
     #[error("{format} cannot hold coordinates in {units}, glb and gltf can")]
     NotInUnits {
         /// The format's name.
@@ -101,22 +101,22 @@ pub enum FormatError {
         /// The units' name.
         units: &'static str,
     },
-    /// Pictures are drawn, not written.
-    #[error("{format} is a picture of a mesh, and holds none")]
+    /// The format is a picture, which is rendered, not encoded.
+    #[error("{format} is a picture format and cannot hold a mesh")]
     NotAMesh {
         /// The format's name.
         format: &'static str,
     },
-    /// Vertices that were rounded before are not rounded again, nor are they made longer than they are.
-    #[error("the mesh's vertices are quantised in steps of {step} Å, and can be stored in no other way")]
+    /// The vertices are already quantized and cannot be stored with another step or as floats.
+    #[error("the mesh's vertices are quantised in steps of {step} Å and cannot be stored differently")]
     OtherPacking {
         /// The mesh's step, Å.
         step: f32,
     },
-    /// The JSON part of a glTF could not be made.
+    /// The JSON part of a glTF cannot be serialized.
     #[error("the glTF document cannot be written as JSON: {reason}")]
     Json {
-        /// The serialiser's words.
+        /// Message of the serializer.
         reason: String,
     },
 }

@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use thiserror::Error;
 
-/// What a file is: a mesh, or a picture of one.
+/// Format of an output file: a mesh or a picture of one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Format {
     /// glTF 2.0, binary container.
@@ -23,7 +23,7 @@ pub enum Format {
     Png,
 }
 
-/// No format has this name.
+/// Error: no format has this name.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("unknown format `{0}`; expected one of glb, gltf, ply, stl, obj, png")]
 pub struct UnknownFormat(pub String);
@@ -32,7 +32,7 @@ impl Format {
     /// Every format.
     pub const ALL: [Self; 6] = [Self::Glb, Self::Gltf, Self::Ply, Self::Stl, Self::Obj, Self::Png];
 
-    /// Those that hold a mesh.
+    /// Formats that hold a mesh.
     pub const MESHES: [Self; 5] = [Self::Glb, Self::Gltf, Self::Ply, Self::Stl, Self::Obj];
 
     /// File extension and name, without a dot.
@@ -48,19 +48,19 @@ impl Format {
         }
     }
 
-    /// Whether it shows a mesh instead of holding it: no writer of this room makes such a file.
+    /// Returns true if the format is a picture of a mesh; no encoder writes such a file.
     #[must_use]
     pub const fn is_picture(self) -> bool {
         matches!(self, Self::Png)
     }
 
-    /// Whether it can hold quantised vertices.
+    /// Returns true if the format can hold quantized vertices.
     #[must_use]
     pub const fn holds_quantized(self) -> bool {
         matches!(self, Self::Glb | Self::Gltf)
     }
 
-    /// Media type. Registered with IANA, except that of PLY, which has none: `application/ply` is what people send.
+    /// Media type, registered with IANA except that of PLY, for which `application/ply` is common.
     #[must_use]
     pub const fn media_type(self) -> &'static str {
         match self {
@@ -73,8 +73,8 @@ impl Format {
         }
     }
 
-    /// The format that a media type means: ours, or one that other programs use for the same format. Letter case
-    /// and parameters (`; charset=…`) do not matter. Wildcards mean no format: choosing is the caller's affair.
+    /// Returns the format for a media type, including types that other programs use. Ignores letter case and parameters
+    /// (`; charset=…`). Wildcards match no format.
     #[must_use]
     pub fn from_media_type(text: &str) -> Option<Self> {
         let essence = text.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
@@ -114,7 +114,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_format_is_found_by_its_own_name_and_media_type() {
+    fn every_format_parses_its_own_name_and_media_type() {
         for format in Format::ALL {
             assert_eq!(format.to_string().to_uppercase().parse(), Ok(format));
             assert_eq!(Format::from_media_type(format.media_type()), Some(format));

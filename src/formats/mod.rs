@@ -1,13 +1,12 @@
-//! Meshes to bytes. Pure: a mesh and an `io::Write` in, no paths, no HTTP.
+//! Mesh encoders. Pure: they take a mesh and an `io::Write`, without paths or HTTP.
 //!
-//! A file is made in two steps, so that whoever sends it knows its length first: [`Encoder::new`] checks the mesh
-//! and lays the file out without writing a byte, [`Encoder::write`] streams it. The mesh is never copied as a
-//! whole: columns that the format holds as they are go to the writer as they lie in memory, everything else
-//! passes through one block of [`block::BLOCK_BYTES`].
+//! Encoding has two steps, so that the length is known before sending: [`Encoder::new`] checks the mesh and computes
+//! the layout, [`Encoder::write`] streams the file. The mesh is never copied as a whole: columns in the format's own
+//! layout are written from memory, all others pass through one block of [`block::BLOCK_BYTES`].
 //!
 //! One unit is one ångström in every format, unless [`Units`] says otherwise. glTF holds positions relative to
-//! [`Mesh::centre`], in Å, under a node that moves and scales them; PLY, STL and OBJ have no nodes and hold the structure file's
-//! own coordinates, scaled.
+//! [`Mesh::centre`], in Å, under a node that translates and scales them. PLY, STL and OBJ have no nodes and hold the
+//! scaled coordinates of the structure file.
 
 mod block;
 mod check;
@@ -32,10 +31,10 @@ pub use storage::{Normals, Storage, Units};
 
 use crate::surface::Mesh;
 
-/// Program and version, as every format that has room for it says it.
+/// Name and version of the program, for formats with such a field.
 const GENERATOR: &str = concat!("molmesh ", env!("CARGO_PKG_VERSION"));
 
-/// What a file says about its mesh besides the mesh.
+/// Metadata of a mesh for the file.
 #[derive(Debug, Clone, Default)]
 pub struct Meta {
     /// Name of the mesh, such as the PDB id.
@@ -46,36 +45,36 @@ pub struct Meta {
 
 /// Writes `mesh` as `format`.
 ///
-/// # Errors
-/// Those of `out`, and `InvalidInput` around a [`FormatError`] where the mesh is broken or the format cannot hold
-/// it (a GLB of 4 GiB); then nothing has been written.
+/// Returns the errors of `out`, and `InvalidInput` with a [`FormatError`] if the mesh is invalid or the format cannot
+/// hold it (such as a GLB of 4 GiB); nothing has been written then.
 pub fn write(format: Format, mesh: &Mesh, meta: &Meta, out: &mut dyn Write) -> io::Result<()> {
     Encoder::new(format, mesh, meta)?.write(out)
 }
 
-/// Bytes that [`write`] will write, exactly; `None` where it would refuse the mesh, and for OBJ, whose length is
-/// known only once every number is text: see [`encoded_len_bound`].
+/// Returns the exact number of bytes that [`write`] writes; `None` if it rejects the mesh, and for OBJ, whose length is
+/// only known after formatting: see [`encoded_len_bound`].
 ///
-/// [`Encoder`] tells the length and writes the file at the price of one check of the mesh.
+/// [`Encoder`] returns the length and writes the file with a single check of the mesh.
 #[must_use]
 pub fn encoded_len(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
     Encoder::new(format, mesh, meta).ok()?.encoded_len()
 }
 
-/// Bytes that [`write`] will write at most: exact wherever [`encoded_len`] is; `None` where it would refuse.
+/// Returns the maximum number of bytes that [`write`] writes: exact if [`encoded_len`] is; `None` if it rejects the
+/// mesh.
 #[must_use]
 pub fn encoded_len_bound(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
     Some(Encoder::new(format, mesh, meta).ok()?.encoded_len_bound())
 }
 
-/// A file that is laid out and not yet written.
+/// Encoder of a file whose layout is known.
 #[derive(Debug)]
 pub struct Encoder<'a> {
     mesh: &'a Mesh,
     plan: Plan,
 }
 
-/// What is known of a file before it is written.
+/// Layout of a file.
 #[derive(Debug)]
 enum Plan {
     Glb(gltf::GlbPlan),
@@ -86,7 +85,7 @@ enum Plan {
 }
 
 impl<'a> Encoder<'a> {
-    /// Checks `mesh` and lays the file out. Reads every column of the mesh once, on rayon's pool if it is large.
+    /// Checks `mesh` and computes the layout. Reads every column once, on rayon's pool if the mesh is large.
     ///
     /// # Errors
     /// Any [`FormatError`].
@@ -94,10 +93,10 @@ impl<'a> Encoder<'a> {
         Self::lay_out(format, Packing::of(mesh).into(), mesh, meta, Depth::All)
     }
 
-    /// The same for a mesh that a backend returned, whose invariants hold: does not look at normals and indices
-    /// that the format holds as they are. Writing a large GLB then costs hardly more than copying the mesh.
+    /// Returns the encoder of a mesh from a backend, whose invariants hold: skips normals and indices that are copied
+    /// unchanged. Writing a large GLB then costs little more than copying the mesh.
     ///
-    /// A mesh that breaks its invariants may be written as a file that breaks them too; nothing panics.
+    /// An invalid mesh may then result in an invalid file; nothing panics.
     ///
     /// # Errors
     /// Any [`FormatError`].
@@ -105,13 +104,12 @@ impl<'a> Encoder<'a> {
         Self::stored(format, Packing::of(mesh), mesh, meta)
     }
 
-    /// As [`Self::trusting`], with the mesh stored as asked: a [`Storage`], or a [`Packing`] alone. Vertices that are packed so
-    /// already are written as they lie.
+    /// As [`Self::trusting`], with a given [`Storage`] or [`Packing`]. Vertices that are already packed this way are
+    /// copied.
     ///
-    /// # Errors
-    /// Any [`FormatError`]; [`FormatError::NotQuantized`] and [`FormatError::NotInUnits`] if `format` has no such
-    /// packing or units, [`FormatError::BeyondStep`] if the step is too small for the mesh, [`FormatError::OtherPacking`] if
-    /// the mesh is packed otherwise.
+    /// Returns any [`FormatError`]: [`FormatError::NotQuantized`] and [`FormatError::NotInUnits`] if `format` has no
+    /// such packing or units, [`FormatError::BeyondStep`] if the step is too small for the mesh,
+    /// [`FormatError::OtherPacking`] if the mesh has another packing.
     pub fn stored(
         format: Format,
         storage: impl Into<Storage>,
@@ -151,7 +149,7 @@ impl<'a> Encoder<'a> {
         Ok(Self { mesh, plan })
     }
 
-    /// Bytes of the file, exactly; `None` for OBJ.
+    /// Returns the exact length of the file, bytes; `None` for OBJ.
     #[must_use]
     pub fn encoded_len(&self) -> Option<u64> {
         match &self.plan {
@@ -163,7 +161,7 @@ impl<'a> Encoder<'a> {
         }
     }
 
-    /// Bytes of the file at most; exact where [`Self::encoded_len`] is.
+    /// Returns the maximum length of the file, bytes; exact if [`Self::encoded_len`] is.
     #[must_use]
     pub fn encoded_len_bound(&self) -> u64 {
         match &self.plan {
@@ -174,10 +172,10 @@ impl<'a> Encoder<'a> {
 
     /// Writes the file and flushes `out`. The same mesh and meta give the same bytes.
     ///
-    /// Blocks are large: `out` needs no buffer of its own.
+    /// Writes large blocks: `out` needs no buffer.
     ///
     /// # Errors
-    /// Those of `out`.
+    /// Returns the errors of `out`.
     pub fn write(&self, out: &mut dyn Write) -> io::Result<()> {
         match &self.plan {
             Plan::Glb(plan) => plan.write(self.mesh, out),

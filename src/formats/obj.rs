@@ -1,7 +1,7 @@
 //! Wavefront OBJ: text, one line per vertex, normal and triangle; indices count from 1.
 //!
-//! Coordinates are rounded to 1e-4 Å (four decimals, in nanometres five: a thousandth of a bond and a tenth of what structure
-//! files hold), so vertices closer than that may get the same coordinates; they stay different vertices, and the surface closed.
+//! Coordinates are rounded to 1e-4 Å (five decimals in nanometres), a tenth of the precision of structure files.
+//! Vertices closer than that may get equal coordinates; they stay separate vertices, and the surface stays closed.
 
 use std::io::{self, Write};
 
@@ -14,11 +14,11 @@ use crate::surface::Mesh;
 /// Decimals of a normal's component.
 const NORMAL_DECIMALS: Decimals = Decimals::Four;
 
-/// Coordinates beyond this are refused, in the file's units.
+/// Largest coordinate, in the file's units.
 const MAX_COORDINATE: f64 = 1e9;
 
-/// Room for the longest line: `f` and three times `4294967296//4294967296` are 71 bytes, `v` and three
-/// coordinates of 17 characters 56.
+/// Capacity for the longest line: `f` and three times `4294967296//4294967296` take 71 bytes, `v` and three coordinates
+/// of 17 characters 56.
 const LINE_BYTES: usize = 80;
 
 /// Decimals of a number.
@@ -29,7 +29,7 @@ enum Decimals {
 }
 
 impl Decimals {
-    /// Those of a coordinate: a tenth of what structure files hold, in any unit that a file can have.
+    /// Returns the decimals of a coordinate: a tenth of the precision of structure files, in any unit.
     const fn of(units: Units) -> Self {
         match units {
             Units::Angstrom => Self::Four,
@@ -44,7 +44,7 @@ impl Decimals {
         }
     }
 
-    /// Ten to their power.
+    /// Returns ten to the power of the number of decimals.
     const fn power(self) -> u32 {
         match self {
             Self::Four => 10_000,
@@ -53,7 +53,7 @@ impl Decimals {
     }
 }
 
-/// An OBJ file that is laid out.
+/// Layout of an OBJ file.
 #[derive(Debug)]
 pub(super) struct ObjPlan {
     header: String,
@@ -124,7 +124,7 @@ fn header(mesh: &Mesh, units: Units, meta: &Meta) -> String {
     header
 }
 
-/// Lines gathered into blocks, each written with one call.
+/// Lines collected into blocks; each block is written with one call.
 struct Lines<'a> {
     out: &'a mut dyn Write,
     block: Vec<u8>,
@@ -133,7 +133,7 @@ struct Lines<'a> {
 
 impl<'a> Lines<'a> {
     fn new(out: &'a mut dyn Write, len_bound: u64) -> Self {
-        // A small mesh needs a small block; the line that is being made always has room.
+        // A small mesh needs a small block; the current line always fits.
         let small = usize::try_from(len_bound).unwrap_or(usize::MAX).saturating_add(LINE_BYTES);
         Self { out, block: vec![0; small.min(BLOCK_BYTES)], used: 0 }
     }
@@ -159,7 +159,7 @@ impl<'a> Lines<'a> {
     }
 }
 
-/// One line in the making.
+/// A line under construction.
 struct Line<'a> {
     bytes: &'a mut [u8],
     used: usize,
@@ -194,7 +194,7 @@ impl Line<'_> {
         self.put(b"\n");
     }
 
-    /// A triangle whose vertices have no normals.
+    /// Appends a triangle whose vertices have no normals.
     fn bare_face(&mut self, triangle: [u32; 3]) {
         self.put(b"f");
         let mut digits = itoa::Buffer::new();
@@ -205,10 +205,10 @@ impl Line<'_> {
         self.put(b"\n");
     }
 
-    /// A number with so many decimals, halves away from zero, without a negative zero.
+    /// Appends a number with fixed decimals, rounded half away from zero, without a negative zero.
     #[expect(
         clippy::cast_possible_truncation,
-        reason = "at most 1e14 by MAX_COORDINATE; the fraction is cut on purpose"
+        reason = "at most 1e14 by MAX_COORDINATE; the fraction is truncated on purpose"
     )]
     fn fixed(&mut self, value: f32, decimals: Decimals) {
         let scaled = f64::from(value) * f64::from(decimals.power());
@@ -227,17 +227,17 @@ impl Line<'_> {
     }
 }
 
-/// Copies a word of a line.
+/// Copies a short slice.
 #[inline(always)]
 fn copy_short(to: &mut [u8], from: &[u8]) {
-    // Musl's `memcpy` takes longer for a few bytes than the rest of the line does; glibc's is as fast as what follows.
+    // Musl's `memcpy` is slower for a few bytes than the rest of the line; glibc's is as fast as this code.
     if !cfg!(target_env = "musl") {
         return to.copy_from_slice(from);
     }
     copy_in_halves(to, from);
 }
 
-/// The same by the first and the last bytes, which may overlap.
+/// Copies the first and the last bytes, which may overlap.
 #[inline(always)]
 fn copy_in_halves(to: &mut [u8], from: &[u8]) {
     match from.len() {
@@ -321,7 +321,7 @@ mod tests {
     }
 
     #[test]
-    fn the_longest_lines_have_room() {
+    fn the_longest_lines_fit() {
         let mut bytes = [0; LINE_BYTES];
         let mut line = Line { bytes: &mut bytes, used: 0 };
         line.face([u32::MAX; 3]);
@@ -332,12 +332,12 @@ mod tests {
     }
 
     #[test]
-    fn coordinates_without_room_are_refused() {
+    fn too_large_coordinates_are_rejected() {
         let mesh = Mesh { centre: [0.0, -2e9, 0.0], positions: vec![[0.0; 3]].into(), ..Mesh::default() };
         let summary = Summary { bounds: [[0.0; 3]; 2], max_atom: None, translucent: false };
         let plan = |storage: Storage| ObjPlan::new(&mesh, storage, &summary, &Meta::default());
-        let refusal = plan(Storage::default()).unwrap_err();
-        assert_eq!(refusal, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });
+        let error = plan(Storage::default()).unwrap_err();
+        assert_eq!(error, FormatError::CoordinateTooLarge { value: -2e9, limit: 1e9 });
         assert!(plan(Storage { units: Units::Nanometer, ..Storage::default() }).is_ok());
     }
 }

@@ -9,7 +9,7 @@ use crate::surface::Mesh;
 /// Bytes of a face: the count 3, then three indices.
 const FACE_BYTES: usize = 13;
 
-/// A PLY file that is laid out.
+/// Layout of a PLY file.
 #[derive(Debug)]
 pub(super) struct PlyPlan {
     header: String,
@@ -52,7 +52,7 @@ impl PlyPlan {
     }
 }
 
-/// Bytes of a vertex record: a position, then whatever of normal, colour and atom there is.
+/// Returns the length of a vertex record, bytes: position, then normal, colour and atom if present.
 fn vertex_bytes(mesh: &Mesh, normals: Normals) -> usize {
     let normal = if normals == Normals::Smooth { 12 } else { 0 };
     12 + normal + 4 * usize::from(mesh.colors.is_some()) + 4 * usize::from(mesh.atom_ids.is_some())

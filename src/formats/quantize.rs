@@ -1,13 +1,13 @@
-//! Vertices in 12 bytes instead of 24, as glTF stores them. The integers are the core's: see
-//! [`surface::quantize`](crate::surface::quantize).
+//! Vertices in 12 bytes instead of 24, as glTF stores them. [`surface::quantize`](crate::surface::quantize) does the
+//! arithmetic.
 
 use crate::surface::Mesh;
 pub use crate::surface::quantize::{Step, normal};
 
-/// What the parameter `compress` asks for.
+/// Value of the parameter `compress`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Compress {
-    /// Vertices as they are computed.
+    /// Vertices as floats.
     #[default]
     None,
     /// Vertices as small integers: see [`Packing::Quantized`].
@@ -15,7 +15,7 @@ pub enum Compress {
 }
 
 impl Compress {
-    /// Every way.
+    /// All values.
     pub const ALL: [Self; 2] = [Self::None, Self::Quantize];
 
     /// Its name as a parameter.
@@ -28,7 +28,7 @@ impl Compress {
     }
 }
 
-/// How the vertices of a glTF are stored.
+/// Storage of glTF vertices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Packing {
     /// Positions and normals as 32-bit floats: 24 bytes.
@@ -39,7 +39,7 @@ pub enum Packing {
 }
 
 impl Packing {
-    /// How the vertices of `mesh` lie in memory.
+    /// Returns the packing of the vertices of `mesh` in memory.
     #[must_use]
     pub fn of(mesh: &Mesh) -> Self {
         mesh.quantized.as_ref().map_or(Self::Full, |quantized| Self::Quantized(quantized.step))
@@ -54,7 +54,7 @@ impl Packing {
         }
     }
 
-    /// Bytes from one position to the next. glTF wants multiples of four: three 16-bit integers are followed by two zeros.
+    /// Stride of positions, bytes. glTF requires multiples of four: two zero bytes follow three 16-bit integers.
     pub(super) const fn position_bytes(self) -> u64 {
         match self {
             Self::Full => 12,
@@ -62,7 +62,7 @@ impl Packing {
         }
     }
 
-    /// Bytes from one normal to the next. Three 8-bit integers are followed by a zero.
+    /// Stride of normals, bytes. A zero byte follows three 8-bit integers.
     pub(super) const fn normal_bytes(self) -> u64 {
         match self {
             Self::Full => 12,

@@ -12,7 +12,7 @@ const HEADER_BYTES: usize = 80;
 /// Normal, three corners, and an attribute that is 0.
 const TRIANGLE_BYTES: usize = 50;
 
-/// An STL file that is laid out.
+/// Layout of an STL file.
 #[derive(Debug)]
 pub(super) struct StlPlan {
     /// Header and count.
@@ -31,7 +31,7 @@ impl StlPlan {
             limit: u64::from(u32::MAX),
         })?;
         let mut head = [b' '; HEADER_BYTES + 4];
-        // A header that begins with "solid" says text STL; one with "COLOR=" says colours to some programs.
+        // A header that begins with "solid" marks a text STL; some programs read colours after "COLOR=".
         let words = format!("{GENERATOR} units={} {}", units.name(), text::word(meta).replace('=', "_"));
         let words = &words.as_bytes()[..words.len().min(HEADER_BYTES)];
         head[..words.len()].copy_from_slice(words);
@@ -61,9 +61,9 @@ impl StlPlan {
     }
 }
 
-/// Unit normal of a triangle by the right-hand rule; zero where the triangle has no area, as STL readers expect.
+/// Returns the unit normal of a triangle by the right-hand rule; zero without area, as STL readers expect.
 #[inline]
-#[expect(clippy::cast_possible_truncation, reason = "rounding to f32 is what STL asks for")]
+#[expect(clippy::cast_possible_truncation, reason = "STL requires f32")]
 fn face_normal(corners: [[f32; 3]; 3]) -> [f32; 3] {
     // Double precision: the cross product of two edges of 1e-10 Å would underflow in single precision.
     let [a, b, c] = corners.map(|p| p.map(f64::from));
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn the_header_never_says_text_or_colours() {
+    fn the_header_never_marks_text_or_colours() {
         for name in ["solid", "COLOR=rgba", "a very long name ".repeat(20).as_str(), ""] {
             let meta = Meta { name: Some(name.to_owned()), ..Meta::default() };
             let plan = StlPlan::new(&Mesh::default(), Units::Nanometer, &meta).unwrap();

@@ -1,20 +1,19 @@
-//! What a caller may choose about a file besides its format: how vertices are stored, whether normals are, in which units
-//! coordinates are.
+//! Storage options of a file besides its format: packing of vertices, normals, and units of coordinates.
 
 use super::{Format, Packing};
 
-/// What the parameter `normals` asks for.
+/// Value of the parameter `normals`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Normals {
-    /// A normal per vertex, of the density's gradient.
+    /// One normal per vertex, from the gradient of the density.
     #[default]
     Smooth,
-    /// No vertex normals. STL's are those of its triangles and belong to the format.
+    /// No vertex normals. STL keeps the normals of its triangles, which are part of the format.
     None,
 }
 
 impl Normals {
-    /// Every way.
+    /// All values.
     pub const ALL: [Self; 2] = [Self::Smooth, Self::None];
 
     /// Its name as a parameter.
@@ -27,7 +26,7 @@ impl Normals {
     }
 }
 
-/// What the parameter `units` asks for: the length that 1 stands for in a file.
+/// Value of the parameter `units`: length of one unit in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Units {
     /// 1e-10 m, as in structure files.
@@ -35,12 +34,12 @@ pub enum Units {
     Angstrom,
     /// 10 Å.
     Nanometer,
-    /// 1e10 Å: what glTF says that its units are.
+    /// 1e10 Å: the unit of glTF.
     Meter,
 }
 
 impl Units {
-    /// Every unit.
+    /// All units.
     pub const ALL: [Self; 3] = [Self::Angstrom, Self::Nanometer, Self::Meter];
 
     /// Its name as a parameter, and in files.
@@ -53,7 +52,7 @@ impl Units {
         }
     }
 
-    /// Its length, Å.
+    /// Length of the unit, Å.
     #[must_use]
     pub const fn length(self) -> f64 {
         match self {
@@ -63,7 +62,7 @@ impl Units {
         }
     }
 
-    /// What a length in Å is multiplied by to be one in this unit.
+    /// Scale factor from Å to this unit.
     #[must_use]
     pub const fn scale(self) -> f64 {
         match self {
@@ -75,8 +74,9 @@ impl Units {
 }
 
 impl Format {
-    /// Whether it can hold coordinates in `units`. In metres a molecule is so small that programs which weld vertices nearer
-    /// than some fixed distance make one of all of them: only formats with a node, which scales for itself, hold that.
+    /// Returns true if the format can hold coordinates in `units`. In metres a molecule is so small that programs which
+    /// weld vertices within a fixed distance would merge all of them: only formats with a node that scales support
+    /// metres.
     #[must_use]
     pub const fn holds_units(self, units: Units) -> bool {
         match (self, units) {
@@ -88,14 +88,14 @@ impl Format {
     }
 }
 
-/// How a file stores a mesh.
+/// Storage of a mesh in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Storage {
-    /// The bytes of a vertex.
+    /// Packing of a vertex.
     pub packing: Packing,
-    /// Whether vertices have normals.
+    /// Normals of the vertices.
     pub normals: Normals,
-    /// What 1 stands for.
+    /// Length unit.
     pub units: Units,
 }
 
@@ -106,7 +106,7 @@ impl From<Packing> for Storage {
 }
 
 impl Storage {
-    /// Bytes from one normal to the next in a glTF; none without normals.
+    /// Stride of normals in a glTF, bytes; `None` without normals.
     pub(super) const fn normal_bytes(self) -> Option<u64> {
         match self.normals {
             Normals::Smooth => Some(self.packing.normal_bytes()),

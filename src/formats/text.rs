@@ -1,4 +1,4 @@
-//! What the text headers of PLY, STL and OBJ say: one line per fact, ASCII, short.
+//! Text headers of PLY, STL and OBJ: one short ASCII line per fact.
 
 use std::fmt::Write;
 
@@ -7,13 +7,14 @@ use serde_json::Value;
 use super::{GENERATOR, Meta, Units};
 use crate::surface::Mesh;
 
-/// Characters of one fact at most: readers of PLY have line buffers of 256 and more.
+/// Maximum length of a fact, characters: PLY readers have line buffers of 256 or more.
 const MAX_CHARS: usize = 200;
 
 /// Name of a mesh that has none.
 const NAMELESS: &str = "surface";
 
-/// `text` on one line of printable ASCII: control characters become spaces, others JSON's `\u` escapes.
+/// Returns `text` as one line of printable ASCII: control characters become spaces, other characters JSON's `\u`
+/// escapes.
 pub(super) fn one_line(text: &str) -> String {
     let mut line = String::with_capacity(text.len());
     for c in text.trim().chars() {
@@ -33,14 +34,14 @@ pub(super) fn one_line(text: &str) -> String {
     line
 }
 
-/// The mesh's name as one word.
+/// Returns the mesh's name as one word.
 pub(super) fn word(meta: &Meta) -> String {
     let name = one_line(meta.name.as_deref().unwrap_or_default()).replace(' ', "_");
     if name.is_empty() { NAMELESS.to_owned() } else { name }
 }
 
-/// The facts: generator, name, units, centre in these units, and every plain value of `meta.extras`. `precision` says how
-/// the numbers of the file are rounded, if they are.
+/// Returns the facts: generator, name, units, centre in these units, and every scalar of `meta.extras`. `precision`
+/// describes the rounding of the numbers in the file, if any.
 pub(super) fn facts(mesh: &Mesh, meta: &Meta, units: Units, precision: Option<&str>) -> Vec<String> {
     let [x, y, z] = mesh.centre.map(|v| v * units.scale());
     let mut facts = vec![format!("generator {GENERATOR}")];
@@ -54,7 +55,7 @@ pub(super) fn facts(mesh: &Mesh, meta: &Meta, units: Units, precision: Option<&s
         match value {
             Value::String(text) => facts.push(one_line(&format!("{key} {text}"))),
             Value::Bool(_) | Value::Number(_) => facts.push(one_line(&format!("{key} {value}"))),
-            // Lists and maps are for glTF, which has a place for them.
+            // Lists and maps are written to glTF only.
             Value::Null | Value::Array(_) | Value::Object(_) => {}
         }
     }

@@ -153,7 +153,7 @@ pub trait Backend: Send + Sync {
         self.write(spheres, params, limits, control, None)
     }
 
-    /// Makes a first, tiny mesh on all threads and devices: starts threads, loads code and detects what does not work.
+    /// Makes a first, tiny mesh on all threads and devices: starts threads, loads code and detects failures.
     ///
     /// # Errors
     /// As [`Self::write`].

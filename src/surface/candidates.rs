@@ -21,7 +21,7 @@ pub(super) fn limit(limits: &SurfaceLimits) -> u64 {
     limits.max_candidates.min(MAX_LIMIT)
 }
 
-/// Refuses a run that is certain to exceed the limit, by one pass over the radii and before anything is allocated.
+/// Rejects a run that is certain to exceed the limit, by one pass over the radii and before anything is allocated.
 ///
 /// # Errors
 /// [`SurfaceError::TooManyCandidates`].
@@ -39,7 +39,7 @@ pub(crate) fn check(spheres: &Spheres, params: &SurfaceParams, limits: &SurfaceL
     Err(error(least, limit(limits), spheres.len(), longest, params.resolution))
 }
 
-/// The error of a run on `lattice` that has `candidates` pairs or more.
+/// Returns the error of a run on `lattice` that has at least `candidates` pairs.
 pub(super) fn exceeded(lattice: &Lattice, candidates: u64, limits: &SurfaceLimits) -> SurfaceError {
     let longest = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
     error(candidates, limit(limits), lattice.atoms.len(), longest, lattice.spacing)
@@ -50,7 +50,8 @@ fn error(candidates: u64, limit: u64, n_spheres: usize, reach: f64, resolution: 
     SurfaceError::TooManyCandidates { candidates, limit, resolution, suggested_resolution }
 }
 
-/// Spacing (Å) at which a sphere that reaches `reach` Å has no more than `pairs` candidate pairs, if there is one.
+/// Returns a spacing (Å) at which a sphere that reaches `reach` Å has no more than `pairs` candidate pairs, if there is
+/// one.
 fn fitting(pairs: f64, reach: f64) -> Option<f64> {
     // A sphere touches at most 2·reach/brick + 2 bricks along each axis.
     let along = pairs.cbrt() - 2.0;
@@ -88,7 +89,7 @@ mod tests {
     }
 
     #[test]
-    fn identical_spheres_are_refused_at_the_exact_limit_and_the_suggestion_fits() {
+    fn identical_spheres_are_rejected_at_the_exact_limit_and_the_suggestion_fits() {
         let (spheres, params) = (same_place(100), params(0.4, 3.0));
         let exact = pairs(&spheres, &params);
         let backend = CpuBackend::new(Some(2)).unwrap();
@@ -113,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn the_lower_bound_holds_and_refuses_a_hopeless_run_at_once() {
+    fn the_lower_bound_holds_and_rejects_an_excessive_run_early() {
         for (resolution, scale) in [(0.2, 1.0), (0.5, 1.0), (0.5, 8.0), (4.0, 0.5)] {
             let (spheres, params) = (same_place(20), params(resolution, scale));
             let exact = pairs(&spheres, &params);
@@ -126,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn no_spacing_is_suggested_where_none_fits() {
+    fn no_spacing_is_suggested_if_none_fits() {
         assert_eq!(fitting(8.0, 3.0), None);
         assert_eq!(fitting(27.0, 4.0), Some(1.01));
         assert_eq!(fitting(27.0, 400.0), None);

@@ -4,14 +4,13 @@
 //! inside. Edge `e = 4·axis + k` runs along `axis` (0 x, 1 y, 2 z) from the corner whose two other coordinates
 //! are the bits of `k`, lower axis first.
 //!
-//! On each face the surface's outline is traced with the inside on its right (seen from outside the cell). Where
-//! a face's diagonal corners are inside, each is cut off by itself: a rule that looks at nothing but the face's
-//! four signs, so the two cells that share a face always agree. The outlines close into loops; each loop is
-//! triangulated without a diagonal that lies in a face, so no edge of the mesh gets a third triangle. The tests
-//! prove both for every case and for every pair of cases that can share a face, and that the table below is what this
-//! rule gives.
+//! On each face the surface's outline is traced with the inside on its right (seen from outside the cell). If diagonal
+//! corners of a face are inside, each is cut off by itself. This rule depends only on the face's four signs, so two
+//! cells that share a face always agree. The outlines close into loops. Each loop is triangulated without a diagonal
+//! within a face, so no edge of the mesh gets a third triangle. The tests verify both for every case and for every pair
+//! of cases that can share a face, and that the table below follows from the rule.
 
-/// Most triangles that a case has.
+/// Maximum number of triangles of a case.
 pub const MAX_TRIANGLES: usize = 5;
 
 /// The table of all cases.
@@ -57,7 +56,7 @@ pub struct CellEdge {
     pub axis: u8,
 }
 
-/// All cases: how many triangles each has, and their corners as cell edges.
+/// All cases: number of triangles, and their corners as cell edges.
 #[derive(Debug, Clone)]
 pub struct Cases {
     /// Triangles per case.
@@ -114,7 +113,7 @@ impl Cases {
         &self.triangles[usize::from(case)][..usize::from(self.count[usize::from(case)])]
     }
 
-    /// Into how many loops the outline of a case closes. Each is a disc of its own.
+    /// Returns the number of closed loops in the outline of a case. Each bounds a separate disc.
     #[must_use]
     pub fn n_loops(&self, case: u8) -> u8 {
         // A loop's triangles follow each other, and each but the first has a corner with an earlier one in common.
@@ -223,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_is_what_the_topology_gives() {
+    fn the_table_matches_the_generated_cases() {
         for case in 0..=255_u8 {
             let triangles: Vec<_> = loops(case).iter().flat_map(|l| best_triangulation(l).1).collect();
             assert_eq!(CASES.of(case), triangles, "case {case}");
@@ -369,7 +368,7 @@ mod tests {
         assert!(n.iter().all(|&c| c > 0), "{n:?}");
     }
 
-    /// The proof above must be able to fail: joining instead of separating on one side only breaks it.
+    /// Negative control for the tests above: joining instead of separating on one side only breaks the table.
     #[test]
     fn a_wrong_table_is_caught() {
         let mut triangles = CASES.of(0b0110_1001).to_vec();

@@ -1,7 +1,7 @@
 //! Column of a mesh: a slice of plain rows.
 //!
-//! Large columns are mapped with huge pages if the system has them: page faults of 4 KiB for 350 MB took half as long as
-//! meshing.
+//! Large columns are mapped with huge pages if the system has them: page faults of 4 KiB for 350 MB took half as long
+//! as meshing.
 
 use std::fmt;
 use std::ops::{Deref, DerefMut, Range};
@@ -56,7 +56,7 @@ impl<T: Pod> Column<T> {
     }
 }
 
-/// Maps zeroed memory; `None` if the column is small or the system refuses.
+/// Maps zeroed memory; `None` if the column is small or the system fails to.
 fn mapped(bytes: usize) -> Option<MmapMut> {
     let map = MmapMut::map_anon(bytes).ok().filter(|_| bytes >= MAP_FROM)?;
     // Advice only: kernels without huge pages ignore it.

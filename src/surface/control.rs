@@ -1,4 +1,4 @@
-//! How a caller watches and stops a meshing run. The core reads no clock: the observer does.
+//! Observation and cancellation of a meshing run. The core reads no clock; the observer does.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,7 +15,7 @@ pub enum Stage {
     Field,
     /// Inside bits, crossing edges and cell cases.
     Classify,
-    /// Exclusive scan over bricks: where each brick's vertices and triangles go.
+    /// Exclusive scan over bricks: first vertex and triangle of each brick.
     Scan,
     /// Vertex positions and normals.
     Interpolate,
@@ -56,12 +56,12 @@ pub trait Observer: Sync {
         work();
     }
 
-    /// (A part of) `stage` took `ns` nanoseconds by a device's own clock.
+    /// Reports that (a part of) `stage` took `ns` nanoseconds by a device's clock.
     fn elapsed(&self, stage: Stage, ns: u64) {
         let _ = (stage, ns);
     }
 
-    /// `done` of `total` parts of `stage` are finished.
+    /// Reports that `done` of `total` parts of `stage` are finished.
     fn progress(&self, stage: Stage, done: usize, total: usize) {
         let _ = (stage, done, total);
     }
@@ -73,32 +73,32 @@ pub struct Silent;
 
 impl Observer for Silent {}
 
-/// A flag shared between whoever runs a mesh and whoever may stop it.
+/// Cancellation flag, shared between a run and its caller.
 #[derive(Debug, Clone, Default)]
 pub struct CancelToken(Arc<AtomicBool>);
 
 impl CancelToken {
-    /// Asks the run to stop at its next check (between stages and every few bricks).
+    /// Requests the run to stop at its next check (between stages and every few bricks).
     pub fn cancel(&self) {
         self.0.store(true, Ordering::Relaxed);
     }
 
-    /// Whether somebody asked the run to stop.
+    /// Returns true if cancellation was requested.
     #[must_use]
     pub fn is_cancelled(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
 }
 
-/// What a caller hands to a backend besides the work itself.
+/// Cancellation, deadline and observer of a run.
 #[derive(Clone)]
 pub struct Control<'a> {
     /// Checked between stages and every few bricks.
     pub cancel: CancelToken,
-    /// When nobody wants the mesh any more. The core reads no clock and only hands it on: backends that queue jobs
-    /// behind one another look at it.
+    /// Time after which the mesh is not needed. The core reads no clock and only passes it on; backends that queue jobs
+    /// check it.
     pub deadline: Option<Instant>,
-    /// Told of stages and progress.
+    /// Receives stages and progress.
     pub observer: &'a dyn Observer,
 }
 
@@ -109,10 +109,10 @@ impl Default for Control<'_> {
 }
 
 impl Control<'_> {
-    /// Fails with [`SurfaceError::Cancelled`] once the token is cancelled.
+    /// Fails if the token is cancelled.
     ///
     /// # Errors
-    /// [`SurfaceError::Cancelled`].
+    /// Returns [`SurfaceError::Cancelled`] if the token is cancelled.
     pub fn check(&self) -> Result<(), SurfaceError> {
         if self.cancel.is_cancelled() { Err(SurfaceError::Cancelled) } else { Ok(()) }
     }

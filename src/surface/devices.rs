@@ -203,8 +203,8 @@ mod tests {
     #[test]
     fn invalid_choices_are_rejected() {
         for text in ["", ",", "0,", "-1", "+1", "0.5", "gpu", "cpu,0", "all,0", "0;1", "99999999999999999999999"] {
-            let refused = text.parse::<DeviceChoice>().unwrap_err();
-            assert!(refused.contains(&format!("`{text}`")) && refused.contains("0,2"), "{refused}");
+            let error = text.parse::<DeviceChoice>().unwrap_err();
+            assert!(error.contains(&format!("`{text}`")) && error.contains("0,2"), "{error}");
         }
     }
 

@@ -1,4 +1,4 @@
-//! Why a surface could not be made. Each variant carries the numbers that a caller needs to do better.
+//! Errors of the meshing core. Each variant carries the numbers that a caller needs to adjust the request.
 
 use thiserror::Error;
 
@@ -13,21 +13,21 @@ pub enum SurfaceError {
     BadSphere {
         /// Index of the sphere in the input.
         index: usize,
-        /// `x`, `y`, `z` or `radius`.
+        /// Name of the value: `x`, `y`, `z` or `radius`.
         what: &'static str,
         /// The offending value.
         value: f64,
-        /// What was expected, in words.
+        /// Description of valid values.
         expected: &'static str,
     },
-    /// A parameter is out of its range, or does not go with another one.
+    /// A parameter is out of its range, or conflicts with another one.
     #[error("parameter `{name}`: {value} is not allowed; expected {expected}")]
     BadParameter {
         /// The parameter's name as query, JSON and command line spell it.
         name: &'static str,
         /// The offending value as text.
         value: String,
-        /// What was expected, in words.
+        /// Description of valid values.
         expected: String,
     },
     /// More grid samples than allowed would be needed.
@@ -44,7 +44,7 @@ pub enum SurfaceError {
         /// A spacing that would fit, in Å.
         suggested_resolution: f64,
     },
-    /// The spheres would reach more grid bricks than allowed, all spheres together: they overlap each other too often.
+    /// The spheres would reach more grid bricks than allowed in total: too many of them overlap.
     #[error(
         "the spheres would reach at least {candidates} grid bricks in total at {resolution} Å, the limit is {limit}; {}",
         suggested_resolution
@@ -57,7 +57,7 @@ pub enum SurfaceError {
         limit: u64,
         /// The spacing asked for, in Å.
         resolution: f64,
-        /// A spacing that is certain to fit, in Å, if one is.
+        /// A spacing that is certain to fit, in Å, if there is one.
         suggested_resolution: Option<f64>,
     },
     /// The mesh would take more bytes than allowed.
@@ -70,14 +70,14 @@ pub enum SurfaceError {
         /// A spacing that would fit, in Å.
         suggested_resolution: f64,
     },
-    /// No spacing that is coarse enough for a bound on triangles shows the surface.
+    /// The triangle limit cannot be met at any spacing that still shows the surface.
     #[error("the mesh has {triangles} triangles at {resolution} Å, and no coarser one has {limit} or fewer")]
     TooManyTriangles {
-        /// The fewest that were found.
+        /// Smallest number of triangles found.
         triangles: u64,
-        /// Triangles asked for at most.
+        /// Maximum number of triangles requested.
         limit: u64,
-        /// Where they were found, Å.
+        /// Spacing with that number of triangles, Å.
         resolution: f64,
     },
     /// No sample reaches the isovalue.
@@ -86,23 +86,23 @@ pub enum SurfaceError {
         /// The isovalue asked for.
         isovalue: f64,
     },
-    /// Whoever takes the mesh part by part failed, and knows why.
-    #[error("the mesh could not be handed on")]
+    /// The sink of the mesh failed. It keeps the cause.
+    #[error("the mesh sink failed")]
     Sink,
     /// The device has too little memory for the mesh, even piece by piece.
     #[error("the device would need {needed} bytes of memory, it has {available}; {suggested_resolution} Å would fit")]
     DeviceMemory {
         /// Bytes needed.
         needed: u64,
-        /// Bytes that the device can give.
+        /// Bytes available on the device.
         available: u64,
         /// A spacing that would fit, in Å.
         suggested_resolution: f64,
     },
-    /// Every device that could have run the job failed, and nothing stands in for them.
+    /// Every device that could have run the job failed, and there is no fallback.
     #[error("no device could run the job: {why}")]
     Device {
-        /// What happened, in words.
+        /// Description of the failure.
         why: String,
     },
     /// The deadline passed.

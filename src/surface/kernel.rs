@@ -1,21 +1,21 @@
 //! The three kernels: density and slope of one atom as functions of `u = d²/ρ²`.
 //!
-//! This is the one place on the CPU where the formulas live. `d` is the distance to the atom's centre and `ρ`
-//! the atom's length scale: its radius for the Gaussian, the radius of its support for the two others. All
-//! kernels vanish, with their slope, at `u = support()`; an isolated atom's density at its radius is 1.
+//! This is the only implementation of the formulas on the CPU. `d` is the distance to the atom's centre and `ρ` the
+//! atom's length scale: its radius for the Gaussian, the radius of its support for the two others. All kernels and
+//! their slopes vanish at `u = support()`; an isolated atom's density at its radius is 1.
 //!
 //! Sources: J. Blinn, ACM TOG 1(3), 1982 (Gaussian); G. Wyvill, C. `McPheeters`, B. Wyvill, The Visual Computer 2,
 //! 1986 (soft object); S. Dias, K. Bora, A. Gomes, HPDC 2010 (all three as blending functions of molecules).
 
 use super::params::{Kernel, PaperParams, SUPPORT_RADII, SurfaceParams};
 
-/// Squared distances below this are taken as this by the inverse-square kernel, Å².
+/// Lower bound of squared distances for the inverse-square kernel, Å².
 pub const MIN_DISTANCE2: f64 = 1e-4;
 
-/// A kernel with its constants, shared by all atoms of a run. Each atom adds only its length scale.
+/// Kernel with its constants, shared by all atoms of a run. Each atom adds only its length scale.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Profile {
-    /// Which formula.
+    /// Kernel function.
     pub kernel: Kernel,
     /// ρ = `scale` × the atom's radius, unless `fixed` is set.
     scale: f64,
@@ -30,7 +30,7 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// The profile that validated parameters ask for.
+    /// Returns the profile of validated parameters.
     #[must_use]
     pub fn new(params: &SurfaceParams) -> Self {
         let kernel = params.kernel;
@@ -76,7 +76,7 @@ impl Profile {
         length * self.support().sqrt()
     }
 
-    /// What the C¹ cut-off divides by, so that g(1) = 1.
+    /// Returns the divisor of the C¹ cut-off, so that g(1) = 1.
     #[must_use]
     pub fn cutoff_norm(&self) -> f64 {
         1.0 - self.tolerance * (1.0 + (1.0 / self.tolerance).ln())

@@ -1,8 +1,8 @@
 //! The sampling lattice: spheres in units of the grid spacing, in one canonical order.
 //!
-//! Samples lie at multiples of the spacing, so the lattice is the same wherever a structure is cut into tiles.
-//! A sphere's centre is a lattice cell plus a fraction: the distance from a sample to a centre is then a function
-//! of the two alone, bit for bit, whichever brick or tile evaluates it, without 64-bit arithmetic.
+//! Samples lie at multiples of the spacing, so the lattice does not depend on the tiling of a structure. A sphere's
+//! centre is a lattice cell plus a fraction: the offset of a sample from a centre then depends on these two alone, bit
+//! for bit, in every brick and tile, without 64-bit arithmetic.
 
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
@@ -47,7 +47,7 @@ impl LatticeAtom {
     }
 }
 
-/// Spheres on a lattice, in canonical order: by tile, brick, cell and offset, whatever the input's order was.
+/// Spheres on a lattice, in canonical order: by tile, brick, cell and offset, independent of the input's order.
 #[derive(Debug, Clone)]
 pub struct Lattice {
     /// Spacing, Å.
@@ -96,15 +96,15 @@ impl Lattice {
         (self.support / f64::from(atom.inv_length2)).sqrt()
     }
 
-    /// What mesh positions are relative to, Å.
+    /// Origin of mesh positions, Å.
     #[must_use]
     pub fn centre(&self) -> [f64; 3] {
         self.centre.map(|c| f64::from(c) * self.spacing)
     }
 }
 
-/// How far from the mesh's centre a vertex can lie along any axis, Å, by spheres and parameters alone: known before any
-/// density is. 0 without spheres.
+/// Returns an upper bound of a vertex's distance from the mesh's centre along any axis, Å, from spheres and parameters
+/// alone, before any density is computed. 0 without spheres.
 #[must_use]
 pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
@@ -122,7 +122,7 @@ pub(super) fn effective_radius(r: f32, params: &SurfaceParams) -> f64 {
     f64::from(r) * params.radius_scale + params.radius_offset
 }
 
-/// Spheres on their way to the lattice.
+/// Spheres that are being placed on the lattice.
 struct Placing<'a> {
     spheres: &'a Spheres,
     params: &'a SurfaceParams,
@@ -187,13 +187,13 @@ fn sorted<K: Pod + Ord + Send + Sync>(n: usize, make: impl Fn(usize, &mut [K]) +
     keys
 }
 
-/// Atoms that one task puts in place.
+/// Atoms per placement task.
 const PART: usize = 4096;
 /// Bits of an atom's brick and cell within its tile.
 const PLACE_BITS: u32 = 18;
 
 impl Placing<'_> {
-    /// What atom `i` is sorted by: tile, brick and cell.
+    /// Returns the sort key of atom `i`: tile, brick and cell.
     #[inline(always)]
     fn key(&self, rank: &TileRanks, i: usize) -> u64 {
         let cell = self.cell(self.spheres.centre(i));
@@ -215,7 +215,7 @@ fn write_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut 
 }
 
 dispatched! {
-/// The same where places and indices have 32 bits each: half the memory, and less time to sort.
+/// As above if places and indices have 32 bits each: half the memory, and less time to sort.
 fn write_short_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut [u64]) {
     for (i, key) in (first..).zip(keys) {
         *key = placing.key(rank, i) << 32 | i as u64;
@@ -233,7 +233,7 @@ fn place_by_keys(placing: &Placing<'_>, order: &[u128], atoms: &mut [LatticeAtom
 }
 
 dispatched! {
-/// The same by short keys.
+/// As above with short keys.
 fn place_by_short_keys(placing: &Placing<'_>, order: &[u64], atoms: &mut [LatticeAtom]) {
     for (key, atom) in order.iter().zip(atoms) {
         *atom = placing.atom(usize::try_from(key & u64::from(u32::MAX)).unwrap_or(usize::MAX));
@@ -243,9 +243,9 @@ fn place_by_short_keys(placing: &Placing<'_>, order: &[u64], atoms: &mut [Lattic
 
 /// Numbers that order tiles, below 2⁴⁶.
 enum TileRanks {
-    /// Places in the box of these sides from the lowest tile on.
+    /// Ranks within the box with these sides from the lowest tile on.
     Box { lo: [i32; 3], side: [u64; 3] },
-    /// Places among the tiles with atoms, where the box has too many.
+    /// Ranks among the tiles with atoms, if the box has too many.
     Listed(Vec<[i32; 3]>),
 }
 
@@ -284,7 +284,7 @@ impl TileRanks {
 }
 
 /// The tile that a sample belongs to.
-// Written out, here and below: `map` is a call where it is not inlined, and these are looked at for every atom.
+// Written out, here and below: `map` may not be inlined, and these run for every atom.
 #[inline(always)]
 #[must_use]
 pub fn tile_of([x, y, z]: [i32; 3]) -> [i32; 3] {
@@ -298,13 +298,13 @@ pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
     [tile[2], tile[1], tile[0]]
 }
 
-/// A spacing a little above `spacing`, rounded up to hundredths of an Å: a suggestion that fits.
+/// Returns a spacing slightly above `spacing`, rounded up to hundredths of an Å, as a suggestion that fits.
 pub(super) fn roomier(spacing: f64) -> f64 {
     (spacing * 105.0).ceil() / 100.0
 }
 
-/// `v` as f32; the loss of digits is meant.
-#[expect(clippy::cast_possible_truncation, reason = "rounding to single precision is the point")]
+/// Converts `v` to f32, rounding.
+#[expect(clippy::cast_possible_truncation, reason = "rounding to single precision is intended")]
 pub(crate) fn to_f32(v: f64) -> f32 {
     v as f32
 }
@@ -316,8 +316,8 @@ pub(crate) fn to_i32(v: f64) -> i32 {
     v as i32
 }
 
-/// An index as u32. Indices within tiles, of atoms and of vertices are bounded where they arise; were a bound ever
-/// wrong, the saturated value fails the next look-up instead of aliasing another index.
+/// Converts an index to u32. Callers bound indices; if a bound were wrong, the saturated value would fail the next
+/// look-up instead of aliasing another index.
 pub(crate) fn to_u32(n: usize) -> u32 {
     debug_assert!(u32::try_from(n).is_ok(), "{n} is no 32-bit index");
     u32::try_from(n).unwrap_or(u32::MAX)
@@ -336,7 +336,7 @@ mod tests {
     use super::*;
     use crate::surface::params::SurfaceOptions;
 
-    /// The canonical order, said once more and slowly.
+    /// Independent implementation of the canonical order.
     fn order(a: &LatticeAtom, b: &LatticeAtom) -> Ordering {
         let place = |atom: &LatticeAtom| {
             let brick = atom.cell.map(|c| c.div_euclid(BRICK));

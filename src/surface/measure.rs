@@ -1,6 +1,6 @@
-//! What people compute surfaces for, and the validation that the mesh is one: area, volume, components, closedness.
+//! Measures of a mesh (area, volume, components) and the validation that it is closed.
 //!
-//! Sums run over the parts of the mesh, merged in order: the same mesh gives the same digits whatever the thread count.
+//! Sums run over the parts of the mesh, merged in order: the same mesh gives the same digits on any number of threads.
 
 use rayon::prelude::*;
 
@@ -12,12 +12,12 @@ use super::mesh::Mesh;
 use super::sums::{self, Positions, Sums};
 use super::topology;
 
-/// How closedness and manifoldness are established.
+/// Method of validating closedness and manifoldness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Validation {
-    /// A 64-bit checksum over the directed edges of the index buffer: opposite directions cancel, so anything but
-    /// a closed, consistently wound mesh leaves a remainder (but for one chance in 2⁶⁴). That no edge is used more
-    /// than twice then follows from the case table, which the tests prove: meant for meshes that a backend made.
+    /// A 64-bit checksum over the directed edges of the index buffer: opposite directions cancel, so a mesh that is not
+    /// closed and consistently wound leaves a remainder, with a probability of error of 2⁻⁶⁴. That no edge is used more
+    /// than twice then follows from the case table, which the tests verify: for meshes that a backend made.
     #[default]
     Checksum,
     /// Every edge and the fan of triangles around every vertex, for any mesh. Takes about four times as long as meshing.
@@ -73,14 +73,14 @@ pub struct Measures {
     pub oriented: bool,
     /// Every edge has exactly two triangles and the triangles around every vertex form one closed fan.
     pub manifold: bool,
-    /// How the last three were established.
+    /// Validation method of the last three fields.
     pub validation: Validation,
     /// Connected components, largest area first.
     pub components: Vec<Component>,
 }
 
 impl Measures {
-    /// Measures `mesh` by its vertices as they are, rounded ones where it has such.
+    /// Measures `mesh` with its vertices as stored, including rounding.
     ///
     /// # Errors
     /// [`SurfaceError::Cancelled`].
@@ -91,7 +91,7 @@ impl Measures {
         let balanced = checksum == 0 && !degenerate;
         let exact = (validation == Validation::Exact).then(|| topology::check(&mesh.triangles));
         let faces = mesh.n_triangles() as u64;
-        // Where every edge has two triangles there are 3F/2 of them; otherwise only counting tells.
+        // If every edge has two triangles, there are 3F/2 edges; otherwise they must be counted.
         let edges = match &exact {
             Some(topology) => topology.edges,
             None if balanced => faces * 3 / 2,
@@ -128,7 +128,7 @@ impl Measures {
     }
 }
 
-/// What one pass over the parts of a mesh gives.
+/// Result of one pass over the parts of a mesh.
 struct Totals {
     /// Largest area first.
     components: Vec<Component>,
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn defects_are_seen_by_both_validations() {
+    fn both_validations_detect_defects() {
         let mut whole = Mesh::default();
         tetrahedron(&mut whole, [0.0; 3], false);
         let mut hole = whole.clone();

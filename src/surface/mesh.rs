@@ -8,7 +8,7 @@ use super::lattice::to_f32;
 use super::quantize::{self, Step};
 use super::sink::Vertices;
 
-/// Rows that one task looks at.
+/// Rows per task.
 const ROWS: usize = 1 << 16;
 
 /// An indexed triangle mesh. Vertex `i` lies at `centre + position(i)`, in Å.
@@ -19,7 +19,7 @@ const ROWS: usize = 1 << 16;
 /// outwards, triangles wind counter-clockwise seen from outside, and the surface is closed.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Mesh {
-    /// What to add to a position to get the structure file's own coordinates, Å.
+    /// Origin of the positions in the structure file's coordinates, Å.
     pub centre: [f64; 3],
     /// Vertex positions relative to `centre`, Å.
     pub positions: Column<[f32; 3]>,
@@ -33,15 +33,15 @@ pub struct Mesh {
     pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
     pub colors: Option<Column<[u8; 4]>>,
-    /// Where the mesh falls into parts that hang together, as (first vertex, first triangle), ascending from (0, 0):
-    /// most triangles of a part use vertices of the part. A hint for parallel work; empty is always right.
+    /// Starts of the connected parts of the mesh, as (first vertex, first triangle), ascending from (0, 0): most
+    /// triangles of a part use vertices of that part. A hint for parallel work; an empty list is always valid.
     pub parts: Vec<(usize, usize)>,
 }
 
 /// Vertices in 12 bytes. The fourth number of a row is 0.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Quantized {
-    /// What an integer of a position is multiplied by, Å.
+    /// Length of a unit of the positions.
     pub step: Step,
     /// Positions relative to the mesh's centre, in steps; [`BEYOND`](quantize::BEYOND) where a coordinate is out of reach.
     pub positions: Column<[i16; 4]>,
@@ -56,7 +56,7 @@ impl Quantized {
         Self { step, positions: Column::zeroed(n), normals: Column::zeroed(n) }
     }
 
-    /// Lowest and highest position per axis, in steps; none without rows.
+    /// Returns the lowest and highest position per axis, in steps; `None` without rows.
     #[must_use]
     pub fn bounds(&self) -> Option<[[i16; 3]; 2]> {
         self.positions.pieces().filter_map(bounds_in_steps).reduce(joined)
@@ -124,7 +124,7 @@ impl Mesh {
     /// The position of vertex `i` relative to `centre`, Å.
     ///
     /// # Panics
-    /// Where there is no such vertex.
+    /// Panics if there is no such vertex.
     #[must_use]
     pub fn position(&self, i: usize) -> [f32; 3] {
         match &self.quantized {
@@ -148,7 +148,8 @@ impl Mesh {
         })
     }
 
-    /// Rounds the vertices to integers. A mesh that has such with this step stays as it is. Whether anything changed.
+    /// Rounds the vertices to integers. A mesh that already has this step is unchanged. Returns true if the mesh
+    /// changed.
     pub fn quantize(&mut self, step: Step) -> bool {
         if self.quantized.as_ref().is_some_and(|quantized| quantized.step == step) {
             return false;
@@ -200,8 +201,8 @@ impl Mesh {
         }
     }
 
-    /// Gives every vertex whose normal is zero the area-weighted mean normal of its triangles: at a saddle of the
-    /// density the gradient vanishes and has no direction.
+    /// Sets every zero normal to the area-weighted mean normal of the vertex's triangles: at a saddle of the density
+    /// the gradient vanishes and has no direction.
     pub(crate) fn fill_flat_normals(&mut self) {
         let flat: FxHashMap<u32, usize> = self.flat_vertices().into_iter().zip(0..).collect();
         let mut sums = vec![[0.0_f64; 3]; flat.len()];
@@ -248,7 +249,7 @@ impl Mesh {
     }
 }
 
-/// Numbers of the rows that are such.
+/// Returns the indices of the rows that satisfy `such`.
 fn numbers_of<T>(rows: &[T], such: impl Fn(&T) -> bool) -> Vec<u32> {
     (0_u32..).zip(rows).filter(|(_, row)| such(row)).map(|(v, _)| v).collect()
 }
@@ -270,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mesh_is_rounded_once_and_says_what_it_is() {
+    fn a_mesh_is_rounded_once_and_reports_its_packing() {
         let (mut mesh, step) = (fan(0.3), Step::covering(1.0));
         let single = mesh.clone();
         assert_eq!((mesh.bytes(), mesh.n_vertices()), (5 * 24 + 4 * 12, 5));
@@ -284,7 +285,7 @@ mod tests {
             assert_eq!(found, step.decoded(step.position(*position)));
         }
         assert_eq!(mesh.bounds(), single.bounds().map(|row| step.decoded(step.position(row))));
-        // A coarser step takes the integers for what they are.
+        // A coarser step rounds the decoded integers.
         let coarse = Step::covering(100.0);
         assert!(mesh.quantize(coarse));
         assert_eq!(mesh.position(1)[0], 1.0, "a multiple of both");
@@ -293,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn bounds_of_integers_are_found_in_any_row_of_any_piece() {
+    fn integer_bounds_include_every_row_of_every_chunk() {
         let step = Step::covering(1.0);
         for n in [1, 5, ROWS, 2 * ROWS + 3] {
             for row in [0, n / 2, n - 1] {

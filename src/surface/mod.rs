@@ -1,8 +1,8 @@
 //! The meshing core: spheres and parameters in, a closed triangle mesh out.
 //!
-//! It knows nothing of files, clocks, async, serialisation, GPUs or molecules. Lengths are ångström (Å),
-//! areas Å², volumes Å³. Density grows inwards; a sample is inside when its density is at least the isovalue;
-//! triangles wind counter-clockwise seen from outside and normals point outwards.
+//! The core does not depend on files, clocks, async, serialisation, GPUs or molecules. Lengths are ångström (Å), areas
+//! Å², volumes Å³. Density grows inwards; a sample is inside if its density is at least the isovalue; triangles wind
+//! counter-clockwise seen from outside and normals point outwards.
 
 pub mod backend;
 pub(crate) mod candidates;

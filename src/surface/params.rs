@@ -1,4 +1,4 @@
-//! Parameters of a surface: what a caller may ask for, and the validated form that the core uses.
+//! Parameters of a surface: the caller's options, and the validated form that the core uses.
 
 use std::fmt;
 use std::str::FromStr;
@@ -112,7 +112,7 @@ pub enum PaperParams {
     },
 }
 
-/// What a caller may ask for; `None` takes the preset's or the default value.
+/// Options of a surface; `None` selects the value of the preset or the default.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SurfaceOptions {
     /// Kernel function; Gaussian by default.
@@ -123,11 +123,11 @@ pub struct SurfaceOptions {
     pub isovalue: Option<f64>,
     /// The Gaussian's `a` (Blinn's blobbiness without its sign); 1.25 by default. Gaussian only.
     pub smoothness: Option<f64>,
-    /// Radii are multiplied by this first; 1 by default.
+    /// Factor of the radii, applied first; 1 by default.
     pub radius_scale: Option<f64>,
-    /// Then this is added, Å; 0 by default.
+    /// Offset added to the scaled radii, Å; 0 by default.
     pub radius_offset: Option<f64>,
-    /// Where the Gaussian is cut off, as a fraction of its value at the radius; 0.01 by default. Gaussian only.
+    /// Cut-off of the Gaussian, as a fraction of its value at the radius; 0.01 by default. Gaussian only.
     pub cutoff_tolerance: Option<f64>,
     /// Values for the parameters that are not given.
     pub preset: Option<Preset>,
@@ -152,11 +152,11 @@ pub struct SurfaceParams {
     pub isovalue: f64,
     /// The Gaussian's `a`.
     pub smoothness: f64,
-    /// Radii are multiplied by this first.
+    /// Factor of the radii, applied first.
     pub radius_scale: f64,
-    /// Then this is added, Å.
+    /// Offset added to the scaled radii, Å.
     pub radius_offset: f64,
-    /// Where the Gaussian is cut off, as a fraction of its value at the radius.
+    /// Cut-off of the Gaussian, as a fraction of its value at the radius.
     pub cutoff_tolerance: f64,
     /// The preset that filled in the values that were not given.
     pub preset: Preset,
@@ -192,7 +192,7 @@ impl Default for SurfaceParams {
     fn default() -> Self {
         match Self::new(&SurfaceOptions::default()) {
             Ok(params) => params,
-            Err(_) => unreachable!("the defaults are valid: a test says so"),
+            Err(_) => unreachable!("a test checks that the defaults are valid"),
         }
     }
 }
@@ -279,7 +279,7 @@ impl SurfaceParams {
         if self.quantize.is_some() { 12 * (n_vertices + n_triangles) } else { Mesh::bytes_for(n_vertices, n_triangles) }
     }
 
-    /// Whether scale and offset leave the smallest radius usable.
+    /// Returns true if scale and offset leave the smallest radius usable.
     ///
     /// # Errors
     /// [`SurfaceError::BadParameter`] names `radius_offset`.
@@ -305,21 +305,21 @@ fn paper_params(kernel: Kernel, options: &SurfaceOptions) -> Result<Option<Paper
         let missing = || format!("`{name}` beside it: the paper's {kernel} kernel needs both");
         value.map_or_else(|| Err(bad(given, given_value, missing())), |value| within(name, value, lo, hi))
     };
-    let refuse = |name: &'static str, value: Option<f64>| match value {
+    let reject = |name: &'static str, value: Option<f64>| match value {
         Some(value) => Err(bad(name, value, format!("no value: the paper's {kernel} kernel has no such parameter"))),
         None => Ok(()),
     };
     Ok(Some(match kernel {
         Kernel::Gaussian => {
-            refuse("paper_c", c)?;
+            reject("paper_c", c)?;
             PaperParams::Gaussian { a: need("paper_a", a, 1e-3, 100.0)?, b: need("paper_b", b, 1e-2, 1e6)? }
         }
         Kernel::SoftObject => {
-            refuse("paper_c", c)?;
+            reject("paper_c", c)?;
             PaperParams::SoftObject { a: need("paper_a", a, 1e-2, 1e6)?, b: need("paper_b", b, 0.1, 50.0)? }
         }
         Kernel::InverseSquare => {
-            refuse("paper_a", a)?;
+            reject("paper_a", a)?;
             PaperParams::InverseSquare { c: need("paper_c", c, 1e-6, 1.0)?, b: need("paper_b", b, 0.1, 50.0)? }
         }
     }))

@@ -1,17 +1,18 @@
 //! Vertices in 12 bytes instead of 24: positions as 16-bit integers times a step, normals as 8-bit ones.
 //!
 //! The step is a power of two, so multiplying by it and dividing by it are exact in single precision: a position is
-//! rounded once, and whoever rounds to the nearest integer, ties to even, gets these very integers, WGSL's `round`
-//! included. A step that used all 16 bits would be up to half as large, and its division would differ between devices.
+//! rounded once, and every implementation that rounds to nearest, ties to even, gets the same integers, including
+//! WGSL's `round`. A step that used all 16 bits would be up to half as large, and its division would differ between
+//! devices.
 
 /// Largest integer of a position. Symmetric, as the structure's middle is 0.
 const POSITION_MAX: f32 = 32_767.0;
-/// What stands for a coordinate that no integer is near, or that is no number: one more than the largest wraps around to
-/// it, as does one less than the lowest.
+/// Marker of a coordinate that is out of range or not finite: one more than the largest integer wraps around to it, as
+/// does one less than the lowest.
 pub const BEYOND: i16 = i16::MIN;
 /// Largest integer of a normal.
 const NORMAL_MAX: f32 = 127.0;
-/// The largest square of a normal's length, in units of 1/127, that glTF's validator takes for 1: 0.674 % too long.
+/// Largest squared length of a normal, in units of 1/127, that glTF's validator accepts: 0.674 % too long.
 const NORMAL_MAX_SQUARE: i32 = 16_347;
 /// Exponent of the smallest step, 1.5e-5 Å: 32,767 of them are half an ångström, less than any atom's radius.
 const MIN_EXPONENT: i32 = -16;
@@ -23,34 +24,34 @@ pub struct Step {
 }
 
 impl Step {
-    /// The smallest step with which 32,767 of them reach `extent`, Å.
+    /// Returns the smallest step whose 32,767 multiples reach `extent`, Å.
     #[must_use]
     pub fn covering(extent: f64) -> Self {
         let reaches = |exponent: &i32| f64::from(POSITION_MAX) * 2.0_f64.powi(*exponent) >= extent;
         let exponent = (MIN_EXPONENT..=f32::MAX_EXP - 16).find(reaches);
-        // What no step covers is refused when the mesh's bounds are looked at.
+        // Larger extents are rejected when the mesh's bounds are checked.
         Self { exponent: exponent.unwrap_or(MIN_EXPONENT) }
     }
 
-    /// Its length, Å. No decoded coordinate is further than half of it from the computed one.
+    /// Length of the step, Å. A decoded coordinate differs from the computed one by at most half of it.
     #[must_use]
     pub fn length(self) -> f32 {
         2.0_f32.powi(self.exponent)
     }
 
-    /// What a coordinate is multiplied by to be counted in steps, 1/Å: a power of two, too.
+    /// Factor from a coordinate to steps, 1/Å: also a power of two.
     #[must_use]
     pub fn per_angstrom(self) -> f32 {
         2.0_f32.powi(-self.exponent)
     }
 
-    /// The largest coordinate that it reaches, Å.
+    /// Returns the largest coordinate that can be stored, Å.
     #[must_use]
     pub fn reach(self) -> f32 {
         POSITION_MAX * self.length()
     }
 
-    /// Whether all of `bounds` can be stored: lowest and highest relative position, Å.
+    /// Returns true if all of `bounds` can be stored: lowest and highest relative position, Å.
     #[must_use]
     pub fn holds(self, bounds: &[[f32; 3]; 2]) -> bool {
         let half = 0.5 * self.length();
@@ -59,7 +60,7 @@ impl Step {
 
     /// A position relative to the mesh's centre, Å, as multiples of the step: the nearest, ties to even. The position is
     /// the single-precision number that `interpolate` writes (spacings from the centre times the spacing, rounded once).
-    /// A coordinate that [`Self::holds`] refuses becomes [`BEYOND`].
+    /// A coordinate that [`Self::holds`] rejects becomes [`BEYOND`].
     #[inline]
     #[must_use]
     pub fn position(self, position: [f32; 3]) -> [i16; 3] {
@@ -67,7 +68,7 @@ impl Step {
         position.map(|v| nearest(v * inverse, POSITION_MAX + 1.0))
     }
 
-    /// The position that such integers stand for, Å: exactly.
+    /// Returns the exact position that the integers represent, Å.
     #[inline]
     #[must_use]
     pub fn decoded(self, position: [i16; 3]) -> [f32; 3] {
@@ -78,8 +79,8 @@ impl Step {
 
 /// A unit normal as multiples of 1/127: 127 times each component, the nearest, ties to even.
 ///
-/// Near one direction, (66.5, 75.5, 77.5) and its mirror images, all three components are rounded up by half of a unit, and
-/// the vector comes out by a hair longer than what passes for a unit vector. There the largest component is rounded down.
+/// Near one direction, (66.5, 75.5, 77.5) and its mirror images, all three components are rounded up by half a unit,
+/// and the vector slightly exceeds the accepted length. Its largest component is rounded down there.
 #[inline]
 #[must_use]
 pub fn normal(normal: [f32; 3]) -> [i8; 3] {
@@ -103,8 +104,8 @@ fn shorten(normal: &mut [i16; 3]) {
     normal[largest] -= normal[largest].signum();
 }
 
-/// The low 16 bits of the integer nearest to `v`, ties to even, within ±`max`, which is 2¹⁵ at most; what is no number
-/// becomes `max`.
+/// The low 16 bits of the integer nearest to `v`, ties to even, within ±`max`, which is 2¹⁵ at most; NaN becomes
+/// `max`.
 ///
 /// Adding 1.5 · 2²³ leaves no bits for a fraction, and the integer in the low ones; unlike a rounding instruction every
 /// processor has that for whole vectors.
@@ -141,13 +142,13 @@ mod tests {
         for nonsense in [f64::NAN, f64::INFINITY] {
             assert!(
                 !Step::covering(nonsense).holds(&[[0.0; 3], [1.0; 3]]),
-                "{nonsense} is not covered, and is refused"
+                "{nonsense} is not covered, and is rejected"
             );
         }
     }
 
     #[test]
-    fn the_outermost_coordinates_are_held_and_those_beyond_are_not() {
+    fn outermost_coordinates_fit_and_larger_ones_do_not() {
         let step = Step::covering(20.0);
         let reach = step.reach();
         assert_eq!(step.position([reach, -reach, 0.0]), [32_767, -32_767, 0]);
@@ -157,13 +158,13 @@ mod tests {
         let (inside, half) = (reach + 0.49 * step.length(), reach + 0.5 * step.length());
         assert!(step.holds(&[[-inside; 3], [inside; 3]]));
         assert_eq!(step.position([inside, -inside, -0.0]), [32_767, -32_767, 0]);
-        // What is refused by its size is what is marked, to the last bit.
+        // `holds` rejects exactly the coordinates that are marked.
         for beyond in [half, -half, reach + step.length(), f32::MAX, f32::INFINITY, f32::NEG_INFINITY, -1e9] {
             assert!(!step.holds(&[[beyond, 0.0, 0.0]; 2]), "{beyond}");
             assert_eq!(step.position([beyond, 0.0, beyond]), [BEYOND, 0, BEYOND], "{beyond}");
         }
         assert_eq!(step.position([f32::NAN; 3]), [BEYOND; 3]);
-        assert!(!step.holds(&[step.decoded([BEYOND, 0, 0]), [0.0; 3]]), "a marked coordinate is refused when decoded");
+        assert!(!step.holds(&[step.decoded([BEYOND, 0, 0]), [0.0; 3]]), "a marked coordinate is rejected when decoded");
         assert_eq!(step.decoded([32_767, -32_767, 1]), [reach, -reach, step.length()]);
     }
 
@@ -177,7 +178,7 @@ mod tests {
             assert_eq!(f32::from(nearest(v, POSITION_MAX + 1.0)), v.round_ties_even(), "{v}");
         }
         assert_eq!((nearest(0.5, 127.0), nearest(1.5, 127.0), nearest(-2.5, 127.0)), (0, 2, -2));
-        assert_eq!(normal([f32::NAN, 0.0, f32::NEG_INFINITY]), [126, 0, -127], "what is no normal at all");
+        assert_eq!(normal([f32::NAN, 0.0, f32::NEG_INFINITY]), [126, 0, -127], "not a normal");
     }
 
     /// Looks at every integer vector that some unit vector is rounded to.

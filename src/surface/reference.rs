@@ -70,7 +70,7 @@ impl Density {
         best.map_or(0, |(i, _)| i)
     }
 
-    /// The furthest that any sphere's density reaches, Å.
+    /// Returns the largest reach of any sphere's density, Å.
     fn reach(&self) -> f64 {
         self.spheres.iter().map(|(_, length)| self.profile.reach(*length)).fold(0.0, f64::max)
     }

@@ -1,4 +1,4 @@
-//! Small SIMD-friendly pieces. They inline into `multiversion` functions, which compile them per instruction set.
+//! SIMD-friendly primitives, inlined into `multiversion` functions, which compile them per instruction set.
 
 /// Compiles a function once per instruction set and picks the best one at run time, so that a portable build runs
 /// at native speed.
@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_arithmetic_is_that_of_the_dispatch() {
+    fn the_arithmetic_matches_the_dispatch() {
         // Both vector extensions have fused multiply-add; plain x86-64 has not.
         assert_eq!(is_fused(), ["AVX-512", "AVX2", "NEON"].contains(&extension()));
         assert!(arithmetic().ends_with(if is_fused() { " fma" } else { " no-fma" }), "{}", arithmetic());

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::error::SurfaceError;
 
-/// Centres beyond this distance from the origin (Å, per axis) are refused: 32-bit vertex coordinates would
+/// Centres beyond this distance from the origin (Å, per axis) are rejected: 32-bit vertex coordinates would
 /// lose more than a hundredth of an ångström there, and no structure file's columns reach that far.
 pub const MAX_COORDINATE: f64 = 100_000.0;
 
@@ -25,7 +25,7 @@ impl Spheres {
     /// [`MAX_COORDINATE`], or the first radius that is not positive and finite.
     ///
     /// # Panics
-    /// If the columns differ in length: that is the caller's mistake, not the input's.
+    /// Panics if the columns differ in length, which is a bug of the caller.
     pub fn new(x: Vec<f64>, y: Vec<f64>, z: Vec<f64>, r: Vec<f32>) -> Result<Self, SurfaceError> {
         assert!(x.len() == y.len() && y.len() == z.len() && z.len() == r.len(), "columns of unequal length");
         for (what, column) in [("x", &x), ("y", &y), ("z", &z)] {
@@ -41,13 +41,13 @@ impl Spheres {
         Ok(Self { x, y, z, r })
     }
 
-    /// How many spheres there are.
+    /// Returns the number of spheres.
     #[must_use]
     pub fn len(&self) -> usize {
         self.r.len()
     }
 
-    /// Whether there are none.
+    /// Returns true if there are no spheres.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.r.is_empty()

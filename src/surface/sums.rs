@@ -1,6 +1,6 @@
 //! Sums over triangles: area, volume, and the checksum of directed edges.
 //!
-//! Everything that can fill vectors is done for a batch of triangles at a time.
+//! Work is vectorised over batches of triangles.
 
 use super::measure::Component;
 use super::mesh::Mesh;
@@ -14,11 +14,11 @@ pub(super) const NONE: u32 = u32::MAX;
 pub(super) struct Sums {
     /// By label.
     pub(super) by_label: Vec<Component>,
-    /// Triangles without a label, each with a vertex of theirs.
+    /// Triangles without a label, each with one of its vertices.
     pub(super) unlabelled: Vec<(u32, Component)>,
     /// Sum of the shares of all directed edges: zero for a closed, consistently wound mesh.
     pub(super) checksum: u64,
-    /// A triangle has a corner twice.
+    /// True if a triangle has a corner twice.
     pub(super) degenerate: bool,
 }
 
@@ -42,7 +42,7 @@ fn edge_share(from: u32, to: u32) -> u64 {
     if from < to { key } else { key.wrapping_neg() }
 }
 
-/// Where vertices are, relative to the mesh's centre.
+/// Vertex positions relative to the mesh's centre.
 #[derive(Clone, Copy)]
 pub(super) enum Positions<'a> {
     /// Å.
@@ -61,7 +61,7 @@ impl<'a> From<&'a Mesh> for Positions<'a> {
     }
 }
 
-/// Triangles whose geometry is computed together: enough that what was gathered lane by lane has left the store
+/// Triangles whose geometry is computed together: enough that values gathered lane by lane have left the store
 /// buffer when it is read back as vectors.
 const LANES: usize = 128;
 
@@ -101,7 +101,7 @@ pub(super) fn sum(positions: Positions<'_>, triangles: &[[u32; 3]], first: u32, 
 }
 }
 
-/// Sum in double precision, in eight strands: one would wait for every addition.
+/// Sums in double precision with eight accumulators, as a single one would wait for every addition.
 #[inline(always)]
 pub(super) fn sum_lanes<const N: usize>(lanes: &[f32; N]) -> f64 {
     let mut strands = [0.0_f64; 8];

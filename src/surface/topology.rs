@@ -2,16 +2,16 @@
 
 use rayon::prelude::*;
 
-/// What [`check`] finds.
+/// Result of [`check`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Topology {
     /// Distinct undirected edges.
     pub edges: u64,
-    /// Every edge is used as often in one direction as in the other, and no triangle is degenerate.
+    /// True if every edge is used as often in one direction as in the other, and no triangle is degenerate.
     pub closed: bool,
-    /// No directed edge is used twice.
+    /// True if no directed edge is used twice.
     pub oriented: bool,
-    /// Every edge has exactly two triangles and the triangles around every vertex form one closed fan.
+    /// True if every edge has exactly two triangles and the triangles around every vertex form one closed fan.
     pub manifold: bool,
 }
 
@@ -55,7 +55,8 @@ fn count_edges(forward: &[Corner]) -> u64 {
     edges.len() as u64
 }
 
-/// Whether the triangles around one vertex form one cycle. `fan`: its outgoing edges, each with the third corner.
+/// Returns true if the triangles around one vertex form one cycle. `fan`: its outgoing edges, each with the third
+/// corner.
 fn one_fan(fan: &[Corner]) -> bool {
     let Some(&(start, _)) = fan.first() else { return true };
     let [vertex, first] = ends(start);

@@ -86,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_lowest_member_represents_a_set_whatever_the_order_of_unions() {
+    fn the_lowest_member_represents_a_set_for_any_order_of_unions() {
         let pairs = [[7, 3], [3, 9], [1, 2], [9, 8], [2, 0]];
         let joined = |order: &mut dyn Iterator<Item = &[u32; 2]>| {
             let mut sets = UnionFind::new(10);

@@ -9,7 +9,7 @@ use crate::surface::Mesh;
 
 /// Writes the buffer of `mesh`: `layout.len` bytes.
 pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) -> io::Result<()> {
-    // Rows are written where they lie: a column in pieces is not joined for this.
+    // Writes each chunk of a column directly, without joining the chunks.
     let packing = layout.storage.packing;
     let normals = layout.normals.is_some();
     if let Some(quantized) = &mesh.quantized {
@@ -39,7 +39,7 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
     mesh.triangles.pieces().try_for_each(|rows| write_indices(out, layout.indices.0, rows.as_flattened()))
 }
 
-/// Writes positions relative to the mesh's centre, Å, as the layout has them.
+/// Writes positions relative to the mesh's centre, Å, in the packing of the layout.
 pub(super) fn write_positions(out: &mut dyn Write, packing: Packing, rows: &[[f32; 3]]) -> io::Result<()> {
     match packing {
         Packing::Full => write_floats(out, rows),
@@ -50,7 +50,7 @@ pub(super) fn write_positions(out: &mut dyn Write, packing: Packing, rows: &[[f3
     }
 }
 
-/// Writes unit normals as the layout has them.
+/// Writes unit normals in the packing of the layout.
 pub(super) fn write_normals(out: &mut dyn Write, packing: Packing, rows: &[[f32; 3]]) -> io::Result<()> {
     match packing {
         Packing::Full => write_floats(out, rows),
@@ -61,7 +61,7 @@ pub(super) fn write_normals(out: &mut dyn Write, packing: Packing, rows: &[[f32;
     }
 }
 
-/// Writes indices as the layout has them.
+/// Writes indices in the type of the layout.
 pub(super) fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32]) -> io::Result<()> {
     match index_type {
         IndexType::U8 => convert_words(out, indices, one_byte),

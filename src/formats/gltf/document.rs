@@ -1,4 +1,4 @@
-//! The JSON of a glTF: one scene, one node moved to the mesh's centre, one mesh with one primitive.
+//! JSON document of a glTF: one scene, one node translated to the mesh's centre, one mesh with one primitive.
 
 use std::collections::BTreeMap;
 
@@ -15,18 +15,18 @@ use super::layout::{AtomType, IndexType, Layout, Span};
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, GENERATOR, Meta, Packing, Step, Storage, Units};
 
-/// A calm blue, linear light. Like every constant here it is a short binary fraction, so JSON shows it short.
+/// Blue, in linear light. Like all constants here it is a short binary fraction, which JSON shows in few digits.
 const BASE_COLOR: [f32; 4] = [0.156_25, 0.390_625, 0.718_75, 1.0];
-/// White leaves the mesh's own colours as they are.
+/// White: does not change the mesh's own colours.
 const WHITE: [f32; 4] = [1.0; 4];
-/// Between chalk and plastic: highlights show the shape and do not hide it.
+/// Roughness between chalk and plastic: highlights show the shape without hiding it.
 const ROUGHNESS: f32 = 0.625;
 
-/// What allows vertices that are no floats. A program that does not know it cannot show the file, hence required.
+/// Extension that allows integer vertices. Required, as a program without it cannot show the file.
 const QUANTIZED: &str = "KHR_mesh_quantization";
 
-/// The document as a JSON object. With a layout it has one buffer, without a URI: the caller adds what its
-/// wrapping needs.
+/// Returns the document as a JSON object. With a layout it has one buffer without a URI, which the caller adds if
+/// needed.
 pub(super) fn document(
     centre: [f64; 3],
     summary: &Summary,
@@ -77,7 +77,7 @@ pub(super) fn document(
     }
 }
 
-/// What the file says of itself: units first, then parameters and report.
+/// Returns the metadata of the file: units first, then parameters and report.
 fn extras(centre: [f64; 3], units: Units, step: Option<Step>, meta: &Meta) -> Map<String, Value> {
     let mut extras = Map::new();
     extras.insert("units".to_owned(), Value::from(units.name()));
@@ -94,7 +94,7 @@ fn extras(centre: [f64; 3], units: Units, step: Option<Step>, meta: &Meta) -> Ma
     extras
 }
 
-/// Adds buffer, views, accessors and material, and gives the primitive that uses them.
+/// Adds buffer, views, accessors and material, and returns the primitive that uses them.
 fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
     let buffer =
         root.push(Buffer { byte_length: USize64(layout.len), name: None, uri: None, extensions: None, extras: None });
@@ -109,7 +109,7 @@ fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
         let mut accessor = accessor(view, n, component, shape);
         accessor.normalized = matches!(component, ComponentType::U8 | ComponentType::I8);
         if semantic == Semantic::Positions {
-            // Exactly values in the buffer: rounding keeps the order, and floats are double-precision numbers too.
+            // These are exactly values of the buffer: rounding preserves the order, and doubles hold floats exactly.
             let [low, high] = summary.bounds.map(|row| match layout.storage.packing {
                 Packing::Full => Value::from(row.map(f64::from).to_vec()),
                 Packing::Quantized(step) => Value::from(step.position(row).to_vec()),
@@ -123,7 +123,7 @@ fn primitive(root: &mut Root, layout: &Layout, summary: &Summary) -> Primitive {
         Packing::Quantized(_) => [ComponentType::I16, ComponentType::I8],
     };
     let mut attributes = BTreeMap::from([attribute(Semantic::Positions, layout.positions, position, Type::Vec3)]);
-    // Without them viewers shade each triangle flat, as the standard asks.
+    // Without normals viewers shade each triangle flat, as the standard requires.
     attributes.extend(layout.normals.map(|span| attribute(Semantic::Normals, span, normal, Type::Vec3)));
     attributes.extend(layout.colors.map(|span| attribute(Semantic::Colors(0), span, ComponentType::U8, Type::Vec4)));
     attributes.extend(layout.atoms.map(|(atom_type, span)| {

@@ -13,18 +13,18 @@ const MAGIC: u32 = u32::from_le_bytes(*b"glTF");
 const VERSION: u32 = 2;
 const JSON: u32 = u32::from_le_bytes(*b"JSON");
 const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
-/// Bytes of the file header, and of a chunk's.
+/// Length of the file header and of a chunk header, bytes.
 const HEADER_BYTES: u64 = 12;
 const CHUNK_HEADER_BYTES: u64 = 8;
 
-/// From so many bytes on a buffer begins at a multiple of [`HEAD_BYTES`]: it can be written, mapped or asked for by
+/// Buffer size from which the buffer begins at a multiple of [`HEAD_BYTES`]: it can be written, mapped or requested by
 /// range before the JSON is known.
 pub(super) const LARGE_BUFFER_BYTES: u64 = 1 << 20;
 /// The longest report takes 15,500 bytes: a hundred components of 105 bytes, a title of a thousand characters of four
 /// bytes, and a thousand more.
 pub(super) const HEAD_BYTES: u64 = 16 << 10;
 
-/// A GLB that is laid out.
+/// Layout of a GLB file.
 #[derive(Debug)]
 pub(in crate::formats) struct GlbPlan {
     /// Everything before the buffer.
@@ -43,7 +43,7 @@ impl GlbPlan {
         Self::placed(Layout::of(mesh, storage, summary)?, storage, mesh.centre, summary, meta)
     }
 
-    /// The same for a mesh of which only this is known.
+    /// Returns the layout of a mesh of which only the summary is known.
     pub(super) fn placed(
         layout: Option<Layout>,
         storage: Storage,
@@ -82,7 +82,7 @@ impl GlbPlan {
         Ok(Self { head, layout, len })
     }
 
-    /// The length of a file as the header says it.
+    /// Returns the file length as the header stores it.
     pub(super) fn check_len(bytes: u64) -> Result<u32, FormatError> {
         u32::try_from(bytes).map_err(|_overflow| FormatError::GlbTooLarge { bytes, limit: u64::from(u32::MAX) })
     }
@@ -111,26 +111,26 @@ mod tests {
     use crate::formats::Packing;
 
     #[test]
-    fn a_glb_of_four_gibibytes_is_refused_with_numbers() {
+    fn rejects_a_glb_of_four_gibibytes() {
         // 24 bytes per vertex and 12 per triangle, two triangles per vertex: 48 bytes a vertex.
         let fits = Layout::plain([89_000_000, 178_000_000], Packing::Full).unwrap();
         assert_eq!(GlbPlan::wrap(vec![b' '; 1000], fits).unwrap().len(), 48 * 89_000_000 + HEAD_BYTES);
         let large = Layout::plain([90_000_000, 180_000_000], Packing::Full).unwrap();
-        let refusal = GlbPlan::wrap(vec![b' '; 1000], large).unwrap_err();
-        assert_eq!(refusal, FormatError::GlbTooLarge { bytes: 4_320_016_384, limit: 4_294_967_295 });
-        assert!(refusal.to_string().contains("4320016384"));
-        assert_eq!(io::Error::from(refusal).kind(), io::ErrorKind::InvalidInput);
+        let error = GlbPlan::wrap(vec![b' '; 1000], large).unwrap_err();
+        assert_eq!(error, FormatError::GlbTooLarge { bytes: 4_320_016_384, limit: 4_294_967_295 });
+        assert!(error.to_string().contains("4320016384"));
+        assert_eq!(io::Error::from(error).kind(), io::ErrorKind::InvalidInput);
     }
 
     #[test]
-    fn the_limit_is_met_to_the_byte() {
+    fn glb_limit_is_exact() {
         // A GLB's length is a multiple of 4: the largest is 4,294,967,292 bytes.
         assert_eq!(GlbPlan::check_len(4_294_967_295).unwrap(), u32::MAX);
         assert!(GlbPlan::check_len(4_294_967_296).is_err());
     }
 
     #[test]
-    fn a_large_buffer_begins_at_a_fixed_place() {
+    fn a_large_buffer_begins_at_a_fixed_offset() {
         let head = |json: usize, vertices: u64| {
             let layout = Layout::plain([vertices, 1], Packing::Full).unwrap();
             GlbPlan::wrap(vec![b' '; json], layout).unwrap().head().len() as u64

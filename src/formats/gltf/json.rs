@@ -1,4 +1,4 @@
-//! `.gltf`: the document as JSON, with the buffer as a base64 data URI that is encoded while it is written.
+//! `.gltf`: the document as JSON, with the buffer as a base64 data URI that is encoded while writing.
 
 use std::io::{self, BufWriter, IntoInnerError, Write};
 

@@ -1,10 +1,10 @@
-//! What lies where in the buffer of a glTF. Pure arithmetic on counts, so that files of any size can be planned.
+//! Layout of the buffer of a glTF. Pure arithmetic on counts, so files of any size can be planned.
 
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Storage};
 use crate::surface::Mesh;
 
-/// Largest integer below which every integer is a 32-bit float.
+/// Limit up to which every integer is exact in a 32-bit float.
 const MAX_EXACT_F32: u32 = 1 << 24;
 
 /// Component type of the indices.
@@ -16,8 +16,8 @@ pub(super) enum IndexType {
 }
 
 impl IndexType {
-    /// The smallest type that holds the indices of so many vertices; `None` beyond 32 bits. The largest value of
-    /// each type means "restart" to graphics hardware and is no index.
+    /// Returns the smallest type for the indices of `n_vertices` vertices; `None` beyond 32 bits. The largest value of
+    /// each type is the primitive restart index.
     pub(super) fn for_vertices(n_vertices: u64) -> Option<Self> {
         match n_vertices {
             0..=0xff => Some(Self::U8),
@@ -46,7 +46,7 @@ pub(super) enum AtomType {
 }
 
 impl AtomType {
-    /// The type that holds atom indices up to `max`.
+    /// Returns the type that holds atom indices up to `max`.
     pub(super) fn for_largest(max: u32) -> Result<Self, FormatError> {
         if u16::try_from(max).is_ok() {
             Ok(Self::U16)
@@ -67,8 +67,7 @@ pub(super) struct Span {
     pub(super) len: u64,
 }
 
-/// The buffer: attributes, four bytes or a multiple of them per vertex, then indices, which need not end at a
-/// multiple of four and therefore come last.
+/// Layout of the buffer: attributes in multiples of four bytes per vertex, then indices, which may end unaligned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Layout {
     pub(super) n_vertices: u64,
@@ -79,12 +78,12 @@ pub(super) struct Layout {
     pub(super) colors: Option<Span>,
     pub(super) atoms: Option<(AtomType, Span)>,
     pub(super) indices: (IndexType, Span),
-    /// Bytes of the whole buffer.
+    /// Length of the whole buffer, bytes.
     pub(super) len: u64,
 }
 
 impl Layout {
-    /// The layout of `mesh`; `None` if there is nothing to draw, as glTF knows no empty accessors.
+    /// Returns the layout of `mesh`; `None` if it has no triangles, as glTF has no empty accessors.
     pub(super) fn of(mesh: &Mesh, storage: Storage, summary: &Summary) -> Result<Option<Self>, FormatError> {
         let (n_vertices, n_triangles) = (mesh.n_vertices() as u64, mesh.triangles.len() as u64);
         if n_triangles == 0 {
@@ -120,7 +119,7 @@ impl Layout {
         Ok(Self { n_vertices, n_triangles, storage, positions, normals, colors, atoms, indices, len: end })
     }
 
-    /// The layout of a mesh without colours and atoms; `None` if there is nothing to draw.
+    /// Returns the layout of a mesh without colours and atoms; `None` if it has no triangles.
     pub(super) fn plain(counts: [u64; 2], storage: impl Into<Storage>) -> Result<Option<Self>, FormatError> {
         if counts[1] == 0 { Ok(None) } else { Self::new(counts, storage.into(), false, None).map(Some) }
     }
@@ -155,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn atom_indices_are_exact_or_refused() {
+    fn atom_indices_are_exact_or_rejected() {
         assert_eq!(AtomType::for_largest(0), Ok(AtomType::U16));
         assert_eq!(AtomType::for_largest(65_535), Ok(AtomType::U16));
         assert_eq!(AtomType::for_largest(65_536), Ok(AtomType::F32));

@@ -1,8 +1,8 @@
-//! glTF 2.0: the same document and the same buffer in two wrappings, GLB (binary) and `.gltf` (JSON with the
-//! buffer as a data URI).
+//! glTF 2.0: the same document and buffer in two containers, GLB (binary) and `.gltf` (JSON with the buffer as a data
+//! URI).
 //!
-//! Buffers are in Å relative to the mesh's centre; the root node's translation gives the structure file's own
-//! coordinates back, so 32-bit floats keep their digits far from the origin.
+//! Buffers are in Å relative to the mesh's centre. The root node's translation restores the structure file's
+//! coordinates, so 32-bit floats keep their precision far from the origin.
 
 mod buffer;
 mod document;

@@ -1,4 +1,4 @@
-//! GLB sink: writes the rows of a mesh to their final place as they arrive, and the header last.
+//! GLB sink: writes the rows of a mesh to their final offset as they arrive, and the header last.
 //!
 //! The bytes are those of [`GlbPlan::write`]. A large buffer begins at a fixed place, so its rows can be written before
 //! the header is known; a small one waits in memory.
@@ -217,7 +217,7 @@ fn write_at(out: &mut dyn RandomAccess, offset: u64, bytes: &[u8]) -> io::Result
     out.write_all(bytes)
 }
 
-/// Locks a mutex; a panic of another thread ends the run there and leaves the data usable.
+/// Locks a mutex and ignores poisoning: a panic of another thread leaves the data valid.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

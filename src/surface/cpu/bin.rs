@@ -1,8 +1,7 @@
-//! Stage `bin`: atoms to tiles, and within a tile to bricks.
+//! Stage `bin`: assigns atoms to tiles, and within a tile to bricks.
 //!
-//! A tile is 8 × 8 × 8 bricks, the unit of parallel work. Work inside a tile also sees one layer of bricks beyond
-//! its upper faces (index 8), of which it needs the face samples only: they belong to the next tile, which
-//! computes the same bits.
+//! A tile is 8 × 8 × 8 bricks, the unit of parallel work. A tile also evaluates the face samples of one layer of bricks
+//! beyond its upper faces (index 8). They belong to the next tile, which computes the same bits.
 
 use std::ops::Range;
 
@@ -19,14 +18,14 @@ use crate::surface::simd::dispatched;
 pub(super) const SIDE: usize = 9;
 /// Bricks of a tile with the layer beyond.
 pub(super) const SLOTS: usize = SIDE * SIDE * SIDE;
-/// Marks a candidate that reaches no sample of the brick, only the space up to its neighbours' first samples: it
-/// matters to normals, not to the field.
+/// Marks a candidate that reaches no sample of the brick, only the gap up to its neighbours' first samples: it affects
+/// normals, not the field.
 pub(super) const NORMAL_ONLY: u32 = 1 << 31;
 /// Pairs of an atom and a tile between two checks of the cancellation flag.
 const PAIRS_PER_CHECK: u64 = 1 << 16;
 /// Atoms whose candidate pairs are counted and checked against the limit together: 190,000 pairs at most.
 const ATOMS_PER_CHECK: usize = 256;
-/// Candidates that a list keeps memory for between tiles; longer lists are freed.
+/// Maximum capacity of a list that is kept between tiles; longer lists are freed.
 const KEPT_CAPACITY: usize = 4096;
 /// Atoms are indexed with 31 bits.
 pub(crate) const MAX_ATOMS: usize = (1 << 31) - 1;
@@ -38,7 +37,7 @@ pub(super) struct Tiles {
     pub(super) coords: Vec<[i32; 3]>,
     /// Index of a tile by its coordinates.
     pub(super) index: FxHashMap<[i32; 3], u32>,
-    /// Where each tile's atoms begin; one more entry than tiles.
+    /// Index of each tile's first atom in `atoms`, and the number of atoms last.
     starts: Vec<usize>,
     /// Atom indices, ascending within a tile.
     atoms: Vec<u32>,
@@ -62,18 +61,18 @@ impl Tiles {
     /// Assigns atoms to tiles.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond what
-    /// the limits allow, and [`SurfaceError::Cancelled`].
+    /// Returns [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond
+    /// the limits, and [`SurfaceError::Cancelled`].
     pub(super) fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let mut index: FxHashMap<[i32; 3], u32> = FxHashMap::default();
         let (mut pairs, mut unchecked) = (0_u64, 0_u64);
         // Every tile in reach holds at least one occupied brick. A tile in reach of an atom holds at least one of its
-        // candidate pairs, except where the atom reaches a corner alone. Both bound what is allocated below.
+        // candidate pairs, except where the atom reaches a corner alone. Both bound the allocations below.
         let max_tiles = limits.max_samples / 512 + 1;
         let max_pairs = candidates::limit(limits).max(8 * lattice.atoms.len() as u64);
-        // Tiles in the order in which they were first met, and every pair of an atom and such a tile.
+        // Tiles in the order of their first atoms, and every pair of an atom and such a tile.
         let mut hits: Vec<(u32, u32)> = Vec::with_capacity(2 * lattice.atoms.len());
-        // The last tile of each parity: a run of neighbouring atoms asks for the same eight again and again.
+        // The last tile of each parity: neighbouring atoms look up the same eight tiles repeatedly.
         let mut recent = [([i32::MAX; 3], 0_u32); 8];
         for (i, atom) in (0_u32..).zip(&lattice.atoms) {
             let range = tile_range(atom, lattice.reach(atom));
@@ -137,17 +136,17 @@ impl Tiles {
     }
 }
 
-/// The refusal of more atoms than 31-bit indices can number.
+/// Returns the error for more atoms than 31-bit indices can number.
 pub(crate) fn too_many_atoms(n: usize) -> SurfaceError {
     let expected = format!("at most {MAX_ATOMS} spheres");
     SurfaceError::BadParameter { name: "spheres", value: n.to_string(), expected }
 }
 
-/// The refusal of a grid of (at least) `samples` samples.
+/// Returns the error for a grid of at least `samples` samples.
 pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
     let excess = samples as f64 / limits.max_samples.max(1) as f64;
     let mut fitting = lattice.spacing * excess.max(1.0).cbrt();
-    // Ever coarser until an upper bound of the samples fits; a box of one cell needs 27 blocks at most.
+    // Coarsens the spacing until an upper bound of the samples fits; a box of one cell needs 27 blocks at most.
     while samples_at_most(lattice, fitting) > limits.max_samples as f64 && fitting < MAX_RESOLUTION {
         fitting *= 1.08;
     }
@@ -159,10 +158,10 @@ pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits)
     }
 }
 
-/// Refuses a grid that is certain to exceed the limit before any of it is computed.
+/// Rejects a grid that is certain to exceed the limit before any of it is computed.
 ///
 /// # Errors
-/// [`SurfaceError::GridTooLarge`].
+/// Returns [`SurfaceError::GridTooLarge`].
 pub(super) fn refuse_early(lattice: &Lattice, tiles: &Tiles, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
     let tile_samples = f64::from(TILE).powi(3);
     if tiles.len() as f64 * tile_samples <= limits.max_samples as f64 {
@@ -203,10 +202,10 @@ fn samples_at_most(lattice: &Lattice, spacing: f64) -> f64 {
     blocks.len() as f64 * (side / spacing).powi(3)
 }
 
-/// A tile's bricks and their candidate atoms. Kept and refilled from tile to tile.
+/// Bricks of a tile and their candidate atoms. Reused from tile to tile.
 #[derive(Debug)]
 pub(super) struct Bricks {
-    /// Per slot its candidates: atom indices, ascending, some marked [`NORMAL_ONLY`].
+    /// Candidates per slot: atom indices, ascending, some marked [`NORMAL_ONLY`].
     lists: Vec<Vec<u32>>,
     /// Per slot the number of candidates that reach a sample.
     pub(super) reaching: Vec<u32>,
@@ -251,11 +250,11 @@ impl Bricks {
         &self.lists[slot]
     }
 
-    /// Finds the candidates of every brick in these layers of a tile, and in the layer beyond. `count` takes the number
-    /// of candidate pairs of the layers' own bricks, some at a time, and ends the search by an error.
+    /// Finds the candidates of every brick in `layers` of a tile, and in the layer beyond. Calls `count` with the
+    /// number of candidate pairs of the layers' own bricks, in portions; an error of `count` ends the search.
     ///
     /// # Errors
-    /// Those of `count`.
+    /// Returns the errors of `count`.
     pub(super) fn fill(
         &mut self,
         lattice: &Lattice,
@@ -269,21 +268,21 @@ impl Bricks {
         atoms.chunks(ATOMS_PER_CHECK).try_for_each(|atoms| count(find(self, lattice, tile, layers, atoms)))
     }
 
-    /// Frees the lists that are much longer than those of an ordinary structure.
+    /// Frees lists that are much longer than those of a typical structure.
     pub(super) fn free_long_lists(&mut self) {
         self.lists.iter_mut().filter(|list| list.capacity() > KEPT_CAPACITY).for_each(|list| *list = Vec::new());
     }
 }
 
 dispatched! {
-/// Appends the candidates among `atoms`, which follow those that were appended before. Returns the number of candidate
-/// pairs of the layers' own bricks.
+/// Appends the candidates among `atoms`, which follow those appended before. Returns the number of candidate pairs of
+/// the layers' own bricks.
 fn find(bricks: &mut Bricks, lattice: &Lattice, tile: [i32; 3], layers: &Range<usize>, atoms: &[u32]) -> u64 {
     let origin = tile.map(|t| t * TILE);
     let mut own = 0;
     for &ix in atoms {
         let atom = &lattice.atoms[ix as usize];
-        // A little more than the support: rounding must not lose a pair, and a pair too many adds zero.
+        // Slightly more than the support: rounding must not lose a pair, and an additional pair adds zero.
         let reach = to_f32(lattice.reach(atom) * (1.0 + 1e-5)) + 1e-3;
         let local = |k: usize| (atom.cell[k] - origin[k]) as f32 + atom.frac[k];
         let [x, y, z] = std::array::from_fn(|k| AxisReach::new(local(k), reach));

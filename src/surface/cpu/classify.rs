@@ -14,7 +14,7 @@ use crate::surface::simd::dispatched;
 /// Inside bits of a brick: word z, bit `8·y + x`.
 pub(super) type Inside = [u64; 8];
 
-/// A brick that the surface passes through, as the later stages need it.
+/// Brick that the surface intersects, as the later stages need it.
 #[derive(Debug, Clone)]
 pub(super) struct SurfaceBrick {
     /// Slot within the tile (0 to 8 per axis; 8 never occurs here).
@@ -33,17 +33,17 @@ pub(super) struct SurfaceBrick {
     pub(super) case: u32,
     /// Candidates in the tile's list of kept candidates.
     pub(super) candidates: [u32; 2],
-    /// Sheets of surface that hang together within the brick; `None` where a cell holds two of them, which takes a
-    /// closer look.
+    /// Number of connected sheets of surface within the brick; `None` if a cell holds two of them, which requires a
+    /// search.
     pub(super) n_sheets: Option<NonZeroU16>,
     /// The cells of each sheet in the tile's list, if there are several sheets.
     pub(super) sheets: u32,
 }
 
-/// What `classify` finds in the bricks of one tile, appended brick by brick.
+/// Results of `classify` for the bricks of one tile, appended brick by brick.
 #[derive(Debug, Default)]
 pub(super) struct Found {
-    /// The bricks with surface, by slot.
+    /// Bricks with surface, by slot.
     pub(super) bricks: Vec<SurfaceBrick>,
     /// Parameter of each vertex along its edge, from the owning sample, in vertex order.
     pub(super) t: Vec<f32>,
@@ -59,14 +59,14 @@ pub(super) struct Found {
     pub(super) candidates: Vec<u32>,
     /// Cells of the sheets of bricks with several: word z, bit `8·y + x`.
     pub(super) sheets: Vec<[u64; 8]>,
-    /// F(owner) − F(other end) of the edges of the brick at hand.
+    /// F(owner) − F(other end) of the edges of the current brick.
     drop: Vec<f32>,
 }
 
-/// Vertices, and active cells, that a brick in reach of an atom seldom has more of on average.
+/// Vertices, and active cells, that a brick in reach of an atom rarely exceeds on average.
 const USUAL: usize = 96;
 
-/// How much of a tile comes before a brick.
+/// Counts of a tile before a brick.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Before {
     pub(super) vertices: usize,
@@ -74,7 +74,7 @@ pub(super) struct Before {
     pub(super) cases: usize,
 }
 
-/// A brick's samples with those of the seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
+/// Samples of a brick and of its seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
 #[derive(Clone, Copy)]
 pub(super) struct Around<'a> {
     /// Inside bits of the brick and its neighbours.
@@ -86,7 +86,7 @@ pub(super) struct Around<'a> {
 dispatched! {
 /// Inside bits of a brick.
 pub(super) fn inside_bits(samples: &Samples, iso: f32) -> Inside {
-    // Loops, as a closure is not always compiled for the same instructions.
+    // Loops, as a closure does not always compile to the same instructions.
     let mut inside = [0; 8];
     for (z, word) in inside.iter_mut().enumerate() {
         for y in 0..8 {
@@ -117,8 +117,8 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
 }
 
 impl Found {
-    /// Clears the lists and reserves room for `bricks` bricks, usually more than needed: growing would copy, and untouched
-    /// memory costs nothing.
+    /// Clears the lists and reserves capacity for `bricks` bricks, usually more than needed: growing would copy, and
+    /// untouched memory costs nothing.
     pub(super) fn begin(&mut self, bricks: usize) {
         *self = Self {
             bricks: Vec::with_capacity(bricks),
@@ -131,11 +131,11 @@ impl Found {
         };
     }
 
-    /// What was found, in memory of just the right size; what is left has nothing.
+    /// Takes the results in memory of exactly their size and leaves `self` empty.
     pub(super) fn take(&mut self) -> Self {
         let drop = std::mem::take(&mut self.drop);
         let mut found = std::mem::replace(self, Self { drop, ..Self::default() });
-        // The rest goes back to the allocator, for the next tile.
+        // Returns the rest to the allocator, for the next tile.
         found.bricks.shrink_to_fit();
         found.t.shrink_to_fit();
         found.edges.shrink_to_fit();
@@ -145,7 +145,7 @@ impl Found {
         found
     }
 
-    /// Nothing yet, and room for all of these, which are to be appended.
+    /// Returns an empty value with capacity for all `parts`.
     pub(super) fn with_room_for(parts: &[&Self]) -> Self {
         let sum = |len: fn(&Self) -> usize| parts.iter().map(|part| len(part)).sum();
         Self {
@@ -159,7 +159,7 @@ impl Found {
         }
     }
 
-    /// Adds what was found in bricks that come after these.
+    /// Appends the results of the bricks that follow.
     pub(super) fn append(&mut self, next: &Self) {
         let (vertex, triangle) = (self.vertices, self.triangles);
         let [case, candidate, sheet] = [self.cases.len(), self.candidates.len(), self.sheets.len()].map(to_u32);
@@ -180,7 +180,8 @@ impl Found {
         self.triangles += next.triangles;
     }
 
-    /// Vertices, triangles and cases of the tile before brick `i`; all of them where `i` is their number.
+    /// Returns the vertices, triangles and cases of the tile before brick `i`; the totals if `i` is the number of
+    /// bricks.
     pub(super) fn before(&self, i: usize) -> Before {
         let all =
             Before { vertices: self.vertices as usize, triangles: self.triangles as usize, cases: self.cases.len() };
@@ -191,7 +192,7 @@ impl Found {
         })
     }
 
-    /// Classifies one brick and appends what it holds. Returns where, if it holds any surface.
+    /// Classifies one brick and appends its results. Returns its index if it holds any surface.
     pub(super) fn add(&mut self, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) -> Option<u16> {
         let n = self.bricks.len();
         classify(self, slot, around, iso, candidates);
@@ -249,7 +250,7 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
 }
 }
 
-/// What a cell's case adds to its brick.
+/// Contribution of a cell's case to its brick.
 #[derive(Clone, Copy)]
 struct CellCase {
     triangles: u8,
@@ -262,7 +263,7 @@ static CELLS: LazyLock<Vec<CellCase>> = LazyLock::new(|| {
         .collect()
 });
 
-/// Cells whose surface goes on in the cell before them along x, y and z, if that is in the brick.
+/// Returns the cells whose surface continues in the previous cell along x, y and z, if that is in the brick.
 #[inline(always)]
 fn links(corners: &[[u64; 8]; 8]) -> [[u64; 8]; 3] {
     const FIRST: [u64; 2] = [0x0101_0101_0101_0101, 0xff];
@@ -278,8 +279,8 @@ fn links(corners: &[[u64; 8]; 8]) -> [[u64; 8]; 3] {
     ]
 }
 
-/// Counts the sheets of a brick in whose cells there is one each: cells hang together where the face between them is
-/// crossed. Appends the cells of each if there are several.
+/// Counts the sheets of a brick with one sheet per cell: cells are connected if the surface crosses the face between
+/// them. Appends the cells of each sheet if there are several.
 #[inline(always)]
 fn sheets(active: &[u64; 8], links: &[[u64; 8]; 3], found: &mut Vec<[u64; 8]>) -> Option<NonZeroU16> {
     let mut left = *active;
@@ -301,7 +302,7 @@ fn sheets(active: &[u64; 8], links: &[[u64; 8]; 3], found: &mut Vec<[u64; 8]>) -
     NonZeroU16::new(n)
 }
 
-/// Adds to `sheet` every cell that links lead to.
+/// Adds to `sheet` every cell that its links reach.
 #[inline(always)]
 fn flood(sheet: &mut [u64; 8], links: &[[u64; 8]; 3]) {
     let [lx, ly, lz] = links;
@@ -331,7 +332,7 @@ fn ones(word: u64) -> u16 {
     u16::try_from(word.count_ones()).unwrap_or_default()
 }
 
-/// The crossing edges, and where along each the density is `iso`, by linear interpolation.
+/// Computes the crossing edges, and the point along each at which the density is `iso`, by linear interpolation.
 #[inline(always)]
 fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut Found) {
     const STEP: [usize; 3] = [1, 8, 64];

@@ -1,13 +1,13 @@
-//! Where a vertex lies within its brick: on which edge of the grid.
+//! Grid edges of a brick, which carry its vertices.
 
 /// Samples along a brick's side with the neighbours' first layer.
 const N: u16 = 9;
 const SIDE: usize = N as usize;
-/// Grid edges of a brick with those layers, three per sample, `3·((z·9 + y)·9 + x) + axis`, and idle room behind them: a
-/// power of two, so that a mask bounds an index.
+/// Number of grid edges of a brick with those layers, three per sample, `3·((z·9 + y)·9 + x) + axis`, rounded up to a
+/// power of two so that a mask bounds an index.
 pub(super) const EDGES: usize = (3 * SIDE * SIDE * SIDE).next_power_of_two();
 
-/// An edge of a brick's own: `z << 8 | (8·y + x) << 2 | axis` of the sample that it starts from.
+/// Edge of a brick: `z << 8 | (8·y + x) << 2 | axis` of its first sample.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(super) struct Edge(u16);
 
@@ -25,37 +25,37 @@ impl Edge {
         self.0 & 3
     }
 
-    /// Of its sample, likewise.
+    /// X coordinate of its sample.
     #[inline(always)]
     pub(super) fn x(self) -> u16 {
         self.0 >> 2 & 7
     }
 
-    /// Of its sample, likewise.
+    /// Y coordinate of its sample.
     #[inline(always)]
     pub(super) fn y(self) -> u16 {
         self.0 >> 5 & 7
     }
 
-    /// Of its sample, likewise.
+    /// Z coordinate of its sample.
     #[inline(always)]
     pub(super) fn z(self) -> u16 {
         self.0 >> 8 & 7
     }
 
-    /// Among the brick's samples, and so among its cells: `(z·8 + y)·8 + x`.
+    /// Index among the brick's samples and cells: `(z·8 + y)·8 + x`.
     #[inline(always)]
     pub(super) fn sample(self) -> usize {
         usize::from(self.0 >> 2 & 511)
     }
 
-    /// Among the grid edges of the brick and its neighbours' first layers.
+    /// Index among the grid edges of the brick and its neighbours' first layers.
     #[inline(always)]
     pub(super) fn index(self) -> usize {
         self.index_from([0; 3])
     }
 
-    /// The same, among those of a brick from which this one lies `far` (0 or 8 per axis) away.
+    /// Index among the grid edges of a brick from which this brick is `far` (0 or 8 per axis) away.
     #[inline(always)]
     pub(super) fn index_from(self, far: [usize; 3]) -> usize {
         let [x, y, z] = [self.x(), self.y(), self.z()].map(usize::from);
@@ -64,7 +64,7 @@ impl Edge {
     }
 }
 
-/// By grid edge the cell that it starts from; one beyond the brick belongs to the brick's last cell before it.
+/// Cell of each grid edge's first sample; an edge beyond the brick belongs to the brick's last cell before it.
 pub(super) static CELL_OF: [u16; EDGES] = {
     let mut cells = [0; EDGES];
     let mut sample = 0;
@@ -87,7 +87,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_edge_is_where_it_was_made() {
+    fn edges_return_their_coordinates() {
         for (z, y, x, axis) in (0..8 * 8 * 8 * 3).map(|i| (i / 192, i / 24 % 8, i / 3 % 8, i % 3)) {
             let edge = Edge::new(z, 8 * y + x, axis);
             assert_eq!([edge.x(), edge.y(), edge.z(), edge.axis()].map(usize::from), [x, y, z, axis]);

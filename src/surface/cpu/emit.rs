@@ -1,7 +1,7 @@
-//! Stage `emit`: triangle indices, and while their corners are at hand, sheets and sums.
+//! Stage `emit`: triangle indices, and sheets and sums while their corners are in cache.
 //!
-//! A brick's cells use vertices of the brick itself and of its seven neighbours towards +x, +y, +z. They are entered
-//! into a small table by grid edge first; each corner of a triangle is then a look-up.
+//! A brick's cells use vertices of the brick itself and of its seven neighbours towards +x, +y, +z. They are first
+//! entered into a small table by grid edge; each corner of a triangle is then a look-up.
 
 use std::sync::LazyLock;
 
@@ -12,12 +12,12 @@ use super::table::{BrickTable, ROW, Rounding};
 use crate::surface::cases::{CASES, cell_edge};
 use crate::surface::simd::dispatched;
 
-/// Edges that the straight path handles for every cell, without asking how many there are.
+/// Number of edges that the fast path processes for every cell, without a check of their number.
 const FAST_EDGES: usize = 6;
 
 /// A case as offsets from a cell's own entry in the table.
 struct CaseRow {
-    /// One loop of six edges at most; all others take the careful path.
+    /// True for a single loop of at most six edges; other cases use the slow path.
     fast: bool,
     /// Triangles.
     n_triangles: usize,
@@ -25,7 +25,7 @@ struct CaseRow {
     corners: [u16; ROW],
     /// Edges loop by loop, the last one repeated to the end.
     edges: [u16; 12],
-    /// Where each loop ends in `edges`.
+    /// End of each loop in `edges`.
     loop_ends: [u8; 4],
     n_loops: usize,
 }
@@ -75,7 +75,8 @@ impl CaseRow {
 }
 
 impl BrickTable {
-    /// Corners of the triangles of the active cells, in order. If `JOIN`, vertices that a loop joins come onto one sheet.
+    /// Writes the corners of the triangles of the active cells, in order. If `JOIN`, unites the sheets of vertices that
+    /// a loop connects.
     #[inline(always)]
     fn triangulate<const JOIN: bool>(&mut self, active: &[u64; 8], cases: &[u8], sheets: &mut Sheets) {
         let rows = &**ROWS;
@@ -115,9 +116,9 @@ impl BrickTable {
 }
 
 dispatched! {
-/// Writes the triangles of a brick. `cases` are those of its active cells in order, `own_sheets` the cells of each sheet
-/// if there are several and they are known. Leaves in `table` and `sheets`
-/// what the sums need, with vertices where `rounding` puts them.
+/// Writes the triangles of a brick. `cases` are those of its active cells in order, `own_sheets` the cells of each
+/// sheet if there are several and they are known. Leaves the inputs of the sums in `table` and `sheets`, with vertices
+/// rounded by `rounding`.
 pub(super) fn emit(
     table: &mut BrickTable,
     sheets: &mut Sheets,

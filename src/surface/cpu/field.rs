@@ -1,8 +1,8 @@
 //! Stage `field`: the density at the 8 × 8 × 8 samples of a brick.
 //!
-//! Each sample's density is a sum over the brick's candidates in ascending order, and each term is a function of
-//! the atom and the sample alone. An atom out of reach adds an exact zero. So a sample has the same bits
-//! whichever tile computes it and however generous the candidate list is: neighbours never disagree on a sign.
+//! Each sample's density is a sum over the brick's candidates in ascending order, and each term is a function of the
+//! atom and the sample alone. An atom out of reach adds an exact zero. A sample therefore has the same bits in every
+//! tile and for every candidate list that is long enough: neighbours never disagree on a sign.
 
 use super::bin::NORMAL_ONLY;
 use crate::surface::kernel::{MIN_DISTANCE2, Profile};
@@ -13,11 +13,11 @@ use crate::surface::simd::{dispatched, exp2, fma};
 /// Densities of a brick, x fastest: index `(z·8 + y)·8 + x`.
 pub(super) type Samples = [f32; BRICK_SAMPLES];
 
-/// Exponents are not let below this: products of two stay normal numbers, as subnormal ones cost hundreds of
-/// cycles. Terms that small lie beyond the cut-off for every smoothness that is accepted.
+/// Lower bound of exponents: products of two stay normal numbers, as subnormal ones cost hundreds of cycles. Terms that
+/// small lie beyond the cut-off for every valid smoothness.
 const MIN_EXPONENT: f32 = -62.0;
 
-/// A kernel's constants in the form that the inner loops want.
+/// Constants of a kernel in the form that the inner loops use.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Constants {
     pub(crate) kernel: Kernel,
@@ -60,7 +60,7 @@ impl Constants {
     }
 }
 
-/// Which samples of a brick are needed: all, or only the first layer along some axes.
+/// Range of samples of a brick that are needed: all, or only the first layer along some axes.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Need {
     /// Row pairs along y: 4, or 1 for the first layer.
@@ -161,14 +161,14 @@ fn gaussian<const FMA: bool, const FULL: bool>(
         let seen = see(atom, origin, c.support, need);
         let e = seen.u.map(|u| {
             let exponent = fma::<FMA>(-c.rate, u, c.share);
-            // A plain comparison: `f32::max` minds NaN and costs the vector.
+            // A plain comparison: `f32::max` handles NaN and prevents vectorisation.
             exp2::<FMA>(if exponent > MIN_EXPONENT { exponent } else { MIN_EXPONENT })
         });
         let w = seen.u.map(|u| fma::<FMA>(c.tail_rate, u, c.tail_share));
         let (exy, wxy) = (e.plane(|x, y| x * y), w.plane(|x, y| x + y));
         for z in seen.z[0]..seen.z[1] {
             let (ez, wz) = (e.z(z), w.z(z));
-            // All rows of the layer: where those in reach end is harder to foresee than adding zeros to the others takes.
+            // Processes all rows of the layer: mispredicting the end of the rows in reach costs more than adding zeros.
             for pair in 0..if FULL { 4 } else { 1 } {
                 let (exy, wxy) = (&exy[pair & 3], &wxy[pair & 3]);
                 let at = (z * 4 + pair) * 16;

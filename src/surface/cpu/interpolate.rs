@@ -23,14 +23,14 @@ pub(crate) struct SlopeConstants {
     /// Gaussian: the exponent of 2 is `offset − rate·u`; the factor's logarithm is in `offset`.
     pub(crate) offset: f32,
     rate: f32,
-    /// Gaussian: what the C¹ cut-off takes away.
+    /// Gaussian: subtrahend of the C¹ cut-off.
     pub(crate) tail: f32,
     u_min: f32,
 }
 
 impl SlopeConstants {
-    /// Constants of `profile` on a lattice of `spacing` Å. The amplitude is irrelevant to a direction, so it is
-    /// left out: numbers stay near 1.
+    /// Returns the constants of `profile` on a lattice of `spacing` Å. Omits the amplitude, which does not affect a
+    /// direction, so numbers stay near 1.
     pub(crate) fn new(profile: &Profile, spacing: f64) -> Self {
         let rate = profile.decay * std::f64::consts::LOG2_E;
         Self {
@@ -53,7 +53,7 @@ pub(super) struct Batch {
 }
 
 impl Batch {
-    /// Lays out a brick's vertices in order; rounds the count up to whole vectors by repeating the last one.
+    /// Places a brick's vertices in order; pads the count to whole vectors by repeating the last one.
     fn place(&mut self, edges: &[Edge], t: &[f32]) {
         let padded = t.len().next_multiple_of(LANES);
         for column in self.p.iter_mut().chain(&mut self.n) {
@@ -68,7 +68,7 @@ impl Batch {
 }
 
 dispatched! {
-/// Places of vertices on their edges, in spacings from the brick's first sample.
+/// Computes the positions of vertices on their edges, in spacings from the brick's first sample.
 fn places(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
     let [x, y, z] = p;
     for (((x, y), z), (edge, t)) in x.iter_mut().zip(y).zip(z).zip(edges.iter().zip(t)) {
@@ -80,7 +80,7 @@ fn places(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
 }
 }
 
-/// What a brick's vertices are made from.
+/// Inputs of a brick's vertices.
 pub(super) struct Source<'a> {
     /// The brick's tile.
     pub(super) tile: [i32; 3],
@@ -140,7 +140,7 @@ pub(super) fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
     head
 }
 
-/// Where a brick's vertices go.
+/// Destination of a brick's vertices.
 pub(super) struct Target<'a> {
     pub(super) rows: Rows<'a>,
     /// Nearest sphere of each vertex, in the caller's numbering.
@@ -150,7 +150,7 @@ pub(super) struct Target<'a> {
 /// Candidates whose gradients are summed together: their coordinates take 200 KB and stay in the core's cache.
 const BLOCK: usize = 4096;
 
-/// Computes the vertices of one brick. Returns how many have no gradient to take a normal from.
+/// Computes the vertices of one brick. Returns the number of vertices whose gradient has no direction.
 ///
 /// # Errors
 /// [`SurfaceError::Cancelled`].
@@ -181,24 +181,24 @@ pub(super) fn interpolate(
     })
 }
 
-/// A position in Å, from a brick's offset from the mesh's centre and a place in the brick, both in spacings. Whole
-/// lattice steps are exact in f32; the fraction is added before the one multiplication.
+/// Returns a position in Å, from a brick's offset from the mesh's centre and a position within the brick, both in
+/// spacings. Whole lattice steps are exact in f32; the fraction is added before the one multiplication.
 #[inline(always)]
 pub(super) fn position(offset: [f32; 3], place: [f32; 3], spacing: f32) -> [f32; 3] {
     std::array::from_fn(|k| (offset[k] + place[k]) * spacing)
 }
 
-/// A gradient scaled to length 1, if it can be.
+/// Returns a gradient scaled to length 1, and true if it has a direction.
 #[inline(always)]
 fn normal([x, y, z]: [f32; 3]) -> ([f32; 3], bool) {
     let length2 = x * x + y * y + z * z;
-    // Below this, single precision has no direction left.
+    // Below this, single precision cannot represent the direction.
     let usable = length2 > 1e-14;
     let scale = if usable { length2.sqrt().recip() } else { 0.0 };
     ([x * scale, y * scale, z * scale], usable)
 }
 
-/// Writes the rows of a batch. Returns how many gradients have no direction.
+/// Writes the rows of a batch. Returns the number of gradients without a direction.
 #[inline(always)]
 fn write<P, N>(
     spacing: f64,
@@ -299,7 +299,7 @@ fn gradients(c: &SlopeConstants, around: &mut Around, p: &[Vec<f32>; 3], n: &mut
 }
 
 dispatched! {
-/// The candidate whose centre is nearest to each vertex; among equals the first in canonical order.
+/// Finds the candidate whose centre is nearest to each vertex; of equals the first in canonical order.
 fn nearest_atoms(atoms: &[LatticeAtom], candidates: &[u32], origin: [i32; 3], p: &[Vec<f32>; 3], ids: &mut [u32]) {
     let [px, py, pz] = p;
     let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));

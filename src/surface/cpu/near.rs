@@ -1,15 +1,15 @@
-//! A brick among its neighbours towards +x, +y, +z: which of their vertices its cells use.
+//! Vertices of the neighbours towards +x, +y, +z that a brick's cells use.
 
 use super::bin::{SIDE, slot_brick};
 use super::classify::SurfaceBrick;
 use super::edge::Edge;
 
-/// A surface brick that has its number, as its vertices have theirs.
+/// A surface brick with its number and the numbers of its vertices.
 #[derive(Clone, Copy)]
 pub(super) struct Numbered<'a> {
     /// The brick.
     pub(super) brick: &'a SurfaceBrick,
-    /// Its place among all surface bricks.
+    /// Its index among all surface bricks.
     pub(super) id: u32,
     /// Global id of its first vertex.
     pub(super) first: u32,
@@ -39,15 +39,15 @@ fn bits(mut word: u64, mut each: impl FnMut(usize)) {
     }
 }
 
-/// What `take` takes of the words of an axis, `shift` bits from layer to layer.
+/// Combines the words of an axis after `take`, `shift` bits from layer to layer.
 #[inline(always)]
 fn layers(crossing: &[u64; 24], axis: usize, shift: usize, take: impl Fn(u64) -> u64) -> u64 {
     (0..8).fold(0, |word, z| word | take(crossing[3 * z + axis]) << (shift * z))
 }
 
-/// Calls `each(layer, bit, axis)` for the crossing edges that the neighbour `n` (bits: 0 x, 1 y, 2 z, but not 0) has on
-/// what it shares with a brick; edges that leave that belong to other cells. Layers that hold a few each are taken as one
-/// word: where one ends is hard to foresee for a processor.
+/// Calls `each(layer, bit, axis)` for the crossing edges of the neighbour `n` (bits: 0 x, 1 y, 2 z, but not 0) on the
+/// face, edge or corner that it shares with a brick; other edges belong to other cells. Layers with few edges are
+/// combined into one word, which reduces branch mispredictions.
 #[inline(always)]
 fn shared_edges(crossing: &[u64; 24], n: usize, mut each: impl FnMut(usize, usize, usize)) {
     match n {
@@ -57,12 +57,12 @@ fn shared_edges(crossing: &[u64; 24], n: usize, mut each: impl FnMut(usize, usiz
         4 => [0, 1].iter().for_each(|&axis| bits(crossing[axis], |b| each(0, b, axis))),
         5 => bits(crossing[1] & X0, |b| each(0, b, 1)),
         6 => bits(crossing[0] & Y0, |b| each(0, b, 0)),
-        // What all eight share is a sample; no edge lies on it.
+        // All eight share a single sample and no edge.
         _ => {}
     }
 }
 
-/// How far the neighbour `n` (bits: 0 x, 1 y, 2 z) lies away, in samples.
+/// Returns the offset of the neighbour `n` (bits: 0 x, 1 y, 2 z), in samples.
 #[inline(always)]
 pub(super) fn far(n: usize) -> [usize; 3] {
     [8 * (n & 1), 8 * (n >> 1 & 1), 8 * (n >> 2 & 1)]
@@ -71,11 +71,11 @@ pub(super) fn far(n: usize) -> [usize; 3] {
 /// A vertex of a neighbour.
 #[derive(Clone, Copy)]
 pub(super) struct Shared {
-    /// Among the neighbour's vertices.
+    /// Rank among the neighbour's vertices.
     pub(super) rank: u32,
     /// Its edge in the neighbour.
     pub(super) edge: Edge,
-    /// Where that is among the grid edges of the brick itself.
+    /// Index among the grid edges of the brick itself.
     pub(super) index: usize,
 }
 
@@ -93,8 +93,8 @@ pub(super) fn shared_vertices(of: &Numbered<'_>, n: usize, mut each: impl FnMut(
     });
 }
 
-/// The slot of the neighbour `n` (bits: 0 x, 1 y, 2 z) of the brick in `slot`, and whether it lies beyond the
-/// tile, per axis.
+/// Returns the slot of the neighbour `n` (bits: 0 x, 1 y, 2 z) of the brick in `slot`, and per axis whether it lies
+/// beyond the tile.
 #[inline(always)]
 pub(super) fn neighbour_slot(slot: usize, n: usize) -> (usize, [usize; 3]) {
     let brick = slot_brick(slot);

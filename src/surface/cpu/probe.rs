@@ -1,5 +1,5 @@
-//! What the stages of this backend hold between each other, brick by brick: what a device's stages are compared with and
-//! fed. For tests; a mesh is made without it.
+//! Intermediate results of the stages of this backend, brick by brick: reference and input for tests of a device's
+//! stages. Meshing does not use it.
 
 use super::bin::{Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
@@ -11,10 +11,10 @@ use crate::surface::lattice::{BRICK, BRICK_SAMPLES, Lattice, to_f32};
 use crate::surface::mesh::Mesh;
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
 
-/// A brick that some atom is near to.
+/// A brick with candidates.
 #[derive(Debug, Clone)]
 pub struct ProbedBrick {
-    /// Its place, in bricks from the lattice's origin.
+    /// Coordinates in bricks from the lattice's origin.
     pub coord: [i32; 3],
     /// Atoms that reach one of its samples, ascending.
     pub reaching: Vec<u32>,
@@ -26,10 +26,10 @@ pub struct ProbedBrick {
     pub inside: [u64; 8],
 }
 
-/// A brick that the surface passes through.
+/// A brick that the surface intersects.
 #[derive(Debug, Clone)]
 pub struct ProbedSurface {
-    /// Its place, in bricks from the lattice's origin.
+    /// Coordinates in bricks from the lattice's origin.
     pub coord: [i32; 3],
     /// Crossing edges: word `3·z + axis`, bit `8·y + x` of the owning sample.
     pub crossing: [u64; 24],
@@ -41,7 +41,7 @@ pub struct ProbedSurface {
     pub count: [u32; 2],
 }
 
-/// Everything between the stages.
+/// Intermediate results of all stages.
 #[derive(Debug, Clone)]
 pub struct Probe {
     /// Bricks with candidates, tile by tile.
@@ -52,7 +52,7 @@ pub struct Probe {
     pub mesh: Mesh,
 }
 
-/// Runs every stage and keeps what lies between them.
+/// Runs every stage and keeps the intermediate results.
 ///
 /// # Errors
 /// Any [`SurfaceError`].

@@ -1,4 +1,4 @@
-//! The atoms around a brick's vertices, and which of them reach a few of these.
+//! Atoms around a brick's vertices, and the subset that reaches a few of these.
 
 use super::bin::NORMAL_ONLY;
 use crate::surface::lattice::LatticeAtom;
@@ -6,22 +6,22 @@ use crate::surface::lattice::LatticeAtom;
 /// Vertices are shaded in batches of this many: one AVX-512 vector, two AVX ones.
 pub(super) const LANES: usize = 16;
 
-/// More than u of a vertex and of the box around it can differ by rounding.
+/// Factor above the difference by rounding between u of a vertex and of the box around it.
 const MARGIN: f32 = 1.0 + 1e-4;
 
 /// A brick's candidates in its own coordinates.
 #[derive(Debug, Default)]
 pub(super) struct Around {
-    /// Centres, and 1/ρ², column by column, whole vectors: those beyond the last candidate are out of everybody's reach.
+    /// Centres, and 1/ρ², column by column, padded to whole vectors: the padding is out of reach of every vertex.
     columns: [Vec<f32>; 4],
     /// The same, row by row.
     rows: Vec<[f32; 4]>,
-    /// Rows of those that may reach the vertices at hand, and room for the others.
+    /// Rows of the candidates that may reach the current vertices, with spare capacity.
     near: Vec<[f32; 4]>,
 }
 
 impl Around {
-    /// Takes the candidates of the brick at `origin`.
+    /// Loads the candidates of the brick at `origin`.
     pub(super) fn fill(&mut self, atoms: &[LatticeAtom], candidates: &[u32], origin: [i32; 3]) {
         self.rows.clear();
         self.rows.extend(candidates.iter().map(|&candidate| {
@@ -37,8 +37,8 @@ impl Around {
         self.near.resize(self.rows.len(), [0.0; 4]);
     }
 
-    /// Gathers the candidates that may reach a box, in order: rows of centre and 1/ρ². One that is left out is farther than
-    /// `support` (in u) from whatever lies in the box, so it would add exact zeros.
+    /// Returns the candidates that may reach a box, in order: rows of centre and 1/ρ². An omitted candidate is farther
+    /// than `support` (in u) from every point in the box, so it would add exact zeros.
     #[inline(always)]
     pub(super) fn reach<'a>(&'a mut self, support: f32, bounds: [[f32; 2]; 3]) -> &'a [[f32; 4]] {
         let limit = support * MARGIN;
@@ -68,7 +68,7 @@ impl Around {
     }
 }
 
-/// Lowest and highest of a vector's lanes.
+/// Returns the lowest and highest of a vector's lanes.
 #[inline(always)]
 pub(super) fn extent(lanes: &[f32]) -> [f32; 2] {
     let (mut lo, mut hi) = ([0.0; LANES], [0.0; LANES]);
@@ -99,7 +99,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn who_reaches_a_vertex_reaches_its_box(
+        fn atoms_that_reach_a_vertex_reach_its_box(
             atoms in prop::collection::vec((prop::array::uniform3(-12.0_f32..20.0), 2.0_f32..5.0), 0..70),
             vertices in prop::array::uniform3(prop::array::uniform16(0.0_f32..8.0)),
             support in 0.5_f32..5.0,
@@ -118,7 +118,7 @@ mod tests {
             });
             let mut left = near.iter().peekable();
             for row in &all {
-                // In order, nothing lost, nothing made up.
+                // Rows keep their order; none is lost or added.
                 let kept = left.next_if(|kept| kept.map(f32::to_bits) == row.map(f32::to_bits)).is_some();
                 prop_assert!(kept || !reaches(row), "{row:?}");
             }
@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_far_away_is_left_out() {
+    fn distant_atoms_are_omitted() {
         let atoms = [atom([0.0; 3], 2.0), atom([30.0, 0.0, 0.0], 2.0), atom([7.0; 3], 2.0)];
         let mut around = Around::default();
         around.fill(&atoms, &[0, 1, 2], [0; 3]);

@@ -1,5 +1,5 @@
-//! The first pass over a tile, or a slab of it: its bricks' candidates, the `field` in a scratch, and what `classify` keeps
-//! of it.
+//! First pass over a tile, or a slab of it: candidates of its bricks, `field` in a scratch buffer, and the results of
+//! `classify`.
 
 use std::cell::RefCell;
 use std::ops::Range;
@@ -16,24 +16,23 @@ use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK_SAMPLES, Lattice};
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
 
-/// What one thread keeps from tile to tile.
+/// Buffers that a thread reuses from tile to tile.
 struct Scratch {
     bricks: Bricks,
-    /// Of two layers of bricks, those with even and those with odd z: no more is needed at a time, and what is not touched
-    /// need not be got from the system.
+    /// Two layers of bricks, with even and odd z: no more are needed at a time, and untouched memory is never mapped.
     layers: [Layer; 2],
     /// Index into its layer per slot, or `NO_BRICK`.
     slots: Vec<u16>,
-    /// What `classify` appends to; a tile takes it with it.
+    /// Results of `classify`, moved into the tile at its end.
     found: Found,
 }
 
-/// Densities of a brick from the start of a line of the cache on, so that no vector of them crosses one.
+/// Densities of a brick, aligned to a cache line, so that no vector crosses one.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
 struct Lines(Samples);
 
-/// Densities and inside bits of the bricks of a layer that some atom reaches.
+/// Densities and inside bits of the bricks of a layer in reach of an atom.
 #[derive(Default)]
 struct Layer {
     fields: Vec<Lines>,
@@ -57,22 +56,23 @@ impl Default for Scratch {
 const CANDIDATES_PER_CHECK: usize = 4096;
 
 thread_local! {
-    // Rayon hands out work in pieces and would make a scratch for each; fresh memory costs more than filling it.
+    // Thread-local: rayon splits work and would create a scratch for each part, and fresh memory costs more than
+    // filling it.
     static SCRATCH: RefCell<Scratch> = RefCell::default();
 }
 
 impl Layer {
-    /// Makes this many bricks.
+    /// Extends the layer to `n` bricks.
     fn grow(&mut self, n: usize) {
         if self.fields.len() < n {
-            // Room for all that there can be, once: growing would copy, and what is not touched costs nothing.
+            // Reserves the maximum once: growing would copy, and untouched memory costs nothing.
             self.fields.reserve_exact(SIDE * SIDE - self.fields.len());
             self.fields.resize(n, Lines([0.0; BRICK_SAMPLES]));
         }
     }
 }
 
-/// Counters that the tiles add to.
+/// Counters over all tiles.
 #[derive(Default)]
 pub(super) struct Tally {
     pub(super) bricks: AtomicU64,
@@ -84,14 +84,14 @@ pub(super) struct Tally {
 }
 
 impl Tally {
-    /// What all `n` slabs will have, going by what the finished ones have.
+    /// Extrapolates a count of the finished slabs to all `n` slabs.
     fn all_slabs(&self, so_far: u64, n: usize) -> u64 {
         let done = self.slabs_done.load(Ordering::Relaxed) + 1;
         so_far / done as u64 * n as u64
     }
 }
 
-/// What the first pass over every tile shares.
+/// Shared inputs and counters of the first pass over all tiles.
 pub(super) struct Pass<'a> {
     pub(super) lattice: &'a Lattice,
     pub(super) tiles: &'a Tiles,
@@ -106,11 +106,11 @@ pub(super) struct Pass<'a> {
 }
 
 impl Pass<'_> {
-    /// `bin` within the `i`th slab, `field` and `classify`. Returns its tile, if that has no further slabs.
+    /// Runs `bin`, `field` and `classify` for the `i`th slab. Returns its tile once all slabs of the tile are finished.
     ///
     /// # Errors
-    /// [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`], [`SurfaceError::MeshTooLarge`] as soon as
-    /// the slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
+    /// Returns [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`] or [`SurfaceError::MeshTooLarge`] as
+    /// soon as the slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
     pub(super) fn sample(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
         self.control.check()?;
         let slab = &self.slabs[i];
@@ -165,11 +165,11 @@ impl Pass<'_> {
 }
 
 impl Scratch {
-    /// The densities of every brick of layer z that some atom reaches; z up to the layer beyond the slab's `own`, of which
-    /// the first samples are needed.
+    /// Evaluates the densities of every brick of layer z in reach of an atom; z is at most the layer beyond the slab's
+    /// `own`, of which only the first samples are needed.
     ///
     /// # Errors
-    /// [`SurfaceError::Cancelled`].
+    /// Returns [`SurfaceError::Cancelled`].
     fn evaluate(&mut self, pass: &Pass<'_>, tile: [i32; 3], own: &Range<usize>, z: usize) -> Result<(), SurfaceError> {
         let Self { bricks, layers, slots, .. } = self;
         let layer = &mut layers[z % 2];
@@ -203,8 +203,8 @@ impl Scratch {
         Ok(())
     }
 
-    /// Classifies every brick of layer z that has, or borders on, samples inside; the layer above it was evaluated last.
-    /// Enters into `local` where each local brick's record is.
+    /// Classifies every brick of layer z that has, or borders on, samples inside; requires the layer above to be the
+    /// last one evaluated. Writes the index of each local brick's record to `local`.
     fn classify(&mut self, iso: f32, z: usize, local: &mut [u16]) {
         const NOTHING: Samples = [0.0; BRICK_SAMPLES];
         let Self { bricks, layers, slots, found } = self;
@@ -229,14 +229,14 @@ impl Scratch {
     }
 }
 
-/// Of a brick without samples inside.
+/// Inside bits of a brick without samples inside.
 const NOWHERE: Inside = [0; 8];
 
 /// Distance in slots to the neighbour towards +x (bit 0), +y (bit 1), +z (bit 2).
 const NEIGHBOUR: [usize; 8] =
     [0, 1, SIDE, SIDE + 1, SIDE * SIDE, SIDE * SIDE + 1, SIDE * SIDE + SIDE, SIDE * SIDE + SIDE + 1];
 
-/// Counts the slab's own bricks that some atom reaches.
+/// Counts the slab's own bricks in reach of an atom.
 fn count_occupied(bricks: &Bricks, layers: &Range<usize>, tally: &Tally) -> usize {
     let slots = layers.start * SIDE * SIDE..layers.end * SIDE * SIDE;
     let own = slots.filter(|&slot| slot_brick(slot)[..2].iter().all(|&b| b < SIDE - 1));

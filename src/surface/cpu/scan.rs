@@ -1,4 +1,4 @@
-//! Stage `scan`: the exclusive scan over tiles that tells each brick where its vertices and triangles go.
+//! Stage `scan`: exclusive scan over tiles for the first vertex and triangle of each.
 
 use super::Tile;
 use crate::surface::error::SurfaceError;
@@ -14,10 +14,10 @@ pub(super) struct Totals {
     pub(super) triangles: usize,
 }
 
-/// Gives every tile its first vertex and triangle.
+/// Sets the first vertex and triangle of every tile.
 ///
 /// # Errors
-/// [`SurfaceError::MeshTooLarge`] where the mesh would exceed the limit, or 32-bit indices.
+/// Returns [`SurfaceError::MeshTooLarge`] if the mesh exceeds the limit, or 32-bit indices.
 pub(super) fn scan(tiles: &mut [Tile], params: &SurfaceParams, limits: &SurfaceLimits) -> Result<Totals, SurfaceError> {
     let (mut vertices, mut triangles) = (0, 0);
     for tile in &mut *tiles {
@@ -31,8 +31,8 @@ pub(super) fn scan(tiles: &mut [Tile], params: &SurfaceParams, limits: &SurfaceL
     if bytes <= most { Ok(Totals { vertices, triangles }) } else { Err(too_large(bytes, params.resolution, most)) }
 }
 
-/// The refusal of a mesh of `bytes` bytes. Areas stay while cells shrink: bytes grow with the inverse square of the
-/// spacing.
+/// Returns the error for a mesh of `bytes` bytes. The number of bytes grows with the inverse square of the spacing, as
+/// the area stays the same.
 pub(crate) fn too_large(bytes: u64, spacing: f64, limit: u64) -> SurfaceError {
     let excess = (bytes as f64 / limit.max(1) as f64).max(1.0);
     SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution: roomier(spacing * excess.sqrt()) }

@@ -6,7 +6,7 @@ use crate::surface::union_find::UnionFind;
 /// Mark of a vertex that no triangle has used yet.
 pub(super) const NONE: u16 = u16::MAX;
 
-/// Sheets of the current brick. Provisional numbers are given as sheets are found; sheets that meet are united.
+/// Sheets of the current brick. New sheets get provisional numbers; sheets that meet are united.
 #[derive(Default)]
 pub(super) struct Sheets {
     united: UnionFind,
@@ -27,7 +27,7 @@ impl Sheets {
         }
     }
 
-    /// Puts the vertices on `edges` onto one sheet: the lowest that any of them is on, or a new one.
+    /// Puts the vertices on `edges` onto one sheet: the lowest of their sheets, or a new one.
     #[inline(always)]
     pub(super) fn join(&mut self, sheet: &mut [u16; EDGES], edges: &[u16]) {
         let (mut low, mut above) = (NONE, 0);
@@ -57,7 +57,7 @@ impl Sheets {
         }
     }
 
-    /// Numbers the sheets that are left, from 0, and returns how many there are.
+    /// Numbers the remaining sheets from 0, and returns their number.
     pub(super) fn resolve(&mut self) -> u16 {
         u16::try_from(self.united.number_sets(&mut self.numbers)).unwrap_or(u16::MAX)
     }

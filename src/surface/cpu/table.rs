@@ -1,4 +1,4 @@
-//! The brick at hand while its triangles are made: where its vertices are, by grid edge.
+//! Vertices of the current brick by grid edge, for the creation of its triangles.
 
 use glam::Vec3A;
 
@@ -10,31 +10,31 @@ use crate::surface::cases::MAX_TRIANGLES;
 use crate::surface::lattice::{BRICK_SAMPLES, to_f32};
 use crate::surface::quantize::Step;
 
-/// Room for the corners of a brick's triangles: five triangles a cell, and what a cell writes beyond its own.
+/// Capacity for the corners of a brick's triangles: five triangles per cell, and the padding of a cell's row.
 const CORNERS: usize = 512 * 3 * MAX_TRIANGLES + ROW;
 /// Corners that every cell writes, as whole vectors: those beyond its triangles are overwritten by the next cell.
 pub(super) const ROW: usize = 16;
 
-/// The brick at hand: its vertices by grid edge, `3·((z·9 + y)·9 + x) + axis`, and its triangles. Entries of edges that
-/// do not cross are stale. Kept and refilled from brick to brick.
+/// Vertices of the current brick by grid edge, `3·((z·9 + y)·9 + x) + axis`, and its triangles. Entries of edges that
+/// do not cross are stale. Reused from brick to brick.
 pub(super) struct BrickTable {
     /// Global vertex ids.
     pub(super) ids: Box<[u32; EDGES]>,
     /// Positions in spacings from the brick's first sample.
     at: Box<[Vec3A; EDGES]>,
-    /// The sheet that a vertex belongs to, before sheets that met are made one.
+    /// Sheet of a vertex, before sheets that meet are united.
     pub(super) sheet: Box<[u16; EDGES]>,
-    /// The sheet of a brick's cells, where it has several and they are known.
+    /// Sheet of each cell of the brick, if there are several and they are known.
     cells: Box<[u16; BRICK_SAMPLES]>,
     /// Corners of the triangles as grid edges.
     pub(super) corners: Box<[u16; CORNERS]>,
     /// Triangles.
     pub(super) triangles: usize,
-    /// The neighbours that hold vertices of its: bit n for neighbour n.
+    /// Neighbours that hold vertices of the brick's triangles: bit n for neighbour n.
     shared: u8,
 }
 
-/// A table on the heap, without passing through the stack.
+/// Allocates a table on the heap, without a copy on the stack.
 fn boxed<T: Copy>(value: T) -> Box<[T; EDGES]> {
     match vec![value; EDGES].into_boxed_slice().try_into() {
         Ok(table) => table,
@@ -56,7 +56,7 @@ impl Default for BrickTable {
     }
 }
 
-/// Samples' coordinates within a layer, by bit.
+/// Coordinates of samples within a layer, by bit.
 static LAYER: [Vec3A; 64] = {
     let mut table = [Vec3A::ZERO; 64];
     let mut bit = 0_u8;
@@ -67,7 +67,7 @@ static LAYER: [Vec3A; 64] = {
     table
 };
 
-/// Layers' places along z.
+/// Offsets of layers along z.
 static LAYERS: [Vec3A; 8] = {
     let mut table = [Vec3A::ZERO; 8];
     let mut z = 0_u8;
@@ -78,10 +78,10 @@ static LAYERS: [Vec3A; 8] = {
     table
 };
 
-/// Directions; the last one is none.
+/// Directions by axis; the last one is zero.
 static ALONG: [Vec3A; 4] = [Vec3A::X, Vec3A::Y, Vec3A::Z, Vec3A::ZERO];
 
-/// A vertex's place in its own brick, in spacings from that one's first sample.
+/// Returns a vertex's position in its own brick, in spacings from the first sample of that brick.
 #[inline(always)]
 fn place(edge: Edge, t: f32) -> Vec3A {
     corner(edge) + along(edge, t)
@@ -151,17 +151,17 @@ impl BrickTable {
         }
     }
 
-    /// Moves the vertices of a brick that lies `n` away to where they are after rounding.
+    /// Moves the vertices of the neighbour `n` to their rounded positions.
     #[inline(always)]
     pub(super) fn round(&mut self, of: &Numbered<'_>, n: usize, rounding: &Rounding) {
         let Rounding { step, spacing, offset } = *rounding;
         let far = far(n);
-        // As the vertex's own brick has it: so a vertex is at one place in all bricks that use it.
+        // Computed as in the vertex's own brick, so that all bricks see the same position.
         let own: [f32; 3] = std::array::from_fn(|k| to_f32(offset[k] + far[k] as f64));
         let (h, length) = (to_f32(spacing), f64::from(step.length()));
         let mut put = |index: usize, edge: Edge, t: f32| {
             let steps = step.position(position(own, place(edge, t).to_array(), h));
-            // Double precision, as a large offset is taken off.
+            // Double precision, as a large offset is subtracted.
             let at: [f32; 3] = std::array::from_fn(|k| to_f32(f64::from(steps[k]) * length / spacing - offset[k]));
             self.at[index] = Vec3A::from_array(at);
         };
@@ -184,25 +184,25 @@ impl BrickTable {
         self.shared
     }
 
-    /// A vertex's position in spacings from the brick's first sample.
+    /// Returns a vertex's position in spacings from the brick's first sample.
     #[inline(always)]
     pub(super) fn position(&self, edge: u16) -> Vec3A {
         self.at[usize::from(edge) % EDGES]
     }
 
-    /// The sheet that a vertex was put on.
+    /// Returns the sheet of a vertex.
     #[inline(always)]
     pub(super) fn sheet(&self, edge: u16) -> u16 {
         self.sheet[usize::from(edge) % EDGES]
     }
 }
 
-/// How vertices are rounded.
+/// Rounding of vertices.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Rounding {
     pub(super) step: Step,
     /// Å.
     pub(super) spacing: f64,
-    /// From the mesh's centre to the brick's first sample, in spacings.
+    /// Offset of the brick's first sample from the mesh's centre, in spacings.
     pub(super) offset: [f64; 3],
 }

@@ -1,6 +1,6 @@
-//! Area, volume and the checksum of directed edges, brick by brick, while the triangles are in the fastest cache.
+//! Area, volume and the checksum of directed edges, brick by brick, while the triangles are in the first-level cache.
 //!
-//! What [`Measures::of`](crate::surface::Measures::of) finds in a finished mesh.
+//! The results equal those of [`Measures::of`](crate::surface::Measures::of) for the finished mesh.
 
 use std::num::NonZeroU16;
 
@@ -17,35 +17,35 @@ use crate::surface::sums::{edge_shares, sum_lanes};
 /// Triangles whose areas are computed together.
 const LANES: usize = 32;
 
-/// The sheets of a brick as its piece numbers them.
+/// Sheets of a brick in the numbering of its piece.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct BrickSheets {
     /// The brick's first sheet.
     pub(super) first: u32,
-    /// How many it has.
+    /// Number of sheets.
     n: u16,
-    /// The neighbours (bit n for neighbour n) that hold vertices of a lone sheet and may have several themselves.
+    /// Neighbours (bit n for neighbour n) that hold vertices of a single sheet and may have several sheets themselves.
     unsettled: u8,
-    /// Where the sheets of its vertices begin in `of_vertices`, if it has several.
+    /// Start of the sheets of its vertices in `of_vertices`, if it has several.
     detail: u32,
 }
 
-/// A vertex on a sheet of a brick that has several, of a neighbour that may have several too.
+/// Vertex on a sheet of a brick with several sheets, in a neighbour that may also have several.
 #[derive(Debug, Clone, Copy)]
 struct Far {
     brick: u32,
-    /// Which neighbour (bits: 0 x, 1 y, 2 z), and the vertex's rank in it.
+    /// Number of the neighbour (bits: 0 x, 1 y, 2 z); `rank` is the vertex's rank in it.
     neighbour: u8,
     rank: u32,
     sheet: u32,
 }
 
-/// What one piece adds up.
+/// Sums over one piece.
 #[derive(Debug, Default)]
 pub(super) struct Tally {
     /// Sum of the shares of all directed edges.
     pub(super) checksum: u64,
-    /// A triangle has a corner twice.
+    /// True if a triangle has a corner twice.
     pub(super) degenerate: bool,
     /// Per sheet of the piece.
     pub(super) sheets: Vec<Sheet>,
@@ -84,15 +84,15 @@ impl Sheet {
         }
     }
 
-    /// Adds the sheet to its component, of which `first` is one too. Volumes are taken against that one's origin: against
-    /// one that is far away, small errors of the area vectors would weigh as much as a molecule.
+    /// Adds the sheet to its component, which contains `first`. Volumes are relative to the origin of `first`: relative
+    /// to a distant origin, small errors of the area vectors would be as large as a molecule.
     pub(super) fn add_to(&self, component: &mut Component, first: &Self, spacing: f64) {
         let h2 = spacing * spacing;
         component.triangles += self.triangles;
         component.vertices += self.vertices;
         component.area += 0.5 * self.area * h2;
         for k in 0..3 {
-            // The sums as they are with the corners moved by the offset.
+            // The sums after moving the corners by the offset.
             let offset = f64::from(self.origin[k] - first.origin[k]);
             let product = self.product[k] + 3.0 * offset * self.vector[k];
             let moment = self.moment[k] + offset * (4.0 * self.product[k] + 6.0 * offset * self.vector[k]);
@@ -101,7 +101,7 @@ impl Sheet {
         }
     }
 
-    /// Refers a finished component's moment, which is about the sheet's origin, to the sample `centre`.
+    /// Moves the reference point of a finished component's moment from the sheet's origin to the sample `centre`.
     pub(super) fn refer_moment(&self, component: &mut Component, centre: [i32; 3], spacing: f64) {
         for ((moment, origin), centre) in component.moment.iter_mut().zip(self.origin).zip(centre) {
             *moment += component.volume * f64::from(origin - centre) * spacing;
@@ -147,8 +147,8 @@ impl Tally {
         note_vertices(self, table, sheets, around, first);
     }
 
-    /// Notes those of the neighbours `shared` that are known to have one sheet, as the brick has, which is `sheet`. Returns
-    /// the others.
+    /// Records the neighbours in `shared` that are known to have one sheet, like the brick, whose sheet is `sheet`.
+    /// Returns the others.
     #[inline(always)]
     fn settle(&mut self, sheet: u32, shared: u8, around: &[Option<Numbered<'_>>; 8]) -> u8 {
         let mut unsettled = 0;
@@ -161,9 +161,9 @@ impl Tally {
         unsettled
     }
 
-    /// The pairs of sheets that neighbouring bricks share, beyond those of `lone`. `near(brick, neighbour)` gives a brick's
-    /// neighbour, the tally of its piece, and its piece with its place in that; `pair` gets the sheet of this piece, and
-    /// the other's piece and sheet.
+    /// Calls `pair` for the pairs of sheets that neighbouring bricks share, beyond those of `lone`. `near(brick,
+    /// neighbour)` returns a brick's neighbour, the tally of its piece, its piece, and its index in that piece; `pair`
+    /// receives the sheet of this piece, and the other piece and sheet.
     #[inline(always)]
     pub(super) fn pairs<'a>(
         &self,
@@ -201,7 +201,7 @@ impl Tally {
         }
     }
 
-    /// The sheet of a brick's vertex.
+    /// Returns the sheet of a brick's vertex.
     #[inline(always)]
     fn sheet_of(&self, brick: usize, rank: u32) -> u32 {
         let brick = &self.bricks[brick];
@@ -213,15 +213,15 @@ impl Tally {
 }
 
 dispatched! {
-/// The checksum of triangles, and whether one of them has a corner twice.
+/// Returns the checksum of triangles, and true if one of them has a corner twice.
 fn check(triangles: &[[u32; 3]]) -> (u64, bool) {
     edge_shares(triangles)
 }
 }
 
 dispatched! {
-/// Notes which sheet, from number `first` on, every vertex is on that a brick of several uses: its own by their ranks, and
-/// those of its neighbours for who joins the bricks.
+/// Records the sheet, numbered from `first`, of every vertex of a brick with several sheets: its own by rank, and those
+/// of its neighbours for the later join of bricks.
 fn note_vertices(
     tally: &mut Tally,
     table: &BrickTable,
@@ -255,7 +255,7 @@ fn note_vertices(
 }
 }
 
-/// Whether a brick is known to have one sheet before its triangles are there.
+/// Returns true if a brick is known to have one sheet before its triangles exist.
 #[inline(always)]
 fn has_one_sheet(of: &Numbered<'_>) -> bool {
     of.brick.n_sheets == Some(NonZeroU16::MIN)
@@ -270,7 +270,7 @@ fn terms(table: &BrickTable, edges: [u16; 3]) -> [Vec3A; 3] {
     [n, n * sum, n * (a * sum + b * (b + c) + c * c)]
 }
 
-/// Lengths of normals, zeros behind them: together, as a root alone takes as long as a vector of them.
+/// Computes the lengths of normals, padded with zeros: a single square root takes as long as a vector of them.
 #[inline(always)]
 fn lengths(normals: &[Vec3A]) -> [f32; LANES] {
     let mut lengths = [0.0; LANES];
@@ -279,7 +279,7 @@ fn lengths(normals: &[Vec3A]) -> [f32; LANES] {
 }
 
 dispatched! {
-/// As [`sum`], for a brick of several sheets, whose triangles come in no order of sheets: adds each to its own.
+/// As [`sum`], for a brick of several sheets, whose triangles are not ordered by sheet: adds each to its own sheet.
 fn sum_by_sheet(table: &BrickTable, sheets: &Sheets, sums: &mut [Sheet]) {
     let (mut normals, mut others) = ([Vec3A::ZERO; LANES], [[Vec3A::ZERO; 2]; LANES]);
     for batch in table.corners().chunks(LANES) {
@@ -299,8 +299,8 @@ fn sum_by_sheet(table: &BrickTable, sheets: &Sheets, sums: &mut [Sheet]) {
 }
 
 dispatched! {
-/// Sums over triangles given by the grid edges of their corners. Single precision within a brick, where differences of positions are nearly
-/// exact; double between bricks.
+/// Returns the sums over triangles given by the grid edges of their corners. Single precision within a brick, where
+/// differences of positions are nearly exact; double precision between bricks.
 fn sum(table: &BrickTable, corners: &[[u16; 3]]) -> Sheet {
     let mut all = Sheet { triangles: corners.len() as u64, ..Sheet::default() };
     let mut normals = [Vec3A::ZERO; LANES];

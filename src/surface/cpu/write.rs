@@ -103,8 +103,8 @@ pub(super) fn write(
     let measures = control.span(Stage::Measure, || join::measures(scanned, &written));
     let measures = match measures {
         Some(measures) if written.iter().all(|piece| piece.flat == 0) => measures,
-        // A normal without a gradient depends on the triangles around it, and measuring a mesh that is not closed takes
-        // all of it: the mesh is made again, in memory, and its rows replace the first ones.
+        // A normal without a gradient depends on the triangles around it, and measuring a mesh that is not closed needs
+        // the whole mesh: it is computed again in memory, and its rows replace the first ones.
         _ => {
             let MeshOutput { mesh, measures, .. } = in_memory(scanned, false, control)?;
             sink.part(&MeshPart::whole(&mesh)).map_err(failed)?;
