@@ -170,11 +170,11 @@ const MAX_COLUMNS: usize = 120;
 /// Folders and files with code.
 const CODE: &[&str] = &["build.rs", "src", "shaders", "tests", "bench", "benches", "examples"];
 /// Documentation comments that still begin with a question word. The aim is 0.
-const MAX_QUESTION_DOCS: usize = 990;
+const MAX_QUESTION_DOCS: usize = 0;
 /// Comment lines in Rust that are still too long. The aim is 0.
-const MAX_LONG_COMMENTS: usize = 298;
+const MAX_LONG_COMMENTS: usize = 0;
 /// Lines of Markdown prose that are still too long. The aim is 0.
-const MAX_LONG_PROSE: usize = 441;
+const MAX_LONG_PROSE: usize = 0;
 
 const STAGES: &[&str] = &["bin", "field", "classify", "scan", "interpolate", "emit"];
 /// Limit for the lines of a source file, without its tests.
