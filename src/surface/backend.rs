@@ -59,7 +59,7 @@ impl MeshOutput {
         Self { mesh, streamed: None, grid, measures: None, served: None }
     }
 
-    /// Number of vertices and triangles, wherever the mesh is.
+    /// Number of vertices and triangles, in memory or in a sink.
     #[must_use]
     pub fn size(&self) -> [usize; 2] {
         match &self.streamed {
@@ -117,8 +117,8 @@ pub trait Backend: Send + Sync {
     /// Short stable name: `cpu`, `reference`, `gpu`.
     fn name(&self) -> &'static str;
 
-    /// Name of the arithmetic: equal names give equal bytes for equal input. With several devices, that of the first one
-    /// that accepts jobs. Part of the keys of cached results.
+    /// Name of the arithmetic: equal names give equal bytes for equal input. With several devices, that of the first
+    /// one that accepts jobs. Part of the keys of cached results.
     fn arithmetic(&self) -> String {
         format!("{} {}", self.name(), simd::arithmetic())
     }

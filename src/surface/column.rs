@@ -13,8 +13,8 @@ use rayon::prelude::*;
 
 /// Size from which a column is mapped, bytes.
 const MAP_FROM: usize = 64 << 10;
-/// Size from which a mapped column uses huge pages, bytes. The pages of smaller mappings are populated in one call instead
-/// of one page fault each.
+/// Size from which a mapped column uses huge pages, bytes. The pages of smaller mappings are populated in one call
+/// instead of one page fault each.
 const HUGE_FROM: usize = 4 << 20;
 
 /// Bytes per copying task.
@@ -23,8 +23,8 @@ const COPIED: usize = 4 << 20;
 /// Memory with another owner, released with the last reference.
 pub type SharedBytes = Arc<dyn AsRef<[u8]> + Send + Sync>;
 
-/// Rows of a mesh; dereferences to a slice. A column in several chunks is copied into one when it is first used as a slice;
-/// [`Self::pieces`] gives the chunks without a copy.
+/// Rows of a mesh; dereferences to a slice. A column in several chunks is copied into one when it is first used as a
+/// slice; [`Self::pieces`] gives the chunks without a copy.
 pub struct Column<T: Pod>(Storage<T>);
 
 enum Storage<T: Pod> {
@@ -67,8 +67,8 @@ fn mapped(bytes: usize) -> Option<MmapMut> {
 }
 
 impl<T: Pod> Column<T> {
-    /// Column over `bytes` of shared memory, without a copy; the memory is kept until the column is dropped or written to.
-    /// `None` if the range is out of bounds, misaligned, or not a whole number of rows.
+    /// Column over `bytes` of shared memory, without a copy; the memory is kept until the column is dropped or written
+    /// to. `None` if the range is out of bounds, misaligned, or not a whole number of rows.
     #[must_use]
     pub fn shared(owner: SharedBytes, bytes: Range<usize>) -> Option<Self> {
         let rows = (*owner).as_ref().get(bytes.clone())?;

@@ -112,8 +112,8 @@ pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let largest = spheres.radii().iter().copied().fold(0.0, f32::max);
     let reach = profile.reach(profile.length(effective_radius(largest, params)));
     let half = (0..3).map(|k| 0.5 * (hi[k] - lo[k])).fold(0.0, f64::max);
-    // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within reach.
-    // Half a spacing more is far above every rounding.
+    // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within
+    // reach. Half a spacing more is far above every rounding.
     half + reach + 2.0 * params.resolution
 }
 
@@ -149,8 +149,8 @@ impl Placing<'_> {
         c.map(|c| to_i32((c / self.params.resolution).round()))
     }
 
-    /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order last.
-    /// `bounds`: lowest and highest coordinates.
+    /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order
+    /// last. `bounds`: lowest and highest coordinates.
     fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
         let n = self.spheres.len();
         // Rounding is monotone, so the outermost tiles are those of the outermost coordinates.
@@ -299,7 +299,7 @@ pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
 }
 
 /// Returns a spacing slightly above `spacing`, rounded up to hundredths of an Å, as a suggestion that fits.
-pub(super) fn roomier(spacing: f64) -> f64 {
+pub(super) fn slightly_coarser(spacing: f64) -> f64 {
     (spacing * 105.0).ceil() / 100.0
 }
 

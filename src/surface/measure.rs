@@ -20,7 +20,8 @@ pub enum Validation {
     /// than twice then follows from the case table, which the tests verify: for meshes that a backend made.
     #[default]
     Checksum,
-    /// Every edge and the fan of triangles around every vertex, for any mesh. Takes about four times as long as meshing.
+    /// Every edge and the fan of triangles around every vertex, for any mesh. Takes about four times as long as
+    /// meshing.
     Exact,
 }
 

@@ -29,7 +29,7 @@ pub struct Mesh {
     pub quantized: Option<Quantized>,
     /// Vertex indices, counter-clockwise seen from outside.
     pub triangles: Column<[u32; 3]>,
-    /// Per vertex the index of the nearest sphere in the input, if it was asked for.
+    /// Per vertex the index of the nearest sphere in the input, if requested.
     pub atom_ids: Option<Column<u32>>,
     /// Per vertex an sRGB colour with alpha, if the caller set one. Backends leave it empty.
     pub colors: Option<Column<[u8; 4]>>,
@@ -43,7 +43,8 @@ pub struct Mesh {
 pub struct Quantized {
     /// Length of a unit of the positions.
     pub step: Step,
-    /// Positions relative to the mesh's centre, in steps; [`BEYOND`](quantize::BEYOND) where a coordinate is out of reach.
+    /// Positions relative to the mesh's centre, in steps; [`BEYOND`](quantize::BEYOND) where a coordinate is out of
+    /// reach.
     pub positions: Column<[i16; 4]>,
     /// Unit normals, one per position, in units of 1/127.
     pub normals: Column<[i8; 4]>,

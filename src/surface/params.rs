@@ -164,8 +164,9 @@ pub struct SurfaceParams {
     pub paper: Option<PaperParams>,
     /// Find the nearest atom of every vertex.
     pub atom_ids: bool,
-    /// Deliver vertices as [`Quantized`](super::mesh::Quantized) ones with this step, which reaches as far as the surface
-    /// does; else in single precision. A backend that cannot delivers single precision, which the caller may round.
+    /// Deliver vertices as [`Quantized`](super::mesh::Quantized) ones with this step, which reaches as far as the
+    /// surface does; else in single precision. A backend that cannot delivers single precision, which the caller may
+    /// round.
     pub quantize: Option<Step>,
 }
 

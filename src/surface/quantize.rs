@@ -58,9 +58,9 @@ impl Step {
         bounds.as_flattened().iter().all(|v| v.abs() < self.reach() + half)
     }
 
-    /// A position relative to the mesh's centre, Å, as multiples of the step: the nearest, ties to even. The position is
-    /// the single-precision number that `interpolate` writes (spacings from the centre times the spacing, rounded once).
-    /// A coordinate that [`Self::holds`] rejects becomes [`BEYOND`].
+    /// A position relative to the mesh's centre, Å, as multiples of the step: the nearest, ties to even. The position
+    /// is the single-precision number that `interpolate` writes (spacings from the centre times the spacing, rounded
+    /// once). A coordinate that [`Self::holds`] rejects becomes [`BEYOND`].
     #[inline]
     #[must_use]
     pub fn position(self, position: [f32; 3]) -> [i16; 3] {
@@ -139,11 +139,8 @@ mod tests {
             assert_eq!(f64::from(step.length()), length, "{extent}");
             assert!(f64::from(step.reach()) >= extent);
         }
-        for nonsense in [f64::NAN, f64::INFINITY] {
-            assert!(
-                !Step::covering(nonsense).holds(&[[0.0; 3], [1.0; 3]]),
-                "{nonsense} is not covered, and is rejected"
-            );
+        for value in [f64::NAN, f64::INFINITY] {
+            assert!(!Step::covering(value).holds(&[[0.0; 3], [1.0; 3]]), "{value} is not covered, and is rejected");
         }
     }
 

@@ -8,7 +8,7 @@ use super::cases::{CASES, cell_edge};
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
-use super::lattice::{EDGE_MARGIN, roomier, to_f32, to_i32, to_u64};
+use super::lattice::{EDGE_MARGIN, slightly_coarser, to_f32, to_i32, to_u64};
 use super::mesh::Mesh;
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::sink::MeshSink;
@@ -92,7 +92,7 @@ impl Grid {
         let samples = to_u64(n.iter().product());
         if samples > limits.max_samples {
             let excess = samples as f64 / limits.max_samples.max(1) as f64;
-            let suggested_resolution = roomier(h * excess.cbrt());
+            let suggested_resolution = slightly_coarser(h * excess.cbrt());
             let limit = limits.max_samples;
             return Err(SurfaceError::GridTooLarge { samples, limit, resolution: h, suggested_resolution });
         }
@@ -176,7 +176,7 @@ impl Backend for ReferenceBackend {
         let bytes = Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64);
         if bytes > limits.max_mesh_bytes {
             let excess = bytes as f64 / limits.max_mesh_bytes.max(1) as f64;
-            let suggested_resolution = roomier(h * excess.sqrt());
+            let suggested_resolution = slightly_coarser(h * excess.sqrt());
             return Err(SurfaceError::MeshTooLarge { bytes, limit: limits.max_mesh_bytes, suggested_resolution });
         }
         let n = grid.len() as u64;

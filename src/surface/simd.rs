@@ -50,7 +50,7 @@ pub fn arithmetic() -> String {
     format!("{} {} {fused}", std::env::consts::OS, std::env::consts::ARCH)
 }
 
-/// The vector extension that the dispatched functions use here, for people.
+/// The vector extension that the dispatched functions use here, for display.
 #[must_use]
 pub(super) fn extension() -> &'static str {
     #[cfg(target_arch = "x86_64")]

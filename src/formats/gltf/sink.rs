@@ -80,8 +80,8 @@ impl<'a> GlbSink<'a> {
         lock(&self.failure).take()
     }
 
-    /// Writes the header, which completes the file, and returns the file's length in bytes. `centre` is that of the mesh,
-    /// `bounds` are those of its positions.
+    /// Writes the header, which completes the file, and returns the file's length in bytes. `centre` is that of the
+    /// mesh, `bounds` are those of its positions.
     ///
     /// # Errors
     /// [`SinkFailed`]; see [`Self::failure`].

@@ -146,7 +146,7 @@ impl Found {
     }
 
     /// Returns an empty value with capacity for all `parts`.
-    pub(super) fn with_room_for(parts: &[&Self]) -> Self {
+    pub(super) fn with_capacity_for(parts: &[&Self]) -> Self {
         let sum = |len: fn(&Self) -> usize| parts.iter().map(|part| len(part)).sum();
         Self {
             bricks: Vec::with_capacity(sum(|part| part.bricks.len())),

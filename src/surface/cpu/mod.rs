@@ -1,9 +1,9 @@
 //! Native CPU backend: six stages over occupied bricks, parallel over tiles, with SIMD.
 //!
-//! First pass (`sample.rs`): `bin` assigns atoms to tiles. Each tile, or a slab of it, finds the candidates of its bricks,
-//! evaluates `field` into a scratch that fits the core's cache, and `classify` keeps crossing bits, edge parameters and
-//! cases. The field is never stored beyond a tile. `scan` numbers the tiles. Second pass (`write.rs`): `interpolate` and
-//! `emit` write vertices and triangles to memory or to a sink.
+//! First pass (`sample.rs`): `bin` assigns atoms to tiles. Each tile, or a slab of it, finds the candidates of its
+//! bricks, evaluates `field` into a scratch that fits the core's cache, and `classify` keeps crossing bits, edge
+//! parameters and cases. The field is never stored beyond a tile. `scan` numbers the tiles. Second pass (`write.rs`):
+//! `interpolate` and `emit` write vertices and triangles to memory or to a sink.
 //!
 //! The same input gives the same bytes on any number of threads.
 

@@ -2,7 +2,7 @@
 
 use super::Tile;
 use crate::surface::error::SurfaceError;
-use crate::surface::lattice::roomier;
+use crate::surface::lattice::slightly_coarser;
 use crate::surface::params::{SurfaceLimits, SurfaceParams};
 
 /// Totals of a run.
@@ -35,5 +35,5 @@ pub(super) fn scan(tiles: &mut [Tile], params: &SurfaceParams, limits: &SurfaceL
 /// the area stays the same.
 pub(crate) fn too_large(bytes: u64, spacing: f64, limit: u64) -> SurfaceError {
     let excess = (bytes as f64 / limit.max(1) as f64).max(1.0);
-    SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution: roomier(spacing * excess.sqrt()) }
+    SurfaceError::MeshTooLarge { bytes, limit, suggested_resolution: slightly_coarser(spacing * excess.sqrt()) }
 }

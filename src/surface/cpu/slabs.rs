@@ -69,7 +69,7 @@ impl Unfinished {
         };
         parts.sort_unstable_by_key(|(layer, _)| *layer);
         let all: Vec<&Found> = parts.iter().map(|(_, tile)| &tile.found).collect();
-        let mut found = Found::with_room_for(&all);
+        let mut found = Found::with_capacity_for(&all);
         let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
         for (_, part) in &parts {
             let before = found.bricks.len();

@@ -3,8 +3,8 @@
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Runs `work` for 0 to `n` on all threads of the pool and returns the results in order. Items start in ascending order,
-/// so the costly ones should come first.
+/// Runs `work` for 0 to `n` on all threads of the pool and returns the results in order. Items start in ascending
+/// order, so the costly ones should come first.
 ///
 /// # Errors
 /// The first error of `work`; items that have not started by then are skipped.
