@@ -1,4 +1,5 @@
 //! Meshes a structure file and writes it as PLY: `cargo run --example mesh samples/4pti.pdb 4pti.ply`.
+#![allow(clippy::print_stdout, reason = "an example prints its result")]
 
 use std::error::Error;
 use std::fs::File;

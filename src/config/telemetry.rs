@@ -16,8 +16,8 @@ use super::Secret;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TelemetryConfig {
-    /// Base URL of the collector, such as `http://localhost:4318`; spans are sent to `/v1/traces` below it. Default `none`:
-    /// no spans are recorded. Trace ids are passed on and logged in any case.
+    /// Base URL of the collector, such as `http://localhost:4318`; spans are sent to `/v1/traces` below it. Default
+    /// `none`: no spans are recorded. Trace ids are passed on and logged in any case.
     pub endpoint: Option<CollectorUrl>,
     /// Fraction of new traces that are sampled, from 0 to 1. Default 1. A request with `traceparent` is sampled as its
     /// sampled flag says.

@@ -2,7 +2,7 @@
 //!
 //! Encoding has two steps, so that the length is known before sending: [`Encoder::new`] checks the mesh and computes
 //! the layout, [`Encoder::write`] streams the file. The mesh is never copied as a whole: columns in the format's own
-//! layout are written from memory, all others pass through one block of [`block::BLOCK_BYTES`].
+//! layout are written from memory, all others pass through one block of `BLOCK_BYTES`.
 //!
 //! One unit is one ångström in every format, unless [`Units`] says otherwise. glTF holds positions relative to
 //! [`Mesh::centre`], in Å, under a node that translates and scales them. PLY, STL and OBJ have no nodes and hold the
@@ -45,14 +45,15 @@ pub struct Meta {
 
 /// Writes `mesh` as `format`.
 ///
+/// # Errors
 /// Returns the errors of `out`, and `InvalidInput` with a [`FormatError`] if the mesh is invalid or the format cannot
 /// hold it (such as a GLB of 4 GiB); nothing has been written then.
 pub fn write(format: Format, mesh: &Mesh, meta: &Meta, out: &mut dyn Write) -> io::Result<()> {
     Encoder::new(format, mesh, meta)?.write(out)
 }
 
-/// Returns the exact number of bytes that [`write`] writes; `None` if it rejects the mesh, and for OBJ, whose length is
-/// only known after formatting: see [`encoded_len_bound`].
+/// Returns the exact number of bytes that [`write()`] writes; `None` if it rejects the mesh, and for OBJ, whose length
+/// is only known after formatting: see [`encoded_len_bound`].
 ///
 /// [`Encoder`] returns the length and writes the file with a single check of the mesh.
 #[must_use]
@@ -60,7 +61,7 @@ pub fn encoded_len(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
     Encoder::new(format, mesh, meta).ok()?.encoded_len()
 }
 
-/// Returns the maximum number of bytes that [`write`] writes: exact if [`encoded_len`] is; `None` if it rejects the
+/// Returns the maximum number of bytes that [`write()`] writes: exact if [`encoded_len`] is; `None` if it rejects the
 /// mesh.
 #[must_use]
 pub fn encoded_len_bound(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
@@ -107,6 +108,7 @@ impl<'a> Encoder<'a> {
     /// As [`Self::trusting`], with a given [`Storage`] or [`Packing`]. Vertices that are already packed this way are
     /// copied.
     ///
+    /// # Errors
     /// Returns any [`FormatError`]: [`FormatError::NotQuantized`] and [`FormatError::NotInUnits`] if `format` has no
     /// such packing or units, [`FormatError::BeyondStep`] if the step is too small for the mesh,
     /// [`FormatError::OtherPacking`] if the mesh has another packing.

@@ -41,8 +41,8 @@ impl Discovery {
     /// Opens the selected device with this number, with its own limits and, if supported, timestamps.
     ///
     /// # Errors
-    /// Returns [`GpuError::NoDevice`] if no selected device has the number, and [`GpuError::Failed`] if the driver rejects
-    /// the request.
+    /// Returns [`GpuError::NoDevice`] if no selected device has the number, and [`GpuError::Failed`] if the driver
+    /// rejects the request.
     pub fn open(&self, number: usize) -> Result<(wgpu::Device, wgpu::Queue), GpuError> {
         let mut all = self.devices.iter().zip(&self.adapters);
         match all.find(|(device, _)| device.taken && device.number == number) {

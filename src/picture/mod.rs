@@ -1,7 +1,7 @@
 //! Pictures of meshes: pixels and PNG from a mesh and a view. Pure: no files, no clock, no graphics API.
 //!
 //! The projection is orthographic, so lengths can be measured in a picture: [`Rendered::pixel`] is the width of a pixel
-//! in Å. [`camera`] computes the view, [`bins`] and [`raster`] the visible surface at four samples per pixel,
+//! in Å. [`camera`] computes the view, `bins` and `raster` the visible surface at four samples per pixel,
 //! [`finish`] shades the pixels, [`png`] encodes them. [`cpu`] combines these steps in a [`Renderer`]; a device
 //! renderer uses the same parameters.
 //!

@@ -2,8 +2,8 @@
 
 use super::report::{PictureReport, Report};
 use super::{JobError, Product, ProgressSink, StageClock};
-use crate::picture::{Drawer, PictureParams, png};
-use crate::surface::{CancelToken, Control, Mesh};
+use crate::picture::{Drawer, PictureParams, Rendered, png};
+use crate::surface::{CancelToken, Control, Mesh, Served};
 
 /// Draws the mesh of `product` and replaces it with the PNG.
 ///
@@ -34,4 +34,34 @@ pub fn draw(
     }
     product.picture = Some(bytes);
     Ok(())
+}
+
+impl PictureReport {
+    /// Returns the report of a picture.
+    fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
+        let served = drawn.served.clone().unwrap_or_else(|| Served {
+            backend: drawer.renderer.name(),
+            arithmetic: drawer.renderer.arithmetic(),
+            device: drawer.renderer.describe(),
+            fallback_reason: None,
+        });
+        Self {
+            width: params.width,
+            height: params.height,
+            view: params.view.name(),
+            azimuth: params.azimuth,
+            elevation: params.elevation,
+            background: params.background.to_string(),
+            style: params.style.name(),
+            pixel: drawn.pixel,
+            renderer: served.backend,
+            arithmetic: served.arithmetic,
+            device: served.device,
+            reason: match &served.fallback_reason {
+                Some(why) => format!("{}; but {why}", drawer.reason),
+                None => drawer.reason.clone(),
+            },
+            fallback: served.fallback_reason,
+        }
+    }
 }

@@ -1,7 +1,7 @@
-//! The parameters of a job as people write them: one table of names, documentation and ranges, shared by the
-//! query of the HTTP service, `/v1/capabilities` and the command line.
+//! Parser of job parameters. One table of names, descriptions and ranges serves the query of the HTTP service,
+//! `/v1/capabilities` and the command line.
 //!
-//! Pairs of names and values come in, a validated [`Job`] goes out. It knows neither HTTP nor flags.
+//! Input: pairs of names and values. Output: a validated [`Job`]. The module depends on neither HTTP nor flags.
 
 mod table;
 
@@ -21,15 +21,15 @@ use crate::picture::{Background, MOST_SIDE, PictureParams, Style, View};
 use crate::structure::Selection;
 use crate::surface::{Kernel, PaperParams, Preset, SurfaceError, SurfaceOptions, SurfaceParams, Validation};
 
-/// Why parameters are refused.
+/// Errors of parsing parameters.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum ParamError {
     /// No parameter has this name.
     #[error("unknown parameter `{name}`{}", nearest.map_or(String::new(), |n| format!("; did you mean `{n}`?")))]
     Unknown {
-        /// The name that was given, at most 64 characters of it.
+        /// The given name, at most 64 characters.
         name: String,
-        /// The known name that is nearest to it, if one is near.
+        /// The most similar known name, if there is one.
         nearest: Option<&'static str>,
     },
     /// A parameter is given twice.
@@ -38,33 +38,33 @@ pub enum ParamError {
         /// Its name.
         name: &'static str,
     },
-    /// A value is not one of the parameter's.
+    /// The value is invalid for the parameter.
     #[error("parameter `{name}`: {value} is not allowed; expected {expected}")]
     BadValue {
         /// Its name.
         name: &'static str,
-        /// The value that was given.
+        /// The given value.
         value: String,
-        /// What was expected, in words.
+        /// Description of valid values.
         expected: String,
     },
 }
 
-/// What the pairs asked for.
+/// Parsed parameters.
 #[derive(Debug, Clone, Default)]
 pub struct Request {
     /// The job.
     pub job: Job,
-    /// The mesh format, if one was named.
+    /// Format, if given.
     pub format: Option<Format>,
-    /// A strict check of the file was asked for.
+    /// True if strict validation of the file is requested.
     pub strict: bool,
 }
 
-/// Reads parameters.
+/// Parses parameters.
 ///
 /// # Errors
-/// [`ParamError`] names the first parameter that is unknown, repeated, malformed, out of range, or does not go
+/// Returns a [`ParamError`] for the first parameter that is unknown, repeated, malformed, out of range, or in conflict
 /// with another one.
 pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V)>) -> Result<Request, ParamError> {
     let mut seen = [false; TABLE.len()];
@@ -105,10 +105,10 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     Ok(request)
 }
 
-/// The parameters of a picture.
+/// Parameters of a picture.
 pub(crate) const PICTURES: [&str; 7] = ["width", "height", "view", "azimuth", "elevation", "background", "style"];
 
-/// The parameters that set the grid's spacing, each in its own way.
+/// Parameters that set the grid spacing and exclude each other.
 pub(crate) const SPACINGS: [&str; 3] = ["resolution", "detail", "max_triangles"];
 
 fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
@@ -119,12 +119,11 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
     }
 }
 
-/// Makes a job one for `format`: for a format that was named elsewhere than in the pairs. A job for a picture has one from then
-/// on.
+/// Sets the format of a job, for a format that was not given as a parameter. A picture format adds picture parameters.
 ///
 /// # Errors
-/// [`ParamError::BadValue`] for `compress`, `units`, `normals` and a picture's parameters where the format has nothing of the
-/// kind.
+/// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals` or a picture parameter that the format does not
+/// support.
 pub fn settle(job: &mut Job, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::extension).collect();
@@ -157,7 +156,7 @@ pub fn settle(job: &mut Job, format: Format) -> Result<(), ParamError> {
     refuse(name, value, "the default", &|f| f.is_picture())
 }
 
-/// The refusal of an unknown name.
+/// Returns the error for an unknown name.
 #[must_use]
 pub fn unknown(name: &str) -> ParamError {
     let nearest = nearest(name, TABLE.iter().map(|p| p.name));
@@ -175,7 +174,7 @@ impl From<SurfaceError> for ParamError {
     }
 }
 
-/// Puts one value where it belongs.
+/// Parses the value of one parameter.
 fn set(
     parameter: &Parameter,
     text: &str,
@@ -231,7 +230,7 @@ fn set(
     Ok(())
 }
 
-/// Puts one value of a picture where it belongs.
+/// Parses the value of one picture parameter.
 fn set_picture(parameter: &Parameter, text: &str, picture: &mut PictureParams) -> Result<(), ParamError> {
     let bad = || ParamError::BadValue {
         name: parameter.name,
@@ -258,7 +257,7 @@ fn set_picture(parameter: &Parameter, text: &str, picture: &mut PictureParams) -
 
 const VALIDATIONS: [Validation; 2] = [Validation::Checksum, Validation::Exact];
 
-/// The value of this name.
+/// Returns the value with this name.
 fn named<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, text: &str) -> Option<T> {
     all.iter().copied().find(|value| name(*value) == text)
 }
@@ -267,7 +266,7 @@ fn whole(text: &str) -> Option<u64> {
     text.trim().parse().ok()
 }
 
-/// Words separated by commas, none of them empty or with control characters.
+/// Splits a list at commas. Rejects empty items and control characters.
 fn list(text: &str) -> Option<Vec<&str>> {
     let words: Vec<&str> = text.split(',').map(str::trim).collect();
     words.iter().all(|w| !w.is_empty() && !w.chars().any(char::is_control)).then_some(words)
@@ -278,8 +277,7 @@ fn one_char(text: &str) -> Option<char> {
     chars.next().filter(|c| chars.next().is_none() && !c.is_control())
 }
 
-/// Everything that decides what a mesh looks like, as one line of text: equal for equal jobs, different for
-/// different ones. Part of the key under which results are known.
+/// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content key.
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a field that is added without a place here does not compile.

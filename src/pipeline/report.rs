@@ -5,8 +5,6 @@ use serde_json::{Map, Value};
 
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
-#[cfg(feature = "png")]
-use crate::picture::{Drawer, PictureParams, Rendered};
 use crate::structure::{LeftOut, Selected, Structure, radii};
 use crate::surface::{Component, GridStats, Measures, Served};
 
@@ -136,36 +134,6 @@ pub struct PictureReport {
     /// Reason why `renderer` replaced the chosen one; absent if it did not.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fallback: Option<String>,
-}
-
-#[cfg(feature = "png")]
-impl PictureReport {
-    pub(super) fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
-        let served = drawn.served.clone().unwrap_or_else(|| Served {
-            backend: drawer.renderer.name(),
-            arithmetic: drawer.renderer.arithmetic(),
-            device: drawer.renderer.describe(),
-            fallback_reason: None,
-        });
-        Self {
-            width: params.width,
-            height: params.height,
-            view: params.view.name(),
-            azimuth: params.azimuth,
-            elevation: params.elevation,
-            background: params.background.to_string(),
-            style: params.style.name(),
-            pixel: drawn.pixel,
-            renderer: served.backend,
-            arithmetic: served.arithmetic,
-            device: served.device,
-            reason: match &served.fallback_reason {
-                Some(why) => format!("{}; but {why}", drawer.reason),
-                None => drawer.reason.clone(),
-            },
-            fallback: served.fallback_reason,
-        }
-    }
 }
 
 /// Report of a job: input, grid, mesh, measures and times.

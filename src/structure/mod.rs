@@ -3,8 +3,8 @@
 //! The module does not depend on grids, meshes or HTTP. Only [`archive`] reads files from disk.
 //!
 //! [`read()`] parses bytes into columns. [`Selection`] chooses the atoms to mesh, and [`Contents`] lists what can be
-//! selected. [`radii`] assigns a van der Waals radius to every element. [`strict_validator`] checks a file with a second, strict
-//! reader.
+//! selected. [`radii`] assigns a van der Waals radius to every element. [`strict_validator`] checks a file with a
+//! second, strict reader.
 
 mod altloc;
 pub mod archive;

@@ -1,5 +1,6 @@
 //! BinaryCIF: encodings compared with arrays computed by hand, columns compared with the same values in text, and
 //! inconsistent files.
+#![allow(clippy::pedantic, reason = "tests fail by panicking")]
 
 use crate::bcif_support;
 
@@ -503,7 +504,7 @@ fn rejects_inconsistent_encodings() {
         ),
         (
             number(&i32s(&[1, 2]), vec![packing(1, false, 2), delta(0), byte_array(3)]),
-            "auth_seq_id, IntegerPacking (encoding 1 of 3): found another encoding behind it",
+            "auth_seq_id, IntegerPacking (encoding 1 of 3): found another encoding after it",
         ),
         (
             number(&[[0xFF; 4].repeat(40_000), vec![0, 0]].concat(), vec![packing(2, true, 1), byte_array(5)]),

@@ -54,7 +54,7 @@ fn ended(seen: &Seen, server: &Running, body: &[u8]) -> String {
     job
 }
 
-/// What needs no parameter, and paths that are no text.
+/// Requests without parameters, and paths that are not UTF-8.
 fn plain(seen: &Seen, server: &Running) {
     let paths: Vec<_> = seen.described().filter(|(m, p)| *m == "GET" && !p.contains('{')).collect();
     assert!(paths.len() >= 5, "{paths:?}");
@@ -249,7 +249,7 @@ fn failures(seen: &Seen) {
     }
 }
 
-/// What was kept under other limits, and a store that breaks.
+/// Objects stored under other limits, and a failing store.
 fn restarts(seen: &Seen) {
     let folder = tempfile::tempdir().unwrap();
     let begin = |change: fn(&mut Config)| {

@@ -163,7 +163,8 @@ impl<'a> GlbSink<'a> {
         if lock(&self.waiting).len() > MAX_WAITING { Some(lock(&self.out)) } else { self.out.try_lock().ok() }
     }
 
-    /// Writes rows from byte `offset` of a large buffer to the output, if there is one, or into a block that waits for it.
+    /// Writes rows from byte `offset` of a large buffer to the output, if there is one, or into a block that waits for
+    /// it.
     fn place(
         &self,
         out: &mut Option<Output<'_, 'a>>,

@@ -1,4 +1,4 @@
-//! The table of parameters: names, what values they take, what they do.
+//! Table of parameters: names, domains and descriptions.
 
 use std::str::FromStr;
 
@@ -9,10 +9,10 @@ use crate::structure::select::KIND_NAMES;
 use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Kernel, Preset, Validation};
 
-/// What values a parameter takes.
+/// Domain of a parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Domain {
-    /// A number within bounds, both included, in a unit (empty: none).
+    /// A number within inclusive bounds, with a unit (may be empty).
     Number {
         /// Lowest value.
         min: f64,
@@ -21,7 +21,7 @@ pub enum Domain {
         /// Unit, such as `Å`.
         unit: &'static str,
     },
-    /// A whole number within bounds, both included.
+    /// An integer within inclusive bounds.
     Integer {
         /// Lowest value.
         min: i64,
@@ -30,19 +30,19 @@ pub enum Domain {
     },
     /// `true` or `false`.
     Flag,
-    /// One of these words.
+    /// One of these values.
     Choice(&'static [&'static str]),
-    /// Words of this set, separated by commas.
+    /// A comma-separated list of these values.
     Set(&'static [&'static str]),
     /// Free text.
     Text {
-        /// What is expected, in words.
+        /// Description of valid values.
         expected: &'static str,
     },
 }
 
 impl Domain {
-    /// What is expected, in words.
+    /// Describes the valid values.
     #[must_use]
     pub fn expected(&self) -> String {
         match self {
@@ -60,19 +60,19 @@ impl Domain {
 /// One parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Parameter {
-    /// Its name in queries and, with dashes for underscores, on the command line.
+    /// Name in queries and, with hyphens for underscores, on the command line.
     pub name: &'static str,
-    /// What values it takes.
+    /// Domain.
     pub domain: Domain,
-    /// The value that is used when it is absent, in words.
+    /// Default value, or a description of it.
     pub default: &'static str,
-    /// What it does, one sentence.
+    /// Description, one sentence.
     pub doc: &'static str,
 }
 
 impl Parameter {
-    /// Returns true if `text` equals the declared default. Defaults in words, such as `the first model of the file`, are not
-    /// values and equal nothing.
+    /// Returns true if `text` equals the declared default. Defaults in words, such as `the first model of the file`,
+    /// are not values and equal nothing.
     #[must_use]
     pub fn is_default(&self, text: &str) -> bool {
         match self.domain {
@@ -89,7 +89,7 @@ fn same_number<T: FromStr + PartialEq>(text: &str, default: &str) -> bool {
     text.trim().parse::<T>().is_ok_and(|value| default.parse().is_ok_and(|default: T| value == default))
 }
 
-/// The value of a flag.
+/// Domain of a flag.
 pub(super) fn flag(text: &str) -> Option<bool> {
     match text {
         "true" | "1" => Some(true),
@@ -108,7 +108,7 @@ const fn number(
     Parameter { name, domain: Domain::Number { min, max, unit }, default, doc }
 }
 
-/// The part of a number's bounds that people mostly want, for sliders; the bounds themselves where nothing is said of it.
+/// Returns the usual range of a number, for sliders; by default its bounds.
 #[must_use]
 pub fn usual(parameter: &Parameter) -> Option<[f64; 2]> {
     let Domain::Number { min, max, .. } = parameter.domain else { return None };
@@ -146,8 +146,8 @@ const fn view_names(all: [View; 7]) -> [&'static str; 7] {
     [a.name(), b.name(), c.name(), d.name(), e.name(), f.name(), g.name()]
 }
 
-/// Every parameter, in documentation order. The bounds repeat those of [`SurfaceParams::new`]; a test says that
-/// the two agree.
+/// All parameters in documentation order. A test checks that the bounds equal those of
+/// [`crate::surface::SurfaceParams::new`].
 pub const TABLE: &[Parameter] = &[
     Parameter {
         name: "preset",
