@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Draws the gallery anew: docs/gallery/*.png and the table of docs/research/gallery.md.
+"""Draws the gallery: docs/gallery/*.png and the table of docs/research/gallery.md.
 
     docs/gallery/make.py --data FOLDER [--binary target/release/molmesh] [--only 4PTI]
 
@@ -23,7 +23,7 @@ VIEW = ["--width", "320", "--height", "240", "--background", "white"]
 # PDB id, what it is, what its mesh needs to be asked for besides its kernel.
 SHOWN = [
     ("4PTI", "trypsin inhibitor; an entry of the paper", []),
-    ("2HHB", "deoxyhaemoglobin; stands in for the paper's 1BIJ, another haemoglobin", []),
+    ("2HHB", "deoxyhaemoglobin; replaces the paper's 1BIJ, another haemoglobin", []),
     ("1A0Q", "a Fab fragment, the antibody 29G11", []),
     ("7CTH", "dengue virus serotype 2 with fragments of the antibody EDE1 C10", ["--detail", "4"]),
     ("6ZU5", "a microsporidian ribosome", ["--detail", "4"]),
