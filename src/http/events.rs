@@ -42,7 +42,7 @@ refusals!(EventsRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::StoreFailed
     params(JobPath, Resumption),
     responses(
         (status = 200, description = "Server-sent events until the job ends.",
-            body = String, content_type = "text/event-stream"),
+            body = serde_json::Value, content_type = "text/event-stream"),
         (status = 204, description = "`Last-Event-ID` names the final event; no more events follow."),
         EventsRefusals,
     ))]

@@ -277,7 +277,8 @@ fn one_char(text: &str) -> Option<char> {
     chars.next().filter(|c| chars.next().is_none() && !c.is_control())
 }
 
-/// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content key.
+/// Returns all parameters of a job as one line of text, which is equal for equal jobs only. It is part of the content
+/// key.
 #[must_use]
 pub fn canonical(job: &Job) -> String {
     // Destructured, so that a field that is added without a place here does not compile.

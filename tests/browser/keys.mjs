@@ -10,11 +10,11 @@ await run({
     assert.ok(await page.locator("#problem").isHidden());
     assert.deepEqual(await axe(page), []);
   },
-  "a wrong key is refused in the service's words": async () => {
+  "an unknown key is rejected with the message of the service": async () => {
     await page.locator("#key").fill("mm_wrong");
     await page.locator("#key").press("Enter");
     await page.locator("#problem strong").waitFor();
-    assert.match(await page.locator("#problem").textContent(), /key is not known/);
+    assert.match(await page.locator("#problem").textContent(), /key is unknown/);
   },
   "with the key everything works, and it is kept nowhere": async () => {
     await page.locator("#key").fill(process.env.MOLMESH_KEY);

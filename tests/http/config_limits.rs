@@ -194,7 +194,7 @@ fn every_limit_has_a_metric_and_a_test() {
     // Control: a missing key, an unknown key, an unknown metric and an unknown test.
     assert!(faults(&ROWS[1..])[0].contains("server.connections"));
     for bad in [
-        ("server.nothing", "deadline", "http/limits::atoms_are_limited"),
+        ("server.atoms", "deadline", "http/limits::atoms_are_limited"),
         ("limits.atoms", "molmesh_nothing", "http/limits::atoms_are_limited"),
         ("limits.atoms", "too-many-atoms", "http/limits::nothing"),
         ("store.probe_ms", "", "http/limits::atoms_are_limited"),
