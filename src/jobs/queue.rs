@@ -326,7 +326,7 @@ impl Queue {
 
 /// Starts the span of a job, below that of the first request for it.
 fn job_span(task: &Task, start: Instant) -> TraceSpan {
-    // Nobody waits for an asynchronous job in its request.
+    // A durable job runs after its request was answered.
     let kind = if task.rank.batch { SpanKind::Consumer } else { SpanKind::Internal };
     TraceSpan::start(&task.parent, "job", kind, start)
 }
