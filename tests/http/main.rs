@@ -36,6 +36,7 @@ mod openapi;
 mod openapi_clients;
 mod openapi_statuses;
 mod pictures;
+mod raw_sockets;
 mod ready;
 mod results;
 mod schemathesis;
