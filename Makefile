@@ -1,6 +1,7 @@
 # Main targets: `make run` and `make test`. `make help` lists all targets.
 #
-# Optional variables: PROFILE=release runs optimised tests; ARGS passes flags to `make run`.
+# Optional variables: PROFILE=release runs optimised tests; ARGS passes flags to `make run`; SECONDS=180 fuzzes each
+# target for longer.
 
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
@@ -8,7 +9,7 @@ SHELL := bash
 CARGO ?= cargo
 ARGS ?=
 
-.PHONY: help run test nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
+.PHONY: help run test fuzz nothing-skipped tools static static-if-possible web web-if-possible fmt fmt-check lint matrix deny deny-if-installed audit sbom container tests bench figures gallery release clean
 
 help: ## List the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -74,6 +75,12 @@ container: $(if $(BINARY),,release) ## Build and test the images (two to four mi
 
 tests: ## Run only the tests
 	@bash .ci/tests $(if $(PROFILE),$(PROFILE),dev)
+
+# The wrapper compiles the library with counters that guide the fuzzer. Dependencies are those of the tests.
+fuzz: override SECONDS := $(or $(SECONDS),30)
+fuzz: ## Fuzz readers, configuration, keys, records and requests, 30 s per target
+	RUSTC_WORKSPACE_WRAPPER=$(CURDIR)/fuzz/rustc.sh $(CARGO) build --locked --package molmesh-fuzz --target-dir target
+	target/debug/molmesh-fuzz --seconds $(SECONDS)
 
 bench: ## Run the benchmarks
 	$(CARGO) bench
