@@ -38,11 +38,11 @@ impl Engine {
         recording.count_stages(&[(loaded.dispatch(0, 0), params)]);
         let bytes = BODY_OFFSET + group_bytes(own);
         let readback = self.readback.acquire(&self.device, bytes);
-        let target = readback.buffer().map_err(GpuError::Failed)?;
+        let target = &readback.buffer;
         recording.copy_timestamps(target);
         recording.copy_counters(&loaded.workspace, target);
         recording.copy_groups(&loaded.workspace, target, BODY_OFFSET, group_bytes(own));
-        self.submit(recording, vec![(readback, bytes)])
+        Ok(self.submit(recording, vec![(readback, bytes)]))
     }
 
     /// Waits for the counts of a chunk.

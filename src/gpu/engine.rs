@@ -20,7 +20,7 @@ use super::plan::{Chunk, ChunkLimits, Partition};
 use super::readback::ReadbackPool;
 use super::recording::{Dispatch, Recording, StageTimer};
 use super::workspace::{BufferSizes, OutputCapacity, ROW, Workspace};
-use crate::surface::lattice::LatticeAtom;
+use crate::surface::lattice::{LatticeAtom, slightly_coarser};
 
 /// Maximum number of storage buffers that a stage binds.
 const MAX_BINDINGS: u32 = 14;
@@ -288,5 +288,5 @@ fn max_binding(limits: &wgpu::Limits) -> u64 {
 fn out_of_memory(job: &GpuJob, needed: u64, available: u64) -> GpuError {
     let excess = (needed as f64 / available.max(1) as f64).max(1.0);
     let fitting = job.prepared.lattice.spacing * excess.cbrt();
-    GpuError::OutOfMemory { needed, available, suggested_resolution: (fitting * 105.0).ceil() / 100.0 }
+    GpuError::OutOfMemory { needed, available, suggested_resolution: slightly_coarser(fitting) }
 }

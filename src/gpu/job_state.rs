@@ -8,7 +8,6 @@ use super::error::GpuError;
 use super::job::{Finished, JobResult};
 use super::output_layout::{COUNTERS_OFFSET, ReadbackLayout, ReadbackRows, values};
 use super::pipelines::{N_STAGES, STAGES};
-use super::plan::check_totals;
 use super::plan::layout::{self, Counters, GROUP};
 use super::readback::ReadbackBuffer;
 use super::submit::{PendingSubmission, StageTimes};
@@ -102,25 +101,14 @@ impl<'a> JobState<'a> {
         Ok(ChunkCounts { groups, first, n_vertices, n_triangles })
     }
 
-    /// Checks the counts so far against the limits. An empty mesh is accepted: later chunks may have triangles.
-    ///
-    /// # Errors
-    /// [`GpuError::Surface`].
+    /// Checks the counts so far against the limits.
     pub(super) fn check_limits(&self) -> Result<(), GpuError> {
-        self.check_totals(self.total[1].max(1))
+        Ok(self.loaded.job.prepared.check_size(self.total)?)
     }
 
     /// Checks the counts of all chunks against the limits and rejects an empty mesh.
-    ///
-    /// # Errors
-    /// [`GpuError::Surface`].
     pub(super) fn check_complete(&self) -> Result<(), GpuError> {
-        self.check_totals(self.total[1])
-    }
-
-    fn check_totals(&self, n_triangles: u64) -> Result<(), GpuError> {
-        let job = &self.loaded.job.prepared;
-        Ok(check_totals(&job.lattice, &job.params, &job.limits, self.total[0], n_triangles)?)
+        Ok(self.loaded.job.prepared.check_mesh(self.total)?)
     }
 
     /// Reads the counters of a finished output.

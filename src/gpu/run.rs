@@ -117,14 +117,14 @@ impl Engine {
             let layout = ReadbackLayout::new(rows, loaded.vertex);
             let groups = group_bytes(&loaded.chunks[0]);
             let readback = self.readback.acquire(&self.device, layout.end + groups);
-            let target = readback.buffer().map_err(GpuError::Failed)?;
+            let target = &readback.buffer;
             recording.copy_timestamps(target);
             recording.copy_counters(&loaded.workspace, target);
             recording.copy_groups(&loaded.workspace, target, layout.end, groups);
             recording.copy_output(&loaded.workspace, loaded.vertex, rows, target, &layout);
             readbacks.push((readback, layout.end + groups));
         }
-        self.wait(self.submit(recording, readbacks)?)
+        self.wait(self.submit(recording, readbacks))
     }
 
     /// Assembles the mesh of a small job. Its output is made again if the estimate was too low.

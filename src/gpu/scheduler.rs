@@ -92,7 +92,7 @@ impl Scheduler {
         }
         let best = (0..queues.len())
             .filter(|n| eligible(n) && queues[*n].waiting.len() < self.limit)
-            .min_by_key(|&n| (Reverse(failures[n]), queues[n].load, queues[n].finished));
+            .min_by_key(|&n| (Reverse(failures[n]), queues[n].load, queues[n].counters.finished));
         let Some(n) = best else { return Err(EnqueueError::Full) };
         let ticket = state.push(n, job, None, failures.iter().any(|n| *n > 0));
         drop(state);
@@ -104,7 +104,7 @@ impl Scheduler {
     pub(super) fn idle_devices(&self) -> Vec<usize> {
         let state = self.lock();
         let mut idle: Vec<usize> = (0..state.queues.len()).filter(|&n| state.queues[n].is_idle()).collect();
-        idle.sort_by_key(|&n| (state.queues[n].load, state.queues[n].finished));
+        idle.sort_by_key(|&n| (state.queues[n].load, state.queues[n].counters.finished));
         idle
     }
 
@@ -174,7 +174,7 @@ impl Scheduler {
             }
             if !batch.is_empty() {
                 queue.running = batch.len();
-                queue.shared += u64::from(batch.len() > 1);
+                queue.counters.shared += u64::from(batch.len() > 1);
                 drop(state);
                 self.changed.notify_all();
                 return Some(batch);
@@ -189,7 +189,7 @@ impl Scheduler {
 
     /// Sets the bytes of memory that device `n` holds.
     pub(super) fn set_held_bytes(&self, n: usize, bytes: u64) {
-        self.lock().queues[n].held_bytes = bytes;
+        self.lock().queues[n].counters.held_bytes = bytes;
     }
 
     /// Moves small jobs from anywhere in `waiting` to `batch`. A large job ahead of them becomes the next batch.
@@ -216,10 +216,10 @@ impl Scheduler {
                 queue.load -= job.load();
                 match result {
                     Ok(_) => {
-                        queue.finished += 1;
-                        queue.partitions += u64::from(job.partition.is_some());
+                        queue.counters.finished += 1;
+                        queue.counters.partitions += u64::from(job.partition.is_some());
                     }
-                    Err(error) if error.is_device_failure() => queue.failed += 1,
+                    Err(error) if error.is_device_failure() => queue.counters.failed += 1,
                     Err(_) => {}
                 }
             }
@@ -227,9 +227,9 @@ impl Scheduler {
                 queue.consecutive_rebuilds = 0;
             }
             queue.running = 0;
-            queue.busy += time;
-            queue.lost += u64::from(failed);
-            queue.held_bytes = held_bytes;
+            queue.counters.busy += time;
+            queue.counters.lost += u64::from(failed);
+            queue.counters.held_bytes = held_bytes;
             if let Some(why) = &down {
                 left = queue.mark_down(why);
             }
@@ -244,7 +244,7 @@ impl Scheduler {
         let queue = &mut self.lock().queues[n];
         let allowed = queue.consecutive_rebuilds < max;
         queue.consecutive_rebuilds += usize::from(allowed);
-        queue.rebuilds += u64::from(allowed);
+        queue.counters.rebuilds += u64::from(allowed);
         allowed
     }
 

@@ -26,13 +26,13 @@ impl Engine {
         &self,
         recording: Recording<'_>,
         readbacks: Vec<(ReadbackBuffer, u64)>,
-    ) -> Result<PendingSubmission, GpuError> {
+    ) -> PendingSubmission {
         let index = self.queue.submit([recording.encoder.finish()]);
         for (readback, bytes) in &readbacks {
-            readback.map(*bytes).map_err(GpuError::Failed)?;
+            readback.map(*bytes);
         }
         self.submissions.update(|n| n + 1);
-        Ok(PendingSubmission { index, readbacks })
+        PendingSubmission { index, readbacks }
     }
 
     /// Waits for a submission and all before it. Returns the mapped readback buffers.
@@ -46,15 +46,6 @@ impl Engine {
         self.check_errors()?;
         waited.map_err(|e| GpuError::Failed(e.to_string()))?;
         readbacks.into_iter().map(|(readback, bytes)| readback.mapped(bytes).map_err(GpuError::Failed)).collect()
-    }
-
-    /// Submits a recording with one readback buffer and waits for it.
-    pub(super) fn submit_and_wait(
-        &self,
-        recording: Recording<'_>,
-        readback: (ReadbackBuffer, u64),
-    ) -> Result<Arc<ReadbackBuffer>, GpuError> {
-        self.wait_one(self.submit(recording, vec![readback])?)
     }
 
     /// Waits for a submission that has one readback buffer.

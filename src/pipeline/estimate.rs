@@ -5,6 +5,7 @@
 //! vertex. A coarser mesh gives the area.
 
 use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock, fit};
+use crate::surface::cpu::scan;
 use crate::surface::lattice::Lattice;
 use crate::surface::occupancy::Occupancy;
 use crate::surface::{CancelToken, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
@@ -119,9 +120,7 @@ fn of_mesh(
     let bytes = params.mesh_bytes(vertices, triangles);
     let estimate = MeshEstimate { bricks, samples: bricks * 512, area, vertices, triangles, bytes };
     if bytes > limits.max_mesh_bytes {
-        let fits = h * (bytes as f64 / limits.max_mesh_bytes as f64).sqrt();
-        let suggested_resolution = (fits * 105.0).ceil() / 100.0;
-        return Err(SurfaceError::MeshTooLarge { bytes, limit: limits.max_mesh_bytes, suggested_resolution });
+        return Err(scan::too_large(bytes, h, limits.max_mesh_bytes));
     }
     Ok(estimate)
 }

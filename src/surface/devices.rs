@@ -152,7 +152,7 @@ pub struct FoundDevice {
 }
 
 /// Status of a device in use.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DeviceStatus {
     /// Number.
     pub number: usize,

@@ -299,7 +299,7 @@ pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
 }
 
 /// Returns a spacing slightly above `spacing`, rounded up to hundredths of an Å, as a suggestion that fits.
-pub(super) fn slightly_coarser(spacing: f64) -> f64 {
+pub(crate) fn slightly_coarser(spacing: f64) -> f64 {
     (spacing * 105.0).ceil() / 100.0
 }
 

@@ -193,6 +193,28 @@ impl Mesh {
         }
     }
 
+    /// Adds the rows of `next`, whose triangles already refer to the joint vertices, without a copy. An empty mesh takes
+    /// the centre and the representation of `next`.
+    pub(crate) fn append(&mut self, next: Self) {
+        let before = (self.n_vertices(), self.n_triangles());
+        self.parts.extend(next.parts.iter().map(|(v, t)| (before.0 + v, before.1 + t)));
+        self.centre = next.centre;
+        self.positions.append(next.positions);
+        self.normals.append(next.normals);
+        self.triangles.append(next.triangles);
+        match (&mut self.quantized, next.quantized) {
+            (Some(own), Some(next)) => {
+                own.positions.append(next.positions);
+                own.normals.append(next.normals);
+            }
+            (own, next) => *own = own.take().or(next),
+        }
+        match (&mut self.atom_ids, next.atom_ids) {
+            (Some(own), Some(next)) => own.append(next),
+            (own, next) => *own = own.take().or(next),
+        }
+    }
+
     /// Vertices whose normal is zero.
     fn flat_vertices(&self) -> Vec<u32> {
         // Half a unit of a component is far below every unit vector's longest one.

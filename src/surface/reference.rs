@@ -6,6 +6,7 @@
 use super::backend::{Backend, GridStats, MeshOutput};
 use super::cases::{CASES, cell_edge};
 use super::control::{Control, Stage};
+use super::cpu::scan::too_large as mesh_too_large;
 use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
 use super::lattice::{EDGE_MARGIN, slightly_coarser, to_f32, to_i32, to_u64};
@@ -175,9 +176,7 @@ impl Backend for ReferenceBackend {
         }
         let bytes = Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64);
         if bytes > limits.max_mesh_bytes {
-            let excess = bytes as f64 / limits.max_mesh_bytes.max(1) as f64;
-            let suggested_resolution = slightly_coarser(h * excess.sqrt());
-            return Err(SurfaceError::MeshTooLarge { bytes, limit: limits.max_mesh_bytes, suggested_resolution });
+            return Err(mesh_too_large(bytes, h, limits.max_mesh_bytes));
         }
         let n = grid.len() as u64;
         let stats =

@@ -15,7 +15,7 @@ use self::layout::{NONE, Params, Tile, halves};
 pub use self::partition::Partition;
 use crate::surface::cpu::field::Constants;
 use crate::surface::cpu::interpolate::SlopeConstants;
-use crate::surface::cpu::{self, scan};
+use crate::surface::cpu;
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, tile_of, tile_order, to_f32, to_u32, to_u64};
 use crate::surface::occupancy::{BrickBits, Occupancy, TileOccupancy, count_ones, local_brick};
 use crate::surface::{Control, Step, SurfaceError, SurfaceLimits, SurfaceParams};
@@ -101,26 +101,6 @@ impl Plan {
             ..bytemuck::Zeroable::zeroed()
         }
     }
-}
-
-/// Checks a mesh of `n_vertices` and `n_triangles` against the limits.
-///
-/// # Errors
-/// [`SurfaceError::MeshTooLarge`], also if 32 bits cannot number the vertices; [`SurfaceError::NoSurface`] for an empty
-/// mesh.
-pub fn check_totals(
-    lattice: &Lattice,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
-    n_vertices: u64,
-    n_triangles: u64,
-) -> Result<(), SurfaceError> {
-    if n_triangles == 0 {
-        return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
-    }
-    let bytes = params.mesh_bytes(n_vertices, n_triangles);
-    let limit = limits.max_mesh_bytes.min(params.mesh_bytes(u64::from(u32::MAX), 0));
-    if bytes <= limit { Ok(()) } else { Err(scan::too_large(bytes, lattice.spacing, limit)) }
 }
 
 /// First brick of each tile. `None` if there are more tiles or bricks than the shaders can number.
