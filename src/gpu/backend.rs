@@ -137,12 +137,8 @@ impl Backend for GpuBackend {
             (error, None) => Err(SurfaceError::Device { why: single_line(&error.to_string()) }),
             (error, Some(fallback)) => {
                 let output = fallback.write(spheres, params, limits, control, sink)?;
-                let served = Served {
-                    backend: fallback.name(),
-                    arithmetic: fallback.arithmetic(),
-                    device: fallback.describe(),
-                    fallback_reason: Some(single_line(&format!("the GPU failed: {error}"))),
-                };
+                let fallback_reason = Some(single_line(&format!("the GPU failed: {error}")));
+                let served = Served { fallback_reason, ..fallback.identity() };
                 Ok(MeshOutput { served: Some(served), ..output })
             }
         }

@@ -100,12 +100,7 @@ impl Renderer for GpuRenderer {
             (Err(DrawError::Device(why)), None) => Err(PictureError::Device { why }),
             (Err(DrawError::Device(why)), Some(cpu)) => {
                 let fallback_reason = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
-                let served = Served {
-                    backend: cpu.name(),
-                    arithmetic: cpu.arithmetic(),
-                    device: cpu.describe(),
-                    fallback_reason,
-                };
+                let served = Served { fallback_reason, ..cpu.identity() };
                 Ok(Rendered { served: Some(served), ..cpu.render(mesh, params, control)? })
             }
         }

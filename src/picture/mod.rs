@@ -110,6 +110,16 @@ pub trait Renderer: Send + Sync {
     /// Description of the hardware, for display.
     fn describe(&self) -> String;
 
+    /// Identity of this renderer, as the maker of a picture.
+    fn identity(&self) -> Served {
+        Served {
+            backend: self.name(),
+            arithmetic: self.arithmetic(),
+            device: self.describe(),
+            fallback_reason: None,
+        }
+    }
+
     /// Draws `mesh`, whose vertices must not be quantised.
     ///
     /// # Errors

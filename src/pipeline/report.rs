@@ -274,12 +274,7 @@ impl Report {
     ) -> Self {
         let params = &job.params;
         let gaussian = params.kernel == crate::surface::Kernel::Gaussian && params.paper.is_none();
-        let served = counts.served.clone().unwrap_or_else(|| Served {
-            backend: choice.backend.name(),
-            arithmetic: choice.backend.arithmetic(),
-            device: choice.backend.describe(),
-            fallback_reason: None,
-        });
+        let served = counts.served.clone().unwrap_or_else(|| choice.backend.identity());
         let mut voids: Vec<&Component> = measures.components.iter().filter(|c| c.volume < 0.0).collect();
         voids.sort_by(|a, b| a.volume.total_cmp(&b.volume));
         Self {
@@ -322,13 +317,10 @@ impl Report {
             file_units: counts.storage.units.name(),
             normals: counts.storage.normals.name(),
             quantization: counts.storage.packing.step().map(|step| Quantization { step: step.length() }),
+            backend_reason: served.reason(choice.reason),
             backend: served.backend,
             arithmetic: served.arithmetic,
             device: served.device,
-            backend_reason: match &served.fallback_reason {
-                Some(why) => format!("{}; but {why}", choice.reason),
-                None => choice.reason.to_owned(),
-            },
             fallback: served.fallback_reason,
             picture: None,
             timings_ms: timings

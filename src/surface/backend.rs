@@ -112,6 +112,14 @@ pub struct Served {
     pub fallback_reason: Option<String>,
 }
 
+impl Served {
+    /// Adds the reason for a fallback, if there was one, to the reason for the choice of a backend.
+    #[must_use]
+    pub fn reason(&self, choice: &str) -> String {
+        self.fallback_reason.as_ref().map_or_else(|| choice.to_owned(), |why| format!("{choice}; but {why}"))
+    }
+}
+
 /// A meshing backend. The same input gives the same bytes on any number of threads.
 pub trait Backend: Send + Sync {
     /// Short stable name: `cpu`, `reference`, `gpu`.
@@ -125,6 +133,16 @@ pub trait Backend: Send + Sync {
 
     /// Description of the hardware for display: threads and vector extension, or the adapter's name.
     fn describe(&self) -> String;
+
+    /// Identity of this backend, as the maker of a mesh.
+    fn identity(&self) -> Served {
+        Served {
+            backend: self.name(),
+            arithmetic: self.arithmetic(),
+            device: self.describe(),
+            fallback_reason: None,
+        }
+    }
 
     /// Meshes `spheres`, in memory or, if there is a `sink`, into that. Both get the same rows.
     ///

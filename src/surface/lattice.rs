@@ -109,7 +109,7 @@ impl Lattice {
 pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
     let profile = Profile::new(params);
-    let largest = spheres.radii().iter().copied().fold(0.0, f32::max);
+    let (_, largest) = spheres.radius_range();
     let reach = profile.reach(profile.length(effective_radius(largest, params)));
     let half = (0..3).map(|k| 0.5 * (hi[k] - lo[k])).fold(0.0, f64::max);
     // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within

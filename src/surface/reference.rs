@@ -145,8 +145,7 @@ impl Backend for ReferenceBackend {
         control: &Control<'_>,
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
-        let smallest = spheres.radii().iter().copied().fold(f32::MAX, f32::min);
-        params.check_radius(smallest)?;
+        params.check_radius(spheres.radius_range().0)?;
         let density = Density::new(spheres, params);
         let grid = Grid::new(spheres, &density, params.resolution, limits)?;
         let h = params.resolution;

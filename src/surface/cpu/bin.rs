@@ -162,17 +162,13 @@ pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits)
 ///
 /// # Errors
 /// Returns [`SurfaceError::GridTooLarge`].
-pub(super) fn refuse_early(lattice: &Lattice, tiles: &Tiles, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
-    let tile_samples = f64::from(TILE).powi(3);
-    if tiles.len() as f64 * tile_samples <= limits.max_samples as f64 {
-        return Ok(());
-    }
+pub(crate) fn check_lower_bound(lattice: &Lattice, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
     let least = to_u64(samples_at_least(lattice));
     if least > limits.max_samples { Err(too_large(lattice, least, limits)) } else { Ok(()) }
 }
 
 /// A lower bound of the samples: the volume of the blocks that lie wholly within some atom's reach.
-pub(crate) fn samples_at_least(lattice: &Lattice) -> f64 {
+fn samples_at_least(lattice: &Lattice) -> f64 {
     let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(f64::MAX, f64::min);
     // Half the least reach: a sphere then holds a few blocks wherever it lies.
     let side = 0.5 * reach;

@@ -30,7 +30,7 @@ mod write;
 use std::ops::Range;
 
 // Errors that the occupancy count shares with this backend.
-pub(crate) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
+pub(crate) use self::bin::{MAX_ATOMS, check_lower_bound, too_large as grid_too_large, too_many_atoms};
 
 use self::bin::{Tiles, slot_brick};
 use self::classify::{Before, Found};
@@ -42,7 +42,7 @@ use super::backend::{Backend, GridStats, MeshOutput};
 use super::candidates;
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
-use super::lattice::{Lattice, to_f32, to_u32};
+use super::lattice::{Lattice, TILE, to_f32, to_u32};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
 use super::simd;
@@ -182,7 +182,9 @@ fn scan_lattice(lattice: Lattice, means: Means<'_>) -> Result<Scanned, SurfaceEr
     let Means { params, limits, control, free_threads } = means;
     let tiles = control.span(Stage::Bin, || {
         let tiles = Tiles::new(&lattice, limits, control)?;
-        bin::refuse_early(&lattice, &tiles, limits)?;
+        if tiles.len() as f64 * f64::from(TILE).powi(3) > limits.max_samples as f64 {
+            bin::check_lower_bound(&lattice, limits)?;
+        }
         Ok(tiles)
     });
     let tiles = tiles?;

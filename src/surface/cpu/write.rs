@@ -22,9 +22,8 @@ use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::Lattice;
 use crate::surface::measure::{Measures, Validation};
-use crate::surface::mesh::{Mesh, Quantized};
+use crate::surface::mesh::{Mesh, Quantized, joined_bounds};
 use crate::surface::quantize::Step;
-use crate::surface::simd::dispatched;
 use crate::surface::sink::{MeshPart, MeshSink, SinkFailed, Vertices};
 
 thread_local! {
@@ -76,14 +75,9 @@ pub(super) struct Written {
     flat: usize,
     /// Sums over its triangles.
     pub(super) tally: Tally,
-    /// Bounds of its positions, for a sink only.
-    bounds: Bounds,
+    /// Bounds of its positions, Å; for a sink only.
+    bounds: Option<[[f32; 3]; 2]>,
 }
-
-type Bounds = [[f32; 3]; 2];
-
-/// Bounds of nothing.
-const EMPTY: Bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
 
 /// Runs `interpolate` and `emit` for every piece. The output has measures unless the mesh is in memory and not closed.
 ///
@@ -111,7 +105,7 @@ pub(super) fn write(
             measures.map_or_else(|| Measures::of(&mesh, Validation::Checksum, control), Ok)?
         }
     };
-    let bounds = written.iter().map(|piece| piece.bounds).fold(EMPTY, join_bounds);
+    let bounds = written.iter().filter_map(|piece| piece.bounds).reduce(joined_bounds).unwrap_or_default();
     let mesh = Mesh { centre: scanned.lattice.centre(), ..Mesh::default() };
     let streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds });
     Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, scanned.grid) })
@@ -197,7 +191,7 @@ impl ScratchRows {
             Rows::Single { positions, normals } => Vertices::Single { positions, normals },
             Rows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
         };
-        written.bounds = bounds_of(&vertices);
+        written.bounds = vertices.bounds();
         let (tile, [start, _]) = (&scanned.done[piece.tile], scanned.done[piece.tile].span(piece));
         let part = MeshPart {
             first_vertex: tile.first_vertex + start.vertices,
@@ -226,7 +220,7 @@ impl PieceRows<'_> {
         let flat =
             control.span(Stage::Interpolate, || self.interpolate(scanned, piece, slope, &mut stages.batch, control))?;
         let tally = control.span(Stage::Emit, || self.emit(scanned, piece, &mut stages.table, &mut stages.sheets));
-        Ok(Written { flat, tally, bounds: EMPTY })
+        Ok(Written { flat, tally, bounds: None })
     }
 
     /// Writes the vertices. Returns how many have no gradient.
@@ -334,43 +328,4 @@ fn first<T: Clone + Default>(rows: &mut Vec<T>, n: usize) -> &mut [T] {
         rows.resize(n, T::default());
     }
     &mut rows[..n]
-}
-
-/// Lowest and highest position, Å.
-fn bounds_of(vertices: &Vertices<'_>) -> Bounds {
-    match vertices {
-        Vertices::Single { positions, .. } => bounds(positions),
-        Vertices::Quantized { step, positions, .. } => positions.iter().fold(EMPTY, |bounds, [x, y, z, _]| {
-            let p = step.decoded([*x, *y, *z]);
-            join_bounds(bounds, [p, p])
-        }),
-    }
-}
-
-dispatched! {
-/// Lowest and highest of positions in single precision, sixteen at a time.
-fn bounds(positions: &[[f32; 3]]) -> Bounds {
-    const LANES: usize = 16;
-    let (batches, rest) = positions.as_chunks::<LANES>();
-    let (mut low, mut high) = ([[f32::INFINITY; 3]; LANES], [[f32::NEG_INFINITY; 3]; LANES]);
-    for batch in batches {
-        let rows = low.as_flattened_mut().iter_mut().zip(high.as_flattened_mut()).zip(batch.as_flattened());
-        for ((low, high), v) in rows {
-            *low = if *v < *low { *v } else { *low };
-            *high = if *v > *high { *v } else { *high };
-        }
-    }
-    let lanes = low.into_iter().zip(high).map(|(low, high)| [low, high]);
-    lanes.chain(rest.iter().map(|p| [*p, *p])).fold(EMPTY, join_bounds)
-}
-}
-
-/// Union of two bounds.
-#[inline(always)]
-fn join_bounds([low, high]: Bounds, [other_low, other_high]: Bounds) -> Bounds {
-    // These comparisons compile to vector minimum and maximum.
-    [
-        std::array::from_fn(|k| if other_low[k] < low[k] { other_low[k] } else { low[k] }),
-        std::array::from_fn(|k| if other_high[k] > high[k] { other_high[k] } else { high[k] }),
-    ]
 }
