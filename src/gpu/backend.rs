@@ -9,7 +9,8 @@ use super::discover::Discovery;
 use super::error::GpuError;
 use super::executor::Executor;
 use super::job::{GpuJob, Prepared};
-use super::pool::{self, DevicePool, PoolDevice, PoolSettings};
+use super::pool::{self, DevicePool, PoolDevice};
+use super::scheduler::PoolSettings;
 use crate::surface::{
     Backend, Control, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, backend::one_atom,

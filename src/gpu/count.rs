@@ -1,5 +1,6 @@
 //! First half of a job: the stages that sample a chunk and count its vertices and triangles.
 
+use super::buffers::BufferId;
 use super::engine::Engine;
 use super::error::GpuError;
 use super::job_state::{ChunkCounts, JobState};
@@ -41,7 +42,7 @@ impl Engine {
         let target = &readback.buffer;
         recording.copy_timestamps(target);
         recording.copy_counters(&loaded.workspace, target);
-        recording.copy_groups(&loaded.workspace, target, BODY_OFFSET, group_bytes(own));
+        recording.copy_start(loaded.workspace.buffer(BufferId::Groups), target, BODY_OFFSET, group_bytes(own));
         Ok(self.submit(recording, vec![(readback, bytes)]))
     }
 

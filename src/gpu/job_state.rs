@@ -6,7 +6,7 @@ use bytemuck::Pod;
 use super::engine::LoadedJob;
 use super::error::GpuError;
 use super::job::{Finished, JobResult};
-use super::output_layout::{COUNTERS_OFFSET, ReadbackLayout, ReadbackRows, values};
+use super::output_layout::{COUNTERS_OFFSET, ReadbackLayout, ReadbackRows, byte_range, values};
 use super::pipelines::{N_STAGES, STAGES};
 use super::plan::layout::{self, Counters, GROUP};
 use super::readback::ReadbackBuffer;
@@ -83,7 +83,7 @@ impl<'a> JobState<'a> {
             return Err(GpuError::Failed(why));
         }
         let n_groups = u64::from(chunk.n_own.div_ceil(GROUP));
-        let groups: Vec<[u32; 4]> = values(readback.as_ref(), offset, n_groups).map_err(GpuError::Failed)?.to_vec();
+        let groups: Vec<[u32; 4]> = values(readback.as_ref(), offset, n_groups)?.to_vec();
         let first = self.total;
         for &[vertices, triangles, bricks, _] in &groups {
             if let [Ok(vertex), Ok(triangle)] = self.total.map(usize::try_from) {
@@ -134,7 +134,7 @@ impl<'a> JobState<'a> {
     /// # Errors
     /// Those of [`Self::finish`].
     pub(super) fn assemble(&mut self) -> JobResult {
-        let mesh = self.mesh().map_err(GpuError::Failed)?;
+        let mesh = self.mesh()?;
         let (plan, lattice) = (&self.loaded.job.prepared.plan, &self.loaded.job.prepared.lattice);
         let grid = GridStats {
             bricks: plan.n_reached,
@@ -148,7 +148,7 @@ impl<'a> JobState<'a> {
         Ok(Finished { meshed: MeshOutput::new(mesh, grid), stages })
     }
 
-    fn mesh(&mut self) -> Result<Mesh, String> {
+    fn mesh(&mut self) -> Result<Mesh, GpuError> {
         let prepared = &self.loaded.job.prepared;
         let params = &prepared.params;
         let vertices = &self.vertices;
@@ -174,19 +174,18 @@ impl<'a> JobState<'a> {
 }
 
 /// Column of `pieces`; `place` returns the offset and the number of rows of a piece.
-fn column<T: Pod>(pieces: &[ReadbackRows], place: impl Fn(&ReadbackRows) -> (u64, u64)) -> Result<Column<T>, String> {
+fn column<T: Pod>(pieces: &[ReadbackRows], place: impl Fn(&ReadbackRows) -> (u64, u64)) -> Result<Column<T>, GpuError> {
     let piece = |rows: &ReadbackRows| {
         let (offset, n) = place(rows);
-        let from = usize::try_from(offset).map_err(|e| e.to_string())?;
-        let bytes = usize::try_from(n).map_err(|e| e.to_string())? * size_of::<T>();
-        Column::shared(rows.readback.clone(), from..from + bytes)
-            .ok_or_else(|| format!("{bytes} bytes at {from} are not a column"))
+        let bytes = byte_range::<T>(offset, n)?;
+        Column::shared(rows.readback.clone(), bytes.clone())
+            .ok_or_else(|| GpuError::Failed(format!("bytes {bytes:?} are not a column")))
     };
-    pieces.iter().map(piece).collect::<Result<_, String>>().map(Column::from_chunks)
+    pieces.iter().map(piece).collect::<Result<_, GpuError>>().map(Column::from_chunks)
 }
 
 /// Counters in a readback buffer.
 fn counters(readback: &ReadbackBuffer) -> Result<Counters, GpuError> {
-    let rows: &[Counters] = values(readback.as_ref(), COUNTERS_OFFSET, 1).map_err(GpuError::Failed)?;
+    let rows: &[Counters] = values(readback.as_ref(), COUNTERS_OFFSET, 1)?;
     rows.first().copied().ok_or_else(|| GpuError::Failed("a readback buffer without counters".to_owned()))
 }

@@ -70,6 +70,7 @@ pub use job::{Finished, GpuJob, JobResult, Prepared};
 pub use manifests::{Manifest, manifests};
 pub use partition_handle::PartitionHandle;
 pub use picture::GpuRenderer;
-pub use pool::{CompletedJob, DevicePool, DeviceWork, PoolDevice, PoolSettings};
+pub use pool::{CompletedJob, DevicePool, DeviceWork, PoolDevice};
+pub use scheduler::PoolSettings;
 pub use shaders::stage_shaders;
 pub use worker::{Build, MAX_REBUILDS};

@@ -8,6 +8,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use wgpu::{Buffer, BufferUsages, BufferView, Device};
 
+use super::error::GpuError;
+
 /// Pool of idle readback buffers.
 #[derive(Debug, Clone)]
 pub(super) struct ReadbackPool(Arc<Mutex<Idle>>);
@@ -116,9 +118,9 @@ impl ReadbackBuffer {
     }
 
     /// Returns the buffer with its first `bytes` bytes, as requested by [`Self::map`], readable.
-    pub(super) fn mapped(mut self, bytes: u64) -> Result<Arc<Self>, String> {
-        let view = self.buffer.slice(..bytes).get_mapped_range().map_err(|e| e.to_string())?;
-        self.view = Some(view);
+    pub(super) fn mapped(mut self, bytes: u64) -> Result<Arc<Self>, GpuError> {
+        let view = self.buffer.slice(..bytes).get_mapped_range();
+        self.view = Some(view.map_err(|e| GpuError::Failed(e.to_string()))?);
         Ok(Arc::new(self))
     }
 }

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use super::buffers::BufferId;
 use super::count::{group_bytes, narrow};
 use super::engine::{Engine, LoadedJob};
 use super::error::GpuError;
@@ -120,7 +121,7 @@ impl Engine {
             let target = &readback.buffer;
             recording.copy_timestamps(target);
             recording.copy_counters(&loaded.workspace, target);
-            recording.copy_groups(&loaded.workspace, target, layout.end, groups);
+            recording.copy_start(loaded.workspace.buffer(BufferId::Groups), target, layout.end, groups);
             recording.copy_output(&loaded.workspace, loaded.vertex, rows, target, &layout);
             readbacks.push((readback, layout.end + groups));
         }

@@ -91,9 +91,8 @@ impl Engine {
         let Import { bricks, position, n_exported, exported, first_vertex } = import;
         let (n, first) = (u64::from(bricks.end - bricks.start), u64::from(bricks.start));
         let exported: &[u8] = (**exported).as_ref();
-        let records: &[u8] = values(exported, RECORD * position, RECORD * n).map_err(GpuError::Failed)?;
-        let offsets: &[[u32; 2]] =
-            values(exported, RECORD * n_exported + OFFSET * position, n).map_err(GpuError::Failed)?;
+        let records: &[u8] = values(exported, RECORD * position, RECORD * n)?;
+        let offsets: &[[u32; 2]] = values(exported, RECORD * n_exported + OFFSET * position, n)?;
         // The shader adds the base, which undoes the wrapping subtraction.
         let shift = narrow(*first_vertex)?.wrapping_sub(base);
         let offsets: Vec<[u32; 2]> = offsets.iter().map(|[v, t]| [v.wrapping_add(shift), *t]).collect();

@@ -45,7 +45,7 @@ impl Engine {
         }
         self.check_errors()?;
         waited.map_err(|e| GpuError::Failed(e.to_string()))?;
-        readbacks.into_iter().map(|(readback, bytes)| readback.mapped(bytes).map_err(GpuError::Failed)).collect()
+        readbacks.into_iter().map(|(readback, bytes)| readback.mapped(bytes)).collect()
     }
 
     /// Waits for a submission that has one readback buffer.
@@ -62,7 +62,7 @@ impl Engine {
         stages: Range<usize>,
     ) -> Result<(), GpuError> {
         if let Some(timer) = &self.timer {
-            let ticks: &[u64] = values(readback.as_ref(), 0, 2 * N_STAGES as u64).map_err(GpuError::Failed)?;
+            let ticks: &[u64] = values(readback.as_ref(), 0, 2 * N_STAGES as u64)?;
             for s in stages {
                 times[s] += ticks_to_ns(ticks[2 * s + 1].saturating_sub(ticks[2 * s]), timer.period);
             }

@@ -182,12 +182,8 @@ fn set(
     selection: &mut Selection,
     request: &mut Request,
 ) -> Result<(), ParamError> {
-    let bad = || ParamError::BadValue {
-        name: parameter.name,
-        value: format!("`{}`", text.chars().take(64).collect::<String>()),
-        expected: parameter.domain.expected(),
-    };
-    // Whether a number is in range is the core's to say, as the range may hang on the kernel.
+    let bad = || parameter.invalid(text);
+    // The core checks ranges, because they may depend on the kernel.
     let number = || text.trim().parse::<f64>().ok().filter(|v| v.is_finite()).map(Some).ok_or_else(bad);
     match parameter.name {
         "preset" => options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
@@ -232,11 +228,7 @@ fn set(
 
 /// Parses the value of one picture parameter.
 fn set_picture(parameter: &Parameter, text: &str, picture: &mut PictureParams) -> Result<(), ParamError> {
-    let bad = || ParamError::BadValue {
-        name: parameter.name,
-        value: format!("`{}`", text.chars().take(64).collect::<String>()),
-        expected: parameter.domain.expected(),
-    };
+    let bad = || parameter.invalid(text);
     let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MOST_SIDE).contains(n));
     let angle = || {
         let Domain::Number { min, max, .. } = parameter.domain else { return None };
@@ -281,7 +273,7 @@ fn one_char(text: &str) -> Option<char> {
 /// key.
 #[must_use]
 pub fn canonical(job: &Job) -> String {
-    // Destructured, so that a field that is added without a place here does not compile.
+    // Destructured, so that a new field must be added here.
     let Job { selection, params, spacing, validation, compress, normals, units, picture } = job;
     let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = selection;
     let SurfaceParams {
@@ -298,7 +290,7 @@ pub fn canonical(job: &Job) -> String {
         // Follows from `compress` and the spheres.
         quantize: _,
     } = params;
-    // What sets the spacing, and nothing else: of the other two only defaults are left.
+    // Only the parameter that sets the spacing; the other two have their defaults.
     let spacing = match spacing {
         Spacing::Given => format!("resolution={resolution}"),
         Spacing::Detail(level) => format!("detail={level}"),

@@ -157,15 +157,10 @@ impl Placing<'_> {
         let rank =
             TileRanks::new(bounds.map(|c| tile_of(self.cell(c))), n, |i| tile_of(self.cell(self.spheres.centre(i))));
         let mut atoms = Column::zeroed(n);
-        if rank.end() <= u64::from(u32::MAX) >> PLACE_BITS && u32::try_from(n).is_ok() {
-            let order = sorted(n, |first, keys| write_short_keys(self, &rank, first, keys));
-            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
-            parts.for_each(|(atoms, order)| place_by_short_keys(self, order, atoms));
-        } else {
-            let order = sorted(n, |first, keys| write_keys(self, &rank, first, keys));
-            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
-            parts.for_each(|(atoms, order)| place_by_keys(self, order, atoms));
-        }
+        let mut keys: Column<u128> = Column::zeroed(n);
+        keys.par_chunks_mut(PART).enumerate().for_each(|(part, keys)| write_keys(self, &rank, part * PART, keys));
+        keys.par_sort_unstable();
+        atoms.par_chunks_mut(PART).zip(keys.par_chunks(PART)).for_each(|(atoms, keys)| place(self, keys, atoms));
         let same = |a: &LatticeAtom, b: &LatticeAtom| a.cell == b.cell;
         let order = |same: &mut [LatticeAtom]| {
             same.sort_unstable_by(|a, b| {
@@ -177,14 +172,6 @@ impl Placing<'_> {
         atoms.par_chunk_by_mut(same).filter(|same| same.len() > 1).for_each(order);
         atoms
     }
-}
-
-/// Returns `n` keys in ascending order; `make(first, part)` writes those from number `first` on.
-fn sorted<K: Pod + Ord + Send + Sync>(n: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
-    let mut keys = Column::zeroed(n);
-    keys.par_chunks_mut(PART).enumerate().for_each(|(part, keys)| make(part * PART, keys));
-    keys.par_sort_unstable();
-    keys
 }
 
 /// Atoms per placement task.
@@ -215,28 +202,10 @@ fn write_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut 
 }
 
 dispatched! {
-/// As above if places and indices have 32 bits each: half the memory, and less time to sort.
-fn write_short_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut [u64]) {
-    for (i, key) in (first..).zip(keys) {
-        *key = placing.key(rank, i) << 32 | i as u64;
-    }
-}
-}
-
-dispatched! {
-/// Writes the atoms whose keys are `order`.
-fn place_by_keys(placing: &Placing<'_>, order: &[u128], atoms: &mut [LatticeAtom]) {
-    for (key, atom) in order.iter().zip(atoms) {
+/// Writes the atoms whose sort keys are `keys`.
+fn place(placing: &Placing<'_>, keys: &[u128], atoms: &mut [LatticeAtom]) {
+    for (key, atom) in keys.iter().zip(atoms) {
         *atom = placing.atom(usize::try_from(key & u128::from(u64::MAX)).unwrap_or(usize::MAX));
-    }
-}
-}
-
-dispatched! {
-/// As above with short keys.
-fn place_by_short_keys(placing: &Placing<'_>, order: &[u64], atoms: &mut [LatticeAtom]) {
-    for (key, atom) in order.iter().zip(atoms) {
-        *atom = placing.atom(usize::try_from(key & u64::from(u32::MAX)).unwrap_or(usize::MAX));
     }
 }
 }
@@ -261,14 +230,6 @@ impl TileRanks {
         order.par_sort_unstable();
         order.dedup();
         Self::Listed(order)
-    }
-
-    /// Above every number.
-    fn end(&self) -> u64 {
-        match self {
-            Self::Box { side, .. } => side.iter().product(),
-            Self::Listed(order) => order.len() as u64,
-        }
     }
 
     #[inline(always)]

@@ -2,6 +2,7 @@
 
 use std::str::FromStr;
 
+use super::ParamError;
 use crate::formats::{Compress, Normals, Units};
 use crate::picture::{Background, MOST_SIDE, Style, View};
 use crate::pipeline::spacing::{LEAST_TRIANGLES, MOST_TRIANGLES};
@@ -71,6 +72,12 @@ pub struct Parameter {
 }
 
 impl Parameter {
+    /// Returns the error for a value that is not valid.
+    pub(super) fn invalid(&self, value: &str) -> ParamError {
+        let value = format!("`{}`", value.chars().take(64).collect::<String>());
+        ParamError::BadValue { name: self.name, value, expected: self.domain.expected() }
+    }
+
     /// Returns true if `text` equals the declared default. Defaults in words, such as `the first model of the file`,
     /// are not values and equal nothing.
     #[must_use]
@@ -123,8 +130,6 @@ pub fn usual(parameter: &Parameter) -> Option<[f64; 2]> {
     })
 }
 
-const KERNELS: &[&str] = &names(Kernel::ALL);
-const PRESETS: &[&str] = &preset_names(Preset::ALL);
 const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj", "png"];
 const VIEWS: &[&str] = &view_names(View::ALL);
 const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
@@ -132,14 +137,6 @@ const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
 const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
 const VALIDATIONS: &[&str] = &[Validation::Checksum.name(), Validation::Exact.name()];
-
-const fn names(all: &[Kernel]) -> [&'static str; 3] {
-    [all[0].name(), all[1].name(), all[2].name()]
-}
-
-const fn preset_names(all: &[Preset]) -> [&'static str; 6] {
-    [all[0].name(), all[1].name(), all[2].name(), all[3].name(), all[4].name(), all[5].name()]
-}
 
 const fn view_names(all: [View; 7]) -> [&'static str; 7] {
     let [a, b, c, d, e, f, g] = all;
@@ -151,13 +148,13 @@ const fn view_names(all: [View; 7]) -> [&'static str; 7] {
 pub const TABLE: &[Parameter] = &[
     Parameter {
         name: "preset",
-        domain: Domain::Choice(PRESETS),
+        domain: Domain::Choice(Preset::NAMES),
         default: "default",
         doc: "A named pair of smoothness and isovalue for the gaussian kernel. ses-like approximates the solvent-excluded surface without a probe: area within −6.5 to +6.0 % and volume within −0.6 to +5.1 % on eight proteins, worse for small structures (area +13.5 % for a DNA dodecamer).",
     },
     Parameter {
         name: "kernel",
-        domain: Domain::Choice(KERNELS),
+        domain: Domain::Choice(Kernel::NAMES),
         default: "gaussian",
         doc: "Density kernel: the contribution of an atom as a function of the distance.",
     },

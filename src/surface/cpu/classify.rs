@@ -3,7 +3,6 @@
 //! A brick's samples are eight 64-bit words, one per z layer, bit `8·y + x`. Every test on them is a shift.
 
 use std::num::NonZeroU16;
-use std::sync::LazyLock;
 
 use super::edge::Edge;
 use super::field::Samples;
@@ -228,7 +227,6 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
         n += ones(*crossing);
     }
     edge_parameters(&brick.crossing, n, &around.samples, iso, found);
-    let cases = &*CELLS;
     let mut torn = false;
     for (layer, &cells) in corners.iter().zip(&active) {
         let mut cells = cells;
@@ -237,9 +235,8 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
             cells &= cells - 1;
             let case = (0..8).fold(0, |case, c| case | u8::from(layer[c] >> bit & 1 == 1) << c);
             found.cases.push(case);
-            let CellCase { triangles, loops } = cases[usize::from(case)];
-            found.triangles += u32::from(triangles);
-            torn |= loops > 1;
+            found.triangles += u32::from(CASES.count[usize::from(case)]);
+            torn |= CASES.loops[usize::from(case)] > 1;
         }
     }
     found.vertices += u32::from(n);
@@ -249,19 +246,6 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
     found.bricks.push(brick);
 }
 }
-
-/// Contribution of a cell's case to its brick.
-#[derive(Clone, Copy)]
-struct CellCase {
-    triangles: u8,
-    loops: u8,
-}
-
-static CELLS: LazyLock<Vec<CellCase>> = LazyLock::new(|| {
-    (0..=255_u8)
-        .map(|case| CellCase { triangles: CASES.count[usize::from(case)], loops: CASES.n_loops(case) })
-        .collect()
-});
 
 /// Returns the cells whose surface continues in the previous cell along x, y and z, if that is in the brick.
 #[inline(always)]
