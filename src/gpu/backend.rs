@@ -2,10 +2,9 @@
 
 use std::sync::Arc;
 
-use super::describe::{arithmetic, describe};
-use super::device;
 use super::device_queue::single_line;
-use super::discover::Discovery;
+use super::discover::{self, Discovery, arithmetic, describe};
+use super::engine::Engine;
 use super::error::GpuError;
 use super::executor::Executor;
 use super::job::{GpuJob, Prepared};
@@ -39,7 +38,10 @@ impl GpuBackend {
         let taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(device, _)| device.taken);
         let devices = taken.map(|(device, adapter)| {
             let adapter = adapter.clone();
-            let build = Box::new(move || device::engine(&adapter).map(|engine| Box::new(engine) as Box<dyn Executor>));
+            let build = Box::new(move || {
+                let (device, queue) = discover::open(&adapter)?;
+                Ok(Box::new(Engine::new(device, queue)?) as Box<dyn Executor>)
+            });
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
         let devices: Vec<_> = devices.collect();
@@ -131,7 +133,6 @@ impl Backend for GpuBackend {
         drop(job);
         match (error, &self.fallback) {
             (GpuError::Surface(error), _) => Err(error),
-            (GpuError::Deadline, _) => Err(SurfaceError::Deadline),
             (GpuError::OutOfMemory { needed, available, suggested_resolution }, _) => {
                 Err(SurfaceError::DeviceMemory { needed, available, suggested_resolution })
             }

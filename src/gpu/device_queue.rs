@@ -188,7 +188,7 @@ mod tests {
         drop(job);
         assert_eq!(other.check(), cancelled, "dropped without a result");
         let (job, other) = queued();
-        job.reply(Err(GpuError::Deadline));
+        job.reply(Err(SurfaceError::Deadline.into()));
         assert_eq!(other.check(), cancelled, "failed");
         let (job, other) = queued();
         job.reply(Ok(Finished { meshed: MeshOutput::new(Mesh::default(), GridStats::default()), stages: Vec::new() }));

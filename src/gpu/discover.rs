@@ -1,12 +1,19 @@
-//! Discovery of devices: lists the adapters of all drivers and selects devices by the user's choice.
+//! Discovery of devices: lists the adapters of all drivers, selects devices by the user's choice, and opens and describes
+//! them.
 
 use std::panic::catch_unwind;
 
-use wgpu::{Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags};
+use wgpu::{
+    Adapter, Backends, Device, DeviceDescriptor, DeviceType, ExperimentalFeatures, Features, Instance,
+    InstanceDescriptor, InstanceFlags, MemoryHints, Queue, Trace,
+};
 
 use super::error::GpuError;
-use super::{choose, device, hardware};
+use super::{choose, hardware};
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, FoundDevice};
+
+/// Features that are used if the device has them.
+const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 
 /// Effort of a discovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -43,10 +50,10 @@ impl Discovery {
     /// # Errors
     /// Returns [`GpuError::NoDevice`] if no selected device has the number, and [`GpuError::Failed`] if the driver
     /// rejects the request.
-    pub fn open(&self, number: usize) -> Result<(wgpu::Device, wgpu::Queue), GpuError> {
+    pub fn open(&self, number: usize) -> Result<(Device, Queue), GpuError> {
         let mut all = self.devices.iter().zip(&self.adapters);
         match all.find(|(device, _)| device.taken && device.number == number) {
-            Some((_, adapter)) => device::open(adapter),
+            Some((_, adapter)) => open(adapter),
             None => Err(GpuError::NoDevice(format!("no usable device has number {number}"))),
         }
     }
@@ -134,5 +141,63 @@ fn facts(adapter: &Adapter) -> DeviceFacts {
         storage_buffers: limits.max_storage_buffers_per_shader_stage.into(),
         timestamps: features.contains(Features::TIMESTAMP_QUERY),
         subgroups: features.contains(Features::SUBGROUP).then_some([info.subgroup_min_size, info.subgroup_max_size]),
+    }
+}
+
+/// Opens `adapter` with its own limits.
+///
+/// # Errors
+/// [`GpuError::Failed`] if the driver rejects the request.
+pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
+    let descriptor = DeviceDescriptor {
+        label: Some("molmesh"),
+        required_features: adapter.features() & WANTED,
+        required_limits: adapter.limits(),
+        experimental_features: ExperimentalFeatures::disabled(),
+        memory_hints: MemoryHints::Performance,
+        trace: Trace::Off,
+    };
+    pollster::block_on(adapter.request_device(&descriptor))
+        .map_err(|error| GpuError::Failed(format!("the device cannot be opened: {error}")))
+}
+
+/// Name of the arithmetic of a device: model and driver, and the processor, which prepares jobs and measures meshes.
+pub(super) fn arithmetic(name: &str, device: &str) -> String {
+    format!("{name} {device} {}", crate::surface::arithmetic())
+}
+
+/// Describes a device and its driver, for display.
+pub(super) fn describe(facts: &DeviceFacts) -> String {
+    let DeviceFacts { name, kind, api, driver, .. } = facts;
+    let driver = if driver.is_empty() { String::new() } else { format!(", {driver}") };
+    format!("{name} ({}, {api}{driver})", kind.name())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::DeviceKind;
+
+    #[test]
+    fn the_arithmetic_names_model_driver_and_processor() {
+        let facts = |name: &str, driver: &str| DeviceFacts {
+            name: name.to_owned(),
+            kind: DeviceKind::Discrete,
+            api: "vulkan",
+            driver: driver.to_owned(),
+            bus: String::new(),
+            binding_bytes: 0,
+            buffer_bytes: 0,
+            workgroup_bytes: 0,
+            workgroup_size: 0,
+            storage_buffers: 0,
+            timestamps: false,
+            subgroups: None,
+        };
+        let arithmetic_of = |name, driver| arithmetic("gpu", &describe(&facts(name, driver)));
+        assert_eq!(arithmetic_of("card", "driver 1"), arithmetic_of("card", "driver 1"));
+        assert_ne!(arithmetic_of("card", "driver 1"), arithmetic_of("card", "driver 2"));
+        assert_ne!(arithmetic_of("card", "driver 1"), arithmetic_of("other card", "driver 1"));
+        assert!(arithmetic_of("card", "driver 1").ends_with(&crate::surface::arithmetic()), "without the processor");
     }
 }

@@ -78,12 +78,13 @@ impl GpuJob {
     /// Fails if the job was cancelled or its deadline has passed.
     ///
     /// # Errors
-    /// [`SurfaceError::Cancelled`], [`GpuError::Deadline`].
-    pub fn check(&self) -> Result<(), GpuError> {
+    /// [`SurfaceError::Cancelled`], [`SurfaceError::Deadline`].
+    pub fn check(&self) -> Result<(), SurfaceError> {
         if self.cancel.is_cancelled() {
-            return Err(SurfaceError::Cancelled.into());
+            return Err(SurfaceError::Cancelled);
         }
-        if self.deadline.is_some_and(|deadline| deadline <= Instant::now()) { Err(GpuError::Deadline) } else { Ok(()) }
+        let late = self.deadline.is_some_and(|deadline| deadline <= Instant::now());
+        if late { Err(SurfaceError::Deadline) } else { Ok(()) }
     }
 }
 

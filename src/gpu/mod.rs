@@ -7,7 +7,7 @@
 //! A module names only modules of earlier lines:
 //!
 //! ```text
-//! error, buffers, plan, describe, readback, hardware, manifests, choose, picture_targets
+//! error, buffers, plan, readback, hardware, manifests, choose, picture_targets
 //! job, shaders, device_errors, discover
 //! partition_handle, pipelines, multi_device, picture_passes
 //! executor, output_layout, device_queue
@@ -15,7 +15,7 @@
 //! recording, worker
 //! pool
 //! engine
-//! submit, device
+//! submit
 //! job_state, probe, backend, picture
 //! count
 //! output
@@ -27,8 +27,6 @@ pub mod backend;
 mod buffers;
 mod choose;
 mod count;
-mod describe;
-mod device;
 mod device_errors;
 mod device_queue;
 pub mod discover;

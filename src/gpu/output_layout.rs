@@ -107,7 +107,7 @@ impl ReadbackLayout {
 }
 
 /// Vertices and triangles in a mapped readback buffer.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub(super) struct ReadbackRows {
     pub(super) readback: Arc<ReadbackBuffer>,
     pub(super) layout: ReadbackLayout,

@@ -5,9 +5,7 @@ use std::sync::{Mutex, PoisonError};
 
 use wgpu::Adapter;
 
-use super::describe::{arithmetic, describe};
-use super::device;
-use super::discover::Discovery;
+use super::discover::{self, Discovery, arithmetic, describe};
 use super::error::GpuError;
 use super::picture_passes::PicturePasses;
 use super::picture_targets::Requirements;
@@ -68,7 +66,7 @@ impl GpuRenderer {
 
 /// Opens a device and compiles the passes.
 fn open(adapter: &Adapter) -> Result<PicturePasses, GpuError> {
-    let (device, queue) = device::open(adapter)?;
+    let (device, queue) = discover::open(adapter)?;
     PicturePasses::new(device, queue)
 }
 

@@ -203,7 +203,7 @@ impl DevicePool {
             }
         }
         if let Err(error) = job.check() {
-            return MultiDeviceOutcome::JobFailed(error);
+            return MultiDeviceOutcome::JobFailed(error.into());
         }
         if let Some(error) = device_error {
             return MultiDeviceOutcome::DevicesFailed(failures, error);
@@ -230,7 +230,7 @@ impl DevicePool {
                     if let Err(error) = job.check() {
                         for ticket in &tickets[results.len()..] {
                             self.scheduler.cancel(ticket);
-                            results.push(ticket.result.try_recv().unwrap_or_else(|_pending| Err(error.clone())));
+                            results.push(ticket.result.try_recv().unwrap_or_else(|_pending| Err(error.clone().into())));
                         }
                     }
                 }

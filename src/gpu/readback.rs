@@ -3,7 +3,6 @@
 //! The columns of a mesh stay in the buffer for as long as the mesh lives; then the buffer returns to the pool. Copying
 //! them into other memory would take many times as long as the transfer.
 
-use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use wgpu::{Buffer, BufferUsages, BufferView, Device};
@@ -137,12 +136,6 @@ impl Drop for ReadbackBuffer {
         self.view = None;
         self.buffer.unmap();
         self.pool.put_back(self.buffer.clone());
-    }
-}
-
-impl fmt::Debug for ReadbackBuffer {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "ReadbackBuffer({} bytes)", self.as_ref().len())
     }
 }
 

@@ -27,7 +27,7 @@ impl Executor for Engine {
         let mut results: Vec<Option<JobResult>> = jobs.iter().map(|_| None).collect();
         let mut small = Vec::new();
         for (result, job) in results.iter_mut().zip(jobs) {
-            let loaded = job.check().and_then(|()| self.chunks(job, None)).and_then(|chunks| {
+            let loaded = self.chunks(job, None).and_then(|chunks| {
                 let estimate = self.small_capacity(job, &chunks);
                 let loaded = self.load(job, None, chunks, estimate.unwrap_or(NO_OUTPUT))?;
                 Ok((loaded, estimate))

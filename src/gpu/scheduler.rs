@@ -185,7 +185,7 @@ impl Scheduler {
             while let Some(first) = queue.waiting.pop_front() {
                 if let Err(error) = first.job.check() {
                     queue.load -= first.load();
-                    first.reply(Err(error));
+                    first.reply(Err(error.into()));
                     continue;
                 }
                 let batchable = first.is_batchable();
@@ -342,7 +342,7 @@ impl Scheduler {
 pub(super) fn proves_device_works(result: &JobResult) -> bool {
     match result {
         Ok(_) => true,
-        Err(GpuError::Surface(error)) => *error != SurfaceError::Cancelled,
+        Err(GpuError::Surface(error)) => !matches!(error, SurfaceError::Cancelled | SurfaceError::Deadline),
         Err(_) => false,
     }
 }

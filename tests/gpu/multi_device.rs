@@ -405,7 +405,7 @@ fn cancellation_and_deadline_end_a_wait_for_other_partitions() {
     let (pool, _gate) = faulty_pool(Fault::Idles, usize::MAX);
     let mut late = fresh();
     late.deadline = Some(started + Duration::from_millis(1500));
-    assert_eq!(pool.run(&late).map(drop).unwrap_err(), GpuError::Deadline);
+    assert_eq!(pool.run(&late).map(drop).unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     let (pool, gate) = faulty_pool(Fault::Idles, usize::MAX);
     let cancelled = fresh();
     let error = std::thread::scope(|scope| {

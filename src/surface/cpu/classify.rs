@@ -58,8 +58,6 @@ pub(super) struct Found {
     pub(super) candidates: Vec<u32>,
     /// Cells of the sheets of bricks with several: word z, bit `8·y + x`.
     pub(super) sheets: Vec<[u64; 8]>,
-    /// F(owner) − F(other end) of the edges of the current brick.
-    drop: Vec<f32>,
 }
 
 /// Vertices, and active cells, that a brick in reach of an atom rarely exceeds on average.
@@ -116,46 +114,27 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
 }
 
 impl Found {
-    /// Clears the lists and reserves capacity for `bricks` bricks, usually more than needed: growing would copy, and
+    /// Returns an empty value with capacity for `bricks` bricks, usually more than needed: growing would copy, and
     /// untouched memory costs nothing.
-    pub(super) fn begin(&mut self, bricks: usize) {
-        *self = Self {
+    pub(super) fn with_capacity(bricks: usize) -> Self {
+        Self {
             bricks: Vec::with_capacity(bricks),
             t: Vec::with_capacity(USUAL * bricks),
             edges: Vec::with_capacity(USUAL * bricks),
             cases: Vec::with_capacity(USUAL * bricks),
             candidates: Vec::with_capacity(USUAL * bricks),
-            drop: std::mem::take(&mut self.drop),
-            ..Self::default()
-        };
-    }
-
-    /// Takes the results in memory of exactly their size and leaves `self` empty.
-    pub(super) fn take(&mut self) -> Self {
-        let drop = std::mem::take(&mut self.drop);
-        let mut found = std::mem::replace(self, Self { drop, ..Self::default() });
-        // Returns the rest to the allocator, for the next tile.
-        found.bricks.shrink_to_fit();
-        found.t.shrink_to_fit();
-        found.edges.shrink_to_fit();
-        found.cases.shrink_to_fit();
-        found.candidates.shrink_to_fit();
-        found.sheets.shrink_to_fit();
-        found
-    }
-
-    /// Returns an empty value with capacity for all `parts`.
-    pub(super) fn with_capacity_for(parts: &[&Self]) -> Self {
-        let sum = |len: fn(&Self) -> usize| parts.iter().map(|part| len(part)).sum();
-        Self {
-            bricks: Vec::with_capacity(sum(|part| part.bricks.len())),
-            t: Vec::with_capacity(sum(|part| part.t.len())),
-            edges: Vec::with_capacity(sum(|part| part.edges.len())),
-            cases: Vec::with_capacity(sum(|part| part.cases.len())),
-            candidates: Vec::with_capacity(sum(|part| part.candidates.len())),
-            sheets: Vec::with_capacity(sum(|part| part.sheets.len())),
             ..Self::default()
         }
+    }
+
+    /// Returns unused memory to the allocator, for the next tile.
+    pub(super) fn shrink_to_fit(&mut self) {
+        self.bricks.shrink_to_fit();
+        self.t.shrink_to_fit();
+        self.edges.shrink_to_fit();
+        self.cases.shrink_to_fit();
+        self.candidates.shrink_to_fit();
+        self.sheets.shrink_to_fit();
     }
 
     /// Appends the results of the bricks that follow.
@@ -320,15 +299,14 @@ fn ones(word: u64) -> u16 {
 #[inline(always)]
 fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut Found) {
     const STEP: [usize; 3] = [1, 8, 64];
-    let Found { t, edges, drop, .. } = found;
+    let Found { t, edges, .. } = found;
     let first = t.len();
     // Densities at both ends first, one division per vector afterwards: `t` holds F(owner) − iso meanwhile.
     t.resize(first + usize::from(n), 0.0);
     edges.resize(first + usize::from(n), Edge::default());
-    if drop.len() < usize::from(n) {
-        drop.resize(3 * BRICK_SAMPLES, 0.0);
-    }
-    let mut ends = t[first..].iter_mut().zip(drop.iter_mut()).zip(&mut edges[first..]);
+    // F(owner) − F(other end).
+    let mut drop = [0.0; 3 * BRICK_SAMPLES];
+    let mut ends = t[first..].iter_mut().zip(&mut drop).zip(&mut edges[first..]);
     for (w, &word) in crossing.iter().enumerate() {
         let (z, axis) = (w / 3, w % 3);
         let mut left = word;
@@ -344,7 +322,7 @@ fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f
             }
         }
     }
-    for (t, drop) in t[first..].iter_mut().zip(drop.iter()) {
+    for (t, drop) in t[first..].iter_mut().zip(&drop) {
         *t = (*t / drop).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
     }
 }

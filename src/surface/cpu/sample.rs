@@ -23,8 +23,6 @@ struct Scratch {
     layers: [Layer; 2],
     /// Index into its layer per slot, or `NO_BRICK`.
     slots: Vec<u16>,
-    /// Results of `classify`, moved into the tile at its end.
-    found: Found,
 }
 
 /// Densities of a brick, aligned to a cache line, so that no vector crosses one.
@@ -47,7 +45,6 @@ impl Default for Scratch {
             bricks: Bricks::default(),
             layers: Default::default(),
             slots: vec![NO_BRICK; SLOTS],
-            found: Found::default(),
         }
     }
 }
@@ -146,14 +143,14 @@ impl Pass<'_> {
             return Err(bin::too_large(self.lattice, tally.all_slabs(samples, self.slabs.len()), self.limits));
         }
         let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
-        scratch.found.begin(reached);
+        let mut found = Found::with_capacity(reached);
         for z in layers.start..=layers.end {
             self.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z))?;
             if z > layers.start {
-                self.control.span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut bricks));
+                self.control.span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut found, &mut bricks));
             }
         }
-        let found = self.control.span(Stage::Classify, || scratch.found.take());
+        self.control.span(Stage::Classify, || found.shrink_to_fit());
         let bytes = self.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
         let so_far = tally.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
         if so_far > self.limits.max_mesh_bytes {
@@ -205,9 +202,9 @@ impl Scratch {
 
     /// Classifies every brick of layer z that has, or borders on, samples inside; requires the layer above to be the
     /// last one evaluated. Writes the index of each local brick's record to `local`.
-    fn classify(&mut self, iso: f32, z: usize, local: &mut [u16]) {
+    fn classify(&self, iso: f32, z: usize, found: &mut Found, local: &mut [u16]) {
         const NOTHING: Samples = [0.0; BRICK_SAMPLES];
-        let Self { bricks, layers, slots, found } = self;
+        let Self { bricks, layers, slots } = self;
         for y in 0..SIDE - 1 {
             let rows = layers.iter().fold(0, |rows, layer| rows | layer.rows[y] | layer.rows[y + 1]);
             let mut left = (rows | rows >> 1) & ((1 << (SIDE - 1)) - 1);

@@ -11,9 +11,7 @@ use std::sync::{Mutex, PoisonError};
 use rustc_hash::FxHashMap;
 
 use super::bin::{SIDE, Tiles};
-use super::classify::Found;
 use super::{NO_BRICK, Tile};
-use crate::surface::lattice::BRICK_SAMPLES;
 
 /// Layers of a tile's bricks that one thread samples at once.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -68,19 +66,17 @@ impl Unfinished {
             complete.then(|| unfinished.remove(&slab.tile)).flatten()?
         };
         parts.sort_unstable_by_key(|(layer, _)| *layer);
-        let all: Vec<&Found> = parts.iter().map(|(_, tile)| &tile.found).collect();
-        let mut found = Found::with_capacity_for(&all);
-        let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
-        for (_, part) in &parts {
-            let before = found.bricks.len();
-            for (to, from) in bricks.iter_mut().zip(&part.bricks).filter(|(_, from)| **from != NO_BRICK) {
+        let mut parts = parts.into_iter().map(|(_, tile)| tile);
+        let mut joined = parts.next()?;
+        for part in parts {
+            let before = joined.found.bricks.len();
+            for (to, from) in joined.bricks.iter_mut().zip(&part.bricks).filter(|(_, from)| **from != NO_BRICK) {
                 // A tile has 512 bricks.
                 *to = u16::try_from(before + usize::from(*from)).unwrap_or(NO_BRICK);
             }
-            found.append(&part.found);
+            joined.found.append(&part.found);
         }
-        let (_, tile) = parts.pop()?;
-        Some(Tile { found, bricks, ..tile })
+        Some(joined)
     }
 }
 
