@@ -53,7 +53,11 @@ impl Prepared {
 
     /// Checks the size of a complete mesh likewise, and rejects an empty one.
     pub(super) fn check_mesh(&self, size: [u64; 2]) -> Result<(), SurfaceError> {
-        if size[1] == 0 { Err(SurfaceError::NoSurface { isovalue: self.params.isovalue }) } else { self.check_size(size) }
+        if size[1] == 0 {
+            Err(SurfaceError::NoSurface { isovalue: self.params.isovalue })
+        } else {
+            self.check_size(size)
+        }
     }
 
     /// Returns true if the job may share a submission with others.

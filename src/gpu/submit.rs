@@ -22,11 +22,7 @@ pub(super) struct PendingSubmission {
 
 impl Engine {
     /// Submits a recording and requests to map the given number of bytes of each readback buffer.
-    pub(super) fn submit(
-        &self,
-        recording: Recording<'_>,
-        readbacks: Vec<(ReadbackBuffer, u64)>,
-    ) -> PendingSubmission {
+    pub(super) fn submit(&self, recording: Recording<'_>, readbacks: Vec<(ReadbackBuffer, u64)>) -> PendingSubmission {
         let index = self.queue.submit([recording.encoder.finish()]);
         for (readback, bytes) in &readbacks {
             readback.map(*bytes);

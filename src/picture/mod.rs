@@ -112,12 +112,7 @@ pub trait Renderer: Send + Sync {
 
     /// Identity of this renderer, as the maker of a picture.
     fn identity(&self) -> Served {
-        Served {
-            backend: self.name(),
-            arithmetic: self.arithmetic(),
-            device: self.describe(),
-            fallback_reason: None,
-        }
+        Served { backend: self.name(), arithmetic: self.arithmetic(), device: self.describe(), fallback_reason: None }
     }
 
     /// Draws `mesh`, whose vertices must not be quantised.

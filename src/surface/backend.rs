@@ -136,12 +136,7 @@ pub trait Backend: Send + Sync {
 
     /// Identity of this backend, as the maker of a mesh.
     fn identity(&self) -> Served {
-        Served {
-            backend: self.name(),
-            arithmetic: self.arithmetic(),
-            device: self.describe(),
-            fallback_reason: None,
-        }
+        Served { backend: self.name(), arithmetic: self.arithmetic(), device: self.describe(), fallback_reason: None }
     }
 
     /// Meshes `spheres`, in memory or, if there is a `sink`, into that. Both get the same rows.

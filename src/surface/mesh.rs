@@ -73,10 +73,7 @@ pub(super) fn bounds_of<T: Copy + PartialOrd + Send + Sync, const N: usize>(rows
 /// The bounds of both.
 pub(super) fn joined_bounds<T: Copy + PartialOrd>([a, b]: [[T; 3]; 2], [c, d]: [[T; 3]; 2]) -> [[T; 3]; 2] {
     let choose = |take: bool, new, old| if take { new } else { old };
-    [
-        std::array::from_fn(|k| choose(c[k] < a[k], c[k], a[k])),
-        std::array::from_fn(|k| choose(d[k] > b[k], d[k], b[k])),
-    ]
+    [std::array::from_fn(|k| choose(c[k] < a[k], c[k], a[k])), std::array::from_fn(|k| choose(d[k] > b[k], d[k], b[k]))]
 }
 
 /// A position as a row.

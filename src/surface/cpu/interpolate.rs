@@ -2,8 +2,7 @@
 
 use std::ops::Range;
 
-use super::bin::{NORMAL_ONLY, slot_origin};
-use super::classify::SurfaceBrick;
+use super::bin::NORMAL_ONLY;
 use super::edge::Edge;
 use super::reach::{Around, LANES, extent};
 use crate::surface::control::Control;
@@ -82,8 +81,8 @@ fn places(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
 
 /// Inputs of a brick's vertices.
 pub(super) struct Source<'a> {
-    /// The brick's tile.
-    pub(super) tile: [i32; 3],
+    /// The brick's first sample.
+    pub(super) origin: [i32; 3],
     /// The brick's candidate atoms.
     pub(super) candidates: &'a [u32],
     /// Parameter of each vertex along its edge.
@@ -157,14 +156,13 @@ const BLOCK: usize = 4096;
 pub(super) fn interpolate(
     lattice: &Lattice,
     slope: &SlopeConstants,
-    brick: &SurfaceBrick,
     source: &Source<'_>,
     batch: &mut Batch,
     target: Target<'_>,
     control: &Control<'_>,
 ) -> Result<usize, SurfaceError> {
-    let (origin, candidates) = (slot_origin(source.tile, usize::from(brick.slot)), source.candidates);
-    batch.place(source.edges, source.t);
+    let Source { origin, candidates, t, edges } = *source;
+    batch.place(edges, t);
     batch.n.iter_mut().for_each(|column| column.fill(0.0));
     for block in candidates.chunks(BLOCK) {
         control.check()?;

@@ -41,11 +41,7 @@ struct Layer {
 
 impl Default for Scratch {
     fn default() -> Self {
-        Self {
-            bricks: Bricks::default(),
-            layers: Default::default(),
-            slots: vec![NO_BRICK; SLOTS],
-        }
+        Self { bricks: Bricks::default(), layers: Default::default(), slots: vec![NO_BRICK; SLOTS] }
     }
 }
 

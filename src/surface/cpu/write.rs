@@ -149,16 +149,16 @@ fn write_pieces(
     destination: &Destination<'_>,
 ) -> Result<Vec<Written>, SurfaceError> {
     let Scanned { lattice, pieces, .. } = scanned;
-    let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
+    let writer = Writer { scanned, slope: SlopeConstants::new(&lattice.profile, lattice.spacing), control };
     let finished = AtomicUsize::new(0);
     threads::each(pieces.len(), |i| {
         control.check()?;
         let written = SCRATCH.with_borrow_mut(|Scratch { stages, rows }| match destination {
             Destination::Memory(of_piece) => {
                 let mut rows = of_piece[i].lock().unwrap_or_else(PoisonError::into_inner);
-                rows.write(scanned, &pieces[i], &slope, stages, control)
+                writer.write(&pieces[i], &mut rows, stages)
             }
-            Destination::Sink(sink) => rows.write(scanned, &pieces[i], &slope, stages, control, *sink),
+            Destination::Sink(sink) => writer.write_to_sink(&pieces[i], rows, stages, *sink),
         })?;
         let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
         control.observer.progress(Stage::Emit, n, pieces.len());
@@ -166,73 +166,61 @@ fn write_pieces(
     })
 }
 
-impl ScratchRows {
+/// Shared inputs of the second pass.
+struct Writer<'a> {
+    scanned: &'a Scanned,
+    slope: SlopeConstants,
+    control: &'a Control<'a>,
+}
+
+impl Writer<'_> {
     /// Writes a piece into the scratch, then into `sink`.
-    fn write(
-        &mut self,
-        scanned: &Scanned,
+    fn write_to_sink(
+        &self,
         piece: &Piece,
-        slope: &SlopeConstants,
+        scratch: &mut ScratchRows,
         stages: &mut Stages,
-        control: &Control<'_>,
         sink: &dyn MeshSink,
     ) -> Result<Written, SurfaceError> {
-        let [n, m] = scanned.size_of(piece);
-        let rows = match scanned.quantize {
-            None => Rows::Single { positions: first(&mut self.positions, n), normals: first(&mut self.normals, n) },
+        let [n, m] = self.scanned.size_of(piece);
+        let rows = match self.scanned.quantize {
+            None => {
+                Rows::Single { positions: first(&mut scratch.positions, n), normals: first(&mut scratch.normals, n) }
+            }
             Some(step) => {
-                let (positions, normals) = &mut self.quantized;
+                let (positions, normals) = &mut scratch.quantized;
                 Rows::Quantized { step, positions: first(positions, n), normals: first(normals, n) }
             }
         };
-        let mut rows = PieceRows { rows, triangles: first(&mut self.triangles, m), atom_ids: None };
-        let mut written = rows.write(scanned, piece, slope, stages, control)?;
+        let mut rows = PieceRows { rows, triangles: first(&mut scratch.triangles, m), atom_ids: None };
+        let mut written = self.write(piece, &mut rows, stages)?;
         let vertices = match rows.rows {
             Rows::Single { positions, normals } => Vertices::Single { positions, normals },
             Rows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
         };
         written.bounds = vertices.bounds();
-        let (tile, [start, _]) = (&scanned.done[piece.tile], scanned.done[piece.tile].span(piece));
+        let tile = &self.scanned.done[piece.tile];
+        let [start, _] = tile.span(piece);
         let part = MeshPart {
             first_vertex: tile.first_vertex + start.vertices,
             vertices,
             first_triangle: tile.first_triangle + start.triangles,
             triangles: rows.triangles,
         };
-        control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
+        self.control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
         Ok(written)
     }
-}
 
-impl PieceRows<'_> {
     /// Writes the vertices and triangles of a piece and sums over them.
-    ///
-    /// # Errors
-    /// [`SurfaceError::Cancelled`].
-    fn write(
-        &mut self,
-        scanned: &Scanned,
-        piece: &Piece,
-        slope: &SlopeConstants,
-        stages: &mut Stages,
-        control: &Control<'_>,
-    ) -> Result<Written, SurfaceError> {
-        let flat =
-            control.span(Stage::Interpolate, || self.interpolate(scanned, piece, slope, &mut stages.batch, control))?;
-        let tally = control.span(Stage::Emit, || self.emit(scanned, piece, &mut stages.table, &mut stages.sheets));
+    fn write(&self, piece: &Piece, rows: &mut PieceRows<'_>, stages: &mut Stages) -> Result<Written, SurfaceError> {
+        let flat = self.control.span(Stage::Interpolate, || self.interpolate(piece, rows, &mut stages.batch))?;
+        let tally = self.control.span(Stage::Emit, || self.emit(piece, rows.triangles, stages));
         Ok(Written { flat, tally, bounds: None })
     }
 
-    /// Writes the vertices. Returns how many have no gradient.
-    fn interpolate(
-        &mut self,
-        scanned: &Scanned,
-        piece: &Piece,
-        slope: &SlopeConstants,
-        batch: &mut Batch,
-        control: &Control<'_>,
-    ) -> Result<usize, SurfaceError> {
-        let tile = &scanned.done[piece.tile];
+    /// Writes the vertices. Returns the number of vertices without a gradient.
+    fn interpolate(&self, piece: &Piece, out: &mut PieceRows<'_>, batch: &mut Batch) -> Result<usize, SurfaceError> {
+        let tile = &self.scanned.done[piece.tile];
         let found = &tile.found;
         let base = found.before(piece.bricks.start).vertices;
         let mut flat = 0;
@@ -241,24 +229,28 @@ impl PieceRows<'_> {
             if all.is_empty() {
                 continue;
             }
-            let candidates = &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize];
             let rows = all.start - base..all.end - base;
             let target = Target {
-                rows: self.rows.slice(rows.clone()),
-                atom_ids: self.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
+                rows: out.rows.slice(rows.clone()),
+                atom_ids: out.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
             };
-            let (t, edges) = (&found.t[all.clone()], &found.edges[all]);
-            let source = Source { tile: tile.coord, candidates, t, edges };
-            flat += interpolate::interpolate(&scanned.lattice, slope, brick, &source, batch, target, control)?;
+            let source = Source {
+                origin: slot_origin(tile.coord, usize::from(brick.slot)),
+                candidates: &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize],
+                t: &found.t[all.clone()],
+                edges: &found.edges[all],
+            };
+            let lattice = &self.scanned.lattice;
+            flat += interpolate::interpolate(lattice, &self.slope, &source, batch, target, self.control)?;
         }
         Ok(flat)
     }
 
     /// Writes the triangles. Returns the sums over them.
-    fn emit(&mut self, scanned: &Scanned, piece: &Piece, table: &mut BrickTable, sheets: &mut Sheets) -> Tally {
-        let Scanned { tiles, done, .. } = scanned;
-        let tile = &done[piece.tile];
-        let near = Near::new(tiles, done, tile.coord);
+    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> Tally {
+        let (scanned, Stages { table, sheets, .. }) = (self.scanned, stages);
+        let tile = &scanned.done[piece.tile];
+        let near = Near::new(&scanned.tiles, &scanned.done, tile.coord);
         let found = &tile.found;
         let base = found.before(piece.bricks.start).triangles;
         let mut tally = Tally::with_capacity(piece.bricks.len());
@@ -267,7 +259,7 @@ impl PieceRows<'_> {
             let around: [Option<Numbered<'_>>; 8] =
                 std::array::from_fn(|n| near.of(usize::from(brick.slot), n).map(|(_, _, numbered)| numbered));
             let cases = &found.cases[before.cases..end.cases];
-            let out = &mut self.triangles[before.triangles - base..end.triangles - base];
+            let out = &mut triangles[before.triangles - base..end.triangles - base];
             let own_sheets = match brick.n_sheets.map_or(0, |n| usize::from(n.get())) {
                 0 | 1 => &[][..],
                 n => &found.sheets[brick.sheets as usize..][..n],
