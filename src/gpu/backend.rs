@@ -11,14 +11,14 @@ use super::job::{GpuJob, Prepared};
 use super::pool::{self, DevicePool, PoolDevice};
 use super::scheduler::PoolSettings;
 use crate::surface::{
-    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
+    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, backend::one_atom,
 };
 
 /// Backend that meshes on devices.
 pub struct GpuBackend {
     pool: DevicePool,
-    /// Backend for jobs that no device could run; reported in [`MeshOutput::served`].
+    /// Backend for jobs that no device could run; reported in [`MeshOutput::made_by`].
     fallback: Option<Box<dyn Backend>>,
 }
 
@@ -32,11 +32,11 @@ impl GpuBackend {
         settings: &PoolSettings,
         fallback: Option<Box<dyn Backend>>,
     ) -> Result<Self, GpuError> {
-        if let Some(why) = discovery.why_none() {
+        if let Some(why) = discovery.no_device_reason() {
             return Err(GpuError::NoDevice(why));
         }
-        let taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(device, _)| device.taken);
-        let devices = taken.map(|(device, adapter)| {
+        let selected = discovery.devices.iter().zip(&discovery.adapters).filter(|(device, _)| device.selected);
+        let devices = selected.map(|(device, adapter)| {
             let adapter = adapter.clone();
             let build = Box::new(move || {
                 let (device, queue) = discover::open(&adapter)?;
@@ -122,9 +122,13 @@ impl Backend for GpuBackend {
                 // Only identical devices share a job.
                 let device = completed.devices.first().map_or("", |work| work.device.as_str());
                 let arithmetic = arithmetic(self.name(), device);
-                let served =
-                    Served { backend: self.name(), arithmetic, device: completed.device(), fallback_reason: None };
-                let output = MeshOutput { served: Some(served), ..completed.finished.meshed };
+                let made_by = BackendIdentity {
+                    backend: self.name(),
+                    arithmetic,
+                    device: completed.device(),
+                    fallback_reason: None,
+                };
+                let output = MeshOutput { made_by: Some(made_by), ..completed.finished.meshed };
                 return output.deliver(params, control, sink);
             }
             Err(error) => error,
@@ -140,13 +144,13 @@ impl Backend for GpuBackend {
             (error, Some(fallback)) => {
                 let output = fallback.write(spheres, params, limits, control, sink)?;
                 let fallback_reason = Some(single_line(&format!("the GPU failed: {error}")));
-                let served = Served { fallback_reason, ..fallback.identity() };
-                Ok(MeshOutput { served: Some(served), ..output })
+                let made_by = BackendIdentity { fallback_reason, ..fallback.identity() };
+                Ok(MeshOutput { made_by: Some(made_by), ..output })
             }
         }
     }
 
-    fn warm(&self) -> Result<(), SurfaceError> {
+    fn warm_up(&self) -> Result<(), SurfaceError> {
         let n_devices = self.pool.status().len();
         std::thread::scope(|scope| {
             let warming: Vec<_> = (0..n_devices).map(|n| scope.spawn(move || self.warm_device(n))).collect();
@@ -156,12 +160,12 @@ impl Backend for GpuBackend {
             return Ok(());
         }
         match &self.fallback {
-            Some(fallback) => fallback.warm(),
+            Some(fallback) => fallback.warm_up(),
             None => Err(SurfaceError::Device { why: self.describe() }),
         }
     }
 
-    fn able(&self) -> bool {
+    fn is_available(&self) -> bool {
         self.fallback.is_some() || self.pool.status().iter().any(|device| device.down.is_none())
     }
 

@@ -17,7 +17,7 @@ const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 
 /// Effort of a discovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Look {
+pub enum DiscoveryMode {
     /// Load no driver if there is no sign of hardware, unless devices were requested by name.
     Quick,
     /// Load every driver, to list all devices.
@@ -32,17 +32,17 @@ pub struct Discovery {
     /// Adapters of `devices`, in the same order.
     pub(super) adapters: Vec<Adapter>,
     /// Reason for an empty list.
-    pub looked: String,
+    pub empty_reason: String,
 }
 
 impl Discovery {
-    fn nothing(looked: String) -> Self {
-        Self { devices: Vec::new(), adapters: Vec::new(), looked }
+    fn nothing(empty_reason: String) -> Self {
+        Self { devices: Vec::new(), adapters: Vec::new(), empty_reason }
     }
 
     /// Returns the selected devices.
-    pub fn taken(&self) -> impl Iterator<Item = &FoundDevice> {
-        self.devices.iter().filter(|device| device.taken)
+    pub fn selected(&self) -> impl Iterator<Item = &FoundDevice> {
+        self.devices.iter().filter(|device| device.selected)
     }
 
     /// Opens the selected device with this number, with its own limits and, if supported, timestamps.
@@ -52,7 +52,7 @@ impl Discovery {
     /// rejects the request.
     pub fn open(&self, number: usize) -> Result<(Device, Queue), GpuError> {
         let mut all = self.devices.iter().zip(&self.adapters);
-        match all.find(|(device, _)| device.taken && device.number == number) {
+        match all.find(|(device, _)| device.selected && device.number == number) {
             Some((_, adapter)) => open(adapter),
             None => Err(GpuError::NoDevice(format!("no usable device has number {number}"))),
         }
@@ -60,12 +60,12 @@ impl Discovery {
 
     /// Reason for which no device is selected, on one line; `None` if one is.
     #[must_use]
-    pub fn why_none(&self) -> Option<String> {
-        if self.taken().next().is_some() {
+    pub fn no_device_reason(&self) -> Option<String> {
+        if self.selected().next().is_some() {
             return None;
         }
         if self.devices.is_empty() {
-            return Some(self.looked.clone());
+            return Some(self.empty_reason.clone());
         }
         let each = |d: &FoundDevice| format!("{} {}: {}", d.number, d.facts.name, d.reason);
         Some(self.devices.iter().map(each).collect::<Vec<_>>().join("; "))
@@ -80,15 +80,15 @@ impl Discovery {
 
 /// Lists all devices and selects some by `choice`. Failures become reasons in the result.
 #[must_use]
-pub fn discover(choice: &DeviceChoice, look: Look) -> Discovery {
-    let signs = hardware::signs();
+pub fn discover(choice: &DeviceChoice, mode: DiscoveryMode) -> Discovery {
+    let nodes = hardware::device_nodes();
     // Only drivers know software devices and device numbers.
-    let named = matches!(choice, DeviceChoice::These(_));
-    match (look, &signs) {
-        (Look::Quick, _) if *choice == DeviceChoice::Cpu => {
+    let named = matches!(choice, DeviceChoice::Listed(_));
+    match (mode, &nodes) {
+        (DiscoveryMode::Quick, _) if *choice == DeviceChoice::Cpu => {
             return Discovery::nothing("the CPU was requested".to_owned());
         }
-        (Look::Quick, Err(why)) if !named => return Discovery::nothing(why.clone()),
+        (DiscoveryMode::Quick, Err(why)) if !named => return Discovery::nothing(why.clone()),
         _ => {}
     }
     let Ok(mut adapters) = catch_unwind(adapters) else {
@@ -99,13 +99,13 @@ pub fn discover(choice: &DeviceChoice, look: Look) -> Discovery {
         let facts = facts(adapter);
         (facts.kind, facts.bus, facts.name, facts.api)
     });
-    let looked = format!(
+    let empty_reason = format!(
         "no driver offers an adapter (searched: {}; hardware: {})",
         if cfg!(target_vendor = "apple") { "Metal" } else { "all Vulkan drivers that the loader finds" },
-        signs.unwrap_or_else(|why| why),
+        nodes.unwrap_or_else(|why| why),
     );
     let devices = choose::select(adapters.iter().map(facts).collect(), choice);
-    Discovery { devices, adapters, looked }
+    Discovery { devices, adapters, empty_reason }
 }
 
 /// All Vulkan and Metal adapters.

@@ -60,7 +60,7 @@ mod worker;
 mod workspace;
 
 pub use backend::GpuBackend;
-pub use discover::{Discovery, Look, discover};
+pub use discover::{Discovery, DiscoveryMode, discover};
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
 pub use executor::Executor;

@@ -11,7 +11,7 @@ use super::picture_passes::PicturePasses;
 use super::picture_targets::Requirements;
 use crate::picture::camera::Camera;
 use crate::picture::{CpuRenderer, Image, PictureError, PictureParams, Rendered, Renderer};
-use crate::surface::{Control, Mesh, Served, Vertices};
+use crate::surface::{BackendIdentity, Control, Mesh, Vertices};
 
 /// Renderer on one device, with an optional fallback to the CPU.
 pub struct GpuRenderer {
@@ -30,9 +30,9 @@ impl GpuRenderer {
     /// # Errors
     /// [`GpuError::NoDevice`] if no device is selected, and errors of opening the device.
     pub fn start(discovery: &Discovery, fallback: Option<CpuRenderer>) -> Result<Self, GpuError> {
-        let mut taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(found, _)| found.taken);
-        let Some((found, adapter)) = taken.next() else {
-            return Err(GpuError::NoDevice(discovery.why_none().unwrap_or_default()));
+        let mut selected = discovery.devices.iter().zip(&discovery.adapters).filter(|(found, _)| found.selected);
+        let Some((found, adapter)) = selected.next() else {
+            return Err(GpuError::NoDevice(discovery.no_device_reason().unwrap_or_default()));
         };
         let passes = Mutex::new(Some(open(adapter)?));
         Ok(Self { adapter: adapter.clone(), device: describe(&found.facts), passes, fallback })
@@ -93,13 +93,13 @@ impl Renderer for GpuRenderer {
 
     fn render(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError> {
         match (self.draw(mesh, params, control), &self.fallback) {
-            (Ok((image, pixel)), _) => Ok(Rendered { image, pixel, served: None }),
+            (Ok((image, pixel)), _) => Ok(Rendered { image, pixel, made_by: None }),
             (Err(DrawError::Picture(error)), _) => Err(error),
             (Err(DrawError::Device(why)), None) => Err(PictureError::Device { why }),
             (Err(DrawError::Device(why)), Some(cpu)) => {
                 let fallback_reason = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
-                let served = Served { fallback_reason, ..cpu.identity() };
-                Ok(Rendered { served: Some(served), ..cpu.render(mesh, params, control)? })
+                let made_by = BackendIdentity { fallback_reason, ..cpu.identity() };
+                Ok(Rendered { made_by: Some(made_by), ..cpu.render(mesh, params, control)? })
             }
         }
     }

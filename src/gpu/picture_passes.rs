@@ -12,7 +12,7 @@ use wgpu::{
 use super::device_errors::DeviceErrors;
 use super::error::GpuError;
 use super::picture_targets::{
-    DEPTH, FinishParams, Layered, NEAREST, NOTHING, PATTERN, SHADE, View, buffer, taps_of, texture,
+    DEPTH, DEPTH_BUFFER, FinishParams, Layered, NO_SURFACE_DEPTH, PATTERN, SHADE, View, buffer, taps_of, texture,
 };
 use super::shaders::{PICTURE, Shader};
 use crate::picture::PictureParams;
@@ -87,7 +87,7 @@ impl PicturePasses {
         let shades = Layered::new(device, "molmesh.picture.shades", SHADE, params);
         let depths = Layered::new(device, "molmesh.picture.depths", DEPTH, params);
         let attachment = TextureUsages::RENDER_ATTACHMENT;
-        let nearest = texture(device, "molmesh.picture.nearest", NEAREST, params, 1, attachment);
+        let nearest = texture(device, "molmesh.picture.nearest", DEPTH_BUFFER, params, 1, attachment);
         let nearest = nearest.create_view(&TextureViewDescriptor::default());
         self.check_errors()?;
 
@@ -180,7 +180,7 @@ fn begin_draw<'a>(
         |view, r| Some(RenderPassColorAttachment { view, depth_slice: None, resolve_target: None, ops: cleared(r) });
     encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
         label: Some("molmesh.picture"),
-        color_attachments: &[color(&views[0], 0.0), color(&views[1], NOTHING)],
+        color_attachments: &[color(&views[0], 0.0), color(&views[1], NO_SURFACE_DEPTH)],
         depth_stencil_attachment: Some(RenderPassDepthStencilAttachment {
             view: nearest,
             depth_ops: Some(Operations { load: LoadOp::Clear(1.0), store: StoreOp::Discard }),
@@ -216,7 +216,7 @@ fn draw_pipeline(device: &Device, [vertex, fragment]: [&Shader; 2]) -> RenderPip
             ..wgpu::PrimitiveState::default()
         },
         depth_stencil: Some(wgpu::DepthStencilState {
-            format: NEAREST,
+            format: DEPTH_BUFFER,
             depth_write_enabled: Some(true),
             depth_compare: Some(wgpu::CompareFunction::Less),
             stencil: wgpu::StencilState::default(),

@@ -19,9 +19,9 @@ pub(super) const SHADE: TextureFormat = TextureFormat::Rgba16Float;
 /// Format of the depth of a sample, Å.
 pub(super) const DEPTH: TextureFormat = TextureFormat::R32Float;
 /// Format of the depth buffer.
-pub(super) const NEAREST: TextureFormat = TextureFormat::Depth32Float;
+pub(super) const DEPTH_BUFFER: TextureFormat = TextureFormat::Depth32Float;
 /// Depth of samples without a surface.
-pub(super) const NOTHING: f64 = 3.0e38;
+pub(super) const NO_SURFACE_DEPTH: f64 = 3.0e38;
 
 /// Uniform of the draw passes, as `shaders/picture/vertex.wgsl` reads it.
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]

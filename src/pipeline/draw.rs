@@ -39,7 +39,7 @@ pub fn draw(
 impl PictureReport {
     /// Returns the report of a picture.
     fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
-        let served = drawn.served.clone().unwrap_or_else(|| drawer.renderer.identity());
+        let made_by = drawn.made_by.clone().unwrap_or_else(|| drawer.renderer.identity());
         Self {
             width: params.width,
             height: params.height,
@@ -49,11 +49,11 @@ impl PictureReport {
             background: params.background.to_string(),
             style: params.style.name(),
             pixel: drawn.pixel,
-            reason: served.reason(&drawer.reason),
-            renderer: served.backend,
-            arithmetic: served.arithmetic,
-            device: served.device,
-            fallback: served.fallback_reason,
+            reason: made_by.reason(&drawer.reason),
+            renderer: made_by.backend,
+            arithmetic: made_by.arithmetic,
+            device: made_by.device,
+            fallback: made_by.fallback_reason,
         }
     }
 }

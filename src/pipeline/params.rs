@@ -11,13 +11,13 @@ use std::str::FromStr;
 use thiserror::Error;
 
 use table::flag;
-pub use table::{Domain, Parameter, TABLE, usual};
+pub use table::{Domain, Parameter, TABLE, usual_range};
 
 use super::nearest::nearest;
-use super::spacing::{DETAILS, LEAST_TRIANGLES, MOST_TRIANGLES};
+use super::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use super::{Job, Spacing};
 use crate::formats::{Compress, Format, Normals, Units};
-use crate::picture::{Background, MOST_SIDE, PictureParams, Style, View};
+use crate::picture::{Background, MAX_SIDE, PictureParams, Style, View};
 use crate::structure::Selection;
 use crate::surface::{Kernel, PaperParams, Preset, SurfaceError, SurfaceOptions, SurfaceParams, Validation};
 
@@ -94,7 +94,7 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
     let Values { options, selection, mut request } = values;
     request.job = Job { selection, params: SurfaceParams::new(&options)?, ..request.job };
     if let Some(format) = request.format {
-        settle(&mut request.job, format)?;
+        set_format(&mut request.job, format)?;
     }
     Ok(request)
 }
@@ -118,7 +118,7 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
 /// # Errors
 /// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals` or a picture parameter that the format does not
 /// support.
-pub fn settle(job: &mut Job, format: Format) -> Result<(), ParamError> {
+pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::extension).collect();
         Err(ParamError::BadValue {
@@ -187,7 +187,7 @@ impl Values {
         let bad = || parameter.invalid(text);
         // The core checks ranges, because they may depend on the kernel.
         let number = || text.trim().parse::<f64>().ok().filter(|v| v.is_finite()).map(Some).ok_or_else(bad);
-        let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MOST_SIDE).contains(n));
+        let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MAX_SIDE).contains(n));
         let angle = || {
             let Domain::Number { min, max, .. } = parameter.domain else { return None };
             text.trim().parse::<f64>().ok().filter(|angle| (min..=max).contains(angle))
@@ -201,8 +201,8 @@ impl Values {
                 self.request.job.spacing = Spacing::Detail(level.and_then(|l| u8::try_from(l).ok()).ok_or_else(bad)?);
             }
             "max_triangles" => {
-                let most =
-                    whole(text).filter(|most| (u64::from(LEAST_TRIANGLES)..=u64::from(MOST_TRIANGLES)).contains(most));
+                let most = whole(text)
+                    .filter(|most| (u64::from(MIN_TRIANGLE_LIMIT)..=u64::from(MAX_TRIANGLE_LIMIT)).contains(most));
                 self.request.job.spacing = Spacing::MaxTriangles(most.ok_or_else(bad)?);
             }
             "isovalue" => self.options.isovalue = number()?,

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::column::Column;
 use super::control::Control;
 use super::error::SurfaceError;
-use super::labels::{self, Joined, Labels};
+use super::labels::{self, Labels, PartLabels};
 use super::mesh::Mesh;
 use super::sums::{self, Positions, Sums};
 use super::topology::{self, Topology};
@@ -138,7 +138,7 @@ impl Totals {
     fn of(mesh: &Mesh) -> Self {
         let mut of_vertex = Column::zeroed(mesh.n_vertices());
         let positions = Positions::from(mesh);
-        let (joined, sums): (Vec<Joined>, Vec<Sums>) = labels::split(mesh, &mut of_vertex)
+        let (joined, sums): (Vec<PartLabels>, Vec<Sums>) = labels::split(mesh, &mut of_vertex)
             .into_par_iter()
             .with_max_len(1)
             .map(|mut part| {

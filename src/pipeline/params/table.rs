@@ -4,8 +4,8 @@ use std::str::FromStr;
 
 use super::ParamError;
 use crate::formats::{Compress, Normals, Units};
-use crate::picture::{Background, MOST_SIDE, Style, View};
-use crate::pipeline::spacing::{LEAST_TRIANGLES, MOST_TRIANGLES};
+use crate::picture::{Background, MAX_SIDE, Style, View};
+use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::structure::select::KIND_NAMES;
 use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Kernel, Preset, Validation};
@@ -117,7 +117,7 @@ const fn number(
 
 /// Returns the usual range of a number, for sliders; by default its bounds.
 #[must_use]
-pub fn usual(parameter: &Parameter) -> Option<[f64; 2]> {
+pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
     let Domain::Number { min, max, .. } = parameter.domain else { return None };
     Some(match parameter.name {
         "resolution" => [0.2, 2.0],
@@ -173,7 +173,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "max_triangles",
-        domain: Domain::Integer { min: LEAST_TRIANGLES as i64, max: MOST_TRIANGLES as i64 },
+        domain: Domain::Integer { min: MIN_TRIANGLE_LIMIT as i64, max: MAX_TRIANGLE_LIMIT as i64 },
         default: "absent",
         doc: "Maximum number of triangles: selects the finest grid spacing from 0.25 to 4 Å that does not exceed it. Replaces resolution.",
     },
@@ -283,13 +283,13 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "width",
-        domain: Domain::Integer { min: 1, max: MOST_SIDE as i64 },
+        domain: Domain::Integer { min: 1, max: MAX_SIDE as i64 },
         default: "512",
         doc: "Width of the picture in pixels; png only.",
     },
     Parameter {
         name: "height",
-        domain: Domain::Integer { min: 1, max: MOST_SIDE as i64 },
+        domain: Domain::Integer { min: 1, max: MAX_SIDE as i64 },
         default: "512",
         doc: "Height of the picture in pixels; png only.",
     },

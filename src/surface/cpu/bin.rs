@@ -147,7 +147,7 @@ pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits)
     let excess = samples as f64 / limits.max_samples.max(1) as f64;
     let mut fitting = lattice.spacing * excess.max(1.0).cbrt();
     // Coarsens the spacing until an upper bound of the samples fits; a box of one cell needs 27 blocks at most.
-    while samples_at_most(lattice, fitting) > limits.max_samples as f64 && fitting < MAX_RESOLUTION {
+    while max_samples(lattice, fitting) > limits.max_samples as f64 && fitting < MAX_RESOLUTION {
         fitting *= 1.08;
     }
     SurfaceError::GridTooLarge {
@@ -163,12 +163,12 @@ pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits)
 /// # Errors
 /// Returns [`SurfaceError::GridTooLarge`].
 pub(crate) fn check_lower_bound(lattice: &Lattice, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
-    let least = to_u64(samples_at_least(lattice));
+    let least = to_u64(min_samples(lattice));
     if least > limits.max_samples { Err(too_large(lattice, least, limits)) } else { Ok(()) }
 }
 
 /// A lower bound of the samples: the volume of the blocks that lie wholly within some atom's reach.
-fn samples_at_least(lattice: &Lattice) -> f64 {
+fn min_samples(lattice: &Lattice) -> f64 {
     let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(f64::MAX, f64::min);
     // Half the least reach: a sphere then holds a few blocks wherever it lies.
     let side = 0.5 * reach;
@@ -187,7 +187,7 @@ fn samples_at_least(lattice: &Lattice) -> f64 {
 
 /// An upper bound of the samples at another `spacing` (Å): blocks as long as the reach and a brick together that
 /// hold an atom, with their neighbours, contain every brick in reach.
-fn samples_at_most(lattice: &Lattice, spacing: f64) -> f64 {
+fn max_samples(lattice: &Lattice, spacing: f64) -> f64 {
     let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
     let side = reach + spacing * f64::from(BRICK);
     let scale = lattice.spacing / side;

@@ -41,7 +41,7 @@ pub(super) struct SurfaceBrick {
 
 /// Results of `classify` for the bricks of one tile, appended brick by brick.
 #[derive(Debug, Default)]
-pub(super) struct Found {
+pub(super) struct ClassifiedBricks {
     /// Bricks with surface, by slot.
     pub(super) bricks: Vec<SurfaceBrick>,
     /// Parameter of each vertex along its edge, from the owning sample, in vertex order.
@@ -65,7 +65,7 @@ const USUAL: usize = 96;
 
 /// Counts of a tile before a brick.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Before {
+pub(super) struct CountsBefore {
     pub(super) vertices: usize,
     pub(super) triangles: usize,
     pub(super) cases: usize,
@@ -73,7 +73,7 @@ pub(super) struct Before {
 
 /// Samples of a brick and of its seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
 #[derive(Clone, Copy)]
-pub(super) struct Around<'a> {
+pub(super) struct Neighbourhood<'a> {
     /// Inside bits of the brick and its neighbours.
     pub(super) inside: [&'a Inside; 8],
     /// Densities likewise.
@@ -113,7 +113,7 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
     }
 }
 
-impl Found {
+impl ClassifiedBricks {
     /// Returns an empty value with capacity for `bricks` bricks, usually more than needed: growing would copy, and
     /// untouched memory costs nothing.
     pub(super) fn with_capacity(bricks: usize) -> Self {
@@ -160,10 +160,13 @@ impl Found {
 
     /// Returns the vertices, triangles and cases of the tile before brick `i`; the totals if `i` is the number of
     /// bricks.
-    pub(super) fn before(&self, i: usize) -> Before {
-        let all =
-            Before { vertices: self.vertices as usize, triangles: self.triangles as usize, cases: self.cases.len() };
-        self.bricks.get(i).map_or(all, |brick| Before {
+    pub(super) fn before(&self, i: usize) -> CountsBefore {
+        let all = CountsBefore {
+            vertices: self.vertices as usize,
+            triangles: self.triangles as usize,
+            cases: self.cases.len(),
+        };
+        self.bricks.get(i).map_or(all, |brick| CountsBefore {
             vertices: brick.vertex as usize,
             triangles: brick.triangle as usize,
             cases: brick.case as usize,
@@ -171,7 +174,7 @@ impl Found {
     }
 
     /// Classifies one brick and appends its results. Returns its index if it holds any surface.
-    pub(super) fn add(&mut self, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) -> Option<u16> {
+    pub(super) fn add(&mut self, slot: usize, around: &Neighbourhood<'_>, iso: f32, candidates: &[u32]) -> Option<u16> {
         let n = self.bricks.len();
         classify(self, slot, around, iso, candidates);
         // A tile has 512 bricks.
@@ -180,7 +183,7 @@ impl Found {
 }
 
 dispatched! {
-fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) {
+fn classify(found: &mut ClassifiedBricks, slot: usize, around: &Neighbourhood<'_>, iso: f32, candidates: &[u32]) {
     let corners: [[u64; 8]; 8] = std::array::from_fn(|z| std::array::from_fn(|c| shifted(&around.inside, c, z)));
     let active = corners.map(|c| c.iter().fold(0, |m, w| m | w) & !c.iter().fold(u64::MAX, |m, w| m & w));
     if active == [0; 8] {
@@ -297,9 +300,9 @@ fn ones(word: u64) -> u16 {
 
 /// Computes the crossing edges, and the point along each at which the density is `iso`, by linear interpolation.
 #[inline(always)]
-fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut Found) {
+fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut ClassifiedBricks) {
     const STEP: [usize; 3] = [1, 8, 64];
-    let Found { t, edges, .. } = found;
+    let ClassifiedBricks { t, edges, .. } = found;
     let first = t.len();
     // Densities at both ends first, one division per vector afterwards: `t` holds F(owner) − iso meanwhile.
     t.resize(first + usize::from(n), 0.0);

@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use super::bin::NORMAL_ONLY;
+use super::brick_atoms::{BrickAtoms, LANES, extent};
 use super::edge::Edge;
-use super::reach::{Around, LANES, extent};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::kernel::{MIN_DISTANCE2, Profile};
@@ -45,13 +45,13 @@ impl SlopeConstants {
 
 /// Vertices of one brick in its own coordinates, spacings from its first sample, and the atoms around them.
 #[derive(Debug, Default)]
-pub(super) struct Batch {
+pub(super) struct VertexBatch {
     p: [Vec<f32>; 3],
     n: [Vec<f32>; 3],
-    atoms: Around,
+    atoms: BrickAtoms,
 }
 
-impl Batch {
+impl VertexBatch {
     /// Places a brick's vertices in order; pads the count to whole vectors by repeating the last one.
     fn place(&mut self, edges: &[Edge], t: &[f32]) {
         let padded = t.len().next_multiple_of(LANES);
@@ -80,7 +80,7 @@ fn places(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
 }
 
 /// Inputs of a brick's vertices.
-pub(super) struct Source<'a> {
+pub(super) struct BrickVertices<'a> {
     /// The brick's first sample.
     pub(super) origin: [i32; 3],
     /// The brick's candidate atoms.
@@ -92,14 +92,14 @@ pub(super) struct Source<'a> {
 }
 
 /// Rows of a mesh's vertices. Normals are zero where the gradient vanishes, to be filled from the triangles.
-pub(super) enum Rows<'a> {
+pub(super) enum VertexRows<'a> {
     /// Positions relative to the mesh's centre, Å, and unit normals.
     Single { positions: &'a mut [[f32; 3]], normals: &'a mut [[f32; 3]] },
     /// The same in steps, and in units of 1/127.
     Quantized { step: Step, positions: &'a mut [[i16; 4]], normals: &'a mut [[i8; 4]] },
 }
 
-impl<'a> Rows<'a> {
+impl<'a> VertexRows<'a> {
     /// All rows of some quantised vertices.
     pub(super) fn of(quantized: &'a mut Quantized) -> Self {
         let Quantized { step, positions, normals } = quantized;
@@ -107,14 +107,16 @@ impl<'a> Rows<'a> {
     }
 
     /// Some of the rows.
-    pub(super) fn slice(&mut self, rows: Range<usize>) -> Rows<'_> {
+    pub(super) fn slice(&mut self, rows: Range<usize>) -> VertexRows<'_> {
         match self {
             Self::Single { positions, normals } => {
-                Rows::Single { positions: &mut positions[rows.clone()], normals: &mut normals[rows] }
+                VertexRows::Single { positions: &mut positions[rows.clone()], normals: &mut normals[rows] }
             }
-            Self::Quantized { step, positions, normals } => {
-                Rows::Quantized { step: *step, positions: &mut positions[rows.clone()], normals: &mut normals[rows] }
-            }
+            Self::Quantized { step, positions, normals } => VertexRows::Quantized {
+                step: *step,
+                positions: &mut positions[rows.clone()],
+                normals: &mut normals[rows],
+            },
         }
     }
 
@@ -140,8 +142,8 @@ pub(super) fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
 }
 
 /// Destination of a brick's vertices.
-pub(super) struct Target<'a> {
-    pub(super) rows: Rows<'a>,
+pub(super) struct VertexTarget<'a> {
+    pub(super) rows: VertexRows<'a>,
     /// Nearest sphere of each vertex, in the caller's numbering.
     pub(super) atom_ids: Option<&'a mut [u32]>,
 }
@@ -156,12 +158,12 @@ const BLOCK: usize = 4096;
 pub(super) fn interpolate(
     lattice: &Lattice,
     slope: &SlopeConstants,
-    source: &Source<'_>,
-    batch: &mut Batch,
-    target: Target<'_>,
+    source: &BrickVertices<'_>,
+    batch: &mut VertexBatch,
+    target: VertexTarget<'_>,
     control: &Control<'_>,
 ) -> Result<usize, SurfaceError> {
-    let Source { origin, candidates, t, edges } = *source;
+    let BrickVertices { origin, candidates, t, edges } = *source;
     batch.place(edges, t);
     batch.n.iter_mut().for_each(|column| column.fill(0.0));
     for block in candidates.chunks(BLOCK) {
@@ -174,8 +176,10 @@ pub(super) fn interpolate(
     }
     let offset: [f64; 3] = std::array::from_fn(|k| f64::from(origin[k] - lattice.centre[k]));
     Ok(match target.rows {
-        Rows::Single { positions, normals } => finish(lattice.spacing, offset, batch, positions, normals),
-        Rows::Quantized { step, positions, normals } => round(lattice.spacing, offset, batch, step, positions, normals),
+        VertexRows::Single { positions, normals } => finish(lattice.spacing, offset, batch, positions, normals),
+        VertexRows::Quantized { step, positions, normals } => {
+            round(lattice.spacing, offset, batch, step, positions, normals)
+        }
     })
 }
 
@@ -201,7 +205,7 @@ fn normal([x, y, z]: [f32; 3]) -> ([f32; 3], bool) {
 fn write<P, N>(
     spacing: f64,
     offset: [f64; 3],
-    batch: &Batch,
+    batch: &VertexBatch,
     (positions, position_of): (&mut [P], impl Fn([f32; 3]) -> P),
     (normals, normal_of): (&mut [N], impl Fn([f32; 3]) -> N),
 ) -> usize {
@@ -221,7 +225,7 @@ fn write<P, N>(
 
 dispatched! {
 /// Positions in Å and normals of length 1, row by row.
-fn finish(spacing: f64, offset: [f64; 3], batch: &Batch, positions: &mut [[f32; 3]], normals: &mut [[f32; 3]]) -> usize {
+fn finish(spacing: f64, offset: [f64; 3], batch: &VertexBatch, positions: &mut [[f32; 3]], normals: &mut [[f32; 3]]) -> usize {
     write(spacing, offset, batch, (positions, |p| p), (normals, |n| n))
 }
 }
@@ -231,7 +235,7 @@ dispatched! {
 fn round(
     spacing: f64,
     offset: [f64; 3],
-    batch: &Batch,
+    batch: &VertexBatch,
     step: Step,
     positions: &mut [[i16; 4]],
     normals: &mut [[i8; 4]],
@@ -242,7 +246,12 @@ fn round(
 
 /// Adds −∇F of the candidates to each vertex's sum, up to a common factor.
 #[inline(always)]
-fn sum_gradients<const FMA: bool>(c: &SlopeConstants, around: &mut Around, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
+fn sum_gradients<const FMA: bool>(
+    c: &SlopeConstants,
+    around: &mut BrickAtoms,
+    p: &[Vec<f32>; 3],
+    n: &mut [Vec<f32>; 3],
+) {
     let [px, py, pz] = p;
     let [nx, ny, nz] = n;
     let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
@@ -281,7 +290,7 @@ fn sum_gradients<const FMA: bool>(c: &SlopeConstants, around: &mut Around, p: &[
 }
 
 dispatched! {
-fn gradients(c: &SlopeConstants, around: &mut Around, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
+fn gradients(c: &SlopeConstants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
         match c.kernel {
             Kernel::Gaussian => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::Gaussian, ..*c }, around, p, n),

@@ -9,12 +9,12 @@ use std::sync::{Mutex, PoisonError};
 
 use super::bin::{Tiles, slot_origin};
 use super::emit;
-use super::interpolate::{self, Batch, Rows, SlopeConstants, Source, Target, take};
+use super::interpolate::{self, BrickVertices, SlopeConstants, VertexBatch, VertexRows, VertexTarget, take};
 use super::join;
-use super::near::{self, Numbered};
+use super::neighbours::{self, NumberedBrick};
+use super::piece_sums::PieceSums;
 use super::sheets::Sheets;
 use super::table::{BrickTable, Rounding};
-use super::tally::Tally;
 use super::{Piece, Scanned, Tile, threads};
 use crate::surface::backend::{MeshOutput, StreamedMesh};
 use crate::surface::column::Column;
@@ -41,7 +41,7 @@ struct Scratch {
 /// Working memory of the stages.
 #[derive(Default)]
 struct Stages {
-    batch: Batch,
+    batch: VertexBatch,
     table: BrickTable,
     sheets: Sheets,
 }
@@ -57,7 +57,7 @@ struct ScratchRows {
 
 /// Rows of the mesh that a piece fills.
 struct PieceRows<'a> {
-    rows: Rows<'a>,
+    rows: VertexRows<'a>,
     triangles: &'a mut [[u32; 3]],
     atom_ids: Option<&'a mut [u32]>,
 }
@@ -70,11 +70,11 @@ enum Destination<'a> {
 }
 
 /// Summary of a piece.
-pub(super) struct Written {
+pub(super) struct PieceSummary {
     /// Vertices whose gradient vanishes.
     flat: usize,
     /// Sums over its triangles.
-    pub(super) tally: Tally,
+    pub(super) sums: PieceSums,
     /// Bounds of its positions, Å; for a sink only.
     bounds: Option<[[f32; 3]; 2]>,
 }
@@ -125,8 +125,8 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
         parts: done.iter().map(|tile| (tile.first_vertex, tile.first_triangle)).collect(),
     };
     let mut rows = match &mut mesh.quantized {
-        Some(quantized) => Rows::of(quantized),
-        None => Rows::Single { positions: &mut mesh.positions, normals: &mut mesh.normals },
+        Some(quantized) => VertexRows::of(quantized),
+        None => VertexRows::Single { positions: &mut mesh.positions, normals: &mut mesh.normals },
     };
     let (mut triangles, mut ids) = (&mut mesh.triangles[..], mesh.atom_ids.as_deref_mut());
     let of_piece = pieces.iter().map(|piece| {
@@ -147,7 +147,7 @@ fn write_pieces(
     scanned: &Scanned,
     control: &Control<'_>,
     destination: &Destination<'_>,
-) -> Result<Vec<Written>, SurfaceError> {
+) -> Result<Vec<PieceSummary>, SurfaceError> {
     let Scanned { lattice, pieces, .. } = scanned;
     let writer = Writer { scanned, slope: SlopeConstants::new(&lattice.profile, lattice.spacing), control };
     let finished = AtomicUsize::new(0);
@@ -181,22 +181,23 @@ impl Writer<'_> {
         scratch: &mut ScratchRows,
         stages: &mut Stages,
         sink: &dyn MeshSink,
-    ) -> Result<Written, SurfaceError> {
+    ) -> Result<PieceSummary, SurfaceError> {
         let [n, m] = self.scanned.size_of(piece);
         let rows = match self.scanned.quantize {
-            None => {
-                Rows::Single { positions: first(&mut scratch.positions, n), normals: first(&mut scratch.normals, n) }
-            }
+            None => VertexRows::Single {
+                positions: first(&mut scratch.positions, n),
+                normals: first(&mut scratch.normals, n),
+            },
             Some(step) => {
                 let (positions, normals) = &mut scratch.quantized;
-                Rows::Quantized { step, positions: first(positions, n), normals: first(normals, n) }
+                VertexRows::Quantized { step, positions: first(positions, n), normals: first(normals, n) }
             }
         };
         let mut rows = PieceRows { rows, triangles: first(&mut scratch.triangles, m), atom_ids: None };
         let mut written = self.write(piece, &mut rows, stages)?;
         let vertices = match rows.rows {
-            Rows::Single { positions, normals } => Vertices::Single { positions, normals },
-            Rows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
+            VertexRows::Single { positions, normals } => Vertices::Single { positions, normals },
+            VertexRows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
         };
         written.bounds = vertices.bounds();
         let tile = &self.scanned.done[piece.tile];
@@ -212,14 +213,24 @@ impl Writer<'_> {
     }
 
     /// Writes the vertices and triangles of a piece and sums over them.
-    fn write(&self, piece: &Piece, rows: &mut PieceRows<'_>, stages: &mut Stages) -> Result<Written, SurfaceError> {
+    fn write(
+        &self,
+        piece: &Piece,
+        rows: &mut PieceRows<'_>,
+        stages: &mut Stages,
+    ) -> Result<PieceSummary, SurfaceError> {
         let flat = self.control.span(Stage::Interpolate, || self.interpolate(piece, rows, &mut stages.batch))?;
-        let tally = self.control.span(Stage::Emit, || self.emit(piece, rows.triangles, stages));
-        Ok(Written { flat, tally, bounds: None })
+        let sums = self.control.span(Stage::Emit, || self.emit(piece, rows.triangles, stages));
+        Ok(PieceSummary { flat, sums, bounds: None })
     }
 
     /// Writes the vertices. Returns the number of vertices without a gradient.
-    fn interpolate(&self, piece: &Piece, out: &mut PieceRows<'_>, batch: &mut Batch) -> Result<usize, SurfaceError> {
+    fn interpolate(
+        &self,
+        piece: &Piece,
+        out: &mut PieceRows<'_>,
+        batch: &mut VertexBatch,
+    ) -> Result<usize, SurfaceError> {
         let tile = &self.scanned.done[piece.tile];
         let found = &tile.found;
         let base = found.before(piece.bricks.start).vertices;
@@ -230,11 +241,11 @@ impl Writer<'_> {
                 continue;
             }
             let rows = all.start - base..all.end - base;
-            let target = Target {
+            let target = VertexTarget {
                 rows: out.rows.slice(rows.clone()),
                 atom_ids: out.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
             };
-            let source = Source {
+            let source = BrickVertices {
                 origin: slot_origin(tile.coord, usize::from(brick.slot)),
                 candidates: &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize],
                 t: &found.t[all.clone()],
@@ -247,16 +258,16 @@ impl Writer<'_> {
     }
 
     /// Writes the triangles. Returns the sums over them.
-    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> Tally {
+    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> PieceSums {
         let (scanned, Stages { table, sheets, .. }) = (self.scanned, stages);
         let tile = &scanned.done[piece.tile];
-        let near = Near::new(&scanned.tiles, &scanned.done, tile.coord);
+        let near = TileNeighbours::new(&scanned.tiles, &scanned.done, tile.coord);
         let found = &tile.found;
         let base = found.before(piece.bricks.start).triangles;
-        let mut tally = Tally::with_capacity(piece.bricks.len());
+        let mut sums = PieceSums::with_capacity(piece.bricks.len());
         for i in piece.bricks.clone() {
             let (brick, before, end) = (&found.bricks[i], found.before(i), found.before(i + 1));
-            let around: [Option<Numbered<'_>>; 8] =
+            let around: [Option<NumberedBrick<'_>>; 8] =
                 std::array::from_fn(|n| near.of(usize::from(brick.slot), n).map(|(_, _, numbered)| numbered));
             let cases = &found.cases[before.cases..end.cases];
             let out = &mut triangles[before.triangles - base..end.triangles - base];
@@ -267,9 +278,9 @@ impl Writer<'_> {
             let origin = slot_origin(tile.coord, usize::from(brick.slot));
             let rounding = scanned.quantize.map(|step| scanned.rounding(step, origin));
             emit::emit(table, sheets, &around, cases, own_sheets, rounding, out);
-            tally.add(table, sheets, &around, origin, out);
+            sums.add(table, sheets, &around, origin, out);
         }
-        tally
+        sums
     }
 }
 
@@ -289,11 +300,11 @@ impl Scanned {
 }
 
 /// A tile and its neighbours towards +x, +y, +z.
-pub(super) struct Near<'a> {
+pub(super) struct TileNeighbours<'a> {
     tiles: [Option<(usize, &'a Tile)>; 8],
 }
 
-impl<'a> Near<'a> {
+impl<'a> TileNeighbours<'a> {
     pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3]) -> Self {
         Self {
             tiles: std::array::from_fn(|n| {
@@ -306,8 +317,8 @@ impl<'a> Near<'a> {
     /// The neighbour `n` (bits: 0 x, 1 y, 2 z; 0 is the brick itself) of the brick in `slot`, if the surface intersects
     /// it: the index of its tile, its index in the tile, and the brick.
     #[inline(always)]
-    pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, Numbered<'a>)> {
-        let (slot, beyond) = near::neighbour_slot(slot, n);
+    pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, NumberedBrick<'a>)> {
+        let (slot, beyond) = neighbours::neighbour_slot(slot, n);
         let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
         let (ix, numbered) = tile.numbered(slot)?;
         Some((t, ix, numbered))
