@@ -35,8 +35,7 @@ impl GpuBackend {
         if let Some(why) = discovery.no_device_reason() {
             return Err(GpuError::NoDevice(why));
         }
-        let selected = discovery.devices.iter().zip(&discovery.adapters).filter(|(device, _)| device.selected);
-        let devices = selected.map(|(device, adapter)| {
+        let devices = discovery.selected_adapters().map(|(device, adapter)| {
             let adapter = adapter.clone();
             let build = Box::new(move || {
                 let (device, queue) = discover::open(&adapter)?;

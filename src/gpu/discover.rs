@@ -45,14 +45,18 @@ impl Discovery {
         self.devices.iter().filter(|device| device.selected)
     }
 
+    /// Returns the selected devices with their adapters.
+    pub(super) fn selected_adapters(&self) -> impl Iterator<Item = (&FoundDevice, &Adapter)> {
+        self.devices.iter().zip(&self.adapters).filter(|(device, _)| device.selected)
+    }
+
     /// Opens the selected device with this number, with its own limits and, if supported, timestamps.
     ///
     /// # Errors
     /// Returns [`GpuError::NoDevice`] if no selected device has the number, and [`GpuError::Failed`] if the driver
     /// rejects the request.
     pub fn open(&self, number: usize) -> Result<(Device, Queue), GpuError> {
-        let mut all = self.devices.iter().zip(&self.adapters);
-        match all.find(|(device, _)| device.selected && device.number == number) {
+        match self.selected_adapters().find(|(device, _)| device.number == number) {
             Some((_, adapter)) => open(adapter),
             None => Err(GpuError::NoDevice(format!("no usable device has number {number}"))),
         }

@@ -22,9 +22,6 @@ use super::recording::{Dispatch, Recording, StageTimer};
 use super::workspace::{BufferSizes, OutputCapacity, ROW, Workspace};
 use crate::surface::lattice::{LatticeAtom, slightly_coarser};
 
-/// Maximum number of storage buffers that a stage binds.
-const MAX_BINDINGS: u32 = 14;
-
 /// Resources that the engine may use of its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Budget {
@@ -113,11 +110,6 @@ impl Engine {
     /// Those of [`Self::new`].
     pub fn with_budget(device: Device, queue: Queue, budget: Budget) -> Result<Self, GpuError> {
         let limits = device.limits();
-        let bindings = limits.max_storage_buffers_per_shader_stage;
-        if bindings < MAX_BINDINGS {
-            let why = format!("{bindings} storage buffers per stage are supported, {MAX_BINDINGS} are needed");
-            return Err(GpuError::Failed(why));
-        }
         let errors = DeviceErrors::listen(&device);
         let pipelines = Pipelines::new(&device);
         let table = layout::case_table();

@@ -8,7 +8,7 @@ use super::error::GpuError;
 use super::job::{Finished, JobResult};
 use super::output_layout::{COUNTERS_OFFSET, ReadbackLayout, ReadbackRows, byte_range, values};
 use super::pipelines::{N_STAGES, STAGES};
-use super::plan::layout::{self, Counters, GROUP};
+use super::plan::layout::{self, Counters};
 use super::readback::ReadbackBuffer;
 use super::submit::{PendingSubmission, StageTimes};
 use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage};
@@ -20,8 +20,6 @@ pub(super) struct ChunkCounts {
     pub(super) groups: Vec<[u32; 4]>,
     /// Number of vertices and triangles before the chunk.
     pub(super) first: [u64; 2],
-    pub(super) n_vertices: u64,
-    pub(super) n_triangles: u64,
 }
 
 /// Output piece that was submitted and has not been collected.
@@ -82,8 +80,7 @@ impl<'a> JobState<'a> {
             let why = format!("{} candidates where {} were planned", counters.list_end, chunk.candidates);
             return Err(GpuError::Failed(why));
         }
-        let n_groups = u64::from(chunk.n_own.div_ceil(GROUP));
-        let groups: Vec<[u32; 4]> = values(readback.as_ref(), offset, n_groups)?.to_vec();
+        let groups: Vec<[u32; 4]> = values(readback.as_ref(), offset, chunk.n_groups())?.to_vec();
         let first = self.total;
         for &[vertices, triangles, bricks, _] in &groups {
             if let [Ok(vertex), Ok(triangle)] = self.total.map(usize::try_from) {
@@ -97,8 +94,7 @@ impl<'a> JobState<'a> {
         if end != self.total.map(|n| n & u64::from(u32::MAX)) {
             return Err(GpuError::Failed(format!("the scan ends at {end:?}, the groups at {:?}", self.total)));
         }
-        let [n_vertices, n_triangles] = [self.total[0] - first[0], self.total[1] - first[1]];
-        Ok(ChunkCounts { groups, first, n_vertices, n_triangles })
+        Ok(ChunkCounts { groups, first })
     }
 
     /// Checks the counts so far against the limits.

@@ -30,8 +30,7 @@ impl GpuRenderer {
     /// # Errors
     /// [`GpuError::NoDevice`] if no device is selected, and errors of opening the device.
     pub fn start(discovery: &Discovery, fallback: Option<CpuRenderer>) -> Result<Self, GpuError> {
-        let mut selected = discovery.devices.iter().zip(&discovery.adapters).filter(|(found, _)| found.selected);
-        let Some((found, adapter)) = selected.next() else {
+        let Some((found, adapter)) = discovery.selected_adapters().next() else {
             return Err(GpuError::NoDevice(discovery.no_device_reason().unwrap_or_default()));
         };
         let passes = Mutex::new(Some(open(adapter)?));

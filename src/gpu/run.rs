@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::buffers::BufferId;
-use super::count::{group_bytes, narrow};
+use super::count::narrow;
 use super::engine::{Engine, LoadedJob};
 use super::error::GpuError;
 use super::executor::Executor;
@@ -116,7 +116,7 @@ impl Engine {
         for (loaded, capacity) in jobs {
             let rows = [capacity.vertices, capacity.triangles];
             let layout = ReadbackLayout::new(rows, loaded.vertex);
-            let groups = group_bytes(&loaded.chunks[0]);
+            let groups = 16 * loaded.chunks[0].n_groups();
             let readback = self.readback.acquire(&self.device, layout.end + groups);
             let target = &readback.buffer;
             recording.copy_timestamps(target);
@@ -142,7 +142,7 @@ impl Engine {
         let mut times = [0; N_STAGES];
         self.add_times(&mut times, readback, 0..N_STAGES)?;
         state.times = times.map(|ns| portion(ns, share));
-        let (n_vertices, n_triangles) = (counts.n_vertices, counts.n_triangles);
+        let [n_vertices, n_triangles] = state.total;
         if n_vertices > capacity.vertices || n_triangles > capacity.triangles {
             self.make_output(state, &[(0, &counts)], Stage::Interpolate)?;
             self.make_triangles(state, &[counts])?;

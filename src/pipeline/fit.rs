@@ -17,10 +17,10 @@ const TRIES_BEFORE_COARSEST: u32 = 4;
 const FULL: f64 = 0.95;
 /// Fraction of the limit that the search aims at. It is below 1, as the power law is not exact.
 const AIM: f64 = 0.98;
-/// Spacing of the first mesh as a multiple of the expected one.
-const COARSER: f64 = 2.0;
-/// Minimum spacing of the first mesh, Å.
-const COARSE: f64 = 1.0;
+/// Spacing of a first, coarse mesh as a multiple of the expected one.
+pub(super) const COARSER: f64 = 2.0;
+/// Minimum spacing of that mesh, Å.
+pub(super) const COARSE: f64 = 1.0;
 
 /// Next step of the search.
 #[derive(Debug, Clone, Copy, PartialEq)]

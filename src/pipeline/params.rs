@@ -224,9 +224,7 @@ impl Values {
                 expected: e.expected,
             })?,
             "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
-            "validation" => {
-                self.request.job.validation = named(&VALIDATIONS, Validation::name, text).ok_or_else(bad)?
-            }
+            "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
             "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
             "format" => self.request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
             "compress" => self.request.job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
@@ -244,8 +242,6 @@ impl Values {
         Ok(())
     }
 }
-
-const VALIDATIONS: [Validation; 2] = [Validation::Checksum, Validation::Exact];
 
 /// Returns the value with this name.
 fn named<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, text: &str) -> Option<T> {

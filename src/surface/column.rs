@@ -228,12 +228,6 @@ impl<T: Pod + PartialEq> PartialEq for Column<T> {
     }
 }
 
-impl<T: Pod + PartialEq> PartialEq<Column<T>> for Vec<T> {
-    fn eq(&self, other: &Column<T>) -> bool {
-        **self == **other
-    }
-}
-
 impl<T: Pod + fmt::Debug> fmt::Debug for Column<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "Column({} rows)", self.len())

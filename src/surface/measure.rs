@@ -2,6 +2,9 @@
 //!
 //! Sums run over the parts of the mesh, merged in order: the same mesh gives the same digits on any number of threads.
 
+use std::fmt;
+use std::str::FromStr;
+
 use rayon::prelude::*;
 
 use super::column::Column;
@@ -9,6 +12,7 @@ use super::control::Control;
 use super::error::SurfaceError;
 use super::labels::{self, Labels, PartLabels};
 use super::mesh::Mesh;
+use super::params::named;
 use super::sums::{self, Positions, Sums};
 use super::topology::{self, Topology};
 
@@ -25,16 +29,7 @@ pub enum Validation {
     Exact,
 }
 
-impl Validation {
-    /// `checksum` or `exact`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Checksum => "checksum",
-            Self::Exact => "exact",
-        }
-    }
-}
+named!(Validation, "validation", Checksum => "checksum", Exact => "exact");
 
 /// One connected component of a mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

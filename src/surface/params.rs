@@ -48,6 +48,7 @@ pub enum Preset {
     Quicksurf,
 }
 
+/// Implements names, [`Display`](fmt::Display) and [`FromStr`] for an enum of named values.
 macro_rules! named {
     ($type:ident, $what:literal, $($variant:ident => $name:literal),+ $(,)?) => {
         impl $type {
@@ -82,6 +83,8 @@ macro_rules! named {
         }
     };
 }
+
+pub(super) use named;
 
 named!(Kernel, "kernel", Gaussian => "gaussian", SoftObject => "soft-object", InverseSquare => "inverse-square");
 named!(Preset, "preset", Default => "default", SesLike => "ses-like", VdwLike => "vdw-like", Molstar => "molstar",

@@ -6,7 +6,7 @@
 use super::backend::{Backend, GridStats, MeshOutput};
 use super::cases::{CASES, cell_edge};
 use super::control::{Control, Stage};
-use super::cpu::scan::too_large as mesh_too_large;
+use super::cpu::scan;
 use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
 use super::lattice::{EDGE_MARGIN, slightly_coarser, to_f32, to_i32, to_u64};
@@ -173,10 +173,7 @@ impl Backend for ReferenceBackend {
         if mesh.n_triangles() == 0 {
             return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
         }
-        let bytes = Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64);
-        if bytes > limits.max_mesh_bytes {
-            return Err(mesh_too_large(bytes, h, limits.max_mesh_bytes));
-        }
+        scan::check_size(params, limits, mesh.n_vertices() as u64, mesh.n_triangles() as u64)?;
         let n = grid.len() as u64;
         let stats =
             GridStats { bricks: 0, surface_bricks: 0, samples: n, box_cells: cases.len() as u64, candidates: 0 };

@@ -15,7 +15,6 @@ use self::layout::{NONE, Params, Tile, halves};
 pub use self::partition::Partition;
 use crate::surface::cpu;
 use crate::surface::cpu::field::Constants;
-use crate::surface::cpu::interpolate::SlopeConstants;
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, tile_of, tile_order, to_f32, to_u32, to_u64};
 use crate::surface::occupancy::{BrickBits, Occupancy, TileOccupancy, count_ones, local_brick};
 use crate::surface::{Control, Step, SurfaceError, SurfaceLimits, SurfaceParams};
@@ -75,7 +74,6 @@ impl Plan {
     #[must_use]
     pub fn params(&self, lattice: &Lattice, params: &SurfaceParams) -> Params {
         let field = Constants::new(&lattice.profile, lattice.spacing);
-        let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
         // An atom lies at most half a spacing outside the samples of its brick.
         let bricks = |reach: f32| u32::try_from(to_u64(f64::from(reach) / f64::from(BRICK))).unwrap_or(u32::MAX);
         Params {
@@ -90,8 +88,8 @@ impl Plan {
             tail_end: field.tail_end,
             amplitude: field.amplitude,
             u_min: field.u_min,
-            slope_offset: slope.offset,
-            slope_tail: slope.tail,
+            slope_offset: field.slope_offset,
+            slope_tail: field.slope_tail,
             reach: self.max_reach,
             back: bricks(self.max_reach + 7.51),
             ahead: bricks(self.max_reach + 8.51),

@@ -136,7 +136,6 @@ const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
 const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
-const VALIDATIONS: &[&str] = &[Validation::Checksum.name(), Validation::Exact.name()];
 
 const fn view_names(all: [View; 7]) -> [&'static str; 7] {
     let [a, b, c, d, e, f, g] = all;
@@ -247,7 +246,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "validation",
-        domain: Domain::Choice(VALIDATIONS),
+        domain: Domain::Choice(Validation::NAMES),
         default: "checksum",
         doc: "Method that checks whether the mesh is watertight: a checksum of its edges, or exact matching of every edge and the triangles around every vertex.",
     },

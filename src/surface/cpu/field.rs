@@ -35,6 +35,10 @@ pub(crate) struct Constants {
     pub(crate) amplitude: f32,
     /// Inverse square: least u, per 1/ρ².
     pub(crate) u_min: f32,
+    /// Gaussian: the slope −dF/du is `2^(slope_offset − rate·u) − slope_tail` up to a factor. The amplitude is omitted,
+    /// as it does not affect a direction, so numbers stay near 1.
+    pub(crate) slope_offset: f32,
+    pub(crate) slope_tail: f32,
 }
 
 impl Constants {
@@ -56,6 +60,8 @@ impl Constants {
             tail_end: to_f32(-factor * profile.tolerance),
             amplitude: to_f32(factor),
             u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
+            slope_offset: to_f32(rate),
+            slope_tail: to_f32(profile.tolerance),
         }
     }
 }

@@ -5,43 +5,14 @@ use std::ops::Range;
 use super::bin::NORMAL_ONLY;
 use super::brick_atoms::{BrickAtoms, LANES, extent};
 use super::edge::Edge;
+use super::field::Constants;
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::kernel::{MIN_DISTANCE2, Profile};
 use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
-use crate::surface::mesh::{Quantized, normal_row, position_row};
+use crate::surface::mesh::{normal_row, position_row};
 use crate::surface::params::Kernel;
 use crate::surface::quantize::Step;
 use crate::surface::simd::{dispatched, exp2, fma};
-
-/// Constants of the slope −dF/du of a kernel.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct SlopeConstants {
-    kernel: Kernel,
-    support: f32,
-    /// Gaussian: the exponent of 2 is `offset − rate·u`; the factor's logarithm is in `offset`.
-    pub(crate) offset: f32,
-    rate: f32,
-    /// Gaussian: subtrahend of the C¹ cut-off.
-    pub(crate) tail: f32,
-    u_min: f32,
-}
-
-impl SlopeConstants {
-    /// Returns the constants of `profile` on a lattice of `spacing` Å. Omits the amplitude, which does not affect a
-    /// direction, so numbers stay near 1.
-    pub(crate) fn new(profile: &Profile, spacing: f64) -> Self {
-        let rate = profile.decay * std::f64::consts::LOG2_E;
-        Self {
-            kernel: profile.kernel,
-            support: to_f32(profile.support()),
-            offset: to_f32(rate),
-            rate: to_f32(rate),
-            tail: to_f32(profile.tolerance),
-            u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
-        }
-    }
-}
 
 /// Vertices of one brick in its own coordinates, spacings from its first sample, and the atoms around them.
 #[derive(Debug, Default)]
@@ -100,12 +71,6 @@ pub(super) enum VertexRows<'a> {
 }
 
 impl<'a> VertexRows<'a> {
-    /// All rows of some quantised vertices.
-    pub(super) fn of(quantized: &'a mut Quantized) -> Self {
-        let Quantized { step, positions, normals } = quantized;
-        Self::Quantized { step: *step, positions, normals }
-    }
-
     /// Some of the rows.
     pub(super) fn slice(&mut self, rows: Range<usize>) -> VertexRows<'_> {
         match self {
@@ -157,7 +122,7 @@ const BLOCK: usize = 4096;
 /// [`SurfaceError::Cancelled`].
 pub(super) fn interpolate(
     lattice: &Lattice,
-    slope: &SlopeConstants,
+    constants: &Constants,
     source: &BrickVertices<'_>,
     batch: &mut VertexBatch,
     target: VertexTarget<'_>,
@@ -169,7 +134,7 @@ pub(super) fn interpolate(
     for block in candidates.chunks(BLOCK) {
         control.check()?;
         batch.atoms.fill(&lattice.atoms, block, origin);
-        gradients(slope, &mut batch.atoms, &batch.p, &mut batch.n);
+        gradients(constants, &mut batch.atoms, &batch.p, &mut batch.n);
     }
     if let Some(ids) = target.atom_ids {
         nearest_atoms(&lattice.atoms, candidates, origin, &batch.p, ids);
@@ -246,12 +211,7 @@ fn round(
 
 /// Adds −∇F of the candidates to each vertex's sum, up to a common factor.
 #[inline(always)]
-fn sum_gradients<const FMA: bool>(
-    c: &SlopeConstants,
-    around: &mut BrickAtoms,
-    p: &[Vec<f32>; 3],
-    n: &mut [Vec<f32>; 3],
-) {
+fn sum_gradients<const FMA: bool>(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     let [px, py, pz] = p;
     let [nx, ny, nz] = n;
     let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
@@ -268,8 +228,8 @@ fn sum_gradients<const FMA: bool>(
                 let u = fma::<FMA>(dx, dx, fma::<FMA>(dy, dy, dz * dz)) * inv;
                 let slope = match c.kernel {
                     Kernel::Gaussian => {
-                        let exponent = fma::<FMA>(-c.rate, u, c.offset);
-                        exp2::<FMA>(if exponent > -100.0 { exponent } else { -100.0 }) - c.tail
+                        let exponent = fma::<FMA>(-c.rate, u, c.slope_offset);
+                        exp2::<FMA>(if exponent > -100.0 { exponent } else { -100.0 }) - c.slope_tail
                     }
                     Kernel::SoftObject => (1.0 - u) * fma::<FMA>(u, -6.0, 11.0),
                     Kernel::InverseSquare => {
@@ -290,13 +250,13 @@ fn sum_gradients<const FMA: bool>(
 }
 
 dispatched! {
-fn gradients(c: &SlopeConstants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
+fn gradients(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
         match c.kernel {
-            Kernel::Gaussian => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::Gaussian, ..*c }, around, p, n),
-            Kernel::SoftObject => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::SoftObject, ..*c }, around, p, n),
+            Kernel::Gaussian => sum_gradients::<true>(&Constants { kernel: Kernel::Gaussian, ..*c }, around, p, n),
+            Kernel::SoftObject => sum_gradients::<true>(&Constants { kernel: Kernel::SoftObject, ..*c }, around, p, n),
             Kernel::InverseSquare => {
-                sum_gradients::<true>(&SlopeConstants { kernel: Kernel::InverseSquare, ..*c }, around, p, n);
+                sum_gradients::<true>(&Constants { kernel: Kernel::InverseSquare, ..*c }, around, p, n);
             }
         }
     } else {

@@ -1,10 +1,10 @@
 //! Connected components: the sheets of all bricks, joined across the bricks' borders.
 
-use std::convert::Infallible;
+use rayon::prelude::*;
 
 use super::piece_sums::{PieceSums, Sheet};
 use super::write::{PieceSummary, TileNeighbours};
-use super::{PIECE_BRICKS, Piece, Scanned, threads};
+use super::{PIECE_BRICKS, Piece, Scanned};
 use crate::surface::lattice::to_u32;
 use crate::surface::measure::{Component, Measures};
 use crate::surface::simd::dispatched;
@@ -25,8 +25,8 @@ pub(super) fn measures(scanned: &Scanned, written: &[PieceSummary]) -> Option<Me
         first.push(to_u32(n));
         n += sums.sheets.len();
     }
-    let pairs = threads::each(pieces.len(), |p| Ok(pairs_of(scanned, &all_sums, &first, p)));
-    let Ok::<_, Infallible>(pairs) = pairs;
+    let pairs: Vec<Vec<[u32; 2]>> =
+        (0..pieces.len()).into_par_iter().map(|p| pairs_of(scanned, &all_sums, &first, p)).collect();
     let mut joined = UnionFind::new(n);
     let mut of_brick = Vec::with_capacity(pieces.iter().map(|piece| piece.bricks.len()).sum());
     for (sums, first) in all_sums.iter().zip(&first) {

@@ -13,7 +13,7 @@ mod classify;
 mod edge;
 mod emit;
 pub(crate) mod field;
-pub(crate) mod interpolate;
+mod interpolate;
 mod join;
 mod neighbours;
 mod piece_sums;

@@ -9,7 +9,8 @@ use std::sync::{Mutex, PoisonError};
 
 use super::bin::{Tiles, slot_origin};
 use super::emit;
-use super::interpolate::{self, BrickVertices, SlopeConstants, VertexBatch, VertexRows, VertexTarget, take};
+use super::field::Constants;
+use super::interpolate::{self, BrickVertices, VertexBatch, VertexRows, VertexTarget, take};
 use super::join;
 use super::neighbours::{self, NumberedBrick};
 use super::piece_sums::PieceSums;
@@ -125,7 +126,7 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
         parts: done.iter().map(|tile| (tile.first_vertex, tile.first_triangle)).collect(),
     };
     let mut rows = match &mut mesh.quantized {
-        Some(quantized) => VertexRows::of(quantized),
+        Some(Quantized { step, positions, normals }) => VertexRows::Quantized { step: *step, positions, normals },
         None => VertexRows::Single { positions: &mut mesh.positions, normals: &mut mesh.normals },
     };
     let (mut triangles, mut ids) = (&mut mesh.triangles[..], mesh.atom_ids.as_deref_mut());
@@ -149,7 +150,7 @@ fn write_pieces(
     destination: &Destination<'_>,
 ) -> Result<Vec<PieceSummary>, SurfaceError> {
     let Scanned { lattice, pieces, .. } = scanned;
-    let writer = Writer { scanned, slope: SlopeConstants::new(&lattice.profile, lattice.spacing), control };
+    let writer = Writer { scanned, constants: Constants::new(&lattice.profile, lattice.spacing), control };
     let finished = AtomicUsize::new(0);
     threads::each(pieces.len(), |i| {
         control.check()?;
@@ -169,7 +170,7 @@ fn write_pieces(
 /// Shared inputs of the second pass.
 struct Writer<'a> {
     scanned: &'a Scanned,
-    slope: SlopeConstants,
+    constants: Constants,
     control: &'a Control<'a>,
 }
 
@@ -252,7 +253,7 @@ impl Writer<'_> {
                 edges: &found.edges[all],
             };
             let lattice = &self.scanned.lattice;
-            flat += interpolate::interpolate(lattice, &self.slope, &source, batch, target, self.control)?;
+            flat += interpolate::interpolate(lattice, &self.constants, &source, batch, target, self.control)?;
         }
         Ok(flat)
     }
