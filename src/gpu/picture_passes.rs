@@ -12,7 +12,7 @@ use wgpu::{
 use super::device_errors::DeviceErrors;
 use super::error::GpuError;
 use super::picture_targets::{
-    DEPTH, DEPTH_BUFFER, FinishParams, Layered, NO_SURFACE_DEPTH, PATTERN, SHADE, View, buffer, taps_of, texture,
+    DEPTH, DEPTH_BUFFER, FinishParams, NO_SURFACE_DEPTH, PATTERN, SHADE, View, buffer, layer, layered, taps_of, texture,
 };
 use super::shaders::{PICTURE, Shader};
 use crate::picture::PictureParams;
@@ -84,8 +84,8 @@ impl PicturePasses {
         let n_indices = u32::try_from(3 * triangles.len()).map_err(|_too_many| {
             GpuError::Failed(format!("{} triangles are too many for one draw", triangles.len()))
         })?;
-        let shades = Layered::new(device, "molmesh.picture.shades", SHADE, params);
-        let depths = Layered::new(device, "molmesh.picture.depths", DEPTH, params);
+        let shades = layered(device, "molmesh.picture.shades", SHADE, params);
+        let depths = layered(device, "molmesh.picture.depths", DEPTH, params);
         let attachment = TextureUsages::RENDER_ATTACHMENT;
         let nearest = texture(device, "molmesh.picture.nearest", DEPTH_BUFFER, params, 1, attachment);
         let nearest = nearest.create_view(&TextureViewDescriptor::default());
@@ -97,7 +97,7 @@ impl PicturePasses {
             let view = View::new(camera, offset);
             let view = column("view", bytemuck::bytes_of(&view), BufferUsages::UNIFORM);
             let group = bind(device, &self.draw.get_bind_group_layout(0), &[view.as_entire_binding()]);
-            let views = [shades.layer(sample), depths.layer(sample)];
+            let views = [layer(&shades, sample), layer(&depths, sample)];
             let mut pass = begin_draw(&mut encoder, &views, &nearest);
             pass.set_pipeline(&self.draw);
             pass.set_bind_group(0, &group, &[]);
@@ -117,7 +117,8 @@ impl PicturePasses {
         let mappable = BufferUsages::COPY_DST | BufferUsages::MAP_READ;
         let readback = buffer(device, "molmesh.picture.readback", 4 * n_pixels, mappable);
         let groups = [params.width.div_ceil(GROUP), params.height.div_ceil(GROUP)];
-        let (all_shades, all_depths) = (shades.all(), depths.all());
+        let [all_shades, all_depths] =
+            [&shades, &depths].map(|texture| texture.create_view(&TextureViewDescriptor::default()));
         let resources = [
             finish_params.as_entire_binding(),
             BindingResource::TextureView(&all_shades),

@@ -154,32 +154,20 @@ impl Requirements {
     }
 }
 
-/// Texture with one layer per sample.
-pub(super) struct Layered {
-    texture: Texture,
+/// Creates a texture with one layer per sample.
+pub(super) fn layered(device: &Device, label: &str, format: TextureFormat, params: &PictureParams) -> Texture {
+    let usage = TextureUsages::RENDER_ATTACHMENT | TextureUsages::TEXTURE_BINDING;
+    texture(device, label, format, params, PATTERN.len(), usage)
 }
 
-impl Layered {
-    pub(super) fn new(device: &Device, label: &str, format: TextureFormat, params: &PictureParams) -> Self {
-        let usage = TextureUsages::RENDER_ATTACHMENT | TextureUsages::TEXTURE_BINDING;
-        Self { texture: texture(device, label, format, params, PATTERN.len(), usage) }
-    }
-
-    /// View of the layer of one sample, as a render target.
-    pub(super) fn layer(&self, sample: u32) -> TextureView {
-        self.texture.create_view(&TextureViewDescriptor {
-            dimension: Some(TextureViewDimension::D2),
-            base_array_layer: sample,
-            array_layer_count: Some(1),
-            ..TextureViewDescriptor::default()
-        })
-    }
-
-    /// View of all layers, for reading.
-    pub(super) fn all(&self) -> TextureView {
-        let dimension = Some(TextureViewDimension::D2Array);
-        self.texture.create_view(&TextureViewDescriptor { dimension, ..TextureViewDescriptor::default() })
-    }
+/// View of the layer of one sample, as a render target.
+pub(super) fn layer(texture: &Texture, sample: u32) -> TextureView {
+    texture.create_view(&TextureViewDescriptor {
+        dimension: Some(TextureViewDimension::D2),
+        base_array_layer: sample,
+        array_layer_count: Some(1),
+        ..TextureViewDescriptor::default()
+    })
 }
 
 /// Creates a texture of the size of the picture.

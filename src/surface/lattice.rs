@@ -21,6 +21,9 @@ pub const BRICK_SAMPLES: usize = 512;
 /// Samples along a tile's edge: 8 bricks.
 pub const TILE: i32 = 64;
 
+/// Maximum number of atoms: candidate lists store indices of 31 bits.
+const MAX_ATOMS: usize = (1 << 31) - 1;
+
 /// Edge parameters are kept this far from both ends, in every backend: no triangle degenerates and no two vertices of
 /// different edges coincide.
 pub(super) const EDGE_MARGIN: f32 = 1.0 / 1024.0;
@@ -68,9 +71,14 @@ impl Lattice {
     /// Places `spheres` on the lattice of `params.resolution`.
     ///
     /// # Errors
-    /// [`SurfaceError::NoSpheres`]; [`SurfaceError::BadParameter`] if scale and offset leave a radius of 0 or less.
+    /// [`SurfaceError::NoSpheres`]; [`SurfaceError::BadParameter`] if scale and offset leave a radius of 0 or less, or
+    /// there are more spheres than 31 bits can number.
     pub fn new(spheres: &Spheres, params: &SurfaceParams) -> Result<Self, SurfaceError> {
         let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
+        if spheres.len() > MAX_ATOMS {
+            let expected = format!("at most {MAX_ATOMS} spheres");
+            return Err(SurfaceError::BadParameter { name: "spheres", value: spheres.len().to_string(), expected });
+        }
         let spacing = params.resolution;
         let profile = Profile::new(params);
         let (smallest, largest) = spheres.radius_range();
@@ -149,6 +157,17 @@ impl Placing<'_> {
         c.map(|c| to_i32((c / self.params.resolution).round()))
     }
 
+    /// Returns the sort key of atom `i`: tile, brick and cell.
+    #[inline(always)]
+    fn key(&self, rank: &TileRanks, i: usize) -> u64 {
+        let cell = self.cell(self.spheres.centre(i));
+        let local = cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
+        let brick = local.map(|c| c / BRICK.unsigned_abs());
+        let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
+        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
+        rank.of(tile_of(cell)) << PLACE_BITS | pack(brick) << 9 | pack(cell_in_brick)
+    }
+
     /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order
     /// last. `bounds`: lowest and highest coordinates.
     fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
@@ -178,19 +197,6 @@ impl Placing<'_> {
 const PART: usize = 4096;
 /// Bits of an atom's brick and cell within its tile.
 const PLACE_BITS: u32 = 18;
-
-impl Placing<'_> {
-    /// Returns the sort key of atom `i`: tile, brick and cell.
-    #[inline(always)]
-    fn key(&self, rank: &TileRanks, i: usize) -> u64 {
-        let cell = self.cell(self.spheres.centre(i));
-        let local = cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
-        let brick = local.map(|c| c / BRICK.unsigned_abs());
-        let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
-        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
-        rank.of(tile_of(cell)) << PLACE_BITS | pack(brick) << 9 | pack(cell_in_brick)
-    }
-}
 
 dispatched! {
 /// Writes the sort keys of the atoms from `first` on: their places above their indices.

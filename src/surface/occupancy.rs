@@ -59,12 +59,9 @@ impl Occupancy {
     ///
     /// # Errors
     /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond the
-    /// limits, [`SurfaceError::BadParameter`] for more atoms than 31 bits can number, [`SurfaceError::Cancelled`].
+    /// limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let atoms = &lattice.atoms;
-        if atoms.len() > cpu::MAX_ATOMS {
-            return Err(cpu::too_many_atoms(atoms.len()));
-        }
         let tile_starts = tile_starts(atoms);
         let runs = runs(&tile_starts, atoms.len());
         let reaches: Vec<f32> = atoms.par_iter().with_min_len(RUN).map(|atom| reach(lattice, atom)).collect();

@@ -45,7 +45,7 @@ impl Plan {
     ///
     /// # Errors
     /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond the
-    /// limits, [`SurfaceError::BadParameter`] for more atoms than 31 bits can number, [`SurfaceError::Cancelled`].
+    /// limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let occupancy = Occupancy::new(lattice, limits, control)?;
         let bases = tile_bases(&occupancy.tiles)

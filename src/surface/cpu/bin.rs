@@ -27,8 +27,6 @@ const PAIRS_PER_CHECK: u64 = 1 << 16;
 const ATOMS_PER_CHECK: usize = 256;
 /// Maximum capacity of a list that is kept between tiles; longer lists are freed.
 const KEPT_CAPACITY: usize = 4096;
-/// Atoms are indexed with 31 bits.
-pub(crate) const MAX_ATOMS: usize = (1 << 31) - 1;
 
 /// The tiles that some atom reaches, in canonical order, with their atoms.
 #[derive(Debug)]
@@ -134,12 +132,6 @@ impl Tiles {
     pub(super) fn atoms(&self, t: usize) -> &[u32] {
         &self.atoms[self.starts[t]..self.starts[t + 1]]
     }
-}
-
-/// Returns the error for more atoms than 31-bit indices can number.
-pub(crate) fn too_many_atoms(n: usize) -> SurfaceError {
-    let expected = format!("at most {MAX_ATOMS} spheres");
-    SurfaceError::BadParameter { name: "spheres", value: n.to_string(), expected }
 }
 
 /// Returns the error for a grid of at least `samples` samples.

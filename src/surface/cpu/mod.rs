@@ -29,8 +29,8 @@ mod write;
 
 use std::ops::Range;
 
-// Errors that the occupancy count shares with this backend.
-pub(crate) use self::bin::{MAX_ATOMS, check_lower_bound, too_large as grid_too_large, too_many_atoms};
+// Limits that the occupancy count shares with this backend.
+pub(crate) use self::bin::{check_lower_bound, too_large as grid_too_large};
 
 use self::bin::{Tiles, slot_brick};
 use self::classify::{ClassifiedBricks, CountsBefore};
@@ -170,9 +170,6 @@ fn pieces(done: &mut [Tile]) -> Vec<Piece> {
 fn scan(spheres: &Spheres, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
     let lattice = context.control.span(Stage::Bin, || {
         candidates::check(spheres, context.params, context.limits)?;
-        if spheres.len() > bin::MAX_ATOMS {
-            return Err(bin::too_many_atoms(spheres.len()));
-        }
         Lattice::new(spheres, context.params)
     });
     scan_lattice(lattice?, context)
@@ -197,10 +194,8 @@ fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, Su
         partial_tiles: slabs::PartialTiles::default(),
         constants: Constants::new(&lattice.profile, lattice.spacing),
         iso: to_f32(params.isovalue),
-        params,
-        limits,
+        context,
         counters: sample::PassCounters::default(),
-        control,
     };
     let sampled = threads::each(slabs.len(), |i| pass.sample(i))?;
     let counters = pass.counters;

@@ -9,12 +9,11 @@ use super::bin::{self, Bricks, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, ClassifiedBricks, Inside, Neighbourhood};
 use super::field::{self, Constants, SampleRange, Samples};
 use super::slabs::{PartialTiles, Slab};
-use super::{NO_BRICK, Tile, scan};
+use super::{NO_BRICK, RunContext, Tile, scan};
 use crate::surface::candidates;
-use crate::surface::control::{Control, Stage};
+use crate::surface::control::Stage;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK_SAMPLES, Lattice};
-use crate::surface::params::{SurfaceLimits, SurfaceParams};
 
 /// Buffers that a thread reuses from tile to tile.
 struct Scratch {
@@ -92,10 +91,8 @@ pub(super) struct Pass<'a> {
     pub(super) partial_tiles: PartialTiles,
     pub(super) constants: Constants,
     pub(super) iso: f32,
-    pub(super) params: &'a SurfaceParams,
-    pub(super) limits: &'a SurfaceLimits,
+    pub(super) context: RunContext<'a>,
     pub(super) counters: PassCounters,
-    pub(super) control: &'a Control<'a>,
 }
 
 impl Pass<'_> {
@@ -105,25 +102,25 @@ impl Pass<'_> {
     /// Returns [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`] or [`SurfaceError::MeshTooLarge`] as
     /// soon as the slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
     pub(super) fn sample(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
-        self.control.check()?;
+        self.context.control.check()?;
         let slab = &self.slabs[i];
         let tile = SCRATCH.with_borrow_mut(|scratch| {
             let tile = self.sample_into(slab, scratch);
             scratch.bricks.free_long_lists();
             tile
         })?;
-        let tile = self.control.span(Stage::Classify, || self.partial_tiles.add(slab, tile));
+        let tile = self.context.control.span(Stage::Classify, || self.partial_tiles.add(slab, tile));
         let n = self.counters.slabs_done.fetch_add(1, Ordering::Relaxed) + 1;
-        self.control.observer.progress(Stage::Field, n, self.slabs.len());
+        self.context.control.observer.progress(Stage::Field, n, self.slabs.len());
         Ok(tile)
     }
 
     /// Counts `n` more candidate pairs.
     fn count(&self, n: u64) -> Result<(), SurfaceError> {
-        self.control.check()?;
+        self.context.control.check()?;
         let all = self.counters.candidate_pairs.fetch_add(n, Ordering::Relaxed) + n;
-        if all > candidates::limit(self.limits) {
-            return Err(candidates::exceeded(self.lattice, all, self.limits));
+        if all > candidates::limit(self.context.limits) {
+            return Err(candidates::exceeded(self.lattice, all, self.context.limits));
         }
         Ok(())
     }
@@ -131,27 +128,35 @@ impl Pass<'_> {
     fn sample_into(&self, slab: &Slab, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
         let (coord, counters, layers) = (self.tiles.coords[slab.tile], &self.counters, &slab.layers);
         let atoms = self.tiles.atoms(slab.tile);
-        self.control.span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, layers, atoms, |n| self.count(n)))?;
+        self.context
+            .control
+            .span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, layers, atoms, |n| self.count(n)))?;
         let reached = count_occupied(&scratch.bricks, layers, counters);
         let occupied = reached as u64 * BRICK_SAMPLES as u64;
         let samples = counters.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
-        if samples > self.limits.max_samples {
-            return Err(bin::too_large(self.lattice, counters.all_slabs(samples, self.slabs.len()), self.limits));
+        if samples > self.context.limits.max_samples {
+            return Err(bin::too_large(
+                self.lattice,
+                counters.all_slabs(samples, self.slabs.len()),
+                self.context.limits,
+            ));
         }
         let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
         let mut found = ClassifiedBricks::with_capacity(reached);
         for z in layers.start..=layers.end {
-            self.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z))?;
+            self.context.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z))?;
             if z > layers.start {
-                self.control.span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut found, &mut bricks));
+                self.context
+                    .control
+                    .span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut found, &mut bricks));
             }
         }
-        self.control.span(Stage::Classify, || found.shrink_to_fit());
-        let bytes = self.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
+        self.context.control.span(Stage::Classify, || found.shrink_to_fit());
+        let bytes = self.context.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
         let so_far = counters.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        if so_far > self.limits.max_mesh_bytes {
+        if so_far > self.context.limits.max_mesh_bytes {
             let all = counters.all_slabs(so_far, self.slabs.len());
-            return Err(scan::too_large(all, self.lattice.spacing, self.limits.max_mesh_bytes));
+            return Err(scan::too_large(all, self.lattice.spacing, self.context.limits.max_mesh_bytes));
         }
         Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_brick: 0, first_piece: 0 })
     }
@@ -180,7 +185,7 @@ impl Scratch {
             field.fill(0.0);
             let (atoms, origin) = (&pass.lattice.atoms, slot_origin(tile, slot));
             for candidates in bricks.of(slot).chunks(CANDIDATES_PER_CHECK) {
-                pass.control.check()?;
+                pass.context.control.check()?;
                 field::evaluate(&pass.constants, atoms, candidates, origin, range, field);
             }
             // A layer has 81 bricks.
