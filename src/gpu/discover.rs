@@ -1,5 +1,5 @@
-//! Discovery of devices: lists the adapters of all drivers, selects devices by the user's choice, and opens and describes
-//! them.
+//! Discovery of devices: lists the adapters of all drivers, selects devices by the user's choice, and opens and
+//! describes them.
 
 use std::panic::catch_unwind;
 

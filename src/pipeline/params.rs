@@ -216,7 +216,7 @@ impl Values {
             "atom_ids" => self.options.atom_ids = flag(text).ok_or_else(bad)?,
             "model" => self.selection.model = Some(text.trim().parse().ok().ok_or_else(bad)?),
             "chains" => {
-                self.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect())
+                self.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect());
             }
             "select" => self.selection.set_kinds(text).map_err(|e| ParamError::BadValue {
                 name: "select",

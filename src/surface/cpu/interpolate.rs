@@ -70,7 +70,7 @@ pub(super) enum VertexRows<'a> {
     Quantized { step: Step, positions: &'a mut [[i16; 4]], normals: &'a mut [[i8; 4]] },
 }
 
-impl<'a> VertexRows<'a> {
+impl VertexRows<'_> {
     /// Some of the rows.
     pub(super) fn slice(&mut self, rows: Range<usize>) -> VertexRows<'_> {
         match self {
