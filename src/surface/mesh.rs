@@ -182,8 +182,8 @@ impl Mesh {
         }
     }
 
-    /// Adds the rows of `next` without a copy. Its triangles refer to the joint vertices already. An empty mesh takes the
-    /// centre and the representation of `next`.
+    /// Adds the rows of `next` without a copy. Its triangles already refer to the joint vertices. An empty mesh takes
+    /// the centre and the representation of `next`.
     pub(crate) fn append(&mut self, next: Self) {
         let before = (self.n_vertices(), self.n_triangles());
         self.parts.extend(next.parts.iter().map(|(v, t)| (before.0 + v, before.1 + t)));
