@@ -130,7 +130,7 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBack
     let Gpu { backend, drawer, devices, mut state } = gpu(requested, use_);
     if let (Some(backend), Some(drawer), Ok(reason)) = (backend, drawer, &state) {
         let reason = match (requested.backend, requested.devices) {
-            (_, DeviceChoice::These(_)) => format!("--devices {}", requested.devices),
+            (_, DeviceChoice::Listed(_)) => format!("--devices {}", requested.devices),
             (BackendName::Auto, _) => match estimate {
                 Some(estimate) => format!("auto: {reason}, {estimate}"),
                 None => format!("auto: {reason}"),
@@ -141,7 +141,7 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBack
     }
     let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
     // A request for a specific device fails instead of falling back to the CPU.
-    if requested.backend != BackendName::Auto || matches!(requested.devices, DeviceChoice::These(_)) {
+    if requested.backend != BackendName::Auto || matches!(requested.devices, DeviceChoice::Listed(_)) {
         return Err(CliError::NoBackend { requested: "gpu", why: format!("no GPU can be used: {why}") });
     }
     let reason = match requested.devices {
@@ -178,19 +178,20 @@ fn gpu(_asked: &BackendRequest<'_>, _use: &Use) -> Gpu {
 
 #[cfg(feature = "gpu")]
 fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
-    use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, discover};
+    use molmesh::gpu::{DiscoveryMode, GpuBackend, GpuError, PoolSettings, discover};
 
     // For a single mesh, skip drivers without a device, unless a GPU was requested.
     let once = matches!(use_, Use::Once | Use::Picture);
-    let look = if once && requested.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
-    let discovery = discover(requested.devices, look);
+    let mode =
+        if once && requested.backend == BackendName::Auto { DiscoveryMode::Quick } else { DiscoveryMode::Thorough };
+    let discovery = discover(requested.devices, mode);
     let none = |devices, why| Gpu { backend: None, drawer: None, devices, state: Err(why) };
     let missing = discovery.missing(requested.devices);
     if !missing.is_empty() {
-        let there = discovery.why_none().map(|why| format!(" ({why})")).unwrap_or_default();
+        let there = discovery.no_device_reason().map(|why| format!(" ({why})")).unwrap_or_default();
         return none(discovery.devices, format!("{}{there}", missing.join(", ")));
     }
-    if let Some(why) = discovery.why_none() {
+    if let Some(why) = discovery.no_device_reason() {
         return none(discovery.devices, why);
     }
     let settings = match use_ {
@@ -219,10 +220,10 @@ fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
             for status in backend.devices() {
                 let found = devices.iter_mut().find(|found| found.number == status.number);
                 if let (Some(found), Some(why)) = (found, status.down) {
-                    (found.taken, found.reason) = (false, why);
+                    (found.selected, found.reason) = (false, why);
                 }
             }
-            let up: Vec<&str> = devices.iter().filter(|d| d.taken).map(|d| d.reason.as_str()).collect();
+            let up: Vec<&str> = devices.iter().filter(|d| d.selected).map(|d| d.reason.as_str()).collect();
             let reason = match up[..] {
                 [one] => format!("a GPU ({one})"),
                 _ => format!("{} GPUs", up.len()),
@@ -234,8 +235,8 @@ fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
                 GpuError::NoDevice(why) => why,
                 error => error.to_string(),
             };
-            for device in devices.iter_mut().filter(|device| device.taken) {
-                (device.taken, device.reason) = (false, format!("the pipelines could not be built: {why}"));
+            for device in devices.iter_mut().filter(|device| device.selected) {
+                (device.selected, device.reason) = (false, format!("the pipelines could not be built: {why}"));
             }
             none(devices, why)
         }

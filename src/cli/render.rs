@@ -29,7 +29,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     interrupt::watch(&cancel)?;
     let mut output = Output::open(output_path, &cancel)?;
     let input = mesh::read(input_path, limits.read.max_inflated_bytes)?;
-    let requested = BackendRequest { work: Some(pipeline::work(&input, &job)), ..BackendRequest::once(args) };
+    let requested = BackendRequest { work: Some(pipeline::estimate_work(&input, &job)), ..BackendRequest::once(args) };
     let picked = backend::pick(&requested, &Use::Picture)?;
 
     let progress = Progress::new(!args.quiet);

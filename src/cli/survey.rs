@@ -37,7 +37,7 @@ pub(crate) fn survey(picked: &SelectedBackend) -> Vec<Availability> {
     // The reasons of the devices follow, one per line.
     let gpu = gpu.map_err(|why| if picked.devices.is_empty() { why } else { "no device is used".to_owned() });
     survey.push(candidate("gpu", gpu));
-    let left = picked.devices.iter().filter(|device| !device.taken);
+    let left = picked.devices.iter().filter(|device| !device.selected);
     survey
         .extend(left.map(|d| candidate(&format!("gpu {}", d.number), Err(format!("{}: {}", d.facts.name, d.reason)))));
     survey

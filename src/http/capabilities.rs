@@ -302,7 +302,7 @@ fn devices(found: &[FoundDevice], running: &[DeviceStatus]) -> Vec<DeviceDocumen
             workgroup_bytes: facts.workgroup_bytes,
             timestamps: facts.timestamps,
             subgroups: facts.subgroups,
-            taken: found.taken,
+            taken: found.selected,
             up: status.is_some() && down.is_none(),
             reason: down.unwrap_or(&found.reason).clone(),
         }

@@ -104,7 +104,7 @@ fn devices(app: &Shared) -> Check {
     let found = match app.readiness.warm() {
         Warm::Warming => Err("the first mesh is being computed".to_owned()),
         Warm::Broken => Err("the first mesh failed; see the log".to_owned()),
-        Warm::Yes if !backend.able() => Err("no device is in service, and there is no fallback".to_owned()),
+        Warm::Yes if !backend.is_available() => Err("no device is in service, and there is no fallback".to_owned()),
         Warm::Yes => {
             let devices = backend.devices();
             let up = devices.iter().filter(|device| device.down.is_none()).count();

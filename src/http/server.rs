@@ -315,7 +315,7 @@ async fn recover(jobs: &JobStore) {
 fn warm_up(app: &App) {
     let start = Instant::now();
     let backend = Arc::clone(app.pool.backend());
-    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| backend.warm()));
+    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| backend.warm_up()));
     app.pool.publish();
     match result {
         Ok(Ok(())) => {

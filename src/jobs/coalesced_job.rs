@@ -65,7 +65,7 @@ pub(super) struct CoalescedJob {
     pub(super) id: u64,
     pub(super) work: WorkKey,
     pub(super) rank: Rank,
-    /// Expected work, in the units of [`crate::pipeline::work`].
+    /// Expected work, in the units of [`crate::pipeline::estimate_work`].
     pub(super) units: f64,
     /// Start tag of fair queueing: the lowest one runs first.
     pub(super) tag: f64,

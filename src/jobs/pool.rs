@@ -104,7 +104,7 @@ impl Pool {
     /// Estimates the duration of a job on this machine, s, without its time in the queue.
     #[must_use]
     pub fn expected(&self, input: &[u8], job: &Job) -> f64 {
-        self.shared.queue.expected(pipeline::work(input, job))
+        self.shared.queue.expected(pipeline::estimate_work(input, job))
     }
 
     /// Estimates the queueing time of a job that is accepted now.

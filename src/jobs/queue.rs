@@ -119,7 +119,7 @@ impl Queue {
             // The next process runs the job. Without a sender the ticket ends as stopped.
             return Ok(admit(Arc::default(), job_span(&task, now)));
         }
-        let units = pipeline::work(&task.input, &task.job);
+        let units = pipeline::estimate_work(&task.input, &task.job);
         let wait = self.wait(&state, now);
         // A job of a free worker counts as running before the worker has woken up.
         if state.jobs.len() >= self.limit + self.workers {

@@ -199,7 +199,7 @@ impl Record {
     pub(super) fn request(&self) -> Result<(params::Request, Format), String> {
         let mut request = params::parse(self.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
         let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
-        params::settle(&mut request.job, format).map_err(|e| e.to_string())?;
+        params::set_format(&mut request.job, format).map_err(|e| e.to_string())?;
         Ok((request, format))
     }
 

@@ -68,5 +68,5 @@ fn draw(mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Re
     control.check()?;
     let image = finish(&layers, &Finish::new(params, &camera), params);
     control.check()?;
-    Ok(Rendered { image, pixel: camera.pixel(), served: None })
+    Ok(Rendered { image, pixel: camera.pixel(), made_by: None })
 }

@@ -23,9 +23,9 @@ use std::sync::Arc;
 
 use thiserror::Error;
 
-use crate::surface::{Control, Mesh, Served, SurfaceError, arithmetic};
+use crate::surface::{BackendIdentity, Control, Mesh, SurfaceError, arithmetic};
 pub use cpu::CpuRenderer;
-pub use params::{Background, DEFAULT_SIDE, MOST_SIDE, PictureLimits, PictureParams, Style, View};
+pub use params::{Background, DEFAULT_SIDE, MAX_SIDE, PictureLimits, PictureParams, Style, View};
 
 /// Reason for which a picture cannot be made.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -94,7 +94,7 @@ pub struct Rendered {
     /// Width and height of a pixel, Å.
     pub pixel: f64,
     /// Fallback that drew it instead of a device, if any.
-    pub served: Option<Served>,
+    pub made_by: Option<BackendIdentity>,
 }
 
 /// Draws meshes. Equal meshes and parameters give equal pixels.
@@ -109,6 +109,16 @@ pub trait Renderer: Send + Sync {
 
     /// Description of the hardware, for display.
     fn describe(&self) -> String;
+
+    /// Identity of this renderer, as the maker of a picture.
+    fn identity(&self) -> BackendIdentity {
+        BackendIdentity {
+            backend: self.name(),
+            arithmetic: self.arithmetic(),
+            device: self.describe(),
+            fallback_reason: None,
+        }
+    }
 
     /// Draws `mesh`, whose vertices must not be quantised.
     ///

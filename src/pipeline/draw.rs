@@ -3,7 +3,7 @@
 use super::report::{PictureReport, Report};
 use super::{JobError, Product, ProgressSink, StageClock};
 use crate::picture::{Drawer, PictureParams, Rendered, png};
-use crate::surface::{CancelToken, Control, Mesh, Served};
+use crate::surface::{CancelToken, Control, Mesh};
 
 /// Draws the mesh of `product` and replaces it with the PNG.
 ///
@@ -39,12 +39,7 @@ pub fn draw(
 impl PictureReport {
     /// Returns the report of a picture.
     fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
-        let served = drawn.served.clone().unwrap_or_else(|| Served {
-            backend: drawer.renderer.name(),
-            arithmetic: drawer.renderer.arithmetic(),
-            device: drawer.renderer.describe(),
-            fallback_reason: None,
-        });
+        let made_by = drawn.made_by.clone().unwrap_or_else(|| drawer.renderer.identity());
         Self {
             width: params.width,
             height: params.height,
@@ -54,14 +49,11 @@ impl PictureReport {
             background: params.background.to_string(),
             style: params.style.name(),
             pixel: drawn.pixel,
-            renderer: served.backend,
-            arithmetic: served.arithmetic,
-            device: served.device,
-            reason: match &served.fallback_reason {
-                Some(why) => format!("{}; but {why}", drawer.reason),
-                None => drawer.reason.clone(),
-            },
-            fallback: served.fallback_reason,
+            reason: made_by.reason(&drawer.reason),
+            renderer: made_by.backend,
+            arithmetic: made_by.arithmetic,
+            device: made_by.device,
+            fallback: made_by.fallback_reason,
         }
     }
 }

@@ -172,7 +172,7 @@ fn stl_contains_corners_and_normals_of_all_triangles() {
 fn obj_round_trips_coordinates_to_its_decimals() {
     for (name, mesh) in cases() {
         let found = read_obj(&encode(Format::Obj, &mesh, &meta()));
-        assert_eq!(found.triangles, mesh.triangles, "{name}");
+        assert_eq!(found.triangles[..], mesh.triangles[..], "{name}");
         let close = |found: &[[f32; 3]], expected: &[[f32; 3]]| {
             assert_eq!(found.len(), expected.len(), "{name}");
             for (f, e) in found.as_flattened().iter().zip(expected.as_flattened()) {
@@ -403,9 +403,9 @@ proptest! {
             prop_assert_eq!(glb.json["asset"]["extras"][&key].as_str().unwrap(), text);
         }
         let (json, bin) = split_gltf(&encode(Format::Gltf, &mesh, &meta));
-        prop_assert_eq!(&gltf_contents(&json, &bin).positions, &mesh.positions);
-        prop_assert_eq!(&read_ply(&encode(Format::Ply, &mesh, &meta)).positions, &mesh.positions);
-        prop_assert_eq!(&read_obj(&encode(Format::Obj, &mesh, &meta)).positions, &mesh.positions);
+        prop_assert_eq!(&gltf_contents(&json, &bin).positions[..], &mesh.positions[..]);
+        prop_assert_eq!(&read_ply(&encode(Format::Ply, &mesh, &meta)).positions[..], &mesh.positions[..]);
+        prop_assert_eq!(&read_obj(&encode(Format::Obj, &mesh, &meta)).positions[..], &mesh.positions[..]);
         let stl = encode(Format::Stl, &mesh, &meta);
         prop_assert_eq!((stl.len(), u32_at(&stl, 80), stl[..80].is_ascii()), (134, 1, true));
     }

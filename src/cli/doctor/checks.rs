@@ -85,7 +85,7 @@ pub(super) fn log(config: &Config) -> Check {
 /// Makes a first mesh, as a service does before it is ready.
 pub(super) fn first_mesh(backend: &dyn Backend) -> Check {
     let start = Instant::now();
-    match backend.warm() {
+    match backend.warm_up() {
         Ok(()) => {
             let ms = start.elapsed().as_secs_f64() * 1e3;
             Check::new(DEVICES, State::Ok, format!("{} made a first mesh in {ms:.1} ms", backend.name()))

@@ -97,7 +97,7 @@ impl Findings {
         let device = |device: &FoundDevice| {
             let facts = &device.facts;
             json!({
-                "number": device.number, "taken": device.taken, "reason": device.reason, "name": facts.name,
+                "number": device.number, "taken": device.selected, "reason": device.reason, "name": facts.name,
                 "kind": facts.kind.name(), "api": facts.api, "driver": facts.driver,
                 "binding_bytes": facts.binding_bytes, "buffer_bytes": facts.buffer_bytes,
                 "workgroup_bytes": facts.workgroup_bytes, "timestamps": facts.timestamps, "subgroups": facts.subgroups,

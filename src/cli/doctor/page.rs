@@ -40,8 +40,8 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     }
     for device in &findings.devices {
         let facts = &device.facts;
-        let taken = if device.taken { style.green("yes") } else { style.dim("no ") };
-        page.row(&format!("device {}", device.number), &format!("{taken} {}: {}", facts.name, device.reason));
+        let used = if device.selected { style.green("yes") } else { style.dim("no ") };
+        page.row(&format!("device {}", device.number), &format!("{used} {}: {}", facts.name, device.reason));
         page.row("", &format!("    {}, {}, {}", facts.kind.name(), facts.api, facts.driver));
         page.row("", &format!("    {}", abilities(facts)));
     }

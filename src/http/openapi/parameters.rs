@@ -91,7 +91,7 @@ fn hints(parameter: &params::Parameter) -> Option<Extensions> {
     {
         control.insert("unit".to_owned(), unit.into());
     }
-    if let Some(usual) = params::usual(parameter) {
+    if let Some(usual) = params::usual_range(parameter) {
         control.insert("usual".to_owned(), usual.to_vec().into());
     }
     if params::PICTURES.contains(&parameter.name) {
