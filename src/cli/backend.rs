@@ -8,7 +8,7 @@ use std::sync::Arc;
 use molmesh::config::DevicesConfig;
 #[cfg(feature = "gpu")]
 use molmesh::picture::CpuRenderer;
-use molmesh::picture::Drawer;
+use molmesh::picture::SelectedRenderer;
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::reference::ReferenceBackend;
 use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
@@ -50,7 +50,7 @@ pub(crate) struct SelectedBackend {
     /// Reason of the selection.
     pub(crate) reason: String,
     /// Renderer of pictures with its reason; the CPU if no pictures are needed.
-    pub(crate) drawer: Drawer,
+    pub(crate) renderer: SelectedRenderer,
     /// All discovered devices, used or not.
     #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) devices: Vec<FoundDevice>,
@@ -95,7 +95,7 @@ pub(crate) fn pick(requested: &BackendRequest<'_>, use_: &Use) -> Result<Selecte
     let without_gpu = |backend: Box<dyn Backend>| SelectedBackend {
         backend,
         reason: "requested".to_owned(),
-        drawer: Drawer::cpu("a backend other than the GPU was requested"),
+        renderer: SelectedRenderer::cpu("a backend other than the GPU was requested"),
         devices: Vec::new(),
         no_gpu: Some("no discovery: another backend was requested".to_owned()),
     };
@@ -118,17 +118,17 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBack
     if let Some(estimate) = estimate.filter(|estimate| !estimate.favours_gpu()) {
         let why = format!("no GPU discovery ({estimate})");
         let reason = format!("auto: {why}");
-        let drawer = Drawer::cpu(&reason);
+        let renderer = SelectedRenderer::cpu(&reason);
         return Ok(SelectedBackend {
             backend: cpu(requested, use_)?,
             reason,
-            drawer,
+            renderer,
             devices: Vec::new(),
             no_gpu: Some(why),
         });
     }
-    let Gpu { backend, drawer, devices, mut state } = gpu(requested, use_);
-    if let (Some(backend), Some(drawer), Ok(reason)) = (backend, drawer, &state) {
+    let Gpu { backend, renderer, devices, mut state } = gpu(requested, use_);
+    if let (Some(backend), Some(renderer), Ok(reason)) = (backend, renderer, &state) {
         let reason = match (requested.backend, requested.devices) {
             (_, DeviceChoice::These(_)) => format!("--devices {}", requested.devices),
             (BackendName::Auto, _) => match estimate {
@@ -137,7 +137,7 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBack
             },
             _ => "requested".to_owned(),
         };
-        return Ok(SelectedBackend { backend, reason, drawer, devices, no_gpu: None });
+        return Ok(SelectedBackend { backend, reason, renderer, devices, no_gpu: None });
     }
     let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
     // A request for a specific device fails instead of falling back to the CPU.
@@ -148,8 +148,8 @@ fn gpu_or_cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBack
         DeviceChoice::Cpu => "--devices cpu".to_owned(),
         _ => format!("auto: no GPU: {why}"),
     };
-    let drawer = Drawer::cpu(&reason);
-    Ok(SelectedBackend { backend: cpu(requested, use_)?, reason, drawer, devices, no_gpu: Some(why) })
+    let renderer = SelectedRenderer::cpu(&reason);
+    Ok(SelectedBackend { backend: cpu(requested, use_)?, reason, renderer, devices, no_gpu: Some(why) })
 }
 
 fn cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
@@ -165,7 +165,7 @@ fn cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<Box<dyn Backend>, C
 /// Result of GPU discovery.
 struct Gpu {
     backend: Option<Box<dyn Backend>>,
-    drawer: Option<Drawer>,
+    renderer: Option<SelectedRenderer>,
     devices: Vec<FoundDevice>,
     /// Reason of the selection, or reason for not using a GPU.
     state: Result<String, String>,
@@ -173,7 +173,7 @@ struct Gpu {
 
 #[cfg(not(feature = "gpu"))]
 fn gpu(_asked: &BackendRequest<'_>, _use: &Use) -> Gpu {
-    Gpu { backend: None, drawer: None, devices: Vec::new(), state: Err("this build has no GPU support".to_owned()) }
+    Gpu { backend: None, renderer: None, devices: Vec::new(), state: Err("this build has no GPU support".to_owned()) }
 }
 
 #[cfg(feature = "gpu")]
@@ -184,7 +184,7 @@ fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
     let once = matches!(use_, Use::Once | Use::Picture);
     let look = if once && requested.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
     let discovery = discover(requested.devices, look);
-    let none = |devices, why| Gpu { backend: None, drawer: None, devices, state: Err(why) };
+    let none = |devices, why| Gpu { backend: None, renderer: None, devices, state: Err(why) };
     let missing = discovery.missing(requested.devices);
     if !missing.is_empty() {
         let there = discovery.why_none().map(|why| format!(" ({why})")).unwrap_or_default();
@@ -209,8 +209,8 @@ fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
         _ => None,
     };
     let started = GpuBackend::start(&discovery, &settings, fallback);
-    let drawer = match drawer(requested, use_, &discovery) {
-        Ok(drawer) => drawer,
+    let renderer = match renderer(requested, use_, &discovery) {
+        Ok(renderer) => renderer,
         Err(why) => return none(discovery.devices, why),
     };
     let mut devices = discovery.devices;
@@ -227,7 +227,7 @@ fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
                 [one] => format!("a GPU ({one})"),
                 _ => format!("{} GPUs", up.len()),
             };
-            Gpu { backend: Some(Box::new(backend)), drawer: Some(drawer), devices, state: Ok(reason) }
+            Gpu { backend: Some(Box::new(backend)), renderer: Some(renderer), devices, state: Ok(reason) }
         }
         Err(error) => {
             let why = match error {
@@ -244,19 +244,23 @@ fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
 
 /// Starts the renderer on the GPUs that make the meshes. With `--backend auto`, falls back to the CPU with the reason.
 #[cfg(feature = "gpu")]
-fn drawer(requested: &BackendRequest<'_>, use_: &Use, discovery: &molmesh::gpu::Discovery) -> Result<Drawer, String> {
+fn renderer(
+    requested: &BackendRequest<'_>,
+    use_: &Use,
+    discovery: &molmesh::gpu::Discovery,
+) -> Result<SelectedRenderer, String> {
     use molmesh::gpu::GpuRenderer;
 
     if *use_ == Use::Once {
-        return Ok(Drawer::cpu("no pictures were requested"));
+        return Ok(SelectedRenderer::cpu("no pictures were requested"));
     }
     let auto = requested.backend == BackendName::Auto;
-    match GpuRenderer::start(discovery, auto.then(CpuRenderer::default)) {
+    match GpuRenderer::start(discovery, auto.then_some(CpuRenderer)) {
         Ok(renderer) => {
             let reason = "the device that makes the meshes".to_owned();
-            Ok(Drawer { renderer: Arc::new(renderer), reason })
+            Ok(SelectedRenderer { renderer: Arc::new(renderer), reason })
         }
-        Err(error) if auto => Ok(Drawer::cpu(&format!("the GPU cannot render: {error}"))),
+        Err(error) if auto => Ok(SelectedRenderer::cpu(&format!("the GPU cannot render: {error}"))),
         Err(error) => Err(format!("it cannot render: {error}")),
     }
 }

@@ -262,11 +262,11 @@ fn format_code(error: &FormatError) -> i32 {
         | FormatError::IndexOutOfRange { .. }
         | FormatError::NotFinite { .. }
         | FormatError::NotUnit { .. }
-        | FormatError::BeyondStep { .. }
-        | FormatError::NotQuantized { .. }
-        | FormatError::NotInUnits { .. }
-        | FormatError::NotAMesh { .. }
-        | FormatError::OtherPacking { .. }
+        | FormatError::OutOfQuantizationRange { .. }
+        | FormatError::QuantizationNotSupported { .. }
+        | FormatError::UnitsNotSupported { .. }
+        | FormatError::NotAMeshFormat { .. }
+        | FormatError::AlreadyQuantized { .. }
         | FormatError::Json { .. } => code::INTERNAL,
     }
 }

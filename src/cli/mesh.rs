@@ -47,8 +47,8 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
     let progress = Progress::new(!args.quiet);
     let findings = if strict { Some(check(input_path, &input, &limits)?) } else { None };
     let work = Work { path: input_path, job: &job, limits: &limits, picked: &picked, input: &input, cancel: &cancel };
-    let product = if format == Format::Glb && output.is_file() {
-        work.run_to_file(&mut output, &progress)?
+    let product = if format == Format::Glb && output.has_random_access() {
+        work.run_to_file(&output, &progress)?
     } else {
         work.run(&progress, None).map_err(|source| work.failure(source))?
     };
@@ -146,7 +146,7 @@ impl Work<'_> {
     }
 
     /// Runs the job and writes a GLB while it is meshed, if the job allows that.
-    fn run_to_file(&self, output: &mut Output, progress: &Progress) -> Result<Product, CliError> {
+    fn run_to_file(&self, output: &Output, progress: &Progress) -> Result<Product, CliError> {
         let sink = GlbSink::new(output);
         let product = self.run(progress, Some(&sink));
         let cause = sink.failure();
@@ -212,7 +212,7 @@ fn finding(finding: &Diagnostic) -> String {
 fn encode(product: &Product, format: Format, out: &mut Output, sink: &dyn ProgressSink) -> Result<f64, CliError> {
     sink.progress("encode", 0.0);
     let start = Instant::now();
-    let written = Encoder::stored(format, product.storage, &product.mesh, &product.meta())?.write(out);
+    let written = Encoder::new(format, product.storage, &product.mesh, &product.meta())?.write(out);
     let encoding = start.elapsed().saturating_sub(out.writing);
     written.map_err(|source| out.failure(source))?;
     Ok(encoding.as_secs_f64() * 1e3)

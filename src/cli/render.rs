@@ -38,7 +38,7 @@ pub(super) fn run(args: &RenderArgs) -> Result<(), CliError> {
     let failed = |source| mesh::failure(input_path, &input, &limits, source);
     let mut product = pipeline::run(&input, &job, &limits, &choice, &cancel, &progress, None).map_err(failed)?;
     let plain = PictureParams::default();
-    pipeline::draw(&mut product, job.picture.as_ref().unwrap_or(&plain), &picked.drawer, &cancel, &progress)
+    pipeline::draw(&mut product, job.picture.as_ref().unwrap_or(&plain), &picked.renderer, &cancel, &progress)
         .map_err(failed)?;
     let start = Instant::now();
     product.file(Format::Png)?.write(&mut output).map_err(|source| output.failure(source))?;

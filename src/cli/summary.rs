@@ -39,7 +39,7 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     );
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
     if let Some(quantization) = report.quantization {
-        page.row("vertices", &format!("quantised in steps of {} Å", quantization.step));
+        page.row("vertices", &format!("quantized in steps of {} Å", quantization.step));
     }
     if let Some(picture) = &report.picture {
         page.row("picture", &drawn(picture));

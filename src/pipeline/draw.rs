@@ -2,7 +2,7 @@
 
 use super::report::{PictureReport, Report};
 use super::{JobError, Product, ProgressSink, StageClock};
-use crate::picture::{Drawer, PictureParams, Rendered, png};
+use crate::picture::{PictureParams, Rendered, SelectedRenderer, png};
 use crate::surface::{CancelToken, Control, Mesh, Served};
 
 /// Draws the mesh of `product` and replaces it with the PNG.
@@ -13,7 +13,7 @@ use crate::surface::{CancelToken, Control, Mesh, Served};
 pub fn draw(
     product: &mut Product,
     params: &PictureParams,
-    drawer: &Drawer,
+    renderer: &SelectedRenderer,
     cancel: &CancelToken,
     progress: &dyn ProgressSink,
 ) -> Result<(), JobError> {
@@ -23,12 +23,12 @@ pub fn draw(
         // The renderer needs random access to vertices.
         mesh.make_contiguous();
         let control = Control { cancel: cancel.clone(), deadline: None, observer: &clock };
-        drawer.renderer.render(&mesh, params, &control)
+        renderer.renderer.render(&mesh, params, &control)
     })?;
     // Free the mesh before the PNG is allocated.
     drop::<Mesh>(mesh);
     let bytes = clock.time("png", || png::encode(&drawn.image))?;
-    product.report.picture = Some(PictureReport::new(params, drawer, &drawn));
+    product.report.picture = Some(PictureReport::new(params, renderer, &drawn));
     for (stage, ms) in clock.finish() {
         Report::add_timing(&mut product.report, stage, ms);
     }
@@ -38,11 +38,11 @@ pub fn draw(
 
 impl PictureReport {
     /// Returns the report of a picture.
-    fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
+    fn new(params: &PictureParams, renderer: &SelectedRenderer, drawn: &Rendered) -> Self {
         let served = drawn.served.clone().unwrap_or_else(|| Served {
-            backend: drawer.renderer.name(),
-            arithmetic: drawer.renderer.arithmetic(),
-            device: drawer.renderer.describe(),
+            backend: renderer.renderer.name(),
+            arithmetic: renderer.renderer.arithmetic(),
+            device: renderer.renderer.describe(),
             fallback_reason: None,
         });
         Self {
@@ -58,8 +58,8 @@ impl PictureReport {
             arithmetic: served.arithmetic,
             device: served.device,
             reason: match &served.fallback_reason {
-                Some(why) => format!("{}; but {why}", drawer.reason),
-                None => drawer.reason.clone(),
+                Some(why) => format!("{}; but {why}", renderer.reason),
+                None => renderer.reason.clone(),
             },
             fallback: served.fallback_reason,
         }

@@ -101,7 +101,7 @@ pub(super) enum Rows<'a> {
 }
 
 impl<'a> Rows<'a> {
-    /// All rows of some quantised vertices.
+    /// All rows of some quantized vertices.
     pub(super) fn of(quantized: &'a mut Quantized) -> Self {
         let Quantized { step, positions, normals } = quantized;
         Self::Quantized { step: *step, positions, normals }
