@@ -6,7 +6,6 @@
 mod row;
 mod rows;
 
-use self::row::PREFIX;
 use self::rows::Rows;
 use super::atom_site::{Layout, Passed};
 use super::atoms::{Source, SourceFormat, Structure};
@@ -105,7 +104,7 @@ impl<'a> Reader<'a> {
                 }
                 Kind::Value => {
                     let expected = "a data block, loop_, or a tag that begins with _";
-                    return Err(Fault::token(self.text, token.start, token.end, expected).into());
+                    return Err(token.fault(self.text, expected).into());
                 }
             }
             token = self.tokens.next()?;
@@ -127,14 +126,11 @@ impl<'a> Reader<'a> {
         let value = self.tokens.next()?;
         if value.kind != Kind::Value {
             let expected = format!("a value of {}", decode(&self.text[tag.start..tag.end.min(tag.start + 80)]));
-            return Err(match value.kind {
-                Kind::End => Fault::words(value.start, "the end of the file", expected).into(),
-                _ => Fault::token(self.text, value.start, value.end, expected).into(),
-            });
+            return Err(value.fault(self.text, expected).into());
         }
         self.note_category(tag);
         let name = &self.text[tag.start..tag.end];
-        if !self.in_frame && starts_with(name, PREFIX) {
+        if !self.in_frame && row::has_prefix(name) {
             self.single.tags.push((tag.start, tag.end));
             self.single.values.push((value.start, value.end));
         } else {
@@ -162,7 +158,8 @@ impl<'a> Reader<'a> {
 
     /// Stores the id or title of the entry.
     fn note_value(&mut self, tag: &[u8], value: &Token) {
-        if self.in_frame || !(starts_with(tag, b"_entry.id") || starts_with(tag, b"_struct.title")) {
+        let is_id = tag.eq_ignore_ascii_case(b"_entry.id");
+        if self.in_frame || !(is_id || tag.eq_ignore_ascii_case(b"_struct.title")) {
             return;
         }
         let (start, end, quoted) = cif::unquote(self.text, value.start, value.end);
@@ -170,10 +167,9 @@ impl<'a> Reader<'a> {
         if !quoted && matches!(raw, b"?" | b".") {
             return;
         }
-        if tag.eq_ignore_ascii_case(b"_entry.id") && self.entry.is_none() {
-            self.entry = normalize(raw, 80);
-        } else if tag.eq_ignore_ascii_case(b"_struct.title") && self.title.is_none() {
-            self.title = normalize(raw, MAX_TITLE);
+        let (place, max) = if is_id { (&mut self.entry, 80) } else { (&mut self.title, MAX_TITLE) };
+        if place.is_none() {
+            *place = normalize(raw, max);
         }
     }
 
@@ -186,13 +182,10 @@ impl<'a> Reader<'a> {
             token = self.tokens.next()?;
         }
         let Some(first) = tags.first() else {
-            return Err(match token.kind {
-                Kind::End => Fault::words(token.start, "the end of the file", "a tag after loop_").into(),
-                _ => Fault::token(self.text, token.start, token.end, "a tag after loop_").into(),
-            });
+            return Err(token.fault(self.text, "a tag after loop_").into());
         };
         self.note_category(first);
-        let is_atom_site = !self.in_frame && starts_with(&self.text[first.start..first.end], PREFIX);
+        let is_atom_site = !self.in_frame && row::has_prefix(&self.text[first.start..first.end]);
         if is_atom_site && self.rows.is_none() && token.kind == Kind::Value {
             let ranges: Vec<_> = tags.iter().map(|t| (t.start, t.end)).collect();
             if let Some(layout) = self.layout(&ranges)? {
@@ -289,8 +282,4 @@ impl<'a> Reader<'a> {
         };
         Ok(columns.finish(tables, source))
     }
-}
-
-fn starts_with(tag: &[u8], prefix: &[u8]) -> bool {
-    tag.get(..prefix.len()).is_some_and(|t| t.eq_ignore_ascii_case(prefix))
 }
