@@ -14,7 +14,8 @@ use super::interrupt;
 /// Open output. Dropping it without [`Output::finish`] removes the file.
 pub(crate) struct Output {
     to: To,
-    name: String,
+    /// Path, or `stdout`.
+    pub(crate) name: String,
     cancel: CancelToken,
     /// Bytes written so far.
     pub(crate) bytes: u64,

@@ -32,11 +32,9 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         tracing::warn!("{warning}");
     }
     strict_validator::quiet_panics();
-    let requested =
-        BackendRequest { backend: args.backend, devices: &config.devices.choice, threads: None, work: None };
-    let picked = backend::pick(&requested, &backend::Use::Service(config.devices.clone()))?;
-    let others = survey::survey(&picked);
-    let SelectedBackend { backend, reason, renderer, devices, .. } = picked;
+    let selected = backend::select(&BackendRequest::of_service(args.backend, &config.devices))?;
+    let others = survey::survey(&selected);
+    let SelectedBackend { backend, reason, renderer, devices, .. } = selected;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();
     let facts = Facts {

@@ -27,17 +27,17 @@ pub(crate) fn describe(backend: &dyn Backend) -> String {
 }
 
 /// Returns all backends and the unused devices, with their states.
-pub(crate) fn survey(picked: &SelectedBackend) -> Vec<Availability> {
+pub(crate) fn survey(selected: &SelectedBackend) -> Vec<Availability> {
     let candidate = |name: &str, state| Availability { name: name.to_owned(), state };
-    let gpu = picked.no_gpu.clone().map_or_else(|| Ok(picked.backend.describe()), Err);
+    let gpu = selected.no_gpu.clone().map_or_else(|| Ok(selected.backend.describe()), Err);
     let mut survey = vec![
         candidate("cpu", CpuBackend::new(None).map(|cpu| cpu.describe())),
         candidate("reference", Ok(ReferenceBackend.describe())),
     ];
     // The reasons of the devices follow, one per line.
-    let gpu = gpu.map_err(|why| if picked.devices.is_empty() { why } else { "no device is used".to_owned() });
+    let gpu = gpu.map_err(|why| if selected.devices.is_empty() { why } else { "no device is used".to_owned() });
     survey.push(candidate("gpu", gpu));
-    let left = picked.devices.iter().filter(|device| !device.taken);
+    let left = selected.devices.iter().filter(|device| !device.taken);
     survey
         .extend(left.map(|d| candidate(&format!("gpu {}", d.number), Err(format!("{}: {}", d.facts.name, d.reason)))));
     survey
