@@ -33,7 +33,7 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
     }
     strict_validator::quiet_panics();
     let selected = backend::select(&BackendRequest::of_service(args.backend, &config.devices))?;
-    let others = survey::survey(&selected);
+    let others = survey::backends(&selected).into_iter().chain(survey::unused_devices(&selected)).collect();
     let SelectedBackend { backend, reason, renderer, devices, .. } = selected;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();

@@ -56,7 +56,7 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
     match backend::select(&BackendRequest::of_service(args.serve.backend, &config.devices)) {
         Ok(selected) => {
-            backends = survey::survey(&selected);
+            backends = survey::backends(&selected);
             let SelectedBackend { backend, reason, devices: found, .. } = selected;
             checks.push(checks::first_mesh(backend.as_ref()));
             let workers = config.jobs.workers.max(config.devices.jobs * backend.devices().len());
@@ -110,7 +110,7 @@ impl Findings {
                 "target": machine::TARGET, "compiler": machine::COMPILER,
             },
             "machine": self.machine.document(),
-            "backends": self.backends.iter().filter(|b| !b.is_device()).map(backend).collect::<Vec<_>>(),
+            "backends": self.backends.iter().map(backend).collect::<Vec<_>>(),
             "devices": self.devices.iter().map(device).collect::<Vec<_>>(),
             "backend": self.taken.as_ref().map(|(name, reason)| json!({ "name": name, "reason": reason })),
             "checks": self.checks.iter().map(check).collect::<Vec<_>>(),
