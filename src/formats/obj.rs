@@ -307,7 +307,7 @@ mod tests {
     fn the_longest_lines_fit() {
         let mut bytes = [0; LINE_BYTES];
         let mut line = Line { bytes: &mut bytes, used: 0 };
-        line.face([u32::MAX; 3]);
+        line.face([u32::MAX; 3], true);
         assert_eq!(&line.bytes[..line.used], format!("f{}\n", " 4294967296//4294967296".repeat(3)).as_bytes());
         line.used = 0;
         line.vector(b"vn", [-1e9; 3], Decimals::Five);
