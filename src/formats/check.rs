@@ -35,8 +35,8 @@ pub(super) struct Summary {
     pub(super) translucent: bool,
 }
 
-/// Checks that all columns have the same length, and that the values that the writer of `format` relies on are finite and
-/// in range. Columns that are copied unchanged are not read.
+/// Checks that all columns have the same length, and that the values that the writer of `format` relies on are finite
+/// and in range. Columns that are copied unchanged are not read.
 pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError> {
     let n = mesh.n_vertices();
     let n_normals = mesh.quantized.as_ref().map_or(mesh.normals.len(), |quantized| quantized.normals.len());

@@ -61,8 +61,8 @@ enum Plan {
 
 impl<'a> Encoder<'a> {
     /// Checks `mesh` and computes the layout. Reads only the columns whose values the format relies on: the others are
-    /// copied unchanged, so that the file of an invalid mesh may be invalid. [`Packing::of`] is the storage of a mesh as
-    /// it is in memory.
+    /// copied unchanged, so that the file of an invalid mesh may be invalid. [`Packing::of`] is the storage of a mesh
+    /// as it is in memory.
     ///
     /// # Errors
     /// Returns any [`FormatError`].

@@ -105,8 +105,8 @@ impl Archive {
         Self { max_bytes: bytes, ..self }
     }
 
-    /// Reads the file of an entry, without decompressing it, and its stamp. Returns `None` if the folder or the entry does
-    /// not exist. Blocks.
+    /// Reads the file of an entry, without decompressing it, and its stamp. Returns `None` if the folder or the entry
+    /// does not exist. Blocks.
     ///
     /// # Errors
     /// [`ArchiveError::TooLarge`] and [`ArchiveError::Io`].
