@@ -228,7 +228,7 @@ impl Shared {
     async fn local(self: &Arc<Self>, id: &EntryId) -> Result<Option<(Bytes, Digest, Stamp)>, FetchError> {
         let (shared, wanted) = (Arc::clone(self), id.clone());
         let found = blocking(move || {
-            let found = shared.folder.fetch_stamped(&wanted)?;
+            let found = shared.folder.fetch(&wanted)?;
             Ok(found.map(|(bytes, stamp)| {
                 let digest = Digest::of(&bytes);
                 (Bytes::from(bytes), digest, stamp)

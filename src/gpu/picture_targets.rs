@@ -8,7 +8,7 @@ use wgpu::{
 
 use crate::picture::PictureParams;
 use crate::picture::camera::Camera;
-use crate::picture::finish::Finish;
+use crate::picture::finish::{self, Finish};
 use crate::picture::light::{AMBIENT, DIFFUSE, LIGHT};
 use crate::surface::Mesh;
 
@@ -91,12 +91,12 @@ impl FinishParams {
             n_taps: u32::try_from(finish.taps.len()).unwrap_or(0),
             line_width: finish.line_width,
             falloff: finish.falloff,
-            bias: finish.bias,
-            strength: finish.strength,
-            min_light: finish.min_light,
+            bias: finish::BIAS,
+            strength: finish::STRENGTH,
+            min_light: finish::MIN_LIGHT,
             step_min,
             step_max,
-            line_strength: finish.line_strength,
+            line_strength: finish::LINE_STRENGTH,
             pad: 0.0,
         }
     }

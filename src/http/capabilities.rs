@@ -250,7 +250,7 @@ pub(super) async fn show(State(app): State<Shared>) -> Response {
 
 /// Writes the document.
 pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> Bytes {
-    let (backend, drawer) = (pool.backend(), pool.drawer());
+    let (backend, renderer) = (pool.backend(), pool.renderer());
     let document = Capabilities {
         name: "molmesh",
         version: env!("CARGO_PKG_VERSION"),
@@ -272,9 +272,9 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
             reason: pool.reason().to_owned(),
         }],
         renderers: vec![BackendDocument {
-            name: drawer.renderer.name(),
-            device: drawer.renderer.describe(),
-            reason: drawer.reason.clone(),
+            name: renderer.renderer.name(),
+            device: renderer.renderer.describe(),
+            reason: renderer.reason.clone(),
         }],
         devices: devices(found, &backend.devices()),
         radii: Radii { table: radii::TABLE, unit: "Å", fallback: radii::FALLBACK, values: radii_by_symbol() },

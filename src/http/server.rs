@@ -21,7 +21,7 @@ use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::config::Config;
 use crate::jobs::{Budget, EndError, JobStore, JobStoreSettings, Pool, Settings};
-use crate::picture::Drawer;
+use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
 use crate::store::{FolderLock, LockError, Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
@@ -75,7 +75,7 @@ pub struct Chosen {
     /// Reason for its choice.
     pub reason: String,
     /// Renderer of pictures.
-    pub drawer: Drawer,
+    pub renderer: SelectedRenderer,
     /// Every device that was found, used or not.
     pub devices: Vec<FoundDevice>,
 }
@@ -110,7 +110,7 @@ impl Server {
     /// # Errors
     /// [`ServeError`].
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
-        let Chosen { backend, reason, drawer, devices: found } = chosen;
+        let Chosen { backend, reason, renderer, devices: found } = chosen;
         let access = Arc::new(Access::open(&config)?);
         let (listener, addr) = listen("server.listen", config.server.listen)?;
         let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
@@ -127,7 +127,7 @@ impl Server {
             batch_max_delay: config.jobs.batch_max_delay(),
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
-            drawer,
+            renderer,
             meter: Some(Arc::new(UsageRecorder(Arc::clone(&access)))),
             tracer: traces.tracer(),
         };

@@ -207,7 +207,6 @@ fn folder_problem(error: &ArchiveError) -> Problem {
             .with("parameter", "id")
             .with("value", id.as_str())
             .with("expected", "a PDB id such as 4pti or pdb_00004pti"),
-        ArchiveError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
         ArchiveError::TooLarge { bytes, limit, .. } => {
             Problem::new(Kind::InflatedTooLarge, detail).with("limit", *limit).with("actual", *bytes)
         }

@@ -9,7 +9,7 @@ use metrics::counter;
 use super::devices::Watch;
 use super::queue::Queue;
 use super::{Budget, Client, OnStart, Refusal, Task, Ticket, worker};
-use crate::picture::Drawer;
+use crate::picture::SelectedRenderer;
 use crate::pipeline::{self, Job, JobLimits, maker};
 use crate::surface::Backend;
 use crate::telemetry::{JOBS_SUBMITTED, Tracer};
@@ -28,7 +28,7 @@ pub struct Settings {
     /// Memory budget for uploads and meshes.
     pub budget: Budget,
     /// Renderer of pictures.
-    pub drawer: Drawer,
+    pub renderer: SelectedRenderer,
     /// Receiver of the time that each job took.
     pub meter: Option<Arc<dyn Meter>>,
     /// Exporter for the spans of resumed jobs.
@@ -50,7 +50,7 @@ pub(super) struct Shared {
     pub(super) limits: JobLimits,
     pub(super) budget: Budget,
     pub(super) workers: usize,
-    pub(super) drawer: Drawer,
+    pub(super) renderer: SelectedRenderer,
     pub(super) meter: Option<Arc<dyn Meter>>,
     tracer: Tracer,
     watch: Watch,
@@ -74,11 +74,11 @@ impl Pool {
     /// # Errors
     /// That of the operating system if a thread cannot be started.
     pub fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
-        let Settings { workers, queue, batch_max_delay, limits, budget, drawer, meter, tracer } = settings;
+        let Settings { workers, queue, batch_max_delay, limits, budget, renderer, meter, tracer } = settings;
         let workers = workers.max(1);
         let queue = Arc::new(Queue::new(queue, workers, batch_max_delay));
         let watch = Watch::default();
-        let shared = Shared { queue, backend, reason, limits, budget, workers, drawer, meter, tracer, watch };
+        let shared = Shared { queue, backend, reason, limits, budget, workers, renderer, meter, tracer, watch };
         let pool = Self { shared: Arc::new(shared) };
         for n in 0..workers {
             let shared = Arc::clone(&pool.shared);
@@ -127,14 +127,14 @@ impl Pool {
 
     /// Returns the renderer of pictures.
     #[must_use]
-    pub fn drawer(&self) -> &Drawer {
-        &self.shared.drawer
+    pub fn renderer(&self) -> &SelectedRenderer {
+        &self.shared.renderer
     }
 
     /// Returns the arithmetic of a job's file, provided that neither backend nor renderer falls back to another one.
     #[must_use]
     pub fn maker(&self, job: &Job) -> String {
-        let renderer = job.picture.map(|_| self.shared.drawer.renderer.arithmetic());
+        let renderer = job.picture.map(|_| self.shared.renderer.renderer.arithmetic());
         maker(&self.shared.backend.arithmetic(), renderer.as_deref())
     }
 

@@ -18,7 +18,7 @@ use super::{
     Settings, Status, Task, now_ms,
 };
 use crate::formats::Format;
-use crate::picture::Drawer;
+use crate::picture::SelectedRenderer;
 use crate::pipeline::{JobLimits, params};
 use crate::store::faulty::{Faults, faulty};
 use crate::store::{Digest, Folder, Name, Store, StoreError};
@@ -45,7 +45,7 @@ impl Fixture {
             batch_max_delay: Duration::from_secs(10),
             limits: JobLimits::default(),
             budget: Budget::new(1 << 30),
-            drawer: Drawer::cpu("a test"),
+            renderer: SelectedRenderer::cpu("a test"),
             meter: None,
             tracer: Tracer::default(),
         };

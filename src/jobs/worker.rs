@@ -69,7 +69,7 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
                 pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref(), None)
                     .map_err(|error| explained(shared, &task.input, error))?;
             if let Some(picture) = &task.job.picture {
-                pipeline::draw(&mut product, picture, &shared.drawer, &cancel, progress.as_ref())
+                pipeline::draw(&mut product, picture, &shared.renderer, &cancel, progress.as_ref())
                     .map_err(|error| Failure::Job { error, diagnostics: Vec::new() })?;
             }
             if let Some(time) = checked {

@@ -43,8 +43,8 @@ pub enum PictureError {
     /// The run was cancelled.
     #[error("cancelled")]
     Cancelled,
-    /// The vertices are quantised.
-    #[error("quantised vertices cannot be drawn")]
+    /// The vertices are quantized.
+    #[error("quantized vertices cannot be drawn")]
     Quantized,
     /// The device failed, and there is no fallback.
     #[error("no device could draw the picture: {why}")]
@@ -120,7 +120,7 @@ pub trait Renderer: Send + Sync {
         }
     }
 
-    /// Draws `mesh`, whose vertices must not be quantised.
+    /// Draws `mesh`, whose vertices must not be quantized.
     ///
     /// # Errors
     /// Any [`PictureError`] but [`PictureError::Png`] and [`PictureError::TooLarge`], which are detected earlier.
@@ -129,17 +129,17 @@ pub trait Renderer: Send + Sync {
 
 /// Renderer in use, with the reason for its choice.
 #[derive(Clone)]
-pub struct Drawer {
+pub struct SelectedRenderer {
     /// Renderer.
     pub renderer: Arc<dyn Renderer>,
     /// Reason for the choice.
     pub reason: String,
 }
 
-impl Drawer {
-    /// CPU renderer on the global thread pool.
+impl SelectedRenderer {
+    /// Returns the CPU renderer.
     #[must_use]
     pub fn cpu(reason: &str) -> Self {
-        Self { renderer: Arc::new(CpuRenderer::default()), reason: reason.to_owned() }
+        Self { renderer: Arc::new(CpuRenderer), reason: reason.to_owned() }
     }
 }

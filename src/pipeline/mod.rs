@@ -186,7 +186,7 @@ pub fn run(
     } else {
         let storage = storage(job, &mut params, &spheres);
         if let Some(sink) = sink {
-            sink.store(storage);
+            sink.set_storage(storage);
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
         (clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink))?, None, storage)

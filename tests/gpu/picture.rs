@@ -19,7 +19,7 @@ fn gpu(fallback: bool) -> Option<GpuRenderer> {
         }
         return None;
     }
-    Some(GpuRenderer::start(&found, fallback.then(CpuRenderer::default)).unwrap())
+    Some(GpuRenderer::start(&found, fallback.then_some(CpuRenderer)).unwrap())
 }
 
 fn params(style: Style, view: View) -> PictureParams {
@@ -53,7 +53,7 @@ fn a_device_draws_the_picture_of_the_cpu() {
     let Some(gpu) = gpu(false) else { return };
     assert_eq!(gpu.name(), "gpu");
     assert!(gpu.describe().contains("software"), "{}", gpu.describe());
-    let (cpu, mesh) = (CpuRenderer::default(), balls());
+    let (cpu, mesh) = (CpuRenderer, balls());
     for (style, view, background) in [
         (Style::Gouraud, View::Front, "transparent"),
         (Style::Surface, View::Principal, "transparent"),
@@ -95,7 +95,7 @@ fn the_cpu_is_the_fallback_and_is_reported() {
     let made_by = rendered.made_by.unwrap();
     assert_eq!(made_by.backend, "cpu");
     assert!(made_by.fallback_reason.unwrap().contains("the GPU could not draw it"));
-    assert_eq!(rendered.image, of(&CpuRenderer::default(), &mesh, &wide));
+    assert_eq!(rendered.image, of(&CpuRenderer, &mesh, &wide));
     // Errors of the request are not passed to the fallback.
     let cancel = CancelToken::default();
     cancel.cancel();

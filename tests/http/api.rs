@@ -296,7 +296,7 @@ fn errors_name_bad_parameters_and_expected_values() {
 }
 
 #[test]
-fn only_glb_and_gltf_are_quantised() {
+fn only_glb_and_gltf_are_quantized() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let archive = server.dir.path().join("archive/pt");
     std::fs::create_dir_all(&archive).unwrap();

@@ -31,7 +31,7 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     if let Some([now, most]) = machine.files {
         page.row("open files", &format!("{now}, raised to {most} by a service"));
     }
-    for candidate in findings.backends.iter().filter(|candidate| !candidate.is_device()) {
+    for candidate in &findings.backends {
         let state = match &candidate.state {
             Ok(device) => format!("{} {device}", style.green("yes")),
             Err(why) => format!("{} {why}", style.dim("no ")),
