@@ -1,7 +1,6 @@
 //! Configuration of the structure archive: a local folder, and a remote archive for entries that it lacks.
 
 use std::path::PathBuf;
-use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -85,61 +84,5 @@ impl Default for ArchiveConfig {
             breaker_failures: 5,
             breaker_ms: 30_000,
         }
-    }
-}
-
-impl ArchiveConfig {
-    /// Returns the time between checks of a local file.
-    #[must_use]
-    pub fn check(&self) -> Duration {
-        Duration::from_millis(self.check_ms)
-    }
-
-    /// Returns the time for a connection.
-    #[must_use]
-    pub fn connect_timeout(&self) -> Duration {
-        Duration::from_millis(self.connect_timeout_ms)
-    }
-
-    /// Returns the time for the head of a response, and the longest pause within its body.
-    #[must_use]
-    pub fn first_byte_timeout(&self) -> Duration {
-        Duration::from_millis(self.first_byte_timeout_ms)
-    }
-
-    /// Returns the total time for an entry.
-    #[must_use]
-    pub fn timeout(&self) -> Duration {
-        Duration::from_millis(self.timeout_ms)
-    }
-
-    /// Returns the longest pause before the second attempt.
-    #[must_use]
-    pub fn backoff(&self) -> Duration {
-        Duration::from_millis(self.backoff_ms)
-    }
-
-    /// Returns the longest `Retry-After` that a fetch waits for.
-    #[must_use]
-    pub fn retry_after(&self) -> Duration {
-        Duration::from_millis(self.retry_after_ms)
-    }
-
-    /// Returns the time for which a copy is used without revalidation.
-    #[must_use]
-    pub fn fresh(&self) -> Duration {
-        Duration::from_millis(self.fresh_ms)
-    }
-
-    /// Returns the time for which a missing entry is not requested again.
-    #[must_use]
-    pub fn absent(&self) -> Duration {
-        Duration::from_millis(self.absent_ms)
-    }
-
-    /// Returns the length of the pause after repeated failures.
-    #[must_use]
-    pub fn breaker(&self) -> Duration {
-        Duration::from_millis(self.breaker_ms)
     }
 }

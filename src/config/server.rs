@@ -2,7 +2,6 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
-use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -82,49 +81,5 @@ impl Default for ServerConfig {
             trusted_proxies: None,
             forwarded_header: ForwardedHeader::default(),
         }
-    }
-}
-
-impl ServerConfig {
-    /// Returns the time for the head of a request.
-    #[must_use]
-    pub fn header_timeout(&self) -> Duration {
-        Duration::from_millis(self.header_timeout_ms)
-    }
-
-    /// Returns the time for the whole body of a request.
-    #[must_use]
-    pub fn body_timeout(&self) -> Duration {
-        Duration::from_millis(self.body_timeout_ms)
-    }
-
-    /// Returns the time in which a client must receive `write_bytes` of a response body.
-    #[must_use]
-    pub fn write_timeout(&self) -> Duration {
-        Duration::from_millis(self.write_timeout_ms)
-    }
-
-    /// Returns the time that an idle HTTP/2 connection is kept.
-    #[must_use]
-    pub fn idle_timeout(&self) -> Duration {
-        Duration::from_millis(self.idle_timeout_ms)
-    }
-
-    /// Returns the longest silence of an event stream.
-    #[must_use]
-    pub fn heartbeat(&self) -> Duration {
-        Duration::from_millis(self.heartbeat_ms)
-    }
-
-    /// Time after SIGTERM in which all requests are served.
-    #[must_use]
-    pub fn termination_notice(&self) -> Duration {
-        Duration::from_millis(self.termination_notice_ms.unwrap_or_default())
-    }
-
-    /// Time after the termination notice for running requests and jobs to finish.
-    #[must_use]
-    pub fn drain_timeout(&self) -> Duration {
-        Duration::from_millis(self.drain_timeout_ms)
     }
 }

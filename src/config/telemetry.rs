@@ -3,7 +3,6 @@
 use std::borrow::Cow;
 use std::fmt;
 use std::path::PathBuf;
-use std::time::Duration;
 
 use reqwest::Url;
 use reqwest::header::{HeaderMap, HeaderName, HeaderValue};
@@ -51,20 +50,6 @@ impl Default for TelemetryConfig {
             queue: 4096,
             flush_timeout_ms: 2000,
         }
-    }
-}
-
-impl TelemetryConfig {
-    /// Returns the maximum time to send a batch, retries included.
-    #[must_use]
-    pub fn timeout(&self) -> Duration {
-        Duration::from_millis(self.timeout_ms)
-    }
-
-    /// Returns the maximum time to export the queued spans when the service stops.
-    #[must_use]
-    pub fn flush_timeout(&self) -> Duration {
-        Duration::from_millis(self.flush_timeout_ms)
     }
 }
 

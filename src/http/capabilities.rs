@@ -344,7 +344,7 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         inflated_bytes: limits.inflated_bytes,
         atoms: limits.atoms,
         labels: limits.labels,
-        grid_samples: limits.grid_samples,
+        grid_samples: limits.grid_points,
         candidate_pairs: limits.candidate_pairs,
         mesh_bytes: limits.mesh_bytes,
         output_bytes: limits.output_bytes,

@@ -2,6 +2,7 @@
 //! that reconnects with `Last-Event-ID` needs no earlier events.
 
 use std::convert::Infallible;
+use std::time::Duration;
 
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
@@ -65,7 +66,8 @@ pub(super) async fn show(
         let event = listener.next().await?;
         Some((Ok::<_, Infallible>(event), listener))
     });
-    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(app.config.server.heartbeat())).into_response())
+    let heartbeat = Duration::from_millis(app.config.server.heartbeat_ms);
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(heartbeat)).into_response())
 }
 
 impl Listener {

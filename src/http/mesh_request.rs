@@ -131,7 +131,8 @@ impl MeshRequest {
         let permit = app.delivery()?;
         let wait = self.preferences.wait.filter(|_| !report);
         let jobs = &app.config.jobs;
-        let allowed = if wait.is_some() { jobs.batch_deadline() } else { jobs.deadline() };
+        let deadline = Duration::from_millis(jobs.deadline_ms);
+        let allowed = if wait.is_some() { Duration::from_millis(jobs.batch_deadline_ms) } else { deadline };
         let ticket = app.pool.submit(self.task(&input), allowed, None);
         let mut ticket = ticket.map_err(|refusal| self.refused(refusal))?;
         if ticket.is_shared()
@@ -141,7 +142,7 @@ impl MeshRequest {
         }
         let outcome = match wait {
             None => ticket.wait().await,
-            Some(wait) => match tokio::time::timeout(wait.min(jobs.deadline()), ticket.wait()).await {
+            Some(wait) => match tokio::time::timeout(wait.min(deadline), ticket.wait()).await {
                 Ok(outcome) => outcome,
                 Err(_elapsed) => {
                     drop(permit);

@@ -1,5 +1,7 @@
 //! Request bodies: raw bytes, multipart forms or JSON, checked against the limits while they arrive.
 
+use std::time::Duration;
+
 use axum::body::Body;
 use axum::http::HeaderMap;
 use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE};
@@ -82,10 +84,12 @@ fn announced(headers: &HeaderMap, limit: Limit) -> Result<u64, Problem> {
 
 /// Limits the reception of a body to `server.body_timeout_ms`.
 async fn in_time<T>(app: &App, receive: impl Future<Output = Result<T, Problem>>) -> Result<T, Problem> {
-    tokio::time::timeout(app.config.server.body_timeout(), receive).await.map_err(|_elapsed| {
-        let ms = app.config.server.body_timeout_ms;
-        Problem::new(Kind::BodyTimeout, format!("the body was not complete after {ms} ms")).with("limit", ms)
-    })?
+    tokio::time::timeout(Duration::from_millis(app.config.server.body_timeout_ms), receive).await.map_err(
+        |_elapsed| {
+            let ms = app.config.server.body_timeout_ms;
+            Problem::new(Kind::BodyTimeout, format!("the body was not complete after {ms} ms")).with("limit", ms)
+        },
+    )?
 }
 
 fn text<'a>(headers: &'a HeaderMap, name: &axum::http::HeaderName) -> Option<&'a str> {

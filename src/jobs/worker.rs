@@ -14,7 +14,7 @@ use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report
 use crate::structure::strict_validator::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, SurfaceError};
-use crate::telemetry::{JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan, VOXELS};
+use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
 
 /// Size limit of files that the strict parser examines after a failure, bytes: it takes 10 to 40 ms for this size.
 const MAX_EXPLAINED: u64 = 512 << 10;
@@ -188,7 +188,7 @@ fn panicked(payload: &(dyn Any + Send)) -> Failure {
 
 fn count(report: &Report) {
     counter!(TRIANGLES).increment(report.triangles);
-    counter!(VOXELS).increment(report.samples);
+    counter!(GRID_POINTS).increment(report.samples);
     for (stage, ms) in &report.timings_ms {
         histogram!(STAGE_DURATION, "stage" => stage.clone()).record(ms.as_f64().unwrap_or_default() / 1e3);
     }

@@ -80,9 +80,9 @@ impl Store {
 
     fn ttl(&self, folder: Folder) -> Duration {
         match folder {
-            Folder::Inputs => self.0.config.input_ttl(),
-            Folder::Jobs => self.0.config.job_ttl(),
-            Folder::Results => self.0.config.result_ttl(),
+            Folder::Inputs => Duration::from_millis(self.0.config.input_ttl_ms),
+            Folder::Jobs => Duration::from_millis(self.0.config.job_ttl_ms),
+            Folder::Results => Duration::from_millis(self.0.config.result_ttl_ms),
         }
     }
 

@@ -49,7 +49,7 @@ pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn Object
         .with_config(key(ClientConfigKey::ReadTimeout), format!("{}ms", config.timeout_ms))
         .with_config(key(ClientConfigKey::ConnectTimeout), format!("{}ms", config.timeout_ms.min(5000)))
         .with_retry(RetryConfig { backoff: BackoffConfig::default(), max_retries: 3, retry_timeout: RETRY });
-    let mut plain = ClientOptions::new().with_timeout(config.timeout());
+    let mut plain = ClientOptions::new().with_timeout(Duration::from_millis(config.timeout_ms));
     if config.allow_http {
         builder = builder.with_allow_http(true);
         plain = plain.with_allow_http(true);

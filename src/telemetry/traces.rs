@@ -60,7 +60,7 @@ impl Traces {
             .build();
         let provider =
             provider(config.sample_ratio.get()).with_resource(resource).with_span_processor(processor).build();
-        Ok(Self { provider, flush_timeout: config.flush_timeout() })
+        Ok(Self { provider, flush_timeout: Duration::from_millis(config.flush_timeout_ms) })
     }
 
     /// Returns a provider that exports nothing and samples no new trace.
@@ -97,13 +97,14 @@ fn exporter(config: &TelemetryConfig, endpoint: &CollectorUrl) -> Result<Counted
     let failed = |reason: String| TelemetryError::Install { what: "the trace exporter", reason };
     let headers = config.secret_headers.iter().flat_map(SecretHeaders::reveal);
     let headers = headers.filter_map(|(name, value)| Some((name.to_string(), value.to_str().ok()?.to_owned())));
+    let timeout = Duration::from_millis(config.timeout_ms);
     let exporter = opentelemetry_otlp::SpanExporter::builder()
         .with_http()
-        .with_http_client(client(config.timeout(), endpoint).map_err(|e| failed(format!("{e:?}")))?)
+        .with_http_client(client(timeout, endpoint).map_err(|e| failed(format!("{e:?}")))?)
         .with_protocol(Protocol::HttpBinary)
         .with_endpoint(endpoint.traces())
         .with_headers(headers.collect())
-        .with_timeout(config.timeout())
+        .with_timeout(timeout)
         .build();
     exporter.map(Counted).map_err(|e| failed(e.to_string()))
 }
