@@ -87,7 +87,7 @@ pub(super) fn build(config: &ArchiveConfig) -> Result<Client, reqwest::Error> {
             .referer(false)
             .dns_resolver(PublicResolver { allow_private: config.allow_private || config.proxy.is_some() });
         Ok(match &config.proxy {
-            Some(proxy) => builder.proxy(Proxy::all(proxy.as_str())?),
+            Some(proxy) => builder.proxy(Proxy::all(proxy)?),
             None => builder.no_proxy(),
         })
     };

@@ -2,10 +2,11 @@
 
 use std::path::PathBuf;
 
+use reqwest::Url;
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
-use super::{ProxyUrl, Templates};
+use super::{Templates, list};
 
 /// Local folder, remote archive and copies of its entries.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -19,11 +20,15 @@ pub struct ArchiveConfig {
     pub check_ms: u64,
     /// URL templates of an entry, tried in order until one has it; `none` disables the remote archive. Default:
     /// compressed mmCIF from RCSB's download service, the smallest complete format.
+    #[serde(with = "list")]
+    #[schemars(schema_with = "Templates::schema")]
     pub url: Option<Templates>,
     /// Proxy for all requests to the remote archive. Default `none`. Environment variables such as `HTTPS_PROXY` are
     /// ignored, because the check for private addresses does not apply behind a proxy: a proxy is set here deliberately
     /// or not at all.
-    pub proxy: Option<ProxyUrl>,
+    #[serde(deserialize_with = "proxy")]
+    #[schemars(regex(pattern = "^(none|https?://.+)$"))]
+    pub proxy: Option<String>,
     /// Allows host names that resolve to private, loopback and link-local addresses. Default false: DNS records of
     /// others must not lead to the operator's machines. IP addresses in `url` are always allowed.
     pub allow_private: bool,
@@ -84,5 +89,16 @@ impl Default for ArchiveConfig {
             breaker_failures: 5,
             breaker_ms: 30_000,
         }
+    }
+}
+
+/// Deserializes the URL of a proxy.
+fn proxy<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
+    let proxy: Option<String> = Option::deserialize(deserializer)?;
+    let is_valid = |url: Url| ["http", "https"].contains(&url.scheme()) && url.has_host();
+    if proxy.as_ref().is_none_or(|text| text.parse().is_ok_and(is_valid)) {
+        Ok(proxy)
+    } else {
+        Err(serde::de::Error::custom("none, or http(s)://host:port"))
     }
 }

@@ -9,6 +9,7 @@ mod devices;
 mod error;
 mod jobs;
 mod limits;
+mod list;
 mod load;
 mod log;
 mod print;
@@ -23,7 +24,7 @@ mod template;
 use std::path::PathBuf;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
 pub use access::{AccessConfig, Origins};
 pub use archive::ArchiveConfig;
@@ -37,8 +38,8 @@ pub use proxies::{ForwardedHeader, Proxies};
 pub use schema::schema;
 pub use server::ServerConfig;
 pub use store::{Secret, StoreConfig};
-pub use telemetry::{CollectorUrl, Ratio, SecretHeaders, TelemetryConfig};
-pub use template::{ProxyUrl, Template, Templates};
+pub use telemetry::{SecretHeaders, TelemetryConfig};
+pub use template::{Template, Templates};
 
 /// Complete configuration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -76,18 +77,4 @@ impl Config {
     pub fn archive_cache_dir(&self) -> PathBuf {
         self.server.data_dir.join("cache").join("archive")
     }
-}
-
-/// Deserialises a string, or a list of strings joined with spaces.
-fn joined<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
-    #[derive(Deserialize)]
-    #[serde(untagged)]
-    enum StringOrList {
-        Text(String),
-        List(Vec<String>),
-    }
-    Ok(match StringOrList::deserialize(deserializer)? {
-        StringOrList::Text(text) => text,
-        StringOrList::List(texts) => texts.join(" "),
-    })
 }

@@ -36,10 +36,10 @@ pub fn schema() -> Value {
 fn finish(key: &str, of_key: &mut Map<String, Value>, default: &Value) {
     one_line(of_key);
     let absent = drop_null(of_key);
+    // Formats such as uint64 are not standard.
+    of_key.remove("format");
     let of_type = |of_key: &Map<String, Value>, name: &str| of_key.get("type").is_some_and(|kind| kind == name);
     if of_type(of_key, "integer") {
-        // Formats such as uint64 are not standard.
-        of_key.remove("format");
         of_key.insert("minimum".to_owned(), minimum(key).into());
         let texts = match (key.ends_with("_bytes"), absent) {
             (true, false) => Some(SIZE.to_owned()),

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{ForwardedHeader, Proxies};
+use super::{ForwardedHeader, Proxies, list};
 
 /// Listeners and limits of connections.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -55,6 +55,8 @@ pub struct ServerConfig {
     pub drain_timeout_ms: u64,
     /// Trusted proxies, by address or network, whose forwarding header names the client. Default `none`: the peer is
     /// the client, and its forwarding headers are ignored.
+    #[serde(with = "list")]
+    #[schemars(schema_with = "Proxies::schema")]
     pub trusted_proxies: Option<Proxies>,
     /// Forwarding header of the trusted proxies: `x-forwarded-for` or `forwarded` (RFC 7239). Default
     /// `x-forwarded-for`, which most proxies write. The other header is ignored, because the client may have sent it.
