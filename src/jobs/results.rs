@@ -61,7 +61,7 @@ pub async fn save(
     }
     let document = serde_json::to_vec(&finished.product.report).map_err(|e| SaveError::Other(e.to_string()))?;
     store.put(&report, Bytes::from(document)).await?;
-    let mut writer = store.writer(&mesh, None);
+    let mut writer = store.writer(&mesh);
     let encode = move || {
         let file = finished.product.file(format)?;
         let bytes = file.bytes_bound();

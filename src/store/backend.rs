@@ -15,7 +15,7 @@ use tokio::task::spawn_blocking;
 
 use super::error::StoreError;
 use super::name::{Folder, Name};
-use super::object::Meta;
+use super::object::{Meta, Stored};
 use super::s3::{self, Bucket};
 use super::secret::{self, Secret};
 use super::stale;
@@ -101,7 +101,12 @@ impl Backend {
         StoreError::classify(op, &format!("{}/{at}", self.place), error)
     }
 
-    fn fail_at<'a>(&'a self, op: &'static str, name: &'a Name) -> impl Fn(object_store::Error) -> StoreError + 'a {
+    /// Returns a function that classifies and counts an error of the object `name`.
+    pub(super) fn fail_at<'a>(
+        &'a self,
+        op: &'static str,
+        name: &'a Name,
+    ) -> impl Fn(object_store::Error) -> StoreError + 'a {
         move |error| self.fail(op, &name.to_string(), &error)
     }
 
@@ -126,11 +131,11 @@ impl Backend {
     }
 
     /// Reads all bytes of an object.
-    pub(super) async fn get_whole(&self, name: &Name) -> Result<Option<(Meta, Bytes)>, StoreError> {
+    pub(super) async fn get_whole(&self, name: &Name) -> Result<Option<Stored>, StoreError> {
         let Some(read) = self.get(name, None).await? else { return Ok(None) };
         let meta = Meta::from(&read.meta);
         let bytes = read.bytes().await.map_err(self.fail_at("get", name))?;
-        Ok(Some((meta, bytes)))
+        Ok(Some(Stored { bytes, meta }))
     }
 
     /// Reads a range of an object. Keeps no file open.

@@ -30,6 +30,7 @@ pub struct Swept {
 }
 
 /// Bytes reserved by a writer, until they are committed or released.
+#[derive(Debug)]
 pub(super) struct Reservation {
     store: Store,
     bytes: u64,
@@ -37,7 +38,7 @@ pub(super) struct Reservation {
 }
 
 impl Reservation {
-    /// Reserves more bytes.
+    /// Reserves more bytes, evicting objects if necessary.
     pub(super) async fn grow(&mut self, bytes: u64) -> Result<(), StoreError> {
         if self.capped {
             self.store.reserve(self.bytes, bytes).await?;
@@ -86,11 +87,9 @@ impl Store {
         }
     }
 
-    /// Reserves space for an object, evicting others if necessary.
-    pub(super) async fn reserve_for(&self, name: &Name, bytes: u64) -> Result<Reservation, StoreError> {
-        let mut reservation = Reservation { store: self.clone(), bytes: 0, capped: name.folder().is_capped() };
-        reservation.grow(bytes).await?;
-        Ok(reservation)
+    /// Returns a reservation of 0 bytes for an object.
+    pub(super) fn empty_reservation(&self, name: &Name) -> Reservation {
+        Reservation { store: self.clone(), bytes: 0, capped: name.folder().is_capped() }
     }
 
     /// Reserves `more` bytes for a writer that has reserved `had`.

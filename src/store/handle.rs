@@ -119,19 +119,24 @@ impl Store {
     async fn write(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
         let (store, name) = (self.clone(), name.clone());
         self.run_to_completion(async move {
-            let reservation = store.reserve_for(&name, bytes.len() as u64).await?;
+            let mut reservation = store.empty_reservation(&name);
+            reservation.grow(bytes.len() as u64).await?;
             let _lock = store.stripe(&name).lock().await;
+            let backend = &store.0.backend;
             // Content-addressed objects are equal anyway; only job documents need an atomic check.
-            if new && name.folder() != Folder::Jobs && store.0.backend.head(&name).await?.is_some() {
+            let create = new && name.folder() == Folder::Jobs;
+            if new && !create && backend.head(&name).await?.is_some() {
                 return Ok(false);
             }
-            let written =
-                upload::put(&store.0.backend, &name, bytes.clone(), new && name.folder() == Folder::Jobs).await?;
-            if written {
-                store.commit(&name, bytes.len() as u64, Some(&bytes));
+            if create || backend.is_local() || bytes.len() <= backend.part() {
+                if !backend.put(&name, bytes.clone(), create).await? {
+                    return Ok(false);
+                }
+            } else {
+                upload::put_in_parts(&store, &name, bytes.clone()).await?;
             }
-            drop(reservation);
-            Ok(written)
+            store.commit(&name, bytes.len() as u64, Some(&bytes));
+            Ok(true)
         })
         .await
     }
@@ -142,18 +147,19 @@ impl Store {
     /// # Errors
     /// Returns a [`StoreError`]. A missing object is `None`, not an error, since objects may be removed at any time.
     pub async fn get(&self, name: &Name) -> Result<Option<Stored>, StoreError> {
-        if let Some((meta, bytes)) = self.get_from_memory(name) {
-            return Ok(Some(Stored { bytes, meta }));
+        if let Some(stored) = self.get_from_memory(name) {
+            return Ok(Some(stored));
         }
         let Some(seen) = self.begin_read(name) else { return Ok(None) };
         let read = self.0.backend.get_whole(name).await?;
-        self.end_read(name, seen, read.as_ref().map(|(meta, _)| *meta));
-        let Some((meta, bytes)) = read else { return Ok(None) };
+        self.end_read(name, seen, read.as_ref().map(|stored| stored.meta));
         let index = self.index();
-        if index.is_current(name, seen) {
-            self.0.memory.put(name, meta, &bytes);
+        if let Some(stored) = &read
+            && index.is_current(name, seen)
+        {
+            self.0.memory.put(name, stored.clone());
         }
-        Ok(Some(Stored { bytes, meta }))
+        Ok(read)
     }
 
     /// Streams an object, or a range of it whose end may exceed the size. Use it for content-addressed objects: each
@@ -164,7 +170,7 @@ impl Store {
     /// stream fails if the object is deleted during the read.
     pub async fn read(&self, name: &Name, range: Option<Range<u64>>) -> Result<Option<(Meta, ByteStream)>, StoreError> {
         let pin = self.pin(name);
-        let known = self.get_from_memory(name).map(|(meta, _)| meta);
+        let known = self.get_from_memory(name).map(|stored| stored.meta);
         if known.is_none() && !self.0.backend.is_local() {
             return self.read_remote(name, range).await;
         }
@@ -206,7 +212,7 @@ impl Store {
     /// Reads a range of the object that `meta` describes. Copies from memory, so that the result does not keep the
     /// whole object alive.
     pub(super) async fn piece(&self, name: &Name, meta: Meta, range: Range<u64>) -> Result<Bytes, StoreError> {
-        if let Some((_, bytes)) = self.0.memory.get(name).filter(|(now, _)| now.size == meta.size) {
+        if let Some(Stored { bytes, .. }) = self.0.memory.get(name).filter(|stored| stored.meta.size == meta.size) {
             let at = |offset: u64| usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
             return Ok(Bytes::copy_from_slice(&bytes[at(range.start)..at(range.end)]));
         }
@@ -255,7 +261,7 @@ impl Store {
     /// [`delete`](Self::delete) ignores pins.
     pub fn pin(&self, name: &Name) -> Pin {
         self.index().pin(name);
-        Pin::new(self.clone(), name.clone())
+        Pin { store: self.clone(), name: name.clone() }
     }
 
     /// Tests the store: writes, reads and removes a small object.
@@ -310,7 +316,7 @@ impl Store {
         let mut index = self.index();
         index.commit(name, size, now);
         match bytes {
-            Some(bytes) => self.0.memory.put(name, Meta { size, modified: now }, bytes),
+            Some(bytes) => self.0.memory.put(name, Stored { bytes: bytes.clone(), meta: Meta { size, modified: now } }),
             None => self.0.memory.remove(name),
         }
     }
@@ -333,7 +339,7 @@ impl Store {
     }
 
     /// Returns a result from memory.
-    fn get_from_memory(&self, name: &Name) -> Option<(Meta, Bytes)> {
+    fn get_from_memory(&self, name: &Name) -> Option<Stored> {
         if name.folder() != Folder::Results {
             return None;
         }
