@@ -250,7 +250,7 @@ pub(super) async fn show(State(app): State<Shared>) -> Response {
 
 /// Writes the document.
 pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> Bytes {
-    let (backend, drawer) = (pool.backend(), pool.drawer());
+    let (backend, drawer) = (pool.backend(), &pool.settings().drawer);
     let document = Capabilities {
         name: "molmesh",
         version: env!("CARGO_PKG_VERSION"),
@@ -350,7 +350,7 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         output_bytes: limits.output_bytes,
         memory_bytes: limits.memory_bytes,
         picture_side: limits.picture_side,
-        workers: pool.workers(),
+        workers: pool.settings().workers,
         queue: jobs.queue,
         deliveries: jobs.deliveries,
         deadline_ms: jobs.deadline_ms,

@@ -26,7 +26,7 @@ use super::problem::Problem;
 use super::scopes;
 use super::state::{App, Shared};
 use crate::access::{Access, Account, Denied, Exceeded, Key, Quota, Running, Scope, Signed, limits, policies, without};
-use crate::jobs::{Client, Meter, rfc3339};
+use crate::jobs::{Client, rfc3339};
 
 /// `X-Api-Key`, an alternative to `Authorization`.
 pub(super) const API_KEY: HeaderName = HeaderName::from_static("x-api-key");
@@ -255,16 +255,6 @@ impl App {
     /// Charges `time` of work that is not a job to `caller`.
     pub(super) fn charge(&self, caller: &Caller, time: Duration) {
         self.access.meter().spent(caller.client.number(), time, Instant::now());
-    }
-}
-
-/// Charges jobs to the quotas of their clients.
-#[derive(Debug)]
-pub(super) struct UsageRecorder(pub(super) Arc<Access>);
-
-impl Meter for UsageRecorder {
-    fn spent(&self, client: Client, time: Duration) {
-        self.0.meter().spent(client.number(), time, Instant::now());
     }
 }
 

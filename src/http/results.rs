@@ -123,7 +123,7 @@ pub(super) async fn stored(
     headers: &HeaderMap,
 ) -> Result<Option<Response>, Problem> {
     let name = key.name(format.extension())?;
-    app.pool.budget().check()?;
+    app.pool.settings().budget.check()?;
     let Some((meta, mut body)) = app.store.read(&name, None).await? else { return Ok(None) };
     let Some(headers_of_result) = result_headers(app, key, format).await? else { return Ok(None) };
     let mut out = HeaderMap::clone(&headers_of_result);
@@ -154,7 +154,7 @@ pub(super) async fn stored(
         body = part;
     }
     // Pieces of running answers are charged regardless of the limit; new answers are refused while it is exceeded.
-    let budget = app.pool.budget().clone();
+    let budget = app.pool.settings().budget.clone();
     let charged = body.map_ok(move |piece| {
         let mut lease = budget.lease();
         lease.force(piece.len() as u64);

@@ -10,7 +10,6 @@ use thiserror::Error;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinHandle;
 
-use super::guard::UsageRecorder;
 use super::probe::Probe;
 use super::problem::Problem;
 use super::source::FetchMemory;
@@ -20,7 +19,7 @@ use super::{accept, capabilities, key_reload, metrics, results, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::config::Config;
-use crate::jobs::{Budget, EndError, JobStore, JobStoreSettings, Pool, Settings};
+use crate::jobs::{Budget, Client, EndError, JobStore, Pool, Settings};
 use crate::picture::Drawer;
 use crate::single_flight::SingleFlight;
 use crate::store::{FolderLock, LockError, Store, StoreError};
@@ -128,21 +127,19 @@ impl Server {
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
             drawer,
-            meter: Some(Arc::new(UsageRecorder(Arc::clone(&access)))),
+            meter: Some(Arc::new({
+                let access = Arc::clone(&access);
+                move |client: Client, time| access.meter().spent(client.number(), time, Instant::now())
+            })),
             tracer: traces.tracer(),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
-        let settings = JobStoreSettings {
-            allowed: Duration::from_millis(config.jobs.batch_deadline_ms),
-            attempts: config.jobs.attempts,
-            output_bytes: config.limits.output_bytes,
-            retry_for: Duration::from_millis(config.jobs.save_retry_ms),
-        };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
-        let job_store = JobStore::new(store.clone(), Arc::clone(&pool), settings, secret, describe);
-        let archive = Archive::new(&config, Arc::new(FetchMemory(pool.budget().clone())));
+        let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
+        let job_store = JobStore::new(store.clone(), Arc::clone(&pool), jobs, output_bytes, secret, describe);
+        let archive = Archive::new(&config, Arc::new(FetchMemory(pool.settings().budget.clone())));
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();

@@ -49,11 +49,11 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
             return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
-        let form = form::read(&app.config.limits, limit, content_type, body, app.pool.budget().lease());
+        let form = form::read(&app.config.limits, limit, content_type, body, app.pool.settings().budget.lease());
         let Form { bytes, lease, fields, declared } = in_time(app, form).await?;
         Upload { bytes, lease, fields, declared }
     } else {
-        let mut lease = app.pool.budget().lease();
+        let mut lease = app.pool.settings().budget.lease();
         let bytes = in_time(app, collect(body, announced, limit, &mut lease)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
         Upload { bytes, lease, fields: Vec::new(), declared }
@@ -72,7 +72,7 @@ pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> 
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
-    let mut lease = app.pool.budget().lease();
+    let mut lease = app.pool.settings().budget.lease();
     in_time(app, collect(body, announced, limit, &mut lease)).await
 }
 

@@ -1,25 +1,21 @@
 //! One durable job from its acceptance to its end, and the state that its watchers see.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
 use metrics::gauge;
 use tokio::sync::{Notify, watch};
 use tracing::Instrument as _;
 
-use super::coalesced_job::Progress;
 use super::job_store::{JobStore, JobView};
-use super::rank::{Client, Rank};
 use super::record::{JobId, Record, Status, now_ms};
 use super::results::{self, SaveError};
 use super::retry::{self, retry};
-use super::{ContentKey, EndError, Failure, Finished, Lease, Refusal, Task, Ticket};
-use crate::formats::Format;
+use super::{ContentKey, EndError, Failure, Finished, Refusal, Ticket};
 use crate::pipeline::JobError;
 use crate::store::{Digest, Pin};
 use crate::surface::SurfaceError;
-use crate::telemetry::{JOBS_OPEN, SpanKind, TraceSpan, Tracer};
+use crate::telemetry::{JOBS_OPEN, SpanKind, TraceSpan};
 
 /// Interval at which the progress of a running job is published.
 const TICK: Duration = Duration::from_millis(100);
@@ -29,7 +25,6 @@ const PAUSE: Duration = Duration::from_millis(500);
 /// A job whose record is in the store.
 pub(super) struct DurableJob {
     view: watch::Sender<JobView>,
-    progress: Mutex<Option<Arc<Progress>>>,
     dismissed: Notify,
     /// Held while the record is written.
     pub(super) writing: tokio::sync::Mutex<()>,
@@ -39,7 +34,7 @@ impl DurableJob {
     pub(super) fn new(record: Record) -> Self {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
         let (view, _) = watch::channel(JobView { record, stage: None, fraction, version: 1, written: Arc::default() });
-        Self { view, progress: Mutex::default(), dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
+        Self { view, dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
     }
 
     pub(super) fn id(&self) -> JobId {
@@ -117,17 +112,6 @@ impl DurableJob {
         self.dismissed.notify_one();
     }
 
-    fn follow(&self, progress: &Arc<Progress>) {
-        *self.progress.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::clone(progress));
-    }
-
-    /// Publishes the progress of the work.
-    fn publish_progress(&self) {
-        let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let Some((stage, fraction)) = progress.and_then(|progress| progress.now()) else { return };
-        self.publish_stage(stage, fraction);
-    }
-
     /// Publishes stage and fraction if they have advanced.
     fn publish_stage(&self, stage: &'static str, fraction: f64) {
         self.view.send_if_modified(|view| {
@@ -149,12 +133,12 @@ impl DurableJob {
 }
 
 /// Runs a durable job to its end.
-pub(super) struct Runner<P> {
+pub(super) struct Runner {
     pub(super) job: Arc<DurableJob>,
     /// Ticket of queued or running work; `None` for a job from the records.
     pub(super) ticket: Option<Ticket>,
     /// Keeps input and record in the store.
-    pub(super) pin: P,
+    pub(super) pin: [Pin; 2],
     pub(super) digest: Digest,
     /// Number of attempts by earlier processes.
     pub(super) earlier_attempts: u32,
@@ -162,9 +146,9 @@ pub(super) struct Runner<P> {
 
 impl JobStore {
     /// Runs a job in a task of its own, traced under the request that created it.
-    pub(super) fn spawn(&self, runner: Runner<[Pin; 2]>) {
+    pub(super) fn spawn(&self, runner: Runner) {
         let record = runner.job.record();
-        let log = record.requester.parent(self.0.pool.tracer()).log_span(Some(record.id.as_str()));
+        let log = record.requester.parent(&self.0.pool.settings().tracer).log_span(Some(record.id.as_str()));
         gauge!(JOBS_OPEN).increment(1.0);
         self.0.open.send_modify(|open| *open += 1);
         let jobs = self.clone();
@@ -177,7 +161,7 @@ impl JobStore {
     }
 
     /// Waits until every job has ended or is left, and its record is written. The pool must be drained.
-    pub async fn settled(&self) {
+    pub(crate) async fn settled(&self) {
         drop(self.0.open.subscribe().wait_for(|open| *open == 0).await);
     }
 }
@@ -193,7 +177,7 @@ enum Attempt {
     Left,
 }
 
-impl<P> Runner<P> {
+impl Runner {
     pub(super) async fn run(self, jobs: &JobStore) {
         let Self { job, mut ticket, pin, digest, earlier_attempts } = self;
         let mut pause = retry::FIRST_PAUSE;
@@ -241,11 +225,14 @@ async fn attempt(jobs: &JobStore, job: &Arc<DurableJob>, ticket: &mut Option<Tic
             Err(attempt) => return attempt,
         },
     };
-    job.follow(ticket.progress());
     let outcome = loop {
         tokio::select! {
             outcome = ticket.wait() => break outcome,
-            () = tokio::time::sleep(TICK) => job.publish_progress(),
+            () = tokio::time::sleep(TICK) => {
+                if let Some((stage, fraction)) = ticket.progress.now() {
+                    job.publish_stage(stage, fraction);
+                }
+            }
         }
     };
     match outcome {
@@ -254,7 +241,7 @@ async fn attempt(jobs: &JobStore, job: &Arc<DurableJob>, ticket: &mut Option<Tic
             match save(jobs, &record, finished).await {
                 // The mesh is not held for ever. It is computed again while attempts are left.
                 Err(EndError::Save { error, .. })
-                    if error.is_temporary() && job.record().attempts < jobs.0.settings.attempts =>
+                    if error.is_temporary() && job.record().attempts < jobs.0.config.attempts =>
                 {
                     tracing::warn!(job_id = %record.id, %error, "a result was not stored; computing it again");
                     Attempt::StoreFailed
@@ -271,8 +258,7 @@ async fn attempt(jobs: &JobStore, job: &Arc<DurableJob>, ticket: &mut Option<Tic
 
 /// Submits a job from its record to the queue.
 async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &Record, digest: Digest) -> Result<Ticket, Attempt> {
-    let settings = &jobs.0.settings;
-    if record.attempts >= settings.attempts {
+    if record.attempts >= jobs.0.config.attempts {
         return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
     }
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
@@ -286,12 +272,12 @@ async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &Record, digest:
         return Err(Attempt::Ended(Ok(key)));
     }
     let on_start = jobs.on_start(job, None);
-    let ticket = jobs.0.pool.submit(task, settings.allowed, Some(on_start)).map_err(|refusal| match refusal {
+    let ticket = jobs.0.pool.submit(task, jobs.0.allowed(), Some(on_start)).map_err(|refusal| match refusal {
         Refusal::Draining => Attempt::Left,
         // An accepted job waits until the queue has a place.
         Refusal::QueueFull { .. } | Refusal::TooLate { .. } => Attempt::Retry,
     })?;
-    if ticket.joined_running() && job.begin() {
+    if ticket.joined_running && job.begin() {
         jobs.0.write_job(job).await.map_err(failed)?;
     }
     Ok(ticket)
@@ -304,28 +290,12 @@ async fn save(jobs: &JobStore, record: &Record, finished: Arc<Finished>) -> Resu
     let report = &finished.product.report;
     let (resolution, digest) = (report.resolution, finished.digest);
     let key = ContentKey::new(&digest, &request.job, format, &report.maker());
-    let (store, settings) = (&jobs.0.store, &jobs.0.settings);
-    let parent = record.requester.parent(jobs.0.pool.tracer());
+    let parent = record.requester.parent(&jobs.0.pool.settings().tracer);
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
-    let save = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
-    retry(&record.id, settings.retry_for, SaveError::is_temporary, save)
+    let save = || results::save(&jobs.0.store, Arc::clone(&finished), format, &key, jobs.0.output_bytes);
+    retry(&record.id, jobs.0.retry_time(), SaveError::is_temporary, save)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
     span.end();
     Ok(key.to_string())
-}
-
-/// Returns the task of a record, or why it cannot be run any more.
-pub(super) fn task(
-    record: &Record,
-    digest: Digest,
-    input: Bytes,
-    lease: Lease,
-    tracer: &Tracer,
-) -> Result<(Task, Format), String> {
-    let (request, format) = record.request()?;
-    let rank = Rank { client: Client::numbered(record.client), batch: true, urgency: record.urgency };
-    let (parent, id) = (record.requester.parent(tracer), Some(record.id.clone()));
-    let lease = Some(Arc::new(lease));
-    Ok((Task { input, digest, strict: request.strict, job: request.job, rank, lease, parent, id }, format))
 }

@@ -11,7 +11,7 @@ use crate::structure::strict_validator::{Diagnostic, Level};
 
 /// Error of a task that the queue does not accept.
 #[derive(Debug, Clone, PartialEq, Error)]
-pub enum Refusal {
+pub(crate) enum Refusal {
     /// The queue is full.
     #[error("{waiting} jobs are waiting and the limit is {limit}; the queue takes about {} s", wait.as_secs_f64().ceil())]
     QueueFull {
@@ -37,7 +37,7 @@ pub enum Refusal {
 
 /// Error of an accepted job.
 #[derive(Debug, Clone, PartialEq, Error)]
-pub enum Failure {
+pub(crate) enum Failure {
     /// The job itself failed.
     #[error("{error}")]
     Job {
@@ -78,7 +78,7 @@ fn errors(diagnostics: &[Diagnostic]) -> usize {
 
 /// Error of [`JobStore::accept`](super::JobStore::accept).
 #[derive(Debug, Error)]
-pub enum AcceptError {
+pub(crate) enum AcceptError {
     /// The queue refused the task.
     #[error(transparent)]
     Refused(#[from] Refusal),
@@ -95,7 +95,7 @@ pub enum AcceptError {
 
 /// Error of a durable job that ended without a result.
 #[derive(Debug, Clone, Error)]
-pub enum EndError {
+pub(crate) enum EndError {
     /// The mesh could not be computed.
     #[error(transparent)]
     Job(#[from] Failure),
