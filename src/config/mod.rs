@@ -32,7 +32,7 @@ pub use devices::DevicesConfig;
 pub use error::ConfigError;
 pub use jobs::JobsConfig;
 pub use limits::LimitsConfig;
-pub use load::{Loaded, Source, load, load_process, load_with_sources};
+pub use load::{Loaded, Source, load, load_process};
 pub use log::{LogConfig, LogFormat};
 pub use proxies::{ForwardedHeader, Proxies};
 pub use schema::schema;
@@ -73,8 +73,7 @@ impl Config {
     }
 
     /// Returns the folder of copies from the remote archive.
-    #[must_use]
-    pub fn archive_cache_dir(&self) -> PathBuf {
+    pub(crate) fn archive_cache_dir(&self) -> PathBuf {
         self.server.data_dir.join("cache").join("archive")
     }
 }

@@ -21,8 +21,7 @@ impl Proxies {
     }
 
     /// Returns true if `address` is a trusted proxy. IPv4-mapped IPv6 addresses count as IPv4.
-    #[must_use]
-    pub fn contains(&self, address: IpAddr) -> bool {
+    pub(crate) fn contains(&self, address: IpAddr) -> bool {
         let address = address.to_canonical();
         self.0.iter().any(|net| net.contains(&address))
     }
@@ -63,8 +62,7 @@ pub enum ForwardedHeader {
 
 impl ForwardedHeader {
     /// Returns the name of the header.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
+    pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::XForwardedFor => "x-forwarded-for",
             Self::Forwarded => "forwarded",

@@ -64,29 +64,15 @@ fn finish(key: &str, of_key: &mut Map<String, Value>, default: &Value) {
 
 /// Removes `null` from the schema of a key, because TOML has none. Returns true if the key is optional.
 fn drop_null(of_key: &mut Map<String, Value>) -> bool {
-    match of_key.get_mut("type") {
-        Some(Value::Array(kinds)) => {
-            let before = kinds.len();
-            kinds.retain(|kind| kind != "null");
-            let absent = kinds.len() < before;
-            if let [one] = kinds.as_slice() {
-                let one = one.clone();
-                of_key.insert("type".to_owned(), one);
-            }
-            return absent;
-        }
-        Some(_) => return false,
-        None => {}
-    }
-    let Some(Value::Array(kinds)) = of_key.get_mut("anyOf") else { return false };
+    let (key, null) =
+        if of_key.contains_key("anyOf") { ("anyOf", json!({ "type": "null" })) } else { ("type", json!("null")) };
+    let Some(Value::Array(kinds)) = of_key.get_mut(key) else { return false };
     let before = kinds.len();
-    kinds.retain(|kind| *kind != json!({ "type": "null" }));
+    kinds.retain(|kind| *kind != null);
     let absent = kinds.len() < before;
-    // Replaces an alternative of one schema by that schema.
-    if let [Value::Object(one)] = kinds.as_slice() {
+    if let [one] = kinds.as_slice() {
         let one = one.clone();
-        of_key.remove("anyOf");
-        of_key.extend(one);
+        of_key.insert(key.to_owned(), one);
     }
     absent
 }

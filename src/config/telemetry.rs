@@ -89,8 +89,7 @@ pub struct SecretHeaders(HeaderMap);
 
 impl SecretHeaders {
     /// Returns the headers.
-    #[must_use]
-    pub fn reveal(&self) -> &HeaderMap {
+    pub(crate) fn reveal(&self) -> &HeaderMap {
         &self.0
     }
 }

@@ -26,14 +26,12 @@ pub struct Template {
 
 impl Template {
     /// Returns the host as written in the URL.
-    #[must_use]
-    pub fn host(&self) -> &str {
+    pub(crate) fn host(&self) -> &str {
         &self.host
     }
 
     /// Returns the URL of an entry. Ids contain only letters, digits and `_`, which need no escapes.
-    #[must_use]
-    pub fn url(&self, id: &EntryId) -> Option<Url> {
+    pub(crate) fn url(&self, id: &EntryId) -> Option<Url> {
         fill(&self.text, id.as_str(), id.middle()).parse().ok()
     }
 }
@@ -101,8 +99,7 @@ impl Templates {
     }
 
     /// Returns the templates in order.
-    #[must_use]
-    pub fn as_slice(&self) -> &[Template] {
+    pub(crate) fn as_slice(&self) -> &[Template] {
         &self.0
     }
 }

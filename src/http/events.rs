@@ -81,8 +81,7 @@ impl Listener {
                 let view = news.ok()?;
                 (self.seen, self.over) = (view.version, view.record.status.is_final());
                 let event = Event::default().id(view.version.to_string()).event(view.record.status.name());
-                let write = || serde_json::to_string(&jobs::document(&view)).unwrap_or_default();
-                Some(event.data(view.written.get_or_init(write)))
+                Some(event.data(serde_json::to_string(&jobs::document(&view)).unwrap_or_default()))
             }
             // The stream ends with the service; clients reconnect.
             () = stop::reached(&mut self.stopping, Stop::Drain) => None,

@@ -56,7 +56,7 @@ impl Caller {
     fn new(name: &str, is_key: bool, quota: Option<&Arc<Quota>>) -> Self {
         let client = Client::named(name);
         let quota = quota.filter(|quota| !quota.is_unlimited()).cloned();
-        Self { client, account: quota.map(|quota| Account { client: client.number(), is_key, quota }) }
+        Self { client, account: quota.map(|quota| Account { client: client.0, is_key, quota }) }
     }
 
     fn key(key: &Key) -> Self {
@@ -254,7 +254,7 @@ impl App {
 
     /// Charges `time` of work that is not a job to `caller`.
     pub(super) fn charge(&self, caller: &Caller, time: Duration) {
-        self.access.meter().spent(caller.client.number(), time, Instant::now());
+        self.access.meter().spent(caller.client.0, time, Instant::now());
     }
 }
 

@@ -129,7 +129,7 @@ impl Server {
             drawer,
             meter: Some(Arc::new({
                 let access = Arc::clone(&access);
-                move |client: Client, time| access.meter().spent(client.number(), time, Instant::now())
+                move |client: Client, time| access.meter().spent(client.0, time, Instant::now())
             })),
             tracer: traces.tracer(),
         };

@@ -79,7 +79,7 @@ pub(super) struct CoalescedJob {
 impl CoalescedJob {
     /// Returns true if no ticket is left.
     pub(super) fn is_abandoned(&self) -> bool {
-        self.outcome.as_ref().is_none_or(ResultSender::is_abandoned)
+        self.outcome.as_ref().is_none_or(|sender| sender.receiver_count() == 0)
     }
 }
 

@@ -24,8 +24,9 @@ const PAUSE: Duration = Duration::from_millis(500);
 
 /// A job whose record is in the store.
 pub(super) struct DurableJob {
-    view: watch::Sender<JobView>,
-    dismissed: Notify,
+    pub(super) state: watch::Sender<JobView>,
+    /// Tells the runner to stop the work.
+    pub(super) dismissed: Notify,
     /// Held while the record is written.
     pub(super) writing: tokio::sync::Mutex<()>,
 }
@@ -33,42 +34,45 @@ pub(super) struct DurableJob {
 impl DurableJob {
     pub(super) fn new(record: Record) -> Self {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
-        let (view, _) = watch::channel(JobView { record, stage: None, fraction, version: 1, written: Arc::default() });
-        Self { view, dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
+        let (state, _) = watch::channel(JobView { record, stage: None, fraction, version: 1 });
+        Self { state, dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
     }
 
     pub(super) fn id(&self) -> JobId {
-        self.view.borrow().record.id.clone()
+        self.state.borrow().record.id.clone()
     }
 
     pub(super) fn record(&self) -> Record {
-        self.view.borrow().record.clone()
+        self.state.borrow().record.clone()
     }
 
     pub(super) fn view(&self) -> JobView {
-        self.view.borrow().clone()
-    }
-
-    pub(super) fn subscribe(&self) -> watch::Receiver<JobView> {
-        self.view.subscribe()
+        self.state.borrow().clone()
     }
 
     /// Returns the time of its end, ms since 1970, and its id; `None` if it has not ended.
     pub(super) fn ended(&self) -> Option<(u64, JobId)> {
-        let view = self.view.borrow();
+        let view = self.state.borrow();
         view.record.finished_ms.map(|ms| (ms, view.record.id.clone()))
+    }
+
+    /// Changes the state unless the job has ended. Returns true if `change` did.
+    fn update(&self, change: impl FnOnce(&mut JobView) -> bool) -> bool {
+        self.state.send_if_modified(|view| {
+            let changed = !view.record.status.is_final() && change(view);
+            if changed {
+                view.version += 1;
+            }
+            changed
+        })
     }
 
     /// Marks the job as running and counts an attempt. Returns false if the job has ended, for example by a dismissal.
     pub(super) fn begin(&self) -> bool {
-        self.view.send_if_modified(|view| {
-            if view.record.status.is_final() {
-                return false;
-            }
+        self.update(|view| {
             view.record.attempts += 1;
             view.record.status = Status::Running;
             view.record.started_ms = Some(now_ms());
-            view.changed();
             true
         })
     }
@@ -76,30 +80,25 @@ impl DurableJob {
     /// Marks the job as accepted again, with `attempts` attempts, for the next process. Returns true if that changed
     /// the record.
     fn leave(&self, attempts: u32) -> bool {
-        self.view.send_if_modified(|view| {
-            if view.record.status.is_final() || view.record.attempts == attempts && view.record.started_ms.is_none() {
+        self.update(|view| {
+            if view.record.attempts == attempts && view.record.started_ms.is_none() {
                 return false;
             }
             view.record.attempts = attempts;
             view.record.status = Status::Accepted;
             view.record.started_ms = None;
             view.stage = None;
-            view.changed();
             true
         })
     }
 
     /// Ends the job with `status` and changes its record with `and`. Returns false if it had already ended.
     pub(super) fn end(&self, status: Status, and: impl FnOnce(&mut Record)) -> bool {
-        self.view.send_if_modified(|view| {
-            if view.record.status.is_final() {
-                return false;
-            }
+        self.update(|view| {
             view.record.status = status;
             view.record.finished_ms = Some(now_ms());
             and(&mut view.record);
             view.stage = None;
-            view.changed();
             if status == Status::Successful {
                 view.fraction = 1.0;
             }
@@ -107,17 +106,11 @@ impl DurableJob {
         })
     }
 
-    /// Tells the runner to stop the work.
-    pub(super) fn dismiss(&self) {
-        self.dismissed.notify_one();
-    }
-
-    /// Publishes stage and fraction if they have advanced.
+    /// Publishes stage and fraction of the running work if they have advanced.
     fn publish_stage(&self, stage: &'static str, fraction: f64) {
-        self.view.send_if_modified(|view| {
+        self.update(|view| {
             let waits = view.record.status == Status::Accepted;
-            let advanced = view.stage != Some(stage) || fraction > view.fraction + 0.004;
-            if view.record.status.is_final() || !(waits || advanced) {
+            if !waits && view.stage == Some(stage) && fraction <= view.fraction + 0.004 {
                 return false;
             }
             if waits {
@@ -126,13 +119,12 @@ impl DurableJob {
             }
             view.stage = Some(stage);
             view.fraction = view.fraction.max(fraction);
-            view.changed();
             true
         });
     }
 }
 
-/// Runs a durable job to its end.
+/// State of the task that runs a durable job to its end.
 pub(super) struct Runner {
     pub(super) job: Arc<DurableJob>,
     /// Ticket of queued or running work; `None` for a job from the records.

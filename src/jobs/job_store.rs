@@ -5,7 +5,7 @@
 //! computing one twice is harmless; a crash costs time and never loses a job.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -50,16 +50,6 @@ pub(crate) struct JobView {
     pub(crate) fraction: f64,
     /// Number of this state; grows with every change.
     pub(crate) version: u64,
-    /// Text of this state, written once for all event streams.
-    pub(crate) written: Arc<OnceLock<String>>,
-}
-
-impl JobView {
-    /// Marks the state as changed.
-    pub(super) fn changed(&mut self) {
-        self.version += 1;
-        self.written = Arc::default();
-    }
 }
 
 /// Converts the error of a failed job into the document that clients get.
@@ -157,7 +147,7 @@ impl JobStore {
     /// already.
     pub(crate) async fn accept(&self, spec: JobSpec, ticket: Option<Ticket>) -> Result<JobView, AcceptError> {
         let inner = &self.0;
-        let client = spec.task.rank.client.number();
+        let client = spec.task.rank.client.0;
         let id = match &spec.idempotency_key {
             Some(key) => JobId::of_key(&inner.secret, client, key),
             None => JobId::random().map_err(AcceptError::Random)?,
@@ -237,15 +227,15 @@ impl JobStore {
     /// Watches the state of a job; `None` if there is no such job.
     pub(crate) async fn watch(&self, id: &JobId) -> Result<Option<watch::Receiver<JobView>>, StoreError> {
         if let Some(job) = self.0.lock().get(id) {
-            return Ok(Some(job.subscribe()));
+            return Ok(Some(job.state.subscribe()));
         }
         let Some(stored) = self.0.store.get(&Name::job(id.as_str())?).await? else { return Ok(None) };
         // Only a foreign program writes records that cannot be parsed.
         let Ok(record) = serde_json::from_slice::<Record>(&stored.bytes) else { return Ok(None) };
         if record.status.is_final() {
-            return Ok(Some(DurableJob::new(record).subscribe()));
+            return Ok(Some(DurableJob::new(record).state.subscribe()));
         }
-        Ok(Some(self.resume(record).await?.subscribe()))
+        Ok(Some(self.resume(record).await?.state.subscribe()))
     }
 
     /// Returns the present state of a job; `None` if there is no such job.
@@ -259,7 +249,7 @@ impl JobStore {
         let job = self.0.lock().get(id).cloned();
         let Some(job) = job else { return self.view(id).await };
         if job.end(Status::Dismissed, |_| {}) {
-            job.dismiss();
+            job.dismissed.notify_one();
             self.0.write_job(&job).await?;
         }
         Ok(Some(job.view()))
@@ -363,7 +353,7 @@ impl JobStore {
         let mut lease = settings.budget.lease();
         lease.force(input.len() as u64);
         Ok(record.request().map(|(request, format)| {
-            let rank = Rank { client: Client::numbered(record.client), batch: true, urgency: record.urgency };
+            let rank = Rank { client: Client(record.client), batch: true, urgency: record.urgency };
             let task = Task {
                 input,
                 digest,

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use metrics::counter;
 
-use super::devices::Watch;
+use super::devices::DeviceMonitor;
 use super::queue::Queue;
 use super::{Budget, Client, OnStart, Refusal, Task, Ticket, worker};
 use crate::picture::Drawer;
@@ -45,13 +45,13 @@ pub(super) struct Shared {
     pub(super) backend: Arc<dyn Backend>,
     pub(super) reason: String,
     pub(super) settings: Settings,
-    watch: Watch,
+    monitor: DeviceMonitor,
 }
 
 impl Shared {
     /// Updates metrics and log with the state of the devices.
     pub(super) fn publish_devices(&self) {
-        self.watch.publish(&self.backend.devices());
+        self.monitor.publish(&self.backend.devices());
     }
 }
 
@@ -65,7 +65,7 @@ impl Pool {
     pub(crate) fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
         let workers = settings.workers;
         let queue = Arc::new(Queue::new(settings.queue, workers, settings.batch_max_delay));
-        let shared = Shared { queue, backend, reason, settings, watch: Watch::default() };
+        let shared = Shared { queue, backend, reason, settings, monitor: DeviceMonitor::default() };
         let pool = Self { shared: Arc::new(shared) };
         for n in 0..workers {
             let shared = Arc::clone(&pool.shared);

@@ -11,7 +11,7 @@ use super::cost::Rate;
 use super::rank::{self, Shares};
 use super::{Outcome, Refusal, Task, Ticket};
 use crate::pipeline;
-use crate::single_flight::{self, ResultSender};
+use crate::single_flight::{self, ResultReceiver};
 use crate::surface::CancelToken;
 use crate::telemetry::{QUEUE_AGE, QUEUE_DEPTH, QUEUE_WAIT, SpanKind, TraceSpan};
 
@@ -100,7 +100,7 @@ impl Queue {
             if let Some(context) = &task.parent.context {
                 job.span.link(context.clone());
             }
-            let outcome = job.outcome.as_ref().map(ResultSender::subscribe);
+            let outcome = job.outcome.as_ref().map(ResultReceiver::of);
             let mut ticket = ticket(job.id, outcome, Arc::clone(&job.progress), job.span.clone());
             (ticket.is_shared, ticket.joined_running) = (true, joined_running);
             return Ok(ticket);
@@ -196,7 +196,7 @@ impl Queue {
         self.after_removal(&mut state);
         drop(state);
         if let Some((sender, outcome)) = job.outcome.zip(outcome) {
-            sender.send(outcome);
+            sender.send_replace(Some(outcome));
         }
     }
 

@@ -24,19 +24,9 @@ pub(crate) struct Rank {
 
 /// Identity of a client for fair queueing.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub(crate) struct Client(u64);
+pub(crate) struct Client(pub(crate) u64);
 
 impl Client {
-    /// Returns the number of the client, for records.
-    pub(crate) const fn number(self) -> u64 {
-        self.0
-    }
-
-    /// Returns the client with this number.
-    pub(crate) const fn numbered(number: u64) -> Self {
-        Self(number)
-    }
-
     /// Returns the client with this `name`, an address or a key. Numbers are truncated SHA-256 hashes, so a client
     /// cannot choose a name with the number of another client.
     pub(crate) fn named(name: &str) -> Self {

@@ -87,7 +87,7 @@ impl Backend {
     }
 
     /// Returns the size of a part of a large object, bytes.
-    pub(super) fn part(&self) -> usize {
+    pub(super) fn part_size(&self) -> usize {
         if self.is_local() { FILE_PART } else { S3_PART }
     }
 
@@ -161,7 +161,7 @@ impl Backend {
     /// Lists the objects of a folder in name order. Ignores files with other names.
     pub(super) async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
         let listed = self.objects.list(Some(&Path::from(folder.as_str())));
-        let parsed = |meta: ObjectMeta| Some((Name::at(meta.location.as_ref())?, Meta::from(&meta)));
+        let parsed = |meta: ObjectMeta| Some((Name::from_path(meta.location.as_ref())?, Meta::from(&meta)));
         let fail = |e| self.fail("list", folder.as_str(), &e);
         let mut names: Vec<_> =
             listed.try_filter_map(|meta| std::future::ready(Ok(parsed(meta)))).try_collect().await.map_err(fail)?;

@@ -60,11 +60,11 @@ impl Store {
     /// Returns [`StoreError::Open`] if it cannot be written and read.
     pub async fn open(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
         let backend = Backend::open(config, data_dir).await?;
-        Self::over(backend, config).await
+        Self::open_backend(backend, config).await
     }
 
     /// Opens a store over `backend`; see [`open`](Self::open).
-    pub(super) async fn over(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
+    pub(super) async fn open_backend(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
         backend.probe().await.map_err(|e| backend.open_error(&e))?;
         let now = SystemTime::now();
         // Not fatal: credentials may permit uploads without permitting their listing.
@@ -82,7 +82,7 @@ impl Store {
             }
             index.update_metrics(folder);
         }
-        let [inputs, jobs, results] = Folder::ALL.map(|folder| index.total(folder).1);
+        let [inputs, jobs, results] = Folder::ALL.map(|folder| index.usage(folder).objects);
         tracing::info!(place = backend.place(), inputs, jobs, results, cleared, "store opened");
         Ok(Self(Arc::new(Inner {
             backend,
@@ -128,7 +128,7 @@ impl Store {
             if new && !create && backend.head(&name).await?.is_some() {
                 return Ok(false);
             }
-            if create || backend.is_local() || bytes.len() <= backend.part() {
+            if create || backend.is_local() || bytes.len() <= backend.part_size() {
                 if !backend.put(&name, bytes.clone(), create).await? {
                     return Ok(false);
                 }
@@ -283,8 +283,7 @@ impl Store {
     /// Returns the number and total size of the objects in a folder.
     #[must_use]
     pub fn usage(&self, folder: Folder) -> Usage {
-        let (bytes, objects) = self.index().total(folder);
-        Usage { bytes, objects }
+        self.index().usage(folder)
     }
 
     /// Returns the bytes of results in memory.

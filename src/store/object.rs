@@ -38,7 +38,7 @@ pub struct Stored {
 pub type ByteStream = BoxStream<'static, Result<Bytes, StoreError>>;
 
 /// Usage of a folder.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Usage {
     /// Total size of its objects, bytes.
     pub bytes: u64,

@@ -23,7 +23,7 @@ impl Upload {
     pub(super) async fn begin(store: &Store, name: &Name) -> Result<Self, StoreError> {
         let backend = &store.0.backend;
         let begun = backend.objects().put_multipart(&name.path()).await.map_err(backend.fail_at("put", name))?;
-        let parts = WriteMultipart::new_with_chunk_size(begun, backend.part());
+        let parts = WriteMultipart::new_with_chunk_size(begun, backend.part_size());
         Ok(Self { store: store.clone(), name: name.clone(), parts })
     }
 
@@ -54,7 +54,7 @@ impl Upload {
 pub(super) async fn put_in_parts(store: &Store, name: &Name, mut bytes: Bytes) -> Result<(), StoreError> {
     let mut upload = Upload::begin(store, name).await?;
     while !bytes.is_empty() {
-        let next = bytes.split_to(store.0.backend.part().min(bytes.len()));
+        let next = bytes.split_to(store.0.backend.part_size().min(bytes.len()));
         if let Err(error) = upload.push(next).await {
             upload.abort().await;
             return Err(error);

@@ -105,7 +105,7 @@ impl io::Write for Writer {
         if self.failed {
             return Err(StoreError::WriterFailed.into());
         }
-        let part = self.store.0.backend.part();
+        let part = self.store.0.backend.part_size();
         if self.filling.capacity() == 0 {
             self.filling.reserve(part);
         }

@@ -11,12 +11,13 @@ macro_rules! metrics {
 
         /// All metrics, in the order of the documentation.
         pub const METRICS: &[Metric] = &[$(
-            Metric::new(
-                $name,
-                Kind::$kind,
-                &[$(Label { name: stringify!($label), values: $values }),*],
-                &[$($help),+],
-            )
+            Metric {
+                name: $name,
+                kind: Kind::$kind,
+                labels: &[$(Label { name: stringify!($label), values: $values }),*],
+                // Every line of a doc comment begins with a space.
+                help: concat!($($help),+).trim_ascii(),
+            }
         ),+];
     };
 }
@@ -146,7 +147,7 @@ mod tests {
             assert_eq!(metric.kind == Kind::Seconds, name.ends_with("_seconds_total"), "{name}");
             let known = ["molmesh_", "http_server_", "process_"].iter().any(|prefix| name.starts_with(prefix));
             assert!(known, "{name}");
-            assert!(metric.help().ends_with('.') && metric.help().len() > 12, "{name}: {}", metric.help());
+            assert!(metric.help.ends_with('.') && metric.help.len() > 12, "{name}: {}", metric.help);
             for label in metric.labels {
                 assert!(!["id", "job", "request", "trace"].contains(&label.name), "{name}: {}", label.name);
             }

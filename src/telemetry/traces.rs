@@ -26,7 +26,7 @@ const BATCH_DELAY: Duration = Duration::from_secs(1);
 
 /// Creates spans. The default tracer records nothing and continues traces only.
 #[derive(Debug, Clone)]
-pub struct Tracer(pub(super) SdkTracer);
+pub(crate) struct Tracer(pub(super) SdkTracer);
 
 impl Default for Tracer {
     fn default() -> Self {
@@ -36,17 +36,14 @@ impl Default for Tracer {
 
 /// Tracer provider of a service, with the batch processor if a collector is configured.
 #[derive(Debug)]
-pub struct Traces {
+pub(crate) struct Traces {
     provider: SdkTracerProvider,
     flush_timeout: Duration,
 }
 
 impl Traces {
     /// Sets up the tracer provider and starts the export thread if the configuration names a collector.
-    ///
-    /// # Errors
-    /// Returns [`TelemetryError::Install`] if the HTTP client cannot be built.
-    pub fn start(config: &TelemetryConfig) -> Result<Self, TelemetryError> {
+    pub(crate) fn start(config: &TelemetryConfig) -> Result<Self, TelemetryError> {
         let Some(endpoint) = &config.endpoint else { return Ok(Self::off()) };
         let batch = BatchConfigBuilder::default()
             .with_max_queue_size(config.queue)
@@ -69,15 +66,14 @@ impl Traces {
     }
 
     /// Returns the tracer of the service.
-    #[must_use]
-    pub fn tracer(&self) -> Tracer {
+    pub(crate) fn tracer(&self) -> Tracer {
         let version = env!("CARGO_PKG_VERSION");
         let scope = InstrumentationScope::builder(env!("CARGO_PKG_NAME")).with_version(version).build();
         Tracer(self.provider.tracer_with_scope(scope))
     }
 
     /// Exports the queued spans, for `telemetry.flush_timeout_ms` at most, and stops the export.
-    pub async fn shut_down(self) {
+    pub(crate) async fn shut_down(self) {
         let Self { provider, flush_timeout } = self;
         let flush = move || provider.shutdown_with_timeout(flush_timeout);
         if let Ok(Err(error)) = tokio::task::spawn_blocking(flush).await {

@@ -26,7 +26,7 @@ fn recipe() -> Recipe {
 }
 
 fn config(path: &str) -> Config {
-    load(Some(&root().join(path)), [], &[]).unwrap_or_else(|e| panic!("{path}: {e}"))
+    load(Some(&root().join(path)), [], &[]).unwrap_or_else(|e| panic!("{path}: {e}")).config
 }
 
 /// Returns the ports of the service and of its metrics.
@@ -337,7 +337,7 @@ fn scaled_pods_fit_their_ephemeral_storage() {
         .map(|v| (v["name"].as_str().unwrap().to_owned(), v["value"].as_str().unwrap().to_owned()))
         .collect();
     assert!(environment.iter().all(|(name, _)| name.starts_with("MOLMESH__")));
-    let config = load(Some(&root().join(CONFIGURATIONS[1])), environment, &[]).unwrap();
+    let config = load(Some(&root().join(CONFIGURATIONS[1])), environment, &[]).unwrap().config;
     let volume = bytes(pod["volumes"][0]["emptyDir"]["sizeLimit"].as_str().unwrap());
     assert!(volume > config.store.max_bytes + config.archive.cache_bytes, "{volume} bytes on the volume");
     let ephemeral = bytes(pod["containers"][0]["resources"]["limits"]["ephemeral-storage"].as_str().unwrap());

@@ -732,10 +732,10 @@ fn errors_do_not_quote_secrets() {
     assert!(message.contains("store.secret_access_key") && !message.contains("8675309"), "{message}");
     // Control: other values are quoted.
     assert!(load("[store]\naccess_key_id = 8675309").unwrap_err().to_string().contains("8675309"));
-    let config = load("[store]\nsecret_access_key = \"8675309\"\nallow_http = true").unwrap();
+    let config = load("[store]\nsecret_access_key = \"8675309\"\nallow_http = true").unwrap().config;
     assert_eq!(config.store.secret_access_key.as_ref().map(Secret::reveal), Some("8675309"));
     assert!(!format!("{config:?}").contains("8675309") && config.store.allow_http);
     let flag = |value: &str| molmesh::config::load(None, [], &[("store.allow_http".to_owned(), value.to_owned())]);
-    assert!(flag("true").unwrap().store.allow_http && !flag("false").unwrap().store.allow_http);
+    assert!(flag("true").unwrap().config.store.allow_http && !flag("false").unwrap().config.store.allow_http);
     assert!(flag("maybe").unwrap_err().to_string().contains("true or false"));
 }

@@ -337,7 +337,7 @@ fn table() -> String {
         };
         let Metric { name, labels, .. } = metric;
         let labels = labels.iter().map(label).collect::<Vec<_>>().join("; ");
-        writeln!(text, "| `{name}` | {} | {labels} | {} |", metric.kind.name(), metric.help()).unwrap();
+        writeln!(text, "| `{name}` | {} | {labels} | {} |", metric.kind.name(), metric.help).unwrap();
     }
     text
 }
