@@ -58,7 +58,7 @@ impl Remote {
             sources.push((template.clone(), breaker));
         }
         let limits = Limits {
-            head: Duration::from_millis(config.connect_timeout_ms + config.first_byte_timeout_ms),
+            head: Duration::from_millis(config.connect_timeout_ms.saturating_add(config.first_byte_timeout_ms)),
             pause: Duration::from_millis(config.first_byte_timeout_ms),
             bytes: config.max_bytes,
             inflated,

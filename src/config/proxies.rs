@@ -21,7 +21,8 @@ impl Proxies {
     }
 
     /// Returns true if `address` is a trusted proxy. IPv4-mapped IPv6 addresses count as IPv4.
-    pub(crate) fn contains(&self, address: IpAddr) -> bool {
+    #[must_use]
+    pub fn contains(&self, address: IpAddr) -> bool {
         let address = address.to_canonical();
         self.0.iter().any(|net| net.contains(&address))
     }
