@@ -31,6 +31,7 @@ impl Progress {
         self.begun.load(Ordering::Acquire).then(|| self.tracker.now())
     }
 
+    /// Marks the job as running.
     pub(super) fn begin(&self) {
         self.begun.store(true, Ordering::Release);
     }

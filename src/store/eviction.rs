@@ -145,7 +145,7 @@ impl Store {
     async fn remove_candidate(&self, candidate: EvictionCandidate) -> Result<bool, StoreError> {
         let store = self.clone();
         self.run_to_completion(async move {
-            let _lock = store.stripe(&candidate.name).lock().await;
+            let _lock = store.write_lock(&candidate.name).lock().await;
             let begun = store.index().begin_removal(&candidate);
             if begun {
                 store.remove(&candidate.name).await?;

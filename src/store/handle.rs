@@ -26,7 +26,7 @@ use crate::config::StoreConfig;
 use crate::telemetry::CACHE_REQUESTS;
 
 /// Number of locks for writing and removing. Names share them by hash.
-const STRIPES: usize = 64;
+const WRITE_LOCKS: usize = 64;
 
 /// Object store in a folder or on S3. Clones share one store.
 ///
@@ -39,7 +39,7 @@ pub(super) struct Inner {
     pub(super) config: StoreConfig,
     index: Mutex<Index>,
     memory: Memory,
-    stripes: [AsyncMutex<()>; STRIPES],
+    write_locks: [AsyncMutex<()>; WRITE_LOCKS],
     /// Serializes evictions, so that two do not remove twice as much. The value is the time of the last search for
     /// staged files.
     pub(super) last_cleanup: AsyncMutex<SystemTime>,
@@ -88,7 +88,7 @@ impl Store {
             backend,
             index: Mutex::new(index),
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
-            stripes: [const { AsyncMutex::const_new(()) }; STRIPES],
+            write_locks: [const { AsyncMutex::const_new(()) }; WRITE_LOCKS],
             last_cleanup: AsyncMutex::new(now),
             runtime: Handle::current(),
             config: config.clone(),
@@ -121,7 +121,7 @@ impl Store {
         self.run_to_completion(async move {
             let mut reservation = store.empty_reservation(&name);
             reservation.grow(bytes.len() as u64).await?;
-            let _lock = store.stripe(&name).lock().await;
+            let _lock = store.write_lock(&name).lock().await;
             let backend = &store.0.backend;
             // Content-addressed objects are equal anyway; only job documents need an atomic check.
             let create = new && name.folder() == Folder::Jobs;
@@ -237,7 +237,7 @@ impl Store {
     pub async fn delete(&self, name: &Name) -> Result<(), StoreError> {
         let (store, name) = (self.clone(), name.clone());
         self.run_to_completion(async move {
-            let _lock = store.stripe(&name).lock().await;
+            let _lock = store.write_lock(&name).lock().await;
             store.index().mark_removed(&name);
             store.remove(&name).await
         })
@@ -302,11 +302,12 @@ impl Store {
         self.0.index.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn stripe(&self, name: &Name) -> &AsyncMutex<()> {
+    /// Returns the lock for writing and removing an object.
+    pub(super) fn write_lock(&self, name: &Name) -> &AsyncMutex<()> {
         let mut hasher = DefaultHasher::new();
         name.hash(&mut hasher);
-        let stripe = usize::try_from(hasher.finish() % STRIPES as u64).unwrap_or_default();
-        &self.0.stripes[stripe]
+        let ix = usize::try_from(hasher.finish() % WRITE_LOCKS as u64).unwrap_or_default();
+        &self.0.write_locks[ix]
     }
 
     /// Indexes an object that was just written under the lock of its name. Caches small results in memory.

@@ -65,7 +65,7 @@ impl Writer {
         } else {
             self.reservation.grow(last.len() as u64).await?;
         }
-        let _lock = self.store.stripe(&self.name).lock().await;
+        let _lock = self.store.write_lock(&self.name).lock().await;
         if let Some(upload) = self.upload.take() {
             upload.finish().await?;
             self.store.commit(&self.name, self.uploaded, None);
