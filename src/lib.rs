@@ -35,7 +35,7 @@ pub mod gpu;
 #[cfg(feature = "server")]
 pub mod http;
 #[cfg(feature = "server")]
-pub mod jobs;
+mod jobs;
 #[cfg(feature = "server")]
 mod single_flight;
 #[cfg(feature = "server")]

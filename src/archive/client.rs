@@ -82,12 +82,12 @@ pub(super) fn build(config: &ArchiveConfig) -> Result<Client, reqwest::Error> {
     let builder = || {
         let builder = Client::builder()
             .user_agent(USER_AGENT)
-            .connect_timeout(config.connect_timeout())
+            .connect_timeout(Duration::from_millis(config.connect_timeout_ms))
             .redirect(Policy::custom(follow))
             .referer(false)
             .dns_resolver(PublicResolver { allow_private: config.allow_private || config.proxy.is_some() });
         Ok(match &config.proxy {
-            Some(proxy) => builder.proxy(Proxy::all(proxy.as_str())?),
+            Some(proxy) => builder.proxy(Proxy::all(proxy)?),
             None => builder.no_proxy(),
         })
     };

@@ -89,9 +89,9 @@ impl Archive {
             fetches: SingleFlight::default(),
             known: Cache::new(CACHED_DIGESTS),
             absent: Cache::new(CACHED_DIGESTS),
-            check: archive.check(),
-            fresh: archive.fresh(),
-            absent_for: archive.absent(),
+            check: Duration::from_millis(archive.check_ms),
+            fresh: Duration::from_millis(archive.fresh_ms),
+            absent_for: Duration::from_millis(archive.absent_ms),
         };
         Self { shared: Arc::new(shared) }
     }

@@ -47,13 +47,19 @@ impl Remote {
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
         for template in config.url.as_ref()?.as_slice() {
             let known = sources.iter().find(|(_, breaker)| breaker.host() == template.host());
-            let new = || Arc::new(Breaker::new(template.host(), config.breaker_failures, config.breaker()));
+            let new = || {
+                Arc::new(Breaker::new(
+                    template.host(),
+                    config.breaker_failures,
+                    Duration::from_millis(config.breaker_ms),
+                ))
+            };
             let breaker = known.map_or_else(new, |(_, breaker)| Arc::clone(breaker));
             sources.push((template.clone(), breaker));
         }
         let limits = Limits {
-            head: config.connect_timeout() + config.first_byte_timeout(),
-            pause: config.first_byte_timeout(),
+            head: Duration::from_millis(config.connect_timeout_ms.saturating_add(config.first_byte_timeout_ms)),
+            pause: Duration::from_millis(config.first_byte_timeout_ms),
             bytes: config.max_bytes,
             inflated,
         };
@@ -84,7 +90,7 @@ impl Remote {
 
     /// Requests the entry from every URL in order until one has it.
     pub(super) async fn fetch(&self, id: &EntryId, copy: Option<&Origin>) -> Result<Answer, FetchError> {
-        let deadline = Instant::now() + self.config.timeout();
+        let deadline = Instant::now() + Duration::from_millis(self.config.timeout_ms);
         let mut failure = None;
         for (template, breaker) in &self.sources {
             match self.fetch_from(id, template, breaker, copy, deadline).await {
@@ -144,7 +150,7 @@ impl Remote {
 
     /// Returns the pause after an attempt: the time that the host requested, plus a random part of a span that doubles.
     fn pause(&self, attempt: u32, requested: Option<Duration>) -> Duration {
-        let span = self.config.backoff().saturating_mul(1 << (attempt - 1).min(16));
+        let span = Duration::from_millis(self.config.backoff_ms).saturating_mul(1 << (attempt - 1).min(16));
         requested.unwrap_or_default() + span.mul_f64(fraction())
     }
 
@@ -179,7 +185,7 @@ impl Remote {
         match &answer {
             Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => permit.succeeded(),
             Err(Failed::Other { retry_after: Some(wait), why, .. })
-                if why.is_temporary() && *wait > self.config.retry_after() =>
+                if why.is_temporary() && *wait > Duration::from_millis(self.config.retry_after_ms) =>
             {
                 permit.asked_to_wait((*wait).min(MAX_PAUSE));
             }

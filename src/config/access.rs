@@ -1,16 +1,15 @@
 //! Configuration of access: keys, quotas, signed URLs and cross-origin requests.
 
-use std::borrow::Cow;
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
 use reqwest::Url;
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
 
-use super::Secret;
+use super::{Secret, list};
 
 /// Keys, quotas, signed URLs and headers for browsers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -42,6 +41,8 @@ pub struct AccessConfig {
     pub clients: usize,
     /// Origins whose pages may read responses: `*`, or a list such as `https://viewer.example`. Default `*`: the
     /// service uses no cookies, and only a page that has a key can send it. `none`: only pages of this server.
+    #[serde(with = "list")]
+    #[schemars(schema_with = "Origins::schema")]
     pub cors_origins: Option<Origins>,
     /// Allows pages of these origins to send credentials, such as the cookies of a proxy. Default false. Excludes `*`.
     pub cors_credentials: bool,
@@ -90,6 +91,12 @@ pub enum Origins {
     These(Vec<String>),
 }
 
+impl Origins {
+    fn schema(_: &mut SchemaGenerator) -> Schema {
+        list::schema(r"(\*|https?://\S+)")
+    }
+}
+
 impl FromStr for Origins {
     type Err = String;
 
@@ -121,35 +128,6 @@ impl fmt::Display for Origins {
             Self::Any => f.write_str("*"),
             Self::These(origins) => f.write_str(&origins.join(" ")),
         }
-    }
-}
-
-impl Serialize for Origins {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
-}
-
-impl JsonSchema for Origins {
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn schema_name() -> Cow<'static, str> {
-        "Origins".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({ "anyOf": [
-            { "type": "string", "pattern": r"^\s*(\*|https?://\S+(\s+https?://\S+)*)\s*$" },
-            { "type": "array", "minItems": 1, "items": { "type": "string", "pattern": r"^(\*|https?://\S+)$" } },
-        ] })
-    }
-}
-
-impl<'de> Deserialize<'de> for Origins {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        super::joined(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 

@@ -121,7 +121,7 @@ pub(super) async fn of_entry(
 async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
     let mut limits = app.config.limits.job().read;
     limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
-    let mut lease = app.pool.budget().lease();
+    let mut lease = app.pool.settings().budget.lease();
     let listing = tokio::task::spawn_blocking(move || {
         let structure = structure::read(&input.bytes, &limits)?;
         lease.grow(BYTES_PER_ATOM * structure.len() as u64).map_err(Failed::Memory)?;

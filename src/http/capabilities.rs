@@ -250,7 +250,7 @@ pub(super) async fn show(State(app): State<Shared>) -> Response {
 
 /// Writes the document.
 pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> Bytes {
-    let (backend, renderer) = (pool.backend(), pool.renderer());
+    let (backend, renderer) = (pool.backend(), &pool.settings().renderer);
     let document = Capabilities {
         name: "molmesh",
         version: env!("CARGO_PKG_VERSION"),
@@ -344,13 +344,13 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         inflated_bytes: limits.inflated_bytes,
         atoms: limits.atoms,
         labels: limits.labels,
-        grid_samples: limits.grid_samples,
+        grid_samples: limits.grid_points,
         candidate_pairs: limits.candidate_pairs,
         mesh_bytes: limits.mesh_bytes,
         output_bytes: limits.output_bytes,
         memory_bytes: limits.memory_bytes,
         picture_side: limits.picture_side,
-        workers: pool.workers(),
+        workers: pool.settings().workers,
         queue: jobs.queue,
         deliveries: jobs.deliveries,
         deadline_ms: jobs.deadline_ms,

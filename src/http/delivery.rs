@@ -75,7 +75,8 @@ pub(super) async fn mesh(
     headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
     headers.insert(header::ETAG, etag(key));
     let (length, body) =
-        stream::start(finished, format, app.config.limits.output_bytes, app.pool.budget().clone(), permit).await?;
+        stream::start(finished, format, app.config.limits.output_bytes, app.pool.settings().budget.clone(), permit)
+            .await?;
     if let Some(length) = length {
         headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     }

@@ -2,7 +2,7 @@
 //! of `POST /v1/meshes`.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::Json;
 use axum::body::Body;
@@ -128,7 +128,7 @@ pub(super) async fn create(
     drop(source);
     let seconds = app.pool.expected(&bytes, &job);
     let stop = CancelOnDrop(CancelToken::default());
-    let limit = app.config.jobs.deadline();
+    let limit = Duration::from_millis(app.config.jobs.deadline_ms);
     let limits = pipeline::JobLimits { deadline: Some(Instant::now() + limit), ..app.config.limits.job() };
     let estimating = tokio::task::spawn_blocking({
         let (app, cancel, job) = (Arc::clone(&app), stop.0.clone(), job.clone());

@@ -2,6 +2,7 @@
 //! that reconnects with `Last-Event-ID` needs no earlier events.
 
 use std::convert::Infallible;
+use std::time::Duration;
 
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, State};
@@ -65,7 +66,8 @@ pub(super) async fn show(
         let event = listener.next().await?;
         Some((Ok::<_, Infallible>(event), listener))
     });
-    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(app.config.server.heartbeat())).into_response())
+    let heartbeat = Duration::from_millis(app.config.server.heartbeat_ms);
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(heartbeat)).into_response())
 }
 
 impl Listener {
@@ -79,8 +81,7 @@ impl Listener {
                 let view = news.ok()?;
                 (self.seen, self.over) = (view.version, view.record.status.is_final());
                 let event = Event::default().id(view.version.to_string()).event(view.record.status.name());
-                let write = || serde_json::to_string(&jobs::document(&view)).unwrap_or_default();
-                Some(event.data(view.written.get_or_init(write)))
+                Some(event.data(serde_json::to_string(&jobs::document(&view)).unwrap_or_default()))
             }
             // The stream ends with the service; clients reconnect.
             () = stop::reached(&mut self.stopping, Stop::Drain) => None,

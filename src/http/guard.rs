@@ -26,7 +26,7 @@ use super::problem::Problem;
 use super::scopes;
 use super::state::{App, Shared};
 use crate::access::{Access, Account, Denied, Exceeded, Key, Quota, Running, Scope, Signed, limits, policies, without};
-use crate::jobs::{Client, Meter, rfc3339};
+use crate::jobs::{Client, rfc3339};
 
 /// `X-Api-Key`, an alternative to `Authorization`.
 pub(super) const API_KEY: HeaderName = HeaderName::from_static("x-api-key");
@@ -56,7 +56,7 @@ impl Caller {
     fn new(name: &str, is_key: bool, quota: Option<&Arc<Quota>>) -> Self {
         let client = Client::named(name);
         let quota = quota.filter(|quota| !quota.is_unlimited()).cloned();
-        Self { client, account: quota.map(|quota| Account { client: client.number(), is_key, quota }) }
+        Self { client, account: quota.map(|quota| Account { client: client.0, is_key, quota }) }
     }
 
     fn key(key: &Key) -> Self {
@@ -254,17 +254,7 @@ impl App {
 
     /// Charges `time` of work that is not a job to `caller`.
     pub(super) fn charge(&self, caller: &Caller, time: Duration) {
-        self.access.meter().spent(caller.client.number(), time, Instant::now());
-    }
-}
-
-/// Charges jobs to the quotas of their clients.
-#[derive(Debug)]
-pub(super) struct UsageRecorder(pub(super) Arc<Access>);
-
-impl Meter for UsageRecorder {
-    fn spent(&self, client: Client, time: Duration) {
-        self.0.meter().spent(client.number(), time, Instant::now());
+        self.access.meter().spent(caller.client.0, time, Instant::now());
     }
 }
 

@@ -131,17 +131,18 @@ impl MeshRequest {
         let permit = app.delivery()?;
         let wait = self.preferences.wait.filter(|_| !report);
         let jobs = &app.config.jobs;
-        let allowed = if wait.is_some() { jobs.batch_deadline() } else { jobs.deadline() };
+        let deadline = Duration::from_millis(jobs.deadline_ms);
+        let allowed = if wait.is_some() { Duration::from_millis(jobs.batch_deadline_ms) } else { deadline };
         let ticket = app.pool.submit(self.task(&input), allowed, None);
         let mut ticket = ticket.map_err(|refusal| self.refused(refusal))?;
-        if ticket.is_shared()
+        if ticket.is_shared
             && let Some(span) = TraceSpan::current()
         {
-            span.link(ticket.span().context());
+            span.link(ticket.span.context());
         }
         let outcome = match wait {
             None => ticket.wait().await,
-            Some(wait) => match tokio::time::timeout(wait.min(jobs.deadline()), ticket.wait()).await {
+            Some(wait) => match tokio::time::timeout(wait.min(deadline), ticket.wait()).await {
                 Ok(outcome) => outcome,
                 Err(_elapsed) => {
                     drop(permit);
@@ -149,7 +150,7 @@ impl MeshRequest {
                 }
             },
         };
-        let (digest, joined) = (input.digest, ticket.is_shared());
+        let (digest, joined) = (input.digest, ticket.is_shared);
         // Dropping the last ticket of unfinished work cancels it.
         drop((ticket, input));
         let finished = outcome.map_err(|failure| self.failed(failure))?;

@@ -57,7 +57,7 @@ impl Rate {
     }
 
     pub(super) fn new(config: &ServerConfig) -> Self {
-        Self { bytes: config.write_bytes, within: config.write_timeout() }
+        Self { bytes: config.write_bytes, within: Duration::from_millis(config.write_timeout_ms) }
     }
 }
 

@@ -18,8 +18,8 @@ const MARGIN: Duration = Duration::from_secs(10);
 
 /// Builds the router with its middleware.
 pub(super) fn router(app: &Shared) -> Router {
-    let longest = app.config.jobs.deadline().max(Duration::from_secs(jobs::MAX_WAIT_S));
-    let input = app.config.server.body_timeout().max(app.config.archive.timeout());
+    let longest = Duration::from_millis(app.config.jobs.deadline_ms).max(Duration::from_secs(jobs::MAX_WAIT_S));
+    let input = Duration::from_millis(app.config.server.body_timeout_ms.max(app.config.archive.timeout_ms));
     let timeout = input + longest + MARGIN;
     let router = Router::new()
         // Meshes.

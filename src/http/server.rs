@@ -3,14 +3,13 @@
 use std::io;
 use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
-use std::time::{Instant, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use quick_cache::sync::Cache;
 use thiserror::Error;
 use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinHandle;
 
-use super::guard::UsageRecorder;
 use super::probe::Probe;
 use super::problem::Problem;
 use super::source::FetchMemory;
@@ -20,7 +19,7 @@ use super::{accept, capabilities, key_reload, metrics, results, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::config::Config;
-use crate::jobs::{Budget, EndError, JobStore, JobStoreSettings, Pool, Settings};
+use crate::jobs::{Budget, Client, EndError, JobStore, Pool, Settings};
 use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
 use crate::store::{FolderLock, LockError, Store, StoreError};
@@ -28,15 +27,15 @@ use crate::surface::{Backend, FoundDevice};
 use crate::telemetry::{self, TelemetryError, Traces};
 
 /// Interval of metrics upkeep.
-const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
+const UPKEEP: Duration = Duration::from_secs(5);
 
 /// Pause between two attempts to list the jobs of earlier processes.
-const RECOVER_PAUSE: std::time::Duration = std::time::Duration::from_secs(5);
+const RECOVER_PAUSE: Duration = Duration::from_secs(5);
 /// Number of results whose headers are cached, about 1 KB each.
 const CACHED_HEADERS: usize = 4096;
 
 /// Time for cancelled jobs to stop and for their records to be written.
-const CANCELLING: std::time::Duration = std::time::Duration::from_secs(1);
+const CANCELLING: Duration = Duration::from_secs(1);
 
 /// Error of a server that cannot start.
 #[derive(Debug, Error)]
@@ -124,25 +123,23 @@ impl Server {
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
-            batch_max_delay: config.jobs.batch_max_delay(),
+            batch_max_delay: Duration::from_millis(config.jobs.batch_max_delay_ms),
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
             renderer,
-            meter: Some(Arc::new(UsageRecorder(Arc::clone(&access)))),
+            meter: Some(Arc::new({
+                let access = Arc::clone(&access);
+                move |client: Client, time| access.meter().spent(client.0, time, Instant::now())
+            })),
             tracer: traces.tracer(),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
-        let settings = JobStoreSettings {
-            allowed: config.jobs.batch_deadline(),
-            attempts: config.jobs.attempts,
-            output_bytes: config.limits.output_bytes,
-            retry_for: config.jobs.store_patience(),
-        };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
-        let job_store = JobStore::new(store.clone(), Arc::clone(&pool), settings, secret, describe);
-        let archive = Archive::new(&config, Arc::new(FetchMemory(pool.budget().clone())));
+        let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
+        let job_store = JobStore::new(store.clone(), Arc::clone(&pool), jobs, output_bytes, secret, describe);
+        let archive = Archive::new(&config, Arc::new(FetchMemory(pool.settings().budget.clone())));
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();
@@ -201,7 +198,7 @@ impl Server {
             async move { recover(&jobs).await }
         });
         let sweeping = tokio::spawn({
-            let (store, every) = (self.app.store.clone(), self.app.config.store.sweep());
+            let (store, every) = (self.app.store.clone(), Duration::from_millis(self.app.config.store.sweep_ms));
             async move {
                 loop {
                     tokio::time::sleep(every).await;
@@ -252,14 +249,14 @@ async fn wind_down(
     mut serving: JoinHandle<bool>,
 ) -> bool {
     app.readiness.end();
-    let notice = app.config.server.termination_notice();
+    let notice = Duration::from_millis(app.config.server.termination_notice_ms.unwrap_or_default());
     if orders.has_changed().is_ok() && *orders.borrow() == Stop::Notice && !notice.is_zero() {
         stop.send_replace(Stop::Notice);
         tracing::info!(notice_ms = notice.as_millis(), "termination notice: not ready, but serving");
         drop(tokio::time::timeout(notice, stop::reached(orders, Stop::Drain)).await);
     }
     tracing::info!("draining: finishing requests, accepting no new ones");
-    let end = tokio::time::Instant::now() + app.config.server.drain_timeout();
+    let end = tokio::time::Instant::now() + Duration::from_millis(app.config.server.drain_timeout_ms);
     // Only orders received from here on count as new.
     orders.borrow_and_update();
     app.pool.leave();

@@ -49,7 +49,7 @@ pub(super) struct Input {
 impl Input {
     /// Charges bytes to the service's memory budget.
     fn new(app: &Shared, bytes: Bytes, digest: Digest) -> Result<Self, Problem> {
-        let mut lease = app.pool.budget().lease();
+        let mut lease = app.pool.settings().budget.lease();
         lease.grow(bytes.len() as u64)?;
         Ok(Self { bytes, digest, lease: Arc::new(lease) })
     }

@@ -1,5 +1,7 @@
 //! Request bodies: raw bytes, multipart forms or JSON, checked against the limits while they arrive.
 
+use std::time::Duration;
+
 use axum::body::Body;
 use axum::http::HeaderMap;
 use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE};
@@ -47,11 +49,11 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
             return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
-        let form = form::read(&app.config.limits, limit, content_type, body, app.pool.budget().lease());
+        let form = form::read(&app.config.limits, limit, content_type, body, app.pool.settings().budget.lease());
         let Form { bytes, lease, fields, declared } = in_time(app, form).await?;
         Upload { bytes, lease, fields, declared }
     } else {
-        let mut lease = app.pool.budget().lease();
+        let mut lease = app.pool.settings().budget.lease();
         let bytes = in_time(app, collect(body, announced, limit, &mut lease)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
         Upload { bytes, lease, fields: Vec::new(), declared }
@@ -70,7 +72,7 @@ pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> 
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
-    let mut lease = app.pool.budget().lease();
+    let mut lease = app.pool.settings().budget.lease();
     in_time(app, collect(body, announced, limit, &mut lease)).await
 }
 
@@ -82,10 +84,12 @@ fn announced(headers: &HeaderMap, limit: Limit) -> Result<u64, Problem> {
 
 /// Limits the reception of a body to `server.body_timeout_ms`.
 async fn in_time<T>(app: &App, receive: impl Future<Output = Result<T, Problem>>) -> Result<T, Problem> {
-    tokio::time::timeout(app.config.server.body_timeout(), receive).await.map_err(|_elapsed| {
-        let ms = app.config.server.body_timeout_ms;
-        Problem::new(Kind::BodyTimeout, format!("the body was not complete after {ms} ms")).with("limit", ms)
-    })?
+    tokio::time::timeout(Duration::from_millis(app.config.server.body_timeout_ms), receive).await.map_err(
+        |_elapsed| {
+            let ms = app.config.server.body_timeout_ms;
+            Problem::new(Kind::BodyTimeout, format!("the body was not complete after {ms} ms")).with("limit", ms)
+        },
+    )?
 }
 
 fn text<'a>(headers: &'a HeaderMap, name: &axum::http::HeaderName) -> Option<&'a str> {

@@ -59,8 +59,8 @@ pub(super) fn sources(file: Option<&Path>, loaded: &Loaded) -> Check {
     for (_, source) in loaded.sources() {
         match source {
             Source::Default => {}
-            Source::File(_) => from_file += 1,
-            Source::Environment(name) => variables.push(name.as_str()),
+            Source::File { .. } => from_file += 1,
+            Source::Environment { variable } => variables.push(variable.as_str()),
             Source::Flag => flags += 1,
         }
     }
