@@ -11,9 +11,9 @@ use tracing::Instrument as _;
 use super::client::Answer;
 use super::disk::{Disk, Found, Stored};
 use super::error::FetchError;
-use super::memory::Memory;
-use super::remote::{Origin, Remote};
+use super::remote::Remote;
 use crate::config::Config;
+use crate::memory_budget::Budget;
 use crate::single_flight::SingleFlight;
 use crate::store::Digest;
 use crate::structure::{Archive as Folder, EntryId, Stamp};
@@ -77,10 +77,10 @@ struct Shared {
 }
 
 impl Archive {
-    /// Creates the archive of a configuration. `memory` counts the bytes of running fetches. The first request starts
-    /// all I/O.
+    /// Creates the archive of a configuration. Running fetches are charged to `memory`. The first request starts all
+    /// I/O.
     #[must_use]
-    pub fn new(config: &Config, memory: Arc<dyn Memory>) -> Self {
+    pub fn new(config: &Config, memory: Budget) -> Self {
         let (archive, inflated) = (&config.archive, config.limits.inflated_bytes);
         let shared = Shared {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
@@ -193,13 +193,13 @@ impl Shared {
         count("remote", result);
         histogram!(ARCHIVE_FETCH, "result" => result).record(checked.elapsed().as_secs_f64());
         match (answer, stored) {
-            (Ok(Answer::Body { bytes, digest, url, validators, share }), _) => {
-                tracing::info!(%id, url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
-                let (origin, kept) = (Origin { url, validators }, bytes.clone());
+            (Ok(Answer::Body { bytes, digest, origin, lease }), _) => {
+                tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
+                let kept = bytes.clone();
                 self.on_disk(id, "stored", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
                 self.remember(id, Known { digest, stamp: None, checked, fresh_until: Some(checked + self.fresh) });
-                // From here on the caller counts the memory.
-                drop(share);
+                // From here on the caller accounts for the memory.
+                drop(lease);
                 Ok(Entry { bytes, digest, source: Source::Remote })
             }
             (Ok(Answer::Unchanged), Some(stored)) => {

@@ -13,7 +13,6 @@ use tokio::task::JoinHandle;
 use super::guard::UsageRecorder;
 use super::probe::Probe;
 use super::problem::Problem;
-use super::source::FetchMemory;
 use super::state::{App, Readiness, Shared, Warm};
 use super::stop::{self, Stop};
 use super::{accept, capabilities, key_reload, metrics, results, router};
@@ -142,7 +141,7 @@ impl Server {
         };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
         let job_store = JobStore::new(store.clone(), Arc::clone(&pool), settings, secret, describe);
-        let archive = Archive::new(&config, Arc::new(FetchMemory(pool.budget().clone())));
+        let archive = Archive::new(&config, pool.budget().clone());
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
         let readiness = Readiness::default();

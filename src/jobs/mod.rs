@@ -7,7 +7,6 @@
 //! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps the records of `durable_job`s, which
 //! survive the process.
 
-mod budget;
 mod coalesced_job;
 mod cost;
 mod devices;
@@ -26,7 +25,7 @@ mod tests;
 mod ticket;
 mod worker;
 
-pub use budget::{Budget, Exhausted, Lease};
+pub use crate::memory_budget::{Budget, Exhausted, Lease};
 pub use coalesced_job::{OnStart, Progress};
 pub use error::{AcceptError, EndError, Failure, Refusal};
 pub use job_store::{DescribeError, JobSpec, JobStore, JobStoreSettings, JobView};
