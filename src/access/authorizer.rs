@@ -68,7 +68,7 @@ impl Access {
             keys: keys.transpose()?,
             signing: signing.transpose().map_err(AccessError::Signing)?,
             address_quota: (!quota.is_unlimited()).then(|| Arc::new(quota)),
-            meter: Arc::new(Meter::new(config.clients)),
+            meter: Arc::new(Meter::new(config.max_addresses)),
             config,
             server,
         })

@@ -71,9 +71,9 @@ struct Shared {
     known: Cache<EntryId, Known>,
     /// Entries that no remote archive has, each with the time until which it is not requested again.
     absent: Cache<EntryId, Instant>,
-    check: Duration,
-    fresh: Duration,
-    absent_for: Duration,
+    check_interval: Duration,
+    revalidate_after: Duration,
+    retry_missing_after: Duration,
 }
 
 impl Archive {
@@ -89,9 +89,9 @@ impl Archive {
             fetches: SingleFlight::default(),
             known: Cache::new(CACHED_DIGESTS),
             absent: Cache::new(CACHED_DIGESTS),
-            check: archive.check(),
-            fresh: archive.fresh(),
-            absent_for: archive.absent(),
+            check_interval: archive.local_check_interval(),
+            revalidate_after: archive.revalidate_after(),
+            retry_missing_after: archive.retry_missing_after(),
         };
         Self { shared: Arc::new(shared) }
     }
@@ -144,7 +144,7 @@ impl Archive {
         if known.fresh_until.is_some_and(|end| Instant::now() >= end) {
             return None;
         }
-        if known.checked.elapsed() >= self.shared.check {
+        if known.checked.elapsed() >= self.shared.check_interval {
             let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
             let checked = Instant::now();
             let stamp = blocking(move || shared.folder.stamp(&wanted)).await.ok()?.ok()?;
@@ -166,12 +166,12 @@ impl Shared {
             return Ok(Entry { bytes, digest, source: Source::Local });
         }
         let stored = self.stored(id).await?;
-        let is_fresh = |stored: &Stored| stored.age.is_some_and(|age| age < self.fresh);
+        let is_fresh = |stored: &Stored| stored.age.is_some_and(|age| age < self.revalidate_after);
         let (remote, stored) = match (&self.remote, stored) {
             // Without a remote archive a copy does not expire.
             (None, Some(stored)) => return Ok(self.copy(id, stored, checked, None)),
             (Some(_), Some(stored)) if is_fresh(&stored) => {
-                let left = self.fresh.saturating_sub(stored.age.unwrap_or_default());
+                let left = self.revalidate_after.saturating_sub(stored.age.unwrap_or_default());
                 return Ok(self.copy(id, stored, checked, Some(left)));
             }
             (None, None) => return Err(FetchError::NotFound { id: id.clone() }),
@@ -197,7 +197,7 @@ impl Shared {
                 tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
                 let kept = bytes.clone();
                 self.on_disk(id, "stored", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
-                self.remember(id, Known { digest, stamp: None, checked, fresh_until: Some(checked + self.fresh) });
+                self.remember(id, Known { digest, stamp: None, checked, fresh_until: Some(checked + self.revalidate_after) });
                 // From here on the caller accounts for the memory.
                 drop(lease);
                 Ok(Entry { bytes, digest, source: Source::Remote })
@@ -205,13 +205,13 @@ impl Shared {
             (Ok(Answer::Unchanged), Some(stored)) => {
                 let (n_bytes, digest, origin) = (stored.bytes.len() as u64, stored.digest, stored.origin.clone());
                 self.on_disk(id, "confirmed", move |disk, id| disk.confirm(id, n_bytes, &digest, &origin)).await;
-                Ok(self.copy(id, stored, checked, Some(self.fresh)))
+                Ok(self.copy(id, stored, checked, Some(self.revalidate_after)))
             }
             (Ok(_), _) => Err(FetchError::Internal("the archive answered `304 Not Modified` without a copy")),
             (Err(error @ FetchError::NotFound { .. }), _) => {
                 self.on_disk(id, "removed", Disk::remove).await;
                 self.known.remove(id);
-                self.absent.insert(id.clone(), checked + self.absent_for);
+                self.absent.insert(id.clone(), checked + self.retry_missing_after);
                 Err(error)
             }
             (Err(error @ FetchError::Unavailable { .. }), Some(stored)) => {

@@ -17,7 +17,7 @@ pub struct ArchiveConfig {
     pub dir: Option<PathBuf>,
     /// Time between checks of a local file for changes, ms. Default 1,000: a check costs a dozen system calls, and
     /// entries change rarely.
-    pub check_ms: u64,
+    pub local_check_interval_ms: u64,
     /// URL templates of an entry, tried in order until one has it; `none` disables the remote archive. Default:
     /// compressed mmCIF from RCSB's download service, the smallest complete format.
     pub url: Option<Templates>,
@@ -51,9 +51,9 @@ pub struct ArchiveConfig {
     pub concurrent: usize,
     /// Time for which a copy is used without revalidation, ms. Default 86,400,000, a day: entries are released and
     /// revised weekly.
-    pub fresh_ms: u64,
+    pub revalidate_after_ms: u64,
     /// Time for which a missing entry is not requested again, ms. Default 60,000.
-    pub absent_ms: u64,
+    pub retry_missing_after_ms: u64,
     /// Size of the copies on disk, bytes; the least recently used ones are evicted. Default 4 GiB: ten thousand typical
     /// entries.
     pub cache_bytes: u64,
@@ -67,7 +67,7 @@ impl Default for ArchiveConfig {
     fn default() -> Self {
         Self {
             dir: None,
-            check_ms: 1000,
+            local_check_interval_ms: 1000,
             url: Some(Templates::default()),
             proxy: None,
             allow_private: false,
@@ -79,8 +79,8 @@ impl Default for ArchiveConfig {
             retry_after_ms: 5000,
             max_bytes: 256 << 20,
             concurrent: 8,
-            fresh_ms: 86_400_000,
-            absent_ms: 60_000,
+            revalidate_after_ms: 86_400_000,
+            retry_missing_after_ms: 60_000,
             cache_bytes: 4 << 30,
             breaker_failures: 5,
             breaker_ms: 30_000,
@@ -91,8 +91,8 @@ impl Default for ArchiveConfig {
 impl ArchiveConfig {
     /// Returns the time between checks of a local file.
     #[must_use]
-    pub fn check(&self) -> Duration {
-        Duration::from_millis(self.check_ms)
+    pub fn local_check_interval(&self) -> Duration {
+        Duration::from_millis(self.local_check_interval_ms)
     }
 
     /// Returns the time for a connection.
@@ -127,14 +127,14 @@ impl ArchiveConfig {
 
     /// Returns the time for which a copy is used without revalidation.
     #[must_use]
-    pub fn fresh(&self) -> Duration {
-        Duration::from_millis(self.fresh_ms)
+    pub fn revalidate_after(&self) -> Duration {
+        Duration::from_millis(self.revalidate_after_ms)
     }
 
     /// Returns the time for which a missing entry is not requested again.
     #[must_use]
-    pub fn absent(&self) -> Duration {
-        Duration::from_millis(self.absent_ms)
+    pub fn retry_missing_after(&self) -> Duration {
+        Duration::from_millis(self.retry_missing_after_ms)
     }
 
     /// Returns the length of the pause after repeated failures.

@@ -4,28 +4,25 @@
 //! the client that requested it first.
 
 use std::net::IpAddr;
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::{Duration, Instant, SystemTime};
 
-use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::header::{self, AUTHORIZATION, HeaderMap, HeaderName, WWW_AUTHENTICATE};
 use axum::http::uri::{PathAndQuery, Uri};
 use axum::http::{Extensions, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
-use bytes::Bytes;
 use http_body_util::BodyExt as _;
-use hyper::body::{Body as HttpBody, Frame, SizeHint};
+use hyper::body::Body as _;
 use tracing::Span;
 
 use super::kinds::Kind;
+use super::observed_body::observed;
 use super::problem::Problem;
 use super::scopes;
 use super::state::{App, Shared};
-use crate::access::{Access, Account, Denied, Exceeded, Key, Quota, Running, Scope, Signed, limits, policies, without};
+use crate::access::{Access, Account, Denied, Exceeded, Key, Quota, Scope, Signed, limits, policies, without};
 use crate::jobs::{Client, Meter, rfc3339};
 
 /// `X-Api-Key`, an alternative to `Authorization`.
@@ -100,7 +97,10 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     request.extensions_mut().insert(caller);
     let mut response = match running {
         Ok(None) => next.run(request).await,
-        Ok(Some(running)) => next.run(request).await.map(|body| Body::new(Held { body, _running: running })),
+        Ok(Some(running)) => next.run(request).await.map(|body| {
+            // The request counts until the body is dropped.
+            observed(body, move |_bytes, _is_end| _ = &running)
+        }),
         Err(exceeded) => {
             swallow(request).await;
             refusal(&exceeded).into_response()
@@ -122,7 +122,7 @@ async fn swallow(request: Request) {
     const PATIENCE: Duration = Duration::from_millis(500);
     let asks_first = request.headers().contains_key(header::EXPECT);
     let mut body = request.into_body();
-    if asks_first || HttpBody::size_hint(&body).lower() > MOST {
+    if asks_first || body.size_hint().lower() > MOST {
         return;
     }
     let read = async {
@@ -290,29 +290,6 @@ fn keep_private(headers: &mut HeaderMap) {
     let private = value.strip_prefix("public").map(|rest| HeaderValue::try_from(format!("private{rest}")));
     if let Some(Ok(value)) = private {
         headers.insert(header::CACHE_CONTROL, value);
-    }
-}
-
-/// Response body that holds a concurrency slot until it is dropped.
-struct Held {
-    body: Body,
-    _running: Running,
-}
-
-impl HttpBody for Held {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        Pin::new(&mut self.body).poll_frame(cx)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }
 

@@ -12,7 +12,8 @@ use utoipa::ToSchema;
 use super::kinds::Kind;
 use super::openapi::refusals;
 use super::problem::Problem;
-use super::state::{Shared, Warm};
+use super::state::Shared;
+use super::stop::Stop;
 
 const NO_STORE: [(axum::http::HeaderName, &str); 1] = [(CACHE_CONTROL, "no-store")];
 
@@ -94,18 +95,18 @@ pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem
 }
 
 fn accepting(app: &Shared) -> Check {
-    let ending = app.readiness.is_ending();
+    let ending = *app.stopping.borrow() != Stop::Serve;
     let found = if ending { Err("the service is shutting down") } else { Ok("requests are accepted") };
     Check::new("accepting", found.map(str::to_owned).map_err(str::to_owned))
 }
 
 fn devices(app: &Shared) -> Check {
     let backend = app.pool.backend();
-    let found = match app.readiness.warm() {
-        Warm::Warming => Err("the first mesh is being computed".to_owned()),
-        Warm::Broken => Err("the first mesh failed; see the log".to_owned()),
-        Warm::Yes if !backend.able() => Err("no device is in service, and there is no fallback".to_owned()),
-        Warm::Yes => {
+    let found = match app.first_mesh.get() {
+        None => Err("the first mesh is being computed".to_owned()),
+        Some(false) => Err("the first mesh failed; see the log".to_owned()),
+        Some(true) if !backend.able() => Err("no device is in service, and there is no fallback".to_owned()),
+        Some(true) => {
             let devices = backend.devices();
             let up = devices.iter().filter(|device| device.down.is_none()).count();
             Ok(match devices.len() {

@@ -1,9 +1,11 @@
 //! `POST /v1/meshes`: the mesh of an upload, or of the structure that a JSON document names.
 
+use std::sync::Arc;
+
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::header::HeaderMap;
-use axum::http::{Extensions, HeaderValue, Method, header};
+use axum::http::{Extensions, HeaderValue, header};
 use axum::response::Response;
 
 use super::kinds::Kind;
@@ -75,9 +77,7 @@ async fn answer(
     let timing = Timing::start();
     let preferences = RequestPreferences::of(headers, extensions)?;
     let parsed = ParsedRequest { report, ..ParsedRequest::from_body(app, query, headers, body).await? };
-    let request = MeshRequest::of_upload(parsed, preferences, timing);
-    // Conditions and ranges apply to GET requests only.
-    let mut response = request.answer(app, &Method::POST, &HeaderMap::new()).await?;
+    let mut response = MeshRequest::of_upload(Arc::clone(app), parsed, preferences, timing).answer().await?;
     if !report {
         response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
     }

@@ -6,6 +6,7 @@
 // Protocol rules that use no other file.
 mod conditional;
 mod kinds;
+mod observed_body;
 mod pace;
 mod probe;
 mod range;

@@ -1,9 +1,6 @@
 //! `GET /v1/pdb/{id}/surface.{ext}` and `report.json`: the mesh of an archive entry at a cacheable address, and its
 //! report.
 
-use axum::extract::State;
-use axum::http::Method;
-use axum::http::header::HeaderMap;
 use axum::response::Response;
 
 use super::kinds::Kind;
@@ -13,7 +10,6 @@ use super::openapi::parameters::{EntryPath, MeshParameters, Parts, SurfaceParame
 use super::openapi::problems::{ASKING, MESHING, PARAMETERS, READING};
 use super::openapi::refusals;
 use super::problem::Problem;
-use super::state::Shared;
 
 refusals!(SurfaceRefusals: [PARAMETERS, READING, MESHING, ASKING, [
     Kind::NotFound, Kind::NotInArchive, Kind::EntryTooLarge, Kind::RangeNotSatisfiable, Kind::ArchiveUnavailable,
@@ -22,21 +18,10 @@ refusals!(SurfaceRefusals: [PARAMETERS, READING, MESHING, ASKING, [
 /// Mesh an archive entry
 ///
 /// The path names the format, so that the response can be cached and linked to.
-#[utoipa::path(
-    get,
-    path = "/v1/pdb/{id}/{file}",
-    tag = "meshes",
-    operation_id = "meshEntry",
-    params(EntryPath, SurfaceParameters, Wishes, Unchanged, Parts),
-    responses(Addressed, SurfaceRefusals)
-)]
-pub(super) async fn surface(
-    State(app): State<Shared>,
-    method: Method,
-    headers: HeaderMap,
-    request: MeshRequest,
-) -> Result<Response, Problem> {
-    request.answer(&app, &method, &headers).await
+#[utoipa::path(get, path = "/v1/pdb/{id}/{file}", tag = "meshes", operation_id = "meshEntry",
+    params(EntryPath, SurfaceParameters, Wishes, Unchanged, Parts), responses(Addressed, SurfaceRefusals))]
+pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
+    request.answer().await
 }
 
 refusals!(ReportRefusals: [PARAMETERS, READING, MESHING, [
@@ -44,19 +29,8 @@ refusals!(ReportRefusals: [PARAMETERS, READING, MESHING, [
 ]]);
 
 /// Mesh an archive entry and return the report
-#[utoipa::path(
-    get,
-    path = "/v1/pdb/{id}/report.json",
-    tag = "meshes",
-    operation_id = "reportEntry",
-    params(EntryPath, MeshParameters),
-    responses(Reported, ReportRefusals)
-)]
-pub(super) async fn report(
-    State(app): State<Shared>,
-    method: Method,
-    headers: HeaderMap,
-    request: MeshRequest,
-) -> Result<Response, Problem> {
-    request.answer(&app, &method, &headers).await
+#[utoipa::path(get, path = "/v1/pdb/{id}/report.json", tag = "meshes", operation_id = "reportEntry",
+    params(EntryPath, MeshParameters), responses(Reported, ReportRefusals))]
+pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
+    request.answer().await
 }

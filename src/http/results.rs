@@ -27,7 +27,7 @@ use super::{conditional, delivery};
 use crate::formats::Format;
 use crate::jobs::{self, ContentKey, Finished, REPORT};
 use crate::pipeline::Report;
-use crate::telemetry::{RESULTS_NOT_KEPT, SpanKind, SpanParent, TraceSpan};
+use crate::telemetry::{RESULTS_NOT_STORED, SpanKind, SpanParent, TraceSpan};
 
 /// Caching of results, whose bytes follow from their key.
 pub(super) const IMMUTABLE: HeaderValue = HeaderValue::from_static("public, max-age=31536000, immutable");
@@ -190,7 +190,7 @@ pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format,
         return true;
     }
     let Ok(permit) = Arc::clone(&app.save_permits).try_acquire_owned() else {
-        counter!(RESULTS_NOT_KEPT, "reason" => "busy").increment(1);
+        counter!(RESULTS_NOT_STORED, "reason" => "busy").increment(1);
         return false;
     };
     let (shared, finished, saved) = (Arc::clone(app), Arc::clone(finished), *key);
@@ -198,7 +198,7 @@ pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format,
     let save = async move {
         let limit = shared.config.limits.output_bytes;
         if let Err(error) = jobs::save(&shared.store, finished, format, &saved, limit).await {
-            counter!(RESULTS_NOT_KEPT, "reason" => "failed").increment(1);
+            counter!(RESULTS_NOT_STORED, "reason" => "failed").increment(1);
             tracing::warn!(%error, "cannot store a result");
         }
         span.end();

@@ -5,7 +5,7 @@ use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::header::{self, HeaderMap};
-use axum::http::{Method, StatusCode};
+use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
@@ -188,21 +188,10 @@ pub(super) async fn show(
 /// Mesh an uploaded structure
 ///
 /// The path names the format, so that the response can be cached and linked to.
-#[utoipa::path(
-    get,
-    path = "/v1/structures/{digest}/{file}",
-    tag = "meshes",
-    operation_id = "meshStructure",
-    params(StructurePath, SurfaceParameters, Wishes, Unchanged, Parts),
-    responses(Addressed, SurfaceRefusals)
-)]
-pub(super) async fn surface(
-    State(app): State<Shared>,
-    method: Method,
-    headers: HeaderMap,
-    request: MeshRequest,
-) -> Result<Response, Problem> {
-    request.answer(&app, &method, &headers).await
+#[utoipa::path(get, path = "/v1/structures/{digest}/{file}", tag = "meshes", operation_id = "meshStructure",
+    params(StructurePath, SurfaceParameters, Wishes, Unchanged, Parts), responses(Addressed, SurfaceRefusals))]
+pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
+    request.answer().await
 }
 
 refusals!(ReportRefusals: [
@@ -211,21 +200,10 @@ refusals!(ReportRefusals: [
 ]);
 
 /// Mesh an uploaded structure and return the report
-#[utoipa::path(
-    get,
-    path = "/v1/structures/{digest}/report.json",
-    tag = "meshes",
-    operation_id = "reportStructure",
-    params(StructurePath, MeshParameters),
-    responses(Reported, ReportRefusals)
-)]
-pub(super) async fn report(
-    State(app): State<Shared>,
-    method: Method,
-    headers: HeaderMap,
-    request: MeshRequest,
-) -> Result<Response, Problem> {
-    request.answer(&app, &method, &headers).await
+#[utoipa::path(get, path = "/v1/structures/{digest}/report.json", tag = "meshes", operation_id = "reportStructure",
+    params(StructurePath, MeshParameters), responses(Reported, ReportRefusals))]
+pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
+    request.answer().await
 }
 
 /// Parses a structure and describes its contents, on a blocking thread.

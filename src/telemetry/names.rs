@@ -59,7 +59,7 @@ metrics! {
     STAGE_DURATION = "molmesh_job_stage_duration_seconds", Histogram,
         stage: "queue|check|read|select|bin|field|classify|scan|interpolate|emit|write|measure|roundtrip|encode";
     /// Results of synchronous requests that were not stored.
-    RESULTS_NOT_KEPT = "molmesh_results_not_kept_total", Counter, reason: "busy|failed";
+    RESULTS_NOT_STORED = "molmesh_results_not_stored_total", Counter, reason: "busy|failed";
     /// Jobs waiting in the queue.
     QUEUE_DEPTH = "molmesh_queue_depth", Gauge;
     /// Time for which the oldest job in the queue has waited.

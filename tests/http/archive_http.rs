@@ -114,7 +114,7 @@ async fn accepts_chunked_responses() {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_folder_takes_precedence() {
     let remote = Remote::saying(ok(b"remote"));
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.check_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.local_check_interval_ms = 1);
     place.put("4pti.cif", b"local");
     let archive = place.archive();
     let entry = archive.fetch(&id("4pti")).await.unwrap();
@@ -137,15 +137,15 @@ async fn digests_are_cached() {
     std::fs::remove_dir_all(place.copies()).unwrap();
     assert_eq!(archive.known(&id("4pti")).await, Some(Digest::of(b"remote")));
     // Cached digests expire.
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1000);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1000);
     let archive = place.archive();
     archive.fetch(&id("4pti")).await.unwrap();
     assert!(archive.known(&id("4pti")).await.is_some());
     pause(1100).await;
     assert_eq!(archive.known(&id("4pti")).await, None);
-    // A local file is checked again after `check_ms`.
-    for (check_ms, expected) in [(60_000, &b"old"[..]), (1, &b"newer"[..])] {
-        let place = Setup::new(&remote.url(CIF), |c| c.archive.check_ms = check_ms);
+    // A local file is checked again after `local_check_interval_ms`.
+    for (local_check_interval_ms, expected) in [(60_000, &b"old"[..]), (1, &b"newer"[..])] {
+        let place = Setup::new(&remote.url(CIF), |c| c.archive.local_check_interval_ms = local_check_interval_ms);
         place.put("4pti.cif", b"old");
         let archive = place.archive();
         assert_eq!(archive.digest(&id("4pti")).await.unwrap(), Digest::of(b"old"));
@@ -153,7 +153,7 @@ async fn digests_are_cached() {
         assert_eq!(archive.known(&id("4pti")).await, Some(Digest::of(b"old")));
         place.put("4pti.cif", b"newer");
         pause(5).await;
-        assert_eq!(archive.digest(&id("4pti")).await.unwrap(), Digest::of(expected), "{check_ms}");
+        assert_eq!(archive.digest(&id("4pti")).await.unwrap(), Digest::of(expected), "{local_check_interval_ms}");
     }
 }
 
@@ -165,7 +165,7 @@ async fn old_copies_are_revalidated() {
         2 => tagged("\"b\"", b"second"),
         _ => status(500),
     });
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1000);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1000);
     let archive = place.archive();
     let fetch = async || {
         let entry = archive.fetch(&id("4pti")).await.unwrap();
@@ -195,7 +195,7 @@ async fn revalidates_by_date_without_an_etag() {
         Some(since) if since == date => status(304),
         _ => Response::Whole(200, vec![("last-modified", date.to_owned())], b"x".to_vec()),
     });
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1);
     let archive = place.archive();
     for source in [Source::Remote, Source::Cache, Source::Cache] {
         assert_eq!(archive.fetch(&id("4pti")).await.unwrap().source, source);
@@ -225,7 +225,7 @@ async fn tries_the_second_url_if_the_first_fails() {
 async fn missing_entries_are_not_requested_again_for_a_while() {
     for absent in [404, 410] {
         let remote = Remote::saying(status(absent));
-        let place = Setup::new(&remote.url(CIF), |c| c.archive.absent_ms = 1000);
+        let place = Setup::new(&remote.url(CIF), |c| c.archive.retry_missing_after_ms = 1000);
         let archive = place.archive();
         for _ in 0..3 {
             assert!(matches!(archive.fetch(&id("4pti")).await, Err(FetchError::NotFound { .. })), "{absent}");
@@ -242,7 +242,7 @@ async fn missing_entries_are_not_requested_again_for_a_while() {
 #[tokio::test(flavor = "multi_thread")]
 async fn copies_of_withdrawn_entries_are_removed() {
     let remote = Remote::start(|_, n| if n == 0 { ok(b"x") } else { status(410) });
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1);
     let archive = place.archive();
     archive.fetch(&id("4pti")).await.unwrap();
     pause(5).await;
@@ -254,7 +254,7 @@ async fn copies_of_withdrawn_entries_are_removed() {
 #[tokio::test(flavor = "multi_thread")]
 async fn without_urls_no_request_is_sent() {
     let remote = Remote::saying(ok(b"x"));
-    let mut place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let mut place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1);
     place.archive().fetch(&id("4pti")).await.unwrap();
     place.config.archive.url = None;
     pause(5).await;
@@ -437,7 +437,7 @@ async fn the_circuit_breaker_opens_and_closes() {
 async fn a_stale_copy_is_used_if_the_archive_fails() {
     let remote = Remote::start(|_, n| if n == 0 { ok(b"x") } else { status(500) });
     let place = Setup::new(&remote.url(CIF), |c| {
-        c.archive.fresh_ms = 1;
+        c.archive.revalidate_after_ms = 1;
         c.archive.attempts = 1;
         c.archive.breaker_failures = 1;
     });
@@ -704,7 +704,7 @@ fn missing_and_too_large_entries_are_reported() {
 fn stale_copies_are_counted_and_logged() {
     let remote = Remote::start(|_, n| if n == 0 { ok(SAMPLE) } else { status(500) });
     let server = server(&remote.url(CIF), |c| {
-        c.archive.fresh_ms = 1;
+        c.archive.revalidate_after_ms = 1;
         c.archive.attempts = 1;
     });
     let stale = || server.metric("molmesh_archive_requests_total", &["result=\"stale\""]);

@@ -516,7 +516,7 @@ fn asynchronous_jobs_yield_for_the_maximum_delay() {
 #[test]
 fn concurrent_saves_are_limited() {
     let server = fake(|c| (c.jobs.concurrent_saves, c.jobs.queue) = (1, 100));
-    let (server, busy) = (&server, || server.metric("molmesh_results_not_kept_total", &["reason=\"busy\""]));
+    let (server, busy) = (&server, || server.metric("molmesh_results_not_stored_total", &["reason=\"busy\""]));
     let (before, end) = (busy(), Instant::now() + Duration::from_mins(1));
     for round in 0.. {
         std::thread::scope(|scope| {

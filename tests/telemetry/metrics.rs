@@ -40,7 +40,7 @@ const ROWS: &[Row] = &[
     (t::JOBS_RECOVERED, &[], restart),
     (t::JOBS_FALLBACK, &[], devices),
     (t::STAGE_DURATION, &["stage=\"field\""], meshes),
-    (t::RESULTS_NOT_KEPT, &["reason=\"failed\""], tiny_store),
+    (t::RESULTS_NOT_STORED, &["reason=\"failed\""], tiny_store),
     (t::QUEUE_DEPTH, &[], held),
     (t::QUEUE_AGE, &[], held),
     (t::QUEUE_WAIT, &[], held),
