@@ -157,7 +157,11 @@ pub(super) async fn get(
         }
         status => {
             let retry_after = retry_after(response.headers());
-            return Err(Failed::Other { reason: UnavailableReason::Status(status.as_u16()), retry_after, detail: status.to_string() });
+            return Err(Failed::Other {
+                reason: UnavailableReason::Status(status.as_u16()),
+                retry_after,
+                detail: status.to_string(),
+            });
         }
     }
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
@@ -195,9 +199,10 @@ async fn body(mut response: Response, limits: Limits, lease: &mut Lease) -> Resu
         body.extend_from_slice(&chunk);
     }
     match announced {
-        Some(bytes) if bytes != body.len() as u64 => {
-            Err(Failed::other(UnavailableReason::Broken, &format!("received {} of {bytes} announced bytes", body.len())))
-        }
+        Some(bytes) if bytes != body.len() as u64 => Err(Failed::other(
+            UnavailableReason::Broken,
+            &format!("received {} of {bytes} announced bytes", body.len()),
+        )),
         _ => Ok(body.freeze()),
     }
 }

@@ -197,7 +197,10 @@ impl Shared {
                 tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
                 let kept = bytes.clone();
                 self.on_disk(id, "stored", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
-                self.remember(id, Known { digest, stamp: None, checked, fresh_until: Some(checked + self.revalidate_after) });
+                self.remember(
+                    id,
+                    Known { digest, stamp: None, checked, fresh_until: Some(checked + self.revalidate_after) },
+                );
                 // From here on the caller accounts for the memory.
                 drop(lease);
                 Ok(Entry { bytes, digest, source: Source::Remote })

@@ -122,7 +122,8 @@ impl Remote {
                 if reason != UnavailableReason::Paused {
                     tracing::warn!(%id, host = breaker.host(), attempt, detail, "the request to the archive failed");
                 }
-                let is_temporary = reason.is_temporary() || matches!(reason, UnavailableReason::Paused | UnavailableReason::Busy);
+                let is_temporary =
+                    reason.is_temporary() || matches!(reason, UnavailableReason::Paused | UnavailableReason::Busy);
                 let retry_after = breaker.open_for().or(requested).unwrap_or(DEFAULT_RETRY_AFTER);
                 return Err(FetchError::Unavailable {
                     host: breaker.host().to_owned(),
@@ -150,7 +151,8 @@ impl Remote {
         copy: Option<&Origin>,
         deadline: Instant,
     ) -> Result<Answer, Failed> {
-        let paused = |wait: Duration| Failed::other(UnavailableReason::Paused, &format!("paused for {} ms", wait.as_millis()));
+        let paused =
+            |wait: Duration| Failed::other(UnavailableReason::Paused, &format!("paused for {} ms", wait.as_millis()));
         // Checked before waiting for a permit.
         breaker.open_for().map_or(Ok(()), |wait| Err(paused(wait)))?;
         let _permit = tokio::time::timeout_at(deadline, self.permits.acquire())

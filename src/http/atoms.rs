@@ -16,8 +16,7 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::Shared;
-use crate::jobs::Failure;
-use crate::structure::{self, Structure, StructureError, element};
+use crate::structure::{self, Structure, element};
 
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
 const BYTES_PER_ATOM: u64 = 24;
@@ -124,36 +123,12 @@ async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
     let mut lease = app.pool.budget().lease();
     let listing = tokio::task::spawn_blocking(move || {
         let structure = structure::read(&input.bytes, &limits)?;
-        lease.grow(BYTES_PER_ATOM * structure.len() as u64).map_err(Failed::Memory)?;
-        let text = serde_json::to_vec(&document(&structure)).map_err(Failed::Writing)?;
-        Ok(lease.attach(text))
+        lease.grow(BYTES_PER_ATOM * structure.len() as u64)?;
+        let text = serde_json::to_vec(&document(&structure)).map_err(Problem::internal)?;
+        Ok::<Bytes, Problem>(lease.attach(text))
     });
-    let listed: Result<Bytes, Failed> = listing.await.map_err(Problem::internal)?;
-    let text = listed.map_err(Problem::from)?;
+    let text = listing.await.map_err(Problem::internal)??;
     Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
-}
-
-/// Error of [`list`].
-enum Failed {
-    Structure(StructureError),
-    Memory(crate::jobs::Exhausted),
-    Writing(serde_json::Error),
-}
-
-impl From<StructureError> for Failed {
-    fn from(error: StructureError) -> Self {
-        Self::Structure(error)
-    }
-}
-
-impl From<Failed> for Problem {
-    fn from(failed: Failed) -> Self {
-        match failed {
-            Failed::Structure(error) => Failure::Job { error: error.into(), diagnostics: Vec::new() }.into(),
-            Failed::Memory(error) => error.into(),
-            Failed::Writing(error) => Self::internal(error),
-        }
-    }
 }
 
 /// Builds the columns.

@@ -3,8 +3,7 @@
 
 use std::convert::Infallible;
 
-use axum::extract::rejection::PathRejection;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::http::header::HeaderName;
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::sse::{Event, KeepAlive, Sse};
@@ -19,7 +18,7 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::JobView;
+use crate::jobs::{JobId, JobView};
 
 /// `Last-Event-ID`.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
@@ -46,13 +45,8 @@ refusals!(EventsRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::StoreFailed
         (status = 204, description = "`Last-Event-ID` names the final event; no more events follow."),
         EventsRefusals,
     ))]
-pub(super) async fn show(
-    State(app): State<Shared>,
-    path: Result<Path<String>, PathRejection>,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
-    let id = jobs::id(path)?;
-    let watched = app.job_store.watch(&id).await?.ok_or_else(|| jobs::none(id.as_str()))?;
+pub(super) async fn show(State(app): State<Shared>, id: JobId, headers: HeaderMap) -> Result<Response, Problem> {
+    let watched = app.job_store.watch(&id).await?.ok_or_else(|| jobs::no_such_job(id.as_str()))?;
     let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()?.trim().parse::<u64>().ok());
     // Versions start again with the service, so a larger id is from an earlier process.
     let seen = last.filter(|last| *last <= watched.borrow().version).unwrap_or(0);

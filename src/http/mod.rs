@@ -12,15 +12,16 @@ mod probe;
 mod range;
 mod request_id;
 mod scopes;
+mod signal;
 mod socket;
-mod stop;
 mod timing;
+
+mod stop;
 
 // Problems, and what can be checked without the state of the service.
 mod problem;
 
 mod content_type;
-mod embedded;
 mod errors;
 mod json_body;
 mod limit;
@@ -54,7 +55,6 @@ mod results;
 mod mesh_request;
 
 mod atoms;
-mod docs;
 mod estimate;
 mod events;
 mod health;

@@ -68,9 +68,8 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         bytes: 0,
         complete: false,
     };
-    let request = request.map(|body| {
-        observed(body, move |bytes, _is_end| _ = received.fetch_add(bytes as u64, Ordering::Relaxed))
-    });
+    let request = request
+        .map(|body| observed(body, move |bytes, _is_end| _ = received.fetch_add(bytes as u64, Ordering::Relaxed)));
     let place = HeaderValue::from_str(&traceparent(&trace.context()));
     let mut response = trace.run(next.run(request)).instrument(span).await;
     timing::write_header(&mut response, start.elapsed());

@@ -18,8 +18,14 @@ refusals!(SurfaceRefusals: [PARAMETERS, READING, MESHING, ASKING, [
 /// Mesh an archive entry
 ///
 /// The path names the format, so that the response can be cached and linked to.
-#[utoipa::path(get, path = "/v1/pdb/{id}/{file}", tag = "meshes", operation_id = "meshEntry",
-    params(EntryPath, SurfaceParameters, Wishes, Unchanged, Parts), responses(Addressed, SurfaceRefusals))]
+#[utoipa::path(
+    get,
+    path = "/v1/pdb/{id}/{file}",
+    tag = "meshes",
+    operation_id = "meshEntry",
+    params(EntryPath, SurfaceParameters, Wishes, Unchanged, Parts),
+    responses(Addressed, SurfaceRefusals)
+)]
 pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
     request.answer().await
 }
@@ -29,8 +35,14 @@ refusals!(ReportRefusals: [PARAMETERS, READING, MESHING, [
 ]]);
 
 /// Mesh an archive entry and return the report
-#[utoipa::path(get, path = "/v1/pdb/{id}/report.json", tag = "meshes", operation_id = "reportEntry",
-    params(EntryPath, MeshParameters), responses(Reported, ReportRefusals))]
+#[utoipa::path(
+    get,
+    path = "/v1/pdb/{id}/report.json",
+    tag = "meshes",
+    operation_id = "reportEntry",
+    params(EntryPath, MeshParameters),
+    responses(Reported, ReportRefusals)
+)]
 pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
     request.answer().await
 }

@@ -49,7 +49,7 @@ pub(super) async fn list() -> Response {
     params(ProblemPath),
     responses((status = 200, description = "The explanation.", body = ProblemDescription), OneRefusals))]
 pub(super) async fn one(path: Result<Path<String>, PathRejection>) -> Result<Response, Problem> {
-    let Path(slug) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let Path(slug) = path?;
     let row = KINDS.iter().find(|row| row.slug == slug);
     row.map(|row| Json(describe(row)).into_response())
         .ok_or_else(|| Problem::new(Kind::NotFound, "there is no problem type with this name; /problems lists all"))

@@ -61,7 +61,7 @@ pub(super) async fn show(
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let Path(file) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let Path(file) = path?;
     let (key, format) = parse(&file).ok_or_else(|| no_such_result(&file))?;
     let etag = delivery::etag(&key);
     if conditional::is_unchanged(&headers, &etag) {
@@ -86,7 +86,7 @@ pub(super) async fn report(
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let Path(text) = path?;
     let key: ContentKey = text.parse().map_err(|_bad| no_such_result(&text))?;
     wait_for_save(&app, &key).await;
     let bytes = app.store.get(&key.name(REPORT)?).await?.ok_or_else(|| no_such_result(&text))?.bytes;

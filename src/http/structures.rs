@@ -4,13 +4,13 @@
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
-use axum::http::header::{self, HeaderMap};
 use axum::http::StatusCode;
+use axum::http::header::{self, HeaderMap};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::delivery;
+use super::form::Upload;
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::StructureFile;
@@ -21,7 +21,7 @@ use super::openapi::refusals;
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::Shared;
-use super::upload::{self, Upload};
+use super::{delivery, upload};
 use crate::jobs::Failure;
 use crate::store::{Digest, Name};
 use crate::structure::contents::Counts;
@@ -188,8 +188,14 @@ pub(super) async fn show(
 /// Mesh an uploaded structure
 ///
 /// The path names the format, so that the response can be cached and linked to.
-#[utoipa::path(get, path = "/v1/structures/{digest}/{file}", tag = "meshes", operation_id = "meshStructure",
-    params(StructurePath, SurfaceParameters, Wishes, Unchanged, Parts), responses(Addressed, SurfaceRefusals))]
+#[utoipa::path(
+    get,
+    path = "/v1/structures/{digest}/{file}",
+    tag = "meshes",
+    operation_id = "meshStructure",
+    params(StructurePath, SurfaceParameters, Wishes, Unchanged, Parts),
+    responses(Addressed, SurfaceRefusals)
+)]
 pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
     request.answer().await
 }
@@ -200,8 +206,14 @@ refusals!(ReportRefusals: [
 ]);
 
 /// Mesh an uploaded structure and return the report
-#[utoipa::path(get, path = "/v1/structures/{digest}/report.json", tag = "meshes", operation_id = "reportStructure",
-    params(StructurePath, MeshParameters), responses(Reported, ReportRefusals))]
+#[utoipa::path(
+    get,
+    path = "/v1/structures/{digest}/report.json",
+    tag = "meshes",
+    operation_id = "reportStructure",
+    params(StructurePath, MeshParameters),
+    responses(Reported, ReportRefusals)
+)]
 pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
     request.answer().await
 }

@@ -328,7 +328,11 @@ async fn responses_of_the_wrong_length_are_rejected() {
     let announcing = |n: usize| {
         [format!("HTTP/1.1 200 X\r\nconnection: close\r\ncontent-length: {n}\r\n\r\n").as_bytes(), &gz].concat()
     };
-    for (n, expected) in [(gz.len() + 1, UnavailableReason::Broken), (gz.len() - 1, UnavailableReason::Damaged), (4, UnavailableReason::Damaged)] {
+    for (n, expected) in [
+        (gz.len() + 1, UnavailableReason::Broken),
+        (gz.len() - 1, UnavailableReason::Damaged),
+        (4, UnavailableReason::Damaged),
+    ] {
         let remote = Remote::saying(Response::Raw(announcing(n)));
         let place = Setup::new(&remote.url(GZ), |_| {});
         let result = place.archive().fetch(&id("4pti")).await;
