@@ -22,7 +22,10 @@ use super::observed_body::observed;
 use super::problem::Problem;
 use super::scopes;
 use super::state::{App, Shared};
-use crate::access::{Access, Account, Denied, Exceeded, Key, Quota, Scope, Signed, limits, policies, without};
+use crate::access::{
+    Access, Account, Denied, Exceeded, Key, Quota, Scope, SignatureCheck, rate_limit, rate_limit_policy,
+    remove_signature,
+};
 use crate::jobs::{Client, Meter, rfc3339};
 
 /// `X-Api-Key`, an alternative to `Authorization`.
@@ -63,12 +66,12 @@ impl Caller {
     fn address(access: &Access, request: &Request) -> Self {
         let Some(Peer(peer)) = request.extensions().get::<Peer>() else { return Self::default() };
         let values = request.headers().get_all(access.forwarded_header()).iter().filter_map(|v| v.to_str().ok());
-        Self::new(&place(access.client(*peer, values)), false, access.address_quota())
+        Self::new(&client_name(access.client(*peer, values)), false, access.address_quota())
     }
 }
 
 /// Name of an address as a client. IPv6 addresses count by their /64 network, which one client commonly owns.
-fn place(address: IpAddr) -> String {
+fn client_name(address: IpAddr) -> String {
     match address {
         IpAddr::V4(address) => address.to_string(),
         IpAddr::V6(address) => {
@@ -85,7 +88,7 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     request.headers_mut().remove(AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
     let Some(scope) = scopes::needed(&request) else { return next.run(request).await };
-    let caller = match enter(&app.access, scope, key, &mut request) {
+    let caller = match authorize(&app.access, scope, key, &mut request) {
         Ok(caller) => caller,
         Err(problem) => {
             swallow(request).await;
@@ -163,21 +166,22 @@ fn presented(headers: &HeaderMap) -> Presented {
 }
 
 /// Identifies and authorizes the client. Removes a signature from the address.
-fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -> Result<Caller, Problem> {
+fn authorize(access: &Access, scope: Scope, key: Presented, request: &mut Request) -> Result<Caller, Problem> {
     if !access.is_closed() {
         return Ok(Caller::address(access, request));
     }
     let now = SystemTime::now();
     let may_be_signed = [Method::GET, Method::HEAD].contains(request.method());
     let uri = request.uri();
-    let worth = if may_be_signed { access.signed(uri.path(), uri.query(), now) } else { Signed::No };
-    if worth != Signed::No {
+    let signature =
+        if may_be_signed { access.check_signature(uri.path(), uri.query(), now) } else { SignatureCheck::Absent };
+    if signature != SignatureCheck::Absent {
         *request.uri_mut() = unsigned(request.uri())?;
     }
     let found = match key {
         Presented::Text(text) => access.verify(&text, now),
         Presented::Nonsense => Err(Denied::Unknown),
-        Presented::Nothing => return by_signature(&worth).map(|()| Caller::address(access, request)),
+        Presented::Nothing => return by_signature(&signature).map(|()| Caller::address(access, request)),
     };
     let key = found.map_err(no_key)?;
     Span::current().record("key", key.id.as_str());
@@ -193,26 +197,26 @@ fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -
 
 /// Returns the address without its signature.
 fn unsigned(uri: &Uri) -> Result<Uri, Problem> {
-    let rest = uri.query().and_then(without);
+    let rest = uri.query().and_then(remove_signature);
     let target = rest.map_or_else(|| uri.path().to_owned(), |rest| format!("{}?{rest}", uri.path()));
     let mut parts = uri.clone().into_parts();
     parts.path_and_query = Some(PathAndQuery::try_from(target).map_err(Problem::internal)?);
     Uri::from_parts(parts).map_err(Problem::internal)
 }
 
-fn by_signature(worth: &Signed) -> Result<(), Problem> {
-    match worth {
-        Signed::Valid => Ok(()),
-        Signed::No => Err(Problem::new(
+fn by_signature(signature: &SignatureCheck) -> Result<(), Problem> {
+    match signature {
+        SignatureCheck::Valid => Ok(()),
+        SignatureCheck::Absent => Err(Problem::new(
             Kind::KeyRequired,
             "a key is required, in `Authorization: Bearer …` or `X-Api-Key`; a GET may use a signed address instead",
         )
         .header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\"")),
-        Signed::Invalid => {
+        SignatureCheck::Invalid => {
             let detail = "the signature does not match this address, which must be used unchanged";
             Err(Problem::new(Kind::SignatureInvalid, detail))
         }
-        Signed::Expired(end) => {
+        SignatureCheck::Expired(end) => {
             let end = rfc3339(end.saturating_mul(1000));
             let detail = format!("the signed address expired at {end}");
             Err(Problem::new(Kind::SignatureExpired, detail).with("expired", end))
@@ -274,8 +278,8 @@ fn add_quota_headers(access: &Access, account: &Account, response: &mut Response
     let redirects = response.headers().contains_key(header::LOCATION) && response.status().is_redirection();
     let usage = access.meter().usage(account, Instant::now());
     let fields = [
-        (RATE_LIMIT_POLICY, policies(&account.quota)),
-        (RATE_LIMIT, limits(&account.quota, &usage).filter(|_| !redirects)),
+        (RATE_LIMIT_POLICY, rate_limit_policy(&account.quota)),
+        (RATE_LIMIT, rate_limit(&account.quota, &usage).filter(|_| !redirects)),
     ];
     for (name, value) in fields {
         if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
@@ -334,7 +338,7 @@ mod tests {
         for (address, name) in
             [("192.0.2.1", "192.0.2.1"), ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"), ("::1", "0:0:0:0::/64")]
         {
-            assert_eq!(place(address.parse().unwrap()), name);
+            assert_eq!(client_name(address.parse().unwrap()), name);
         }
     }
 
