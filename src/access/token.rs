@@ -60,8 +60,8 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 15)]).collect()
 }
 
-/// SHA-256 of the text of a key, as in the key file: `sha256:` and 64 digits. Comparison is in constant time only, hence
-/// no `PartialEq`.
+/// SHA-256 of the text of a key, as in the key file: `sha256:` and 64 digits. Comparison is in constant time only,
+/// hence no `PartialEq`.
 #[derive(Clone)]
 pub struct Hash(String);
 

@@ -65,19 +65,6 @@ impl Failed {
     }
 }
 
-/// Limits of a request.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Limits {
-    /// Time for the response head, redirects included.
-    pub(super) head: Duration,
-    /// Longest pause within the body.
-    pub(super) pause: Duration,
-    /// Size of the body, bytes.
-    pub(super) bytes: u64,
-    /// Inflated bytes after which the completeness check of a gzip file stops.
-    pub(super) inflated: u64,
-}
-
 /// Creates the HTTP client. Blocks, because it reads the system's certificates.
 pub(super) fn build(config: &ArchiveConfig) -> Result<Client, reqwest::Error> {
     crate::tls::install_provider();
@@ -125,12 +112,13 @@ pub(super) async fn head(client: &Client, url: Url) -> Result<u16, Failed> {
 }
 
 /// Sends one GET request, a conditional one if a copy is `known`. `lease` is charged with the body while it arrives and
-/// until the answer is dropped.
+/// until the answer is dropped. The check of a gzip file stops after `inflated_bytes`.
 pub(super) async fn get(
     client: &Client,
     url: Url,
     known: Option<&Origin>,
-    limits: Limits,
+    config: &ArchiveConfig,
+    inflated_bytes: u64,
     mut lease: Lease,
     trace: &SpanContext,
 ) -> Result<Answer, Failed> {
@@ -143,7 +131,8 @@ pub(super) async fn get(
             request = value.iter().fold(request, |request, value| request.header(header.clone(), value));
         }
     }
-    let response = tokio::time::timeout(limits.head, request.send())
+    let head_timeout = config.connect_timeout() + config.first_byte_timeout();
+    let response = tokio::time::timeout(head_timeout, request.send())
         .await
         .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "no head in time"))?
         .map_err(|error| of_client(&error))?;
@@ -166,9 +155,9 @@ pub(super) async fn get(
     }
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
     let origin = Origin { url: name, etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
-    let bytes = body(response, limits, &mut lease).await?;
+    let bytes = body(response, config, &mut lease).await?;
     let (bytes, digest) = tokio::task::spawn_blocking(move || {
-        if compressed && !gzip::is_complete_gzip(&bytes, limits.inflated) {
+        if compressed && !gzip::is_complete_gzip(&bytes, inflated_bytes) {
             return Err(Failed::other(UnavailableReason::Damaged, "the file is incomplete"));
         }
         let digest = Digest::of(&bytes);
@@ -180,19 +169,19 @@ pub(super) async fn get(
 }
 
 /// Receives the body up to the limit.
-async fn body(mut response: Response, limits: Limits, lease: &mut Lease) -> Result<Bytes, Failed> {
+async fn body(mut response: Response, config: &ArchiveConfig, lease: &mut Lease) -> Result<Bytes, Failed> {
     let announced = response.content_length();
-    if announced.is_some_and(|bytes| bytes > limits.bytes) {
+    if announced.is_some_and(|bytes| bytes > config.max_bytes) {
         return Err(Failed::TooLarge(announced));
     }
     let capacity = usize::try_from(announced.unwrap_or(0).min(MAX_PREALLOCATION)).unwrap_or(0);
     let mut body = BytesMut::with_capacity(capacity);
     loop {
-        let chunk = tokio::time::timeout(limits.pause, response.chunk())
+        let chunk = tokio::time::timeout(config.first_byte_timeout(), response.chunk())
             .await
             .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the body stalls"))?;
         let Some(chunk) = chunk.map_err(|error| of_client(&error))? else { break };
-        if body.len() as u64 + chunk.len() as u64 > limits.bytes {
+        if body.len() as u64 + chunk.len() as u64 > config.max_bytes {
             return Err(Failed::TooLarge(None));
         }
         lease.grow(chunk.len() as u64).map_err(Failed::Memory)?;

@@ -9,7 +9,7 @@ use tokio::sync::{OnceCell, Semaphore};
 use tokio::time::Instant;
 
 use super::breaker::Breaker;
-use super::client::{self, Answer, Failed, Limits, Origin};
+use super::client::{self, Answer, Failed, Origin};
 use super::error::{FetchError, UnavailableReason};
 use crate::config::{ArchiveConfig, Template};
 use crate::memory_budget::Budget;
@@ -27,7 +27,8 @@ pub(super) struct Remote {
     /// URL templates with the circuit breakers of their hosts.
     sources: Vec<(Template, Arc<Breaker>)>,
     config: ArchiveConfig,
-    limits: Limits,
+    /// Inflated bytes after which the check of a gzip file stops.
+    inflated_bytes: u64,
     permits: Semaphore,
     memory: Budget,
     /// Created on first use, because it reads the system's certificates.
@@ -36,7 +37,7 @@ pub(super) struct Remote {
 
 impl Remote {
     /// Creates the remote archive of a configuration, if it names one. Bodies that arrive are charged to `memory`.
-    pub(super) fn new(config: &ArchiveConfig, inflated: u64, memory: Budget) -> Option<Self> {
+    pub(super) fn new(config: &ArchiveConfig, inflated_bytes: u64, memory: Budget) -> Option<Self> {
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
         for template in config.url.as_ref()?.as_slice() {
             let known = sources.iter().find(|(_, breaker)| breaker.host() == template.host());
@@ -44,14 +45,8 @@ impl Remote {
             let breaker = known.map_or_else(new, |(_, breaker)| Arc::clone(breaker));
             sources.push((template.clone(), breaker));
         }
-        let limits = Limits {
-            head: config.connect_timeout() + config.first_byte_timeout(),
-            pause: config.first_byte_timeout(),
-            bytes: config.max_bytes,
-            inflated,
-        };
         let permits = Semaphore::new(config.concurrent);
-        Some(Self { sources, config: config.clone(), limits, permits, memory, client: OnceCell::new() })
+        Some(Self { sources, config: config.clone(), inflated_bytes, permits, memory, client: OnceCell::new() })
     }
 
     /// Sends a HEAD request for `id` to every URL. Returns the hosts with the status or the error.
@@ -107,7 +102,7 @@ impl Remote {
             let (reason, requested, detail) = match self.attempt(id, template, breaker, copy, deadline).await {
                 Ok(answer) => return Ok(answer),
                 Err(Failed::TooLarge(bytes)) => {
-                    return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.limits.bytes });
+                    return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.config.max_bytes });
                 }
                 Err(Failed::Memory(error)) => return Err(FetchError::Memory { id: id.clone(), error }),
                 Err(Failed::Other { reason, retry_after, detail }) => (reason, retry_after, detail),
@@ -165,7 +160,7 @@ impl Remote {
         let permit = breaker.acquire().map_err(paused)?;
         let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());
         let trace = span.context();
-        let get = client::get(client, url, known, self.limits, self.memory.lease(), &trace);
+        let get = client::get(client, url, known, &self.config, self.inflated_bytes, self.memory.lease(), &trace);
         let answer = tokio::time::timeout_at(deadline, get)
             .await
             .unwrap_or_else(|_elapsed| Err(Failed::other(UnavailableReason::Timeout, "incomplete at the deadline")));

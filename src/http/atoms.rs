@@ -10,9 +10,9 @@ use utoipa::ToSchema;
 
 use super::kinds::Kind;
 use super::openapi::meshes::NotModified;
-use super::openapi::parameters::{EntryPath, StructurePath, Unchanged};
+use super::openapi::parameters::{EntryPath, IfNoneMatchHeader, StructurePath};
+use super::openapi::problem_responses;
 use super::openapi::problems::READING;
-use super::openapi::refusals;
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::Shared;
@@ -64,11 +64,11 @@ struct ResidueColumns {
     kind: Vec<&'static str>,
 }
 
-refusals!(StructureRefusals: [
+problem_responses!(StructureProblems: [
     READING,
     [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
 ]);
-refusals!(EntryRefusals: [READING, [
+problem_responses!(EntryProblems: [READING, [
     Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
     Kind::MemoryFull, Kind::TooManyDeliveries,
 ]]);
@@ -78,13 +78,13 @@ refusals!(EntryRefusals: [READING, [
 /// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
 /// list.
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
-    params(StructurePath, Unchanged),
+    params(StructurePath, IfNoneMatchHeader),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, StructureRefusals,
+        NotModified, StructureProblems,
     ))]
 pub(super) async fn of_structure(
     State(app): State<Shared>,
@@ -99,13 +99,13 @@ pub(super) async fn of_structure(
 /// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
 /// list.
 #[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
-    params(EntryPath, Unchanged),
+    params(EntryPath, IfNoneMatchHeader),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, EntryRefusals,
+        NotModified, EntryProblems,
     ))]
 pub(super) async fn of_entry(
     State(app): State<Shared>,

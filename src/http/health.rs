@@ -10,7 +10,7 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::kinds::Kind;
-use super::openapi::refusals;
+use super::openapi::problem_responses;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::Stop;
@@ -71,14 +71,14 @@ impl Check {
     }
 }
 
-refusals!(ReadyRefusals: [[Kind::NotReady]]);
+problem_responses!(ReadyProblems: [[Kind::NotReady]]);
 
 /// Check that the service is ready for requests
 ///
 /// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
 /// jobs, and can write and read the store. The answer does not depend on the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
-    responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyRefusals))]
+    responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyProblems))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
     let checks = [accepting(&app), devices(&app), store(&app).await];
     let failing = checks.iter().find(|check| !check.ok).map(|check| check.detail.clone());

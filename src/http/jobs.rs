@@ -17,8 +17,8 @@ use utoipa::{IntoParams, ToSchema};
 use super::delivery;
 use super::kinds::Kind;
 use super::openapi::parameters::JobPath;
+use super::openapi::problem_responses;
 use super::openapi::problems::{MESHING, ProblemDocument, READING};
-use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
@@ -120,9 +120,9 @@ enum StatusSchema {
     Dismissed,
 }
 
-refusals!(ShowRefusals: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::StoreFailed]]);
-refusals!(DismissRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::StoreFailed]]);
-refusals!(ResultRefusals: [READING, MESHING, [
+problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::StoreFailed]]);
+problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::StoreFailed]]);
+problem_responses!(ResultProblems: [READING, MESHING, [
     Kind::BadRequest, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed, Kind::ResultGone, Kind::JobAbandoned,
     Kind::StoreFull, Kind::StoreFailed,
 ]]);
@@ -151,7 +151,7 @@ pub(super) fn no_such_job(id: &str) -> Problem {
         (status = 200, description = "Status of the job.", body = JobDocument,
             headers(("Retry-After" = u64, description = "Seconds to wait before the next request.")),
             links(("result" = (operation_id = "showResult", parameters(("file" = "$response.body#/result")))))),
-        ShowRefusals,
+        ShowProblems,
     ))]
 pub(super) async fn show(
     State(app): State<Shared>,
@@ -183,7 +183,7 @@ pub(super) async fn show(
 
 /// Cancel a job
 #[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "dismissJob", params(JobPath),
-    responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissRefusals))]
+    responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissProblems))]
 pub(super) async fn dismiss(State(app): State<Shared>, id: JobId) -> Result<Response, Problem> {
     let view = app.job_store.dismiss(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     if view.record.status != Status::Dismissed {
@@ -201,7 +201,7 @@ pub(super) async fn dismiss(State(app): State<Shared>, id: JobId) -> Result<Resp
     responses(
         (status = 303, description = "The job has succeeded.",
             headers(("Location" = String, description = "Path of the mesh: `/v1/results/{file}`."))),
-        ResultRefusals,
+        ResultProblems,
     ))]
 pub(super) async fn result(State(app): State<Shared>, id: JobId) -> Result<Response, Problem> {
     let view = app.job_store.view(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;

@@ -1,5 +1,5 @@
-//! Embedded pages: the viewer at `/`, if the program was built with it, `<molmesh-viewer>` for other pages, and Swagger UI
-//! for the OpenAPI document at `/docs`. Nothing is loaded from other servers.
+//! Embedded pages: the viewer at `/`, if the program was built with it, `<molmesh-viewer>` for other pages, and Swagger
+//! UI for the OpenAPI document at `/docs`. Nothing is loaded from other servers.
 
 use std::io::Read as _;
 

@@ -16,9 +16,9 @@ use serde_json::Value;
 use tracing::Instrument as _;
 
 use super::kinds::Kind;
-use super::openapi::meshes::{Kept, NotModified};
-use super::openapi::parameters::{Parts, ResultFile, ResultPath, Unchanged};
-use super::openapi::refusals;
+use super::openapi::meshes::{NotModified, StoredMesh};
+use super::openapi::parameters::{IfNoneMatchHeader, RangeHeaders, ResultFile, ResultPath};
+use super::openapi::problem_responses;
 use super::problem::Problem;
 use super::range::{self, Wanted};
 use super::state::{App, Shared};
@@ -39,10 +39,10 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
     format!("/v1/results/{key}.{extension}")
 }
 
-refusals!(ShowRefusals: [[
+problem_responses!(ShowProblems: [[
     Kind::BadRequest, Kind::NotFound, Kind::RangeNotSatisfiable, Kind::MemoryFull, Kind::StoreFailed,
 ]]);
-refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
+problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
 
 /// Get a stored mesh
 ///
@@ -52,8 +52,8 @@ refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]
     path = "/v1/results/{file}",
     tag = "results",
     operation_id = "showResult",
-    params(ResultFile, Unchanged, Parts),
-    responses(Kept, ShowRefusals)
+    params(ResultFile, IfNoneMatchHeader, RangeHeaders),
+    responses(StoredMesh, ShowProblems)
 )]
 pub(super) async fn show(
     State(app): State<Shared>,
@@ -75,11 +75,11 @@ pub(super) async fn show(
 
 /// Get the report of a stored mesh
 #[utoipa::path(get, path = "/v1/results/{key}/report.json", tag = "results", operation_id = "showReport",
-    params(ResultPath, Unchanged),
+    params(ResultPath, IfNoneMatchHeader),
     responses(
         (status = 200, description = "The report of the run that computed the mesh.", body = Report,
             headers(("ETag" = String, description = "Strong validator of the document."))),
-        NotModified, ReportRefusals,
+        NotModified, ReportProblems,
     ))]
 pub(super) async fn report(
     State(app): State<Shared>,
@@ -170,7 +170,7 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
     }
     let Some(report) = app.store.get(&key.name(REPORT)?).await? else { return Ok(None) };
     let report: Value = serde_json::from_slice(&report.bytes).map_err(Problem::internal)?;
-    let mut headers = delivery::summary(&report);
+    let mut headers = delivery::summary_headers(&report);
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, delivery::disposition(report["id"].as_str(), format));
     headers.insert(header::ETAG, delivery::etag(key));

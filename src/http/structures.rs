@@ -14,10 +14,13 @@ use super::form::Upload;
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::StructureFile;
-use super::openapi::meshes::{Addressed, NotModified, Reported};
-use super::openapi::parameters::{Coding, MeshParameters, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
-use super::openapi::problems::{ASKING, BODY, MESHING, PARAMETERS, READING};
-use super::openapi::refusals;
+use super::openapi::meshes::{CacheableMeshOrJob, NotModified, ReportResponse};
+use super::openapi::parameters::{
+    ContentEncodingHeader, IfNoneMatchHeader, MeshParameters, PreferenceHeaders, RangeHeaders, StructurePath,
+    SurfaceParameters,
+};
+use super::openapi::problem_responses;
+use super::openapi::problems::{BODY, MESHING, PARAMETERS, READING, SUBMITTING};
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::Shared;
@@ -111,22 +114,23 @@ impl From<&Counts> for KindCounts {
     }
 }
 
-refusals!(CreateRefusals: [
+problem_responses!(CreateProblems: [
     BODY, READING, [Kind::BadParameter, Kind::TooManyDeliveries, Kind::StoreFull, Kind::StoreFailed],
 ]);
-refusals!(ShowRefusals: [
+problem_responses!(ShowProblems: [
     READING,
     [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
 ]);
-refusals!(SurfaceRefusals: [
-    PARAMETERS, READING, MESHING, ASKING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
+problem_responses!(SurfaceProblems: [
+    PARAMETERS, READING, MESHING, SUBMITTING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
 ]);
 
 /// Upload a structure
 ///
 /// Stores a structure, so that it can be meshed several times without another upload. Uploading the same bytes again
 /// returns 200 and the same digest.
-#[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure", params(Coding),
+#[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure",
+    params(ContentEncodingHeader),
     request_body(
         content = StructureFile,
         description = "A structure file, or `multipart/form-data` with the file in the field `file`.",
@@ -138,7 +142,7 @@ refusals!(SurfaceRefusals: [
             links(("mesh" = (operation_id = "meshStructure", parameters(("digest" = "$response.body#/digest")))))),
         (status = 200, description = "The structure was already stored.", body = StructureDocument,
             headers(("Location" = String, description = "Path of the structure."))),
-        CreateRefusals,
+        CreateProblems,
     ))]
 pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
     if upload::is_json(&headers) {
@@ -168,13 +172,13 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
 
 /// Get the contents of a structure
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
-    params(StructurePath, Unchanged),
+    params(StructurePath, IfNoneMatchHeader),
     responses(
         (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, ShowRefusals,
+        NotModified, ShowProblems,
     ))]
 pub(super) async fn show(
     State(app): State<Shared>,
@@ -193,14 +197,14 @@ pub(super) async fn show(
     path = "/v1/structures/{digest}/{file}",
     tag = "meshes",
     operation_id = "meshStructure",
-    params(StructurePath, SurfaceParameters, Wishes, Unchanged, Parts),
-    responses(Addressed, SurfaceRefusals)
+    params(StructurePath, SurfaceParameters, PreferenceHeaders, IfNoneMatchHeader, RangeHeaders),
+    responses(CacheableMeshOrJob, SurfaceProblems)
 )]
 pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
     request.answer().await
 }
 
-refusals!(ReportRefusals: [
+problem_responses!(ReportProblems: [
     PARAMETERS, READING, MESHING,
     [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFailed],
 ]);
@@ -212,7 +216,7 @@ refusals!(ReportRefusals: [
     tag = "meshes",
     operation_id = "reportStructure",
     params(StructurePath, MeshParameters),
-    responses(Reported, ReportRefusals)
+    responses(ReportResponse, ReportProblems)
 )]
 pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
     request.answer().await
