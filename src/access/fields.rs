@@ -67,6 +67,6 @@ mod tests {
         assert_eq!(field, "\"requests\";r=0;t=1, \"work\";r=0;t=1, \"concurrency\";r=0");
         let only = Quota { requests: Some(1), ..Quota::default() };
         assert_eq!(rate_limit_policy(&only).unwrap(), "\"requests\";q=1;w=1");
-        assert_eq!((rate_limit_policy(&Quota::default()), limits(&Quota::default(), &usage)), (None, None));
+        assert_eq!((rate_limit_policy(&Quota::default()), rate_limit(&Quota::default(), &usage)), (None, None));
     }
 }

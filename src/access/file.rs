@@ -179,7 +179,7 @@ mod tests {
         };
         let text = format!("# keys\n{}\n{}", format_key(&full), format_key(&plain));
         let ring = parse(&text, 60).unwrap_or_else(|e| panic!("{e}\n{text}"));
-        assert_eq!(ring.len(), 2);
+        assert_eq!(ring.0.len(), 2);
         for key in [&full, &plain] {
             let read = &ring.0[&key.id];
             assert!(read.hash.same(&key.hash));
@@ -188,7 +188,7 @@ mod tests {
                 (&key.scopes, &key.quota, &key.expires, &key.note)
             );
         }
-        assert!(!format_key(&plain).contains("window_s") && parse("", 60).unwrap().is_empty());
+        assert!(!format_key(&plain).contains("window_s") && parse("", 60).unwrap().0.is_empty());
     }
 
     #[test]
@@ -217,7 +217,7 @@ mod tests {
         ] {
             let text = good.replace(change.0, change.1);
             assert_ne!(text, good, "{change:?}");
-            let error = parse(&text, 60).map(|ring| ring.len()).unwrap_err();
+            let error = parse(&text, 60).map(|ring| ring.0.len()).unwrap_err();
             assert_eq!(error.line, line, "{error}\n{text}");
             assert!(error.reason.contains(reason), "{error}\n{text}");
             assert!(!error.reason.contains(&hash.to_string()[20..]), "{error}");

@@ -1,7 +1,7 @@
 //! `GET /v1/results/{key}.{ext}` and `…/{key}/report.json`: stored results, byte for byte.
 
 use std::ops::Range;
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
@@ -186,6 +186,7 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
 /// Stores the result of a synchronous request in the background. Returns false if too many results are being stored
 /// already; then the next request computes it again.
 pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format, key: &ContentKey) -> bool {
+    let _starting = app.save_start.lock().unwrap_or_else(PoisonError::into_inner);
     if app.saves.running(key).is_some() {
         return true;
     }

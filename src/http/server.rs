@@ -2,7 +2,7 @@
 
 use std::io;
 use std::net::SocketAddr;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use futures_util::FutureExt as _;
@@ -156,6 +156,7 @@ impl Server {
             job_store,
             result_headers: Cache::new(CACHED_HEADERS),
             save_permits,
+            save_start: Mutex::new(()),
             saves: SingleFlight::default(),
             stopping,
             deliveries,

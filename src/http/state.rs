@@ -1,6 +1,6 @@
 //! State of the service that the handlers share.
 
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use axum::http::HeaderMap;
 use bytes::Bytes;
@@ -33,6 +33,8 @@ pub(super) struct App {
     pub(super) result_headers: Cache<ContentKey, Arc<HeaderMap>>,
     /// Permits of `jobs.concurrent_saves`.
     pub(super) save_permits: Arc<Semaphore>,
+    /// Held while a save starts, so that its permit and its entry in `saves` appear together.
+    pub(super) save_start: Mutex<()>,
     /// Results that are being stored.
     pub(super) saves: SingleFlight<ContentKey, ()>,
     /// Phase of the shutdown, which ends long answers.

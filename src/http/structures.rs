@@ -66,7 +66,7 @@ pub(super) struct StructureDocument {
     /// Number of the model that the counts below refer to.
     model: i32,
     /// Atoms of the model by kind.
-    atoms_in_model: KindCounts,
+    atoms_in_model: Counts,
     /// Number of atoms with alternative locations.
     alternatives: u64,
     /// Number of atoms of unknown elements.
@@ -89,29 +89,7 @@ struct ChainDocument {
     /// Number of atoms.
     atoms: u64,
     /// Atoms by kind.
-    of: KindCounts,
-}
-
-/// Numbers of atoms by kind. Hydrogens are counted apart from the heavy atoms of their residues.
-#[derive(Debug, Serialize, ToSchema)]
-struct KindCounts {
-    /// Heavy atoms of polymers.
-    polymer: u64,
-    /// Heavy atoms of ligands.
-    ligand: u64,
-    /// Heavy atoms of water.
-    water: u64,
-    /// Hydrogen atoms.
-    hydrogens: u64,
-    /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
-    virtual_sites: u64,
-}
-
-impl From<&Counts> for KindCounts {
-    fn from(counts: &Counts) -> Self {
-        let Counts { polymer, ligand, water, hydrogens, virtual_sites } = *counts;
-        Self { polymer, ligand, water, hydrogens, virtual_sites }
-    }
+    of: Counts,
 }
 
 problem_responses!(CreateProblems: [
@@ -238,7 +216,7 @@ fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDoc
     let chains = contents.chains.iter().take(MAX_CHAINS).map(|chain| ChainDocument {
         name: chain.name.clone(),
         atoms: chain.counts.total(),
-        of: (&chain.counts).into(),
+        of: chain.counts,
     });
     StructureDocument {
         digest: digest.to_string(),
@@ -249,7 +227,7 @@ fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDoc
         atoms: contents.atoms,
         models: contents.models,
         model: contents.model,
-        atoms_in_model: (&contents.counts).into(),
+        atoms_in_model: contents.counts,
         alternatives: contents.alternatives,
         unknown_elements: contents.unknown_elements,
         warnings: structure.warnings.clone(),
