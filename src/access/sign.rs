@@ -97,8 +97,8 @@ impl SigningKeys {
         if keys.is_empty() { Err("there is no key; expected ID:SECRET".to_owned()) } else { Ok(Self(keys)) }
     }
 
-    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time) with the key `key_id`, by default
-    /// the first one. Returns the target followed by the three parameters.
+    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time). Uses the key `key_id`, by
+    /// default the first one. Returns the target followed by the three parameters.
     ///
     /// # Errors
     /// [`SignError`].
