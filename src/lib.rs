@@ -37,6 +37,8 @@ pub mod http;
 #[cfg(feature = "server")]
 mod jobs;
 #[cfg(feature = "server")]
+pub mod memory_budget;
+#[cfg(feature = "server")]
 mod single_flight;
 #[cfg(feature = "server")]
 pub mod store;

@@ -38,7 +38,7 @@ pub struct AccessConfig {
     pub window_s: u64,
     /// Number of addresses with a separate quota. Default 10,000, about 2 MB. Further addresses share one quota,
     /// because forgetting an address would give it a new one.
-    pub clients: usize,
+    pub max_addresses: usize,
     /// Origins whose pages may read responses: `*`, or a list such as `https://viewer.example`. Default `*`: the
     /// service uses no cookies, and only a page that has a key can send it. `none`: only pages of this server.
     #[serde(with = "list")]
@@ -62,7 +62,7 @@ impl Default for AccessConfig {
             address_work_s: None,
             address_concurrent: None,
             window_s: 60,
-            clients: 10_000,
+            max_addresses: 10_000,
             cors_origins: Some(Origins::Any),
             cors_credentials: false,
             hsts_s: None,

@@ -17,7 +17,7 @@ pub struct ArchiveConfig {
     pub dir: Option<PathBuf>,
     /// Time between checks of a local file for changes, ms. Default 1,000: a check costs a dozen system calls, and
     /// entries change rarely.
-    pub check_ms: u64,
+    pub local_check_interval_ms: u64,
     /// URL templates of an entry, tried in order until one has it; `none` disables the remote archive. Default:
     /// compressed mmCIF from RCSB's download service, the smallest complete format.
     #[serde(with = "list")]
@@ -55,9 +55,9 @@ pub struct ArchiveConfig {
     pub concurrent: usize,
     /// Time for which a copy is used without revalidation, ms. Default 86,400,000, a day: entries are released and
     /// revised weekly.
-    pub fresh_ms: u64,
+    pub revalidate_after_ms: u64,
     /// Time for which a missing entry is not requested again, ms. Default 60,000.
-    pub absent_ms: u64,
+    pub retry_missing_after_ms: u64,
     /// Size of the copies on disk, bytes; the least recently used ones are evicted. Default 4 GiB: ten thousand typical
     /// entries.
     pub cache_bytes: u64,
@@ -71,7 +71,7 @@ impl Default for ArchiveConfig {
     fn default() -> Self {
         Self {
             dir: None,
-            check_ms: 1000,
+            local_check_interval_ms: 1000,
             url: Some(Templates::default()),
             proxy: None,
             allow_private: false,
@@ -83,8 +83,8 @@ impl Default for ArchiveConfig {
             retry_after_ms: 5000,
             max_bytes: 256 << 20,
             concurrent: 8,
-            fresh_ms: 86_400_000,
-            absent_ms: 60_000,
+            revalidate_after_ms: 86_400_000,
+            retry_missing_after_ms: 60_000,
             cache_bytes: 4 << 30,
             breaker_failures: 5,
             breaker_ms: 30_000,

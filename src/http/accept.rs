@@ -27,7 +27,7 @@ use tower::ServiceExt as _;
 
 use super::guard::Peer;
 use super::kinds::Kind;
-use super::pace::{self, MAX_PATIENCE, Pace, Rate, Streams};
+use super::pace::{self, GaugeGuard, MAX_PATIENCE, Pace, Rate, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::socket::Guarded;
 use super::stop::{self, Stop};
@@ -104,8 +104,11 @@ pub(super) async fn serve(
             tracing::debug!(%error, "the client disconnected at once");
             continue;
         }
-        let stream =
-            Guarded::new(stream, Place::new(place), MAX_PATIENCE * Duration::from_millis(config.write_timeout_ms));
+        let stream = Guarded::new(
+            stream,
+            (place, GaugeGuard::new(gauge!(CONNECTIONS))),
+            MAX_PATIENCE * Duration::from_millis(config.write_timeout_ms),
+        );
         connections.spawn(connection(stream, Peer(peer.ip()), router.clone(), Arc::clone(&config), stop.clone()));
     }
     drop(listener);
@@ -128,21 +131,8 @@ fn set_up(stream: &TcpStream) -> io::Result<()> {
     stream.set_nodelay(true)
 }
 
-/// Permit of `server.connections`.
-struct Place(#[expect(dead_code, reason = "held for its drop")] OwnedSemaphorePermit);
-
-impl Place {
-    fn new(permit: OwnedSemaphorePermit) -> Self {
-        gauge!(CONNECTIONS).increment(1.0);
-        Self(permit)
-    }
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        gauge!(CONNECTIONS).decrement(1.0);
-    }
-}
+/// Permit of `server.connections`, counted in the metrics.
+type Place = (OwnedSemaphorePermit, GaugeGuard);
 
 /// Answers a connection beyond the limit with 503, without reading its request.
 fn refuse(stream: TcpStream, hold: OwnedSemaphorePermit) {

@@ -6,12 +6,12 @@ use axum::extract::rejection::QueryRejection;
 use axum::http::header::HeaderMap;
 
 use super::content_type::DeclaredType;
+use super::form::Upload;
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::{App, Shared};
-use super::upload::{self, Upload};
-use super::{json_body, negotiate};
+use super::{json_body, negotiate, upload};
 use crate::formats::Format;
 use crate::pipeline::params::{self, Request};
 

@@ -8,8 +8,8 @@ use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE};
 use bytes::{Bytes, BytesMut};
 use futures_util::StreamExt as _;
 
-use super::content_type::DeclaredType;
-use super::form::{self, Form};
+use super::content_type::{DeclaredType, GZIP_MAGIC, ZSTD_MAGIC};
+use super::form::{self, Upload};
 use super::kinds::Kind;
 use super::limit::Limit;
 use super::problem::Problem;
@@ -18,15 +18,6 @@ use crate::jobs::Lease;
 
 /// Limit of memory that is reserved because of a `Content-Length` header alone.
 const MAX_RESERVED_BYTES: u64 = 1 << 20;
-
-/// Received structure file.
-pub(super) struct Upload {
-    pub(super) bytes: Bytes,
-    pub(super) lease: Lease,
-    /// Parameters from the other fields of a form.
-    pub(super) fields: Vec<(String, String)>,
-    pub(super) declared: DeclaredType,
-}
 
 /// Returns true if the body is declared as a form.
 pub(super) fn is_multipart(headers: &HeaderMap) -> bool {
@@ -50,16 +41,15 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
         let form = form::read(&app.config.limits, limit, content_type, body, app.pool.settings().budget.lease());
-        let Form { bytes, lease, fields, declared } = in_time(app, form).await?;
-        Upload { bytes, lease, fields, declared }
+        in_time(app, form).await?
     } else {
         let mut lease = app.pool.settings().budget.lease();
         let bytes = in_time(app, collect(body, announced, limit, &mut lease)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
         Upload { bytes, lease, fields: Vec::new(), declared }
     };
-    if let Some(coding) = coding.filter(|coding| !coding.fits(&upload.bytes)) {
-        return Err(bad_encoding(&format!("the body is declared as {} but is not", coding.name())));
+    if let Some((name, _)) = coding.filter(|(_, magic)| !upload.bytes.starts_with(magic)) {
+        return Err(bad_encoding(&format!("the body is declared as {name} but is not")));
     }
     upload.declared.check_bytes(&upload.bytes)?;
     Ok(upload)
@@ -125,28 +115,8 @@ async fn collect(body: Body, announced: u64, limit: Limit, lease: &mut Lease) ->
     Ok(if all.is_empty() { first } else { all.freeze() })
 }
 
-/// Content coding that the structure reader supports.
-#[derive(Debug, Clone, Copy)]
-enum Coding {
-    Gzip,
-    Zstd,
-}
-
-impl Coding {
-    const fn name(self) -> &'static str {
-        match self {
-            Self::Gzip => "gzip",
-            Self::Zstd => "zstd",
-        }
-    }
-
-    fn fits(self, bytes: &[u8]) -> bool {
-        match self {
-            Self::Gzip => bytes.starts_with(&[0x1f, 0x8b]),
-            Self::Zstd => bytes.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]),
-        }
-    }
-}
+/// Content coding that the structure reader supports: its name and the first bytes of a compressed file.
+type Coding = (&'static str, &'static [u8]);
 
 fn bad_encoding(detail: &str) -> Problem {
     Problem::new(Kind::UnsupportedEncoding, detail).with("available", vec!["gzip", "zstd", "identity"])
@@ -159,8 +129,8 @@ fn content_encoding(headers: &HeaderMap) -> Result<Option<Coding>, Problem> {
     let name = String::from_utf8_lossy(first.unwrap_or_default()).trim().to_ascii_lowercase();
     match (name.as_str(), second) {
         ("" | "identity", None) => Ok(None),
-        ("gzip" | "x-gzip", None) => Ok(Some(Coding::Gzip)),
-        ("zstd", None) => Ok(Some(Coding::Zstd)),
+        ("gzip" | "x-gzip", None) => Ok(Some(("gzip", GZIP_MAGIC))),
+        ("zstd", None) => Ok(Some(("zstd", ZSTD_MAGIC))),
         (_, Some(_)) => Err(bad_encoding("the request has more than one content encoding")),
         (other, None) => Err(bad_encoding(&format!("unknown content encoding `{other}`"))),
     }

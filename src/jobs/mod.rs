@@ -7,7 +7,6 @@
 //! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps the records of `durable_job`s, which
 //! survive the process.
 
-mod budget;
 mod coalesced_job;
 mod cost;
 mod devices;
@@ -26,7 +25,7 @@ mod tests;
 mod ticket;
 mod worker;
 
-pub(crate) use budget::{Budget, Exhausted, Lease};
+pub(crate) use crate::memory_budget::{Budget, Exhausted, Lease};
 pub(crate) use coalesced_job::OnStart;
 pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
 pub(crate) use job_store::{JobSpec, JobStore, JobView};

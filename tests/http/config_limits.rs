@@ -65,7 +65,7 @@ const ROWS: &[Row] = &[
         "molmesh_device_partitions_total",
         "gpu/multi_device::concurrent_callers_neither_deadlock_nor_mix_partitions",
     ),
-    ("archive.check_ms", "", "http/archive_http::digests_are_cached"),
+    ("archive.local_check_interval_ms", "", "http/archive_http::digests_are_cached"),
     (
         "archive.connect_timeout_ms",
         "molmesh_archive_requests_total",
@@ -82,9 +82,9 @@ const ROWS: &[Row] = &[
     ("archive.retry_after_ms", "molmesh_archive_breaker_open", "http/archive_http::retry_after_is_respected"),
     ("archive.max_bytes", "entry-too-large", "http/archive_http::bodies_are_limited_during_the_transfer"),
     ("archive.concurrent", "molmesh_archive_fetch_seconds", "http/archive_http::concurrent_fetches_are_limited"),
-    ("archive.fresh_ms", "molmesh_archive_requests_total", "http/archive_http::old_copies_are_revalidated"),
+    ("archive.revalidate_after_ms", "molmesh_archive_requests_total", "http/archive_http::old_copies_are_revalidated"),
     (
-        "archive.absent_ms",
+        "archive.retry_missing_after_ms",
         "molmesh_archive_requests_total",
         "http/archive_http::missing_entries_are_not_requested_again_for_a_while",
     ),
@@ -129,7 +129,7 @@ const ROWS: &[Row] = &[
     ("access.address_work_s", "quota-exceeded", "http/access::addresses_have_quotas_of_time_and_concurrency"),
     ("access.address_concurrent", "quota-exceeded", "http/access::addresses_have_quotas_of_time_and_concurrency"),
     ("access.window_s", "quota-exceeded", "http/access::addresses_have_quotas_of_time_and_concurrency"),
-    ("access.clients", "molmesh_quota_clients", "src/access/meter::memory_is_bounded_and_no_usage_is_forgotten"),
+    ("access.max_addresses", "molmesh_quota_clients", "src/access/meter::memory_is_bounded_and_no_usage_is_forgotten"),
     ("access.hsts_s", "", "http/access::security_headers_are_sent"),
     ("telemetry.sample_ratio", "molmesh_trace_spans_total", "telemetry/traces::a_fraction_of_the_traces_is_recorded"),
     (

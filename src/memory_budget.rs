@@ -12,48 +12,62 @@ use crate::telemetry::MEMORY_HELD;
 /// Error of an exhausted budget.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("{held} of {limit} bytes of memory for uploads and meshes are in use")]
-pub(crate) struct Exhausted {
+pub struct Exhausted {
     /// Size of the budget, bytes.
-    pub(crate) limit: u64,
+    pub limit: u64,
     /// Used part of it, bytes.
-    pub(crate) held: u64,
+    pub held: u64,
 }
 
 /// Memory budget in bytes. Clones share one budget.
 #[derive(Debug, Clone)]
-pub(crate) struct Budget {
+pub struct Budget {
     limit: u64,
     held: Arc<AtomicU64>,
 }
 
 impl Budget {
     /// Creates a budget of `limit` bytes.
-    pub(crate) fn new(limit: u64) -> Self {
+    #[must_use]
+    pub fn new(limit: u64) -> Self {
         Self { limit, held: Arc::default() }
     }
 
+    /// Creates a budget without a limit.
+    #[must_use]
+    pub fn unlimited() -> Self {
+        Self::new(u64::MAX)
+    }
+
     /// Fails while more than the limit is in use.
-    pub(crate) fn check(&self) -> Result<(), Exhausted> {
+    ///
+    /// # Errors
+    /// [`Exhausted`].
+    pub fn check(&self) -> Result<(), Exhausted> {
         let held = self.held.load(Ordering::Relaxed);
         if held > self.limit { Err(Exhausted { limit: self.limit, held }) } else { Ok(()) }
     }
 
     /// Creates a lease of 0 bytes.
-    pub(crate) fn lease(&self) -> Lease {
+    #[must_use]
+    pub fn lease(&self) -> Lease {
         Lease { budget: self.clone(), bytes: 0 }
     }
 }
 
 /// Bytes taken from a budget, until this is dropped.
 #[derive(Debug)]
-pub(crate) struct Lease {
+pub struct Lease {
     budget: Budget,
     bytes: u64,
 }
 
 impl Lease {
     /// Adds `bytes` to the lease; changes nothing on failure.
-    pub(crate) fn grow(&mut self, bytes: u64) -> Result<(), Exhausted> {
+    ///
+    /// # Errors
+    /// [`Exhausted`].
+    pub fn grow(&mut self, bytes: u64) -> Result<(), Exhausted> {
         let Budget { limit, held } = &self.budget;
         held.try_update(Ordering::Relaxed, Ordering::Relaxed, |now| now.checked_add(bytes).filter(|sum| sum <= limit))
             .map_err(|held| Exhausted { limit: *limit, held })?;
@@ -63,14 +77,14 @@ impl Lease {
     }
 
     /// Adds `bytes` regardless of the limit, for memory that is allocated already.
-    pub(crate) fn force(&mut self, bytes: u64) {
+    pub fn force(&mut self, bytes: u64) {
         self.budget.held.fetch_add(bytes, Ordering::Relaxed);
         self.bytes += bytes;
         publish(bytes, 1.0);
     }
 
     /// Returns `memory` as bytes that hold this lease until the last reference to them is dropped.
-    pub(crate) fn attach(self, memory: impl AsRef<[u8]> + Send + 'static) -> Bytes {
+    pub fn attach(self, memory: impl AsRef<[u8]> + Send + 'static) -> Bytes {
         Bytes::from_owner(Leased { memory, _lease: self })
     }
 }
