@@ -8,7 +8,7 @@ use std::hint::black_box;
 use std::io;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use molmesh::formats::{self, Encoder, Format, Meta};
+use molmesh::formats::{Encoder, Format, Meta, Storage};
 use molmesh::surface::Mesh;
 
 /// Creates a torus of `side`² vertices, far from the origin.
@@ -29,6 +29,10 @@ fn torus(side: u32) -> Mesh {
     mesh
 }
 
+fn write(format: Format, mesh: &Mesh, meta: &Meta, out: &mut dyn io::Write) -> io::Result<()> {
+    Encoder::new(format, Storage::default(), mesh, meta).map_err(io::Error::other)?.write(out)
+}
+
 fn encode(criterion: &mut Criterion) {
     let side = std::env::var("MOLMESH_BENCH_SIDE").ok().and_then(|v| v.parse().ok()).unwrap_or(700);
     let mesh = torus(side);
@@ -37,24 +41,24 @@ fn encode(criterion: &mut Criterion) {
     group.sample_size(10);
     for format in Format::MESHES {
         let mut bytes = Vec::new();
-        let written = formats::write(format, &mesh, &meta, &mut bytes);
+        let written = write(format, &mesh, &meta, &mut bytes);
         assert!(written.is_ok(), "{written:?}");
         group.throughput(Throughput::Bytes(bytes.len() as u64));
         group.bench_function(BenchmarkId::new("sink", format), |b| {
-            b.iter(|| formats::write(format, black_box(&mesh), &meta, &mut io::sink()));
+            b.iter(|| write(format, black_box(&mesh), &meta, &mut io::sink()));
         });
         // Into allocated memory, like a pooled buffer.
         group.bench_function(BenchmarkId::new("memory", format), |b| {
             b.iter(|| {
                 bytes.clear();
-                formats::write(format, black_box(&mesh), &meta, &mut bytes)
+                write(format, black_box(&mesh), &meta, &mut bytes)
             });
         });
     }
-    let glb = formats::encoded_len(Format::Glb, &mesh, &meta).unwrap_or_default();
-    group.throughput(Throughput::Bytes(glb));
+    let glb = Encoder::new(Format::Glb, Storage::default(), &mesh, &meta).ok().and_then(|e| e.encoded_len());
+    group.throughput(Throughput::Bytes(glb.unwrap_or_default()));
     group.bench_function("check only", |b| {
-        b.iter(|| Encoder::new(Format::Glb, black_box(&mesh), &meta).map(|e| e.encoded_len()));
+        b.iter(|| Encoder::new(Format::Glb, Storage::default(), black_box(&mesh), &meta).map(|e| e.encoded_len()));
     });
     // Baseline of GLB: copies of the same columns.
     let mut copy = Vec::new();
@@ -64,13 +68,6 @@ fn encode(criterion: &mut Criterion) {
             copy.extend_from_slice(bytemuck::must_cast_slice::<_, u8>(black_box(&mesh.positions[..])));
             copy.extend_from_slice(bytemuck::must_cast_slice::<_, u8>(black_box(&mesh.normals[..])));
             copy.extend_from_slice(bytemuck::must_cast_slice::<_, u8>(black_box(&mesh.triangles[..])));
-        });
-    });
-    // Into the same memory. The difference is the cost of checks and layout.
-    group.bench_function("memory, trusting/glb", |b| {
-        b.iter(|| {
-            copy.clear();
-            Encoder::trusting(Format::Glb, black_box(&mesh), &meta).map(|e| e.write(&mut copy))
         });
     });
     group.finish();

@@ -49,7 +49,7 @@ fn floor(mesh: &Mesh, image: &mut Image) -> f32 {
 
 #[expect(clippy::unwrap_used, reason = "a benchmark fails by panicking")]
 fn picture(criterion: &mut Criterion) {
-    let renderer = CpuRenderer::default();
+    let renderer = CpuRenderer;
     for (name, path) in structures() {
         let mesh = mesh(&path);
         let mut group = criterion.benchmark_group(format!("picture/{name}/{} triangles", mesh.n_triangles()));

@@ -5,7 +5,7 @@ use std::error::Error;
 use std::fs::File;
 use std::io::BufWriter;
 
-use molmesh::formats::{Encoder, Format, Meta};
+use molmesh::formats::{Encoder, Format, Meta, Storage};
 use molmesh::surface::{Control, Measures, Validation};
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -16,7 +16,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let mesh = molmesh::mesh(&std::fs::read(input)?, &molmesh::Options::default())?;
     let measures = Measures::of(&mesh, Validation::Exact, &Control::default())?;
     println!("{:.1} Å², {:.1} Å³, watertight: {}", measures.area, measures.volume, measures.closed);
-    let encoder = Encoder::new(Format::Ply, &mesh, &Meta::default())?;
+    let encoder = Encoder::new(Format::Ply, Storage::default(), &mesh, &Meta::default())?;
     encoder.write(&mut BufWriter::new(File::create(output)?))?;
     Ok(())
 }

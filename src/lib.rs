@@ -35,7 +35,9 @@ pub mod gpu;
 #[cfg(feature = "server")]
 pub mod http;
 #[cfg(feature = "server")]
-pub mod jobs;
+mod jobs;
+#[cfg(feature = "server")]
+pub mod memory_budget;
 #[cfg(feature = "server")]
 mod single_flight;
 #[cfg(feature = "server")]

@@ -8,38 +8,25 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::watch;
 
-/// Creates the two ends of a shared result.
-pub(crate) fn channel<T>() -> (ResultSender<T>, ResultReceiver<T>) {
-    let (sender, receiver) = watch::channel(None);
-    (ResultSender(sender), ResultReceiver(receiver))
-}
-
 /// Sending end of a shared result. Dropping it without a result ends every wait.
-#[derive(Debug)]
-pub(crate) struct ResultSender<T>(watch::Sender<Option<T>>);
-
-impl<T> ResultSender<T> {
-    /// Returns a further receiver.
-    pub(crate) fn subscribe(&self) -> ResultReceiver<T> {
-        ResultReceiver(self.0.subscribe())
-    }
-
-    /// Returns true if no receiver is left.
-    pub(crate) fn is_abandoned(&self) -> bool {
-        self.0.receiver_count() == 0
-    }
-
-    /// Sends the result to every receiver.
-    pub(crate) fn send(self, result: T) {
-        self.0.send_replace(Some(result));
-    }
-}
+pub(crate) type ResultSender<T> = watch::Sender<Option<T>>;
 
 /// Receiving end of a shared result.
 #[derive(Debug, Clone)]
 pub(crate) struct ResultReceiver<T>(watch::Receiver<Option<T>>);
 
+/// Creates the two ends of a shared result.
+pub(crate) fn channel<T>() -> (ResultSender<T>, ResultReceiver<T>) {
+    let (sender, receiver) = watch::channel(None);
+    (sender, ResultReceiver(receiver))
+}
+
 impl<T: Clone> ResultReceiver<T> {
+    /// Creates a further receiver of a result.
+    pub(crate) fn of(sender: &ResultSender<T>) -> Self {
+        Self(sender.subscribe())
+    }
+
     /// Waits for the result. `None` if the work ended without one. Cancel safe.
     pub(crate) async fn recv(&mut self) -> Option<T> {
         self.0.wait_for(Option::is_some).await.ok().and_then(|result| result.clone())
@@ -86,7 +73,7 @@ where
         tokio::spawn(async move {
             let result = work.await;
             drop(entry);
-            sender.send(result);
+            sender.send_replace(Some(result));
         });
         receiver
     }
@@ -143,15 +130,5 @@ mod tests {
         let mut receiver = flights.run(&1, || async { std::panic::resume_unwind(Box::new(())) });
         assert_eq!(receiver.recv().await, None);
         assert!(flights.running(&1).is_none());
-    }
-
-    #[test]
-    fn a_result_without_receivers_is_abandoned() {
-        let (sender, receiver) = channel::<u8>();
-        let other = sender.subscribe();
-        drop(receiver);
-        assert!(!sender.is_abandoned());
-        drop(other);
-        assert!(sender.is_abandoned());
     }
 }

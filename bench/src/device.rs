@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use molmesh::gpu::{Discovery, Engine, Look, discover};
+use molmesh::gpu::{Discovery, DiscoveryMode, Engine, discover};
 use molmesh::surface::{DeviceChoice, DeviceKind};
 use wgpu::{Buffer, BufferUsages, BufferView, CommandEncoder, ComputePass, ComputePipeline, Device, QuerySet, Queue};
 
@@ -30,9 +30,9 @@ impl Selected {
     /// # Errors
     /// Returns [`Error::NoDevice`] if there is none.
     pub(crate) fn new(choice: &DeviceChoice) -> Result<Self> {
-        let discovery = discover(choice, Look::Thorough);
-        let Some(device) = discovery.taken().next() else {
-            return Err(Error::NoDevice(discovery.why_none().unwrap_or_default()));
+        let discovery = discover(choice, DiscoveryMode::Thorough);
+        let Some(device) = discovery.selected().next() else {
+            return Err(Error::NoDevice(discovery.no_device_reason().unwrap_or_default()));
         };
         let facts = &device.facts;
         Ok(Self {

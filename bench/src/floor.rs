@@ -9,7 +9,7 @@
 //! | field | the lists, 32 B per atom | 2 KiB per brick | 2 multiply-adds per pair of grid point and atom |
 //! | classify | 2 KiB per brick | 292 B per brick | – |
 //! | scan | 4 B per brick | 8 B per brick | – |
-//! | interpolate | 2 KiB, 248 B and the lists of a brick with surface, 32 B per atom | 24 B per vertex, quantised 12 B | 10 per vertex and atom that reaches the vertex's brick |
+//! | interpolate | 2 KiB, 248 B and the lists of a brick with surface, 32 B per atom | 24 B per vertex, quantized 12 B | 10 per vertex and atom that reaches the vertex's brick |
 //! | emit | 300 B per brick with surface | 12 B per triangle | – |
 
 use molmesh::gpu::Prepared;

@@ -24,43 +24,42 @@ impl Quota {
     }
 
     /// Returns the length of the window, at least 1 s.
-    #[must_use]
-    pub fn window(&self) -> Duration {
+    pub(crate) fn window(&self) -> Duration {
         Duration::from_secs(self.window_s.max(1))
     }
 }
 
 /// Client whose requests are counted.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Account {
+pub(crate) struct Account {
     /// Number of the client, also recorded with its jobs.
-    pub client: u64,
+    pub(crate) client: u64,
     /// True for an API key, false for an address. Addresses, of which there may be any number, are counted separately.
-    pub is_key: bool,
+    pub(crate) is_key: bool,
     /// Limits of this client.
-    pub quota: Arc<Quota>,
+    pub(crate) quota: Arc<Quota>,
 }
 
 /// Usage of a quota in the current window.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct QuotaUsage {
+pub(crate) struct QuotaUsage {
     /// Requests.
-    pub requests: u64,
+    pub(crate) requests: u64,
     /// Computing time.
-    pub work: Duration,
+    pub(crate) work: Duration,
     /// Requests that are running.
-    pub running: u64,
+    pub(crate) running: u64,
     /// Time until the next window.
-    pub left: Duration,
+    pub(crate) left: Duration,
 }
 
 /// Error: a quota is used up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Exceeded {
+pub(crate) struct Exceeded {
     /// Policy as named in the `RateLimit` fields: `requests`, `work` or `concurrency`.
-    pub policy: &'static str,
+    pub(crate) policy: &'static str,
     /// Limit of the policy.
-    pub limit: u64,
+    pub(crate) limit: u64,
     /// Time after which a retry may succeed.
-    pub wait: Duration,
+    pub(crate) wait: Duration,
 }

@@ -1,6 +1,7 @@
 //! Keys, signing keys and quotas of a configuration.
 
 use std::fs;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError, RwLock};
 use std::time::{Instant, SystemTime};
@@ -9,13 +10,13 @@ use super::account::Quota;
 use super::error::AccessError;
 use super::keys::{Denied, Key, KeyRing};
 use super::meter::Meter;
-use super::sign::{Signed, SigningKeys};
+use super::sign::{SignatureCheck, SigningKeys};
 use super::{file, forwarded};
 use crate::config::{AccessConfig, Config, Origins, ServerConfig};
 
 /// Access control of a configuration.
 #[derive(Debug)]
-pub struct Access {
+pub(crate) struct Access {
     keys: Option<Keys>,
     signing: Option<SigningKeys>,
     /// Quota per address of clients without a key; `None` means unlimited.
@@ -44,10 +45,7 @@ fn stamp(path: &Path) -> Option<Stamp> {
 
 impl Access {
     /// Creates the access control and reads the key file, if one is configured.
-    ///
-    /// # Errors
-    /// Returns any [`AccessError`].
-    pub fn open(config: &Config) -> Result<Self, AccessError> {
+    pub(crate) fn open(config: &Config) -> Result<Self, AccessError> {
         let (config, server) = (config.access.clone(), config.server.clone());
         if config.cors_credentials && config.cors_origins == Some(Origins::Any) {
             return Err(AccessError::CredentialsForAll);
@@ -68,78 +66,61 @@ impl Access {
             keys: keys.transpose()?,
             signing: signing.transpose().map_err(AccessError::Signing)?,
             address_quota: (!quota.is_unlimited()).then(|| Arc::new(quota)),
-            meter: Arc::new(Meter::new(config.clients)),
+            meter: Arc::new(Meter::new(config.max_addresses)),
             config,
             server,
         })
     }
 
     /// Returns true if requests need a key or a signature. If only signatures are configured, no key is accepted.
-    #[must_use]
-    pub fn is_closed(&self) -> bool {
+    pub(crate) fn is_closed(&self) -> bool {
         self.keys.is_some() || self.signing.is_some()
     }
 
     /// Returns true if a key file is configured.
-    #[must_use]
-    pub fn has_keys(&self) -> bool {
+    pub(crate) fn has_keys(&self) -> bool {
         self.keys.is_some()
     }
 
-    /// Returns the key with this text.
-    ///
-    /// # Errors
-    /// Returns [`Denied`] if the key is unknown or has expired at `now`.
-    pub fn verify(&self, text: &str, now: SystemTime) -> Result<Arc<Key>, Denied> {
+    /// Returns the key with this text. Fails if the key is unknown or has expired at `now`.
+    pub(crate) fn verify(&self, text: &str, now: SystemTime) -> Result<Arc<Key>, Denied> {
         let ring = self.keys.as_ref().map(|keys| Arc::clone(&keys.ring.read().unwrap_or_else(PoisonError::into_inner)));
         ring.map_or(Err(Denied::Unknown), |ring| ring.verify(text, now))
     }
 
-    /// Checks the signature of a path and query. Returns [`Signed::No`] if signatures are off.
-    #[must_use]
-    pub fn signed(&self, path: &str, query: Option<&str>, now: SystemTime) -> Signed {
-        self.signing.as_ref().map_or(Signed::No, |keys| keys.check(path, query, now))
+    /// Checks the signature of a path and query. No signature is found if signatures are off.
+    pub(crate) fn check_signature(&self, path: &str, query: Option<&str>, now: SystemTime) -> SignatureCheck {
+        self.signing.as_ref().map_or(SignatureCheck::Absent, |keys| keys.check(path, query, now))
     }
 
     /// Returns the quota of clients without a key.
-    #[must_use]
-    pub fn address_quota(&self) -> Option<&Arc<Quota>> {
+    pub(crate) fn address_quota(&self) -> Option<&Arc<Quota>> {
         self.address_quota.as_ref()
     }
 
     /// Returns the usage meter.
-    #[must_use]
-    pub fn meter(&self) -> &Arc<Meter> {
+    pub(crate) fn meter(&self) -> &Arc<Meter> {
         &self.meter
     }
 
     /// Returns the configuration.
-    #[must_use]
-    pub fn config(&self) -> &AccessConfig {
+    pub(crate) fn config(&self) -> &AccessConfig {
         &self.config
     }
 
     /// Returns the client address of a request from `peer`, given the values of the forwarding header.
-    pub fn client<'a>(
-        &self,
-        peer: std::net::IpAddr,
-        values: impl DoubleEndedIterator<Item = &'a str>,
-    ) -> std::net::IpAddr {
+    pub(crate) fn client<'a>(&self, peer: IpAddr, values: impl DoubleEndedIterator<Item = &'a str>) -> IpAddr {
         forwarded::client(peer, self.server.forwarded_header, values, self.server.trusted_proxies.as_ref())
     }
 
     /// Returns the name of the forwarding header.
-    #[must_use]
-    pub fn forwarded_header(&self) -> &'static str {
+    pub(crate) fn forwarded_header(&self) -> &'static str {
         self.server.forwarded_header.name()
     }
 
     /// Reads the key file again if it has changed, or always with `force`. Returns the number of keys, or `None` if the
-    /// file was not read.
-    ///
-    /// # Errors
-    /// Returns any [`AccessError`] and keeps the previous keys. An invalid file is reported once until it changes.
-    pub fn refresh(&self, force: bool) -> Result<Option<usize>, AccessError> {
+    /// file was not read. An error keeps the previous keys; an invalid file is reported once until it changes.
+    pub(crate) fn refresh(&self, force: bool) -> Result<Option<usize>, AccessError> {
         let Some(keys) = &self.keys else { return Ok(None) };
         let now = stamp(&keys.path);
         let mut seen = keys.seen.lock().unwrap_or_else(PoisonError::into_inner);
@@ -148,7 +129,7 @@ impl Access {
         }
         *seen = now;
         let ring = read(&keys.path, self.config.window_s)?;
-        let n = ring.len();
+        let n = ring.0.len();
         *keys.ring.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(ring);
         self.meter.forget_keys(Instant::now());
         Ok(Some(n))
@@ -174,17 +155,18 @@ mod tests {
     }
 
     fn new_key(id: &str) -> (String, String) {
-        let token::NewKey { text, hash } = token::mint(id).unwrap();
+        let text = token::new_key(id).unwrap();
+        let hash = token::Hash::of(&text);
         let key =
             Key { id: id.into(), hash, scopes: vec![Scope::Read], quota: Arc::default(), expires: None, note: None };
-        (text, file::entry(&key))
+        (text, file::format_key(&key))
     }
 
     #[test]
     fn default_configuration_requires_no_key() {
         let access = open(|_| {}).unwrap();
         assert!(!access.is_closed() && access.address_quota().is_none());
-        assert_eq!(access.signed("/", Some("signature=x"), SystemTime::now()), Signed::No);
+        assert_eq!(access.check_signature("/", Some("signature=x"), SystemTime::now()), SignatureCheck::Absent);
         assert_eq!(access.refresh(true).unwrap(), None);
     }
 

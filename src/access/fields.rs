@@ -9,8 +9,7 @@ use super::account::{Quota, QuotaUsage};
 const WORK_UNIT: &str = "molmesh-work-seconds";
 
 /// Returns the value of `RateLimit-Policy`, the limits of `quota`, or `None` if nothing is limited.
-#[must_use]
-pub fn policies(quota: &Quota) -> Option<String> {
+pub(crate) fn rate_limit_policy(quota: &Quota) -> Option<String> {
     let window = quota.window().as_secs();
     let requests = quota.requests.map(|q| format!("\"requests\";q={q};w={window}"));
     let work = quota.work_s.map(|q| format!("\"work\";q={q};qu=\"{WORK_UNIT}\";w={window}"));
@@ -20,8 +19,7 @@ pub fn policies(quota: &Quota) -> Option<String> {
 
 /// Returns the value of `RateLimit`, the remaining quota and the seconds until the next window, or `None` if nothing is
 /// limited.
-#[must_use]
-pub fn limits(quota: &Quota, usage: &QuotaUsage) -> Option<String> {
+pub(crate) fn rate_limit(quota: &Quota, usage: &QuotaUsage) -> Option<String> {
     let left = whole_seconds(usage.left.as_millis());
     let requests = quota.requests.map(|q| format!("\"requests\";r={};t={left}", q.saturating_sub(usage.requests)));
     // Rounding the used time up rounds the remaining time down.
@@ -51,7 +49,7 @@ mod tests {
     fn fields_follow_the_draft() {
         let quota = Quota { requests: Some(100), work_s: Some(600), concurrent: Some(4), window_s: 60 };
         assert_eq!(
-            policies(&quota).unwrap(),
+            rate_limit_policy(&quota).unwrap(),
             "\"requests\";q=100;w=60, \"work\";q=600;qu=\"molmesh-work-seconds\";w=60, \
              \"concurrency\";q=4;qu=\"concurrent-requests\""
         );
@@ -61,14 +59,14 @@ mod tests {
             running: 1,
             left: Duration::from_millis(29_001),
         };
-        let field = limits(&quota, &usage).unwrap();
+        let field = rate_limit(&quota, &usage).unwrap();
         assert_eq!(field, "\"requests\";r=50;t=30, \"work\";r=598;t=30, \"concurrency\";r=3");
         let beyond =
             QuotaUsage { requests: 1000, work: Duration::from_hours(1), running: 9, left: Duration::from_secs(1) };
-        let field = limits(&quota, &beyond).unwrap();
+        let field = rate_limit(&quota, &beyond).unwrap();
         assert_eq!(field, "\"requests\";r=0;t=1, \"work\";r=0;t=1, \"concurrency\";r=0");
         let only = Quota { requests: Some(1), ..Quota::default() };
-        assert_eq!(policies(&only).unwrap(), "\"requests\";q=1;w=1");
-        assert_eq!((policies(&Quota::default()), limits(&Quota::default(), &usage)), (None, None));
+        assert_eq!(rate_limit_policy(&only).unwrap(), "\"requests\";q=1;w=1");
+        assert_eq!((rate_limit_policy(&Quota::default()), rate_limit(&Quota::default(), &usage)), (None, None));
     }
 }

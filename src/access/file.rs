@@ -20,10 +20,7 @@ const NAMES: [&str; 9] = ["id", "hash", "scopes", "requests", "work_s", "concurr
 type Field<'a> = (Range<usize>, &'a DeValue<'a>);
 
 /// Parses a key file. `window_s` is the quota window of keys without their own, s.
-///
-/// # Errors
-/// Returns the first error in the file.
-pub fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> {
+pub(super) fn parse(text: &str, window_s: u64) -> Result<KeyRing, KeyFileError> {
     let wrong = |span: Range<usize>, reason: String| KeyFileError { line: line_of(text, span.start), reason };
     let table = DeTable::parse(text).map_err(|e| wrong(e.span().unwrap_or_default(), e.message().to_owned()))?;
     let mut keys = BTreeMap::new();
@@ -138,7 +135,7 @@ fn line_of(text: &str, offset: usize) -> usize {
 
 /// Formats a key as a `[[key]]` table.
 #[must_use]
-pub fn entry(key: &Key) -> String {
+pub fn format_key(key: &Key) -> String {
     // TOML accepts all escapes of JSON. DEL, which only JSON allows unescaped, is removed.
     let quote = |text: &str| serde_json::Value::from(text.replace('\u{7f}', "")).to_string();
     let scopes: Vec<String> = key.scopes.iter().map(|scope| quote(scope.name())).collect();
@@ -180,9 +177,9 @@ mod tests {
             note: None,
             ..full.clone()
         };
-        let text = format!("# keys\n{}\n{}", entry(&full), entry(&plain));
+        let text = format!("# keys\n{}\n{}", format_key(&full), format_key(&plain));
         let ring = parse(&text, 60).unwrap_or_else(|e| panic!("{e}\n{text}"));
-        assert_eq!(ring.len(), 2);
+        assert_eq!(ring.0.len(), 2);
         for key in [&full, &plain] {
             let read = &ring.0[&key.id];
             assert!(read.hash.same(&key.hash));
@@ -191,7 +188,7 @@ mod tests {
                 (&key.scopes, &key.quota, &key.expires, &key.note)
             );
         }
-        assert!(!entry(&plain).contains("window_s") && parse("", 60).unwrap().is_empty());
+        assert!(!format_key(&plain).contains("window_s") && parse("", 60).unwrap().0.is_empty());
     }
 
     #[test]
@@ -220,7 +217,7 @@ mod tests {
         ] {
             let text = good.replace(change.0, change.1);
             assert_ne!(text, good, "{change:?}");
-            let error = parse(&text, 60).map(|ring| ring.len()).unwrap_err();
+            let error = parse(&text, 60).map(|ring| ring.0.len()).unwrap_err();
             assert_eq!(error.line, line, "{error}\n{text}");
             assert!(error.reason.contains(reason), "{error}\n{text}");
             assert!(!error.reason.contains(&hash.to_string()[20..]), "{error}");

@@ -55,15 +55,14 @@ pub struct Key {
 
 impl Key {
     /// Returns true if the key has `scope`.
-    #[must_use]
-    pub fn allows(&self, scope: Scope) -> bool {
+    pub(crate) fn allows(&self, scope: Scope) -> bool {
         self.scopes.contains(&scope)
     }
 }
 
 /// Reason to reject a key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Denied {
+pub(crate) enum Denied {
     /// The key does not exist. The wrong part is not revealed.
     Unknown,
     /// The key expired at this time.
@@ -72,26 +71,11 @@ pub enum Denied {
 
 /// All keys, by id.
 #[derive(Debug, Clone, Default)]
-pub struct KeyRing(pub(super) BTreeMap<String, Arc<Key>>);
+pub(super) struct KeyRing(pub(super) BTreeMap<String, Arc<Key>>);
 
 impl KeyRing {
-    /// Returns the number of keys.
-    #[must_use]
-    pub fn len(&self) -> usize {
-        self.0.len()
-    }
-
-    /// Returns true if there are no keys.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
-    }
-
-    /// Returns the key with this text.
-    ///
-    /// # Errors
-    /// Returns [`Denied`] if the key is unknown or has expired. Expiry is reported only for the correct secret.
-    pub fn verify(&self, text: &str, now: SystemTime) -> Result<Arc<Key>, Denied> {
+    /// Returns the key with this text. Reports expiry only for the correct secret.
+    pub(super) fn verify(&self, text: &str, now: SystemTime) -> Result<Arc<Key>, Denied> {
         // Unknown ids take as long as known ones.
         static UNKNOWN: LazyLock<Hash> = LazyLock::new(|| Hash::of(""));
         let key = token::id_of(text).and_then(|id| self.0.get(id));
@@ -112,11 +96,11 @@ mod tests {
 
     #[test]
     fn a_key_is_valid_until_its_expiry() {
-        let minted = token::mint("a").unwrap();
+        let minted = token::new_key("a").unwrap();
         let end = SystemTime::UNIX_EPOCH + Duration::from_secs(100);
         let key = Key {
             id: "a".into(),
-            hash: minted.hash,
+            hash: Hash::of(&minted),
             scopes: vec![Scope::Read],
             quota: Arc::default(),
             expires: Some(end),
@@ -127,11 +111,11 @@ mod tests {
         let verify = |text: &str, at: u64| {
             ring.verify(text, SystemTime::UNIX_EPOCH + Duration::from_secs(at)).map(|key| key.id.clone())
         };
-        assert_eq!(verify(&minted.text, 99), Ok("a".into()));
-        assert_eq!(verify(&minted.text, 100), Err(Denied::Expired(end)));
+        assert_eq!(verify(&minted, 99), Ok("a".into()));
+        assert_eq!(verify(&minted, 100), Err(Denied::Expired(end)));
         // Every character is compared, and a wrong secret does not reveal the expiry.
-        for at in 0..minted.text.len() {
-            let mut other = minted.text.clone().into_bytes();
+        for at in 0..minted.len() {
+            let mut other = minted.clone().into_bytes();
             other[at] = if other[at] == b'0' { b'1' } else { b'0' };
             let other = String::from_utf8(other).unwrap();
             assert_eq!(verify(&other, 100), Err(Denied::Unknown), "{at}");

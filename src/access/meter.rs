@@ -118,7 +118,7 @@ impl State {
 
 /// Meter of the quota usage of clients.
 #[derive(Debug)]
-pub struct Meter {
+pub(crate) struct Meter {
     state: Mutex<State>,
     capacity: usize,
 }
@@ -126,8 +126,7 @@ pub struct Meter {
 impl Meter {
     /// Creates a meter with separate counters for `capacity` addresses; further addresses share one. Keys always have
     /// their own.
-    #[must_use]
-    pub fn new(capacity: usize) -> Self {
+    pub(crate) fn new(capacity: usize) -> Self {
         Self { state: Mutex::default(), capacity }
     }
 
@@ -136,11 +135,8 @@ impl Meter {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Counts a request, which runs until the returned guard is dropped.
-    ///
-    /// # Errors
-    /// Returns [`Exceeded`] and counts nothing if a quota is used up.
-    pub fn admit(self: &Arc<Self>, account: &Account, now: Instant) -> Result<Running, Exceeded> {
+    /// Counts a request, which runs until the returned guard is dropped. Counts nothing if a quota is used up.
+    pub(crate) fn admit(self: &Arc<Self>, account: &Account, now: Instant) -> Result<Running, Exceeded> {
         let mut state = self.lock();
         let (counter, window) = state.of(account, self.capacity, now);
         if let Some(exceeded) = window.exceeded(&account.quota, now) {
@@ -153,10 +149,7 @@ impl Meter {
     }
 
     /// Checks that the account has computing time left in this window.
-    ///
-    /// # Errors
-    /// Returns [`Exceeded`] if it has none.
-    pub fn admit_work(&self, account: &Account, now: Instant) -> Result<(), Exceeded> {
+    pub(crate) fn admit_work(&self, account: &Account, now: Instant) -> Result<(), Exceeded> {
         let Some(limit) = account.quota.work_s else { return Ok(()) };
         let mut state = self.lock();
         let (_, window) = state.of(account, self.capacity, now);
@@ -167,7 +160,7 @@ impl Meter {
     }
 
     /// Adds `time` of computing to the usage of `client`, or to the shared counter if the client has none.
-    pub fn spent(&self, client: u64, time: Duration, now: Instant) {
+    pub(crate) fn spent(&self, client: u64, time: Duration, now: Instant) {
         let mut state = self.lock();
         let State { keys, addresses, others, .. } = &mut *state;
         let window = keys.get_mut(&client).or_else(|| addresses.get_mut(&client)).or(others.as_mut());
@@ -178,19 +171,17 @@ impl Meter {
     }
 
     /// Returns the usage of an account.
-    #[must_use]
-    pub fn usage(&self, account: &Account, now: Instant) -> QuotaUsage {
+    pub(crate) fn usage(&self, account: &Account, now: Instant) -> QuotaUsage {
         self.lock().of(account, self.capacity, now).1.usage(now)
     }
 
     /// Removes keys with ended windows. Called after a reload of the key file, so that removed keys do not accumulate.
-    pub fn forget_keys(&self, now: Instant) {
+    pub(crate) fn forget_keys(&self, now: Instant) {
         self.lock().keys.retain(|_, window| window.running > 0 || !window.is_over(now));
     }
 
     /// Returns the number of clients with their own counter.
-    #[must_use]
-    pub fn clients(&self) -> usize {
+    pub(crate) fn clients(&self) -> usize {
         let state = self.lock();
         state.keys.len() + state.addresses.len()
     }
@@ -198,7 +189,7 @@ impl Meter {
 
 /// Guard of a running request.
 #[derive(Debug)]
-pub struct Running {
+pub(crate) struct Running {
     meter: Arc<Meter>,
     counter: Counter,
 }

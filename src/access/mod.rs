@@ -1,7 +1,7 @@
 //! Access control: API keys, quotas, signed URLs and the addresses of clients behind proxies.
 //!
 //! Decisions depend on values only: the text of a key, an address, a time. The module uses no HTTP library and starts
-//! no task. [`crate::http`] consults [`Access`] once per request.
+//! no task. [`crate::http`] consults `Access` once per request.
 
 mod account;
 mod authorizer;
@@ -14,13 +14,15 @@ mod meter;
 mod sign;
 mod token;
 
-pub use account::{Account, Exceeded, Quota, QuotaUsage};
-pub use authorizer::Access;
+pub(crate) use account::{Account, Exceeded};
+pub(crate) use authorizer::Access;
+pub(crate) use fields::{rate_limit, rate_limit_policy};
+pub(crate) use keys::Denied;
+pub(crate) use sign::{SIGNATURE, SignatureCheck, remove_signature};
+
+pub use account::Quota;
 pub use error::{AccessError, KeyFileError};
-pub use fields::{limits, policies};
-pub use file::{entry, parse};
-pub use forwarded::client;
-pub use keys::{Denied, Key, KeyRing, Scope};
-pub use meter::{Meter, Running};
-pub use sign::{EXPIRES, KEY_ID, SIGNATURE, SignError, Signed, SigningKeys, new_secret, without};
-pub use token::{Hash, NewKey, is_id, mint};
+pub use file::format_key;
+pub use keys::{Key, Scope};
+pub use sign::{SignError, SigningKeys};
+pub use token::{Hash, is_id, new_key, new_secret};

@@ -15,24 +15,16 @@ use thiserror::Error;
 use super::token;
 
 /// Query parameter of the expiry, s of Unix time.
-pub const EXPIRES: &str = "expires";
+pub(crate) const EXPIRES: &str = "expires";
 /// Query parameter of the signing key's id.
-pub const KEY_ID: &str = "key_id";
+pub(crate) const KEY_ID: &str = "key_id";
 /// Query parameter of the signature.
-pub const SIGNATURE: &str = "signature";
+pub(crate) const SIGNATURE: &str = "signature";
 
 /// Prefix of the signed message, which separates it from messages of other kinds.
 const DOMAIN: &str = "molmesh-address-1\n";
-/// Minimum length of a secret, characters: 128 bits in hexadecimal. [`new_secret`] returns twice as many.
+/// Minimum length of a secret, characters: 128 bits in hexadecimal. [`token::new_secret`] returns twice as many.
 const MIN_SECRET: usize = 32;
-
-/// Returns a new secret, 256 random bits in hexadecimal.
-///
-/// # Errors
-/// Returns the error of the system's random number generator.
-pub fn new_secret() -> Result<String, getrandom::Error> {
-    token::random_hex()
-}
 
 /// Errors of signing a URL.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -58,9 +50,9 @@ pub enum SignError {
 
 /// Result of checking a signature.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Signed {
+pub(crate) enum SignatureCheck {
     /// The query has no signature.
-    No,
+    Absent,
     /// The signature is valid.
     Valid,
     /// The signature is invalid. The wrong part is not revealed.
@@ -105,8 +97,8 @@ impl SigningKeys {
         if keys.is_empty() { Err("there is no key; expected ID:SECRET".to_owned()) } else { Ok(Self(keys)) }
     }
 
-    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time), with the key of this name,
-    /// else the first one. The target comes back with the three parameters behind it.
+    /// Signs `target`, a path with or without a query, until `expires` (s of Unix time). Uses the key `key_id`, by
+    /// default the first one. Returns the target followed by the three parameters.
     ///
     /// # Errors
     /// [`SignError`].
@@ -140,38 +132,36 @@ impl SigningKeys {
     }
 
     /// Checks the signature of a path and query at `now`. Compares in constant time.
-    #[must_use]
-    pub fn check(&self, path: &str, query: Option<&str>, now: SystemTime) -> Signed {
+    pub(crate) fn check(&self, path: &str, query: Option<&str>, now: SystemTime) -> SignatureCheck {
         let parameters: Vec<&str> = query.into_iter().flat_map(|query| query.split('&')).collect();
         if !parameters.iter().any(|parameter| name_of(parameter) == SIGNATURE) {
-            return Signed::No;
+            return SignatureCheck::Absent;
         }
         let [Some(expires), Some(key_id), Some(signature)] =
             [EXPIRES, KEY_ID, SIGNATURE].map(|name| only(&parameters, name))
         else {
-            return Signed::Invalid;
+            return SignatureCheck::Invalid;
         };
-        let Ok(tag) = URL_SAFE_NO_PAD.decode(signature) else { return Signed::Invalid };
+        let Ok(tag) = URL_SAFE_NO_PAD.decode(signature) else { return SignatureCheck::Invalid };
         let signed = parameters.iter().copied().filter(|parameter| name_of(parameter) != SIGNATURE).collect();
         // Unknown ids take as long as known ones.
         let found = self.0.iter().find(|(id, _)| id == key_id);
-        let Some((_, mac)) = found.or(self.0.first()) else { return Signed::Invalid };
+        let Some((_, mac)) = found.or(self.0.first()) else { return SignatureCheck::Invalid };
         let matches = message(mac, path, signed).verify_slice(&tag).is_ok();
         if !matches || found.is_none() {
-            return Signed::Invalid;
+            return SignatureCheck::Invalid;
         }
         // `sign` writes numbers only.
-        let Ok(end) = expires.parse::<u64>() else { return Signed::Invalid };
+        let Ok(end) = expires.parse::<u64>() else { return SignatureCheck::Invalid };
         if UNIX_EPOCH.checked_add(Duration::from_secs(end)).is_some_and(|end| end <= now) {
-            return Signed::Expired(end);
+            return SignatureCheck::Expired(end);
         }
-        Signed::Valid
+        SignatureCheck::Valid
     }
 }
 
 /// Removes the three parameters from a query. Returns `None` if nothing else remains.
-#[must_use]
-pub fn without(query: &str) -> Option<String> {
+pub(crate) fn remove_signature(query: &str) -> Option<String> {
     let own = [EXPIRES, KEY_ID, SIGNATURE];
     let rest: Vec<&str> = query.split('&').filter(|p| !own.contains(&name_of(p))).collect();
     (!rest.is_empty()).then(|| rest.join("&"))
@@ -208,7 +198,7 @@ mod tests {
         SigningKeys::parse(&secrets.join("\n ")).unwrap()
     }
 
-    fn check(keys: &SigningKeys, target: &str, now: u64) -> Signed {
+    fn check(keys: &SigningKeys, target: &str, now: u64) -> SignatureCheck {
         let (path, query) = target.split_once('?').map_or((target, None), |(path, query)| (path, Some(query)));
         keys.check(path, query, UNIX_EPOCH + Duration::from_secs(now))
     }
@@ -234,28 +224,28 @@ mod tests {
         ] {
             let signed = keys.sign(None, target, 100).unwrap();
             assert!(signed.starts_with(target) && signed.contains("expires=100&key_id=new&signature="), "{signed}");
-            assert_eq!(check(&keys, &signed, 99), Signed::Valid, "{signed}");
-            assert_eq!(without(signed.split_once('?').unwrap().1).as_deref(), rest);
-            assert_eq!(check(&keys, &signed, 100), Signed::Expired(100));
-            assert_eq!(check(&keys, target, 99), Signed::No);
+            assert_eq!(check(&keys, &signed, 99), SignatureCheck::Valid, "{signed}");
+            assert_eq!(remove_signature(signed.split_once('?').unwrap().1).as_deref(), rest);
+            assert_eq!(check(&keys, &signed, 100), SignatureCheck::Expired(100));
+            assert_eq!(check(&keys, target, 99), SignatureCheck::Absent);
         }
         // The order of parameters is irrelevant.
         let signed = keys.sign(None, "/x?b=1&a=2", 100).unwrap();
         let (_, query) = signed.split_once('?').unwrap();
         let reversed: Vec<&str> = query.split('&').rev().collect();
-        assert_eq!(check(&keys, &format!("/x?{}", reversed.join("&")), 0), Signed::Valid);
+        assert_eq!(check(&keys, &format!("/x?{}", reversed.join("&")), 0), SignatureCheck::Valid);
     }
 
     #[test]
     fn signing_keys_can_be_rotated() {
         let both = keys();
         let signed = both.sign(Some("old"), "/x", 100).unwrap();
-        assert_eq!(check(&both, &signed, 0), Signed::Valid);
+        assert_eq!(check(&both, &signed, 0), SignatureCheck::Valid);
         let only_new = SigningKeys::parse(&format!("new:{}", "new".repeat(11))).unwrap();
-        assert_eq!(check(&only_new, &signed, 0), Signed::Invalid);
-        assert_eq!(check(&only_new, &both.sign(None, "/x", 100).unwrap(), 0), Signed::Valid);
+        assert_eq!(check(&only_new, &signed, 0), SignatureCheck::Invalid);
+        assert_eq!(check(&only_new, &both.sign(None, "/x", 100).unwrap(), 0), SignatureCheck::Valid);
         let renamed = signed.replace("key_id=old", "key_id=new");
-        assert_eq!(check(&both, &renamed, 0), Signed::Invalid);
+        assert_eq!(check(&both, &renamed, 0), SignatureCheck::Invalid);
         assert!(
             matches!(both.sign(Some("x"), "/x", 1), Err(SignError::UnknownKey { available, .. }) if available == "new, old")
         );
@@ -279,10 +269,10 @@ mod tests {
             signed.replace("a=1", "%61=1"),
             format!("{}signature", signed.split("signature=").next().unwrap()),
         ] {
-            assert_eq!(check(&keys, &other, 0), Signed::Invalid, "{other}");
+            assert_eq!(check(&keys, &other, 0), SignatureCheck::Invalid, "{other}");
         }
         // Expiry is reported only for a correct signature.
-        assert_eq!(check(&keys, &signed.replace("a=1", "a=2"), 200), Signed::Invalid);
+        assert_eq!(check(&keys, &signed.replace("a=1", "a=2"), 200), SignatureCheck::Invalid);
     }
 
     proptest! {
@@ -295,7 +285,7 @@ mod tests {
             prop_assume!(other != signed);
             let result = check(&keys, &other, 0);
             // With a changed name of the signature parameter, the URL is unsigned.
-            prop_assert!(matches!(result, Signed::Invalid | Signed::No), "{other}: {result:?}");
+            prop_assert!(matches!(result, SignatureCheck::Invalid | SignatureCheck::Absent), "{other}: {result:?}");
         }
     }
 
@@ -313,7 +303,7 @@ mod tests {
             assert!(!message.contains("justasecret") && !message.contains("short"), "{message}");
         }
         assert_eq!(format!("{:?}", keys()), "[\"new\", \"old\"]");
-        assert_eq!(new_secret().unwrap().len(), 64);
+        assert_eq!(token::new_secret().unwrap().len(), 64);
         for bad in ["x", "", "http://h/x", "/a b", "/x#y", "/x?é", "/x?a=1&signature=2"] {
             assert!(keys().sign(None, bad, 1).is_err(), "{bad}");
         }

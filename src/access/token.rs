@@ -13,6 +13,8 @@ use subtle::ConstantTimeEq as _;
 const PREFIX: &str = "mm_";
 /// Length of a secret: 256 bits in lower-case hexadecimal digits.
 const SECRET_CHARS: usize = 64;
+/// Prefix of a hash in the key file.
+const HASH_PREFIX: &str = "sha256:";
 /// Maximum length of an id.
 const MAX_ID: usize = 32;
 
@@ -23,26 +25,19 @@ pub fn is_id(id: &str) -> bool {
     (1..=MAX_ID).contains(&id.len()) && id.bytes().all(allowed)
 }
 
-/// New key.
-pub struct NewKey {
-    /// Text, which is not stored.
-    pub text: String,
-    /// Hash of the text, which is stored.
-    pub hash: Hash,
-}
-
-/// Creates a key. `id` must have passed [`is_id`].
+/// Creates the text of a key, of which only the [`Hash`] is stored. `id` must have passed [`is_id`].
 ///
 /// # Errors
 /// Returns the error of the system's random number generator.
-pub fn mint(id: &str) -> Result<NewKey, getrandom::Error> {
-    let text = format!("{PREFIX}{id}_{}", random_hex()?);
-    let hash = Hash::of(&text);
-    Ok(NewKey { text, hash })
+pub fn new_key(id: &str) -> Result<String, getrandom::Error> {
+    Ok(format!("{PREFIX}{id}_{}", new_secret()?))
 }
 
-/// Returns 256 random bits in hexadecimal digits.
-pub(super) fn random_hex() -> Result<String, getrandom::Error> {
+/// Returns a new secret, 256 random bits in hexadecimal.
+///
+/// # Errors
+/// Returns the error of the system's random number generator.
+pub fn new_secret() -> Result<String, getrandom::Error> {
     let mut bytes = [0; SECRET_CHARS / 2];
     getrandom::fill(&mut bytes)?;
     Ok(hex(&bytes))
@@ -51,8 +46,12 @@ pub(super) fn random_hex() -> Result<String, getrandom::Error> {
 /// Returns the id in the text of a key, or `None` if the text is malformed.
 pub(super) fn id_of(text: &str) -> Option<&str> {
     let (id, secret) = text.strip_prefix(PREFIX)?.split_once('_')?;
-    let digit = |b: u8| b.is_ascii_digit() || (b'a'..=b'f').contains(&b);
-    (is_id(id) && secret.len() == SECRET_CHARS && secret.bytes().all(digit)).then_some(id)
+    (is_id(id) && is_256_bits(secret)).then_some(id)
+}
+
+/// Returns true if `text` is 256 bits in lower-case hexadecimal digits.
+fn is_256_bits(text: &str) -> bool {
+    text.len() == SECRET_CHARS && text.bytes().all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b))
 }
 
 fn hex(bytes: &[u8]) -> String {
@@ -61,28 +60,28 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().flat_map(|byte| [digit(byte >> 4), digit(byte & 15)]).collect()
 }
 
-/// SHA-256 of the text of a key. Comparison is in constant time only, hence no `PartialEq`.
+/// SHA-256 of the text of a key, as in the key file: `sha256:` and 64 digits. Comparison is in constant time only,
+/// hence no `PartialEq`.
 #[derive(Clone)]
-pub struct Hash([u8; 32]);
+pub struct Hash(String);
 
 impl Hash {
     /// Returns the hash of a text.
     #[must_use]
     pub fn of(text: &str) -> Self {
-        Self(Sha256::digest(text.as_bytes()).into())
+        Self(format!("{HASH_PREFIX}{}", hex(&Sha256::digest(text.as_bytes()))))
     }
 
     /// Returns true if both hashes are equal, in constant time.
     #[must_use]
     pub fn same(&self, other: &Self) -> bool {
-        self.0.ct_eq(&other.0).into()
+        self.0.as_bytes().ct_eq(other.0.as_bytes()).into()
     }
 }
 
 impl fmt::Display for Hash {
-    /// Writes `sha256:` and 64 digits, as in the key file.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "sha256:{}", hex(&self.0))
+        f.write_str(&self.0)
     }
 }
 
@@ -95,24 +94,10 @@ impl fmt::Debug for Hash {
 impl FromStr for Hash {
     type Err = &'static str;
 
-    /// Parses `sha256:` and 64 digits. The error states the expected form.
+    /// Parses the form of the key file. The error states the expected form.
     fn from_str(text: &str) -> Result<Self, &'static str> {
-        const EXPECTED: &str = "`sha256:` and 64 lower-case hexadecimal digits";
-        let digits = text.strip_prefix("sha256:").ok_or(EXPECTED)?.as_bytes();
-        let value = |b: u8| match b {
-            b'0'..=b'9' => Some(b - b'0'),
-            b'a'..=b'f' => Some(b - b'a' + 10),
-            _ => None,
-        };
-        let mut bytes = [0; 32];
-        if digits.len() != 2 * bytes.len() {
-            return Err(EXPECTED);
-        }
-        for (byte, pair) in bytes.iter_mut().zip(digits.chunks_exact(2)) {
-            let [high, low] = [value(pair[0]).ok_or(EXPECTED)?, value(pair[1]).ok_or(EXPECTED)?];
-            *byte = high << 4 | low;
-        }
-        Ok(Self(bytes))
+        let digits = text.strip_prefix(HASH_PREFIX).filter(|digits| is_256_bits(digits));
+        digits.map(|_| Self(text.to_owned())).ok_or("`sha256:` and 64 lower-case hexadecimal digits")
     }
 }
 
@@ -122,16 +107,17 @@ mod tests {
 
     #[test]
     fn new_keys_are_well_formed_and_unique() {
-        let [a, b] = [mint("viewer-1").unwrap(), mint("viewer-1").unwrap()];
-        assert_eq!(id_of(&a.text), Some("viewer-1"));
-        assert!(a.text != b.text && !a.hash.same(&b.hash) && a.hash.same(&Hash::of(&a.text)));
-        assert!(a.hash.to_string().parse::<Hash>().unwrap().same(&a.hash));
-        assert_eq!(format!("{:?}", a.hash), "Hash(…)");
+        let [a, b] = [new_key("viewer-1").unwrap(), new_key("viewer-1").unwrap()];
+        assert_eq!(id_of(&a), Some("viewer-1"));
+        let hash = Hash::of(&a);
+        assert!(a != b && !hash.same(&Hash::of(&b)) && hash.same(&Hash::of(&a)));
+        assert!(hash.to_string().parse::<Hash>().unwrap().same(&hash));
+        assert_eq!(format!("{hash:?}"), "Hash(…)");
     }
 
     #[test]
     fn malformed_keys_have_no_id() {
-        let good = mint("a").unwrap().text;
+        let good = new_key("a").unwrap();
         let secret = &good[5..];
         for bad in [
             String::new(),

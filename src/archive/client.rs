@@ -8,12 +8,13 @@ use bytes::{Bytes, BytesMut};
 use reqwest::header::{ETAG, HeaderMap, HeaderName, IF_MODIFIED_SINCE, IF_NONE_MATCH, LAST_MODIFIED, RETRY_AFTER};
 use reqwest::redirect::{Attempt, Policy};
 use reqwest::{Client, Proxy, Response, StatusCode, Url};
+use serde::{Deserialize, Serialize};
 
 use super::address::{PublicResolver, Refused};
-use super::error::Why;
+use super::error::UnavailableReason;
 use super::gzip;
-use super::memory::{NoMemory, Share};
 use crate::config::{ArchiveConfig, Templates};
+use crate::memory_budget::{Exhausted, Lease};
 use crate::store::Digest;
 use crate::telemetry::{SpanContext, traceparent, tracestate};
 
@@ -28,9 +29,10 @@ const USER_AGENT: &str = concat!("molmesh/", env!("CARGO_PKG_VERSION"), " (molec
 const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
 const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
-/// Validators of a response, for a later conditional request.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub(super) struct Validators {
+/// URL of a response and its validators, for a later conditional request.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(super) struct Origin {
+    pub(super) url: String,
     pub(super) etag: Option<String>,
     pub(super) last_modified: Option<String>,
 }
@@ -39,7 +41,7 @@ pub(super) struct Validators {
 #[derive(Debug)]
 pub(super) enum Answer {
     /// The entry.
-    Body { bytes: Bytes, digest: Digest, url: String, validators: Validators, share: Box<dyn Share> },
+    Body { bytes: Bytes, digest: Digest, origin: Origin, lease: Lease },
     /// The copy is still current.
     Unchanged,
     /// The archive does not have the entry.
@@ -52,28 +54,15 @@ pub(super) enum Failed {
     /// The body is too large. Contains the announced size, bytes, if any.
     TooLarge(Option<u64>),
     /// The memory limit is reached.
-    Memory(NoMemory),
+    Memory(Exhausted),
     /// Any other failure: cause, `Retry-After` of the host, details for the log.
-    Other { why: Why, retry_after: Option<Duration>, detail: String },
+    Other { reason: UnavailableReason, retry_after: Option<Duration>, detail: String },
 }
 
 impl Failed {
-    pub(super) fn other(why: Why, detail: &(impl ToString + ?Sized)) -> Self {
-        Self::Other { why, retry_after: None, detail: detail.to_string() }
+    pub(super) fn other(reason: UnavailableReason, detail: &(impl ToString + ?Sized)) -> Self {
+        Self::Other { reason, retry_after: None, detail: detail.to_string() }
     }
-}
-
-/// Limits of a request.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Limits {
-    /// Time for the response head, redirects included.
-    pub(super) head: Duration,
-    /// Longest pause within the body.
-    pub(super) pause: Duration,
-    /// Size of the body, bytes.
-    pub(super) bytes: u64,
-    /// Inflated bytes after which the completeness check of a gzip file stops.
-    pub(super) inflated: u64,
 }
 
 /// Creates the HTTP client. Blocks, because it reads the system's certificates.
@@ -82,12 +71,12 @@ pub(super) fn build(config: &ArchiveConfig) -> Result<Client, reqwest::Error> {
     let builder = || {
         let builder = Client::builder()
             .user_agent(USER_AGENT)
-            .connect_timeout(config.connect_timeout())
+            .connect_timeout(Duration::from_millis(config.connect_timeout_ms))
             .redirect(Policy::custom(follow))
             .referer(false)
             .dns_resolver(PublicResolver { allow_private: config.allow_private || config.proxy.is_some() });
         Ok(match &config.proxy {
-            Some(proxy) => builder.proxy(Proxy::all(proxy.as_str())?),
+            Some(proxy) => builder.proxy(Proxy::all(proxy)?),
             None => builder.no_proxy(),
         })
     };
@@ -122,27 +111,30 @@ pub(super) async fn head(client: &Client, url: Url) -> Result<u16, Failed> {
     client.head(url).send().await.map(|answer| answer.status().as_u16()).map_err(|error| of_client(&error))
 }
 
-/// Sends one GET request. `share` counts the memory of the body while it arrives and until the answer is dropped.
+/// Sends one GET request, a conditional one if a copy is `known`. `lease` is charged with the body while it arrives and
+/// until the answer is dropped. The check of a gzip file stops after `inflated_bytes`.
 pub(super) async fn get(
     client: &Client,
     url: Url,
-    known: Option<&Validators>,
-    limits: Limits,
-    mut share: Box<dyn Share>,
+    known: Option<&Origin>,
+    config: &ArchiveConfig,
+    inflated_bytes: u64,
+    mut lease: Lease,
     trace: &SpanContext,
 ) -> Result<Answer, Failed> {
     let compressed = Path::new(url.path()).extension().is_some_and(|extension| extension.eq_ignore_ascii_case("gz"));
     let name = url.to_string();
     let mut request = client.get(url).header(TRACEPARENT, traceparent(trace));
     request = tracestate(trace).into_iter().fold(request, |request, state| request.header(TRACESTATE, state));
-    if let Some(Validators { etag, last_modified }) = known {
+    if let Some(Origin { etag, last_modified, .. }) = known {
         for (header, value) in [(IF_NONE_MATCH, etag), (IF_MODIFIED_SINCE, last_modified)] {
             request = value.iter().fold(request, |request, value| request.header(header.clone(), value));
         }
     }
-    let response = tokio::time::timeout(limits.head, request.send())
+    let head_timeout = Duration::from_millis(config.connect_timeout_ms.saturating_add(config.first_byte_timeout_ms));
+    let response = tokio::time::timeout(head_timeout, request.send())
         .await
-        .map_err(|_elapsed| Failed::other(Why::Timeout, "no head in time"))?
+        .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "no head in time"))?
         .map_err(|error| of_client(&error))?;
     match response.status() {
         StatusCode::OK => {}
@@ -150,51 +142,56 @@ pub(super) async fn get(
         StatusCode::NOT_FOUND | StatusCode::GONE => return Ok(Answer::Absent),
         // Redirects without a valid location.
         status if status.is_redirection() && status != StatusCode::NOT_MODIFIED => {
-            return Err(Failed::other(Why::Redirect, &status));
+            return Err(Failed::other(UnavailableReason::Redirect, &status));
         }
         status => {
             let retry_after = retry_after(response.headers());
-            return Err(Failed::Other { why: Why::Status(status.as_u16()), retry_after, detail: status.to_string() });
+            return Err(Failed::Other {
+                reason: UnavailableReason::Status(status.as_u16()),
+                retry_after,
+                detail: status.to_string(),
+            });
         }
     }
     let text = |name: HeaderName| Some(response.headers().get(name)?.to_str().ok()?.to_owned());
-    let validators = Validators { etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
-    let bytes = body(response, limits, share.as_mut()).await?;
+    let origin = Origin { url: name, etag: text(ETAG), last_modified: text(LAST_MODIFIED) };
+    let bytes = body(response, config, &mut lease).await?;
     let (bytes, digest) = tokio::task::spawn_blocking(move || {
-        if compressed && !gzip::is_complete_gzip(&bytes, limits.inflated) {
-            return Err(Failed::other(Why::Damaged, "the file is incomplete"));
+        if compressed && !gzip::is_complete_gzip(&bytes, inflated_bytes) {
+            return Err(Failed::other(UnavailableReason::Damaged, "the file is incomplete"));
         }
         let digest = Digest::of(&bytes);
         Ok((bytes, digest))
     })
     .await
-    .map_err(|error| Failed::other(Why::Client, &error))??;
-    Ok(Answer::Body { bytes, digest, url: name, validators, share })
+    .map_err(|error| Failed::other(UnavailableReason::Client, &error))??;
+    Ok(Answer::Body { bytes, digest, origin, lease })
 }
 
 /// Receives the body up to the limit.
-async fn body(mut response: Response, limits: Limits, share: &mut dyn Share) -> Result<Bytes, Failed> {
+async fn body(mut response: Response, config: &ArchiveConfig, lease: &mut Lease) -> Result<Bytes, Failed> {
     let announced = response.content_length();
-    if announced.is_some_and(|bytes| bytes > limits.bytes) {
+    if announced.is_some_and(|bytes| bytes > config.max_bytes) {
         return Err(Failed::TooLarge(announced));
     }
     let capacity = usize::try_from(announced.unwrap_or(0).min(MAX_PREALLOCATION)).unwrap_or(0);
     let mut body = BytesMut::with_capacity(capacity);
     loop {
-        let chunk = tokio::time::timeout(limits.pause, response.chunk())
+        let chunk = tokio::time::timeout(Duration::from_millis(config.first_byte_timeout_ms), response.chunk())
             .await
-            .map_err(|_elapsed| Failed::other(Why::Timeout, "the body stalls"))?;
+            .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the body stalls"))?;
         let Some(chunk) = chunk.map_err(|error| of_client(&error))? else { break };
-        if body.len() as u64 + chunk.len() as u64 > limits.bytes {
+        if body.len() as u64 + chunk.len() as u64 > config.max_bytes {
             return Err(Failed::TooLarge(None));
         }
-        share.grow(chunk.len() as u64).map_err(Failed::Memory)?;
+        lease.grow(chunk.len() as u64).map_err(Failed::Memory)?;
         body.extend_from_slice(&chunk);
     }
     match announced {
-        Some(bytes) if bytes != body.len() as u64 => {
-            Err(Failed::other(Why::Broken, &format!("received {} of {bytes} announced bytes", body.len())))
-        }
+        Some(bytes) if bytes != body.len() as u64 => Err(Failed::other(
+            UnavailableReason::Broken,
+            &format!("received {} of {bytes} announced bytes", body.len()),
+        )),
         _ => Ok(body.freeze()),
     }
 }
@@ -206,19 +203,19 @@ fn of_client(error: &reqwest::Error) -> Failed {
         causes.push(cause);
         next = cause.source();
     }
-    let why = if causes.iter().any(|cause| cause.is::<Refused>()) {
-        Why::Private
+    let reason = if causes.iter().any(|cause| cause.is::<Refused>()) {
+        UnavailableReason::Private
     } else if error.is_redirect() {
-        Why::Redirect
+        UnavailableReason::Redirect
     } else if error.is_timeout() {
-        Why::Timeout
+        UnavailableReason::Timeout
     } else if error.is_connect() {
-        Why::Connect
+        UnavailableReason::Connect
     } else {
-        Why::Broken
+        UnavailableReason::Broken
     };
     let words: Vec<String> = causes.iter().map(ToString::to_string).collect();
-    Failed::other(why, &words.join(": "))
+    Failed::other(reason, &words.join(": "))
 }
 
 /// Returns the value of `Retry-After`, given in seconds or as a date.

@@ -13,8 +13,7 @@ use bytes::Bytes;
 use metrics::gauge;
 use serde::{Deserialize, Serialize};
 
-use super::client::Validators;
-use super::remote::Origin;
+use super::client::Origin;
 use crate::store::Digest;
 use crate::structure::EntryId;
 use crate::telemetry::ARCHIVE_KEPT;
@@ -29,9 +28,8 @@ const STALE_TEMPORARY: Duration = Duration::from_hours(1);
 struct Metadata {
     bytes: u64,
     sha256: String,
-    url: String,
-    etag: Option<String>,
-    last_modified: Option<String>,
+    #[serde(flatten)]
+    origin: Origin,
     /// Time of the last confirmation by the archive, ms of Unix time.
     checked_ms: u64,
 }
@@ -147,9 +145,8 @@ impl Disk {
             return Ok(None);
         }
         let checked = SystemTime::UNIX_EPOCH + Duration::from_millis(metadata.checked_ms);
-        let validators = Validators { etag: metadata.etag, last_modified: metadata.last_modified };
-        let (bytes, origin) = (Bytes::from(body), Origin { url: metadata.url, validators });
-        Ok(Some(Stored { bytes, digest, origin, age: SystemTime::now().duration_since(checked).ok() }))
+        let age = SystemTime::now().duration_since(checked).ok();
+        Ok(Some(Stored { bytes: Bytes::from(body), digest, origin: metadata.origin, age }))
     }
 
     /// Stores an entry and evicts others if necessary. An entry larger than the capacity is not stored.
@@ -170,13 +167,10 @@ impl Disk {
     /// Writes the metadata of a copy that the archive has just sent or confirmed.
     pub(super) fn confirm(&self, id: &EntryId, bytes: u64, digest: &Digest, origin: &Origin) -> io::Result<()> {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-        let Validators { etag, last_modified } = origin.validators.clone();
         let metadata = Metadata {
             bytes,
             sha256: digest.to_string(),
-            url: origin.url.clone(),
-            etag,
-            last_modified,
+            origin: origin.clone(),
             checked_ms: u64::try_from(now.as_millis()).unwrap_or(u64::MAX),
         };
         self.write(&self.path(id, "json"), serde_json::to_string(&metadata)?.as_bytes())

@@ -11,9 +11,9 @@ use tracing::Instrument as _;
 use super::client::Answer;
 use super::disk::{Disk, Found, Stored};
 use super::error::FetchError;
-use super::memory::Memory;
-use super::remote::{Origin, Remote};
+use super::remote::Remote;
 use crate::config::Config;
+use crate::memory_budget::Budget;
 use crate::single_flight::SingleFlight;
 use crate::store::Digest;
 use crate::structure::{Archive as Folder, EntryId, Stamp};
@@ -71,16 +71,16 @@ struct Shared {
     known: Cache<EntryId, Known>,
     /// Entries that no remote archive has, each with the time until which it is not requested again.
     absent: Cache<EntryId, Instant>,
-    check: Duration,
-    fresh: Duration,
-    absent_for: Duration,
+    check_interval: Duration,
+    revalidate_after: Duration,
+    retry_missing_after: Duration,
 }
 
 impl Archive {
-    /// Creates the archive of a configuration. `memory` counts the bytes of running fetches. The first request starts
-    /// all I/O.
+    /// Creates the archive of a configuration. Running fetches are charged to `memory`. The first request starts all
+    /// I/O.
     #[must_use]
-    pub fn new(config: &Config, memory: Arc<dyn Memory>) -> Self {
+    pub fn new(config: &Config, memory: Budget) -> Self {
         let (archive, inflated) = (&config.archive, config.limits.inflated_bytes);
         let shared = Shared {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
@@ -89,9 +89,9 @@ impl Archive {
             fetches: SingleFlight::default(),
             known: Cache::new(CACHED_DIGESTS),
             absent: Cache::new(CACHED_DIGESTS),
-            check: archive.check(),
-            fresh: archive.fresh(),
-            absent_for: archive.absent(),
+            check_interval: Duration::from_millis(archive.local_check_interval_ms),
+            revalidate_after: Duration::from_millis(archive.revalidate_after_ms),
+            retry_missing_after: Duration::from_millis(archive.retry_missing_after_ms),
         };
         Self { shared: Arc::new(shared) }
     }
@@ -144,7 +144,7 @@ impl Archive {
         if known.fresh_until.is_some_and(|end| Instant::now() >= end) {
             return None;
         }
-        if known.checked.elapsed() >= self.shared.check {
+        if known.checked.elapsed() >= self.shared.check_interval {
             let (shared, wanted) = (Arc::clone(&self.shared), id.clone());
             let checked = Instant::now();
             let stamp = blocking(move || shared.folder.stamp(&wanted)).await.ok()?.ok()?;
@@ -166,12 +166,12 @@ impl Shared {
             return Ok(Entry { bytes, digest, source: Source::Local });
         }
         let stored = self.stored(id).await?;
-        let is_fresh = |stored: &Stored| stored.age.is_some_and(|age| age < self.fresh);
+        let is_fresh = |stored: &Stored| stored.age.is_some_and(|age| age < self.revalidate_after);
         let (remote, stored) = match (&self.remote, stored) {
             // Without a remote archive a copy does not expire.
             (None, Some(stored)) => return Ok(self.copy(id, stored, checked, None)),
             (Some(_), Some(stored)) if is_fresh(&stored) => {
-                let left = self.fresh.saturating_sub(stored.age.unwrap_or_default());
+                let left = self.revalidate_after.saturating_sub(stored.age.unwrap_or_default());
                 return Ok(self.copy(id, stored, checked, Some(left)));
             }
             (None, None) => return Err(FetchError::NotFound { id: id.clone() }),
@@ -193,25 +193,28 @@ impl Shared {
         count("remote", result);
         histogram!(ARCHIVE_FETCH, "result" => result).record(checked.elapsed().as_secs_f64());
         match (answer, stored) {
-            (Ok(Answer::Body { bytes, digest, url, validators, share }), _) => {
-                tracing::info!(%id, url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
-                let (origin, kept) = (Origin { url, validators }, bytes.clone());
+            (Ok(Answer::Body { bytes, digest, origin, lease }), _) => {
+                tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
+                let kept = bytes.clone();
                 self.on_disk(id, "stored", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
-                self.remember(id, Known { digest, stamp: None, checked, fresh_until: Some(checked + self.fresh) });
-                // From here on the caller counts the memory.
-                drop(share);
+                self.remember(
+                    id,
+                    Known { digest, stamp: None, checked, fresh_until: Some(checked + self.revalidate_after) },
+                );
+                // From here on the caller accounts for the memory.
+                drop(lease);
                 Ok(Entry { bytes, digest, source: Source::Remote })
             }
             (Ok(Answer::Unchanged), Some(stored)) => {
                 let (n_bytes, digest, origin) = (stored.bytes.len() as u64, stored.digest, stored.origin.clone());
                 self.on_disk(id, "confirmed", move |disk, id| disk.confirm(id, n_bytes, &digest, &origin)).await;
-                Ok(self.copy(id, stored, checked, Some(self.fresh)))
+                Ok(self.copy(id, stored, checked, Some(self.revalidate_after)))
             }
             (Ok(_), _) => Err(FetchError::Internal("the archive answered `304 Not Modified` without a copy")),
             (Err(error @ FetchError::NotFound { .. }), _) => {
                 self.on_disk(id, "removed", Disk::remove).await;
                 self.known.remove(id);
-                self.absent.insert(id.clone(), checked + self.absent_for);
+                self.absent.insert(id.clone(), checked + self.retry_missing_after);
                 Err(error)
             }
             (Err(error @ FetchError::Unavailable { .. }), Some(stored)) => {
@@ -228,7 +231,7 @@ impl Shared {
     async fn local(self: &Arc<Self>, id: &EntryId) -> Result<Option<(Bytes, Digest, Stamp)>, FetchError> {
         let (shared, wanted) = (Arc::clone(self), id.clone());
         let found = blocking(move || {
-            let found = shared.folder.fetch_stamped(&wanted)?;
+            let found = shared.folder.fetch(&wanted)?;
             Ok(found.map(|(bytes, stamp)| {
                 let digest = Digest::of(&bytes);
                 (Bytes::from(bytes), digest, stamp)

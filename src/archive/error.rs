@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use thiserror::Error;
 
+use crate::memory_budget::Exhausted;
 use crate::structure::{ArchiveError, EntryId};
 
 /// Errors of fetching an entry.
@@ -31,24 +32,22 @@ pub enum FetchError {
         limit: u64,
     },
     /// The remote archive is unavailable, and there is no copy.
-    #[error("the archive at {host} {why}")]
+    #[error("the archive at {host} {reason}")]
     Unavailable {
         /// Host as in the configuration.
         host: String,
         /// Cause.
-        why: Why,
+        reason: UnavailableReason,
         /// Time until a retry is useful; `None` if retries will not help.
         retry_after: Option<Duration>,
     },
     /// The memory limit is reached.
-    #[error("entry {id} cannot be fetched now: {held} of {limit} bytes of memory for uploads and meshes are in use")]
+    #[error("entry {id} cannot be fetched now: {error}")]
     Memory {
         /// Requested entry.
         id: EntryId,
-        /// Memory limit, bytes.
-        limit: u64,
-        /// Memory in use, bytes.
-        held: u64,
+        /// Limit and use of the memory.
+        error: Exhausted,
     },
     /// Internal error, or the service is stopping.
     #[error("the entry could not be fetched: {0}")]
@@ -57,7 +56,7 @@ pub enum FetchError {
 
 /// Cause of a failed request to a remote archive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Why {
+pub enum UnavailableReason {
     /// No connection: unknown name, refused, TLS error.
     Connect,
     /// Timeout.
@@ -80,7 +79,7 @@ pub enum Why {
     Client,
 }
 
-impl Why {
+impl UnavailableReason {
     /// Returns true if a retry may succeed.
     #[must_use]
     pub fn is_temporary(self) -> bool {
@@ -97,7 +96,7 @@ impl Why {
     }
 }
 
-impl fmt::Display for Why {
+impl fmt::Display for UnavailableReason {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Connect => "cannot be connected to",

@@ -11,9 +11,7 @@ mod disk;
 mod entries;
 mod error;
 mod gzip;
-mod memory;
 mod remote;
 
 pub use entries::{Archive, Entry, Source};
-pub use error::{FetchError, Why};
-pub use memory::{Memory, NoMemory, Share, Uncounted};
+pub use error::{FetchError, UnavailableReason};

@@ -9,10 +9,10 @@ use tokio::sync::{OnceCell, Semaphore};
 use tokio::time::Instant;
 
 use super::breaker::Breaker;
-use super::client::{self, Answer, Failed, Limits, Validators};
-use super::error::{FetchError, Why};
-use super::memory::{Memory, NoMemory};
+use super::client::{self, Answer, Failed, Origin};
+use super::error::{FetchError, UnavailableReason};
 use crate::config::{ArchiveConfig, Template};
+use crate::memory_budget::Budget;
 use crate::structure::EntryId;
 use crate::telemetry::{SpanKind, SpanParent, TraceSpan};
 
@@ -21,44 +21,38 @@ const MAX_PAUSE: Duration = Duration::from_mins(10);
 /// Retry time reported to callers if no better one is known.
 const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(1);
 
-/// URL and validators of a copy.
-#[derive(Debug, Clone)]
-pub(super) struct Origin {
-    pub(super) url: String,
-    pub(super) validators: Validators,
-}
-
 /// The remote archive.
 #[derive(Debug)]
 pub(super) struct Remote {
     /// URL templates with the circuit breakers of their hosts.
     sources: Vec<(Template, Arc<Breaker>)>,
     config: ArchiveConfig,
-    limits: Limits,
+    /// Inflated bytes after which the check of a gzip file stops.
+    inflated_bytes: u64,
     permits: Semaphore,
-    memory: Arc<dyn Memory>,
+    memory: Budget,
     /// Created on first use, because it reads the system's certificates.
     client: OnceCell<Client>,
 }
 
 impl Remote {
-    /// Creates the remote archive of a configuration, if it names one. `memory` counts the bytes of fetches.
-    pub(super) fn new(config: &ArchiveConfig, inflated: u64, memory: Arc<dyn Memory>) -> Option<Self> {
+    /// Creates the remote archive of a configuration, if it names one. Bodies that arrive are charged to `memory`.
+    pub(super) fn new(config: &ArchiveConfig, inflated_bytes: u64, memory: Budget) -> Option<Self> {
         let mut sources: Vec<(Template, Arc<Breaker>)> = Vec::new();
         for template in config.url.as_ref()?.as_slice() {
             let known = sources.iter().find(|(_, breaker)| breaker.host() == template.host());
-            let new = || Arc::new(Breaker::new(template.host(), config.breaker_failures, config.breaker()));
+            let new = || {
+                Arc::new(Breaker::new(
+                    template.host(),
+                    config.breaker_failures,
+                    Duration::from_millis(config.breaker_ms),
+                ))
+            };
             let breaker = known.map_or_else(new, |(_, breaker)| Arc::clone(breaker));
             sources.push((template.clone(), breaker));
         }
-        let limits = Limits {
-            head: config.connect_timeout() + config.first_byte_timeout(),
-            pause: config.first_byte_timeout(),
-            bytes: config.max_bytes,
-            inflated,
-        };
         let permits = Semaphore::new(config.concurrent);
-        Some(Self { sources, config: config.clone(), limits, permits, memory, client: OnceCell::new() })
+        Some(Self { sources, config: config.clone(), inflated_bytes, permits, memory, client: OnceCell::new() })
     }
 
     /// Sends a HEAD request for `id` to every URL. Returns the hosts with the status or the error.
@@ -68,7 +62,7 @@ impl Remote {
             let request = async {
                 let failed = |failed: Failed| match failed {
                     Failed::TooLarge(_) => "too large".to_owned(),
-                    Failed::Memory(none) => format!("no memory: {} of {} bytes are in use", none.held, none.limit),
+                    Failed::Memory(error) => error.to_string(),
                     Failed::Other { detail, .. } => detail,
                 };
                 let client = self.client().await.map_err(failed)?;
@@ -84,7 +78,7 @@ impl Remote {
 
     /// Requests the entry from every URL in order until one has it.
     pub(super) async fn fetch(&self, id: &EntryId, copy: Option<&Origin>) -> Result<Answer, FetchError> {
-        let deadline = Instant::now() + self.config.timeout();
+        let deadline = Instant::now() + Duration::from_millis(self.config.timeout_ms);
         let mut failure = None;
         for (template, breaker) in &self.sources {
             match self.fetch_from(id, template, breaker, copy, deadline).await {
@@ -109,33 +103,34 @@ impl Remote {
         copy: Option<&Origin>,
         deadline: Instant,
     ) -> Result<Answer, FetchError> {
-        let unavailable =
-            |why, retry_after| FetchError::Unavailable { host: breaker.host().to_owned(), why, retry_after };
         let mut attempt = 1;
         loop {
-            let (why, requested, detail) = match self.attempt(id, template, breaker, copy, deadline).await {
+            let (reason, requested, detail) = match self.attempt(id, template, breaker, copy, deadline).await {
                 Ok(answer) => return Ok(answer),
                 Err(Failed::TooLarge(bytes)) => {
-                    return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.limits.bytes });
+                    return Err(FetchError::TooLarge { id: id.clone(), bytes, limit: self.config.max_bytes });
                 }
-                Err(Failed::Memory(NoMemory { limit, held })) => {
-                    return Err(FetchError::Memory { id: id.clone(), limit, held });
-                }
-                Err(Failed::Other { why, retry_after, detail }) => (why, retry_after, detail),
+                Err(Failed::Memory(error)) => return Err(FetchError::Memory { id: id.clone(), error }),
+                Err(Failed::Other { reason, retry_after, detail }) => (reason, retry_after, detail),
             };
             tracing::debug!(%id, host = breaker.host(), attempt, detail, "an attempt failed");
             let pause = self.pause(attempt, requested);
-            let again = why.is_temporary()
+            let again = reason.is_temporary()
                 && attempt < self.config.attempts
                 && breaker.open_for().is_none()
                 && Instant::now() + pause < deadline;
             if !again {
-                if why != Why::Paused {
+                if reason != UnavailableReason::Paused {
                     tracing::warn!(%id, host = breaker.host(), attempt, detail, "the request to the archive failed");
                 }
-                let is_temporary = why.is_temporary() || matches!(why, Why::Paused | Why::Busy);
+                let is_temporary =
+                    reason.is_temporary() || matches!(reason, UnavailableReason::Paused | UnavailableReason::Busy);
                 let retry_after = breaker.open_for().or(requested).unwrap_or(DEFAULT_RETRY_AFTER);
-                return Err(unavailable(why, is_temporary.then_some(retry_after)));
+                return Err(FetchError::Unavailable {
+                    host: breaker.host().to_owned(),
+                    reason,
+                    retry_after: is_temporary.then_some(retry_after),
+                });
             }
             tokio::time::sleep(pause).await;
             attempt += 1;
@@ -144,7 +139,7 @@ impl Remote {
 
     /// Returns the pause after an attempt: the time that the host requested, plus a random part of a span that doubles.
     fn pause(&self, attempt: u32, requested: Option<Duration>) -> Duration {
-        let span = self.config.backoff().saturating_mul(1 << (attempt - 1).min(16));
+        let span = Duration::from_millis(self.config.backoff_ms).saturating_mul(1 << (attempt - 1).min(16));
         requested.unwrap_or_default() + span.mul_f64(fraction())
     }
 
@@ -157,33 +152,34 @@ impl Remote {
         copy: Option<&Origin>,
         deadline: Instant,
     ) -> Result<Answer, Failed> {
-        let paused = |wait: Duration| Failed::other(Why::Paused, &format!("paused for {} ms", wait.as_millis()));
+        let paused =
+            |wait: Duration| Failed::other(UnavailableReason::Paused, &format!("paused for {} ms", wait.as_millis()));
         // Checked before waiting for a permit.
         breaker.open_for().map_or(Ok(()), |wait| Err(paused(wait)))?;
         let _permit = tokio::time::timeout_at(deadline, self.permits.acquire())
             .await
-            .map_err(|_elapsed| Failed::other(Why::Busy, "no permit in time"))?
-            .map_err(|closed| Failed::other(Why::Busy, &closed))?;
+            .map_err(|_elapsed| Failed::other(UnavailableReason::Busy, "no permit in time"))?
+            .map_err(|closed| Failed::other(UnavailableReason::Busy, &closed))?;
         let client = self.client().await?;
-        let url = template.url(id).ok_or_else(|| Failed::other(Why::Client, "the address is no URL"))?;
-        let known = copy.filter(|copy| copy.url == url.as_str()).map(|copy| &copy.validators);
+        let url = template.url(id).ok_or_else(|| Failed::other(UnavailableReason::Client, "the address is no URL"))?;
+        let known = copy.filter(|copy| copy.url == url.as_str());
         let permit = breaker.acquire().map_err(paused)?;
         let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());
         let trace = span.context();
-        let get = client::get(client, url, known, self.limits, self.memory.begin(), &trace);
+        let get = client::get(client, url, known, &self.config, self.inflated_bytes, self.memory.lease(), &trace);
         let answer = tokio::time::timeout_at(deadline, get)
             .await
-            .unwrap_or_else(|_elapsed| Err(Failed::other(Why::Timeout, "incomplete at the deadline")));
+            .unwrap_or_else(|_elapsed| Err(Failed::other(UnavailableReason::Timeout, "incomplete at the deadline")));
         describe(&span, id, breaker.host(), &answer);
         span.end();
         match &answer {
             Ok(_) | Err(Failed::TooLarge(_) | Failed::Memory(_)) => permit.succeeded(),
-            Err(Failed::Other { retry_after: Some(wait), why, .. })
-                if why.is_temporary() && *wait > self.config.retry_after() =>
+            Err(Failed::Other { retry_after: Some(wait), reason, .. })
+                if reason.is_temporary() && *wait > Duration::from_millis(self.config.retry_after_ms) =>
             {
                 permit.asked_to_wait((*wait).min(MAX_PAUSE));
             }
-            Err(Failed::Other { why, .. }) if why.is_host_response() => permit.succeeded(),
+            Err(Failed::Other { reason, .. }) if reason.is_host_response() => permit.succeeded(),
             Err(Failed::Other { .. }) => permit.failed(),
         }
         answer
@@ -193,7 +189,7 @@ impl Remote {
         let make = || async {
             let config = self.config.clone();
             let built = tokio::task::spawn_blocking(move || client::build(&config)).await;
-            let failed = |words: String| Failed::other(Why::Client, &words);
+            let failed = |words: String| Failed::other(UnavailableReason::Client, &words);
             built.map_err(|e| failed(e.to_string()))?.map_err(|e| failed(format!("{e:?}")))
         };
         self.client.get_or_try_init(make).await
@@ -211,8 +207,8 @@ fn describe(span: &TraceSpan, id: &EntryId, host: &str, answer: &Result<Answer, 
         // 410 is reported as 404.
         Ok(Answer::Absent) => (Some(404), None),
         Err(Failed::Memory(_)) => (Some(200), Some("memory limit reached".to_owned())),
-        Err(Failed::Other { why, detail, .. }) => match why {
-            Why::Status(status) => (Some(i64::from(*status)), Some(detail.clone())),
+        Err(Failed::Other { reason, detail, .. }) => match reason {
+            UnavailableReason::Status(status) => (Some(i64::from(*status)), Some(detail.clone())),
             _ => (None, Some(detail.clone())),
         },
     };
@@ -232,13 +228,12 @@ fn fraction() -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::memory::Uncounted;
     use super::*;
 
     #[test]
     fn pauses_double_and_are_random() {
         let config = ArchiveConfig { backoff_ms: 1000, ..ArchiveConfig::default() };
-        let remote = Remote::new(&config, 1, Arc::new(Uncounted)).unwrap();
+        let remote = Remote::new(&config, 1, Budget::unlimited()).unwrap();
         let longest = |attempt| (0..200).map(|_| remote.pause(attempt, None)).max().unwrap_or_default().as_millis();
         for (attempt, span) in [(1, 1000), (2, 2000), (3, 4000)] {
             let longest = longest(attempt);

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use molmesh::config::DevicesConfig;
 #[cfg(feature = "gpu")]
 use molmesh::picture::CpuRenderer;
-use molmesh::picture::Drawer;
+use molmesh::picture::SelectedRenderer;
 use molmesh::surface::cpu::CpuBackend;
 use molmesh::surface::reference::ReferenceBackend;
 use molmesh::surface::{Backend, DeviceChoice, FoundDevice};
@@ -20,24 +20,47 @@ use super::estimate::Estimate;
 /// Requested backend and devices.
 #[derive(Debug)]
 pub(crate) struct BackendRequest<'a> {
-    /// Backend.
     pub(crate) backend: BackendName,
-    /// Devices that it may use.
+    /// Devices that the backend may use.
     pub(crate) devices: &'a DeviceChoice,
     /// Threads of the CPU backend.
     pub(crate) threads: Option<usize>,
     /// Estimated work of a command's only job, if there is one and its input is known.
     pub(crate) work: Option<f64>,
+    pub(crate) purpose: Purpose,
+}
+
+/// Purpose of a backend.
+#[derive(Debug)]
+pub(crate) enum Purpose {
+    /// One mesh.
+    Mesh,
+    /// One mesh and its picture.
+    Picture,
+    /// A service.
+    #[cfg(feature = "server")]
+    Service(DevicesConfig),
 }
 
 impl<'a> BackendRequest<'a> {
     /// Creates the request of a command with a single job of unknown work.
-    pub(crate) fn once(args: &'a JobArgs) -> Self {
+    pub(crate) fn of_command(args: &'a JobArgs, purpose: Purpose) -> Self {
         let (backend, devices, threads) = (args.backend, &args.devices.devices, args.threads);
-        Self { backend, devices, threads, work: None }
+        Self { backend, devices, threads, work: None, purpose }
     }
 
-    /// Threads that the CPU backend gets.
+    /// Creates the request of a service.
+    #[cfg(feature = "server")]
+    pub(crate) fn of_service(backend: BackendName, config: &'a DevicesConfig) -> Self {
+        let purpose = Purpose::Service(config.clone());
+        Self { backend, devices: &config.choice, threads: None, work: None, purpose }
+    }
+
+    fn is_command(&self) -> bool {
+        matches!(self.purpose, Purpose::Mesh | Purpose::Picture)
+    }
+
+    /// Returns the threads that the CPU backend of a command gets.
     fn n_threads(&self) -> usize {
         self.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, NonZero::get))
     }
@@ -45,30 +68,17 @@ impl<'a> BackendRequest<'a> {
 
 /// Selected backend with the reason.
 pub(crate) struct SelectedBackend {
-    /// Backend.
     pub(crate) backend: Box<dyn Backend>,
     /// Reason of the selection.
     pub(crate) reason: String,
     /// Renderer of pictures with its reason; the CPU if no pictures are needed.
-    pub(crate) drawer: Drawer,
+    pub(crate) renderer: SelectedRenderer,
     /// All discovered devices, used or not.
     #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) devices: Vec<FoundDevice>,
     /// Reason for not using a GPU, if none is used.
     #[cfg_attr(not(feature = "server"), expect(dead_code, reason = "the banner and `doctor` read it"))]
     pub(crate) no_gpu: Option<String>,
-}
-
-/// Purpose of a backend.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) enum Use {
-    /// One mesh.
-    Once,
-    /// One mesh and its picture.
-    Picture,
-    /// A service.
-    #[cfg(feature = "server")]
-    Service(DevicesConfig),
 }
 
 /// Rejects flags that contradict each other.
@@ -90,20 +100,20 @@ pub(crate) fn check(requested: &BackendRequest<'_>) -> Result<(), CliError> {
 /// # Errors
 /// Returns [`CliError::Usage`] if flags contradict each other, and [`CliError::NoBackend`] with the reason if the
 /// requested backend is not available.
-pub(crate) fn pick(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBackend, CliError> {
+pub(crate) fn select(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliError> {
     check(requested)?;
-    let without_gpu = |backend: Box<dyn Backend>| SelectedBackend {
+    let backend: Box<dyn Backend> = match requested.backend {
+        BackendName::Cpu => cpu(requested)?,
+        BackendName::Reference => Box::new(ReferenceBackend),
+        BackendName::Auto | BackendName::Gpu => return gpu_or_cpu(requested),
+    };
+    Ok(SelectedBackend {
         backend,
         reason: "requested".to_owned(),
-        drawer: Drawer::cpu("a backend other than the GPU was requested"),
+        renderer: SelectedRenderer::cpu("a backend other than the GPU was requested"),
         devices: Vec::new(),
         no_gpu: Some("no discovery: another backend was requested".to_owned()),
-    };
-    match requested.backend {
-        BackendName::Cpu => Ok(without_gpu(cpu(requested, use_)?)),
-        BackendName::Reference => Ok(without_gpu(Box::new(ReferenceBackend))),
-        BackendName::Auto | BackendName::Gpu => gpu_or_cpu(requested, use_),
-    }
+    })
 }
 
 /// Returns the estimate for a command if both backend and devices are `auto`.
@@ -113,105 +123,94 @@ fn estimate(requested: &BackendRequest<'_>) -> Option<Estimate> {
 }
 
 /// Selects a GPU, or the CPU if the request allows any backend.
-fn gpu_or_cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<SelectedBackend, CliError> {
+fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliError> {
     let estimate = estimate(requested);
     if let Some(estimate) = estimate.filter(|estimate| !estimate.favours_gpu()) {
         let why = format!("no GPU discovery ({estimate})");
-        let reason = format!("auto: {why}");
-        let drawer = Drawer::cpu(&reason);
-        return Ok(SelectedBackend {
-            backend: cpu(requested, use_)?,
-            reason,
-            drawer,
-            devices: Vec::new(),
-            no_gpu: Some(why),
-        });
+        return instead_of_gpu(requested, format!("auto: {why}"), NoGpu { why, devices: Vec::new() });
     }
-    let Gpu { backend, drawer, devices, mut state } = gpu(requested, use_);
-    if let (Some(backend), Some(drawer), Ok(reason)) = (backend, drawer, &state) {
-        let reason = match (requested.backend, requested.devices) {
-            (_, DeviceChoice::These(_)) => format!("--devices {}", requested.devices),
-            (BackendName::Auto, _) => match estimate {
-                Some(estimate) => format!("auto: {reason}, {estimate}"),
-                None => format!("auto: {reason}"),
-            },
-            _ => "requested".to_owned(),
-        };
-        return Ok(SelectedBackend { backend, reason, drawer, devices, no_gpu: None });
+    let auto = requested.backend == BackendName::Auto;
+    let these = matches!(requested.devices, DeviceChoice::Listed(_));
+    match gpu(requested) {
+        Ok(mut selected) => {
+            let estimate = estimate.map(|estimate| format!(", {estimate}")).unwrap_or_default();
+            selected.reason = match auto {
+                _ if these => format!("--devices {}", requested.devices),
+                true => format!("auto: {}{estimate}", selected.reason),
+                false => "requested".to_owned(),
+            };
+            Ok(selected)
+        }
+        // A request for a specific device fails instead of falling back to the CPU.
+        Err(NoGpu { why, .. }) if !auto || these => {
+            Err(CliError::NoBackend { requested: "gpu", why: format!("no GPU can be used: {why}") })
+        }
+        Err(none) => {
+            let reason = match requested.devices {
+                DeviceChoice::Cpu => "--devices cpu".to_owned(),
+                _ => format!("auto: no GPU: {}", none.why),
+            };
+            instead_of_gpu(requested, reason, none)
+        }
     }
-    let why = state.as_mut().err().map(std::mem::take).unwrap_or_default();
-    // A request for a specific device fails instead of falling back to the CPU.
-    if requested.backend != BackendName::Auto || matches!(requested.devices, DeviceChoice::These(_)) {
-        return Err(CliError::NoBackend { requested: "gpu", why: format!("no GPU can be used: {why}") });
-    }
-    let reason = match requested.devices {
-        DeviceChoice::Cpu => "--devices cpu".to_owned(),
-        _ => format!("auto: no GPU: {why}"),
-    };
-    let drawer = Drawer::cpu(&reason);
-    Ok(SelectedBackend { backend: cpu(requested, use_)?, reason, drawer, devices, no_gpu: Some(why) })
 }
 
-fn cpu(requested: &BackendRequest<'_>, use_: &Use) -> Result<Box<dyn Backend>, CliError> {
-    let backend = match use_ {
-        Use::Once | Use::Picture => CpuBackend::new(Some(requested.n_threads())),
-        #[cfg(feature = "server")]
-        Use::Service(_) => CpuBackend::new(requested.threads),
-    };
-    let backend = backend.map_err(|why| CliError::NoBackend { requested: "cpu", why })?;
+fn instead_of_gpu(requested: &BackendRequest<'_>, reason: String, none: NoGpu) -> Result<SelectedBackend, CliError> {
+    let renderer = SelectedRenderer::cpu(&reason);
+    Ok(SelectedBackend { backend: cpu(requested)?, reason, renderer, devices: none.devices, no_gpu: Some(none.why) })
+}
+
+fn cpu(requested: &BackendRequest<'_>) -> Result<Box<dyn Backend>, CliError> {
+    let threads = if requested.is_command() { Some(requested.n_threads()) } else { requested.threads };
+    let backend = CpuBackend::new(threads).map_err(|why| CliError::NoBackend { requested: "cpu", why })?;
     Ok(Box::new(backend))
 }
 
-/// Result of GPU discovery.
-struct Gpu {
-    backend: Option<Box<dyn Backend>>,
-    drawer: Option<Drawer>,
+/// Reason for not using a GPU, with the discovered devices.
+struct NoGpu {
+    why: String,
     devices: Vec<FoundDevice>,
-    /// Reason of the selection, or reason for not using a GPU.
-    state: Result<String, String>,
 }
 
 #[cfg(not(feature = "gpu"))]
-fn gpu(_asked: &BackendRequest<'_>, _use: &Use) -> Gpu {
-    Gpu { backend: None, drawer: None, devices: Vec::new(), state: Err("this build has no GPU support".to_owned()) }
+fn gpu(_requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
+    Err(NoGpu { why: "this build has no GPU support".to_owned(), devices: Vec::new() })
 }
 
+/// Discovers GPUs and starts the backend and the renderer on those that may be used.
 #[cfg(feature = "gpu")]
-fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
-    use molmesh::gpu::{GpuBackend, GpuError, Look, PoolSettings, discover};
+fn gpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, NoGpu> {
+    use molmesh::gpu::{DiscoveryMode, GpuBackend, GpuError, PoolSettings, discover};
 
+    let auto = requested.backend == BackendName::Auto;
     // For a single mesh, skip drivers without a device, unless a GPU was requested.
-    let once = matches!(use_, Use::Once | Use::Picture);
-    let look = if once && requested.backend == BackendName::Auto { Look::Quick } else { Look::Thorough };
-    let discovery = discover(requested.devices, look);
-    let none = |devices, why| Gpu { backend: None, drawer: None, devices, state: Err(why) };
+    let mode = if requested.is_command() && auto { DiscoveryMode::Quick } else { DiscoveryMode::Thorough };
+    let discovery = discover(requested.devices, mode);
     let missing = discovery.missing(requested.devices);
     if !missing.is_empty() {
-        let there = discovery.why_none().map(|why| format!(" ({why})")).unwrap_or_default();
-        return none(discovery.devices, format!("{}{there}", missing.join(", ")));
+        let there = discovery.no_device_reason().map(|why| format!(" ({why})")).unwrap_or_default();
+        return Err(NoGpu { why: format!("{}{there}", missing.join(", ")), devices: discovery.devices });
     }
-    if let Some(why) = discovery.why_none() {
-        return none(discovery.devices, why);
+    if let Some(why) = discovery.no_device_reason() {
+        return Err(NoGpu { why, devices: discovery.devices });
     }
-    let settings = match use_ {
-        Use::Once | Use::Picture => PoolSettings::default(),
+    let settings = match &requested.purpose {
         #[cfg(feature = "server")]
-        Use::Service(config) => PoolSettings {
+        Purpose::Service(config) => PoolSettings {
             queue: config.jobs,
             batch: config.batch,
             min_partition_bricks: config.min_partition_bricks,
             ..PoolSettings::default()
         },
+        _ => PoolSettings::default(),
     };
     // A request for the GPU has no fallback.
-    let fallback = match requested.backend {
-        BackendName::Auto => CpuBackend::new(requested.threads).ok().map(|cpu| Box::new(cpu) as Box<dyn Backend>),
-        _ => None,
-    };
+    let fallback = if auto { CpuBackend::new(requested.threads).ok() } else { None };
+    let fallback = fallback.map(|cpu| Box::new(cpu) as Box<dyn Backend>);
     let started = GpuBackend::start(&discovery, &settings, fallback);
-    let drawer = match drawer(requested, use_, &discovery) {
-        Ok(drawer) => drawer,
-        Err(why) => return none(discovery.devices, why),
+    let renderer = match renderer(requested, &discovery) {
+        Ok(renderer) => renderer,
+        Err(why) => return Err(NoGpu { why, devices: discovery.devices }),
     };
     let mut devices = discovery.devices;
     match started {
@@ -219,44 +218,44 @@ fn gpu(requested: &BackendRequest<'_>, use_: &Use) -> Gpu {
             for status in backend.devices() {
                 let found = devices.iter_mut().find(|found| found.number == status.number);
                 if let (Some(found), Some(why)) = (found, status.down) {
-                    (found.taken, found.reason) = (false, why);
+                    (found.selected, found.reason) = (false, why);
                 }
             }
-            let up: Vec<&str> = devices.iter().filter(|d| d.taken).map(|d| d.reason.as_str()).collect();
+            let up: Vec<&str> = devices.iter().filter(|d| d.selected).map(|d| d.reason.as_str()).collect();
             let reason = match up[..] {
                 [one] => format!("a GPU ({one})"),
                 _ => format!("{} GPUs", up.len()),
             };
-            Gpu { backend: Some(Box::new(backend)), drawer: Some(drawer), devices, state: Ok(reason) }
+            Ok(SelectedBackend { backend: Box::new(backend), reason, renderer, devices, no_gpu: None })
         }
         Err(error) => {
             let why = match error {
                 GpuError::NoDevice(why) => why,
                 error => error.to_string(),
             };
-            for device in devices.iter_mut().filter(|device| device.taken) {
-                (device.taken, device.reason) = (false, format!("the pipelines could not be built: {why}"));
+            for device in devices.iter_mut().filter(|device| device.selected) {
+                (device.selected, device.reason) = (false, format!("the pipelines could not be built: {why}"));
             }
-            none(devices, why)
+            Err(NoGpu { why, devices })
         }
     }
 }
 
 /// Starts the renderer on the GPUs that make the meshes. With `--backend auto`, falls back to the CPU with the reason.
 #[cfg(feature = "gpu")]
-fn drawer(requested: &BackendRequest<'_>, use_: &Use, discovery: &molmesh::gpu::Discovery) -> Result<Drawer, String> {
+fn renderer(requested: &BackendRequest<'_>, discovery: &molmesh::gpu::Discovery) -> Result<SelectedRenderer, String> {
     use molmesh::gpu::GpuRenderer;
 
-    if *use_ == Use::Once {
-        return Ok(Drawer::cpu("no pictures were requested"));
+    if matches!(requested.purpose, Purpose::Mesh) {
+        return Ok(SelectedRenderer::cpu("no pictures were requested"));
     }
     let auto = requested.backend == BackendName::Auto;
-    match GpuRenderer::start(discovery, auto.then(CpuRenderer::default)) {
+    match GpuRenderer::start(discovery, auto.then_some(CpuRenderer)) {
         Ok(renderer) => {
             let reason = "the device that makes the meshes".to_owned();
-            Ok(Drawer { renderer: Arc::new(renderer), reason })
+            Ok(SelectedRenderer { renderer: Arc::new(renderer), reason })
         }
-        Err(error) if auto => Ok(Drawer::cpu(&format!("the GPU cannot render: {error}"))),
+        Err(error) if auto => Ok(SelectedRenderer::cpu(&format!("the GPU cannot render: {error}"))),
         Err(error) => Err(format!("it cannot render: {error}")),
     }
 }

@@ -58,18 +58,12 @@ const DOCTOR: &str = if cfg!(feature = "server") { "; `molmesh doctor` lists the
 pub(crate) enum CliError {
     /// The flags are invalid or contradict each other.
     #[error("{message}")]
-    Usage {
-        /// Description of the error.
-        message: String,
-        /// Suggestion.
-        hint: Option<String>,
-    },
+    Usage { message: String, hint: Option<String> },
     /// The input cannot be read.
     #[error("cannot read {name}: {}", reason(source))]
     Input {
         /// Path, or `stdin`.
         name: String,
-        /// Error of the system.
         source: io::Error,
     },
     /// The input has more bytes than allowed.
@@ -77,46 +71,30 @@ pub(crate) enum CliError {
     InputTooLarge {
         /// Path, or `stdin`.
         name: String,
-        /// Bytes allowed.
         limit: u64,
     },
     /// Reading, selecting or meshing failed.
     #[error("{name}: {source}")]
     Job {
-        /// The input.
         name: String,
-        /// Cause.
         source: JobError,
         /// Worst finding of the strict validator in the same file.
         strict_finding: Option<String>,
     },
     /// The requested strict check found errors.
     #[error("{name}: the strict check found {errors} errors")]
-    Strict {
-        /// The input.
-        name: String,
-        /// Number of errors.
-        errors: usize,
-        /// First error.
-        first: String,
-    },
+    Strict { name: String, errors: usize, first: String },
     /// The format cannot hold the mesh, or the mesh is broken.
     #[error(transparent)]
     Format(#[from] FormatError),
     /// The requested backend is not available.
     #[error("no backend `{requested}` on this machine: {why}")]
-    NoBackend {
-        /// Requested backend.
-        requested: &'static str,
-        /// Reason.
-        why: String,
-    },
+    NoBackend { requested: &'static str, why: String },
     /// The output cannot be written.
     #[error("cannot write {name}: {}", reason(source))]
     Output {
         /// Path, or `stdout`.
         name: String,
-        /// Error of the system.
         source: io::Error,
     },
     /// Interrupted by a signal.
@@ -258,16 +236,7 @@ fn format_code(error: &FormatError) -> i32 {
         | FormatError::AtomIndexTooLarge { .. }
         | FormatError::CoordinateTooLarge { .. } => code::LIMIT,
         // A broken mesh is a defect of the program.
-        FormatError::ColumnLength { .. }
-        | FormatError::IndexOutOfRange { .. }
-        | FormatError::NotFinite { .. }
-        | FormatError::NotUnit { .. }
-        | FormatError::BeyondStep { .. }
-        | FormatError::NotQuantized { .. }
-        | FormatError::NotInUnits { .. }
-        | FormatError::NotAMesh { .. }
-        | FormatError::OtherPacking { .. }
-        | FormatError::Json { .. } => code::INTERNAL,
+        _ => code::INTERNAL,
     }
 }
 

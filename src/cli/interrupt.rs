@@ -79,22 +79,8 @@ pub(crate) fn watch(token: &CancelToken) -> Result<(), CliError> {
             drop(grace);
         }
     };
-    let start = move || {
-        let thread = std::thread::Builder::new().name("interrupt".to_owned()).spawn(watch);
-        thread.map(drop).map_err(|e| unwatched(&e))
-    };
-    if rayon::current_thread_index().is_none() || rayon::current_num_threads() < 2 {
-        return start();
-    }
-    // Starting a thread takes as long as reading a small structure, so an idle thread of the pool does it.
-    rayon::spawn(move || {
-        if let Err(error) = start() {
-            discard();
-            error.print(Style::stderr());
-            super::leave(error.code())
-        }
-    });
-    Ok(())
+    let thread = std::thread::Builder::new().name("interrupt".to_owned()).spawn(watch);
+    thread.map(drop).map_err(|e| unwatched(&e))
 }
 
 /// Returns the error for signals that cannot be watched.

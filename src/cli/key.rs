@@ -4,7 +4,7 @@ use std::io::{self, Write as _};
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use molmesh::access::{self, Key, Quota, Scope};
+use molmesh::access::{self, Hash, Key, Quota, Scope};
 
 use super::args::{KeyCommand, NewKeyArgs, SigningKeyArgs};
 use super::error::CliError;
@@ -34,12 +34,18 @@ fn new(args: &NewKeyArgs) -> Result<(), CliError> {
         concurrent: args.concurrent,
         window_s: seconds("window", &args.window)?,
     };
-    let minted = access::mint(id).map_err(|error| CliError::Internal(error.to_string()))?;
+    let key_text = access::new_key(id).map_err(|error| CliError::Internal(error.to_string()))?;
     let expires = args.expires.as_deref().map(end).transpose()?;
-    let key =
-        Key { id: id.to_owned(), hash: minted.hash, scopes, quota: Arc::new(quota), expires, note: args.note.clone() };
-    super::print(&access::entry(&key))?;
-    let text = format!("\nThe key (shown only once):\n{}\n", minted.text);
+    let key = Key {
+        id: id.to_owned(),
+        hash: Hash::of(&key_text),
+        scopes,
+        quota: Arc::new(quota),
+        expires,
+        note: args.note.clone(),
+    };
+    super::print(&access::format_key(&key))?;
+    let text = format!("\nThe key (shown only once):\n{key_text}\n");
     io::stderr().write_all(text.as_bytes()).map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
 }
 

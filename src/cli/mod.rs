@@ -15,6 +15,7 @@ mod estimate;
 #[cfg(feature = "server")]
 mod healthcheck;
 mod interrupt;
+mod job;
 #[cfg(feature = "server")]
 mod key;
 mod mesh;

@@ -1,10 +1,11 @@
 //! Output of a command: stdout, or a file that gets its name only when it is complete.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Seek, SeekFrom, Write};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use molmesh::formats::RandomAccess;
 use molmesh::surface::CancelToken;
 
 use super::error::CliError;
@@ -13,7 +14,8 @@ use super::interrupt;
 /// Open output. Dropping it without [`Output::finish`] removes the file.
 pub(crate) struct Output {
     to: To,
-    name: String,
+    /// Path, or `stdout`.
+    pub(crate) name: String,
     cancel: CancelToken,
     /// Bytes written so far.
     pub(crate) bytes: u64,
@@ -43,9 +45,9 @@ impl Output {
         }
     }
 
-    /// Returns true if the output supports seeking: it is a file, not a stream.
-    pub(crate) fn is_file(&self) -> bool {
-        matches!(self.to, To::Staged { .. })
+    /// Returns true if the output is a file that can be written in any order.
+    pub(crate) fn has_random_access(&self) -> bool {
+        cfg!(unix) && matches!(self.to, To::Staged { .. })
     }
 
     /// Returns true if the mesh goes to stdout.
@@ -60,6 +62,11 @@ impl Output {
             To::Stdout(_) | To::Device(_) => Ok(()),
         });
         done.map_err(|source| self.failure(source))
+    }
+
+    fn check_cancelled(&self) -> io::Result<()> {
+        // Not `Interrupted`: callers retry a write that fails with it.
+        if self.cancel.is_cancelled() { Err(io::Error::other("interrupted")) } else { Ok(()) }
     }
 
     /// Error of the command for a failed write: an interrupt, or the error itself.
@@ -80,21 +87,20 @@ impl Drop for Output {
     }
 }
 
-impl Seek for Output {
-    fn seek(&mut self, position: SeekFrom) -> io::Result<u64> {
-        match &mut self.to {
-            To::Device(file) | To::Staged { file, .. } => file.seek(position),
-            To::Stdout(_) => Err(io::ErrorKind::NotSeekable.into()),
+impl RandomAccess for Output {
+    fn write_all_at(&self, bytes: &[u8], offset: u64) -> io::Result<()> {
+        self.check_cancelled()?;
+        match &self.to {
+            #[cfg(unix)]
+            To::Staged { file, .. } => std::os::unix::fs::FileExt::write_all_at(file, bytes, offset),
+            _ => Err(io::ErrorKind::NotSeekable.into()),
         }
     }
 }
 
 impl Write for Output {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        if self.cancel.is_cancelled() {
-            // Not `Interrupted`: callers retry a write that fails with it.
-            return Err(io::Error::other("interrupted"));
-        }
+        self.check_cancelled()?;
         let start = Instant::now();
         let written = match &mut self.to {
             To::Stdout(out) => out.write(bytes),

@@ -37,7 +37,7 @@ fn parse(own: &[(&'static str, &Option<String>)], args: &JobArgs) -> Result<Requ
 
 /// Adapts the job to the output format.
 pub(super) fn settle(job: &mut Job, format: Format) -> Result<(), CliError> {
-    params::settle(job, format).map_err(|error| refusal(&error))
+    params::set_format(job, format).map_err(|error| refusal(&error))
 }
 
 fn refusal(error: &ParamError) -> CliError {

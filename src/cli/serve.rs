@@ -32,11 +32,9 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         tracing::warn!("{warning}");
     }
     strict_validator::quiet_panics();
-    let requested =
-        BackendRequest { backend: args.backend, devices: &config.devices.choice, threads: None, work: None };
-    let picked = backend::pick(&requested, &backend::Use::Service(config.devices.clone()))?;
-    let others = survey::survey(&picked);
-    let SelectedBackend { backend, reason, drawer, devices, .. } = picked;
+    let selected = backend::select(&BackendRequest::of_service(args.backend, &config.devices))?;
+    let others = survey::backends(&selected).into_iter().chain(survey::unused_devices(&selected)).collect();
+    let SelectedBackend { backend, reason, renderer, devices, .. } = selected;
     let backend: Arc<dyn Backend> = Arc::from(backend);
     let keys = config.access.keys_file.is_some();
     let facts = Facts {
@@ -55,14 +53,15 @@ pub(super) fn run(args: &ServeArgs) -> Result<(), CliError> {
         .build()
         .map_err(failed)?;
     lower_compute_priority();
-    let server = runtime.block_on(Server::bind(config, Chosen { backend, reason, drawer, devices })).map_err(
-        |error| match error {
-            // Keys and secrets are part of the configuration.
-            ServeError::Access(error) => CliError::usage(error.to_string()),
-            ServeError::Lock(error @ LockError::Held { .. }) => CliError::InUse(error.to_string()),
-            error => CliError::Service(error.to_string()),
-        },
-    )?;
+    let server =
+        runtime.block_on(Server::bind(config, Chosen { backend, reason, renderer, devices })).map_err(|error| {
+            match error {
+                // Keys and secrets are part of the configuration.
+                ServeError::Access(error) => CliError::usage(error.to_string()),
+                ServeError::Lock(error @ LockError::Held { .. }) => CliError::InUse(error.to_string()),
+                error => CliError::Service(error.to_string()),
+            }
+        })?;
     let text = banner::text(server.addr(), server.metrics_addr(), &facts, Style::stderr());
     // A closed stderr does not stop the service.
     drop(io::stderr().write_all(text.as_bytes()));

@@ -39,7 +39,7 @@ pub(crate) fn text(report: &Report, written: &Written<'_>, findings: Option<&[St
     );
     page.row("mesh", &format!("{} vertices, {} triangles", grouped(report.vertices), grouped(report.triangles)));
     if let Some(quantization) = report.quantization {
-        page.row("vertices", &format!("quantised in steps of {} Å", quantization.step));
+        page.row("vertices", &format!("quantized in steps of {} Å", quantization.step));
     }
     if let Some(picture) = &report.picture {
         page.row("picture", &drawn(picture));
@@ -163,15 +163,7 @@ fn bar(fraction: f64) -> String {
 
 /// Formats `1234567` as `1,234,567`.
 fn grouped(n: u64) -> String {
-    let digits = n.to_string();
-    let mut out = String::with_capacity(digits.len() + digits.len() / 3);
-    for (i, digit) in digits.chars().enumerate() {
-        if i > 0 && (digits.len() - i).is_multiple_of(3) {
-            out.push(',');
-        }
-        out.push(digit);
-    }
-    out
+    indicatif::HumanCount(n).to_string()
 }
 
 /// Formats a number with one decimal from 100, two from 1 and three below 1.

@@ -14,31 +14,29 @@ pub(crate) struct Availability {
     pub(crate) state: Result<String, String>,
 }
 
-impl Availability {
-    /// Returns true for a device of a backend.
-    pub(crate) fn is_device(&self) -> bool {
-        self.name.contains(' ')
-    }
-}
-
 /// Formats a backend's name and hardware.
 pub(crate) fn describe(backend: &dyn Backend) -> String {
     format!("{}: {}", backend.name(), backend.describe())
 }
 
-/// Returns all backends and the unused devices, with their states.
-pub(crate) fn survey(picked: &SelectedBackend) -> Vec<Availability> {
-    let candidate = |name: &str, state| Availability { name: name.to_owned(), state };
-    let gpu = picked.no_gpu.clone().map_or_else(|| Ok(picked.backend.describe()), Err);
-    let mut survey = vec![
-        candidate("cpu", CpuBackend::new(None).map(|cpu| cpu.describe())),
-        candidate("reference", Ok(ReferenceBackend.describe())),
-    ];
-    // The reasons of the devices follow, one per line.
-    let gpu = gpu.map_err(|why| if picked.devices.is_empty() { why } else { "no device is used".to_owned() });
-    survey.push(candidate("gpu", gpu));
-    let left = picked.devices.iter().filter(|device| !device.taken);
-    survey
-        .extend(left.map(|d| candidate(&format!("gpu {}", d.number), Err(format!("{}: {}", d.facts.name, d.reason)))));
-    survey
+/// Returns all backends with their states.
+pub(crate) fn backends(selected: &SelectedBackend) -> Vec<Availability> {
+    let gpu = match &selected.no_gpu {
+        None => Ok(selected.backend.describe()),
+        Some(why) if selected.devices.is_empty() => Err(why.clone()),
+        // The devices have their own reasons.
+        Some(_) => Err("no device is used".to_owned()),
+    };
+    let cpu = CpuBackend::new(None).map(|cpu| cpu.describe());
+    [("cpu", cpu), ("reference", Ok(ReferenceBackend.describe())), ("gpu", gpu)]
+        .map(|(name, state)| Availability { name: name.to_owned(), state })
+        .into()
+}
+
+/// Returns the unused devices with the reasons.
+pub(crate) fn unused_devices(selected: &SelectedBackend) -> impl Iterator<Item = Availability> {
+    selected.devices.iter().filter(|device| !device.selected).map(|device| Availability {
+        name: format!("gpu {}", device.number),
+        state: Err(format!("{}: {}", device.facts.name, device.reason)),
+    })
 }

@@ -1,16 +1,15 @@
 //! Configuration of access: keys, quotas, signed URLs and cross-origin requests.
 
-use std::borrow::Cow;
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
 use reqwest::Url;
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
 
-use super::Secret;
+use super::{Secret, list};
 
 /// Keys, quotas, signed URLs and headers for browsers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -39,9 +38,11 @@ pub struct AccessConfig {
     pub window_s: u64,
     /// Number of addresses with a separate quota. Default 10,000, about 2 MB. Further addresses share one quota,
     /// because forgetting an address would give it a new one.
-    pub clients: usize,
+    pub max_addresses: usize,
     /// Origins whose pages may read responses: `*`, or a list such as `https://viewer.example`. Default `*`: the
     /// service uses no cookies, and only a page that has a key can send it. `none`: only pages of this server.
+    #[serde(with = "list")]
+    #[schemars(schema_with = "Origins::schema")]
     pub cors_origins: Option<Origins>,
     /// Allows pages of these origins to send credentials, such as the cookies of a proxy. Default false. Excludes `*`.
     pub cors_credentials: bool,
@@ -61,7 +62,7 @@ impl Default for AccessConfig {
             address_work_s: None,
             address_concurrent: None,
             window_s: 60,
-            clients: 10_000,
+            max_addresses: 10_000,
             cors_origins: Some(Origins::Any),
             cors_credentials: false,
             hsts_s: None,
@@ -88,6 +89,12 @@ pub enum Origins {
     Any,
     /// These origins, at least one, each in the form of the `Origin` header.
     These(Vec<String>),
+}
+
+impl Origins {
+    fn schema(_: &mut SchemaGenerator) -> Schema {
+        list::schema(r"(\*|https?://\S+)")
+    }
 }
 
 impl FromStr for Origins {
@@ -121,35 +128,6 @@ impl fmt::Display for Origins {
             Self::Any => f.write_str("*"),
             Self::These(origins) => f.write_str(&origins.join(" ")),
         }
-    }
-}
-
-impl Serialize for Origins {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
-}
-
-impl JsonSchema for Origins {
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn schema_name() -> Cow<'static, str> {
-        "Origins".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({ "anyOf": [
-            { "type": "string", "pattern": r"^\s*(\*|https?://\S+(\s+https?://\S+)*)\s*$" },
-            { "type": "array", "minItems": 1, "items": { "type": "string", "pattern": r"^(\*|https?://\S+)$" } },
-        ] })
-    }
-}
-
-impl<'de> Deserialize<'de> for Origins {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        super::joined(deserializer)?.parse().map_err(serde::de::Error::custom)
     }
 }
 

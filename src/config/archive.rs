@@ -1,12 +1,12 @@
 //! Configuration of the structure archive: a local folder, and a remote archive for entries that it lacks.
 
 use std::path::PathBuf;
-use std::time::Duration;
 
+use reqwest::Url;
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 
-use super::{ProxyUrl, Templates};
+use super::{Templates, list};
 
 /// Local folder, remote archive and copies of its entries.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -17,14 +17,18 @@ pub struct ArchiveConfig {
     pub dir: Option<PathBuf>,
     /// Time between checks of a local file for changes, ms. Default 1,000: a check costs a dozen system calls, and
     /// entries change rarely.
-    pub check_ms: u64,
+    pub local_check_interval_ms: u64,
     /// URL templates of an entry, tried in order until one has it; `none` disables the remote archive. Default:
     /// compressed mmCIF from RCSB's download service, the smallest complete format.
+    #[serde(with = "list")]
+    #[schemars(schema_with = "Templates::schema")]
     pub url: Option<Templates>,
     /// Proxy for all requests to the remote archive. Default `none`. Environment variables such as `HTTPS_PROXY` are
     /// ignored, because the check for private addresses does not apply behind a proxy: a proxy is set here deliberately
     /// or not at all.
-    pub proxy: Option<ProxyUrl>,
+    #[serde(deserialize_with = "proxy")]
+    #[schemars(regex(pattern = "^(none|https?://.+)$"))]
+    pub proxy: Option<String>,
     /// Allows host names that resolve to private, loopback and link-local addresses. Default false: DNS records of
     /// others must not lead to the operator's machines. IP addresses in `url` are always allowed.
     pub allow_private: bool,
@@ -51,9 +55,9 @@ pub struct ArchiveConfig {
     pub concurrent: usize,
     /// Time for which a copy is used without revalidation, ms. Default 86,400,000, a day: entries are released and
     /// revised weekly.
-    pub fresh_ms: u64,
+    pub revalidate_after_ms: u64,
     /// Time for which a missing entry is not requested again, ms. Default 60,000.
-    pub absent_ms: u64,
+    pub retry_missing_after_ms: u64,
     /// Size of the copies on disk, bytes; the least recently used ones are evicted. Default 4 GiB: ten thousand typical
     /// entries.
     pub cache_bytes: u64,
@@ -67,7 +71,7 @@ impl Default for ArchiveConfig {
     fn default() -> Self {
         Self {
             dir: None,
-            check_ms: 1000,
+            local_check_interval_ms: 1000,
             url: Some(Templates::default()),
             proxy: None,
             allow_private: false,
@@ -79,8 +83,8 @@ impl Default for ArchiveConfig {
             retry_after_ms: 5000,
             max_bytes: 256 << 20,
             concurrent: 8,
-            fresh_ms: 86_400_000,
-            absent_ms: 60_000,
+            revalidate_after_ms: 86_400_000,
+            retry_missing_after_ms: 60_000,
             cache_bytes: 4 << 30,
             breaker_failures: 5,
             breaker_ms: 30_000,
@@ -88,58 +92,13 @@ impl Default for ArchiveConfig {
     }
 }
 
-impl ArchiveConfig {
-    /// Returns the time between checks of a local file.
-    #[must_use]
-    pub fn check(&self) -> Duration {
-        Duration::from_millis(self.check_ms)
-    }
-
-    /// Returns the time for a connection.
-    #[must_use]
-    pub fn connect_timeout(&self) -> Duration {
-        Duration::from_millis(self.connect_timeout_ms)
-    }
-
-    /// Returns the time for the head of a response, and the longest pause within its body.
-    #[must_use]
-    pub fn first_byte_timeout(&self) -> Duration {
-        Duration::from_millis(self.first_byte_timeout_ms)
-    }
-
-    /// Returns the total time for an entry.
-    #[must_use]
-    pub fn timeout(&self) -> Duration {
-        Duration::from_millis(self.timeout_ms)
-    }
-
-    /// Returns the longest pause before the second attempt.
-    #[must_use]
-    pub fn backoff(&self) -> Duration {
-        Duration::from_millis(self.backoff_ms)
-    }
-
-    /// Returns the longest `Retry-After` that a fetch waits for.
-    #[must_use]
-    pub fn retry_after(&self) -> Duration {
-        Duration::from_millis(self.retry_after_ms)
-    }
-
-    /// Returns the time for which a copy is used without revalidation.
-    #[must_use]
-    pub fn fresh(&self) -> Duration {
-        Duration::from_millis(self.fresh_ms)
-    }
-
-    /// Returns the time for which a missing entry is not requested again.
-    #[must_use]
-    pub fn absent(&self) -> Duration {
-        Duration::from_millis(self.absent_ms)
-    }
-
-    /// Returns the length of the pause after repeated failures.
-    #[must_use]
-    pub fn breaker(&self) -> Duration {
-        Duration::from_millis(self.breaker_ms)
+/// Deserializes the URL of a proxy.
+fn proxy<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
+    let proxy: Option<String> = Option::deserialize(deserializer)?;
+    let is_valid = |url: Url| ["http", "https"].contains(&url.scheme()) && url.has_host();
+    if proxy.as_ref().is_none_or(|text| text.parse().is_ok_and(is_valid)) {
+        Ok(proxy)
+    } else {
+        Err(serde::de::Error::custom("none, or http(s)://host:port"))
     }
 }

@@ -1,7 +1,5 @@
 //! Settings of the worker pool: concurrency, queue and time limits.
 
-use std::time::Duration;
-
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -32,7 +30,7 @@ pub struct JobsConfig {
     pub attempts: u32,
     /// Time for which an asynchronous job retries to store its mesh, ms. Default 60,000: longer than a restart of the
     /// store takes. After that the mesh is computed again, for at most `attempts` attempts.
-    pub store_patience_ms: u64,
+    pub save_retry_ms: u64,
     /// Number of results of synchronous requests that are stored concurrently. Default 4: more would compete with
     /// meshing; a result that is not stored is computed again for the next request.
     pub concurrent_saves: usize,
@@ -48,34 +46,8 @@ impl Default for JobsConfig {
             batch_deadline_ms: 3_600_000,
             batch_max_delay_ms: 10_000,
             attempts: 3,
-            store_patience_ms: 60_000,
+            save_retry_ms: 60_000,
             concurrent_saves: 4,
         }
-    }
-}
-
-impl JobsConfig {
-    /// Time from acceptance to the result of an asynchronous job.
-    #[must_use]
-    pub fn batch_deadline(&self) -> Duration {
-        Duration::from_millis(self.batch_deadline_ms)
-    }
-
-    /// Time for which an asynchronous job retries to store its mesh.
-    #[must_use]
-    pub fn store_patience(&self) -> Duration {
-        Duration::from_millis(self.store_patience_ms)
-    }
-
-    /// Maximum time that an asynchronous job yields to interactive requests.
-    #[must_use]
-    pub fn batch_max_delay(&self) -> Duration {
-        Duration::from_millis(self.batch_max_delay_ms)
-    }
-
-    /// Time from acceptance to the finished mesh.
-    #[must_use]
-    pub fn deadline(&self) -> Duration {
-        Duration::from_millis(self.deadline_ms)
     }
 }

@@ -32,9 +32,9 @@ pub struct LimitsConfig {
     pub labels: u64,
     /// Number of grid points in occupied bricks. Default 1,073,741,824: two million atoms at 0.5 Å; 4 GiB as 32-bit
     /// numbers.
-    pub grid_samples: u64,
+    pub grid_points: u64,
     /// Number of pairs of an atom and a brick (8³ grid points) that its support reaches. Default 268,435,456: 128 atoms
-    /// per brick of `grid_samples`, several times the number in ordinary structures. Limits the computing time to about
+    /// per brick of `grid_points`, several times the number in ordinary structures. Limits the computing time to about
     /// 16 s of one core, and the memory of candidate lists, 4 to 12 bytes a pair. At most 2,147,483,648.
     pub candidate_pairs: u64,
     /// Size of a mesh in memory (24 bytes a vertex, 12 a triangle), bytes. Default 2 GiB: 85 million triangles.
@@ -61,7 +61,7 @@ impl Default for LimitsConfig {
             inflated_bytes: 2 << 30,
             atoms: 10_000_000,
             labels: 1_000_000,
-            grid_samples: 1 << 30,
+            grid_points: 1 << 30,
             candidate_pairs: 1 << 28,
             mesh_bytes: 2 << 30,
             output_bytes: 3 << 30,
@@ -78,7 +78,7 @@ impl LimitsConfig {
         JobLimits {
             read: ReadLimits { max_inflated_bytes: self.inflated_bytes, max_atoms: self.atoms },
             surface: SurfaceLimits {
-                max_samples: self.grid_samples,
+                max_samples: self.grid_points,
                 max_mesh_bytes: self.mesh_bytes,
                 max_candidates: self.candidate_pairs,
             },

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use serde::Serialize;
 use serde_json::Value;
 
 use super::secrets;
@@ -15,15 +16,23 @@ use crate::pipeline::nearest::nearest;
 const PREFIX: &str = "MOLMESH__";
 
 /// Layer that set a value.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[serde(tag = "source", rename_all = "lowercase")]
 pub enum Source {
     /// No layer set the value.
     Default,
     /// TOML file.
-    File(PathBuf),
+    File {
+        /// Path of the file.
+        path: PathBuf,
+    },
     /// Environment variable.
-    Environment(String),
+    Environment {
+        /// Name of the variable.
+        variable: String,
+    },
     /// Flag of the command line.
+    #[serde(rename = "command line")]
     Flag,
 }
 
@@ -31,8 +40,8 @@ impl fmt::Display for Source {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Default => f.write_str("default"),
-            Self::File(path) => write!(f, "{}", path.display()),
-            Self::Environment(name) => f.write_str(name),
+            Self::File { path } => write!(f, "{}", path.display()),
+            Self::Environment { variable } => f.write_str(variable),
             Self::Flag => f.write_str("command line"),
         }
     }
@@ -67,7 +76,7 @@ impl Loaded {
 /// Returns the errors of [`load`].
 pub fn load_process(file: Option<&Path>, flags: &[(String, String)]) -> Result<Loaded, ConfigError> {
     let env = std::env::vars_os().filter_map(|(k, v)| Some((k.into_string().ok()?, v.to_string_lossy().into_owned())));
-    load_with_sources(file, env, flags)
+    load(file, env, flags)
 }
 
 /// Loads a configuration: defaults, then `file`, then the variables of `env` that begin with `MOLMESH__`, then
@@ -82,25 +91,13 @@ pub fn load(
     file: Option<&Path>,
     env: impl IntoIterator<Item = (String, String)>,
     flags: &[(String, String)],
-) -> Result<Config, ConfigError> {
-    load_with_sources(file, env, flags).map(|loaded| loaded.config)
-}
-
-/// Loads a configuration as [`load`] does, and returns it with the source of every value.
-///
-/// # Errors
-/// Returns the errors of [`load`].
-pub fn load_with_sources(
-    file: Option<&Path>,
-    env: impl IntoIterator<Item = (String, String)>,
-    flags: &[(String, String)],
 ) -> Result<Loaded, ConfigError> {
     let mut tree = Tree::new();
     if let Some(path) = file {
         let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Read { path: path.to_owned(), error })?;
         let table: Value = toml::from_str(&text)
             .map_err(|e| ConfigError::Syntax { path: path.to_owned(), reason: e.to_string().trim().to_owned() })?;
-        let source = Source::File(path.to_owned());
+        let source = Source::File { path: path.to_owned() };
         for (section, entries) in table.as_object().into_iter().flatten() {
             let Some(entries) = entries.as_object() else {
                 return Err(tree.unknown(section, source));
@@ -114,7 +111,7 @@ pub fn load_with_sources(
     env.sort();
     for (name, value) in env {
         let key = name[PREFIX.len()..].to_ascii_lowercase().replace("__", ".");
-        tree.set(&key, &Value::String(value), &Source::Environment(name))?;
+        tree.set(&key, &Value::String(value), &Source::Environment { variable: name })?;
     }
     for (key, value) in flags {
         tree.set(key, &Value::String(value.clone()), &Source::Flag)?;
@@ -199,7 +196,8 @@ impl Tree {
         for key in secrets::SECRETS {
             let file_key = secrets::file_key(key);
             let at = |key: &str| format!("/{}", key.replace('.', "/"));
-            let Some(path) = secrets::path_of(self.values.pointer(&at(&file_key))) else { continue };
+            let path = self.values.pointer(&at(&file_key)).and_then(Value::as_str);
+            let Some(path) = path.map(PathBuf::from) else { continue };
             let source = |key: &str| self.sources.get(key).cloned().unwrap_or(Source::Default);
             if self.values.pointer(&at(key)).is_some_and(|value| !value.is_null()) {
                 let [one, other] = [key, &file_key].map(|key| (key.to_owned(), source(key)));
@@ -220,7 +218,7 @@ impl Tree {
                 key: key.to_owned(),
                 value: HIDDEN.to_owned(),
                 expected: e.to_string(),
-                source_layer: Source::File(path),
+                source_layer: Source::File { path },
             })?;
         }
         Ok(warnings)

@@ -9,6 +9,7 @@ mod devices;
 mod error;
 mod jobs;
 mod limits;
+mod list;
 mod load;
 mod log;
 mod print;
@@ -23,7 +24,7 @@ mod template;
 use std::path::PathBuf;
 
 use schemars::JsonSchema;
-use serde::{Deserialize, Deserializer, Serialize};
+use serde::{Deserialize, Serialize};
 
 pub use access::{AccessConfig, Origins};
 pub use archive::ArchiveConfig;
@@ -31,14 +32,14 @@ pub use devices::DevicesConfig;
 pub use error::ConfigError;
 pub use jobs::JobsConfig;
 pub use limits::LimitsConfig;
-pub use load::{Loaded, Source, load, load_process, load_with_sources};
+pub use load::{Loaded, Source, load, load_process};
 pub use log::{LogConfig, LogFormat};
 pub use proxies::{ForwardedHeader, Proxies};
 pub use schema::schema;
 pub use server::ServerConfig;
 pub use store::{Secret, StoreConfig};
-pub use telemetry::{CollectorUrl, Ratio, SecretHeaders, TelemetryConfig};
-pub use template::{ProxyUrl, Template, Templates};
+pub use telemetry::{SecretHeaders, TelemetryConfig};
+pub use template::{Template, Templates};
 
 /// Complete configuration.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -72,22 +73,7 @@ impl Config {
     }
 
     /// Returns the folder of copies from the remote archive.
-    #[must_use]
-    pub fn archive_cache_dir(&self) -> PathBuf {
+    pub(crate) fn archive_cache_dir(&self) -> PathBuf {
         self.server.data_dir.join("cache").join("archive")
     }
-}
-
-/// Deserialises a string, or a list of strings joined with spaces.
-fn joined<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
-    #[derive(Deserialize)]
-    #[serde(untagged)]
-    enum StringOrList {
-        Text(String),
-        List(Vec<String>),
-    }
-    Ok(match StringOrList::deserialize(deserializer)? {
-        StringOrList::Text(text) => text,
-        StringOrList::List(texts) => texts.join(" "),
-    })
 }

@@ -5,55 +5,52 @@ use serde_json::{Map, Value, json};
 use super::load::{Loaded, Source};
 use super::secrets::{SECRETS, file_key, is_hidden};
 
-/// Printed form of a value.
-enum Shown {
-    Value(Value),
-    /// Set, but secret.
-    Hidden,
-    /// Secret read from the file that the `_file` key names.
-    FromFile,
+/// Printed key.
+struct Row {
+    key: String,
+    /// `None` for a secret.
+    value: Option<Value>,
+    /// Source of the value. For a secret from a file, source of the key that names the file.
+    source: Source,
+    /// The value is a secret from the file that the `_file` key names.
+    is_from_file: bool,
 }
-
-/// Key, printed value and source.
-type Row = (String, Shown, Source);
 
 impl Loaded {
     /// Returns the sections with their rows.
     fn rows(&self) -> Vec<(String, Vec<Row>)> {
         let tree = serde_json::to_value(&self.config).unwrap_or_default();
-        let keys = |section: &str, keys: &Map<String, Value>| {
-            let row = |(key, value): (&String, &Value)| {
-                let path = format!("{section}.{key}");
-                let source = self.source(&path);
-                (key.clone(), self.shown(&path, value), source)
-            };
-            keys.iter().map(row).collect()
+        let section = |(section, keys): (&String, &Value)| {
+            let row = |(key, value): (&String, &Value)| self.row(section, key, value);
+            Some((section.clone(), keys.as_object()?.iter().map(row).collect()))
         };
-        let sections = tree.as_object().into_iter().flatten();
-        sections.filter_map(|(name, of)| Some((name.clone(), keys(name, of.as_object()?)))).collect()
+        tree.as_object().into_iter().flatten().filter_map(section).collect()
     }
 
-    fn shown(&self, path: &str, value: &Value) -> Shown {
-        match value {
-            Value::Null => Shown::Value("none".into()),
-            // No layer set the secret itself.
-            _ if SECRETS.contains(&path) && self.source(&file_key(path)) != Source::Default => Shown::FromFile,
-            Value::String(text) if is_hidden(path, text) => Shown::Hidden,
-            other => Shown::Value(other.clone()),
-        }
+    fn row(&self, section: &str, key: &str, value: &Value) -> Row {
+        let path = format!("{section}.{key}");
+        let file_source = self.source(&file_key(&path));
+        let is_from_file = SECRETS.contains(&path.as_str()) && !value.is_null() && file_source != Source::Default;
+        let source = if is_from_file { file_source } else { self.source(&path) };
+        let value = match value {
+            Value::Null => Some("none".into()),
+            Value::String(text) if is_hidden(&path, text) => None,
+            other => Some(other.clone()),
+        };
+        Row { key: key.to_owned(), value, source, is_from_file }
     }
 
     /// Returns the effective configuration as a TOML file that loads to the same configuration, except for secrets. A
     /// comment after each value names its source.
     #[must_use]
     pub fn to_toml(&self) -> String {
-        let row = |(key, shown, source): &(String, Shown, Source)| match shown {
-            Shown::Value(value) => format!("{key} = {} # {}\n", toml(value), one_line(source)),
-            Shown::Hidden => format!("# {key} is set and not shown # {}\n", one_line(source)),
-            Shown::FromFile => format!("# {key} is set and not shown # the file that {} names\n", file_key(key)),
+        let row = |Row { key, value, source, is_from_file }: &Row| match value {
+            Some(value) => format!("{key} = {} # {}\n", toml(value), one_line(source)),
+            None if *is_from_file => format!("# {key} is set and not shown # the file that {} names\n", file_key(key)),
+            None => format!("# {key} is set and not shown # {}\n", one_line(source)),
         };
-        let section = |(section, keys): (String, Vec<_>)| {
-            let rows: String = keys.iter().map(row).collect();
+        let section = |(section, rows): (String, Vec<Row>)| {
+            let rows: String = rows.iter().map(row).collect();
             format!("[{section}]\n{rows}")
         };
         self.rows().into_iter().map(section).collect::<Vec<_>>().join("\n")
@@ -64,36 +61,23 @@ impl Loaded {
     #[must_use]
     pub fn to_json(&self) -> Value {
         let (mut config, mut sources) = (Map::new(), Map::new());
-        for (section, keys) in self.rows() {
+        for (section, rows) in self.rows() {
             let (mut values, mut from) = (Map::new(), Map::new());
-            for (key, shown, source) in keys {
-                let mut of = source.document();
-                match shown {
-                    Shown::Value(value) => drop(values.insert(key.clone(), value)),
-                    Shown::Hidden => of["hidden"] = true.into(),
-                    Shown::FromFile => {
-                        of = self.source(&file_key(&format!("{section}.{key}"))).document();
-                        (of["hidden"], of["key"]) = (true.into(), file_key(&key).into());
-                    }
+            for Row { key, value, source, is_from_file } in rows {
+                let mut of = serde_json::to_value(source).unwrap_or_default();
+                if value.is_none() {
+                    of["hidden"] = true.into();
                 }
+                if is_from_file {
+                    of["key"] = file_key(&key).into();
+                }
+                values.extend(value.map(|value| (key.clone(), value)));
                 from.insert(key, of);
             }
             config.insert(section.clone(), values.into());
             sources.insert(section, from.into());
         }
         json!({ "config": config, "sources": sources })
-    }
-}
-
-impl Source {
-    /// Returns the source as JSON.
-    fn document(&self) -> Value {
-        match self {
-            Self::Default => json!({ "source": "default" }),
-            Self::File(path) => json!({ "source": "file", "path": path.to_string_lossy() }),
-            Self::Environment(name) => json!({ "source": "environment", "variable": name }),
-            Self::Flag => json!({ "source": "command line" }),
-        }
     }
 }
 

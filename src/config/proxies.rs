@@ -1,19 +1,25 @@
 //! Trusted proxies and the header in which they name their clients.
 
-use std::borrow::Cow;
 use std::fmt;
 use std::net::IpAddr;
 use std::str::FromStr;
 
 use ipnet::IpNet;
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::{Deserialize, Serialize};
+
+use super::list;
 
 /// Addresses and networks of proxies, at least one: a string separated by white space, or a list of strings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Proxies(Vec<IpNet>);
 
 impl Proxies {
+    /// Returns the schema of an optional list of proxies.
+    pub(super) fn schema(_: &mut SchemaGenerator) -> Schema {
+        list::schema("[0-9A-Fa-f.:/]+")
+    }
+
     /// Returns true if `address` is a trusted proxy. IPv4-mapped IPv6 addresses count as IPv4.
     #[must_use]
     pub fn contains(&self, address: IpAddr) -> bool {
@@ -44,35 +50,6 @@ impl fmt::Display for Proxies {
     }
 }
 
-impl Serialize for Proxies {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
-}
-
-impl JsonSchema for Proxies {
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn schema_name() -> Cow<'static, str> {
-        "Proxies".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({ "anyOf": [
-            { "type": "string", "pattern": r"^\s*[0-9A-Fa-f.:/]+(\s+[0-9A-Fa-f.:/]+)*\s*$" },
-            { "type": "array", "minItems": 1, "items": { "type": "string", "pattern": "^[0-9A-Fa-f.:/]+$" } },
-        ] })
-    }
-}
-
-impl<'de> Deserialize<'de> for Proxies {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        super::joined(deserializer)?.parse().map_err(serde::de::Error::custom)
-    }
-}
-
 /// Header in which proxies name their clients.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
@@ -86,8 +63,7 @@ pub enum ForwardedHeader {
 
 impl ForwardedHeader {
     /// Returns the name of the header.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
+    pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::XForwardedFor => "x-forwarded-for",
             Self::Forwarded => "forwarded",

@@ -36,10 +36,10 @@ pub fn schema() -> Value {
 fn finish(key: &str, of_key: &mut Map<String, Value>, default: &Value) {
     one_line(of_key);
     let absent = drop_null(of_key);
+    // Formats such as uint64 are not standard.
+    of_key.remove("format");
     let of_type = |of_key: &Map<String, Value>, name: &str| of_key.get("type").is_some_and(|kind| kind == name);
     if of_type(of_key, "integer") {
-        // Formats such as uint64 are not standard.
-        of_key.remove("format");
         of_key.insert("minimum".to_owned(), minimum(key).into());
         let texts = match (key.ends_with("_bytes"), absent) {
             (true, false) => Some(SIZE.to_owned()),
@@ -64,29 +64,15 @@ fn finish(key: &str, of_key: &mut Map<String, Value>, default: &Value) {
 
 /// Removes `null` from the schema of a key, because TOML has none. Returns true if the key is optional.
 fn drop_null(of_key: &mut Map<String, Value>) -> bool {
-    match of_key.get_mut("type") {
-        Some(Value::Array(kinds)) => {
-            let before = kinds.len();
-            kinds.retain(|kind| kind != "null");
-            let absent = kinds.len() < before;
-            if let [one] = kinds.as_slice() {
-                let one = one.clone();
-                of_key.insert("type".to_owned(), one);
-            }
-            return absent;
-        }
-        Some(_) => return false,
-        None => {}
-    }
-    let Some(Value::Array(kinds)) = of_key.get_mut("anyOf") else { return false };
+    let (key, null) =
+        if of_key.contains_key("anyOf") { ("anyOf", json!({ "type": "null" })) } else { ("type", json!("null")) };
+    let Some(Value::Array(kinds)) = of_key.get_mut(key) else { return false };
     let before = kinds.len();
-    kinds.retain(|kind| *kind != json!({ "type": "null" }));
+    kinds.retain(|kind| *kind != null);
     let absent = kinds.len() < before;
-    // Replaces an alternative of one schema by that schema.
-    if let [Value::Object(one)] = kinds.as_slice() {
+    if let [one] = kinds.as_slice() {
         let one = one.clone();
-        of_key.remove("anyOf");
-        of_key.extend(one);
+        of_key.insert(key.to_owned(), one);
     }
     absent
 }

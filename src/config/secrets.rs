@@ -2,7 +2,7 @@
 
 use std::fs::File;
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Keys whose values are secret. For each there is a key with the suffix `_file`.
 pub(super) const SECRETS: [&str; 3] = ["store.secret_access_key", "access.signing_secret", "telemetry.secret_headers"];
@@ -72,11 +72,6 @@ fn readable_by_others(path: &Path, data: &std::fs::Metadata) -> Option<String> {
 #[cfg(not(unix))]
 fn readable_by_others(_path: &Path, _data: &std::fs::Metadata) -> Option<String> {
     None
-}
-
-/// Returns the path in a value of the configuration.
-pub(super) fn path_of(value: Option<&serde_json::Value>) -> Option<PathBuf> {
-    value?.as_str().map(PathBuf::from)
 }
 
 #[cfg(test)]

@@ -2,12 +2,11 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::PathBuf;
-use std::time::Duration;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::{ForwardedHeader, Proxies};
+use super::{ForwardedHeader, Proxies, list};
 
 /// Listeners and limits of connections.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -56,6 +55,8 @@ pub struct ServerConfig {
     pub drain_timeout_ms: u64,
     /// Trusted proxies, by address or network, whose forwarding header names the client. Default `none`: the peer is
     /// the client, and its forwarding headers are ignored.
+    #[serde(with = "list")]
+    #[schemars(schema_with = "Proxies::schema")]
     pub trusted_proxies: Option<Proxies>,
     /// Forwarding header of the trusted proxies: `x-forwarded-for` or `forwarded` (RFC 7239). Default
     /// `x-forwarded-for`, which most proxies write. The other header is ignored, because the client may have sent it.
@@ -82,49 +83,5 @@ impl Default for ServerConfig {
             trusted_proxies: None,
             forwarded_header: ForwardedHeader::default(),
         }
-    }
-}
-
-impl ServerConfig {
-    /// Returns the time for the head of a request.
-    #[must_use]
-    pub fn header_timeout(&self) -> Duration {
-        Duration::from_millis(self.header_timeout_ms)
-    }
-
-    /// Returns the time for the whole body of a request.
-    #[must_use]
-    pub fn body_timeout(&self) -> Duration {
-        Duration::from_millis(self.body_timeout_ms)
-    }
-
-    /// Returns the time in which a client must receive `write_bytes` of a response body.
-    #[must_use]
-    pub fn write_timeout(&self) -> Duration {
-        Duration::from_millis(self.write_timeout_ms)
-    }
-
-    /// Returns the time that an idle HTTP/2 connection is kept.
-    #[must_use]
-    pub fn idle_timeout(&self) -> Duration {
-        Duration::from_millis(self.idle_timeout_ms)
-    }
-
-    /// Returns the longest silence of an event stream.
-    #[must_use]
-    pub fn heartbeat(&self) -> Duration {
-        Duration::from_millis(self.heartbeat_ms)
-    }
-
-    /// Time after SIGTERM in which all requests are served.
-    #[must_use]
-    pub fn termination_notice(&self) -> Duration {
-        Duration::from_millis(self.termination_notice_ms.unwrap_or_default())
-    }
-
-    /// Time after the termination notice for running requests and jobs to finish.
-    #[must_use]
-    pub fn drain_timeout(&self) -> Duration {
-        Duration::from_millis(self.drain_timeout_ms)
     }
 }

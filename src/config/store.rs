@@ -3,7 +3,6 @@
 use std::borrow::Cow;
 use std::fmt;
 use std::path::PathBuf;
-use std::time::Duration;
 
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -83,50 +82,6 @@ impl Default for StoreConfig {
             memory_bytes: 256 << 20,
             memory_object_bytes: 4 << 20,
         }
-    }
-}
-
-impl StoreConfig {
-    /// Returns the time without a response after which a request to S3 fails or is retried.
-    #[must_use]
-    pub fn timeout(&self) -> Duration {
-        Duration::from_millis(self.timeout_ms)
-    }
-
-    /// Returns the minimum time between health checks of the store.
-    #[must_use]
-    pub fn probe(&self) -> Duration {
-        Duration::from_millis(self.probe_ms)
-    }
-
-    /// Returns the time after which a health check of the store fails.
-    #[must_use]
-    pub fn probe_timeout(&self) -> Duration {
-        Duration::from_millis(self.probe_timeout_ms)
-    }
-
-    /// Returns the time between removals of expired objects.
-    #[must_use]
-    pub fn sweep(&self) -> Duration {
-        Duration::from_millis(self.sweep_ms)
-    }
-
-    /// Returns the time that a result is kept after its last use.
-    #[must_use]
-    pub fn result_ttl(&self) -> Duration {
-        Duration::from_millis(self.result_ttl_ms)
-    }
-
-    /// Returns the time that an input is kept after its last use.
-    #[must_use]
-    pub fn input_ttl(&self) -> Duration {
-        Duration::from_millis(self.input_ttl_ms)
-    }
-
-    /// Returns the time that a job document is kept after it was last written or read.
-    #[must_use]
-    pub fn job_ttl(&self) -> Duration {
-        Duration::from_millis(self.job_ttl_ms)
     }
 }
 

@@ -1,13 +1,12 @@
-//! URL templates of a remote archive, and the URL of its proxy.
+//! URL templates of a remote archive.
 
-use std::borrow::Cow;
 use std::fmt;
 use std::str::FromStr;
 
 use reqwest::Url;
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use schemars::{Schema, SchemaGenerator};
 
+use super::list;
 use crate::structure::EntryId;
 
 /// RCSB's download service: compressed mmCIF.
@@ -27,14 +26,12 @@ pub struct Template {
 
 impl Template {
     /// Returns the host as written in the URL.
-    #[must_use]
-    pub fn host(&self) -> &str {
+    pub(crate) fn host(&self) -> &str {
         &self.host
     }
 
     /// Returns the URL of an entry. Ids contain only letters, digits and `_`, which need no escapes.
-    #[must_use]
-    pub fn url(&self, id: &EntryId) -> Option<Url> {
+    pub(crate) fn url(&self, id: &EntryId) -> Option<Url> {
         fill(&self.text, id.as_str(), id.middle()).parse().ok()
     }
 }
@@ -96,9 +93,13 @@ impl Default for Templates {
 }
 
 impl Templates {
+    /// Returns the schema of an optional list of templates.
+    pub(super) fn schema(_: &mut SchemaGenerator) -> Schema {
+        list::schema(r"https?://[^/\s]+/\S*\{id(_upper)?\}\S*")
+    }
+
     /// Returns the templates in order.
-    #[must_use]
-    pub fn as_slice(&self) -> &[Template] {
+    pub(crate) fn as_slice(&self) -> &[Template] {
         &self.0
     }
 }
@@ -116,71 +117,6 @@ impl fmt::Display for Templates {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let texts: Vec<&str> = self.0.iter().map(|t| t.text.as_str()).collect();
         f.write_str(&texts.join(" "))
-    }
-}
-
-impl Serialize for Templates {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
-}
-
-impl JsonSchema for Templates {
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn schema_name() -> Cow<'static, str> {
-        "Templates".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        let one = r"https?://[^/\s]+/\S*\{id(_upper)?\}\S*";
-        json_schema!({ "anyOf": [
-            { "type": "string", "pattern": format!(r"^\s*{one}(\s+{one})*\s*$") },
-            { "type": "array", "minItems": 1, "items": { "type": "string", "pattern": format!("^{one}$") } },
-        ] })
-    }
-}
-
-impl<'de> Deserialize<'de> for Templates {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        super::joined(deserializer)?.parse().map_err(serde::de::Error::custom)
-    }
-}
-
-/// URL of a proxy: `http://host:port` or `https://host:port`.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-#[serde(transparent)]
-pub struct ProxyUrl(String);
-
-impl ProxyUrl {
-    /// Returns the URL.
-    #[must_use]
-    pub fn as_str(&self) -> &str {
-        &self.0
-    }
-}
-
-impl JsonSchema for ProxyUrl {
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn schema_name() -> Cow<'static, str> {
-        "ProxyUrl".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({ "type": "string", "pattern": "^(none|https?://.+)$" })
-    }
-}
-
-impl<'de> Deserialize<'de> for ProxyUrl {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let text = String::deserialize(deserializer)?;
-        let good = text.parse().is_ok_and(|url: Url| ["http", "https"].contains(&url.scheme()) && url.has_host());
-        if good { Ok(Self(text)) } else { Err(serde::de::Error::custom("none, or http(s)://host:port")) }
     }
 }
 

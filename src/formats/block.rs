@@ -1,5 +1,5 @@
-//! Writers of columns as little-endian bytes: copied from memory if the layouts agree, otherwise converted through one
-//! reused block of fixed-size records.
+//! Writers of columns: copied from memory if the layouts agree, otherwise converted through one reused block of
+//! fixed-size records.
 
 use std::io::{self, Write};
 use std::ops::Range;
@@ -26,36 +26,10 @@ pub(super) fn write_records<const N: usize>(
     Ok(())
 }
 
-/// Writes rows of three floats.
-pub(super) fn write_floats(out: &mut dyn Write, rows: &[[f32; 3]]) -> io::Result<()> {
-    if cfg!(target_endian = "little") {
-        out.write_all(bytemuck::must_cast_slice(rows))
-    } else {
-        convert_words(out, rows.as_flattened(), f32::to_le_bytes)
-    }
-}
-
-/// Writes rows of four 16-bit integers.
-pub(super) fn write_shorts(out: &mut dyn Write, rows: &[[i16; 4]]) -> io::Result<()> {
-    if cfg!(target_endian = "little") {
-        out.write_all(bytemuck::must_cast_slice(rows))
-    } else {
-        convert_words(out, rows.as_flattened(), i16::to_le_bytes)
-    }
-}
-
-/// Writes rows of four 8-bit integers.
-pub(super) fn write_bytes(out: &mut dyn Write, rows: &[[i8; 4]]) -> io::Result<()> {
+/// Writes rows of numbers as they are in memory.
+pub(super) fn write_rows<T: bytemuck::NoUninit>(out: &mut dyn Write, rows: &[T]) -> io::Result<()> {
+    const { assert!(cfg!(target_endian = "little"), "files are little-endian") };
     out.write_all(bytemuck::must_cast_slice(rows))
-}
-
-/// Writes integers.
-pub(super) fn write_integers(out: &mut dyn Write, values: &[u32]) -> io::Result<()> {
-    if cfg!(target_endian = "little") {
-        out.write_all(bytemuck::must_cast_slice(values))
-    } else {
-        convert_words(out, values, u32::to_le_bytes)
-    }
 }
 
 /// Writes one record of `N` bytes per value.
@@ -104,19 +78,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_conversion_for_other_byte_orders_writes_the_same_bytes() {
-        let rows: Vec<[f32; 3]> = (0..60_000_u16).map(|i| [f32::from(i), -1.5, 1e-3 * f32::from(i)]).collect();
-        let (mut direct, mut converted) = (Vec::new(), Vec::new());
-        write_floats(&mut direct, &rows).unwrap();
-        convert_words(&mut converted, rows.as_flattened(), f32::to_le_bytes).unwrap();
-        assert_eq!(direct, converted);
-        assert_eq!(&direct[12..16], &1.0_f32.to_le_bytes());
-        let rows: Vec<[i16; 4]> = (0..30_000).map(|i| [i, -i, 1, 0]).collect();
-        let (mut direct, mut converted) = (Vec::new(), Vec::new());
-        write_shorts(&mut direct, &rows).unwrap();
-        convert_words(&mut converted, rows.as_flattened(), i16::to_le_bytes).unwrap();
-        assert_eq!(direct, converted);
-        assert_eq!(&direct[8..12], &[1, 0, 0xff, 0xff]);
+    fn rows_are_little_endian() {
+        let mut bytes = Vec::new();
+        write_rows(&mut bytes, &[[1.0_f32, -1.5, 0.0]]).unwrap();
+        write_rows(&mut bytes, &[[1_i16, -2, 1, 0]]).unwrap();
+        assert_eq!(bytes, [0, 0, 0x80, 0x3f, 0, 0, 0xc0, 0xbf, 0, 0, 0, 0, 1, 0, 0xfe, 0xff, 1, 0, 0, 0]);
     }
 
     #[test]

@@ -15,29 +15,12 @@ const CHUNK_ROWS: usize = 1 << 16;
 /// Maximum component of a unit vector, with tolerance for rounding.
 const MAX_NORMAL: f32 = 1.001;
 
-/// Extent of the check.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Depth {
-    /// All columns.
-    All,
-    /// Only the values that the writer of the format relies on; a writer that copies a column does not rely on its
-    /// values.
-    Needed(Format),
-}
-
-impl Depth {
-    /// Returns true if normals are checked: OBJ lines, and hence numbers, have bounded length.
-    fn normals(self) -> bool {
-        matches!(self, Self::All | Self::Needed(Format::Obj))
-    }
-
-    /// Returns true if indices are checked: STL looks vertices up, and glTF narrows indices that fit into 16 bits.
-    fn indices(self, n_vertices: usize) -> bool {
-        match self {
-            Self::All | Self::Needed(Format::Stl) => true,
-            Self::Needed(Format::Glb | Format::Gltf) => u16::try_from(n_vertices).is_ok(),
-            Self::Needed(Format::Ply | Format::Obj | Format::Png) => false,
-        }
+/// Returns true if the writer relies on indices: STL looks vertices up, and glTF narrows indices that fit into 16 bits.
+fn needs_indices(format: Format, n_vertices: usize) -> bool {
+    match format {
+        Format::Stl => true,
+        Format::Glb | Format::Gltf => u16::try_from(n_vertices).is_ok(),
+        Format::Ply | Format::Obj | Format::Png => false,
     }
 }
 
@@ -52,8 +35,9 @@ pub(super) struct Summary {
     pub(super) translucent: bool,
 }
 
-/// Checks that all columns have the same length, numbers are finite and indices in range.
-pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
+/// Checks that all columns have the same length, and that the values that the writer of `format` relies on are finite
+/// and in range. Columns that are copied unchanged are not read.
+pub(super) fn check(mesh: &Mesh, format: Format) -> Result<Summary, FormatError> {
     let n = mesh.n_vertices();
     let n_normals = mesh.quantized.as_ref().map_or(mesh.normals.len(), |quantized| quantized.normals.len());
     let lengths = [
@@ -74,10 +58,11 @@ pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
         Some(_) => mesh.bounds().map(|row| row.map(|v| v + 0.0)),
         None => extent("position", &mesh.positions[..])?.unwrap_or_default(),
     };
-    if depth.normals() {
-        normals(mesh)?;
+    if format == Format::Obj {
+        // The length of a line is bounded.
+        check_normals(&mesh.normals[..])?;
     }
-    if depth.indices(n) {
+    if needs_indices(format, n) {
         in_range(&mesh.triangles[..], n)?;
     }
     Ok(Summary {
@@ -88,15 +73,8 @@ pub(super) fn check(mesh: &Mesh, depth: Depth) -> Result<Summary, FormatError> {
 }
 
 /// Rejects normals that are longer than unit vectors.
-fn normals(mesh: &Mesh) -> Result<(), FormatError> {
-    let longest = match &mesh.quantized {
-        // Only the lowest integer is too large.
-        Some(quantized) => {
-            let lowest = quantized.normals.iter().flatten().min().copied().unwrap_or_default();
-            [[f32::from(lowest) / 127.0; 3]; 2]
-        }
-        None => extent("normal", &mesh.normals[..])?.unwrap_or_default(),
-    };
+fn check_normals(normals: &[[f32; 3]]) -> Result<(), FormatError> {
+    let longest = extent("normal", normals)?.unwrap_or_default();
     let beyond = longest.as_flattened().iter().find(|v| v.abs() > MAX_NORMAL);
     beyond.map_or(Ok(()), |&value| Err(FormatError::NotUnit { value }))
 }
@@ -243,7 +221,7 @@ mod tests {
     fn columns_of_different_lengths_are_rejected() {
         let whole =
             Mesh { positions: vec![[0.0; 3]; 2].into(), normals: vec![[0.0, 0.0, 1.0]; 2].into(), ..Mesh::default() };
-        assert!(check(&whole, Depth::All).is_ok());
+        assert!(check(&whole, Format::Glb).is_ok());
         let broken = [
             ("normals", Mesh { normals: vec![[0.0; 3]].into(), ..whole.clone() }),
             ("atom_ids", Mesh { atom_ids: Some(vec![1].into()), ..whole.clone() }),
@@ -251,26 +229,21 @@ mod tests {
         ];
         for (name, mesh) in broken {
             assert!(
-                matches!(check(&mesh, Depth::All), Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name),
+                matches!(check(&mesh, Format::Glb), Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name),
                 "{name}"
             );
         }
+        let long = Mesh { normals: vec![[0.0, 0.0, 1.5]; 2].into(), ..whole.clone() };
+        assert_eq!(check(&long, Format::Obj), Err(FormatError::NotUnit { value: 1.5 }));
+        assert!(check(&long, Format::Glb).is_ok());
         let mut rounded = whole.clone();
         rounded.quantize(Step::covering(1.0));
-        assert!(check(&rounded, Depth::All).is_ok());
-        if let Some(quantized) = &mut rounded.quantized {
-            quantized.normals[1][2] = -128;
-            assert_eq!(check(&rounded, Depth::All), Err(FormatError::NotUnit { value: -128.0 / 127.0 }));
-            assert!(check(&rounded, Depth::Needed(Format::Glb)).is_ok());
-        }
+        assert!(check(&rounded, Format::Glb).is_ok());
         if let Some(quantized) = &mut rounded.quantized {
             quantized.normals.edit().pop();
-            assert!(matches!(check(&rounded, Depth::All), Err(FormatError::ColumnLength { column: "normals", .. })));
+            assert!(matches!(check(&rounded, Format::Glb), Err(FormatError::ColumnLength { column: "normals", .. })));
         }
         let adrift = Mesh { centre: [0.0, f64::NAN, 0.0], ..whole };
-        assert!(matches!(
-            check(&adrift, Depth::Needed(Format::Ply)),
-            Err(FormatError::NotFinite { column: "centre", row: 1, .. })
-        ));
+        assert!(matches!(check(&adrift, Format::Ply), Err(FormatError::NotFinite { column: "centre", row: 1, .. })));
     }
 }

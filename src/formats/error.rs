@@ -1,7 +1,5 @@
 //! Errors of writing a mesh. All are returned before the first byte is written.
 
-use std::io;
-
 use thiserror::Error;
 
 /// Error of a mesh that is invalid or that the format cannot hold.
@@ -81,21 +79,21 @@ pub enum FormatError {
     },
     /// A position is out of the range of 16-bit multiples of the step.
     #[error("a vertex lies beyond {reach} Å from the mesh's centre, the largest coordinate with a step of {step} Å")]
-    BeyondStep {
+    OutOfQuantizationRange {
         /// The largest coordinate that can be stored, Å.
         reach: f32,
         /// The step, Å.
         step: f32,
     },
-    /// Only glTF and GLB hold quantised vertices.
-    #[error("{format} cannot hold quantised vertices, glb and gltf can")]
-    NotQuantized {
+    /// Only glTF and GLB hold quantized vertices.
+    #[error("{format} cannot hold quantized vertices, glb and gltf can")]
+    QuantizationNotSupported {
         /// The format's name.
         format: &'static str,
     },
     /// Only glTF and GLB hold coordinates in units this large.
     #[error("{format} cannot hold coordinates in {units}, glb and gltf can")]
-    NotInUnits {
+    UnitsNotSupported {
         /// The format's name.
         format: &'static str,
         /// The units' name.
@@ -103,13 +101,13 @@ pub enum FormatError {
     },
     /// The format is a picture, which is rendered, not encoded.
     #[error("{format} is a picture format and cannot hold a mesh")]
-    NotAMesh {
+    NotAMeshFormat {
         /// The format's name.
         format: &'static str,
     },
     /// The vertices are already quantized and cannot be stored with another step or as floats.
-    #[error("the mesh's vertices are quantised in steps of {step} Å and cannot be stored differently")]
-    OtherPacking {
+    #[error("the mesh's vertices are quantized in steps of {step} Å and cannot be stored differently")]
+    AlreadyQuantized {
         /// The mesh's step, Å.
         step: f32,
     },
@@ -119,10 +117,4 @@ pub enum FormatError {
         /// Message of the serializer.
         reason: String,
     },
-}
-
-impl From<FormatError> for io::Error {
-    fn from(error: FormatError) -> Self {
-        Self::new(io::ErrorKind::InvalidInput, error)
-    }
 }

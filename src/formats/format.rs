@@ -72,26 +72,6 @@ impl Format {
             Self::Png => "image/png",
         }
     }
-
-    /// Returns the format for a media type, including types that other programs use. Ignores letter case and parameters
-    /// (`; charset=…`). Wildcards match no format.
-    #[must_use]
-    pub fn from_media_type(text: &str) -> Option<Self> {
-        let essence = text.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
-        match essence.as_str() {
-            "model/gltf-binary" => Some(Self::Glb),
-            "model/gltf+json" => Some(Self::Gltf),
-            "application/ply" | "application/x-ply" | "model/ply" | "model/x-ply" | "model/vnd.ply" => Some(Self::Ply),
-            "model/stl"
-            | "model/x.stl-binary"
-            | "application/sla"
-            | "application/x-stl"
-            | "application/vnd.ms-pki.stl" => Some(Self::Stl),
-            "model/obj" | "application/x-obj" => Some(Self::Obj),
-            "image/png" => Some(Self::Png),
-            _ => None,
-        }
-    }
 }
 
 impl fmt::Display for Format {
@@ -114,33 +94,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_format_parses_its_own_name_and_media_type() {
+    fn every_format_parses_its_own_name() {
         for format in Format::ALL {
             assert_eq!(format.to_string().to_uppercase().parse(), Ok(format));
-            assert_eq!(Format::from_media_type(format.media_type()), Some(format));
         }
         assert_eq!("off".parse::<Format>(), Err(UnknownFormat("off".into())));
-    }
-
-    #[test]
-    fn media_types_have_aliases_parameters_and_any_case() {
-        let cases = [
-            ("Model/STL", Some(Format::Stl)),
-            ("application/sla", Some(Format::Stl)),
-            ("application/vnd.ms-pki.stl ; q=0.5", Some(Format::Stl)),
-            ("model/vnd.ply", Some(Format::Ply)),
-            (" model/ply", Some(Format::Ply)),
-            ("model/obj;charset=utf-8", Some(Format::Obj)),
-            ("model/gltf+json", Some(Format::Gltf)),
-            ("model/*", None),
-            ("*/*", None),
-            ("text/plain", None),
-            ("IMAGE/png", Some(Format::Png)),
-            ("application/json", None),
-            ("", None),
-        ];
-        for (text, expected) in cases {
-            assert_eq!(Format::from_media_type(text), expected, "{text}");
-        }
     }
 }

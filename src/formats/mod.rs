@@ -22,7 +22,6 @@ mod text;
 
 use std::io::{self, Write};
 
-use check::Depth;
 pub use error::FormatError;
 pub use format::{Format, UnknownFormat};
 pub use gltf::{GlbSink, GlbSinkError, RandomAccess};
@@ -43,31 +42,6 @@ pub struct Meta {
     pub extras: serde_json::Map<String, serde_json::Value>,
 }
 
-/// Writes `mesh` as `format`.
-///
-/// # Errors
-/// Returns the errors of `out`, and `InvalidInput` with a [`FormatError`] if the mesh is invalid or the format cannot
-/// hold it (such as a GLB of 4 GiB); nothing has been written then.
-pub fn write(format: Format, mesh: &Mesh, meta: &Meta, out: &mut dyn Write) -> io::Result<()> {
-    Encoder::new(format, mesh, meta)?.write(out)
-}
-
-/// Returns the exact number of bytes that [`write()`] writes; `None` if it rejects the mesh, and for OBJ, whose length
-/// is only known after formatting: see [`encoded_len_bound`].
-///
-/// [`Encoder`] returns the length and writes the file with a single check of the mesh.
-#[must_use]
-pub fn encoded_len(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
-    Encoder::new(format, mesh, meta).ok()?.encoded_len()
-}
-
-/// Returns the maximum number of bytes that [`write()`] writes: exact if [`encoded_len`] is; `None` if it rejects the
-/// mesh.
-#[must_use]
-pub fn encoded_len_bound(format: Format, mesh: &Mesh, meta: &Meta) -> Option<u64> {
-    Some(Encoder::new(format, mesh, meta).ok()?.encoded_len_bound())
-}
-
 /// Encoder of a file whose layout is known.
 #[derive(Debug)]
 pub struct Encoder<'a> {
@@ -86,67 +60,33 @@ enum Plan {
 }
 
 impl<'a> Encoder<'a> {
-    /// Checks `mesh` and computes the layout. Reads every column once, on rayon's pool if the mesh is large.
+    /// Checks `mesh` and computes the layout. Reads only the columns whose values the format relies on: the others are
+    /// copied unchanged, so that the file of an invalid mesh may be invalid. [`Packing::of`] is the storage of a mesh
+    /// as it is in memory.
     ///
     /// # Errors
-    /// Any [`FormatError`].
-    pub fn new(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::lay_out(format, Packing::of(mesh).into(), mesh, meta, Depth::All)
-    }
-
-    /// Returns the encoder of a mesh from a backend, whose invariants hold: skips normals and indices that are copied
-    /// unchanged. Writing a large GLB then costs little more than copying the mesh.
-    ///
-    /// An invalid mesh may then result in an invalid file; nothing panics.
-    ///
-    /// # Errors
-    /// Any [`FormatError`].
-    pub fn trusting(format: Format, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
-        Self::stored(format, Packing::of(mesh), mesh, meta)
-    }
-
-    /// As [`Self::trusting`], with a given [`Storage`] or [`Packing`]. Vertices that are already packed this way are
-    /// copied.
-    ///
-    /// # Errors
-    /// Returns any [`FormatError`]: [`FormatError::NotQuantized`] and [`FormatError::NotInUnits`] if `format` has no
-    /// such packing or units, [`FormatError::BeyondStep`] if the step is too small for the mesh,
-    /// [`FormatError::OtherPacking`] if the mesh has another packing.
-    pub fn stored(
-        format: Format,
-        storage: impl Into<Storage>,
-        mesh: &'a Mesh,
-        meta: &Meta,
-    ) -> Result<Self, FormatError> {
-        Self::lay_out(format, storage.into(), mesh, meta, Depth::Needed(format))
-    }
-
-    fn lay_out(
-        format: Format,
-        storage: Storage,
-        mesh: &'a Mesh,
-        meta: &Meta,
-        depth: Depth,
-    ) -> Result<Self, FormatError> {
+    /// Returns any [`FormatError`].
+    pub fn new(format: Format, storage: impl Into<Storage>, mesh: &'a Mesh, meta: &Meta) -> Result<Self, FormatError> {
+        let storage = storage.into();
         if storage.packing != Packing::Full && !format.holds_quantized() {
-            return Err(FormatError::NotQuantized { format: format.extension() });
+            return Err(FormatError::QuantizationNotSupported { format: format.extension() });
         }
         if !format.holds_units(storage.units) {
-            return Err(FormatError::NotInUnits { format: format.extension(), units: storage.units.name() });
+            return Err(FormatError::UnitsNotSupported { format: format.extension(), units: storage.units.name() });
         }
         if let Packing::Quantized(step) = Packing::of(mesh)
             && storage.packing != Packing::Quantized(step)
         {
-            return Err(FormatError::OtherPacking { step: step.length() });
+            return Err(FormatError::AlreadyQuantized { step: step.length() });
         }
-        let summary = check::check(mesh, depth)?;
+        let summary = check::check(mesh, format)?;
         let plan = match format {
             Format::Glb => Plan::Glb(gltf::GlbPlan::new(mesh, storage, &summary, meta)?),
             Format::Gltf => Plan::Gltf(gltf::GltfPlan::new(mesh, storage, &summary, meta)?),
             Format::Ply => Plan::Ply(ply::PlyPlan::new(mesh, storage, meta)),
             Format::Stl => Plan::Stl(stl::StlPlan::new(mesh, storage.units, meta)?),
             Format::Obj => Plan::Obj(obj::ObjPlan::new(mesh, storage, &summary, meta)?),
-            Format::Png => return Err(FormatError::NotAMesh { format: format.extension() }),
+            Format::Png => return Err(FormatError::NotAMeshFormat { format: format.extension() }),
         };
         Ok(Self { mesh, plan })
     }

@@ -98,19 +98,14 @@ impl ObjPlan {
         for &position in &mesh.positions[..] {
             lines.push(|line| line.vector(b"v", place.absolute(position), decimals))?;
         }
-        if normals == Normals::None {
-            for &triangle in &mesh.triangles[..] {
-                lines.push(|line| line.bare_face(triangle))?;
-            }
-            return lines.finish();
-        }
-        for &normal in &mesh.normals[..] {
+        let smooth = normals == Normals::Smooth;
+        for &normal in mesh.normals.iter().filter(|_| smooth) {
             lines.push(|line| line.vector(b"vn", normal, NORMAL_DECIMALS))?;
         }
         for &triangle in &mesh.triangles[..] {
-            lines.push(|line| line.face(triangle))?;
+            lines.push(|line| line.face(triangle, smooth))?;
         }
-        lines.finish()
+        lines.flush()
     }
 }
 
@@ -153,10 +148,6 @@ impl<'a> Lines<'a> {
         self.used = 0;
         Ok(())
     }
-
-    fn finish(mut self) -> io::Result<()> {
-        self.flush()
-    }
 }
 
 /// A line under construction.
@@ -181,26 +172,18 @@ impl Line<'_> {
         self.put(b"\n");
     }
 
-    fn face(&mut self, triangle: [u32; 3]) {
+    /// Appends a triangle. If `smooth`, its vertices have the normals of the same index.
+    fn face(&mut self, triangle: [u32; 3], smooth: bool) {
         self.put(b"f");
         let mut digits = itoa::Buffer::new();
         for index in triangle {
             let number = digits.format(u64::from(index) + 1).as_bytes();
             self.put(b" ");
             self.put(number);
-            self.put(b"//");
-            self.put(number);
-        }
-        self.put(b"\n");
-    }
-
-    /// Appends a triangle whose vertices have no normals.
-    fn bare_face(&mut self, triangle: [u32; 3]) {
-        self.put(b"f");
-        let mut digits = itoa::Buffer::new();
-        for index in triangle {
-            self.put(b" ");
-            self.put(digits.format(u64::from(index) + 1).as_bytes());
+            if smooth {
+                self.put(b"//");
+                self.put(number);
+            }
         }
         self.put(b"\n");
     }
@@ -324,7 +307,7 @@ mod tests {
     fn the_longest_lines_fit() {
         let mut bytes = [0; LINE_BYTES];
         let mut line = Line { bytes: &mut bytes, used: 0 };
-        line.face([u32::MAX; 3]);
+        line.face([u32::MAX; 3], true);
         assert_eq!(&line.bytes[..line.used], format!("f{}\n", " 4294967296//4294967296".repeat(3)).as_bytes());
         line.used = 0;
         line.vector(b"vn", [-1e9; 3], Decimals::Five);

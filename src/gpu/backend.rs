@@ -2,23 +2,23 @@
 
 use std::sync::Arc;
 
-use super::describe::{arithmetic, describe};
-use super::device;
 use super::device_queue::single_line;
-use super::discover::Discovery;
+use super::discover::{self, Discovery, arithmetic, describe};
+use super::engine::Engine;
 use super::error::GpuError;
 use super::executor::Executor;
 use super::job::{GpuJob, Prepared};
-use super::pool::{self, DevicePool, PoolDevice, PoolSettings};
+use super::pool::{self, DevicePool, PoolDevice};
+use super::scheduler::PoolSettings;
 use crate::surface::{
-    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, Stage, SurfaceError, SurfaceLimits,
+    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, Stage, SurfaceError, SurfaceLimits,
     SurfaceParams, backend::one_atom,
 };
 
 /// Backend that meshes on devices.
 pub struct GpuBackend {
     pool: DevicePool,
-    /// Backend for jobs that no device could run; reported in [`MeshOutput::served`].
+    /// Backend for jobs that no device could run; reported in [`MeshOutput::made_by`].
     fallback: Option<Box<dyn Backend>>,
 }
 
@@ -32,13 +32,15 @@ impl GpuBackend {
         settings: &PoolSettings,
         fallback: Option<Box<dyn Backend>>,
     ) -> Result<Self, GpuError> {
-        if let Some(why) = discovery.why_none() {
+        if let Some(why) = discovery.no_device_reason() {
             return Err(GpuError::NoDevice(why));
         }
-        let taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(device, _)| device.taken);
-        let devices = taken.map(|(device, adapter)| {
+        let devices = discovery.selected_adapters().map(|(device, adapter)| {
             let adapter = adapter.clone();
-            let build = Box::new(move || device::engine(&adapter).map(|engine| Box::new(engine) as Box<dyn Executor>));
+            let build = Box::new(move || {
+                let (device, queue) = discover::open(&adapter)?;
+                Ok(Box::new(Engine::new(device, queue)?) as Box<dyn Executor>)
+            });
             PoolDevice { number: device.number, name: describe(&device.facts), build }
         });
         let devices: Vec<_> = devices.collect();
@@ -119,9 +121,13 @@ impl Backend for GpuBackend {
                 // Only identical devices share a job.
                 let device = completed.devices.first().map_or("", |work| work.device.as_str());
                 let arithmetic = arithmetic(self.name(), device);
-                let served =
-                    Served { backend: self.name(), arithmetic, device: completed.device(), fallback_reason: None };
-                let output = MeshOutput { served: Some(served), ..completed.finished.meshed };
+                let made_by = BackendIdentity {
+                    backend: self.name(),
+                    arithmetic,
+                    device: completed.device(),
+                    fallback_reason: None,
+                };
+                let output = MeshOutput { made_by: Some(made_by), ..completed.finished.meshed };
                 return output.deliver(params, control, sink);
             }
             Err(error) => error,
@@ -130,25 +136,20 @@ impl Backend for GpuBackend {
         drop(job);
         match (error, &self.fallback) {
             (GpuError::Surface(error), _) => Err(error),
-            (GpuError::Deadline, _) => Err(SurfaceError::Deadline),
             (GpuError::OutOfMemory { needed, available, suggested_resolution }, _) => {
                 Err(SurfaceError::DeviceMemory { needed, available, suggested_resolution })
             }
             (error, None) => Err(SurfaceError::Device { why: single_line(&error.to_string()) }),
             (error, Some(fallback)) => {
                 let output = fallback.write(spheres, params, limits, control, sink)?;
-                let served = Served {
-                    backend: fallback.name(),
-                    arithmetic: fallback.arithmetic(),
-                    device: fallback.describe(),
-                    fallback_reason: Some(single_line(&format!("the GPU failed: {error}"))),
-                };
-                Ok(MeshOutput { served: Some(served), ..output })
+                let fallback_reason = Some(single_line(&format!("the GPU failed: {error}")));
+                let made_by = BackendIdentity { fallback_reason, ..fallback.identity() };
+                Ok(MeshOutput { made_by: Some(made_by), ..output })
             }
         }
     }
 
-    fn warm(&self) -> Result<(), SurfaceError> {
+    fn warm_up(&self) -> Result<(), SurfaceError> {
         let n_devices = self.pool.status().len();
         std::thread::scope(|scope| {
             let warming: Vec<_> = (0..n_devices).map(|n| scope.spawn(move || self.warm_device(n))).collect();
@@ -158,12 +159,12 @@ impl Backend for GpuBackend {
             return Ok(());
         }
         match &self.fallback {
-            Some(fallback) => fallback.warm(),
+            Some(fallback) => fallback.warm_up(),
             None => Err(SurfaceError::Device { why: self.describe() }),
         }
     }
 
-    fn able(&self) -> bool {
+    fn is_available(&self) -> bool {
         self.fallback.is_some() || self.pool.status().iter().any(|device| device.down.is_none())
     }
 

@@ -24,11 +24,11 @@ pub(super) fn select(facts: Vec<DeviceFacts>, choice: &DeviceChoice) -> Vec<Foun
             Some(other) if !contains(choice, number) => Err(format!("the same device as {other}")),
             _ => decide(number, &facts, choice, best_kind),
         };
-        let (taken, reason) = match decision {
+        let (selected, reason) = match decision {
             Ok(reason) => (true, reason),
             Err(reason) => (false, reason),
         };
-        found.push(FoundDevice { number, facts, taken, reason });
+        found.push(FoundDevice { number, facts, selected, reason });
     }
     found
 }
@@ -42,7 +42,7 @@ fn decide(
     let kind = facts.kind.name();
     match choice {
         DeviceChoice::Cpu => return Err("the CPU was requested".to_owned()),
-        DeviceChoice::These(list) => {
+        DeviceChoice::Listed(list) => {
             let software = facts.kind == DeviceKind::Software && list.contains(&DeviceName::Software);
             if !software && !contains(choice, number) {
                 return Err(format!("not in --devices {choice}"));
@@ -55,7 +55,7 @@ fn decide(
     }
     check_requirements(facts)?;
     match (choice, best_kind) {
-        (DeviceChoice::These(_), _) => Ok("requested".to_owned()),
+        (DeviceChoice::Listed(_), _) => Ok("requested".to_owned()),
         (DeviceChoice::Auto, Some(best)) if facts.kind > best => {
             Err(format!("{kind}: a {} device is available", best.name()))
         }
@@ -65,7 +65,7 @@ fn decide(
 
 /// Returns true if the choice lists this number.
 fn contains(choice: &DeviceChoice, number: usize) -> bool {
-    matches!(choice, DeviceChoice::These(list) if list.contains(&DeviceName::Number(number)))
+    matches!(choice, DeviceChoice::Listed(list) if list.contains(&DeviceName::Number(number)))
 }
 
 fn check_requirements(facts: &DeviceFacts) -> Result<(), String> {
@@ -93,7 +93,7 @@ fn size(n: u64) -> String {
 
 /// Messages for the requested devices that do not exist.
 pub(super) fn missing(found: &[FoundDevice], choice: &DeviceChoice) -> Vec<String> {
-    let DeviceChoice::These(list) = choice else { return Vec::new() };
+    let DeviceChoice::Listed(list) = choice else { return Vec::new() };
     let exists = |name: &DeviceName| match name {
         DeviceName::Number(n) => *n < found.len(),
         DeviceName::Software => found.iter().any(|device| device.facts.kind == DeviceKind::Software),
@@ -135,12 +135,12 @@ mod tests {
         ]
     }
 
-    fn taken(found: &[FoundDevice]) -> Vec<usize> {
-        found.iter().filter(|d| d.taken).map(|d| d.number).collect()
+    fn selected(found: &[FoundDevice]) -> Vec<usize> {
+        found.iter().filter(|d| d.selected).map(|d| d.number).collect()
     }
 
     fn take(facts: Vec<DeviceFacts>, choice: &str) -> Vec<usize> {
-        taken(&select(facts, &choice.parse().unwrap()))
+        selected(&select(facts, &choice.parse().unwrap()))
     }
 
     #[test]
@@ -178,7 +178,10 @@ mod tests {
         let facts = || vec![DeviceFacts { binding_bytes: 64 << 20, ..device("A", DeviceKind::Discrete, "0:1") }];
         for choice in ["auto", "all", "0"] {
             let found = select(facts(), &choice.parse().unwrap());
-            assert_eq!((found[0].taken, found[0].reason.as_str()), (false, "largest binding is 64 MiB, below 128 MiB"));
+            assert_eq!(
+                (found[0].selected, found[0].reason.as_str()),
+                (false, "largest binding is 64 MiB, below 128 MiB")
+            );
         }
         // The next best kind is selected instead.
         let mut both = facts();
@@ -190,7 +193,7 @@ mod tests {
     fn a_device_is_selected_once() {
         let twice = || vec![device("A", DeviceKind::Discrete, "0:1"), device("B", DeviceKind::Discrete, "0:1")];
         let found = select(twice(), &DeviceChoice::All);
-        assert_eq!((taken(&found), found[1].reason.as_str()), (vec![0], "the same device as 0"));
+        assert_eq!((selected(&found), found[1].reason.as_str()), (vec![0], "the same device as 0"));
         assert_eq!(take(twice(), "1"), [1], "unless the other number is requested");
         let metal = DeviceFacts { api: "metal", ..device("M", DeviceKind::Integrated, "") };
         let vulkan = device("M", DeviceKind::Integrated, "");

@@ -1,20 +1,15 @@
 //! First half of a job: the stages that sample a chunk and count its vertices and triangles.
 
+use super::buffers::BufferId;
 use super::engine::Engine;
 use super::error::GpuError;
 use super::job_state::{ChunkCounts, JobState};
 use super::output_layout::BODY_OFFSET;
-use super::plan::Chunk;
-use super::plan::layout::{GROUP, Params};
+use super::plan::layout::Params;
 use super::submit::PendingSubmission;
 
 /// Number of the stages that run before the size of the output is known: `bin` to `scan`.
 pub(super) const N_COUNT_STAGES: usize = 4;
-
-/// Bytes of the group counts of a chunk.
-pub(super) fn group_bytes(chunk: &Chunk) -> u64 {
-    16 * u64::from(chunk.n_own.div_ceil(GROUP))
-}
 
 /// Converts a number of rows to 32 bits; buffers are smaller than that.
 pub(super) fn narrow(n: u64) -> Result<u32, GpuError> {
@@ -36,13 +31,14 @@ impl Engine {
         self.write_halo(&loaded.workspace, own);
         let mut recording = self.recording();
         recording.count_stages(&[(loaded.dispatch(0, 0), params)]);
-        let bytes = BODY_OFFSET + group_bytes(own);
+        let group_bytes = 16 * own.n_groups();
+        let bytes = BODY_OFFSET + group_bytes;
         let readback = self.readback.acquire(&self.device, bytes);
-        let target = readback.buffer().map_err(GpuError::Failed)?;
+        let target = &readback.buffer;
         recording.copy_timestamps(target);
         recording.copy_counters(&loaded.workspace, target);
-        recording.copy_groups(&loaded.workspace, target, BODY_OFFSET, group_bytes(own));
-        self.submit(recording, vec![(readback, bytes)])
+        recording.copy_start(loaded.workspace.buffer(BufferId::Groups), target, BODY_OFFSET, group_bytes);
+        Ok(self.submit(recording, vec![(readback, bytes)]))
     }
 
     /// Waits for the counts of a chunk.

@@ -75,8 +75,6 @@ pub(super) enum DeviceState {
 
 /// Queue, state and counters of a device.
 pub(super) struct DeviceQueue {
-    pub(super) number: usize,
-    pub(super) name: String,
     pub(super) waiting: VecDeque<QueuedJob>,
     /// Number of jobs that run now.
     pub(super) running: usize,
@@ -85,39 +83,20 @@ pub(super) struct DeviceQueue {
     pub(super) state: DeviceState,
     /// Number of rebuilds since the last finished job.
     pub(super) consecutive_rebuilds: usize,
-    pub(super) finished: u64,
-    pub(super) failed: u64,
-    /// Time spent on jobs.
-    pub(super) busy: Duration,
-    /// Number of failures after which the executor was discarded.
-    pub(super) lost: u64,
-    pub(super) rebuilds: u64,
-    /// Number of submissions that several jobs shared.
-    pub(super) shared: u64,
-    /// Number of finished partitions.
-    pub(super) partitions: u64,
-    pub(super) held_bytes: u64,
+    /// Name and counters; [`Self::status`] fills in the rest.
+    pub(super) counters: DeviceStatus,
 }
 
 impl DeviceQueue {
     /// Creates the queue of a device that is starting.
     pub(super) fn new(number: usize, name: String, limit: usize) -> Self {
         Self {
-            number,
-            name,
             waiting: VecDeque::with_capacity(limit),
             running: 0,
             load: 0,
             state: DeviceState::Starting,
             consecutive_rebuilds: 0,
-            finished: 0,
-            failed: 0,
-            busy: Duration::ZERO,
-            lost: 0,
-            rebuilds: 0,
-            shared: 0,
-            partitions: 0,
-            held_bytes: 0,
+            counters: DeviceStatus { number, name, ..DeviceStatus::default() },
         }
     }
 
@@ -135,22 +114,13 @@ impl DeviceQueue {
     /// Status of the device.
     pub(super) fn status(&self) -> DeviceStatus {
         DeviceStatus {
-            number: self.number,
-            name: self.name.clone(),
             down: match &self.state {
                 DeviceState::Starting => Some("it is being built".to_owned()),
                 DeviceState::Up => None,
                 DeviceState::Down(why) => Some(why.clone()),
             },
             waiting: self.waiting.len() + self.running,
-            finished: self.finished,
-            failed: self.failed,
-            busy: self.busy,
-            lost: self.lost,
-            rebuilds: self.rebuilds,
-            shared: self.shared,
-            partitions: self.partitions,
-            held_bytes: self.held_bytes,
+            ..self.counters.clone()
         }
     }
 
@@ -159,7 +129,7 @@ impl DeviceQueue {
         if !matches!(self.state, DeviceState::Down(_)) {
             self.state = DeviceState::Down(single_line(why));
         }
-        self.held_bytes = 0;
+        self.counters.held_bytes = 0;
         let waiting = std::mem::take(&mut self.waiting);
         self.load -= waiting.iter().map(QueuedJob::load).sum::<u64>();
         waiting
@@ -169,7 +139,7 @@ impl DeviceQueue {
 /// Reasons of all devices that are down.
 pub(super) fn down_reasons(queues: &[DeviceQueue]) -> String {
     let why = |queue: &DeviceQueue| match &queue.state {
-        DeviceState::Down(why) => Some(format!("{} {}: {why}", queue.number, queue.name)),
+        DeviceState::Down(why) => Some(format!("{} {}: {why}", queue.counters.number, queue.counters.name)),
         DeviceState::Starting | DeviceState::Up => None,
     };
     queues.iter().filter_map(why).collect::<Vec<_>>().join("; ")
@@ -218,7 +188,7 @@ mod tests {
         drop(job);
         assert_eq!(other.check(), cancelled, "dropped without a result");
         let (job, other) = queued();
-        job.reply(Err(GpuError::Deadline));
+        job.reply(Err(SurfaceError::Deadline.into()));
         assert_eq!(other.check(), cancelled, "failed");
         let (job, other) = queued();
         job.reply(Ok(Finished { meshed: MeshOutput::new(Mesh::default(), GridStats::default()), stages: Vec::new() }));

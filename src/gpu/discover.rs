@@ -1,16 +1,23 @@
-//! Discovery of devices: lists the adapters of all drivers and selects devices by the user's choice.
+//! Discovery of devices: lists the adapters of all drivers, selects devices by the user's choice, and opens and
+//! describes them.
 
 use std::panic::catch_unwind;
 
-use wgpu::{Adapter, Backends, DeviceType, Features, Instance, InstanceDescriptor, InstanceFlags};
+use wgpu::{
+    Adapter, Backends, Device, DeviceDescriptor, DeviceType, ExperimentalFeatures, Features, Instance,
+    InstanceDescriptor, InstanceFlags, MemoryHints, Queue, Trace,
+};
 
 use super::error::GpuError;
-use super::{choose, device, hardware};
+use super::{choose, hardware};
 use crate::surface::{DeviceChoice, DeviceFacts, DeviceKind, FoundDevice};
+
+/// Features that are used if the device has them.
+const WANTED: Features = Features::TIMESTAMP_QUERY.union(Features::SUBGROUP);
 
 /// Effort of a discovery.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Look {
+pub enum DiscoveryMode {
     /// Load no driver if there is no sign of hardware, unless devices were requested by name.
     Quick,
     /// Load every driver, to list all devices.
@@ -25,17 +32,22 @@ pub struct Discovery {
     /// Adapters of `devices`, in the same order.
     pub(super) adapters: Vec<Adapter>,
     /// Reason for an empty list.
-    pub looked: String,
+    pub empty_reason: String,
 }
 
 impl Discovery {
-    fn nothing(looked: String) -> Self {
-        Self { devices: Vec::new(), adapters: Vec::new(), looked }
+    fn nothing(empty_reason: String) -> Self {
+        Self { devices: Vec::new(), adapters: Vec::new(), empty_reason }
     }
 
     /// Returns the selected devices.
-    pub fn taken(&self) -> impl Iterator<Item = &FoundDevice> {
-        self.devices.iter().filter(|device| device.taken)
+    pub fn selected(&self) -> impl Iterator<Item = &FoundDevice> {
+        self.devices.iter().filter(|device| device.selected)
+    }
+
+    /// Returns the selected devices with their adapters.
+    pub(super) fn selected_adapters(&self) -> impl Iterator<Item = (&FoundDevice, &Adapter)> {
+        self.devices.iter().zip(&self.adapters).filter(|(device, _)| device.selected)
     }
 
     /// Opens the selected device with this number, with its own limits and, if supported, timestamps.
@@ -43,22 +55,21 @@ impl Discovery {
     /// # Errors
     /// Returns [`GpuError::NoDevice`] if no selected device has the number, and [`GpuError::Failed`] if the driver
     /// rejects the request.
-    pub fn open(&self, number: usize) -> Result<(wgpu::Device, wgpu::Queue), GpuError> {
-        let mut all = self.devices.iter().zip(&self.adapters);
-        match all.find(|(device, _)| device.taken && device.number == number) {
-            Some((_, adapter)) => device::open(adapter),
+    pub fn open(&self, number: usize) -> Result<(Device, Queue), GpuError> {
+        match self.selected_adapters().find(|(device, _)| device.number == number) {
+            Some((_, adapter)) => open(adapter),
             None => Err(GpuError::NoDevice(format!("no usable device has number {number}"))),
         }
     }
 
     /// Reason for which no device is selected, on one line; `None` if one is.
     #[must_use]
-    pub fn why_none(&self) -> Option<String> {
-        if self.taken().next().is_some() {
+    pub fn no_device_reason(&self) -> Option<String> {
+        if self.selected().next().is_some() {
             return None;
         }
         if self.devices.is_empty() {
-            return Some(self.looked.clone());
+            return Some(self.empty_reason.clone());
         }
         let each = |d: &FoundDevice| format!("{} {}: {}", d.number, d.facts.name, d.reason);
         Some(self.devices.iter().map(each).collect::<Vec<_>>().join("; "))
@@ -73,15 +84,15 @@ impl Discovery {
 
 /// Lists all devices and selects some by `choice`. Failures become reasons in the result.
 #[must_use]
-pub fn discover(choice: &DeviceChoice, look: Look) -> Discovery {
-    let signs = hardware::signs();
+pub fn discover(choice: &DeviceChoice, mode: DiscoveryMode) -> Discovery {
+    let nodes = hardware::device_nodes();
     // Only drivers know software devices and device numbers.
-    let named = matches!(choice, DeviceChoice::These(_));
-    match (look, &signs) {
-        (Look::Quick, _) if *choice == DeviceChoice::Cpu => {
+    let named = matches!(choice, DeviceChoice::Listed(_));
+    match (mode, &nodes) {
+        (DiscoveryMode::Quick, _) if *choice == DeviceChoice::Cpu => {
             return Discovery::nothing("the CPU was requested".to_owned());
         }
-        (Look::Quick, Err(why)) if !named => return Discovery::nothing(why.clone()),
+        (DiscoveryMode::Quick, Err(why)) if !named => return Discovery::nothing(why.clone()),
         _ => {}
     }
     let Ok(mut adapters) = catch_unwind(adapters) else {
@@ -92,13 +103,13 @@ pub fn discover(choice: &DeviceChoice, look: Look) -> Discovery {
         let facts = facts(adapter);
         (facts.kind, facts.bus, facts.name, facts.api)
     });
-    let looked = format!(
+    let empty_reason = format!(
         "no driver offers an adapter (searched: {}; hardware: {})",
         if cfg!(target_vendor = "apple") { "Metal" } else { "all Vulkan drivers that the loader finds" },
-        signs.unwrap_or_else(|why| why),
+        nodes.unwrap_or_else(|why| why),
     );
     let devices = choose::select(adapters.iter().map(facts).collect(), choice);
-    Discovery { devices, adapters, looked }
+    Discovery { devices, adapters, empty_reason }
 }
 
 /// All Vulkan and Metal adapters.
@@ -134,5 +145,63 @@ fn facts(adapter: &Adapter) -> DeviceFacts {
         storage_buffers: limits.max_storage_buffers_per_shader_stage.into(),
         timestamps: features.contains(Features::TIMESTAMP_QUERY),
         subgroups: features.contains(Features::SUBGROUP).then_some([info.subgroup_min_size, info.subgroup_max_size]),
+    }
+}
+
+/// Opens `adapter` with its own limits.
+///
+/// # Errors
+/// [`GpuError::Failed`] if the driver rejects the request.
+pub(super) fn open(adapter: &Adapter) -> Result<(Device, Queue), GpuError> {
+    let descriptor = DeviceDescriptor {
+        label: Some("molmesh"),
+        required_features: adapter.features() & WANTED,
+        required_limits: adapter.limits(),
+        experimental_features: ExperimentalFeatures::disabled(),
+        memory_hints: MemoryHints::Performance,
+        trace: Trace::Off,
+    };
+    pollster::block_on(adapter.request_device(&descriptor))
+        .map_err(|error| GpuError::Failed(format!("the device cannot be opened: {error}")))
+}
+
+/// Name of the arithmetic of a device: model and driver, and the processor, which prepares jobs and measures meshes.
+pub(super) fn arithmetic(name: &str, device: &str) -> String {
+    format!("{name} {device} {}", crate::surface::arithmetic())
+}
+
+/// Describes a device and its driver, for display.
+pub(super) fn describe(facts: &DeviceFacts) -> String {
+    let DeviceFacts { name, kind, api, driver, .. } = facts;
+    let driver = if driver.is_empty() { String::new() } else { format!(", {driver}") };
+    format!("{name} ({}, {api}{driver})", kind.name())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surface::DeviceKind;
+
+    #[test]
+    fn the_arithmetic_names_model_driver_and_processor() {
+        let facts = |name: &str, driver: &str| DeviceFacts {
+            name: name.to_owned(),
+            kind: DeviceKind::Discrete,
+            api: "vulkan",
+            driver: driver.to_owned(),
+            bus: String::new(),
+            binding_bytes: 0,
+            buffer_bytes: 0,
+            workgroup_bytes: 0,
+            workgroup_size: 0,
+            storage_buffers: 0,
+            timestamps: false,
+            subgroups: None,
+        };
+        let arithmetic_of = |name, driver| arithmetic("gpu", &describe(&facts(name, driver)));
+        assert_eq!(arithmetic_of("card", "driver 1"), arithmetic_of("card", "driver 1"));
+        assert_ne!(arithmetic_of("card", "driver 1"), arithmetic_of("card", "driver 2"));
+        assert_ne!(arithmetic_of("card", "driver 1"), arithmetic_of("other card", "driver 1"));
+        assert!(arithmetic_of("card", "driver 1").ends_with(&crate::surface::arithmetic()), "without the processor");
     }
 }

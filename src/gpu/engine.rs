@@ -20,10 +20,7 @@ use super::plan::{Chunk, ChunkLimits, Partition};
 use super::readback::ReadbackPool;
 use super::recording::{Dispatch, Recording, StageTimer};
 use super::workspace::{BufferSizes, OutputCapacity, ROW, Workspace};
-use crate::surface::lattice::LatticeAtom;
-
-/// Maximum number of storage buffers that a stage binds.
-const MAX_BINDINGS: u32 = 14;
+use crate::surface::lattice::{LatticeAtom, slightly_coarser};
 
 /// Resources that the engine may use of its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -113,11 +110,6 @@ impl Engine {
     /// Those of [`Self::new`].
     pub fn with_budget(device: Device, queue: Queue, budget: Budget) -> Result<Self, GpuError> {
         let limits = device.limits();
-        let bindings = limits.max_storage_buffers_per_shader_stage;
-        if bindings < MAX_BINDINGS {
-            let why = format!("{bindings} storage buffers per stage are supported, {MAX_BINDINGS} are needed");
-            return Err(GpuError::Failed(why));
-        }
         let errors = DeviceErrors::listen(&device);
         let pipelines = Pipelines::new(&device);
         let table = layout::case_table();
@@ -288,5 +280,5 @@ fn max_binding(limits: &wgpu::Limits) -> u64 {
 fn out_of_memory(job: &GpuJob, needed: u64, available: u64) -> GpuError {
     let excess = (needed as f64 / available.max(1) as f64).max(1.0);
     let fitting = job.prepared.lattice.spacing * excess.cbrt();
-    GpuError::OutOfMemory { needed, available, suggested_resolution: (fitting * 105.0).ceil() / 100.0 }
+    GpuError::OutOfMemory { needed, available, suggested_resolution: slightly_coarser(fitting) }
 }

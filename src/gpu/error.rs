@@ -7,7 +7,7 @@ use crate::surface::SurfaceError;
 /// Reason why a device did not finish a job.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum GpuError {
-    /// The job itself is invalid, exceeds a limit or was cancelled; the device works.
+    /// The job itself is invalid, exceeds a limit, was cancelled or is late; the device works.
     #[error(transparent)]
     Surface(#[from] SurfaceError),
     /// The device has too little memory, even in chunks.
@@ -26,9 +26,6 @@ pub enum GpuError {
     /// The device was lost; the job may succeed on the rebuilt device.
     #[error("the device was lost: {0}")]
     Lost(String),
-    /// The job's deadline passed.
-    #[error("the deadline passed")]
-    Deadline,
     /// The graphics API rejected a call, or a result is inconsistent: a defect of this program or of the driver.
     #[error("the device failed: {0}")]
     Failed(String),
@@ -41,6 +38,6 @@ impl GpuError {
     /// Returns true if the device caused the error, so that the job may succeed elsewhere.
     #[must_use]
     pub const fn is_device_failure(&self) -> bool {
-        !matches!(self, Self::Surface(_) | Self::Deadline)
+        !matches!(self, Self::Surface(_))
     }
 }

@@ -15,7 +15,7 @@ const NODES: [(&str, &[&str]); 3] = [
 ///
 /// # Errors
 /// A message if there is no GPU.
-pub(super) fn signs() -> Result<String, String> {
+pub(super) fn device_nodes() -> Result<String, String> {
     if cfg!(target_os = "linux") {
         nodes_under(Path::new("/"))
     } else {

@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use super::error::GpuError;
 use super::plan::Plan;
+use crate::surface::cpu::scan;
 use crate::surface::lattice::Lattice;
 use crate::surface::{
     CancelToken, Control, MeshOutput, Spheres, Stage, SurfaceError, SurfaceLimits, SurfaceParams, candidates,
@@ -45,6 +46,20 @@ impl Prepared {
         Ok(Self { lattice, plan, params: params.clone(), limits: *limits })
     }
 
+    /// Checks the size of a mesh, given as numbers of vertices and triangles, against the limits.
+    pub(super) fn check_size(&self, [n_vertices, n_triangles]: [u64; 2]) -> Result<(), SurfaceError> {
+        scan::check_size(&self.params, &self.limits, n_vertices, n_triangles)
+    }
+
+    /// Checks the size of a complete mesh likewise, and rejects an empty one.
+    pub(super) fn check_mesh(&self, size: [u64; 2]) -> Result<(), SurfaceError> {
+        if size[1] == 0 {
+            Err(SurfaceError::NoSurface { isovalue: self.params.isovalue })
+        } else {
+            self.check_size(size)
+        }
+    }
+
     /// Returns true if the job may share a submission with others.
     #[must_use]
     pub fn is_small(&self) -> bool {
@@ -67,12 +82,13 @@ impl GpuJob {
     /// Fails if the job was cancelled or its deadline has passed.
     ///
     /// # Errors
-    /// [`SurfaceError::Cancelled`], [`GpuError::Deadline`].
-    pub fn check(&self) -> Result<(), GpuError> {
+    /// [`SurfaceError::Cancelled`], [`SurfaceError::Deadline`].
+    pub fn check(&self) -> Result<(), SurfaceError> {
         if self.cancel.is_cancelled() {
-            return Err(SurfaceError::Cancelled.into());
+            return Err(SurfaceError::Cancelled);
         }
-        if self.deadline.is_some_and(|deadline| deadline <= Instant::now()) { Err(GpuError::Deadline) } else { Ok(()) }
+        let late = self.deadline.is_some_and(|deadline| deadline <= Instant::now());
+        if late { Err(SurfaceError::Deadline) } else { Ok(()) }
     }
 }
 

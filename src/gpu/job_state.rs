@@ -6,10 +6,9 @@ use bytemuck::Pod;
 use super::engine::LoadedJob;
 use super::error::GpuError;
 use super::job::{Finished, JobResult};
-use super::output_layout::{COUNTERS_OFFSET, ReadbackLayout, ReadbackRows, values};
+use super::output_layout::{COUNTERS_OFFSET, ReadbackLayout, ReadbackRows, byte_range, values};
 use super::pipelines::{N_STAGES, STAGES};
-use super::plan::check_totals;
-use super::plan::layout::{self, Counters, GROUP};
+use super::plan::layout::{self, Counters};
 use super::readback::ReadbackBuffer;
 use super::submit::{PendingSubmission, StageTimes};
 use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage};
@@ -21,8 +20,6 @@ pub(super) struct ChunkCounts {
     pub(super) groups: Vec<[u32; 4]>,
     /// Number of vertices and triangles before the chunk.
     pub(super) first: [u64; 2],
-    pub(super) n_vertices: u64,
-    pub(super) n_triangles: u64,
 }
 
 /// Output piece that was submitted and has not been collected.
@@ -83,8 +80,7 @@ impl<'a> JobState<'a> {
             let why = format!("{} candidates where {} were planned", counters.list_end, chunk.candidates);
             return Err(GpuError::Failed(why));
         }
-        let n_groups = u64::from(chunk.n_own.div_ceil(GROUP));
-        let groups: Vec<[u32; 4]> = values(readback.as_ref(), offset, n_groups).map_err(GpuError::Failed)?.to_vec();
+        let groups: Vec<[u32; 4]> = values(readback.as_ref(), offset, chunk.n_groups())?.to_vec();
         let first = self.total;
         for &[vertices, triangles, bricks, _] in &groups {
             if let [Ok(vertex), Ok(triangle)] = self.total.map(usize::try_from) {
@@ -98,29 +94,17 @@ impl<'a> JobState<'a> {
         if end != self.total.map(|n| n & u64::from(u32::MAX)) {
             return Err(GpuError::Failed(format!("the scan ends at {end:?}, the groups at {:?}", self.total)));
         }
-        let [n_vertices, n_triangles] = [self.total[0] - first[0], self.total[1] - first[1]];
-        Ok(ChunkCounts { groups, first, n_vertices, n_triangles })
+        Ok(ChunkCounts { groups, first })
     }
 
-    /// Checks the counts so far against the limits. An empty mesh is accepted: later chunks may have triangles.
-    ///
-    /// # Errors
-    /// [`GpuError::Surface`].
+    /// Checks the counts so far against the limits.
     pub(super) fn check_limits(&self) -> Result<(), GpuError> {
-        self.check_totals(self.total[1].max(1))
+        Ok(self.loaded.job.prepared.check_size(self.total)?)
     }
 
     /// Checks the counts of all chunks against the limits and rejects an empty mesh.
-    ///
-    /// # Errors
-    /// [`GpuError::Surface`].
     pub(super) fn check_complete(&self) -> Result<(), GpuError> {
-        self.check_totals(self.total[1])
-    }
-
-    fn check_totals(&self, n_triangles: u64) -> Result<(), GpuError> {
-        let job = &self.loaded.job.prepared;
-        Ok(check_totals(&job.lattice, &job.params, &job.limits, self.total[0], n_triangles)?)
+        Ok(self.loaded.job.prepared.check_mesh(self.total)?)
     }
 
     /// Reads the counters of a finished output.
@@ -146,7 +130,7 @@ impl<'a> JobState<'a> {
     /// # Errors
     /// Those of [`Self::finish`].
     pub(super) fn assemble(&mut self) -> JobResult {
-        let mesh = self.mesh().map_err(GpuError::Failed)?;
+        let mesh = self.mesh()?;
         let (plan, lattice) = (&self.loaded.job.prepared.plan, &self.loaded.job.prepared.lattice);
         let grid = GridStats {
             bricks: plan.n_reached,
@@ -160,7 +144,7 @@ impl<'a> JobState<'a> {
         Ok(Finished { meshed: MeshOutput::new(mesh, grid), stages })
     }
 
-    fn mesh(&mut self) -> Result<Mesh, String> {
+    fn mesh(&mut self) -> Result<Mesh, GpuError> {
         let prepared = &self.loaded.job.prepared;
         let params = &prepared.params;
         let vertices = &self.vertices;
@@ -186,19 +170,18 @@ impl<'a> JobState<'a> {
 }
 
 /// Column of `pieces`; `place` returns the offset and the number of rows of a piece.
-fn column<T: Pod>(pieces: &[ReadbackRows], place: impl Fn(&ReadbackRows) -> (u64, u64)) -> Result<Column<T>, String> {
+fn column<T: Pod>(pieces: &[ReadbackRows], place: impl Fn(&ReadbackRows) -> (u64, u64)) -> Result<Column<T>, GpuError> {
     let piece = |rows: &ReadbackRows| {
         let (offset, n) = place(rows);
-        let from = usize::try_from(offset).map_err(|e| e.to_string())?;
-        let bytes = usize::try_from(n).map_err(|e| e.to_string())? * size_of::<T>();
-        Column::shared(rows.readback.clone(), from..from + bytes)
-            .ok_or_else(|| format!("{bytes} bytes at {from} are not a column"))
+        let bytes = byte_range::<T>(offset, n)?;
+        Column::shared(rows.readback.clone(), bytes.clone())
+            .ok_or_else(|| GpuError::Failed(format!("bytes {bytes:?} are not a column")))
     };
-    pieces.iter().map(piece).collect::<Result<_, String>>().map(Column::from_chunks)
+    pieces.iter().map(piece).collect::<Result<_, GpuError>>().map(Column::from_chunks)
 }
 
 /// Counters in a readback buffer.
 fn counters(readback: &ReadbackBuffer) -> Result<Counters, GpuError> {
-    let rows: &[Counters] = values(readback.as_ref(), COUNTERS_OFFSET, 1).map_err(GpuError::Failed)?;
+    let rows: &[Counters] = values(readback.as_ref(), COUNTERS_OFFSET, 1)?;
     rows.first().copied().ok_or_else(|| GpuError::Failed("a readback buffer without counters".to_owned()))
 }

@@ -7,7 +7,7 @@
 //! A module names only modules of earlier lines:
 //!
 //! ```text
-//! error, buffers, plan, describe, readback, hardware, manifests, choose, picture_targets
+//! error, buffers, plan, readback, hardware, manifests, choose, picture_targets
 //! job, shaders, device_errors, discover
 //! partition_handle, pipelines, multi_device, picture_passes
 //! executor, output_layout, device_queue
@@ -15,7 +15,7 @@
 //! recording, worker
 //! pool
 //! engine
-//! submit, device
+//! submit
 //! job_state, probe, backend, picture
 //! count
 //! output
@@ -27,8 +27,6 @@ pub mod backend;
 mod buffers;
 mod choose;
 mod count;
-mod describe;
-mod device;
 mod device_errors;
 mod device_queue;
 pub mod discover;
@@ -62,7 +60,7 @@ mod worker;
 mod workspace;
 
 pub use backend::GpuBackend;
-pub use discover::{Discovery, Look, discover};
+pub use discover::{Discovery, DiscoveryMode, discover};
 pub use engine::{Budget, Engine};
 pub use error::GpuError;
 pub use executor::Executor;
@@ -70,6 +68,7 @@ pub use job::{Finished, GpuJob, JobResult, Prepared};
 pub use manifests::{Manifest, manifests};
 pub use partition_handle::PartitionHandle;
 pub use picture::GpuRenderer;
-pub use pool::{CompletedJob, DevicePool, DeviceWork, PoolDevice, PoolSettings};
+pub use pool::{CompletedJob, DevicePool, DeviceWork, PoolDevice};
+pub use scheduler::PoolSettings;
 pub use shaders::stage_shaders;
 pub use worker::{Build, MAX_REBUILDS};

@@ -4,7 +4,7 @@
 //! makes its triangles with the final vertex numbers. The mesh has the same bytes as that of one device.
 
 use super::job::Finished;
-use crate::surface::{Column, GridStats, Mesh, MeshOutput, Quantized, Stage};
+use crate::surface::{GridStats, Mesh, MeshOutput, Stage};
 
 /// Number of devices for a job of `n_bricks`, given `idle` devices and a minimum of bricks per partition. A job runs on
 /// one device if the result is 1, which is always the case without a minimum.
@@ -18,36 +18,12 @@ pub(super) fn n_partitions(n_bricks: u64, idle: usize, min_bricks: Option<u64>) 
 pub(super) fn join(partitions: Vec<Finished>, has_flat_vertices: bool) -> Finished {
     let stages = max_times(&partitions);
     let mut mesh = Mesh::default();
-    let (mut positions, mut normals, mut triangles, mut atom_ids) = (vec![], vec![], vec![], vec![]);
-    let (mut step, mut quantized_positions, mut quantized_normals) = (None, vec![], vec![]);
     let mut grid = GridStats::default();
-    let mut before = (0, 0);
     for Finished { meshed, .. } in partitions {
-        let part = meshed.mesh;
-        mesh.centre = part.centre;
-        mesh.parts.extend(part.parts.iter().map(|(v, t)| (before.0 + v, before.1 + t)));
-        before = (before.0 + part.n_vertices(), before.1 + part.n_triangles());
-        positions.push(part.positions);
-        normals.push(part.normals);
-        if let Some(quantized) = part.quantized {
-            step = Some(quantized.step);
-            quantized_positions.push(quantized.positions);
-            quantized_normals.push(quantized.normals);
-        }
-        triangles.push(part.triangles);
-        atom_ids.extend(part.atom_ids);
         let surface_bricks = grid.surface_bricks + meshed.grid.surface_bricks;
         grid = GridStats { surface_bricks, ..meshed.grid };
+        mesh.append(meshed.mesh);
     }
-    mesh.positions = Column::from_chunks(positions);
-    mesh.normals = Column::from_chunks(normals);
-    mesh.quantized = step.map(|step| Quantized {
-        step,
-        positions: Column::from_chunks(quantized_positions),
-        normals: Column::from_chunks(quantized_normals),
-    });
-    mesh.triangles = Column::from_chunks(triangles);
-    mesh.atom_ids = (!atom_ids.is_empty()).then(|| Column::from_chunks(atom_ids));
     if has_flat_vertices {
         mesh.fill_flat_normals();
     }

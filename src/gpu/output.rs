@@ -118,13 +118,13 @@ impl Engine {
         self.write_params(&loaded.workspace, 1, &params);
         let layout = ReadbackLayout::new(rows, loaded.vertex);
         let readback = self.readback.acquire(&self.device, layout.end);
-        let target = readback.buffer().map_err(GpuError::Failed)?;
+        let target = &readback.buffer;
         let mut recording = self.recording();
         recording.stage(stage, &[loaded.dispatch(1, piece.n_bricks)]);
         recording.copy_output(&loaded.workspace, loaded.vertex, rows, target, &layout);
         recording.copy_timestamps(target);
         recording.copy_counters(&loaded.workspace, target);
-        let submission = self.submit(recording, vec![(readback, layout.end)])?;
+        let submission = self.submit(recording, vec![(readback, layout.end)]);
         Ok(PendingOutput { submission, layout, rows, stage })
     }
 

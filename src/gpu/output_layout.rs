@@ -1,9 +1,11 @@
 //! Layout of a job's output: pieces that are computed at once, and the columns of each piece in a readback buffer.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use bytemuck::Pod;
 
+use super::error::GpuError;
 use super::pipelines::TIMESTAMP_BYTES;
 use super::plan::layout::{Counters, GROUP};
 use super::readback::ReadbackBuffer;
@@ -105,7 +107,7 @@ impl ReadbackLayout {
 }
 
 /// Vertices and triangles in a mapped readback buffer.
-#[derive(Debug, Clone)]
+#[derive(Clone)]
 pub(super) struct ReadbackRows {
     pub(super) readback: Arc<ReadbackBuffer>,
     pub(super) layout: ReadbackLayout,
@@ -114,11 +116,17 @@ pub(super) struct ReadbackRows {
 }
 
 /// Returns `n` values at byte `offset` of a readback buffer.
-pub(super) fn values<T: Pod>(bytes: &[u8], offset: u64, n: u64) -> Result<&[T], String> {
-    let from = usize::try_from(offset).map_err(|e| e.to_string())?;
-    let len = usize::try_from(n).map_err(|e| e.to_string())? * size_of::<T>();
-    let range = bytes.get(from..from + len).ok_or_else(|| format!("{len} bytes at {from} of {}", bytes.len()))?;
-    bytemuck::try_cast_slice(range).map_err(|e| e.to_string())
+pub(super) fn values<T: Pod>(bytes: &[u8], offset: u64, n: u64) -> Result<&[T], GpuError> {
+    let range = byte_range::<T>(offset, n)?;
+    let values = bytes.get(range.clone()).and_then(|bytes| bytemuck::try_cast_slice(bytes).ok());
+    values.ok_or_else(|| GpuError::Failed(format!("no values in bytes {range:?} of {}", bytes.len())))
+}
+
+/// Byte range of `n` values at byte `offset`.
+pub(super) fn byte_range<T>(offset: u64, n: u64) -> Result<Range<usize>, GpuError> {
+    let number = |n: u64| usize::try_from(n).map_err(|e| GpuError::Failed(e.to_string()));
+    let from = number(offset)?;
+    Ok(from..from + number(n)? * size_of::<T>())
 }
 
 #[cfg(test)]

@@ -1,7 +1,6 @@
 //! Rendezvous for the partitions of a multi-device job: each publishes its counts and receives its vertex and triangle
 //! offsets, and the records of the bricks that it imports from later partitions.
 
-use std::fmt;
 use std::ops::Range;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -128,7 +127,7 @@ impl PartitionHandle {
     /// Waits until all partitions have published their counts.
     ///
     /// # Errors
-    /// [`SurfaceError::Cancelled`] if the run was aborted or the job cancelled; [`GpuError::Deadline`].
+    /// [`SurfaceError::Cancelled`] if the run was aborted or the job cancelled; [`SurfaceError::Deadline`].
     pub(super) fn await_counts(&self, job: &GpuJob) -> Result<Numbering, GpuError> {
         let mut state = self.lock();
         loop {
@@ -178,11 +177,5 @@ impl PartitionHandle {
     fn lock(&self) -> MutexGuard<'_, State> {
         // No code panics between two changes under the lock, so a poisoned state is consistent.
         self.shared.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-}
-
-impl fmt::Debug for PartitionHandle {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "PartitionHandle({} of {})", self.index, self.shared.partitions.len())
     }
 }

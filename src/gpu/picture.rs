@@ -5,15 +5,13 @@ use std::sync::{Mutex, PoisonError};
 
 use wgpu::Adapter;
 
-use super::describe::{arithmetic, describe};
-use super::device;
-use super::discover::Discovery;
+use super::discover::{self, Discovery, arithmetic, describe};
 use super::error::GpuError;
 use super::picture_passes::PicturePasses;
 use super::picture_targets::Requirements;
 use crate::picture::camera::Camera;
 use crate::picture::{CpuRenderer, Image, PictureError, PictureParams, Rendered, Renderer};
-use crate::surface::{Control, Mesh, Served, Vertices};
+use crate::surface::{BackendIdentity, Control, Mesh, Vertices};
 
 /// Renderer on one device, with an optional fallback to the CPU.
 pub struct GpuRenderer {
@@ -32,9 +30,8 @@ impl GpuRenderer {
     /// # Errors
     /// [`GpuError::NoDevice`] if no device is selected, and errors of opening the device.
     pub fn start(discovery: &Discovery, fallback: Option<CpuRenderer>) -> Result<Self, GpuError> {
-        let mut taken = discovery.devices.iter().zip(&discovery.adapters).filter(|(found, _)| found.taken);
-        let Some((found, adapter)) = taken.next() else {
-            return Err(GpuError::NoDevice(discovery.why_none().unwrap_or_default()));
+        let Some((found, adapter)) = discovery.selected_adapters().next() else {
+            return Err(GpuError::NoDevice(discovery.no_device_reason().unwrap_or_default()));
         };
         let passes = Mutex::new(Some(open(adapter)?));
         Ok(Self { adapter: adapter.clone(), device: describe(&found.facts), passes, fallback })
@@ -68,7 +65,7 @@ impl GpuRenderer {
 
 /// Opens a device and compiles the passes.
 fn open(adapter: &Adapter) -> Result<PicturePasses, GpuError> {
-    let (device, queue) = device::open(adapter)?;
+    let (device, queue) = discover::open(adapter)?;
     PicturePasses::new(device, queue)
 }
 
@@ -95,18 +92,13 @@ impl Renderer for GpuRenderer {
 
     fn render(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError> {
         match (self.draw(mesh, params, control), &self.fallback) {
-            (Ok((image, pixel)), _) => Ok(Rendered { image, pixel, served: None }),
+            (Ok((image, pixel)), _) => Ok(Rendered { image, pixel, made_by: None }),
             (Err(DrawError::Picture(error)), _) => Err(error),
             (Err(DrawError::Device(why)), None) => Err(PictureError::Device { why }),
             (Err(DrawError::Device(why)), Some(cpu)) => {
                 let fallback_reason = Some(format!("the GPU could not draw it: {}", why.replace('\n', " ")));
-                let served = Served {
-                    backend: cpu.name(),
-                    arithmetic: cpu.arithmetic(),
-                    device: cpu.describe(),
-                    fallback_reason,
-                };
-                Ok(Rendered { served: Some(served), ..cpu.render(mesh, params, control)? })
+                let made_by = BackendIdentity { fallback_reason, ..cpu.identity() };
+                Ok(Rendered { made_by: Some(made_by), ..cpu.render(mesh, params, control)? })
             }
         }
     }

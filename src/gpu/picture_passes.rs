@@ -3,17 +3,16 @@
 use std::sync::Arc;
 
 use wgpu::{
-    BindGroup, BindGroupEntry, BindGroupLayout, BindGroupLayoutEntry, BindingResource, BindingType, Buffer,
-    BufferBindingType, BufferUsages, CommandEncoder, ComputePipeline, Device, Limits, LoadOp, MapMode, Operations,
-    PollType, Queue, RenderPassColorAttachment, RenderPassDepthStencilAttachment, RenderPipeline, ShaderModule,
-    ShaderStages, StoreOp, TextureSampleType, TextureUsages, TextureViewDescriptor, TextureViewDimension,
+    BindGroup, BindGroupEntry, BindGroupLayout, BindingResource, Buffer, BufferUsages, CommandEncoder, ComputePipeline,
+    Device, Limits, LoadOp, MapMode, Operations, PollType, Queue, RenderPassColorAttachment,
+    RenderPassDepthStencilAttachment, RenderPipeline, ShaderModule, StoreOp, TextureUsages, TextureViewDescriptor,
     VertexAttribute, VertexBufferLayout, VertexFormat, VertexStepMode,
 };
 
 use super::device_errors::DeviceErrors;
 use super::error::GpuError;
 use super::picture_targets::{
-    DEPTH, FinishParams, Layered, NEAREST, NOTHING, PATTERN, SHADE, View, buffer, taps_of, texture,
+    DEPTH, DEPTH_BUFFER, FinishParams, NO_SURFACE_DEPTH, PATTERN, SHADE, View, buffer, layer, layered, taps_of, texture,
 };
 use super::shaders::{PICTURE, Shader};
 use crate::picture::PictureParams;
@@ -24,21 +23,14 @@ use crate::picture::light::Levels;
 /// Width and height of a workgroup in pixels, as in the shaders.
 const GROUP: u32 = 8;
 
-/// Compute pass with its bind group layout.
-struct ComputePass {
-    pipeline: ComputePipeline,
-    layout: BindGroupLayout,
-}
-
-/// Open device with the compiled passes.
+/// Open device with the compiled passes. The bind group layouts follow from the shaders.
 pub(super) struct PicturePasses {
     device: Device,
     queue: Queue,
     errors: Arc<DeviceErrors>,
     draw: RenderPipeline,
-    view: BindGroupLayout,
-    resolve: ComputePass,
-    finish: ComputePass,
+    resolve: ComputePipeline,
+    finish: ComputePipeline,
     levels: Buffer,
 }
 
@@ -50,28 +42,15 @@ impl PicturePasses {
     pub(super) fn new(device: Device, queue: Queue) -> Result<Self, GpuError> {
         let errors = DeviceErrors::listen(&device);
         let [vertex, fragment, resolve, finish] = &PICTURE;
-        let view = layout(&device, "view", &[uniform(0, ShaderStages::VERTEX)]);
-        let draw = draw_pipeline(&device, &view, [vertex, fragment]);
-        let compute = ShaderStages::COMPUTE;
-        let resolved = [uniform(0, compute), layers(1), layers(2), storage(3, false), storage(4, false)];
-        let finished = [
-            uniform(0, compute),
-            storage(1, true),
-            storage(2, true),
-            storage(3, true),
-            storage(4, true),
-            storage(5, false),
-        ];
         let table: Vec<u32> = Levels::get().table().iter().copied().map(u32::from).collect();
         let levels = filled(&device, &queue, "levels", bytemuck::cast_slice(&table), BufferUsages::STORAGE);
         let passes = Self {
-            resolve: compute_pass(&device, resolve, &resolved),
-            finish: compute_pass(&device, finish, &finished),
+            draw: draw_pipeline(&device, [vertex, fragment]),
+            resolve: compute_pipeline(&device, resolve),
+            finish: compute_pipeline(&device, finish),
             device,
             queue,
             errors,
-            draw,
-            view,
             levels,
         };
         passes.check_errors()?;
@@ -105,10 +84,10 @@ impl PicturePasses {
         let n_indices = u32::try_from(3 * triangles.len()).map_err(|_too_many| {
             GpuError::Failed(format!("{} triangles are too many for one draw", triangles.len()))
         })?;
-        let shades = Layered::new(device, "molmesh.picture.shades", SHADE, params);
-        let depths = Layered::new(device, "molmesh.picture.depths", DEPTH, params);
+        let shades = layered(device, "molmesh.picture.shades", SHADE, params);
+        let depths = layered(device, "molmesh.picture.depths", DEPTH, params);
         let attachment = TextureUsages::RENDER_ATTACHMENT;
-        let nearest = texture(device, "molmesh.picture.nearest", NEAREST, params, 1, attachment);
+        let nearest = texture(device, "molmesh.picture.nearest", DEPTH_BUFFER, params, 1, attachment);
         let nearest = nearest.create_view(&TextureViewDescriptor::default());
         self.check_errors()?;
 
@@ -117,8 +96,8 @@ impl PicturePasses {
         for (sample, offset) in (0_u32..).zip(PATTERN) {
             let view = View::new(camera, offset);
             let view = column("view", bytemuck::bytes_of(&view), BufferUsages::UNIFORM);
-            let group = bind(device, &self.view, &[view.as_entire_binding()]);
-            let views = [shades.layer(sample), depths.layer(sample)];
+            let group = bind(device, &self.draw.get_bind_group_layout(0), &[view.as_entire_binding()]);
+            let views = [layer(&shades, sample), layer(&depths, sample)];
             let mut pass = begin_draw(&mut encoder, &views, &nearest);
             pass.set_pipeline(&self.draw);
             pass.set_bind_group(0, &group, &[]);
@@ -138,7 +117,8 @@ impl PicturePasses {
         let mappable = BufferUsages::COPY_DST | BufferUsages::MAP_READ;
         let readback = buffer(device, "molmesh.picture.readback", 4 * n_pixels, mappable);
         let groups = [params.width.div_ceil(GROUP), params.height.div_ceil(GROUP)];
-        let (all_shades, all_depths) = (shades.all(), depths.all());
+        let [all_shades, all_depths] =
+            [&shades, &depths].map(|texture| texture.create_view(&TextureViewDescriptor::default()));
         let resources = [
             finish_params.as_entire_binding(),
             BindingResource::TextureView(&all_shades),
@@ -146,10 +126,10 @@ impl PicturePasses {
             seen.as_entire_binding(),
             resolved_normals.as_entire_binding(),
         ];
-        self.resolve.run(device, &mut encoder, &resources, groups);
+        compute(device, &mut encoder, &self.resolve, &resources, groups);
         let resources =
             [&finish_params, &seen, &resolved_normals, &taps, &self.levels, &pixels].map(Buffer::as_entire_binding);
-        self.finish.run(device, &mut encoder, &resources, groups);
+        compute(device, &mut encoder, &self.finish, &resources, groups);
         encoder.copy_buffer_to_buffer(&pixels, 0, &readback, 0, 4 * n_pixels);
         queue.submit([encoder.finish()]);
         self.read(&readback)
@@ -174,14 +154,19 @@ impl PicturePasses {
     }
 }
 
-impl ComputePass {
-    fn run(&self, device: &Device, encoder: &mut CommandEncoder, resources: &[BindingResource<'_>], groups: [u32; 2]) {
-        let group = bind(device, &self.layout, resources);
-        let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: None, timestamp_writes: None });
-        pass.set_pipeline(&self.pipeline);
-        pass.set_bind_group(0, &group, &[]);
-        pass.dispatch_workgroups(groups[0], groups[1], 1);
-    }
+/// Records a compute pass.
+fn compute(
+    device: &Device,
+    encoder: &mut CommandEncoder,
+    pipeline: &ComputePipeline,
+    resources: &[BindingResource<'_>],
+    groups: [u32; 2],
+) {
+    let group = bind(device, &pipeline.get_bind_group_layout(0), resources);
+    let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor { label: None, timestamp_writes: None });
+    pass.set_pipeline(pipeline);
+    pass.set_bind_group(0, &group, &[]);
+    pass.dispatch_workgroups(groups[0], groups[1], 1);
 }
 
 /// Begins a pass that draws one sample of every pixel onto cleared targets.
@@ -196,7 +181,7 @@ fn begin_draw<'a>(
         |view, r| Some(RenderPassColorAttachment { view, depth_slice: None, resolve_target: None, ops: cleared(r) });
     encoder.begin_render_pass(&wgpu::RenderPassDescriptor {
         label: Some("molmesh.picture"),
-        color_attachments: &[color(&views[0], 0.0), color(&views[1], NOTHING)],
+        color_attachments: &[color(&views[0], 0.0), color(&views[1], NO_SURFACE_DEPTH)],
         depth_stencil_attachment: Some(RenderPassDepthStencilAttachment {
             view: nearest,
             depth_ops: Some(Operations { load: LoadOp::Clear(1.0), store: StoreOp::Discard }),
@@ -209,22 +194,17 @@ fn begin_draw<'a>(
 }
 
 /// Compiles the pipeline of the draw passes.
-fn draw_pipeline(device: &Device, view: &BindGroupLayout, [vertex, fragment]: [&Shader; 2]) -> RenderPipeline {
+fn draw_pipeline(device: &Device, [vertex, fragment]: [&Shader; 2]) -> RenderPipeline {
     let attributes =
         [0, 1].map(|shader_location| [VertexAttribute { format: VertexFormat::Float32x3, offset: 0, shader_location }]);
     let columns = attributes
         .each_ref()
         .map(|attributes| Some(VertexBufferLayout { array_stride: 12, step_mode: VertexStepMode::Vertex, attributes }));
     let [vertex, fragment] = [vertex, fragment].map(|shader| module(device, shader));
-    let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-        label: Some("molmesh.picture"),
-        bind_group_layouts: &[Some(view)],
-        immediate_size: 0,
-    });
     let target = |format| Some(wgpu::ColorTargetState { format, blend: None, write_mask: wgpu::ColorWrites::ALL });
     device.create_render_pipeline(&wgpu::RenderPipelineDescriptor {
         label: Some("molmesh.picture"),
-        layout: Some(&layout),
+        layout: None,
         vertex: wgpu::VertexState {
             module: &vertex,
             entry_point: Some("main"),
@@ -237,7 +217,7 @@ fn draw_pipeline(device: &Device, view: &BindGroupLayout, [vertex, fragment]: [&
             ..wgpu::PrimitiveState::default()
         },
         depth_stencil: Some(wgpu::DepthStencilState {
-            format: NEAREST,
+            format: DEPTH_BUFFER,
             depth_write_enabled: Some(true),
             depth_compare: Some(wgpu::CompareFunction::Less),
             stencil: wgpu::StencilState::default(),
@@ -260,26 +240,15 @@ fn module(device: &Device, shader: &Shader) -> ShaderModule {
     device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(shader.stage), source })
 }
 
-fn compute_pass(device: &Device, shader: &Shader, entries: &[BindGroupLayoutEntry]) -> ComputePass {
-    let layout = layout(device, shader.stage, entries);
-    let pipeline_layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+fn compute_pipeline(device: &Device, shader: &Shader) -> ComputePipeline {
+    device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: Some(shader.stage),
-        bind_group_layouts: &[Some(&layout)],
-        immediate_size: 0,
-    });
-    let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-        label: Some(shader.stage),
-        layout: Some(&pipeline_layout),
+        layout: None,
         module: &module(device, shader),
         entry_point: Some("main"),
         compilation_options: wgpu::PipelineCompilationOptions::default(),
         cache: None,
-    });
-    ComputePass { pipeline, layout }
-}
-
-fn layout(device: &Device, label: &str, entries: &[BindGroupLayoutEntry]) -> BindGroupLayout {
-    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: Some(label), entries })
+    })
 }
 
 fn bind(device: &Device, layout: &BindGroupLayout, resources: &[BindingResource<'_>]) -> BindGroup {
@@ -288,28 +257,6 @@ fn bind(device: &Device, layout: &BindGroupLayout, resources: &[BindingResource<
         .map(|(binding, resource)| BindGroupEntry { binding, resource: resource.clone() })
         .collect();
     device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout, entries: &entries })
-}
-
-fn entry(binding: u32, visibility: ShaderStages, ty: BindingType) -> BindGroupLayoutEntry {
-    BindGroupLayoutEntry { binding, visibility, ty, count: None }
-}
-
-fn of_buffer(ty: BufferBindingType) -> BindingType {
-    BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None }
-}
-
-fn uniform(binding: u32, visibility: ShaderStages) -> BindGroupLayoutEntry {
-    entry(binding, visibility, of_buffer(BufferBindingType::Uniform))
-}
-
-fn storage(binding: u32, read_only: bool) -> BindGroupLayoutEntry {
-    entry(binding, ShaderStages::COMPUTE, of_buffer(BufferBindingType::Storage { read_only }))
-}
-
-fn layers(binding: u32) -> BindGroupLayoutEntry {
-    let sample_type = TextureSampleType::Float { filterable: false };
-    let view_dimension = TextureViewDimension::D2Array;
-    entry(binding, ShaderStages::COMPUTE, BindingType::Texture { sample_type, view_dimension, multisampled: false })
 }
 
 /// Creates a buffer that holds `bytes`, a multiple of four.

@@ -8,7 +8,7 @@ use wgpu::{
 
 use crate::picture::PictureParams;
 use crate::picture::camera::Camera;
-use crate::picture::finish::Finish;
+use crate::picture::finish::{self, Finish};
 use crate::picture::light::{AMBIENT, DIFFUSE, LIGHT};
 use crate::surface::Mesh;
 
@@ -19,9 +19,9 @@ pub(super) const SHADE: TextureFormat = TextureFormat::Rgba16Float;
 /// Format of the depth of a sample, Å.
 pub(super) const DEPTH: TextureFormat = TextureFormat::R32Float;
 /// Format of the depth buffer.
-pub(super) const NEAREST: TextureFormat = TextureFormat::Depth32Float;
+pub(super) const DEPTH_BUFFER: TextureFormat = TextureFormat::Depth32Float;
 /// Depth of samples without a surface.
-pub(super) const NOTHING: f64 = 3.0e38;
+pub(super) const NO_SURFACE_DEPTH: f64 = 3.0e38;
 
 /// Uniform of the draw passes, as `shaders/picture/vertex.wgsl` reads it.
 #[derive(Debug, Clone, Copy, Pod, Zeroable)]
@@ -91,12 +91,12 @@ impl FinishParams {
             n_taps: u32::try_from(finish.taps.len()).unwrap_or(0),
             line_width: finish.line_width,
             falloff: finish.falloff,
-            bias: finish.bias,
-            strength: finish.strength,
-            min_light: finish.min_light,
+            bias: finish::BIAS,
+            strength: finish::STRENGTH,
+            min_light: finish::MIN_LIGHT,
             step_min,
             step_max,
-            line_strength: finish.line_strength,
+            line_strength: finish::LINE_STRENGTH,
             pad: 0.0,
         }
     }
@@ -154,32 +154,20 @@ impl Requirements {
     }
 }
 
-/// Texture with one layer per sample.
-pub(super) struct Layered {
-    texture: Texture,
+/// Creates a texture with one layer per sample.
+pub(super) fn layered(device: &Device, label: &str, format: TextureFormat, params: &PictureParams) -> Texture {
+    let usage = TextureUsages::RENDER_ATTACHMENT | TextureUsages::TEXTURE_BINDING;
+    texture(device, label, format, params, PATTERN.len(), usage)
 }
 
-impl Layered {
-    pub(super) fn new(device: &Device, label: &str, format: TextureFormat, params: &PictureParams) -> Self {
-        let usage = TextureUsages::RENDER_ATTACHMENT | TextureUsages::TEXTURE_BINDING;
-        Self { texture: texture(device, label, format, params, PATTERN.len(), usage) }
-    }
-
-    /// View of the layer of one sample, as a render target.
-    pub(super) fn layer(&self, sample: u32) -> TextureView {
-        self.texture.create_view(&TextureViewDescriptor {
-            dimension: Some(TextureViewDimension::D2),
-            base_array_layer: sample,
-            array_layer_count: Some(1),
-            ..TextureViewDescriptor::default()
-        })
-    }
-
-    /// View of all layers, for reading.
-    pub(super) fn all(&self) -> TextureView {
-        let dimension = Some(TextureViewDimension::D2Array);
-        self.texture.create_view(&TextureViewDescriptor { dimension, ..TextureViewDescriptor::default() })
-    }
+/// View of the layer of one sample, as a render target.
+pub(super) fn layer(texture: &Texture, sample: u32) -> TextureView {
+    texture.create_view(&TextureViewDescriptor {
+        dimension: Some(TextureViewDimension::D2),
+        base_array_layer: sample,
+        array_layer_count: Some(1),
+        ..TextureViewDescriptor::default()
+    })
 }
 
 /// Creates a texture of the size of the picture.

@@ -15,9 +15,8 @@ use super::error::GpuError;
 use super::job::{Finished, GpuJob, JobResult};
 use super::multi_device::{join, n_partitions};
 use super::partition_handle::PartitionHandle;
-use super::scheduler::{EnqueueError, Scheduler, Ticket};
-use super::worker::{self, Build, Timing};
-use crate::surface::devices::MIN_PARTITION_BRICKS;
+use super::scheduler::{EnqueueError, PoolSettings, Scheduler, Ticket};
+use super::worker::{self, Build};
 use crate::surface::{DeviceStatus, Stage, SurfaceError};
 
 /// Interval at which a waiting caller checks for cancellation and deadline. Results wake it at once.
@@ -35,37 +34,11 @@ pub struct PoolDevice {
     pub build: Build,
 }
 
-/// Settings of a pool.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct PoolSettings {
-    /// Maximum number of jobs that wait for one device; further callers block.
-    pub queue: usize,
-    /// Maximum number of small jobs that share a submission.
-    pub batch: usize,
-    /// Pause after a failed rebuild, doubled each time.
-    pub rebuild_pause: Duration,
-    /// Time without work after which a device releases the memory that it keeps for the next large job.
-    pub idle: Duration,
-    /// Minimum number of bricks per partition of a multi-device job. `None` disables multi-device jobs.
-    pub min_partition_bricks: Option<u64>,
-}
-
-impl Default for PoolSettings {
-    /// 64 waiting jobs, so that memory runs out before callers block. 16 jobs per submission: the fixed cost is
-    /// negligible beyond. 200 ms between rebuilds: a driver restarts in about half a second. 5 s of idle time: longer
-    /// than the gaps between consecutive large jobs of one caller.
-    fn default() -> Self {
-        let (rebuild_pause, idle) = (Duration::from_millis(200), Duration::from_secs(5));
-        Self { queue: 64, batch: 16, rebuild_pause, idle, min_partition_bricks: Some(MIN_PARTITION_BRICKS) }
-    }
-}
-
 /// Devices with their threads. Dropping the pool stops and joins the threads.
 pub struct DevicePool {
     scheduler: Arc<Scheduler>,
     threads: Vec<JoinHandle<()>>,
     names: Vec<String>,
-    min_partition_bricks: Option<u64>,
 }
 
 /// Finished job with the devices that made it.
@@ -122,15 +95,14 @@ impl DevicePool {
     /// started.
     pub fn start(devices: Vec<PoolDevice>, settings: &PoolSettings) -> Result<Self, GpuError> {
         let known: Vec<(usize, String)> = devices.iter().map(|d| (d.number, d.name.clone())).collect();
-        let scheduler = Arc::new(Scheduler::new(&known, settings.queue, settings.batch));
+        let scheduler = Arc::new(Scheduler::new(&known, *settings));
         let names = known.into_iter().map(|(_, name)| name).collect();
         let threads = Vec::with_capacity(devices.len());
-        let mut pool = Self { scheduler, threads, names, min_partition_bricks: settings.min_partition_bricks };
-        let timing = Timing { rebuild_pause: settings.rebuild_pause, idle: settings.idle };
+        let mut pool = Self { scheduler, threads, names };
         for (n, device) in devices.into_iter().enumerate() {
             let scheduler = Arc::clone(&pool.scheduler);
             let thread = std::thread::Builder::new().name(format!("molmesh-gpu-{}", device.number));
-            let started = thread.spawn(move || worker::work(&scheduler, n, &device.build, timing));
+            let started = thread.spawn(move || worker::work(&scheduler, n, &device.build));
             let failed = |e: io::Error| GpuError::Failed(format!("the thread of a device cannot be started: {e}"));
             pool.threads.push(started.map_err(failed)?);
         }
@@ -202,7 +174,7 @@ impl DevicePool {
     fn run_on_several(&self, job: &GpuJob) -> MultiDeviceOutcome {
         let idle = self.scheduler.idle_devices();
         let plan = &job.prepared.plan;
-        let n = n_partitions(plan.bricks.len() as u64, idle.len(), self.min_partition_bricks);
+        let n = n_partitions(plan.bricks.len() as u64, idle.len(), self.scheduler.settings.min_partition_bricks);
         if n < 2 {
             return MultiDeviceOutcome::NotApplicable;
         }
@@ -231,7 +203,7 @@ impl DevicePool {
             }
         }
         if let Err(error) = job.check() {
-            return MultiDeviceOutcome::JobFailed(error);
+            return MultiDeviceOutcome::JobFailed(error.into());
         }
         if let Some(error) = device_error {
             return MultiDeviceOutcome::DevicesFailed(failures, error);
@@ -258,7 +230,7 @@ impl DevicePool {
                     if let Err(error) = job.check() {
                         for ticket in &tickets[results.len()..] {
                             self.scheduler.cancel(ticket);
-                            results.push(ticket.result.try_recv().unwrap_or_else(|_pending| Err(error.clone())));
+                            results.push(ticket.result.try_recv().unwrap_or_else(|_pending| Err(error.clone().into())));
                         }
                     }
                 }

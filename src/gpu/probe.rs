@@ -76,7 +76,7 @@ impl StageProbe {
         let workgroups = workgroups(stage, &self.params);
         let mut recording = self.engine.recording();
         recording.stage(stage, &[Dispatch { workspace: &self.workspace, row: 0, workgroups, variant: self.variant }]);
-        self.engine.wait(self.engine.submit(recording, Vec::new())?).map(drop)
+        self.engine.wait(self.engine.submit(recording, Vec::new())).map(drop)
     }
 
     /// Reads the first `bytes` bytes of a buffer.
@@ -87,9 +87,9 @@ impl StageProbe {
         let mapped = bytes.next_multiple_of(8);
         let readback = self.engine.readback.acquire(&self.engine.device, mapped);
         let mut recording = self.engine.recording();
-        let target = readback.buffer().map_err(GpuError::Failed)?;
+        let target = &readback.buffer;
         recording.encoder.copy_buffer_to_buffer(self.workspace.buffer(id), 0, target, 0, bytes);
-        let readback = self.engine.submit_and_wait(recording, (readback, mapped))?;
+        let readback = self.engine.wait_one(self.engine.submit(recording, vec![(readback, mapped)]))?;
         let all: &[u8] = (*readback).as_ref();
         Ok(all[..usize::try_from(bytes).unwrap_or_default()].to_vec())
     }

@@ -3,10 +3,11 @@
 //! The columns of a mesh stay in the buffer for as long as the mesh lives; then the buffer returns to the pool. Copying
 //! them into other memory would take many times as long as the transfer.
 
-use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use wgpu::{Buffer, BufferUsages, BufferView, Device};
+
+use super::error::GpuError;
 
 /// Pool of idle readback buffers.
 #[derive(Debug, Clone)]
@@ -24,8 +25,8 @@ struct Idle {
 
 /// Buffer that a submission copies into. Returns to its pool when dropped.
 pub(super) struct ReadbackBuffer {
-    /// `None` only while the buffer is being dropped.
-    buffer: Option<Buffer>,
+    /// Target of copies.
+    pub(super) buffer: Buffer,
     view: Option<BufferView>,
     pool: ReadbackPool,
 }
@@ -63,7 +64,7 @@ impl ReadbackPool {
                 mapped_at_creation: false,
             })
         };
-        ReadbackBuffer { buffer: Some(buffer), view: None, pool: self.clone() }
+        ReadbackBuffer { buffer, view: None, pool: self.clone() }
     }
 
     /// Bytes of all buffers, idle and in use.
@@ -108,23 +109,17 @@ pub(super) fn size_class(bytes: u64) -> u64 {
 }
 
 impl ReadbackBuffer {
-    /// Returns the target of copies.
-    pub(super) fn buffer(&self) -> Result<&Buffer, String> {
-        self.buffer.as_ref().ok_or_else(|| "the readback buffer was dropped".to_owned())
-    }
-
     /// Requests to map the first `bytes` bytes. They are readable when the submission is finished and the device was
     /// polled; see [`Self::mapped`].
-    pub(super) fn map(&self, bytes: u64) -> Result<(), String> {
+    pub(super) fn map(&self, bytes: u64) {
         // `mapped` reports a failure.
-        self.buffer()?.slice(..bytes).map_async(wgpu::MapMode::Read, |_| {});
-        Ok(())
+        self.buffer.slice(..bytes).map_async(wgpu::MapMode::Read, |_| {});
     }
 
     /// Returns the buffer with its first `bytes` bytes, as requested by [`Self::map`], readable.
-    pub(super) fn mapped(mut self, bytes: u64) -> Result<Arc<Self>, String> {
-        let view = self.buffer()?.slice(..bytes).get_mapped_range().map_err(|e| e.to_string())?;
-        self.view = Some(view);
+    pub(super) fn mapped(mut self, bytes: u64) -> Result<Arc<Self>, GpuError> {
+        let view = self.buffer.slice(..bytes).get_mapped_range();
+        self.view = Some(view.map_err(|e| GpuError::Failed(e.to_string()))?);
         Ok(Arc::new(self))
     }
 }
@@ -139,16 +134,8 @@ impl Drop for ReadbackBuffer {
     fn drop(&mut self) {
         // The view must be dropped before the buffer is unmapped.
         self.view = None;
-        if let Some(buffer) = self.buffer.take() {
-            buffer.unmap();
-            self.pool.put_back(buffer);
-        }
-    }
-}
-
-impl fmt::Debug for ReadbackBuffer {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "ReadbackBuffer({} bytes)", self.as_ref().len())
+        self.buffer.unmap();
+        self.pool.put_back(self.buffer.clone());
     }
 }
 

@@ -135,11 +135,6 @@ impl<'a> Recording<'a> {
         self.copy_start(from, target, COUNTERS_OFFSET, size_of::<Counters>() as u64);
     }
 
-    /// Copies the counts of groups, `bytes` bytes to `offset`.
-    pub(super) fn copy_groups(&mut self, workspace: &Workspace, target: &Buffer, offset: u64, bytes: u64) {
-        self.copy_start(workspace.buffer(BufferId::Groups), target, offset, bytes);
-    }
-
     /// Copies the first `n_vertices` and `n_triangles` of the output buffers to their columns.
     pub(super) fn copy_output(
         &mut self,
@@ -160,7 +155,7 @@ impl<'a> Recording<'a> {
     }
 
     /// Copies the first `bytes` bytes of a buffer.
-    fn copy_start(&mut self, from: &Buffer, target: &Buffer, offset: u64, bytes: u64) {
+    pub(super) fn copy_start(&mut self, from: &Buffer, target: &Buffer, offset: u64, bytes: u64) {
         if bytes > 0 {
             self.encoder.copy_buffer_to_buffer(from, 0, target, offset, bytes);
         }

@@ -2,7 +2,8 @@
 
 use std::sync::Arc;
 
-use super::count::{group_bytes, narrow};
+use super::buffers::BufferId;
+use super::count::narrow;
 use super::engine::{Engine, LoadedJob};
 use super::error::GpuError;
 use super::executor::Executor;
@@ -26,7 +27,7 @@ impl Executor for Engine {
         let mut results: Vec<Option<JobResult>> = jobs.iter().map(|_| None).collect();
         let mut small = Vec::new();
         for (result, job) in results.iter_mut().zip(jobs) {
-            let loaded = job.check().and_then(|()| self.chunks(job, None)).and_then(|chunks| {
+            let loaded = self.chunks(job, None).and_then(|chunks| {
                 let estimate = self.small_capacity(job, &chunks);
                 let loaded = self.load(job, None, chunks, estimate.unwrap_or(NO_OUTPUT))?;
                 Ok((loaded, estimate))
@@ -115,16 +116,16 @@ impl Engine {
         for (loaded, capacity) in jobs {
             let rows = [capacity.vertices, capacity.triangles];
             let layout = ReadbackLayout::new(rows, loaded.vertex);
-            let groups = group_bytes(&loaded.chunks[0]);
+            let groups = 16 * loaded.chunks[0].n_groups();
             let readback = self.readback.acquire(&self.device, layout.end + groups);
-            let target = readback.buffer().map_err(GpuError::Failed)?;
+            let target = &readback.buffer;
             recording.copy_timestamps(target);
             recording.copy_counters(&loaded.workspace, target);
-            recording.copy_groups(&loaded.workspace, target, layout.end, groups);
+            recording.copy_start(loaded.workspace.buffer(BufferId::Groups), target, layout.end, groups);
             recording.copy_output(&loaded.workspace, loaded.vertex, rows, target, &layout);
             readbacks.push((readback, layout.end + groups));
         }
-        self.wait(self.submit(recording, readbacks)?)
+        self.wait(self.submit(recording, readbacks))
     }
 
     /// Assembles the mesh of a small job. Its output is made again if the estimate was too low.
@@ -141,7 +142,7 @@ impl Engine {
         let mut times = [0; N_STAGES];
         self.add_times(&mut times, readback, 0..N_STAGES)?;
         state.times = times.map(|ns| portion(ns, share));
-        let (n_vertices, n_triangles) = (counts.n_vertices, counts.n_triangles);
+        let [n_vertices, n_triangles] = state.total;
         if n_vertices > capacity.vertices || n_triangles > capacity.triangles {
             self.make_output(state, &[(0, &counts)], Stage::Interpolate)?;
             self.make_triangles(state, &[counts])?;

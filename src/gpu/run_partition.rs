@@ -12,7 +12,6 @@ use super::job_state::JobState;
 use super::output::NO_OUTPUT;
 use super::output_layout::values;
 use super::partition_handle::{Import, PartitionCounts, PartitionHandle};
-use super::plan::check_totals;
 use super::plan::layout::Record;
 use super::plan::partition::total_len;
 use super::submit::PendingSubmission;
@@ -45,7 +44,7 @@ impl Engine {
         let counts = self.count_chunks(state, |engine, state, chunk| {
             handle.check()?;
             if chunk == last {
-                export = Some(engine.submit_export(&state.loaded, handle)?);
+                export = Some(engine.submit_export(&state.loaded, handle));
             }
             // A partition beyond the limits is rejected below with the counts of the whole mesh.
             Ok(state.check_limits().is_ok())
@@ -56,9 +55,7 @@ impl Engine {
         handle.publish(PartitionCounts { vertices, triangles, exported });
         // The vertices are read back meanwhile.
         let numbering = handle.await_counts(job)?;
-        let prepared = &job.prepared;
-        let [all_vertices, all_triangles] = numbering.total;
-        check_totals(&prepared.lattice, &prepared.params, &prepared.limits, all_vertices, all_triangles)?;
+        job.prepared.check_mesh(numbering.total)?;
         let base = narrow(numbering.first[0])?;
         for import in &numbering.imports {
             self.write_import(&state.loaded, import, base)?;
@@ -72,11 +69,11 @@ impl Engine {
     }
 
     /// Submits the copies of the records and offsets that earlier partitions import.
-    fn submit_export(&self, loaded: &LoadedJob<'_>, handle: &PartitionHandle) -> Result<PendingSubmission, GpuError> {
+    fn submit_export(&self, loaded: &LoadedJob<'_>, handle: &PartitionHandle) -> PendingSubmission {
         let runs = handle.exports();
         let bytes = export_bytes(&runs);
         let readback = self.readback.acquire(&self.device, bytes);
-        let target = readback.buffer().map_err(GpuError::Failed)?;
+        let target = &readback.buffer;
         let mut recording = self.recording();
         let columns = [(BufferId::Records, RECORD, 0), (BufferId::Offsets, OFFSET, RECORD * total_len(&runs))];
         for (id, each, mut at) in columns {
@@ -94,9 +91,8 @@ impl Engine {
         let Import { bricks, position, n_exported, exported, first_vertex } = import;
         let (n, first) = (u64::from(bricks.end - bricks.start), u64::from(bricks.start));
         let exported: &[u8] = (**exported).as_ref();
-        let records: &[u8] = values(exported, RECORD * position, RECORD * n).map_err(GpuError::Failed)?;
-        let offsets: &[[u32; 2]] =
-            values(exported, RECORD * n_exported + OFFSET * position, n).map_err(GpuError::Failed)?;
+        let records: &[u8] = values(exported, RECORD * position, RECORD * n)?;
+        let offsets: &[[u32; 2]] = values(exported, RECORD * n_exported + OFFSET * position, n)?;
         // The shader adds the base, which undoes the wrapping subtraction.
         let shift = narrow(*first_vertex)?.wrapping_sub(base);
         let offsets: Vec<[u32; 2]> = offsets.iter().map(|[v, t]| [v.wrapping_add(shift), *t]).collect();

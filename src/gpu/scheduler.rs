@@ -10,7 +10,33 @@ use super::device_queue::{DeviceQueue, DeviceState, QueuedJob, RunOutcome, down_
 use super::error::GpuError;
 use super::job::{GpuJob, JobResult};
 use super::partition_handle::PartitionHandle;
+use crate::surface::devices::MIN_PARTITION_BRICKS;
 use crate::surface::{DeviceStatus, SurfaceError};
+
+/// Settings of a pool.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PoolSettings {
+    /// Maximum number of jobs that wait for one device; further callers block.
+    pub queue: usize,
+    /// Maximum number of small jobs that share a submission.
+    pub batch: usize,
+    /// Pause after a failed rebuild, doubled each time.
+    pub rebuild_pause: Duration,
+    /// Time without work after which a device releases the memory that it keeps for the next large job.
+    pub idle: Duration,
+    /// Minimum number of bricks per partition of a multi-device job. `None` disables multi-device jobs.
+    pub min_partition_bricks: Option<u64>,
+}
+
+impl Default for PoolSettings {
+    /// 64 waiting jobs, so that memory runs out before callers block. 16 jobs per submission: the fixed cost is
+    /// negligible beyond. 200 ms between rebuilds: a driver restarts in about half a second. 5 s of idle time: longer
+    /// than the gaps between consecutive large jobs of one caller.
+    fn default() -> Self {
+        let (rebuild_pause, idle) = (Duration::from_millis(200), Duration::from_secs(5));
+        Self { queue: 64, batch: 16, rebuild_pause, idle, min_partition_bricks: Some(MIN_PARTITION_BRICKS) }
+    }
+}
 
 struct State {
     queues: Vec<DeviceQueue>,
@@ -25,10 +51,7 @@ pub(super) struct Scheduler {
     changed: Condvar,
     /// Notified when a job was added, one per device.
     added: Vec<Condvar>,
-    /// Maximum number of jobs that wait for one device.
-    limit: usize,
-    /// Maximum number of jobs that share a submission.
-    batch: usize,
+    pub(super) settings: PoolSettings,
 }
 
 /// Ticket of an enqueued job.
@@ -60,14 +83,14 @@ impl State {
 
 impl Scheduler {
     /// Creates the queues of `devices`, given by number and name.
-    pub(super) fn new(devices: &[(usize, String)], limit: usize, batch: usize) -> Self {
-        let queue = |(number, name): &(usize, String)| DeviceQueue::new(*number, name.clone(), limit);
+    pub(super) fn new(devices: &[(usize, String)], settings: PoolSettings) -> Self {
+        let settings = PoolSettings { queue: settings.queue.max(1), batch: settings.batch.max(1), ..settings };
+        let queue = |(number, name): &(usize, String)| DeviceQueue::new(*number, name.clone(), settings.queue);
         Self {
             state: Mutex::new(State { queues: devices.iter().map(queue).collect(), closed: false, next_id: 0 }),
             changed: Condvar::new(),
             added: devices.iter().map(|_| Condvar::new()).collect(),
-            limit: limit.max(1),
-            batch: batch.max(1),
+            settings,
         }
     }
 
@@ -91,8 +114,8 @@ impl Scheduler {
             return Err(EnqueueError::NoDevice(down_reasons(queues)));
         }
         let best = (0..queues.len())
-            .filter(|n| eligible(n) && queues[*n].waiting.len() < self.limit)
-            .min_by_key(|&n| (Reverse(failures[n]), queues[n].load, queues[n].finished));
+            .filter(|n| eligible(n) && queues[*n].waiting.len() < self.settings.queue)
+            .min_by_key(|&n| (Reverse(failures[n]), queues[n].load, queues[n].counters.finished));
         let Some(n) = best else { return Err(EnqueueError::Full) };
         let ticket = state.push(n, job, None, failures.iter().any(|n| *n > 0));
         drop(state);
@@ -104,7 +127,7 @@ impl Scheduler {
     pub(super) fn idle_devices(&self) -> Vec<usize> {
         let state = self.lock();
         let mut idle: Vec<usize> = (0..state.queues.len()).filter(|&n| state.queues[n].is_idle()).collect();
-        idle.sort_by_key(|&n| (state.queues[n].load, state.queues[n].finished));
+        idle.sort_by_key(|&n| (state.queues[n].load, state.queues[n].counters.finished));
         idle
     }
 
@@ -116,7 +139,7 @@ impl Scheduler {
         partitions: Vec<(usize, PartitionHandle)>,
     ) -> Option<Vec<Ticket>> {
         let mut state = self.lock();
-        let accepts = |queue: &DeviceQueue| queue.is_idle() && queue.waiting.len() < self.limit;
+        let accepts = |queue: &DeviceQueue| queue.is_idle() && queue.waiting.len() < self.settings.queue;
         if !partitions.iter().all(|(n, _)| accepts(&state.queues[*n])) {
             return None;
         }
@@ -148,8 +171,8 @@ impl Scheduler {
     }
 
     /// Waits for the next batch of device `n`: one job, or several small ones. The batch is empty if none came for
-    /// `idle`. `None` once the device is down or the scheduler is closed.
-    pub(super) fn next_batch(&self, n: usize, idle: Duration) -> Option<Vec<QueuedJob>> {
+    /// [`PoolSettings::idle`]. `None` once the device is down or the scheduler is closed.
+    pub(super) fn next_batch(&self, n: usize) -> Option<Vec<QueuedJob>> {
         let mut state = self.lock();
         let mut timed_out = false;
         loop {
@@ -162,7 +185,7 @@ impl Scheduler {
             while let Some(first) = queue.waiting.pop_front() {
                 if let Err(error) = first.job.check() {
                     queue.load -= first.load();
-                    first.reply(Err(error));
+                    first.reply(Err(error.into()));
                     continue;
                 }
                 let batchable = first.is_batchable();
@@ -174,7 +197,7 @@ impl Scheduler {
             }
             if !batch.is_empty() {
                 queue.running = batch.len();
-                queue.shared += u64::from(batch.len() > 1);
+                queue.counters.shared += u64::from(batch.len() > 1);
                 drop(state);
                 self.changed.notify_all();
                 return Some(batch);
@@ -182,20 +205,20 @@ impl Scheduler {
             if timed_out {
                 return Some(batch);
             }
-            let waited = self.added[n].wait_timeout(state, idle).unwrap_or_else(PoisonError::into_inner);
+            let waited = self.added[n].wait_timeout(state, self.settings.idle).unwrap_or_else(PoisonError::into_inner);
             (state, timed_out) = (waited.0, waited.1.timed_out());
         }
     }
 
     /// Sets the bytes of memory that device `n` holds.
     pub(super) fn set_held_bytes(&self, n: usize, bytes: u64) {
-        self.lock().queues[n].held_bytes = bytes;
+        self.lock().queues[n].counters.held_bytes = bytes;
     }
 
     /// Moves small jobs from anywhere in `waiting` to `batch`. A large job ahead of them becomes the next batch.
     fn fill_batch(&self, waiting: &mut VecDeque<QueuedJob>, batch: &mut Vec<QueuedJob>) {
         let mut at = 0;
-        while at < waiting.len() && batch.len() < self.batch {
+        while at < waiting.len() && batch.len() < self.settings.batch {
             if waiting[at].is_batchable() && waiting[at].job.check().is_ok() {
                 batch.extend(waiting.remove(at));
             } else {
@@ -216,10 +239,10 @@ impl Scheduler {
                 queue.load -= job.load();
                 match result {
                     Ok(_) => {
-                        queue.finished += 1;
-                        queue.partitions += u64::from(job.partition.is_some());
+                        queue.counters.finished += 1;
+                        queue.counters.partitions += u64::from(job.partition.is_some());
                     }
-                    Err(error) if error.is_device_failure() => queue.failed += 1,
+                    Err(error) if error.is_device_failure() => queue.counters.failed += 1,
                     Err(_) => {}
                 }
             }
@@ -227,9 +250,9 @@ impl Scheduler {
                 queue.consecutive_rebuilds = 0;
             }
             queue.running = 0;
-            queue.busy += time;
-            queue.lost += u64::from(failed);
-            queue.held_bytes = held_bytes;
+            queue.counters.busy += time;
+            queue.counters.lost += u64::from(failed);
+            queue.counters.held_bytes = held_bytes;
             if let Some(why) = &down {
                 left = queue.mark_down(why);
             }
@@ -244,7 +267,7 @@ impl Scheduler {
         let queue = &mut self.lock().queues[n];
         let allowed = queue.consecutive_rebuilds < max;
         queue.consecutive_rebuilds += usize::from(allowed);
-        queue.rebuilds += u64::from(allowed);
+        queue.counters.rebuilds += u64::from(allowed);
         allowed
     }
 
@@ -319,7 +342,7 @@ impl Scheduler {
 pub(super) fn proves_device_works(result: &JobResult) -> bool {
     match result {
         Ok(_) => true,
-        Err(GpuError::Surface(error)) => *error != SurfaceError::Cancelled,
+        Err(GpuError::Surface(error)) => !matches!(error, SurfaceError::Cancelled | SurfaceError::Deadline),
         Err(_) => false,
     }
 }

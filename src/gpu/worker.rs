@@ -2,7 +2,7 @@
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use super::device_queue::{QueuedJob, RunOutcome};
 use super::error::GpuError;
@@ -17,31 +17,22 @@ pub type Build = Box<dyn Fn() -> Result<Box<dyn Executor>, GpuError> + Send + Sy
 /// attempt, and a job that crashes devices must not keep one busy forever.
 pub const MAX_REBUILDS: usize = 3;
 
-/// Waiting times of a device thread.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Timing {
-    /// Pause after a failed rebuild.
-    pub(super) rebuild_pause: Duration,
-    /// Time without work after which idle memory is released.
-    pub(super) idle: Duration,
-}
-
 /// Runs jobs on device `n` until the scheduler is closed or the device is given up.
-pub(super) fn work(scheduler: &Scheduler, n: usize, build: &Build, timing: Timing) {
+pub(super) fn work(scheduler: &Scheduler, n: usize, build: &Build) {
     // Only the executor is expected to panic. Any other panic must not leave callers waiting.
-    let ended = catch_unwind(AssertUnwindSafe(|| run(scheduler, n, build, timing)));
+    let ended = catch_unwind(AssertUnwindSafe(|| run(scheduler, n, build)));
     if let Err(payload) = ended {
         scheduler.mark_down(n, &format!("its thread panicked: {}", message(&*payload)));
     }
 }
 
-fn run(scheduler: &Scheduler, n: usize, build: &Build, timing: Timing) {
+fn run(scheduler: &Scheduler, n: usize, build: &Build) {
     let mut executor = match try_build(build) {
         Ok(executor) => executor,
         Err(error) => return scheduler.mark_down(n, &error.to_string()),
     };
     scheduler.mark_up(n);
-    while let Some(batch) = scheduler.next_batch(n, timing.idle) {
+    while let Some(batch) = scheduler.next_batch(n) {
         if batch.is_empty() {
             executor.release_idle_memory();
             scheduler.set_held_bytes(n, executor.held_bytes());
@@ -62,7 +53,7 @@ fn run(scheduler: &Scheduler, n: usize, build: &Build, timing: Timing) {
         if give_up {
             return;
         }
-        match rebuild(scheduler, n, build, timing.rebuild_pause, why) {
+        match rebuild(scheduler, n, build, why) {
             Ok(rebuilt) => executor = rebuilt,
             Err(why) => return scheduler.mark_down(n, &given_up(&why)),
         }
@@ -72,13 +63,8 @@ fn run(scheduler: &Scheduler, n: usize, build: &Build, timing: Timing) {
 
 /// Rebuilds the executor. The pause between attempts doubles, because a driver takes time to restart. Fails with the
 /// last reason.
-fn rebuild(
-    scheduler: &Scheduler,
-    n: usize,
-    build: &Build,
-    mut pause: Duration,
-    mut why: String,
-) -> Result<Box<dyn Executor>, String> {
+fn rebuild(scheduler: &Scheduler, n: usize, build: &Build, mut why: String) -> Result<Box<dyn Executor>, String> {
+    let mut pause = scheduler.settings.rebuild_pause;
     while scheduler.count_rebuild(n, MAX_REBUILDS) {
         match try_build(build) {
             Ok(executor) => return Ok(executor),

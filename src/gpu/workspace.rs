@@ -5,7 +5,7 @@ use wgpu::{BindGroup, Buffer, BufferUsages, Device};
 use super::buffers::BufferId;
 use super::output_layout::{TRIANGLE_BYTES, VertexBytes};
 use super::pipelines::{Pipelines, STAGES, stage_index};
-use super::plan::layout::{Counters, GROUP, Params, Record, SAMPLES, Tile};
+use super::plan::layout::{Counters, Params, Record, SAMPLES, Tile};
 use super::plan::{Chunk, Plan};
 use super::readback::size_class;
 use super::shaders::SHADERS;
@@ -49,7 +49,7 @@ impl BufferSizes {
             BufferId::Inside => bytes(n_bricks, 64),
             BufferId::Records => bytes(n_bricks, size_of::<Record>()),
             BufferId::Offsets => bytes(n_bricks, 8),
-            BufferId::Groups => max(&|c| 16 * u64::from(c.n_own.div_ceil(GROUP))),
+            BufferId::Groups => max(&|c| 16 * c.n_groups()),
             BufferId::Counters => size_of::<Counters>() as u64,
             BufferId::Positions => vertex.positions * capacity.vertices,
             BufferId::Normals => vertex.normals * capacity.vertices,

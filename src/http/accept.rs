@@ -27,7 +27,7 @@ use tower::ServiceExt as _;
 
 use super::guard::Peer;
 use super::kinds::Kind;
-use super::pace::{self, MAX_PATIENCE, Pace, Rate, Streams};
+use super::pace::{self, GaugeGuard, MAX_PATIENCE, Pace, Rate, Streams};
 use super::problem::{MEDIA_TYPE, Problem};
 use super::socket::Guarded;
 use super::stop::{self, Stop};
@@ -104,13 +104,17 @@ pub(super) async fn serve(
             tracing::debug!(%error, "the client disconnected at once");
             continue;
         }
-        let stream = Guarded::new(stream, Place::new(place), MAX_PATIENCE * config.write_timeout());
+        let stream = Guarded::new(
+            stream,
+            (place, GaugeGuard::new(gauge!(CONNECTIONS))),
+            MAX_PATIENCE * Duration::from_millis(config.write_timeout_ms),
+        );
         connections.spawn(connection(stream, Peer(peer.ip()), router.clone(), Arc::clone(&config), stop.clone()));
     }
     drop(listener);
     let all = async { while connections.join_next().await.is_some() {} };
     let drained = tokio::select! {
-        ended = tokio::time::timeout(config.drain_timeout(), all) => ended.is_ok(),
+        ended = tokio::time::timeout(Duration::from_millis(config.drain_timeout_ms), all) => ended.is_ok(),
         () = stop::reached(&mut stop, Stop::Now) => false,
     };
     connections.shutdown().await;
@@ -127,21 +131,8 @@ fn set_up(stream: &TcpStream) -> io::Result<()> {
     stream.set_nodelay(true)
 }
 
-/// Permit of `server.connections`.
-struct Place(#[expect(dead_code, reason = "held for its drop")] OwnedSemaphorePermit);
-
-impl Place {
-    fn new(permit: OwnedSemaphorePermit) -> Self {
-        gauge!(CONNECTIONS).increment(1.0);
-        Self(permit)
-    }
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        gauge!(CONNECTIONS).decrement(1.0);
-    }
-}
+/// Permit of `server.connections`, counted in the metrics.
+type Place = (OwnedSemaphorePermit, GaugeGuard);
 
 /// Answers a connection beyond the limit with 503, without reading its request.
 fn refuse(stream: TcpStream, hold: OwnedSemaphorePermit) {
@@ -220,7 +211,7 @@ async fn connection(
     let connection = builder.serve_connection(TokioIo::new(stream), service);
     tokio::pin!(connection);
     let (mut stopping, mut patient) = (false, false);
-    let mut look = Instant::now() + config.header_timeout();
+    let mut look = Instant::now() + Duration::from_millis(config.header_timeout_ms);
     loop {
         tokio::select! {
             ended = connection.as_mut() => {
@@ -245,7 +236,7 @@ async fn connection(
             () = tokio::time::sleep_until(look), if patient => {
                 patient = false;
                 connection.as_mut().graceful_shutdown();
-                look = Instant::now() + config.header_timeout();
+                look = Instant::now() + Duration::from_millis(config.header_timeout_ms);
             }
             () = tokio::time::sleep_until(look), if !patient => {
                 // hyper starts its own timer only when the protocol version is known.
@@ -257,7 +248,7 @@ async fn connection(
                 if !busy {
                     connection.as_mut().graceful_shutdown();
                 }
-                look = Instant::now() + config.idle_timeout();
+                look = Instant::now() + Duration::from_millis(config.idle_timeout_ms);
             }
         }
     }
@@ -268,14 +259,14 @@ fn builder(config: &ServerConfig, streams: Streams) -> auto::Builder<Streams> {
     builder
         .http1()
         .timer(TokioTimer::new())
-        .header_read_timeout(config.header_timeout())
+        .header_read_timeout(Duration::from_millis(config.header_timeout_ms))
         .max_buf_size(config.head_bytes as usize);
     builder
         .http2()
         .timer(TokioTimer::new())
         .keep_alive_interval(PING)
         // A slow client answers a ping after it has read all data before it.
-        .keep_alive_timeout(MAX_PATIENCE * config.write_timeout())
+        .keep_alive_timeout(MAX_PATIENCE * Duration::from_millis(config.write_timeout_ms))
         .initial_stream_window_size(WINDOWS[0])
         .initial_connection_window_size(WINDOWS[1])
         .max_concurrent_streams(config.streams)

@@ -8,8 +8,8 @@ use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use utoipa::OpenApi;
 
-use super::openapi::access::Rights;
-use super::openapi::parameters::Choices;
+use super::openapi::access::SecurityRequirements;
+use super::openapi::parameters::ChoiceSchemas;
 use super::openapi::{components, problems};
 use super::problem::Problem;
 
@@ -50,7 +50,7 @@ and `.`, or a new one.";
         super::health::live, super::health::ready, super::health::version,
     ),
     components(schemas(problems::ProblemDocument, super::delivery::ReportDocument)),
-    modifiers(&Rights, &Choices),
+    modifiers(&SecurityRequirements, &ChoiceSchemas),
 )]
 struct Description;
 

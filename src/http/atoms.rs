@@ -10,14 +10,13 @@ use utoipa::ToSchema;
 
 use super::kinds::Kind;
 use super::openapi::meshes::NotModified;
-use super::openapi::parameters::{EntryPath, StructurePath, Unchanged};
+use super::openapi::parameters::{EntryPath, IfNoneMatchHeader, StructurePath};
+use super::openapi::problem_responses;
 use super::openapi::problems::READING;
-use super::openapi::refusals;
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::Shared;
-use crate::jobs::Failure;
-use crate::structure::{self, Structure, StructureError, element};
+use crate::structure::{self, Structure, element};
 
 /// Memory charged for the document, bytes per atom: two numbers, and a tenth of a residue with five.
 const BYTES_PER_ATOM: u64 = 24;
@@ -65,11 +64,11 @@ struct ResidueColumns {
     kind: Vec<&'static str>,
 }
 
-refusals!(StructureRefusals: [
+problem_responses!(StructureProblems: [
     READING,
     [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
 ]);
-refusals!(EntryRefusals: [READING, [
+problem_responses!(EntryProblems: [READING, [
     Kind::BadRequest, Kind::BadParameter, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable,
     Kind::MemoryFull, Kind::TooManyDeliveries,
 ]]);
@@ -79,13 +78,13 @@ refusals!(EntryRefusals: [READING, [
 /// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
 /// list.
 #[utoipa::path(get, path = "/v1/structures/{digest}/atoms", tag = "structures", operation_id = "listAtoms",
-    params(StructurePath, Unchanged),
+    params(StructurePath, IfNoneMatchHeader),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, StructureRefusals,
+        NotModified, StructureProblems,
     ))]
 pub(super) async fn of_structure(
     State(app): State<Shared>,
@@ -100,13 +99,13 @@ pub(super) async fn of_structure(
 /// A mesh with `atom_ids=true` has a vertex attribute `_ATOM` (`atom` in PLY): the row of the nearest atom in this
 /// list.
 #[utoipa::path(get, path = "/v1/pdb/{id}/atoms", tag = "structures", operation_id = "listEntryAtoms",
-    params(EntryPath, Unchanged),
+    params(EntryPath, IfNoneMatchHeader),
     responses(
         (status = 200, description = "The atoms.", body = AtomsDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, EntryRefusals,
+        NotModified, EntryProblems,
     ))]
 pub(super) async fn of_entry(
     State(app): State<Shared>,
@@ -121,39 +120,15 @@ pub(super) async fn of_entry(
 async fn list(app: &Shared, input: Input) -> Result<Response, Problem> {
     let mut limits = app.config.limits.job().read;
     limits.max_atoms = limits.max_atoms.min(app.config.limits.labels);
-    let mut lease = app.pool.budget().lease();
+    let mut lease = app.pool.settings().budget.lease();
     let listing = tokio::task::spawn_blocking(move || {
         let structure = structure::read(&input.bytes, &limits)?;
-        lease.grow(BYTES_PER_ATOM * structure.len() as u64).map_err(Failed::Memory)?;
-        let text = serde_json::to_vec(&document(&structure)).map_err(Failed::Writing)?;
-        Ok(lease.attach(text))
+        lease.grow(BYTES_PER_ATOM * structure.len() as u64)?;
+        let text = serde_json::to_vec(&document(&structure)).map_err(Problem::internal)?;
+        Ok::<Bytes, Problem>(lease.attach(text))
     });
-    let listed: Result<Bytes, Failed> = listing.await.map_err(Problem::internal)?;
-    let text = listed.map_err(Problem::from)?;
+    let text = listing.await.map_err(Problem::internal)??;
     Ok(([(header::CONTENT_TYPE, "application/json")], Body::from(text)).into_response())
-}
-
-/// Error of [`list`].
-enum Failed {
-    Structure(StructureError),
-    Memory(crate::jobs::Exhausted),
-    Writing(serde_json::Error),
-}
-
-impl From<StructureError> for Failed {
-    fn from(error: StructureError) -> Self {
-        Self::Structure(error)
-    }
-}
-
-impl From<Failed> for Problem {
-    fn from(failed: Failed) -> Self {
-        match failed {
-            Failed::Structure(error) => Failure::Job { error: error.into(), diagnostics: Vec::new() }.into(),
-            Failed::Memory(error) => error.into(),
-            Failed::Writing(error) => Self::internal(error),
-        }
-    }
 }
 
 /// Builds the columns.

@@ -56,8 +56,8 @@ pub(super) fn cors(access: &Access) -> CorsLayer {
         RATE_LIMIT_POLICY,
         request_id::HEADER,
     ];
-    let summary = delivery::SUMMARY.into_iter().chain(delivery::PICTURE.map(|(name, _)| name));
-    let exposed = exposed.into_iter().chain(summary.map(HeaderName::from_static));
+    let summary = delivery::SUMMARY.iter().chain(&delivery::PICTURE);
+    let exposed = exposed.into_iter().chain(summary.map(|header| HeaderName::from_static(header.name)));
     let layer = CorsLayer::new()
         .allow_methods([Method::GET, Method::HEAD, Method::POST, Method::DELETE])
         .expose_headers(exposed.collect::<Vec<_>>())

@@ -250,7 +250,7 @@ pub(super) async fn show(State(app): State<Shared>) -> Response {
 
 /// Writes the document.
 pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> Bytes {
-    let (backend, drawer) = (pool.backend(), pool.drawer());
+    let (backend, renderer) = (pool.backend(), &pool.settings().renderer);
     let document = Capabilities {
         name: "molmesh",
         version: env!("CARGO_PKG_VERSION"),
@@ -272,9 +272,9 @@ pub(super) fn document(config: &Config, pool: &Pool, found: &[FoundDevice]) -> B
             reason: pool.reason().to_owned(),
         }],
         renderers: vec![BackendDocument {
-            name: drawer.renderer.name(),
-            device: drawer.renderer.describe(),
-            reason: drawer.reason.clone(),
+            name: renderer.renderer.name(),
+            device: renderer.renderer.describe(),
+            reason: renderer.reason.clone(),
         }],
         devices: devices(found, &backend.devices()),
         radii: Radii { table: radii::TABLE, unit: "Å", fallback: radii::FALLBACK, values: radii_by_symbol() },
@@ -302,7 +302,7 @@ fn devices(found: &[FoundDevice], running: &[DeviceStatus]) -> Vec<DeviceDocumen
             workgroup_bytes: facts.workgroup_bytes,
             timestamps: facts.timestamps,
             subgroups: facts.subgroups,
-            taken: found.taken,
+            taken: found.selected,
             up: status.is_some() && down.is_none(),
             reason: down.unwrap_or(&found.reason).clone(),
         }
@@ -344,13 +344,13 @@ fn limits(config: &Config, pool: &Pool) -> Limits {
         inflated_bytes: limits.inflated_bytes,
         atoms: limits.atoms,
         labels: limits.labels,
-        grid_samples: limits.grid_samples,
+        grid_samples: limits.grid_points,
         candidate_pairs: limits.candidate_pairs,
         mesh_bytes: limits.mesh_bytes,
         output_bytes: limits.output_bytes,
         memory_bytes: limits.memory_bytes,
         picture_side: limits.picture_side,
-        workers: pool.workers(),
+        workers: pool.settings().workers,
         queue: jobs.queue,
         deliveries: jobs.deliveries,
         deadline_ms: jobs.deadline_ms,

@@ -8,6 +8,11 @@ use crate::pipeline::JobError;
 use crate::structure::StructureError;
 use crate::structure::atoms::SourceFormat;
 
+/// First bytes of a gzip file.
+pub(super) const GZIP_MAGIC: &[u8] = &[0x1f, 0x8b];
+/// First bytes of a zstd file.
+pub(super) const ZSTD_MAGIC: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
+
 /// Declared type of a body.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum DeclaredType {
@@ -34,8 +39,8 @@ impl DeclaredType {
             | ("application", "vnd.binarycif" | "x-bcif" | "vnd.msgpack" | "msgpack" | "x-msgpack") => {
                 Self::Structure(SourceFormat::BinaryCif, essence)
             }
-            ("application", "gzip" | "x-gzip") => Self::Compressed(&[0x1f, 0x8b], essence),
-            ("application", "zstd") => Self::Compressed(&[0x28, 0xb5, 0x2f, 0xfd], essence),
+            ("application", "gzip" | "x-gzip") => Self::Compressed(GZIP_MAGIC, essence),
+            ("application", "zstd") => Self::Compressed(ZSTD_MAGIC, essence),
             ("image" | "audio" | "video" | "font" | "model", _)
             | ("application", "json" | "pdf" | "xml" | "zip")
             | ("text", "html" | "xml" | "css" | "javascript") => Self::Foreign(essence),

@@ -5,10 +5,11 @@ use std::sync::Arc;
 use axum::http::HeaderValue;
 use axum::http::header::{self, HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
-
 use serde::Serialize;
 use serde_json::Value;
 use tokio::sync::OwnedSemaphorePermit;
+use utoipa::ToSchema;
+use utoipa::openapi::schema::Type;
 
 use super::errors::{self, Finding};
 use super::problem::Problem;
@@ -18,35 +19,50 @@ use super::timing::Timing;
 use crate::formats::Format;
 use crate::jobs::{ContentKey, Finished};
 use crate::pipeline::Report;
-use utoipa::ToSchema;
 
-/// Headers that summarise the report.
-pub(super) const SUMMARY: [&str; 17] = [
-    "molmesh-atoms",
-    "molmesh-vertices",
-    "molmesh-triangles",
-    "molmesh-area",
-    "molmesh-volume",
-    "molmesh-closed",
-    "molmesh-manifold",
-    "molmesh-euler",
-    "molmesh-components",
-    "molmesh-kernel",
-    "molmesh-preset",
-    "molmesh-resolution",
-    "molmesh-resolution-from",
-    "molmesh-isovalue",
-    "molmesh-radii",
-    "molmesh-backend",
-    "molmesh-backend-reason",
+/// Header that summarises a member of the report.
+pub(super) struct SummaryHeader {
+    pub(super) name: &'static str,
+    /// Name of the member.
+    member: &'static str,
+    /// Type of the value, for the OpenAPI document.
+    pub(super) kind: Type,
+    pub(super) doc: &'static str,
+}
+
+const fn summary(name: &'static str, member: &'static str, kind: Type, doc: &'static str) -> SummaryHeader {
+    SummaryHeader { name, member, kind, doc }
+}
+
+/// Headers of every mesh.
+#[rustfmt::skip]
+pub(super) static SUMMARY: [SummaryHeader; 17] = [
+    summary("molmesh-atoms", "atoms", Type::Integer, "Atoms meshed."),
+    summary("molmesh-vertices", "vertices", Type::Integer, "Vertices of the mesh."),
+    summary("molmesh-triangles", "triangles", Type::Integer, "Triangles of the mesh."),
+    summary("molmesh-area", "area", Type::Number, "Surface area in Å², including the walls of voids."),
+    summary("molmesh-volume", "volume", Type::Number, "Enclosed volume in Å³, voids subtracted."),
+    summary("molmesh-closed", "closed", Type::Boolean, "`true` if the mesh has no boundary."),
+    summary("molmesh-manifold", "manifold", Type::Boolean, "`true` if all edges and vertices are manifold."),
+    summary("molmesh-euler", "euler", Type::Integer, "Euler characteristic: vertices − edges + triangles."),
+    summary("molmesh-components", "components", Type::Integer, "Connected components of the mesh."),
+    summary("molmesh-kernel", "kernel", Type::String, "Density kernel."),
+    summary("molmesh-preset", "preset", Type::String, "Preset."),
+    summary("molmesh-resolution", "resolution", Type::Number, "Grid spacing in Å."),
+    summary("molmesh-resolution-from", "resolution_from", Type::String, "Parameter that set the spacing: `resolution`, `detail` or `max_triangles`."),
+    summary("molmesh-isovalue", "isovalue", Type::Number, "Isovalue of the density."),
+    summary("molmesh-radii", "radii", Type::String, "Table of van der Waals radii."),
+    summary("molmesh-backend", "backend", Type::String, "Backend that computed the mesh: `cpu` or `gpu`."),
+    summary("molmesh-backend-reason", "backend_reason", Type::String, "Reason for the choice of the backend."),
 ];
 
-/// Headers that summarise the report of a picture, with the members of its `picture`.
-pub(super) const PICTURE: [(&str, &str); 4] = [
-    ("molmesh-renderer", "renderer"),
-    ("molmesh-renderer-device", "device"),
-    ("molmesh-renderer-reason", "reason"),
-    ("molmesh-pixel", "pixel"),
+/// Headers of a picture, with members of the report's `picture`.
+#[rustfmt::skip]
+pub(super) static PICTURE: [SummaryHeader; 4] = [
+    summary("molmesh-renderer", "renderer", Type::String, "Backend that rendered the picture: `cpu` or `gpu`. Pictures only."),
+    summary("molmesh-renderer-device", "device", Type::String, "Device that rendered the picture. Pictures only."),
+    summary("molmesh-renderer-reason", "reason", Type::String, "Reason for the choice of the renderer. Pictures only."),
+    summary("molmesh-pixel", "pixel", Type::Number, "Width and height of a pixel in Å. Pictures only."),
 ];
 
 /// Report of a request, with the findings of the strict validator.
@@ -70,12 +86,13 @@ pub(super) async fn mesh(
     permit: OwnedSemaphorePermit,
 ) -> Result<Response, Problem> {
     let report = &finished.product.report;
-    let mut headers = summary(&serde_json::to_value(report).map_err(Problem::internal)?);
+    let mut headers = summary_headers(&serde_json::to_value(report).map_err(Problem::internal)?);
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, disposition(report.id.as_deref(), format));
     headers.insert(header::ETAG, etag(key));
     let (length, body) =
-        stream::start(finished, format, app.config.limits.output_bytes, app.pool.budget().clone(), permit).await?;
+        stream::start(finished, format, app.config.limits.output_bytes, app.pool.settings().budget.clone(), permit)
+            .await?;
     if let Some(length) = length {
         headers.insert(header::CONTENT_LENGTH, HeaderValue::from(length));
     }
@@ -88,7 +105,7 @@ pub(super) async fn mesh(
 /// Sends the report as JSON.
 pub(super) fn report(finished: &Finished, mut timing: Timing) -> Result<Response, Problem> {
     let report = &finished.product.report;
-    let mut headers = summary(&serde_json::to_value(report).map_err(Problem::internal)?);
+    let mut headers = summary_headers(&serde_json::to_value(report).map_err(Problem::internal)?);
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static("application/json"));
     // Every report holds the times of its own run.
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
@@ -121,22 +138,21 @@ pub(super) fn text(value: &str) -> HeaderValue {
 }
 
 /// Returns the summary headers of a report, from its JSON.
-pub(super) fn summary(report: &Value) -> HeaderMap {
-    let header = |name: &'static str, value: &Value| {
-        let value = match value {
+pub(super) fn summary_headers(report: &Value) -> HeaderMap {
+    let header = |summary: &SummaryHeader, members: &Value| {
+        let value = match &members[summary.member] {
             Value::String(text) => text.replace('Å', "A"),
             // Areas and volumes to a thousandth.
-            Value::Number(number) if name == "molmesh-area" || name == "molmesh-volume" => {
+            Value::Number(number) if ["area", "volume"].contains(&summary.member) => {
                 format!("{:.3}", number.as_f64().unwrap_or_default())
             }
             other => other.to_string(),
         };
-        (HeaderName::from_static(name), text(&value))
+        (HeaderName::from_static(summary.name), text(&value))
     };
-    let member = |name: &str| name.trim_start_matches("molmesh-").replace('-', "_");
-    let mut headers: HeaderMap = SUMMARY.into_iter().map(|name| header(name, &report[member(name).as_str()])).collect();
+    let mut headers: HeaderMap = SUMMARY.iter().map(|summary| header(summary, report)).collect();
     if let Some(picture) = report.get("picture") {
-        headers.extend(PICTURE.into_iter().map(|(name, of)| header(name, &picture[of])));
+        headers.extend(PICTURE.iter().map(|summary| header(summary, picture)));
     }
     headers
 }

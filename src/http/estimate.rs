@@ -2,7 +2,7 @@
 //! of `POST /v1/meshes`.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use axum::Json;
 use axum::body::Body;
@@ -18,9 +18,9 @@ use super::errors::file_too_large;
 use super::guard::Caller;
 use super::kinds::Kind;
 use super::openapi::bodies::{STRUCTURE_TO_MESH, StructureFile};
-use super::openapi::parameters::{Coding, MeshParameters};
-use super::openapi::problems::{BODY, NAMED, PARAMETERS, ProblemDocument, READING};
-use super::openapi::refusals;
+use super::openapi::parameters::{ContentEncodingHeader, MeshParameters};
+use super::openapi::problem_responses;
+use super::openapi::problems::{BODY, NAMED_STRUCTURE, PARAMETERS, ProblemDocument, READING};
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::problem::Problem;
 use super::source::Input;
@@ -97,7 +97,7 @@ pub(super) struct EstimateDocument {
     backend: &'static str,
 }
 
-refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
+problem_responses!(EstimateProblems: [BODY, NAMED_STRUCTURE, PARAMETERS, READING, [
     Kind::EmptySelection, Kind::PictureTooLarge, Kind::Internal, Kind::TooManyDeliveries, Kind::Deadline,
 ]]);
 
@@ -105,9 +105,9 @@ refusals!(EstimateRefusals: [BODY, NAMED, PARAMETERS, READING, [
 ///
 /// Takes what `POST /v1/meshes` takes and returns the expected size, memory and time of the mesh without computing it.
 #[utoipa::path(post, path = "/v1/estimate", tag = "meshes", operation_id = "estimateMesh",
-    params(MeshParameters, Coding),
+    params(MeshParameters, ContentEncodingHeader),
     request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
-    responses((status = 200, description = "The estimate.", body = EstimateDocument), EstimateRefusals))]
+    responses((status = 200, description = "The estimate.", body = EstimateDocument), EstimateProblems))]
 pub(super) async fn create(
     State(app): State<Shared>,
     query: Pairs,
@@ -128,7 +128,7 @@ pub(super) async fn create(
     drop(source);
     let seconds = app.pool.expected(&bytes, &job);
     let stop = CancelOnDrop(CancelToken::default());
-    let limit = app.config.jobs.deadline();
+    let limit = Duration::from_millis(app.config.jobs.deadline_ms);
     let limits = pipeline::JobLimits { deadline: Some(Instant::now() + limit), ..app.config.limits.job() };
     let estimating = tokio::task::spawn_blocking({
         let (app, cancel, job) = (Arc::clone(&app), stop.0.clone(), job.clone());

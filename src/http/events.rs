@@ -2,9 +2,9 @@
 //! that reconnects with `Last-Event-ID` needs no earlier events.
 
 use std::convert::Infallible;
+use std::time::Duration;
 
-use axum::extract::rejection::PathRejection;
-use axum::extract::{Path, State};
+use axum::extract::State;
 use axum::http::header::HeaderName;
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::sse::{Event, KeepAlive, Sse};
@@ -14,12 +14,12 @@ use tokio::sync::watch;
 
 use super::jobs;
 use super::kinds::Kind;
-use super::openapi::parameters::{JobPath, Resumption};
-use super::openapi::refusals;
+use super::openapi::parameters::{JobPath, LastEventIdHeader};
+use super::openapi::problem_responses;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::JobView;
+use crate::jobs::{JobId, JobView};
 
 /// `Last-Event-ID`.
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
@@ -32,27 +32,22 @@ struct Listener {
     over: bool,
 }
 
-refusals!(EventsRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::StoreFailed]]);
+problem_responses!(EventsProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::StoreFailed]]);
 
 /// Follow a job as server-sent events
 ///
 /// Each event carries the whole status document of the job as `data` and its status as `event`. The stream ends with
 /// the job.
 #[utoipa::path(get, path = "/v1/jobs/{id}/events", tag = "jobs", operation_id = "watchJob",
-    params(JobPath, Resumption),
+    params(JobPath, LastEventIdHeader),
     responses(
         (status = 200, description = "Server-sent events until the job ends.",
             body = serde_json::Value, content_type = "text/event-stream"),
         (status = 204, description = "`Last-Event-ID` names the final event; no more events follow."),
-        EventsRefusals,
+        EventsProblems,
     ))]
-pub(super) async fn show(
-    State(app): State<Shared>,
-    path: Result<Path<String>, PathRejection>,
-    headers: HeaderMap,
-) -> Result<Response, Problem> {
-    let id = jobs::id(path)?;
-    let watched = app.job_store.watch(&id).await?.ok_or_else(|| jobs::none(id.as_str()))?;
+pub(super) async fn show(State(app): State<Shared>, id: JobId, headers: HeaderMap) -> Result<Response, Problem> {
+    let watched = app.job_store.watch(&id).await?.ok_or_else(|| jobs::no_such_job(id.as_str()))?;
     let last = headers.get(LAST_EVENT_ID).and_then(|id| id.to_str().ok()?.trim().parse::<u64>().ok());
     // Versions start again with the service, so a larger id is from an earlier process.
     let seen = last.filter(|last| *last <= watched.borrow().version).unwrap_or(0);
@@ -65,7 +60,8 @@ pub(super) async fn show(
         let event = listener.next().await?;
         Some((Ok::<_, Infallible>(event), listener))
     });
-    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(app.config.server.heartbeat())).into_response())
+    let heartbeat = Duration::from_millis(app.config.server.heartbeat_ms);
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(heartbeat)).into_response())
 }
 
 impl Listener {
@@ -79,8 +75,7 @@ impl Listener {
                 let view = news.ok()?;
                 (self.seen, self.over) = (view.version, view.record.status.is_final());
                 let event = Event::default().id(view.version.to_string()).event(view.record.status.name());
-                let write = || serde_json::to_string(&jobs::document(&view)).unwrap_or_default();
-                Some(event.data(view.written.get_or_init(write)))
+                Some(event.data(serde_json::to_string(&jobs::document(&view)).unwrap_or_default()))
             }
             // The stream ends with the service; clients reconnect.
             () = stop::reached(&mut self.stopping, Stop::Drain) => None,

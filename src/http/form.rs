@@ -104,11 +104,11 @@ impl Bounds {
     }
 }
 
-/// Received form.
-pub(super) struct Form {
+/// Received structure file.
+pub(super) struct Upload {
     pub(super) bytes: Bytes,
     pub(super) lease: Lease,
-    /// Parameters.
+    /// Parameters from the other fields of a form.
     pub(super) fields: Vec<(String, String)>,
     /// Content type of the file.
     pub(super) declared: DeclaredType,
@@ -121,7 +121,7 @@ pub(super) async fn read(
     content_type: &str,
     body: Body,
     mut lease: Lease,
-) -> Result<Form, Problem> {
+) -> Result<Upload, Problem> {
     let bounds = Bounds::new(limits, within);
     let boundary = multer::parse_boundary(content_type).map_err(|e| bounds.problem(&e))?;
     if boundary.len() > MAX_BOUNDARY {
@@ -178,7 +178,7 @@ pub(super) async fn read(
         let detail = "the form has no file; put it into a field named `file` or `structure`";
         return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
     };
-    Ok(Form { bytes, lease, fields, declared })
+    Ok(Upload { bytes, lease, fields, declared })
 }
 
 /// Returns the size of a part's headers, bytes.

@@ -4,29 +4,29 @@
 //! the client that requested it first.
 
 use std::net::IpAddr;
-use std::pin::Pin;
 use std::sync::Arc;
-use std::task::{Context, Poll};
 use std::time::{Duration, Instant, SystemTime};
 
-use axum::body::Body;
 use axum::extract::{Request, State};
 use axum::http::header::{self, AUTHORIZATION, HeaderMap, HeaderName, WWW_AUTHENTICATE};
 use axum::http::uri::{PathAndQuery, Uri};
 use axum::http::{Extensions, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
-use bytes::Bytes;
 use http_body_util::BodyExt as _;
-use hyper::body::{Body as HttpBody, Frame, SizeHint};
+use hyper::body::Body as _;
 use tracing::Span;
 
 use super::kinds::Kind;
+use super::observed_body::observed;
 use super::problem::Problem;
 use super::scopes;
 use super::state::{App, Shared};
-use crate::access::{Access, Account, Denied, Exceeded, Key, Quota, Running, Scope, Signed, limits, policies, without};
-use crate::jobs::{Client, Meter, rfc3339};
+use crate::access::{
+    Access, Account, Denied, Exceeded, Key, Quota, Scope, SignatureCheck, rate_limit, rate_limit_policy,
+    remove_signature,
+};
+use crate::jobs::{Client, rfc3339};
 
 /// `X-Api-Key`, an alternative to `Authorization`.
 pub(super) const API_KEY: HeaderName = HeaderName::from_static("x-api-key");
@@ -56,7 +56,7 @@ impl Caller {
     fn new(name: &str, is_key: bool, quota: Option<&Arc<Quota>>) -> Self {
         let client = Client::named(name);
         let quota = quota.filter(|quota| !quota.is_unlimited()).cloned();
-        Self { client, account: quota.map(|quota| Account { client: client.number(), is_key, quota }) }
+        Self { client, account: quota.map(|quota| Account { client: client.0, is_key, quota }) }
     }
 
     fn key(key: &Key) -> Self {
@@ -66,12 +66,12 @@ impl Caller {
     fn address(access: &Access, request: &Request) -> Self {
         let Some(Peer(peer)) = request.extensions().get::<Peer>() else { return Self::default() };
         let values = request.headers().get_all(access.forwarded_header()).iter().filter_map(|v| v.to_str().ok());
-        Self::new(&place(access.client(*peer, values)), false, access.address_quota())
+        Self::new(&client_name(access.client(*peer, values)), false, access.address_quota())
     }
 }
 
 /// Name of an address as a client. IPv6 addresses count by their /64 network, which one client commonly owns.
-fn place(address: IpAddr) -> String {
+fn client_name(address: IpAddr) -> String {
     match address {
         IpAddr::V4(address) => address.to_string(),
         IpAddr::V6(address) => {
@@ -88,7 +88,7 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     request.headers_mut().remove(AUTHORIZATION);
     request.headers_mut().remove(API_KEY);
     let Some(scope) = scopes::needed(&request) else { return next.run(request).await };
-    let caller = match enter(&app.access, scope, key, &mut request) {
+    let caller = match authorize(&app.access, scope, key, &mut request) {
         Ok(caller) => caller,
         Err(problem) => {
             swallow(request).await;
@@ -100,7 +100,10 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
     request.extensions_mut().insert(caller);
     let mut response = match running {
         Ok(None) => next.run(request).await,
-        Ok(Some(running)) => next.run(request).await.map(|body| Body::new(Held { body, _running: running })),
+        Ok(Some(running)) => next.run(request).await.map(|body| {
+            // The request counts until the body is dropped.
+            observed(body, move |_bytes, _is_end| _ = &running)
+        }),
         Err(exceeded) => {
             swallow(request).await;
             refusal(&exceeded).into_response()
@@ -122,7 +125,7 @@ async fn swallow(request: Request) {
     const PATIENCE: Duration = Duration::from_millis(500);
     let asks_first = request.headers().contains_key(header::EXPECT);
     let mut body = request.into_body();
-    if asks_first || HttpBody::size_hint(&body).lower() > MOST {
+    if asks_first || body.size_hint().lower() > MOST {
         return;
     }
     let read = async {
@@ -163,21 +166,22 @@ fn presented(headers: &HeaderMap) -> Presented {
 }
 
 /// Identifies and authorizes the client. Removes a signature from the address.
-fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -> Result<Caller, Problem> {
+fn authorize(access: &Access, scope: Scope, key: Presented, request: &mut Request) -> Result<Caller, Problem> {
     if !access.is_closed() {
         return Ok(Caller::address(access, request));
     }
     let now = SystemTime::now();
     let may_be_signed = [Method::GET, Method::HEAD].contains(request.method());
     let uri = request.uri();
-    let worth = if may_be_signed { access.signed(uri.path(), uri.query(), now) } else { Signed::No };
-    if worth != Signed::No {
+    let signature =
+        if may_be_signed { access.check_signature(uri.path(), uri.query(), now) } else { SignatureCheck::Absent };
+    if signature != SignatureCheck::Absent {
         *request.uri_mut() = unsigned(request.uri())?;
     }
     let found = match key {
         Presented::Text(text) => access.verify(&text, now),
         Presented::Nonsense => Err(Denied::Unknown),
-        Presented::Nothing => return by_signature(&worth).map(|()| Caller::address(access, request)),
+        Presented::Nothing => return by_signature(&signature).map(|()| Caller::address(access, request)),
     };
     let key = found.map_err(no_key)?;
     Span::current().record("key", key.id.as_str());
@@ -193,26 +197,26 @@ fn enter(access: &Access, scope: Scope, key: Presented, request: &mut Request) -
 
 /// Returns the address without its signature.
 fn unsigned(uri: &Uri) -> Result<Uri, Problem> {
-    let rest = uri.query().and_then(without);
+    let rest = uri.query().and_then(remove_signature);
     let target = rest.map_or_else(|| uri.path().to_owned(), |rest| format!("{}?{rest}", uri.path()));
     let mut parts = uri.clone().into_parts();
     parts.path_and_query = Some(PathAndQuery::try_from(target).map_err(Problem::internal)?);
     Uri::from_parts(parts).map_err(Problem::internal)
 }
 
-fn by_signature(worth: &Signed) -> Result<(), Problem> {
-    match worth {
-        Signed::Valid => Ok(()),
-        Signed::No => Err(Problem::new(
+fn by_signature(signature: &SignatureCheck) -> Result<(), Problem> {
+    match signature {
+        SignatureCheck::Valid => Ok(()),
+        SignatureCheck::Absent => Err(Problem::new(
             Kind::KeyRequired,
             "a key is required, in `Authorization: Bearer …` or `X-Api-Key`; a GET may use a signed address instead",
         )
         .header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\"")),
-        Signed::Invalid => {
+        SignatureCheck::Invalid => {
             let detail = "the signature does not match this address, which must be used unchanged";
             Err(Problem::new(Kind::SignatureInvalid, detail))
         }
-        Signed::Expired(end) => {
+        SignatureCheck::Expired(end) => {
             let end = rfc3339(end.saturating_mul(1000));
             let detail = format!("the signed address expired at {end}");
             Err(Problem::new(Kind::SignatureExpired, detail).with("expired", end))
@@ -254,17 +258,7 @@ impl App {
 
     /// Charges `time` of work that is not a job to `caller`.
     pub(super) fn charge(&self, caller: &Caller, time: Duration) {
-        self.access.meter().spent(caller.client.number(), time, Instant::now());
-    }
-}
-
-/// Charges jobs to the quotas of their clients.
-#[derive(Debug)]
-pub(super) struct UsageRecorder(pub(super) Arc<Access>);
-
-impl Meter for UsageRecorder {
-    fn spent(&self, client: Client, time: Duration) {
-        self.0.meter().spent(client.number(), time, Instant::now());
+        self.access.meter().spent(caller.client.0, time, Instant::now());
     }
 }
 
@@ -274,8 +268,8 @@ fn add_quota_headers(access: &Access, account: &Account, response: &mut Response
     let redirects = response.headers().contains_key(header::LOCATION) && response.status().is_redirection();
     let usage = access.meter().usage(account, Instant::now());
     let fields = [
-        (RATE_LIMIT_POLICY, policies(&account.quota)),
-        (RATE_LIMIT, limits(&account.quota, &usage).filter(|_| !redirects)),
+        (RATE_LIMIT_POLICY, rate_limit_policy(&account.quota)),
+        (RATE_LIMIT, rate_limit(&account.quota, &usage).filter(|_| !redirects)),
     ];
     for (name, value) in fields {
         if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
@@ -290,29 +284,6 @@ fn keep_private(headers: &mut HeaderMap) {
     let private = value.strip_prefix("public").map(|rest| HeaderValue::try_from(format!("private{rest}")));
     if let Some(Ok(value)) = private {
         headers.insert(header::CACHE_CONTROL, value);
-    }
-}
-
-/// Response body that holds a concurrency slot until it is dropped.
-struct Held {
-    body: Body,
-    _running: Running,
-}
-
-impl HttpBody for Held {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        Pin::new(&mut self.body).poll_frame(cx)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }
 
@@ -357,7 +328,7 @@ mod tests {
         for (address, name) in
             [("192.0.2.1", "192.0.2.1"), ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"), ("::1", "0:0:0:0::/64")]
         {
-            assert_eq!(place(address.parse().unwrap()), name);
+            assert_eq!(client_name(address.parse().unwrap()), name);
         }
     }
 

@@ -10,9 +10,10 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::kinds::Kind;
-use super::openapi::refusals;
+use super::openapi::problem_responses;
 use super::problem::Problem;
-use super::state::{Shared, Warm};
+use super::state::Shared;
+use super::stop::Stop;
 
 const NO_STORE: [(axum::http::HeaderName, &str); 1] = [(CACHE_CONTROL, "no-store")];
 
@@ -70,14 +71,14 @@ impl Check {
     }
 }
 
-refusals!(ReadyRefusals: [[Kind::NotReady]]);
+problem_responses!(ReadyProblems: [[Kind::NotReady]]);
 
 /// Check that the service is ready for requests
 ///
 /// The service is ready if it is not shutting down, has computed a first mesh, has a device or a fallback that accepts
 /// jobs, and can write and read the store. The answer does not depend on the load.
 #[utoipa::path(get, path = "/readyz", tag = "service", operation_id = "ready",
-    responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyRefusals))]
+    responses((status = 200, description = "The service is ready.", body = ReadyDocument), ReadyProblems))]
 pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem> {
     let checks = [accepting(&app), devices(&app), store(&app).await];
     let failing = checks.iter().find(|check| !check.ok).map(|check| check.detail.clone());
@@ -94,18 +95,18 @@ pub(super) async fn ready(State(app): State<Shared>) -> Result<Response, Problem
 }
 
 fn accepting(app: &Shared) -> Check {
-    let ending = app.readiness.is_ending();
+    let ending = *app.stopping.borrow() != Stop::Serve;
     let found = if ending { Err("the service is shutting down") } else { Ok("requests are accepted") };
     Check::new("accepting", found.map(str::to_owned).map_err(str::to_owned))
 }
 
 fn devices(app: &Shared) -> Check {
     let backend = app.pool.backend();
-    let found = match app.readiness.warm() {
-        Warm::Warming => Err("the first mesh is being computed".to_owned()),
-        Warm::Broken => Err("the first mesh failed; see the log".to_owned()),
-        Warm::Yes if !backend.able() => Err("no device is in service, and there is no fallback".to_owned()),
-        Warm::Yes => {
+    let found = match app.first_mesh.get() {
+        None => Err("the first mesh is being computed".to_owned()),
+        Some(false) => Err("the first mesh failed; see the log".to_owned()),
+        Some(true) if !backend.is_available() => Err("no device is in service, and there is no fallback".to_owned()),
+        Some(true) => {
             let devices = backend.devices();
             let up = devices.iter().filter(|device| device.down.is_none()).count();
             Ok(match devices.len() {

@@ -4,10 +4,11 @@
 use std::time::Duration;
 
 use axum::Json;
-use axum::extract::rejection::{PathRejection, QueryRejection};
-use axum::extract::{Path, Query, State};
+use axum::extract::rejection::QueryRejection;
+use axum::extract::{FromRequestParts, Path, Query, State};
 use axum::http::StatusCode;
 use axum::http::header::{self, HeaderValue};
+use axum::http::request::Parts;
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -16,8 +17,8 @@ use utoipa::{IntoParams, ToSchema};
 use super::delivery;
 use super::kinds::Kind;
 use super::openapi::parameters::JobPath;
+use super::openapi::problem_responses;
 use super::openapi::problems::{MESHING, ProblemDocument, READING};
-use super::openapi::refusals;
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
@@ -119,21 +120,25 @@ enum StatusSchema {
     Dismissed,
 }
 
-refusals!(ShowRefusals: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::StoreFailed]]);
-refusals!(DismissRefusals: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::StoreFailed]]);
-refusals!(ResultRefusals: [READING, MESHING, [
+problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::StoreFailed]]);
+problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::StoreFailed]]);
+problem_responses!(ResultProblems: [READING, MESHING, [
     Kind::BadRequest, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed, Kind::ResultGone, Kind::JobAbandoned,
     Kind::StoreFull, Kind::StoreFailed,
 ]]);
 
-/// Parses the job id of a path.
-pub(super) fn id(path: Result<Path<String>, PathRejection>) -> Result<JobId, Problem> {
-    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
-    text.parse().map_err(|_bad| none(&text))
+/// Reads the job id from the path.
+impl FromRequestParts<Shared> for JobId {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, app: &Shared) -> Result<Self, Problem> {
+        let Path(text) = Path::<String>::from_request_parts(parts, app).await?;
+        text.parse().map_err(|_bad| no_such_job(&text))
+    }
 }
 
 /// Returns the problem of an unknown job.
-pub(super) fn none(id: &str) -> Problem {
+pub(super) fn no_such_job(id: &str) -> Problem {
     let shown: String = id.chars().take(40).collect();
     Problem::new(Kind::NoSuchJob, format!("there is no job `{shown}`: jobs are removed some time after their end"))
 }
@@ -146,14 +151,13 @@ pub(super) fn none(id: &str) -> Problem {
         (status = 200, description = "Status of the job.", body = JobDocument,
             headers(("Retry-After" = u64, description = "Seconds to wait before the next request.")),
             links(("result" = (operation_id = "showResult", parameters(("file" = "$response.body#/result")))))),
-        ShowRefusals,
+        ShowProblems,
     ))]
 pub(super) async fn show(
     State(app): State<Shared>,
-    path: Result<Path<String>, PathRejection>,
+    id: JobId,
     query: Result<Query<Poll>, QueryRejection>,
 ) -> Result<Response, Problem> {
-    let id = id(path)?;
     let Query(poll) = query.map_err(|e| Problem::new(Kind::BadParameter, e.body_text()).with("parameter", "wait"))?;
     let wait = poll.wait.unwrap_or(0);
     if wait > MAX_WAIT_S {
@@ -163,7 +167,7 @@ pub(super) async fn show(
             .with("limit", MAX_WAIT_S)
             .with("expected", format!("a whole number of seconds up to {MAX_WAIT_S}")));
     }
-    let mut watched = app.job_store.watch(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    let mut watched = app.job_store.watch(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     let mut stopping = app.stopping.clone();
     let ended = async {
         tokio::select! {
@@ -179,13 +183,9 @@ pub(super) async fn show(
 
 /// Cancel a job
 #[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", operation_id = "dismissJob", params(JobPath),
-    responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissRefusals))]
-pub(super) async fn dismiss(
-    State(app): State<Shared>,
-    path: Result<Path<String>, PathRejection>,
-) -> Result<Response, Problem> {
-    let id = id(path)?;
-    let view = app.job_store.dismiss(&id).await?.ok_or_else(|| none(id.as_str()))?;
+    responses((status = 200, description = "The job is cancelled.", body = JobDocument), DismissProblems))]
+pub(super) async fn dismiss(State(app): State<Shared>, id: JobId) -> Result<Response, Problem> {
+    let view = app.job_store.dismiss(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     if view.record.status != Status::Dismissed {
         let detail = format!("the job is {} and cannot be cancelled", view.record.status.name());
         return Err(Problem::new(Kind::JobEnded, detail).with("status_name", view.record.status.name()));
@@ -201,14 +201,10 @@ pub(super) async fn dismiss(
     responses(
         (status = 303, description = "The job has succeeded.",
             headers(("Location" = String, description = "Path of the mesh: `/v1/results/{file}`."))),
-        ResultRefusals,
+        ResultProblems,
     ))]
-pub(super) async fn result(
-    State(app): State<Shared>,
-    path: Result<Path<String>, PathRejection>,
-) -> Result<Response, Problem> {
-    let id = id(path)?;
-    let view = app.job_store.view(&id).await?.ok_or_else(|| none(id.as_str()))?;
+pub(super) async fn result(State(app): State<Shared>, id: JobId) -> Result<Response, Problem> {
+    let view = app.job_store.view(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     let record = &view.record;
     match (record.status, &record.result) {
         (Status::Successful, Some(key)) => {

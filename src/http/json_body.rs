@@ -1,9 +1,9 @@
-//! JSON bodies: an object of parameters, one of which names a structure. Parsed into names and texts without a tree, so
-//! a body within `limits.json_bytes` takes less than a millisecond.
+//! JSON bodies: an object of parameters, one of which names a structure.
 
 use std::fmt;
 
-use serde::de::{Deserialize, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
+use serde_json::Value;
 
 use super::kinds::Kind;
 use super::problem::Problem;
@@ -12,11 +12,11 @@ use super::problem::Problem;
 pub(super) fn members(bytes: &[u8]) -> Result<Vec<(String, String)>, Problem> {
     let Members(members) = serde_json::from_slice(bytes)
         .map_err(|e| bad(&e.to_string()).with("line", e.line()).with("column", e.column()))?;
-    let text = |(name, Member(text)): (String, Member)| match text {
+    let pair = |(name, value): (String, Value)| match text(&value) {
         Some(text) => Ok((name, text)),
         None => Err(bad_member(&name)),
     };
-    members.into_iter().map(text).collect()
+    members.into_iter().map(pair).collect()
 }
 
 /// Returns the problem of a body that is not such a document.
@@ -31,10 +31,26 @@ fn bad_member(name: &str) -> Problem {
     Problem::new(Kind::BadParameter, detail).with("parameter", name)
 }
 
-struct Members(Vec<(String, Member)>);
+/// Returns a scalar, or a list of scalars separated by commas, as text. Returns `None` for any other value.
+fn text(value: &Value) -> Option<String> {
+    match value {
+        Value::Array(items) if !items.is_empty() => {
+            items.iter().map(scalar).collect::<Option<Vec<_>>>().map(|items| items.join(","))
+        }
+        other => scalar(other),
+    }
+}
 
-/// Scalar or list of scalars as text; `None` for any other value.
-struct Member(Option<String>);
+fn scalar(value: &Value) -> Option<String> {
+    match value {
+        Value::String(text) => Some(text.clone()),
+        Value::Bool(_) | Value::Number(_) => Some(value.to_string()),
+        Value::Null | Value::Array(_) | Value::Object(_) => None,
+    }
+}
+
+/// Members of an object in order. Unlike a map, it keeps repeated names, which are errors.
+struct Members(Vec<(String, Value)>);
 
 impl<'de> Deserialize<'de> for Members {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
@@ -55,82 +71,6 @@ impl<'de> Deserialize<'de> for Members {
             }
         }
         deserializer.deserialize_map(Object)
-    }
-}
-
-impl<'de> Deserialize<'de> for Member {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(Scalars { is_item: false }).map(Self)
-    }
-}
-
-/// Visitor that reads a value as text. Nested lists are rejected.
-#[derive(Clone, Copy)]
-struct Scalars {
-    is_item: bool,
-}
-
-impl<'de> Visitor<'de> for Scalars {
-    type Value = Option<String>;
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("a value")
-    }
-
-    fn visit_str<E: Error>(self, text: &str) -> Result<Option<String>, E> {
-        Ok(Some(text.to_owned()))
-    }
-
-    fn visit_bool<E: Error>(self, flag: bool) -> Result<Option<String>, E> {
-        Ok(Some(flag.to_string()))
-    }
-
-    fn visit_u64<E: Error>(self, number: u64) -> Result<Option<String>, E> {
-        Ok(Some(number.to_string()))
-    }
-
-    fn visit_i64<E: Error>(self, number: i64) -> Result<Option<String>, E> {
-        Ok(Some(number.to_string()))
-    }
-
-    fn visit_f64<E: Error>(self, number: f64) -> Result<Option<String>, E> {
-        Ok(serde_json::Number::from_f64(number).map(|number| number.to_string()))
-    }
-
-    fn visit_unit<E: Error>(self) -> Result<Option<String>, E> {
-        Ok(None)
-    }
-
-    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Option<String>, A::Error> {
-        while map.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {}
-        Ok(None)
-    }
-
-    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Option<String>, A::Error> {
-        let mut text: Option<String> = None;
-        let mut fits = !self.is_item;
-        while let Some(item) = list.next_element_seed(Item)? {
-            match (item, &mut text) {
-                (Some(item), Some(text)) => {
-                    text.push(',');
-                    text.push_str(&item);
-                }
-                (Some(item), None) => text = Some(item),
-                (None, _) => fits = false,
-            }
-        }
-        Ok(text.filter(|_| fits))
-    }
-}
-
-/// Item of a list.
-struct Item;
-
-impl<'de> serde::de::DeserializeSeed<'de> for Item {
-    type Value = Option<String>;
-
-    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Option<String>, D::Error> {
-        deserializer.deserialize_any(Scalars { is_item: true })
     }
 }
 

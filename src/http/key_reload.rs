@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use metrics::gauge;
 
+use super::signal::Signal;
 use crate::access::Access;
 use crate::telemetry::QUOTA_CLIENTS;
 
@@ -20,7 +21,7 @@ pub(super) fn publish_clients(access: &Access) {
 /// Reloads the key file when it changes and on SIGHUP. Without keys it does nothing, and SIGHUP keeps its default
 /// action. Listens for the signal from the call on, not from the first poll.
 pub(super) fn run(access: Arc<Access>) -> impl Future<Output = ()> + Send + 'static {
-    let hangup = access.has_keys().then(Hangup::listen);
+    let hangup = access.has_keys().then(Signal::hangup);
     async move {
         if let Some(hangup) = hangup {
             reload(&access, hangup).await;
@@ -28,7 +29,7 @@ pub(super) fn run(access: Arc<Access>) -> impl Future<Output = ()> + Send + 'sta
     }
 }
 
-async fn reload(access: &Arc<Access>, mut hangup: Hangup) {
+async fn reload(access: &Arc<Access>, mut hangup: Signal) {
     loop {
         let requested = tokio::select! {
             () = hangup.next() => true,
@@ -41,37 +42,5 @@ async fn reload(access: &Arc<Access>, mut hangup: Hangup) {
             Ok(Err(error)) => tracing::error!(%error, "cannot reload the keys; the earlier ones stay valid"),
             Err(error) => tracing::error!(%error, "reloading the keys panicked"),
         }
-    }
-}
-
-/// SIGHUP, on systems that have it.
-struct Hangup {
-    #[cfg(unix)]
-    signal: Option<tokio::signal::unix::Signal>,
-}
-
-impl Hangup {
-    #[cfg(unix)]
-    fn listen() -> Self {
-        let signal = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::hangup());
-        Self { signal: signal.inspect_err(|error| tracing::warn!(%error, "cannot listen for SIGHUP")).ok() }
-    }
-
-    #[cfg(not(unix))]
-    fn listen() -> Self {
-        Self {}
-    }
-
-    #[cfg(unix)]
-    async fn next(&mut self) {
-        match &mut self.signal {
-            Some(signal) => drop(signal.recv().await),
-            None => std::future::pending().await,
-        }
-    }
-
-    #[cfg(not(unix))]
-    async fn next(&mut self) {
-        std::future::pending().await
     }
 }

@@ -27,6 +27,10 @@ use crate::telemetry::{SpanParent, TraceSpan};
 
 /// Request for a mesh or its report.
 pub(super) struct MeshRequest {
+    app: Shared,
+    method: Method,
+    /// Conditions and the range of a GET request; empty for an upload.
+    headers: HeaderMap,
     parsed: ParsedRequest,
     preferences: RequestPreferences,
     /// `Cache-Control` of the answer; `None` if it belongs to this request alone.
@@ -46,42 +50,38 @@ impl FromRequestParts<Shared> for MeshRequest {
         let preferences = RequestPreferences::of(&parts.headers, &parts.extensions)?;
         let structure = StructureSource::from_request_parts(parts, app).await?;
         let parsed = ParsedRequest::from_address(app, structure, file, query)?;
-        Ok(Self { parsed, preferences, cache: Some(source::CACHE), timing })
+        let (method, headers) = (parts.method.clone(), parts.headers.clone());
+        Ok(Self { app: Arc::clone(app), method, headers, parsed, preferences, cache: Some(source::CACHE), timing })
     }
 }
 
 impl MeshRequest {
     /// Creates the request of an upload, whose reception began with `timing`.
-    pub(super) fn of_upload(parsed: ParsedRequest, preferences: RequestPreferences, timing: Timing) -> Self {
-        Self { parsed, preferences, cache: None, timing }
+    pub(super) fn of_upload(
+        app: Shared,
+        parsed: ParsedRequest,
+        preferences: RequestPreferences,
+        timing: Timing,
+    ) -> Self {
+        Self { app, method: Method::POST, headers: HeaderMap::new(), parsed, preferences, cache: None, timing }
     }
 
-    /// Answers the request. `headers` may hold conditions and a range.
-    pub(super) async fn answer(
-        mut self,
-        app: &Shared,
-        method: &Method,
-        headers: &HeaderMap,
-    ) -> Result<Response, Problem> {
-        let digest = self.parsed.source.digest(app).await?;
+    /// Answers the request.
+    pub(super) async fn answer(mut self) -> Result<Response, Problem> {
+        let digest = self.parsed.source.digest(&self.app).await?;
         self.timing.lap("receive");
-        if let Some(response) = self.without_work(app, &digest, method, headers).await? {
+        if let Some(response) = self.without_work(&digest).await? {
             return Ok(response);
         }
         self.timing.lap("lookup");
-        let input = self.parsed.source.load(app).await?;
+        let input = self.parsed.source.load(&self.app).await?;
         self.timing.lap("load");
-        self.compute(app, input).await
+        self.compute(input).await
     }
 
     /// Returns an answer that needs no job: a stored result, a 304, or the headers for a HEAD request.
-    async fn without_work(
-        &self,
-        app: &Shared,
-        digest: &Digest,
-        method: &Method,
-        headers: &HeaderMap,
-    ) -> Result<Option<Response>, Problem> {
+    async fn without_work(&self, digest: &Digest) -> Result<Option<Response>, Problem> {
+        let Self { app, method, headers, .. } = self;
         let ParsedRequest { request, format, report, declared, .. } = &self.parsed;
         // Strict checks and reports need a run, a declared format is checked by parsing, and a job has its own address.
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
@@ -104,7 +104,7 @@ impl MeshRequest {
                 return Ok(Some(self.cached(response)));
             }
         }
-        if method != Method::HEAD || *report {
+        if *method != Method::HEAD || *report {
             return Ok(None);
         }
         // The summary headers would need a run.
@@ -121,35 +121,37 @@ impl MeshRequest {
     }
 
     /// Computes the mesh, or answers with a job.
-    async fn compute(self, app: &Shared, input: Input) -> Result<Response, Problem> {
+    async fn compute(self, input: Input) -> Result<Response, Problem> {
+        let app = Arc::clone(&self.app);
         app.admit_work(&self.preferences.caller)?;
         // A job has no report of its own to return later, so a request for a report is never answered with a job.
         let report = self.parsed.report;
         if self.preferences.respond_async && !report {
-            return self.accept(app, input, None).await;
+            return self.accept(input, None).await;
         }
         let permit = app.delivery()?;
         let wait = self.preferences.wait.filter(|_| !report);
         let jobs = &app.config.jobs;
-        let allowed = if wait.is_some() { jobs.batch_deadline() } else { jobs.deadline() };
+        let deadline = Duration::from_millis(jobs.deadline_ms);
+        let allowed = if wait.is_some() { Duration::from_millis(jobs.batch_deadline_ms) } else { deadline };
         let ticket = app.pool.submit(self.task(&input), allowed, None);
         let mut ticket = ticket.map_err(|refusal| self.refused(refusal))?;
-        if ticket.is_shared()
+        if ticket.is_shared
             && let Some(span) = TraceSpan::current()
         {
-            span.link(ticket.span().context());
+            span.link(ticket.span.context());
         }
         let outcome = match wait {
             None => ticket.wait().await,
-            Some(wait) => match tokio::time::timeout(wait.min(jobs.deadline()), ticket.wait()).await {
+            Some(wait) => match tokio::time::timeout(wait.min(deadline), ticket.wait()).await {
                 Ok(outcome) => outcome,
                 Err(_elapsed) => {
                     drop(permit);
-                    return self.accept(app, input, Some(ticket)).await;
+                    return self.accept(input, Some(ticket)).await;
                 }
             },
         };
-        let (digest, joined) = (input.digest, ticket.is_shared());
+        let (digest, joined) = (input.digest, ticket.is_shared);
         // Dropping the last ticket of unfinished work cancels it.
         drop((ticket, input));
         let finished = outcome.map_err(|failure| self.failed(failure))?;
@@ -167,8 +169,8 @@ impl MeshRequest {
         }
         // Another backend may have computed the mesh, with other bytes.
         let key = ContentKey::new(&digest, &request.job, format, &finished.product.report.maker());
-        let is_stored = results::save_later(app, &finished, format, &key);
-        let mut response = delivery::mesh(app, Arc::clone(&finished), format, &key, timing, permit).await?;
+        let is_stored = results::save_later(&app, &finished, format, &key);
+        let mut response = delivery::mesh(&app, Arc::clone(&finished), format, &key, timing, permit).await?;
         let headers = response.headers_mut();
         if is_stored {
             headers.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, format.extension())));
@@ -193,9 +195,9 @@ impl MeshRequest {
     }
 
     /// Accepts a durable job and answers with its address.
-    async fn accept(self, app: &Shared, input: Input, ticket: Option<Ticket>) -> Result<Response, Problem> {
+    async fn accept(self, input: Input, ticket: Option<Ticket>) -> Result<Response, Problem> {
         let task = self.task(&input);
-        let Self { parsed: ParsedRequest { request, pairs, format, .. }, preferences, .. } = self;
+        let Self { app, parsed: ParsedRequest { request, pairs, format, .. }, preferences, .. } = self;
         let spec = JobSpec { task, parameters: pairs, format, idempotency_key: preferences.idempotency_key };
         let job_store = app.job_store.clone();
         // A client that disconnects now does not interrupt the acceptance.

@@ -1,34 +1,38 @@
 //! `POST /v1/meshes`: the mesh of an upload, or of the structure that a JSON document names.
 
+use std::sync::Arc;
+
 use axum::body::Body;
 use axum::extract::State;
 use axum::http::header::HeaderMap;
-use axum::http::{Extensions, HeaderValue, Method, header};
+use axum::http::{Extensions, HeaderValue, header};
 use axum::response::Response;
 
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::{STRUCTURE_TO_MESH, StructureFile};
-use super::openapi::meshes::{Reported, Uploaded};
-use super::openapi::parameters::{Coding, MeshParameters, Wishes};
-use super::openapi::problems::{ASKING, BODY, MESHING, NAMED, PARAMETERS, READING};
-use super::openapi::refusals;
+use super::openapi::meshes::{MeshOrJob, ReportResponse};
+use super::openapi::parameters::{ContentEncodingHeader, MeshParameters, PreferenceHeaders};
+use super::openapi::problem_responses;
+use super::openapi::problems::{BODY, MESHING, NAMED_STRUCTURE, PARAMETERS, READING, SUBMITTING};
 use super::parsed_request::{Pairs, ParsedRequest};
 use super::preferences::RequestPreferences;
 use super::problem::Problem;
 use super::state::Shared;
 use super::timing::Timing;
 
-refusals!(MeshRefusals: [BODY, NAMED, PARAMETERS, READING, MESHING, ASKING, [Kind::NotAcceptable]]);
+problem_responses!(MeshProblems: [
+    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING, SUBMITTING, [Kind::NotAcceptable],
+]);
 
 /// Mesh a structure
 ///
 /// The parameter `format` sets the format of the mesh; without it the server uses the format that `Accept` prefers, or
 /// GLB. `POST /v1/report` returns the report without the mesh.
 #[utoipa::path(post, path = "/v1/meshes", tag = "meshes", operation_id = "createMesh",
-    params(MeshParameters, Wishes, Coding),
+    params(MeshParameters, PreferenceHeaders, ContentEncodingHeader),
     request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
-    responses(Uploaded, MeshRefusals))]
+    responses(MeshOrJob, MeshProblems))]
 pub(super) async fn create(
     State(app): State<Shared>,
     query: Pairs,
@@ -39,8 +43,8 @@ pub(super) async fn create(
     answer(&app, query, &headers, &extensions, body, false).await
 }
 
-refusals!(ReportRefusals: [
-    BODY, NAMED, PARAMETERS, READING, MESHING, [Kind::QueueFull, Kind::TooManyDeliveries],
+problem_responses!(ReportProblems: [
+    BODY, NAMED_STRUCTURE, PARAMETERS, READING, MESHING, [Kind::QueueFull, Kind::TooManyDeliveries],
 ]);
 
 /// Mesh a structure and return the report
@@ -48,9 +52,9 @@ refusals!(ReportRefusals: [
 /// Takes what `POST /v1/meshes` takes, computes the mesh and returns its report instead of the file: atoms, grid, area,
 /// volume, components, voids, validation and times.
 #[utoipa::path(post, path = "/v1/report", tag = "meshes", operation_id = "createReport",
-    params(MeshParameters, Coding),
+    params(MeshParameters, ContentEncodingHeader),
     request_body(content = StructureFile, description = STRUCTURE_TO_MESH, content_type = "application/octet-stream"),
-    responses(Reported, ReportRefusals))]
+    responses(ReportResponse, ReportProblems))]
 pub(super) async fn report(
     State(app): State<Shared>,
     query: Pairs,
@@ -75,9 +79,7 @@ async fn answer(
     let timing = Timing::start();
     let preferences = RequestPreferences::of(headers, extensions)?;
     let parsed = ParsedRequest { report, ..ParsedRequest::from_body(app, query, headers, body).await? };
-    let request = MeshRequest::of_upload(parsed, preferences, timing);
-    // Conditions and ranges apply to GET requests only.
-    let mut response = request.answer(app, &Method::POST, &HeaderMap::new()).await?;
+    let mut response = MeshRequest::of_upload(Arc::clone(app), parsed, preferences, timing).answer().await?;
     if !report {
         response.headers_mut().append(header::VARY, HeaderValue::from_static("accept"));
     }

@@ -6,20 +6,22 @@
 // Protocol rules that use no other file.
 mod conditional;
 mod kinds;
+mod observed_body;
 mod pace;
 mod probe;
 mod range;
 mod request_id;
 mod scopes;
+mod signal;
 mod socket;
-mod stop;
 mod timing;
+
+mod stop;
 
 // Problems, and what can be checked without the state of the service.
 mod problem;
 
 mod content_type;
-mod embedded;
 mod errors;
 mod json_body;
 mod limit;
@@ -53,7 +55,6 @@ mod results;
 mod mesh_request;
 
 mod atoms;
-mod docs;
 mod estimate;
 mod events;
 mod health;

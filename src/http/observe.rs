@@ -1,21 +1,18 @@
 //! Span, log line and metrics of a request, which end with the last byte of the response.
 
-use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::task::{Context, Poll};
 use std::time::Instant;
 
-use axum::body::Body;
 use axum::extract::{MatchedPath, Request, State};
 use axum::http::{HeaderName, HeaderValue, Method};
 use axum::middleware::Next;
 use axum::response::Response;
-use bytes::Bytes;
-use hyper::body::{Body as HttpBody, Frame, SizeHint};
+use hyper::body::Body as _;
 use metrics::{gauge, histogram};
 use tracing::Instrument as _;
 
+use super::observed_body::observed;
 use super::request_id::RequestId;
 use super::timing;
 use crate::telemetry::{
@@ -71,7 +68,8 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
         bytes: 0,
         complete: false,
     };
-    let request = request.map(|body| Body::new(Received { body, bytes: received }));
+    let request = request
+        .map(|body| observed(body, move |bytes, _is_end| _ = received.fetch_add(bytes as u64, Ordering::Relaxed)));
     let place = HeaderValue::from_str(&traceparent(&trace.context()));
     let mut response = trace.run(next.run(request)).instrument(span).await;
     timing::write_header(&mut response, start.elapsed());
@@ -82,7 +80,7 @@ pub(super) async fn request(State(tracer): State<Tracer>, request: Request, next
     response.map(|body| {
         // An empty body and the answer to HEAD are not polled.
         log.complete = body.is_end_stream() || log.method == Method::HEAD;
-        Body::new(Observed { body, log })
+        observed(body, move |bytes, is_end| log.count(bytes, is_end))
     })
 }
 
@@ -136,6 +134,11 @@ impl Drop for Log {
 }
 
 impl Log {
+    fn count(&mut self, bytes: usize, is_end: bool) {
+        self.bytes += bytes;
+        self.complete |= is_end;
+    }
+
     /// Sets the attributes of the span, named by OpenTelemetry's conventions, and its status.
     fn describe(&self, method: &'static str, route: String, received: u64) {
         let trace = &self.trace;
@@ -169,64 +172,5 @@ fn known(method: &Method) -> &'static str {
         "DELETE" => "DELETE",
         "PATCH" => "PATCH",
         _ => "other",
-    }
-}
-
-/// Request body that counts its bytes.
-struct Received {
-    body: Body,
-    bytes: Arc<AtomicU64>,
-}
-
-impl HttpBody for Received {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        let polled = Pin::new(&mut self.body).poll_frame(cx);
-        if let Poll::Ready(Some(Ok(frame))) = &polled {
-            self.bytes.fetch_add(frame.data_ref().map_or(0, Bytes::len) as u64, Ordering::Relaxed);
-        }
-        polled
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
-}
-
-/// Response body that counts its bytes.
-struct Observed {
-    body: Body,
-    log: Log,
-}
-
-impl HttpBody for Observed {
-    type Data = Bytes;
-    type Error = axum::Error;
-
-    fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        let polled = Pin::new(&mut self.body).poll_frame(cx);
-        match &polled {
-            Poll::Ready(Some(Ok(frame))) => self.log.bytes += frame.data_ref().map_or(0, Bytes::len),
-            Poll::Ready(None) => self.log.complete = true,
-            _ => {}
-        }
-        if self.body.is_end_stream() {
-            self.log.complete = true;
-        }
-        polled
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }

@@ -17,7 +17,7 @@ use axum::http::{Response, Version};
 use bytes::Bytes;
 use hyper::body::{Body as HttpBody, Frame, SizeHint};
 use hyper::rt::Executor;
-use metrics::{counter, gauge};
+use metrics::{Gauge, counter, gauge};
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
@@ -57,7 +57,7 @@ impl Rate {
     }
 
     pub(super) fn new(config: &ServerConfig) -> Self {
-        Self { bytes: config.write_bytes, within: config.write_timeout() }
+        Self { bytes: config.write_bytes, within: Duration::from_millis(config.write_timeout_ms) }
     }
 }
 
@@ -160,7 +160,16 @@ impl Pace {
         let stream = if version == Version::HTTP_2 { STREAM.try_with(Arc::clone).ok() } else { None };
         let stays = stream.is_some();
         let pace = stream.unwrap_or_else(|| Arc::clone(connection));
-        answer.map(|body| Body::new(Paced { body, rest: Bytes::new(), ended: false, stays, pace, _open: Open::new() }))
+        answer.map(|body| {
+            Body::new(Paced {
+                body,
+                rest: Bytes::new(),
+                ended: false,
+                stays,
+                pace,
+                _open: GaugeGuard::new(gauge!(BODIES_OPEN)),
+            })
+        })
     }
 }
 
@@ -188,19 +197,19 @@ impl Drop for Slice {
     }
 }
 
-/// Counts an open body until it is dropped.
-struct Open;
+/// Adds 1 to a gauge until it is dropped.
+pub(super) struct GaugeGuard(Gauge);
 
-impl Open {
-    fn new() -> Self {
-        gauge!(BODIES_OPEN).increment(1.0);
-        Self
+impl GaugeGuard {
+    pub(super) fn new(gauge: Gauge) -> Self {
+        gauge.increment(1.0);
+        Self(gauge)
     }
 }
 
-impl Drop for Open {
+impl Drop for GaugeGuard {
     fn drop(&mut self) {
-        gauge!(BODIES_OPEN).decrement(1.0);
+        self.0.decrement(1.0);
     }
 }
 
@@ -215,7 +224,7 @@ struct Paced {
     /// the buffer could not be freed afterwards.
     stays: bool,
     pace: Arc<Pace>,
-    _open: Open,
+    _open: GaugeGuard,
 }
 
 impl HttpBody for Paced {

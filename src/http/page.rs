@@ -1,21 +1,30 @@
-//! `/`: the embedded viewer, if the program was built with it, and `<molmesh-viewer>` for other pages. Nothing is
-//! loaded from other servers.
+//! Embedded pages: the viewer at `/`, if the program was built with it, `<molmesh-viewer>` for other pages, and Swagger
+//! UI for the OpenAPI document at `/docs`. Nothing is loaded from other servers.
+
+use std::io::Read as _;
 
 use axum::extract::Path;
 use axum::extract::rejection::PathRejection;
-use axum::http::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY};
+use axum::http::header::{
+    ACCEPT_ENCODING, CACHE_CONTROL, CONTENT_ENCODING, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, VARY,
+};
 use axum::http::{HeaderMap, HeaderName};
 use axum::response::{IntoResponse, Response};
+use bytes::Bytes;
 
-use super::embedded;
 use super::kinds::Kind;
 use super::problem::Problem;
 
-/// Content security policy of the page: scripts and requests of this server only. WebAssembly is allowed for the
+/// Content security policy of the viewer: scripts and requests of this server only. WebAssembly is allowed for the
 /// meshopt decoder, `eval` is not. Images may be blobs, since the address of an image cannot carry a key.
 const POLICY: &str = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; style-src 'self'; \
                       img-src 'self' blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; \
                       frame-ancestors 'none'";
+
+/// Content security policy of Swagger UI: data URIs for its icons. Its inline styles are set by scripts, which a policy
+/// does not restrict.
+const DOCS_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; \
+                           connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 // `static FILES`: paths below `web/dist` with their contents, compressed with gzip; empty if the page was not built.
 include!(concat!(env!("OUT_DIR"), "/page.rs"));
@@ -37,7 +46,7 @@ fn found(path: &str) -> Option<&'static [u8]> {
     FILES.iter().find(|(name, _)| *name == path).map(|(_, packed)| *packed)
 }
 
-fn headers(path: &str) -> [(HeaderName, &'static str); 4] {
+fn headers(path: &str, policy: &'static str) -> [(HeaderName, &'static str); 4] {
     let media_type = match path.rsplit('.').next().unwrap_or_default() {
         "html" => "text/html; charset=utf-8",
         "js" => "text/javascript; charset=utf-8",
@@ -48,7 +57,7 @@ fn headers(path: &str) -> [(HeaderName, &'static str); 4] {
     let caching = if is_named_by_contents(path) { "public, max-age=31536000, immutable" } else { "no-cache" };
     [
         (CONTENT_TYPE, media_type),
-        (CONTENT_SECURITY_POLICY, POLICY),
+        (CONTENT_SECURITY_POLICY, policy),
         (REFERRER_POLICY, "no-referrer"),
         (CACHE_CONTROL, caching),
     ]
@@ -63,9 +72,25 @@ fn is_named_by_contents(path: &str) -> bool {
 /// Answers with a file of the page, or with `instead`.
 fn answer(request: &HeaderMap, path: &str, instead: &'static str) -> Result<Response, Problem> {
     match found(path) {
-        Some(bytes) => Ok((headers(path), embedded::file(request, bytes)?).into_response()),
-        None => Ok((headers(path), instead).into_response()),
+        Some(bytes) => Ok((headers(path, POLICY), packed(request, bytes)?).into_response()),
+        None => Ok((headers(path, POLICY), instead).into_response()),
     }
+}
+
+/// Answers with a file that is compressed with gzip. Inflates it for clients that do not accept gzip.
+fn packed(request: &HeaderMap, bytes: &'static [u8]) -> Result<Response, Problem> {
+    let takes = |coding: &str| {
+        let (name, weight) = coding.split_once(';').unwrap_or((coding, "q=1"));
+        matches!(name.trim(), "gzip" | "*") && weight.trim().strip_prefix("q=").is_none_or(|q| q.parse() != Ok(0.0))
+    };
+    let accepted = request.get_all(ACCEPT_ENCODING).iter().filter_map(|value| value.to_str().ok());
+    if accepted.flat_map(|value| value.split(',')).any(takes) {
+        let coding = [(CONTENT_ENCODING, "gzip"), (VARY, "accept-encoding")];
+        return Ok((coding, Bytes::from_static(bytes)).into_response());
+    }
+    let mut plain = Vec::new();
+    flate2::read::GzDecoder::new(bytes).read_to_end(&mut plain).map_err(Problem::internal)?;
+    Ok(([(VARY, "accept-encoding")], plain).into_response())
 }
 
 /// Serves the viewer.
@@ -82,7 +107,7 @@ pub(super) async fn component(request: HeaderMap) -> Result<Response, Problem> {
 
 /// Serves the files of the page.
 pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: HeaderMap) -> Result<Response, Problem> {
-    let Path(file) = file.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let Path(file) = file?;
     let path = format!("assets/{file}");
     if found(&path).is_none() && file != "icon.svg" {
         let shown: String = file.chars().take(80).collect();
@@ -93,9 +118,31 @@ pub(super) async fn asset(file: Result<Path<String>, PathRejection>, request: He
 
 /// Serves a sample structure.
 pub(super) async fn sample() -> Response {
-    let mut headers = headers("sample.pdb");
+    let mut headers = headers("sample.pdb", POLICY);
     headers[0].1 = "chemical/x-pdb";
     (headers, include_str!("../../samples/4pti.pdb")).into_response()
+}
+
+/// Serves Swagger UI.
+pub(super) async fn docs() -> Response {
+    (headers("docs.html", DOCS_POLICY), include_str!("../../web/docs.html")).into_response()
+}
+
+/// Serves the script that starts Swagger UI.
+pub(super) async fn docs_script() -> Response {
+    (headers("docs.js", DOCS_POLICY), include_str!("../../web/docs.js")).into_response()
+}
+
+/// Serves the style of Swagger UI, a file of the package `swagger-ui-dist`.
+pub(super) async fn swagger_style(request: HeaderMap) -> Result<Response, Problem> {
+    let style = include_bytes!("../../web/swagger/swagger-ui.css.gz");
+    Ok((headers("swagger-ui.css", DOCS_POLICY), packed(&request, style)?).into_response())
+}
+
+/// Serves the script of Swagger UI, a file of the package `swagger-ui-dist`.
+pub(super) async fn swagger_script(request: HeaderMap) -> Result<Response, Problem> {
+    let script = include_bytes!("../../web/swagger/swagger-ui-bundle.js.gz");
+    Ok((headers("swagger-ui-bundle.js", DOCS_POLICY), packed(&request, script)?).into_response())
 }
 
 #[cfg(test)]
@@ -113,7 +160,7 @@ mod tests {
             ("index.html", false),
         ] {
             assert_eq!(is_named_by_contents(path), kept, "{path}");
-            assert_eq!(headers(path)[3].1.contains("immutable"), kept, "{path}");
+            assert_eq!(headers(path, POLICY)[3].1.contains("immutable"), kept, "{path}");
         }
         assert!(!POLICY.contains("unsafe-inline") && !POLICY.contains("'unsafe-eval'"));
     }

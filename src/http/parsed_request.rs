@@ -6,12 +6,12 @@ use axum::extract::rejection::QueryRejection;
 use axum::http::header::HeaderMap;
 
 use super::content_type::DeclaredType;
+use super::form::Upload;
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::{App, Shared};
-use super::upload::{self, Upload};
-use super::{json_body, negotiate};
+use super::{json_body, negotiate, upload};
 use crate::formats::Format;
 use crate::pipeline::params::{self, Request};
 
@@ -50,7 +50,7 @@ impl ParsedRequest {
         }
         let report = format.is_none();
         let format = format.or(request.format).unwrap_or_default();
-        params::settle(&mut request.job, format)?;
+        params::set_format(&mut request.job, format)?;
         app.accepts(&request.job)?;
         Ok(Self { source, request, pairs, format, report, declared: DeclaredType::Neutral })
     }
@@ -93,7 +93,7 @@ fn parse(query: Pairs) -> Result<(Vec<(String, String)>, Request), Problem> {
 /// Returns the format of a request and checks the request against it.
 fn finish(app: &App, request: &mut Request, headers: &HeaderMap) -> Result<Format, Problem> {
     let format = request.format.map_or_else(|| negotiate::format(headers), Ok)?;
-    params::settle(&mut request.job, format)?;
+    params::set_format(&mut request.job, format)?;
     app.accepts(&request.job)?;
     Ok(format)
 }

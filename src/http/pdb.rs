@@ -1,21 +1,19 @@
 //! `GET /v1/pdb/{id}/surface.{ext}` and `report.json`: the mesh of an archive entry at a cacheable address, and its
 //! report.
 
-use axum::extract::State;
-use axum::http::Method;
-use axum::http::header::HeaderMap;
 use axum::response::Response;
 
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
-use super::openapi::meshes::{Addressed, Reported};
-use super::openapi::parameters::{EntryPath, MeshParameters, Parts, SurfaceParameters, Unchanged, Wishes};
-use super::openapi::problems::{ASKING, MESHING, PARAMETERS, READING};
-use super::openapi::refusals;
+use super::openapi::meshes::{CacheableMeshOrJob, ReportResponse};
+use super::openapi::parameters::{
+    EntryPath, IfNoneMatchHeader, MeshParameters, PreferenceHeaders, RangeHeaders, SurfaceParameters,
+};
+use super::openapi::problem_responses;
+use super::openapi::problems::{MESHING, PARAMETERS, READING, SUBMITTING};
 use super::problem::Problem;
-use super::state::Shared;
 
-refusals!(SurfaceRefusals: [PARAMETERS, READING, MESHING, ASKING, [
+problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
     Kind::NotFound, Kind::NotInArchive, Kind::EntryTooLarge, Kind::RangeNotSatisfiable, Kind::ArchiveUnavailable,
 ]]);
 
@@ -27,19 +25,14 @@ refusals!(SurfaceRefusals: [PARAMETERS, READING, MESHING, ASKING, [
     path = "/v1/pdb/{id}/{file}",
     tag = "meshes",
     operation_id = "meshEntry",
-    params(EntryPath, SurfaceParameters, Wishes, Unchanged, Parts),
-    responses(Addressed, SurfaceRefusals)
+    params(EntryPath, SurfaceParameters, PreferenceHeaders, IfNoneMatchHeader, RangeHeaders),
+    responses(CacheableMeshOrJob, SurfaceProblems)
 )]
-pub(super) async fn surface(
-    State(app): State<Shared>,
-    method: Method,
-    headers: HeaderMap,
-    request: MeshRequest,
-) -> Result<Response, Problem> {
-    request.answer(&app, &method, &headers).await
+pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
+    request.answer().await
 }
 
-refusals!(ReportRefusals: [PARAMETERS, READING, MESHING, [
+problem_responses!(ReportProblems: [PARAMETERS, READING, MESHING, [
     Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable, Kind::QueueFull, Kind::TooManyDeliveries,
 ]]);
 
@@ -50,13 +43,8 @@ refusals!(ReportRefusals: [PARAMETERS, READING, MESHING, [
     tag = "meshes",
     operation_id = "reportEntry",
     params(EntryPath, MeshParameters),
-    responses(Reported, ReportRefusals)
+    responses(ReportResponse, ReportProblems)
 )]
-pub(super) async fn report(
-    State(app): State<Shared>,
-    method: Method,
-    headers: HeaderMap,
-    request: MeshRequest,
-) -> Result<Response, Problem> {
-    request.answer(&app, &method, &headers).await
+pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
+    request.answer().await
 }

@@ -43,7 +43,7 @@ impl Probe {
     /// `store.probe_timeout_ms`: a busy disk still works.
     pub(super) async fn failure(&self, store: &Store, config: &StoreConfig) -> Option<&'static str> {
         let mut verdict = self.0.subscribe();
-        if verdict.borrow_and_update().at.elapsed() >= config.probe() {
+        if verdict.borrow_and_update().at.elapsed() >= Duration::from_millis(config.probe_ms) {
             let mine = self
                 .0
                 .send_if_modified(|verdict| verdict.begun.is_none() && verdict.begun.replace(Instant::now()).is_none());
@@ -57,7 +57,7 @@ impl Probe {
             }
             drop(tokio::time::timeout(MAX_WAIT, verdict.wait_for(|verdict| verdict.begun.is_none())).await);
         }
-        verdict.borrow().failure(config.probe_timeout())
+        verdict.borrow().failure(Duration::from_millis(config.probe_timeout_ms))
     }
 
     fn conclude(&self, place: &str, outcome: &Result<(), StoreError>) {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use axum::body::Body;
 use axum::extract::Request;
+use axum::extract::rejection::PathRejection;
 use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, HeaderName, RETRY_AFTER};
 use axum::http::{HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
@@ -110,6 +111,12 @@ impl Problem {
         let mut bytes = Value::Object(document).to_string().into_bytes();
         bytes.push(b'\n');
         bytes
+    }
+}
+
+impl From<PathRejection> for Problem {
+    fn from(error: PathRejection) -> Self {
+        Self::new(Kind::BadRequest, error.body_text())
     }
 }
 

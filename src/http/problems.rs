@@ -9,7 +9,7 @@ use utoipa::ToSchema;
 
 use super::kinds::{KINDS, Kind, Row};
 use super::openapi::parameters::ProblemPath;
-use super::openapi::refusals;
+use super::openapi::problem_responses;
 use super::problem::Problem;
 
 /// Explanation of a problem type.
@@ -35,7 +35,7 @@ fn describe(row: &Row) -> ProblemDescription {
     }
 }
 
-refusals!(OneRefusals: [[Kind::BadRequest, Kind::NotFound]]);
+problem_responses!(OneProblems: [[Kind::BadRequest, Kind::NotFound]]);
 
 /// List all problem types
 #[utoipa::path(get, path = "/problems", tag = "service", operation_id = "listProblems",
@@ -47,9 +47,9 @@ pub(super) async fn list() -> Response {
 /// Explain a problem type
 #[utoipa::path(get, path = "/problems/{slug}", tag = "service", operation_id = "showProblem",
     params(ProblemPath),
-    responses((status = 200, description = "The explanation.", body = ProblemDescription), OneRefusals))]
+    responses((status = 200, description = "The explanation.", body = ProblemDescription), OneProblems))]
 pub(super) async fn one(path: Result<Path<String>, PathRejection>) -> Result<Response, Problem> {
-    let Path(slug) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let Path(slug) = path?;
     let row = KINDS.iter().find(|row| row.slug == slug);
     row.map(|row| Json(describe(row)).into_response())
         .ok_or_else(|| Problem::new(Kind::NotFound, "there is no problem type with this name; /problems lists all"))

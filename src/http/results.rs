@@ -1,7 +1,7 @@
 //! `GET /v1/results/{key}.{ext}` and `…/{key}/report.json`: stored results, byte for byte.
 
 use std::ops::Range;
-use std::sync::Arc;
+use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 
 use axum::body::Body;
@@ -16,9 +16,9 @@ use serde_json::Value;
 use tracing::Instrument as _;
 
 use super::kinds::Kind;
-use super::openapi::meshes::{Kept, NotModified};
-use super::openapi::parameters::{Parts, ResultFile, ResultPath, Unchanged};
-use super::openapi::refusals;
+use super::openapi::meshes::{NotModified, StoredMesh};
+use super::openapi::parameters::{IfNoneMatchHeader, RangeHeaders, ResultFile, ResultPath};
+use super::openapi::problem_responses;
 use super::problem::Problem;
 use super::range::{self, Wanted};
 use super::state::{App, Shared};
@@ -27,7 +27,7 @@ use super::{conditional, delivery};
 use crate::formats::Format;
 use crate::jobs::{self, ContentKey, Finished, REPORT};
 use crate::pipeline::Report;
-use crate::telemetry::{RESULTS_NOT_KEPT, SpanKind, SpanParent, TraceSpan};
+use crate::telemetry::{RESULTS_NOT_STORED, SpanKind, SpanParent, TraceSpan};
 
 /// Caching of results, whose bytes follow from their key.
 pub(super) const IMMUTABLE: HeaderValue = HeaderValue::from_static("public, max-age=31536000, immutable");
@@ -39,10 +39,10 @@ pub(super) fn path(key: &ContentKey, extension: &str) -> String {
     format!("/v1/results/{key}.{extension}")
 }
 
-refusals!(ShowRefusals: [[
+problem_responses!(ShowProblems: [[
     Kind::BadRequest, Kind::NotFound, Kind::RangeNotSatisfiable, Kind::MemoryFull, Kind::StoreFailed,
 ]]);
-refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
+problem_responses!(ReportProblems: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]]);
 
 /// Get a stored mesh
 ///
@@ -52,8 +52,8 @@ refusals!(ReportRefusals: [[Kind::BadRequest, Kind::NotFound, Kind::StoreFailed]
     path = "/v1/results/{file}",
     tag = "results",
     operation_id = "showResult",
-    params(ResultFile, Unchanged, Parts),
-    responses(Kept, ShowRefusals)
+    params(ResultFile, IfNoneMatchHeader, RangeHeaders),
+    responses(StoredMesh, ShowProblems)
 )]
 pub(super) async fn show(
     State(app): State<Shared>,
@@ -61,7 +61,7 @@ pub(super) async fn show(
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let Path(file) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let Path(file) = path?;
     let (key, format) = parse(&file).ok_or_else(|| no_such_result(&file))?;
     let etag = delivery::etag(&key);
     if conditional::is_unchanged(&headers, &etag) {
@@ -75,18 +75,18 @@ pub(super) async fn show(
 
 /// Get the report of a stored mesh
 #[utoipa::path(get, path = "/v1/results/{key}/report.json", tag = "results", operation_id = "showReport",
-    params(ResultPath, Unchanged),
+    params(ResultPath, IfNoneMatchHeader),
     responses(
         (status = 200, description = "The report of the run that computed the mesh.", body = Report,
             headers(("ETag" = String, description = "Strong validator of the document."))),
-        NotModified, ReportRefusals,
+        NotModified, ReportProblems,
     ))]
 pub(super) async fn report(
     State(app): State<Shared>,
     path: Result<Path<String>, PathRejection>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let Path(text) = path.map_err(|e| Problem::new(Kind::BadRequest, e.body_text()))?;
+    let Path(text) = path?;
     let key: ContentKey = text.parse().map_err(|_bad| no_such_result(&text))?;
     wait_for_save(&app, &key).await;
     let bytes = app.store.get(&key.name(REPORT)?).await?.ok_or_else(|| no_such_result(&text))?.bytes;
@@ -123,7 +123,7 @@ pub(super) async fn stored(
     headers: &HeaderMap,
 ) -> Result<Option<Response>, Problem> {
     let name = key.name(format.extension())?;
-    app.pool.budget().check()?;
+    app.pool.settings().budget.check()?;
     let Some((meta, mut body)) = app.store.read(&name, None).await? else { return Ok(None) };
     let Some(headers_of_result) = result_headers(app, key, format).await? else { return Ok(None) };
     let mut out = HeaderMap::clone(&headers_of_result);
@@ -154,7 +154,7 @@ pub(super) async fn stored(
         body = part;
     }
     // Pieces of running answers are charged regardless of the limit; new answers are refused while it is exceeded.
-    let budget = app.pool.budget().clone();
+    let budget = app.pool.settings().budget.clone();
     let charged = body.map_ok(move |piece| {
         let mut lease = budget.lease();
         lease.force(piece.len() as u64);
@@ -170,7 +170,7 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
     }
     let Some(report) = app.store.get(&key.name(REPORT)?).await? else { return Ok(None) };
     let report: Value = serde_json::from_slice(&report.bytes).map_err(Problem::internal)?;
-    let mut headers = delivery::summary(&report);
+    let mut headers = delivery::summary_headers(&report);
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(format.media_type()));
     headers.insert(header::CONTENT_DISPOSITION, delivery::disposition(report["id"].as_str(), format));
     headers.insert(header::ETAG, delivery::etag(key));
@@ -186,11 +186,12 @@ async fn result_headers(app: &App, key: &ContentKey, format: Format) -> Result<O
 /// Stores the result of a synchronous request in the background. Returns false if too many results are being stored
 /// already; then the next request computes it again.
 pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format, key: &ContentKey) -> bool {
+    let _starting = app.save_start.lock().unwrap_or_else(PoisonError::into_inner);
     if app.saves.running(key).is_some() {
         return true;
     }
     let Ok(permit) = Arc::clone(&app.save_permits).try_acquire_owned() else {
-        counter!(RESULTS_NOT_KEPT, "reason" => "busy").increment(1);
+        counter!(RESULTS_NOT_STORED, "reason" => "busy").increment(1);
         return false;
     };
     let (shared, finished, saved) = (Arc::clone(app), Arc::clone(finished), *key);
@@ -198,7 +199,7 @@ pub(super) fn save_later(app: &Shared, finished: &Arc<Finished>, format: Format,
     let save = async move {
         let limit = shared.config.limits.output_bytes;
         if let Err(error) = jobs::save(&shared.store, finished, format, &saved, limit).await {
-            counter!(RESULTS_NOT_KEPT, "reason" => "failed").increment(1);
+            counter!(RESULTS_NOT_STORED, "reason" => "failed").increment(1);
             tracing::warn!(%error, "cannot store a result");
         }
         span.end();

@@ -9,7 +9,7 @@ use axum::routing::{get, post};
 
 use super::state::Shared;
 use super::{
-    api_document, atoms, capabilities, docs, estimate, events, health, jobs, meshes, middleware, negotiate, page, pdb,
+    api_document, atoms, capabilities, estimate, events, health, jobs, meshes, middleware, negotiate, page, pdb,
     problems, results, structures,
 };
 
@@ -18,8 +18,8 @@ const MARGIN: Duration = Duration::from_secs(10);
 
 /// Builds the router with its middleware.
 pub(super) fn router(app: &Shared) -> Router {
-    let longest = app.config.jobs.deadline().max(Duration::from_secs(jobs::MAX_WAIT_S));
-    let input = app.config.server.body_timeout().max(app.config.archive.timeout());
+    let longest = Duration::from_millis(app.config.jobs.deadline_ms).max(Duration::from_secs(jobs::MAX_WAIT_S));
+    let input = Duration::from_millis(app.config.server.body_timeout_ms.max(app.config.archive.timeout_ms));
     let timeout = input + longest + MARGIN;
     let router = Router::new()
         // Meshes.
@@ -49,10 +49,10 @@ pub(super) fn router(app: &Shared) -> Router {
         .route("/version", get(health::version))
         .route("/openapi.yaml", get(api_document::yaml))
         .route("/openapi.json", get(api_document::json))
-        .route("/docs", get(docs::index))
-        .route("/docs.js", get(docs::start))
-        .route("/swagger-ui.css", get(docs::style))
-        .route("/swagger-ui-bundle.js", get(docs::bundle))
+        .route("/docs", get(page::docs))
+        .route("/docs.js", get(page::docs_script))
+        .route("/swagger-ui.css", get(page::swagger_style))
+        .route("/swagger-ui-bundle.js", get(page::swagger_script))
         // The web page.
         .route("/", get(page::index))
         .route("/assets/{file}", get(page::asset))

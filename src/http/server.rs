@@ -1,42 +1,42 @@
 //! The server: binds its listeners, warms up the backend, serves, and shuts down.
 
 use std::io;
-use std::net::{SocketAddr, TcpListener};
-use std::sync::Arc;
-use std::time::{Instant, SystemTime};
+use std::net::SocketAddr;
+use std::sync::{Arc, Mutex, OnceLock};
+use std::time::{Duration, Instant, SystemTime};
 
+use futures_util::FutureExt as _;
 use quick_cache::sync::Cache;
 use thiserror::Error;
+use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, watch};
-use tokio::task::JoinHandle;
+use tokio::task::{JoinHandle, JoinSet};
 
-use super::guard::UsageRecorder;
 use super::probe::Probe;
 use super::problem::Problem;
-use super::source::FetchMemory;
-use super::state::{App, Readiness, Shared, Warm};
+use super::state::{App, Shared};
 use super::stop::{self, Stop};
 use super::{accept, capabilities, key_reload, metrics, results, router};
 use crate::access::{Access, AccessError};
 use crate::archive::Archive;
 use crate::config::Config;
-use crate::jobs::{Budget, EndError, JobStore, JobStoreSettings, Pool, Settings};
-use crate::picture::Drawer;
+use crate::jobs::{Budget, Client, EndError, JobStore, Pool, Settings};
+use crate::picture::SelectedRenderer;
 use crate::single_flight::SingleFlight;
 use crate::store::{FolderLock, LockError, Store, StoreError};
 use crate::surface::{Backend, FoundDevice};
-use crate::telemetry::{self, TelemetryError, Traces};
+use crate::telemetry::{self, Recorder, TelemetryError, Traces};
 
 /// Interval of metrics upkeep.
-const UPKEEP: std::time::Duration = std::time::Duration::from_secs(5);
+const UPKEEP: Duration = Duration::from_secs(5);
 
 /// Pause between two attempts to list the jobs of earlier processes.
-const RECOVER_PAUSE: std::time::Duration = std::time::Duration::from_secs(5);
+const RECOVER_PAUSE: Duration = Duration::from_secs(5);
 /// Number of results whose headers are cached, about 1 KB each.
 const CACHED_HEADERS: usize = 4096;
 
 /// Time for cancelled jobs to stop and for their records to be written.
-const CANCELLING: std::time::Duration = std::time::Duration::from_secs(1);
+const CANCELLING: Duration = Duration::from_secs(1);
 
 /// Error of a server that cannot start.
 #[derive(Debug, Error)]
@@ -75,7 +75,7 @@ pub struct Chosen {
     /// Reason for its choice.
     pub reason: String,
     /// Renderer of pictures.
-    pub drawer: Drawer,
+    pub renderer: SelectedRenderer,
     /// Every device that was found, used or not.
     pub devices: Vec<FoundDevice>,
 }
@@ -84,23 +84,20 @@ pub struct Chosen {
 pub struct Server {
     app: Shared,
     listener: TcpListener,
-    metrics_listener: Option<TcpListener>,
     addr: SocketAddr,
-    metrics_addr: Option<SocketAddr>,
+    /// Listener of `/metrics` with its address.
+    metrics_listener: Option<(TcpListener, SocketAddr)>,
     stop: watch::Sender<Stop>,
     traces: Traces,
     /// Lock of the data folder.
     data: FolderLock,
 }
 
-fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
-    let bind = || {
-        let listener = TcpListener::bind(addr)?;
-        listener.set_nonblocking(true)?;
-        let bound = listener.local_addr()?;
-        Ok((listener, bound))
-    };
-    bind().map_err(|error| ServeError::Listen { key, addr, error })
+async fn listen(key: &'static str, addr: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
+    let failed = |error| ServeError::Listen { key, addr, error };
+    let listener = TcpListener::bind(addr).await.map_err(failed)?;
+    let bound = listener.local_addr().map_err(failed)?;
+    Ok((listener, bound))
 }
 
 impl Server {
@@ -110,11 +107,13 @@ impl Server {
     /// # Errors
     /// [`ServeError`].
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
-        let Chosen { backend, reason, drawer, devices: found } = chosen;
+        let Chosen { backend, reason, renderer, devices: found } = chosen;
         let access = Arc::new(Access::open(&config)?);
-        let (listener, addr) = listen("server.listen", config.server.listen)?;
-        let metrics = config.server.metrics_listen.map(|addr| listen("server.metrics_listen", addr)).transpose()?;
-        let (metrics_listener, metrics_addr) = metrics.unzip();
+        let (listener, addr) = listen("server.listen", config.server.listen).await?;
+        let metrics_listener = match config.server.metrics_listen {
+            Some(addr) => Some(listen("server.metrics_listen", addr).await?),
+            None => None,
+        };
         let data = FolderLock::acquire(&config.server.data_dir, addr)?;
         // Before any metric is recorded. Without a listener none is.
         if metrics_listener.is_some() {
@@ -124,28 +123,25 @@ impl Server {
         let settings = Settings {
             workers: config.jobs.workers.max(config.devices.jobs * backend.devices().len()),
             queue: config.jobs.queue,
-            batch_max_delay: config.jobs.batch_max_delay(),
+            batch_max_delay: Duration::from_millis(config.jobs.batch_max_delay_ms),
             limits: config.limits.job(),
             budget: Budget::new(config.limits.memory_bytes),
-            drawer,
-            meter: Some(Arc::new(UsageRecorder(Arc::clone(&access)))),
+            renderer,
+            meter: Some(Arc::new({
+                let access = Arc::clone(&access);
+                move |client: Client, time| access.meter().spent(client.0, time, Instant::now())
+            })),
             tracer: traces.tracer(),
         };
         let store = Store::open(&config.store, &config.server.data_dir).await?;
         let secret = store.secret().await?;
         let pool = Arc::new(Pool::start(settings, backend, reason).map_err(ServeError::Workers)?);
-        let settings = JobStoreSettings {
-            allowed: config.jobs.batch_deadline(),
-            attempts: config.jobs.attempts,
-            output_bytes: config.limits.output_bytes,
-            retry_for: config.jobs.store_patience(),
-        };
         let describe = |error: &EndError| Problem::from(error.clone()).record();
-        let job_store = JobStore::new(store.clone(), Arc::clone(&pool), settings, secret, describe);
-        let archive = Archive::new(&config, Arc::new(FetchMemory(pool.budget().clone())));
+        let (jobs, output_bytes) = (config.jobs.clone(), config.limits.output_bytes);
+        let job_store = JobStore::new(store.clone(), Arc::clone(&pool), jobs, output_bytes, secret, describe);
+        let archive = Archive::new(&config, pool.settings().budget.clone());
         let capabilities = capabilities::document(&config, &pool, &found);
         let deliveries = Arc::new(Semaphore::new(config.jobs.deliveries));
-        let readiness = Readiness::default();
         let save_permits = Arc::new(Semaphore::new(config.jobs.concurrent_saves));
         let (stop, stopping) = watch::channel(Stop::Serve);
         let app = Arc::new(App {
@@ -157,16 +153,17 @@ impl Server {
             job_store,
             result_headers: Cache::new(CACHED_HEADERS),
             save_permits,
+            save_start: Mutex::new(()),
             saves: SingleFlight::default(),
             stopping,
             deliveries,
-            readiness,
+            first_mesh: OnceLock::new(),
             probe: Probe::new(),
             tracer: traces.tracer(),
             found,
             capabilities,
         });
-        Ok(Self { app, listener, metrics_listener, addr, metrics_addr, stop, traces, data })
+        Ok(Self { app, listener, addr, metrics_listener, stop, traces, data })
     }
 
     /// Returns the address of the service.
@@ -178,7 +175,7 @@ impl Server {
     /// Returns the address of `/metrics`, if it is served.
     #[must_use]
     pub fn metrics_addr(&self) -> Option<SocketAddr> {
-        self.metrics_addr
+        self.metrics_listener.as_ref().map(|(_, addr)| *addr)
     }
 
     /// Serves until `orders` requests a stop, then shuts down in the phases of [`Stop`]: `server.termination_notice_ms`
@@ -191,53 +188,26 @@ impl Server {
     pub async fn run(self, mut orders: watch::Receiver<Stop>) -> Result<bool, ServeError> {
         let (stop, stopped) = (self.stop, self.app.stopping.clone());
         let config = Arc::new(self.app.config.server.clone());
-        let renewing = tokio::spawn(key_reload::run(Arc::clone(&self.app.access)));
-        let warming = tokio::task::spawn_blocking({
-            let app = Arc::clone(&self.app);
-            move || warm_up(&app)
-        });
-        let recovering = tokio::spawn({
-            let jobs = self.app.job_store.clone();
-            async move { recover(&jobs).await }
-        });
-        let sweeping = tokio::spawn({
-            let (store, every) = (self.app.store.clone(), self.app.config.store.sweep());
-            async move {
-                loop {
-                    tokio::time::sleep(every).await;
-                    store.sweep(SystemTime::now()).await;
-                }
-            }
-        });
-        let listener = tokio_listener("server.listen", self.addr, self.listener)?;
-        let service = router::router(&self.app);
-        let serving = tokio::spawn(accept::serve(listener, service, Arc::clone(&config), stopped.clone()));
-        let metrics = match self.metrics_listener.zip(self.metrics_addr) {
-            Some((listener, addr)) => {
-                let listener = tokio_listener("server.metrics_listen", addr, listener)?;
-                let router = metrics::router(telemetry::recorder()?);
-                Some(tokio::spawn(accept::serve(listener, router, config, stopped)))
-            }
-            None => None,
-        };
-        let watched = Arc::clone(&self.app);
-        let recorder = self.metrics_addr.map(|_| telemetry::recorder()).transpose()?;
-        let upkeep = tokio::spawn(async move {
-            loop {
-                tokio::time::sleep(UPKEEP).await;
-                watched.pool.publish();
-                key_reload::publish_clients(&watched.access);
-                recorder.iter().for_each(telemetry::Recorder::run_upkeep);
-            }
-        });
+        // Dropping the set aborts its tasks.
+        let mut background = JoinSet::new();
+        background.spawn(key_reload::run(Arc::clone(&self.app.access)));
+        let app = Arc::clone(&self.app);
+        background.spawn_blocking(move || warm_up(&app));
+        background.spawn(recover(self.app.job_store.clone()));
+        background.spawn(sweep(self.app.store.clone(), Duration::from_millis(self.app.config.store.sweep_ms)));
+        let serving = accept::serve(self.listener, router::router(&self.app), Arc::clone(&config), stopped.clone());
+        let serving = tokio::spawn(serving);
+        let mut recorder = None;
+        if let Some((listener, _)) = self.metrics_listener {
+            let of_process = telemetry::recorder()?;
+            let router = metrics::router(of_process.clone());
+            background.spawn(accept::serve(listener, router, config, stopped).map(drop));
+            recorder = Some(of_process);
+        }
+        background.spawn(publish(Arc::clone(&self.app), recorder));
         stop::reached(&mut orders, Stop::Notice).await;
         let requests = wind_down(&self.app, &stop, &mut orders, serving).await;
-        for task in [upkeep, warming, recovering, sweeping, renewing] {
-            task.abort();
-        }
-        if let Some(metrics) = metrics {
-            metrics.abort();
-        }
+        drop(background);
         self.traces.shut_down().await;
         drop(self.data);
         Ok(requests)
@@ -251,15 +221,14 @@ async fn wind_down(
     orders: &mut watch::Receiver<Stop>,
     mut serving: JoinHandle<bool>,
 ) -> bool {
-    app.readiness.end();
-    let notice = app.config.server.termination_notice();
+    let notice = Duration::from_millis(app.config.server.termination_notice_ms.unwrap_or_default());
     if orders.has_changed().is_ok() && *orders.borrow() == Stop::Notice && !notice.is_zero() {
         stop.send_replace(Stop::Notice);
         tracing::info!(notice_ms = notice.as_millis(), "termination notice: not ready, but serving");
         drop(tokio::time::timeout(notice, stop::reached(orders, Stop::Drain)).await);
     }
     tracing::info!("draining: finishing requests, accepting no new ones");
-    let end = tokio::time::Instant::now() + app.config.server.drain_timeout();
+    let end = tokio::time::Instant::now() + Duration::from_millis(app.config.server.drain_timeout_ms);
     // Only orders received from here on count as new.
     orders.borrow_and_update();
     app.pool.leave();
@@ -288,16 +257,26 @@ async fn wind_down(
     requests
 }
 
-fn tokio_listener(
-    key: &'static str,
-    addr: SocketAddr,
-    listener: TcpListener,
-) -> Result<tokio::net::TcpListener, ServeError> {
-    tokio::net::TcpListener::from_std(listener).map_err(|error| ServeError::Listen { key, addr, error })
+/// Publishes the gauges that no event updates.
+async fn publish(app: Shared, recorder: Option<Recorder>) {
+    loop {
+        tokio::time::sleep(UPKEEP).await;
+        app.pool.publish();
+        key_reload::publish_clients(&app.access);
+        recorder.iter().for_each(Recorder::run_upkeep);
+    }
+}
+
+/// Removes expired objects of the store at regular intervals.
+async fn sweep(store: Store, interval: Duration) {
+    loop {
+        tokio::time::sleep(interval).await;
+        store.sweep(SystemTime::now()).await;
+    }
 }
 
 /// Resumes unfinished jobs of earlier processes; retries while the store fails.
-async fn recover(jobs: &JobStore) {
+async fn recover(jobs: JobStore) {
     loop {
         match jobs.recover().await {
             Ok(0) => return,
@@ -315,22 +294,23 @@ async fn recover(jobs: &JobStore) {
 fn warm_up(app: &App) {
     let start = Instant::now();
     let backend = Arc::clone(app.pool.backend());
-    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| backend.warm()));
+    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| backend.warm_up()));
     app.pool.publish();
-    match result {
+    let succeeded = match result {
         Ok(Ok(())) => {
             let ms = start.elapsed().as_secs_f64() * 1e3;
             let (device, reason) = (backend.describe(), app.pool.reason());
             tracing::info!(ms, backend = backend.name(), device, reason, "ready");
-            app.readiness.set(Warm::Yes);
+            true
         }
         Ok(Err(error)) => {
             tracing::error!(%error, backend = backend.name(), "the first mesh failed");
-            app.readiness.set(Warm::Broken);
+            false
         }
         Err(_payload) => {
             tracing::error!(backend = backend.name(), "the first mesh panicked");
-            app.readiness.set(Warm::Broken);
+            false
         }
-    }
+    };
+    app.first_mesh.get_or_init(|| succeeded);
 }

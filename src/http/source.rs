@@ -15,8 +15,8 @@ use super::conditional;
 use super::kinds::Kind;
 use super::problem::Problem;
 use super::state::Shared;
-use crate::archive::{Entry, FetchError, Memory, NoMemory, Share, Why};
-use crate::jobs::{Budget, Exhausted, Lease};
+use crate::archive::{Entry, FetchError, UnavailableReason};
+use crate::memory_budget::Lease;
 use crate::store::{Digest, Name};
 use crate::structure::{ArchiveError, EntryId};
 
@@ -49,7 +49,7 @@ pub(super) struct Input {
 impl Input {
     /// Charges bytes to the service's memory budget.
     fn new(app: &Shared, bytes: Bytes, digest: Digest) -> Result<Self, Problem> {
-        let mut lease = app.pool.budget().lease();
+        let mut lease = app.pool.settings().budget.lease();
         lease.grow(bytes.len() as u64)?;
         Ok(Self { bytes, digest, lease: Arc::new(lease) })
     }
@@ -160,22 +160,6 @@ fn no_such_structure(digest: &str) -> Problem {
     Problem::new(Kind::NoSuchStructure, detail)
 }
 
-/// Memory budget of the service as the archive sees it.
-#[derive(Debug)]
-pub(super) struct FetchMemory(pub(super) Budget);
-
-impl Memory for FetchMemory {
-    fn begin(&self) -> Box<dyn Share> {
-        Box::new(self.0.lease())
-    }
-}
-
-impl Share for Lease {
-    fn grow(&mut self, bytes: u64) -> Result<(), NoMemory> {
-        Self::grow(self, bytes).map_err(|Exhausted { limit, held }| NoMemory { limit, held })
-    }
-}
-
 /// Converts an error of the archive.
 fn archive_problem(error: &FetchError) -> Problem {
     let detail = error.to_string();
@@ -186,15 +170,15 @@ fn archive_problem(error: &FetchError) -> Problem {
             let problem = Problem::new(Kind::EntryTooLarge, detail).with("limit", *limit);
             bytes.iter().fold(problem, |problem, bytes| problem.with("actual", *bytes))
         }
-        FetchError::Unavailable { host, why, retry_after } => {
+        FetchError::Unavailable { host, reason, retry_after } => {
             let problem = Problem::new(Kind::ArchiveUnavailable, detail).with("host", host.as_str());
-            let problem = match why {
-                Why::Status(status) => problem.with("found", *status),
+            let problem = match reason {
+                UnavailableReason::Status(status) => problem.with("found", *status),
                 _ => problem,
             };
             retry_after.iter().fold(problem, |problem, wait| problem.retry_after(*wait))
         }
-        FetchError::Memory { limit, held, .. } => Exhausted { limit: *limit, held: *held }.into(),
+        FetchError::Memory { error, .. } => (*error).into(),
         FetchError::Internal(_) => Problem::internal(detail),
     }
 }
@@ -207,7 +191,6 @@ fn folder_problem(error: &ArchiveError) -> Problem {
             .with("parameter", "id")
             .with("value", id.as_str())
             .with("expected", "a PDB id such as 4pti or pdb_00004pti"),
-        ArchiveError::NotFound { .. } => Problem::new(Kind::NotInArchive, detail),
         ArchiveError::TooLarge { bytes, limit, .. } => {
             Problem::new(Kind::InflatedTooLarge, detail).with("limit", *limit).with("actual", *bytes)
         }

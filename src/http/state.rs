@@ -1,7 +1,6 @@
 //! State of the service that the handlers share.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use axum::http::HeaderMap;
 use bytes::Bytes;
@@ -34,13 +33,16 @@ pub(super) struct App {
     pub(super) result_headers: Cache<ContentKey, Arc<HeaderMap>>,
     /// Permits of `jobs.concurrent_saves`.
     pub(super) save_permits: Arc<Semaphore>,
+    /// Held while a save starts, so that its permit and its entry in `saves` appear together.
+    pub(super) save_start: Mutex<()>,
     /// Results that are being stored.
     pub(super) saves: SingleFlight<ContentKey, ()>,
     /// Phase of the shutdown, which ends long answers.
     pub(super) stopping: watch::Receiver<Stop>,
     /// Permits of `jobs.deliveries`.
     pub(super) deliveries: Arc<Semaphore>,
-    pub(super) readiness: Readiness,
+    /// Set after the first mesh: true if it was computed, false if it failed.
+    pub(super) first_mesh: OnceLock<bool>,
     /// Health check of the store.
     pub(super) probe: Probe,
     /// Exporter of spans.
@@ -74,47 +76,3 @@ impl App {
 
 /// State as handlers extract it.
 pub(super) type Shared = Arc<App>;
-
-/// Readiness of the process, for `/readyz`.
-#[derive(Debug, Default)]
-pub(super) struct Readiness {
-    warm: AtomicU8,
-    ending: AtomicBool,
-}
-
-/// State of the first mesh.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[repr(u8)]
-pub(super) enum Warm {
-    /// The first mesh is being computed.
-    Warming = 0,
-    /// The first mesh was computed.
-    Yes = 1,
-    /// The first mesh failed.
-    Broken = 2,
-}
-
-impl Readiness {
-    pub(super) fn warm(&self) -> Warm {
-        match self.warm.load(Ordering::Relaxed) {
-            0 => Warm::Warming,
-            1 => Warm::Yes,
-            _ => Warm::Broken,
-        }
-    }
-
-    /// Sets the state of the first mesh.
-    pub(super) fn set(&self, warm: Warm) {
-        self.warm.store(warm as u8, Ordering::Relaxed);
-    }
-
-    /// Returns true if the service has been told to stop.
-    pub(super) fn is_ending(&self) -> bool {
-        self.ending.load(Ordering::Relaxed)
-    }
-
-    /// Marks the service as stopping, which is final.
-    pub(super) fn end(&self) {
-        self.ending.store(true, Ordering::Relaxed);
-    }
-}

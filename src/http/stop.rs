@@ -2,6 +2,8 @@
 
 use tokio::sync::watch;
 
+use super::signal::Signal;
+
 /// Phase of the shutdown. Later phases include the restrictions of earlier ones.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stop {
@@ -48,68 +50,16 @@ pub(super) async fn further(orders: &mut watch::Receiver<Stop>) {
 pub fn shutdown_signals() -> watch::Receiver<Stop> {
     let (order, orders) = watch::channel(Stop::Serve);
     tokio::spawn(async move {
-        let mut signals = Signals::new();
+        let (mut terminate, mut interrupt) = (Signal::terminate(), Signal::interrupt());
         loop {
-            let first = signals.next().await;
+            let first = tokio::select! {
+                () = terminate.next() => Stop::Notice,
+                () = interrupt.next() => Stop::Drain,
+            };
             order.send_modify(|stop| *stop = (*stop).next().max(first));
         }
     });
     orders
-}
-
-/// Signals that stop the service, each with its first phase.
-#[cfg(unix)]
-struct Signals {
-    terminate: Option<tokio::signal::unix::Signal>,
-    interrupt: Option<tokio::signal::unix::Signal>,
-}
-
-#[cfg(unix)]
-impl Signals {
-    fn new() -> Self {
-        use tokio::signal::unix::{SignalKind, signal};
-        let listen = |kind: SignalKind, name: &str| {
-            signal(kind).inspect_err(|error| tracing::warn!(%error, "cannot listen for {name}")).ok()
-        };
-        Self {
-            terminate: listen(SignalKind::terminate(), "SIGTERM"),
-            interrupt: listen(SignalKind::interrupt(), "Ctrl-C"),
-        }
-    }
-
-    async fn next(&mut self) -> Stop {
-        async fn one(signal: &mut Option<tokio::signal::unix::Signal>) {
-            let came = match signal {
-                Some(signal) => signal.recv().await.is_some(),
-                None => false,
-            };
-            if !came {
-                std::future::pending::<()>().await;
-            }
-        }
-        tokio::select! {
-            () = one(&mut self.terminate) => Stop::Notice,
-            () = one(&mut self.interrupt) => Stop::Drain,
-        }
-    }
-}
-
-#[cfg(not(unix))]
-struct Signals;
-
-#[cfg(not(unix))]
-impl Signals {
-    fn new() -> Self {
-        Self
-    }
-
-    async fn next(&mut self) -> Stop {
-        if let Err(error) = tokio::signal::ctrl_c().await {
-            tracing::warn!(%error, "cannot listen for Ctrl-C");
-            std::future::pending::<()>().await;
-        }
-        Stop::Drain
-    }
 }
 
 #[cfg(test)]

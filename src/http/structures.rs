@@ -4,24 +4,27 @@
 use axum::Json;
 use axum::body::Body;
 use axum::extract::State;
+use axum::http::StatusCode;
 use axum::http::header::{self, HeaderMap};
-use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::delivery;
+use super::form::Upload;
 use super::kinds::Kind;
 use super::mesh_request::MeshRequest;
 use super::openapi::bodies::StructureFile;
-use super::openapi::meshes::{Addressed, NotModified, Reported};
-use super::openapi::parameters::{Coding, MeshParameters, Parts, StructurePath, SurfaceParameters, Unchanged, Wishes};
-use super::openapi::problems::{ASKING, BODY, MESHING, PARAMETERS, READING};
-use super::openapi::refusals;
+use super::openapi::meshes::{CacheableMeshOrJob, NotModified, ReportResponse};
+use super::openapi::parameters::{
+    ContentEncodingHeader, IfNoneMatchHeader, MeshParameters, PreferenceHeaders, RangeHeaders, StructurePath,
+    SurfaceParameters,
+};
+use super::openapi::problem_responses;
+use super::openapi::problems::{BODY, MESHING, PARAMETERS, READING, SUBMITTING};
 use super::problem::Problem;
 use super::source::{Input, StructureSource};
 use super::state::Shared;
-use super::upload::{self, Upload};
+use super::{delivery, upload};
 use crate::jobs::Failure;
 use crate::store::{Digest, Name};
 use crate::structure::contents::Counts;
@@ -63,7 +66,7 @@ pub(super) struct StructureDocument {
     /// Number of the model that the counts below refer to.
     model: i32,
     /// Atoms of the model by kind.
-    atoms_in_model: KindCounts,
+    atoms_in_model: Counts,
     /// Number of atoms with alternative locations.
     alternatives: u64,
     /// Number of atoms of unknown elements.
@@ -86,47 +89,26 @@ struct ChainDocument {
     /// Number of atoms.
     atoms: u64,
     /// Atoms by kind.
-    of: KindCounts,
+    of: Counts,
 }
 
-/// Numbers of atoms by kind. Hydrogens are counted apart from the heavy atoms of their residues.
-#[derive(Debug, Serialize, ToSchema)]
-struct KindCounts {
-    /// Heavy atoms of polymers.
-    polymer: u64,
-    /// Heavy atoms of ligands.
-    ligand: u64,
-    /// Heavy atoms of water.
-    water: u64,
-    /// Hydrogen atoms.
-    hydrogens: u64,
-    /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
-    virtual_sites: u64,
-}
-
-impl From<&Counts> for KindCounts {
-    fn from(counts: &Counts) -> Self {
-        let Counts { polymer, ligand, water, hydrogens, virtual_sites } = *counts;
-        Self { polymer, ligand, water, hydrogens, virtual_sites }
-    }
-}
-
-refusals!(CreateRefusals: [
+problem_responses!(CreateProblems: [
     BODY, READING, [Kind::BadParameter, Kind::TooManyDeliveries, Kind::StoreFull, Kind::StoreFailed],
 ]);
-refusals!(ShowRefusals: [
+problem_responses!(ShowProblems: [
     READING,
     [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
 ]);
-refusals!(SurfaceRefusals: [
-    PARAMETERS, READING, MESHING, ASKING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
+problem_responses!(SurfaceProblems: [
+    PARAMETERS, READING, MESHING, SUBMITTING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
 ]);
 
 /// Upload a structure
 ///
 /// Stores a structure, so that it can be meshed several times without another upload. Uploading the same bytes again
 /// returns 200 and the same digest.
-#[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure", params(Coding),
+#[utoipa::path(post, path = "/v1/structures", tag = "structures", operation_id = "createStructure",
+    params(ContentEncodingHeader),
     request_body(
         content = StructureFile,
         description = "A structure file, or `multipart/form-data` with the file in the field `file`.",
@@ -138,7 +120,7 @@ refusals!(SurfaceRefusals: [
             links(("mesh" = (operation_id = "meshStructure", parameters(("digest" = "$response.body#/digest")))))),
         (status = 200, description = "The structure was already stored.", body = StructureDocument,
             headers(("Location" = String, description = "Path of the structure."))),
-        CreateRefusals,
+        CreateProblems,
     ))]
 pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: Body) -> Result<Response, Problem> {
     if upload::is_json(&headers) {
@@ -168,13 +150,13 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
 
 /// Get the contents of a structure
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
-    params(StructurePath, Unchanged),
+    params(StructurePath, IfNoneMatchHeader),
     responses(
         (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
             ("Cache-Control" = String, description = "Caching rules."),
         )),
-        NotModified, ShowRefusals,
+        NotModified, ShowProblems,
     ))]
 pub(super) async fn show(
     State(app): State<Shared>,
@@ -193,19 +175,14 @@ pub(super) async fn show(
     path = "/v1/structures/{digest}/{file}",
     tag = "meshes",
     operation_id = "meshStructure",
-    params(StructurePath, SurfaceParameters, Wishes, Unchanged, Parts),
-    responses(Addressed, SurfaceRefusals)
+    params(StructurePath, SurfaceParameters, PreferenceHeaders, IfNoneMatchHeader, RangeHeaders),
+    responses(CacheableMeshOrJob, SurfaceProblems)
 )]
-pub(super) async fn surface(
-    State(app): State<Shared>,
-    method: Method,
-    headers: HeaderMap,
-    request: MeshRequest,
-) -> Result<Response, Problem> {
-    request.answer(&app, &method, &headers).await
+pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {
+    request.answer().await
 }
 
-refusals!(ReportRefusals: [
+problem_responses!(ReportProblems: [
     PARAMETERS, READING, MESHING,
     [Kind::NoSuchStructure, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFailed],
 ]);
@@ -217,15 +194,10 @@ refusals!(ReportRefusals: [
     tag = "meshes",
     operation_id = "reportStructure",
     params(StructurePath, MeshParameters),
-    responses(Reported, ReportRefusals)
+    responses(ReportResponse, ReportProblems)
 )]
-pub(super) async fn report(
-    State(app): State<Shared>,
-    method: Method,
-    headers: HeaderMap,
-    request: MeshRequest,
-) -> Result<Response, Problem> {
-    request.answer(&app, &method, &headers).await
+pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
+    request.answer().await
 }
 
 /// Parses a structure and describes its contents, on a blocking thread.
@@ -244,7 +216,7 @@ fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDoc
     let chains = contents.chains.iter().take(MAX_CHAINS).map(|chain| ChainDocument {
         name: chain.name.clone(),
         atoms: chain.counts.total(),
-        of: (&chain.counts).into(),
+        of: chain.counts,
     });
     StructureDocument {
         digest: digest.to_string(),
@@ -255,7 +227,7 @@ fn summary(digest: &Digest, bytes: usize, structure: &Structure) -> StructureDoc
         atoms: contents.atoms,
         models: contents.models,
         model: contents.model,
-        atoms_in_model: (&contents.counts).into(),
+        atoms_in_model: contents.counts,
         alternatives: contents.alternatives,
         unknown_elements: contents.unknown_elements,
         warnings: structure.warnings.clone(),

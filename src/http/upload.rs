@@ -1,13 +1,15 @@
 //! Request bodies: raw bytes, multipart forms or JSON, checked against the limits while they arrive.
 
+use std::time::Duration;
+
 use axum::body::Body;
 use axum::http::HeaderMap;
 use axum::http::header::{CONTENT_ENCODING, CONTENT_LENGTH, CONTENT_TYPE};
 use bytes::{Bytes, BytesMut};
 use futures_util::StreamExt as _;
 
-use super::content_type::DeclaredType;
-use super::form::{self, Form};
+use super::content_type::{DeclaredType, GZIP_MAGIC, ZSTD_MAGIC};
+use super::form::{self, Upload};
 use super::kinds::Kind;
 use super::limit::Limit;
 use super::problem::Problem;
@@ -16,15 +18,6 @@ use crate::jobs::Lease;
 
 /// Limit of memory that is reserved because of a `Content-Length` header alone.
 const MAX_RESERVED_BYTES: u64 = 1 << 20;
-
-/// Received structure file.
-pub(super) struct Upload {
-    pub(super) bytes: Bytes,
-    pub(super) lease: Lease,
-    /// Parameters from the other fields of a form.
-    pub(super) fields: Vec<(String, String)>,
-    pub(super) declared: DeclaredType,
-}
 
 /// Returns true if the body is declared as a form.
 pub(super) fn is_multipart(headers: &HeaderMap) -> bool {
@@ -47,17 +40,16 @@ pub(super) async fn receive(app: &App, headers: &HeaderMap, body: Body) -> Resul
             return Err(bad_encoding("a form cannot be compressed as a whole; compress the file in it"));
         }
         let content_type = text(headers, &CONTENT_TYPE).unwrap_or_default();
-        let form = form::read(&app.config.limits, limit, content_type, body, app.pool.budget().lease());
-        let Form { bytes, lease, fields, declared } = in_time(app, form).await?;
-        Upload { bytes, lease, fields, declared }
+        let form = form::read(&app.config.limits, limit, content_type, body, app.pool.settings().budget.lease());
+        in_time(app, form).await?
     } else {
-        let mut lease = app.pool.budget().lease();
+        let mut lease = app.pool.settings().budget.lease();
         let bytes = in_time(app, collect(body, announced, limit, &mut lease)).await?;
         let declared = DeclaredType::new(text(headers, &CONTENT_TYPE).unwrap_or_default());
         Upload { bytes, lease, fields: Vec::new(), declared }
     };
-    if let Some(coding) = coding.filter(|coding| !coding.fits(&upload.bytes)) {
-        return Err(bad_encoding(&format!("the body is declared as {} but is not", coding.name())));
+    if let Some((name, _)) = coding.filter(|(_, magic)| !upload.bytes.starts_with(magic)) {
+        return Err(bad_encoding(&format!("the body is declared as {name} but is not")));
     }
     upload.declared.check_bytes(&upload.bytes)?;
     Ok(upload)
@@ -70,7 +62,7 @@ pub(super) async fn receive_json(app: &App, headers: &HeaderMap, body: Body) -> 
     if content_encoding(headers)?.is_some() {
         return Err(bad_encoding("a JSON document cannot be compressed"));
     }
-    let mut lease = app.pool.budget().lease();
+    let mut lease = app.pool.settings().budget.lease();
     in_time(app, collect(body, announced, limit, &mut lease)).await
 }
 
@@ -82,10 +74,12 @@ fn announced(headers: &HeaderMap, limit: Limit) -> Result<u64, Problem> {
 
 /// Limits the reception of a body to `server.body_timeout_ms`.
 async fn in_time<T>(app: &App, receive: impl Future<Output = Result<T, Problem>>) -> Result<T, Problem> {
-    tokio::time::timeout(app.config.server.body_timeout(), receive).await.map_err(|_elapsed| {
-        let ms = app.config.server.body_timeout_ms;
-        Problem::new(Kind::BodyTimeout, format!("the body was not complete after {ms} ms")).with("limit", ms)
-    })?
+    tokio::time::timeout(Duration::from_millis(app.config.server.body_timeout_ms), receive).await.map_err(
+        |_elapsed| {
+            let ms = app.config.server.body_timeout_ms;
+            Problem::new(Kind::BodyTimeout, format!("the body was not complete after {ms} ms")).with("limit", ms)
+        },
+    )?
 }
 
 fn text<'a>(headers: &'a HeaderMap, name: &axum::http::HeaderName) -> Option<&'a str> {
@@ -121,28 +115,8 @@ async fn collect(body: Body, announced: u64, limit: Limit, lease: &mut Lease) ->
     Ok(if all.is_empty() { first } else { all.freeze() })
 }
 
-/// Content coding that the structure reader supports.
-#[derive(Debug, Clone, Copy)]
-enum Coding {
-    Gzip,
-    Zstd,
-}
-
-impl Coding {
-    const fn name(self) -> &'static str {
-        match self {
-            Self::Gzip => "gzip",
-            Self::Zstd => "zstd",
-        }
-    }
-
-    fn fits(self, bytes: &[u8]) -> bool {
-        match self {
-            Self::Gzip => bytes.starts_with(&[0x1f, 0x8b]),
-            Self::Zstd => bytes.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]),
-        }
-    }
-}
+/// Content coding that the structure reader supports: its name and the first bytes of a compressed file.
+type Coding = (&'static str, &'static [u8]);
 
 fn bad_encoding(detail: &str) -> Problem {
     Problem::new(Kind::UnsupportedEncoding, detail).with("available", vec!["gzip", "zstd", "identity"])
@@ -155,8 +129,8 @@ fn content_encoding(headers: &HeaderMap) -> Result<Option<Coding>, Problem> {
     let name = String::from_utf8_lossy(first.unwrap_or_default()).trim().to_ascii_lowercase();
     match (name.as_str(), second) {
         ("" | "identity", None) => Ok(None),
-        ("gzip" | "x-gzip", None) => Ok(Some(Coding::Gzip)),
-        ("zstd", None) => Ok(Some(Coding::Zstd)),
+        ("gzip" | "x-gzip", None) => Ok(Some(("gzip", GZIP_MAGIC))),
+        ("zstd", None) => Ok(Some(("zstd", ZSTD_MAGIC))),
         (_, Some(_)) => Err(bad_encoding("the request has more than one content encoding")),
         (other, None) => Err(bad_encoding(&format!("unknown content encoding `{other}`"))),
     }

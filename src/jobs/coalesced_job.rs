@@ -6,25 +6,20 @@ use std::time::{Duration, Instant};
 
 use super::rank::Rank;
 use super::{Outcome, Task};
-use crate::pipeline::{Job, ProgressSink, Tracker, params};
+use crate::pipeline::{ProgressSink, Tracker, params};
 use crate::single_flight::ResultSender;
 use crate::store::Digest;
 use crate::surface::CancelToken;
 use crate::telemetry::TraceSpan;
 
-/// Identity of the work of a task: input, parameters and strictness. Tasks with equal keys share one job.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) struct WorkKey(Digest);
-
-impl WorkKey {
-    pub(super) fn new(input: &Digest, job: &Job, strict: bool) -> Self {
-        Self(Digest::of(format!("{strict}\n{}\n{input}\n", params::canonical(job)).as_bytes()))
-    }
+/// Returns the identity of the work of a task: input, parameters and strictness. Tasks with equal keys share one job.
+pub(super) fn work_key(task: &Task) -> Digest {
+    Digest::of(format!("{}\n{}\n{}\n", task.strict, params::canonical(&task.job), task.digest).as_bytes())
 }
 
 /// Progress of a job, written by its worker.
 #[derive(Debug, Default)]
-pub struct Progress {
+pub(crate) struct Progress {
     begun: AtomicBool,
     tracker: Tracker,
     ended: Mutex<Vec<(&'static str, Instant, Duration)>>,
@@ -32,11 +27,11 @@ pub struct Progress {
 
 impl Progress {
     /// Returns the running stage and the finished fraction of the job, from 0 to 1; `None` while the job is queued.
-    #[must_use]
-    pub fn now(&self) -> Option<(&'static str, f64)> {
+    pub(crate) fn now(&self) -> Option<(&'static str, f64)> {
         self.begun.load(Ordering::Acquire).then(|| self.tracker.now())
     }
 
+    /// Marks the job as running.
     pub(super) fn begin(&self) {
         self.begun.store(true, Ordering::Release);
     }
@@ -58,14 +53,14 @@ impl ProgressSink for Progress {
 }
 
 /// Callback that a worker runs right before it starts a job.
-pub type OnStart = Box<dyn FnOnce() + Send>;
+pub(crate) type OnStart = Box<dyn FnOnce() + Send>;
 
 /// A queued or running job.
 pub(super) struct CoalescedJob {
     pub(super) id: u64,
-    pub(super) work: WorkKey,
+    pub(super) work: Digest,
     pub(super) rank: Rank,
-    /// Expected work, in the units of [`crate::pipeline::work`].
+    /// Expected work, in the units of [`crate::pipeline::estimate_work`].
     pub(super) units: f64,
     /// Start tag of fair queueing: the lowest one runs first.
     pub(super) tag: f64,
@@ -85,7 +80,7 @@ pub(super) struct CoalescedJob {
 impl CoalescedJob {
     /// Returns true if no ticket is left.
     pub(super) fn is_abandoned(&self) -> bool {
-        self.outcome.as_ref().is_none_or(ResultSender::is_abandoned)
+        self.outcome.as_ref().is_none_or(|sender| sender.receiver_count() == 0)
     }
 }
 

@@ -12,9 +12,9 @@ use crate::telemetry::{
 
 /// State of each device at the last call: number of rebuilds, and whether it was up.
 #[derive(Debug, Default)]
-pub(super) struct Watch(Mutex<Vec<(u64, bool)>>);
+pub(super) struct DeviceMonitor(Mutex<Vec<(u64, bool)>>);
 
-impl Watch {
+impl DeviceMonitor {
     /// Publishes the status of `devices` and logs changes since the last call.
     #[expect(clippy::cast_precision_loss, reason = "gauges are floats; exact up to 8 PiB")]
     pub(super) fn publish(&self, devices: &[DeviceStatus]) {

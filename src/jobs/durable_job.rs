@@ -1,25 +1,21 @@
 //! One durable job from its acceptance to its end, and the state that its watchers see.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
 use metrics::gauge;
 use tokio::sync::{Notify, watch};
 use tracing::Instrument as _;
 
-use super::coalesced_job::Progress;
 use super::job_store::{JobStore, JobView};
-use super::rank::{Client, Rank};
 use super::record::{JobId, Record, Status, now_ms};
 use super::results::{self, SaveError};
 use super::retry::{self, retry};
-use super::{ContentKey, EndError, Failure, Finished, Lease, Refusal, Task, Ticket};
-use crate::formats::Format;
+use super::{ContentKey, EndError, Failure, Finished, Refusal, Ticket};
 use crate::pipeline::JobError;
 use crate::store::{Digest, Pin};
 use crate::surface::SurfaceError;
-use crate::telemetry::{JOBS_OPEN, SpanKind, TraceSpan, Tracer};
+use crate::telemetry::{JOBS_OPEN, SpanKind, TraceSpan};
 
 /// Interval at which the progress of a running job is published.
 const TICK: Duration = Duration::from_millis(100);
@@ -28,9 +24,9 @@ const PAUSE: Duration = Duration::from_millis(500);
 
 /// A job whose record is in the store.
 pub(super) struct DurableJob {
-    view: watch::Sender<JobView>,
-    progress: Mutex<Option<Arc<Progress>>>,
-    dismissed: Notify,
+    pub(super) state: watch::Sender<JobView>,
+    /// Tells the runner to stop the work.
+    pub(super) dismissed: Notify,
     /// Held while the record is written.
     pub(super) writing: tokio::sync::Mutex<()>,
 }
@@ -38,42 +34,45 @@ pub(super) struct DurableJob {
 impl DurableJob {
     pub(super) fn new(record: Record) -> Self {
         let fraction = if record.status == Status::Successful { 1.0 } else { 0.0 };
-        let (view, _) = watch::channel(JobView { record, stage: None, fraction, version: 1, written: Arc::default() });
-        Self { view, progress: Mutex::default(), dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
+        let (state, _) = watch::channel(JobView { record, stage: None, fraction, version: 1 });
+        Self { state, dismissed: Notify::new(), writing: tokio::sync::Mutex::default() }
     }
 
     pub(super) fn id(&self) -> JobId {
-        self.view.borrow().record.id.clone()
+        self.state.borrow().record.id.clone()
     }
 
     pub(super) fn record(&self) -> Record {
-        self.view.borrow().record.clone()
+        self.state.borrow().record.clone()
     }
 
     pub(super) fn view(&self) -> JobView {
-        self.view.borrow().clone()
-    }
-
-    pub(super) fn subscribe(&self) -> watch::Receiver<JobView> {
-        self.view.subscribe()
+        self.state.borrow().clone()
     }
 
     /// Returns the time of its end, ms since 1970, and its id; `None` if it has not ended.
     pub(super) fn ended(&self) -> Option<(u64, JobId)> {
-        let view = self.view.borrow();
+        let view = self.state.borrow();
         view.record.finished_ms.map(|ms| (ms, view.record.id.clone()))
+    }
+
+    /// Changes the state unless the job has ended. Returns true if `change` did.
+    fn update(&self, change: impl FnOnce(&mut JobView) -> bool) -> bool {
+        self.state.send_if_modified(|view| {
+            let changed = !view.record.status.is_final() && change(view);
+            if changed {
+                view.version += 1;
+            }
+            changed
+        })
     }
 
     /// Marks the job as running and counts an attempt. Returns false if the job has ended, for example by a dismissal.
     pub(super) fn begin(&self) -> bool {
-        self.view.send_if_modified(|view| {
-            if view.record.status.is_final() {
-                return false;
-            }
+        self.update(|view| {
             view.record.attempts += 1;
             view.record.status = Status::Running;
             view.record.started_ms = Some(now_ms());
-            view.changed();
             true
         })
     }
@@ -81,30 +80,25 @@ impl DurableJob {
     /// Marks the job as accepted again, with `attempts` attempts, for the next process. Returns true if that changed
     /// the record.
     fn leave(&self, attempts: u32) -> bool {
-        self.view.send_if_modified(|view| {
-            if view.record.status.is_final() || view.record.attempts == attempts && view.record.started_ms.is_none() {
+        self.update(|view| {
+            if view.record.attempts == attempts && view.record.started_ms.is_none() {
                 return false;
             }
             view.record.attempts = attempts;
             view.record.status = Status::Accepted;
             view.record.started_ms = None;
             view.stage = None;
-            view.changed();
             true
         })
     }
 
     /// Ends the job with `status` and changes its record with `and`. Returns false if it had already ended.
     pub(super) fn end(&self, status: Status, and: impl FnOnce(&mut Record)) -> bool {
-        self.view.send_if_modified(|view| {
-            if view.record.status.is_final() {
-                return false;
-            }
+        self.update(|view| {
             view.record.status = status;
             view.record.finished_ms = Some(now_ms());
             and(&mut view.record);
             view.stage = None;
-            view.changed();
             if status == Status::Successful {
                 view.fraction = 1.0;
             }
@@ -112,28 +106,11 @@ impl DurableJob {
         })
     }
 
-    /// Tells the runner to stop the work.
-    pub(super) fn dismiss(&self) {
-        self.dismissed.notify_one();
-    }
-
-    fn follow(&self, progress: &Arc<Progress>) {
-        *self.progress.lock().unwrap_or_else(PoisonError::into_inner) = Some(Arc::clone(progress));
-    }
-
-    /// Publishes the progress of the work.
-    fn publish_progress(&self) {
-        let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        let Some((stage, fraction)) = progress.and_then(|progress| progress.now()) else { return };
-        self.publish_stage(stage, fraction);
-    }
-
-    /// Publishes stage and fraction if they have advanced.
+    /// Publishes stage and fraction of the running work if they have advanced.
     fn publish_stage(&self, stage: &'static str, fraction: f64) {
-        self.view.send_if_modified(|view| {
+        self.update(|view| {
             let waits = view.record.status == Status::Accepted;
-            let advanced = view.stage != Some(stage) || fraction > view.fraction + 0.004;
-            if view.record.status.is_final() || !(waits || advanced) {
+            if !waits && view.stage == Some(stage) && fraction <= view.fraction + 0.004 {
                 return false;
             }
             if waits {
@@ -142,19 +119,18 @@ impl DurableJob {
             }
             view.stage = Some(stage);
             view.fraction = view.fraction.max(fraction);
-            view.changed();
             true
         });
     }
 }
 
-/// Runs a durable job to its end.
-pub(super) struct Runner<P> {
+/// State of the task that runs a durable job to its end.
+pub(super) struct Runner {
     pub(super) job: Arc<DurableJob>,
     /// Ticket of queued or running work; `None` for a job from the records.
     pub(super) ticket: Option<Ticket>,
     /// Keeps input and record in the store.
-    pub(super) pin: P,
+    pub(super) pin: [Pin; 2],
     pub(super) digest: Digest,
     /// Number of attempts by earlier processes.
     pub(super) earlier_attempts: u32,
@@ -162,9 +138,9 @@ pub(super) struct Runner<P> {
 
 impl JobStore {
     /// Runs a job in a task of its own, traced under the request that created it.
-    pub(super) fn spawn(&self, runner: Runner<[Pin; 2]>) {
+    pub(super) fn spawn(&self, runner: Runner) {
         let record = runner.job.record();
-        let log = record.requester.parent(self.0.pool.tracer()).log_span(Some(record.id.as_str()));
+        let log = record.requester.parent(&self.0.pool.settings().tracer).log_span(Some(record.id.as_str()));
         gauge!(JOBS_OPEN).increment(1.0);
         self.0.open.send_modify(|open| *open += 1);
         let jobs = self.clone();
@@ -177,7 +153,7 @@ impl JobStore {
     }
 
     /// Waits until every job has ended or is left, and its record is written. The pool must be drained.
-    pub async fn settled(&self) {
+    pub(crate) async fn settled(&self) {
         drop(self.0.open.subscribe().wait_for(|open| *open == 0).await);
     }
 }
@@ -193,7 +169,7 @@ enum Attempt {
     Left,
 }
 
-impl<P> Runner<P> {
+impl Runner {
     pub(super) async fn run(self, jobs: &JobStore) {
         let Self { job, mut ticket, pin, digest, earlier_attempts } = self;
         let mut pause = retry::FIRST_PAUSE;
@@ -241,11 +217,14 @@ async fn attempt(jobs: &JobStore, job: &Arc<DurableJob>, ticket: &mut Option<Tic
             Err(attempt) => return attempt,
         },
     };
-    job.follow(ticket.progress());
     let outcome = loop {
         tokio::select! {
             outcome = ticket.wait() => break outcome,
-            () = tokio::time::sleep(TICK) => job.publish_progress(),
+            () = tokio::time::sleep(TICK) => {
+                if let Some((stage, fraction)) = ticket.progress.now() {
+                    job.publish_stage(stage, fraction);
+                }
+            }
         }
     };
     match outcome {
@@ -254,7 +233,7 @@ async fn attempt(jobs: &JobStore, job: &Arc<DurableJob>, ticket: &mut Option<Tic
             match save(jobs, &record, finished).await {
                 // The mesh is not held for ever. It is computed again while attempts are left.
                 Err(EndError::Save { error, .. })
-                    if error.is_temporary() && job.record().attempts < jobs.0.settings.attempts =>
+                    if error.is_temporary() && job.record().attempts < jobs.0.config.attempts =>
                 {
                     tracing::warn!(job_id = %record.id, %error, "a result was not stored; computing it again");
                     Attempt::StoreFailed
@@ -271,8 +250,7 @@ async fn attempt(jobs: &JobStore, job: &Arc<DurableJob>, ticket: &mut Option<Tic
 
 /// Submits a job from its record to the queue.
 async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &Record, digest: Digest) -> Result<Ticket, Attempt> {
-    let settings = &jobs.0.settings;
-    if record.attempts >= settings.attempts {
+    if record.attempts >= jobs.0.config.attempts {
         return Err(Attempt::Ended(Err(EndError::Poison { attempts: record.attempts })));
     }
     let lost = |why| Attempt::Ended(Err(EndError::Lost { why }));
@@ -286,12 +264,12 @@ async fn submit(jobs: &JobStore, job: &Arc<DurableJob>, record: &Record, digest:
         return Err(Attempt::Ended(Ok(key)));
     }
     let on_start = jobs.on_start(job, None);
-    let ticket = jobs.0.pool.submit(task, settings.allowed, Some(on_start)).map_err(|refusal| match refusal {
+    let ticket = jobs.0.pool.submit(task, jobs.0.allowed(), Some(on_start)).map_err(|refusal| match refusal {
         Refusal::Draining => Attempt::Left,
         // An accepted job waits until the queue has a place.
         Refusal::QueueFull { .. } | Refusal::TooLate { .. } => Attempt::Retry,
     })?;
-    if ticket.joined_running() && job.begin() {
+    if ticket.joined_running && job.begin() {
         jobs.0.write_job(job).await.map_err(failed)?;
     }
     Ok(ticket)
@@ -304,28 +282,12 @@ async fn save(jobs: &JobStore, record: &Record, finished: Arc<Finished>) -> Resu
     let report = &finished.product.report;
     let (resolution, digest) = (report.resolution, finished.digest);
     let key = ContentKey::new(&digest, &request.job, format, &report.maker());
-    let (store, settings) = (&jobs.0.store, &jobs.0.settings);
-    let parent = record.requester.parent(jobs.0.pool.tracer());
+    let parent = record.requester.parent(&jobs.0.pool.settings().tracer);
     let span = TraceSpan::start(&parent, "save", SpanKind::Internal, Instant::now());
-    let save = || results::save(store, Arc::clone(&finished), format, &key, settings.output_bytes);
-    retry(&record.id, settings.retry_for, SaveError::is_temporary, save)
+    let save = || results::save(&jobs.0.store, Arc::clone(&finished), format, &key, jobs.0.output_bytes);
+    retry(&record.id, jobs.0.retry_time(), SaveError::is_temporary, save)
         .await
         .map_err(|error| EndError::Save { error, resolution })?;
     span.end();
     Ok(key.to_string())
-}
-
-/// Returns the task of a record, or why it cannot be run any more.
-pub(super) fn task(
-    record: &Record,
-    digest: Digest,
-    input: Bytes,
-    lease: Lease,
-    tracer: &Tracer,
-) -> Result<(Task, Format), String> {
-    let (request, format) = record.request()?;
-    let rank = Rank { client: Client::numbered(record.client), batch: true, urgency: record.urgency };
-    let (parent, id) = (record.requester.parent(tracer), Some(record.id.clone()));
-    let lease = Some(Arc::new(lease));
-    Ok((Task { input, digest, strict: request.strict, job: request.job, rank, lease, parent, id }, format))
 }

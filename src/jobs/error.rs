@@ -11,13 +11,11 @@ use crate::structure::strict_validator::{Diagnostic, Level};
 
 /// Error of a task that the queue does not accept.
 #[derive(Debug, Clone, PartialEq, Error)]
-pub enum Refusal {
+pub(crate) enum Refusal {
     /// The queue is full.
     #[error("{waiting} jobs are waiting and the limit is {limit}; the queue takes about {} s", wait.as_secs_f64().ceil())]
     QueueFull {
-        /// Number of queued jobs.
         waiting: usize,
-        /// Maximum number of queued jobs.
         limit: usize,
         /// Estimated time until the present jobs are finished.
         wait: Duration,
@@ -37,27 +35,20 @@ pub enum Refusal {
 
 /// Error of an accepted job.
 #[derive(Debug, Clone, PartialEq, Error)]
-pub enum Failure {
+pub(crate) enum Failure {
     /// The job itself failed.
     #[error("{error}")]
     Job {
-        /// Cause.
         error: JobError,
         /// Findings of the strict parser if the file cannot be read; empty otherwise.
         diagnostics: Vec<Diagnostic>,
     },
     /// The strict parser found errors.
     #[error("the strict check found {} errors", errors(diagnostics))]
-    Check {
-        /// All findings.
-        diagnostics: Vec<Diagnostic>,
-    },
+    Check { diagnostics: Vec<Diagnostic> },
     /// The deadline passed.
     #[error("the deadline of {} s passed", limit.as_secs_f64())]
-    Deadline {
-        /// Allowed time.
-        limit: Duration,
-    },
+    Deadline { limit: Duration },
     /// The memory budget is exhausted.
     #[error(transparent)]
     Memory(#[from] Exhausted),
@@ -66,10 +57,7 @@ pub enum Failure {
     Stopped,
     /// The job panicked; the message belongs in the log.
     #[error("the job panicked: {message}")]
-    Panicked {
-        /// Message of the panic.
-        message: String,
-    },
+    Panicked { message: String },
 }
 
 fn errors(diagnostics: &[Diagnostic]) -> usize {
@@ -78,7 +66,7 @@ fn errors(diagnostics: &[Diagnostic]) -> usize {
 
 /// Error of [`JobStore::accept`](super::JobStore::accept).
 #[derive(Debug, Error)]
-pub enum AcceptError {
+pub(crate) enum AcceptError {
     /// The queue refused the task.
     #[error(transparent)]
     Refused(#[from] Refusal),
@@ -95,28 +83,21 @@ pub enum AcceptError {
 
 /// Error of a durable job that ended without a result.
 #[derive(Debug, Clone, Error)]
-pub enum EndError {
+pub(crate) enum EndError {
     /// The mesh could not be computed.
     #[error(transparent)]
     Job(#[from] Failure),
     /// The mesh could not be stored.
     #[error("{error}")]
     Save {
-        /// Cause.
         error: SaveError,
         /// Grid spacing, Å.
         resolution: f64,
     },
     /// The job was started repeatedly and never finished: it is assumed to crash the process.
     #[error("the job was started {attempts} times and never finished")]
-    Poison {
-        /// Number of attempts.
-        attempts: u32,
-    },
+    Poison { attempts: u32 },
     /// Input or parameters cannot be read any more.
     #[error("the job cannot be resumed: {why}")]
-    Lost {
-        /// Cause.
-        why: String,
-    },
+    Lost { why: String },
 }

@@ -5,7 +5,7 @@
 //! computing one twice is harmless; a crash costs time and never loses a job.
 
 use std::collections::HashMap;
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError, mpsc};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -13,10 +13,12 @@ use metrics::counter;
 use serde_json::Value;
 use tokio::sync::watch;
 
-use super::durable_job::{self, DurableJob, Runner};
+use super::durable_job::{DurableJob, Runner};
+use super::rank::{Client, Rank};
 use super::record::{JobId, Record, Requester, Status, now_ms};
 use super::retry::retry;
 use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket};
+use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Secret, Store, StoreError};
 use crate::telemetry::JOBS_RECOVERED;
@@ -24,66 +26,45 @@ use crate::telemetry::JOBS_RECOVERED;
 /// Number of ended jobs that are held in memory; older ones are read from the store.
 const MAX_ENDED: usize = 10_000;
 
-/// Settings of a [`JobStore`].
-#[derive(Debug, Clone, Copy)]
-pub struct JobStoreSettings {
-    /// Time from acceptance to the result, time in the queue included.
-    pub allowed: Duration,
-    /// Maximum number of attempts to run a job.
-    pub attempts: u32,
-    /// Maximum size of a result, bytes.
-    pub output_bytes: u64,
-    /// Time for which a write is retried that the store rejects.
-    pub retry_for: Duration,
-}
-
 /// Request for a durable job.
 #[derive(Debug)]
-pub struct JobSpec {
+pub(crate) struct JobSpec {
     /// The task.
-    pub task: Task,
+    pub(crate) task: Task,
     /// Parameters as the client wrote them.
-    pub parameters: Vec<(String, String)>,
+    pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format.
-    pub format: Format,
+    pub(crate) format: Format,
     /// Idempotency key of the request.
-    pub idempotency_key: Option<String>,
+    pub(crate) idempotency_key: Option<String>,
 }
 
 /// State of a job that its watchers see.
 #[derive(Debug, Clone, PartialEq)]
-pub struct JobView {
+pub(crate) struct JobView {
     /// Record of the job.
-    pub record: Record,
+    pub(crate) record: Record,
     /// Running stage.
-    pub stage: Option<&'static str>,
+    pub(crate) stage: Option<&'static str>,
     /// Finished fraction, from 0 to 1.
-    pub fraction: f64,
+    pub(crate) fraction: f64,
     /// Number of this state; grows with every change.
-    pub version: u64,
-    /// Text of this state, written once for all event streams.
-    pub written: Arc<OnceLock<String>>,
-}
-
-impl JobView {
-    /// Marks the state as changed.
-    pub(super) fn changed(&mut self) {
-        self.version += 1;
-        self.written = Arc::default();
-    }
+    pub(crate) version: u64,
 }
 
 /// Converts the error of a failed job into the document that clients get.
-pub type DescribeError = fn(&EndError) -> Value;
+pub(crate) type DescribeError = fn(&EndError) -> Value;
 
 /// Durable jobs. Clones share one state.
 #[derive(Clone)]
-pub struct JobStore(pub(super) Arc<Inner>);
+pub(crate) struct JobStore(pub(super) Arc<Inner>);
 
 pub(super) struct Inner {
     pub(super) store: Store,
     pub(super) pool: Arc<Pool>,
-    pub(super) settings: JobStoreSettings,
+    pub(super) config: JobsConfig,
+    /// Maximum size of a result, bytes.
+    pub(super) output_bytes: u64,
     pub(super) describe: DescribeError,
     /// Secret that derives job ids from idempotency keys.
     secret: Secret,
@@ -93,6 +74,16 @@ pub(super) struct Inner {
 }
 
 impl Inner {
+    /// Returns the time from the acceptance of a job to its result.
+    pub(super) fn allowed(&self) -> Duration {
+        Duration::from_millis(self.config.batch_deadline_ms)
+    }
+
+    /// Returns the time for which a write is retried that the store rejects.
+    pub(super) fn retry_time(&self) -> Duration {
+        Duration::from_millis(self.config.save_retry_ms)
+    }
+
     fn lock(&self) -> MutexGuard<'_, HashMap<JobId, Arc<DurableJob>>> {
         self.jobs.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -132,18 +123,19 @@ impl Inner {
 
 impl JobStore {
     /// Creates an empty job store over `store`, whose jobs run on `pool`. `secret` is the secret of the store.
-    #[must_use]
     pub(crate) fn new(
         store: Store,
         pool: Arc<Pool>,
-        settings: JobStoreSettings,
+        config: JobsConfig,
+        output_bytes: u64,
         secret: Secret,
         describe: DescribeError,
     ) -> Self {
         Self(Arc::new(Inner {
             store,
             pool,
-            settings,
+            config,
+            output_bytes,
             describe,
             secret,
             jobs: Mutex::default(),
@@ -153,12 +145,9 @@ impl JobStore {
 
     /// Accepts a job, which survives the process from then on. `ticket` is that of work that is queued or running
     /// already.
-    ///
-    /// # Errors
-    /// [`AcceptError`]; no job exists then.
-    pub async fn accept(&self, spec: JobSpec, ticket: Option<Ticket>) -> Result<JobView, AcceptError> {
+    pub(crate) async fn accept(&self, spec: JobSpec, ticket: Option<Ticket>) -> Result<JobView, AcceptError> {
         let inner = &self.0;
-        let client = spec.task.rank.client.number();
+        let client = spec.task.rank.client.0;
         let id = match &spec.idempotency_key {
             Some(key) => JobId::of_key(&inner.secret, client, key),
             None => JobId::random().map_err(AcceptError::Random)?,
@@ -202,8 +191,8 @@ impl JobStore {
         } else {
             let on_start = self.on_start(&job, Some(wait_for_record));
             let task = Task { id: Some(id.clone()), ..spec.task };
-            let ticket = inner.pool.submit(task, inner.settings.allowed, Some(on_start))?;
-            if ticket.joined_running() {
+            let ticket = inner.pool.submit(task, inner.allowed(), Some(on_start))?;
+            if ticket.joined_running {
                 job.begin();
             }
             ticket
@@ -236,49 +225,38 @@ impl JobStore {
     }
 
     /// Watches the state of a job; `None` if there is no such job.
-    ///
-    /// # Errors
-    /// That of the store.
-    pub async fn watch(&self, id: &JobId) -> Result<Option<watch::Receiver<JobView>>, StoreError> {
+    pub(crate) async fn watch(&self, id: &JobId) -> Result<Option<watch::Receiver<JobView>>, StoreError> {
         if let Some(job) = self.0.lock().get(id) {
-            return Ok(Some(job.subscribe()));
+            return Ok(Some(job.state.subscribe()));
         }
         let Some(stored) = self.0.store.get(&Name::job(id.as_str())?).await? else { return Ok(None) };
         // Only a foreign program writes records that cannot be parsed.
         let Ok(record) = serde_json::from_slice::<Record>(&stored.bytes) else { return Ok(None) };
         if record.status.is_final() {
-            return Ok(Some(DurableJob::new(record).subscribe()));
+            return Ok(Some(DurableJob::new(record).state.subscribe()));
         }
-        Ok(Some(self.resume(record).await?.subscribe()))
+        Ok(Some(self.resume(record).await?.state.subscribe()))
     }
 
     /// Returns the present state of a job; `None` if there is no such job.
-    ///
-    /// # Errors
-    /// That of the store.
-    pub async fn view(&self, id: &JobId) -> Result<Option<JobView>, StoreError> {
+    pub(crate) async fn view(&self, id: &JobId) -> Result<Option<JobView>, StoreError> {
         Ok(self.watch(id).await?.map(|watched| watched.borrow().clone()))
     }
 
-    /// Cancels a job unless it has ended, and returns its state; `None` if there is no such job.
-    ///
-    /// # Errors
-    /// That of the store; the job is cancelled nevertheless.
-    pub async fn dismiss(&self, id: &JobId) -> Result<Option<JobView>, StoreError> {
+    /// Cancels a job unless it has ended, and returns its state; `None` if there is no such job. The job is cancelled
+    /// even if the store fails.
+    pub(crate) async fn dismiss(&self, id: &JobId) -> Result<Option<JobView>, StoreError> {
         let job = self.0.lock().get(id).cloned();
         let Some(job) = job else { return self.view(id).await };
         if job.end(Status::Dismissed, |_| {}) {
-            job.dismiss();
+            job.dismissed.notify_one();
             self.0.write_job(&job).await?;
         }
         Ok(Some(job.view()))
     }
 
     /// Resumes the unfinished jobs of earlier processes and returns their number.
-    ///
-    /// # Errors
-    /// That of the store if the records cannot be listed or read.
-    pub async fn recover(&self) -> Result<usize, StoreError> {
+    pub(crate) async fn recover(&self) -> Result<usize, StoreError> {
         let mut open = Vec::new();
         for (name, _) in self.0.store.list(Folder::Jobs).await? {
             let Some(stored) = self.0.store.get(&name).await? else { continue };
@@ -358,15 +336,12 @@ impl JobStore {
         }
         let write = || self.0.write_job(job);
         // Without the record a restart runs the job again: wasted work, but nothing is lost.
-        if let Err(error) = retry(&id, self.0.settings.retry_for, StoreError::is_temporary, write).await {
+        if let Err(error) = retry(&id, self.0.retry_time(), StoreError::is_temporary, write).await {
             tracing::error!(job_id = %id, %error, "cannot record the end of a job");
         }
     }
 
-    /// Returns the task of a record, with its input.
-    ///
-    /// # Errors
-    /// That of the store, which may be temporary. The inner error says why the task cannot be run any more.
+    /// Returns the task of a record, with its input. The inner error says why the task cannot be run any more.
     pub(super) async fn load_task(
         &self,
         record: &Record,
@@ -374,9 +349,23 @@ impl JobStore {
     ) -> Result<Result<(Task, Format), String>, StoreError> {
         let stored = self.0.store.get(&Name::input(&digest)).await?;
         let Some(input) = stored.map(|stored| stored.bytes) else { return Ok(Err("its input was removed".to_owned())) };
-        let mut lease = self.0.pool.budget().lease();
+        let settings = self.0.pool.settings();
+        let mut lease = settings.budget.lease();
         lease.force(input.len() as u64);
-        Ok(durable_job::task(record, digest, input, lease, self.0.pool.tracer()))
+        Ok(record.request().map(|(request, format)| {
+            let rank = Rank { client: Client(record.client), batch: true, urgency: record.urgency };
+            let task = Task {
+                input,
+                digest,
+                strict: request.strict,
+                job: request.job,
+                rank,
+                lease: Some(Arc::new(lease)),
+                parent: record.requester.parent(&settings.tracer),
+                id: Some(record.id.clone()),
+            };
+            (task, format)
+        }))
     }
 }
 

@@ -9,13 +9,12 @@ use crate::store::{BadDigest, Digest, Name, StoreError};
 
 /// Name of a mesh file. Equal keys mean equal bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct ContentKey(Digest);
+pub(crate) struct ContentKey(Digest);
 
 impl ContentKey {
     /// Returns the key of a result. `maker` names the arithmetic of the backend, followed by that of a picture's
     /// renderer. The version is part of the key, since a release may change the last bits.
-    #[must_use]
-    pub fn new(input: &Digest, job: &Job, format: Format, maker: &str) -> Self {
+    pub(crate) fn new(input: &Digest, job: &Job, format: Format, maker: &str) -> Self {
         let (canonical, version) = (params::canonical(job), env!("CARGO_PKG_VERSION"));
         let text = format!("molmesh {version}\n{maker}\n{}\n{canonical}\n{input}\n", format.extension());
         Self(Digest::of(text.as_bytes()))
@@ -24,10 +23,7 @@ impl ContentKey {
 
 impl ContentKey {
     /// Returns the name in the store, of the file or of its report.
-    ///
-    /// # Errors
-    /// [`StoreError::Name`] for an invalid extension.
-    pub fn name(&self, extension: &str) -> Result<Name, StoreError> {
+    pub(crate) fn name(&self, extension: &str) -> Result<Name, StoreError> {
         Ok(Name::result(&self.0.to_string(), extension)?)
     }
 }

@@ -7,7 +7,6 @@
 //! `queue` holds `coalesced_job`s: identical requests share one. `job_store` keeps the records of `durable_job`s, which
 //! survive the process.
 
-mod budget;
 mod coalesced_job;
 mod cost;
 mod devices;
@@ -26,19 +25,18 @@ mod tests;
 mod ticket;
 mod worker;
 
-pub use budget::{Budget, Exhausted, Lease};
-pub use coalesced_job::{OnStart, Progress};
-pub use error::{AcceptError, EndError, Failure, Refusal};
-pub use job_store::{DescribeError, JobSpec, JobStore, JobStoreSettings, JobView};
-pub use key::ContentKey;
-pub use pool::{Meter, Pool, Settings};
-pub use rank::{Client, DEFAULT_URGENCY, Rank};
-pub use record::{BadJobId, JobId, Record, Requester, Status, now_ms, rfc3339};
-pub use results::{REPORT, SaveError, save};
-pub use ticket::Ticket;
+pub(crate) use crate::memory_budget::{Budget, Exhausted, Lease};
+pub(crate) use coalesced_job::OnStart;
+pub(crate) use error::{AcceptError, EndError, Failure, Refusal};
+pub(crate) use job_store::{JobSpec, JobStore, JobView};
+pub(crate) use key::ContentKey;
+pub(crate) use pool::{Pool, Settings};
+pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
+pub(crate) use record::{JobId, Status, rfc3339};
+pub(crate) use results::{REPORT, SaveError, save};
+pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use bytes::Bytes;
 
@@ -49,39 +47,39 @@ use crate::telemetry::SpanParent;
 
 /// Work for the pool.
 #[derive(Debug)]
-pub struct Task {
+pub(crate) struct Task {
     /// Structure file, compressed or not.
-    pub input: Bytes,
+    pub(crate) input: Bytes,
     /// SHA-256 of `input`.
-    pub digest: Digest,
+    pub(crate) digest: Digest,
     /// Run the strict parser as well, and reject a file in which it finds errors.
-    pub strict: bool,
+    pub(crate) strict: bool,
     /// Parameters of the mesh.
-    pub job: Job,
+    pub(crate) job: Job,
     /// Client and priority.
-    pub rank: Rank,
+    pub(crate) rank: Rank,
     /// Memory budget that `input` is charged to.
-    pub lease: Option<Arc<Lease>>,
+    #[expect(dead_code, reason = "held until this is dropped")]
+    pub(crate) lease: Option<Arc<Lease>>,
     /// Parent of the spans of the task.
-    pub parent: SpanParent,
+    pub(crate) parent: SpanParent,
     /// Id of the durable job; `None` for an interactive request.
-    pub id: Option<JobId>,
+    pub(crate) id: Option<JobId>,
 }
 
 /// Result of a job.
 #[derive(Debug)]
-pub struct Finished {
+pub(crate) struct Finished {
     /// Mesh and report.
-    pub product: Product,
+    pub(crate) product: Product,
     /// Findings of the strict parser if the task was strict.
-    pub diagnostics: Option<Vec<Diagnostic>>,
+    pub(crate) diagnostics: Option<Vec<Diagnostic>>,
     /// SHA-256 of the input.
-    pub digest: Digest,
-    /// Time in the queue.
-    pub waited: Duration,
+    pub(crate) digest: Digest,
     /// Memory budget that the mesh is charged to, until this is dropped.
-    pub lease: Lease,
+    #[expect(dead_code, reason = "held until this is dropped")]
+    pub(crate) lease: Lease,
 }
 
 /// Outcome of a job.
-pub type Outcome = Result<Arc<Finished>, Failure>;
+pub(crate) type Outcome = Result<Arc<Finished>, Failure>;

@@ -2,83 +2,70 @@
 
 use std::io;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use metrics::counter;
 
-use super::devices::Watch;
+use super::devices::DeviceMonitor;
 use super::queue::Queue;
 use super::{Budget, Client, OnStart, Refusal, Task, Ticket, worker};
-use crate::picture::Drawer;
+use crate::picture::SelectedRenderer;
 use crate::pipeline::{self, Job, JobLimits, maker};
 use crate::surface::Backend;
 use crate::telemetry::{JOBS_SUBMITTED, Tracer};
 
 /// Settings of a [`Pool`].
 #[derive(Clone)]
-pub struct Settings {
-    /// Number of concurrent jobs, at least 1.
-    pub workers: usize,
+pub(crate) struct Settings {
+    /// Number of concurrent jobs.
+    pub(crate) workers: usize,
     /// Number of queued jobs.
-    pub queue: usize,
+    pub(crate) queue: usize,
     /// Maximum time that a durable job yields to interactive ones.
-    pub batch_max_delay: Duration,
+    pub(crate) batch_max_delay: Duration,
     /// Limits of every job.
-    pub limits: JobLimits,
+    pub(crate) limits: JobLimits,
     /// Memory budget for uploads and meshes.
-    pub budget: Budget,
+    pub(crate) budget: Budget,
     /// Renderer of pictures.
-    pub drawer: Drawer,
+    pub(crate) renderer: SelectedRenderer,
     /// Receiver of the time that each job took.
-    pub meter: Option<Arc<dyn Meter>>,
+    pub(crate) meter: Option<Meter>,
     /// Exporter for the spans of resumed jobs.
-    pub tracer: Tracer,
+    pub(crate) tracer: Tracer,
 }
 
-/// Receiver of the computing time that clients use.
-pub trait Meter: std::fmt::Debug + Send + Sync {
-    /// Records that a worker spent `time` on a job of `client`, successful or not. A shared job is charged to its first
-    /// client. Called before the outcome is sent.
-    fn spent(&self, client: Client, time: Duration);
-}
+/// Receives the time that a worker spent on a job of a client, successful or not. A shared job is charged to its first
+/// client. Called before the outcome is sent.
+pub(crate) type Meter = Arc<dyn Fn(Client, Duration) + Send + Sync>;
 
 /// State that workers share.
 pub(super) struct Shared {
     pub(super) queue: Arc<Queue>,
     pub(super) backend: Arc<dyn Backend>,
     pub(super) reason: String,
-    pub(super) limits: JobLimits,
-    pub(super) budget: Budget,
-    pub(super) workers: usize,
-    pub(super) drawer: Drawer,
-    pub(super) meter: Option<Arc<dyn Meter>>,
-    tracer: Tracer,
-    watch: Watch,
+    pub(super) settings: Settings,
+    monitor: DeviceMonitor,
 }
 
 impl Shared {
     /// Updates metrics and log with the state of the devices.
     pub(super) fn publish_devices(&self) {
-        self.watch.publish(&self.backend.devices());
+        self.monitor.publish(&self.backend.devices());
     }
 }
 
 /// A running pool. Dropping it cancels running jobs.
-pub struct Pool {
+pub(crate) struct Pool {
     shared: Arc<Shared>,
 }
 
 impl Pool {
     /// Starts the workers. `reason` says why this backend was chosen, for reports.
-    ///
-    /// # Errors
-    /// That of the operating system if a thread cannot be started.
-    pub fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
-        let Settings { workers, queue, batch_max_delay, limits, budget, drawer, meter, tracer } = settings;
-        let workers = workers.max(1);
-        let queue = Arc::new(Queue::new(queue, workers, batch_max_delay));
-        let watch = Watch::default();
-        let shared = Shared { queue, backend, reason, limits, budget, workers, drawer, meter, tracer, watch };
+    pub(crate) fn start(settings: Settings, backend: Arc<dyn Backend>, reason: String) -> io::Result<Self> {
+        let workers = settings.workers;
+        let queue = Arc::new(Queue::new(settings.queue, workers, settings.batch_max_delay));
+        let shared = Shared { queue, backend, reason, settings, monitor: DeviceMonitor::default() };
         let pool = Self { shared: Arc::new(shared) };
         for n in 0..workers {
             let shared = Arc::clone(&pool.shared);
@@ -89,86 +76,59 @@ impl Pool {
 
     /// Accepts a task whose mesh must be finished within `allowed`, time in the queue included. `on_start` is called
     /// before the work starts, unless the task joins a running job.
-    ///
-    /// # Errors
-    /// Any [`Refusal`].
-    pub fn submit(&self, task: Task, allowed: Duration, on_start: Option<OnStart>) -> Result<Ticket, Refusal> {
+    pub(crate) fn submit(&self, task: Task, allowed: Duration, on_start: Option<OnStart>) -> Result<Ticket, Refusal> {
         let mode = if task.rank.batch { "async" } else { "sync" };
-        let deadline = Instant::now() + allowed;
-        let admission = self.shared.queue.push(task, allowed, on_start)?;
-        let dedup = if admission.shared { "yes" } else { "no" };
+        let ticket = self.shared.queue.push(task, allowed, on_start)?;
+        let dedup = if ticket.is_shared { "yes" } else { "no" };
         counter!(JOBS_SUBMITTED, "mode" => mode, "dedup" => dedup).increment(1);
-        Ok(Ticket { queue: Arc::clone(&self.shared.queue), admission, deadline, allowed })
+        Ok(ticket)
     }
 
     /// Estimates the duration of a job on this machine, s, without its time in the queue.
-    #[must_use]
-    pub fn expected(&self, input: &[u8], job: &Job) -> f64 {
-        self.shared.queue.expected(pipeline::work(input, job))
+    pub(crate) fn expected(&self, input: &[u8], job: &Job) -> f64 {
+        self.shared.queue.expected(pipeline::estimate_work(input, job))
     }
 
     /// Estimates the queueing time of a job that is accepted now.
-    #[must_use]
-    pub fn estimated_wait(&self) -> Duration {
+    pub(crate) fn estimated_wait(&self) -> Duration {
         self.shared.queue.estimated_wait()
     }
 
+    /// Returns the settings.
+    pub(crate) fn settings(&self) -> &Settings {
+        &self.shared.settings
+    }
+
     /// Returns the backend.
-    #[must_use]
-    pub fn backend(&self) -> &Arc<dyn Backend> {
+    pub(crate) fn backend(&self) -> &Arc<dyn Backend> {
         &self.shared.backend
     }
 
     /// Returns why the backend was chosen.
-    #[must_use]
-    pub fn reason(&self) -> &str {
+    pub(crate) fn reason(&self) -> &str {
         &self.shared.reason
     }
 
-    /// Returns the renderer of pictures.
-    #[must_use]
-    pub fn drawer(&self) -> &Drawer {
-        &self.shared.drawer
-    }
-
     /// Returns the arithmetic of a job's file, provided that neither backend nor renderer falls back to another one.
-    #[must_use]
-    pub fn maker(&self, job: &Job) -> String {
-        let renderer = job.picture.map(|_| self.shared.drawer.renderer.arithmetic());
+    pub(crate) fn maker(&self, job: &Job) -> String {
+        let renderer = job.picture.map(|_| self.shared.settings.renderer.renderer.arithmetic());
         maker(&self.shared.backend.arithmetic(), renderer.as_deref())
     }
 
-    /// Number of concurrent jobs.
-    #[must_use]
-    pub fn workers(&self) -> usize {
-        self.shared.workers
-    }
-
     /// Updates metrics and log with the state of the queue and the devices, as every finished job does.
-    pub fn publish(&self) {
+    pub(crate) fn publish(&self) {
         self.shared.queue.refresh();
         self.shared.publish_devices();
     }
 
-    /// Exporter for the spans of resumed jobs.
-    pub(super) fn tracer(&self) -> &Tracer {
-        &self.shared.tracer
-    }
-
-    /// Returns the memory budget for uploads and meshes.
-    #[must_use]
-    pub fn budget(&self) -> &Budget {
-        &self.shared.budget
-    }
-
     /// Leaves queued durable jobs for the next process: their tickets end as stopped.
-    pub fn leave(&self) {
+    pub(crate) fn leave(&self) {
         self.shared.queue.leave();
     }
 
     /// Accepts no more jobs and waits for the accepted ones until `end`; then cancels the rest, whose tickets end as
     /// stopped. Returns true if every job finished.
-    pub async fn drain(&self, end: impl Future<Output = ()>) -> bool {
+    pub(crate) async fn drain(&self, end: impl Future<Output = ()>) -> bool {
         self.shared.queue.close();
         let in_time = tokio::select! {
             () = self.shared.queue.idle() => true,

@@ -6,10 +6,10 @@ use std::time::{Duration, Instant};
 use metrics::gauge;
 use tokio::sync::Notify;
 
-use super::coalesced_job::{CoalescedJob, Entry, OnStart, Progress, WorkKey};
+use super::coalesced_job::{CoalescedJob, Entry, OnStart, Progress, work_key};
 use super::cost::Rate;
 use super::rank::{self, Shares};
-use super::{Outcome, Refusal, Task};
+use super::{Outcome, Refusal, Task, Ticket};
 use crate::pipeline;
 use crate::single_flight::{self, ResultReceiver};
 use crate::surface::CancelToken;
@@ -35,21 +35,6 @@ impl State {
     fn find(&self, id: u64) -> Option<usize> {
         self.jobs.iter().position(|job| job.id == id)
     }
-}
-
-/// Result of [`Queue::push`] for an accepted task.
-pub(super) struct Admission {
-    /// Number of the job in the queue.
-    pub(super) job: u64,
-    /// `None` once the ticket has left.
-    pub(super) outcome: Option<ResultReceiver<Outcome>>,
-    pub(super) progress: Arc<Progress>,
-    /// Span of the job.
-    pub(super) span: TraceSpan,
-    /// The task joined a job that was queued or running.
-    pub(super) shared: bool,
-    /// The joined job was already running, so `on_start` is not called.
-    pub(super) running: bool,
 }
 
 /// Bounded queue of jobs.
@@ -84,42 +69,49 @@ impl Queue {
     }
 
     /// Accepts a task that must be finished within `allowed`: joins an identical job or queues a new one.
-    pub(super) fn push(&self, task: Task, allowed: Duration, on_start: Option<OnStart>) -> Result<Admission, Refusal> {
-        let work = WorkKey::new(&task.digest, &task.job, task.strict);
+    pub(super) fn push(
+        self: &Arc<Self>,
+        task: Task,
+        allowed: Duration,
+        on_start: Option<OnStart>,
+    ) -> Result<Ticket, Refusal> {
+        let work = work_key(&task);
+        let now = Instant::now();
         let mut state = self.lock();
         if state.closed {
             return Err(Refusal::Draining);
         }
+        let ticket = |job, outcome, progress, span| Ticket {
+            queue: Arc::clone(self),
+            job,
+            outcome,
+            deadline: now + allowed,
+            allowed,
+            progress,
+            span,
+            is_shared: false,
+            joined_running: false,
+        };
         let same = |job: &&mut CoalescedJob| job.work == work && !job.cancel.is_cancelled();
         if let Some(job) = state.jobs.iter_mut().find(same) {
             job.rank.batch &= task.rank.batch;
-            let running = job.begun.is_some();
-            job.on_start.extend(on_start.filter(|_| !running));
+            let joined_running = job.begun.is_some();
+            job.on_start.extend(on_start.filter(|_| !joined_running));
             if let Some(context) = &task.parent.context {
                 job.span.link(context.clone());
             }
-            return Ok(Admission {
-                job: job.id,
-                outcome: job.outcome.as_ref().map(single_flight::ResultSender::subscribe),
-                progress: Arc::clone(&job.progress),
-                span: job.span.clone(),
-                shared: true,
-                running,
-            });
+            let outcome = job.outcome.as_ref().map(ResultReceiver::of);
+            let mut ticket = ticket(job.id, outcome, Arc::clone(&job.progress), job.span.clone());
+            (ticket.is_shared, ticket.joined_running) = (true, joined_running);
+            return Ok(ticket);
         }
-        let now = Instant::now();
-        let (sender, outcome) = single_flight::channel();
         let id = state.next_id;
         state.next_id += 1;
-        let admit = |progress, span| {
-            let outcome = Some(outcome);
-            Admission { job: id, outcome, progress, span, shared: false, running: false }
-        };
         if state.leaving && task.rank.batch {
             // The next process runs the job. Without a sender the ticket ends as stopped.
-            return Ok(admit(Arc::default(), job_span(&task, now)));
+            return Ok(ticket(id, None, Arc::default(), job_span(&task, now)));
         }
-        let units = pipeline::work(&task.input, &task.job);
+        let units = pipeline::estimate_work(&task.input, &task.job);
         let wait = self.wait(&state, now);
         // A job of a free worker counts as running before the worker has woken up.
         if state.jobs.len() >= self.limit + self.workers {
@@ -128,6 +120,7 @@ impl Queue {
         if wait > allowed {
             return Err(Refusal::TooLate { wait, allowed });
         }
+        let (sender, outcome) = single_flight::channel();
         let tag = state.shares.tag(&task.rank, units);
         let (progress, span) = (Arc::new(Progress::default()), job_span(&task, now));
         state.jobs.push(CoalescedJob {
@@ -148,7 +141,7 @@ impl Queue {
         self.publish(&mut state);
         drop(state);
         self.filled.notify_one();
-        Ok(admit(progress, span))
+        Ok(ticket(id, Some(outcome), progress, span))
     }
 
     /// Takes the next job; blocks until there is one. `None` once the queue is closed and empty.
@@ -200,14 +193,10 @@ impl Queue {
         if let Some(time) = time {
             state.rate.learn(job.units, time.as_secs_f64());
         }
-        if state.jobs.is_empty() {
-            state.shares.reset();
-            self.idle.notify_waiters();
-        }
-        self.publish(&mut state);
+        self.after_removal(&mut state);
         drop(state);
         if let Some((sender, outcome)) = job.outcome.zip(outcome) {
-            sender.send(outcome);
+            sender.send_replace(Some(outcome));
         }
     }
 
@@ -220,17 +209,22 @@ impl Queue {
         }
         state.jobs[at].cancel.cancel();
         let removed = state.jobs[at].begun.is_none().then(|| state.jobs.swap_remove(at));
-        if state.jobs.is_empty() {
-            state.shares.reset();
-            self.idle.notify_waiters();
-        }
-        self.publish(&mut state);
+        self.after_removal(&mut state);
         drop(state);
         // Frees the input, which may be large, without the lock.
         if let Some(job) = removed {
             job.span.fail("all clients disconnected");
             job.span.end();
         }
+    }
+
+    /// Updates the metrics and, if no job is left, the shares and the callers of `idle`.
+    fn after_removal(&self, state: &mut State) {
+        if state.jobs.is_empty() {
+            state.shares.reset();
+            self.idle.notify_waiters();
+        }
+        self.publish(state);
     }
 
     /// Accepts no more jobs. Accepted jobs still run.
@@ -246,10 +240,7 @@ impl Queue {
         let (left, stay): (Vec<_>, Vec<_>) =
             std::mem::take(&mut state.jobs).into_iter().partition(|job| job.begun.is_none() && job.rank.batch);
         state.jobs = stay;
-        if state.jobs.is_empty() {
-            self.idle.notify_waiters();
-        }
-        self.publish(&mut state);
+        self.after_removal(&mut state);
         drop(state);
         drop(left);
     }

@@ -9,40 +9,27 @@ use rustc_hash::FxHashMap;
 use sha2::{Digest as _, Sha256};
 
 /// Urgency of a request without a `Priority` header (RFC 9218).
-pub const DEFAULT_URGENCY: u8 = 3;
+pub(crate) const DEFAULT_URGENCY: u8 = 3;
 
 /// Client and priority of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Rank {
+pub(crate) struct Rank {
     /// Client.
-    pub client: Client,
+    pub(crate) client: Client,
     /// No connection waits for the result.
-    pub batch: bool,
+    pub(crate) batch: bool,
     /// Urgency among the jobs of the same client, from 0 (first) to 7 (last) as in RFC 9218.
-    pub urgency: u8,
+    pub(crate) urgency: u8,
 }
 
 /// Identity of a client for fair queueing.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub struct Client(u64);
+pub(crate) struct Client(pub(crate) u64);
 
 impl Client {
-    /// Returns the number of the client, for records.
-    #[must_use]
-    pub const fn number(self) -> u64 {
-        self.0
-    }
-
-    /// Returns the client with this number.
-    #[must_use]
-    pub const fn numbered(number: u64) -> Self {
-        Self(number)
-    }
-
     /// Returns the client with this `name`, an address or a key. Numbers are truncated SHA-256 hashes, so a client
     /// cannot choose a name with the number of another client.
-    #[must_use]
-    pub fn named(name: &str) -> Self {
+    pub(crate) fn named(name: &str) -> Self {
         Self(Sha256::digest(name.as_bytes()).iter().take(8).fold(0, |number, byte| number << 8 | u64::from(*byte)))
     }
 }

@@ -18,19 +18,16 @@ use crate::telemetry::{SpanParent, Tracer, read_trace_context, traceparent, trac
 /// Error of a text that is not a job id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("a job id has 32 lower-case hexadecimal digits")]
-pub struct BadJobId;
+pub(crate) struct BadJobId;
 
 /// Id of a job. It is a secret: every client that knows it can see and cancel the job.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
-pub struct JobId(String);
+#[serde(try_from = "String")]
+pub(crate) struct JobId(String);
 
 impl JobId {
     /// Creates an id of 128 random bits.
-    ///
-    /// # Errors
-    /// That of the operating system if it has no random numbers.
-    pub fn random() -> std::io::Result<Self> {
+    pub(crate) fn random() -> std::io::Result<Self> {
         let mut bytes = [0; 16];
         getrandom::fill(&mut bytes).map_err(std::io::Error::from)?;
         Ok(Self(format!("{:032x}", u128::from_be_bytes(bytes))))
@@ -38,7 +35,6 @@ impl JobId {
 
     /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart.
     /// HMAC-SHA-256 under `secret`, so that client and key alone do not reveal it.
-    #[must_use]
     pub(super) fn of_key(secret: &Secret, client: u64, key: &str) -> Self {
         // HMAC pads a key to the block length with zeros.
         let mut block = [0; 64];
@@ -51,8 +47,7 @@ impl JobId {
     }
 
     /// Returns the id as text.
-    #[must_use]
-    pub fn as_str(&self) -> &str {
+    pub(crate) fn as_str(&self) -> &str {
         &self.0
     }
 }
@@ -80,16 +75,10 @@ impl TryFrom<String> for JobId {
     }
 }
 
-impl From<JobId> for String {
-    fn from(id: JobId) -> Self {
-        id.0
-    }
-}
-
 /// Status of a job, as in OGC API Processes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum Status {
+pub(crate) enum Status {
     /// Queued.
     Accepted,
     /// Running.
@@ -104,8 +93,7 @@ pub enum Status {
 
 impl Status {
     /// Returns the name of the status.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
+    pub(crate) const fn name(self) -> &'static str {
         match self {
             Self::Accepted => "accepted",
             Self::Running => "running",
@@ -116,62 +104,60 @@ impl Status {
     }
 
     /// Returns true if the job has ended.
-    #[must_use]
-    pub const fn is_final(self) -> bool {
+    pub(crate) const fn is_final(self) -> bool {
         matches!(self, Self::Successful | Self::Failed | Self::Dismissed)
     }
 }
 
 /// Stored state of a job.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Record {
+pub(crate) struct Record {
     /// Id of the job.
-    pub id: JobId,
+    pub(crate) id: JobId,
     /// SHA-256 of the input.
-    pub input: String,
+    pub(crate) input: String,
     /// Names and values of the parameters, as the client wrote them.
-    pub parameters: Vec<(String, String)>,
+    pub(crate) parameters: Vec<(String, String)>,
     /// Mesh format, as a file name extension.
-    pub format: String,
+    pub(crate) format: String,
     /// Number of the client, for fair queueing after a restart.
-    pub client: u64,
+    pub(crate) client: u64,
     /// Urgency among the jobs of the client.
-    pub urgency: u8,
+    pub(crate) urgency: u8,
     /// Status at the last write.
-    pub status: Status,
+    pub(crate) status: Status,
     /// Number of attempts to run it.
-    pub attempts: u32,
+    pub(crate) attempts: u32,
     /// Time of acceptance, ms since 1970.
-    pub created_ms: u64,
+    pub(crate) created_ms: u64,
     /// Start of the last attempt, ms since 1970.
-    pub started_ms: Option<u64>,
+    pub(crate) started_ms: Option<u64>,
     /// End, ms since 1970.
-    pub finished_ms: Option<u64>,
+    pub(crate) finished_ms: Option<u64>,
     /// Key of the result.
-    pub result: Option<String>,
+    pub(crate) result: Option<String>,
     /// Problem document of a failed job.
-    pub problem: Option<Value>,
+    pub(crate) problem: Option<Value>,
     /// Request that created it.
     #[serde(default)]
-    pub requester: Requester,
+    pub(crate) requester: Requester,
 }
 
 /// Request that created a job, with its W3C trace context.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
-pub struct Requester {
+pub(crate) struct Requester {
     /// Id of the request.
-    pub request: Option<String>,
+    pub(crate) request: Option<String>,
     /// `traceparent` of the request's span.
-    pub traceparent: Option<String>,
+    pub(crate) traceparent: Option<String>,
     /// `tracestate` of the request.
-    pub tracestate: Option<String>,
+    pub(crate) tracestate: Option<String>,
 }
 
 impl Requester {
     /// Returns the part of a span's parent that is stored.
-    #[must_use]
-    pub fn of(parent: &SpanParent) -> Self {
+    pub(crate) fn of(parent: &SpanParent) -> Self {
         Self {
             request: parent.request.as_deref().map(str::to_owned),
             traceparent: parent.context.as_ref().map(traceparent),
@@ -180,8 +166,7 @@ impl Requester {
     }
 
     /// Returns the stored parent, for spans of `tracer`.
-    #[must_use]
-    pub fn parent(&self, tracer: &Tracer) -> SpanParent {
+    pub(crate) fn parent(&self, tracer: &Tracer) -> SpanParent {
         let text = |text: &'_ Option<String>| text.clone().unwrap_or_default();
         SpanParent {
             request: self.request.as_deref().map(Into::into),
@@ -193,13 +178,10 @@ impl Requester {
 
 impl Record {
     /// Parses the stored parameters and the format.
-    ///
-    /// # Errors
-    /// The reason, for the error of the job.
     pub(super) fn request(&self) -> Result<(params::Request, Format), String> {
         let mut request = params::parse(self.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
         let format = self.format.parse().map_err(|_bad| format!("its format `{}` is unknown", self.format))?;
-        params::settle(&mut request.job, format).map_err(|e| e.to_string())?;
+        params::set_format(&mut request.job, format).map_err(|e| e.to_string())?;
         Ok((request, format))
     }
 
@@ -216,15 +198,13 @@ impl Record {
 }
 
 /// Returns the present time, ms since 1970.
-#[must_use]
-pub fn now_ms() -> u64 {
+pub(crate) fn now_ms() -> u64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }
 
 /// Formats a time as RFC 3339.
-#[must_use]
-pub fn rfc3339(ms: u64) -> String {
+pub(crate) fn rfc3339(ms: u64) -> String {
     humantime::format_rfc3339_millis(UNIX_EPOCH + Duration::from_millis(ms.min(MAX_MS))).to_string()
 }
 

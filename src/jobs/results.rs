@@ -11,11 +11,11 @@ use crate::formats::{Format, FormatError};
 use crate::store::{Store, StoreError};
 
 /// File name extension of a report.
-pub const REPORT: &str = "json";
+pub(crate) const REPORT: &str = "json";
 
 /// Error of [`save`].
 #[derive(Debug, Clone, Error)]
-pub enum SaveError {
+pub(crate) enum SaveError {
     /// The format cannot hold the mesh.
     #[error(transparent)]
     Format(#[from] FormatError),
@@ -37,18 +37,14 @@ pub enum SaveError {
 
 impl SaveError {
     /// Returns true if a later attempt may succeed.
-    #[must_use]
-    pub fn is_temporary(&self) -> bool {
+    pub(crate) fn is_temporary(&self) -> bool {
         matches!(self, Self::Store(error) if error.is_temporary())
     }
 }
 
 /// Stores the report and the mesh as `format`, unless the mesh is stored already. The report comes first, so that every
 /// stored mesh has one.
-///
-/// # Errors
-/// [`SaveError`].
-pub async fn save(
+pub(crate) async fn save(
     store: &Store,
     finished: Arc<Finished>,
     format: Format,
@@ -61,7 +57,7 @@ pub async fn save(
     }
     let document = serde_json::to_vec(&finished.product.report).map_err(|e| SaveError::Other(e.to_string()))?;
     store.put(&report, Bytes::from(document)).await?;
-    let mut writer = store.writer(&mesh, None);
+    let mut writer = store.writer(&mesh);
     let encode = move || {
         let file = finished.product.file(format)?;
         let bytes = file.bytes_bound();

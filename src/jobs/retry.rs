@@ -14,9 +14,6 @@ pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(250);
 pub(super) const MAX_PAUSE: Duration = Duration::from_secs(5);
 
 /// Repeats `work` for job `id` until it succeeds, fails with a permanent error, or has been retried for `limit`.
-///
-/// # Errors
-/// The last error of `work`.
 pub(super) async fn retry<T, E: Display, F: Future<Output = Result<T, E>>>(
     id: &JobId,
     limit: Duration,

@@ -13,12 +13,11 @@ use tokio::sync::watch;
 
 use super::durable_job::DurableJob;
 use super::rank::{Client, DEFAULT_URGENCY, Rank};
-use super::{
-    AcceptError, Budget, EndError, JobId, JobSpec, JobStore, JobStoreSettings, JobView, Pool, Record, Requester,
-    Settings, Status, Task, now_ms,
-};
+use super::record::{Record, Requester, now_ms};
+use super::{AcceptError, Budget, EndError, JobId, JobSpec, JobStore, JobView, Pool, Settings, Status, Task};
+use crate::config::JobsConfig;
 use crate::formats::Format;
-use crate::picture::Drawer;
+use crate::picture::SelectedRenderer;
 use crate::pipeline::{JobLimits, params};
 use crate::store::faulty::{Faults, faulty};
 use crate::store::{Digest, Folder, Name, Store, StoreError};
@@ -45,14 +44,15 @@ impl Fixture {
             batch_max_delay: Duration::from_secs(10),
             limits: JobLimits::default(),
             budget: Budget::new(1 << 30),
-            drawer: Drawer::cpu("a test"),
+            renderer: SelectedRenderer::cpu("a test"),
             meter: None,
             tracer: Tracer::default(),
         };
         let pool = Arc::new(Pool::start(settings, Arc::new(ReferenceBackend), "a test".to_owned()).unwrap());
-        let settings = JobStoreSettings { allowed: PATIENT, attempts, output_bytes: 1 << 30, retry_for };
+        let save_retry_ms = u64::try_from(retry_for.as_millis()).unwrap();
+        let config = JobsConfig { attempts, save_retry_ms, ..JobsConfig::default() };
         let describe = |error: &EndError| Value::String(format!("{error:?}"));
-        Self { faults, jobs: JobStore::new(store.clone(), pool, settings, [0; 32], describe), store, _dir: dir }
+        Self { faults, jobs: JobStore::new(store.clone(), pool, config, 1 << 30, [0; 32], describe), store, _dir: dir }
     }
 
     async fn accept(&self) -> Result<JobView, AcceptError> {
@@ -188,7 +188,8 @@ async fn a_result_that_is_never_stored_is_computed_for_every_attempt() {
     fixture.jobs = JobStore::new(
         fixture.store.clone(),
         Arc::clone(&fixture.jobs.0.pool),
-        JobStoreSettings { output_bytes: 100, ..fixture.jobs.0.settings },
+        fixture.jobs.0.config.clone(),
+        100,
         [0; 32],
         fixture.jobs.0.describe,
     );

@@ -14,7 +14,7 @@ use crate::pipeline::{self, Choice, JobError, Product, ProgressSink as _, Report
 use crate::structure::strict_validator::{self, Diagnostic, Level};
 use crate::structure::{ReadLimits, StructureError};
 use crate::surface::{Column, SurfaceError};
-use crate::telemetry::{JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan, VOXELS};
+use crate::telemetry::{GRID_POINTS, JOBS_FALLBACK, JOBS_FINISHED, PANICS, STAGE_DURATION, TRIANGLES, TraceSpan};
 
 /// Size limit of files that the strict parser examines after a failure, bytes: it takes 10 to 40 ms for this size.
 const MAX_EXPLAINED: u64 = 512 << 10;
@@ -25,8 +25,8 @@ pub(super) fn work(shared: &Shared) {
         let (id, client) = (entry.id, entry.task.rank.client);
         let start = Instant::now();
         let outcome = run(shared, entry);
-        if let Some(meter) = &shared.meter {
-            meter.spent(client, start.elapsed());
+        if let Some(meter) = &shared.settings.meter {
+            meter(client, start.elapsed());
         }
         shared.publish_devices();
         // Only successful jobs count in the duration estimate.
@@ -40,17 +40,17 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
     let Entry { task, cancel, progress, on_start, accepted, span, .. } = entry;
     let log = span.as_parent().log_span(task.id.as_ref().map(JobId::as_str));
     let _entered = log.enter();
-    let trace = Trace { span, job: task.id.clone() };
+    let id = task.id.clone();
     if cancel.is_cancelled() {
         counter!(JOBS_FINISHED, "outcome" => "dismissed").increment(1);
-        trace.close("dismissed", None);
+        end_span(&span, id, "dismissed", None);
         return None;
     }
     let waited = accepted.elapsed();
-    trace.span.part("queue", accepted, waited);
-    let outcome = shared.budget.check().map_err(Failure::from).and_then(|()| {
+    span.part("queue", accepted, waited);
+    let outcome = shared.settings.budget.check().map_err(Failure::from).and_then(|()| {
         // The memory for drawing is known in advance.
-        let mut drawing = shared.budget.lease();
+        let mut drawing = shared.settings.budget.lease();
         drawing.grow(task.job.picture.map_or(0, |picture| picture.bytes()))?;
         let choice = Choice { backend: shared.backend.as_ref(), reason: &shared.reason };
         let work = || {
@@ -65,11 +65,18 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
             } else {
                 (None, None)
             };
-            let mut product =
-                pipeline::run(&task.input, &task.job, &shared.limits, &choice, &cancel, progress.as_ref(), None)
-                    .map_err(|error| explained(shared, &task.input, error))?;
+            let mut product = pipeline::run(
+                &task.input,
+                &task.job,
+                &shared.settings.limits,
+                &choice,
+                &cancel,
+                progress.as_ref(),
+                None,
+            )
+            .map_err(|error| explained(shared, &task.input, error))?;
             if let Some(picture) = &task.job.picture {
-                pipeline::draw(&mut product, picture, &shared.drawer, &cancel, progress.as_ref())
+                pipeline::draw(&mut product, picture, &shared.settings.renderer, &cancel, progress.as_ref())
                     .map_err(|error| Failure::Job { error, diagnostics: Vec::new() })?;
             }
             if let Some(time) = checked {
@@ -91,56 +98,47 @@ fn run(shared: &Shared, entry: Entry) -> Option<Outcome> {
             counter!(JOBS_FALLBACK).increment(1);
             tracing::warn!(renderer, why, "a picture fell back to another renderer");
         }
-        let mut lease = shared.budget.lease();
+        let mut lease = shared.settings.budget.lease();
         lease.force(bytes_of(&product));
-        Ok(Finished { product, diagnostics, digest: task.digest, waited, lease })
+        Ok(Finished { product, diagnostics, digest: task.digest, lease })
     });
     // Frees the input before the outcome is sent, so that the receiver sees the true memory use.
     drop(task);
     let outcome = outcome.map(Arc::new);
     for (stage, begun, time) in progress.stages() {
-        trace.span.part(stage, begun, time);
+        span.part(stage, begun, time);
     }
-    trace.close(count_outcome(&outcome), Some(&outcome));
+    end_span(&span, id, count_outcome(&outcome), Some(&outcome));
     Some(outcome)
 }
 
-/// Span of a job.
-struct Trace {
-    span: TraceSpan,
-    job: Option<JobId>,
-}
-
-impl Trace {
-    /// Sets the attributes and the status, and ends the span.
-    fn close(&self, label: &'static str, outcome: Option<&Outcome>) {
-        let span = &self.span;
-        span.set("molmesh.job.outcome", label);
-        if let Some(id) = &self.job {
-            span.set("molmesh.job.id", id.to_string());
-        }
-        match outcome {
-            Some(Ok(finished)) => {
-                let report = &finished.product.report;
-                span.set("molmesh.backend", report.backend);
-                span.set("molmesh.device", report.device.clone());
-                span.set("molmesh.atoms", report.atoms.cast_signed());
-                span.set("molmesh.samples", report.samples.cast_signed());
-                span.set("molmesh.triangles", report.triangles.cast_signed());
-                if let Some(picture) = &report.picture {
-                    span.set("molmesh.renderer", picture.renderer);
-                }
-            }
-            Some(Err(failure)) => span.fail(failure.to_string()),
-            None => {}
-        }
-        span.end();
+/// Sets attributes and status of the span of a job, and ends it.
+fn end_span(span: &TraceSpan, id: Option<JobId>, label: &'static str, outcome: Option<&Outcome>) {
+    span.set("molmesh.job.outcome", label);
+    if let Some(id) = id {
+        span.set("molmesh.job.id", id.to_string());
     }
+    match outcome {
+        Some(Ok(finished)) => {
+            let report = &finished.product.report;
+            span.set("molmesh.backend", report.backend);
+            span.set("molmesh.device", report.device.clone());
+            span.set("molmesh.atoms", report.atoms.cast_signed());
+            span.set("molmesh.samples", report.samples.cast_signed());
+            span.set("molmesh.triangles", report.triangles.cast_signed());
+            if let Some(picture) = &report.picture {
+                span.set("molmesh.renderer", picture.renderer);
+            }
+        }
+        Some(Err(failure)) => span.fail(failure.to_string()),
+        None => {}
+    }
+    span.end();
 }
 
 /// Runs the strict parser. Fails if it finds errors.
 fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
-    let diagnostics = strict_validator::check(input, &shared.limits.read)
+    let diagnostics = strict_validator::check(input, &shared.settings.limits.read)
         .map_err(|error| Failure::Job { error: error.into(), diagnostics: Vec::new() })?;
     if diagnostics.iter().any(|d| d.level == Level::Error) {
         return Err(Failure::Check { diagnostics });
@@ -152,17 +150,10 @@ fn check(shared: &Shared, input: &[u8]) -> Result<Vec<Diagnostic>, Failure> {
 fn explained(shared: &Shared, input: &[u8], error: JobError) -> Failure {
     let unreadable =
         matches!(error, JobError::Structure(StructureError::Syntax { .. } | StructureError::NoAtoms { .. }));
-    let limits = ReadLimits { max_inflated_bytes: MAX_EXPLAINED, ..shared.limits.read };
+    let limits = ReadLimits { max_inflated_bytes: MAX_EXPLAINED, ..shared.settings.limits.read };
     // If the strict parser fails as well, there are no findings.
     let diagnostics = if unreadable { strict_validator::check(input, &limits).unwrap_or_default() } else { Vec::new() };
     Failure::Job { error, diagnostics }
-}
-
-/// Logs the driver's message about a failed device, which clients do not get.
-fn log_device(failure: &Failure) {
-    if let Failure::Job { error: JobError::Surface(SurfaceError::Device { why }), .. } = failure {
-        tracing::error!(why, "no device could run a job");
-    }
 }
 
 /// Counts and logs an outcome. Returns its label.
@@ -173,8 +164,9 @@ fn count_outcome(outcome: &Outcome) -> &'static str {
         Err(Failure::Panicked { .. }) => "panicked",
         Err(_) => "failed",
     };
-    if let Err(failure) = outcome {
-        log_device(failure);
+    // Clients do not get the driver's message about a failed device.
+    if let Err(Failure::Job { error: JobError::Surface(SurfaceError::Device { why }), .. }) = outcome {
+        tracing::error!(why, "no device could run a job");
     }
     counter!(JOBS_FINISHED, "outcome" => label).increment(1);
     label
@@ -188,7 +180,7 @@ fn panicked(payload: &(dyn Any + Send)) -> Failure {
 
 fn count(report: &Report) {
     counter!(TRIANGLES).increment(report.triangles);
-    counter!(VOXELS).increment(report.samples);
+    counter!(GRID_POINTS).increment(report.samples);
     for (stage, ms) in &report.timings_ms {
         histogram!(STAGE_DURATION, "stage" => stage.clone()).record(ms.as_f64().unwrap_or_default() / 1e3);
     }

@@ -10,23 +10,9 @@ use super::raster::{Band, Samples, Shape, fill};
 use super::{PictureError, PictureParams, Rendered, Renderer};
 use crate::surface::{Control, Mesh, Vertices};
 
-/// Renderer on the CPU.
-#[derive(Debug, Default)]
-pub struct CpuRenderer {
-    /// Thread pool; `None` for the global one.
-    pool: Option<rayon::ThreadPool>,
-}
-
-impl CpuRenderer {
-    /// Creates a renderer with its own threads.
-    ///
-    /// # Errors
-    /// Message of the system if the threads cannot be started.
-    pub fn with_threads(threads: usize) -> Result<Self, String> {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().map_err(|e| e.to_string())?;
-        Ok(Self { pool: Some(pool) })
-    }
-}
+/// Renderer on the threads of the current pool.
+#[derive(Debug, Clone, Copy)]
+pub struct CpuRenderer;
 
 impl Renderer for CpuRenderer {
     fn name(&self) -> &'static str {
@@ -34,39 +20,33 @@ impl Renderer for CpuRenderer {
     }
 
     fn describe(&self) -> String {
-        let threads =
-            self.pool.as_ref().map_or_else(rayon::current_num_threads, rayon::ThreadPool::current_num_threads);
+        let threads = rayon::current_num_threads();
         format!("CPU rasteriser, {threads} thread{}", if threads == 1 { "" } else { "s" })
     }
 
     fn render(&self, mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError> {
-        let draw = || draw(mesh, params, control);
-        self.pool.as_ref().map_or_else(draw, |pool| pool.install(draw))
-    }
-}
-
-fn draw(mesh: &Mesh, params: &PictureParams, control: &Control<'_>) -> Result<Rendered, PictureError> {
-    let Vertices::Single { positions, normals } = mesh.vertices() else { return Err(PictureError::Quantized) };
-    let shape = Shape { positions, normals, triangles: &mesh.triangles };
-    let camera = Camera::new(positions, shape.triangles, params);
-    control.check()?;
-    let (width, height) = (params.width as usize, params.height as usize);
-    let tiles = Tiles::of(width, height);
-    let bins = Bins::new(positions, shape.triangles, &camera, tiles);
-    control.check()?;
-    let mut layers = Layers::empty(width, height);
-    let rows = TILE_HEIGHT * width;
-    let bands = layers.depth.par_chunks_mut(rows).zip(layers.light.par_chunks_mut(rows));
-    let bands = bands.zip(layers.facing.par_chunks_mut(rows)).enumerate();
-    bands.try_for_each_init(Samples::default, |samples, (n, ((depth, light), facing))| {
+        let Vertices::Single { positions, normals } = mesh.vertices() else { return Err(PictureError::Quantized) };
+        let shape = Shape { positions, normals, triangles: &mesh.triangles };
+        let camera = Camera::new(positions, shape.triangles, params);
         control.check()?;
-        let mut band = Band { top: n * TILE_HEIGHT, width, depth, light, facing };
-        fill(shape, &camera, &bins, tiles, &mut band, samples);
-        Ok::<_, PictureError>(())
-    })?;
-    drop(bins);
-    control.check()?;
-    let image = finish(&layers, &Finish::new(params, &camera), params);
-    control.check()?;
-    Ok(Rendered { image, pixel: camera.pixel(), served: None })
+        let (width, height) = (params.width as usize, params.height as usize);
+        let tiles = Tiles::of(width, height);
+        let bins = Bins::new(positions, shape.triangles, &camera, tiles);
+        control.check()?;
+        let mut layers = Layers::empty(width, height);
+        let rows = TILE_HEIGHT * width;
+        let bands = layers.depth.par_chunks_mut(rows).zip(layers.light.par_chunks_mut(rows));
+        let bands = bands.zip(layers.facing.par_chunks_mut(rows)).enumerate();
+        bands.try_for_each_init(Samples::default, |samples, (n, ((depth, light), facing))| {
+            control.check()?;
+            let mut band = Band { top: n * TILE_HEIGHT, width, depth, light, facing };
+            fill(shape, &camera, &bins, tiles, &mut band, samples);
+            Ok::<_, PictureError>(())
+        })?;
+        drop(bins);
+        control.check()?;
+        let image = finish(&layers, &Finish::new(params, &camera), params);
+        control.check()?;
+        Ok(Rendered { image, pixel: camera.pixel(), made_by: None })
+    }
 }

@@ -8,29 +8,12 @@ use super::layers::{Layers, NOTHING};
 use super::light::{self, Levels};
 use super::{Background, Image, PictureParams, Style};
 
-/// Sixteen directions around a pixel, at equal angles.
-const AROUND: [[f64; 2]; 16] = {
+/// Directions around a pixel in a quarter of the circle, at equal angles.
+const QUARTER: [[f64; 2]; 4] = {
     const C: f64 = 0.923_879_532_511_286_7;
     const S: f64 = 0.382_683_432_365_089_8;
     const H: f64 = std::f64::consts::FRAC_1_SQRT_2;
-    [
-        [1., 0.],
-        [C, S],
-        [H, H],
-        [S, C],
-        [0., 1.],
-        [-S, C],
-        [-H, H],
-        [-C, S],
-        [-1., 0.],
-        [-C, -S],
-        [-H, -H],
-        [-S, -C],
-        [0., -1.],
-        [S, -C],
-        [H, -H],
-        [C, -S],
-    ]
+    [[1., 0.], [C, S], [H, H], [S, C]]
 };
 /// Radii of the rings of neighbours, relative to the radius. Rings use the even and the odd directions in
 /// turn.
@@ -39,17 +22,17 @@ const RINGS: [f64; 6] = [0.06, 0.13, 0.24, 0.4, 0.65, 1.0];
 const RADIUS: f64 = 6.0;
 const RADIUS_SHARE: f64 = 0.07;
 /// Sine above the tangent plane below which a neighbour does not occlude, so that convex surfaces are not darkened.
-const BIAS: f32 = 0.12;
+pub const BIAS: f32 = 0.12;
 /// Factor of the mean occlusion.
-const STRENGTH: f32 = 2.8;
+pub const STRENGTH: f32 = 2.8;
 /// Minimum light after occlusion.
-const MIN_LIGHT: f32 = 0.25;
+pub const MIN_LIGHT: f32 = 0.25;
 /// Step in depth at which an outline begins, in Å plus pixels, and the factor at which it has full strength.
 const STEP: f32 = 1.2;
 const STEP_PIXELS: f32 = 2.5;
 const STEP_FULL: f32 = 3.0;
 /// Share of the light that an outline removes.
-const LINE: f32 = 0.6;
+pub const LINE_STRENGTH: f32 = 0.6;
 /// Pixels of the shorter side per pixel of line width.
 const LINE_SIDE: u32 = 700;
 
@@ -73,18 +56,10 @@ pub struct Finish {
     pub taps: Vec<Tap>,
     /// Inverse square of the distance at which occlusion is halved, Å⁻².
     pub falloff: f32,
-    /// Sine above the tangent plane below which a neighbour does not occlude.
-    pub bias: f32,
-    /// Factor of the mean occlusion.
-    pub strength: f32,
-    /// Minimum light after occlusion.
-    pub min_light: f32,
     /// Distance in pixels of the neighbours that are compared for outlines; 0 without outlines.
     pub line_width: i32,
     /// Steps in depth at which an outline begins and at which it has full strength, Å.
     pub steps: [f32; 2],
-    /// Share of the light that an outline removes.
-    pub line_strength: f32,
     /// Colour of the surface in full light, linear.
     pub color: [f32; 3],
     /// Colour of the background, linear and premultiplied, and its alpha.
@@ -107,12 +82,8 @@ impl Finish {
         Self {
             taps: if shaded { taps(radius / camera.pixel(), camera.pixel()) } else { Vec::new() },
             falloff: (1.0 / (radius * radius)) as f32 * 4.0,
-            bias: BIAS,
-            strength: STRENGTH,
-            min_light: MIN_LIGHT,
             line_width: if shaded { line } else { 0 },
             steps: [step, step * STEP_FULL],
-            line_strength: LINE,
             color: light::COLOR.map(|level| light::linear(level) as f32),
             background: [r, g, b, alpha],
         }
@@ -122,9 +93,14 @@ impl Finish {
 /// Neighbours within `radius` pixels of `pixel` Å each.
 #[expect(clippy::cast_possible_truncation, reason = "pixels of a picture")]
 fn taps(radius: f64, pixel: f64) -> Vec<Tap> {
+    let (mut around, mut quarter) = (Vec::new(), QUARTER);
+    for _ in 0..4 {
+        around.extend(quarter);
+        quarter = quarter.map(|[x, y]| [-y, x]);
+    }
     let mut taps = Vec::new();
     for (ring, part) in RINGS.iter().enumerate() {
-        for [x, y] in AROUND.iter().skip(ring % 2).step_by(2) {
+        for [x, y] in around.iter().skip(ring % 2).step_by(2) {
             let [dx, dy] = [x, y].map(|c| (c * part * radius).round() as i32);
             if (dx, dy) != (0, 0) {
                 let [right, up] = [f64::from(dx), -f64::from(dy)].map(|c| (c * pixel) as f32);
@@ -158,7 +134,7 @@ fn color(layers: &Layers, shading: &Finish, levels: &Levels, open: Option<f32>, 
             light *= open;
         }
         if shading.line_width > 0 {
-            light *= 1.0 - shading.line_strength * outline(layers, shading, x, y);
+            light *= 1.0 - LINE_STRENGTH * outline(layers, shading, x, y);
         }
     }
     let alpha = share + shading.background[3] * (1.0 - share);
@@ -213,17 +189,10 @@ impl Row {
             let begin = if tap.dx < 0 { from - shift } else { from + shift };
             let other = &layers.depth[row(there)][begin..begin + to - from];
             let normal = self.normal.each_ref().map(|column| &column[from..to]);
-            add_occlusion(
-                &mut self.open[from..to],
-                &depth[from..to],
-                other,
-                normal,
-                *tap,
-                [shading.bias, shading.falloff],
-            );
+            add_occlusion(&mut self.open[from..to], &depth[from..to], other, normal, *tap, shading.falloff);
         }
-        let scale = shading.strength / shading.taps.len() as f32;
-        self.open.iter_mut().for_each(|shade| *shade = (1.0 - *shade * scale).max(shading.min_light));
+        let scale = STRENGTH / shading.taps.len() as f32;
+        self.open.iter_mut().for_each(|shade| *shade = (1.0 - *shade * scale).max(MIN_LIGHT));
     }
 }
 
@@ -234,7 +203,7 @@ fn add_occlusion(
     other: &[f32],
     [right, up, toward]: [&[f32]; 3],
     tap: Tap,
-    [bias, falloff]: [f32; 2],
+    falloff: f32,
 ) {
     let n = shade.len();
     let (depth, other, right, up, toward) = (&depth[..n], &other[..n], &right[..n], &up[..n], &toward[..n]);
@@ -242,7 +211,7 @@ fn add_occlusion(
     for i in 0..n {
         let rise = depth[i] - other[i];
         let square = flat + rise * rise;
-        let sine = (right[i] * tap.right + up[i] * tap.up + toward[i] * rise) / square.sqrt() - bias;
+        let sine = (right[i] * tap.right + up[i] * tap.up + toward[i] * rise) / square.sqrt() - BIAS;
         // Without a surface at either pixel the sine is NaN and nothing is added.
         shade[i] += if sine > 0.0 { sine / (1.0 + square * falloff) } else { 0.0 };
     }

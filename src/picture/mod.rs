@@ -23,9 +23,9 @@ use std::sync::Arc;
 
 use thiserror::Error;
 
-use crate::surface::{Control, Mesh, Served, SurfaceError, arithmetic};
+use crate::surface::{BackendIdentity, Control, Mesh, SurfaceError, arithmetic};
 pub use cpu::CpuRenderer;
-pub use params::{Background, DEFAULT_SIDE, MOST_SIDE, PictureLimits, PictureParams, Style, View};
+pub use params::{Background, DEFAULT_SIDE, MAX_SIDE, PictureLimits, PictureParams, Style, View};
 
 /// Reason for which a picture cannot be made.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -43,8 +43,8 @@ pub enum PictureError {
     /// The run was cancelled.
     #[error("cancelled")]
     Cancelled,
-    /// The vertices are quantised.
-    #[error("quantised vertices cannot be drawn")]
+    /// The vertices are quantized.
+    #[error("quantized vertices cannot be drawn")]
     Quantized,
     /// The device failed, and there is no fallback.
     #[error("no device could draw the picture: {why}")]
@@ -94,7 +94,7 @@ pub struct Rendered {
     /// Width and height of a pixel, Å.
     pub pixel: f64,
     /// Fallback that drew it instead of a device, if any.
-    pub served: Option<Served>,
+    pub made_by: Option<BackendIdentity>,
 }
 
 /// Draws meshes. Equal meshes and parameters give equal pixels.
@@ -110,7 +110,17 @@ pub trait Renderer: Send + Sync {
     /// Description of the hardware, for display.
     fn describe(&self) -> String;
 
-    /// Draws `mesh`, whose vertices must not be quantised.
+    /// Identity of this renderer, as the maker of a picture.
+    fn identity(&self) -> BackendIdentity {
+        BackendIdentity {
+            backend: self.name(),
+            arithmetic: self.arithmetic(),
+            device: self.describe(),
+            fallback_reason: None,
+        }
+    }
+
+    /// Draws `mesh`, whose vertices must not be quantized.
     ///
     /// # Errors
     /// Any [`PictureError`] but [`PictureError::Png`] and [`PictureError::TooLarge`], which are detected earlier.
@@ -119,17 +129,17 @@ pub trait Renderer: Send + Sync {
 
 /// Renderer in use, with the reason for its choice.
 #[derive(Clone)]
-pub struct Drawer {
+pub struct SelectedRenderer {
     /// Renderer.
     pub renderer: Arc<dyn Renderer>,
     /// Reason for the choice.
     pub reason: String,
 }
 
-impl Drawer {
-    /// CPU renderer on the global thread pool.
+impl SelectedRenderer {
+    /// Returns the CPU renderer.
     #[must_use]
     pub fn cpu(reason: &str) -> Self {
-        Self { renderer: Arc::new(CpuRenderer::default()), reason: reason.to_owned() }
+        Self { renderer: Arc::new(CpuRenderer), reason: reason.to_owned() }
     }
 }

@@ -8,7 +8,7 @@ use super::PictureError;
 /// Default width and height, pixels.
 pub const DEFAULT_SIDE: u32 = 512;
 /// Maximum width and height, pixels: the maximum texture size that devices have in common.
-pub const MOST_SIDE: u32 = 16_384;
+pub const MAX_SIDE: u32 = 16_384;
 /// Maximum working memory per pixel, bytes: depth, light, normal and colour, twice on a device.
 const PIXEL_BYTES: u64 = 40;
 
@@ -133,16 +133,16 @@ pub struct PictureLimits {
 
 impl Default for PictureLimits {
     fn default() -> Self {
-        Self { max_side: MOST_SIDE }
+        Self { max_side: MAX_SIDE }
     }
 }
 
 /// Parameters of a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PictureParams {
-    /// Width in pixels, 1 to [`MOST_SIDE`].
+    /// Width in pixels, 1 to [`MAX_SIDE`].
     pub width: u32,
-    /// Height in pixels, 1 to [`MOST_SIDE`].
+    /// Height in pixels, 1 to [`MAX_SIDE`].
     pub height: u32,
     /// Direction of view.
     pub view: View,

@@ -2,8 +2,8 @@
 
 use super::report::{PictureReport, Report};
 use super::{JobError, Product, ProgressSink, StageClock};
-use crate::picture::{Drawer, PictureParams, Rendered, png};
-use crate::surface::{CancelToken, Control, Mesh, Served};
+use crate::picture::{PictureParams, Rendered, SelectedRenderer, png};
+use crate::surface::{CancelToken, Control, Mesh};
 
 /// Draws the mesh of `product` and replaces it with the PNG.
 ///
@@ -13,7 +13,7 @@ use crate::surface::{CancelToken, Control, Mesh, Served};
 pub fn draw(
     product: &mut Product,
     params: &PictureParams,
-    drawer: &Drawer,
+    renderer: &SelectedRenderer,
     cancel: &CancelToken,
     progress: &dyn ProgressSink,
 ) -> Result<(), JobError> {
@@ -23,12 +23,12 @@ pub fn draw(
         // The renderer needs random access to vertices.
         mesh.make_contiguous();
         let control = Control { cancel: cancel.clone(), deadline: None, observer: &clock };
-        drawer.renderer.render(&mesh, params, &control)
+        renderer.renderer.render(&mesh, params, &control)
     })?;
     // Free the mesh before the PNG is allocated.
     drop::<Mesh>(mesh);
     let bytes = clock.time("png", || png::encode(&drawn.image))?;
-    product.report.picture = Some(PictureReport::new(params, drawer, &drawn));
+    product.report.picture = Some(PictureReport::new(params, renderer, &drawn));
     for (stage, ms) in clock.finish() {
         Report::add_timing(&mut product.report, stage, ms);
     }
@@ -38,13 +38,8 @@ pub fn draw(
 
 impl PictureReport {
     /// Returns the report of a picture.
-    fn new(params: &PictureParams, drawer: &Drawer, drawn: &Rendered) -> Self {
-        let served = drawn.served.clone().unwrap_or_else(|| Served {
-            backend: drawer.renderer.name(),
-            arithmetic: drawer.renderer.arithmetic(),
-            device: drawer.renderer.describe(),
-            fallback_reason: None,
-        });
+    fn new(params: &PictureParams, renderer: &SelectedRenderer, drawn: &Rendered) -> Self {
+        let made_by = drawn.made_by.clone().unwrap_or_else(|| renderer.renderer.identity());
         Self {
             width: params.width,
             height: params.height,
@@ -54,14 +49,11 @@ impl PictureReport {
             background: params.background.to_string(),
             style: params.style.name(),
             pixel: drawn.pixel,
-            renderer: served.backend,
-            arithmetic: served.arithmetic,
-            device: served.device,
-            reason: match &served.fallback_reason {
-                Some(why) => format!("{}; but {why}", drawer.reason),
-                None => drawer.reason.clone(),
-            },
-            fallback: served.fallback_reason,
+            reason: made_by.reason(&renderer.reason),
+            renderer: made_by.backend,
+            arithmetic: made_by.arithmetic,
+            device: made_by.device,
+            fallback: made_by.fallback_reason,
         }
     }
 }

@@ -4,15 +4,12 @@
 //! |nx| + |ny| + |nz| over all normals is 1.5. Each crossing is a vertex, and a closed mesh has about two triangles per
 //! vertex. A coarser mesh gives the area.
 
-use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock, fit};
+use super::fit::{self, COARSE, COARSER};
+use super::{Choice, Job, JobError, JobLimits, Spacing, StageClock};
+use crate::surface::cpu::scan;
 use crate::surface::lattice::Lattice;
 use crate::surface::occupancy::Occupancy;
 use crate::surface::{CancelToken, Control, Mesh, Spheres, SurfaceError, SurfaceLimits, SurfaceParams};
-
-/// Spacing of the coarser mesh as a multiple of the job's.
-const COARSER: f64 = 2.0;
-/// Minimum spacing of the coarser mesh, Å.
-const COARSE: f64 = 1.0;
 
 /// Estimated size of a job.
 #[derive(Debug, Clone, PartialEq)]
@@ -119,9 +116,7 @@ fn of_mesh(
     let bytes = params.mesh_bytes(vertices, triangles);
     let estimate = MeshEstimate { bricks, samples: bricks * 512, area, vertices, triangles, bytes };
     if bytes > limits.max_mesh_bytes {
-        let fits = h * (bytes as f64 / limits.max_mesh_bytes as f64).sqrt();
-        let suggested_resolution = (fits * 105.0).ceil() / 100.0;
-        return Err(SurfaceError::MeshTooLarge { bytes, limit: limits.max_mesh_bytes, suggested_resolution });
+        return Err(scan::too_large(bytes, h, limits.max_mesh_bytes));
     }
     Ok(estimate)
 }

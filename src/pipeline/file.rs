@@ -18,11 +18,11 @@ impl Product {
     /// Plans the file of this product in `format`.
     ///
     /// # Errors
-    /// Returns a [`FormatError`]; [`FormatError::NotAMesh`] for a picture that was not drawn.
+    /// Returns a [`FormatError`]; [`FormatError::NotAMeshFormat`] for a picture that was not drawn.
     pub fn file(&self, format: Format) -> Result<File<'_>, FormatError> {
         match &self.picture {
             Some(picture) if format.is_picture() => Ok(File::Picture(picture)),
-            _ => Ok(File::Mesh(Encoder::stored(format, self.storage, &self.mesh, &self.meta())?)),
+            _ => Ok(File::Mesh(Encoder::new(format, self.storage, &self.mesh, &self.meta())?)),
         }
     }
 }

@@ -17,10 +17,10 @@ const TRIES_BEFORE_COARSEST: u32 = 4;
 const FULL: f64 = 0.95;
 /// Fraction of the limit that the search aims at. It is below 1, as the power law is not exact.
 const AIM: f64 = 0.98;
-/// Spacing of the first mesh as a multiple of the expected one.
-const COARSER: f64 = 2.0;
-/// Minimum spacing of the first mesh, Å.
-const COARSE: f64 = 1.0;
+/// Spacing of a first, coarse mesh as a multiple of the expected one.
+pub(super) const COARSER: f64 = 2.0;
+/// Minimum spacing of that mesh, Å.
+pub(super) const COARSE: f64 = 1.0;
 
 /// Next step of the search.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,9 +28,9 @@ pub(super) enum Next {
     /// Mesh at this spacing and record the number of triangles.
     Try(f64),
     /// Use this spacing, which was tried.
-    Take(f64),
+    Use(f64),
     /// No spacing fits. The fields describe the mesh with the fewest triangles.
-    Refuse {
+    Fail {
         /// Spacing, Å.
         resolution: f64,
         /// Number of triangles.
@@ -76,10 +76,10 @@ impl Search {
         let spent = self.tries() + 1 >= MAX_TRIES;
         if let Some((h, n)) = self.fits() {
             let enough = spent || h <= FINEST || n as f64 >= FULL * self.limit as f64;
-            return self.finer((h, n)).filter(|_| !enough).map_or(Next::Take(h), Next::Try);
+            return self.finer((h, n)).filter(|_| !enough).map_or(Next::Use(h), Next::Try);
         }
         let coarsest = self.counts().max_by(|a, b| a.0.total_cmp(&b.0));
-        let next = match (coarsest, self.finest_hollow(0.0)) {
+        let next = match (coarsest, self.finest_empty(0.0)) {
             (None, None) => Some(self.first),
             (Some(exceeds), _) => self.coarser(exceeds),
             // No surface yet: try finer spacings.
@@ -89,7 +89,7 @@ impl Search {
             return Next::Try(next);
         }
         let (resolution, triangles) = self.counts().min_by_key(|(_, n)| *n).unwrap_or((FINEST, 0));
-        Next::Refuse { resolution, triangles }
+        Next::Fail { resolution, triangles }
     }
 
     /// Returns the spacings that had a surface, with their triangles.
@@ -103,9 +103,9 @@ impl Search {
     }
 
     /// Returns the finest spacing above `floor` that had no surface.
-    fn finest_hollow(&self, floor: f64) -> Option<f64> {
-        let hollow = self.tried.iter().filter(|(h, n)| n.is_none() && *h > floor);
-        hollow.map(|(h, _)| *h).min_by(f64::total_cmp)
+    fn finest_empty(&self, floor: f64) -> Option<f64> {
+        let empty = self.tried.iter().filter(|(h, n)| n.is_none() && *h > floor);
+        empty.map(|(h, _)| *h).min_by(f64::total_cmp)
     }
 
     fn is_new(&self, spacing: f64) -> bool {
@@ -130,7 +130,7 @@ impl Search {
 
     /// Returns a coarser spacing than one with too many triangles, below any without a surface.
     fn coarser(&self, (x, m): (f64, u64)) -> Option<f64> {
-        let ceiling = self.finest_hollow(x);
+        let ceiling = self.finest_empty(x);
         let law = rounded(x * (m as f64 / (AIM * self.limit as f64)).sqrt()).max(rounded(1.01 * x));
         let next = match ceiling {
             Some(h) if law >= h => rounded((x * h).sqrt()),
@@ -173,16 +173,16 @@ pub(super) fn mesh(
     let mut search = Search::new(limit, &job.params, spheres.len());
     let mut last: Option<(f64, MeshOutput)> = None;
     // Name of the backend that computed the meshes.
-    let mut served = None;
+    let mut made_by = None;
     let mut restarted = false;
     loop {
         let (spacing, again) = match search.next() {
             Next::Try(spacing) => (spacing, false),
-            Next::Take(spacing) => match last.take().filter(|(made, _)| made.total_cmp(&spacing).is_eq()) {
+            Next::Use(spacing) => match last.take().filter(|(made, _)| made.total_cmp(&spacing).is_eq()) {
                 Some((resolution, output)) => return Ok(Fitted { output, resolution, tries: search.tries() }),
                 None => (spacing, true),
             },
-            Next::Refuse { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
+            Next::Fail { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
         };
         // Hold only one mesh at a time.
         last = None;
@@ -192,8 +192,8 @@ pub(super) fn mesh(
         let observer: &dyn Observer = if search.tries() == 0 { &without_progress } else { clock };
         let control = Control { observer, ..control.clone() };
         let made = unless_empty(clock.pass(|| choice.backend.run(spheres, &params, limits, &control)))?;
-        let by = made.as_ref().map(|m| m.served.as_ref().map_or(choice.backend.name(), |s| s.backend));
-        if by.is_some() && served.is_some() && by != served {
+        let by = made.as_ref().map(|m| m.made_by.as_ref().map_or(choice.backend.name(), |s| s.backend));
+        if by.is_some() && made_by.is_some() && by != made_by {
             // Counts of different backends may differ slightly, and with them the spacing. The content key names one
             // backend, so all counts must come from it.
             if std::mem::replace(&mut restarted, true) {
@@ -201,10 +201,10 @@ pub(super) fn mesh(
                     why: "different backends ran during the search for the grid spacing".into(),
                 });
             }
-            (search, served) = (Search::new(limit, &job.params, spheres.len()), None);
+            (search, made_by) = (Search::new(limit, &job.params, spheres.len()), None);
             continue;
         }
-        served = by.or(served);
+        made_by = by.or(made_by);
         let triangles = made.as_ref().map(|m| m.mesh.n_triangles() as u64);
         search.record(spacing, triangles);
         if again {
@@ -239,8 +239,8 @@ pub(super) fn expected(
                 let made = unless_empty(choice.backend.run(spheres, &params, limits, control))?;
                 search.record(spacing, made.map(|m| m.mesh.n_triangles() as u64));
             }
-            Next::Try(spacing) | Next::Take(spacing) => return Ok(spacing),
-            Next::Refuse { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
+            Next::Try(spacing) | Next::Use(spacing) => return Ok(spacing),
+            Next::Fail { resolution, triangles } => return Err(no_fit(&job.params, limit, resolution, triangles)),
         }
     }
 }
@@ -312,14 +312,14 @@ mod tests {
                         let coarsest = law(area, exponent)(COARSEST).unwrap();
                         let said = format!("{exponent} {area} {limit} {atoms}: {end:?} of {tried:?}");
                         match end {
-                            Next::Take(h) => {
+                            Next::Use(h) => {
                                 let n = law(area, exponent)(h).unwrap();
                                 assert!(n <= limit && coarsest <= limit, "{said}: {n}");
                                 let full = n as f64 >= 0.9 * limit as f64;
                                 assert!(full || h <= FINEST, "{said}: {n}");
                                 assert!(tried.len() <= 5, "{said}");
                             }
-                            Next::Refuse { resolution, triangles } => {
+                            Next::Fail { resolution, triangles } => {
                                 assert_eq!((resolution.to_bits(), triangles), (COARSEST.to_bits(), coarsest), "{said}");
                                 assert!(coarsest > limit, "{said}");
                             }
@@ -347,11 +347,11 @@ mod tests {
                 (!mixed.is_multiple_of(5)).then_some(mixed % 20_000)
             };
             match search(3000, 500, count).0 {
-                Next::Take(h) => {
+                Next::Use(h) => {
                     taken += 1;
                     assert!(count(h).is_some_and(|n| n <= 3000));
                 }
-                Next::Refuse { resolution, triangles } => {
+                Next::Fail { resolution, triangles } => {
                     refused += 1;
                     assert!(triangles == 0 || (count(resolution) == Some(triangles) && triangles > 3000));
                 }
@@ -366,10 +366,10 @@ mod tests {
         // One atom: no surface above 1.8 Å, and at least eight triangles.
         let atom = |h: f64| (h < 1.8).then(|| law(36.0, 2.0)(h).unwrap().max(8));
         let (end, _) = search(100, 1, atom);
-        assert!(matches!(end, Next::Take(h) if atom(h).unwrap() <= 100), "{end:?}");
+        assert!(matches!(end, Next::Use(h) if atom(h).unwrap() <= 100), "{end:?}");
         let (end, tried) = search(8, 1, |h| if h < 1.8 { Some(50) } else { None });
-        assert!(matches!(end, Next::Refuse { triangles: 50, .. }), "{end:?} of {tried:?}");
+        assert!(matches!(end, Next::Fail { triangles: 50, .. }), "{end:?} of {tried:?}");
         let (end, _) = search(100, 10, |_| None);
-        assert!(matches!(end, Next::Refuse { triangles: 0, .. }), "{end:?}");
+        assert!(matches!(end, Next::Fail { triangles: 0, .. }), "{end:?}");
     }
 }

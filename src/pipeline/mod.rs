@@ -27,7 +27,7 @@ pub use report::{
     ComponentReport, LeftOutReport, PictureReport, Quantization, Report, ResidueCount, VoidReport, maker,
 };
 pub use spacing::Spacing;
-pub use work::work;
+pub use work::estimate_work;
 
 use crate::formats::{Compress, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use crate::picture::{PictureError, PictureLimits, PictureParams};
@@ -186,13 +186,13 @@ pub fn run(
     } else {
         let storage = storage(job, &mut params, &spheres);
         if let Some(sink) = sink {
-            sink.store(storage);
+            sink.set_storage(storage);
         }
         let sink = sink.map(|sink| sink as &dyn MeshSink);
         (clock.pass(|| choice.backend.write(&spheres, &params, &limits.surface, &control, sink))?, None, storage)
     };
     let [n_vertices, n_triangles] = output.size();
-    let MeshOutput { mut mesh, streamed, grid, measures, served } = output;
+    let MeshOutput { mut mesh, streamed, grid, measures, made_by } = output;
     if let Some(ids) = &mut mesh.atom_ids {
         // Convert indices of spheres to indices of atoms in the file.
         ids.iter_mut().for_each(|id| *id = selected.atoms[*id as usize]);
@@ -205,7 +205,7 @@ pub fn run(
         })?,
     };
     let (resolution, centre) = (params.resolution, mesh.centre);
-    let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, served, storage };
+    let counts = Counts { resolution, centre, tries, grid, n_vertices, n_triangles, made_by, storage };
     let report = Report::new(&structure, &selected, job, choice, &counts, &measures, clock.finish());
     let mut product = Product { mesh, storage, report, picture: None, streamed_bytes: None };
     if let (Some(sink), Some(streamed)) = (sink, streamed) {

@@ -11,13 +11,13 @@ use std::str::FromStr;
 use thiserror::Error;
 
 use table::flag;
-pub use table::{Domain, Parameter, TABLE, usual};
+pub use table::{Domain, Parameter, TABLE, usual_range};
 
 use super::nearest::nearest;
-use super::spacing::{DETAILS, LEAST_TRIANGLES, MOST_TRIANGLES};
+use super::spacing::{DETAILS, MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use super::{Job, Spacing};
 use crate::formats::{Compress, Format, Normals, Units};
-use crate::picture::{Background, MOST_SIDE, PictureParams, Style, View};
+use crate::picture::{Background, MAX_SIDE, PictureParams, Style, View};
 use crate::structure::Selection;
 use crate::surface::{Kernel, PaperParams, Preset, SurfaceError, SurfaceOptions, SurfaceParams, Validation};
 
@@ -68,10 +68,8 @@ pub struct Request {
 /// with another one.
 pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V)>) -> Result<Request, ParamError> {
     let mut seen = [false; TABLE.len()];
-    let mut options = SurfaceOptions::default();
-    let mut selection = Selection::default();
-    let mut request = Request::default();
-    let (mut spacing, mut picture) = (None, PictureParams::default());
+    let mut values = Values::default();
+    let mut spacing = None;
     for (name, value) in pairs {
         let (name, value) = (name.as_ref(), value.as_ref());
         let Some(index) = TABLE.iter().position(|p| p.name == name) else {
@@ -86,21 +84,17 @@ pub fn parse<N: AsRef<str>, V: AsRef<str>>(pairs: impl IntoIterator<Item = (N, V
         if parameter.name != "format" && parameter.is_default(value) {
             continue;
         }
-        if PICTURES.contains(&parameter.name) {
-            set_picture(parameter, value, &mut picture)?;
-            request.job.picture = Some(picture);
-            continue;
-        }
-        set(parameter, value, &mut options, &mut selection, &mut request)?;
+        values.set(parameter, value)?;
         if SPACINGS.contains(&parameter.name)
             && let Some(other) = spacing.replace(parameter.name)
         {
             return Err(contradiction(parameter.name, value, other));
         }
     }
+    let Values { options, selection, mut request } = values;
     request.job = Job { selection, params: SurfaceParams::new(&options)?, ..request.job };
     if let Some(format) = request.format {
-        settle(&mut request.job, format)?;
+        set_format(&mut request.job, format)?;
     }
     Ok(request)
 }
@@ -124,7 +118,7 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
 /// # Errors
 /// Returns [`ParamError::BadValue`] for `compress`, `units`, `normals` or a picture parameter that the format does not
 /// support.
-pub fn settle(job: &mut Job, format: Format) -> Result<(), ParamError> {
+pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
     let refuse = |name: &'static str, value: &str, instead: &str, holds: &dyn Fn(Format) -> bool| {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::extension).collect();
         Err(ParamError::BadValue {
@@ -174,88 +168,80 @@ impl From<SurfaceError> for ParamError {
     }
 }
 
-/// Parses the value of one parameter.
-fn set(
-    parameter: &Parameter,
-    text: &str,
-    options: &mut SurfaceOptions,
-    selection: &mut Selection,
-    request: &mut Request,
-) -> Result<(), ParamError> {
-    let bad = || ParamError::BadValue {
-        name: parameter.name,
-        value: format!("`{}`", text.chars().take(64).collect::<String>()),
-        expected: parameter.domain.expected(),
-    };
-    // Whether a number is in range is the core's to say, as the range may hang on the kernel.
-    let number = || text.trim().parse::<f64>().ok().filter(|v| v.is_finite()).map(Some).ok_or_else(bad);
-    match parameter.name {
-        "preset" => options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
-        "kernel" => options.kernel = Some(Kernel::from_str(text).ok().ok_or_else(bad)?),
-        "resolution" => options.resolution = number()?,
-        "detail" => {
-            let level = whole(text).filter(|level| *level < DETAILS.len() as u64);
-            request.job.spacing = Spacing::Detail(level.and_then(|l| u8::try_from(l).ok()).ok_or_else(bad)?);
-        }
-        "max_triangles" => {
-            let most =
-                whole(text).filter(|most| (u64::from(LEAST_TRIANGLES)..=u64::from(MOST_TRIANGLES)).contains(most));
-            request.job.spacing = Spacing::MaxTriangles(most.ok_or_else(bad)?);
-        }
-        "isovalue" => options.isovalue = number()?,
-        "smoothness" => options.smoothness = number()?,
-        "radius_scale" => options.radius_scale = number()?,
-        "radius_offset" => options.radius_offset = number()?,
-        "cutoff_tolerance" => options.cutoff_tolerance = number()?,
-        "paper_a" => options.paper_a = number()?,
-        "paper_b" => options.paper_b = number()?,
-        "paper_c" => options.paper_c = number()?,
-        "atom_ids" => options.atom_ids = flag(text).ok_or_else(bad)?,
-        "model" => selection.model = Some(text.trim().parse().ok().ok_or_else(bad)?),
-        "chains" => selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect()),
-        "select" => selection.set_kinds(text).map_err(|e| ParamError::BadValue {
-            name: "select",
-            value: format!("`{}`", e.value),
-            expected: e.expected,
-        })?,
-        "altloc" => selection.altloc = Some(one_char(text).ok_or_else(bad)?),
-        "validation" => request.job.validation = named(&VALIDATIONS, Validation::name, text).ok_or_else(bad)?,
-        "check" => request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
-        "format" => request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
-        "compress" => request.job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
-        "normals" => request.job.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
-        "units" => request.job.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
-        _ => return Err(unknown(parameter.name)),
-    }
-    Ok(())
+/// Values of the parameters so far.
+#[derive(Default)]
+struct Values {
+    options: SurfaceOptions,
+    selection: Selection,
+    request: Request,
 }
 
-/// Parses the value of one picture parameter.
-fn set_picture(parameter: &Parameter, text: &str, picture: &mut PictureParams) -> Result<(), ParamError> {
-    let bad = || ParamError::BadValue {
-        name: parameter.name,
-        value: format!("`{}`", text.chars().take(64).collect::<String>()),
-        expected: parameter.domain.expected(),
-    };
-    let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MOST_SIDE).contains(n));
-    let angle = || {
-        let Domain::Number { min, max, .. } = parameter.domain else { return None };
-        text.trim().parse::<f64>().ok().filter(|angle| (min..=max).contains(angle))
-    };
-    match parameter.name {
-        "width" => picture.width = side().ok_or_else(bad)?,
-        "height" => picture.height = side().ok_or_else(bad)?,
-        "view" => picture.view = named(&View::ALL, View::name, text).ok_or_else(bad)?,
-        "azimuth" => picture.azimuth = angle().ok_or_else(bad)?,
-        "elevation" => picture.elevation = angle().ok_or_else(bad)?,
-        "background" => picture.background = text.parse::<Background>().ok().ok_or_else(bad)?,
-        "style" => picture.style = named(&Style::ALL, Style::name, text).ok_or_else(bad)?,
-        _ => return Err(unknown(parameter.name)),
+impl Values {
+    /// Parameters of the picture, which exists from the first of them on.
+    fn picture(&mut self) -> &mut PictureParams {
+        self.request.job.picture.get_or_insert_default()
     }
-    Ok(())
-}
 
-const VALIDATIONS: [Validation; 2] = [Validation::Checksum, Validation::Exact];
+    /// Parses the value of one parameter.
+    fn set(&mut self, parameter: &Parameter, text: &str) -> Result<(), ParamError> {
+        let bad = || parameter.invalid(text);
+        // The core checks ranges, because they may depend on the kernel.
+        let number = || text.trim().parse::<f64>().ok().filter(|v| v.is_finite()).map(Some).ok_or_else(bad);
+        let side = || whole(text).and_then(|n| u32::try_from(n).ok()).filter(|n| (1..=MAX_SIDE).contains(n));
+        let angle = || {
+            let Domain::Number { min, max, .. } = parameter.domain else { return None };
+            text.trim().parse::<f64>().ok().filter(|angle| (min..=max).contains(angle))
+        };
+        match parameter.name {
+            "preset" => self.options.preset = Some(Preset::from_str(text).ok().ok_or_else(bad)?),
+            "kernel" => self.options.kernel = Some(Kernel::from_str(text).ok().ok_or_else(bad)?),
+            "resolution" => self.options.resolution = number()?,
+            "detail" => {
+                let level = whole(text).filter(|level| *level < DETAILS.len() as u64);
+                self.request.job.spacing = Spacing::Detail(level.and_then(|l| u8::try_from(l).ok()).ok_or_else(bad)?);
+            }
+            "max_triangles" => {
+                let most = whole(text)
+                    .filter(|most| (u64::from(MIN_TRIANGLE_LIMIT)..=u64::from(MAX_TRIANGLE_LIMIT)).contains(most));
+                self.request.job.spacing = Spacing::MaxTriangles(most.ok_or_else(bad)?);
+            }
+            "isovalue" => self.options.isovalue = number()?,
+            "smoothness" => self.options.smoothness = number()?,
+            "radius_scale" => self.options.radius_scale = number()?,
+            "radius_offset" => self.options.radius_offset = number()?,
+            "cutoff_tolerance" => self.options.cutoff_tolerance = number()?,
+            "paper_a" => self.options.paper_a = number()?,
+            "paper_b" => self.options.paper_b = number()?,
+            "paper_c" => self.options.paper_c = number()?,
+            "atom_ids" => self.options.atom_ids = flag(text).ok_or_else(bad)?,
+            "model" => self.selection.model = Some(text.trim().parse().ok().ok_or_else(bad)?),
+            "chains" => {
+                self.selection.chains = Some(list(text).ok_or_else(bad)?.into_iter().map(str::to_owned).collect());
+            }
+            "select" => self.selection.set_kinds(text).map_err(|e| ParamError::BadValue {
+                name: "select",
+                value: format!("`{}`", e.value),
+                expected: e.expected,
+            })?,
+            "altloc" => self.selection.altloc = Some(one_char(text).ok_or_else(bad)?),
+            "validation" => self.request.job.validation = Validation::from_str(text).ok().ok_or_else(bad)?,
+            "check" => self.request.strict = (text == "strict").then_some(true).ok_or_else(bad)?,
+            "format" => self.request.format = Some(Format::from_str(text).ok().ok_or_else(bad)?),
+            "compress" => self.request.job.compress = named(&Compress::ALL, Compress::name, text).ok_or_else(bad)?,
+            "normals" => self.request.job.normals = named(&Normals::ALL, Normals::name, text).ok_or_else(bad)?,
+            "units" => self.request.job.units = named(&Units::ALL, Units::name, text).ok_or_else(bad)?,
+            "width" => self.picture().width = side().ok_or_else(bad)?,
+            "height" => self.picture().height = side().ok_or_else(bad)?,
+            "view" => self.picture().view = named(&View::ALL, View::name, text).ok_or_else(bad)?,
+            "azimuth" => self.picture().azimuth = angle().ok_or_else(bad)?,
+            "elevation" => self.picture().elevation = angle().ok_or_else(bad)?,
+            "background" => self.picture().background = text.parse::<Background>().ok().ok_or_else(bad)?,
+            "style" => self.picture().style = named(&Style::ALL, Style::name, text).ok_or_else(bad)?,
+            _ => return Err(unknown(parameter.name)),
+        }
+        Ok(())
+    }
+}
 
 /// Returns the value with this name.
 fn named<T: Copy>(all: &[T], name: impl Fn(T) -> &'static str, text: &str) -> Option<T> {
@@ -281,7 +267,7 @@ fn one_char(text: &str) -> Option<char> {
 /// key.
 #[must_use]
 pub fn canonical(job: &Job) -> String {
-    // Destructured, so that a field that is added without a place here does not compile.
+    // Destructured, so that a new field must be added here.
     let Job { selection, params, spacing, validation, compress, normals, units, picture } = job;
     let Selection { model, chains, polymer, ligands, waters, hydrogens, altloc } = selection;
     let SurfaceParams {
@@ -298,7 +284,7 @@ pub fn canonical(job: &Job) -> String {
         // Follows from `compress` and the spheres.
         quantize: _,
     } = params;
-    // What sets the spacing, and nothing else: of the other two only defaults are left.
+    // Only the parameter that sets the spacing; the other two have their defaults.
     let spacing = match spacing {
         Spacing::Given => format!("resolution={resolution}"),
         Spacing::Detail(level) => format!("detail={level}"),

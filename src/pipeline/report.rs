@@ -6,7 +6,7 @@ use serde_json::{Map, Value};
 use super::{Choice, Job};
 use crate::formats::{Storage, Units};
 use crate::structure::{LeftOut, Selected, Structure, radii};
-use crate::surface::{Component, GridStats, Measures, Served};
+use crate::surface::{BackendIdentity, Component, GridStats, Measures};
 
 /// Connected component of the mesh.
 #[derive(Debug, Clone, Serialize)]
@@ -258,7 +258,7 @@ pub(super) struct Counts {
     pub(super) grid: GridStats,
     pub(super) n_vertices: usize,
     pub(super) n_triangles: usize,
-    pub(super) served: Option<Served>,
+    pub(super) made_by: Option<BackendIdentity>,
     pub(super) storage: Storage,
 }
 
@@ -274,12 +274,7 @@ impl Report {
     ) -> Self {
         let params = &job.params;
         let gaussian = params.kernel == crate::surface::Kernel::Gaussian && params.paper.is_none();
-        let served = counts.served.clone().unwrap_or_else(|| Served {
-            backend: choice.backend.name(),
-            arithmetic: choice.backend.arithmetic(),
-            device: choice.backend.describe(),
-            fallback_reason: None,
-        });
+        let made_by = counts.made_by.clone().unwrap_or_else(|| choice.backend.identity());
         let mut voids: Vec<&Component> = measures.components.iter().filter(|c| c.volume < 0.0).collect();
         voids.sort_by(|a, b| a.volume.total_cmp(&b.volume));
         Self {
@@ -322,14 +317,11 @@ impl Report {
             file_units: counts.storage.units.name(),
             normals: counts.storage.normals.name(),
             quantization: counts.storage.packing.step().map(|step| Quantization { step: step.length() }),
-            backend: served.backend,
-            arithmetic: served.arithmetic,
-            device: served.device,
-            backend_reason: match &served.fallback_reason {
-                Some(why) => format!("{}; but {why}", choice.reason),
-                None => choice.reason.to_owned(),
-            },
-            fallback: served.fallback_reason,
+            backend_reason: made_by.reason(choice.reason),
+            backend: made_by.backend,
+            arithmetic: made_by.arithmetic,
+            device: made_by.device,
+            fallback: made_by.fallback_reason,
             picture: None,
             timings_ms: timings
                 .into_iter()

@@ -12,9 +12,9 @@ pub const DETAILS: [f64; 7] = [2.0, 1.4, 1.0, 0.7, 0.5, 0.35, FINEST];
 /// Number of atoms up to which [`DETAILS`] applies unchanged.
 pub const DETAIL_ATOMS: f64 = 10_000.0;
 /// Smallest limit on triangles: no closed mesh on a grid has fewer.
-pub const LEAST_TRIANGLES: u32 = 8;
+pub const MIN_TRIANGLE_LIMIT: u32 = 8;
 /// Largest limit on triangles.
-pub const MOST_TRIANGLES: u32 = u32::MAX;
+pub const MAX_TRIANGLE_LIMIT: u32 = u32::MAX;
 
 /// Approximate surface area per atom, Å²: heavy atoms of a protein with the default parameters.
 const AREA_PER_ATOM: f64 = 7.5;

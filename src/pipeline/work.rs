@@ -22,7 +22,7 @@ const PIXEL: f64 = 0.0125;
 
 /// Estimates the work of a job, in atoms at 0.5 Å.
 #[must_use]
-pub fn work(input: &[u8], job: &Job) -> f64 {
+pub fn estimate_work(input: &[u8], job: &Job) -> f64 {
     let compressed = input.starts_with(&[0x1f, 0x8b]) || input.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]);
     // First byte of a MessagePack map; no text begins with it.
     let binary = matches!(input.first(), Some(0x80..=0x8F | 0xDE | 0xDF));
@@ -51,30 +51,33 @@ mod tests {
         let at = |resolution: &str| params::parse([("resolution", resolution)]).unwrap().job;
         let text = vec![b'A'; 90_000];
         let gzip = [&[0x1f, 0x8b][..], &text].concat();
-        let coarse = work(&text, &at("1"));
-        assert!(work(&text, &at("0.5")) > 2.0 * coarse);
-        assert!(work(&gzip, &at("1")) > 2.0 * coarse);
-        let binary = |first: u8| work(&[&[first][..], &vec![0; 450_000]].concat(), &at("1"));
+        let coarse = estimate_work(&text, &at("1"));
+        assert!(estimate_work(&text, &at("0.5")) > 2.0 * coarse);
+        assert!(estimate_work(&gzip, &at("1")) > 2.0 * coarse);
+        let binary = |first: u8| estimate_work(&[&[first][..], &vec![0; 450_000]].concat(), &at("1"));
         assert!(binary(0x83) > 2.0 * binary(b'A'));
-        assert!((work(&text, &at("0.5")) - 3000.0).abs() < 1.0);
+        assert!((estimate_work(&text, &at("0.5")) - 3000.0).abs() < 1.0);
     }
 
     #[test]
     fn large_pictures_cost_more() {
         let (text, of) =
             (vec![b'A'; 90_000], |side: &str| params::parse([("format", "png"), ("width", side)]).unwrap().job);
-        assert!(work(&text, &of("4096")) > 1.2 * work(&text, &of("512")));
+        assert!(estimate_work(&text, &of("4096")) > 1.2 * estimate_work(&text, &of("512")));
     }
 
     #[test]
     fn automatic_spacing_is_estimated_from_the_input_size() {
         let of = |name: &str, value: &str| params::parse([(name, value)]).unwrap().job;
         let [small, large] = [90_000, 90_000_000].map(|n| vec![b'A'; n]);
-        assert!((work(&small, &of("detail", "4")) / work(&small, &of("resolution", "0.5")) - 1.0).abs() < 1e-9);
+        assert!(
+            (estimate_work(&small, &of("detail", "4")) / estimate_work(&small, &of("resolution", "0.5")) - 1.0).abs()
+                < 1e-9
+        );
         // A million atoms at the same level of detail get a coarser grid.
-        assert!(work(&large, &of("detail", "4")) < 0.5 * work(&large, &of("resolution", "0.5")));
-        let bounded = |most: &str| work(&large, &of("max_triangles", most));
+        assert!(estimate_work(&large, &of("detail", "4")) < 0.5 * estimate_work(&large, &of("resolution", "0.5")));
+        let bounded = |most: &str| estimate_work(&large, &of("max_triangles", most));
         assert!(bounded("1000000") < bounded("10000000"));
-        assert!(bounded("4000000000") > work(&large, &of("resolution", "0.5")));
+        assert!(bounded("4000000000") > estimate_work(&large, &of("resolution", "0.5")));
     }
 }

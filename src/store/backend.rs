@@ -15,7 +15,7 @@ use tokio::task::spawn_blocking;
 
 use super::error::StoreError;
 use super::name::{Folder, Name};
-use super::object::Meta;
+use super::object::{Meta, Stored};
 use super::s3::{self, Bucket};
 use super::secret::{self, Secret};
 use super::stale;
@@ -87,7 +87,7 @@ impl Backend {
     }
 
     /// Returns the size of a part of a large object, bytes.
-    pub(super) fn part(&self) -> usize {
+    pub(super) fn part_size(&self) -> usize {
         if self.is_local() { FILE_PART } else { S3_PART }
     }
 
@@ -101,7 +101,12 @@ impl Backend {
         StoreError::classify(op, &format!("{}/{at}", self.place), error)
     }
 
-    fn fail_at<'a>(&'a self, op: &'static str, name: &'a Name) -> impl Fn(object_store::Error) -> StoreError + 'a {
+    /// Returns a function that classifies and counts an error of the object `name`.
+    pub(super) fn fail_at<'a>(
+        &'a self,
+        op: &'static str,
+        name: &'a Name,
+    ) -> impl Fn(object_store::Error) -> StoreError + 'a {
         move |error| self.fail(op, &name.to_string(), &error)
     }
 
@@ -126,11 +131,11 @@ impl Backend {
     }
 
     /// Reads all bytes of an object.
-    pub(super) async fn get_whole(&self, name: &Name) -> Result<Option<(Meta, Bytes)>, StoreError> {
+    pub(super) async fn get_whole(&self, name: &Name) -> Result<Option<Stored>, StoreError> {
         let Some(read) = self.get(name, None).await? else { return Ok(None) };
         let meta = Meta::from(&read.meta);
         let bytes = read.bytes().await.map_err(self.fail_at("get", name))?;
-        Ok(Some((meta, bytes)))
+        Ok(Some(Stored { bytes, meta }))
     }
 
     /// Reads a range of an object. Keeps no file open.
@@ -156,7 +161,7 @@ impl Backend {
     /// Lists the objects of a folder in name order. Ignores files with other names.
     pub(super) async fn list(&self, folder: Folder) -> Result<Vec<(Name, Meta)>, StoreError> {
         let listed = self.objects.list(Some(&Path::from(folder.as_str())));
-        let parsed = |meta: ObjectMeta| Some((Name::at(meta.location.as_ref())?, Meta::from(&meta)));
+        let parsed = |meta: ObjectMeta| Some((Name::from_path(meta.location.as_ref())?, Meta::from(&meta)));
         let fail = |e| self.fail("list", folder.as_str(), &e);
         let mut names: Vec<_> =
             listed.try_filter_map(|meta| std::future::ready(Ok(parsed(meta)))).try_collect().await.map_err(fail)?;

@@ -68,17 +68,9 @@ pub enum StoreError {
         /// Size of the object, bytes.
         size: u64,
     },
-    /// A writer received more or fewer bytes than declared. Nothing is stored.
-    #[error("{written} bytes were written, but {declared} were declared")]
-    Length {
-        /// Declared bytes.
-        declared: u64,
-        /// Bytes written, as far as counted.
-        written: u64,
-    },
-    /// A writer was dropped before it finished. Nothing is stored.
-    #[error("the writer was dropped before it finished")]
-    Abandoned,
+    /// A writer is used after one of its writes failed. Nothing is stored.
+    #[error("an earlier write of the object failed")]
+    WriterFailed,
     /// The name is invalid.
     #[error(transparent)]
     Name(#[from] BadName),

@@ -30,6 +30,7 @@ pub struct Swept {
 }
 
 /// Bytes reserved by a writer, until they are committed or released.
+#[derive(Debug)]
 pub(super) struct Reservation {
     store: Store,
     bytes: u64,
@@ -37,7 +38,7 @@ pub(super) struct Reservation {
 }
 
 impl Reservation {
-    /// Reserves more bytes.
+    /// Reserves more bytes, evicting objects if necessary.
     pub(super) async fn grow(&mut self, bytes: u64) -> Result<(), StoreError> {
         if self.capped {
             self.store.reserve(self.bytes, bytes).await?;
@@ -80,17 +81,15 @@ impl Store {
 
     fn ttl(&self, folder: Folder) -> Duration {
         match folder {
-            Folder::Inputs => self.0.config.input_ttl(),
-            Folder::Jobs => self.0.config.job_ttl(),
-            Folder::Results => self.0.config.result_ttl(),
+            Folder::Inputs => Duration::from_millis(self.0.config.input_ttl_ms),
+            Folder::Jobs => Duration::from_millis(self.0.config.job_ttl_ms),
+            Folder::Results => Duration::from_millis(self.0.config.result_ttl_ms),
         }
     }
 
-    /// Reserves space for an object, evicting others if necessary.
-    pub(super) async fn reserve_for(&self, name: &Name, bytes: u64) -> Result<Reservation, StoreError> {
-        let mut reservation = Reservation { store: self.clone(), bytes: 0, capped: name.folder().is_capped() };
-        reservation.grow(bytes).await?;
-        Ok(reservation)
+    /// Returns a reservation of 0 bytes for an object.
+    pub(super) fn empty_reservation(&self, name: &Name) -> Reservation {
+        Reservation { store: self.clone(), bytes: 0, capped: name.folder().is_capped() }
     }
 
     /// Reserves `more` bytes for a writer that has reserved `had`.
@@ -146,7 +145,7 @@ impl Store {
     async fn remove_candidate(&self, candidate: EvictionCandidate) -> Result<bool, StoreError> {
         let store = self.clone();
         self.run_to_completion(async move {
-            let _lock = store.stripe(&candidate.name).lock().await;
+            let _lock = store.write_lock(&candidate.name).lock().await;
             let begun = store.index().begin_removal(&candidate);
             if begun {
                 store.remove(&candidate.name).await?;

@@ -151,6 +151,6 @@ pub(crate) async fn faulty(max_bytes: u64) -> (TempDir, Arc<Faults>, Store) {
     let (root, faults) = (dir.path().join("store"), Arc::new(Faults::default()));
     let files = LocalFileSystem::new_with_prefix(&root).unwrap();
     let objects = Arc::new(Faulty { files, faults: Arc::clone(&faults) });
-    let store = Store::over(Backend::over(objects, root), &config).await.unwrap();
+    let store = Store::open_backend(Backend::over(objects, root), &config).await.unwrap();
     (dir, faults, store)
 }

@@ -26,7 +26,7 @@ use crate::config::StoreConfig;
 use crate::telemetry::CACHE_REQUESTS;
 
 /// Number of locks for writing and removing. Names share them by hash.
-const STRIPES: usize = 64;
+const WRITE_LOCKS: usize = 64;
 
 /// Object store in a folder or on S3. Clones share one store.
 ///
@@ -39,7 +39,7 @@ pub(super) struct Inner {
     pub(super) config: StoreConfig,
     index: Mutex<Index>,
     memory: Memory,
-    stripes: [AsyncMutex<()>; STRIPES],
+    write_locks: [AsyncMutex<()>; WRITE_LOCKS],
     /// Serializes evictions, so that two do not remove twice as much. The value is the time of the last search for
     /// staged files.
     pub(super) last_cleanup: AsyncMutex<SystemTime>,
@@ -60,11 +60,11 @@ impl Store {
     /// Returns [`StoreError::Open`] if it cannot be written and read.
     pub async fn open(config: &StoreConfig, data_dir: &Path) -> Result<Self, StoreError> {
         let backend = Backend::open(config, data_dir).await?;
-        Self::over(backend, config).await
+        Self::open_backend(backend, config).await
     }
 
     /// Opens a store over `backend`; see [`open`](Self::open).
-    pub(super) async fn over(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
+    pub(super) async fn open_backend(backend: Backend, config: &StoreConfig) -> Result<Self, StoreError> {
         backend.probe().await.map_err(|e| backend.open_error(&e))?;
         let now = SystemTime::now();
         // Not fatal: credentials may permit uploads without permitting their listing.
@@ -82,13 +82,13 @@ impl Store {
             }
             index.update_metrics(folder);
         }
-        let [inputs, jobs, results] = Folder::ALL.map(|folder| index.total(folder).1);
+        let [inputs, jobs, results] = Folder::ALL.map(|folder| index.usage(folder).objects);
         tracing::info!(place = backend.place(), inputs, jobs, results, cleared, "store opened");
         Ok(Self(Arc::new(Inner {
             backend,
             index: Mutex::new(index),
             memory: Memory::new(config.memory_bytes, config.memory_object_bytes),
-            stripes: [const { AsyncMutex::const_new(()) }; STRIPES],
+            write_locks: [const { AsyncMutex::const_new(()) }; WRITE_LOCKS],
             last_cleanup: AsyncMutex::new(now),
             runtime: Handle::current(),
             config: config.clone(),
@@ -119,19 +119,24 @@ impl Store {
     async fn write(&self, name: &Name, bytes: Bytes, new: bool) -> Result<bool, StoreError> {
         let (store, name) = (self.clone(), name.clone());
         self.run_to_completion(async move {
-            let reservation = store.reserve_for(&name, bytes.len() as u64).await?;
-            let _lock = store.stripe(&name).lock().await;
+            let mut reservation = store.empty_reservation(&name);
+            reservation.grow(bytes.len() as u64).await?;
+            let _lock = store.write_lock(&name).lock().await;
+            let backend = &store.0.backend;
             // Content-addressed objects are equal anyway; only job documents need an atomic check.
-            if new && name.folder() != Folder::Jobs && store.0.backend.head(&name).await?.is_some() {
+            let create = new && name.folder() == Folder::Jobs;
+            if new && !create && backend.head(&name).await?.is_some() {
                 return Ok(false);
             }
-            let written =
-                upload::put(&store.0.backend, &name, bytes.clone(), new && name.folder() == Folder::Jobs).await?;
-            if written {
-                store.commit(&name, bytes.len() as u64, Some(&bytes));
+            if create || backend.is_local() || bytes.len() <= backend.part_size() {
+                if !backend.put(&name, bytes.clone(), create).await? {
+                    return Ok(false);
+                }
+            } else {
+                upload::put_in_parts(&store, &name, bytes.clone()).await?;
             }
-            drop(reservation);
-            Ok(written)
+            store.commit(&name, bytes.len() as u64, Some(&bytes));
+            Ok(true)
         })
         .await
     }
@@ -142,18 +147,19 @@ impl Store {
     /// # Errors
     /// Returns a [`StoreError`]. A missing object is `None`, not an error, since objects may be removed at any time.
     pub async fn get(&self, name: &Name) -> Result<Option<Stored>, StoreError> {
-        if let Some((meta, bytes)) = self.get_from_memory(name) {
-            return Ok(Some(Stored { bytes, meta }));
+        if let Some(stored) = self.get_from_memory(name) {
+            return Ok(Some(stored));
         }
         let Some(seen) = self.begin_read(name) else { return Ok(None) };
         let read = self.0.backend.get_whole(name).await?;
-        self.end_read(name, seen, read.as_ref().map(|(meta, _)| *meta));
-        let Some((meta, bytes)) = read else { return Ok(None) };
+        self.end_read(name, seen, read.as_ref().map(|stored| stored.meta));
         let index = self.index();
-        if index.is_current(name, seen) {
-            self.0.memory.put(name, meta, &bytes);
+        if let Some(stored) = &read
+            && index.is_current(name, seen)
+        {
+            self.0.memory.put(name, stored.clone());
         }
-        Ok(Some(Stored { bytes, meta }))
+        Ok(read)
     }
 
     /// Streams an object, or a range of it whose end may exceed the size. Use it for content-addressed objects: each
@@ -164,7 +170,7 @@ impl Store {
     /// stream fails if the object is deleted during the read.
     pub async fn read(&self, name: &Name, range: Option<Range<u64>>) -> Result<Option<(Meta, ByteStream)>, StoreError> {
         let pin = self.pin(name);
-        let known = self.get_from_memory(name).map(|(meta, _)| meta);
+        let known = self.get_from_memory(name).map(|stored| stored.meta);
         if known.is_none() && !self.0.backend.is_local() {
             return self.read_remote(name, range).await;
         }
@@ -206,7 +212,7 @@ impl Store {
     /// Reads a range of the object that `meta` describes. Copies from memory, so that the result does not keep the
     /// whole object alive.
     pub(super) async fn piece(&self, name: &Name, meta: Meta, range: Range<u64>) -> Result<Bytes, StoreError> {
-        if let Some((_, bytes)) = self.0.memory.get(name).filter(|(now, _)| now.size == meta.size) {
+        if let Some(Stored { bytes, .. }) = self.0.memory.get(name).filter(|stored| stored.meta.size == meta.size) {
             let at = |offset: u64| usize::try_from(offset).unwrap_or(usize::MAX).min(bytes.len());
             return Ok(Bytes::copy_from_slice(&bytes[at(range.start)..at(range.end)]));
         }
@@ -231,7 +237,7 @@ impl Store {
     pub async fn delete(&self, name: &Name) -> Result<(), StoreError> {
         let (store, name) = (self.clone(), name.clone());
         self.run_to_completion(async move {
-            let _lock = store.stripe(&name).lock().await;
+            let _lock = store.write_lock(&name).lock().await;
             store.index().mark_removed(&name);
             store.remove(&name).await
         })
@@ -255,7 +261,7 @@ impl Store {
     /// [`delete`](Self::delete) ignores pins.
     pub fn pin(&self, name: &Name) -> Pin {
         self.index().pin(name);
-        Pin::new(self.clone(), name.clone())
+        Pin { store: self.clone(), name: name.clone() }
     }
 
     /// Tests the store: writes, reads and removes a small object.
@@ -277,8 +283,7 @@ impl Store {
     /// Returns the number and total size of the objects in a folder.
     #[must_use]
     pub fn usage(&self, folder: Folder) -> Usage {
-        let (bytes, objects) = self.index().total(folder);
-        Usage { bytes, objects }
+        self.index().usage(folder)
     }
 
     /// Returns the bytes of results in memory.
@@ -297,11 +302,12 @@ impl Store {
         self.0.index.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    pub(super) fn stripe(&self, name: &Name) -> &AsyncMutex<()> {
+    /// Returns the lock for writing and removing an object.
+    pub(super) fn write_lock(&self, name: &Name) -> &AsyncMutex<()> {
         let mut hasher = DefaultHasher::new();
         name.hash(&mut hasher);
-        let stripe = usize::try_from(hasher.finish() % STRIPES as u64).unwrap_or_default();
-        &self.0.stripes[stripe]
+        let ix = usize::try_from(hasher.finish() % WRITE_LOCKS as u64).unwrap_or_default();
+        &self.0.write_locks[ix]
     }
 
     /// Indexes an object that was just written under the lock of its name. Caches small results in memory.
@@ -310,7 +316,7 @@ impl Store {
         let mut index = self.index();
         index.commit(name, size, now);
         match bytes {
-            Some(bytes) => self.0.memory.put(name, Meta { size, modified: now }, bytes),
+            Some(bytes) => self.0.memory.put(name, Stored { bytes: bytes.clone(), meta: Meta { size, modified: now } }),
             None => self.0.memory.remove(name),
         }
     }
@@ -333,7 +339,7 @@ impl Store {
     }
 
     /// Returns a result from memory.
-    fn get_from_memory(&self, name: &Name) -> Option<(Meta, Bytes)> {
+    fn get_from_memory(&self, name: &Name) -> Option<Stored> {
         if name.folder() != Folder::Results {
             return None;
         }

@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime};
 use metrics::gauge;
 
 use super::name::{Folder, Name};
+use super::object::Usage;
 use crate::telemetry::{STORE_BYTES, STORE_OBJECTS};
 
 /// Order of last use. The counter orders uses within one clock tick.
@@ -51,8 +52,8 @@ pub(super) struct Index {
     pins: BTreeMap<Name, usize>,
     /// Objects being removed: no longer readable, but still on disk.
     removing: BTreeSet<Name>,
-    /// Bytes and objects by folder, including objects being removed.
-    totals: [(u64, u64); Folder::ALL.len()],
+    /// Usage by folder, including objects being removed.
+    totals: [Usage; Folder::ALL.len()],
     /// Bytes reserved by writers, in folders that count against the capacity.
     reserved: u64,
     count: u64,
@@ -72,7 +73,7 @@ impl Index {
         self.by_use.insert(used, name.clone());
         self.entries.insert(name.clone(), Entry { bytes, used, version });
         let total = &mut self.totals[name.folder() as usize];
-        *total = (total.0 + bytes, total.1 + 1);
+        *total = Usage { bytes: total.bytes + bytes, objects: total.objects + 1 };
         self.update_metrics(name.folder());
     }
 
@@ -82,7 +83,7 @@ impl Index {
         self.by_use.remove(&entry.used);
         self.removals += 1;
         let total = &mut self.totals[name.folder() as usize];
-        *total = (total.0 - entry.bytes, total.1 - 1);
+        *total = Usage { bytes: total.bytes - entry.bytes, objects: total.objects - 1 };
         self.update_metrics(name.folder());
         true
     }
@@ -178,7 +179,7 @@ impl Index {
     /// Returns the bytes that count against the capacity: on disk and reserved.
     fn used_bytes(&self) -> u64 {
         let capped = Folder::ALL.into_iter().filter(|folder| folder.is_capped());
-        capped.map(|folder| self.total(folder).0).sum::<u64>() + self.reserved
+        capped.map(|folder| self.usage(folder).bytes).sum::<u64>() + self.reserved
     }
 
     /// Releases reserved bytes.
@@ -209,14 +210,13 @@ impl Index {
         }
     }
 
-    /// Returns bytes and number of objects of a folder.
-    pub(super) fn total(&self, folder: Folder) -> (u64, u64) {
+    pub(super) fn usage(&self, folder: Folder) -> Usage {
         self.totals[folder as usize]
     }
 
     /// Updates the metrics of a folder.
     pub(super) fn update_metrics(&self, folder: Folder) {
-        let (bytes, objects) = self.total(folder);
+        let Usage { bytes, objects } = self.usage(folder);
         gauge!(STORE_BYTES, "folder" => folder.as_str()).set(bytes as f64);
         gauge!(STORE_OBJECTS, "folder" => folder.as_str()).set(objects as f64);
     }
@@ -227,7 +227,7 @@ mod tests {
     use super::*;
 
     fn name(id: &str) -> Name {
-        Name::read(Folder::Inputs, &id.repeat(64)).unwrap()
+        Name::from_file_name(Folder::Inputs, &id.repeat(64)).unwrap()
     }
 
     fn at(seconds: u64) -> SystemTime {
@@ -256,11 +256,11 @@ mod tests {
         let mut index = Index::default();
         let seen = index.begin_read(&name("a")).unwrap();
         index.adopt(&name("a"), seen, 7, at(1));
-        assert_eq!(index.total(Folder::Inputs), (7, 1));
+        assert_eq!(index.usage(Folder::Inputs), Usage { bytes: 7, objects: 1 });
         let seen = index.begin_read(&name("b")).unwrap();
         index.forget(&name("a"));
         index.adopt(&name("b"), seen, 7, at(1));
-        assert_eq!(index.total(Folder::Inputs), (0, 0));
+        assert_eq!(index.usage(Folder::Inputs), Usage { bytes: 0, objects: 0 });
     }
 
     #[test]
@@ -279,7 +279,7 @@ mod tests {
         index.unpin(&name("b"));
         assert!(index.begin_removal(&candidates[1]) && !index.begin_removal(&candidates[1]));
         index.end_removal(&name("b"), true);
-        assert_eq!((index.reserve(10, 30), index.total(Folder::Inputs)), (Ok(()), (20, 2)));
+        assert_eq!((index.reserve(10, 30), index.usage(Folder::Inputs)), (Ok(()), Usage { bytes: 20, objects: 2 }));
         index.pin(&name("a"));
         index.pin(&name("c"));
         assert_eq!(index.reserve(1, 30), Err(ReserveError::Held(30)));

@@ -1,11 +1,10 @@
 //! In-memory cache of small results.
 
-use bytes::Bytes;
 use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 
 use super::name::{Folder, Name};
-use super::object::Meta;
+use super::object::Stored;
 
 /// Memory of an entry besides its data, bytes.
 const OVERHEAD: u64 = 256;
@@ -13,15 +12,15 @@ const OVERHEAD: u64 = 256;
 #[derive(Clone)]
 struct Weight;
 
-impl Weighter<Name, (Meta, Bytes)> for Weight {
-    fn weight(&self, _name: &Name, (_, bytes): &(Meta, Bytes)) -> u64 {
-        bytes.len() as u64 + OVERHEAD
+impl Weighter<Name, Stored> for Weight {
+    fn weight(&self, _name: &Name, stored: &Stored) -> u64 {
+        stored.bytes.len() as u64 + OVERHEAD
     }
 }
 
 /// Bounded cache of results.
 pub(super) struct Memory {
-    cache: Cache<Name, (Meta, Bytes), Weight>,
+    cache: Cache<Name, Stored, Weight>,
     largest: u64,
 }
 
@@ -33,18 +32,14 @@ impl Memory {
         Self { cache: Cache::with_weighter(items, bytes, Weight), largest }
     }
 
-    fn accepts(&self, name: &Name, bytes: u64) -> bool {
-        name.folder() == Folder::Results && bytes <= self.largest
-    }
-
-    pub(super) fn get(&self, name: &Name) -> Option<(Meta, Bytes)> {
+    pub(super) fn get(&self, name: &Name) -> Option<Stored> {
         self.cache.get(name)
     }
 
     /// Caches a result if it is small enough. Drops an existing entry in any case.
-    pub(super) fn put(&self, name: &Name, meta: Meta, bytes: &Bytes) {
-        if self.accepts(name, bytes.len() as u64) {
-            self.cache.insert(name.clone(), (meta, bytes.clone()));
+    pub(super) fn put(&self, name: &Name, stored: Stored) {
+        if name.folder() == Folder::Results && stored.bytes.len() as u64 <= self.largest {
+            self.cache.insert(name.clone(), stored);
         } else {
             self.remove(name);
         }

@@ -1,11 +1,11 @@
 //! Bounded object store for inputs, jobs and results, in a folder or on S3.
 //!
 //! [`Store`] is the whole interface. `backend.rs` accesses folder or bucket, `index.rs` tracks objects and their use,
-//! `memory.rs` caches small results, `eviction.rs` frees space, and `writer.rs` accepts data from blocking threads.
-//! `lock.rs` protects the data folder against a second service.
+//! `memory.rs` caches small results, `eviction.rs` frees space, `upload.rs` uploads large objects in parts, and
+//! `writer.rs` accepts data from blocking threads. `lock.rs` protects the data folder against a second service.
 //!
-//! A write or removal reserves space first and then holds the lock of the name (`Store::stripe`), so it never waits for
-//! space under a lock. Reads take no lock. Their results enter index and cache only if the name has not changed.
+//! A write or removal reserves space first and then holds the lock of the name (`Store::write_lock`), so it never waits
+//! for space under a lock. Reads take no lock. Their results enter index and cache only if the name has not changed.
 
 mod backend;
 mod digest;

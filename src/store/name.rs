@@ -38,8 +38,7 @@ impl Folder {
     }
 
     /// Returns true if its objects count against `store.max_bytes`.
-    #[must_use]
-    pub fn is_capped(self) -> bool {
+    pub(super) fn is_capped(self) -> bool {
         self != Self::Jobs
     }
 }
@@ -91,19 +90,13 @@ impl Name {
         self.folder
     }
 
-    /// Returns the file name without the folder.
-    #[must_use]
-    pub fn file(&self) -> &str {
-        &self.file
-    }
-
     /// Returns the path relative to the root of the store.
     pub(super) fn path(&self) -> Path {
         Path::from_iter([self.folder.as_str(), &self.file])
     }
 
     /// Parses a file name in a folder. Returns `None` for files that the store does not write.
-    pub(super) fn read(folder: Folder, file: &str) -> Option<Self> {
+    pub(super) fn from_file_name(folder: Folder, file: &str) -> Option<Self> {
         match folder {
             Folder::Inputs => file.parse().ok().map(|digest| Self::input(&digest)),
             Folder::Jobs => Self::job(file.strip_suffix(".json")?).ok(),
@@ -112,9 +105,9 @@ impl Name {
     }
 
     /// Parses a path relative to the root of the store.
-    pub(super) fn at(path: &str) -> Option<Self> {
+    pub(super) fn from_path(path: &str) -> Option<Self> {
         let (folder, file) = path.split_once('/')?;
-        Folder::ALL.into_iter().find(|f| f.as_str() == folder).and_then(|folder| Self::read(folder, file))
+        Folder::ALL.into_iter().find(|f| f.as_str() == folder).and_then(|folder| Self::from_file_name(folder, file))
     }
 }
 

@@ -1,6 +1,5 @@
 //! Objects, metadata and pins.
 
-use std::ops::Range;
 use std::time::SystemTime;
 
 use bytes::Bytes;
@@ -39,7 +38,7 @@ pub struct Stored {
 pub type ByteStream = BoxStream<'static, Result<Bytes, StoreError>>;
 
 /// Usage of a folder.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Usage {
     /// Total size of its objects, bytes.
     pub bytes: u64,
@@ -51,20 +50,8 @@ pub struct Usage {
 #[derive(Debug)]
 #[must_use = "dropping the pin releases the name"]
 pub struct Pin {
-    store: Store,
-    name: Name,
-}
-
-impl Pin {
-    /// Creates a pin for a name that the index has already pinned.
-    pub(super) fn new(store: Store, name: Name) -> Self {
-        Self { store, name }
-    }
-
-    /// Reads a range of the pinned object, which must still be the one that `meta` describes.
-    pub(super) async fn piece(&self, meta: Meta, range: Range<u64>) -> Result<Bytes, StoreError> {
-        self.store.piece(&self.name, meta, range).await
-    }
+    pub(super) store: Store,
+    pub(super) name: Name,
 }
 
 impl Drop for Pin {

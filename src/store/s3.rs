@@ -10,7 +10,7 @@ use object_store::multipart::MultipartStore as _;
 use object_store::path::Path;
 use object_store::prefix::PrefixStore;
 use object_store::signer::{SignedUrlOptions, Signer as _};
-use object_store::{BackoffConfig, ClientConfigKey, ClientOptions, ObjectMeta, ObjectStore, RetryConfig};
+use object_store::{BackoffConfig, ClientConfigKey, ClientOptions, ObjectStore, RetryConfig};
 
 use super::name::Name;
 use super::stale::is_stale;
@@ -49,7 +49,7 @@ pub(super) fn connect(config: &StoreConfig, url: &str) -> Result<(Arc<dyn Object
         .with_config(key(ClientConfigKey::ReadTimeout), format!("{}ms", config.timeout_ms))
         .with_config(key(ClientConfigKey::ConnectTimeout), format!("{}ms", config.timeout_ms.min(5000)))
         .with_retry(RetryConfig { backoff: BackoffConfig::default(), max_retries: 3, retry_timeout: RETRY });
-    let mut plain = ClientOptions::new().with_timeout(config.timeout());
+    let mut plain = ClientOptions::new().with_timeout(Duration::from_millis(config.timeout_ms));
     if config.allow_http {
         builder = builder.with_allow_http(true);
         plain = plain.with_allow_http(true);
@@ -93,7 +93,7 @@ impl Bucket {
             // Other applications may use the bucket, with keys that are not valid paths.
             let Ok(path) = Path::parse(&upload.key) else { continue };
             let below = path.prefix_match(&self.prefix).map(Path::from_iter);
-            let ours = below.is_some_and(|path| Name::at(path.as_ref()).is_some());
+            let ours = below.is_some_and(|path| Name::from_path(path.as_ref()).is_some());
             if ours && is_stale(upload.begun, now) {
                 self.s3.abort_multipart(&path, &upload.id).await?;
                 removed += 1;
@@ -117,22 +117,13 @@ fn uploads(xml: &str) -> Vec<Unfinished> {
             let (_, rest) = upload.split_once(&format!("<{tag}>"))?;
             rest.split_once("</").map(|(text, _)| text.trim().to_owned())
         };
-        Some(Unfinished { key: text("Key")?, id: text("UploadId")?, begun: time(&text("Initiated")?)? })
+        Some(Unfinished {
+            key: text("Key")?,
+            id: text("UploadId")?,
+            begun: humantime::parse_rfc3339(&text("Initiated")?).ok()?,
+        })
     };
     xml.split("<Upload>").skip(1).filter_map(one).collect()
-}
-
-/// Parses a time such as `2026-01-31T12:00:00.000Z`.
-fn time(text: &str) -> Option<SystemTime> {
-    let mut scratch = ObjectMeta {
-        location: Path::default(),
-        last_modified: SystemTime::UNIX_EPOCH.into(),
-        size: 0,
-        e_tag: None,
-        version: None,
-    };
-    scratch.last_modified = text.parse().ok()?;
-    Some(scratch.last_modified.into())
 }
 
 #[cfg(test)]

@@ -24,7 +24,7 @@ pub(super) fn pieces(pin: Pin, meta: Meta, range: Range<u64>) -> ByteStream {
         }
         let length = (rest.start - start).clamp(FIRST, PIECE);
         let end = rest.end.min(rest.start + length);
-        let piece = pin.piece(meta, rest.start..end).await?;
+        let piece = pin.store.piece(&pin.name, meta, rest.start..end).await?;
         Ok(Some((piece, (pin, end..rest.end))))
     })
     .boxed()
@@ -32,5 +32,5 @@ pub(super) fn pieces(pin: Pin, meta: Meta, range: Range<u64>) -> ByteStream {
 
 /// Streams the bytes of an object from S3.
 pub(super) fn remote(store: Store, name: Name, opened: GetResult) -> ByteStream {
-    opened.into_stream().map_err(move |e| store.0.backend.fail("read", &name.to_string(), &e)).boxed()
+    opened.into_stream().map_err(move |e| store.0.backend.fail_at("read", &name)(e)).boxed()
 }

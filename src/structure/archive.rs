@@ -22,12 +22,6 @@ pub enum ArchiveError {
         /// The text that was given.
         id: String,
     },
-    /// The folder has no such entry.
-    #[error("entry {id} is not in the archive")]
-    NotFound {
-        /// The entry.
-        id: EntryId,
-    },
     /// The file is larger than allowed.
     #[error("entry {id} has {bytes} bytes, the limit is {limit}")]
     TooLarge {
@@ -111,21 +105,13 @@ impl Archive {
         Self { max_bytes: bytes, ..self }
     }
 
-    /// Reads the file of an entry, without decompressing it. Blocks.
-    ///
-    /// # Errors
-    /// Returns any [`ArchiveError`].
-    pub fn fetch(&self, id: &EntryId) -> Result<Vec<u8>, ArchiveError> {
-        let (file, stamp) = self.open(id)?;
-        self.read(file, stamp.bytes, id)
-    }
-
-    /// Reads the file of an entry and its stamp. Returns `None` if the folder or the entry does not exist. Blocks.
+    /// Reads the file of an entry, without decompressing it, and its stamp. Returns `None` if the folder or the entry
+    /// does not exist. Blocks.
     ///
     /// # Errors
     /// [`ArchiveError::TooLarge`] and [`ArchiveError::Io`].
-    pub fn fetch_stamped(&self, id: &EntryId) -> Result<Option<(Vec<u8>, Stamp)>, ArchiveError> {
-        let Some((file, stamp)) = present(self.open(id))? else { return Ok(None) };
+    pub fn fetch(&self, id: &EntryId) -> Result<Option<(Vec<u8>, Stamp)>, ArchiveError> {
+        let Some((file, stamp)) = self.open(id)? else { return Ok(None) };
         Ok(Some((self.read(file, stamp.bytes, id)?, stamp)))
     }
 
@@ -134,19 +120,22 @@ impl Archive {
     /// # Errors
     /// [`ArchiveError::Io`].
     pub fn stamp(&self, id: &EntryId) -> Result<Option<Stamp>, ArchiveError> {
-        Ok(present(self.open(id))?.map(|(_file, stamp)| stamp))
+        Ok(self.open(id)?.map(|(_file, stamp)| stamp))
     }
 
-    fn open(&self, id: &EntryId) -> Result<(File, Stamp), ArchiveError> {
-        let root = self.dir.canonicalize()?;
+    fn open(&self, id: &EntryId) -> io::Result<Option<(File, Stamp)>> {
+        let root = match self.dir.canonicalize() {
+            Err(e) if is_absent(&e) => return Ok(None),
+            root => root?,
+        };
         for path in candidates(id) {
             if let Some(file) = open_inside(&root, &path)? {
                 let data = file.metadata()?;
                 let stamp = Stamp { path, bytes: data.len(), modified: data.modified().ok() };
-                return Ok((file, stamp));
+                return Ok(Some((file, stamp)));
             }
         }
-        Err(ArchiveError::NotFound { id: id.clone() })
+        Ok(None)
     }
 
     fn read(&self, file: File, bytes: u64, id: &EntryId) -> Result<Vec<u8>, ArchiveError> {
@@ -171,16 +160,6 @@ pub struct Stamp {
     path: PathBuf,
     bytes: u64,
     modified: Option<SystemTime>,
-}
-
-/// Turns errors for absent entries into `None`.
-fn present<T>(found: Result<T, ArchiveError>) -> Result<Option<T>, ArchiveError> {
-    match found {
-        Ok(found) => Ok(Some(found)),
-        Err(ArchiveError::NotFound { .. }) => Ok(None),
-        Err(ArchiveError::Io(e)) if is_absent(&e) => Ok(None),
-        Err(error) => Err(error),
-    }
 }
 
 /// Returns candidate paths of an entry's file, relative to the folder, in order of preference.

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use super::atoms::{Atom, Tables};
+use super::atoms::{Atom, Slices, Tables};
 use super::contents::Kind;
 use super::element::{self, Name, atomic_number};
 use super::error::StructureError;
@@ -42,15 +42,22 @@ pub(super) struct Layout {
 const POSITION: [&str; 3] = ["Cartn_x", "Cartn_y", "Cartn_z"];
 
 impl Layout {
-    /// Returns the layout of rows of `width` items. `find` returns the index of an item by name.
-    pub(super) fn new(width: usize, find: impl Fn(&str) -> Option<usize>) -> Self {
-        let column = |item: &str| find(item).unwrap_or(NONE);
+    /// Returns the layout of rows of `items`, in any letter case, or the index of an item that occurs twice.
+    pub(super) fn of<'n>(items: impl ExactSizeIterator<Item = &'n [u8]>) -> Result<Self, usize> {
+        let width = items.len();
+        let mut found = HashMap::with_capacity(width);
+        for (i, item) in items.enumerate() {
+            if found.insert(item.to_ascii_lowercase(), i).is_some() {
+                return Err(i);
+            }
+        }
+        let column = |item: &str| found.get(item.to_ascii_lowercase().as_bytes()).copied().unwrap_or(NONE);
         // The author's item comes first, the dictionary's item is the fallback.
         let pair = |auth: &str, label: &str| match (column(auth), column(label)) {
             (NONE, label) => [label, NONE],
             (auth, label) => [auth, label],
         };
-        Self {
+        Ok(Self {
             width,
             group: column("group_PDB"),
             element: column("type_symbol"),
@@ -66,7 +73,7 @@ impl Layout {
             b_factor: column("B_iso_or_equiv"),
             model: column("pdbx_PDB_model_num"),
             label_chain: column("label_asym_id"),
-        }
+        })
     }
 
     /// Describes missing coordinate items for [`Passed::lacking`]. Returns `None` if all exist.
@@ -177,6 +184,13 @@ impl<F> AtomSite<F> {
         Self { layout, tables: Tables::default(), warnings: Warnings::default(), guesses: HashMap::new() }
     }
 
+    /// Appends the string tables and warnings of the site that read `rows`, which come next.
+    pub(super) fn append(&mut self, later: Self, rows: &mut Slices<'_>) {
+        rows.adopt(&later.tables, &mut self.tables);
+        self.warnings.append(later.warnings);
+    }
+
+    /// Converts a row.
     #[inline]
     pub(super) fn atom<R: Row<Fault = F>>(&mut self, row: &R) -> Result<Atom, F> {
         let layout = self.layout;

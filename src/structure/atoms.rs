@@ -232,6 +232,16 @@ impl Columns {
         self.element.len()
     }
 
+    /// Adds an atom. Returns false if there are `max_rows` already.
+    #[inline]
+    pub(super) fn push_within(&mut self, max_rows: usize, atom: &Atom) -> bool {
+        let room = self.len() < max_rows;
+        if room {
+            self.push(atom);
+        }
+        room
+    }
+
     /// Returns the finished structure.
     pub(super) fn finish(mut self, tables: Tables, source: Source) -> Structure {
         kinds::assign(&mut self, &tables, &source.sequence);

@@ -34,6 +34,18 @@ pub(super) struct Token {
     pub(super) end: usize,
 }
 
+impl Token {
+    /// Returns the fault of a token other than the `expected` one.
+    #[cold]
+    #[expect(clippy::unnecessary_box_returns, reason = "results stay small where nothing is wrong")]
+    pub(super) fn fault(&self, text: &[u8], expected: impl Into<String>) -> Box<Fault> {
+        match self.kind {
+            Kind::End => Fault::words(self.start, "the end of the file", expected),
+            _ => Fault::token(text, self.start, self.end, expected),
+        }
+    }
+}
+
 /// Splits a text into tokens.
 #[derive(Debug, Clone)]
 pub(super) struct Tokenizer<'a> {

@@ -32,18 +32,20 @@ impl Kind {
     }
 }
 
-/// Numbers of atoms by kind. Hydrogen and deuterium are counted separately.
+/// Numbers of atoms by kind. Hydrogens are counted apart from the heavy atoms of their residues.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[cfg_attr(feature = "server", derive(serde::Serialize, utoipa::ToSchema))]
+#[cfg_attr(feature = "server", schema(as = KindCounts))]
 pub struct Counts {
-    /// Polymer atoms without hydrogens.
+    /// Heavy atoms of polymers.
     pub polymer: u64,
-    /// Ligand and ion atoms without hydrogens.
+    /// Heavy atoms of ligands.
     pub ligand: u64,
-    /// Water atoms without hydrogens.
+    /// Heavy atoms of water.
     pub water: u64,
-    /// Hydrogen and deuterium of all kinds.
+    /// Hydrogen atoms.
     pub hydrogens: u64,
-    /// Virtual sites.
+    /// Sites that are not atoms: charge sites of water models, lone pairs, Drude particles.
     pub virtual_sites: u64,
 }
 

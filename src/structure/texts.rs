@@ -3,44 +3,24 @@
 //! Real files repeat a few hundred names millions of times. A small cache answers almost every lookup with one
 //! comparison. Misses go to a hash table with a random seed, which resists hostile choices of names.
 
-use std::hash::{BuildHasher, RandomState};
+use std::hash::RandomState;
+
+use indexmap::IndexSet;
 
 use super::text;
-
-/// Distinct texts, concatenated, by id.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-struct Texts {
-    joined: String,
-    ends: Vec<usize>,
-}
-
-impl Texts {
-    fn len(&self) -> usize {
-        self.ends.len()
-    }
-
-    fn get(&self, id: usize) -> &str {
-        let start = if id == 0 { 0 } else { self.ends[id - 1] };
-        &self.joined[start..self.ends[id]]
-    }
-
-    fn iter(&self) -> impl ExactSizeIterator<Item = &str> {
-        (0..self.len()).map(|id| self.get(id))
-    }
-}
 
 /// Column of texts: `get(i)` returns the text of row `i`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TextColumn {
     ids: Vec<u32>,
-    texts: Texts,
+    texts: Vec<Box<str>>,
 }
 
 impl TextColumn {
     /// Returns the text of row `i`.
     #[must_use]
     pub fn get(&self, i: usize) -> &str {
-        self.texts.get(self.ids[i] as usize)
+        &self.texts[self.ids[i] as usize]
     }
 
     /// Returns the id of the text of row `i`. Equal ids are equal texts. Ids count from 0 in order of first appearance.
@@ -58,7 +38,7 @@ impl TextColumn {
     /// Returns the distinct texts by id.
     #[must_use]
     pub fn texts(&self) -> impl ExactSizeIterator<Item = &str> {
-        self.texts.iter()
+        self.texts.iter().map(AsRef::as_ref)
     }
 
     /// Returns the number of rows.
@@ -84,33 +64,29 @@ fn short(len: usize) -> u32 {
 /// Assigns ids to texts.
 #[derive(Debug)]
 pub(super) struct Interner {
-    texts: Texts,
-    seed: RandomState,
-    /// Hash and id plus one of each text. Open addressing; the size is a power of two, at most half full.
-    table: Vec<(u32, u32)>,
+    texts: IndexSet<Box<str>, RandomState>,
     /// Up to eight bytes of a text, their count, and its id. Direct mapped; an entry with count 0 is vacant.
     cache: Box<[(u64, u32, u32); 1 << CACHE_BITS]>,
 }
 
 impl Default for Interner {
     fn default() -> Self {
-        let cache = Box::new([(0, 0, 0); 1 << CACHE_BITS]);
-        Self { texts: Texts::default(), seed: RandomState::new(), table: vec![(0, 0); 64], cache }
+        Self { texts: IndexSet::default(), cache: Box::new([(0, 0, 0); 1 << CACHE_BITS]) }
     }
 }
 
 impl Interner {
     pub(super) fn is_empty(&self) -> bool {
-        self.texts.len() == 0
+        self.texts.is_empty()
     }
 
     pub(super) fn text(&self, id: u32) -> &str {
-        self.texts.get(id as usize)
+        &self.texts[id as usize]
     }
 
-    /// The distinct texts, by number.
+    /// Returns the distinct texts by id.
     pub(super) fn texts(&self) -> impl ExactSizeIterator<Item = &str> {
-        self.texts.iter()
+        self.texts.iter().map(AsRef::as_ref)
     }
 
     /// Returns the id of `text[start..end]`.
@@ -155,50 +131,15 @@ impl Interner {
 
     /// Returns the id of `text`, and adds it if it is new.
     fn number(&mut self, text: &str) -> u32 {
-        let hash = self.hash(text);
-        let mut slot = self.slot(hash);
-        loop {
-            match self.table[slot] {
-                (_, 0) => break,
-                (known, id_plus_one) if known == hash && self.text(id_plus_one - 1) == text => return id_plus_one - 1,
-                _ => slot = (slot + 1) % self.table.len(),
-            }
-        }
+        let known = self.texts.get_index_of(text);
+        let id = known.unwrap_or_else(|| self.texts.insert_full(text.into()).0);
         // The atom limit of the reader keeps the number of distinct texts below 2³².
-        let id = u32::try_from(self.texts.len()).unwrap_or(u32::MAX - 1);
-        self.texts.joined.push_str(text);
-        self.texts.ends.push(self.texts.joined.len());
-        self.table[slot] = (hash, id + 1);
-        if 2 * self.texts.len() > self.table.len() {
-            self.grow();
-        }
-        id
-    }
-
-    fn grow(&mut self) {
-        let old = std::mem::take(&mut self.table);
-        self.table = vec![(0, 0); 4 * old.len()];
-        for entry in old.into_iter().filter(|entry| entry.1 != 0) {
-            let mut slot = self.slot(entry.0);
-            while self.table[slot].1 != 0 {
-                slot = (slot + 1) % self.table.len();
-            }
-            self.table[slot] = entry;
-        }
-    }
-
-    fn hash(&self, text: &str) -> u32 {
-        // The upper half of the hash has enough bits for the table.
-        u32::try_from(self.seed.hash_one(text) >> 32).unwrap_or(0)
-    }
-
-    fn slot(&self, hash: u32) -> usize {
-        hash as usize % self.table.len()
+        u32::try_from(id).unwrap_or(u32::MAX)
     }
 
     /// Adds the texts of `other` and translates `ids` to the new ids.
     pub(super) fn adopt(&mut self, other: &Self, ids: &mut [u32]) {
-        let map: Vec<u32> = other.texts.iter().map(|text| self.number(text)).collect();
+        let map: Vec<u32> = other.texts().map(|text| self.number(text)).collect();
         if map.iter().enumerate().any(|(i, &id)| i != id as usize) {
             for id in ids {
                 *id = map[*id as usize];
@@ -207,7 +148,7 @@ impl Interner {
     }
 
     pub(super) fn column(self, ids: Vec<u32>) -> TextColumn {
-        TextColumn { ids, texts: self.texts }
+        TextColumn { ids, texts: self.texts.into_iter().collect() }
     }
 }
 

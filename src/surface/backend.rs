@@ -38,7 +38,7 @@ pub struct MeshOutput {
     /// measure. Always present if a sink took the mesh.
     pub measures: Option<Measures>,
     /// The backend that made the mesh, if that is known only after the run.
-    pub served: Option<Served>,
+    pub made_by: Option<BackendIdentity>,
 }
 
 /// Size and bounds of a mesh that was written to a sink.
@@ -56,7 +56,7 @@ impl MeshOutput {
     /// Result of a backend that keeps the mesh in memory and has not measured it.
     #[must_use]
     pub const fn new(mesh: Mesh, grid: GridStats) -> Self {
-        Self { mesh, streamed: None, grid, measures: None, served: None }
+        Self { mesh, streamed: None, grid, measures: None, made_by: None }
     }
 
     /// Number of vertices and triangles, in memory or in a sink.
@@ -101,7 +101,7 @@ impl MeshOutput {
 
 /// Identity of the backend that made a mesh.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Served {
+pub struct BackendIdentity {
     /// Its name, as in [`Backend::name`].
     pub backend: &'static str,
     /// Its arithmetic, as in [`Backend::arithmetic`].
@@ -110,6 +110,14 @@ pub struct Served {
     pub device: String,
     /// The reason why this backend replaced the requested one; `None` if it did not.
     pub fallback_reason: Option<String>,
+}
+
+impl BackendIdentity {
+    /// Adds the reason for a fallback, if there was one, to the reason for the choice of a backend.
+    #[must_use]
+    pub fn reason(&self, choice: &str) -> String {
+        self.fallback_reason.as_ref().map_or_else(|| choice.to_owned(), |why| format!("{choice}; but {why}"))
+    }
 }
 
 /// A meshing backend. The same input gives the same bytes on any number of threads.
@@ -125,6 +133,16 @@ pub trait Backend: Send + Sync {
 
     /// Description of the hardware for display: threads and vector extension, or the adapter's name.
     fn describe(&self) -> String;
+
+    /// Identity of this backend, as the maker of a mesh.
+    fn identity(&self) -> BackendIdentity {
+        BackendIdentity {
+            backend: self.name(),
+            arithmetic: self.arithmetic(),
+            device: self.describe(),
+            fallback_reason: None,
+        }
+    }
 
     /// Meshes `spheres`, in memory or, if there is a `sink`, into that. Both get the same rows.
     ///
@@ -157,13 +175,13 @@ pub trait Backend: Send + Sync {
     ///
     /// # Errors
     /// As [`Self::write`].
-    fn warm(&self) -> Result<(), SurfaceError> {
+    fn warm_up(&self) -> Result<(), SurfaceError> {
         let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
         self.run(&one_atom()?, &params, &limits, &Control::default()).map(|_mesh| ())
     }
 
     /// Returns true if jobs can be run: a device or a fallback is available.
-    fn able(&self) -> bool {
+    fn is_available(&self) -> bool {
         let devices = self.devices();
         devices.is_empty() || devices.iter().any(|device| device.down.is_none())
     }

@@ -61,6 +61,8 @@ pub struct CellEdge {
 pub struct Cases {
     /// Triangles per case.
     pub count: [u8; 256],
+    /// Closed loops in the outline of each case. Each bounds a separate disc.
+    pub loops: [u8; 256],
     /// Triangles per case as cell edges, counter-clockwise seen from outside the surface.
     pub triangles: [[[u8; 3]; MAX_TRIANGLES]; 256],
 }
@@ -82,8 +84,10 @@ impl Cases {
     /// Reads the table, at compile time.
     const fn parse(rows: &str) -> Self {
         let text = rows.as_bytes();
-        let mut table = Self { count: [0; 256], triangles: [[[0; 3]; MAX_TRIANGLES]; 256] };
+        let mut table = Self { count: [0; 256], loops: [0; 256], triangles: [[[0; 3]; MAX_TRIANGLES]; 256] };
         let (mut at, mut case, mut corner) = (0, 0, 0);
+        // Edges of the case so far, and those of the current triangle.
+        let (mut seen, mut own) = (0_u16, 0_u16);
         while at < text.len() {
             let digit = match text[at] {
                 c @ b'0'..=b'9' => Some(c - b'0'),
@@ -92,14 +96,21 @@ impl Cases {
             };
             if let Some(edge) = digit {
                 table.triangles[case][corner / 3][corner % 3] = edge;
+                own |= 1 << edge;
                 corner += 1;
                 if corner % 3 == 0 {
                     table.count[case] += 1;
+                    // A loop's triangles follow each other, and each but the first has a corner with an earlier one in
+                    // common.
+                    if seen & own == 0 {
+                        table.loops[case] += 1;
+                    }
+                    (seen, own) = (seen | own, 0);
                 }
             } else if text[at] == b' ' || text[at] == b'\n' {
                 // A row ends where white space follows something.
                 if at > 0 && text[at - 1] != b' ' && text[at - 1] != b'\n' {
-                    (case, corner) = (case + 1, 0);
+                    (case, corner, seen) = (case + 1, 0, 0);
                 }
             }
             at += 1;
@@ -111,19 +122,6 @@ impl Cases {
     #[must_use]
     pub fn of(&self, case: u8) -> &[[u8; 3]] {
         &self.triangles[usize::from(case)][..usize::from(self.count[usize::from(case)])]
-    }
-
-    /// Returns the number of closed loops in the outline of a case. Each bounds a separate disc.
-    #[must_use]
-    pub fn n_loops(&self, case: u8) -> u8 {
-        // A loop's triangles follow each other, and each but the first has a corner with an earlier one in common.
-        let (mut seen, mut n) = (0_u16, 0);
-        for triangle in self.of(case) {
-            let corners = triangle.iter().fold(0_u16, |mask, e| mask | 1 << e);
-            n += u8::from(seen & corners == 0);
-            seen |= corners;
-        }
-        n
     }
 }
 
@@ -267,7 +265,7 @@ mod tests {
                 "nothing cut off: {case}"
             );
             assert!(half_edges(triangles).values().all(|&n| n == 1), "case {case}");
-            assert_eq!(usize::from(CASES.n_loops(case)), loops(case).len(), "case {case}");
+            assert_eq!(usize::from(CASES.loops[usize::from(case)]), loops(case).len(), "case {case}");
             let mut segments: Vec<_> = FACES.iter().flat_map(|f| face_segments(case, *f)).collect();
             segments.sort_unstable();
             assert_eq!(outline(triangles), segments, "case {case}");

@@ -94,6 +94,11 @@ impl<T: Pod> Column<T> {
         }
     }
 
+    /// Adds the rows of `next` without a copy.
+    pub(crate) fn append(&mut self, next: Self) {
+        *self = Self::from_chunks(vec![std::mem::take(self), next]);
+    }
+
     /// Contiguous runs of rows, in order: one unless the column is in chunks.
     pub fn pieces(&self) -> impl Iterator<Item = &[T]> {
         let (whole, chunks): (Option<&[T]>, &[Self]) = match &self.0 {
@@ -219,12 +224,6 @@ impl<T: Pod> Clone for Column<T> {
 
 impl<T: Pod + PartialEq> PartialEq for Column<T> {
     fn eq(&self, other: &Self) -> bool {
-        **self == **other
-    }
-}
-
-impl<T: Pod + PartialEq> PartialEq<Column<T>> for Vec<T> {
-    fn eq(&self, other: &Column<T>) -> bool {
         **self == **other
     }
 }

@@ -67,11 +67,7 @@ pub trait Observer: Sync {
     }
 }
 
-/// An observer that does nothing.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Silent;
-
-impl Observer for Silent {}
+impl Observer for () {}
 
 /// Cancellation flag, shared between a run and its caller.
 #[derive(Debug, Clone, Default)]
@@ -104,7 +100,7 @@ pub struct Control<'a> {
 
 impl Default for Control<'_> {
     fn default() -> Self {
-        Self { cancel: CancelToken::default(), deadline: None, observer: &Silent }
+        Self { cancel: CancelToken::default(), deadline: None, observer: &() }
     }
 }
 

@@ -21,7 +21,7 @@ pub enum DeviceChoice {
     /// No device: the CPU backend.
     Cpu,
     /// Listed devices, in ascending order without duplicates.
-    These(Vec<DeviceName>),
+    Listed(Vec<DeviceName>),
 }
 
 /// Name of a device in a list.
@@ -59,7 +59,7 @@ impl FromStr for DeviceChoice {
         let mut names = text.split(',').map(name).collect::<Result<Vec<_>, _>>()?;
         names.sort_unstable();
         names.dedup();
-        Ok(Self::These(names))
+        Ok(Self::Listed(names))
     }
 }
 
@@ -69,7 +69,7 @@ impl fmt::Display for DeviceChoice {
             Self::Auto => f.write_str("auto"),
             Self::All => f.write_str("all"),
             Self::Cpu => f.write_str("cpu"),
-            Self::These(names) => {
+            Self::Listed(names) => {
                 let name = |name: &DeviceName| match name {
                     DeviceName::Number(n) => n.to_string(),
                     DeviceName::Software => "software".to_owned(),
@@ -146,13 +146,13 @@ pub struct FoundDevice {
     /// Properties.
     pub facts: DeviceFacts,
     /// True if the device is used.
-    pub taken: bool,
+    pub selected: bool,
     /// Reason for using it or not.
     pub reason: String,
 }
 
 /// Status of a device in use.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DeviceStatus {
     /// Number.
     pub number: usize,
@@ -187,7 +187,7 @@ mod tests {
     #[test]
     fn choices_are_parsed_and_formatted() {
         use DeviceName::{Number, Software};
-        let list = DeviceChoice::These;
+        let list = DeviceChoice::Listed;
         for (text, choice, written) in [
             ("auto", DeviceChoice::Auto, "auto"),
             (" all ", DeviceChoice::All, "all"),

@@ -32,7 +32,7 @@ pub(super) struct Part<'a> {
 
 /// Labels of a part and the edges that connect it to others.
 #[derive(Default)]
-pub(super) struct Joined {
+pub(super) struct PartLabels {
     /// Labels of the part, from 0; those of one component are united.
     pub(super) equal: UnionFind,
     /// Edges that leave the part.
@@ -41,7 +41,7 @@ pub(super) struct Joined {
 
 impl Labels {
     /// Joins the parts of `mesh`, whose vertices have been labelled part by part.
-    pub(super) fn join(mesh: &Mesh, mut of_vertex: Column<u32>, joined: &[Joined]) -> Self {
+    pub(super) fn join(mesh: &Mesh, mut of_vertex: Column<u32>, joined: &[PartLabels]) -> Self {
         // Labels start at 0 in every part.
         let mut equal = UnionFind::default();
         let offsets: Vec<u32> = joined.iter().map(|part| equal.append(&part.equal)).collect();
@@ -100,8 +100,8 @@ pub(super) fn split<'a>(mesh: &'a Mesh, labels: &'a mut [u32]) -> Vec<Part<'a>> 
 
 impl Part<'_> {
     /// Labels the part's own vertices, with labels from 0.
-    pub(super) fn label(&mut self) -> Joined {
-        let mut joined = Joined::default();
+    pub(super) fn label(&mut self) -> PartLabels {
+        let mut joined = PartLabels::default();
         let (first, labels) = (self.first, &mut *self.labels);
         labels.fill(NONE);
         for &[a, b, c] in self.triangles {

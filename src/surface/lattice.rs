@@ -21,6 +21,9 @@ pub const BRICK_SAMPLES: usize = 512;
 /// Samples along a tile's edge: 8 bricks.
 pub const TILE: i32 = 64;
 
+/// Maximum number of atoms: candidate lists store indices of 31 bits.
+const MAX_ATOMS: usize = (1 << 31) - 1;
+
 /// Edge parameters are kept this far from both ends, in every backend: no triangle degenerates and no two vertices of
 /// different edges coincide.
 pub(super) const EDGE_MARGIN: f32 = 1.0 / 1024.0;
@@ -68,9 +71,14 @@ impl Lattice {
     /// Places `spheres` on the lattice of `params.resolution`.
     ///
     /// # Errors
-    /// [`SurfaceError::NoSpheres`]; [`SurfaceError::BadParameter`] if scale and offset leave a radius of 0 or less.
+    /// [`SurfaceError::NoSpheres`]; [`SurfaceError::BadParameter`] if scale and offset leave a radius of 0 or less, or
+    /// there are more spheres than 31 bits can number.
     pub fn new(spheres: &Spheres, params: &SurfaceParams) -> Result<Self, SurfaceError> {
         let Some([lo, hi]) = spheres.bounds() else { return Err(SurfaceError::NoSpheres) };
+        if spheres.len() > MAX_ATOMS {
+            let expected = format!("at most {MAX_ATOMS} spheres");
+            return Err(SurfaceError::BadParameter { name: "spheres", value: spheres.len().to_string(), expected });
+        }
         let spacing = params.resolution;
         let profile = Profile::new(params);
         let (smallest, largest) = spheres.radius_range();
@@ -109,7 +117,7 @@ impl Lattice {
 pub fn extent(spheres: &Spheres, params: &SurfaceParams) -> f64 {
     let Some([lo, hi]) = spheres.bounds() else { return 0.0 };
     let profile = Profile::new(params);
-    let largest = spheres.radii().iter().copied().fold(0.0, f32::max);
+    let (_, largest) = spheres.radius_range();
     let reach = profile.reach(profile.length(effective_radius(largest, params)));
     let half = (0..3).map(|k| 0.5 * (hi[k] - lo[k])).fold(0.0, f64::max);
     // The centre is a sample, half a spacing from the middle at most; a vertex lies on an edge that begins within
@@ -149,6 +157,17 @@ impl Placing<'_> {
         c.map(|c| to_i32((c / self.params.resolution).round()))
     }
 
+    /// Returns the sort key of atom `i`: tile, brick and cell.
+    #[inline(always)]
+    fn key(&self, rank: &TileRanks, i: usize) -> u64 {
+        let cell = self.cell(self.spheres.centre(i));
+        let local = cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
+        let brick = local.map(|c| c / BRICK.unsigned_abs());
+        let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
+        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
+        rank.of(tile_of(cell)) << PLACE_BITS | pack(brick) << 9 | pack(cell_in_brick)
+    }
+
     /// The atoms by tile, brick within the tile, cell within the brick; ties by offset, size, and the input's order
     /// last. `bounds`: lowest and highest coordinates.
     fn in_canonical_order(&self, bounds: [[f64; 3]; 2]) -> Column<LatticeAtom> {
@@ -157,15 +176,10 @@ impl Placing<'_> {
         let rank =
             TileRanks::new(bounds.map(|c| tile_of(self.cell(c))), n, |i| tile_of(self.cell(self.spheres.centre(i))));
         let mut atoms = Column::zeroed(n);
-        if rank.end() <= u64::from(u32::MAX) >> PLACE_BITS && u32::try_from(n).is_ok() {
-            let order = sorted(n, |first, keys| write_short_keys(self, &rank, first, keys));
-            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
-            parts.for_each(|(atoms, order)| place_by_short_keys(self, order, atoms));
-        } else {
-            let order = sorted(n, |first, keys| write_keys(self, &rank, first, keys));
-            let parts = atoms.par_chunks_mut(PART).zip(order.par_chunks(PART));
-            parts.for_each(|(atoms, order)| place_by_keys(self, order, atoms));
-        }
+        let mut keys: Column<u128> = Column::zeroed(n);
+        keys.par_chunks_mut(PART).enumerate().for_each(|(part, keys)| write_keys(self, &rank, part * PART, keys));
+        keys.par_sort_unstable();
+        atoms.par_chunks_mut(PART).zip(keys.par_chunks(PART)).for_each(|(atoms, keys)| place(self, keys, atoms));
         let same = |a: &LatticeAtom, b: &LatticeAtom| a.cell == b.cell;
         let order = |same: &mut [LatticeAtom]| {
             same.sort_unstable_by(|a, b| {
@@ -179,31 +193,10 @@ impl Placing<'_> {
     }
 }
 
-/// Returns `n` keys in ascending order; `make(first, part)` writes those from number `first` on.
-fn sorted<K: Pod + Ord + Send + Sync>(n: usize, make: impl Fn(usize, &mut [K]) + Sync) -> Column<K> {
-    let mut keys = Column::zeroed(n);
-    keys.par_chunks_mut(PART).enumerate().for_each(|(part, keys)| make(part * PART, keys));
-    keys.par_sort_unstable();
-    keys
-}
-
 /// Atoms per placement task.
 const PART: usize = 4096;
 /// Bits of an atom's brick and cell within its tile.
 const PLACE_BITS: u32 = 18;
-
-impl Placing<'_> {
-    /// Returns the sort key of atom `i`: tile, brick and cell.
-    #[inline(always)]
-    fn key(&self, rank: &TileRanks, i: usize) -> u64 {
-        let cell = self.cell(self.spheres.centre(i));
-        let local = cell.map(|c| c.rem_euclid(TILE).unsigned_abs());
-        let brick = local.map(|c| c / BRICK.unsigned_abs());
-        let cell_in_brick = local.map(|c| c % BRICK.unsigned_abs());
-        let pack = |v: [u32; 3]| u64::from(v[0] | v[1] << 3 | v[2] << 6);
-        rank.of(tile_of(cell)) << PLACE_BITS | pack(brick) << 9 | pack(cell_in_brick)
-    }
-}
 
 dispatched! {
 /// Writes the sort keys of the atoms from `first` on: their places above their indices.
@@ -215,28 +208,10 @@ fn write_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut 
 }
 
 dispatched! {
-/// As above if places and indices have 32 bits each: half the memory, and less time to sort.
-fn write_short_keys(placing: &Placing<'_>, rank: &TileRanks, first: usize, keys: &mut [u64]) {
-    for (i, key) in (first..).zip(keys) {
-        *key = placing.key(rank, i) << 32 | i as u64;
-    }
-}
-}
-
-dispatched! {
-/// Writes the atoms whose keys are `order`.
-fn place_by_keys(placing: &Placing<'_>, order: &[u128], atoms: &mut [LatticeAtom]) {
-    for (key, atom) in order.iter().zip(atoms) {
+/// Writes the atoms whose sort keys are `keys`.
+fn place(placing: &Placing<'_>, keys: &[u128], atoms: &mut [LatticeAtom]) {
+    for (key, atom) in keys.iter().zip(atoms) {
         *atom = placing.atom(usize::try_from(key & u128::from(u64::MAX)).unwrap_or(usize::MAX));
-    }
-}
-}
-
-dispatched! {
-/// As above with short keys.
-fn place_by_short_keys(placing: &Placing<'_>, order: &[u64], atoms: &mut [LatticeAtom]) {
-    for (key, atom) in order.iter().zip(atoms) {
-        *atom = placing.atom(usize::try_from(key & u64::from(u32::MAX)).unwrap_or(usize::MAX));
     }
 }
 }
@@ -261,14 +236,6 @@ impl TileRanks {
         order.par_sort_unstable();
         order.dedup();
         Self::Listed(order)
-    }
-
-    /// Above every number.
-    fn end(&self) -> u64 {
-        match self {
-            Self::Box { side, .. } => side.iter().product(),
-            Self::Listed(order) => order.len() as u64,
-        }
     }
 
     #[inline(always)]
@@ -299,7 +266,7 @@ pub fn tile_order(tile: [i32; 3]) -> [i32; 3] {
 }
 
 /// Returns a spacing slightly above `spacing`, rounded up to hundredths of an Å, as a suggestion that fits.
-pub(super) fn slightly_coarser(spacing: f64) -> f64 {
+pub(crate) fn slightly_coarser(spacing: f64) -> f64 {
     (spacing * 105.0).ceil() / 100.0
 }
 

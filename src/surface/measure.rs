@@ -2,15 +2,19 @@
 //!
 //! Sums run over the parts of the mesh, merged in order: the same mesh gives the same digits on any number of threads.
 
+use std::fmt;
+use std::str::FromStr;
+
 use rayon::prelude::*;
 
 use super::column::Column;
 use super::control::Control;
 use super::error::SurfaceError;
-use super::labels::{self, Joined, Labels};
+use super::labels::{self, Labels, PartLabels};
 use super::mesh::Mesh;
+use super::params::named;
 use super::sums::{self, Positions, Sums};
-use super::topology;
+use super::topology::{self, Topology};
 
 /// Method of validating closedness and manifoldness.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -25,16 +29,7 @@ pub enum Validation {
     Exact,
 }
 
-impl Validation {
-    /// `checksum` or `exact`.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Checksum => "checksum",
-            Self::Exact => "exact",
-        }
-    }
-}
+named!(Validation, "validation", Checksum => "checksum", Exact => "exact");
 
 /// One connected component of a mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -89,41 +84,35 @@ impl Measures {
         control.check()?;
         let Totals { components, used, checksum, degenerate } = Totals::of(mesh);
         control.check()?;
-        let balanced = checksum == 0 && !degenerate;
-        let exact = (validation == Validation::Exact).then(|| topology::check(&mesh.triangles));
-        let faces = mesh.n_triangles() as u64;
-        // If every edge has two triangles, there are 3F/2 edges; otherwise they must be counted.
-        let edges = match &exact {
-            Some(topology) => topology.edges,
-            None if balanced => faces * 3 / 2,
-            None => topology::check(&mesh.triangles).edges,
+        let (faces, balanced) = (mesh.n_triangles() as u64, checksum == 0 && !degenerate);
+        let topology = match validation {
+            Validation::Checksum if balanced => Topology::of_closed(faces),
+            Validation::Exact => topology::check(&mesh.triangles),
+            Validation::Checksum => {
+                let Topology { edges, .. } = topology::check(&mesh.triangles);
+                Topology { edges, closed: false, oriented: false, manifold: false }
+            }
         };
-        Ok(Self {
-            area: components.iter().map(|c| c.area).sum(),
-            volume: components.iter().map(|c| c.volume).sum(),
-            euler: (used + faces).cast_signed() - edges.cast_signed(),
-            closed: exact.as_ref().map_or(balanced, |t| t.closed),
-            oriented: exact.as_ref().map_or(balanced, |t| t.oriented),
-            manifold: exact.as_ref().map_or(balanced, |t| t.manifold),
-            validation,
-            components,
-        })
+        Ok(Self::new(components, used, faces, topology, validation))
     }
-}
 
-impl Measures {
     /// Measures from components whose checksum of directed edges is zero; every vertex is used.
     pub(super) fn balanced(mut components: Vec<Component>, vertices: u64, faces: u64) -> Self {
         components.retain(|c| c.triangles > 0);
         components.sort_by(|a, b| b.area.total_cmp(&a.area));
+        Self::new(components, vertices, faces, Topology::of_closed(faces), Validation::Checksum)
+    }
+
+    fn new(components: Vec<Component>, vertices: u64, faces: u64, topology: Topology, validation: Validation) -> Self {
+        let Topology { edges, closed, oriented, manifold } = topology;
         Self {
             area: components.iter().map(|c| c.area).sum(),
             volume: components.iter().map(|c| c.volume).sum(),
-            euler: (vertices + faces).cast_signed() - (faces * 3 / 2).cast_signed(),
-            closed: true,
-            oriented: true,
-            manifold: true,
-            validation: Validation::Checksum,
+            euler: (vertices + faces).cast_signed() - edges.cast_signed(),
+            closed,
+            oriented,
+            manifold,
+            validation,
             components,
         }
     }
@@ -144,7 +133,7 @@ impl Totals {
     fn of(mesh: &Mesh) -> Self {
         let mut of_vertex = Column::zeroed(mesh.n_vertices());
         let positions = Positions::from(mesh);
-        let (joined, sums): (Vec<Joined>, Vec<Sums>) = labels::split(mesh, &mut of_vertex)
+        let (joined, sums): (Vec<PartLabels>, Vec<Sums>) = labels::split(mesh, &mut of_vertex)
             .into_par_iter()
             .with_max_len(1)
             .map(|mut part| {

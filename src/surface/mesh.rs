@@ -60,28 +60,20 @@ impl Quantized {
     /// Returns the lowest and highest position per axis, in steps; `None` without rows.
     #[must_use]
     pub fn bounds(&self) -> Option<[[i16; 3]; 2]> {
-        self.positions.pieces().filter_map(bounds_in_steps).reduce(joined)
+        self.positions.pieces().filter_map(bounds_of).reduce(joined_bounds)
     }
 }
 
-/// Lowest and highest row per axis.
-fn bounds_in_steps(rows: &[[i16; 4]]) -> Option<[[i16; 3]; 2]> {
-    let of = |rows: &[[i16; 4]]| {
-        // Whole rows at once: four rows are a vector, and the fourth number is 0.
-        let (low, high) = rows.iter().fold(([i16::MAX; 4], [i16::MIN; 4]), |(low, high), row| {
-            (std::array::from_fn(|k| low[k].min(row[k])), std::array::from_fn(|k| high[k].max(row[k])))
-        });
-        [low, high].map(|[x, y, z, _]| [x, y, z])
-    };
-    if rows.is_empty() {
-        return None;
-    }
-    if rows.len() <= ROWS { Some(of(rows)) } else { rows.par_chunks(ROWS).map(of).reduce_with(joined) }
+/// Lowest and highest of the first three numbers of the rows; `None` without rows.
+pub(super) fn bounds_of<T: Copy + PartialOrd + Send + Sync, const N: usize>(rows: &[[T; N]]) -> Option<[[T; 3]; 2]> {
+    let of = |rows: &[[T; N]]| rows.iter().map(|row| [[row[0], row[1], row[2]]; 2]).reduce(joined_bounds);
+    if rows.len() <= ROWS { of(rows) } else { rows.par_chunks(ROWS).filter_map(of).reduce_with(joined_bounds) }
 }
 
 /// The bounds of both.
-fn joined([a, b]: [[i16; 3]; 2], [c, d]: [[i16; 3]; 2]) -> [[i16; 3]; 2] {
-    [std::array::from_fn(|k| a[k].min(c[k])), std::array::from_fn(|k| b[k].max(d[k]))]
+pub(super) fn joined_bounds<T: Copy + PartialOrd>([a, b]: [[T; 3]; 2], [c, d]: [[T; 3]; 2]) -> [[T; 3]; 2] {
+    let choose = |take: bool, new, old| if take { new } else { old };
+    [std::array::from_fn(|k| choose(c[k] < a[k], c[k], a[k])), std::array::from_fn(|k| choose(d[k] > b[k], d[k], b[k]))]
 }
 
 /// A position as a row.
@@ -140,13 +132,10 @@ impl Mesh {
     /// Lowest and highest relative position per axis; zeros for an empty mesh.
     #[must_use]
     pub fn bounds(&self) -> [[f32; 3]; 2] {
-        if let Some(quantized) = &self.quantized {
-            return quantized.bounds().unwrap_or_default().map(|row| quantized.step.decoded(row));
+        match &self.quantized {
+            Some(quantized) => quantized.bounds().unwrap_or_default().map(|row| quantized.step.decoded(row)),
+            None => self.positions.pieces().filter_map(bounds_of).reduce(joined_bounds).unwrap_or_default(),
         }
-        let Some(&first) = self.positions.first() else { return [[0.0; 3]; 2] };
-        self.positions.iter().fold([first, first], |[lo, hi], p| {
-            [std::array::from_fn(|k| lo[k].min(p[k])), std::array::from_fn(|k| hi[k].max(p[k]))]
-        })
     }
 
     /// Rounds the vertices to integers. A mesh that already has this step is unchanged. Returns true if the mesh
@@ -190,6 +179,28 @@ impl Mesh {
         self.normals.make_contiguous();
         if let Some(quantized) = &mut self.quantized {
             quantized.normals.make_contiguous();
+        }
+    }
+
+    /// Adds the rows of `next` without a copy. Its triangles already refer to the joint vertices. An empty mesh takes
+    /// the centre and the representation of `next`.
+    pub(crate) fn append(&mut self, next: Self) {
+        let before = (self.n_vertices(), self.n_triangles());
+        self.parts.extend(next.parts.iter().map(|(v, t)| (before.0 + v, before.1 + t)));
+        self.centre = next.centre;
+        self.positions.append(next.positions);
+        self.normals.append(next.normals);
+        self.triangles.append(next.triangles);
+        match (&mut self.quantized, next.quantized) {
+            (Some(own), Some(next)) => {
+                own.positions.append(next.positions);
+                own.normals.append(next.normals);
+            }
+            (own, next) => *own = own.take().or(next),
+        }
+        match (&mut self.atom_ids, next.atom_ids) {
+            (Some(own), Some(next)) => own.append(next),
+            (own, next) => *own = own.take().or(next),
         }
     }
 

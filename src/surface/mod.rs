@@ -28,7 +28,7 @@ mod sums;
 pub mod topology;
 mod union_find;
 
-pub use backend::{Backend, GridStats, MeshOutput, Served, StreamedMesh};
+pub use backend::{Backend, BackendIdentity, GridStats, MeshOutput, StreamedMesh};
 pub use column::{Column, SharedBytes};
 pub use control::{CancelToken, Control, Observer, Stage};
 pub use cpu::CpuBackend;

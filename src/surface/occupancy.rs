@@ -13,7 +13,7 @@ use super::candidates;
 use super::control::Control;
 use super::cpu;
 use super::error::SurfaceError;
-use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_i32, to_u32, to_u64};
+use super::lattice::{BRICK, Lattice, LatticeAtom, TILE, tile_of, tile_order, to_f32, to_i32, to_u32};
 use super::params::SurfaceLimits;
 
 /// Maximum number of atoms of a run, which one thread marks.
@@ -59,12 +59,9 @@ impl Occupancy {
     ///
     /// # Errors
     /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond the
-    /// limits, [`SurfaceError::BadParameter`] for more atoms than 31 bits can number, [`SurfaceError::Cancelled`].
+    /// limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let atoms = &lattice.atoms;
-        if atoms.len() > cpu::MAX_ATOMS {
-            return Err(cpu::too_many_atoms(atoms.len()));
-        }
         let tile_starts = tile_starts(atoms);
         let runs = runs(&tile_starts, atoms.len());
         let reaches: Vec<f32> = atoms.par_iter().with_min_len(RUN).map(|atom| reach(lattice, atom)).collect();
@@ -132,8 +129,7 @@ fn check_lower_bound(
     if along.powi(3) * n_runs as f64 <= MAX_UNCHECKED_TILES || along < 6.0 {
         return Ok(());
     }
-    let samples = to_u64(cpu::samples_at_least(lattice));
-    if samples > limits.max_samples { Err(cpu::grid_too_large(lattice, samples, limits)) } else { Ok(()) }
+    cpu::check_lower_bound(lattice, limits)
 }
 
 /// Squared gaps along one axis between an atom and the bricks of a tile.

@@ -48,11 +48,14 @@ pub enum Preset {
     Quicksurf,
 }
 
+/// Implements names, [`Display`](fmt::Display) and [`FromStr`] for an enum of named values.
 macro_rules! named {
     ($type:ident, $what:literal, $($variant:ident => $name:literal),+ $(,)?) => {
         impl $type {
             /// Every value, in documentation order.
             pub const ALL: &'static [Self] = &[$(Self::$variant),+];
+            /// Their names.
+            pub const NAMES: &'static [&'static str] = &[$($name),+];
 
             /// The value's name in query, JSON and on the command line.
             #[must_use]
@@ -74,12 +77,14 @@ macro_rules! named {
                 Self::ALL.iter().copied().find(|v| v.name() == text).ok_or_else(|| SurfaceError::BadParameter {
                     name: $what,
                     value: format!("`{text}`"),
-                    expected: format!("one of {}", [$($name),+].join(", ")),
+                    expected: format!("one of {}", Self::NAMES.join(", ")),
                 })
             }
         }
     };
 }
+
+pub(super) use named;
 
 named!(Kernel, "kernel", Gaussian => "gaussian", SoftObject => "soft-object", InverseSquare => "inverse-square");
 named!(Preset, "preset", Default => "default", SesLike => "ses-like", VdwLike => "vdw-like", Molstar => "molstar",
@@ -202,6 +207,11 @@ fn bad(name: &'static str, value: impl fmt::Display, expected: impl Into<String>
     SurfaceError::BadParameter { name, value: value.to_string(), expected: expected.into() }
 }
 
+/// Fails if there is a value.
+fn reject(name: &'static str, value: Option<impl fmt::Display>, expected: &str) -> Result<(), SurfaceError> {
+    value.map_or(Ok(()), |value| Err(bad(name, value, expected)))
+}
+
 /// `value` if it is finite and within `[lo, hi]`.
 fn within(name: &'static str, value: f64, lo: f64, hi: f64) -> Result<f64, SurfaceError> {
     if (lo..=hi).contains(&value) { Ok(value) } else { Err(bad(name, value, format!("a number from {lo} to {hi}"))) }
@@ -218,36 +228,18 @@ impl SurfaceParams {
         let preset = options.preset.unwrap_or_default();
         let paper = paper_params(kernel, options)?;
         if kernel != Kernel::Gaussian {
-            if let Some(preset) = options.preset.filter(|&p| p != Preset::Default) {
-                return Err(bad(
-                    "preset",
-                    format!("`{preset}`"),
-                    format!("no preset with kernel {kernel}: presets set the Gaussian's smoothness"),
-                ));
-            }
-            for (name, value) in [("smoothness", options.smoothness), ("cutoff_tolerance", options.cutoff_tolerance)] {
-                if let Some(value) = value {
-                    return Err(bad(
-                        name,
-                        value,
-                        format!("no value with kernel {kernel}: it shapes the gaussian kernel only"),
-                    ));
-                }
-            }
+            let preset = options.preset.filter(|&p| p != Preset::Default).map(|preset| format!("`{preset}`"));
+            let why = format!("no preset with kernel {kernel}: presets set the Gaussian's smoothness");
+            reject("preset", preset, &why)?;
+            let why = format!("no value with kernel {kernel}: it shapes the gaussian kernel only");
+            reject("smoothness", options.smoothness, &why)?;
+            reject("cutoff_tolerance", options.cutoff_tolerance, &why)?;
         }
         if paper.is_some() {
-            let fixed = [
-                ("smoothness", options.smoothness),
-                ("radius_scale", options.radius_scale),
-                ("radius_offset", options.radius_offset),
-            ];
-            if let Some((name, Some(value))) = fixed.into_iter().find(|(_, v)| v.is_some()) {
-                return Err(bad(
-                    name,
-                    value,
-                    "no value together with paper_a, paper_b or paper_c: they replace radii and smoothness",
-                ));
-            }
+            let why = "no value together with paper_a, paper_b or paper_c: they replace radii and smoothness";
+            reject("smoothness", options.smoothness, why)?;
+            reject("radius_scale", options.radius_scale, why)?;
+            reject("radius_offset", options.radius_offset, why)?;
         }
         let (smoothness, isovalue) = match preset {
             Preset::Default => (1.25, 1.0),
@@ -271,9 +263,7 @@ impl SurfaceParams {
             quantize: None,
         })
     }
-}
 
-impl SurfaceParams {
     /// Bytes of the vertices and triangles of such a mesh, nearest atoms aside.
     #[must_use]
     pub fn mesh_bytes(&self, n_vertices: u64, n_triangles: u64) -> u64 {
@@ -306,21 +296,18 @@ fn paper_params(kernel: Kernel, options: &SurfaceOptions) -> Result<Option<Paper
         let missing = || format!("`{name}` beside it: the paper's {kernel} kernel needs both");
         value.map_or_else(|| Err(bad(given, given_value, missing())), |value| within(name, value, lo, hi))
     };
-    let reject = |name: &'static str, value: Option<f64>| match value {
-        Some(value) => Err(bad(name, value, format!("no value: the paper's {kernel} kernel has no such parameter"))),
-        None => Ok(()),
-    };
+    let absent = format!("no value: the paper's {kernel} kernel has no such parameter");
     Ok(Some(match kernel {
         Kernel::Gaussian => {
-            reject("paper_c", c)?;
+            reject("paper_c", c, &absent)?;
             PaperParams::Gaussian { a: need("paper_a", a, 1e-3, 100.0)?, b: need("paper_b", b, 1e-2, 1e6)? }
         }
         Kernel::SoftObject => {
-            reject("paper_c", c)?;
+            reject("paper_c", c, &absent)?;
             PaperParams::SoftObject { a: need("paper_a", a, 1e-2, 1e6)?, b: need("paper_b", b, 0.1, 50.0)? }
         }
         Kernel::InverseSquare => {
-            reject("paper_a", a)?;
+            reject("paper_a", a, &absent)?;
             PaperParams::InverseSquare { c: need("paper_c", c, 1e-6, 1.0)?, b: need("paper_b", b, 0.1, 50.0)? }
         }
     }))

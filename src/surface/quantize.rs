@@ -17,7 +17,7 @@ const NORMAL_MAX_SQUARE: i32 = 16_347;
 /// Exponent of the smallest step, 1.5e-5 Å: 32,767 of them are half an ångström, less than any atom's radius.
 const MIN_EXPONENT: i32 = -16;
 
-/// The distance between two neighbouring values of a quantised coordinate: a power of two, Å.
+/// The distance between two neighbouring values of a quantized coordinate: a power of two, Å.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Step {
     exponent: i32,
@@ -180,7 +180,7 @@ mod tests {
 
     /// Looks at every integer vector that some unit vector is rounded to.
     #[test]
-    fn every_quantised_normal_is_a_unit_vector_to_the_validator() {
+    fn every_quantized_normal_is_a_unit_vector_to_the_validator() {
         const TOLERANCE: f64 = 0.006_74;
         let off = |q: [i16; 3]| (f64::from(square(q)).sqrt() / 127.0 - 1.0).abs();
         let (mut worst, mut shortened) = (0.0_f64, Vec::new());

@@ -6,6 +6,7 @@
 use super::backend::{Backend, GridStats, MeshOutput};
 use super::cases::{CASES, cell_edge};
 use super::control::{Control, Stage};
+use super::cpu::scan;
 use super::error::SurfaceError;
 use super::kernel::{MIN_DISTANCE2, Profile};
 use super::lattice::{EDGE_MARGIN, slightly_coarser, to_f32, to_i32, to_u64};
@@ -144,8 +145,7 @@ impl Backend for ReferenceBackend {
         control: &Control<'_>,
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
-        let smallest = spheres.radii().iter().copied().fold(f32::MAX, f32::min);
-        params.check_radius(smallest)?;
+        params.check_radius(spheres.radius_range().0)?;
         let density = Density::new(spheres, params);
         let grid = Grid::new(spheres, &density, params.resolution, limits)?;
         let h = params.resolution;
@@ -173,12 +173,7 @@ impl Backend for ReferenceBackend {
         if mesh.n_triangles() == 0 {
             return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
         }
-        let bytes = Mesh::bytes_for(mesh.n_vertices() as u64, mesh.n_triangles() as u64);
-        if bytes > limits.max_mesh_bytes {
-            let excess = bytes as f64 / limits.max_mesh_bytes.max(1) as f64;
-            let suggested_resolution = slightly_coarser(h * excess.sqrt());
-            return Err(SurfaceError::MeshTooLarge { bytes, limit: limits.max_mesh_bytes, suggested_resolution });
-        }
+        scan::check_size(params, limits, mesh.n_vertices() as u64, mesh.n_triangles() as u64)?;
         let n = grid.len() as u64;
         let stats =
             GridStats { bricks: 0, surface_bricks: 0, samples: n, box_cells: cases.len() as u64, candidates: 0 };

@@ -1,6 +1,6 @@
 //! Sinks: destinations that take a mesh part by part, so that it is never held as a whole.
 
-use super::mesh::Mesh;
+use super::mesh::{Mesh, bounds_of};
 use super::quantize::Step;
 
 /// Vertex rows as they lie in memory; all columns have the same length.
@@ -31,6 +31,14 @@ impl Vertices<'_> {
         match self {
             Self::Single { positions, .. } => positions.len(),
             Self::Quantized { positions, .. } => positions.len(),
+        }
+    }
+
+    /// Lowest and highest position per axis, Å; `None` without rows.
+    pub(super) fn bounds(&self) -> Option<[[f32; 3]; 2]> {
+        match self {
+            Self::Single { positions, .. } => bounds_of(positions),
+            Self::Quantized { step, positions, .. } => Some(bounds_of(positions)?.map(|row| step.decoded(row))),
         }
     }
 

@@ -81,44 +81,13 @@ impl Spheres {
     /// Lowest and highest centre coordinate per axis, Å; `None` when there are no spheres.
     #[must_use]
     pub fn bounds(&self) -> Option<[[f64; 3]; 2]> {
-        const NONE: [[f64; 3]; 2] = [[f64::MAX; 3], [f64::MIN; 3]];
-        let part = |x: &[f64], y: &[f64], z: &[f64]| {
-            let [x, y, z] = [x, y, z].map(outermost);
-            [[x.0, y.0, z.0], [x.1, y.1, z.1]]
-        };
-        let wider = |a: [[f64; 3]; 2], b: [[f64; 3]; 2]| {
-            let all = |k: usize, of: fn(f64, f64) -> f64| std::array::from_fn(|axis| of(a[k][axis], b[k][axis]));
-            [all(0, lower), all(1, higher)]
-        };
-        // One pass over all columns: tasks are few and small.
-        let parts = self.x.par_chunks(PART).zip(self.y.par_chunks(PART)).zip(self.z.par_chunks(PART));
-        let bounds = parts.map(|((x, y), z)| part(x, y, z)).reduce(|| NONE, wider);
-        (!self.is_empty()).then_some(bounds)
+        let bounds = [&self.x, &self.y, &self.z].map(|column| {
+            let range = |part: &[f64]| part.iter().fold((f64::MAX, f64::MIN), |(lo, hi), &v| (lo.min(v), hi.max(v)));
+            column.par_chunks(PART).map(range).reduce(|| (f64::MAX, f64::MIN), |a, b| (a.0.min(b.0), a.1.max(b.1)))
+        });
+        (!self.is_empty()).then(|| [bounds.map(|(lo, _)| lo), bounds.map(|(_, hi)| hi)])
     }
 }
 
-/// Spheres that one task looks at.
+/// Spheres per task.
 const PART: usize = 1 << 13;
-
-// Plain comparisons: no coordinate is NaN, which `f64::min` would look for.
-fn lower(a: f64, b: f64) -> f64 {
-    if b < a { b } else { a }
-}
-
-fn higher(a: f64, b: f64) -> f64 {
-    if b > a { b } else { a }
-}
-
-/// The lowest and the highest of `values`.
-fn outermost(values: &[f64]) -> (f64, f64) {
-    // Several of each: one alone would wait for the comparison before.
-    let (mut lo, mut hi) = ([f64::MAX; 8], [f64::MIN; 8]);
-    let (rows, rest) = values.as_chunks::<8>();
-    for row in rows {
-        for k in 0..8 {
-            (lo[k], hi[k]) = (lower(lo[k], row[k]), higher(hi[k], row[k]));
-        }
-    }
-    let all = |lanes: [f64; 8], of: fn(f64, f64) -> f64| lanes.iter().chain(rest).copied().fold(lanes[0], of);
-    (all(lo, lower), all(hi, higher))
-}

@@ -15,6 +15,13 @@ pub struct Topology {
     pub manifold: bool,
 }
 
+impl Topology {
+    /// Topology of a closed manifold with this many triangles: every edge has two of them.
+    pub(super) const fn of_closed(n_triangles: u64) -> Self {
+        Self { edges: n_triangles * 3 / 2, closed: true, oriented: true, manifold: true }
+    }
+}
+
 /// A directed edge with the third corner of its triangle, in an order that groups edges by their first vertex.
 type Corner = (u64, u32);
 

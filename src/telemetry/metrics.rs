@@ -52,22 +52,6 @@ pub struct Metric {
     pub kind: Kind,
     /// Labels. Ids are never labels.
     pub labels: &'static [Label],
-    help: &'static [&'static str],
-}
-
-impl Metric {
-    pub(super) const fn new(
-        name: &'static str,
-        kind: Kind,
-        labels: &'static [Label],
-        help: &'static [&'static str],
-    ) -> Self {
-        Self { name, kind, labels, help }
-    }
-
-    /// Returns the help text.
-    #[must_use]
-    pub fn help(&self) -> String {
-        self.help.iter().map(|line| line.trim()).collect::<Vec<_>>().join(" ")
-    }
+    /// Help text.
+    pub help: &'static str,
 }

@@ -11,12 +11,13 @@ macro_rules! metrics {
 
         /// All metrics, in the order of the documentation.
         pub const METRICS: &[Metric] = &[$(
-            Metric::new(
-                $name,
-                Kind::$kind,
-                &[$(Label { name: stringify!($label), values: $values }),*],
-                &[$($help),+],
-            )
+            Metric {
+                name: $name,
+                kind: Kind::$kind,
+                labels: &[$(Label { name: stringify!($label), values: $values }),*],
+                // Every line of a doc comment begins with a space.
+                help: concat!($($help),+).trim_ascii(),
+            }
         ),+];
     };
 }
@@ -59,7 +60,7 @@ metrics! {
     STAGE_DURATION = "molmesh_job_stage_duration_seconds", Histogram,
         stage: "queue|check|read|select|bin|field|classify|scan|interpolate|emit|write|measure|roundtrip|encode";
     /// Results of synchronous requests that were not stored.
-    RESULTS_NOT_KEPT = "molmesh_results_not_kept_total", Counter, reason: "busy|failed";
+    RESULTS_NOT_STORED = "molmesh_results_not_stored_total", Counter, reason: "busy|failed";
     /// Jobs waiting in the queue.
     QUEUE_DEPTH = "molmesh_queue_depth", Gauge;
     /// Time for which the oldest job in the queue has waited.
@@ -69,7 +70,7 @@ metrics! {
     /// Bytes of uploads and meshes held in memory.
     MEMORY_HELD = "molmesh_memory_held_bytes", Gauge;
     /// Grid points at which the density was evaluated.
-    VOXELS = "molmesh_voxels_processed_total", Counter;
+    GRID_POINTS = "molmesh_grid_points_evaluated_total", Counter;
     /// Triangles of finished meshes.
     TRIANGLES = "molmesh_triangles_emitted_total", Counter;
     /// 1 while the device accepts jobs, else 0.
@@ -102,9 +103,9 @@ metrics! {
     STORE_ERRORS = "molmesh_store_errors_total", Counter, op: "operations of a store";
     /// Lookups of archive entries.
     ARCHIVE_REQUESTS = "molmesh_archive_requests_total", Counter, source: "local|cache|remote",
-        result: "known|found|absent|unchanged|stale|corrupt|failed|too-large|unavailable";
+        result: "known|found|absent|unchanged|stale|corrupt|failed|too-large|no-memory|unavailable";
     /// Time to fetch an entry from the remote archive, including all attempts and pauses.
-    ARCHIVE_FETCH = "molmesh_archive_fetch_seconds", Histogram, result: "found|unchanged|absent|too-large|unavailable";
+    ARCHIVE_FETCH = "molmesh_archive_fetch_seconds", Histogram, result: "found|unchanged|absent|too-large|no-memory|unavailable";
     /// 1 while the circuit breaker of a host of the remote archive is open, else 0.
     ARCHIVE_BREAKER = "molmesh_archive_breaker_open", Gauge, host: "hosts of `archive.url`";
     /// Bytes of cached archive entries on disk.
@@ -146,7 +147,7 @@ mod tests {
             assert_eq!(metric.kind == Kind::Seconds, name.ends_with("_seconds_total"), "{name}");
             let known = ["molmesh_", "http_server_", "process_"].iter().any(|prefix| name.starts_with(prefix));
             assert!(known, "{name}");
-            assert!(metric.help().ends_with('.') && metric.help().len() > 12, "{name}: {}", metric.help());
+            assert!(metric.help.ends_with('.') && metric.help.len() > 12, "{name}: {}", metric.help);
             for label in metric.labels {
                 assert!(!["id", "job", "request", "trace"].contains(&label.name), "{name}: {}", label.name);
             }

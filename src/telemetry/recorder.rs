@@ -80,7 +80,7 @@ pub fn recorder() -> Result<Recorder, TelemetryError> {
 /// Sets the help text of a metric. If all its series are known, also sets their initial value: rates are only correct
 /// if the first scrape contains a zero.
 fn describe(metric: &Metric) {
-    let (name, help) = (metric.name, metric.help());
+    let (name, help) = (metric.name, metric.help);
     let unit = if name.contains("_seconds") {
         Unit::Seconds
     } else if name.contains("_bytes") {

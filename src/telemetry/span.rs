@@ -18,25 +18,23 @@ use super::Tracer;
 
 /// Request and parent span of some work. Outlives the span.
 #[derive(Debug, Clone, Default)]
-pub struct SpanParent {
+pub(crate) struct SpanParent {
     /// Id of the request.
-    pub request: Option<Arc<str>>,
+    pub(crate) request: Option<Arc<str>>,
     /// Parent of the spans of this work. Without one, the first span starts a trace.
-    pub context: Option<SpanContext>,
+    pub(crate) context: Option<SpanContext>,
     /// Tracer of the service that does the work.
-    pub tracer: Tracer,
+    pub(crate) tracer: Tracer,
 }
 
 impl SpanParent {
     /// Returns the parent for work that the current task starts; the default outside [`TraceSpan::run`].
-    #[must_use]
-    pub fn current() -> Self {
+    pub(crate) fn current() -> Self {
         TraceSpan::current().map(|span| span.as_parent()).unwrap_or_default()
     }
 
     /// Returns the log span of a job: its lines name the request, the trace and the job.
-    #[must_use]
-    pub fn log_span(&self, job: Option<&str>) -> tracing::Span {
+    pub(crate) fn log_span(&self, job: Option<&str>) -> tracing::Span {
         use tracing::field::{Empty, display};
         let span = tracing::info_span!("job", request_id = Empty, trace_id = Empty, job_id = Empty);
         for (field, id) in [("request_id", self.request.as_deref()), ("job_id", job)] {
@@ -60,7 +58,7 @@ impl SpanParent {
 
 /// Open span. Clones refer to the same span, which ends with [`TraceSpan::end`] or when the last clone is dropped.
 #[derive(Debug, Clone)]
-pub struct TraceSpan(Arc<Inner>);
+pub(crate) struct TraceSpan(Arc<Inner>);
 
 #[derive(Debug)]
 struct Inner {
@@ -81,8 +79,12 @@ tokio::task_local! {
 impl TraceSpan {
     /// Starts a span below `parent` that began at `start`. The parent decides whether it is recorded; without a parent
     /// the sampling ratio does.
-    #[must_use]
-    pub fn start(parent: &SpanParent, name: impl Into<Cow<'static, str>>, kind: SpanKind, start: Instant) -> Self {
+    pub(crate) fn start(
+        parent: &SpanParent,
+        name: impl Into<Cow<'static, str>>,
+        kind: SpanKind,
+        start: Instant,
+    ) -> Self {
         let start_time = SystemTime::now().checked_sub(start.elapsed()).unwrap_or(SystemTime::UNIX_EPOCH);
         let context = Context::new().with_span(parent.start(name.into(), kind, start_time));
         let SpanParent { request, tracer, .. } = parent.clone();
@@ -90,64 +92,58 @@ impl TraceSpan {
     }
 
     /// Returns the span that the current task runs in.
-    #[must_use]
-    pub fn current() -> Option<Self> {
+    pub(crate) fn current() -> Option<Self> {
         CURRENT.try_with(Self::clone).ok()
     }
 
     /// Runs `work` with this span as the current one.
-    pub async fn run<F: Future>(self, work: F) -> F::Output {
+    pub(crate) async fn run<F: Future>(self, work: F) -> F::Output {
         CURRENT.scope(self, work).await
     }
 
     /// Returns this span as the parent of others.
-    #[must_use]
-    pub fn as_parent(&self) -> SpanParent {
+    pub(crate) fn as_parent(&self) -> SpanParent {
         let Inner { request, tracer, .. } = &*self.0;
         SpanParent { request: request.clone(), context: Some(self.context()), tracer: tracer.clone() }
     }
 
     /// Returns trace id, span id, flags and `tracestate`.
-    #[must_use]
-    pub fn context(&self) -> SpanContext {
+    pub(crate) fn context(&self) -> SpanContext {
         self.span().span_context().clone()
     }
 
     /// Returns the id of the trace, which is shown as 32 hexadecimal digits.
-    #[must_use]
-    pub fn trace_id(&self) -> TraceId {
+    pub(crate) fn trace_id(&self) -> TraceId {
         self.span().span_context().trace_id()
     }
 
     /// Returns the id of the request; empty if there is none.
-    #[must_use]
-    pub fn request(&self) -> &str {
+    pub(crate) fn request(&self) -> &str {
         self.0.request.as_deref().unwrap_or_default()
     }
 
     /// Returns whether attributes of this span are recorded.
-    #[must_use]
-    pub fn is_recording(&self) -> bool {
+    pub(crate) fn is_recording(&self) -> bool {
         self.span().is_recording()
     }
 
     /// Links this span to another one, which may belong to another trace.
-    pub fn link(&self, other: SpanContext) {
+    pub(crate) fn link(&self, other: SpanContext) {
         self.span().add_link(other, Vec::new());
     }
 
     /// Sets an attribute.
-    pub fn set(&self, key: &'static str, value: impl Into<Value>) {
+    pub(crate) fn set(&self, key: &'static str, value: impl Into<Value>) {
         self.span().set_attribute(KeyValue::new(key, value));
     }
 
     /// Marks the span as failed.
-    pub fn fail(&self, message: impl Into<Cow<'static, str>>) {
+    pub(crate) fn fail(&self, message: impl Into<Cow<'static, str>>) {
         self.span().set_status(Status::error(message));
     }
 
     /// Records a finished part of this span as a child of it, also after this span has ended.
-    pub fn part(&self, name: &'static str, start: Instant, duration: Duration) {
+    pub(crate) fn part(&self, name: &'static str, start: Instant, duration: Duration) {
         if self.span().span_context().is_sampled() {
             let start = self.wall_clock(start);
             self.as_parent().start(name.into(), SpanKind::Internal, start).end_with_timestamp(start + duration);
@@ -155,7 +151,7 @@ impl TraceSpan {
     }
 
     /// Ends the span now. Later changes have no effect.
-    pub fn end(&self) {
+    pub(crate) fn end(&self) {
         self.span().end_with_timestamp(self.0.start_time + self.0.start.elapsed());
     }
 
@@ -175,8 +171,7 @@ impl TraceSpan {
 
 /// Reads `traceparent` and `tracestate` of W3C Trace Context. Returns `None` for an invalid `traceparent` and ignores
 /// an invalid `tracestate`.
-#[must_use]
-pub fn read_trace_context(traceparent: &str, tracestate: &str) -> Option<SpanContext> {
+pub(crate) fn read_trace_context(traceparent: &str, tracestate: &str) -> Option<SpanContext> {
     let headers = [("traceparent", traceparent), ("tracestate", tracestate)];
     let headers: HashMap<String, String> = headers.map(|(name, value)| (name.to_owned(), value.to_owned())).into();
     let context = TraceContextPropagator::new().extract_with_context(&Context::new(), &headers);
@@ -184,15 +179,13 @@ pub fn read_trace_context(traceparent: &str, tracestate: &str) -> Option<SpanCon
 }
 
 /// Formats the value of `traceparent`.
-#[must_use]
-pub fn traceparent(context: &SpanContext) -> String {
+pub(crate) fn traceparent(context: &SpanContext) -> String {
     let flags = context.trace_flags() & TraceFlags::SAMPLED;
     format!("00-{}-{}-{flags:02x}", context.trace_id(), context.span_id())
 }
 
 /// Formats the value of `tracestate`, unless it is empty.
-#[must_use]
-pub fn tracestate(context: &SpanContext) -> Option<String> {
+pub(crate) fn tracestate(context: &SpanContext) -> Option<String> {
     Some(context.trace_state().header()).filter(|state| !state.is_empty())
 }
 

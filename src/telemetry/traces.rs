@@ -17,7 +17,7 @@ use reqwest::blocking::Client;
 use reqwest::redirect::Policy;
 
 use super::{TRACE_SPANS, TelemetryError};
-use crate::config::{CollectorUrl, SecretHeaders, TelemetryConfig};
+use crate::config::{SecretHeaders, TelemetryConfig};
 
 /// Maximum number of spans in one request to the collector, the default of OpenTelemetry's exporters.
 const BATCH_SIZE: usize = 512;
@@ -26,7 +26,7 @@ const BATCH_DELAY: Duration = Duration::from_secs(1);
 
 /// Creates spans. The default tracer records nothing and continues traces only.
 #[derive(Debug, Clone)]
-pub struct Tracer(pub(super) SdkTracer);
+pub(crate) struct Tracer(pub(super) SdkTracer);
 
 impl Default for Tracer {
     fn default() -> Self {
@@ -36,17 +36,14 @@ impl Default for Tracer {
 
 /// Tracer provider of a service, with the batch processor if a collector is configured.
 #[derive(Debug)]
-pub struct Traces {
+pub(crate) struct Traces {
     provider: SdkTracerProvider,
     flush_timeout: Duration,
 }
 
 impl Traces {
     /// Sets up the tracer provider and starts the export thread if the configuration names a collector.
-    ///
-    /// # Errors
-    /// Returns [`TelemetryError::Install`] if the HTTP client cannot be built.
-    pub fn start(config: &TelemetryConfig) -> Result<Self, TelemetryError> {
+    pub(crate) fn start(config: &TelemetryConfig) -> Result<Self, TelemetryError> {
         let Some(endpoint) = &config.endpoint else { return Ok(Self::off()) };
         let batch = BatchConfigBuilder::default()
             .with_max_queue_size(config.queue)
@@ -58,9 +55,8 @@ impl Traces {
             .with_service_name(config.service_name.clone())
             .with_attribute(opentelemetry::KeyValue::new("service.version", env!("CARGO_PKG_VERSION")))
             .build();
-        let provider =
-            provider(config.sample_ratio.get()).with_resource(resource).with_span_processor(processor).build();
-        Ok(Self { provider, flush_timeout: config.flush_timeout() })
+        let provider = provider(config.sample_ratio).with_resource(resource).with_span_processor(processor).build();
+        Ok(Self { provider, flush_timeout: Duration::from_millis(config.flush_timeout_ms) })
     }
 
     /// Returns a provider that exports nothing and samples no new trace.
@@ -70,15 +66,14 @@ impl Traces {
     }
 
     /// Returns the tracer of the service.
-    #[must_use]
-    pub fn tracer(&self) -> Tracer {
+    pub(crate) fn tracer(&self) -> Tracer {
         let version = env!("CARGO_PKG_VERSION");
         let scope = InstrumentationScope::builder(env!("CARGO_PKG_NAME")).with_version(version).build();
         Tracer(self.provider.tracer_with_scope(scope))
     }
 
     /// Exports the queued spans, for `telemetry.flush_timeout_ms` at most, and stops the export.
-    pub async fn shut_down(self) {
+    pub(crate) async fn shut_down(self) {
         let Self { provider, flush_timeout } = self;
         let flush = move || provider.shutdown_with_timeout(flush_timeout);
         if let Ok(Err(error)) = tokio::task::spawn_blocking(flush).await {
@@ -93,25 +88,31 @@ fn provider(sample_ratio: f64) -> TracerProviderBuilder {
     SdkTracerProvider::builder().with_sampler(sampler)
 }
 
-fn exporter(config: &TelemetryConfig, endpoint: &CollectorUrl) -> Result<Counted, TelemetryError> {
+fn exporter(config: &TelemetryConfig, endpoint: &str) -> Result<Counted, TelemetryError> {
     let failed = |reason: String| TelemetryError::Install { what: "the trace exporter", reason };
     let headers = config.secret_headers.iter().flat_map(SecretHeaders::reveal);
     let headers = headers.filter_map(|(name, value)| Some((name.to_string(), value.to_str().ok()?.to_owned())));
+    let timeout = Duration::from_millis(config.timeout_ms);
     let exporter = opentelemetry_otlp::SpanExporter::builder()
         .with_http()
-        .with_http_client(client(config.timeout(), endpoint).map_err(|e| failed(format!("{e:?}")))?)
+        .with_http_client(client(timeout, endpoint).map_err(|e| failed(format!("{e:?}")))?)
         .with_protocol(Protocol::HttpBinary)
-        .with_endpoint(endpoint.traces())
+        .with_endpoint(traces_url(endpoint))
         .with_headers(headers.collect())
-        .with_timeout(config.timeout())
+        .with_timeout(timeout)
         .build();
     exporter.map(Counted).map_err(|e| failed(e.to_string()))
 }
 
+/// Returns the URL for traces of a collector with the base URL `endpoint`.
+fn traces_url(endpoint: &str) -> String {
+    format!("{}/v1/traces", endpoint.trim_end_matches('/'))
+}
+
 /// Builds the HTTP client of the export thread. A blocking client must not be built on a thread of the async runtime.
-fn client(timeout: Duration, endpoint: &CollectorUrl) -> Result<Client, reqwest::Error> {
+fn client(timeout: Duration, endpoint: &str) -> Result<Client, reqwest::Error> {
     let builder = || Client::builder().no_proxy().redirect(Policy::none()).timeout(timeout);
-    let needs_tls = endpoint.traces().starts_with("https:");
+    let needs_tls = endpoint.starts_with("https:");
     let build = || match builder().build() {
         // Without system certificates, plain HTTP still works.
         Err(_no_certificates) if !needs_tls => builder().tls_certs_only([]).build(),
@@ -145,6 +146,16 @@ mod tests {
     use super::*;
     use crate::telemetry::{SpanParent, TraceSpan};
     use opentelemetry::trace::SpanKind;
+
+    #[test]
+    fn traces_have_a_path_below_the_endpoint() {
+        for (endpoint, url) in [
+            ("http://localhost:4318", "http://localhost:4318/v1/traces"),
+            ("https://c.example/otlp/", "https://c.example/otlp/v1/traces"),
+        ] {
+            assert_eq!(traces_url(endpoint), url);
+        }
+    }
 
     #[test]
     fn the_sampling_ratio_applies_to_new_traces() {

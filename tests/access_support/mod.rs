@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use molmesh::access::{Hash, mint};
+use molmesh::access::{Hash, new_key};
 
 /// Key file and the texts of its keys.
 pub(crate) struct Keys {
@@ -25,7 +25,7 @@ impl Keys {
     /// Rewrites the file. Existing keys keep their text.
     pub(crate) fn write(&mut self, keys: &[(&str, &str, &str)]) {
         let lines = keys.iter().map(|(id, scopes, more)| {
-            let text = self.texts.entry((*id).to_owned()).or_insert_with(|| mint(id).unwrap().text);
+            let text = self.texts.entry((*id).to_owned()).or_insert_with(|| new_key(id).unwrap());
             let scopes: Vec<String> = scopes.split(',').map(|scope| format!("\"{scope}\"")).collect();
             format!("[[key]]\nid = \"{id}\"\nhash = \"{}\"\nscopes = [{}]\n{more}\n", Hash::of(text), scopes.join(", "))
         });

@@ -21,7 +21,7 @@ fn chromium() -> Option<PathBuf> {
 /// Starts a service with the samples as its archive and with a limit that a fine resolution exceeds.
 fn service(folder: &Folder, more: &[&str]) -> Service {
     let samples = Path::new(env!("CARGO_MANIFEST_DIR")).join("samples");
-    let all = ["--devices", "cpu", "--archive", samples.to_str().unwrap(), "--set", "limits.grid_samples=4000000"];
+    let all = ["--devices", "cpu", "--archive", samples.to_str().unwrap(), "--set", "limits.grid_points=4000000"];
     Service::start(folder, &[&all, more].concat())
 }
 

@@ -6,7 +6,7 @@ use crate::cli_support;
 use std::path::Path;
 
 use cli_support::{Folder, assert_code, molmesh, run, stderr, stdout};
-use molmesh::config::{ConfigError, Loaded, Source, load, load_with_sources};
+use molmesh::config::{ConfigError, Loaded, Source, load};
 use serde_json::Value;
 
 fn pairs(list: &[(&str, &str)]) -> Vec<(String, String)> {
@@ -16,6 +16,7 @@ fn pairs(list: &[(&str, &str)]) -> Vec<(String, String)> {
 fn reload(folder: &Folder, loaded: &Loaded) -> molmesh::config::Config {
     load(Some(&folder.file("reload.toml", loaded.to_toml())), [], &[])
         .unwrap_or_else(|e| panic!("{e}\n{}", loaded.to_toml()))
+        .config
 }
 
 /// Creates a file that only its owner can read.
@@ -29,7 +30,7 @@ fn secret_file(folder: &Folder, text: &str) -> std::path::PathBuf {
 #[test]
 fn the_printed_configuration_loads_to_the_same() {
     let folder = Folder::new();
-    let defaults = load_with_sources(None, [], &[]).unwrap();
+    let defaults = load(None, [], &[]).unwrap();
     assert_eq!(reload(&folder, &defaults), defaults.config);
     let secret = secret_file(&folder, "from a file\n");
     let file = folder.file(
@@ -47,13 +48,13 @@ fn the_printed_configuration_loads_to_the_same() {
         ("devices.min_partition_bricks", "none"),
         ("limits.atoms", "18446744073709551615"),
     ]);
-    let loaded = load_with_sources(Some(&file), env, &flags).unwrap();
+    let loaded = load(Some(&file), env, &flags).unwrap();
     assert_eq!(loaded.config.store.secret_access_key.as_ref().unwrap().reveal(), "from a file");
     assert_eq!(loaded.config.server.data_dir, Path::new(odd));
     assert_eq!(reload(&folder, &loaded), loaded.config);
     // Control: a different value gives a different configuration.
     let other = loaded.to_toml().replace("workers = 3", "workers = 4");
-    assert_ne!(load(Some(&folder.file("other.toml", other)), [], &[]).unwrap(), loaded.config);
+    assert_ne!(load(Some(&folder.file("other.toml", other)), [], &[]).unwrap().config, loaded.config);
 }
 
 #[test]
@@ -147,8 +148,7 @@ fn secrets_are_read_from_files_without_one_line_break() {
     let read = |text: &str| {
         let path = folder.file("secret", text).display().to_string();
         let env = pairs(&[("MOLMESH__STORE__SECRET_ACCESS_KEY_FILE", &path)]);
-        load_with_sources(None, env, &[])
-            .map(|loaded| loaded.config.store.secret_access_key.unwrap().reveal().to_owned())
+        load(None, env, &[]).map(|loaded| loaded.config.store.secret_access_key.unwrap().reveal().to_owned())
     };
     for (text, secret) in [
         ("key", "key"),
@@ -192,7 +192,7 @@ fn a_secret_and_its_file_exclude_each_other() {
         assert!(message.contains(part) && !message.contains("hush"), "{message}");
     }
     // Clearing one of them resolves the conflict.
-    let cleared = load(Some(&file), env.clone(), &pairs(&[("store.secret_access_key", "none")])).unwrap();
+    let cleared = load(Some(&file), env.clone(), &pairs(&[("store.secret_access_key", "none")])).unwrap().config;
     assert_eq!(cleared.store.secret_access_key.unwrap().reveal(), "hush");
     load(Some(&file), env, &pairs(&[("store.secret_access_key_file", "none")])).unwrap();
 }
@@ -205,7 +205,7 @@ fn secret_files_that_all_users_can_read_cause_a_warning() {
     for (mode, warned) in [(0o400, false), (0o440, false), (0o600, false), (0o444, true), (0o644, true)] {
         std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
         let flags = pairs(&[("store.secret_access_key_file", path.to_str().unwrap())]);
-        let loaded = load_with_sources(None, [], &flags).unwrap();
+        let loaded = load(None, [], &flags).unwrap();
         assert_eq!(loaded.warnings.len(), usize::from(warned), "{mode:o}: {:?}", loaded.warnings);
         assert!(loaded.warnings.iter().all(|w| w.contains(path.to_str().unwrap()) && !w.contains("hush")));
         assert_eq!(loaded.source("store.secret_access_key_file"), Source::Flag);

@@ -26,7 +26,7 @@ fn recipe() -> Recipe {
 }
 
 fn config(path: &str) -> Config {
-    load(Some(&root().join(path)), [], &[]).unwrap_or_else(|e| panic!("{path}: {e}"))
+    load(Some(&root().join(path)), [], &[]).unwrap_or_else(|e| panic!("{path}: {e}")).config
 }
 
 /// Returns the ports of the service and of its metrics.
@@ -188,7 +188,7 @@ fn compose_matches_the_image() {
         assert!(strings(&service["ports"])[1].starts_with("127.0.0.1:"));
         assert_eq!(service["secrets"][0]["target"], json!("/etc/molmesh/molmesh.toml"));
         let grace = service["stop_grace_period"].as_str().unwrap().strip_suffix('s').unwrap().parse::<u64>().unwrap();
-        assert!(grace >= config.server.drain_timeout().as_secs() + MARGIN, "{grace} s to stop");
+        assert!(grace >= config.server.drain_timeout_ms / 1000 + MARGIN, "{grace} s to stop");
         let memory = service["deploy"]["resources"]["limits"]["memory"].as_str().unwrap();
         let default = memory.trim_end_matches('}').rsplit_once(":-").unwrap().1;
         assert!(bytes(default) >= budget(&config), "{memory}");
@@ -306,7 +306,7 @@ fn pod_matches_the_image_and_its_configuration() {
     // Time to stop: the pause, the drain, a margin.
     let grace = pod["terminationGracePeriodSeconds"].as_u64().unwrap();
     let pause = container["lifecycle"]["preStop"]["sleep"]["seconds"].as_u64().unwrap();
-    let drain = config.server.drain_timeout().as_secs();
+    let drain = config.server.drain_timeout_ms / 1000;
     assert!(grace >= pause + drain + MARGIN, "{grace} s to stop, of which {pause} s pause and {drain} s drain");
     // Memory and volume.
     let memory = container["resources"]["limits"]["memory"].as_str().unwrap();
@@ -339,7 +339,7 @@ fn scaled_pods_fit_their_ephemeral_storage() {
         .map(|v| (v["name"].as_str().unwrap().to_owned(), v["value"].as_str().unwrap().to_owned()))
         .collect();
     assert!(environment.iter().all(|(name, _)| name.starts_with("MOLMESH__")));
-    let config = load(Some(&root().join(CONFIGURATIONS[1])), environment, &[]).unwrap();
+    let config = load(Some(&root().join(CONFIGURATIONS[1])), environment, &[]).unwrap().config;
     let volume = bytes(pod["volumes"][0]["emptyDir"]["sizeLimit"].as_str().unwrap());
     assert!(volume > config.store.max_bytes + config.archive.cache_bytes, "{volume} bytes on the volume");
     let ephemeral = bytes(pod["containers"][0]["resources"]["limits"]["ephemeral-storage"].as_str().unwrap());

@@ -88,7 +88,7 @@ fn glb_is_the_same_in_a_file_and_in_a_pipe() {
 
 /// The step is known before the mesh, so a file written out of order has the same bytes as one written in order.
 #[test]
-fn quantised_glb_is_the_same_in_a_file_and_in_a_pipe() {
+fn quantized_glb_is_the_same_in_a_file_and_in_a_pipe() {
     let folder = Folder::new();
     let sample = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
     let long = folder.file("long.cif", long_report());
@@ -111,7 +111,7 @@ fn quantised_glb_is_the_same_in_a_file_and_in_a_pipe() {
         assert_eq!(json_bytes + 28 == 16_384, file.len() > 1 << 20, "{resolution}: {json_bytes} bytes of JSON");
     }
     let done = mesh(Path::new(sample), &folder.path("out.gltf"), &["--compress", "quantize"]);
-    assert!(stderr(&done).contains("quantised in steps of 0.0009765625 Å"), "{}", stderr(&done));
+    assert!(stderr(&done).contains("quantized in steps of 0.0009765625 Å"), "{}", stderr(&done));
 }
 
 /// Levels of detail, units and normals are known before the mesh and allow writing out of order; a limit on triangles

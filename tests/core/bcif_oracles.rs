@@ -17,10 +17,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use molmesh::formats::{self, Format, Meta};
+use molmesh::formats::{Format, Meta};
 use molmesh::structure::{ReadLimits, Selection, SourceFormat, Structure, read, select};
 use molmesh::surface::{Backend, Control, CpuBackend, SurfaceLimits, SurfaceOptions, SurfaceParams};
 use serde::Deserialize;
+use tools::files::encoded;
 
 const FOLDER: &str = "../shared/data/structures";
 const VARIANTS: [&str; 7] = ["plain", "packed", "bytes", "texts", "compressed", "single", "quantized"];
@@ -57,9 +58,7 @@ fn mesh(structure: &Structure) -> Vec<u8> {
     let params = SurfaceParams::new(&SurfaceOptions { resolution: Some(1.0), ..SurfaceOptions::default() }).unwrap();
     let backend = CpuBackend::new(Some(2)).unwrap();
     let meshed = backend.run(&spheres, &params, &SurfaceLimits::default(), &Control::default()).unwrap();
-    let mut bytes = Vec::new();
-    formats::write(Format::Glb, &meshed.mesh, &Meta::default(), &mut bytes).unwrap();
-    bytes
+    encoded(Format::Glb, &meshed.mesh, &Meta::default())
 }
 
 /// Summary that the writer prints.

@@ -3,9 +3,9 @@
 
 use crate::tools;
 
-use molmesh::formats::{self, Format, Meta};
+use molmesh::formats::{Format, Meta};
 use molmesh::surface::Mesh;
-use tools::files::Files;
+use tools::files::{Files, encoded};
 use tools::readers::{accessor_offset, ply_header, split_glb};
 use tools::shapes::{
     FAR, area_and_volume, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres, union,
@@ -19,9 +19,7 @@ fn add(files: &mut Files, name: &str, format: Format, mesh: &Mesh) {
 fn encode(format: Format, mesh: &Mesh) -> Vec<u8> {
     let extras = [("kernel".to_owned(), "gaussian, 2.0 Å".into())].into_iter().collect();
     let meta = Meta { name: Some("a 名".into()), extras };
-    let mut bytes = Vec::new();
-    formats::write(format, mesh, &meta, &mut bytes).unwrap();
-    bytes
+    encoded(format, mesh, &meta)
 }
 
 /// Closed surfaces with their number of bodies and Euler characteristic.

@@ -1,14 +1,12 @@
-//! Quantised glTF: decoded vertices are within half a step of the computed ones for every way of writing, and the
+//! Quantized glTF: decoded vertices are within half a step of the computed ones for every way of writing, and the
 //! Khronos validator and trimesh read the files. Each comparison has a negative control.
 
 use crate::tools;
 
-use std::io::Cursor;
-
 use molmesh::formats::{Encoder, Format, FormatError, GlbSink, GlbSinkError, Meta, Packing, Step};
 use molmesh::surface::{Mesh, SinkFailed};
 use serde_json::{Value, json};
-use tools::files::{Files, write_parts};
+use tools::files::{Files, MemoryFile, encoded, write_parts};
 use tools::readers::{Contents, Glb, accessor_of, accessor_offset, gltf_contents, split_glb, split_gltf};
 use tools::shapes::{FAR, area_and_volume, dressed, icosphere, sphere_with_cavity, torus, triangle, two_spheres};
 
@@ -23,7 +21,7 @@ fn step(mesh: &Mesh) -> Step {
 }
 
 fn packed(format: Format, packing: Packing, mesh: &Mesh) -> Vec<u8> {
-    let (encoder, mut bytes) = (Encoder::stored(format, packing, mesh, &meta()).unwrap(), Vec::new());
+    let (encoder, mut bytes) = (Encoder::new(format, packing, mesh, &meta()).unwrap(), Vec::new());
     encoder.write(&mut bytes).unwrap();
     assert_eq!(encoder.encoded_len(), Some(bytes.len() as u64));
     bytes
@@ -93,7 +91,7 @@ fn vertices_round_trip_within_half_a_step_and_other_columns_exactly() {
 }
 
 #[test]
-fn the_document_declares_the_quantisation() {
+fn the_document_declares_the_quantization() {
     for (name, mesh, ..) in cases() {
         let Glb { json, bin, .. } = split_glb(&quantized(Format::Glb, &mesh));
         let length = step(&mesh).length();
@@ -117,7 +115,7 @@ fn the_document_declares_the_quantisation() {
             let bounds = [values().min(), values().max()];
             assert_eq!([&position["min"], &position["max"]].map(|b| b[axis].as_i64()), bounds, "{name}");
         }
-        // Not quantised by default.
+        // Not quantized by default.
         let full = split_glb(&packed(Format::Glb, Packing::Full, &mesh)).json;
         let absent =
             [full.get("extensionsUsed"), full["nodes"][0].get("scale"), full["asset"]["extras"].get("quantization")];
@@ -140,12 +138,7 @@ fn integer_vertices_are_written_unchanged() {
             let expected = quantized(format, &mesh);
             assert!(packed(format, Packing::Quantized(step(&mesh)), &small) == expected, "{name} {format}");
             // The integers are detected from the mesh.
-            let mut looked_at = Vec::new();
-            Encoder::new(format, &small, &meta()).unwrap().write(&mut looked_at).unwrap();
-            assert!(looked_at == expected, "{name} {format}");
-            let mut trusted = Vec::new();
-            Encoder::trusting(format, &small, &meta()).unwrap().write(&mut trusted).unwrap();
-            assert!(trusted == expected, "{name} {format}");
+            assert!(encoded(format, &small, &meta()) == expected, "{name} {format}");
         }
         if mesh.colors.is_none() && mesh.atom_ids.is_none() {
             for n_parts in [1, 3] {
@@ -168,26 +161,26 @@ fn quantized_as(small: &Mesh, mesh: &Mesh) -> Vec<u8> {
 fn integer_vertices_are_neither_rounded_nor_widened() {
     let mesh = icosphere(2, 10.0, [0.0; 3], false);
     let small = rounded(&mesh);
-    let own = FormatError::OtherPacking { step: step(&mesh).length() };
+    let own = FormatError::AlreadyQuantized { step: step(&mesh).length() };
     let other = Packing::Quantized(Step::covering(40.0));
     for format in [Format::Glb, Format::Gltf] {
         for packing in [Packing::Full, other] {
-            assert_eq!(Encoder::stored(format, packing, &small, &meta()).unwrap_err(), own);
+            assert_eq!(Encoder::new(format, packing, &small, &meta()).unwrap_err(), own);
         }
     }
     for format in [Format::Ply, Format::Stl, Format::Obj] {
-        let refusal = FormatError::NotQuantized { format: format.extension() };
-        assert_eq!(Encoder::new(format, &small, &meta()).unwrap_err(), refusal);
-        assert_eq!(Encoder::stored(format, Packing::Full, &small, &meta()).unwrap_err(), own);
+        let refusal = FormatError::QuantizationNotSupported { format: format.extension() };
+        assert_eq!(Encoder::new(format, Packing::of(&small), &small, &meta()).unwrap_err(), refusal);
+        assert_eq!(Encoder::new(format, Packing::Full, &small, &meta()).unwrap_err(), own);
     }
     for packing in [Packing::Full, other] {
-        let mut file = Cursor::new(Vec::new());
-        let sink = GlbSink::new(&mut file);
-        sink.store(packing);
+        let file = MemoryFile::default();
+        let sink = GlbSink::new(&file);
+        sink.set_storage(packing);
         write_parts(&sink, &small, 1);
-        assert!(matches!(sink.failure(), Some(GlbSinkError::Format(FormatError::OtherPacking { .. }))));
+        assert!(matches!(sink.failure(), Some(GlbSinkError::Format(FormatError::AlreadyQuantized { .. }))));
     }
-    assert!(Encoder::stored(Format::Glb, Packing::of(&small), &small, &meta()).is_ok());
+    assert!(Encoder::new(Format::Glb, Packing::of(&small), &small, &meta()).is_ok());
 }
 
 #[test]
@@ -200,16 +193,19 @@ fn integers_out_of_range_and_nan_are_rejected() {
         assert!(broken.quantize(step(&mesh)));
         let packing = Packing::of(&broken);
         for format in [Format::Glb, Format::Gltf] {
-            let refusal = Encoder::stored(format, packing, &broken, &meta()).unwrap_err();
-            assert!(matches!(refusal, FormatError::BeyondStep { .. }), "{bad}: {refusal}");
+            let refusal = Encoder::new(format, packing, &broken, &meta()).unwrap_err();
+            assert!(matches!(refusal, FormatError::OutOfQuantizationRange { .. }), "{bad}: {refusal}");
         }
         let refusal = placed(packing, &broken, 2);
-        assert!(matches!(refusal, Err(GlbSinkError::Format(FormatError::BeyondStep { .. }))), "{bad}: {refusal:?}");
+        assert!(
+            matches!(refusal, Err(GlbSinkError::Format(FormatError::OutOfQuantizationRange { .. }))),
+            "{bad}: {refusal:?}"
+        );
     }
 }
 
 #[test]
-fn quantised_vertices_take_half_the_bytes() {
+fn quantized_vertices_take_half_the_bytes() {
     let mesh = torus(300, 300);
     let [full, small] = [Packing::Full, Packing::Quantized(step(&mesh))].map(|p| packed(Format::Glb, p, &mesh).len());
     assert_eq!(full - small, 12 * mesh.n_vertices(), "the buffers begin at the same offset");
@@ -228,27 +224,28 @@ fn vertices_out_of_range_and_other_formats_are_rejected() {
     let mesh = icosphere(2, 10.0, [0.0; 3], false);
     let small = Packing::Quantized(Step::covering(9.0 / 2.0));
     for format in [Format::Glb, Format::Gltf] {
-        let refusal = Encoder::stored(format, small, &mesh, &meta()).unwrap_err();
-        assert!(matches!(refusal, FormatError::BeyondStep { .. }), "{refusal}");
+        let refusal = Encoder::new(format, small, &mesh, &meta()).unwrap_err();
+        assert!(matches!(refusal, FormatError::OutOfQuantizationRange { .. }), "{refusal}");
     }
     for format in [Format::Ply, Format::Stl, Format::Obj] {
-        let refusal = Encoder::stored(format, Packing::Quantized(step(&mesh)), &mesh, &meta()).unwrap_err();
-        assert_eq!(refusal, FormatError::NotQuantized { format: format.extension() });
-        assert!(Encoder::stored(format, Packing::Full, &mesh, &meta()).is_ok());
+        let refusal = Encoder::new(format, Packing::Quantized(step(&mesh)), &mesh, &meta()).unwrap_err();
+        assert_eq!(refusal, FormatError::QuantizationNotSupported { format: format.extension() });
+        assert!(Encoder::new(format, Packing::Full, &mesh, &meta()).is_ok());
     }
-    assert!(matches!(placed(small, &mesh, 2), Err(GlbSinkError::Format(FormatError::BeyondStep { .. }))));
+    assert!(matches!(placed(small, &mesh, 2), Err(GlbSinkError::Format(FormatError::OutOfQuantizationRange { .. }))));
 }
 
 /// Returns the GLB of a mesh that is written out of order.
 fn placed(packing: Packing, mesh: &Mesh, n_parts: usize) -> Result<Vec<u8>, GlbSinkError> {
-    let mut file = Cursor::new(Vec::new());
-    let sink = GlbSink::new(&mut file);
-    sink.store(packing);
+    let file = MemoryFile::default();
+    let sink = GlbSink::new(&file);
+    sink.set_storage(packing);
     write_parts(&sink, mesh, n_parts);
     let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).map_err(|SinkFailed| sink.failure().unwrap())?;
     drop(sink);
-    assert_eq!(len, file.get_ref().len() as u64);
-    Ok(file.into_inner())
+    let bytes = file.into_bytes();
+    assert_eq!(len, bytes.len() as u64);
+    Ok(bytes)
 }
 
 #[test]

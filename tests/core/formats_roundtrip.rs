@@ -5,13 +5,13 @@
 
 use crate::tools;
 
-use std::io::{self, Cursor, ErrorKind, Seek, SeekFrom, Write};
+use std::io::{self, ErrorKind, Write};
 
-use molmesh::formats::{self, Encoder, Format, FormatError, GlbSink, GlbSinkError, Meta};
+use molmesh::formats::{Encoder, Format, FormatError, GlbSink, GlbSinkError, Meta, Packing, RandomAccess};
 use molmesh::surface::{Mesh, MeshPart, MeshSink};
 use proptest::prelude::*;
 use serde_json::{Value, json};
-use tools::files::write_parts;
+use tools::files::{MemoryFile, encoded, write_parts};
 use tools::readers::{
     Contents, accessor_of, gltf_contents, ply_header, read_obj, read_ply, read_stl, split_glb, split_gltf, u32_at,
 };
@@ -28,9 +28,11 @@ fn meta() -> Meta {
 }
 
 fn encode(format: Format, mesh: &Mesh, meta: &Meta) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    formats::write(format, mesh, meta, &mut bytes).unwrap();
-    bytes
+    encoded(format, mesh, meta)
+}
+
+fn encoder(format: Format, mesh: &Mesh) -> Result<Encoder<'_>, FormatError> {
+    Encoder::new(format, Packing::of(mesh), mesh, &meta())
 }
 
 /// Meshes of all kinds, including the limits of the index types.
@@ -172,7 +174,7 @@ fn stl_contains_corners_and_normals_of_all_triangles() {
 fn obj_round_trips_coordinates_to_its_decimals() {
     for (name, mesh) in cases() {
         let found = read_obj(&encode(Format::Obj, &mesh, &meta()));
-        assert_eq!(found.triangles, mesh.triangles, "{name}");
+        assert_eq!(found.triangles[..], mesh.triangles[..], "{name}");
         let close = |found: &[[f32; 3]], expected: &[[f32; 3]]| {
             assert_eq!(found.len(), expected.len(), "{name}");
             for (f, e) in found.as_flattened().iter().zip(expected.as_flattened()) {
@@ -190,10 +192,8 @@ fn lengths_are_known_before_writing() {
     for (name, mesh) in cases() {
         for format in Format::MESHES {
             let len = encode(format, &mesh, &meta()).len() as u64;
-            let (exact, bound) = (
-                formats::encoded_len(format, &mesh, &meta()),
-                formats::encoded_len_bound(format, &mesh, &meta()).unwrap(),
-            );
+            let encoder = encoder(format, &mesh).unwrap();
+            let (exact, bound) = (encoder.encoded_len(), encoder.encoded_len_bound());
             if format == Format::Obj {
                 assert_eq!(exact, None);
                 assert!(len <= bound && bound <= len + len / 2, "{name}: {len} bytes, bound {bound}");
@@ -212,12 +212,12 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
         let in_order = encode(Format::Glb, &mesh, &meta());
         large += usize::from(in_order.len() > 1 << 20);
         for n_parts in [1, 3] {
-            let mut file = Cursor::new(vec![0xee; in_order.len()]);
-            let sink = GlbSink::new(&mut file);
+            let file = MemoryFile(vec![0xee; in_order.len()].into());
+            let sink = GlbSink::new(&file);
             write_parts(&sink, &mesh, n_parts);
             let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).unwrap();
             drop(sink);
-            let placed = file.into_inner();
+            let placed = file.into_bytes();
             assert_eq!(len, in_order.len() as u64, "{name}");
             assert!(placed == in_order, "{name} in {n_parts}");
         }
@@ -225,44 +225,32 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
     assert!(large > 0, "no large buffer");
 }
 
-/// Writer of a full disk.
+/// File on a full disk.
 struct Full;
 
-impl Write for Full {
-    fn write(&mut self, _: &[u8]) -> io::Result<usize> {
+impl RandomAccess for Full {
+    fn write_all_at(&self, _: &[u8], _: u64) -> io::Result<()> {
         Err(ErrorKind::StorageFull.into())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
-}
-
-impl Seek for Full {
-    fn seek(&mut self, _: SeekFrom) -> io::Result<u64> {
-        Ok(0)
     }
 }
 
 #[test]
 fn oversized_headers_are_rejected_and_write_errors_are_kept() {
     let mesh = torus(255, 257);
-    let mut file = Cursor::new(Vec::new());
-    let sink = GlbSink::new(&mut file);
+    let file = MemoryFile::default();
+    let sink = GlbSink::new(&file);
     write_parts(&sink, &mesh, 2);
     let mut long = meta();
     long.extras.insert("title".to_owned(), json!("x".repeat(20_000)));
     assert!(sink.finish(&long, mesh.centre, mesh.bounds()).is_err());
     assert!(matches!(sink.failure(), Some(GlbSinkError::HeadTooLong { bytes: 32_768 })));
 
-    let mut full = Full;
-    let sink = GlbSink::new(&mut full);
+    let sink = GlbSink::new(&Full);
     sink.begin(mesh.n_vertices(), mesh.n_triangles()).unwrap();
     assert!(sink.part(&MeshPart::whole(&mesh)).is_err());
     assert!(matches!(sink.failure(), Some(GlbSinkError::Io(e)) if e.kind() == ErrorKind::StorageFull));
 
-    let mut full = Full;
-    let sink = GlbSink::new(&mut full);
+    let sink = GlbSink::new(&Full);
     assert!(sink.begin(90_000_000, 180_000_000).is_err());
     assert!(matches!(sink.failure(), Some(GlbSinkError::Format(FormatError::GlbTooLarge { .. }))));
 }
@@ -307,7 +295,7 @@ fn columns_are_written_whole_and_conversions_in_large_blocks() {
     let mesh = icosphere(7, 20.0, [0.0; 3], false);
     for format in Format::MESHES {
         let mut meter = Meter { room: usize::MAX, calls: Vec::new() };
-        formats::write(format, &mesh, &meta(), &mut meter).unwrap();
+        encoder(format, &mesh).unwrap().write(&mut meter).unwrap();
         let (total, largest) = (meter.calls.iter().sum::<usize>(), *meter.calls.iter().max().unwrap());
         if format == Format::Glb {
             assert!(
@@ -327,41 +315,41 @@ fn a_full_disk_is_an_error_at_every_offset() {
         let whole = encode(format, &mesh, &meta()).len();
         for room in [0, 10, 500, whole / 2, whole - 1] {
             let mut meter = Meter { room, calls: Vec::new() };
-            let error = formats::write(format, &mesh, &meta(), &mut meter).unwrap_err();
+            let error = encoder(format, &mesh).unwrap().write(&mut meter).unwrap_err();
             assert_eq!(error.kind(), ErrorKind::StorageFull, "{format} after {room} bytes");
         }
-        formats::write(format, &mesh, &meta(), &mut Meter { room: whole, calls: Vec::new() }).unwrap();
+        encoder(format, &mesh).unwrap().write(&mut Meter { room: whole, calls: Vec::new() }).unwrap();
     }
 }
 
 #[test]
-fn invalid_meshes_are_rejected_before_the_first_byte() {
+fn invalid_meshes_are_rejected_by_the_formats_that_rely_on_their_values() {
     let good = dressed(torus(4, 5), 9);
     let broken = |change: fn(&mut Mesh)| {
         let mut mesh = good.clone();
         change(&mut mesh);
         mesh
     };
-    let cases: [(&str, Mesh); 9] = [
-        ("20 positions but 19 normals", broken(|m| m.normals.edit().truncate(19))),
-        ("20 positions but 0 normals", broken(|m| m.normals.edit().clear())),
-        ("20 positions but 21 atom_ids", broken(|m| m.atom_ids.as_mut().unwrap().edit().push(3))),
-        ("20 positions but 1 colors", broken(|m| m.colors = Some(vec![[0; 4]].into()))),
-        ("triangle 7 refers to vertex 20, but the mesh has 20", broken(|m| m.triangles[7][1] = 20)),
-        ("refers to vertex 4294967295", broken(|m| m.triangles[0][0] = u32::MAX)),
-        ("position 3 holds NaN", broken(|m| m.positions[3][2] = f32::NAN)),
-        ("normal 4 holds inf", broken(|m| m.normals[4][0] = f32::INFINITY)),
-        ("centre 1 holds inf", broken(|m| m.centre[1] = f64::INFINITY)),
+    let (all, indexed) = (Format::MESHES, [Format::Glb, Format::Gltf, Format::Stl]);
+    let cases: [(&str, &[Format], Mesh); 9] = [
+        ("20 positions but 19 normals", &all, broken(|m| m.normals.edit().truncate(19))),
+        ("20 positions but 0 normals", &all, broken(|m| m.normals.edit().clear())),
+        ("20 positions but 21 atom_ids", &all, broken(|m| m.atom_ids.as_mut().unwrap().edit().push(3))),
+        ("20 positions but 1 colors", &all, broken(|m| m.colors = Some(vec![[0; 4]].into()))),
+        ("triangle 7 refers to vertex 20, but the mesh has 20", &indexed, broken(|m| m.triangles[7][1] = 20)),
+        ("refers to vertex 4294967295", &indexed, broken(|m| m.triangles[0][0] = u32::MAX)),
+        ("position 3 holds NaN", &all, broken(|m| m.positions[3][2] = f32::NAN)),
+        ("normal 4 holds inf", &[Format::Obj], broken(|m| m.normals[4][0] = f32::INFINITY)),
+        ("centre 1 holds inf", &all, broken(|m| m.centre[1] = f64::INFINITY)),
     ];
     for format in Format::MESHES {
-        for (words, mesh) in &cases {
-            let mut bytes = Vec::new();
-            let error = formats::write(format, mesh, &meta(), &mut bytes).unwrap_err();
-            assert_eq!((error.kind(), bytes.len()), (ErrorKind::InvalidInput, 0), "{format}: {words}");
-            assert!(error.to_string().contains(words), "{format}: {error}");
-            assert!(error.get_ref().unwrap().is::<FormatError>());
-            assert_eq!(formats::encoded_len(format, mesh, &meta()), None);
-            assert_eq!(formats::encoded_len_bound(format, mesh, &meta()), None);
+        for (words, rejecting, mesh) in &cases {
+            match encoder(format, mesh) {
+                Ok(_) => assert!(!rejecting.contains(&format), "{format}: {words}"),
+                Err(error) => {
+                    assert!(rejecting.contains(&format) && error.to_string().contains(words), "{format}: {error}");
+                }
+            }
         }
     }
 }
@@ -370,7 +358,7 @@ fn invalid_meshes_are_rejected_before_the_first_byte() {
 fn only_gltf_rejects_atom_indices_beyond_exact_floats() {
     let mesh = dressed(torus(4, 5), 16_777_217);
     for format in Format::MESHES {
-        let encoder = Encoder::new(format, &mesh, &meta());
+        let encoder = encoder(format, &mesh);
         match format {
             Format::Glb | Format::Gltf => {
                 let refusal = FormatError::AtomIndexTooLarge { atom: 16_777_217, limit: 16_777_216 };
@@ -403,27 +391,16 @@ proptest! {
             prop_assert_eq!(glb.json["asset"]["extras"][&key].as_str().unwrap(), text);
         }
         let (json, bin) = split_gltf(&encode(Format::Gltf, &mesh, &meta));
-        prop_assert_eq!(&gltf_contents(&json, &bin).positions, &mesh.positions);
-        prop_assert_eq!(&read_ply(&encode(Format::Ply, &mesh, &meta)).positions, &mesh.positions);
-        prop_assert_eq!(&read_obj(&encode(Format::Obj, &mesh, &meta)).positions, &mesh.positions);
+        prop_assert_eq!(&gltf_contents(&json, &bin).positions[..], &mesh.positions[..]);
+        prop_assert_eq!(&read_ply(&encode(Format::Ply, &mesh, &meta)).positions[..], &mesh.positions[..]);
+        prop_assert_eq!(&read_obj(&encode(Format::Obj, &mesh, &meta)).positions[..], &mesh.positions[..]);
         let stl = encode(Format::Stl, &mesh, &meta);
         prop_assert_eq!((stl.len(), u32_at(&stl, 80), stl[..80].is_ascii()), (134, 1, true));
     }
 }
 
 #[test]
-fn trusted_meshes_give_the_same_bytes() {
-    for (name, mesh) in cases() {
-        for format in Format::MESHES {
-            let mut bytes = Vec::new();
-            Encoder::trusting(format, &mesh, &meta()).unwrap().write(&mut bytes).unwrap();
-            assert!(bytes == encode(format, &mesh, &meta()), "{name} as {format}");
-        }
-    }
-}
-
-#[test]
-fn trusted_invalid_meshes_never_panic() {
+fn invalid_meshes_never_panic() {
     for n in [4, 300] {
         let mut far_index = torus(n, 300);
         far_index.triangles[1][1] = u32::MAX;
@@ -435,7 +412,7 @@ fn trusted_invalid_meshes_never_panic() {
         short.normals.edit().pop();
         for format in Format::MESHES {
             let refused = |mesh: &Mesh| {
-                let encoder = Encoder::trusting(format, mesh, &meta());
+                let encoder = encoder(format, mesh);
                 if let Ok(encoder) = &encoder {
                     encoder.write(&mut io::sink()).unwrap();
                 }

@@ -3,12 +3,10 @@
 
 use crate::tools;
 
-use std::io::Cursor;
-
 use molmesh::formats::{Encoder, Format, FormatError, GlbSink, Meta, Normals, Packing, Step, Storage, Units};
 use molmesh::surface::Mesh;
 use serde_json::{Value, json};
-use tools::files::{Files, write_parts};
+use tools::files::{Files, MemoryFile, write_parts};
 use tools::readers::{Contents, gltf_contents, read_obj, read_ply, read_stl, split_glb, split_gltf};
 use tools::shapes::{FAR, area_and_volume, dressed, icosphere, torus, triangle, two_spheres};
 
@@ -31,7 +29,7 @@ fn ways(format: Format) -> Vec<Storage> {
 }
 
 fn encode(format: Format, storage: Storage, mesh: &Mesh) -> Vec<u8> {
-    let (encoder, mut bytes) = (Encoder::stored(format, storage, mesh, &meta()).unwrap(), Vec::new());
+    let (encoder, mut bytes) = (Encoder::new(format, storage, mesh, &meta()).unwrap(), Vec::new());
     encoder.write(&mut bytes).unwrap();
     let len = bytes.len() as u64;
     assert!(encoder.encoded_len().is_none_or(|planned| planned == len), "{format} {storage:?}");
@@ -91,7 +89,7 @@ fn without_normals_all_other_columns_are_unchanged() {
             }
         }
     }
-    // Savings per vertex: 12 bytes, in quantised files 4.
+    // Savings per vertex: 12 bytes, in quantized files 4.
     let mesh = icosphere(7, 20.0, [0.0; 3], false);
     let n = mesh.n_vertices();
     for (packing, saved) in [(Packing::Full, 12), (Packing::Quantized(Step::covering(31.0)), 4)] {
@@ -159,8 +157,8 @@ fn metres_require_a_format_with_a_node() {
     let mesh = triangle();
     let meters = Storage { units: Units::Meter, ..Storage::default() };
     for format in Format::MESHES {
-        let refusal = Encoder::stored(format, meters, &mesh, &meta()).err();
-        let expected = FormatError::NotInUnits { format: format.extension(), units: "meter" };
+        let refusal = Encoder::new(format, meters, &mesh, &meta()).err();
+        let expected = FormatError::UnitsNotSupported { format: format.extension(), units: "meter" };
         let node = matches!(format, Format::Glb | Format::Gltf);
         assert_eq!(refusal, (!node).then_some(expected), "{format}");
     }
@@ -174,15 +172,15 @@ fn a_glb_written_out_of_order_has_the_same_bytes() {
             let in_order = encode(Format::Glb, storage, &mesh);
             large += usize::from(in_order.len() > 1 << 20);
             let place = |told: bool| {
-                let mut file = Cursor::new(vec![0xee; in_order.len()]);
-                let sink = GlbSink::new(&mut file);
+                let file = MemoryFile(vec![0xee; in_order.len()].into());
+                let sink = GlbSink::new(&file);
                 if told {
-                    sink.store(storage);
+                    sink.set_storage(storage);
                 }
                 write_parts(&sink, &mesh, 3);
                 let len = sink.finish(&meta(), mesh.centre, mesh.bounds()).unwrap();
                 drop(sink);
-                file.into_inner().into_iter().take(usize::try_from(len).unwrap()).collect::<Vec<_>>()
+                file.into_bytes().into_iter().take(usize::try_from(len).unwrap()).collect::<Vec<_>>()
             };
             assert!(place(true) == in_order, "{name} {storage:?}");
             assert_eq!(place(false) == in_order, storage == Storage::default(), "{name} {storage:?}");

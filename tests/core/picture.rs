@@ -19,7 +19,7 @@ fn params(style: Style, view: View) -> PictureParams {
 }
 
 fn render(mesh: &Mesh, params: &PictureParams) -> Rendered {
-    CpuRenderer::default().render(mesh, params, &Control::default()).unwrap()
+    CpuRenderer.render(mesh, params, &Control::default()).unwrap()
 }
 
 fn image(mesh: &Mesh, params: &PictureParams) -> Image {
@@ -225,8 +225,9 @@ fn an_inverted_surface_gives_a_different_picture() {
 fn the_same_pixels_on_any_number_of_threads() {
     let (mesh, params) = (lump(), params(Style::Surface, View::Principal));
     let on = |threads: usize| {
-        let renderer = CpuRenderer::with_threads(threads).unwrap();
-        png::encode(&renderer.render(&mesh, &params, &Control::default()).unwrap().image).unwrap()
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let rendered = pool.install(|| CpuRenderer.render(&mesh, &params, &Control::default()));
+        png::encode(&rendered.unwrap().image).unwrap()
     };
     let one = on(1);
     assert_eq!(one, on(2));
@@ -273,15 +274,15 @@ fn pictures_of_any_size_are_complete() {
 }
 
 #[test]
-fn cancelled_runs_and_quantised_meshes_are_errors() {
+fn cancelled_runs_and_quantized_meshes_are_errors() {
     let (mesh, cancel) = (lump(), CancelToken::default());
     cancel.cancel();
     let control = Control { cancel, ..Control::default() };
     let params = params(Style::Surface, View::Principal);
-    assert_eq!(CpuRenderer::default().render(&mesh, &params, &control), Err(PictureError::Cancelled));
+    assert_eq!(CpuRenderer.render(&mesh, &params, &control), Err(PictureError::Cancelled));
     let mut packed = mesh.clone();
     packed.quantize(Step::covering(20.0));
-    let refused = CpuRenderer::default().render(&packed, &params, &Control::default());
+    let refused = CpuRenderer.render(&packed, &params, &Control::default());
     assert_eq!(refused, Err(PictureError::Quantized));
 }
 

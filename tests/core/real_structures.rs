@@ -10,12 +10,13 @@ use crate::tools;
 
 use std::path::{Path, PathBuf};
 
-use molmesh::formats::{self, Format, Meta};
+use molmesh::formats::{Format, Meta};
 use molmesh::structure::{self, ReadLimits, Selection, StructureError};
 use molmesh::surface::{
     Backend, Control, CpuBackend, Kernel, Measures, Mesh, Spheres, SurfaceLimits, SurfaceOptions, SurfaceParams,
     Validation,
 };
+use tools::files::encoded;
 
 /// Largest number of selected atoms of structures that run every time.
 const EVERYDAY: usize = 5_000;
@@ -120,9 +121,7 @@ fn every_structure_and_kernel_gives_a_closed_oriented_manifold() {
                     continue;
                 }
                 let path = dir.path().join(format!("{}-{kernel}-{resolution}.ply", case.name));
-                let mut bytes = Vec::new();
-                formats::write(Format::Ply, &mesh, &Meta::default(), &mut bytes).unwrap();
-                std::fs::write(&path, bytes).unwrap();
+                std::fs::write(&path, encoded(Format::Ply, &mesh, &Meta::default())).unwrap();
                 files.push((path, exact));
             }
         }
@@ -184,10 +183,8 @@ fn every_structure_gives_valid_gltf() {
     for case in cases() {
         for format in [Format::Glb, Format::Gltf] {
             let mesh = mesh(&case.spheres, Kernel::Gaussian, 1.0, 2);
-            let mut bytes = Vec::new();
-            formats::write(format, &mesh, &Meta::default(), &mut bytes).unwrap();
             let path = dir.path().join(format!("{}.{}", case.name, format.extension()));
-            std::fs::write(&path, bytes).unwrap();
+            std::fs::write(&path, encoded(format, &mesh, &Meta::default())).unwrap();
             paths.push(path);
         }
     }

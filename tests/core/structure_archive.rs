@@ -92,36 +92,35 @@ fn finds_every_layout_and_prefers_mmcif() {
         put(dir.path(), file);
         put(dir.path(), "divided/mmCIF/ab/2abc.cif.gz");
         let archive = Archive::new(dir.path());
-        assert_eq!(archive.fetch(&id("1ABC")).unwrap(), file.as_bytes());
-        assert_eq!(archive.fetch(&id("pdb_00001abc")).unwrap(), file.as_bytes());
+        assert_eq!(archive.fetch(&id("1ABC")).unwrap().unwrap().0, file.as_bytes());
+        assert_eq!(archive.fetch(&id("pdb_00001abc")).unwrap().unwrap().0, file.as_bytes());
     }
     let dir = tempfile::tempdir().unwrap();
     // BinaryCIF comes last.
     for file in ["1abc.bcif", "ab/pdb1abc.ent.gz"] {
         put(dir.path(), file);
     }
-    assert_eq!(Archive::new(dir.path()).fetch(&id("1abc")).unwrap(), b"ab/pdb1abc.ent.gz");
+    assert_eq!(Archive::new(dir.path()).fetch(&id("1abc")).unwrap().unwrap().0, b"ab/pdb1abc.ent.gz");
     put(dir.path(), "pdb_87654321.bcif.gz");
-    assert_eq!(Archive::new(dir.path()).fetch(&id("pdb_87654321")).unwrap(), b"pdb_87654321.bcif.gz");
+    assert_eq!(Archive::new(dir.path()).fetch(&id("pdb_87654321")).unwrap().unwrap().0, b"pdb_87654321.bcif.gz");
     for file in ["1abc.pdb", "pdb1abc.ent.gz", "ab/1abc.cif.gz"] {
         put(dir.path(), file);
     }
-    assert_eq!(Archive::new(dir.path()).fetch(&id("1abc")).unwrap(), b"ab/1abc.cif.gz");
+    assert_eq!(Archive::new(dir.path()).fetch(&id("1abc")).unwrap().unwrap().0, b"ab/1abc.cif.gz");
     put(dir.path(), "divided/mmCIF/67/pdb_12345678.cif.gz");
-    assert_eq!(Archive::new(dir.path()).fetch(&id("pdb_12345678")).unwrap(), b"divided/mmCIF/67/pdb_12345678.cif.gz");
+    assert_eq!(
+        Archive::new(dir.path()).fetch(&id("pdb_12345678")).unwrap().unwrap().0,
+        b"divided/mmCIF/67/pdb_12345678.cif.gz"
+    );
 }
 
 #[test]
-fn reports_missing_entries_by_id() {
+fn missing_entries_and_folders_are_no_errors() {
     let dir = tempfile::tempdir().unwrap();
     fs::create_dir(dir.path().join("1abc.cif")).unwrap();
     fs::write(dir.path().join("ab"), "a file where a folder would be").unwrap();
-    let error = Archive::new(dir.path()).fetch(&id("1abc")).unwrap_err();
-    assert!(matches!(&error, ArchiveError::NotFound { id } if id.as_str() == "1abc"));
-    assert_eq!(error.to_string(), "entry 1abc is not in the archive");
-    let gone = Archive::new(dir.path().join("missing")).fetch(&id("1abc")).unwrap_err();
-    assert!(matches!(gone, ArchiveError::Io(_)));
-    assert_eq!(gone.to_string(), "the archive cannot be read");
+    assert!(Archive::new(dir.path()).fetch(&id("1abc")).unwrap().is_none());
+    assert!(Archive::new(dir.path().join("missing")).fetch(&id("1abc")).unwrap().is_none());
 }
 
 #[test]
@@ -129,7 +128,7 @@ fn limits_file_sizes() {
     let dir = tempfile::tempdir().unwrap();
     put(dir.path(), "1abc.cif");
     let archive = Archive::new(dir.path());
-    assert_eq!(archive.clone().with_max_bytes(8).fetch(&id("1abc")).unwrap(), b"1abc.cif");
+    assert_eq!(archive.clone().with_max_bytes(8).fetch(&id("1abc")).unwrap().unwrap().0, b"1abc.cif");
     let error = archive.with_max_bytes(7).fetch(&id("1abc")).unwrap_err();
     assert_eq!(error.to_string(), "entry 1abc has 8 bytes, the limit is 7");
 }
@@ -149,13 +148,13 @@ fn ignores_links_that_lead_outside() {
     symlink("data/5abc", dir.path().join("5abc.cif")).unwrap();
     let archive = Archive::new(dir.path());
     for entry in ["1abc", "2bcd", "3abc"] {
-        assert!(matches!(archive.fetch(&id(entry)), Err(ArchiveError::NotFound { .. })), "{entry}");
+        assert!(archive.fetch(&id(entry)).unwrap().is_none(), "{entry}");
     }
-    assert_eq!(archive.fetch(&id("5abc")).unwrap(), b"data/5abc", "a link inside the folder");
+    assert_eq!(archive.fetch(&id("5abc")).unwrap().unwrap().0, b"data/5abc", "a link inside the folder");
     // The folder itself may be a link.
     let link = outside.path().join("link");
     symlink(dir.path(), &link).unwrap();
-    assert_eq!(Archive::new(link).fetch(&id("5abc")).unwrap(), b"data/5abc");
+    assert_eq!(Archive::new(link).fetch(&id("5abc")).unwrap().unwrap().0, b"data/5abc");
 }
 
 #[cfg(unix)]
@@ -167,5 +166,5 @@ fn ignores_named_pipes() {
         eprintln!("SKIPPED: mkfifo does not work here");
         return;
     }
-    assert!(matches!(Archive::new(dir.path()).fetch(&id("1abc")), Err(ArchiveError::NotFound { .. })));
+    assert!(Archive::new(dir.path()).fetch(&id("1abc")).unwrap().is_none());
 }

@@ -586,7 +586,7 @@ fn rounded(spheres: &Spheres, params: &SurfaceParams) -> SurfaceParams {
 }
 
 #[test]
-fn quantised_vertices_are_rounded_once_and_measured_after_rounding() {
+fn quantized_vertices_are_rounded_once_and_measured_after_rounding() {
     let relative = |a: f64, b: f64| (a / b - 1.0).abs();
     for (at, h) in [(spheres(&Random(5).cloud(400, 50.0)), 0.5), (spheres(&[[900.0, 0.0, -77.0, 1.7]]), 0.3)] {
         for kernel in Kernel::ALL {

@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use gpu_fakes::Step::{Block, Finish, Lose, OutOfMemory};
 use gpu_fakes::{FakeDevice, SETTINGS, devices, spheres};
-use molmesh::gpu::{DevicePool, GpuBackend, GpuError, Look, discover};
+use molmesh::gpu::{DevicePool, DiscoveryMode, GpuBackend, GpuError, discover};
 use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, DeviceChoice, DeviceKind, MeshOutput, Observer, Stage, Step,
     SurfaceError, SurfaceLimits, SurfaceParams,
@@ -27,11 +27,11 @@ fn run(backend: &dyn Backend, control: &Control<'_>) -> Result<MeshOutput, Surfa
 #[test]
 fn the_device_of_a_job_is_reported() {
     let backend = backend_with(&[FakeDevice::new(&[]), FakeDevice::new(&[])], true);
-    let served: Vec<_> = (0..2).map(|_| run(&backend, &Control::default()).unwrap().served.unwrap()).collect();
-    assert_eq!([&served[0].device, &served[1].device], ["fake 0", "fake 1"]);
+    let made_by: Vec<_> = (0..2).map(|_| run(&backend, &Control::default()).unwrap().made_by.unwrap()).collect();
+    assert_eq!([&made_by[0].device, &made_by[1].device], ["fake 0", "fake 1"]);
     // Results of different devices have different keys. A look-up uses the key of the first device.
-    assert_eq!(served[0].arithmetic, backend.arithmetic());
-    assert_ne!(served[0].arithmetic, served[1].arithmetic);
+    assert_eq!(made_by[0].arithmetic, backend.arithmetic());
+    assert_ne!(made_by[0].arithmetic, made_by[1].arithmetic);
     assert_eq!((backend.name(), backend.describe().as_str()), ("gpu", "2 devices: fake 0, fake 1"));
 }
 
@@ -44,13 +44,13 @@ fn the_cpu_is_the_fallback_and_is_reported() {
     for n in 0..4 {
         let meshed = run(&backend, &Control::default()).unwrap();
         assert_eq!(meshed.mesh, cpu.mesh);
-        let served = meshed.served.unwrap();
-        let why = served.fallback_reason.unwrap();
-        assert_eq!((served.backend, &served.arithmetic), ("cpu", &CpuBackend::new(None).unwrap().arithmetic()));
+        let made_by = meshed.made_by.unwrap();
+        let why = made_by.fallback_reason.unwrap();
+        assert_eq!((made_by.backend, &made_by.arithmetic), ("cpu", &CpuBackend::new(None).unwrap().arithmetic()));
         // While the device is up, look-ups use its key.
-        assert_eq!(backend.arithmetic() == served.arithmetic, backend.devices()[0].down.is_some(), "{n}");
+        assert_eq!(backend.arithmetic() == made_by.arithmetic, backend.devices()[0].down.is_some(), "{n}");
         assert!(
-            served.device.contains("native CPU") && why.contains("the GPU failed") && why.contains("scripted"),
+            made_by.device.contains("native CPU") && why.contains("the GPU failed") && why.contains("scripted"),
             "{why}"
         );
         assert_eq!(why.contains("no device is up"), n >= 2, "{n}: {why}");
@@ -61,7 +61,7 @@ fn the_cpu_is_the_fallback_and_is_reported() {
     let fallback = backend.run(&spheres(2), &small, &SurfaceLimits::default(), &Control::default()).unwrap();
     assert!(fallback.mesh.quantized.is_some() && fallback.measures.is_some());
     // Negative control: a device that works.
-    let working = run(&backend_with(&[FakeDevice::new(&[])], true), &Control::default()).unwrap().served.unwrap();
+    let working = run(&backend_with(&[FakeDevice::new(&[])], true), &Control::default()).unwrap().made_by.unwrap();
     assert_eq!((working.backend, working.fallback_reason), ("gpu", None));
 }
 
@@ -129,14 +129,14 @@ fn the_observer_receives_stage_times() {
 fn warm_runs_every_device_and_gives_up_those_that_fail() {
     let fakes = [FakeDevice::new(&[Finish]), FakeDevice::new(&[Lose]), FakeDevice::new(&[Finish])];
     let backend = backend_with(&fakes, true);
-    backend.warm().unwrap();
+    backend.warm_up().unwrap();
     assert_eq!(fakes.each_ref().map(|fake| fake.calls().len()), [1, 2, 1]);
     let down: Vec<bool> = backend.devices().iter().map(|device| device.down.is_some()).collect();
     assert_eq!(down, [false, true, false]);
     assert!(backend.devices()[1].down.as_deref().unwrap().contains("first mesh failed"));
     // Without a device the fallback must work; without a fallback warming up fails.
-    backend_with(&[FakeDevice::new(&[Lose])], true).warm().unwrap();
-    assert!(matches!(backend_with(&[FakeDevice::new(&[Lose])], false).warm(), Err(SurfaceError::Device { .. })));
+    backend_with(&[FakeDevice::new(&[Lose])], true).warm_up().unwrap();
+    assert!(matches!(backend_with(&[FakeDevice::new(&[Lose])], false).warm_up(), Err(SurfaceError::Device { .. })));
 }
 
 #[test]
@@ -162,7 +162,7 @@ fn many_callers_share_one_device() {
 
 /// Number of the software Vulkan device (`mesa-vulkan-drivers`). CI has it; elsewhere the test is skipped without it.
 fn software() -> Option<usize> {
-    let found = discover(&DeviceChoice::All, Look::Thorough);
+    let found = discover(&DeviceChoice::All, DiscoveryMode::Thorough);
     let software = found.devices.iter().find(|device| device.facts.kind == DeviceKind::Software);
     if software.is_none() {
         assert!(std::env::var_os("CI").is_none(), "no software Vulkan: install mesa-vulkan-drivers. {found:?}");
@@ -178,19 +178,19 @@ fn software() -> Option<usize> {
 fn software_is_found_and_selected_only_if_requested() {
     let Some(number) = software() else { return };
     for (choice, taken) in [("auto", false), ("all", false), ("software", true), (&number.to_string(), true)] {
-        let found = discover(&choice.parse().unwrap(), Look::Thorough);
+        let found = discover(&choice.parse().unwrap(), DiscoveryMode::Thorough);
         let device = &found.devices[number];
-        assert_eq!((device.number, device.taken), (number, taken), "{choice}: {}", device.reason);
+        assert_eq!((device.number, device.selected), (number, taken), "{choice}: {}", device.reason);
         assert!(!device.reason.is_empty() && !device.facts.name.is_empty() && !device.facts.driver.is_empty());
         assert!(device.facts.binding_bytes >= 128 << 20 && device.facts.workgroup_size >= 256, "{device:?}");
-        assert_eq!(found.why_none().is_none(), found.taken().next().is_some(), "{choice}");
+        assert_eq!(found.no_device_reason().is_none(), found.selected().next().is_some(), "{choice}");
     }
 }
 
 #[test]
 fn devices_keep_their_numbers() {
     let names = || {
-        let found = discover(&DeviceChoice::All, Look::Thorough);
+        let found = discover(&DeviceChoice::All, DiscoveryMode::Thorough);
         found.devices.into_iter().map(|d| (d.number, d.facts)).collect::<Vec<_>>()
     };
     assert_eq!(names(), names());
@@ -199,10 +199,10 @@ fn devices_keep_their_numbers() {
 #[test]
 fn a_missing_device_is_reported_and_cannot_be_started() {
     let choice: DeviceChoice = "77".parse().unwrap();
-    let found = discover(&choice, Look::Quick);
+    let found = discover(&choice, DiscoveryMode::Quick);
     assert_eq!(found.missing(&choice), ["there is no device 77"]);
     let Err(GpuError::NoDevice(why)) = GpuBackend::start(&found, &SETTINGS, None) else { panic!("it started") };
     assert!(!why.is_empty());
-    let quick = discover(&DeviceChoice::Cpu, Look::Quick);
-    assert_eq!((quick.devices.len(), quick.why_none().as_deref()), (0, Some("the CPU was requested")));
+    let quick = discover(&DeviceChoice::Cpu, DiscoveryMode::Quick);
+    assert_eq!((quick.devices.len(), quick.no_device_reason().as_deref()), (0, Some("the CPU was requested")));
 }

@@ -424,7 +424,7 @@ fn jobs_that_share_a_submission_are_independent() {
     jobs[11].deadline = Some(std::time::Instant::now());
     let mut answers = engine().run(&jobs);
     assert_eq!(answers.len(), 12);
-    assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Deadline);
+    assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(molmesh::surface::SurfaceError::Cancelled));
     let none = molmesh::surface::SurfaceError::NoSurface { isovalue: 1e6 };
     assert_eq!(answers.pop().unwrap().unwrap_err(), GpuError::Surface(none));

@@ -212,7 +212,7 @@ fn all_devices_are_reported() {
     let backend = GpuBackend::with_pool(pool(2, |_| (), SETTINGS), None);
     let meshed =
         backend.run(&crowd(200), &params(KERNELS[0], 1.0), &SurfaceLimits::default(), &Control::default()).unwrap();
-    assert_eq!(meshed.served.unwrap().device, "2 devices: device 0, device 1");
+    assert_eq!(meshed.made_by.unwrap().device, "2 devices: device 0, device 1");
     assert!(backend.devices().iter().all(|device| (device.finished, device.partitions) == (1, 1)));
 }
 
@@ -405,7 +405,7 @@ fn cancellation_and_deadline_end_a_wait_for_other_partitions() {
     let (pool, _gate) = faulty_pool(Fault::Idles, usize::MAX);
     let mut late = fresh();
     late.deadline = Some(started + Duration::from_millis(1500));
-    assert_eq!(pool.run(&late).map(drop).unwrap_err(), GpuError::Deadline);
+    assert_eq!(pool.run(&late).map(drop).unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     let (pool, gate) = faulty_pool(Fault::Idles, usize::MAX);
     let cancelled = fresh();
     let error = std::thread::scope(|scope| {

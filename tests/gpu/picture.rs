@@ -2,7 +2,7 @@
 
 use crate::tools;
 
-use molmesh::gpu::{GpuRenderer, Look, discover};
+use molmesh::gpu::{DiscoveryMode, GpuRenderer, discover};
 use molmesh::picture::{CpuRenderer, Image, PictureError, PictureParams, Renderer, Style, View};
 use molmesh::surface::{CancelToken, Control, DeviceChoice, Mesh, Step};
 use tools::shapes::{icosphere, union};
@@ -10,8 +10,8 @@ use tools::shapes::{icosphere, union};
 /// Renderer on the software Vulkan device (`mesa-vulkan-drivers`). CI has it; elsewhere the test is skipped without it.
 fn gpu(fallback: bool) -> Option<GpuRenderer> {
     let choice: DeviceChoice = "software".parse().unwrap();
-    let found = discover(&choice, Look::Thorough);
-    if found.taken().next().is_none() {
+    let found = discover(&choice, DiscoveryMode::Thorough);
+    if found.selected().next().is_none() {
         assert!(std::env::var_os("CI").is_none(), "no software Vulkan: install mesa-vulkan-drivers. {found:?}");
         #[expect(clippy::print_stderr, reason = "a skipped test is reported")]
         {
@@ -19,7 +19,7 @@ fn gpu(fallback: bool) -> Option<GpuRenderer> {
         }
         return None;
     }
-    Some(GpuRenderer::start(&found, fallback.then(CpuRenderer::default)).unwrap())
+    Some(GpuRenderer::start(&found, fallback.then_some(CpuRenderer)).unwrap())
 }
 
 fn params(style: Style, view: View) -> PictureParams {
@@ -35,7 +35,7 @@ fn balls() -> Mesh {
 
 fn of(renderer: &dyn Renderer, mesh: &Mesh, params: &PictureParams) -> Image {
     let rendered = renderer.render(mesh, params, &Control::default()).unwrap();
-    assert_eq!(rendered.served, None);
+    assert_eq!(rendered.made_by, None);
     rendered.image
 }
 
@@ -53,7 +53,7 @@ fn a_device_draws_the_picture_of_the_cpu() {
     let Some(gpu) = gpu(false) else { return };
     assert_eq!(gpu.name(), "gpu");
     assert!(gpu.describe().contains("software"), "{}", gpu.describe());
-    let (cpu, mesh) = (CpuRenderer::default(), balls());
+    let (cpu, mesh) = (CpuRenderer, balls());
     for (style, view, background) in [
         (Style::Gouraud, View::Front, "transparent"),
         (Style::Surface, View::Principal, "transparent"),
@@ -92,10 +92,10 @@ fn the_cpu_is_the_fallback_and_is_reported() {
     let refused = without.render(&mesh, &wide, &Control::default()).unwrap_err();
     assert!(matches!(&refused, PictureError::Device { why } if why.contains("a texture side")), "{refused}");
     let rendered = with.render(&mesh, &wide, &Control::default()).unwrap();
-    let served = rendered.served.unwrap();
-    assert_eq!(served.backend, "cpu");
-    assert!(served.fallback_reason.unwrap().contains("the GPU could not draw it"));
-    assert_eq!(rendered.image, of(&CpuRenderer::default(), &mesh, &wide));
+    let made_by = rendered.made_by.unwrap();
+    assert_eq!(made_by.backend, "cpu");
+    assert!(made_by.fallback_reason.unwrap().contains("the GPU could not draw it"));
+    assert_eq!(rendered.image, of(&CpuRenderer, &mesh, &wide));
     // Errors of the request are not passed to the fallback.
     let cancel = CancelToken::default();
     cancel.cancel();

@@ -125,7 +125,7 @@ fn a_full_queue_makes_callers_wait() {
     assert_eq!(left.join().unwrap().unwrap_err(), CANCELLED);
     let mut late = job(1);
     late.deadline = Some(Instant::now() + Duration::from_millis(20));
-    assert_eq!(pool.run(&late).map(|_| ()).unwrap_err(), GpuError::Deadline);
+    assert_eq!(pool.run(&late).map(|_| ()).unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     assert!(!last.is_finished());
     fake.release();
     ran.push(last);
@@ -169,14 +169,14 @@ fn a_deadline_ends_a_job_while_it_waits_and_while_it_runs() {
     wait_for("the first job to run", || fake.calls() == [1]);
     let ran = [first, start(&pool, &within(2, 30))];
     for job in ran {
-        assert_eq!(job.join().unwrap().unwrap_err(), GpuError::Deadline);
+        assert_eq!(job.join().unwrap().unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     }
     assert!(started.elapsed() >= Duration::from_millis(200));
     wait_for_load(&pool, 0, 0);
     // A job that is late from the start does not run.
     let mut late = job(3);
     late.deadline = Some(started);
-    assert_eq!(pool.run(&late).map(|_| ()).unwrap_err(), GpuError::Deadline);
+    assert_eq!(pool.run(&late).map(|_| ()).unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     pool.run(&job(4)).unwrap();
     assert_eq!(fake.atoms(), [[1], [4]]);
 }
@@ -294,7 +294,7 @@ fn a_dropped_pool_joins_its_threads() {
     let mut held = job(6_000);
     held.deadline = Some(Instant::now() + Duration::from_millis(80));
     running.run(&job(1)).unwrap();
-    assert_eq!(running.run(&held).map(|_| ()).unwrap_err(), GpuError::Deadline);
+    assert_eq!(running.run(&held).map(|_| ()).unwrap_err(), GpuError::Surface(SurfaceError::Deadline));
     assert_eq!(running.status()[0].held_bytes, 4096);
     drop(Arc::into_inner(running).unwrap());
     // Each thread owns its executor, so the threads have ended.

@@ -5,7 +5,9 @@ use crate::gpu_support;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use molmesh::gpu::{DevicePool, Engine, Executor, GpuBackend, GpuError, Look, PoolDevice, PoolSettings, discover};
+use molmesh::gpu::{
+    DevicePool, DiscoveryMode, Engine, Executor, GpuBackend, GpuError, PoolDevice, PoolSettings, discover,
+};
 use molmesh::surface::{Backend, Control, CpuBackend, MeshOutput, SurfaceError, SurfaceLimits, SurfaceParams};
 
 fn run(backend: &dyn Backend) -> Result<MeshOutput, SurfaceError> {
@@ -16,13 +18,14 @@ fn run(backend: &dyn Backend) -> Result<MeshOutput, SurfaceError> {
 #[test]
 fn a_discovered_device_gives_the_mesh_of_the_cpu() {
     let choice = "software".parse().unwrap();
-    let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
-    backend.warm().unwrap();
+    let backend =
+        GpuBackend::start(&discover(&choice, DiscoveryMode::Thorough), &PoolSettings::default(), None).unwrap();
+    backend.warm_up().unwrap();
     let (cpu, gpu) = (run(&CpuBackend::new(None).unwrap()).unwrap(), run(&backend).unwrap());
     assert_eq!(gpu.mesh.n_triangles(), cpu.mesh.n_triangles());
-    let served = gpu.served.unwrap();
-    assert_eq!((served.backend, served.fallback_reason), ("gpu", None));
-    assert_eq!(served.device, backend.describe());
+    let made_by = gpu.made_by.unwrap();
+    assert_eq!((made_by.backend, made_by.fallback_reason), ("gpu", None));
+    assert_eq!(made_by.device, backend.describe());
     let status = backend.devices().remove(0);
     assert_eq!((status.finished, status.failed, status.down), (2, 0, None));
     assert!(status.held_bytes > 0);
@@ -31,7 +34,8 @@ fn a_discovered_device_gives_the_mesh_of_the_cpu() {
 #[test]
 fn callers_share_submissions_and_get_the_mesh_of_a_single_job() {
     let choice = "software".parse().unwrap();
-    let backend = GpuBackend::start(&discover(&choice, Look::Thorough), &PoolSettings::default(), None).unwrap();
+    let backend =
+        GpuBackend::start(&discover(&choice, DiscoveryMode::Thorough), &PoolSettings::default(), None).unwrap();
     let alone = run(&backend).unwrap().mesh;
     std::thread::scope(|scope| {
         for _ in 0..12 {
@@ -87,7 +91,7 @@ fn the_cpu_replaces_a_device_that_is_lost_permanently() {
     for _ in 0..3 {
         let meshed = run(&backend).unwrap();
         assert!(meshed.mesh == cpu, "not the CPU's mesh");
-        assert!(meshed.served.unwrap().fallback_reason.unwrap().contains("the GPU failed"));
+        assert!(meshed.made_by.unwrap().fallback_reason.unwrap().contains("the GPU failed"));
     }
     let why = backend.devices().remove(0).down.unwrap();
     assert!(why.contains("given up after 3 rebuilds") && !why.contains('\n'), "{why}");

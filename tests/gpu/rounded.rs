@@ -1,4 +1,4 @@
-//! Quantised vertices from end to end: by devices, the CPU and the reference backend, in files and through pipes, by
+//! Quantized vertices from end to end: by devices, the CPU and the reference backend, in files and through pipes, by
 //! the command line and over HTTP. The report must agree with measurements of the received file.
 
 use crate::cli_support;
@@ -6,7 +6,7 @@ use crate::gpu_support;
 use crate::tools;
 
 use std::fs;
-use std::io::{Cursor, Read, Write};
+use std::io::{Read, Write};
 use std::net::TcpStream;
 
 use cli_support::{Folder, Service, assert_code, mesh, run, stdout};
@@ -17,7 +17,7 @@ use molmesh::surface::{
     Backend, CancelToken, Control, CpuBackend, Mesh, ReferenceBackend, SurfaceLimits, SurfaceParams, Validation,
 };
 use serde_json::Value;
-use tools::files::Files;
+use tools::files::{Files, MemoryFile};
 use tools::readers::{gltf_contents, split_glb};
 
 const SAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/samples/4pti.pdb");
@@ -47,7 +47,7 @@ fn made(backend: &dyn Backend, job: &Job) -> Product {
 }
 
 fn glb(product: &Product) -> Vec<u8> {
-    let encoder = Encoder::stored(Format::Glb, product.storage, &product.mesh, &product.meta()).unwrap();
+    let encoder = Encoder::new(Format::Glb, product.storage, &product.mesh, &product.meta()).unwrap();
     let mut bytes = Vec::new();
     encoder.write(&mut bytes).unwrap();
     bytes
@@ -91,9 +91,10 @@ fn every_backend_returns_integers_and_reports_their_measures() {
             (plain.report.vertices, plain.report.triangles),
             (product.report.vertices, product.report.triangles)
         );
-        // Other formats get unquantised vertices.
-        let refused = Encoder::new(Format::Ply, &product.mesh, &product.meta()).unwrap_err();
-        assert_eq!(refused, FormatError::NotQuantized { format: "ply" });
+        // Other formats get unquantized vertices.
+        let refused =
+            Encoder::new(Format::Ply, Packing::of(&product.mesh), &product.mesh, &product.meta()).unwrap_err();
+        assert_eq!(refused, FormatError::QuantizationNotSupported { format: "ply" });
     }
 }
 
@@ -148,14 +149,14 @@ fn one_and_two_devices_make_the_same_file_in_any_write_order() {
     let sums = [&alone, &spread].map(|product| (product.report.area, product.report.volume));
     assert!(near(sums[0].0, sums[1].0, 1e-12) && near(sums[0].1, sums[1].1, 1e-12), "{sums:?}");
     for (backend, expected) in [(&one as &dyn Backend, &expected[0]), (&two, &expected[1])] {
-        let mut file = Cursor::new(Vec::new());
-        let sink = GlbSink::new(&mut file);
+        let file = MemoryFile::default();
+        let sink = GlbSink::new(&file);
         let (choice, limits) = (Choice { backend, reason: "set by a test" }, JobLimits::default());
         let cancel = CancelToken::default();
         let product = pipeline::run(&sample(), &job, &limits, &choice, &cancel, &(), Some(&sink)).unwrap();
         drop(sink);
         assert!(product.mesh.positions.is_empty() && product.streamed_bytes == Some(expected.len() as u64));
-        assert!(file.into_inner() == *expected);
+        assert!(file.into_bytes() == *expected);
     }
     // Control: another spacing gives another file.
     let other = glb(&made(&one, &self::job(&[("resolution", "0.45")])));
@@ -173,13 +174,13 @@ fn vertices_beyond_the_step_are_rejected_when_writing() {
     for backend in [&devices(1) as &dyn Backend, &CpuBackend::new(Some(2)).unwrap()] {
         let meshed = backend.run(&spheres, &short, &SurfaceLimits::default(), &Control::default()).unwrap();
         let packing = Packing::of(&meshed.mesh);
-        let refusal = Encoder::stored(Format::Glb, packing, &meshed.mesh, &molmesh::formats::Meta::default());
-        assert!(matches!(refusal, Err(FormatError::BeyondStep { .. })), "{}", backend.name());
+        let refusal = Encoder::new(Format::Glb, packing, &meshed.mesh, &molmesh::formats::Meta::default());
+        assert!(matches!(refusal, Err(FormatError::OutOfQuantizationRange { .. })), "{}", backend.name());
     }
 }
 
 #[test]
-fn external_readers_accept_vertices_quantised_by_devices() {
+fn external_readers_accept_vertices_quantized_by_devices() {
     let (mut files, mut reports) = (Files::new(), Vec::new());
     let two = devices(2);
     for (name, more) in [
@@ -230,7 +231,7 @@ fn contents(glb: &[u8]) -> (Value, Vec<u8>) {
 const ON_SOFTWARE: [&str; 4] = ["--backend", "gpu", "--devices", "software"];
 
 #[test]
-fn the_command_line_quantises_on_a_device() {
+fn the_command_line_quantizes_on_a_device() {
     let folder = Folder::new();
     let output = folder.path("out.glb");
     let flags = [&ON_SOFTWARE[..], &["--compress", "quantize", "--resolution", "0.5", "--report", "json"]].concat();
@@ -275,7 +276,7 @@ fn post(addr: &str, target: &str) -> Vec<u8> {
 }
 
 #[test]
-fn a_service_quantises_on_a_device() {
+fn a_service_quantizes_on_a_device() {
     let folder = Folder::new();
     let service = Service::start(&folder, &ON_SOFTWARE);
     let query = "compress=quantize&resolution=0.5";
@@ -294,11 +295,11 @@ fn a_service_quantises_on_a_device() {
     assert!(plain.len() as u64 > file.len() as u64 + 11 * expected.report.vertices);
 }
 
-/// The mesh of a product is quantised completely or not at all.
+/// The mesh of a product is quantized completely or not at all.
 #[test]
-fn an_empty_mesh_stays_empty_when_quantised() {
+fn an_empty_mesh_stays_empty_when_quantized() {
     let mut mesh = Mesh::default();
     assert!(mesh.quantize(Step::covering(1.0)));
     assert_eq!((mesh.n_vertices(), mesh.bounds()), (0, [[0.0; 3]; 2]));
-    assert!(Encoder::new(Format::Glb, &mesh, &molmesh::formats::Meta::default()).is_ok());
+    assert!(Encoder::new(Format::Glb, Packing::Full, &mesh, &molmesh::formats::Meta::default()).is_ok());
 }

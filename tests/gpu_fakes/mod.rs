@@ -110,7 +110,7 @@ impl Executor for FakeExecutor {
                 Err(GpuError::Surface(SurfaceError::Cancelled))
             }
             Step::Finish | Step::Block | Step::OmitResult if job.deadline.is_some_and(|d| d <= Instant::now()) => {
-                Err(GpuError::Deadline)
+                Err(GpuError::Surface(SurfaceError::Deadline))
             }
             Step::Finish | Step::Block | Step::OmitResult => Ok(Finished {
                 meshed: MeshOutput::new(Mesh::default(), GridStats { samples: 7, ..GridStats::default() }),

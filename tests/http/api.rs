@@ -64,7 +64,7 @@ fn a_plain_curl_upload_is_meshed_by_the_real_backend() {
     let coarse = server.post("/v1/meshes?resolution=1", &[CURL], SAMPLE);
     assert_ne!(coarse.header("etag"), reply.header("etag"));
     assert!(coarse.body.len() < reply.body.len());
-    assert!(server.metric("molmesh_voxels_processed_total", &[]) > 0.0);
+    assert!(server.metric("molmesh_grid_points_evaluated_total", &[]) > 0.0);
     assert!(server.join());
 }
 
@@ -296,7 +296,7 @@ fn errors_name_bad_parameters_and_expected_values() {
 }
 
 #[test]
-fn only_glb_and_gltf_are_quantised() {
+fn only_glb_and_gltf_are_quantized() {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |_| {});
     let archive = server.dir.path().join("archive/pt");
     std::fs::create_dir_all(&archive).unwrap();
@@ -670,7 +670,9 @@ fn requests_change_the_metrics() {
     assert_eq!(SERVER.post("/v1/meshes", &[], &http_support::sample(77)).status, 200);
     http_support::wait_for("the request is counted", || count() > before.0);
     assert!(SERVER.metric("molmesh_jobs_finished_total", &["successful"]) > before.1);
-    for name in ["molmesh_triangles_emitted_total", "molmesh_voxels_processed_total", "molmesh_jobs_submitted_total"] {
+    for name in
+        ["molmesh_triangles_emitted_total", "molmesh_grid_points_evaluated_total", "molmesh_jobs_submitted_total"]
+    {
         assert!(SERVER.metric(name, &[]) > 0.0, "{name}");
     }
     for stage in ["queue", "read", "select", "measure", "encode"] {

@@ -11,8 +11,9 @@ use std::time::{Duration, Instant};
 
 use archive_support::{Remote, Response, ok, status, tagged, with};
 use http_support::{Fake, Mode, SAMPLE, send, start};
-use molmesh::archive::{Archive, Entry, FetchError, Source, Uncounted, Why};
+use molmesh::archive::{Archive, Entry, FetchError, Source, UnavailableReason};
 use molmesh::config::Config;
+use molmesh::memory_budget::Budget;
 use molmesh::store::Digest;
 use molmesh::structure::EntryId;
 
@@ -52,7 +53,7 @@ impl Setup {
     }
 
     fn archive(&self) -> Archive {
-        Archive::new(&self.config, Arc::new(Uncounted))
+        Archive::new(&self.config, Budget::unlimited())
     }
 
     fn copies(&self) -> PathBuf {
@@ -72,9 +73,9 @@ async fn once(url: &str, change: impl FnOnce(&mut Config)) -> Result<Entry, Fetc
 }
 
 #[track_caller]
-fn why(result: Result<Entry, FetchError>) -> (Why, Option<Duration>) {
+fn why(result: Result<Entry, FetchError>) -> (UnavailableReason, Option<Duration>) {
     match result {
-        Err(FetchError::Unavailable { why, retry_after, .. }) => (why, retry_after),
+        Err(FetchError::Unavailable { reason, retry_after, .. }) => (reason, retry_after),
         other => panic!("{other:?}"),
     }
 }
@@ -113,7 +114,7 @@ async fn accepts_chunked_responses() {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_folder_takes_precedence() {
     let remote = Remote::saying(ok(b"remote"));
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.check_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.local_check_interval_ms = 1);
     place.put("4pti.cif", b"local");
     let archive = place.archive();
     let entry = archive.fetch(&id("4pti")).await.unwrap();
@@ -136,15 +137,15 @@ async fn digests_are_cached() {
     std::fs::remove_dir_all(place.copies()).unwrap();
     assert_eq!(archive.known(&id("4pti")).await, Some(Digest::of(b"remote")));
     // Cached digests expire.
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1000);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1000);
     let archive = place.archive();
     archive.fetch(&id("4pti")).await.unwrap();
     assert!(archive.known(&id("4pti")).await.is_some());
     pause(1100).await;
     assert_eq!(archive.known(&id("4pti")).await, None);
-    // A local file is checked again after `check_ms`.
-    for (check_ms, expected) in [(60_000, &b"old"[..]), (1, &b"newer"[..])] {
-        let place = Setup::new(&remote.url(CIF), |c| c.archive.check_ms = check_ms);
+    // A local file is checked again after `local_check_interval_ms`.
+    for (local_check_interval_ms, expected) in [(60_000, &b"old"[..]), (1, &b"newer"[..])] {
+        let place = Setup::new(&remote.url(CIF), |c| c.archive.local_check_interval_ms = local_check_interval_ms);
         place.put("4pti.cif", b"old");
         let archive = place.archive();
         assert_eq!(archive.digest(&id("4pti")).await.unwrap(), Digest::of(b"old"));
@@ -152,7 +153,7 @@ async fn digests_are_cached() {
         assert_eq!(archive.known(&id("4pti")).await, Some(Digest::of(b"old")));
         place.put("4pti.cif", b"newer");
         pause(5).await;
-        assert_eq!(archive.digest(&id("4pti")).await.unwrap(), Digest::of(expected), "{check_ms}");
+        assert_eq!(archive.digest(&id("4pti")).await.unwrap(), Digest::of(expected), "{local_check_interval_ms}");
     }
 }
 
@@ -164,7 +165,7 @@ async fn old_copies_are_revalidated() {
         2 => tagged("\"b\"", b"second"),
         _ => status(500),
     });
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1000);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1000);
     let archive = place.archive();
     let fetch = async || {
         let entry = archive.fetch(&id("4pti")).await.unwrap();
@@ -183,7 +184,7 @@ async fn old_copies_are_revalidated() {
     let mut config = place.config.clone();
     config.archive.url = Some(other.url(CIF).parse().unwrap());
     pause(1100).await;
-    assert_eq!(&Archive::new(&config, Arc::new(Uncounted)).fetch(&id("4pti")).await.unwrap().bytes[..], b"third");
+    assert_eq!(&Archive::new(&config, Budget::unlimited()).fetch(&id("4pti")).await.unwrap().bytes[..], b"third");
     assert_eq!(other.requests()[0].header("if-none-match"), None);
 }
 
@@ -194,7 +195,7 @@ async fn revalidates_by_date_without_an_etag() {
         Some(since) if since == date => status(304),
         _ => Response::Whole(200, vec![("last-modified", date.to_owned())], b"x".to_vec()),
     });
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1);
     let archive = place.archive();
     for source in [Source::Remote, Source::Cache, Source::Cache] {
         assert_eq!(archive.fetch(&id("4pti")).await.unwrap().source, source);
@@ -215,7 +216,7 @@ async fn tries_the_second_url_if_the_first_fails() {
     // The unavailable URL may have the entry, so the error is not "not found".
     let (dead, without) = (Remote::saying(status(500)), Remote::saying(status(404)));
     let urls = format!("{} {}", dead.url(CIF), without.url(CIF));
-    assert_eq!(why(once(&urls, |c| c.archive.attempts = 1).await).0, Why::Status(500));
+    assert_eq!(why(once(&urls, |c| c.archive.attempts = 1).await).0, UnavailableReason::Status(500));
 }
 
 // -------------------------------------------------------------------------------------------------- missing entries
@@ -224,7 +225,7 @@ async fn tries_the_second_url_if_the_first_fails() {
 async fn missing_entries_are_not_requested_again_for_a_while() {
     for absent in [404, 410] {
         let remote = Remote::saying(status(absent));
-        let place = Setup::new(&remote.url(CIF), |c| c.archive.absent_ms = 1000);
+        let place = Setup::new(&remote.url(CIF), |c| c.archive.retry_missing_after_ms = 1000);
         let archive = place.archive();
         for _ in 0..3 {
             assert!(matches!(archive.fetch(&id("4pti")).await, Err(FetchError::NotFound { .. })), "{absent}");
@@ -241,7 +242,7 @@ async fn missing_entries_are_not_requested_again_for_a_while() {
 #[tokio::test(flavor = "multi_thread")]
 async fn copies_of_withdrawn_entries_are_removed() {
     let remote = Remote::start(|_, n| if n == 0 { ok(b"x") } else { status(410) });
-    let place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1);
     let archive = place.archive();
     archive.fetch(&id("4pti")).await.unwrap();
     pause(5).await;
@@ -253,7 +254,7 @@ async fn copies_of_withdrawn_entries_are_removed() {
 #[tokio::test(flavor = "multi_thread")]
 async fn without_urls_no_request_is_sent() {
     let remote = Remote::saying(ok(b"x"));
-    let mut place = Setup::new(&remote.url(CIF), |c| c.archive.fresh_ms = 1);
+    let mut place = Setup::new(&remote.url(CIF), |c| c.archive.revalidate_after_ms = 1);
     place.archive().fetch(&id("4pti")).await.unwrap();
     place.config.archive.url = None;
     pause(5).await;
@@ -286,11 +287,11 @@ async fn redirects_are_limited_and_stay_on_their_host() {
     for to in targets {
         let remote = Remote::saying(with(307, "location", &to));
         let result = once(&remote.url(CIF), |c| c.archive.allow_private = true).await;
-        assert_eq!((why(result), remote.count()), ((Why::Redirect, None), 1), "{to}");
+        assert_eq!((why(result), remote.count()), ((UnavailableReason::Redirect, None), 1), "{to}");
     }
     assert_eq!(elsewhere.count(), 0);
     let looped = Remote::saying(with(301, "location", "/d/4pti.cif"));
-    assert_eq!(why(once(&looped.url(CIF), |_| {}).await).0, Why::Redirect);
+    assert_eq!(why(once(&looped.url(CIF), |_| {}).await).0, UnavailableReason::Redirect);
     assert!(looped.count() <= 4);
 }
 
@@ -308,7 +309,7 @@ async fn slow_heads_and_bodies_time_out() {
             c.archive.attempts = 2;
         })
         .await;
-        assert_eq!((why(result).0, remote.count()), (Why::Timeout, 2));
+        assert_eq!((why(result).0, remote.count()), (UnavailableReason::Timeout, 2));
         assert!(begin.elapsed() < Duration::from_secs(30), "{:?}", begin.elapsed());
     }
     // The total time also ends a response that keeps arriving.
@@ -318,7 +319,7 @@ async fn slow_heads_and_bodies_time_out() {
         c.archive.max_bytes = u64::MAX;
     })
     .await;
-    assert_eq!(why(result).0, Why::Timeout);
+    assert_eq!(why(result).0, UnavailableReason::Timeout);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -327,7 +328,11 @@ async fn responses_of_the_wrong_length_are_rejected() {
     let announcing = |n: usize| {
         [format!("HTTP/1.1 200 X\r\nconnection: close\r\ncontent-length: {n}\r\n\r\n").as_bytes(), &gz].concat()
     };
-    for (n, expected) in [(gz.len() + 1, Why::Broken), (gz.len() - 1, Why::Damaged), (4, Why::Damaged)] {
+    for (n, expected) in [
+        (gz.len() + 1, UnavailableReason::Broken),
+        (gz.len() - 1, UnavailableReason::Damaged),
+        (4, UnavailableReason::Damaged),
+    ] {
         let remote = Remote::saying(Response::Raw(announcing(n)));
         let place = Setup::new(&remote.url(GZ), |_| {});
         let result = place.archive().fetch(&id("4pti")).await;
@@ -337,9 +342,9 @@ async fn responses_of_the_wrong_length_are_rejected() {
     let remote = Remote::saying(Response::Raw(announcing(gz.len())));
     assert_eq!(&once(&remote.url(GZ), |_| {}).await.unwrap().bytes[..], &gz[..]);
     let cut = Remote::saying(Response::Raw(b"HTTP/1.1 200 X\r\ntransfer-encoding: chunked\r\n\r\n5\r\nab".into()));
-    assert_eq!(why(once(&cut.url(CIF), |_| {}).await).0, Why::Broken);
+    assert_eq!(why(once(&cut.url(CIF), |_| {}).await).0, UnavailableReason::Broken);
     let page = Remote::saying(ok(b"<html>please log in</html>"));
-    assert_eq!(why(once(&page.url(GZ), |_| {}).await).0, Why::Damaged);
+    assert_eq!(why(once(&page.url(GZ), |_| {}).await).0, UnavailableReason::Damaged);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -365,7 +370,7 @@ async fn only_temporary_failures_are_retried() {
     for (bad, requests) in [(500, 3), (503, 3), (429, 3), (403, 1), (401, 1), (304, 1), (206, 1)] {
         let remote = Remote::saying(status(bad));
         let (why, retry_after) = why(once(&remote.url(CIF), |_| {}).await);
-        assert_eq!((why, remote.count()), (Why::Status(bad), requests));
+        assert_eq!((why, remote.count()), (UnavailableReason::Status(bad), requests));
         assert_eq!(retry_after.is_some(), requests > 1, "{bad}");
     }
     let remote = Remote::start(|_, n| if n < 2 { status(500) } else { ok(b"x") });
@@ -383,7 +388,7 @@ async fn retry_after_is_respected() {
     let busy = Remote::saying(with(503, "retry-after", "100"));
     let place = Setup::new(&busy.url(CIF), |_| {});
     let archive = place.archive();
-    for expected in [Why::Status(503), Why::Paused] {
+    for expected in [UnavailableReason::Status(503), UnavailableReason::Paused] {
         let (why, retry_after) = why(archive.fetch(&id("4pti")).await);
         assert_eq!((why, busy.count()), (expected, 1));
         assert!(retry_after.is_some_and(|d| (95..=100).contains(&d.as_secs())), "{retry_after:?}");
@@ -399,7 +404,7 @@ fn unreachable() -> String {
 #[tokio::test(flavor = "multi_thread")]
 async fn the_circuit_breaker_opens_and_closes() {
     let (result, retry_after) = why(once(&unreachable(), |_| {}).await);
-    assert_eq!(result, Why::Connect);
+    assert_eq!(result, UnavailableReason::Connect);
     assert!(retry_after.is_some());
 
     let broken = Arc::new(AtomicBool::new(true));
@@ -412,18 +417,18 @@ async fn the_circuit_breaker_opens_and_closes() {
     });
     let archive = place.archive();
     for _ in 0..2 {
-        assert_eq!(why(archive.fetch(&id("4pti")).await).0, Why::Status(500));
+        assert_eq!(why(archive.fetch(&id("4pti")).await).0, UnavailableReason::Status(500));
     }
     for entry in ["4pti", "1abc", "2abc"] {
         let (why, retry_after) = why(archive.fetch(&id(entry)).await);
-        assert_eq!(why, Why::Paused);
+        assert_eq!(why, UnavailableReason::Paused);
         assert!(retry_after.unwrap() <= Duration::from_millis(1500));
     }
     assert_eq!(remote.count(), 2, "no requests during the pause");
     // The probe fails.
     pause(1600).await;
-    assert_eq!(why(archive.fetch(&id("4pti")).await).0, Why::Status(500));
-    assert_eq!(why(archive.fetch(&id("4pti")).await).0, Why::Paused);
+    assert_eq!(why(archive.fetch(&id("4pti")).await).0, UnavailableReason::Status(500));
+    assert_eq!(why(archive.fetch(&id("4pti")).await).0, UnavailableReason::Paused);
     assert_eq!(remote.count(), 3);
     broken.store(false, Ordering::SeqCst);
     pause(1600).await;
@@ -436,7 +441,7 @@ async fn the_circuit_breaker_opens_and_closes() {
 async fn a_stale_copy_is_used_if_the_archive_fails() {
     let remote = Remote::start(|_, n| if n == 0 { ok(b"x") } else { status(500) });
     let place = Setup::new(&remote.url(CIF), |c| {
-        c.archive.fresh_ms = 1;
+        c.archive.revalidate_after_ms = 1;
         c.archive.attempts = 1;
         c.archive.breaker_failures = 1;
     });
@@ -448,14 +453,14 @@ async fn a_stale_copy_is_used_if_the_archive_fails() {
         let entry = archive.fetch(&id("4pti")).await.unwrap();
         assert_eq!((&entry.bytes[..], entry.source, remote.count()), (&b"x"[..], Source::Cache, 2));
     }
-    assert_eq!(why(archive.fetch(&id("1abc")).await).0, Why::Paused);
+    assert_eq!(why(archive.fetch(&id("1abc")).await).0, UnavailableReason::Paused);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn names_must_not_resolve_to_private_addresses() {
     let remote = Remote::saying(ok(b"x"));
     let by_name = format!("http://localhost:{}{CIF}", remote.addr.port());
-    assert_eq!(why(once(&by_name, |_| {}).await), (Why::Private, None));
+    assert_eq!(why(once(&by_name, |_| {}).await), (UnavailableReason::Private, None));
     assert_eq!(remote.count(), 0);
     once(&by_name, |c| c.archive.allow_private = true).await.unwrap();
     // IP addresses in the configuration are allowed.
@@ -471,7 +476,7 @@ async fn a_configured_proxy_is_used() {
     let set = |c: &mut Config| c.archive.proxy = Some(serde_json::from_value(named.into()).unwrap());
     assert_eq!(&once(&url, set).await.unwrap().bytes[..], b"x");
     assert_eq!(proxy.requests()[0].path, "http://archive.invalid/d/4pti.cif");
-    assert_eq!(why(once(&url, |_| {}).await).0, Why::Connect);
+    assert_eq!(why(once(&url, |_| {}).await).0, UnavailableReason::Connect);
 }
 
 // ------------------------------------------------------------------------------------------------------ concurrency
@@ -536,7 +541,7 @@ async fn concurrent_fetches_are_limited() {
         tokio::spawn(async move { archive.fetch(&id(entry)).await });
     }
     let end = why(archive.fetch(&id("5aaa")).await).0;
-    assert!([Why::Timeout, Why::Busy].contains(&end), "{end:?}");
+    assert!([UnavailableReason::Timeout, UnavailableReason::Busy].contains(&end), "{end:?}");
 }
 
 // ------------------------------------------------------------------------------------------------- copies on disk
@@ -703,7 +708,7 @@ fn missing_and_too_large_entries_are_reported() {
 fn stale_copies_are_counted_and_logged() {
     let remote = Remote::start(|_, n| if n == 0 { ok(SAMPLE) } else { status(500) });
     let server = server(&remote.url(CIF), |c| {
-        c.archive.fresh_ms = 1;
+        c.archive.revalidate_after_ms = 1;
         c.archive.attempts = 1;
     });
     let stale = || server.metric("molmesh_archive_requests_total", &["result=\"stale\""]);

@@ -18,7 +18,7 @@ fn file(text: &str) -> tempfile::NamedTempFile {
 #[test]
 fn the_example_is_the_default_and_complete() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("molmesh.example.toml");
-    assert_eq!(load(Some(&path), [], &[]).unwrap(), Config::default());
+    assert_eq!(load(Some(&path), [], &[]).unwrap().config, Config::default());
     let text = std::fs::read_to_string(path).unwrap();
     let defaults = serde_json::to_value(Config::default()).unwrap();
     for (section, keys) in defaults.as_object().unwrap() {
@@ -41,7 +41,7 @@ fn later_layers_override_earlier_ones() {
         ("MOLMESH_OTHER", "x"),
     ]);
     let flags = pairs(&[("jobs.deadline_ms", "9"), ("server.metrics_listen", "none"), ("archive.dir", "/pdb")]);
-    let config = load(Some(file.path()), env, &flags).unwrap();
+    let config = load(Some(file.path()), env, &flags).unwrap().config;
     assert_eq!((config.jobs.workers, config.jobs.queue, config.jobs.deadline_ms), (3, 6, 9));
     assert_eq!((config.limits.body_bytes, config.log.format), (1 << 20, LogFormat::Json));
     assert_eq!((config.server.metrics_listen, config.archive_dir()), (None, "/pdb".into()));
@@ -53,17 +53,17 @@ fn archives_are_configured_as_text_or_as_a_list() {
     let urls = |config: &Config| config.archive.url.as_ref().map(ToString::to_string);
     let both = Some("http://a/{id} http://b/{middle}/{id_upper}".to_owned());
     let list = file("[archive]\nurl = [\"http://a/{id}\", \"http://b/{middle}/{id_upper}\"]\nallow_private = true\n");
-    let config = load(Some(list.path()), [], &[]).unwrap();
+    let config = load(Some(list.path()), [], &[]).unwrap().config;
     assert_eq!((urls(&config), config.archive.allow_private), (both.clone(), true));
     let env = pairs(&[
         ("MOLMESH__ARCHIVE__URL", "http://a/{id} http://b/{middle}/{id_upper}"),
         ("MOLMESH__ARCHIVE__ALLOW_PRIVATE", "true"),
         ("MOLMESH__ARCHIVE__PROXY", "http://p:3128"),
     ]);
-    let config = load(None, env, &[]).unwrap();
+    let config = load(None, env, &[]).unwrap().config;
     assert_eq!((urls(&config), config.archive.allow_private), (both, true));
     assert_eq!(config.archive.proxy.unwrap().as_str(), "http://p:3128");
-    let off = load(None, pairs(&[("MOLMESH__ARCHIVE__URL", "none")]), &[]).unwrap();
+    let off = load(None, pairs(&[("MOLMESH__ARCHIVE__URL", "none")]), &[]).unwrap().config;
     assert_eq!((urls(&off), urls(&Config::default()).is_some()), (None, true));
 }
 
@@ -132,7 +132,7 @@ fn errors_of_bad_values_name_key_value_and_expected_range() {
 
 #[test]
 fn optional_numbers_are_cleared_by_none_and_set_again() {
-    let spread = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().devices.min_partition_bricks;
+    let spread = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().config.devices.min_partition_bricks;
     assert_eq!(spread(&[]), Some(molmesh::surface::devices::MIN_PARTITION_BRICKS));
     assert_eq!(spread(&[("devices.min_partition_bricks", "none")]), None);
     assert_eq!(
@@ -143,7 +143,7 @@ fn optional_numbers_are_cleared_by_none_and_set_again() {
 
 #[test]
 fn optional_counts_are_read_from_every_layer() {
-    let requests = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().access.address_requests;
+    let requests = |flags: &[(&str, &str)]| load(None, [], &pairs(flags)).unwrap().config.access.address_requests;
     assert_eq!(requests(&[]), None);
     assert_eq!(requests(&[("access.address_requests", "1_000")]), Some(1000));
     assert_eq!(requests(&[("access.address_requests", "5"), ("access.address_requests", "none")]), None);
@@ -151,14 +151,14 @@ fn optional_counts_are_read_from_every_layer() {
         "[access]\naddress_requests = 7\ncors_origins = [\"https://a.example\", \"http://b.example:81\"]\n\
          [server]\ntrusted_proxies = [\"10.0.0.0/8\", \"::1\"]\nforwarded_header = \"forwarded\"",
     );
-    let config = load(Some(lists.path()), [], &[]).unwrap();
+    let config = load(Some(lists.path()), [], &[]).unwrap().config;
     assert_eq!(config.access.address_requests, Some(7));
     assert_eq!(config.access.cors_origins.unwrap().to_string(), "https://a.example http://b.example:81");
     assert!(config.server.trusted_proxies.unwrap().contains("10.9.9.9".parse().unwrap()));
-    let off = load(None, [], &pairs(&[("access.cors_origins", "none")])).unwrap();
+    let off = load(None, [], &pairs(&[("access.cors_origins", "none")])).unwrap().config;
     assert_eq!(off.access.cors_origins, None);
     // The secret is not printed.
-    let config = load(None, pairs(&[("MOLMESH__ACCESS__SIGNING_SECRET", "a:geheim")]), &[]).unwrap();
+    let config = load(None, pairs(&[("MOLMESH__ACCESS__SIGNING_SECRET", "a:geheim")]), &[]).unwrap().config;
     assert_eq!(config.access.signing_secret.as_ref().unwrap().reveal(), "a:geheim");
     assert!(!format!("{config:?}").contains("geheim"));
 }

@@ -32,7 +32,7 @@ const ROWS: &[Row] = &[
     ("limits.inflated_bytes", "inflated-too-large", "http/limits::compression_bombs_stop_at_the_inflated_limit"),
     ("limits.atoms", "too-many-atoms", "http/limits::atoms_are_limited"),
     ("limits.labels", "too-many-atoms", "http/limits::listed_atoms_are_limited"),
-    ("limits.grid_samples", "grid-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
+    ("limits.grid_points", "grid-too-large", "http/limits::grids_and_meshes_are_limited_and_suggested_spacings_fit"),
     (
         "limits.candidate_pairs",
         "too-many-candidates",
@@ -57,7 +57,7 @@ const ROWS: &[Row] = &[
         "molmesh_jobs_finished_total",
         "http/jobs_durable::a_job_that_repeatedly_crashes_the_process_fails",
     ),
-    ("jobs.concurrent_saves", "molmesh_results_not_kept_total", "http/limits::concurrent_saves_are_limited"),
+    ("jobs.concurrent_saves", "molmesh_results_not_stored_total", "http/limits::concurrent_saves_are_limited"),
     ("devices.jobs", "molmesh_device_jobs", "http/devices::devices_are_listed_with_their_reasons"),
     ("devices.batch", "molmesh_device_shared_submissions_total", "gpu/pool::small_jobs_share_a_submission"),
     (
@@ -65,7 +65,7 @@ const ROWS: &[Row] = &[
         "molmesh_device_partitions_total",
         "gpu/multi_device::concurrent_callers_neither_deadlock_nor_mix_partitions",
     ),
-    ("archive.check_ms", "", "http/archive_http::digests_are_cached"),
+    ("archive.local_check_interval_ms", "", "http/archive_http::digests_are_cached"),
     (
         "archive.connect_timeout_ms",
         "molmesh_archive_requests_total",
@@ -82,9 +82,9 @@ const ROWS: &[Row] = &[
     ("archive.retry_after_ms", "molmesh_archive_breaker_open", "http/archive_http::retry_after_is_respected"),
     ("archive.max_bytes", "entry-too-large", "http/archive_http::bodies_are_limited_during_the_transfer"),
     ("archive.concurrent", "molmesh_archive_fetch_seconds", "http/archive_http::concurrent_fetches_are_limited"),
-    ("archive.fresh_ms", "molmesh_archive_requests_total", "http/archive_http::old_copies_are_revalidated"),
+    ("archive.revalidate_after_ms", "molmesh_archive_requests_total", "http/archive_http::old_copies_are_revalidated"),
     (
-        "archive.absent_ms",
+        "archive.retry_missing_after_ms",
         "molmesh_archive_requests_total",
         "http/archive_http::missing_entries_are_not_requested_again_for_a_while",
     ),
@@ -124,12 +124,12 @@ const ROWS: &[Row] = &[
         "molmesh_cache_requests_total",
         "http/store::memory_cache_is_bounded_and_drops_removed_objects",
     ),
-    ("jobs.store_patience_ms", "molmesh_store_errors_total", "http/service_s3::asynchronous_jobs_survive_an_s3_outage"),
+    ("jobs.save_retry_ms", "molmesh_store_errors_total", "http/service_s3::asynchronous_jobs_survive_an_s3_outage"),
     ("access.address_requests", "quota-exceeded", "http/access::addresses_have_quotas_also_behind_trusted_proxies"),
     ("access.address_work_s", "quota-exceeded", "http/access::addresses_have_quotas_of_time_and_concurrency"),
     ("access.address_concurrent", "quota-exceeded", "http/access::addresses_have_quotas_of_time_and_concurrency"),
     ("access.window_s", "quota-exceeded", "http/access::addresses_have_quotas_of_time_and_concurrency"),
-    ("access.clients", "molmesh_quota_clients", "src/access/meter::memory_is_bounded_and_no_usage_is_forgotten"),
+    ("access.max_addresses", "molmesh_quota_clients", "src/access/meter::memory_is_bounded_and_no_usage_is_forgotten"),
     ("access.hsts_s", "", "http/access::security_headers_are_sent"),
     ("telemetry.sample_ratio", "molmesh_trace_spans_total", "telemetry/traces::a_fraction_of_the_traces_is_recorded"),
     (

@@ -5,7 +5,7 @@ use crate::tools;
 
 use std::path::Path;
 
-use molmesh::config::{load, load_with_sources, schema};
+use molmesh::config::{load, schema};
 use serde::Deserialize;
 use serde_json::{Value, json};
 
@@ -50,7 +50,7 @@ fn the_committed_schema_matches_the_types() {
 #[test]
 fn an_external_validator_accepts_the_schema_and_the_example() {
     let example = document(&std::fs::read_to_string(self::example()).unwrap());
-    let effective = load_with_sources(Some(&self::example()), [], &[]).unwrap().to_json();
+    let effective = load(Some(&self::example()), [], &[]).unwrap().to_json();
     let Some(verdict) = validate(&schema(), &[example.clone(), effective["config"].clone(), json!({})]) else { return };
     assert_eq!((verdict.schema, verdict.documents), (None, vec![Vec::<String>::new(); 3]));
     // Control: an invalid schema, and one that the example violates.

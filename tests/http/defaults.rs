@@ -112,7 +112,7 @@ fn sending_all_defaults_changes_nothing() {
 /// Reads a request as the canonical text of its parameters.
 fn read(pairs: &[(&str, &str)], format: Format) -> Result<String, ParamError> {
     let mut request = params::parse(pairs.iter().copied())?;
-    params::settle(&mut request.job, format)?;
+    params::set_format(&mut request.job, format)?;
     Ok(format!("{} {}", params::canonical(&request.job), request.strict))
 }
 

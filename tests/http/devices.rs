@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use http_support::{Fake, Mode, SAMPLE, log_lines, send, start_on, wait_for};
 use molmesh::surface::{
-    Backend, Control, DeviceFacts, DeviceKind, DeviceStatus, FoundDevice, MeshOutput, MeshSink, Served, Spheres,
-    SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, BackendIdentity, Control, DeviceFacts, DeviceKind, DeviceStatus, FoundDevice, MeshOutput, MeshSink,
+    Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
 };
 
 /// Backend with two devices, the second of which can fail.
@@ -70,11 +70,11 @@ impl Backend for Devices {
             Some(_) => "cpu".to_owned(),
             None => self.served.lock().unwrap().map_or_else(|| self.arithmetic(), str::to_owned),
         };
-        let served = Some(Served { backend, arithmetic, device: device.to_owned(), fallback_reason });
-        Ok(MeshOutput { served, ..self.fake.write(spheres, params, limits, control, sink)? })
+        let made_by = Some(BackendIdentity { backend, arithmetic, device: device.to_owned(), fallback_reason });
+        Ok(MeshOutput { made_by, ..self.fake.write(spheres, params, limits, control, sink)? })
     }
 
-    fn warm(&self) -> Result<(), SurfaceError> {
+    fn warm_up(&self) -> Result<(), SurfaceError> {
         while !self.warm.load(Ordering::SeqCst) {
             std::thread::sleep(Duration::from_millis(2));
         }
@@ -102,7 +102,7 @@ impl Backend for Devices {
 }
 
 fn found() -> Vec<FoundDevice> {
-    let device = |number: usize, taken: bool, reason: &str| FoundDevice {
+    let device = |number: usize, selected: bool, reason: &str| FoundDevice {
         number,
         facts: DeviceFacts {
             name: format!("card {number}"),
@@ -118,7 +118,7 @@ fn found() -> Vec<FoundDevice> {
             timestamps: true,
             subgroups: Some([32, 32]),
         },
-        taken,
+        selected,
         reason: reason.to_owned(),
     };
     vec![device(0, true, "discrete"), device(1, true, "discrete"), device(2, false, "not in --devices 0,1")]

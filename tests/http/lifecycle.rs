@@ -210,7 +210,7 @@ fn errors_of_an_address_in_use_name_the_key() {
     let chosen = molmesh::http::Chosen {
         backend,
         reason: String::new(),
-        drawer: molmesh::picture::Drawer::cpu("set by a test"),
+        renderer: molmesh::picture::SelectedRenderer::cpu("set by a test"),
         devices: Vec::new(),
     };
     let runtime = tokio::runtime::Runtime::new().unwrap();

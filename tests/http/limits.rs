@@ -225,7 +225,7 @@ fn listed_atoms_are_limited() {
 #[test]
 fn grids_and_meshes_are_limited_and_suggested_spacings_fit() {
     for (slug, change) in [
-        ("grid-too-large", Box::new(|c: &mut Config| c.limits.grid_samples = 60_000) as Box<dyn FnOnce(&mut Config)>),
+        ("grid-too-large", Box::new(|c: &mut Config| c.limits.grid_points = 60_000) as Box<dyn FnOnce(&mut Config)>),
         ("too-many-candidates", Box::new(|c: &mut Config| c.limits.candidate_pairs = 10_000)),
         ("mesh-too-large", Box::new(|c: &mut Config| c.limits.mesh_bytes = 300_000)),
         ("mesh-too-large", Box::new(|c: &mut Config| c.limits.output_bytes = 300_000)),
@@ -516,7 +516,7 @@ fn asynchronous_jobs_yield_for_the_maximum_delay() {
 #[test]
 fn concurrent_saves_are_limited() {
     let server = fake(|c| (c.jobs.concurrent_saves, c.jobs.queue) = (1, 100));
-    let (server, busy) = (&server, || server.metric("molmesh_results_not_kept_total", &["reason=\"busy\""]));
+    let (server, busy) = (&server, || server.metric("molmesh_results_not_stored_total", &["reason=\"busy\""]));
     let (before, end) = (busy(), Instant::now() + Duration::from_mins(1));
     for round in 0.. {
         std::thread::scope(|scope| {

@@ -100,10 +100,10 @@ fn ranges_of_a_result_add_up_to_the_whole() {
 #[test]
 fn a_result_that_exceeds_the_store_is_not_found_later() {
     let server = start(Fake::new(Mode::Octahedra), |c| c.store.max_bytes = 3_000);
-    let before = server.metric("molmesh_results_not_kept_total", &["failed"]);
+    let before = server.metric("molmesh_results_not_stored_total", &["failed"]);
     let made = server.post("/v1/meshes", &[], SAMPLE);
     assert_eq!((made.status, made.complete), (200, true), "the answer does not depend on the store");
-    wait_for("the metric", || server.metric("molmesh_results_not_kept_total", &["failed"]) > before);
+    wait_for("the metric", || server.metric("molmesh_results_not_stored_total", &["failed"]) > before);
     server.get(made.header("content-location").unwrap()).problem(404, "not-found");
     // Work that requires the store is rejected.
     let refused = server.post("/v1/meshes", &[("prefer", "respond-async")], &sample(1));

@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 /// Starts a server with low limits, as generated requests are numerous.
 fn server() -> Running {
     let server = start(Arc::new(CpuBackend::new(None).unwrap()), |c| {
-        c.limits.grid_samples = 1 << 20;
+        c.limits.grid_points = 1 << 20;
         c.limits.mesh_bytes = 16 << 20;
         c.limits.output_bytes = 16 << 20;
         c.jobs.queue = 1000;

@@ -285,7 +285,7 @@ fn asynchronous_jobs_survive_an_s3_outage() {
         c.store = service.config("away");
         c.store.memory_bytes = 0;
         c.jobs.workers = 2;
-        c.jobs.store_patience_ms = 600_000;
+        c.jobs.save_retry_ms = 600_000;
     });
     let addr = server.addr;
     let mesh = |n| send(addr, "POST", "/v1/meshes?format=stl", &[], &sample(n));

@@ -44,7 +44,6 @@ on_both!(
     replacing_an_object_is_atomic,
     a_written_object_appears_when_finished,
     a_dropped_writer_leaves_nothing,
-    a_writer_must_write_the_declared_length,
     least_recently_used_objects_are_evicted,
     objects_over_the_capacity_are_rejected,
     writers_evict_objects,
@@ -220,10 +219,10 @@ async fn replacing_an_object_is_atomic(place: TestStore) {
 async fn a_written_object_appears_when_finished(place: TestStore) {
     let store = place.open().await;
     let bytes = noise(if place.is_local() { 8 * MIB } else { 60 * MIB } + 17, 5);
-    for (name, length) in [(result(1), None), (result(2), Some(bytes.len() as u64))] {
+    for name in [result(1), result(2)] {
         let (step, stepped) = std::sync::mpsc::sync_channel::<()>(0);
         let (sender, written) = tokio::sync::oneshot::channel();
-        let mut writer = store.writer(&name, length);
+        let mut writer = store.writer(&name);
         let body = bytes.clone();
         let thread = std::thread::spawn(move || {
             for piece in body.chunks(100_000) {
@@ -250,10 +249,10 @@ async fn a_written_object_appears_when_finished(place: TestStore) {
     }
     assert_eq!(store.usage(Folder::Results), usage(2 * bytes.len(), 2));
     // An object that fits into one part.
-    let mut writer = store.writer(&result(3), None);
+    let mut writer = store.writer(&result(3));
     blocking(move || writer.write_all(b"solid").map(|()| writer.finish())).await.unwrap().unwrap();
     assert_eq!(get(&store, &result(3)).await, Some(b"solid".to_vec()));
-    let empty = store.writer(&result(4), Some(0));
+    let empty = store.writer(&result(4));
     blocking(move || empty.finish()).await.unwrap();
     assert_eq!(get(&store, &result(4)).await, Some(Vec::new()));
 }
@@ -262,9 +261,8 @@ async fn a_dropped_writer_leaves_nothing(place: TestStore) {
     let store = place.open().await;
     let size = if place.is_local() { 8 * MIB } else { 60 * MIB };
     put(&store, &result(3), 5).await;
-    for (name, length, panics) in [(result(1), None, false), (result(2), Some(1 << 30), true), (result(3), None, false)]
-    {
-        let mut writer = store.writer(&name, length);
+    for (name, panics) in [(result(1), false), (result(2), true), (result(3), false)] {
+        let mut writer = store.writer(&name);
         let (step, stepped) = std::sync::mpsc::sync_channel::<()>(0);
         let thread = std::thread::spawn(move || {
             writer.write_all(&noise(size, 1)).unwrap();
@@ -280,24 +278,6 @@ async fn a_dropped_writer_leaves_nothing(place: TestStore) {
     // The previous object remains.
     assert_eq!(get(&store, &result(3)).await, Some(noise(5, 1)));
     assert_eq!(store.usage(Folder::Results), usage(5, 1));
-}
-
-async fn a_writer_must_write_the_declared_length(place: TestStore) {
-    let store = place.open().await;
-    for (declared, written) in [(10, 9), (10, 11), (5, 20 * MIB), (20 * MIB, 5), (9 * MIB, 9 * MIB - 1)] {
-        let mut writer = store.writer(&result(1), Some(declared as u64));
-        let refused = blocking(move || match writer.write_all(&noise(written, 1)) {
-            Ok(()) => writer.finish(),
-            Err(e) => Err(e.downcast::<StoreError>().unwrap()),
-        });
-        let refused = refused.await;
-        assert!(matches!(refused, Err(StoreError::Length { .. })), "{declared} {written}: {refused:?}");
-        until("the end of the upload", async || place.unfinished().is_empty()).await;
-        assert!(!has(&store, &result(1)).await);
-    }
-    let mut writer = store.writer(&result(1), Some(10));
-    blocking(move || writer.write_all(&noise(10, 1)).map(|()| writer.finish())).await.unwrap().unwrap();
-    assert!(has(&store, &result(1)).await);
 }
 
 async fn least_recently_used_objects_are_evicted(mut place: TestStore) {
@@ -344,8 +324,11 @@ async fn objects_over_the_capacity_are_rejected(mut place: TestStore) {
         store.put(&result(2), noise(1001, 1).into()).await,
         store.put_new(&input(2), noise(1001, 1).into()).await.map(|_| ()),
         blocking({
-            let writer = store.writer(&result(2), Some(1001));
-            move || writer.finish()
+            let mut writer = store.writer(&result(2));
+            move || {
+                writer.write_all(&noise(1001, 1)).unwrap();
+                writer.finish()
+            }
         })
         .await,
     ] {
@@ -368,14 +351,12 @@ async fn writers_evict_objects(mut place: TestStore) {
     for i in 1..=4 {
         put(&store, &result(i), 5 * MIB).await;
     }
-    // With a declared length, the space is reserved at the start.
-    let mut writer = store.writer(&result(5), Some(9 * MIB as u64));
-    until("eviction", async || store.usage(Folder::Results).objects == 2).await;
-    assert!(!has(&store, &result(1)).await && !has(&store, &result(2)).await && has(&store, &result(3)).await);
+    let mut writer = store.writer(&result(5));
     blocking(move || writer.write_all(&noise(9 * MIB, 1)).map(|()| writer.finish())).await.unwrap().unwrap();
+    assert!(!has(&store, &result(1)).await && !has(&store, &result(2)).await && has(&store, &result(3)).await);
     assert_eq!(store.usage(Folder::Results), usage(19 * MIB, 3));
-    // Otherwise the reservation grows up to the capacity.
-    let mut writer = store.writer(&result(6), None);
+    // The reservation grows up to the capacity.
+    let mut writer = store.writer(&result(6));
     let refused = blocking(move || writer.write_all(&noise(64 * MIB, 1))).await.unwrap_err();
     assert_eq!(refused.kind(), std::io::ErrorKind::FileTooLarge);
     assert!(matches!(refused.downcast::<StoreError>().unwrap(), StoreError::TooLarge { .. }));
@@ -492,7 +473,7 @@ async fn memory_cache_is_bounded_and_drops_removed_objects(mut place: TestStore)
     // Replaced objects give the new bytes; deleted and expired ones none.
     store.put(&result(19), noise(10, 7).into()).await.unwrap();
     assert_eq!(get(&store, &result(19)).await, Some(noise(10, 7)));
-    let mut writer = store.writer(&result(19), None);
+    let mut writer = store.writer(&result(19));
     blocking(move || writer.write_all(&noise(9 * MIB, 8)).map(|()| writer.finish())).await.unwrap().unwrap();
     assert_eq!(get(&store, &result(19)).await, Some(noise(9 * MIB, 8)));
     store.delete(&result(19)).await.unwrap();
@@ -751,10 +732,10 @@ fn errors_do_not_quote_secrets() {
     assert!(message.contains("store.secret_access_key") && !message.contains("8675309"), "{message}");
     // Control: other values are quoted.
     assert!(load("[store]\naccess_key_id = 8675309").unwrap_err().to_string().contains("8675309"));
-    let config = load("[store]\nsecret_access_key = \"8675309\"\nallow_http = true").unwrap();
+    let config = load("[store]\nsecret_access_key = \"8675309\"\nallow_http = true").unwrap().config;
     assert_eq!(config.store.secret_access_key.as_ref().map(Secret::reveal), Some("8675309"));
     assert!(!format!("{config:?}").contains("8675309") && config.store.allow_http);
     let flag = |value: &str| molmesh::config::load(None, [], &[("store.allow_http".to_owned(), value.to_owned())]);
-    assert!(flag("true").unwrap().store.allow_http && !flag("false").unwrap().store.allow_http);
+    assert!(flag("true").unwrap().config.store.allow_http && !flag("false").unwrap().config.store.allow_http);
     assert!(flag("maybe").unwrap_err().to_string().contains("true or false"));
 }

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use molmesh::config::Config;
 use molmesh::http::{Chosen, Server, Stop};
-use molmesh::picture::Drawer;
+use molmesh::picture::SelectedRenderer;
 use molmesh::surface::{
     Backend, Control, FoundDevice, GridStats, Mesh, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
     SurfaceParams,
@@ -234,8 +234,8 @@ pub(crate) fn start_on(
     config.archive.url = None;
     change(&mut config);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
-    let drawer = Drawer::cpu("set by a test");
-    let chosen = Chosen { backend, reason: "set by a test".to_owned(), drawer, devices: found };
+    let renderer = SelectedRenderer::cpu("set by a test");
+    let chosen = Chosen { backend, reason: "set by a test".to_owned(), renderer, devices: found };
     let server = runtime.block_on(Server::bind(config, chosen)).unwrap();
     let (addr, metrics) = (server.addr(), server.metrics_addr().unwrap());
     let (stop_sender, stop_receiver) = tokio::sync::watch::channel(Stop::Serve);

@@ -10,7 +10,8 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant};
 
 use molmesh::surface::{
-    Backend, Control, DeviceStatus, MeshOutput, MeshSink, Served, Spheres, SurfaceError, SurfaceLimits, SurfaceParams,
+    Backend, BackendIdentity, Control, DeviceStatus, MeshOutput, MeshSink, Spheres, SurfaceError, SurfaceLimits,
+    SurfaceParams,
 };
 use molmesh::telemetry::{Kind, Metric};
 
@@ -216,8 +217,8 @@ impl Backend for Devices {
     ) -> Result<MeshOutput, SurfaceError> {
         let fallback_reason = Some("fallback of a test".to_owned());
         let (arithmetic, device) = ("cpu".to_owned(), "the processor".to_owned());
-        let served = Some(Served { backend: "cpu", arithmetic, device, fallback_reason });
-        Ok(MeshOutput { served, ..self.0.write(spheres, params, limits, control, sink)? })
+        let made_by = Some(BackendIdentity { backend: "cpu", arithmetic, device, fallback_reason });
+        Ok(MeshOutput { made_by, ..self.0.write(spheres, params, limits, control, sink)? })
     }
 
     fn devices(&self) -> Vec<DeviceStatus> {

@@ -40,12 +40,12 @@ const ROWS: &[Row] = &[
     (t::JOBS_RECOVERED, &[], restart),
     (t::JOBS_FALLBACK, &[], devices),
     (t::STAGE_DURATION, &["stage=\"field\""], meshes),
-    (t::RESULTS_NOT_KEPT, &["reason=\"failed\""], tiny_store),
+    (t::RESULTS_NOT_STORED, &["reason=\"failed\""], tiny_store),
     (t::QUEUE_DEPTH, &[], held),
     (t::QUEUE_AGE, &[], held),
     (t::QUEUE_WAIT, &[], held),
     (t::MEMORY_HELD, &[], held),
-    (t::VOXELS, &[], meshes),
+    (t::GRID_POINTS, &[], meshes),
     (t::TRIANGLES, &[], meshes),
     (t::DEVICE_UP, &["device=\"0\""], devices),
     (t::DEVICE_BUSY, &["device=\"0\""], devices),
@@ -337,7 +337,7 @@ fn table() -> String {
         };
         let Metric { name, labels, .. } = metric;
         let labels = labels.iter().map(label).collect::<Vec<_>>().join("; ");
-        writeln!(text, "| `{name}` | {} | {labels} | {} |", metric.kind.name(), metric.help()).unwrap();
+        writeln!(text, "| `{name}` | {} | {labels} | {} |", metric.kind.name(), metric.help).unwrap();
     }
     text
 }

@@ -1,9 +1,10 @@
-//! Temporary folder of files, and a mesh written to a sink in parts.
+//! Temporary folder of files, encoded meshes, and a mesh written to a sink in parts.
 
-use std::fs;
 use std::path::PathBuf;
+use std::sync::Mutex;
+use std::{fs, io};
 
-use molmesh::formats::GlbSink;
+use molmesh::formats::{Encoder, Format, GlbSink, Meta, Packing, RandomAccess};
 use molmesh::surface::{Mesh, MeshPart, MeshSink, Vertices};
 use tempfile::TempDir;
 
@@ -22,6 +23,34 @@ impl Files {
         let path = self.folder.path().join(name);
         fs::write(&path, bytes).unwrap();
         self.paths.push(path);
+    }
+}
+
+/// Returns a mesh as a file.
+pub fn encoded(format: Format, mesh: &Mesh, meta: &Meta) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    Encoder::new(format, Packing::of(mesh), mesh, meta).unwrap().write(&mut bytes).unwrap();
+    bytes
+}
+
+/// File in memory.
+#[derive(Default)]
+pub struct MemoryFile(pub Mutex<Vec<u8>>);
+
+impl MemoryFile {
+    pub fn into_bytes(self) -> Vec<u8> {
+        self.0.into_inner().unwrap()
+    }
+}
+
+impl RandomAccess for MemoryFile {
+    fn write_all_at(&self, bytes: &[u8], offset: u64) -> io::Result<()> {
+        let mut file = self.0.lock().unwrap();
+        let start = usize::try_from(offset).unwrap();
+        let len = file.len().max(start + bytes.len());
+        file.resize(len, 0);
+        file[start..start + bytes.len()].copy_from_slice(bytes);
+        Ok(())
     }
 }
 

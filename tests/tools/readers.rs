@@ -117,7 +117,7 @@ pub fn gltf_contents(json: &Value, bin: &[u8]) -> Contents {
     contents
 }
 
-/// Returns the scale of the node of a quantised mesh, which is the same for all axes.
+/// Returns the scale of the node of a quantized mesh, which is the same for all axes.
 fn quantized_scale(json: &Value) -> Option<f32> {
     let node = &json["nodes"][0];
     let [used, required] = ["extensionsUsed", "extensionsRequired"].map(|key| json.get(key));

@@ -42,7 +42,7 @@ pub(super) struct Row {
     pairs: u64,
     vertices: usize,
     triangles: usize,
-    /// Quantisation step of the vertices, Å.
+    /// Quantization step of the vertices, Å.
     step: Option<f32>,
     /// Size of the mesh, bytes.
     bytes: u64,

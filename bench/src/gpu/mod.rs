@@ -9,7 +9,7 @@ mod several;
 use std::path::PathBuf;
 
 use molmesh::formats::Compress;
-use molmesh::gpu::{GpuBackend, GpuJob, Look, PoolSettings, Prepared, discover};
+use molmesh::gpu::{DiscoveryMode, GpuBackend, GpuJob, PoolSettings, Prepared, discover};
 use molmesh::surface::devices::DeviceName;
 use molmesh::surface::{
     Backend as _, CancelToken, Control, DeviceChoice, Spheres, Step, SurfaceLimits, SurfaceParams, lattice,
@@ -154,15 +154,15 @@ fn on_more_devices(
     settings: &PoolSettings,
     mut measure: impl FnMut(&GpuBackend, usize) -> Result<()>,
 ) -> Result<()> {
-    let found = discover(choice, Look::Thorough);
-    if let Some(why) = found.why_none() {
+    let found = discover(choice, DiscoveryMode::Thorough);
+    if let Some(why) = found.no_device_reason() {
         return Err(Error::NoDevice(why));
     }
-    let numbers: Vec<DeviceName> = found.taken().map(|device| DeviceName::Number(device.number)).collect();
+    let numbers: Vec<DeviceName> = found.selected().map(|device| DeviceName::Number(device.number)).collect();
     for n in (1..=numbers.len()).filter(|n| n.is_power_of_two() || *n == numbers.len()) {
-        let some = discover(&DeviceChoice::These(numbers[..n].to_vec()), Look::Thorough);
+        let some = discover(&DeviceChoice::Listed(numbers[..n].to_vec()), DiscoveryMode::Thorough);
         let backend = GpuBackend::start(&some, settings, None).map_err(Error::failed)?;
-        backend.warm().map_err(Error::failed)?;
+        backend.warm_up().map_err(Error::failed)?;
         measure(&backend, n)?;
     }
     Ok(())

@@ -24,7 +24,7 @@ struct Row {
     atoms: usize,
     bricks: usize,
     triangles: usize,
-    /// Quantisation step of the vertices, Å.
+    /// Quantization step of the vertices, Å.
     step: Option<f32>,
     /// Size of the mesh, bytes.
     bytes: u64,

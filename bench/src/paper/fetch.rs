@@ -2,10 +2,10 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
-use molmesh::archive::{Archive, FetchError, Uncounted};
+use molmesh::archive::{Archive, FetchError};
 use molmesh::config::{self, Config};
+use molmesh::memory_budget::Budget;
 use molmesh::structure::{self, EntryId, ReadLimits, SourceFormat};
 
 use super::{replace, selected_entries};
@@ -47,7 +47,7 @@ pub(crate) fn run(args: &FetchArgs) -> Result<()> {
     config.server.data_dir.clone_from(&temporary.0);
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build();
     let runtime = runtime.map_err(Error::failed)?;
-    let archive = Archive::new(&config, Arc::new(Uncounted));
+    let archive = Archive::new(&config, Budget::unlimited());
     for entry in entries {
         if let Some(path) = structures::find(&args.data, entry.id)? {
             print(&format!("{}: {} exists\n", entry.id, path.display()))?;

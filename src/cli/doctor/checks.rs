@@ -59,8 +59,8 @@ pub(super) fn sources(file: Option<&Path>, loaded: &Loaded) -> Check {
     for (_, source) in loaded.sources() {
         match source {
             Source::Default => {}
-            Source::File(_) => from_file += 1,
-            Source::Environment(name) => variables.push(name.as_str()),
+            Source::File { .. } => from_file += 1,
+            Source::Environment { variable } => variables.push(variable.as_str()),
             Source::Flag => flags += 1,
         }
     }
@@ -85,7 +85,7 @@ pub(super) fn log(config: &Config) -> Check {
 /// Makes a first mesh, as a service does before it is ready.
 pub(super) fn first_mesh(backend: &dyn Backend) -> Check {
     let start = Instant::now();
-    match backend.warm() {
+    match backend.warm_up() {
         Ok(()) => {
             let ms = start.elapsed().as_secs_f64() * 1e3;
             Check::new(DEVICES, State::Ok, format!("{} made a first mesh in {ms:.1} ms", backend.name()))

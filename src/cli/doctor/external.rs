@@ -2,11 +2,11 @@
 
 use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::Duration;
 
-use molmesh::archive::{Archive, Uncounted};
+use molmesh::archive::Archive;
 use molmesh::config::Config;
+use molmesh::memory_budget::Budget;
 use molmesh::store::{Folder, FolderLock, Store};
 use molmesh::structure::{self, EntryId};
 
@@ -139,5 +139,5 @@ pub(super) async fn remote(config: &Config, limit: Duration) -> Vec<Check> {
         Ok(status) => Check::new("remote", State::Warning, format!("{host} answers {status} for {id}")),
         Err(why) => Check::new("remote", State::Warning, format!("the request to {host} failed: {why}")),
     };
-    Archive::new(config, Arc::new(Uncounted)).reach(&id, limit).await.into_iter().map(check).collect()
+    Archive::new(config, Budget::unlimited()).reach(&id, limit).await.into_iter().map(check).collect()
 }

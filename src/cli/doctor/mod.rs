@@ -13,7 +13,7 @@ use molmesh::surface::FoundDevice;
 use serde_json::{Value, json};
 
 use super::args::{DoctorArgs, DoctorStyle};
-use super::backend::{self, BackendRequest, SelectedBackend, Use};
+use super::backend::{self, BackendRequest, SelectedBackend};
 use super::error::CliError;
 use super::style::Style;
 use super::survey::{self, Availability};
@@ -53,13 +53,11 @@ fn examine(args: &DoctorArgs, loaded: Loaded, limit: Duration) -> Result<Finding
     let mut checks = vec![checks::sources(args.serve.config.as_deref(), &loaded), checks::log(&config)];
     checks.extend(checks::secrets(&loaded));
     // The same steps as in a service: query all drivers, build the pipelines of the selected devices, make a mesh.
-    let requested =
-        BackendRequest { backend: args.serve.backend, devices: &config.devices.choice, threads: None, work: None };
     let (mut backends, mut devices, mut taken) = (Vec::new(), Vec::new(), None);
-    match backend::pick(&requested, &Use::Service(config.devices.clone())) {
-        Ok(picked) => {
-            backends = survey::survey(&picked);
-            let SelectedBackend { backend, reason, devices: found, .. } = picked;
+    match backend::select(&BackendRequest::of_service(args.serve.backend, &config.devices)) {
+        Ok(selected) => {
+            backends = survey::backends(&selected);
+            let SelectedBackend { backend, reason, devices: found, .. } = selected;
             checks.push(checks::first_mesh(backend.as_ref()));
             let workers = config.jobs.workers.max(config.devices.jobs * backend.devices().len());
             checks.push(checks::memory(&machine, &config, workers));
@@ -97,7 +95,7 @@ impl Findings {
         let device = |device: &FoundDevice| {
             let facts = &device.facts;
             json!({
-                "number": device.number, "taken": device.taken, "reason": device.reason, "name": facts.name,
+                "number": device.number, "taken": device.selected, "reason": device.reason, "name": facts.name,
                 "kind": facts.kind.name(), "api": facts.api, "driver": facts.driver,
                 "binding_bytes": facts.binding_bytes, "buffer_bytes": facts.buffer_bytes,
                 "workgroup_bytes": facts.workgroup_bytes, "timestamps": facts.timestamps, "subgroups": facts.subgroups,
@@ -112,7 +110,7 @@ impl Findings {
                 "target": machine::TARGET, "compiler": machine::COMPILER,
             },
             "machine": self.machine.document(),
-            "backends": self.backends.iter().filter(|b| !b.is_device()).map(backend).collect::<Vec<_>>(),
+            "backends": self.backends.iter().map(backend).collect::<Vec<_>>(),
             "devices": self.devices.iter().map(device).collect::<Vec<_>>(),
             "backend": self.taken.as_ref().map(|(name, reason)| json!({ "name": name, "reason": reason })),
             "checks": self.checks.iter().map(check).collect::<Vec<_>>(),

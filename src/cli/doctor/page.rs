@@ -31,7 +31,7 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     if let Some([now, most]) = machine.files {
         page.row("open files", &format!("{now}, raised to {most} by a service"));
     }
-    for candidate in findings.backends.iter().filter(|candidate| !candidate.is_device()) {
+    for candidate in &findings.backends {
         let state = match &candidate.state {
             Ok(device) => format!("{} {device}", style.green("yes")),
             Err(why) => format!("{} {why}", style.dim("no ")),
@@ -40,8 +40,8 @@ pub(super) fn text(findings: &Findings, style: Style) -> String {
     }
     for device in &findings.devices {
         let facts = &device.facts;
-        let taken = if device.taken { style.green("yes") } else { style.dim("no ") };
-        page.row(&format!("device {}", device.number), &format!("{taken} {}: {}", facts.name, device.reason));
+        let used = if device.selected { style.green("yes") } else { style.dim("no ") };
+        page.row(&format!("device {}", device.number), &format!("{used} {}: {}", facts.name, device.reason));
         page.row("", &format!("    {}, {}, {}", facts.kind.name(), facts.api, facts.driver));
         page.row("", &format!("    {}", abilities(facts)));
     }

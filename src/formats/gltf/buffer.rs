@@ -3,7 +3,7 @@
 use std::io::{self, Write};
 
 use super::layout::{AtomType, IndexType, Layout};
-use crate::formats::block::{convert_words, write_bytes, write_floats, write_integers, write_shorts};
+use crate::formats::block::{convert_words, write_rows};
 use crate::formats::{Packing, quantize};
 use crate::surface::Mesh;
 
@@ -13,9 +13,9 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
     let packing = layout.storage.packing;
     let normals = layout.normals.is_some();
     if let Some(quantized) = &mesh.quantized {
-        quantized.positions.pieces().try_for_each(|rows| write_shorts(out, rows))?;
+        quantized.positions.pieces().try_for_each(|rows| write_rows(out, rows))?;
         if normals {
-            quantized.normals.pieces().try_for_each(|rows| write_bytes(out, rows))?;
+            quantized.normals.pieces().try_for_each(|rows| write_rows(out, rows))?;
         }
     } else {
         mesh.positions.pieces().try_for_each(|rows| write_positions(out, packing, rows))?;
@@ -32,7 +32,7 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
     if let (Some(ids), Some((atom_type, _))) = (&mesh.atom_ids, layout.atoms) {
         match atom_type {
             // A small 32-bit integer, low byte first, is a 16-bit integer and two zero bytes.
-            AtomType::U16 => ids.pieces().try_for_each(|rows| write_integers(out, rows))?,
+            AtomType::U16 => ids.pieces().try_for_each(|rows| write_rows(out, rows))?,
             AtomType::F32 => ids.pieces().try_for_each(|rows| convert_words(out, rows, exact_f32_bytes))?,
         }
     }
@@ -42,7 +42,7 @@ pub(super) fn write_buffer(mesh: &Mesh, layout: &Layout, out: &mut dyn Write) ->
 /// Writes positions relative to the mesh's centre, Å, in the packing of the layout.
 pub(super) fn write_positions(out: &mut dyn Write, packing: Packing, rows: &[[f32; 3]]) -> io::Result<()> {
     match packing {
-        Packing::Full => write_floats(out, rows),
+        Packing::Full => write_rows(out, rows),
         Packing::Quantized(step) => convert_words(out, rows, |row| {
             let [x, y, z] = step.position(row).map(i16::to_le_bytes);
             [x[0], x[1], y[0], y[1], z[0], z[1], 0, 0]
@@ -53,7 +53,7 @@ pub(super) fn write_positions(out: &mut dyn Write, packing: Packing, rows: &[[f3
 /// Writes unit normals in the packing of the layout.
 pub(super) fn write_normals(out: &mut dyn Write, packing: Packing, rows: &[[f32; 3]]) -> io::Result<()> {
     match packing {
-        Packing::Full => write_floats(out, rows),
+        Packing::Full => write_rows(out, rows),
         Packing::Quantized(_) => convert_words(out, rows, |row| {
             let [x, y, z] = quantize::normal(row).map(|v| v.to_le_bytes()[0]);
             [x, y, z, 0]
@@ -64,19 +64,13 @@ pub(super) fn write_normals(out: &mut dyn Write, packing: Packing, rows: &[[f32;
 /// Writes indices in the type of the layout.
 pub(super) fn write_indices(out: &mut dyn Write, index_type: IndexType, indices: &[u32]) -> io::Result<()> {
     match index_type {
-        IndexType::U8 => convert_words(out, indices, one_byte),
-        IndexType::U16 => convert_words(out, indices, two_bytes),
-        IndexType::U32 => write_integers(out, indices),
+        IndexType::U8 => convert_words(out, indices, |index| [index.to_le_bytes()[0]]),
+        IndexType::U16 => convert_words(out, indices, |index| {
+            let [low, high, ..] = index.to_le_bytes();
+            [low, high]
+        }),
+        IndexType::U32 => write_rows(out, indices),
     }
-}
-
-fn one_byte(index: u32) -> [u8; 1] {
-    [index.to_le_bytes()[0]]
-}
-
-fn two_bytes(index: u32) -> [u8; 2] {
-    let [low, high, ..] = index.to_le_bytes();
-    [low, high]
 }
 
 #[expect(clippy::cast_precision_loss, reason = "the layout takes floats only where they are exact")]

@@ -43,7 +43,7 @@ pub(super) fn document(
     let step = layout.and_then(|_drawn| storage.packing.step());
     if let Some(step) = step {
         if !step.holds(&summary.bounds) {
-            return Err(FormatError::BeyondStep { reach: step.reach(), step: step.length() });
+            return Err(FormatError::OutOfQuantizationRange { reach: step.reach(), step: step.length() });
         }
         root.extensions_used.push(QUANTIZED.to_owned());
         root.extensions_required.push(QUANTIZED.to_owned());

@@ -1,9 +1,9 @@
 //! GLB sink: writes the rows of a mesh to their final offset as they arrive, and the header last.
 //!
 //! The bytes are those of [`GlbPlan::write`]. A large buffer begins at a fixed place, so its rows can be written before
-//! the header is known; a small one waits in memory.
+//! the header is known. A small one is collected in memory.
 
-use std::io::{self, Seek, SeekFrom, Write};
+use std::io::{self, Cursor, Write};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use thiserror::Error;
@@ -11,15 +11,19 @@ use thiserror::Error;
 use super::buffer::{write_indices, write_normals, write_positions};
 use super::glb::{GlbPlan, HEAD_BYTES, LARGE_BUFFER_BYTES};
 use super::layout::Layout;
-use crate::formats::block::{write_bytes, write_shorts};
+use crate::formats::block::write_rows;
 use crate::formats::check::Summary;
 use crate::formats::{FormatError, Meta, Storage};
 use crate::surface::{MeshPart, MeshSink, SinkFailed, Vertices};
 
-/// Output with random access, such as a file.
-pub trait RandomAccess: Write + Seek + Send {}
-
-impl<T: Write + Seek + Send> RandomAccess for T {}
+/// Output with random access, such as a file. Several threads write to it at once.
+pub trait RandomAccess: Sync {
+    /// Writes all `bytes` from byte `offset` on.
+    ///
+    /// # Errors
+    /// Returns the error of the output.
+    fn write_all_at(&self, bytes: &[u8], offset: u64) -> io::Result<()>;
+}
 
 /// Error of a [`GlbSink`].
 #[derive(Debug, Error)]
@@ -38,39 +42,26 @@ pub enum GlbSinkError {
     },
 }
 
-/// Blocks that may wait for the output before a thread waits, too.
-const MAX_WAITING: usize = 48;
-
-/// Locked output of a sink.
-type Output<'l, 'a> = MutexGuard<'l, &'a mut dyn RandomAccess>;
-
 /// Sink that writes a GLB.
 pub struct GlbSink<'a> {
-    /// Writes to a file are serialized by the system; a thread that finds the output in use leaves its blocks in
-    /// `waiting` and continues to compute.
-    out: Mutex<&'a mut dyn RandomAccess>,
-    /// Blocks with their offsets in the buffer, oldest first.
-    waiting: Mutex<Vec<(u64, Vec<u8>)>>,
+    out: &'a dyn RandomAccess,
     storage: OnceLock<Storage>,
     layout: OnceLock<Option<Layout>>,
+    /// The buffer, if it is small.
+    small: Mutex<Vec<u8>>,
     failure: Mutex<Option<GlbSinkError>>,
 }
 
 impl<'a> GlbSink<'a> {
-    /// Sink that writes to `out`, which is empty.
+    /// Creates a sink that writes to `out`, which is empty.
     #[must_use]
-    pub fn new(out: &'a mut dyn RandomAccess) -> Self {
-        Self {
-            out: Mutex::new(out),
-            waiting: Mutex::default(),
-            storage: OnceLock::new(),
-            layout: OnceLock::new(),
-            failure: Mutex::default(),
-        }
+    pub fn new(out: &'a dyn RandomAccess) -> Self {
+        let (storage, layout) = (OnceLock::new(), OnceLock::new());
+        Self { out, storage, layout, small: Mutex::default(), failure: Mutex::default() }
     }
 
-    /// Sets how the mesh is stored. The first call before the mesh begins counts.
-    pub fn store(&self, storage: impl Into<Storage>) {
+    /// Sets the storage of the mesh in the file. Only the first call before the mesh begins has an effect.
+    pub fn set_storage(&self, storage: impl Into<Storage>) {
         let _first = self.storage.set(storage.into()).is_ok();
     }
 
@@ -96,16 +87,16 @@ impl<'a> GlbSink<'a> {
         let layout = self.layout.get().copied().flatten();
         let plan = GlbPlan::placed(layout, self.storage(), centre, &summary, meta)?;
         let head = plan.head().len() as u64;
-        if layout.is_some_and(|layout| layout.len >= LARGE_BUFFER_BYTES) && head != HEAD_BYTES {
+        let large = layout.is_some_and(|layout| layout.len >= LARGE_BUFFER_BYTES);
+        if large && head != HEAD_BYTES {
             return Err(GlbSinkError::HeadTooLong { bytes: head });
         }
-        let mut out = lock(&self.out);
-        self.drain(&mut **out, head)?;
-        write_at(&mut **out, 0, plan.head())?;
+        self.out.write_all_at(plan.head(), 0)?;
+        self.out.write_all_at(&lock(&self.small), head)?;
         if let Some(layout) = layout {
             let end = head + layout.len;
             let padding = usize::try_from(plan.len() - end).unwrap_or(0);
-            write_at(&mut **out, end, &[0; 3][..padding])?;
+            self.out.write_all_at(&[0; 3][..padding], end)?;
         }
         Ok(plan.len())
     }
@@ -119,79 +110,56 @@ impl<'a> GlbSink<'a> {
         if let Some(layout) = layout {
             GlbPlan::check_len(HEAD_BYTES + layout.len.next_multiple_of(4))?;
         }
-        let _first = self.layout.set(layout).is_ok();
+        if let Some(Layout { len, .. }) = self.layout.get_or_init(|| layout)
+            && *len < LARGE_BUFFER_BYTES
+        {
+            lock(&self.small).resize(usize::try_from(*len).unwrap_or(0), 0);
+        }
         Ok(())
     }
 
     fn try_part(&self, part: &MeshPart<'_>) -> Result<(), GlbSinkError> {
         let Some(layout) = self.layout.get().copied().flatten() else { return Ok(()) };
         let packing = layout.storage.packing;
-        let mut out = if layout.len >= LARGE_BUFFER_BYTES { self.output() } else { None };
-        if let Some(out) = &mut out {
-            // Waiting rows are older than these, which may replace them.
-            self.drain(&mut ***out, HEAD_BYTES)?;
-        }
         let row = part.first_vertex as u64;
         let positions = layout.positions.offset + packing.position_bytes() * row;
         let normals = layout.normals.map(|normals| normals.offset + packing.normal_bytes() * row);
         match part.vertices {
             Vertices::Single { positions: rows, normals: units } => {
-                self.place(&mut out, positions, |out| write_positions(out, packing, rows))?;
+                self.place(&layout, positions, |out| write_positions(out, packing, rows))?;
                 if let Some(normals) = normals {
-                    self.place(&mut out, normals, |out| write_normals(out, packing, units))?;
+                    self.place(&layout, normals, |out| write_normals(out, packing, units))?;
                 }
             }
             Vertices::Quantized { step, positions: rows, normals: units } if packing.step() == Some(step) => {
-                self.place(&mut out, positions, |out| write_shorts(out, rows))?;
+                self.place(&layout, positions, |out| write_rows(out, rows))?;
                 if let Some(normals) = normals {
-                    self.place(&mut out, normals, |out| write_bytes(out, units))?;
+                    self.place(&layout, normals, |out| write_rows(out, units))?;
                 }
             }
-            Vertices::Quantized { step, .. } => return Err(FormatError::OtherPacking { step: step.length() }.into()),
+            Vertices::Quantized { step, .. } => {
+                return Err(FormatError::AlreadyQuantized { step: step.length() }.into());
+            }
         }
         let (index_type, indices) = layout.indices;
         let indices = indices.offset + 3 * index_type.bytes() * part.first_triangle as u64;
-        self.place(&mut out, indices, |out| write_indices(out, index_type, part.triangles.as_flattened()))?;
-        if let Some(out) = &mut out {
-            self.drain(&mut ***out, HEAD_BYTES)?;
-        }
-        Ok(())
+        Ok(self.place(&layout, indices, |out| write_indices(out, index_type, part.triangles.as_flattened()))?)
     }
 
-    /// The output, or `None` if another thread is writing and not too many blocks are waiting.
-    fn output(&self) -> Option<Output<'_, 'a>> {
-        if lock(&self.waiting).len() > MAX_WAITING { Some(lock(&self.out)) } else { self.out.try_lock().ok() }
-    }
-
-    /// Writes rows from byte `offset` of a large buffer to the output, if there is one, or into a block that waits for
-    /// it.
+    /// Writes rows from byte `offset` of the buffer on.
     fn place(
         &self,
-        out: &mut Option<Output<'_, 'a>>,
+        layout: &Layout,
         offset: u64,
-        write: impl Fn(&mut dyn Write) -> io::Result<()>,
+        write: impl FnOnce(&mut dyn Write) -> io::Result<()>,
     ) -> io::Result<()> {
-        if let Some(out) = out {
-            out.seek(SeekFrom::Start(HEAD_BYTES + offset))?;
-            return write(&mut **out);
+        if layout.len >= LARGE_BUFFER_BYTES {
+            return write(&mut WriterAt { out: self.out, offset: HEAD_BYTES + offset });
         }
-        let mut block = Vec::new();
-        write(&mut block)?;
-        lock(&self.waiting).push((offset, block));
-        Ok(())
-    }
-
-    /// Writes the waiting blocks into the buffer, which begins at byte `base`.
-    fn drain(&self, out: &mut dyn RandomAccess, base: u64) -> io::Result<()> {
-        loop {
-            let blocks = std::mem::take(&mut *lock(&self.waiting));
-            if blocks.is_empty() {
-                return Ok(());
-            }
-            for (offset, block) in blocks {
-                write_at(out, base + offset, &block)?;
-            }
-        }
+        let mut small = lock(&self.small);
+        let mut cursor = Cursor::new(&mut small[..]);
+        cursor.set_position(offset);
+        write(&mut cursor)
     }
 
     fn note<T>(&self, done: Result<T, GlbSinkError>) -> Result<T, SinkFailed> {
@@ -212,10 +180,22 @@ impl MeshSink for GlbSink<'_> {
     }
 }
 
-/// Writes `bytes` at `offset`.
-fn write_at(out: &mut dyn RandomAccess, offset: u64, bytes: &[u8]) -> io::Result<()> {
-    out.seek(SeekFrom::Start(offset))?;
-    out.write_all(bytes)
+/// Writer that begins at an offset of the output.
+struct WriterAt<'a> {
+    out: &'a dyn RandomAccess,
+    offset: u64,
+}
+
+impl Write for WriterAt<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.out.write_all_at(bytes, self.offset)?;
+        self.offset += bytes.len() as u64;
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 /// Locks a mutex and ignores poisoning: a panic of another thread leaves the data valid.

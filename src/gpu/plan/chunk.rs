@@ -4,7 +4,7 @@
 use std::ops::Range;
 
 use super::Plan;
-use super::layout::{NONE, Params};
+use super::layout::{GROUP, NONE, Params};
 use crate::surface::lattice::to_u32;
 
 /// Capacity of a device for one chunk.
@@ -34,6 +34,12 @@ impl Chunk {
     #[must_use]
     pub fn n_slots(&self) -> u64 {
         u64::from(self.n_own) + self.halo.len() as u64
+    }
+
+    /// Number of groups of own bricks, whose counts take 16 bytes each.
+    #[must_use]
+    pub fn n_groups(&self) -> u64 {
+        u64::from(self.n_own.div_ceil(GROUP))
     }
 
     /// Contents of the `halo` buffer: the halo bricks, then the slot (or [`NONE`]) of each brick behind the chunk up to

@@ -13,9 +13,8 @@ use rayon::prelude::*;
 pub use self::chunk::{Chunk, ChunkLimits};
 use self::layout::{NONE, Params, Tile, halves};
 pub use self::partition::Partition;
+use crate::surface::cpu;
 use crate::surface::cpu::field::Constants;
-use crate::surface::cpu::interpolate::SlopeConstants;
-use crate::surface::cpu::{self, scan};
 use crate::surface::lattice::{BRICK, Lattice, LatticeAtom, tile_of, tile_order, to_f32, to_u32, to_u64};
 use crate::surface::occupancy::{BrickBits, Occupancy, TileOccupancy, count_ones, local_brick};
 use crate::surface::{Control, Step, SurfaceError, SurfaceLimits, SurfaceParams};
@@ -46,7 +45,7 @@ impl Plan {
     ///
     /// # Errors
     /// [`SurfaceError::GridTooLarge`] and [`SurfaceError::TooManyCandidates`] before memory is allocated beyond the
-    /// limits, [`SurfaceError::BadParameter`] for more atoms than 31 bits can number, [`SurfaceError::Cancelled`].
+    /// limits, [`SurfaceError::Cancelled`].
     pub fn new(lattice: &Lattice, limits: &SurfaceLimits, control: &Control<'_>) -> Result<Self, SurfaceError> {
         let occupancy = Occupancy::new(lattice, limits, control)?;
         let bases = tile_bases(&occupancy.tiles)
@@ -75,7 +74,6 @@ impl Plan {
     #[must_use]
     pub fn params(&self, lattice: &Lattice, params: &SurfaceParams) -> Params {
         let field = Constants::new(&lattice.profile, lattice.spacing);
-        let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
         // An atom lies at most half a spacing outside the samples of its brick.
         let bricks = |reach: f32| u32::try_from(to_u64(f64::from(reach) / f64::from(BRICK))).unwrap_or(u32::MAX);
         Params {
@@ -90,8 +88,8 @@ impl Plan {
             tail_end: field.tail_end,
             amplitude: field.amplitude,
             u_min: field.u_min,
-            slope_offset: slope.offset,
-            slope_tail: slope.tail,
+            slope_offset: field.slope_offset,
+            slope_tail: field.slope_tail,
             reach: self.max_reach,
             back: bricks(self.max_reach + 7.51),
             ahead: bricks(self.max_reach + 8.51),
@@ -101,26 +99,6 @@ impl Plan {
             ..bytemuck::Zeroable::zeroed()
         }
     }
-}
-
-/// Checks a mesh of `n_vertices` and `n_triangles` against the limits.
-///
-/// # Errors
-/// [`SurfaceError::MeshTooLarge`], also if 32 bits cannot number the vertices; [`SurfaceError::NoSurface`] for an empty
-/// mesh.
-pub fn check_totals(
-    lattice: &Lattice,
-    params: &SurfaceParams,
-    limits: &SurfaceLimits,
-    n_vertices: u64,
-    n_triangles: u64,
-) -> Result<(), SurfaceError> {
-    if n_triangles == 0 {
-        return Err(SurfaceError::NoSurface { isovalue: params.isovalue });
-    }
-    let bytes = params.mesh_bytes(n_vertices, n_triangles);
-    let limit = limits.max_mesh_bytes.min(params.mesh_bytes(u64::from(u32::MAX), 0));
-    if bytes <= limit { Ok(()) } else { Err(scan::too_large(bytes, lattice.spacing, limit)) }
 }
 
 /// First brick of each tile. `None` if there are more tiles or bricks than the shaders can number.

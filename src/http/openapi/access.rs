@@ -18,15 +18,15 @@ const API_KEY: &str = "apiKey";
 const SIGNED: &str = "signedAddress";
 
 /// Problems of an operation that requires a scope.
-const REFUSALS: &[Kind] =
+const KEY_PROBLEMS: &[Kind] =
     &[Kind::KeyRequired, Kind::KeyInvalid, Kind::KeyExpired, Kind::ScopeMissing, Kind::QuotaExceeded];
 /// Further problems of an operation that accepts signed URLs.
-const OF_ADDRESSES: &[Kind] = &[Kind::SignatureInvalid, Kind::SignatureExpired];
+const SIGNED_URL_PROBLEMS: &[Kind] = &[Kind::SignatureInvalid, Kind::SignatureExpired];
 
 /// Adds the security requirements, from the table that authorizes requests.
-pub(in crate::http) struct Rights;
+pub(in crate::http) struct SecurityRequirements;
 
-impl Modify for Rights {
+impl Modify for SecurityRequirements {
     fn modify(&self, api: &mut OpenApi) {
         let components = api.components.get_or_insert_with(|| ComponentsBuilder::new().build());
         let bearer = HttpBuilder::new()
@@ -70,10 +70,10 @@ fn restrict(operation: &mut Operation, scope: Scope, is_get: bool) {
         SecurityRequirement::new(BEARER, scopes()),
         SecurityRequirement::new(API_KEY, scopes()),
     ];
-    let mut groups = vec![REFUSALS];
+    let mut groups = vec![KEY_PROBLEMS];
     if is_get {
         security.push(SecurityRequirement::new(SIGNED, nothing));
-        groups.push(OF_ADDRESSES);
+        groups.push(SIGNED_URL_PROBLEMS);
     }
     operation.security = Some(security);
     operation.responses.responses.extend(responses(&groups));

@@ -23,41 +23,10 @@ fn text(doc: &str) -> Header {
     header(Type::String, doc)
 }
 
-/// Returns the type and description of a header of [`SUMMARY`] or [`PICTURE`].
-fn summary_header(name: &str) -> Header {
-    let (kind, doc) = match name {
-        "molmesh-atoms" => (Type::Integer, "Atoms meshed."),
-        "molmesh-vertices" => (Type::Integer, "Vertices of the mesh."),
-        "molmesh-triangles" => (Type::Integer, "Triangles of the mesh."),
-        "molmesh-area" => (Type::Number, "Surface area in Å², including the walls of voids."),
-        "molmesh-volume" => (Type::Number, "Enclosed volume in Å³, voids subtracted."),
-        "molmesh-closed" => (Type::Boolean, "`true` if the mesh has no boundary."),
-        "molmesh-manifold" => (Type::Boolean, "`true` if all edges and vertices are manifold."),
-        "molmesh-euler" => (Type::Integer, "Euler characteristic: vertices − edges + triangles."),
-        "molmesh-components" => (Type::Integer, "Connected components of the mesh."),
-        "molmesh-kernel" => (Type::String, "Density kernel."),
-        "molmesh-preset" => (Type::String, "Preset."),
-        "molmesh-resolution" => (Type::Number, "Grid spacing in Å."),
-        "molmesh-resolution-from" => {
-            (Type::String, "Parameter that set the spacing: `resolution`, `detail` or `max_triangles`.")
-        }
-        "molmesh-isovalue" => (Type::Number, "Isovalue of the density."),
-        "molmesh-radii" => (Type::String, "Table of van der Waals radii."),
-        "molmesh-backend" => (Type::String, "Backend that computed the mesh: `cpu` or `gpu`."),
-        "molmesh-backend-reason" => (Type::String, "Reason for the choice of the backend."),
-        "molmesh-renderer" => (Type::String, "Backend that rendered the picture: `cpu` or `gpu`. Pictures only."),
-        "molmesh-renderer-device" => (Type::String, "Device that rendered the picture. Pictures only."),
-        "molmesh-renderer-reason" => (Type::String, "Reason for the choice of the renderer. Pictures only."),
-        "molmesh-pixel" => (Type::Number, "Width and height of a pixel in Å. Pictures only."),
-        _ => (Type::String, "Member of the report."),
-    };
-    header(kind, doc)
-}
-
 /// Adds the headers that summarize the report.
 fn summarized(response: ResponseBuilder) -> ResponseBuilder {
-    let names = SUMMARY.into_iter().chain(PICTURE.into_iter().map(|(name, _)| name));
-    names.fold(response, |response, name| response.header(name, summary_header(name)))
+    let all = SUMMARY.iter().chain(&PICTURE);
+    all.fold(response, |response, summary| response.header(summary.name, header(summary.kind.clone(), summary.doc)))
 }
 
 fn timed(response: ResponseBuilder) -> ResponseBuilder {
@@ -148,15 +117,15 @@ macro_rules! answers {
 
 answers!(
     /// Responses to an upload.
-    Uploaded: "200": whole(), "202": accepted()
+    MeshOrJob: "200": whole(), "202": accepted()
 );
 answers!(
     /// Responses of a path that names a structure.
-    Addressed: "200": whole(), "202": accepted(), "206": part(), "304": unchanged()
+    CacheableMeshOrJob: "200": whole(), "202": accepted(), "206": part(), "304": unchanged()
 );
 answers!(
     /// Responses of a stored result.
-    Kept: "200": whole(), "206": part(), "304": unchanged()
+    StoredMesh: "200": whole(), "206": part(), "304": unchanged()
 );
 answers!(
     /// Response of a conditional request for a document.
@@ -164,7 +133,7 @@ answers!(
 );
 answers!(
     /// Response with a report.
-    Reported: "200": report()
+    ReportResponse: "200": report()
 );
 
 fn report() -> RefOr<Response> {

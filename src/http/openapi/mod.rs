@@ -8,4 +8,4 @@ pub(super) mod meshes;
 pub(super) mod parameters;
 pub(super) mod problems;
 
-pub(super) use problems::refusals;
+pub(super) use problems::problem_responses;

@@ -11,13 +11,15 @@ use super::components::pascal_case;
 use crate::formats::Format;
 use crate::pipeline::params::{self, Domain, TABLE};
 
+const DIGEST_PATTERN: &str = "^[0-9a-f]{64}$";
+const DIGEST_EXAMPLE: &str = "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087";
 /// Name of the schema of `surface.{ext}`.
 const SURFACE_FILE: &str = "SurfaceFile";
 
 /// Adds a named schema for each parameter with a fixed set of values, so that generators make one type of each.
-pub(in crate::http) struct Choices;
+pub(in crate::http) struct ChoiceSchemas;
 
-impl Modify for Choices {
+impl Modify for ChoiceSchemas {
     fn modify(&self, api: &mut OpenApi) {
         let schemas = &mut api.components.get_or_insert_default().schemas;
         let files = Format::ALL.map(|format| format!("surface.{}", format.extension()));
@@ -91,7 +93,7 @@ fn hints(parameter: &params::Parameter) -> Option<Extensions> {
     {
         control.insert("unit".to_owned(), unit.into());
     }
-    if let Some(usual) = params::usual(parameter) {
+    if let Some(usual) = params::usual_range(parameter) {
         control.insert("usual".to_owned(), usual.to_vec().into());
     }
     if params::PICTURES.contains(&parameter.name) {
@@ -118,28 +120,6 @@ fn query(parameter: &params::Parameter) -> Parameter {
         .build()
 }
 
-/// Query parameters of a mesh.
-pub(in crate::http) enum MeshParameters {}
-
-impl IntoParams for MeshParameters {
-    fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
-        TABLE.iter().map(query).collect()
-    }
-}
-
-/// Parameters of a mesh whose path names the format.
-pub(in crate::http) enum SurfaceParameters {}
-
-impl IntoParams for SurfaceParameters {
-    fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
-        let file =
-            path("file", "`surface.` and the extension of the mesh format; `surface.png` is a picture of the mesh.")
-                .schema(Some(Ref::from_schema_name(SURFACE_FILE)))
-                .build();
-        std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
-    }
-}
-
 fn path(name: &str, doc: &str) -> ParameterBuilder {
     let builder = ParameterBuilder::new().name(name).parameter_in(ParameterIn::Path);
     builder.required(Required::True).description(Some(doc))
@@ -150,53 +130,9 @@ fn text(pattern: &str, example: &str) -> ObjectBuilder {
     ObjectBuilder::new().schema_type(Type::String).pattern(Some(pattern)).examples([example])
 }
 
-/// Declares a type that describes one path segment.
-macro_rules! segment {
-    ($(#[$doc:meta])* $type:ident, $name:literal, $words:literal, $pattern:literal, $example:literal) => {
-        $(#[$doc])*
-        pub(in crate::http) enum $type {}
-
-        impl IntoParams for $type {
-            fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
-                vec![path($name, $words).schema(Some(text($pattern, $example))).build()]
-            }
-        }
-    };
-}
-
-segment!(
-    /// `{id}` of an archive entry.
-    EntryPath, "id", "PDB id of the entry, in upper or lower case.",
-    "^([0-9][A-Za-z0-9]{3}|[Pp][Dd][Bb]_[A-Za-z0-9]{8})$", "4pti"
-);
-segment!(
-    /// `{digest}` of an uploaded structure.
-    StructurePath, "digest", "SHA-256 digest of the structure's bytes as uploaded, in hexadecimal.",
-    "^[0-9a-f]{64}$", "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087"
-);
-segment!(
-    /// `{id}` of a job.
-    JobPath, "id", "Id of the job.", "^[0-9a-f]{32}$", "0123456789abcdef0123456789abcdef"
-);
-segment!(
-    /// `{key}` of a result.
-    ResultPath, "key", "Key of the result.",
-    "^[0-9a-f]{64}$", "edf4c54b21822f1924f4915e0c459f7e53c016e03bc2d01e415cca648e478087"
-);
-segment!(
-    /// `{slug}` of a problem type.
-    ProblemPath, "slug", "Last segment of the `type` of a problem.", "^[a-z-]{1,40}$", "grid-too-large"
-);
-
-/// `{file}` of a result.
-pub(in crate::http) enum ResultFile {}
-
-impl IntoParams for ResultFile {
-    fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
-        let extensions = Format::ALL.map(Format::extension).join("|");
-        let file = text(&format!("^[0-9a-f]{{64}}\\.({extensions})$"), &format!("{}.glb", "0".repeat(64)));
-        vec![path("file", "Key of the result, followed by the extension of its format.").schema(Some(file)).build()]
-    }
+/// Describes a path segment that matches `pattern`.
+fn segment(name: &str, doc: &str, pattern: &str, example: &str) -> Vec<Parameter> {
+    vec![path(name, doc).schema(Some(text(pattern, example))).build()]
 }
 
 /// Request header: name, pattern (`None`: any text), example, description.
@@ -211,23 +147,69 @@ fn headers(all: &[Header]) -> Vec<Parameter> {
     all.iter().map(one).collect()
 }
 
-/// Declares a type that describes request headers.
-macro_rules! request_headers {
-    ($(#[$doc:meta])* $type:ident: $all:expr) => {
+/// Declares a type for `params(…)` of an operation.
+macro_rules! parameters {
+    ($(#[$doc:meta])* $type:ident: $parameters:expr) => {
         $(#[$doc])*
         pub(in crate::http) enum $type {}
 
         impl IntoParams for $type {
             fn into_params(_: impl Fn() -> Option<ParameterIn>) -> Vec<Parameter> {
-                headers(&$all)
+                $parameters
             }
         }
     };
 }
 
-request_headers!(
+parameters!(
+    /// Query parameters of a mesh.
+    MeshParameters: TABLE.iter().map(query).collect()
+);
+parameters!(
+    /// Parameters of a mesh whose path names the format.
+    SurfaceParameters: {
+        let doc = "`surface.` and the extension of the mesh format; `surface.png` is a picture of the mesh.";
+        let file = path("file", doc).schema(Some(Ref::from_schema_name(SURFACE_FILE))).build();
+        std::iter::once(file).chain(TABLE.iter().filter(|p| p.name != "format").map(query)).collect()
+    }
+);
+parameters!(
+    /// `{id}` of an archive entry.
+    EntryPath: {
+        let pattern = "^([0-9][A-Za-z0-9]{3}|[Pp][Dd][Bb]_[A-Za-z0-9]{8})$";
+        segment("id", "PDB id of the entry, in upper or lower case.", pattern, "4pti")
+    }
+);
+parameters!(
+    /// `{digest}` of an uploaded structure.
+    StructurePath: {
+        let doc = "SHA-256 digest of the structure's bytes as uploaded, in hexadecimal.";
+        segment("digest", doc, DIGEST_PATTERN, DIGEST_EXAMPLE)
+    }
+);
+parameters!(
+    /// `{id}` of a job.
+    JobPath: segment("id", "Id of the job.", "^[0-9a-f]{32}$", "0123456789abcdef0123456789abcdef")
+);
+parameters!(
+    /// `{key}` of a result.
+    ResultPath: segment("key", "Key of the result.", DIGEST_PATTERN, DIGEST_EXAMPLE)
+);
+parameters!(
+    /// `{slug}` of a problem type.
+    ProblemPath: segment("slug", "Last segment of the `type` of a problem.", "^[a-z-]{1,40}$", "grid-too-large")
+);
+parameters!(
+    /// `{file}` of a result.
+    ResultFile: {
+        let pattern = format!("^[0-9a-f]{{64}}\\.({})$", Format::ALL.map(Format::extension).join("|"));
+        let example = format!("{}.glb", "0".repeat(64));
+        segment("file", "Key of the result, followed by the extension of its format.", &pattern, &example)
+    }
+);
+parameters!(
     /// Headers that choose between a mesh and a job.
-    Wishes: [
+    PreferenceHeaders: headers(&[
         (
             "Prefer", None, "respond-async",
             "`respond-async` creates a job and returns 202 at once. `wait=SECONDS` waits at most that long for the \
@@ -241,36 +223,36 @@ request_headers!(
             "Idempotency-Key", Some("^[ -~]{1,255}$"), "upload-1",
             "Key chosen by the client, 1 to 255 characters. A repeated request with the same key returns the same job.",
         ),
-    ]
+    ])
 );
-request_headers!(
+parameters!(
     /// Compression of an upload.
-    Coding: [(
+    ContentEncodingHeader: headers(&[(
         "Content-Encoding", Some("^(identity|gzip|x-gzip|zstd)?$"), "gzip",
         "Compression of the body. Optional: the server detects gzip and zstd from the content.",
-    )]
+    )])
 );
-request_headers!(
+parameters!(
     /// Conditional request.
-    Unchanged: [(
+    IfNoneMatchHeader: headers(&[(
         "If-None-Match", None, "\"ba7816bf\"", "`ETag`s that the client has. If one matches, the response is 304.",
-    )]
+    )])
 );
-request_headers!(
+parameters!(
     /// Range request.
-    Parts: [
+    RangeHeaders: headers(&[
         (
             "Range", None, "bytes=0-1023",
             "Part of the file to return. Applies to stored results; other responses, and requests for several ranges, \
              return the whole file.",
         ),
         ("If-Range", None, "\"ba7816bf\"", "`ETag` that the `Range` refers to. If it differs, the whole file is sent."),
-    ]
+    ])
 );
-request_headers!(
+parameters!(
     /// Position in an event stream.
-    Resumption: [(
+    LastEventIdHeader: headers(&[(
         "Last-Event-ID", None, "3",
         "Id of the last event received. Only later events are sent; after the final event the response is 204.",
-    )]
+    )])
 );

@@ -24,7 +24,7 @@ pub(in crate::http) const BODY: &[Kind] = &[
     Kind::MemoryFull,
 ];
 /// Further problems of a JSON body that names a structure.
-pub(in crate::http) const NAMED: &[Kind] =
+pub(in crate::http) const NAMED_STRUCTURE: &[Kind] =
     &[Kind::NoSuchStructure, Kind::NotInArchive, Kind::EntryTooLarge, Kind::ArchiveUnavailable, Kind::StoreFailed];
 /// Problems of parameters.
 pub(in crate::http) const PARAMETERS: &[Kind] = &[Kind::BadRequest, Kind::BadParameter];
@@ -47,11 +47,12 @@ pub(in crate::http) const MESHING: &[Kind] = &[
     Kind::Deadline,
 ];
 /// Problems of submitting a job.
-pub(in crate::http) const ASKING: &[Kind] =
+pub(in crate::http) const SUBMITTING: &[Kind] =
     &[Kind::OtherRequest, Kind::QueueFull, Kind::TooManyDeliveries, Kind::StoreFull, Kind::StoreFailed];
 
-/// Declares a type for `responses(…)` with the problems of one operation: `refusals!(Name: [GROUP, …, [Kind::…, …]])`.
-macro_rules! refusals {
+/// Declares a type for `responses(…)` with the problems of one operation:
+/// `problem_responses!(Name: [GROUP, …, [Kind::…, …]])`.
+macro_rules! problem_responses {
     ($name:ident: [$($group:expr),+ $(,)?]) => {
         /// Problems of an operation.
         pub(in crate::http) enum $name {}
@@ -65,7 +66,7 @@ macro_rules! refusals {
         }
     };
 }
-pub(in crate::http) use refusals;
+pub(in crate::http) use problem_responses;
 
 /// Returns the responses for some kinds, one per status.
 pub(in crate::http) fn responses(groups: &[&[Kind]]) -> BTreeMap<String, RefOr<Response>> {

@@ -2,9 +2,10 @@
 
 use std::str::FromStr;
 
+use super::ParamError;
 use crate::formats::{Compress, Normals, Units};
-use crate::picture::{Background, MOST_SIDE, Style, View};
-use crate::pipeline::spacing::{LEAST_TRIANGLES, MOST_TRIANGLES};
+use crate::picture::{Background, MAX_SIDE, Style, View};
+use crate::pipeline::spacing::{MAX_TRIANGLE_LIMIT, MIN_TRIANGLE_LIMIT};
 use crate::structure::select::KIND_NAMES;
 use crate::surface::params::{MAX_RESOLUTION, MIN_RESOLUTION};
 use crate::surface::{Kernel, Preset, Validation};
@@ -71,6 +72,12 @@ pub struct Parameter {
 }
 
 impl Parameter {
+    /// Returns the error for a value that is not valid.
+    pub(super) fn invalid(&self, value: &str) -> ParamError {
+        let value = format!("`{}`", value.chars().take(64).collect::<String>());
+        ParamError::BadValue { name: self.name, value, expected: self.domain.expected() }
+    }
+
     /// Returns true if `text` equals the declared default. Defaults in words, such as `the first model of the file`,
     /// are not values and equal nothing.
     #[must_use]
@@ -110,7 +117,7 @@ const fn number(
 
 /// Returns the usual range of a number, for sliders; by default its bounds.
 #[must_use]
-pub fn usual(parameter: &Parameter) -> Option<[f64; 2]> {
+pub fn usual_range(parameter: &Parameter) -> Option<[f64; 2]> {
     let Domain::Number { min, max, .. } = parameter.domain else { return None };
     Some(match parameter.name {
         "resolution" => [0.2, 2.0],
@@ -123,23 +130,12 @@ pub fn usual(parameter: &Parameter) -> Option<[f64; 2]> {
     })
 }
 
-const KERNELS: &[&str] = &names(Kernel::ALL);
-const PRESETS: &[&str] = &preset_names(Preset::ALL);
 const FORMATS: &[&str] = &["glb", "gltf", "ply", "stl", "obj", "png"];
 const VIEWS: &[&str] = &view_names(View::ALL);
 const STYLES: &[&str] = &[Style::Surface.name(), Style::Gouraud.name()];
 const COMPRESS: &[&str] = &[Compress::None.name(), Compress::Quantize.name()];
 const NORMALS: &[&str] = &[Normals::Smooth.name(), Normals::None.name()];
 const UNITS: &[&str] = &[Units::Angstrom.name(), Units::Nanometer.name(), Units::Meter.name()];
-const VALIDATIONS: &[&str] = &[Validation::Checksum.name(), Validation::Exact.name()];
-
-const fn names(all: &[Kernel]) -> [&'static str; 3] {
-    [all[0].name(), all[1].name(), all[2].name()]
-}
-
-const fn preset_names(all: &[Preset]) -> [&'static str; 6] {
-    [all[0].name(), all[1].name(), all[2].name(), all[3].name(), all[4].name(), all[5].name()]
-}
 
 const fn view_names(all: [View; 7]) -> [&'static str; 7] {
     let [a, b, c, d, e, f, g] = all;
@@ -151,13 +147,13 @@ const fn view_names(all: [View; 7]) -> [&'static str; 7] {
 pub const TABLE: &[Parameter] = &[
     Parameter {
         name: "preset",
-        domain: Domain::Choice(PRESETS),
+        domain: Domain::Choice(Preset::NAMES),
         default: "default",
         doc: "A named pair of smoothness and isovalue for the gaussian kernel. ses-like approximates the solvent-excluded surface without a probe: area within −6.5 to +6.0 % and volume within −0.6 to +5.1 % on eight proteins, worse for small structures (area +13.5 % for a DNA dodecamer).",
     },
     Parameter {
         name: "kernel",
-        domain: Domain::Choice(KERNELS),
+        domain: Domain::Choice(Kernel::NAMES),
         default: "gaussian",
         doc: "Density kernel: the contribution of an atom as a function of the distance.",
     },
@@ -176,7 +172,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "max_triangles",
-        domain: Domain::Integer { min: LEAST_TRIANGLES as i64, max: MOST_TRIANGLES as i64 },
+        domain: Domain::Integer { min: MIN_TRIANGLE_LIMIT as i64, max: MAX_TRIANGLE_LIMIT as i64 },
         default: "absent",
         doc: "Maximum number of triangles: selects the finest grid spacing from 0.25 to 4 Å that does not exceed it. Replaces resolution.",
     },
@@ -250,7 +246,7 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "validation",
-        domain: Domain::Choice(VALIDATIONS),
+        domain: Domain::Choice(Validation::NAMES),
         default: "checksum",
         doc: "Method that checks whether the mesh is watertight: a checksum of its edges, or exact matching of every edge and the triangles around every vertex.",
     },
@@ -286,13 +282,13 @@ pub const TABLE: &[Parameter] = &[
     },
     Parameter {
         name: "width",
-        domain: Domain::Integer { min: 1, max: MOST_SIDE as i64 },
+        domain: Domain::Integer { min: 1, max: MAX_SIDE as i64 },
         default: "512",
         doc: "Width of the picture in pixels; png only.",
     },
     Parameter {
         name: "height",
-        domain: Domain::Integer { min: 1, max: MOST_SIDE as i64 },
+        domain: Domain::Integer { min: 1, max: MAX_SIDE as i64 },
         default: "512",
         doc: "Height of the picture in pixels; png only.",
     },

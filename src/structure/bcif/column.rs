@@ -57,6 +57,13 @@ impl Column<'_> {
         self.mask.as_ref().is_some_and(|mask| mask[row])
     }
 
+    /// Returns the text of a row, or `None` if it has none.
+    pub(super) fn text(&self, row: usize) -> Option<&[u8]> {
+        let Cells::Text(texts) = &self.cells else { return None };
+        let (start, end) = texts.range(row).filter(|_| !self.is_null(row))?;
+        Some(&texts.joined[start..end])
+    }
+
     /// Returns true if some row has no value.
     pub(super) fn has_nulls(&self) -> bool {
         self.mask.is_some() || matches!(&self.cells, Cells::Text(texts) if texts.ids.iter().any(|&id| id < 0))
@@ -124,18 +131,9 @@ fn whole_column(found: usize, rows: usize) -> Result<(), Box<Fault>> {
 }
 
 /// Reads encoded data and its chain of encodings.
-fn encoded(mut at: Cursor<'_>) -> Result<(&[u8], Chain<'_>), Box<Fault>> {
-    let (mut data, mut chain) = (None, None);
-    at.map(|key, value| {
-        match key {
-            b"data" => data = Some(value.bytes().map_err(|f| f.within("`data`"))?),
-            b"encoding" => chain = Some(*value),
-            _ => {}
-        }
-        Ok(())
-    })?;
-    let data = data.ok_or_else(|| Fault::new("nothing", "`data`"))?;
-    let chain = chain.ok_or_else(|| Fault::new("nothing", "`encoding`"))?;
+fn encoded(at: Cursor<'_>) -> Result<(&[u8], Chain<'_>), Box<Fault>> {
+    let data = at.required("data", Cursor::bytes)?;
+    let chain = at.required("encoding", |value| Ok(*value))?;
     Ok((data, Chain::read(chain)?))
 }
 

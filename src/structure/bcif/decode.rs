@@ -7,33 +7,40 @@
 use super::encoding::{Chain, Encoding, Number};
 use super::fault::Fault;
 
-impl<'a> Chain<'a> {
+impl Chain<'_> {
     /// Decodes `data`. No step may produce more than `most` values.
-    pub(super) fn decode(&self, data: &'a [u8], most: usize) -> Result<Values, Box<Fault>> {
-        let mut stage = None;
-        for (i, encoding) in self.0.iter().enumerate().rev() {
-            let undone = match (encoding, stage.take()) {
-                (&Encoding::ByteArray(number), None) => Stage::bytes(data, number),
-                (&Encoding::IntegerPacking { size, number }, Some(Stage::Bytes(bytes))) => {
-                    bytes.unpack(number, size, most)
-                }
-                (_, None) => Err(Fault::new("it at the end of its chain", "ByteArray at the end")),
-                (Encoding::ByteArray(_), _) => Err(Fault::new("it in the middle of its chain", "it at the end")),
-                (Encoding::IntegerPacking { .. }, _) => {
-                    Err(Fault::new("another encoding after it", "ByteArray after it"))
-                }
-                (Encoding::StringArray(_), _) => Err(Fault::new("it among others", "it alone")),
-                (encoding, Some(stage)) => stage.ints(most).and_then(|ints| encoding.undo(ints, most)),
-            };
-            let place = || format!("{} (encoding {} of {})", encoding.name(), i + 1, self.0.len());
-            stage = Some(undone.map_err(|fault| fault.within(place()))?);
+    pub(super) fn decode(&self, data: &[u8], most: usize) -> Result<Values, Box<Fault>> {
+        let chain = &self.0[..];
+        let place = |i: usize| format!("{} (encoding {} of {})", chain[i].name(), i + 1, chain.len());
+        let Some((last, mut others)) = chain.split_last() else {
+            return Err(Fault::new("no encoding", "at least ByteArray"));
+        };
+        let number = byte_array(last, data).map_err(|fault| fault.within(place(others.len())))?;
+        let mut values = match others.split_last() {
+            Some((&Encoding::IntegerPacking { size, number: packed }, before)) => {
+                others = before;
+                unpack(data, number, packed, size, most).map_err(|fault| fault.within(place(before.len())))?
+            }
+            _ => numbers(data, number, most)?,
+        };
+        for (i, encoding) in others.iter().enumerate().rev() {
+            let undone = values.ints().and_then(|ints| encoding.undo(ints, most));
+            values = undone.map_err(|fault| fault.within(place(i)))?;
         }
-        match stage {
-            None => Err(Fault::new("no encoding", "at least ByteArray")),
-            Some(Stage::Bytes(bytes)) => bytes.values(most),
-            Some(Stage::Values(values)) => Ok(values),
-        }
+        Ok(values)
     }
+}
+
+/// Returns the type of the numbers in `data`. The last encoding of a chain must be `ByteArray`.
+fn byte_array(last: &Encoding<'_>, data: &[u8]) -> Result<Number, Box<Fault>> {
+    let &Encoding::ByteArray(number) = last else {
+        return Err(Fault::new("it at the end of its chain", "ByteArray at the end"));
+    };
+    let size = number.size();
+    if !data.len().is_multiple_of(size) {
+        return Err(Fault::new(format!("{} bytes", data.len()), format!("whole numbers of {size} bytes each")));
+    }
+    Ok(number)
 }
 
 /// Decoded numbers.
@@ -59,39 +66,8 @@ impl Values {
     }
 }
 
-/// Undecoded numbers.
-#[derive(Debug, Clone, Copy)]
-struct Bytes<'a> {
-    data: &'a [u8],
-    number: Number,
-}
-
-/// Intermediate result of decoding.
-#[derive(Debug)]
-enum Stage<'a> {
-    Bytes(Bytes<'a>),
-    Values(Values),
-}
-
-impl<'a> Stage<'a> {
-    fn bytes(data: &'a [u8], number: Number) -> Result<Self, Box<Fault>> {
-        let size = number.size();
-        if !data.len().is_multiple_of(size) {
-            return Err(Fault::new(format!("{} bytes", data.len()), format!("whole numbers of {size} bytes each")));
-        }
-        Ok(Self::Bytes(Bytes { data, number }))
-    }
-
-    fn ints(self, most: usize) -> Result<Vec<i32>, Box<Fault>> {
-        match self {
-            Self::Bytes(bytes) => bytes.values(most)?.ints(),
-            Self::Values(values) => values.ints(),
-        }
-    }
-}
-
-/// Reads little-endian numbers of `N` bytes.
-fn numbers<const N: usize, T, V: FromIterator<T>>(data: &[u8], number: impl Fn([u8; N]) -> T) -> V {
+/// Converts little-endian numbers of `N` bytes.
+fn converted<const N: usize, T, V: FromIterator<T>>(data: &[u8], number: impl Fn([u8; N]) -> T) -> V {
     data.as_chunks::<N>().0.iter().map(|bytes| number(*bytes)).collect()
 }
 
@@ -99,47 +75,37 @@ fn within(n: usize, most: usize) -> Result<(), Box<Fault>> {
     if n > most { Err(Fault::new(format!("{n} values"), format!("at most {most}"))) } else { Ok(()) }
 }
 
-impl<'a> Bytes<'a> {
-    fn values(self, most: usize) -> Result<Values, Box<Fault>> {
-        let data = self.data;
-        within(data.len() / self.number.size(), most)?;
-        Ok(match self.number {
-            Number::Int8 => Values::Int(numbers(data, |b| i8::from_le_bytes(b).into())),
-            Number::Int16 => Values::Int(numbers(data, |b| i16::from_le_bytes(b).into())),
-            Number::Int32 => Values::Int(numbers(data, i32::from_le_bytes)),
-            Number::Uint8 => Values::Int(numbers(data, |b| u8::from_le_bytes(b).into())),
-            Number::Uint16 => Values::Int(numbers(data, |b| u16::from_le_bytes(b).into())),
-            Number::Uint32 => {
-                let values: Option<Vec<i32>> = numbers(data, |b| i32::try_from(u32::from_le_bytes(b)).ok());
-                Values::Int(values.ok_or_else(|| Fault::new("a number of 2³¹ or more", "one below"))?)
-            }
-            Number::Float32 => Values::Real(numbers(data, |b| f32::from_le_bytes(b).into())),
-            Number::Float64 => Values::Real(numbers(data, f64::from_le_bytes)),
-        })
-    }
-
-    /// Decodes `IntegerPacking`: a value is a sum of numbers, all but the last of which are the limits of their type.
-    fn unpack(self, number: Number, size: Option<usize>, most: usize) -> Result<Stage<'a>, Box<Fault>> {
-        if self.number != number {
-            let (found, expected) = (format!("{:?} in the ByteArray", self.number), format!("{number:?}"));
-            return Err(Fault::new(found, expected));
+/// Reads the numbers in `data`.
+fn numbers(data: &[u8], number: Number, most: usize) -> Result<Values, Box<Fault>> {
+    within(data.len() / number.size(), most)?;
+    Ok(match number {
+        Number::Int8 => Values::Int(converted(data, |b| i8::from_le_bytes(b).into())),
+        Number::Int16 => Values::Int(converted(data, |b| i16::from_le_bytes(b).into())),
+        Number::Int32 => Values::Int(converted(data, i32::from_le_bytes)),
+        Number::Uint8 => Values::Int(converted(data, |b| u8::from_le_bytes(b).into())),
+        Number::Uint16 => Values::Int(converted(data, |b| u16::from_le_bytes(b).into())),
+        Number::Uint32 => {
+            let values: Option<Vec<i32>> = converted(data, |b| i32::try_from(u32::from_le_bytes(b)).ok());
+            Values::Int(values.ok_or_else(|| Fault::new("a number of 2³¹ or more", "one below"))?)
         }
-        let data = self.data;
-        let limits = match number {
-            Number::Int8 => [i8::MIN.into(), i8::MAX.into()],
-            Number::Int16 => [i16::MIN.into(), i16::MAX.into()],
-            // Unsigned types have no lower limit.
-            Number::Uint8 => [-1, u8::MAX.into()],
-            _ => [-1, u16::MAX.into()],
-        };
-        let ints = match number {
-            Number::Int8 => sums(data, |b| i8::from_le_bytes(b).into(), limits, size, most),
-            Number::Int16 => sums(data, |b| i16::from_le_bytes(b).into(), limits, size, most),
-            Number::Uint8 => sums(data, |b| u8::from_le_bytes(b).into(), limits, size, most),
-            _ => sums(data, |b| u16::from_le_bytes(b).into(), limits, size, most),
-        };
-        Ok(Stage::Values(Values::Int(ints?)))
+        Number::Float32 => Values::Real(converted(data, |b| f32::from_le_bytes(b).into())),
+        Number::Float64 => Values::Real(converted(data, f64::from_le_bytes)),
+    })
+}
+
+/// Decodes `IntegerPacking`: a value is a sum of numbers, all but the last of which are the limits of their type.
+fn unpack(data: &[u8], found: Number, number: Number, size: Option<usize>, most: usize) -> Result<Values, Box<Fault>> {
+    if found != number {
+        return Err(Fault::new(format!("{found:?} in the ByteArray"), format!("{number:?}")));
     }
+    let values = match number {
+        Number::Int8 => sums(data, |b| i8::from_le_bytes(b).into(), [i8::MIN.into(), i8::MAX.into()], size, most),
+        Number::Int16 => sums(data, |b| i16::from_le_bytes(b).into(), [i16::MIN.into(), i16::MAX.into()], size, most),
+        // Unsigned types have no lower limit.
+        Number::Uint8 => sums(data, |b| u8::from_le_bytes(b).into(), [-1, u8::MAX.into()], size, most),
+        _ => sums(data, |b| u16::from_le_bytes(b).into(), [-1, u16::MAX.into()], size, most),
+    };
+    values.map(Values::Int)
 }
 
 /// Sums runs of numbers that end with a number other than the `limits`.
@@ -188,8 +154,8 @@ fn fits(value: i64) -> Result<i32, Box<Fault>> {
 
 impl Encoding<'_> {
     /// Decodes one encoding of integers.
-    fn undo(&self, ints: Vec<i32>, most: usize) -> Result<Stage<'static>, Box<Fault>> {
-        let values = match *self {
+    fn undo(&self, ints: Vec<i32>, most: usize) -> Result<Values, Box<Fault>> {
+        Ok(match *self {
             Self::Delta { origin } => Values::Int(add_up(ints, origin)?),
             Self::RunLength { size } => Values::Int(repeat(&ints, size, most)?),
             // Division restores the original value exactly; multiplication by the inverse does not.
@@ -201,9 +167,12 @@ impl Encoding<'_> {
                 let width = (max - min) / f64::from(steps - 1);
                 Values::Real(ints.iter().map(|&v| min + width * f64::from(v)).collect())
             }
-            Self::ByteArray(_) | Self::IntegerPacking { .. } | Self::StringArray(_) => Values::Int(ints),
-        };
-        Ok(Stage::Values(values))
+            Self::ByteArray(_) => return Err(Fault::new("it in the middle of its chain", "it at the end")),
+            Self::IntegerPacking { .. } => {
+                return Err(Fault::new("another encoding after it", "ByteArray after it"));
+            }
+            Self::StringArray(_) => return Err(Fault::new("it among others", "it alone")),
+        })
     }
 }
 

@@ -84,102 +84,53 @@ impl Encoding<'_> {
     }
 }
 
-/// Fields of an encoding; `None` if missing.
-#[derive(Default)]
-struct Fields<'a> {
-    kind: Option<&'a [u8]>,
-    number: Option<u8>,
-    factor: Option<f64>,
-    min: Option<f64>,
-    max: Option<f64>,
-    steps: Option<i32>,
-    size: Option<u32>,
-    origin: Option<i32>,
-    byte_count: Option<u8>,
-    unsigned: Option<bool>,
-    joined: Option<&'a [u8]>,
-    offsets: Option<&'a [u8]>,
-    offset_chain: Option<Cursor<'a>>,
-    data_chain: Option<Cursor<'a>>,
-}
-
-fn present<T>(field: Option<T>, name: &str) -> Result<T, Box<Fault>> {
-    field.ok_or_else(|| Fault::new("nothing", format!("`{name}`")))
-}
-
 impl<'a> Encoding<'a> {
-    fn read(at: &mut Cursor<'a>) -> Result<Self, Box<Fault>> {
-        let mut f = Fields::default();
-        at.map(|key, value| {
-            let key_text = || format!("`{}`", String::from_utf8_lossy(key));
-            let read = match key {
-                b"kind" => value.text().map(|v| f.kind = Some(v)),
-                b"type" => value.whole("a type of numbers").map(|v| f.number = Some(v)),
-                b"factor" => value.number().map(|v| f.factor = Some(v)),
-                b"min" => value.number().map(|v| f.min = Some(v)),
-                b"max" => value.number().map(|v| f.max = Some(v)),
-                b"numSteps" => value.whole("a number of steps").map(|v| f.steps = Some(v)),
-                b"srcSize" => value.whole("a number of values").map(|v| f.size = Some(v)),
-                b"origin" => value.whole("a whole number of 32 bits").map(|v| f.origin = Some(v)),
-                b"byteCount" => value.whole("1 or 2").map(|v| f.byte_count = Some(v)),
-                b"isUnsigned" => value.truth().map(|v| f.unsigned = Some(v)),
-                b"stringData" => value.text().map(|v| f.joined = Some(v)),
-                b"offsets" => value.bytes().map(|v| f.offsets = Some(v)),
-                b"offsetEncoding" => {
-                    f.offset_chain = Some(*value);
-                    Ok(())
-                }
-                b"dataEncoding" => {
-                    f.data_chain = Some(*value);
-                    Ok(())
-                }
-                _ => Ok(()),
-            };
-            read.map_err(|fault| fault.within(key_text()))
-        })?;
-        f.encoding()
-    }
-}
-
-impl<'a> Fields<'a> {
-    fn encoding(self) -> Result<Encoding<'a>, Box<Fault>> {
-        let size = self.size.map(|n| n as usize);
-        Ok(match present(self.kind, "kind")? {
+    fn read(at: Cursor<'a>) -> Result<Self, Box<Fault>> {
+        let size = || {
+            let size: Option<u32> = at.field("srcSize", |value| value.whole("a number of values"))?;
+            Ok::<_, Box<Fault>>(size.map(|n| n as usize))
+        };
+        Ok(match at.required("kind", Cursor::text)? {
             b"ByteArray" => {
-                let code = present(self.number, "type")?;
+                let code: u8 = at.required("type", |value| value.whole("a type of numbers"))?;
                 let number = Number::of(code).ok_or_else(|| {
                     Fault::new(format!("type {code}"), "a type of numbers (1 to 6, 32 or 33)").within("ByteArray")
                 })?;
-                Encoding::ByteArray(number)
+                Self::ByteArray(number)
             }
-            b"FixedPoint" => match present(self.factor, "factor")? {
+            b"FixedPoint" => match at.required("factor", Cursor::number)? {
                 0.0 => return Err(Fault::new("a factor of 0", "another one").within("FixedPoint")),
-                factor => Encoding::FixedPoint { factor },
+                factor => Self::FixedPoint { factor },
             },
             b"IntervalQuantization" => {
-                let steps = present(self.steps, "numSteps")?;
+                let steps = at.required("numSteps", |value| value.whole("a number of steps"))?;
                 if steps < 2 {
                     return Err(Fault::new(format!("{steps} steps"), "at least 2").within("IntervalQuantization"));
                 }
-                Encoding::IntervalQuantization { min: present(self.min, "min")?, max: present(self.max, "max")?, steps }
+                let (min, max) = (at.required("min", Cursor::number)?, at.required("max", Cursor::number)?);
+                Self::IntervalQuantization { min, max, steps }
             }
-            b"RunLength" => Encoding::RunLength { size },
-            b"Delta" => Encoding::Delta { origin: self.origin.unwrap_or(0) },
+            b"RunLength" => Self::RunLength { size: size()? },
+            b"Delta" => {
+                let origin = at.field("origin", |value| value.whole("a whole number of 32 bits"))?;
+                Self::Delta { origin: origin.unwrap_or(0) }
+            }
             b"IntegerPacking" => {
-                let number = match (present(self.byte_count, "byteCount")?, present(self.unsigned, "isUnsigned")?) {
+                let bytes: u8 = at.required("byteCount", |value| value.whole("1 or 2"))?;
+                let number = match (bytes, at.required("isUnsigned", Cursor::truth)?) {
                     (1, true) => Number::Uint8,
                     (1, false) => Number::Int8,
                     (2, true) => Number::Uint16,
                     (2, false) => Number::Int16,
                     (n, _) => return Err(Fault::new(format!("a byteCount of {n}"), "1 or 2").within("IntegerPacking")),
                 };
-                Encoding::IntegerPacking { size, number }
+                Self::IntegerPacking { size: size()?, number }
             }
-            b"StringArray" => Encoding::StringArray(Strings {
-                joined: present(self.joined, "stringData")?,
-                offsets: present(self.offsets, "offsets")?,
-                offset_chain: present(self.offset_chain, "offsetEncoding")?,
-                data_chain: present(self.data_chain, "dataEncoding")?,
+            b"StringArray" => Self::StringArray(Strings {
+                joined: at.required("stringData", Cursor::text)?,
+                offsets: at.required("offsets", Cursor::bytes)?,
+                offset_chain: at.required("offsetEncoding", |value| Ok(*value))?,
+                data_chain: at.required("dataEncoding", |value| Ok(*value))?,
             }),
             other => return Err(Fault::new(format!("the encoding {}", quote(other)), "one of BinaryCIF's seven")),
         })
@@ -197,7 +148,7 @@ impl<'a> Chain<'a> {
             if chain.len() >= MAX_CHAIN {
                 return Err(Fault::new("more encodings", format!("at most {MAX_CHAIN} in a row")));
             }
-            let encoding = Encoding::read(item).map_err(|f| f.within(format_args!("encoding {}", i + 1)))?;
+            let encoding = Encoding::read(*item).map_err(|f| f.within(format_args!("encoding {}", i + 1)))?;
             chain.push(encoding);
             Ok(())
         })?;

@@ -13,9 +13,7 @@ mod fault;
 mod msgpack;
 mod rows;
 
-use std::collections::HashMap;
-
-use self::column::{Bounds, Cells, Raw};
+use self::column::{Bounds, Column, Raw};
 use self::fault::Fault;
 use self::msgpack::Cursor;
 use super::atom_site::{Layout, Passed};
@@ -104,34 +102,28 @@ impl<'a> Category<'a> {
         Ok(columns)
     }
 
-    /// Returns the first value of an item, normalized, of at most `max` characters.
-    fn value(&self, item: &[u8], max: usize, limits: &ReadLimits) -> Result<Option<String>, Box<Fault>> {
+    /// Decodes the texts of an item; `None` without the item.
+    fn column(&self, item: &str, max_rows: usize) -> Result<Option<Column<'a>>, Box<Fault>> {
         let columns = self.columns()?;
-        let Some(raw) = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item)) else { return Ok(None) };
-        let bounds = self.bounds(limits).ok_or_else(|| {
-            Fault::new(format!("{} rows", self.rows), format!("at most {}", limits.max_rows())).within("rowCount")
-        })?;
-        if bounds.rows == 0 {
-            return Ok(None);
-        }
-        let column = raw.load(bounds, true)?;
-        let Cells::Text(texts) = &column.cells else { return Ok(None) };
-        let range = texts.range(0).filter(|_| !column.is_null(0));
-        Ok(range.and_then(|(start, end)| normalize(&texts.joined[start..end], max)))
+        let named = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item.as_bytes()));
+        let Some(raw) = named else { return Ok(None) };
+        let Some(rows) = usize::try_from(self.rows).ok().filter(|&n| n <= max_rows) else {
+            return Err(Fault::new(format!("{} rows", self.rows), format!("at most {max_rows}")).within("rowCount"));
+        };
+        raw.load(Bounds { rows, texts: max_rows }, true).map(Some)
+    }
+
+    /// Returns the first value of an item, normalized, of at most `max` characters.
+    fn value(&self, item: &str, max: usize, limits: &ReadLimits) -> Result<Option<String>, Box<Fault>> {
+        let column = self.column(item, limits.max_rows())?.filter(|_| self.rows > 0);
+        Ok(column.as_ref().and_then(|column| column.text(0)).and_then(|text| normalize(text, max)))
     }
 
     /// Returns the values of an item, with empty texts for missing values. Returns no values without the item.
-    fn values(&self, item: &str, most: usize) -> Result<Vec<String>, Box<Fault>> {
-        let columns = self.columns()?;
-        let named = columns.iter().find(|c| c.name.eq_ignore_ascii_case(item.as_bytes()));
-        let Some(raw) = named else { return Ok(Vec::new()) };
-        let Some(rows) = usize::try_from(self.rows).ok().filter(|&n| n <= most) else {
-            return Err(Fault::new(format!("{} rows", self.rows), format!("at most {most}")).within("rowCount"));
-        };
-        let column = raw.load(Bounds { rows, texts: most }, true)?;
-        let Cells::Text(texts) = &column.cells else { return Ok(Vec::new()) };
-        let text = |row| texts.range(row).filter(|_| !column.is_null(row)).map(|(from, to)| &texts.joined[from..to]);
-        Ok((0..rows).map(|row| decode(text(row).unwrap_or_default()).into_owned()).collect())
+    fn values(&self, item: &str, max_rows: usize) -> Result<Vec<String>, Box<Fault>> {
+        let Some(column) = self.column(item, max_rows)? else { return Ok(Vec::new()) };
+        let rows = 0..usize::try_from(self.rows).unwrap_or(0);
+        Ok(rows.map(|row| decode(column.text(row).unwrap_or_default()).into_owned()).collect())
     }
 
     /// Returns the limits of decoding, or `None` if there are more rows than allowed atoms.
@@ -142,16 +134,14 @@ impl<'a> Category<'a> {
     }
 }
 
-/// Required categories of a data block.
+/// Names of the required categories.
+const CATEGORIES: [&[u8]; 6] = [b"atom_site", b"entry", b"struct", b"entity", b"entity_poly", b"struct_asym"];
+
+/// A data block with its required categories.
 #[derive(Debug, Default)]
 struct Block<'a> {
     name: Option<String>,
-    atom_site: Option<Category<'a>>,
-    entry: Option<Category<'a>>,
-    title: Option<Category<'a>>,
-    entity: Option<Category<'a>>,
-    entity_poly: Option<Category<'a>>,
-    struct_asym: Option<Category<'a>>,
+    categories: Vec<Category<'a>>,
 }
 
 impl<'a> Block<'a> {
@@ -180,19 +170,16 @@ impl<'a> Block<'a> {
         if !passed.is_full() {
             passed.category(decode(category.name));
         }
-        let is = |name: &[u8]| category.name.eq_ignore_ascii_case(name);
-        let place = match () {
-            () if is(b"atom_site") => &mut self.atom_site,
-            () if is(b"entry") => &mut self.entry,
-            () if is(b"struct") => &mut self.title,
-            () if is(b"entity") => &mut self.entity,
-            () if is(b"entity_poly") => &mut self.entity_poly,
-            () if is(b"struct_asym") => &mut self.struct_asym,
-            () => return,
-        };
-        if place.is_none() {
-            *place = Some(category);
+        let known = |c: &Category<'_>| c.name.eq_ignore_ascii_case(category.name);
+        let required = CATEGORIES.iter().any(|name| category.name.eq_ignore_ascii_case(name));
+        if required && !self.categories.iter().any(known) {
+            self.categories.push(category);
         }
+    }
+
+    /// Returns a category by its name in lower case.
+    fn category(&self, name: &str) -> Option<&Category<'a>> {
+        self.categories.iter().find(|category| category.name.eq_ignore_ascii_case(name.as_bytes()))
     }
 
     /// Returns the structure, if the block has atoms with coordinates.
@@ -201,13 +188,13 @@ impl<'a> Block<'a> {
         let Some((columns, tables, warnings)) = self.atoms(entities.are_known(), limits, passed)? else {
             return Ok(None);
         };
-        let value = |category: &Option<Category<'_>>, item, max| -> Result<Option<String>, StructureError> {
-            let Some(category) = category else { return Ok(None) };
+        let value = |category, item, max| -> Result<Option<String>, StructureError> {
+            let Some(category) = self.category(category) else { return Ok(None) };
             Ok(category.value(item, max, limits).map_err(|f| f.within(category.place()))?)
         };
-        let entry = value(&self.entry, b"id", 80)?;
-        let title = value(&self.title, b"title", MAX_TITLE)?;
-        let place = self.atom_site.as_ref().map(Category::place).unwrap_or_default();
+        let entry = value("entry", "id", 80)?;
+        let title = value("struct", "title", MAX_TITLE)?;
+        let place = self.category("atom_site").map(Category::place).unwrap_or_default();
         let source = Source {
             format: SourceFormat::BinaryCif,
             id: entry.or_else(|| self.name.clone()),
@@ -222,12 +209,7 @@ impl<'a> Block<'a> {
     fn entities(&self) -> (Entities, Option<String>) {
         let mut known = Entities::default();
         for (place, (name, item)) in entities::ITEMS.into_iter().enumerate() {
-            let category = match name {
-                "entity" => &self.entity,
-                "entity_poly" => &self.entity_poly,
-                _ => &self.struct_asym,
-            };
-            let Some(category) = category else { continue };
+            let Some(category) = self.category(name) else { continue };
             match category.values(item, entities::MAX_VALUES) {
                 Ok(values) => values.into_iter().for_each(|value| known.add(place, value)),
                 Err(fault) => {
@@ -246,7 +228,7 @@ impl<'a> Block<'a> {
         limits: &ReadLimits,
         passed: &mut Passed,
     ) -> Result<Option<rows::Atoms>, StructureError> {
-        let Some(category) = self.atom_site.as_ref().filter(|category| category.rows > 0) else { return Ok(None) };
+        let Some(category) = self.category("atom_site").filter(|category| category.rows > 0) else { return Ok(None) };
         let bounds = category.bounds(limits).ok_or(StructureError::TooManyAtoms { limit: limits.max_atoms })?;
         let within = |fault: Box<Fault>| fault.within(category.place());
         let raw = category.columns().map_err(within)?;
@@ -267,12 +249,7 @@ impl<'a> Block<'a> {
 
 /// Finds the items among the columns.
 fn layout(raw: &[Raw<'_>]) -> Result<Layout, Box<Fault>> {
-    let mut found: HashMap<Vec<u8>, usize> = HashMap::with_capacity(raw.len());
-    for (i, column) in raw.iter().enumerate() {
-        if found.insert(column.name.to_ascii_lowercase(), i).is_some() {
-            let found = format!("two columns {}", decode(column.name));
-            return Err(Fault::new(found, "every column once in its category"));
-        }
-    }
-    Ok(Layout::new(raw.len(), |item| found.get(item.to_ascii_lowercase().as_bytes()).copied()))
+    Layout::of(raw.iter().map(|column| column.name)).map_err(|twice| {
+        Fault::new(format!("two columns {}", decode(raw[twice].name)), "every column once in its category")
+    })
 }

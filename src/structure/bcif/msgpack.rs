@@ -154,6 +154,33 @@ impl<'a> Cursor<'a> {
         Ok(())
     }
 
+    /// Finds a key of a map and reads its value, without moving the cursor. Returns `None` if the key is missing. The
+    /// last of equal keys counts.
+    pub(super) fn field<T>(
+        &self,
+        name: &str,
+        read: impl FnOnce(&mut Self) -> Result<T, Box<Fault>>,
+    ) -> Result<Option<T>, Box<Fault>> {
+        let (mut map, mut found) = (*self, None);
+        map.map(|key, value| {
+            if key == name.as_bytes() {
+                found = Some(*value);
+            }
+            Ok(())
+        })?;
+        let read = |mut value| read(&mut value).map_err(|fault| fault.within(format_args!("`{name}`")));
+        found.map(read).transpose()
+    }
+
+    /// Reads the value of a key like [`Self::field`]. A missing key is an error.
+    pub(super) fn required<T>(
+        &self,
+        name: &str,
+        read: impl FnOnce(&mut Self) -> Result<T, Box<Fault>>,
+    ) -> Result<T, Box<Fault>> {
+        self.field(name, read)?.ok_or_else(|| Fault::new("nothing", format!("`{name}`")))
+    }
+
     pub(super) fn text(&mut self) -> Result<&'a [u8], Box<Fault>> {
         match self.next()? {
             Token::Text(text) => Ok(text),

@@ -119,12 +119,11 @@ pub(super) fn read(raw: &[Raw<'_>], layout: Layout, bounds: Bounds) -> Result<At
         .collect();
     // Reports the first fault in file order, independent of the threads.
     done.into_iter().collect::<Result<(), _>>()?;
-    let (mut tables, mut warnings) = (Tables::default(), Warnings::default());
+    let mut all = AtomSite::new(layout);
     for (_, mut slices, site) in parts {
-        slices.adopt(&site.tables, &mut tables);
-        warnings.append(site.warnings);
+        all.append(site, &mut slices);
     }
-    Ok((columns, tables, warnings))
+    Ok((columns, all.tables, all.warnings))
 }
 
 /// A column and its fallback, if required.
@@ -139,11 +138,11 @@ fn load<'a>(raw: &[Raw<'a>], layout: &Layout, bounds: Bounds) -> Result<Vec<Opti
         .par_iter()
         .map(|&([first, second], texts)| {
             let load = |column: usize| raw.get(column).map(|raw| raw.load(bounds, texts)).transpose();
-            let (first, mut stand_in) = (load(first)?, None);
+            let (first, mut fallback) = (load(first)?, None);
             if first.as_ref().is_some_and(Column::has_nulls) {
-                stand_in = load(second)?;
+                fallback = load(second)?;
             }
-            Ok([first, stand_in])
+            Ok([first, fallback])
         })
         .collect();
     let mut columns: Vec<Option<Column<'a>>> = Vec::new();

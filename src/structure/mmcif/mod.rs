@@ -6,7 +6,6 @@
 mod row;
 mod rows;
 
-use self::row::PREFIX;
 use self::rows::Rows;
 use super::atom_site::{Layout, Passed};
 use super::atoms::{Source, SourceFormat, Structure};
@@ -42,9 +41,15 @@ pub(super) fn read(text: &[u8], limits: &ReadLimits) -> Result<Structure, Struct
     }
 }
 
-/// Tags and values as byte ranges.
+/// Data block with what has been read of it.
 #[derive(Debug, Default)]
-struct SingleRow {
+struct Block {
+    name: Option<String>,
+    entry: Option<String>,
+    title: Option<String>,
+    entities: Entities,
+    in_frame: bool,
+    /// Tags and values of an `atom_site` without a loop, as in files with one atom: byte ranges.
     tags: Vec<(usize, usize)>,
     values: Vec<(usize, usize)>,
 }
@@ -53,32 +58,15 @@ struct Reader<'a> {
     text: &'a [u8],
     tokens: Tokenizer<'a>,
     limits: &'a ReadLimits,
-    block: Option<String>,
-    entry: Option<String>,
-    title: Option<String>,
-    entities: Entities,
-    in_frame: bool,
+    block: Block,
     rows: Option<Rows<'a>>,
-    /// `atom_site` without a loop, as in files with one atom: tags and values as byte ranges.
-    single: SingleRow,
     passed: Passed,
 }
 
 impl<'a> Reader<'a> {
     fn new(text: &'a [u8], limits: &'a ReadLimits) -> Self {
-        Self {
-            text,
-            tokens: Tokenizer::new(text),
-            limits,
-            block: None,
-            entry: None,
-            title: None,
-            entities: Entities::default(),
-            in_frame: false,
-            rows: None,
-            single: SingleRow::default(),
-            passed: Passed::default(),
-        }
+        let (tokens, block, passed) = (Tokenizer::new(text), Block::default(), Passed::default());
+        Self { text, tokens, limits, block, rows: None, passed }
     }
 
     fn run(&mut self) -> Result<(), Stop> {
@@ -92,7 +80,7 @@ impl<'a> Reader<'a> {
                     }
                     self.begin_block(&token);
                 }
-                Kind::Save => self.in_frame = token.end - token.start > b"save_".len(),
+                Kind::Save => self.block.in_frame = token.end - token.start > b"save_".len(),
                 Kind::Reserved => {}
                 Kind::Tag => self.item(&token)?,
                 Kind::Loop => {
@@ -105,7 +93,7 @@ impl<'a> Reader<'a> {
                 }
                 Kind::Value => {
                     let expected = "a data block, loop_, or a tag that begins with _";
-                    return Err(Fault::token(self.text, token.start, token.end, expected).into());
+                    return Err(token.fault(self.text, expected).into());
                 }
             }
             token = self.tokens.next()?;
@@ -114,11 +102,7 @@ impl<'a> Reader<'a> {
 
     fn begin_block(&mut self, token: &Token) {
         let name = &self.text[token.start + b"data_".len()..token.end];
-        self.block = normalize(name, 80);
-        self.entry = None;
-        self.title = None;
-        self.entities = Entities::default();
-        self.in_frame = false;
+        self.block = Block { name: normalize(name, 80), ..Block::default() };
         self.passed.block();
     }
 
@@ -127,16 +111,13 @@ impl<'a> Reader<'a> {
         let value = self.tokens.next()?;
         if value.kind != Kind::Value {
             let expected = format!("a value of {}", decode(&self.text[tag.start..tag.end.min(tag.start + 80)]));
-            return Err(match value.kind {
-                Kind::End => Fault::words(value.start, "the end of the file", expected).into(),
-                _ => Fault::token(self.text, value.start, value.end, expected).into(),
-            });
+            return Err(value.fault(self.text, expected).into());
         }
         self.note_category(tag);
         let name = &self.text[tag.start..tag.end];
-        if !self.in_frame && starts_with(name, PREFIX) {
-            self.single.tags.push((tag.start, tag.end));
-            self.single.values.push((value.start, value.end));
+        if !self.block.in_frame && row::has_prefix(name) {
+            self.block.tags.push((tag.start, tag.end));
+            self.block.values.push((value.start, value.end));
         } else {
             self.note_value(name, &value);
             if let Some(place) = self.entity_item(tag) {
@@ -148,7 +129,7 @@ impl<'a> Reader<'a> {
 
     /// Returns the index of an item that describes entities.
     fn entity_item(&self, tag: &Token) -> Option<usize> {
-        if self.in_frame {
+        if self.block.in_frame {
             return None;
         }
         Entities::find(&self.text[tag.start + 1..tag.end])
@@ -157,12 +138,13 @@ impl<'a> Reader<'a> {
     /// Stores a value that describes entities.
     fn note_entity(&mut self, place: usize, value: &Token) {
         let (start, end, _) = cif::unquote(self.text, value.start, value.end);
-        self.entities.add(place, decode(&self.text[start..end]).into_owned());
+        self.block.entities.add(place, decode(&self.text[start..end]).into_owned());
     }
 
     /// Stores the id or title of the entry.
     fn note_value(&mut self, tag: &[u8], value: &Token) {
-        if self.in_frame || !(starts_with(tag, b"_entry.id") || starts_with(tag, b"_struct.title")) {
+        let is_id = tag.eq_ignore_ascii_case(b"_entry.id");
+        if self.block.in_frame || !(is_id || tag.eq_ignore_ascii_case(b"_struct.title")) {
             return;
         }
         let (start, end, quoted) = cif::unquote(self.text, value.start, value.end);
@@ -170,10 +152,9 @@ impl<'a> Reader<'a> {
         if !quoted && matches!(raw, b"?" | b".") {
             return;
         }
-        if tag.eq_ignore_ascii_case(b"_entry.id") && self.entry.is_none() {
-            self.entry = normalize(raw, 80);
-        } else if tag.eq_ignore_ascii_case(b"_struct.title") && self.title.is_none() {
-            self.title = normalize(raw, MAX_TITLE);
+        let (place, max) = if is_id { (&mut self.block.entry, 80) } else { (&mut self.block.title, MAX_TITLE) };
+        if place.is_none() {
+            *place = normalize(raw, max);
         }
     }
 
@@ -186,13 +167,10 @@ impl<'a> Reader<'a> {
             token = self.tokens.next()?;
         }
         let Some(first) = tags.first() else {
-            return Err(match token.kind {
-                Kind::End => Fault::words(token.start, "the end of the file", "a tag after loop_").into(),
-                _ => Fault::token(self.text, token.start, token.end, "a tag after loop_").into(),
-            });
+            return Err(token.fault(self.text, "a tag after loop_").into());
         };
         self.note_category(first);
-        let is_atom_site = !self.in_frame && starts_with(&self.text[first.start..first.end], PREFIX);
+        let is_atom_site = !self.block.in_frame && row::has_prefix(&self.text[first.start..first.end]);
         if is_atom_site && self.rows.is_none() && token.kind == Kind::Value {
             let ranges: Vec<_> = tags.iter().map(|t| (t.start, t.end)).collect();
             if let Some(layout) = self.layout(&ranges)? {
@@ -231,7 +209,7 @@ impl<'a> Reader<'a> {
 
     /// Ends a data block. An `atom_site` without a loop is one row.
     fn end_block(&mut self) -> Result<(), Stop> {
-        let SingleRow { tags, values } = std::mem::take(&mut self.single);
+        let (tags, values) = (std::mem::take(&mut self.block.tags), std::mem::take(&mut self.block.values));
         if self.rows.is_some() || tags.is_empty() {
             return Ok(());
         }
@@ -247,13 +225,13 @@ impl<'a> Reader<'a> {
     /// atoms are complete.
     fn rest_of_block(&mut self, mut token: Token) {
         let hetero = self.rows.as_ref().is_some_and(Rows::has_hetero);
-        let wanted = |reader: &Self| reader.title.is_none() || (hetero && !reader.entities.are_known());
+        let wanted = |reader: &Self| reader.block.title.is_none() || (hetero && !reader.block.entities.are_known());
         while wanted(self) && !matches!(token.kind, Kind::End | Kind::Data) {
             let next = match token.kind {
                 Kind::Tag => self.item(&token).and_then(|()| Ok(self.tokens.next()?)),
                 Kind::Loop => self.category(),
                 Kind::Save => {
-                    self.in_frame = token.end - token.start > b"save_".len();
+                    self.block.in_frame = token.end - token.start > b"save_".len();
                     self.tokens.next().map_err(Stop::from)
                 }
                 _ => self.tokens.next().map_err(Stop::from),
@@ -276,21 +254,17 @@ impl<'a> Reader<'a> {
     fn finish(self) -> Result<Structure, StructureError> {
         let (columns, tables, warnings) = self.rows.map(Rows::into_parts).unwrap_or_default();
         if columns.len() == 0 {
-            return Err(self.passed.no_atoms("mmCIF", self.block));
+            return Err(self.passed.no_atoms("mmCIF", self.block.name));
         }
-        let too_many = self.entities.warning();
+        let too_many = self.block.entities.warning();
         let warnings = warnings.messages(|fault| fault.locate(self.text));
         let source = Source {
             format: SourceFormat::Mmcif,
-            id: self.entry.or(self.block),
-            title: self.title,
-            sequence: Sequence { polymer_chains: self.entities.polymer_chains(), ..Sequence::default() },
+            id: self.block.entry.or(self.block.name),
+            title: self.block.title,
+            sequence: Sequence { polymer_chains: self.block.entities.polymer_chains(), ..Sequence::default() },
             warnings: warnings.into_iter().chain(too_many).collect(),
         };
         Ok(columns.finish(tables, source))
     }
-}
-
-fn starts_with(tag: &[u8], prefix: &[u8]) -> bool {
-    tag.get(..prefix.len()).is_some_and(|t| t.eq_ignore_ascii_case(prefix))
 }

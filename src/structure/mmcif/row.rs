@@ -1,27 +1,27 @@
 //! Text rows of `atom_site`.
 
-use std::collections::HashMap;
-
 use super::super::atom_site::{self, Layout, NONE, Span};
 use super::super::cif::unquote;
 use super::super::text::Fault;
 
 /// Prefix of the tags of the category.
-pub(super) const PREFIX: &[u8] = b"_atom_site.";
+const PREFIX: &[u8] = b"_atom_site.";
 
 /// Returns the column indices of the items among the tags of a loop, given as ranges of `text`.
 pub(super) fn layout(text: &[u8], tags: &[(usize, usize)]) -> Result<Layout, Box<Fault>> {
-    let mut found: HashMap<Vec<u8>, usize> = HashMap::with_capacity(tags.len());
-    for (i, &(start, end)) in tags.iter().enumerate() {
-        let tag = text[start..end].to_ascii_lowercase();
-        if found.insert(tag, i).is_some() {
-            return Err(Fault::token(text, start, end, "every tag once in its category"));
-        }
-    }
-    Ok(Layout::new(tags.len(), |item| {
-        let tag = [PREFIX, item.to_ascii_lowercase().as_bytes()].concat();
-        found.get(&tag).copied()
-    }))
+    let item = |&(start, end): &(usize, usize)| {
+        let tag = &text[start..end];
+        if has_prefix(tag) { &tag[PREFIX.len()..] } else { tag }
+    };
+    Layout::of(tags.iter().map(item)).map_err(|twice| {
+        let (start, end) = tags[twice];
+        Fault::token(text, start, end, "every tag once in its category")
+    })
+}
+
+/// Returns true for a tag of the category.
+pub(super) fn has_prefix(tag: &[u8]) -> bool {
+    tag.get(..PREFIX.len()).is_some_and(|prefix| prefix.eq_ignore_ascii_case(PREFIX))
 }
 
 /// A row as byte ranges of its values. `QUOTES` is false for rows without quotes, which need no unquoting.

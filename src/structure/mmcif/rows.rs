@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use rayon::prelude::*;
 
 use super::super::atom_site::{AtomSite, Layout};
-use super::super::atoms::{Atom, Columns, Slices, Tables};
+use super::super::atoms::{Atom, Columns, Tables};
 use super::super::cif::{Kind, Tokenizer, bare_kind};
 use super::super::scan::Edges;
 use super::super::text::Fault;
@@ -31,34 +31,6 @@ pub(super) struct Rows<'a> {
     site: AtomSite<Box<Fault>>,
     columns: Columns,
     limit: usize,
-}
-
-/// Destination of atoms. Returns false if it is full.
-trait Sink {
-    fn put(&mut self, atom: &Atom) -> bool;
-}
-
-struct Limited<'c> {
-    columns: &'c mut Columns,
-    max_rows: usize,
-}
-
-impl Sink for Limited<'_> {
-    #[inline]
-    fn put(&mut self, atom: &Atom) -> bool {
-        if self.columns.len() >= self.max_rows {
-            return false;
-        }
-        self.columns.push(atom);
-        true
-    }
-}
-
-impl Sink for Slices<'_> {
-    #[inline]
-    fn put(&mut self, atom: &Atom) -> bool {
-        Slices::put(self, atom)
-    }
 }
 
 impl<'a> Rows<'a> {
@@ -85,8 +57,9 @@ impl<'a> Rows<'a> {
         });
         let mut scanner = Scanner::new(self.text);
         loop {
-            let mut sink = Limited { columns: &mut self.columns, max_rows: self.limit };
-            at = scanner.rows(&mut self.site, &mut sink, at, self.text.len(), &AtomicBool::new(false))?;
+            let (columns, limit) = (&mut self.columns, self.limit);
+            let put = |atom: &Atom| columns.push_within(limit, atom);
+            at = scanner.rows(&mut self.site, put, at, self.text.len(), &AtomicBool::new(false))?;
             match self.special_row(at)? {
                 Some(next) => at = next,
                 None => return Ok(at),
@@ -106,10 +79,7 @@ impl<'a> Rows<'a> {
                     return Ok(None);
                 }
                 let expected = format!("value {} of the {width} in a row of atom_site", i + 1);
-                return Err(match token.kind {
-                    Kind::End => Fault::words(token.start, "the end of the file", expected).into(),
-                    _ => Fault::token(self.text, token.start, token.end, expected).into(),
-                });
+                return Err(token.fault(self.text, expected).into());
             }
             values.push((token.start, token.end));
         }
@@ -128,8 +98,7 @@ impl<'a> Rows<'a> {
             offsets.extend([from, to]);
         }
         let atom = self.site.atom(&Row::<true> { text: self.text, base, offsets: &offsets })?;
-        let mut sink = Limited { columns: &mut self.columns, max_rows: self.limit };
-        if sink.put(&atom) { Ok(()) } else { Err(Stop::TooMany) }
+        if self.columns.push_within(self.limit, &atom) { Ok(()) } else { Err(Stop::TooMany) }
     }
 
     /// Reads rows from `first` on by several threads, and returns the end of what they read. Returns `None`, and
@@ -154,7 +123,7 @@ impl<'a> Rows<'a> {
         parts.par_iter_mut().for_each_init(
             || Scanner::new(text),
             |scanner, (stretch, slices, site)| {
-                let done = scanner.rows(site, slices, stretch.from, stretch.to, &failed);
+                let done = scanner.rows(site, |atom| slices.put(atom), stretch.from, stretch.to, &failed);
                 let whole =
                     done.is_ok_and(|done| text[done..stretch.to].iter().all(|&b| b <= b' ')) && slices.is_full();
                 if !whole {
@@ -165,14 +134,10 @@ impl<'a> Rows<'a> {
         if failed.into_inner() {
             return None;
         }
-        let (mut tables, mut warnings) = (Tables::default(), Warnings::default());
         for (_, mut slices, site) in parts {
-            slices.adopt(&site.tables, &mut tables);
-            warnings.append(site.warnings);
+            self.site.append(site, &mut slices);
         }
         self.columns = columns;
-        self.site.tables = tables;
-        self.site.warnings = warnings;
         Some(end)
     }
 }
@@ -266,12 +231,12 @@ impl<'a> Scanner<'a> {
         Self { text, edges: Edges::default(), window: MAX_WINDOW }
     }
 
-    /// Reads rows from `at` to `end` into `sink`. Stops before the first row that is incomplete or not plain, and
-    /// returns the end of the row before it.
+    /// Reads rows from `at` to `end` and calls `put`, which returns false if there is no room. Stops before the first
+    /// row that is incomplete or not plain, and returns the end of the row before it.
     fn rows(
         &mut self,
         site: &mut AtomSite<Box<Fault>>,
-        sink: &mut impl Sink,
+        mut put: impl FnMut(&Atom) -> bool,
         mut at: usize,
         end: usize,
         stop: &AtomicBool,
@@ -297,7 +262,7 @@ impl<'a> Scanner<'a> {
                         break;
                     }
                 };
-                if !sink.put(&atom) {
+                if !put(&atom) {
                     return Err(Stop::TooMany);
                 }
                 done = at + offsets[per_row - 1] as usize;

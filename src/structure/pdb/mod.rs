@@ -71,6 +71,7 @@ impl Models {
     }
 }
 
+#[derive(Default)]
 struct Reader<'a> {
     text: &'a [u8],
     max_rows: usize,
@@ -94,22 +95,8 @@ struct Reader<'a> {
 
 impl<'a> Reader<'a> {
     fn new(text: &'a [u8], limits: &ReadLimits) -> Self {
-        Self {
-            text,
-            max_rows: limits.max_rows(),
-            full: false,
-            tabs: memchr::memchr(b'\t', text).is_some(),
-            columns: Columns::default(),
-            tables: Tables::default(),
-            models: Models::default(),
-            id: None,
-            title: Vec::new(),
-            left_justified: false,
-            guesses: HashMap::new(),
-            two_letters: None,
-            listed: HashSet::new(),
-            warnings: Warnings::default(),
-        }
+        let tabs = memchr::memchr(b'\t', text).is_some();
+        Self { text, max_rows: limits.max_rows(), tabs, ..Self::default() }
     }
 
     #[inline]

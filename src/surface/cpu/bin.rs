@@ -27,8 +27,6 @@ const PAIRS_PER_CHECK: u64 = 1 << 16;
 const ATOMS_PER_CHECK: usize = 256;
 /// Maximum capacity of a list that is kept between tiles; longer lists are freed.
 const KEPT_CAPACITY: usize = 4096;
-/// Atoms are indexed with 31 bits.
-pub(crate) const MAX_ATOMS: usize = (1 << 31) - 1;
 
 /// The tiles that some atom reaches, in canonical order, with their atoms.
 #[derive(Debug)]
@@ -136,18 +134,12 @@ impl Tiles {
     }
 }
 
-/// Returns the error for more atoms than 31-bit indices can number.
-pub(crate) fn too_many_atoms(n: usize) -> SurfaceError {
-    let expected = format!("at most {MAX_ATOMS} spheres");
-    SurfaceError::BadParameter { name: "spheres", value: n.to_string(), expected }
-}
-
 /// Returns the error for a grid of at least `samples` samples.
 pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits) -> SurfaceError {
     let excess = samples as f64 / limits.max_samples.max(1) as f64;
     let mut fitting = lattice.spacing * excess.max(1.0).cbrt();
     // Coarsens the spacing until an upper bound of the samples fits; a box of one cell needs 27 blocks at most.
-    while samples_at_most(lattice, fitting) > limits.max_samples as f64 && fitting < MAX_RESOLUTION {
+    while max_samples(lattice, fitting) > limits.max_samples as f64 && fitting < MAX_RESOLUTION {
         fitting *= 1.08;
     }
     SurfaceError::GridTooLarge {
@@ -162,17 +154,13 @@ pub(crate) fn too_large(lattice: &Lattice, samples: u64, limits: &SurfaceLimits)
 ///
 /// # Errors
 /// Returns [`SurfaceError::GridTooLarge`].
-pub(super) fn refuse_early(lattice: &Lattice, tiles: &Tiles, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
-    let tile_samples = f64::from(TILE).powi(3);
-    if tiles.len() as f64 * tile_samples <= limits.max_samples as f64 {
-        return Ok(());
-    }
-    let least = to_u64(samples_at_least(lattice));
+pub(crate) fn check_lower_bound(lattice: &Lattice, limits: &SurfaceLimits) -> Result<(), SurfaceError> {
+    let least = to_u64(min_samples(lattice));
     if least > limits.max_samples { Err(too_large(lattice, least, limits)) } else { Ok(()) }
 }
 
 /// A lower bound of the samples: the volume of the blocks that lie wholly within some atom's reach.
-pub(crate) fn samples_at_least(lattice: &Lattice) -> f64 {
+fn min_samples(lattice: &Lattice) -> f64 {
     let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(f64::MAX, f64::min);
     // Half the least reach: a sphere then holds a few blocks wherever it lies.
     let side = 0.5 * reach;
@@ -191,7 +179,7 @@ pub(crate) fn samples_at_least(lattice: &Lattice) -> f64 {
 
 /// An upper bound of the samples at another `spacing` (Å): blocks as long as the reach and a brick together that
 /// hold an atom, with their neighbours, contain every brick in reach.
-fn samples_at_most(lattice: &Lattice, spacing: f64) -> f64 {
+fn max_samples(lattice: &Lattice, spacing: f64) -> f64 {
     let reach = lattice.atoms.iter().map(|atom| lattice.reach(atom)).fold(0.0, f64::max) * lattice.spacing;
     let side = reach + spacing * f64::from(BRICK);
     let scale = lattice.spacing / side;

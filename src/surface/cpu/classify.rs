@@ -3,7 +3,6 @@
 //! A brick's samples are eight 64-bit words, one per z layer, bit `8·y + x`. Every test on them is a shift.
 
 use std::num::NonZeroU16;
-use std::sync::LazyLock;
 
 use super::edge::Edge;
 use super::field::Samples;
@@ -42,7 +41,7 @@ pub(super) struct SurfaceBrick {
 
 /// Results of `classify` for the bricks of one tile, appended brick by brick.
 #[derive(Debug, Default)]
-pub(super) struct Found {
+pub(super) struct ClassifiedBricks {
     /// Bricks with surface, by slot.
     pub(super) bricks: Vec<SurfaceBrick>,
     /// Parameter of each vertex along its edge, from the owning sample, in vertex order.
@@ -59,8 +58,6 @@ pub(super) struct Found {
     pub(super) candidates: Vec<u32>,
     /// Cells of the sheets of bricks with several: word z, bit `8·y + x`.
     pub(super) sheets: Vec<[u64; 8]>,
-    /// F(owner) − F(other end) of the edges of the current brick.
-    drop: Vec<f32>,
 }
 
 /// Vertices, and active cells, that a brick in reach of an atom rarely exceeds on average.
@@ -68,7 +65,7 @@ const USUAL: usize = 96;
 
 /// Counts of a tile before a brick.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Before {
+pub(super) struct CountsBefore {
     pub(super) vertices: usize,
     pub(super) triangles: usize,
     pub(super) cases: usize,
@@ -76,7 +73,7 @@ pub(super) struct Before {
 
 /// Samples of a brick and of its seven neighbours towards +x, +y, +z: index bit 0 is x, 1 y, 2 z.
 #[derive(Clone, Copy)]
-pub(super) struct Around<'a> {
+pub(super) struct Neighbourhood<'a> {
     /// Inside bits of the brick and its neighbours.
     pub(super) inside: [&'a Inside; 8],
     /// Densities likewise.
@@ -116,47 +113,28 @@ fn shifted(inside: &[&Inside; 8], shift: usize, z: usize) -> u64 {
     }
 }
 
-impl Found {
-    /// Clears the lists and reserves capacity for `bricks` bricks, usually more than needed: growing would copy, and
+impl ClassifiedBricks {
+    /// Returns an empty value with capacity for `bricks` bricks, usually more than needed: growing would copy, and
     /// untouched memory costs nothing.
-    pub(super) fn begin(&mut self, bricks: usize) {
-        *self = Self {
+    pub(super) fn with_capacity(bricks: usize) -> Self {
+        Self {
             bricks: Vec::with_capacity(bricks),
             t: Vec::with_capacity(USUAL * bricks),
             edges: Vec::with_capacity(USUAL * bricks),
             cases: Vec::with_capacity(USUAL * bricks),
             candidates: Vec::with_capacity(USUAL * bricks),
-            drop: std::mem::take(&mut self.drop),
-            ..Self::default()
-        };
-    }
-
-    /// Takes the results in memory of exactly their size and leaves `self` empty.
-    pub(super) fn take(&mut self) -> Self {
-        let drop = std::mem::take(&mut self.drop);
-        let mut found = std::mem::replace(self, Self { drop, ..Self::default() });
-        // Returns the rest to the allocator, for the next tile.
-        found.bricks.shrink_to_fit();
-        found.t.shrink_to_fit();
-        found.edges.shrink_to_fit();
-        found.cases.shrink_to_fit();
-        found.candidates.shrink_to_fit();
-        found.sheets.shrink_to_fit();
-        found
-    }
-
-    /// Returns an empty value with capacity for all `parts`.
-    pub(super) fn with_capacity_for(parts: &[&Self]) -> Self {
-        let sum = |len: fn(&Self) -> usize| parts.iter().map(|part| len(part)).sum();
-        Self {
-            bricks: Vec::with_capacity(sum(|part| part.bricks.len())),
-            t: Vec::with_capacity(sum(|part| part.t.len())),
-            edges: Vec::with_capacity(sum(|part| part.edges.len())),
-            cases: Vec::with_capacity(sum(|part| part.cases.len())),
-            candidates: Vec::with_capacity(sum(|part| part.candidates.len())),
-            sheets: Vec::with_capacity(sum(|part| part.sheets.len())),
             ..Self::default()
         }
+    }
+
+    /// Returns unused memory to the allocator, for the next tile.
+    pub(super) fn shrink_to_fit(&mut self) {
+        self.bricks.shrink_to_fit();
+        self.t.shrink_to_fit();
+        self.edges.shrink_to_fit();
+        self.cases.shrink_to_fit();
+        self.candidates.shrink_to_fit();
+        self.sheets.shrink_to_fit();
     }
 
     /// Appends the results of the bricks that follow.
@@ -182,10 +160,13 @@ impl Found {
 
     /// Returns the vertices, triangles and cases of the tile before brick `i`; the totals if `i` is the number of
     /// bricks.
-    pub(super) fn before(&self, i: usize) -> Before {
-        let all =
-            Before { vertices: self.vertices as usize, triangles: self.triangles as usize, cases: self.cases.len() };
-        self.bricks.get(i).map_or(all, |brick| Before {
+    pub(super) fn before(&self, i: usize) -> CountsBefore {
+        let all = CountsBefore {
+            vertices: self.vertices as usize,
+            triangles: self.triangles as usize,
+            cases: self.cases.len(),
+        };
+        self.bricks.get(i).map_or(all, |brick| CountsBefore {
             vertices: brick.vertex as usize,
             triangles: brick.triangle as usize,
             cases: brick.case as usize,
@@ -193,7 +174,7 @@ impl Found {
     }
 
     /// Classifies one brick and appends its results. Returns its index if it holds any surface.
-    pub(super) fn add(&mut self, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) -> Option<u16> {
+    pub(super) fn add(&mut self, slot: usize, around: &Neighbourhood<'_>, iso: f32, candidates: &[u32]) -> Option<u16> {
         let n = self.bricks.len();
         classify(self, slot, around, iso, candidates);
         // A tile has 512 bricks.
@@ -202,7 +183,7 @@ impl Found {
 }
 
 dispatched! {
-fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candidates: &[u32]) {
+fn classify(found: &mut ClassifiedBricks, slot: usize, around: &Neighbourhood<'_>, iso: f32, candidates: &[u32]) {
     let corners: [[u64; 8]; 8] = std::array::from_fn(|z| std::array::from_fn(|c| shifted(&around.inside, c, z)));
     let active = corners.map(|c| c.iter().fold(0, |m, w| m | w) & !c.iter().fold(u64::MAX, |m, w| m & w));
     if active == [0; 8] {
@@ -228,7 +209,6 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
         n += ones(*crossing);
     }
     edge_parameters(&brick.crossing, n, &around.samples, iso, found);
-    let cases = &*CELLS;
     let mut torn = false;
     for (layer, &cells) in corners.iter().zip(&active) {
         let mut cells = cells;
@@ -237,9 +217,8 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
             cells &= cells - 1;
             let case = (0..8).fold(0, |case, c| case | u8::from(layer[c] >> bit & 1 == 1) << c);
             found.cases.push(case);
-            let CellCase { triangles, loops } = cases[usize::from(case)];
-            found.triangles += u32::from(triangles);
-            torn |= loops > 1;
+            found.triangles += u32::from(CASES.count[usize::from(case)]);
+            torn |= CASES.loops[usize::from(case)] > 1;
         }
     }
     found.vertices += u32::from(n);
@@ -249,19 +228,6 @@ fn classify(found: &mut Found, slot: usize, around: &Around<'_>, iso: f32, candi
     found.bricks.push(brick);
 }
 }
-
-/// Contribution of a cell's case to its brick.
-#[derive(Clone, Copy)]
-struct CellCase {
-    triangles: u8,
-    loops: u8,
-}
-
-static CELLS: LazyLock<Vec<CellCase>> = LazyLock::new(|| {
-    (0..=255_u8)
-        .map(|case| CellCase { triangles: CASES.count[usize::from(case)], loops: CASES.n_loops(case) })
-        .collect()
-});
 
 /// Returns the cells whose surface continues in the previous cell along x, y and z, if that is in the brick.
 #[inline(always)]
@@ -334,17 +300,16 @@ fn ones(word: u64) -> u16 {
 
 /// Computes the crossing edges, and the point along each at which the density is `iso`, by linear interpolation.
 #[inline(always)]
-fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut Found) {
+fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f32, found: &mut ClassifiedBricks) {
     const STEP: [usize; 3] = [1, 8, 64];
-    let Found { t, edges, drop, .. } = found;
+    let ClassifiedBricks { t, edges, .. } = found;
     let first = t.len();
     // Densities at both ends first, one division per vector afterwards: `t` holds F(owner) − iso meanwhile.
     t.resize(first + usize::from(n), 0.0);
     edges.resize(first + usize::from(n), Edge::default());
-    if drop.len() < usize::from(n) {
-        drop.resize(3 * BRICK_SAMPLES, 0.0);
-    }
-    let mut ends = t[first..].iter_mut().zip(drop.iter_mut()).zip(&mut edges[first..]);
+    // F(owner) − F(other end).
+    let mut drop = [0.0; 3 * BRICK_SAMPLES];
+    let mut ends = t[first..].iter_mut().zip(&mut drop).zip(&mut edges[first..]);
     for (w, &word) in crossing.iter().enumerate() {
         let (z, axis) = (w / 3, w % 3);
         let mut left = word;
@@ -360,7 +325,7 @@ fn edge_parameters(crossing: &[u64; 24], n: u16, samples: &[&Samples; 8], iso: f
             }
         }
     }
-    for (t, drop) in t[first..].iter_mut().zip(drop.iter()) {
+    for (t, drop) in t[first..].iter_mut().zip(&drop) {
         *t = (*t / drop).clamp(EDGE_MARGIN, 1.0 - EDGE_MARGIN);
     }
 }

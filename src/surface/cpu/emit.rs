@@ -6,7 +6,7 @@
 use std::sync::LazyLock;
 
 use super::edge::{EDGES, Edge};
-use super::near::Numbered;
+use super::neighbours::NumberedBrick;
 use super::sheets::Sheets;
 use super::table::{BrickTable, ROW, Rounding};
 use crate::surface::cases::{CASES, cell_edge};
@@ -122,7 +122,7 @@ dispatched! {
 pub(super) fn emit(
     table: &mut BrickTable,
     sheets: &mut Sheets,
-    around: &[Option<Numbered<'_>>; 8],
+    around: &[Option<NumberedBrick<'_>>; 8],
     cases: &[u8],
     own_sheets: &[[u64; 8]],
     rounding: Option<Rounding>,

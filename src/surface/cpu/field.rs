@@ -35,6 +35,10 @@ pub(crate) struct Constants {
     pub(crate) amplitude: f32,
     /// Inverse square: least u, per 1/ρ².
     pub(crate) u_min: f32,
+    /// Gaussian: the slope −dF/du is `2^(slope_offset − rate·u) − slope_tail` up to a factor. The amplitude is omitted,
+    /// as it does not affect a direction, so numbers stay near 1.
+    pub(crate) slope_offset: f32,
+    pub(crate) slope_tail: f32,
 }
 
 impl Constants {
@@ -56,13 +60,15 @@ impl Constants {
             tail_end: to_f32(-factor * profile.tolerance),
             amplitude: to_f32(factor),
             u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
+            slope_offset: to_f32(rate),
+            slope_tail: to_f32(profile.tolerance),
         }
     }
 }
 
 /// Range of samples of a brick that are needed: all, or only the first layer along some axes.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Need {
+pub(super) struct SampleRange {
     /// Row pairs along y: 4, or 1 for the first layer.
     pub(super) y_pairs: usize,
     /// Layers along z: 8, or 1.
@@ -109,7 +115,7 @@ impl Axes {
 }
 
 /// One atom as a brick sees it: the range of rows in reach, and u along each axis.
-struct Seen {
+struct AtomInBrick {
     z: [usize; 2],
     /// Pairs of rows.
     y: [usize; 2],
@@ -117,14 +123,14 @@ struct Seen {
 }
 
 #[inline(always)]
-fn see(atom: &LatticeAtom, origin: [i32; 3], support: f32, need: Need) -> Seen {
+fn place_atom(atom: &LatticeAtom, origin: [i32; 3], support: f32, range: SampleRange) -> AtomInBrick {
     let reach = (support / atom.inv_length2).sqrt() + 1e-3;
     let base: [f32; 3] = std::array::from_fn(|k| (origin[k] - atom.cell[k]) as f32);
-    let range = |k: usize, n: usize| {
+    let rows = |k: usize, n: usize| {
         let c = atom.frac[k] - base[k];
         [to_row((c - reach).ceil(), n), to_row((c + reach).floor() + 1.0, n)]
     };
-    let [y0, y1] = range(1, 8);
+    let [y0, y1] = rows(1, 8);
     // Whole numbers are exact in f32 here, so this rounds once and depends on sample and atom only.
     let away = |k: usize, i: usize| (base[k] + i as f32) - atom.frac[k];
     let mut d = Axes { x: [0.0; 16], yz: [0.0; 16] };
@@ -132,8 +138,8 @@ fn see(atom: &LatticeAtom, origin: [i32; 3], support: f32, need: Need) -> Seen {
         (d.x[i], d.x[8 + i], d.yz[i], d.yz[8 + i]) = (away(0, i), away(0, i), away(1, i), away(2, i));
     }
     let u = d.map(|d| d * d * atom.inv_length2);
-    let y = [(y0 / 2).min(need.y_pairs), y1.div_ceil(2).min(need.y_pairs)];
-    Seen { z: range(2, need.z_layers), y, u }
+    let y = [(y0 / 2).min(range.y_pairs), y1.div_ceil(2).min(range.y_pairs)];
+    AtomInBrick { z: rows(2, range.z_layers), y, u }
 }
 
 /// A row number within 0 to `n`.
@@ -150,7 +156,7 @@ fn gaussian<const FMA: bool, const FULL: bool>(
     atoms: &[LatticeAtom],
     candidates: &[u32],
     origin: [i32; 3],
-    need: Need,
+    range: SampleRange,
     out: &mut Samples,
 ) {
     for &candidate in candidates {
@@ -158,15 +164,15 @@ fn gaussian<const FMA: bool, const FULL: bool>(
             continue;
         }
         let atom = &atoms[candidate as usize];
-        let seen = see(atom, origin, c.support, need);
-        let e = seen.u.map(|u| {
+        let placed = place_atom(atom, origin, c.support, range);
+        let e = placed.u.map(|u| {
             let exponent = fma::<FMA>(-c.rate, u, c.share);
             // A plain comparison: `f32::max` handles NaN and prevents vectorisation.
             exp2::<FMA>(if exponent > MIN_EXPONENT { exponent } else { MIN_EXPONENT })
         });
-        let w = seen.u.map(|u| fma::<FMA>(c.tail_rate, u, c.tail_share));
+        let w = placed.u.map(|u| fma::<FMA>(c.tail_rate, u, c.tail_share));
         let (exy, wxy) = (e.plane(|x, y| x * y), w.plane(|x, y| x + y));
-        for z in seen.z[0]..seen.z[1] {
+        for z in placed.z[0]..placed.z[1] {
             let (ez, wz) = (e.z(z), w.z(z));
             // Processes all rows of the layer: mispredicting the end of the rows in reach costs more than adding zeros.
             for pair in 0..if FULL { 4 } else { 1 } {
@@ -189,7 +195,7 @@ fn compact<const FMA: bool, const INVERSE: bool>(
     atoms: &[LatticeAtom],
     candidates: &[u32],
     origin: [i32; 3],
-    need: Need,
+    range: SampleRange,
     out: &mut Samples,
 ) {
     for &candidate in candidates {
@@ -197,12 +203,12 @@ fn compact<const FMA: bool, const INVERSE: bool>(
             continue;
         }
         let atom = &atoms[candidate as usize];
-        let seen = see(atom, origin, c.support, need);
+        let placed = place_atom(atom, origin, c.support, range);
         let u_min = c.u_min * atom.inv_length2;
-        let uxy = seen.u.plane(|x, y| x + y);
-        for z in seen.z[0]..seen.z[1] {
-            let uz = seen.u.z(z);
-            for pair in seen.y[0]..seen.y[1] {
+        let uxy = placed.u.plane(|x, y| x + y);
+        for z in placed.z[0]..placed.z[1] {
+            let uz = placed.u.z(z);
+            for pair in placed.y[0]..placed.y[1] {
                 let uxy = &uxy[pair & 3];
                 let at = (z * 4 + pair) * 16;
                 let Some(row) = out.get_mut(at..at + 16) else { continue };
@@ -228,23 +234,23 @@ pub(super) fn evaluate(
     atoms: &[LatticeAtom],
     candidates: &[u32],
     origin: [i32; 3],
-    need: Need,
+    range: SampleRange,
     out: &mut Samples,
 ) {
 
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
         match c.kernel {
-            Kernel::Gaussian if need.y_pairs == 4 => gaussian::<true, true>(c, atoms, candidates, origin, need, out),
-            Kernel::Gaussian => gaussian::<true, false>(c, atoms, candidates, origin, need, out),
-            Kernel::SoftObject => compact::<true, false>(c, atoms, candidates, origin, need, out),
-            Kernel::InverseSquare => compact::<true, true>(c, atoms, candidates, origin, need, out),
+            Kernel::Gaussian if range.y_pairs == 4 => gaussian::<true, true>(c, atoms, candidates, origin, range, out),
+            Kernel::Gaussian => gaussian::<true, false>(c, atoms, candidates, origin, range, out),
+            Kernel::SoftObject => compact::<true, false>(c, atoms, candidates, origin, range, out),
+            Kernel::InverseSquare => compact::<true, true>(c, atoms, candidates, origin, range, out),
         }
     } else {
         match c.kernel {
-            Kernel::Gaussian if need.y_pairs == 4 => gaussian::<false, true>(c, atoms, candidates, origin, need, out),
-            Kernel::Gaussian => gaussian::<false, false>(c, atoms, candidates, origin, need, out),
-            Kernel::SoftObject => compact::<false, false>(c, atoms, candidates, origin, need, out),
-            Kernel::InverseSquare => compact::<false, true>(c, atoms, candidates, origin, need, out),
+            Kernel::Gaussian if range.y_pairs == 4 => gaussian::<false, true>(c, atoms, candidates, origin, range, out),
+            Kernel::Gaussian => gaussian::<false, false>(c, atoms, candidates, origin, range, out),
+            Kernel::SoftObject => compact::<false, false>(c, atoms, candidates, origin, range, out),
+            Kernel::InverseSquare => compact::<false, true>(c, atoms, candidates, origin, range, out),
         }
     }
 }

@@ -2,57 +2,27 @@
 
 use std::ops::Range;
 
-use super::bin::{NORMAL_ONLY, slot_origin};
-use super::classify::SurfaceBrick;
+use super::bin::NORMAL_ONLY;
+use super::brick_atoms::{BrickAtoms, LANES, extent};
 use super::edge::Edge;
-use super::reach::{Around, LANES, extent};
+use super::field::Constants;
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
-use crate::surface::kernel::{MIN_DISTANCE2, Profile};
 use crate::surface::lattice::{Lattice, LatticeAtom, to_f32};
-use crate::surface::mesh::{Quantized, normal_row, position_row};
+use crate::surface::mesh::{normal_row, position_row};
 use crate::surface::params::Kernel;
 use crate::surface::quantize::Step;
 use crate::surface::simd::{dispatched, exp2, fma};
 
-/// Constants of the slope −dF/du of a kernel.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct SlopeConstants {
-    kernel: Kernel,
-    support: f32,
-    /// Gaussian: the exponent of 2 is `offset − rate·u`; the factor's logarithm is in `offset`.
-    pub(crate) offset: f32,
-    rate: f32,
-    /// Gaussian: subtrahend of the C¹ cut-off.
-    pub(crate) tail: f32,
-    u_min: f32,
-}
-
-impl SlopeConstants {
-    /// Returns the constants of `profile` on a lattice of `spacing` Å. Omits the amplitude, which does not affect a
-    /// direction, so numbers stay near 1.
-    pub(crate) fn new(profile: &Profile, spacing: f64) -> Self {
-        let rate = profile.decay * std::f64::consts::LOG2_E;
-        Self {
-            kernel: profile.kernel,
-            support: to_f32(profile.support()),
-            offset: to_f32(rate),
-            rate: to_f32(rate),
-            tail: to_f32(profile.tolerance),
-            u_min: to_f32(MIN_DISTANCE2 / (spacing * spacing)),
-        }
-    }
-}
-
 /// Vertices of one brick in its own coordinates, spacings from its first sample, and the atoms around them.
 #[derive(Debug, Default)]
-pub(super) struct Batch {
+pub(super) struct VertexBatch {
     p: [Vec<f32>; 3],
     n: [Vec<f32>; 3],
-    atoms: Around,
+    atoms: BrickAtoms,
 }
 
-impl Batch {
+impl VertexBatch {
     /// Places a brick's vertices in order; pads the count to whole vectors by repeating the last one.
     fn place(&mut self, edges: &[Edge], t: &[f32]) {
         let padded = t.len().next_multiple_of(LANES);
@@ -81,9 +51,9 @@ fn places(edges: &[Edge], t: &[f32], p: &mut [Vec<f32>; 3]) {
 }
 
 /// Inputs of a brick's vertices.
-pub(super) struct Source<'a> {
-    /// The brick's tile.
-    pub(super) tile: [i32; 3],
+pub(super) struct BrickVertices<'a> {
+    /// The brick's first sample.
+    pub(super) origin: [i32; 3],
     /// The brick's candidate atoms.
     pub(super) candidates: &'a [u32],
     /// Parameter of each vertex along its edge.
@@ -93,29 +63,25 @@ pub(super) struct Source<'a> {
 }
 
 /// Rows of a mesh's vertices. Normals are zero where the gradient vanishes, to be filled from the triangles.
-pub(super) enum Rows<'a> {
+pub(super) enum VertexRows<'a> {
     /// Positions relative to the mesh's centre, Å, and unit normals.
     Single { positions: &'a mut [[f32; 3]], normals: &'a mut [[f32; 3]] },
     /// The same in steps, and in units of 1/127.
     Quantized { step: Step, positions: &'a mut [[i16; 4]], normals: &'a mut [[i8; 4]] },
 }
 
-impl<'a> Rows<'a> {
-    /// All rows of some quantised vertices.
-    pub(super) fn of(quantized: &'a mut Quantized) -> Self {
-        let Quantized { step, positions, normals } = quantized;
-        Self::Quantized { step: *step, positions, normals }
-    }
-
+impl VertexRows<'_> {
     /// Some of the rows.
-    pub(super) fn slice(&mut self, rows: Range<usize>) -> Rows<'_> {
+    pub(super) fn slice(&mut self, rows: Range<usize>) -> VertexRows<'_> {
         match self {
             Self::Single { positions, normals } => {
-                Rows::Single { positions: &mut positions[rows.clone()], normals: &mut normals[rows] }
+                VertexRows::Single { positions: &mut positions[rows.clone()], normals: &mut normals[rows] }
             }
-            Self::Quantized { step, positions, normals } => {
-                Rows::Quantized { step: *step, positions: &mut positions[rows.clone()], normals: &mut normals[rows] }
-            }
+            Self::Quantized { step, positions, normals } => VertexRows::Quantized {
+                step: *step,
+                positions: &mut positions[rows.clone()],
+                normals: &mut normals[rows],
+            },
         }
     }
 
@@ -141,8 +107,8 @@ pub(super) fn take<'a, T>(rest: &mut &'a mut [T], n: usize) -> &'a mut [T] {
 }
 
 /// Destination of a brick's vertices.
-pub(super) struct Target<'a> {
-    pub(super) rows: Rows<'a>,
+pub(super) struct VertexTarget<'a> {
+    pub(super) rows: VertexRows<'a>,
     /// Nearest sphere of each vertex, in the caller's numbering.
     pub(super) atom_ids: Option<&'a mut [u32]>,
 }
@@ -156,28 +122,29 @@ const BLOCK: usize = 4096;
 /// [`SurfaceError::Cancelled`].
 pub(super) fn interpolate(
     lattice: &Lattice,
-    slope: &SlopeConstants,
-    brick: &SurfaceBrick,
-    source: &Source<'_>,
-    batch: &mut Batch,
-    target: Target<'_>,
+    constants: &Constants,
+    source: &BrickVertices<'_>,
+    batch: &mut VertexBatch,
+    target: VertexTarget<'_>,
     control: &Control<'_>,
 ) -> Result<usize, SurfaceError> {
-    let (origin, candidates) = (slot_origin(source.tile, usize::from(brick.slot)), source.candidates);
-    batch.place(source.edges, source.t);
+    let BrickVertices { origin, candidates, t, edges } = *source;
+    batch.place(edges, t);
     batch.n.iter_mut().for_each(|column| column.fill(0.0));
     for block in candidates.chunks(BLOCK) {
         control.check()?;
         batch.atoms.fill(&lattice.atoms, block, origin);
-        gradients(slope, &mut batch.atoms, &batch.p, &mut batch.n);
+        gradients(constants, &mut batch.atoms, &batch.p, &mut batch.n);
     }
     if let Some(ids) = target.atom_ids {
         nearest_atoms(&lattice.atoms, candidates, origin, &batch.p, ids);
     }
     let offset: [f64; 3] = std::array::from_fn(|k| f64::from(origin[k] - lattice.centre[k]));
     Ok(match target.rows {
-        Rows::Single { positions, normals } => finish(lattice.spacing, offset, batch, positions, normals),
-        Rows::Quantized { step, positions, normals } => round(lattice.spacing, offset, batch, step, positions, normals),
+        VertexRows::Single { positions, normals } => finish(lattice.spacing, offset, batch, positions, normals),
+        VertexRows::Quantized { step, positions, normals } => {
+            round(lattice.spacing, offset, batch, step, positions, normals)
+        }
     })
 }
 
@@ -203,7 +170,7 @@ fn normal([x, y, z]: [f32; 3]) -> ([f32; 3], bool) {
 fn write<P, N>(
     spacing: f64,
     offset: [f64; 3],
-    batch: &Batch,
+    batch: &VertexBatch,
     (positions, position_of): (&mut [P], impl Fn([f32; 3]) -> P),
     (normals, normal_of): (&mut [N], impl Fn([f32; 3]) -> N),
 ) -> usize {
@@ -223,7 +190,7 @@ fn write<P, N>(
 
 dispatched! {
 /// Positions in Å and normals of length 1, row by row.
-fn finish(spacing: f64, offset: [f64; 3], batch: &Batch, positions: &mut [[f32; 3]], normals: &mut [[f32; 3]]) -> usize {
+fn finish(spacing: f64, offset: [f64; 3], batch: &VertexBatch, positions: &mut [[f32; 3]], normals: &mut [[f32; 3]]) -> usize {
     write(spacing, offset, batch, (positions, |p| p), (normals, |n| n))
 }
 }
@@ -233,7 +200,7 @@ dispatched! {
 fn round(
     spacing: f64,
     offset: [f64; 3],
-    batch: &Batch,
+    batch: &VertexBatch,
     step: Step,
     positions: &mut [[i16; 4]],
     normals: &mut [[i8; 4]],
@@ -244,7 +211,7 @@ fn round(
 
 /// Adds −∇F of the candidates to each vertex's sum, up to a common factor.
 #[inline(always)]
-fn sum_gradients<const FMA: bool>(c: &SlopeConstants, around: &mut Around, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
+fn sum_gradients<const FMA: bool>(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     let [px, py, pz] = p;
     let [nx, ny, nz] = n;
     let lanes = px.chunks_exact(LANES).zip(py.chunks_exact(LANES)).zip(pz.chunks_exact(LANES));
@@ -261,8 +228,8 @@ fn sum_gradients<const FMA: bool>(c: &SlopeConstants, around: &mut Around, p: &[
                 let u = fma::<FMA>(dx, dx, fma::<FMA>(dy, dy, dz * dz)) * inv;
                 let slope = match c.kernel {
                     Kernel::Gaussian => {
-                        let exponent = fma::<FMA>(-c.rate, u, c.offset);
-                        exp2::<FMA>(if exponent > -100.0 { exponent } else { -100.0 }) - c.tail
+                        let exponent = fma::<FMA>(-c.rate, u, c.slope_offset);
+                        exp2::<FMA>(if exponent > -100.0 { exponent } else { -100.0 }) - c.slope_tail
                     }
                     Kernel::SoftObject => (1.0 - u) * fma::<FMA>(u, -6.0, 11.0),
                     Kernel::InverseSquare => {
@@ -283,13 +250,13 @@ fn sum_gradients<const FMA: bool>(c: &SlopeConstants, around: &mut Around, p: &[
 }
 
 dispatched! {
-fn gradients(c: &SlopeConstants, around: &mut Around, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
+fn gradients(c: &Constants, around: &mut BrickAtoms, p: &[Vec<f32>; 3], n: &mut [Vec<f32>; 3]) {
     if multiversion::target::target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
         match c.kernel {
-            Kernel::Gaussian => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::Gaussian, ..*c }, around, p, n),
-            Kernel::SoftObject => sum_gradients::<true>(&SlopeConstants { kernel: Kernel::SoftObject, ..*c }, around, p, n),
+            Kernel::Gaussian => sum_gradients::<true>(&Constants { kernel: Kernel::Gaussian, ..*c }, around, p, n),
+            Kernel::SoftObject => sum_gradients::<true>(&Constants { kernel: Kernel::SoftObject, ..*c }, around, p, n),
             Kernel::InverseSquare => {
-                sum_gradients::<true>(&SlopeConstants { kernel: Kernel::InverseSquare, ..*c }, around, p, n);
+                sum_gradients::<true>(&Constants { kernel: Kernel::InverseSquare, ..*c }, around, p, n);
             }
         }
     } else {

@@ -8,41 +8,41 @@
 //! The same input gives the same bytes on any number of threads.
 
 mod bin;
+mod brick_atoms;
 mod classify;
 mod edge;
 mod emit;
 pub(crate) mod field;
-pub(crate) mod interpolate;
+mod interpolate;
 mod join;
-mod near;
+mod neighbours;
+mod piece_sums;
 #[doc(hidden)]
 pub mod probe;
-mod reach;
 mod sample;
 pub(crate) mod scan;
 mod sheets;
 mod slabs;
 mod table;
-mod tally;
 mod threads;
 mod write;
 
 use std::ops::Range;
 
-// Errors that the occupancy count shares with this backend.
-pub(crate) use self::bin::{MAX_ATOMS, samples_at_least, too_large as grid_too_large, too_many_atoms};
+// Limits that the occupancy count shares with this backend.
+pub(crate) use self::bin::{check_lower_bound, too_large as grid_too_large};
 
 use self::bin::{Tiles, slot_brick};
-use self::classify::{Before, Found};
+use self::classify::{ClassifiedBricks, CountsBefore};
 use self::field::Constants;
-use self::near::Numbered;
+use self::neighbours::NumberedBrick;
 use self::sample::Pass;
 use self::scan::Totals;
 use super::backend::{Backend, GridStats, MeshOutput};
 use super::candidates;
 use super::control::{Control, Stage};
 use super::error::SurfaceError;
-use super::lattice::{Lattice, to_f32, to_u32};
+use super::lattice::{Lattice, TILE, to_f32, to_u32};
 use super::params::{SurfaceLimits, SurfaceParams};
 use super::quantize::Step;
 use super::simd;
@@ -58,7 +58,7 @@ pub struct CpuBackend {
 
 /// Parameters and context of a run.
 #[derive(Clone, Copy)]
-struct Means<'a> {
+struct RunContext<'a> {
     params: &'a SurfaceParams,
     limits: &'a SurfaceLimits,
     control: &'a Control<'a>,
@@ -111,7 +111,7 @@ impl Backend for CpuBackend {
         sink: Option<&dyn MeshSink>,
     ) -> Result<MeshOutput, SurfaceError> {
         self.install(|free_threads| {
-            let scanned = scan(spheres, Means { params, limits, control, free_threads })?;
+            let scanned = scan(spheres, RunContext { params, limits, control, free_threads })?;
             write::write(&scanned, params.atom_ids, control, sink)
         })
     }
@@ -121,7 +121,7 @@ impl Backend for CpuBackend {
 #[derive(Debug)]
 struct Tile {
     coord: [i32; 3],
-    found: Found,
+    found: ClassifiedBricks,
     /// Index into `found.bricks` per local brick (8 × 8 × 8), or `NO_BRICK`.
     bricks: Vec<u16>,
     first_vertex: usize,
@@ -167,22 +167,21 @@ fn pieces(done: &mut [Tile]) -> Vec<Piece> {
     pieces
 }
 
-fn scan(spheres: &Spheres, means: Means<'_>) -> Result<Scanned, SurfaceError> {
-    let lattice = means.control.span(Stage::Bin, || {
-        candidates::check(spheres, means.params, means.limits)?;
-        if spheres.len() > bin::MAX_ATOMS {
-            return Err(bin::too_many_atoms(spheres.len()));
-        }
-        Lattice::new(spheres, means.params)
+fn scan(spheres: &Spheres, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
+    let lattice = context.control.span(Stage::Bin, || {
+        candidates::check(spheres, context.params, context.limits)?;
+        Lattice::new(spheres, context.params)
     });
-    scan_lattice(lattice?, means)
+    scan_lattice(lattice?, context)
 }
 
-fn scan_lattice(lattice: Lattice, means: Means<'_>) -> Result<Scanned, SurfaceError> {
-    let Means { params, limits, control, free_threads } = means;
+fn scan_lattice(lattice: Lattice, context: RunContext<'_>) -> Result<Scanned, SurfaceError> {
+    let RunContext { params, limits, control, free_threads } = context;
     let tiles = control.span(Stage::Bin, || {
         let tiles = Tiles::new(&lattice, limits, control)?;
-        bin::refuse_early(&lattice, &tiles, limits)?;
+        if tiles.len() as f64 * f64::from(TILE).powi(3) > limits.max_samples as f64 {
+            bin::check_lower_bound(&lattice, limits)?;
+        }
         Ok(tiles)
     });
     let tiles = tiles?;
@@ -192,16 +191,14 @@ fn scan_lattice(lattice: Lattice, means: Means<'_>) -> Result<Scanned, SurfaceEr
         lattice: &lattice,
         tiles: &tiles,
         slabs: &slabs,
-        unfinished: slabs::Unfinished::default(),
+        partial_tiles: slabs::PartialTiles::default(),
         constants: Constants::new(&lattice.profile, lattice.spacing),
         iso: to_f32(params.isovalue),
-        params,
-        limits,
-        tally: sample::Tally::default(),
-        control,
+        context,
+        counters: sample::PassCounters::default(),
     };
     let sampled = threads::each(slabs.len(), |i| pass.sample(i))?;
-    let tally = pass.tally;
+    let counters = pass.counters;
     let mut done: Vec<(usize, Tile)> =
         slabs.iter().zip(sampled).filter_map(|(slab, tile)| Some((slab.tile, tile?))).collect();
     done.sort_unstable_by_key(|(t, _)| *t);
@@ -213,11 +210,11 @@ fn scan_lattice(lattice: Lattice, means: Means<'_>) -> Result<Scanned, SurfaceEr
     }
     let surface_bricks = done.iter().map(|tile| tile.found.bricks.len() as u64).sum();
     let grid = GridStats {
-        bricks: tally.bricks.into_inner(),
+        bricks: counters.bricks.into_inner(),
         surface_bricks,
-        samples: tally.samples.into_inner(),
+        samples: counters.samples.into_inner(),
         box_cells: lattice.box_cells,
-        candidates: tally.candidates.into_inner(),
+        candidates: counters.candidates.into_inner(),
     };
     let pieces = pieces(&mut done);
     Ok(Scanned { lattice, tiles, done, totals, grid, pieces, quantize: params.quantize })
@@ -225,13 +222,13 @@ fn scan_lattice(lattice: Lattice, means: Means<'_>) -> Result<Scanned, SurfaceEr
 
 impl Tile {
     /// Counts before the first brick of a piece of this tile, and before the first brick after it.
-    fn span(&self, piece: &Piece) -> [Before; 2] {
+    fn span(&self, piece: &Piece) -> [CountsBefore; 2] {
         [self.found.before(piece.bricks.start), self.found.before(piece.bricks.end)]
     }
 
     /// The surface brick in `slot`: its index in the tile, and the brick with the global id of its first vertex.
     #[inline(always)]
-    fn numbered(&self, slot: usize) -> Option<(usize, Numbered<'_>)> {
+    fn numbered(&self, slot: usize) -> Option<(usize, NumberedBrick<'_>)> {
         let [x, y, z] = slot_brick(slot);
         let ix = usize::from(self.bricks[(z * 8 + y) * 8 + x]);
         let brick = self.found.bricks.get(ix)?;
@@ -240,6 +237,6 @@ impl Tile {
         let (t, edges) = (&self.found.t[own.clone()], &self.found.edges[own]);
         // `scan` checked that ids fit 32 bits; there are fewer bricks than vertices.
         let (id, first) = (to_u32(self.first_brick + ix), to_u32(self.first_vertex) + brick.vertex);
-        Some((ix, Numbered { brick, id, first, t, edges }))
+        Some((ix, NumberedBrick { brick, id, first, t, edges }))
     }
 }

@@ -3,8 +3,8 @@
 
 use super::bin::{Bricks, NORMAL_ONLY, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
 use super::classify::{self, SurfaceBrick};
-use super::field::{self, Constants, Need, Samples};
-use super::{Means, Tile, write};
+use super::field::{self, Constants, SampleRange, Samples};
+use super::{RunContext, Tile, write};
 use crate::surface::control::Control;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK, BRICK_SAMPLES, Lattice, to_f32};
@@ -68,7 +68,7 @@ pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) 
         for slot in (0..SLOTS).filter(|&slot| slot_brick(slot).iter().all(|&b| b < 8) && !tile.of(slot).is_empty()) {
             let origin = slot_origin(tiles.coords[t], slot);
             let mut samples = [0.0; BRICK_SAMPLES];
-            let whole = Need { y_pairs: 4, z_layers: 8 };
+            let whole = SampleRange { y_pairs: 4, z_layers: 8 };
             field::evaluate(&constants, &lattice.atoms, tile.of(slot), origin, whole, &mut samples);
             let (gap_only, reaching) = tile.of(slot).iter().partition::<Vec<u32>, _>(|&c| c & NORMAL_ONLY != 0);
             bricks.push(ProbedBrick {
@@ -80,7 +80,8 @@ pub fn probe(lattice: &Lattice, params: &SurfaceParams, limits: &SurfaceLimits) 
             });
         }
     }
-    let scanned = super::scan_lattice(lattice.clone(), Means { params, limits, control: &control, free_threads: 1 })?;
+    let scanned =
+        super::scan_lattice(lattice.clone(), RunContext { params, limits, control: &control, free_threads: 1 })?;
     let mesh = write::write(&scanned, params.atom_ids, &control, None)?.mesh;
     Ok(Probe { bricks, surface: scanned.done.iter().flat_map(surface_of).collect(), mesh })
 }

@@ -6,15 +6,14 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use super::bin::{self, Bricks, SIDE, SLOTS, Tiles, slot_brick, slot_origin};
-use super::classify::{self, Around, Found, Inside};
-use super::field::{self, Constants, Need, Samples};
-use super::slabs::{Slab, Unfinished};
-use super::{NO_BRICK, Tile, scan};
+use super::classify::{self, ClassifiedBricks, Inside, Neighbourhood};
+use super::field::{self, Constants, SampleRange, Samples};
+use super::slabs::{PartialTiles, Slab};
+use super::{NO_BRICK, RunContext, Tile, scan};
 use crate::surface::candidates;
-use crate::surface::control::{Control, Stage};
+use crate::surface::control::Stage;
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::{BRICK_SAMPLES, Lattice};
-use crate::surface::params::{SurfaceLimits, SurfaceParams};
 
 /// Buffers that a thread reuses from tile to tile.
 struct Scratch {
@@ -23,19 +22,17 @@ struct Scratch {
     layers: [Layer; 2],
     /// Index into its layer per slot, or `NO_BRICK`.
     slots: Vec<u16>,
-    /// Results of `classify`, moved into the tile at its end.
-    found: Found,
 }
 
 /// Densities of a brick, aligned to a cache line, so that no vector crosses one.
 #[derive(Clone, Copy)]
 #[repr(align(64))]
-struct Lines(Samples);
+struct AlignedSamples(Samples);
 
 /// Densities and inside bits of the bricks of a layer in reach of an atom.
 #[derive(Default)]
 struct Layer {
-    fields: Vec<Lines>,
+    fields: Vec<AlignedSamples>,
     inside: Vec<Inside>,
     /// The bricks with samples inside: row y, bit x.
     rows: [u16; SIDE],
@@ -43,12 +40,7 @@ struct Layer {
 
 impl Default for Scratch {
     fn default() -> Self {
-        Self {
-            bricks: Bricks::default(),
-            layers: Default::default(),
-            slots: vec![NO_BRICK; SLOTS],
-            found: Found::default(),
-        }
+        Self { bricks: Bricks::default(), layers: Default::default(), slots: vec![NO_BRICK; SLOTS] }
     }
 }
 
@@ -67,14 +59,14 @@ impl Layer {
         if self.fields.len() < n {
             // Reserves the maximum once: growing would copy, and untouched memory costs nothing.
             self.fields.reserve_exact(SIDE * SIDE - self.fields.len());
-            self.fields.resize(n, Lines([0.0; BRICK_SAMPLES]));
+            self.fields.resize(n, AlignedSamples([0.0; BRICK_SAMPLES]));
         }
     }
 }
 
 /// Counters over all tiles.
 #[derive(Default)]
-pub(super) struct Tally {
+pub(super) struct PassCounters {
     pub(super) bricks: AtomicU64,
     pub(super) samples: AtomicU64,
     pub(super) candidates: AtomicU64,
@@ -83,7 +75,7 @@ pub(super) struct Tally {
     slabs_done: AtomicUsize,
 }
 
-impl Tally {
+impl PassCounters {
     /// Extrapolates a count of the finished slabs to all `n` slabs.
     fn all_slabs(&self, so_far: u64, n: usize) -> u64 {
         let done = self.slabs_done.load(Ordering::Relaxed) + 1;
@@ -96,13 +88,11 @@ pub(super) struct Pass<'a> {
     pub(super) lattice: &'a Lattice,
     pub(super) tiles: &'a Tiles,
     pub(super) slabs: &'a [Slab],
-    pub(super) unfinished: Unfinished,
+    pub(super) partial_tiles: PartialTiles,
     pub(super) constants: Constants,
     pub(super) iso: f32,
-    pub(super) params: &'a SurfaceParams,
-    pub(super) limits: &'a SurfaceLimits,
-    pub(super) tally: Tally,
-    pub(super) control: &'a Control<'a>,
+    pub(super) context: RunContext<'a>,
+    pub(super) counters: PassCounters,
 }
 
 impl Pass<'_> {
@@ -112,53 +102,61 @@ impl Pass<'_> {
     /// Returns [`SurfaceError::GridTooLarge`], [`SurfaceError::TooManyCandidates`] or [`SurfaceError::MeshTooLarge`] as
     /// soon as the slabs so far exceed a limit, and [`SurfaceError::Cancelled`].
     pub(super) fn sample(&self, i: usize) -> Result<Option<Tile>, SurfaceError> {
-        self.control.check()?;
+        self.context.control.check()?;
         let slab = &self.slabs[i];
         let tile = SCRATCH.with_borrow_mut(|scratch| {
             let tile = self.sample_into(slab, scratch);
             scratch.bricks.free_long_lists();
             tile
         })?;
-        let tile = self.control.span(Stage::Classify, || self.unfinished.add(slab, tile));
-        let n = self.tally.slabs_done.fetch_add(1, Ordering::Relaxed) + 1;
-        self.control.observer.progress(Stage::Field, n, self.slabs.len());
+        let tile = self.context.control.span(Stage::Classify, || self.partial_tiles.add(slab, tile));
+        let n = self.counters.slabs_done.fetch_add(1, Ordering::Relaxed) + 1;
+        self.context.control.observer.progress(Stage::Field, n, self.slabs.len());
         Ok(tile)
     }
 
     /// Counts `n` more candidate pairs.
     fn count(&self, n: u64) -> Result<(), SurfaceError> {
-        self.control.check()?;
-        let all = self.tally.candidate_pairs.fetch_add(n, Ordering::Relaxed) + n;
-        if all > candidates::limit(self.limits) {
-            return Err(candidates::exceeded(self.lattice, all, self.limits));
+        self.context.control.check()?;
+        let all = self.counters.candidate_pairs.fetch_add(n, Ordering::Relaxed) + n;
+        if all > candidates::limit(self.context.limits) {
+            return Err(candidates::exceeded(self.lattice, all, self.context.limits));
         }
         Ok(())
     }
 
     fn sample_into(&self, slab: &Slab, scratch: &mut Scratch) -> Result<Tile, SurfaceError> {
-        let (coord, tally, layers) = (self.tiles.coords[slab.tile], &self.tally, &slab.layers);
+        let (coord, counters, layers) = (self.tiles.coords[slab.tile], &self.counters, &slab.layers);
         let atoms = self.tiles.atoms(slab.tile);
-        self.control.span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, layers, atoms, |n| self.count(n)))?;
-        let reached = count_occupied(&scratch.bricks, layers, tally);
+        self.context
+            .control
+            .span(Stage::Bin, || scratch.bricks.fill(self.lattice, coord, layers, atoms, |n| self.count(n)))?;
+        let reached = count_occupied(&scratch.bricks, layers, counters);
         let occupied = reached as u64 * BRICK_SAMPLES as u64;
-        let samples = tally.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
-        if samples > self.limits.max_samples {
-            return Err(bin::too_large(self.lattice, tally.all_slabs(samples, self.slabs.len()), self.limits));
+        let samples = counters.samples.fetch_add(occupied, Ordering::Relaxed) + occupied;
+        if samples > self.context.limits.max_samples {
+            return Err(bin::too_large(
+                self.lattice,
+                counters.all_slabs(samples, self.slabs.len()),
+                self.context.limits,
+            ));
         }
         let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
-        scratch.found.begin(reached);
+        let mut found = ClassifiedBricks::with_capacity(reached);
         for z in layers.start..=layers.end {
-            self.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z))?;
+            self.context.control.span(Stage::Field, || scratch.evaluate(self, coord, layers, z))?;
             if z > layers.start {
-                self.control.span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut bricks));
+                self.context
+                    .control
+                    .span(Stage::Classify, || scratch.classify(self.iso, z - 1, &mut found, &mut bricks));
             }
         }
-        let found = self.control.span(Stage::Classify, || scratch.found.take());
-        let bytes = self.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
-        let so_far = tally.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        if so_far > self.limits.max_mesh_bytes {
-            let all = tally.all_slabs(so_far, self.slabs.len());
-            return Err(scan::too_large(all, self.lattice.spacing, self.limits.max_mesh_bytes));
+        self.context.control.span(Stage::Classify, || found.shrink_to_fit());
+        let bytes = self.context.params.mesh_bytes(u64::from(found.vertices), u64::from(found.triangles));
+        let so_far = counters.mesh_bytes.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        if so_far > self.context.limits.max_mesh_bytes {
+            let all = counters.all_slabs(so_far, self.slabs.len());
+            return Err(scan::too_large(all, self.lattice.spacing, self.context.limits.max_mesh_bytes));
         }
         Ok(Tile { coord, found, bricks, first_vertex: 0, first_triangle: 0, first_brick: 0, first_piece: 0 })
     }
@@ -180,24 +178,26 @@ impl Scratch {
                 continue;
             }
             layer.grow(n + 1);
-            let Lines(field) = &mut layer.fields[n];
+            let AlignedSamples(field) = &mut layer.fields[n];
             let [_, y, _] = slot_brick(slot);
             let rows = |beyond: bool, all: usize| if beyond { 1 } else { all };
-            let need = Need { y_pairs: rows(y == SIDE - 1, 4), z_layers: rows(z == own.end, 8) };
+            let range = SampleRange { y_pairs: rows(y == SIDE - 1, 4), z_layers: rows(z == own.end, 8) };
             field.fill(0.0);
             let (atoms, origin) = (&pass.lattice.atoms, slot_origin(tile, slot));
             for candidates in bricks.of(slot).chunks(CANDIDATES_PER_CHECK) {
-                pass.control.check()?;
-                field::evaluate(&pass.constants, atoms, candidates, origin, need, field);
+                pass.context.control.check()?;
+                field::evaluate(&pass.constants, atoms, candidates, origin, range, field);
             }
             // A layer has 81 bricks.
             *index = u16::try_from(n).unwrap_or(NO_BRICK);
             n += 1;
         }
         layer.inside.clear();
-        layer.inside.extend(layer.fields[..n].iter().map(|Lines(field)| classify::inside_bits(field, pass.iso)));
+        layer
+            .inside
+            .extend(layer.fields[..n].iter().map(|AlignedSamples(field)| classify::inside_bits(field, pass.iso)));
         for (row, slots) in layer.rows.iter_mut().zip(slots[z * SIDE * SIDE..].chunks(SIDE)) {
-            let inside = |slot: &u16| layer.inside.get(usize::from(*slot)).is_some_and(|bits| *bits != NOWHERE);
+            let inside = |slot: &u16| layer.inside.get(usize::from(*slot)).is_some_and(|bits| *bits != NONE_INSIDE);
             *row = slots.iter().rev().fold(0, |row, slot| row << 1 | u16::from(inside(slot)));
         }
         Ok(())
@@ -205,9 +205,9 @@ impl Scratch {
 
     /// Classifies every brick of layer z that has, or borders on, samples inside; requires the layer above to be the
     /// last one evaluated. Writes the index of each local brick's record to `local`.
-    fn classify(&mut self, iso: f32, z: usize, local: &mut [u16]) {
+    fn classify(&self, iso: f32, z: usize, found: &mut ClassifiedBricks, local: &mut [u16]) {
         const NOTHING: Samples = [0.0; BRICK_SAMPLES];
-        let Self { bricks, layers, slots, found } = self;
+        let Self { bricks, layers, slots } = self;
         for y in 0..SIDE - 1 {
             let rows = layers.iter().fold(0, |rows, layer| rows | layer.rows[y] | layer.rows[y + 1]);
             let mut left = (rows | rows >> 1) & ((1 << (SIDE - 1)) - 1);
@@ -217,9 +217,9 @@ impl Scratch {
                 let slot = (z * SIDE + y) * SIDE + x;
                 let near: [(usize, &Layer); 8] =
                     std::array::from_fn(|n| (usize::from(slots[slot + NEIGHBOUR[n]]), &layers[(z + (n >> 2)) % 2]));
-                let around = Around {
-                    inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NOWHERE)),
-                    samples: near.map(|(i, layer)| layer.fields.get(i).map_or(&NOTHING, |Lines(field)| field)),
+                let around = Neighbourhood {
+                    inside: near.map(|(i, layer)| layer.inside.get(i).unwrap_or(&NONE_INSIDE)),
+                    samples: near.map(|(i, layer)| layer.fields.get(i).map_or(&NOTHING, |AlignedSamples(field)| field)),
                 };
                 if let Some(record) = found.add(slot, &around, iso, bricks.of(slot)) {
                     local[(z * 8 + y) * 8 + x] = record;
@@ -230,14 +230,14 @@ impl Scratch {
 }
 
 /// Inside bits of a brick without samples inside.
-const NOWHERE: Inside = [0; 8];
+const NONE_INSIDE: Inside = [0; 8];
 
 /// Distance in slots to the neighbour towards +x (bit 0), +y (bit 1), +z (bit 2).
 const NEIGHBOUR: [usize; 8] =
     [0, 1, SIDE, SIDE + 1, SIDE * SIDE, SIDE * SIDE + 1, SIDE * SIDE + SIDE, SIDE * SIDE + SIDE + 1];
 
 /// Counts the slab's own bricks in reach of an atom.
-fn count_occupied(bricks: &Bricks, layers: &Range<usize>, tally: &Tally) -> usize {
+fn count_occupied(bricks: &Bricks, layers: &Range<usize>, counters: &PassCounters) -> usize {
     let slots = layers.start * SIDE * SIDE..layers.end * SIDE * SIDE;
     let own = slots.filter(|&slot| slot_brick(slot)[..2].iter().all(|&b| b < SIDE - 1));
     let (mut occupied, mut pairs) = (0, 0);
@@ -245,7 +245,7 @@ fn count_occupied(bricks: &Bricks, layers: &Range<usize>, tally: &Tally) -> usiz
         occupied += usize::from(bricks.reaching[slot] > 0);
         pairs += u64::from(bricks.reaching[slot]);
     }
-    tally.bricks.fetch_add(occupied as u64, Ordering::Relaxed);
-    tally.candidates.fetch_add(pairs, Ordering::Relaxed);
+    counters.bricks.fetch_add(occupied as u64, Ordering::Relaxed);
+    counters.candidates.fetch_add(pairs, Ordering::Relaxed);
     occupied
 }

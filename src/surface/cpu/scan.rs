@@ -25,10 +25,24 @@ pub(super) fn scan(tiles: &mut [Tile], params: &SurfaceParams, limits: &SurfaceL
         vertices += tile.found.vertices as usize;
         triangles += tile.found.triangles as usize;
     }
-    let bytes = params.mesh_bytes(vertices as u64, triangles as u64);
+    check_size(params, limits, vertices as u64, triangles as u64)?;
+    Ok(Totals { vertices, triangles })
+}
+
+/// Rejects a mesh that exceeds the limit or whose vertices 32-bit indices cannot number.
+///
+/// # Errors
+/// Returns [`SurfaceError::MeshTooLarge`].
+pub(crate) fn check_size(
+    params: &SurfaceParams,
+    limits: &SurfaceLimits,
+    n_vertices: u64,
+    n_triangles: u64,
+) -> Result<(), SurfaceError> {
+    let bytes = params.mesh_bytes(n_vertices, n_triangles);
     // The highest value of an index is the primitive restart of graphics interfaces.
-    let most = limits.max_mesh_bytes.min(params.mesh_bytes(u64::from(u32::MAX), 0));
-    if bytes <= most { Ok(Totals { vertices, triangles }) } else { Err(too_large(bytes, params.resolution, most)) }
+    let limit = limits.max_mesh_bytes.min(params.mesh_bytes(u64::from(u32::MAX), 0));
+    if bytes <= limit { Ok(()) } else { Err(too_large(bytes, params.resolution, limit)) }
 }
 
 /// Returns the error for a mesh of `bytes` bytes. The number of bytes grows with the inverse square of the spacing, as

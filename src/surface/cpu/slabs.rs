@@ -11,9 +11,7 @@ use std::sync::{Mutex, PoisonError};
 use rustc_hash::FxHashMap;
 
 use super::bin::{SIDE, Tiles};
-use super::classify::Found;
 use super::{NO_BRICK, Tile};
-use crate::surface::lattice::BRICK_SAMPLES;
 
 /// Layers of a tile's bricks that one thread samples at once.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -50,9 +48,9 @@ fn pieces(own: usize, all: usize, threads: usize) -> usize {
 
 /// Tiles of which only some slabs have been sampled.
 #[derive(Default)]
-pub(super) struct Unfinished(Mutex<FxHashMap<usize, Vec<(usize, Tile)>>>);
+pub(super) struct PartialTiles(Mutex<FxHashMap<usize, Vec<(usize, Tile)>>>);
 
-impl Unfinished {
+impl PartialTiles {
     /// Adds the results of `slab` to the tile's other slabs. Returns the joined tile after the last slab; the calling
     /// thread joins it while others continue.
     pub(super) fn add(&self, slab: &Slab, tile: Tile) -> Option<Tile> {
@@ -61,26 +59,24 @@ impl Unfinished {
         }
         let mut parts = {
             // Poisoning is ignored: a panic elsewhere ends the run, and the data stays valid.
-            let mut unfinished = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-            let parts = unfinished.entry(slab.tile).or_default();
+            let mut partial_tiles = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+            let parts = partial_tiles.entry(slab.tile).or_default();
             parts.push((slab.layers.start, tile));
             let complete = parts.len() * slab.layers.len() == SIDE - 1;
-            complete.then(|| unfinished.remove(&slab.tile)).flatten()?
+            complete.then(|| partial_tiles.remove(&slab.tile)).flatten()?
         };
         parts.sort_unstable_by_key(|(layer, _)| *layer);
-        let all: Vec<&Found> = parts.iter().map(|(_, tile)| &tile.found).collect();
-        let mut found = Found::with_capacity_for(&all);
-        let mut bricks = vec![NO_BRICK; BRICK_SAMPLES];
-        for (_, part) in &parts {
-            let before = found.bricks.len();
-            for (to, from) in bricks.iter_mut().zip(&part.bricks).filter(|(_, from)| **from != NO_BRICK) {
+        let mut parts = parts.into_iter().map(|(_, tile)| tile);
+        let mut joined = parts.next()?;
+        for part in parts {
+            let before = joined.found.bricks.len();
+            for (to, from) in joined.bricks.iter_mut().zip(&part.bricks).filter(|(_, from)| **from != NO_BRICK) {
                 // A tile has 512 bricks.
                 *to = u16::try_from(before + usize::from(*from)).unwrap_or(NO_BRICK);
             }
-            found.append(&part.found);
+            joined.found.append(&part.found);
         }
-        let (_, tile) = parts.pop()?;
-        Some(Tile { found, bricks, ..tile })
+        Some(joined)
     }
 }
 
@@ -88,7 +84,7 @@ impl Unfinished {
 mod tests {
     use super::*;
     use crate::surface::control::Control;
-    use crate::surface::cpu::{Means, Scanned, scan};
+    use crate::surface::cpu::{RunContext, Scanned, scan};
     use crate::surface::params::{SurfaceLimits, SurfaceParams};
     use crate::surface::spheres::Spheres;
 
@@ -105,8 +101,8 @@ mod tests {
         let column = |step: f64| (0..900).map(|i| 6.0 + 40.0 * (f64::from(i) * step).fract()).collect::<Vec<_>>();
         let spheres = Spheres::new(column(0.37), column(0.713), column(0.271), vec![1.6; 900]).unwrap();
         let (params, limits) = (SurfaceParams::default(), SurfaceLimits::default());
-        let means = Means { params: &params, limits: &limits, control: &Control::default(), free_threads };
-        scan(&spheres, means).unwrap()
+        let context = RunContext { params: &params, limits: &limits, control: &Control::default(), free_threads };
+        scan(&spheres, context).unwrap()
     }
 
     #[test]

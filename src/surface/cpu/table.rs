@@ -4,7 +4,7 @@ use glam::Vec3A;
 
 use super::edge::{self, EDGES, Edge};
 use super::interpolate::position;
-use super::near::{Numbered, Shared, far, shared_vertices};
+use super::neighbours::{NumberedBrick, Shared, far, shared_vertices};
 use super::sheets::NONE;
 use crate::surface::cases::MAX_TRIANGLES;
 use crate::surface::lattice::{BRICK_SAMPLES, to_f32};
@@ -109,7 +109,7 @@ impl BrickTable {
 
     /// Enters all vertices that the brick's cells use.
     #[inline(always)]
-    pub(super) fn fill(&mut self, around: &[Option<Numbered<'_>>; 8]) {
+    pub(super) fn fill(&mut self, around: &[Option<NumberedBrick<'_>>; 8]) {
         if let Some(own) = &around[0] {
             for ((edge, t), id) in own.edges.iter().zip(own.t).zip(own.first..) {
                 self.put(edge.index(), id, place(*edge, *t));
@@ -129,7 +129,7 @@ impl BrickTable {
 
     /// Puts all vertices on the sheets of their cells.
     #[inline(always)]
-    pub(super) fn spread(&mut self, around: &[Option<Numbered<'_>>; 8], sheets: &[[u64; 8]]) {
+    pub(super) fn spread(&mut self, around: &[Option<NumberedBrick<'_>>; 8], sheets: &[[u64; 8]]) {
         for (sheet, cells) in (0..).zip(sheets) {
             for (z, word) in cells.iter().enumerate() {
                 let mut left = *word;
@@ -153,7 +153,7 @@ impl BrickTable {
 
     /// Moves the vertices of the neighbour `n` to their rounded positions.
     #[inline(always)]
-    pub(super) fn round(&mut self, of: &Numbered<'_>, n: usize, rounding: &Rounding) {
+    pub(super) fn round(&mut self, of: &NumberedBrick<'_>, n: usize, rounding: &Rounding) {
         let Rounding { step, spacing, offset } = *rounding;
         let far = far(n);
         // Computed as in the vertex's own brick, so that all bricks see the same position.

@@ -9,12 +9,13 @@ use std::sync::{Mutex, PoisonError};
 
 use super::bin::{Tiles, slot_origin};
 use super::emit;
-use super::interpolate::{self, Batch, Rows, SlopeConstants, Source, Target, take};
+use super::field::Constants;
+use super::interpolate::{self, BrickVertices, VertexBatch, VertexRows, VertexTarget, take};
 use super::join;
-use super::near::{self, Numbered};
+use super::neighbours::{self, NumberedBrick};
+use super::piece_sums::PieceSums;
 use super::sheets::Sheets;
 use super::table::{BrickTable, Rounding};
-use super::tally::Tally;
 use super::{Piece, Scanned, Tile, threads};
 use crate::surface::backend::{MeshOutput, StreamedMesh};
 use crate::surface::column::Column;
@@ -22,9 +23,8 @@ use crate::surface::control::{Control, Stage};
 use crate::surface::error::SurfaceError;
 use crate::surface::lattice::Lattice;
 use crate::surface::measure::{Measures, Validation};
-use crate::surface::mesh::{Mesh, Quantized};
+use crate::surface::mesh::{Mesh, Quantized, joined_bounds};
 use crate::surface::quantize::Step;
-use crate::surface::simd::dispatched;
 use crate::surface::sink::{MeshPart, MeshSink, SinkFailed, Vertices};
 
 thread_local! {
@@ -42,7 +42,7 @@ struct Scratch {
 /// Working memory of the stages.
 #[derive(Default)]
 struct Stages {
-    batch: Batch,
+    batch: VertexBatch,
     table: BrickTable,
     sheets: Sheets,
 }
@@ -58,7 +58,7 @@ struct ScratchRows {
 
 /// Rows of the mesh that a piece fills.
 struct PieceRows<'a> {
-    rows: Rows<'a>,
+    rows: VertexRows<'a>,
     triangles: &'a mut [[u32; 3]],
     atom_ids: Option<&'a mut [u32]>,
 }
@@ -71,19 +71,14 @@ enum Destination<'a> {
 }
 
 /// Summary of a piece.
-pub(super) struct Written {
+pub(super) struct PieceSummary {
     /// Vertices whose gradient vanishes.
     flat: usize,
     /// Sums over its triangles.
-    pub(super) tally: Tally,
-    /// Bounds of its positions, for a sink only.
-    bounds: Bounds,
+    pub(super) sums: PieceSums,
+    /// Bounds of its positions, Å; for a sink only.
+    bounds: Option<[[f32; 3]; 2]>,
 }
-
-type Bounds = [[f32; 3]; 2];
-
-/// Bounds of nothing.
-const EMPTY: Bounds = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
 
 /// Runs `interpolate` and `emit` for every piece. The output has measures unless the mesh is in memory and not closed.
 ///
@@ -111,7 +106,7 @@ pub(super) fn write(
             measures.map_or_else(|| Measures::of(&mesh, Validation::Checksum, control), Ok)?
         }
     };
-    let bounds = written.iter().map(|piece| piece.bounds).fold(EMPTY, join_bounds);
+    let bounds = written.iter().filter_map(|piece| piece.bounds).reduce(joined_bounds).unwrap_or_default();
     let mesh = Mesh { centre: scanned.lattice.centre(), ..Mesh::default() };
     let streamed = Some(StreamedMesh { n_vertices, n_triangles, bounds });
     Ok(MeshOutput { streamed, measures: Some(measures), ..MeshOutput::new(mesh, scanned.grid) })
@@ -131,8 +126,8 @@ fn in_memory(scanned: &Scanned, atom_ids: bool, control: &Control<'_>) -> Result
         parts: done.iter().map(|tile| (tile.first_vertex, tile.first_triangle)).collect(),
     };
     let mut rows = match &mut mesh.quantized {
-        Some(quantized) => Rows::of(quantized),
-        None => Rows::Single { positions: &mut mesh.positions, normals: &mut mesh.normals },
+        Some(Quantized { step, positions, normals }) => VertexRows::Quantized { step: *step, positions, normals },
+        None => VertexRows::Single { positions: &mut mesh.positions, normals: &mut mesh.normals },
     };
     let (mut triangles, mut ids) = (&mut mesh.triangles[..], mesh.atom_ids.as_deref_mut());
     let of_piece = pieces.iter().map(|piece| {
@@ -153,18 +148,18 @@ fn write_pieces(
     scanned: &Scanned,
     control: &Control<'_>,
     destination: &Destination<'_>,
-) -> Result<Vec<Written>, SurfaceError> {
+) -> Result<Vec<PieceSummary>, SurfaceError> {
     let Scanned { lattice, pieces, .. } = scanned;
-    let slope = SlopeConstants::new(&lattice.profile, lattice.spacing);
+    let writer = Writer { scanned, constants: Constants::new(&lattice.profile, lattice.spacing), control };
     let finished = AtomicUsize::new(0);
     threads::each(pieces.len(), |i| {
         control.check()?;
         let written = SCRATCH.with_borrow_mut(|Scratch { stages, rows }| match destination {
             Destination::Memory(of_piece) => {
                 let mut rows = of_piece[i].lock().unwrap_or_else(PoisonError::into_inner);
-                rows.write(scanned, &pieces[i], &slope, stages, control)
+                writer.write(&pieces[i], &mut rows, stages)
             }
-            Destination::Sink(sink) => rows.write(scanned, &pieces[i], &slope, stages, control, *sink),
+            Destination::Sink(sink) => writer.write_to_sink(&pieces[i], rows, stages, *sink),
         })?;
         let n = finished.fetch_add(1, Ordering::Relaxed) + 1;
         control.observer.progress(Stage::Emit, n, pieces.len());
@@ -172,73 +167,72 @@ fn write_pieces(
     })
 }
 
-impl ScratchRows {
+/// Shared inputs of the second pass.
+struct Writer<'a> {
+    scanned: &'a Scanned,
+    constants: Constants,
+    control: &'a Control<'a>,
+}
+
+impl Writer<'_> {
     /// Writes a piece into the scratch, then into `sink`.
-    fn write(
-        &mut self,
-        scanned: &Scanned,
+    fn write_to_sink(
+        &self,
         piece: &Piece,
-        slope: &SlopeConstants,
+        scratch: &mut ScratchRows,
         stages: &mut Stages,
-        control: &Control<'_>,
         sink: &dyn MeshSink,
-    ) -> Result<Written, SurfaceError> {
-        let [n, m] = scanned.size_of(piece);
-        let rows = match scanned.quantize {
-            None => Rows::Single { positions: first(&mut self.positions, n), normals: first(&mut self.normals, n) },
+    ) -> Result<PieceSummary, SurfaceError> {
+        let [n, m] = self.scanned.size_of(piece);
+        let rows = match self.scanned.quantize {
+            None => VertexRows::Single {
+                positions: first(&mut scratch.positions, n),
+                normals: first(&mut scratch.normals, n),
+            },
             Some(step) => {
-                let (positions, normals) = &mut self.quantized;
-                Rows::Quantized { step, positions: first(positions, n), normals: first(normals, n) }
+                let (positions, normals) = &mut scratch.quantized;
+                VertexRows::Quantized { step, positions: first(positions, n), normals: first(normals, n) }
             }
         };
-        let mut rows = PieceRows { rows, triangles: first(&mut self.triangles, m), atom_ids: None };
-        let mut written = rows.write(scanned, piece, slope, stages, control)?;
+        let mut rows = PieceRows { rows, triangles: first(&mut scratch.triangles, m), atom_ids: None };
+        let mut written = self.write(piece, &mut rows, stages)?;
         let vertices = match rows.rows {
-            Rows::Single { positions, normals } => Vertices::Single { positions, normals },
-            Rows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
+            VertexRows::Single { positions, normals } => Vertices::Single { positions, normals },
+            VertexRows::Quantized { step, positions, normals } => Vertices::Quantized { step, positions, normals },
         };
-        written.bounds = bounds_of(&vertices);
-        let (tile, [start, _]) = (&scanned.done[piece.tile], scanned.done[piece.tile].span(piece));
+        written.bounds = vertices.bounds();
+        let tile = &self.scanned.done[piece.tile];
+        let [start, _] = tile.span(piece);
         let part = MeshPart {
             first_vertex: tile.first_vertex + start.vertices,
             vertices,
             first_triangle: tile.first_triangle + start.triangles,
             triangles: rows.triangles,
         };
-        control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
+        self.control.span(Stage::Write, || sink.part(&part)).map_err(|SinkFailed| SurfaceError::Sink)?;
         Ok(written)
     }
-}
 
-impl PieceRows<'_> {
     /// Writes the vertices and triangles of a piece and sums over them.
-    ///
-    /// # Errors
-    /// [`SurfaceError::Cancelled`].
     fn write(
-        &mut self,
-        scanned: &Scanned,
+        &self,
         piece: &Piece,
-        slope: &SlopeConstants,
+        rows: &mut PieceRows<'_>,
         stages: &mut Stages,
-        control: &Control<'_>,
-    ) -> Result<Written, SurfaceError> {
-        let flat =
-            control.span(Stage::Interpolate, || self.interpolate(scanned, piece, slope, &mut stages.batch, control))?;
-        let tally = control.span(Stage::Emit, || self.emit(scanned, piece, &mut stages.table, &mut stages.sheets));
-        Ok(Written { flat, tally, bounds: EMPTY })
+    ) -> Result<PieceSummary, SurfaceError> {
+        let flat = self.control.span(Stage::Interpolate, || self.interpolate(piece, rows, &mut stages.batch))?;
+        let sums = self.control.span(Stage::Emit, || self.emit(piece, rows.triangles, stages));
+        Ok(PieceSummary { flat, sums, bounds: None })
     }
 
-    /// Writes the vertices. Returns how many have no gradient.
+    /// Writes the vertices. Returns the number of vertices without a gradient.
     fn interpolate(
-        &mut self,
-        scanned: &Scanned,
+        &self,
         piece: &Piece,
-        slope: &SlopeConstants,
-        batch: &mut Batch,
-        control: &Control<'_>,
+        out: &mut PieceRows<'_>,
+        batch: &mut VertexBatch,
     ) -> Result<usize, SurfaceError> {
-        let tile = &scanned.done[piece.tile];
+        let tile = &self.scanned.done[piece.tile];
         let found = &tile.found;
         let base = found.before(piece.bricks.start).vertices;
         let mut flat = 0;
@@ -247,33 +241,37 @@ impl PieceRows<'_> {
             if all.is_empty() {
                 continue;
             }
-            let candidates = &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize];
             let rows = all.start - base..all.end - base;
-            let target = Target {
-                rows: self.rows.slice(rows.clone()),
-                atom_ids: self.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
+            let target = VertexTarget {
+                rows: out.rows.slice(rows.clone()),
+                atom_ids: out.atom_ids.as_deref_mut().map(|ids| &mut ids[rows]),
             };
-            let (t, edges) = (&found.t[all.clone()], &found.edges[all]);
-            let source = Source { tile: tile.coord, candidates, t, edges };
-            flat += interpolate::interpolate(&scanned.lattice, slope, brick, &source, batch, target, control)?;
+            let source = BrickVertices {
+                origin: slot_origin(tile.coord, usize::from(brick.slot)),
+                candidates: &found.candidates[brick.candidates[0] as usize..brick.candidates[1] as usize],
+                t: &found.t[all.clone()],
+                edges: &found.edges[all],
+            };
+            let lattice = &self.scanned.lattice;
+            flat += interpolate::interpolate(lattice, &self.constants, &source, batch, target, self.control)?;
         }
         Ok(flat)
     }
 
     /// Writes the triangles. Returns the sums over them.
-    fn emit(&mut self, scanned: &Scanned, piece: &Piece, table: &mut BrickTable, sheets: &mut Sheets) -> Tally {
-        let Scanned { tiles, done, .. } = scanned;
-        let tile = &done[piece.tile];
-        let near = Near::new(tiles, done, tile.coord);
+    fn emit(&self, piece: &Piece, triangles: &mut [[u32; 3]], stages: &mut Stages) -> PieceSums {
+        let (scanned, Stages { table, sheets, .. }) = (self.scanned, stages);
+        let tile = &scanned.done[piece.tile];
+        let near = TileNeighbours::new(&scanned.tiles, &scanned.done, tile.coord);
         let found = &tile.found;
         let base = found.before(piece.bricks.start).triangles;
-        let mut tally = Tally::with_capacity(piece.bricks.len());
+        let mut sums = PieceSums::with_capacity(piece.bricks.len());
         for i in piece.bricks.clone() {
             let (brick, before, end) = (&found.bricks[i], found.before(i), found.before(i + 1));
-            let around: [Option<Numbered<'_>>; 8] =
+            let around: [Option<NumberedBrick<'_>>; 8] =
                 std::array::from_fn(|n| near.of(usize::from(brick.slot), n).map(|(_, _, numbered)| numbered));
             let cases = &found.cases[before.cases..end.cases];
-            let out = &mut self.triangles[before.triangles - base..end.triangles - base];
+            let out = &mut triangles[before.triangles - base..end.triangles - base];
             let own_sheets = match brick.n_sheets.map_or(0, |n| usize::from(n.get())) {
                 0 | 1 => &[][..],
                 n => &found.sheets[brick.sheets as usize..][..n],
@@ -281,9 +279,9 @@ impl PieceRows<'_> {
             let origin = slot_origin(tile.coord, usize::from(brick.slot));
             let rounding = scanned.quantize.map(|step| scanned.rounding(step, origin));
             emit::emit(table, sheets, &around, cases, own_sheets, rounding, out);
-            tally.add(table, sheets, &around, origin, out);
+            sums.add(table, sheets, &around, origin, out);
         }
-        tally
+        sums
     }
 }
 
@@ -303,11 +301,11 @@ impl Scanned {
 }
 
 /// A tile and its neighbours towards +x, +y, +z.
-pub(super) struct Near<'a> {
+pub(super) struct TileNeighbours<'a> {
     tiles: [Option<(usize, &'a Tile)>; 8],
 }
 
-impl<'a> Near<'a> {
+impl<'a> TileNeighbours<'a> {
     pub(super) fn new(tiles: &Tiles, done: &'a [Tile], coord: [i32; 3]) -> Self {
         Self {
             tiles: std::array::from_fn(|n| {
@@ -320,8 +318,8 @@ impl<'a> Near<'a> {
     /// The neighbour `n` (bits: 0 x, 1 y, 2 z; 0 is the brick itself) of the brick in `slot`, if the surface intersects
     /// it: the index of its tile, its index in the tile, and the brick.
     #[inline(always)]
-    pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, Numbered<'a>)> {
-        let (slot, beyond) = near::neighbour_slot(slot, n);
+    pub(super) fn of(&self, slot: usize, n: usize) -> Option<(usize, usize, NumberedBrick<'a>)> {
+        let (slot, beyond) = neighbours::neighbour_slot(slot, n);
         let (t, tile) = self.tiles[beyond[0] | beyond[1] << 1 | beyond[2] << 2]?;
         let (ix, numbered) = tile.numbered(slot)?;
         Some((t, ix, numbered))
@@ -334,43 +332,4 @@ fn first<T: Clone + Default>(rows: &mut Vec<T>, n: usize) -> &mut [T] {
         rows.resize(n, T::default());
     }
     &mut rows[..n]
-}
-
-/// Lowest and highest position, Å.
-fn bounds_of(vertices: &Vertices<'_>) -> Bounds {
-    match vertices {
-        Vertices::Single { positions, .. } => bounds(positions),
-        Vertices::Quantized { step, positions, .. } => positions.iter().fold(EMPTY, |bounds, [x, y, z, _]| {
-            let p = step.decoded([*x, *y, *z]);
-            join_bounds(bounds, [p, p])
-        }),
-    }
-}
-
-dispatched! {
-/// Lowest and highest of positions in single precision, sixteen at a time.
-fn bounds(positions: &[[f32; 3]]) -> Bounds {
-    const LANES: usize = 16;
-    let (batches, rest) = positions.as_chunks::<LANES>();
-    let (mut low, mut high) = ([[f32::INFINITY; 3]; LANES], [[f32::NEG_INFINITY; 3]; LANES]);
-    for batch in batches {
-        let rows = low.as_flattened_mut().iter_mut().zip(high.as_flattened_mut()).zip(batch.as_flattened());
-        for ((low, high), v) in rows {
-            *low = if *v < *low { *v } else { *low };
-            *high = if *v > *high { *v } else { *high };
-        }
-    }
-    let lanes = low.into_iter().zip(high).map(|(low, high)| [low, high]);
-    lanes.chain(rest.iter().map(|p| [*p, *p])).fold(EMPTY, join_bounds)
-}
-}
-
-/// Union of two bounds.
-#[inline(always)]
-fn join_bounds([low, high]: Bounds, [other_low, other_high]: Bounds) -> Bounds {
-    // These comparisons compile to vector minimum and maximum.
-    [
-        std::array::from_fn(|k| if other_low[k] < low[k] { other_low[k] } else { low[k] }),
-        std::array::from_fn(|k| if other_high[k] > high[k] { other_high[k] } else { high[k] }),
-    ]
 }

@@ -33,6 +33,12 @@ impl Budget {
         Self { limit, held: Arc::default() }
     }
 
+    /// Creates a budget without a limit.
+    #[must_use]
+    pub fn unlimited() -> Self {
+        Self::new(u64::MAX)
+    }
+
     /// Fails while more than the limit is in use.
     ///
     /// # Errors

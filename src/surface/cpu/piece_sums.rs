@@ -6,7 +6,7 @@ use std::num::NonZeroU16;
 
 use glam::Vec3A;
 
-use super::near::{Numbered, Shared, shared_vertices};
+use super::neighbours::{NumberedBrick, Shared, shared_vertices};
 use super::sheets::Sheets;
 use super::table::BrickTable;
 use crate::surface::lattice::to_u32;
@@ -32,7 +32,7 @@ pub(super) struct BrickSheets {
 
 /// Vertex on a sheet of a brick with several sheets, in a neighbour that may also have several.
 #[derive(Debug, Clone, Copy)]
-struct Far {
+struct FarVertex {
     brick: u32,
     /// Number of the neighbour (bits: 0 x, 1 y, 2 z); `rank` is the vertex's rank in it.
     neighbour: u8,
@@ -42,7 +42,7 @@ struct Far {
 
 /// Sums over one piece.
 #[derive(Debug, Default)]
-pub(super) struct Tally {
+pub(super) struct PieceSums {
     /// Sum of the shares of all directed edges.
     pub(super) checksum: u64,
     /// True if a triangle has a corner twice.
@@ -54,7 +54,7 @@ pub(super) struct Tally {
     /// A sheet of the piece and the number of a brick that shares vertices with it and has one sheet.
     pub(super) lone: Vec<[u32; 2]>,
     of_vertices: Vec<u16>,
-    far: Vec<Far>,
+    far: Vec<FarVertex>,
 }
 
 /// Sums over the triangles of a sheet, in spacings, with the brick's first sample as the origin.
@@ -109,7 +109,7 @@ impl Sheet {
     }
 }
 
-impl Tally {
+impl PieceSums {
     /// An empty tally with memory for a typical piece of this many bricks.
     pub(super) fn with_capacity(bricks: usize) -> Self {
         Self {
@@ -125,7 +125,7 @@ impl Tally {
         &mut self,
         table: &BrickTable,
         sheets: &mut Sheets,
-        around: &[Option<Numbered<'_>>; 8],
+        around: &[Option<NumberedBrick<'_>>; 8],
         origin: [i32; 3],
         written: &[[u32; 3]],
     ) {
@@ -150,7 +150,7 @@ impl Tally {
     /// Records the neighbours in `shared` that are known to have one sheet, like the brick, whose sheet is `sheet`.
     /// Returns the others.
     #[inline(always)]
-    fn settle(&mut self, sheet: u32, shared: u8, around: &[Option<Numbered<'_>>; 8]) -> u8 {
+    fn settle(&mut self, sheet: u32, shared: u8, around: &[Option<NumberedBrick<'_>>; 8]) -> u8 {
         let mut unsettled = 0;
         for (n, near) in around.iter().enumerate().filter(|(n, _)| shared >> n & 1 == 1) {
             match near {
@@ -167,13 +167,13 @@ impl Tally {
     #[inline(always)]
     pub(super) fn pairs<'a>(
         &self,
-        near: impl Fn(usize, usize) -> Option<(Numbered<'a>, &'a Self, (usize, usize))>,
+        near: impl Fn(usize, usize) -> Option<(NumberedBrick<'a>, &'a Self, (usize, usize))>,
         mut pair: impl FnMut(u32, (usize, u32)),
     ) {
         let mut far = self.far.iter().peekable();
         for (ix, brick) in self.bricks.iter().enumerate() {
             // Nothing but those of the brick, where it has several sheets; neighbour by neighbour.
-            while let Some(Far { neighbour, .. }) = far.peek().filter(|f| f.brick as usize == ix) {
+            while let Some(FarVertex { neighbour, .. }) = far.peek().filter(|f| f.brick as usize == ix) {
                 let met = near(ix, usize::from(*neighbour));
                 let mut last = None;
                 while let Some(at) = far.next_if(|f| f.brick as usize == ix && f.neighbour == *neighbour) {
@@ -223,13 +223,13 @@ dispatched! {
 /// Records the sheet, numbered from `first`, of every vertex of a brick with several sheets: its own by rank, and those
 /// of its neighbours for the later join of bricks.
 fn note_vertices(
-    tally: &mut Tally,
+    tally: &mut PieceSums,
     table: &BrickTable,
     sheets: &Sheets,
-    around: &[Option<Numbered<'_>>; 8],
+    around: &[Option<NumberedBrick<'_>>; 8],
     first: u32,
 ) {
-    let Tally { sheets: sums, bricks, of_vertices, far, lone, .. } = tally;
+    let PieceSums { sheets: sums, bricks, of_vertices, far, lone, .. } = tally;
     let brick = to_u32(bricks.len() - 1);
     let on = |edge: usize| sheets.of(table.sheet(u16::try_from(edge).unwrap_or_default()));
     for (neighbour, near) in (0_u8..).zip(around) {
@@ -246,7 +246,7 @@ fn note_vertices(
         shared_vertices(near, usize::from(neighbour), |Shared { rank, index, .. }| {
             let sheet = first + u32::from(on(index));
             if !known {
-                far.push(Far { brick, neighbour, rank, sheet });
+                far.push(FarVertex { brick, neighbour, rank, sheet });
             } else if last.replace(sheet) != Some(sheet) {
                 lone.push([sheet, near.id]);
             }
@@ -257,7 +257,7 @@ fn note_vertices(
 
 /// Returns true if a brick is known to have one sheet before its triangles exist.
 #[inline(always)]
-fn has_one_sheet(of: &Numbered<'_>) -> bool {
+fn has_one_sheet(of: &NumberedBrick<'_>) -> bool {
     of.brick.n_sheets == Some(NonZeroU16::MIN)
 }
 

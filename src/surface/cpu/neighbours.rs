@@ -6,7 +6,7 @@ use super::edge::Edge;
 
 /// A surface brick with its number and the numbers of its vertices.
 #[derive(Clone, Copy)]
-pub(super) struct Numbered<'a> {
+pub(super) struct NumberedBrick<'a> {
     /// The brick.
     pub(super) brick: &'a SurfaceBrick,
     /// Its index among all surface bricks.
@@ -81,7 +81,7 @@ pub(super) struct Shared {
 
 /// Calls `each` for the vertices of the neighbour `n` (bits: 0 x, 1 y, 2 z, but not 0) that a brick's cells use.
 #[inline(always)]
-pub(super) fn shared_vertices(of: &Numbered<'_>, n: usize, mut each: impl FnMut(Shared)) {
+pub(super) fn shared_vertices(of: &NumberedBrick<'_>, n: usize, mut each: impl FnMut(Shared)) {
     let SurfaceBrick { crossing, before, .. } = of.brick;
     let far = far(n);
     shared_edges(crossing, n, |z, bit, axis| {

@@ -11,7 +11,7 @@ const MARGIN: f32 = 1.0 + 1e-4;
 
 /// A brick's candidates in its own coordinates.
 #[derive(Debug, Default)]
-pub(super) struct Around {
+pub(super) struct BrickAtoms {
     /// Centres, and 1/ρ², column by column, padded to whole vectors: the padding is out of reach of every vertex.
     columns: [Vec<f32>; 4],
     /// The same, row by row.
@@ -20,7 +20,7 @@ pub(super) struct Around {
     near: Vec<[f32; 4]>,
 }
 
-impl Around {
+impl BrickAtoms {
     /// Loads the candidates of the brick at `origin`.
     pub(super) fn fill(&mut self, atoms: &[LatticeAtom], candidates: &[u32], origin: [i32; 3]) {
         self.rows.clear();
@@ -108,7 +108,7 @@ mod tests {
             // Every second one is a candidate, some for normals alone.
             let candidates: Vec<u32> =
                 (0..).zip(&atoms).step_by(2).map(|(i, _)| if i % 3 == 0 { i | NORMAL_ONLY } else { i }).collect();
-            let mut around = Around::default();
+            let mut around = BrickAtoms::default();
             around.fill(&atoms, &candidates, [0; 3]);
             let all: Vec<[f32; 4]> = around.rows[..candidates.len()].to_vec();
             let near = around.reach(support, std::array::from_fn(|k| extent(&vertices[k]))).to_vec();
@@ -129,7 +129,7 @@ mod tests {
     #[test]
     fn distant_atoms_are_omitted() {
         let atoms = [atom([0.0; 3], 2.0), atom([30.0, 0.0, 0.0], 2.0), atom([7.0; 3], 2.0)];
-        let mut around = Around::default();
+        let mut around = BrickAtoms::default();
         around.fill(&atoms, &[0, 1, 2], [0; 3]);
         assert_eq!(around.reach(1.0, [[0.0, 1.0]; 3]), [[0.0, 0.0, 0.0, 0.25]]);
         assert_eq!(around.reach(1.0, [[0.0, 8.0]; 3]).len(), 2);

@@ -1,0 +1,206 @@
+//! The job of a command: one structure in, one file and one report out.
+
+use std::fs::File;
+use std::io::{self, Read, Write};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use molmesh::formats::{Format, GlbSink};
+use molmesh::pipeline::{self, Choice, Job, JobError, JobLimits, Product, Report};
+use molmesh::structure::StructureError;
+use molmesh::structure::strict_validator::{self, Diagnostic, Level};
+use molmesh::surface::{CancelToken, SurfaceError};
+use serde_json::{Value, json};
+
+use super::args::{JobArgs, ReportStyle};
+use super::backend::{self, BackendRequest, Purpose, SelectedBackend};
+use super::error::CliError;
+use super::output::{Output, is_stdio};
+use super::progress::Progress;
+use super::style::Style;
+use super::summary::{self, Written};
+use super::{interrupt, request};
+
+/// A command's only job with its input and backend.
+pub(super) struct CommandJob<'a> {
+    path: &'a Path,
+    args: &'a JobArgs,
+    job: Job,
+    limits: JobLimits,
+    cancel: CancelToken,
+    input: Vec<u8>,
+    selected: SelectedBackend,
+    pub(super) progress: Progress,
+    /// Findings of the strict validator, if it ran.
+    findings: Option<Vec<Diagnostic>>,
+}
+
+impl<'a> CommandJob<'a> {
+    /// Prepares a job and opens its output. Cheap steps come first: flags, output, input, backend.
+    pub(super) fn prepare(
+        job: Job,
+        strict: bool,
+        (path, output): (&'a Path, &Path),
+        args: &'a JobArgs,
+        purpose: Purpose,
+    ) -> Result<(Self, Output), CliError> {
+        let limits = request::limits(&args.limits);
+        let mut requested = BackendRequest::of_command(args, purpose);
+        backend::check(&requested)?;
+        let cancel = CancelToken::default();
+        interrupt::watch(&cancel)?;
+        let output = Output::open(output, &cancel)?;
+        let input = read(path, limits.read.max_inflated_bytes)?;
+        requested.work = Some(pipeline::estimate_work(&input, &job));
+        let selected = backend::select(&requested)?;
+        let progress = Progress::new(!args.quiet);
+        let findings = if strict { Some(check(path, &input, &limits)?) } else { None };
+        Ok((Self { path, args, job, limits, cancel, input, selected, progress, findings }, output))
+    }
+
+    /// Makes the mesh. With a `sink`, writes it there as GLB while it is meshed, if the job allows that.
+    pub(super) fn run(&self, sink: Option<&GlbSink<'_>>) -> Result<Product, JobError> {
+        let choice = Choice { backend: self.selected.backend.as_ref(), reason: &self.selected.reason };
+        pipeline::run(&self.input, &self.job, &self.limits, &choice, &self.cancel, &self.progress, sink)
+    }
+
+    /// Draws the picture of a product.
+    pub(super) fn draw(&self, product: &mut Product) -> Result<(), JobError> {
+        let params = self.job.picture.unwrap_or_default();
+        pipeline::draw(product, &params, &self.selected.renderer, &self.cancel, &self.progress)
+    }
+
+    /// Converts the error of the job.
+    pub(super) fn failure(&self, source: JobError) -> CliError {
+        match source {
+            JobError::Surface(SurfaceError::Cancelled) => CliError::Interrupted,
+            source => {
+                let strict_finding = worst_finding(&source, &self.input, &self.limits);
+                CliError::Job { name: name_of(self.path), strict_finding, source }
+            }
+        }
+    }
+
+    /// Completes the output and writes the report. `writing` is the time already spent on writing.
+    pub(super) fn finish(
+        self,
+        output: Output,
+        mut report: Report,
+        format: Format,
+        writing: Duration,
+    ) -> Result<(), CliError> {
+        drop(self.progress);
+        if self.cancel.is_cancelled() {
+            return Err(CliError::Interrupted);
+        }
+        let (to_stdout, name, bytes) = (output.is_stdout(), output.name.clone(), output.bytes);
+        let start = Instant::now();
+        output.finish()?;
+        report.add_timing("write", (writing + start.elapsed()).as_secs_f64() * 1e3);
+        let written = Written { name: &name, format: format.extension(), bytes };
+        write_report(self.args, &report, self.findings.as_deref(), &written, to_stdout)
+    }
+}
+
+/// Reads the input. `limit` is that of the decompressed bytes, which are not fewer.
+fn read(path: &Path, limit: u64) -> Result<Vec<u8>, CliError> {
+    let stdin = is_stdio(path);
+    let name = || name_of(path);
+    let read = || -> io::Result<Vec<u8>> {
+        if stdin {
+            return take(io::stdin().lock(), 0, limit);
+        }
+        let file = File::open(path)?;
+        let size = file.metadata()?.len();
+        // The spare byte lets the reader detect the end of the file without growing the buffer.
+        take(file, if size > limit { 0 } else { size + 1 }, limit)
+    };
+    let bytes = read().map_err(|source| CliError::Input { name: name(), source })?;
+    if bytes.len() as u64 > limit {
+        return Err(CliError::InputTooLarge { name: name(), limit });
+    }
+    Ok(bytes)
+}
+
+fn take(source: impl Read, capacity: u64, limit: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(usize::try_from(capacity).unwrap_or(0));
+    source.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// Returns the name of the input in messages.
+fn name_of(input: &Path) -> String {
+    if is_stdio(input) { "stdin".to_owned() } else { input.display().to_string() }
+}
+
+/// Returns the findings of the strict validator, or an error if there are errors among them.
+fn check(path: &Path, input: &[u8], limits: &JobLimits) -> Result<Vec<Diagnostic>, CliError> {
+    let name = || name_of(path);
+    let findings = strict_validator::check(input, &limits.read).map_err(|source| CliError::Job {
+        name: name(),
+        source: source.into(),
+        strict_finding: None,
+    })?;
+    let errors = findings.iter().filter(|f| f.level == Level::Error);
+    match errors.clone().next() {
+        Some(first) => Err(CliError::Strict { name: name(), errors: errors.count(), first: finding(first) }),
+        None => Ok(findings),
+    }
+}
+
+/// Returns the worst finding of the strict validator in a file with a syntax error.
+fn worst_finding(error: &JobError, input: &[u8], limits: &JobLimits) -> Option<String> {
+    let JobError::Structure(StructureError::Syntax { .. }) = error else { return None };
+    let findings = strict_validator::check(input, &limits.read).ok()?;
+    let worst = findings.iter().max_by_key(|f| f.level)?;
+    Some(format!("the strict validator reports: {}", finding(worst)))
+}
+
+/// Formats a finding on one line.
+fn finding(finding: &Diagnostic) -> String {
+    let place = finding.line.map(|n| format!("line {n}: ")).unwrap_or_default();
+    format!("{place}{}", finding.message.split_whitespace().collect::<Vec<_>>().join(" "))
+}
+
+/// Writes the report: text to stderr, JSON to stdout, or to stderr if the file is on stdout.
+fn write_report(
+    args: &JobArgs,
+    report: &Report,
+    findings: Option<&[Diagnostic]>,
+    written: &Written<'_>,
+    file_on_stdout: bool,
+) -> Result<(), CliError> {
+    match args.report {
+        ReportStyle::Text if args.quiet => Ok(()),
+        ReportStyle::Text => {
+            let lines: Option<Vec<String>> =
+                findings.map(|all| all.iter().map(|f| format!("{}: {}", f.level.name(), finding(f))).collect());
+            let text = summary::text(report, written, lines.as_deref(), Style::stderr());
+            // A closed stderr does not make a finished mesh a failure.
+            drop(io::stderr().write_all(text.as_bytes()));
+            Ok(())
+        }
+        ReportStyle::Json => {
+            let text = json_report(report, findings, written)?;
+            let printed =
+                if file_on_stdout { io::stderr().write_all(text.as_bytes()) } else { return super::print(&text) };
+            printed.map_err(|source| CliError::Output { name: "stderr".to_owned(), source })
+        }
+    }
+}
+
+fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Written<'_>) -> Result<String, CliError> {
+    let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialised: {e}"));
+    let mut value = serde_json::to_value(report).map_err(failed)?;
+    if let Value::Object(map) = &mut value {
+        let output = json!({ "file": written.name, "format": written.format, "bytes": written.bytes });
+        map.insert("output".to_owned(), output);
+        let finding = |f: &Diagnostic| json!({ "level": f.level.name(), "message": f.message, "line": f.line });
+        if let Some(findings) = findings {
+            map.insert("findings".to_owned(), findings.iter().map(finding).collect());
+        }
+    }
+    let mut text = serde_json::to_string_pretty(&value).map_err(failed)?;
+    text.push('\n');
+    Ok(text)
+}
