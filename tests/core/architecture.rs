@@ -147,6 +147,11 @@ const LAYERS: &[Layer] = &[
         crates: &["axum", "tower", "tower_http", "hyper", "hyper_util", "wgpu", "clap"],
     },
     Layer {
+        name: "fuzzing",
+        layers: &[("access", Any), ("jobs", Any)],
+        crates: &["tokio", "axum", "hyper", "wgpu", "clap"],
+    },
+    Layer {
         name: "http",
         layers: &[
             ("surface", Any),

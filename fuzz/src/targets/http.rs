@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use molmesh::config::Config;
 use molmesh::http::{Chosen, Server, Stop};
-use molmesh::picture::Drawer;
+use molmesh::picture::SelectedRenderer;
 use molmesh::surface::CpuBackend;
 
 /// Words of requests. `{digest}`, `{key}` and `{job}` stand for a structure, a result and a job that exist.
@@ -160,7 +160,7 @@ fn start() -> Service {
     config.server.trusted_proxies = "127.0.0.1".parse().ok();
     config.archive.dir = Some(dir.path().to_owned());
     config.archive.url = None;
-    config.limits.grid_samples = 1 << 19;
+    config.limits.grid_points = 1 << 19;
     config.limits.candidate_pairs = 1 << 18;
     config.limits.mesh_bytes = 8 << 20;
     config.limits.output_bytes = 16 << 20;
@@ -170,7 +170,12 @@ fn start() -> Service {
     config.store.max_bytes = 64 << 20;
     config.store.memory_bytes = 4 << 20;
     let backend = Arc::new(CpuBackend::default());
-    let chosen = Chosen { backend, reason: "fuzzing".to_owned(), drawer: Drawer::cpu("fuzzing"), devices: Vec::new() };
+    let chosen = Chosen {
+        backend,
+        reason: "fuzzing".to_owned(),
+        renderer: SelectedRenderer::cpu("fuzzing"),
+        devices: Vec::new(),
+    };
     let runtime = super::text::runtime();
     let server = runtime.block_on(Server::bind(config, chosen)).expect("the server starts");
     let addr = server.addr();

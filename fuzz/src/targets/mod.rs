@@ -11,7 +11,7 @@ pub(crate) const TARGETS: &[Target] = &[
     Target { name: "pdb", run: structure::mesh, max_memory: 64 << 20, words: structure::PDB },
     Target { name: "mmcif", run: structure::mesh, max_memory: 64 << 20, words: structure::MMCIF },
     Target { name: "binarycif", run: structure::mesh, max_memory: 64 << 20, words: structure::BINARYCIF },
-    Target { name: "parameters", run: text::parameters, max_memory: 1 << 20, words: text::PARAMETERS },
+    Target { name: "parameters", run: text::parameters, max_memory: 4 << 20, words: text::PARAMETERS },
     Target { name: "config", run: text::config, max_memory: 8 << 20, words: text::CONFIG },
     Target { name: "key_file", run: text::key_file, max_memory: 8 << 20, words: text::KEY_FILE },
     Target { name: "signature", run: text::signature, max_memory: 8 << 20, words: text::SIGNATURE },
