@@ -26,7 +26,7 @@ pub(super) fn run(args: &MeshArgs) -> Result<(), CliError> {
             hint: Some("molmesh render writes pictures".to_owned()),
         });
     }
-    request::settle(&mut job, format)?;
+    request::set_format(&mut job, format)?;
     let paths = (args.input.as_path(), args.output.as_path());
     let (job, mut output) = CommandJob::prepare(job, strict, paths, &args.job, Purpose::Mesh)?;
     let product = if format == Format::Glb && output.has_random_access() {
