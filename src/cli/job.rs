@@ -190,7 +190,7 @@ fn write_report(
 }
 
 fn json_report(report: &Report, findings: Option<&[Diagnostic]>, written: &Written<'_>) -> Result<String, CliError> {
-    let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialised: {e}"));
+    let failed = |e: serde_json::Error| CliError::Internal(format!("the report cannot be serialized: {e}"));
     let mut value = serde_json::to_value(report).map_err(failed)?;
     if let Value::Object(map) = &mut value {
         let output = json!({ "file": written.name, "format": written.format, "bytes": written.bytes });

@@ -20,7 +20,7 @@ use crate::formats::Format;
 use crate::jobs::{ContentKey, Finished};
 use crate::pipeline::Report;
 
-/// Header that summarises a member of the report.
+/// Header that summarizes a member of the report.
 pub(super) struct SummaryHeader {
     pub(super) name: &'static str,
     /// Name of the member.

@@ -167,7 +167,7 @@ fn gaussian<const FMA: bool, const FULL: bool>(
         let placed = place_atom(atom, origin, c.support, range);
         let e = placed.u.map(|u| {
             let exponent = fma::<FMA>(-c.rate, u, c.share);
-            // A plain comparison: `f32::max` handles NaN and prevents vectorisation.
+            // A plain comparison: `f32::max` handles NaN and prevents vectorization.
             exp2::<FMA>(if exponent > MIN_EXPONENT { exponent } else { MIN_EXPONENT })
         });
         let w = placed.u.map(|u| fma::<FMA>(c.tail_rate, u, c.tail_share));
