@@ -62,7 +62,7 @@ fn format(output: &Path) -> Result<Format, CliError> {
     }
 }
 
-/// Runs the job and writes a GLB while it is meshed, if the job allows that.
+/// Runs the job. If the job allows it, the GLB is written while the mesh is computed.
 fn run_to_file(job: &CommandJob<'_>, output: &Output) -> Result<Product, CliError> {
     let sink = GlbSink::new(output);
     job.run(Some(&sink)).map_err(|error| match error {

@@ -160,7 +160,7 @@ pub(super) fn layered(device: &Device, label: &str, format: TextureFormat, param
     texture(device, label, format, params, PATTERN.len(), usage)
 }
 
-/// View of the layer of one sample, as a render target.
+/// Creates a view of the layer of one sample, as a render target.
 pub(super) fn layer(texture: &Texture, sample: u32) -> TextureView {
     texture.create_view(&TextureViewDescriptor {
         dimension: Some(TextureViewDimension::D2),

@@ -8,7 +8,7 @@ use super::layers::{Layers, NOTHING};
 use super::light::{self, Levels};
 use super::{Background, Image, PictureParams, Style};
 
-/// Directions around a pixel in a quarter of the circle, at equal angles.
+/// Directions from a pixel in a quarter of the circle, at equal angles.
 const QUARTER: [[f64; 2]; 4] = {
     const C: f64 = 0.923_879_532_511_286_7;
     const S: f64 = 0.382_683_432_365_089_8;
