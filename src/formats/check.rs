@@ -229,7 +229,10 @@ mod tests {
         ];
         for (name, mesh) in broken {
             assert!(
-                matches!(check(&mesh, Format::Glb), Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name),
+                matches!(
+                    check(&mesh, Format::Glb),
+                    Err(FormatError::ColumnLength { column, vertices: 2, .. }) if column == name
+                ),
                 "{name}"
             );
         }

@@ -1,6 +1,6 @@
 //! The worker pool: a bounded queue in front of one backend, with worker threads of its own, and durable jobs on top.
 //!
-//! A [`Task`] (structure bytes and a [`crate::pipeline::Job`]) goes in, a mesh with its report comes out. Deadlines,
+//! The result of a [`Task`] (structure bytes and a [`crate::pipeline::Job`]) is a mesh with its report. Deadlines,
 //! cancellation and panics are handled here, so callers only wait for a [`Ticket`]. This module knows no HTTP and no
 //! graphics API.
 //!
