@@ -77,7 +77,7 @@ impl ObjPlan {
         }
         let header = header(mesh, storage.units, meta);
         let (n_vertices, n_triangles) = (mesh.positions.len() as u64, mesh.triangles.len() as u64);
-        // Rounding up can add a digit, hence the one.
+        // Adds 1 because rounding up can add a digit.
         let number = |largest: f64, decimals: Decimals| format!("-{:.*}", decimals.count(), largest + 1.0).len() as u64;
         let vertex = "v   \n".len() as u64 + 3 * number(extreme, decimals);
         let normal = if smooth { "vn   \n".len() as u64 + 3 * number(1.0, NORMAL_DECIMALS) } else { 0 };

@@ -53,7 +53,7 @@ pub struct GlbSink<'a> {
 }
 
 impl<'a> GlbSink<'a> {
-    /// Creates a sink that writes to `out`, which is empty.
+    /// Creates a sink that writes to `out`, which must be empty.
     #[must_use]
     pub fn new(out: &'a dyn RandomAccess) -> Self {
         let (storage, layout) = (OnceLock::new(), OnceLock::new());
