@@ -88,7 +88,7 @@ impl Access {
         ring.map_or(Err(Denied::Unknown), |ring| ring.verify(text, now))
     }
 
-    /// Checks the signature of a path and query. No signature is found if signatures are off.
+    /// Checks the signature of a path and query. Returns [`SignatureCheck::Absent`] if no signing key is configured.
     pub(crate) fn check_signature(&self, path: &str, query: Option<&str>, now: SystemTime) -> SignatureCheck {
         self.signing.as_ref().map_or(SignatureCheck::Absent, |keys| keys.check(path, query, now))
     }

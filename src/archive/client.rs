@@ -134,7 +134,7 @@ pub(super) async fn get(
     let head_timeout = Duration::from_millis(config.connect_timeout_ms.saturating_add(config.first_byte_timeout_ms));
     let response = tokio::time::timeout(head_timeout, request.send())
         .await
-        .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "no head in time"))?
+        .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the response did not begin in time"))?
         .map_err(|error| of_client(&error))?;
     match response.status() {
         StatusCode::OK => {}
@@ -179,7 +179,7 @@ async fn body(mut response: Response, config: &ArchiveConfig, lease: &mut Lease)
     loop {
         let chunk = tokio::time::timeout(Duration::from_millis(config.first_byte_timeout_ms), response.chunk())
             .await
-            .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the body stalls"))?;
+            .map_err(|_elapsed| Failed::other(UnavailableReason::Timeout, "the body stalled"))?;
         let Some(chunk) = chunk.map_err(|error| of_client(&error))? else { break };
         if body.len() as u64 + chunk.len() as u64 > config.max_bytes {
             return Err(Failed::TooLarge(None));

@@ -194,7 +194,8 @@ impl Shared {
         histogram!(ARCHIVE_FETCH, "result" => result).record(checked.elapsed().as_secs_f64());
         match (answer, stored) {
             (Ok(Answer::Body { bytes, digest, origin, lease }), _) => {
-                tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms = checked.elapsed().as_millis(), "fetched an entry");
+                let ms = checked.elapsed().as_millis();
+                tracing::info!(%id, url = origin.url, bytes = bytes.len(), ms, "fetched an entry");
                 let kept = bytes.clone();
                 self.on_disk(id, "stored", move |disk, id| disk.store(id, &kept, &digest, &origin)).await;
                 self.remember(

@@ -66,7 +66,7 @@ impl Remote {
                     Failed::Other { detail, .. } => detail,
                 };
                 let client = self.client().await.map_err(failed)?;
-                let url = template.url(id).ok_or("the address is no URL")?;
+                let url = template.url(id).ok_or("the URL is invalid")?;
                 client::head(client, url).await.map_err(failed)
             };
             let answer = tokio::time::timeout(limit, request).await;
@@ -161,7 +161,7 @@ impl Remote {
             .map_err(|_elapsed| Failed::other(UnavailableReason::Busy, "no permit in time"))?
             .map_err(|closed| Failed::other(UnavailableReason::Busy, &closed))?;
         let client = self.client().await?;
-        let url = template.url(id).ok_or_else(|| Failed::other(UnavailableReason::Client, "the address is no URL"))?;
+        let url = template.url(id).ok_or_else(|| Failed::other(UnavailableReason::Client, "the URL is invalid"))?;
         let known = copy.filter(|copy| copy.url == url.as_str());
         let permit = breaker.acquire().map_err(paused)?;
         let span = TraceSpan::start(&SpanParent::current(), "GET", SpanKind::Client, std::time::Instant::now());

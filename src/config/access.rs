@@ -70,7 +70,7 @@ impl Default for AccessConfig {
     }
 }
 
-/// Deserialises an optional count from a number or text; its default `none` does not tell the loader the type.
+/// Deserializes an optional count from a number or text; its default `none` does not tell the loader the type.
 fn count<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<u64>, D::Error> {
     let number = match Value::deserialize(deserializer)? {
         Value::Null => return Ok(None),

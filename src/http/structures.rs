@@ -140,7 +140,7 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
     let input = Input::uploaded(bytes, lease).await?;
     let digest = input.digest;
     // Parse before storing, so that only readable structures are stored.
-    let summary = summarise(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
+    let summary = summarize(&app, input.clone()).await.map_err(|failure| declared.explain(failure))?;
     declared.check_format(summary.format)?;
     let created = app.store.put_new(&Name::input(&digest), input.bytes).await?;
     let status = if created { StatusCode::CREATED } else { StatusCode::OK };
@@ -163,7 +163,7 @@ pub(super) async fn show(
     source: StructureSource,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
-    let write = async |input| Ok(Json(summarise(&app, input).await?).into_response());
+    let write = async |input| Ok(Json(summarize(&app, input).await?).into_response());
     source.document(&app, &headers, write).await
 }
 
@@ -201,7 +201,7 @@ pub(super) async fn report(request: MeshRequest) -> Result<Response, Problem> {
 }
 
 /// Parses a structure and describes its contents, on a blocking thread.
-async fn summarise(app: &Shared, input: Input) -> Result<StructureDocument, Failure> {
+async fn summarize(app: &Shared, input: Input) -> Result<StructureDocument, Failure> {
     let limits = app.config.limits.job().read;
     let parsing = tokio::task::spawn_blocking(move || {
         let structure = structure::read(&input.bytes, &limits)?;

@@ -106,7 +106,7 @@ impl DurableJob {
         })
     }
 
-    /// Publishes stage and fraction of the running work if they have advanced.
+    /// Publishes the stage and the finished fraction of the running work if they have advanced.
     fn publish_stage(&self, stage: &'static str, fraction: f64) {
         self.update(|view| {
             let waits = view.record.status == Status::Accepted;

@@ -74,12 +74,12 @@ pub(super) struct Inner {
 }
 
 impl Inner {
-    /// Returns the time from the acceptance of a job to its result.
+    /// Returns the maximum time from the acceptance of a job to its result.
     pub(super) fn allowed(&self) -> Duration {
         Duration::from_millis(self.config.batch_deadline_ms)
     }
 
-    /// Returns the time for which a write is retried that the store rejects.
+    /// Returns the time for which a rejected write is retried.
     pub(super) fn retry_time(&self) -> Duration {
         Duration::from_millis(self.config.save_retry_ms)
     }

@@ -34,7 +34,7 @@ impl JobId {
     }
 
     /// Returns the id for an idempotency key: the same for the same key of the same client, also after a restart.
-    /// HMAC-SHA-256 under `secret`, so that client and key alone do not reveal it.
+    /// The id is a truncated HMAC-SHA-256 under `secret`: client and key alone do not reveal it.
     pub(super) fn of_key(secret: &Secret, client: u64, key: &str) -> Self {
         // HMAC pads a key to the block length with zeros.
         let mut block = [0; 64];
@@ -126,7 +126,7 @@ pub(crate) struct Record {
     pub(crate) urgency: u8,
     /// Status at the last write.
     pub(crate) status: Status,
-    /// Number of attempts to run it.
+    /// Number of attempts to run the job.
     pub(crate) attempts: u32,
     /// Time of acceptance, ms since 1970.
     pub(crate) created_ms: u64,
@@ -138,12 +138,12 @@ pub(crate) struct Record {
     pub(crate) result: Option<String>,
     /// Problem document of a failed job.
     pub(crate) problem: Option<Value>,
-    /// Request that created it.
+    /// Request that created the job.
     #[serde(default)]
     pub(crate) requester: Requester,
 }
 
-/// Request that created a job, with its W3C trace context.
+/// Id and W3C trace context of the request that created a job.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub(crate) struct Requester {
@@ -156,7 +156,7 @@ pub(crate) struct Requester {
 }
 
 impl Requester {
-    /// Returns the part of a span's parent that is stored.
+    /// Converts the parent of a span to its stored form.
     pub(crate) fn of(parent: &SpanParent) -> Self {
         Self {
             request: parent.request.as_deref().map(str::to_owned),
@@ -165,7 +165,7 @@ impl Requester {
         }
     }
 
-    /// Returns the stored parent, for spans of `tracer`.
+    /// Returns the stored parent for spans that `tracer` records.
     pub(crate) fn parent(&self, tracer: &Tracer) -> SpanParent {
         let text = |text: &'_ Option<String>| text.clone().unwrap_or_default();
         SpanParent {
@@ -185,7 +185,7 @@ impl Record {
         Ok((request, format))
     }
 
-    /// Returns true if both records are of the same request: equal input, format and parsed parameters.
+    /// Returns true if both records describe the same request: equal input, format and parsed parameters.
     pub(super) fn is_same_request(&self, other: &Self) -> bool {
         let parsed = |record: &Self| {
             let (request, _) = record.request().ok()?;
@@ -203,7 +203,7 @@ pub(crate) fn now_ms() -> u64 {
     u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// Formats a time as RFC 3339.
+/// Formats a time, ms since 1970, as RFC 3339.
 pub(crate) fn rfc3339(ms: u64) -> String {
     humantime::format_rfc3339_millis(UNIX_EPOCH + Duration::from_millis(ms.min(MAX_MS))).to_string()
 }

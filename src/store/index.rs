@@ -52,7 +52,7 @@ pub(super) struct Index {
     pins: BTreeMap<Name, usize>,
     /// Objects being removed: no longer readable, but still on disk.
     removing: BTreeSet<Name>,
-    /// Usage by folder, including objects being removed.
+    /// Usage by folder, including objects that are being removed.
     totals: [Usage; Folder::ALL.len()],
     /// Bytes reserved by writers, in folders that count against the capacity.
     reserved: u64,

@@ -50,7 +50,7 @@ impl Upload {
     }
 }
 
-/// Uploads an object in parts, which S3 requires from 5 GiB on and which is faster for much smaller ones.
+/// Uploads an object in parts. S3 requires parts from 5 GiB on; they are also faster for much smaller objects.
 pub(super) async fn put_in_parts(store: &Store, name: &Name, mut bytes: Bytes) -> Result<(), StoreError> {
     let mut upload = Upload::begin(store, name).await?;
     while !bytes.is_empty() {

@@ -105,7 +105,8 @@ metrics! {
     ARCHIVE_REQUESTS = "molmesh_archive_requests_total", Counter, source: "local|cache|remote",
         result: "known|found|absent|unchanged|stale|corrupt|failed|too-large|no-memory|unavailable";
     /// Time to fetch an entry from the remote archive, including all attempts and pauses.
-    ARCHIVE_FETCH = "molmesh_archive_fetch_seconds", Histogram, result: "found|unchanged|absent|too-large|no-memory|unavailable";
+    ARCHIVE_FETCH = "molmesh_archive_fetch_seconds", Histogram,
+        result: "found|unchanged|absent|too-large|no-memory|unavailable";
     /// 1 while the circuit breaker of a host of the remote archive is open, else 0.
     ARCHIVE_BREAKER = "molmesh_archive_breaker_open", Gauge, host: "hosts of `archive.url`";
     /// Bytes of cached archive entries on disk.

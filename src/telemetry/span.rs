@@ -122,7 +122,7 @@ impl TraceSpan {
         self.0.request.as_deref().unwrap_or_default()
     }
 
-    /// Returns whether attributes of this span are recorded.
+    /// Returns true if attributes of this span are recorded.
     pub(crate) fn is_recording(&self) -> bool {
         self.span().is_recording()
     }

@@ -23,7 +23,7 @@ const END_STREAM: u8 = 1;
 /// Streams on one connection: `server.streams`.
 const STREAMS: u32 = 64;
 
-/// Serialises the tests, because metrics and file descriptors belong to the process.
+/// Serializes the tests, because metrics and file descriptors belong to the process.
 fn serialize() -> MutexGuard<'static, ()> {
     static SERIAL: Mutex<()> = Mutex::new(());
     SERIAL.lock().unwrap_or_else(PoisonError::into_inner)

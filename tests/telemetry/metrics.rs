@@ -219,7 +219,7 @@ fn nothing(look: &dyn Fn()) {
     look();
 }
 
-/// Serialises the tests that count, because the recorder belongs to the process.
+/// Serializes the tests that count, because the recorder belongs to the process.
 static SERIAL: Mutex<()> = Mutex::new(());
 
 fn scrape() -> Scrape {
