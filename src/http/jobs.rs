@@ -22,7 +22,7 @@ use super::openapi::problems::{MESHING, ProblemDocument, READING};
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::{ContentKey, JobId, JobView, Status, rfc3339};
+use crate::jobs::{ContentKey, JobId, JobView, Status, is_stored, rfc3339};
 
 /// Longest poll, s. Proxies commonly cut an exchange after a minute.
 pub(super) const MAX_WAIT_S: u64 = 55;
@@ -211,7 +211,8 @@ pub(super) async fn result(State(app): State<Shared>, id: JobId) -> Result<Respo
             let gone =
                 || Problem::new(Kind::ResultGone, "the result was removed after some time; request the mesh again");
             let key: ContentKey = key.parse().map_err(|_bad| gone())?;
-            if app.store.head(&key.name(&record.format)?).await?.is_none() {
+            let format = record.format.parse().map_err(|_bad| gone())?;
+            if !is_stored(&app.store, format, &key).await? {
                 return Err(gone());
             }
             let location = delivery::text(&format!("/v1/results/{key}.{}", record.format));

@@ -17,7 +17,7 @@ use super::durable_job::{DurableJob, Runner};
 use super::rank::{Client, Rank};
 use super::record::{JobId, Record, Requester, Status, now_ms};
 use super::retry::retry;
-use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket};
+use super::{AcceptError, ContentKey, EndError, OnStart, Pool, Task, Ticket, results};
 use crate::config::JobsConfig;
 use crate::formats::Format;
 use crate::store::{Digest, Folder, Name, Pin, Secret, Store, StoreError};
@@ -220,7 +220,7 @@ impl JobStore {
     /// Returns the key of a task's result if it is stored. Strict tasks always run.
     pub(super) async fn stored_result(&self, task: &Task, format: Format) -> Result<Option<String>, StoreError> {
         let key = ContentKey::new(&task.digest, &task.job, format, &self.0.pool.maker(&task.job));
-        let found = !task.strict && self.0.store.head(&key.name(format.extension())?).await?.is_some();
+        let found = !task.strict && results::is_stored(&self.0.store, format, &key).await?;
         Ok(found.then(|| key.to_string()))
     }
 

@@ -2,6 +2,7 @@
 
 use std::time::{Duration, SystemTime};
 
+use futures_util::future::join_all;
 use metrics::counter;
 
 use super::error::StoreError;
@@ -130,11 +131,11 @@ impl Store {
         let (mut objects, mut bytes) = (0, 0);
         for candidate in candidates {
             match self.remove_candidate(candidate.clone()).await {
-                Ok(true) => (objects, bytes) = (objects + 1, bytes + candidate.bytes),
+                Ok(true) => (objects, bytes) = (objects + candidate.names.len() as u64, bytes + candidate.bytes),
                 Ok(false) => {}
                 Err(error) => {
                     *failed += 1;
-                    tracing::warn!(%error, name = %candidate.name, "an object could not be removed");
+                    tracing::warn!(%error, "an object could not be removed");
                 }
             }
         }
@@ -145,10 +146,12 @@ impl Store {
     async fn remove_candidate(&self, candidate: EvictionCandidate) -> Result<bool, StoreError> {
         let store = self.clone();
         self.run_to_completion(async move {
-            let _lock = store.write_lock(&candidate.name).lock().await;
+            let Some(first) = candidate.names.first() else { return Ok(false) };
+            let _lock = store.write_lock(first).lock().await;
             let begun = store.index().begin_removal(&candidate);
             if begun {
-                store.remove(&candidate.name).await?;
+                let removed = join_all(candidate.names.iter().map(|name| store.remove(name))).await;
+                removed.into_iter().collect::<Result<(), _>>()?;
             }
             Ok(begun)
         })

@@ -252,13 +252,13 @@ impl Store {
         self.0.backend.list(folder).await
     }
 
-    /// Records a use of an object at time `at`, which restarts its time to live.
+    /// Records a use of an object at time `at`, which restarts its time to live. A mesh and its report are used together.
     pub fn touch(&self, name: &Name, at: SystemTime) {
         self.index().touch(name, at);
     }
 
-    /// Protects a name from eviction and expiry until the pin is dropped. The object need not exist yet.
-    /// [`delete`](Self::delete) ignores pins.
+    /// Protects an object from eviction and expiry until the pin is dropped, a mesh together with its report. The object
+    /// need not exist yet. [`delete`](Self::delete) ignores pins.
     pub fn pin(&self, name: &Name) -> Pin {
         self.index().pin(name);
         Pin { store: self.clone(), name: name.clone() }
@@ -302,10 +302,10 @@ impl Store {
         self.0.index.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns the lock for writing and removing an object.
+    /// Returns the lock for writing and removing an object, which its group shares.
     pub(super) fn write_lock(&self, name: &Name) -> &AsyncMutex<()> {
         let mut hasher = DefaultHasher::new();
-        name.hash(&mut hasher);
+        name.group().hash(&mut hasher);
         let ix = usize::try_from(hasher.finish() % WRITE_LOCKS as u64).unwrap_or_default();
         &self.0.write_locks[ix]
     }
