@@ -65,15 +65,22 @@ pub(crate) async fn save(
     }
     let document = serde_json::to_vec(&finished.product.report).map_err(|e| SaveError::Other(e.to_string()))?;
     store.put(&report, Bytes::from(document)).await?;
-    let mut writer = store.writer(&mesh);
+    let (store, runtime) = (store.clone(), tokio::runtime::Handle::current());
     let encode = move || {
         let file = finished.product.file(format)?;
         let bytes = file.bytes_bound();
         if bytes > limit {
             return Err(SaveError::TooLarge { bytes, limit });
         }
-        file.write(&mut writer).and_then(|()| writer.flush()).map_err(of_io)?;
-        Ok(writer.finish()?)
+        let write = || {
+            let mut writer = store.writer(&mesh);
+            file.write(&mut writer).and_then(|()| writer.flush()).map_err(of_io)?;
+            Ok(writer.finish()?)
+        };
+        match write() {
+            Err(SaveError::Store(StoreError::NoSpace { .. })) if runtime.block_on(store.make_room(bytes)) => write(),
+            done => done,
+        }
     };
     tokio::task::spawn_blocking(encode).await.map_err(|e| SaveError::Other(e.to_string()))?
 }

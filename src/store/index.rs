@@ -16,6 +16,8 @@ type Use = (SystemTime, u64);
 struct Entry {
     bytes: u64,
     used: Use,
+    /// Time of last use that the disk has.
+    saved: SystemTime,
     /// Number of writes to the name.
     version: u64,
 }
@@ -72,10 +74,10 @@ impl Index {
         self.forget(name);
         let members = self.members(&name.group());
         let last = members.iter().filter_map(|name| Some(self.entries.get(name)?.used.0)).max();
-        let at = last.map_or(used, |last| last.max(used));
+        let (saved, at) = (used, last.map_or(used, |last| last.max(used)));
         let (version, used) = (self.next(), (at, self.next()));
         self.by_use.insert(used, name.clone());
-        self.entries.insert(name.clone(), Entry { bytes, used, version });
+        self.entries.insert(name.clone(), Entry { bytes, used, saved, version });
         self.touch(name, at);
         let total = &mut self.totals[name.folder() as usize];
         *total = Usage { bytes: total.bytes + bytes, objects: total.objects + 1 };
@@ -144,6 +146,17 @@ impl Index {
         }
     }
 
+    /// Returns the objects whose last use is `interval` later than the disk says, and marks them as saved.
+    pub(super) fn unsaved_uses(&mut self, interval: Duration) -> Vec<(Name, SystemTime)> {
+        let late = |entry: &Entry| entry.used.0.duration_since(entry.saved).is_ok_and(|since| since >= interval);
+        let late = self.entries.iter_mut().filter(|(_, entry)| late(entry));
+        late.map(|(name, entry)| {
+            entry.saved = entry.used.0;
+            (name.clone(), entry.saved)
+        })
+        .collect()
+    }
+
     /// Returns the groups whose time to live has expired, oldest first.
     pub(super) fn expired(&self, now: SystemTime, ttl: impl Fn(Folder) -> Duration) -> Vec<EvictionCandidate> {
         let expired = self
@@ -187,7 +200,14 @@ impl Index {
     /// Returns the least recently used objects to evict so that `bytes` more fit into `cap`, and the bytes that are
     /// missing even then.
     pub(super) fn excess(&self, bytes: u64, cap: u64) -> (Vec<EvictionCandidate>, u64) {
-        let mut missing = self.used_bytes().saturating_add(bytes).saturating_sub(cap);
+        let missing = self.used_bytes().saturating_add(bytes).saturating_sub(cap);
+        let chosen = self.oldest(missing);
+        let found = chosen.iter().map(|candidate| candidate.bytes).sum();
+        (chosen, missing.saturating_sub(found))
+    }
+
+    /// Returns the least recently used objects, of at least `missing` bytes if there are so many.
+    pub(super) fn oldest(&self, mut missing: u64) -> Vec<EvictionCandidate> {
         let mut chosen = Vec::new();
         let mut candidates = self.candidates(self.by_use.values().filter(|name| name.folder().is_capped()));
         while missing > 0 {
@@ -196,7 +216,7 @@ impl Index {
             chosen.push(candidate);
         }
         drop(candidates);
-        (chosen, missing)
+        chosen
     }
 
     /// Returns the bytes that count against the capacity: on disk and reserved.
@@ -218,7 +238,8 @@ impl Index {
     /// Marks a candidate as being removed, unless an object of its group was used, written or pinned since it was
     /// chosen.
     pub(super) fn begin_removal(&mut self, candidate: &EvictionCandidate) -> bool {
-        let unchanged = candidate.names.first().and_then(|name| self.candidate(&name.group())).as_ref() == Some(candidate);
+        let unchanged =
+            candidate.names.first().and_then(|name| self.candidate(&name.group())).as_ref() == Some(candidate);
         if unchanged {
             self.removing.extend(candidate.names.iter().cloned());
         }
