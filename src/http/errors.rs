@@ -173,6 +173,13 @@ impl From<StoreError> for Problem {
                 .with("actual", held)
                 .with("limit", max_bytes)
                 .retry_after(wait),
+            StoreError::NoSpace { .. } => {
+                tracing::error!(%error, "the disk of the store is full");
+                Self::new(Kind::StoreFull, "the disk of the store is full").retry_after(wait)
+            }
+            StoreError::Quarantined { .. } => {
+                Self::new(Kind::RecordUnreadable, "the record of the job cannot be read and is in quarantine")
+            }
             other => {
                 tracing::error!(error = %other, "the store failed");
                 Self::new(Kind::StoreFailed, "the store cannot be reached").retry_after(wait)

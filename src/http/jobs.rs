@@ -22,7 +22,7 @@ use super::openapi::problems::{MESHING, ProblemDocument, READING};
 use super::problem::Problem;
 use super::state::Shared;
 use super::stop::{self, Stop};
-use crate::jobs::{ContentKey, JobId, JobView, Status, rfc3339};
+use crate::jobs::{ContentKey, JobId, JobView, Status, is_stored, rfc3339};
 
 /// Longest poll, s. Proxies commonly cut an exchange after a minute.
 pub(super) const MAX_WAIT_S: u64 = 55;
@@ -120,10 +120,11 @@ enum StatusSchema {
     Dismissed,
 }
 
-problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::StoreFailed]]);
-problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::StoreFailed]]);
+problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::RecordUnreadable, Kind::StoreFailed]]);
+problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::RecordUnreadable, Kind::StoreFull, Kind::StoreFailed]]);
 problem_responses!(ResultProblems: [READING, MESHING, [
     Kind::BadRequest, Kind::NoSuchJob, Kind::NoResultYet, Kind::JobDismissed, Kind::ResultGone, Kind::JobAbandoned,
+    Kind::RecordUnreadable,
     Kind::StoreFull, Kind::StoreFailed,
 ]]);
 
@@ -211,7 +212,8 @@ pub(super) async fn result(State(app): State<Shared>, id: JobId) -> Result<Respo
             let gone =
                 || Problem::new(Kind::ResultGone, "the result was removed after some time; request the mesh again");
             let key: ContentKey = key.parse().map_err(|_bad| gone())?;
-            if app.store.head(&key.name(&record.format)?).await?.is_none() {
+            let format = record.format.parse().map_err(|_bad| gone())?;
+            if !is_stored(&app.store, format, &key).await? {
                 return Err(gone());
             }
             let location = delivery::text(&format!("/v1/results/{key}.{}", record.format));

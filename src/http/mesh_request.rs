@@ -172,7 +172,7 @@ impl MeshRequest {
         let is_stored = results::save_later(&app, &finished, format, &key);
         let mut response = delivery::mesh(&app, Arc::clone(&finished), format, &key, timing, permit).await?;
         let headers = response.headers_mut();
-        if is_stored {
+        if is_stored && results::will_be_stored(&app, &key, format, headers).await? {
             headers.insert(header::CONTENT_LOCATION, delivery::text(&results::path(&key, format.extension())));
         }
         if let Some(cache) = cache {

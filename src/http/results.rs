@@ -216,6 +216,24 @@ async fn wait_for_save(app: &App, key: &ContentKey) {
     }
 }
 
+/// Returns true if a result that is being stored will be found at its address. `headers` are those of its answer. Waits
+/// for the end only if the space may not suffice.
+pub(super) async fn will_be_stored(
+    app: &App,
+    key: &ContentKey,
+    format: Format,
+    headers: &HeaderMap,
+) -> Result<bool, Problem> {
+    let bytes = headers.get(header::CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse().ok());
+    if let Some(bytes) = bytes
+        && app.store.has_room(bytes).await
+    {
+        return Ok(true);
+    }
+    wait_for_save(app, key).await;
+    Ok(jobs::is_stored(&app.store, format, key).await?)
+}
+
 /// Waits until no result is being stored. No new results may be computed by then.
 pub(super) async fn all_saved(app: &App) {
     let permits = u32::try_from(app.config.jobs.concurrent_saves).unwrap_or(u32::MAX);

@@ -33,7 +33,7 @@ pub(crate) use key::ContentKey;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
 pub(crate) use record::{JobId, Status, rfc3339};
-pub(crate) use results::{REPORT, SaveError, save};
+pub(crate) use results::{REPORT, SaveError, is_stored, save};
 pub(crate) use ticket::Ticket;
 
 use std::sync::Arc;

@@ -4,9 +4,10 @@ use std::fmt;
 use std::str::FromStr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use bytes::Bytes;
 use hmac::{Hmac, KeyInit as _, Mac as _};
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Map, Value};
 use sha2::Sha256;
 use thiserror::Error;
 
@@ -176,7 +177,48 @@ impl Requester {
     }
 }
 
+/// Version of the record format.
+const VERSION: u64 = 1;
+
+/// Version of a stored record; the first records have none.
+#[derive(Debug, Serialize, Deserialize)]
+struct Versioned<T> {
+    #[serde(default = "first_version")]
+    version: u64,
+    #[serde(flatten)]
+    content: T,
+}
+
+fn first_version() -> u64 {
+    VERSION
+}
+
+/// Error of a stored record.
+#[derive(Debug, Error)]
+pub(super) enum BadRecord {
+    /// The document is damaged.
+    #[error("{0}")]
+    Damaged(#[from] serde_json::Error),
+    /// A later release wrote the record.
+    #[error("the record has version {0}, expected {VERSION}")]
+    Version(u64),
+}
+
 impl Record {
+    /// Returns the document to store.
+    pub(super) fn to_bytes(&self) -> Bytes {
+        Bytes::from(serde_json::to_vec(&Versioned { version: VERSION, content: self }).unwrap_or_default())
+    }
+
+    /// Parses a stored document.
+    pub(super) fn from_bytes(bytes: &[u8]) -> Result<Self, BadRecord> {
+        // The version first: other fields of another version may have other types.
+        match serde_json::from_slice::<Versioned<Map<String, Value>>>(bytes)?.version {
+            VERSION => Ok(serde_json::from_slice(bytes)?),
+            other => Err(BadRecord::Version(other)),
+        }
+    }
+
     /// Parses the stored parameters and the format.
     pub(super) fn request(&self) -> Result<(params::Request, Format), String> {
         let mut request = params::parse(self.parameters.iter().map(|(n, v)| (n, v))).map_err(|e| e.to_string())?;
@@ -271,12 +313,19 @@ mod tests {
     #[test]
     fn records_survive_a_round_trip() {
         let record = record(&[("resolution", "0.5")]);
-        let text = serde_json::to_vec(&record).unwrap();
-        assert_eq!(serde_json::from_slice::<Record>(&text).unwrap(), record);
+        let text = record.to_bytes().to_vec();
+        assert_eq!(Record::from_bytes(&text).unwrap(), record);
         // Records of earlier versions have no requester.
         let mut old = serde_json::to_value(&record).unwrap();
         old.as_object_mut().unwrap().remove("requester").unwrap();
         assert_eq!(serde_json::from_value::<Record>(old).unwrap().requester, Requester::default());
+        let old = serde_json::to_vec(&record).unwrap();
+        assert_eq!(Record::from_bytes(&old).unwrap(), record, "the first records have no version");
+        let later = br#"{"version":2,"id":7}"#;
+        assert!(matches!(Record::from_bytes(later), Err(BadRecord::Version(2))));
+        for damaged in [b"".as_slice(), &text[..text.len() / 2], b"[]", br#"{"version":1}"#] {
+            assert!(matches!(Record::from_bytes(damaged), Err(BadRecord::Damaged(_))), "{damaged:?}");
+        }
         let hostile = String::from_utf8(text).unwrap().replace(record.id.as_str(), "../../x");
         assert!(serde_json::from_str::<Record>(&hostile).is_err());
     }

@@ -164,6 +164,13 @@ fn jobs(seen: &Seen) {
         get(path, 404);
     }
     seen.expect(404, server.addr, ("DELETE", NO_JOB), &[], b"");
+    // A damaged record.
+    let torn = "1".repeat(32);
+    std::fs::write(server.dir.path().join(format!("store/jobs/{torn}.json")), "{").unwrap();
+    for path in ["", "/events", "/result"] {
+        get(&format!("/v1/jobs/{torn}{path}"), 500);
+    }
+    seen.expect(500, server.addr, ("DELETE", &format!("/v1/jobs/{torn}")), &[], b"");
     get(&format!("{NO_JOB}?wait=1000"), 400);
     // Ends without a result are told as a synchronous request would be.
     result(&ended(seen, &server, &vec![b' '; 100_001]), 413);
