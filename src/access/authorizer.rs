@@ -11,6 +11,7 @@ use super::error::AccessError;
 use super::keys::{Denied, Key, KeyRing};
 use super::meter::Meter;
 use super::sign::{SignatureCheck, SigningKeys};
+use super::sites::Sites;
 use super::{file, forwarded};
 use crate::config::{AccessConfig, Config, Origins, ServerConfig};
 
@@ -22,6 +23,7 @@ pub(crate) struct Access {
     /// Quota per address of clients without a key; `None` means unlimited.
     address_quota: Option<Arc<Quota>>,
     meter: Arc<Meter>,
+    sites: Sites,
     config: AccessConfig,
     server: ServerConfig,
 }
@@ -46,6 +48,7 @@ fn stamp(path: &Path) -> Option<Stamp> {
 impl Access {
     /// Creates the access control and reads the key file, if one is configured.
     pub(crate) fn open(config: &Config) -> Result<Self, AccessError> {
+        let sites = Sites::new(config);
         let (config, server) = (config.access.clone(), config.server.clone());
         if config.cors_credentials && config.cors_origins == Some(Origins::Any) {
             return Err(AccessError::CredentialsForAll);
@@ -67,6 +70,7 @@ impl Access {
             signing: signing.transpose().map_err(AccessError::Signing)?,
             address_quota: (!quota.is_unlimited()).then(|| Arc::new(quota)),
             meter: Arc::new(Meter::new(config.max_addresses)),
+            sites,
             config,
             server,
         })
@@ -101,6 +105,11 @@ impl Access {
     /// Returns the usage meter.
     pub(crate) fn meter(&self) -> &Arc<Meter> {
         &self.meter
+    }
+
+    /// Returns the origins and host names of the service.
+    pub(crate) fn sites(&self) -> &Sites {
+        &self.sites
     }
 
     /// Returns the configuration.

@@ -120,7 +120,7 @@ pub(super) async fn check(State(app): State<Shared>, mut request: Request, next:
 
 /// Reads the body of a refused request if it is small and arrives at once: some HTTP/2 clients report a broken stream
 /// if the response arrives before they have sent their body.
-async fn swallow(request: Request) {
+pub(super) async fn swallow(request: Request) {
     const MOST: u64 = 64 << 10;
     const PATIENCE: Duration = Duration::from_millis(500);
     let asks_first = request.headers().contains_key(header::EXPECT);
@@ -146,6 +146,11 @@ enum Presented {
     Text(String),
     /// Several keys, or not text.
     Nonsense,
+}
+
+/// Returns true if a request has a key, known or not.
+pub(super) fn has_key(headers: &HeaderMap) -> bool {
+    !matches!(presented(headers), Presented::Nothing)
 }
 
 fn presented(headers: &HeaderMap) -> Presented {

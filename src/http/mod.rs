@@ -75,6 +75,7 @@ mod key_reload;
 mod observe;
 
 mod browsers;
+mod origin;
 
 mod middleware;
 

@@ -190,7 +190,8 @@ fn sizes(seen: &Seen) {
     for path in UPLOADS {
         seen.expect(413, small.addr, ("POST", path), &[], SAMPLE);
         let mut stream = connect(small.addr);
-        let head = format!("POST {path} HTTP/1.1\r\nhost: t\r\nconnection: close\r\ncontent-length: 10\r\n\r\nATOM");
+        let head =
+            format!("POST {path} HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\ncontent-length: 10\r\n\r\nATOM");
         stream.write_all(head.as_bytes()).unwrap();
         let late = read_reply(&mut stream, false);
         assert_eq!(late.status, 408);
