@@ -97,6 +97,11 @@ impl Access {
         self.signing.as_ref().map_or(SignatureCheck::Absent, |keys| keys.check(path, query, now))
     }
 
+    /// Signs a target of this service until `end`, s of Unix time. Returns `None` if signatures are off.
+    pub(crate) fn sign(&self, target: &str, end: u64) -> Option<String> {
+        self.signing.as_ref()?.sign(None, target, end).ok()
+    }
+
     /// Returns the quota of clients without a key.
     pub(crate) fn address_quota(&self) -> Option<&Arc<Quota>> {
         self.address_quota.as_ref()

@@ -120,6 +120,13 @@ enum StatusSchema {
     Dismissed,
 }
 
+impl Poll {
+    /// Returns the seconds to wait.
+    pub(super) fn wait(&self) -> u64 {
+        self.wait.unwrap_or(0)
+    }
+}
+
 problem_responses!(ShowProblems: [[Kind::BadRequest, Kind::BadParameter, Kind::NoSuchJob, Kind::StoreFailed]]);
 problem_responses!(DismissProblems: [[Kind::BadRequest, Kind::NoSuchJob, Kind::JobEnded, Kind::StoreFailed]]);
 problem_responses!(ResultProblems: [READING, MESHING, [
@@ -159,7 +166,7 @@ pub(super) async fn show(
     query: Result<Query<Poll>, QueryRejection>,
 ) -> Result<Response, Problem> {
     let Query(poll) = query.map_err(|e| Problem::new(Kind::BadParameter, e.body_text()).with("parameter", "wait"))?;
-    let wait = poll.wait.unwrap_or(0);
+    let wait = poll.wait();
     if wait > MAX_WAIT_S {
         return Err(Problem::new(Kind::BadParameter, format!("parameter `wait`: {wait} is more than {MAX_WAIT_S} s"))
             .with("parameter", "wait")
@@ -195,7 +202,7 @@ pub(super) async fn dismiss(State(app): State<Shared>, id: JobId) -> Result<Resp
 
 /// Get the result of a job
 ///
-/// Redirects to the mesh of a successful job. For a failed job the response is the error that the synchronous request
+/// Redirects to the mesh of a successful job; the target of a signed request is signed until the same time. For a failed job the response is the error that the synchronous request
 /// would have returned.
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(

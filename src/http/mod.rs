@@ -53,6 +53,7 @@ mod jobs;
 mod results;
 
 mod mesh_request;
+mod signing;
 
 mod atoms;
 mod estimate;
@@ -85,4 +86,5 @@ mod server;
 
 pub use page::has_viewer;
 pub use server::{Chosen, ServeError, Server};
+pub use signing::check_signable;
 pub use stop::{Stop, shutdown_signals};

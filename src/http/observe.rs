@@ -22,7 +22,7 @@ use crate::telemetry::{
 
 /// `traceparent` (W3C Trace Context), of requests and responses.
 pub(super) const TRACEPARENT: HeaderName = HeaderName::from_static("traceparent");
-/// `tracestate` (W3C Trace Context), of requests; passed on to the archive.
+/// `tracestate` (W3C Trace Context), of requests; exported with the spans.
 const TRACESTATE: HeaderName = HeaderName::from_static("tracestate");
 
 /// Middleware: observes one request.

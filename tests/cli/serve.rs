@@ -85,6 +85,32 @@ fn log_lines_name_their_request_and_job() {
 }
 
 #[test]
+#[cfg(target_os = "linux")]
+fn stored_data_is_readable_by_its_user_only() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let folder = Folder::new();
+    let service = Service::start(&folder, &["--archive", "samples"]);
+    let pdb = folder.file("rod.pdb", cli_support::rod());
+    let upload = format!("@{}", pdb.display());
+    for prefer in ["Prefer: respond-async", "Prefer: handling=lenient"] {
+        let url = format!("http://{}/v1/meshes", service.addr);
+        let sent = Command::new("curl").args(["-sSf", "-o", "/dev/null", "-H", prefer, "--data-binary", &upload, &url]);
+        assert!({ sent }.status().unwrap().success());
+    }
+    assert_eq!(service.stop("TERM").0, Some(0));
+    let (mut left, mut n) = (vec![folder.path("data")], 0);
+    while let Some(path) = left.pop() {
+        let meta = std::fs::metadata(&path).unwrap();
+        assert_eq!(meta.permissions().mode() & 0o077, 0, "{}", path.display());
+        if meta.is_dir() {
+            left.extend(std::fs::read_dir(&path).unwrap().map(|entry| entry.unwrap().path()));
+        }
+        n += 1;
+    }
+    assert!(n >= 8, "{n} files and folders");
+}
+
+#[test]
 fn flags_reach_the_service() {
     let folder = Folder::new();
     let service = Service::start(&folder, &["--set", "limits.atoms=5", "--backend", "reference"]);

@@ -390,7 +390,7 @@ fn a_signed_url_replaces_a_key_and_changes_nothing_else() {
         let (signed, keyed) = (get(&server, &sign(&target, None), &[]), with(&server, keys.text("a"), &target));
         assert_eq!((signed.status, keyed.status), (200, 200), "{}", signed.text());
         assert!(signed.body == keyed.body);
-        for name in ["etag", "content-type", "cache-control"] {
+        for name in ["etag", "content-type"] {
             assert_eq!(signed.header(name), keyed.header(name), "{name}");
         }
         assert!(!signed.headers.iter().any(|(_, value)| value.contains("signature")), "{:?}", signed.headers);
@@ -415,6 +415,54 @@ fn a_signed_url_replaces_a_key_and_changes_nothing_else() {
     send(server.addr, "POST", &sign("/v1/meshes", None), &key, SAMPLE).problem(400, "bad-parameter");
     get(&server, &format!("{ENTRY}?expires=1"), &key).problem(400, "bad-parameter");
     get(&server, &sign(&format!("{ENTRY}?sginature=1"), None), &[]).problem(400, "bad-parameter");
+}
+
+#[test]
+fn a_signature_opens_a_job_with_its_events_and_bytes() {
+    let keys = Keys::new(&[("a", "mesh,read", "")]);
+    let server = signing(&keys, SECRETS);
+    let key = ("x-api-key", keys.text("a"));
+    let accepted = server.post("/v1/meshes", &[key, ("prefer", "respond-async")], SAMPLE);
+    let job = accepted.header("location").unwrap();
+    eventually("the job ends", || with(&server, keys.text("a"), job).json()["status"] == "successful");
+    let signed = sign(job, None);
+    let query = signed.split_once('?').unwrap().1;
+    assert_eq!(get(&server, &signed, &[]).json()["status"], "successful");
+    let events = get(&server, &format!("{job}/events?{query}"), &[]);
+    assert!(events.status == 200 && events.text().contains("successful"), "{}", events.text());
+    let result = get(&server, &format!("{job}/result?{query}"), &[]);
+    let target = result.header("location").unwrap();
+    assert!(result.status == 303 && target.contains("signature="), "{result:?}");
+    let mesh = get(&server, target, &[]);
+    assert!(mesh.status == 200 && mesh.body.starts_with(b"glTF"), "{}", mesh.status);
+    // The target expires with the job's address.
+    let expires = |target: &str| target.split("expires=").nth(1).unwrap()[..10].to_owned();
+    assert_eq!(expires(target), expires(&signed));
+    get(&server, &format!("{job}x/result?{query}"), &[]).problem(403, "signature-invalid");
+    let keyed = with(&server, keys.text("a"), &format!("{job}/result"));
+    assert!(!keyed.header("location").unwrap().contains('?'));
+}
+
+#[test]
+fn signed_responses_are_not_cached_longer_than_their_signature() {
+    let keys = Keys::new(&[("a", "mesh,read", "")]);
+    let server = signing(&keys, SECRETS);
+    let end = now() + 100;
+    let until = |target: &str| SigningKeys::parse(SECRETS).unwrap().sign(None, target, end).unwrap();
+    let fresh = get(&server, &until(ENTRY), &[]);
+    let stored = fresh.header("content-location").unwrap();
+    eventually("the result is stored", || get(&server, &until(stored), &[]).status == 200);
+    for target in [ENTRY, stored] {
+        let etag = fresh.header("etag").unwrap();
+        for headers in [&[][..], &[("if-none-match", etag)]] {
+            let reply = get(&server, &until(target), headers);
+            let caching = reply.header("cache-control").unwrap();
+            let age: u64 = caching.strip_prefix("private, max-age=").unwrap().parse().unwrap();
+            assert!(age <= 100 && now() + age <= end + 1, "{target}: {caching}");
+        }
+        let keyed = with(&server, keys.text("a"), target);
+        assert!(keyed.header("cache-control").unwrap().len() > "private, max-age=100".len(), "{keyed:?}");
+    }
 }
 
 #[test]

@@ -262,14 +262,20 @@ fn requests_are_linked_to_a_coalesced_job() {
 }
 
 #[test]
-fn archives_receive_the_trace_context() {
+fn archives_receive_the_trace_but_nothing_else_of_the_client() {
     let collector = Collector::start(CollectorMode::Accept);
     let archive = archive_support::Remote::saying(archive_support::ok(SAMPLE));
     let url = archive.url("/d/{id}.pdb");
     let server = traced(Fake::new(Mode::Octahedra), &collector, |config| {
         config.archive.url = Some(url.parse().unwrap());
     });
-    let headers = [("traceparent", PARENT), ("tracestate", "rojo=1,congo=2")];
+    let headers = [
+        ("traceparent", PARENT),
+        ("tracestate", "rojo=1,congo=2"),
+        ("x-request-id", "private-id"),
+        ("user-agent", "private-agent"),
+        ("cookie", "private-cookie"),
+    ];
     let reply = send(server.addr, "GET", "/v1/pdb/4pti/surface.glb", &headers, b"");
     assert_eq!(reply.status, 200);
     assert!(server.join());
@@ -281,7 +287,13 @@ fn archives_receive_the_trace_context() {
     let asked = archive.requests();
     let told = asked.iter().map(|a| (a.header("traceparent"), a.header("tracestate"))).collect::<Vec<_>>();
     let expected = format!("00-{TRACE}-{}-01", hex(&fetch.span_id));
-    assert_eq!(told, [(Some(expected.as_str()), Some("rojo=1,congo=2"))]);
+    assert_eq!(told, [(Some(expected.as_str()), None)]);
+    assert!(!format!("{asked:?}").contains("private-"), "{asked:?}");
+    // Without export, not even the trace.
+    let silent = start(Fake::new(Mode::Octahedra), |config| config.archive.url = Some(url.parse().unwrap()));
+    assert_eq!(send(silent.addr, "GET", "/v1/pdb/4pti/surface.glb", &headers, b"").status, 200);
+    assert_eq!(archive.requests().last().unwrap().header("traceparent"), None);
+    assert_eq!(archive.requests().len(), 2);
 }
 
 #[test]
