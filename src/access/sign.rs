@@ -255,7 +255,9 @@ mod tests {
         for path in ["/v1/jobs/7", "/v1/jobs/7/events", "/v1/jobs/7/result"] {
             assert_eq!(at(path), SignatureCheck::Valid(100), "{path}");
         }
-        for path in ["/v1/jobs/8", "/v1/jobs/8/result", "/v1/jobs/7/x", "/v1/jobs/7/events/result", "/v1/jobs", "/v1/jobs/"] {
+        for path in
+            ["/v1/jobs/8", "/v1/jobs/8/result", "/v1/jobs/7/x", "/v1/jobs/7/events/result", "/v1/jobs", "/v1/jobs/"]
+        {
             assert_eq!(at(path), SignatureCheck::Invalid, "{path}");
         }
     }

@@ -241,7 +241,7 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
     let headers = response.headers_mut();
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-store"));
     if status == StatusCode::ACCEPTED {
-        headers.insert(header::LOCATION, delivery::text(&format!("/v1/jobs/{}", view.record.id)));
+        headers.insert(header::LOCATION, delivery::text(&format!("/v1/jobs/{}", view.record.id.as_str())));
     }
     if !view.record.status.is_final() {
         let seconds = wait.map_or(1, |wait| (wait + Duration::from_millis(999)).as_secs().clamp(1, 600));
@@ -253,7 +253,7 @@ fn answer(status: StatusCode, view: &JobView, wait: Option<Duration>) -> Respons
 /// Returns the document of a job.
 pub(super) fn document(view: &JobView) -> JobDocument {
     let record = &view.record;
-    let own = format!("/v1/jobs/{}", record.id);
+    let own = format!("/v1/jobs/{}", record.id.as_str());
     let link = |rel, href: String, kind| Link { rel, href, r#type: kind };
     let mut links = vec![link("self", own.clone(), "application/json")];
     if !record.status.is_final() {
@@ -268,7 +268,7 @@ pub(super) fn document(view: &JobView) -> JobDocument {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a fraction")]
     let progress = (view.fraction * 100.0) as u64;
     JobDocument {
-        job_id: record.id.to_string(),
+        job_id: record.id.as_str().to_owned(),
         process_id: "surface",
         r#type: "process",
         status: record.status,

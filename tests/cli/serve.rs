@@ -65,19 +65,30 @@ fn log_lines_name_their_request_and_job() {
     let job = job["jobID"].as_str().unwrap().to_owned();
     let done = ask("polls", &[&format!("http://{}/v1/jobs/{job}?wait=30", service.addr)]);
     assert_eq!(done["status"], "successful", "{done}");
+    let result = done["result"].as_str().unwrap().to_owned();
+    let url = format!("http://{}/v1/results/{result}", service.addr);
+    for (id, more) in [("whole", &[][..]), ("part", &["-r", "0-9"]), ("head", &["-I"]), ("again", &[])] {
+        let header = format!("X-Request-Id: {id}");
+        let curl = Command::new("curl").args(["-sSf", "-o", "/dev/null", "-H", &header, &url]).args(more).status();
+        assert!(curl.unwrap().success(), "{id}");
+    }
     let (code, log) = service.stop("TERM");
     assert_eq!(code, Some(0), "{log}");
+    for secret in [&job, &result[..64], done["structure"].as_str().unwrap()] {
+        let leak = log.lines().find(|line| line.contains(&secret[..9]));
+        assert_eq!(leak, None, "the log contains {secret}");
+    }
 
     let lines: Vec<serde_json::Value> = log.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let of = |key: &str, value: &str| -> Vec<_> { lines.iter().filter(|l| l["span"][key] == value).collect() };
-    for id in ["submits", "polls"] {
+    for id in ["submits", "polls", "whole", "part", "head", "again"] {
         let answered: Vec<_> = of("request_id", id).into_iter().filter(|l| l["message"] == "answered").collect();
         assert_eq!(answered.len(), 1, "one line per request\n{log}");
-        assert_eq!(answered[0]["span"]["trace_id"], trace, "{log}");
+        assert_eq!(answered[0]["complete"], true, "{log}");
         assert!(answered[0]["ms"].is_number() && answered[0]["status"].is_u64(), "{}", answered[0]);
     }
     // The lines of the job name the request that submitted it, not the one that polled it.
-    let of_job = of("job_id", &job);
+    let of_job = of("job_id", &format!("{}…", &job[..8]));
     assert!(!of_job.is_empty(), "no line of the job\n{log}");
     for line in of_job {
         assert_eq!((&line["span"]["request_id"], &line["span"]["trace_id"]), (&"submits".into(), &trace.into()));
