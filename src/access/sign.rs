@@ -1,8 +1,9 @@
 //! Signed URLs, which allow GET without a key until they expire.
 //!
 //! The signature covers the path and all query parameters as sent, sorted by their bytes: no parameter can be added,
-//! removed or rewritten. The signature of a job covers its events and its result as well. Three parameters carry it: [`EXPIRES`] in seconds of Unix time, [`KEY_ID`], and [`SIGNATURE`],
-//! an HMAC-SHA-256 in base64url. The host is not signed, because a service behind proxies does not know its own.
+//! removed or rewritten. The signature of a job covers its events and its result as well. Three parameters carry it:
+//! [`EXPIRES`] in seconds of Unix time, [`KEY_ID`], and [`SIGNATURE`], an HMAC-SHA-256 in base64url. The host is not
+//! signed, because a service behind proxies does not know its own.
 
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 

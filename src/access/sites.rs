@@ -44,8 +44,9 @@ impl Sites {
         }
     }
 
-    /// Returns true if the service answers requests for `authority`, a host with an optional port. On a loopback address
-    /// it must be a name of this machine: another name that leads here belongs to a page that rebinds its own name.
+    /// Returns true if the service answers requests for `authority`, a host with an optional port. On a loopback
+    /// address it must be a name of this machine: another name that leads here belongs to a page that rebinds its own
+    /// name.
     pub(crate) fn answers(&self, authority: &str) -> bool {
         let listed = |hosts: &Hosts| hosts.contains(host(authority));
         let is_restricted = self.on_loopback || self.hosts.is_some();

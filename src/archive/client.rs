@@ -111,8 +111,8 @@ pub(super) async fn head(client: &Client, url: Url) -> Result<u16, Failed> {
 }
 
 /// Sends one GET request, a conditional one if a copy is `known`. `lease` is charged with the body while it arrives and
-/// until the answer is dropped. Nothing of the client's request is passed on except the id of a `trace` that is exported.
-/// The check of a gzip file stops after `inflated_bytes`.
+/// until the answer is dropped. Nothing of the client's request is passed on except the id of a `trace` that is
+/// exported. The check of a gzip file stops after `inflated_bytes`.
 pub(super) async fn get(
     client: &Client,
     url: Url,

@@ -40,8 +40,8 @@ pub struct AccessConfig {
     /// because forgetting an address would give it a new one.
     pub max_addresses: usize,
     /// Origins whose pages may read responses and send requests without a key: `auto`, `*`, or a list such as
-    /// `https://viewer.example`. Default `auto`: loopback origins if the service listens on a loopback address, no others.
-    /// `none`: only pages of this server.
+    /// `https://viewer.example`. Default `auto`: loopback origins if the service listens on a loopback address, no
+    /// others. `none`: only pages of this server.
     #[serde(with = "list")]
     #[schemars(schema_with = "Origins::schema")]
     pub cors_origins: Option<Origins>,

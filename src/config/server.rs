@@ -15,9 +15,9 @@ pub struct ServerConfig {
     /// Address of the service. Default 127.0.0.1:8080: the service is not exposed unless configured. Port 0 selects a
     /// free port.
     pub listen: SocketAddr,
-    /// Host names by which clients reach the service, without ports, besides the names of the loopback addresses. Default
-    /// `none`: a service that listens on a loopback address answers no other name with anything but a 421, so that a web
-    /// page cannot reach it through a name of its own. With a list, this applies to every address.
+    /// Host names by which clients reach the service, without ports, besides the names of the loopback addresses.
+    /// Default `none`: a service that listens on a loopback address answers no other name with anything but a 421, so
+    /// that a web page cannot reach it through a name of its own. With a list, this applies to every address.
     #[serde(with = "list")]
     #[schemars(schema_with = "Hosts::schema")]
     pub hosts: Option<Hosts>,

@@ -22,11 +22,12 @@ use crate::access::Access;
 const POLICY: HeaderValue = HeaderValue::from_static("default-src 'none'; frame-ancestors 'none'");
 
 /// Request headers that listed origins may send.
-const ALLOWED: [HeaderName; 14] = [
+const ALLOWED: [HeaderName; 15] = [
     header::ACCEPT,
     header::AUTHORIZATION,
     header::CONTENT_ENCODING,
     header::CONTENT_TYPE,
+    header::IF_MATCH,
     header::IF_NONE_MATCH,
     header::IF_RANGE,
     header::RANGE,

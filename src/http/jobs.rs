@@ -202,8 +202,8 @@ pub(super) async fn dismiss(State(app): State<Shared>, id: JobId) -> Result<Resp
 
 /// Get the result of a job
 ///
-/// Redirects to the mesh of a successful job; the target of a signed request is signed until the same time. For a failed job the response is the error that the synchronous request
-/// would have returned.
+/// Redirects to the mesh of a successful job. The target of a signed request is signed until the same time. For a
+/// failed job the response is the error that the synchronous request would have returned.
 #[utoipa::path(get, path = "/v1/jobs/{id}/result", tag = "jobs", operation_id = "showJobResult", params(JobPath),
     responses(
         (status = 303, description = "The job has succeeded.",

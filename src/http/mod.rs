@@ -4,7 +4,6 @@
 //! threads. A file uses only files of earlier groups in the list below; `tests/core/architecture.rs` checks this order.
 
 // Protocol rules that use no other file.
-mod conditional;
 mod kinds;
 mod observed_body;
 mod pace;
@@ -21,6 +20,7 @@ mod stop;
 // Problems, and what can be checked without the state of the service.
 mod problem;
 
+mod conditional;
 mod content_type;
 mod errors;
 mod json_body;

@@ -105,8 +105,8 @@ fn stored_data_is_readable_by_its_user_only() {
     let upload = format!("@{}", pdb.display());
     for prefer in ["Prefer: respond-async", "Prefer: handling=lenient"] {
         let url = format!("http://{}/v1/meshes", service.addr);
-        let sent = Command::new("curl").args(["-sSf", "-o", "/dev/null", "-H", prefer, "--data-binary", &upload, &url]);
-        assert!({ sent }.status().unwrap().success());
+        let args = ["-sSf", "-o", "/dev/null", "-H", prefer, "--data-binary", &upload, &url];
+        assert!(Command::new("curl").args(args).status().unwrap().success());
     }
     assert_eq!(service.stop("TERM").0, Some(0));
     let (mut left, mut n) = (vec![folder.path("data")], 0);
@@ -119,6 +119,34 @@ fn stored_data_is_readable_by_its_user_only() {
         n += 1;
     }
     assert!(n >= 8, "{n} files and folders");
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn the_limit_of_open_files_is_raised() {
+    use std::io::{BufRead as _, BufReader};
+    let folder = Folder::new();
+    let binary = cli_support::molmesh();
+    let mut child = Command::new("sh")
+        .args(["-c", "ulimit -Sn 256 && exec \"$@\"", "sh"])
+        .arg(binary.get_program())
+        .args(["serve", "--listen", "127.0.0.1:0", "--data-dir"])
+        .arg(folder.path("data"))
+        .envs(binary.get_envs().filter_map(|(name, value)| Some((name, value?))))
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    // The service raises its limit before it prints its banner.
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    let started = lines.any(|line| line.unwrap().trim_start().starts_with("try "));
+    let limits = std::fs::read_to_string(format!("/proc/{}/limits", child.id()));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    assert!(started);
+    let limits = limits.unwrap();
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max open files")).unwrap();
+    let [soft, hard] = [0, 1].map(|n| line.split_whitespace().nth(n).unwrap());
+    assert!(soft == hard && soft != "256", "{line}");
 }
 
 #[test]
