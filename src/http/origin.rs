@@ -5,7 +5,7 @@ use std::time::SystemTime;
 use axum::extract::{Request, State};
 use axum::http::header::{HOST, HeaderName, ORIGIN};
 use axum::http::uri::Authority;
-use axum::http::{Method, Version};
+use axum::http::{HeaderValue, Method, Version};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
@@ -72,7 +72,7 @@ fn is_foreign(access: &Access, request: &Request, host: Option<&Authority>) -> b
     if access.sites().allows_any_origin() || origin.is_some_and(|origin| access.sites().allows_origin(origin)) {
         return false;
     }
-    match request.headers().get(SEC_FETCH_SITE).map(|site| site.as_bytes()) {
+    match request.headers().get(SEC_FETCH_SITE).map(HeaderValue::as_bytes) {
         Some(b"same-origin" | b"none") => false,
         Some(b"cross-site") => true,
         // A page of the service sends its own origin; a proxy with TLS changes only the scheme.
