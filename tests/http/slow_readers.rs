@@ -84,7 +84,7 @@ impl H2 {
         for (n, path) in (0..).zip(paths) {
             // HPACK (RFC 7541): GET, http, and two literals, `:path` and `:authority`.
             let path = [&[0x04, u8::try_from(path.len()).unwrap()], path.as_bytes()].concat();
-            let head = [&[0x82, 0x86][..], &path, b"\x01\x01t"].concat();
+            let head = [&[0x82, 0x86][..], &path, b"\x01\x09localhost"].concat();
             socket.write_all(&frame(HEADERS, 0x4 | END_STREAM, 2 * n + 1, &head)).unwrap();
             seen.insert(2 * n + 1, Seen::default());
         }
