@@ -85,7 +85,7 @@ impl Archive {
         let shared = Shared {
             folder: Folder::new(config.archive_dir()).with_max_bytes(inflated),
             disk: Disk::new(config.archive_cache_dir(), archive.cache_bytes),
-            remote: Remote::new(archive, inflated, memory),
+            remote: Remote::new(config, memory),
             fetches: SingleFlight::default(),
             known: Cache::new(CACHED_DIGESTS),
             absent: Cache::new(CACHED_DIGESTS),

@@ -87,6 +87,10 @@ impl MeshRequest {
         let is_reusable = !request.strict && !report && !declared.is_structure() && !self.preferences.respond_async;
         let key = ContentKey::new(digest, &request.job, *format, &app.pool.maker(&request.job));
         let etag = delivery::etag(&key);
+        // A report has no validator.
+        if !report {
+            conditional::check_match(headers, &etag)?;
+        }
         if is_reusable {
             if let Some(cache) = &self.cache
                 && conditional::is_unchanged(headers, &etag)

@@ -107,6 +107,9 @@ impl Server {
     pub async fn bind(config: Config, chosen: Chosen) -> Result<Self, ServeError> {
         let Chosen { backend, reason, renderer, devices: found } = chosen;
         let access = Arc::new(Access::open(&config)?);
+        if access.sites().lacks_origins() {
+            tracing::warn!("pages of other origins are rejected: set access.cors_origins to their origins, or to none");
+        }
         let (listener, addr) = listen("server.listen", config.server.listen).await?;
         let metrics_listener = match config.server.metrics_listen {
             Some(addr) => Some(listen("server.metrics_listen", addr).await?),

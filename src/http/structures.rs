@@ -16,7 +16,7 @@ use super::mesh_request::MeshRequest;
 use super::openapi::bodies::StructureFile;
 use super::openapi::meshes::{CacheableMeshOrJob, NotModified, ReportResponse};
 use super::openapi::parameters::{
-    ContentEncodingHeader, IfNoneMatchHeader, MeshParameters, PreferenceHeaders, RangeHeaders, StructurePath,
+    ConditionHeaders, ContentEncodingHeader, MeshParameters, PreferenceHeaders, RangeHeaders, StructurePath,
     SurfaceParameters,
 };
 use super::openapi::problem_responses;
@@ -97,11 +97,14 @@ problem_responses!(CreateProblems: [
 ]);
 problem_responses!(ShowProblems: [
     READING,
-    [Kind::BadRequest, Kind::NoSuchStructure, Kind::MemoryFull, Kind::TooManyDeliveries, Kind::StoreFailed],
+    [
+        Kind::BadRequest, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::MemoryFull, Kind::TooManyDeliveries,
+        Kind::StoreFailed,
+    ],
 ]);
-problem_responses!(SurfaceProblems: [
-    PARAMETERS, READING, MESHING, SUBMITTING, [Kind::NotFound, Kind::NoSuchStructure, Kind::RangeNotSatisfiable],
-]);
+problem_responses!(SurfaceProblems: [PARAMETERS, READING, MESHING, SUBMITTING, [
+    Kind::NotFound, Kind::NoSuchStructure, Kind::PreconditionFailed, Kind::RangeNotSatisfiable,
+]]);
 
 /// Upload a structure
 ///
@@ -150,7 +153,7 @@ pub(super) async fn create(State(app): State<Shared>, headers: HeaderMap, body: 
 
 /// Get the contents of a structure
 #[utoipa::path(get, path = "/v1/structures/{digest}", tag = "structures", operation_id = "showStructure",
-    params(StructurePath, IfNoneMatchHeader),
+    params(StructurePath, ConditionHeaders),
     responses(
         (status = 200, description = "Contents of the structure.", body = StructureDocument, headers(
             ("ETag" = String, description = "Strong validator of the document."),
@@ -175,7 +178,7 @@ pub(super) async fn show(
     path = "/v1/structures/{digest}/{file}",
     tag = "meshes",
     operation_id = "meshStructure",
-    params(StructurePath, SurfaceParameters, PreferenceHeaders, IfNoneMatchHeader, RangeHeaders),
+    params(StructurePath, SurfaceParameters, PreferenceHeaders, ConditionHeaders, RangeHeaders),
     responses(CacheableMeshOrJob, SurfaceProblems)
 )]
 pub(super) async fn surface(request: MeshRequest) -> Result<Response, Problem> {

@@ -14,7 +14,7 @@ use thiserror::Error;
 use crate::formats::Format;
 use crate::pipeline::params;
 use crate::store::Secret;
-use crate::telemetry::{SpanParent, Tracer, read_trace_context, traceparent, tracestate};
+use crate::telemetry::{SpanParent, Tracer, read_trace_context, shorten, traceparent, tracestate};
 
 /// Error of a text that is not a job id.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
@@ -47,15 +47,16 @@ impl JobId {
         Self(format!("{id:032x}"))
     }
 
-    /// Returns the id as text.
+    /// Returns the whole id.
     pub(crate) fn as_str(&self) -> &str {
         &self.0
     }
 }
 
 impl fmt::Display for JobId {
+    /// Writes the first digits, for logs and traces: the whole id gives access to the job.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
+        f.write_str(&shorten(&self.0))
     }
 }
 
