@@ -69,7 +69,8 @@ async fn a_full_disk_evicts_twice_the_size_and_tries_once_more() {
     }
     assert_eq!(left, [false, false, true, true, true, true]);
     // A second failure is reported.
-    (faults.frees.store(false, Ordering::Relaxed), faults.full.store(true, Ordering::Relaxed));
+    faults.frees.store(false, Ordering::Relaxed);
+    faults.full.store(true, Ordering::Relaxed);
     let refused = store.put(&name(7), body(800)).await;
     assert!(matches!(refused, Err(StoreError::NoSpace { .. })), "{refused:?}");
     assert_eq!(store.usage(Folder::Results).objects, 2);
@@ -88,7 +89,9 @@ async fn the_last_use_survives_a_restart() {
     for number in 1..=3 {
         store.put(&name(number), body(10)).await.unwrap();
     }
-    (set(1, hours(20)), set(2, hours(20)), set(3, now - Duration::from_mins(30)));
+    set(1, hours(20));
+    set(2, hours(20));
+    set(3, now - Duration::from_mins(30));
     let store = open().await;
     for number in [1, 3] {
         assert!(store.get(&name(number)).await.unwrap().is_some());
