@@ -1,4 +1,4 @@
-//! Memory budget of all requests, in bytes: uploads, and meshes that are not yet sent.
+//! Memory budget of all requests, in bytes: uploads, archive entries, and meshes that are not yet sent.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -15,7 +15,7 @@ use crate::telemetry::MEMORY_HELD;
 pub struct Exhausted {
     /// Size of the budget, bytes.
     pub limit: u64,
-    /// Used part of it, bytes.
+    /// Used part of the budget, bytes.
     pub held: u64,
 }
 
@@ -39,7 +39,7 @@ impl Budget {
         Self::new(u64::MAX)
     }
 
-    /// Fails while more than the limit is in use.
+    /// Checks that at most the limit is in use.
     ///
     /// # Errors
     /// [`Exhausted`].
@@ -55,7 +55,7 @@ impl Budget {
     }
 }
 
-/// Bytes taken from a budget, until this is dropped.
+/// Bytes taken from a budget. Dropping the lease returns them.
 #[derive(Debug)]
 pub struct Lease {
     budget: Budget,
@@ -63,7 +63,7 @@ pub struct Lease {
 }
 
 impl Lease {
-    /// Adds `bytes` to the lease; changes nothing on failure.
+    /// Adds `bytes` to the lease. A failure changes nothing.
     ///
     /// # Errors
     /// [`Exhausted`].

@@ -51,7 +51,7 @@ impl Prepared {
         scan::check_size(&self.params, &self.limits, n_vertices, n_triangles)
     }
 
-    /// Checks the size of a complete mesh likewise, and rejects an empty one.
+    /// Checks the size of a complete mesh like [`Self::check_size`], and rejects an empty mesh.
     pub(super) fn check_mesh(&self, size: [u64; 2]) -> Result<(), SurfaceError> {
         if size[1] == 0 {
             Err(SurfaceError::NoSurface { isovalue: self.params.isovalue })
