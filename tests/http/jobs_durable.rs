@@ -307,7 +307,7 @@ fn a_full_disk_evicts_objects_and_is_reported_as_a_full_store() {
     for n in 20..26 {
         let mut stream = TcpStream::connect(server.addr).unwrap();
         let body = sample(n);
-        let head = "POST /v1/meshes?format=stl&resolution=0.5 HTTP/1.1\r\nhost: t\r\nconnection: close";
+        let head = "POST /v1/meshes?format=stl&resolution=0.5 HTTP/1.1\r\nhost: localhost\r\nconnection: close";
         write!(stream, "{head}\r\ncontent-length: {}\r\n\r\n", body.len()).unwrap();
         stream.write_all(&body).unwrap();
         let mut answer = Vec::new();
