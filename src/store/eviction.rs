@@ -60,7 +60,8 @@ impl Drop for Reservation {
 
 impl Store {
     /// Removes expired objects, then the least recently used ones until the store is within its capacity, and about
-    /// once an hour leftovers of crashed processes. Saves times of last use, at most once an hour for an object. The service calls it regularly.
+    /// once an hour leftovers of crashed processes. Saves times of last use, at most once an hour for an object. The
+    /// service calls it regularly.
     pub async fn sweep(&self, now: SystemTime) -> Swept {
         let mut swept = Swept::default();
         let mut cleared = self.0.last_cleanup.lock().await;
