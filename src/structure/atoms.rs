@@ -235,11 +235,11 @@ impl Columns {
     /// Adds an atom. Returns false if there are `max_rows` already.
     #[inline]
     pub(super) fn push_within(&mut self, max_rows: usize, atom: &Atom) -> bool {
-        let room = self.len() < max_rows;
-        if room {
+        let fits = self.len() < max_rows;
+        if fits {
             self.push(atom);
         }
-        room
+        fits
     }
 
     /// Returns the finished structure.

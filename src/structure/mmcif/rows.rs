@@ -231,8 +231,8 @@ impl<'a> Scanner<'a> {
         Self { text, edges: Edges::default(), window: MAX_WINDOW }
     }
 
-    /// Reads rows from `at` to `end` and calls `put`, which returns false if there is no room. Stops before the first
-    /// row that is incomplete or not plain, and returns the end of the row before it.
+    /// Reads rows from `at` to `end` and calls `put`, which returns false if the limit is reached. Stops before the
+    /// first row that is incomplete or not plain, and returns the end of the row before it.
     fn rows(
         &mut self,
         site: &mut AtomSite<Box<Fault>>,
