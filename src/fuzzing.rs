@@ -17,7 +17,7 @@ pub fn key_file(text: &str) -> Result<(), KeyFileError> {
 #[must_use]
 pub fn has_valid_signature(keys: &SigningKeys, target: &str) -> bool {
     let (path, query) = target.split_once('?').map_or((target, None), |(path, query)| (path, Some(query)));
-    keys.check(path, query, UNIX_EPOCH) == SignatureCheck::Valid
+    matches!(keys.check(path, query, UNIX_EPOCH), SignatureCheck::Valid(_))
 }
 
 /// Reads the record of a job with its parameters, and returns it as it would be written.

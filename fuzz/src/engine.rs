@@ -245,7 +245,7 @@ mod tests {
         let large = run(&target(|_| drop(std::hint::black_box(vec![1_u8; 2 << 20]))), b"");
         assert!(matches!(large, Err(Failure::Memory { bytes, .. }) if bytes >= 2 << 20), "{large:?}");
         let small = run(&target(|_| drop(std::hint::black_box(vec![1_u8; 1 << 19]))), b"");
-        assert!(small.is_ok_and(|cost| cost.bytes >= 1 << 19), "{small:?}");
+        assert!(small.as_ref().is_ok_and(|cost| cost.bytes >= 1 << 19), "{small:?}");
     }
 
     #[test]

@@ -139,13 +139,12 @@ fn one(name: &str, seconds: u64, seed: u64) -> Result<bool, String> {
         }
         Err(Error::Io(error)) => Err(text(error)),
         Err(Error::Failed { failure, input, from }) => {
-            let path = match from {
-                Some(path) => path,
-                None => {
-                    let path = folder.join("failed");
-                    fs::write(&path, input).map_err(text)?;
-                    path
-                }
+            let path = if let Some(seed) = from {
+                seed
+            } else {
+                let path = folder.join("failed");
+                fs::write(&path, input).map_err(text)?;
+                path
             };
             eprintln!("{name}: seed {seed}, FAILED: {failure}; the input is {}", path.display());
             Ok(false)

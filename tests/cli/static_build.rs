@@ -1,6 +1,6 @@
 //! The static executable of `make static`, without the service.
 #![cfg(target_os = "linux")]
-#![expect(clippy::unwrap_used, clippy::print_stdout, reason = "tests fail by panicking and print what they skip")]
+#![expect(clippy::unwrap_used, reason = "tests fail by panicking")]
 
 use crate::cli_support;
 use crate::tools;

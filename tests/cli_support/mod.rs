@@ -156,12 +156,11 @@ impl Service {
         // Read the rest of the log, as a full pipe would block the service.
         let log = std::thread::spawn(move || lines.map_while(Result::ok).collect::<Vec<_>>().join("\n"));
         let json = banner.lines().last().and_then(|line| serde_json::from_str::<serde_json::Value>(line).ok());
-        let addr = match json {
-            Some(event) => event["address"].as_str().unwrap().to_owned(),
-            None => {
-                let viewer = banner.lines().find(|l| l.contains("viewer")).unwrap();
-                viewer.split("http://").nth(1).unwrap().trim_end_matches('/').to_owned()
-            }
+        let addr = if let Some(event) = json {
+            event["address"].as_str().unwrap().to_owned()
+        } else {
+            let viewer = banner.lines().find(|l| l.contains("viewer")).unwrap();
+            viewer.split("http://").nth(1).unwrap().trim_end_matches('/').to_owned()
         };
         let service = Self { child, addr, banner, log: Some(log) };
         let start = std::time::Instant::now();

@@ -29,11 +29,11 @@ fn statuses(server: &Running, bytes: &[u8]) -> Vec<u16> {
 }
 
 /// Request that ends the connection.
-const LAST: &str = "GET /livez HTTP/1.1\r\nhost: t\r\nconnection: close\r\n\r\n";
+const LAST: &str = "GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
 
 /// Returns a request with a body and these header lines, and a second request behind it.
 fn post(headers: &str, body: &str) -> Vec<u8> {
-    format!("POST /v1/structures HTTP/1.1\r\nhost: t\r\n{headers}\r\n{body}{LAST}").into_bytes()
+    format!("POST /v1/structures HTTP/1.1\r\nhost: localhost\r\n{headers}\r\n{body}{LAST}").into_bytes()
 }
 
 #[test]
@@ -103,30 +103,30 @@ fn heads_must_be_well_formed() {
     let server = server();
     let statuses = |head: &str| statuses(&server, head.as_bytes());
     // Lines may end with a bare LF (RFC 9112, 2.2).
-    assert_eq!(statuses("GET /livez HTTP/1.1\nhost: t\nconnection: close\n\n"), [200]);
+    assert_eq!(statuses("GET /livez HTTP/1.1\nhost: localhost\nconnection: close\n\n"), [200]);
     assert_eq!(statuses(&format!("\r\n{LAST}")), [200], "an empty line before a request");
     for head in [
-        "GET /livez HTTP/1.1\r\nhost: t\r\nx-a: 1\r\n folded: 2\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nhost: t\r\nx-a: 1\r\n\t2\r\n\r\n",
-        "GET /livez HTTP/1.1\r\n host: t\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nhost : t\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nhost: t\rx: y\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nhost: t\r\nx-a: \0\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nhost: t\r\nno colon\r\n\r\n",
-        "GET /livez HTTP/1.1\r\nhost: t\r\n: empty\r\n\r\n",
-        "GET  /livez HTTP/1.1\r\nhost: t\r\n\r\n",
-        "GET /liv ez HTTP/1.1\r\nhost: t\r\n\r\n",
-        "GET /livez HTTP/1.1 \r\nhost: t\r\n\r\n",
-        "GET /livez HTTP/1.2\r\nhost: t\r\n\r\n",
-        "GET /livez HTTP/2.0\r\nhost: t\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nhost: localhost\r\nx-a: 1\r\n folded: 2\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nhost: localhost\r\nx-a: 1\r\n\t2\r\n\r\n",
+        "GET /livez HTTP/1.1\r\n host: localhost\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nhost : localhost\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nhost: localhost\rx: y\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nhost: localhost\r\nx-a: \0\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nhost: localhost\r\nno colon\r\n\r\n",
+        "GET /livez HTTP/1.1\r\nhost: localhost\r\n: empty\r\n\r\n",
+        "GET  /livez HTTP/1.1\r\nhost: localhost\r\n\r\n",
+        "GET /liv ez HTTP/1.1\r\nhost: localhost\r\n\r\n",
+        "GET /livez HTTP/1.1 \r\nhost: localhost\r\n\r\n",
+        "GET /livez HTTP/1.2\r\nhost: localhost\r\n\r\n",
+        "GET /livez HTTP/2.0\r\nhost: localhost\r\n\r\n",
         "GET /livez\r\n\r\n",
-        "GE(T /livez HTTP/1.1\r\nhost: t\r\n\r\n",
+        "GE(T /livez HTTP/1.1\r\nhost: localhost\r\n\r\n",
         "\x16\x03\x01\x02\0\x01\0\x01\u{fc}\x03\x03\r\n\r\n",
     ] {
         assert_eq!(statuses(head), [400], "{head:?}");
     }
     let many =
-        |n: usize| format!("GET /livez HTTP/1.1\r\nhost: t\r\nconnection: close\r\n{}\r\n", "a: b\r\n".repeat(n));
+        |n: usize| format!("GET /livez HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n{}\r\n", "a: b\r\n".repeat(n));
     assert_eq!((statuses(&many(90)), statuses(&many(120))), (vec![200], vec![431]), "100 lines");
 }
 
@@ -143,8 +143,8 @@ const ACK: u8 = 1;
 const END_STREAM: u8 = 1;
 const END_HEADERS: u8 = 4;
 const ENHANCE_YOUR_CALM: u32 = 11;
-/// `GET /` with HTTPS in HPACK's static table, and the authority `t`.
-const GET: &[u8] = b"\x82\x84\x87\x01\x01t";
+/// `GET /` with HTTPS in HPACK's static table, and the authority `localhost`.
+const GET: &[u8] = b"\x82\x84\x87\x01\x09localhost";
 
 fn frame(kind: u8, flags: u8, stream: u32, payload: &[u8]) -> Vec<u8> {
     let length = u32::try_from(payload.len()).unwrap().to_be_bytes();

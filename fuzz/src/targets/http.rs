@@ -182,9 +182,9 @@ fn start() -> Service {
     std::thread::spawn(move || {
         // Serves until the process ends: `orders` never changes.
         let (orders, receiver) = tokio::sync::watch::channel(Stop::Serve);
-        let served = runtime.block_on(server.run(receiver));
+        let ended = runtime.block_on(server.run(receiver));
         drop((orders, dir));
-        served.expect("the server runs");
+        ended.expect("the server runs");
     });
     let ask = |head: &str| {
         let head =
