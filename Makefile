@@ -108,7 +108,8 @@ release: web-if-possible ## Build the optimized binary, target/release/molmesh
 static: ## Build the command line as a static file for any Linux, CPU only: dist/molmesh; installs what it needs
 	deploy/static.sh
 
-# Without Linux or network access, the tests of the static executable are skipped. A failed build is an error.
+# Without Linux or network access, the tests of the static executable are skipped, or fail if CI is set. A failed build
+# is an error.
 static-if-possible:
 	@deploy/static.sh || { [ $$? -eq 3 ] && echo "without the static executable" >&2; }
 
