@@ -30,6 +30,9 @@ pub mod access;
 pub mod archive;
 #[cfg(feature = "server")]
 pub mod config;
+#[cfg(feature = "server")]
+#[doc(hidden)]
+pub mod fuzzing;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 #[cfg(feature = "server")]

@@ -32,7 +32,7 @@ pub(crate) use job_store::{JobSpec, JobStore, JobView};
 pub(crate) use key::ContentKey;
 pub(crate) use pool::{Pool, Settings};
 pub(crate) use rank::{Client, DEFAULT_URGENCY, Rank};
-pub(crate) use record::{JobId, Status, rfc3339};
+pub(crate) use record::{JobId, Record, Status, rfc3339};
 pub(crate) use results::{REPORT, SaveError, is_stored, save};
 pub(crate) use ticket::Ticket;
 
