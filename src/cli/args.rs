@@ -255,7 +255,7 @@ pub(crate) struct LimitArgs {
     pub(crate) max_input_bytes: Option<u64>,
     /// Grid points in occupied bricks [default: 4294967296]
     #[arg(long, value_name = "N")]
-    pub(crate) max_samples: Option<u64>,
+    pub(crate) max_grid_points: Option<u64>,
     /// Pairs of an atom and a brick that its support reaches [default: 1073741824]
     #[arg(long, value_name = "N")]
     pub(crate) max_candidates: Option<u64>,

@@ -17,6 +17,9 @@ use super::args::{BackendName, JobArgs};
 use super::error::CliError;
 use super::estimate::Estimate;
 
+/// Maximum number of threads of the CPU backend: more than any machine has cores.
+const MAX_THREADS: usize = 1024;
+
 /// Requested backend and devices.
 #[derive(Debug)]
 pub(crate) struct BackendRequest<'a> {
@@ -87,8 +90,9 @@ pub(crate) struct SelectedBackend {
 /// # Errors
 /// Returns [`CliError::Usage`] if they do.
 pub(crate) fn check(requested: &BackendRequest<'_>) -> Result<(), CliError> {
-    if requested.threads == Some(0) {
-        return Err(CliError::usage("parameter `threads`: 0 is not allowed; expected a number from 1"));
+    if let Some(n) = requested.threads.filter(|n| !(1..=MAX_THREADS).contains(n)) {
+        let message = format!("parameter `threads`: {n} is not allowed; expected a number from 1 to {MAX_THREADS}");
+        return Err(CliError::usage(message));
     }
     if requested.backend == BackendName::Gpu && *requested.devices == DeviceChoice::Cpu {
         return Err(CliError::usage("parameter `devices`: cpu is not allowed with --backend gpu; expected a GPU"));
@@ -127,7 +131,7 @@ fn estimate(requested: &BackendRequest<'_>) -> Option<Estimate> {
 fn gpu_or_cpu(requested: &BackendRequest<'_>) -> Result<SelectedBackend, CliError> {
     let estimate = estimate(requested);
     if let Some(estimate) = estimate.filter(|estimate| !estimate.favours_gpu()) {
-        let why = format!("no GPU discovery ({estimate})");
+        let why = format!("a GPU is not expected to be faster ({estimate})");
         return instead_of_gpu(requested, format!("auto: {why}"), NoGpu { why, devices: Vec::new() });
     }
     let auto = requested.backend == BackendName::Auto;

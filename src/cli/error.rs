@@ -241,23 +241,18 @@ fn format_code(error: &FormatError) -> i32 {
 }
 
 fn surface_hint(error: &SurfaceError) -> Option<String> {
+    let coarser = error.suggested_resolution().map_or(String::new(), |h| format!("try --resolution {h}, "));
     match error {
-        SurfaceError::GridTooLarge { suggested_resolution, .. } => {
-            Some(format!("try --resolution {suggested_resolution}, or raise --max-samples"))
-        }
-        SurfaceError::MeshTooLarge { suggested_resolution, .. } => {
-            Some(format!("try --resolution {suggested_resolution}, or raise --max-mesh-bytes"))
-        }
-        SurfaceError::TooManyCandidates { suggested_resolution: Some(resolution), .. } => {
-            Some(format!("try --resolution {resolution}, or raise --max-candidates"))
+        SurfaceError::GridTooLarge { .. } => Some(format!("{coarser}or raise --max-grid-points")),
+        SurfaceError::MeshTooLarge { .. } => Some(format!("{coarser}or raise --max-mesh-bytes")),
+        SurfaceError::TooManyCandidates { suggested_resolution: Some(_), .. } => {
+            Some(format!("{coarser}or raise --max-candidates"))
         }
         SurfaceError::TooManyCandidates { .. } => {
             Some("try a coarser --resolution or smaller radii, or raise --max-candidates".to_owned())
         }
         SurfaceError::TooManyTriangles { triangles, .. } => Some(format!("try --max-triangles {triangles}")),
-        SurfaceError::DeviceMemory { suggested_resolution, .. } => {
-            Some(format!("try --resolution {suggested_resolution}, or --backend cpu"))
-        }
+        SurfaceError::DeviceMemory { .. } => Some(format!("{coarser}or try --backend cpu")),
         SurfaceError::Device { .. } => Some(format!("try --backend cpu{DOCTOR}")),
         SurfaceError::NoSurface { .. } => Some("try a lower --isovalue, or a finer --resolution".to_owned()),
         _ => None,
@@ -307,6 +302,6 @@ mod tests {
     fn grid_limit_suggests_a_resolution() {
         let error = SurfaceError::GridTooLarge { samples: 9, limit: 1, resolution: 0.1, suggested_resolution: 0.4 };
         let hint = CliError::Job { name: "x".into(), source: error.into(), strict_finding: None }.hint();
-        assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-samples"));
+        assert_eq!(hint.as_deref(), Some("try --resolution 0.4, or raise --max-grid-points"));
     }
 }

@@ -183,8 +183,7 @@ impl Tree {
             }
             (Value::String(text), Value::Number(_)) => {
                 let size = key.ends_with("_bytes");
-                let expected = if size { "an integer, or a size such as 64MiB" } else { "an integer" };
-                Value::from(parse_integer(text, size).ok_or_else(|| bad(expected.to_owned()))?)
+                Value::from(parse_integer(text, size).ok_or_else(|| bad(whole_number(size)))?)
             }
             (Value::String(text), Value::Bool(_)) => {
                 Value::Bool(text.trim().parse().map_err(|_neither| bad("true or false".to_owned()))?)
@@ -199,8 +198,10 @@ impl Tree {
         if let Some(slot) = self.values.pointer_mut(&pointer) {
             *slot = typed;
         }
-        let number = clears && default.is_number();
-        let why = |e: serde_json::Error| bad(if number { "an integer".to_owned() } else { e.to_string() });
+        let why = |e: serde_json::Error| match default {
+            Value::Number(_) if clears => bad(whole_number(key.ends_with("_bytes"))),
+            _ => bad(format!("another value: {e}")),
+        };
         self.config = serde_json::from_value(self.values.clone()).map_err(why)?;
         self.sources.insert(key.to_owned(), source.clone());
         Ok(())
@@ -248,6 +249,11 @@ pub(super) fn minimum(key: &str) -> u64 {
         "server.head_bytes" => 8 << 10,
         _ => 1,
     }
+}
+
+/// Describes the values of an integer key.
+fn whole_number(is_size: bool) -> String {
+    if is_size { "a whole number, or a size such as 64MiB".to_owned() } else { "a whole number".to_owned() }
 }
 
 /// Parses an integer with optional underscores and, for sizes, an optional binary suffix.

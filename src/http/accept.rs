@@ -55,8 +55,11 @@ const UNSENT: u32 = 256 << 10;
 /// Interval of HTTP/2 pings.
 const PING: Duration = Duration::from_secs(20);
 
-/// Serves `router` on `listener` until the drain; then lets requests finish until the drain timeout or [`Stop::Now`].
-/// Returns true if all of them finished.
+/// Time for the last responses, such as those of cancelled jobs.
+const LAST_RESPONSES: Duration = Duration::from_secs(1);
+
+/// Serves `router` on `listener` until the drain; then lets requests finish until [`Stop::Now`], and those that end at
+/// once then for [`LAST_RESPONSES`]. Returns true if all of them finished before [`Stop::Now`].
 pub(super) async fn serve(
     listener: TcpListener,
     router: Router,
@@ -112,13 +115,14 @@ pub(super) async fn serve(
         connections.spawn(connection(stream, Peer(peer.ip()), router.clone(), Arc::clone(&config), stop.clone()));
     }
     drop(listener);
-    let all = async { while connections.join_next().await.is_some() {} };
-    let drained = tokio::select! {
-        ended = tokio::time::timeout(Duration::from_millis(config.drain_timeout_ms), all) => ended.is_ok(),
-        () = stop::reached(&mut stop, Stop::Now) => false,
-    };
-    connections.shutdown().await;
-    drained
+    let mut all = std::pin::pin!(async { while connections.join_next().await.is_some() {} });
+    tokio::select! {
+        () = &mut all => true,
+        () = stop::reached(&mut stop, Stop::Now) => {
+            drop(tokio::time::timeout(LAST_RESPONSES, all).await);
+            false
+        }
+    }
 }
 
 /// Sets the options of a new connection.

@@ -234,30 +234,30 @@ impl From<SurfaceError> for Problem {
     fn from(error: SurfaceError) -> Self {
         use SurfaceError as E;
         let detail = error.to_string();
+        let suggested = error.suggested_resolution();
+        let fitting =
+            |problem: Self| suggested.into_iter().fold(problem, |problem, h| problem.with("suggested_resolution", h));
         match error {
             E::NoSpheres => Self::new(Kind::NoAtoms, detail),
             E::BadSphere { index, expected, .. } => {
                 Self::new(Kind::UnreadableStructure, detail).with("atom", index).with("expected", expected)
             }
             E::BadParameter { .. } => ParamError::from(error).into(),
-            E::GridTooLarge { samples, limit, resolution, suggested_resolution } => {
+            E::GridTooLarge { samples, limit, resolution, .. } => fitting(
                 Self::new(Kind::GridTooLarge, detail)
                     .with("limit", limit)
                     .with("actual", samples)
-                    .with("resolution", resolution)
-                    .with("suggested_resolution", suggested_resolution)
-            }
-            E::TooManyCandidates { candidates, limit, resolution, suggested_resolution } => {
-                let problem = Self::new(Kind::TooManyCandidates, detail)
+                    .with("resolution", resolution),
+            ),
+            E::TooManyCandidates { candidates, limit, resolution, .. } => fitting(
+                Self::new(Kind::TooManyCandidates, detail)
                     .with("limit", limit)
                     .with("actual", candidates)
-                    .with("resolution", resolution);
-                suggested_resolution.into_iter().fold(problem, |p, h| p.with("suggested_resolution", h))
+                    .with("resolution", resolution),
+            ),
+            E::MeshTooLarge { bytes, limit, .. } => {
+                fitting(Self::new(Kind::MeshTooLarge, detail).with("limit", limit).with("actual", bytes))
             }
-            E::MeshTooLarge { bytes, limit, suggested_resolution } => Self::new(Kind::MeshTooLarge, detail)
-                .with("limit", limit)
-                .with("actual", bytes)
-                .with("suggested_resolution", suggested_resolution),
             E::TooManyTriangles { triangles, limit, resolution } => Self::new(Kind::MeshTooLarge, detail)
                 .with("parameter", "max_triangles")
                 .with("limit", limit)
@@ -266,10 +266,9 @@ impl From<SurfaceError> for Problem {
             E::NoSurface { isovalue } => {
                 Self::new(Kind::NoSurface, detail).with("parameter", "isovalue").with("isovalue", isovalue)
             }
-            E::DeviceMemory { needed, available, suggested_resolution } => Self::new(Kind::DeviceMemory, detail)
-                .with("limit", available)
-                .with("actual", needed)
-                .with("suggested_resolution", suggested_resolution),
+            E::DeviceMemory { needed, available, .. } => {
+                fitting(Self::new(Kind::DeviceMemory, detail).with("limit", available).with("actual", needed))
+            }
             // The worker has logged the driver's message.
             E::Device { .. } => {
                 Self::new(Kind::DeviceFailed, "no device could run the job").retry_after(Duration::from_secs(1))

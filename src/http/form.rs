@@ -175,7 +175,7 @@ pub(super) async fn read(
         piece.map_err(|e| bounds.problem(&multer::Error::StreamReadFailed(e.into())))?;
     }
     let Some((bytes, declared)) = file else {
-        let detail = "the form has no file; put it into a field named `file` or `structure`";
+        let detail = "the form has no file; it belongs in a field named `file` or `structure`";
         return Err(Problem::new(Kind::BadRequest, detail).with("expected", "file"));
     };
     Ok(Upload { bytes, lease, fields, declared })
@@ -188,6 +188,8 @@ fn head_bytes(headers: &HeaderMap) -> usize {
 
 fn field_too_long(name: &str) -> Problem {
     let shown: String = name.chars().take(80).collect();
-    let detail = format!("the form field `{shown}` has more than {MAX_FIELD_BYTES} bytes");
+    let detail = format!(
+        "the form field `{shown}` has more than {MAX_FIELD_BYTES} bytes; the file belongs in a field named `file` or `structure`"
+    );
     Problem::new(Kind::BadParameter, detail).with("parameter", shown).with("limit", MAX_FIELD_BYTES)
 }

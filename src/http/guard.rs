@@ -1,4 +1,4 @@
-//! Authentication, authorization and quotas: keys, signed addresses, limits per client.
+//! Authentication, authorization and quotas: keys, signed URLs, limits per client.
 //!
 //! Only permitted requests for operations that need a scope count towards a quota. Work is charged when it is done, to
 //! the client that requested it first.
@@ -227,7 +227,7 @@ fn by_signature(signature: &SignatureCheck) -> Result<u64, Problem> {
         SignatureCheck::Valid(end) => Ok(*end),
         SignatureCheck::Absent => Err(Problem::new(
             Kind::KeyRequired,
-            "a key is required, in `Authorization: Bearer …` or `X-Api-Key`; a GET may use a signed address instead",
+            "a key is required, in `Authorization: Bearer …` or `X-Api-Key`; a GET may use a signed URL instead",
         )
         .header(WWW_AUTHENTICATE, "Bearer realm=\"molmesh\"")),
         SignatureCheck::Invalid => {
@@ -236,7 +236,7 @@ fn by_signature(signature: &SignatureCheck) -> Result<u64, Problem> {
         }
         SignatureCheck::Expired(end) => {
             let end = rfc3339(end.saturating_mul(1000));
-            let detail = format!("the signed address expired at {end}");
+            let detail = format!("the signed URL expired at {end}");
             Err(Problem::new(Kind::SignatureExpired, detail).with("expired", end))
         }
     }
@@ -305,7 +305,7 @@ fn keep_private(headers: &mut HeaderMap) {
     }
 }
 
-/// Limits the caching of a response to the time for which its signed address is valid, and signs the address that it
+/// Limits the caching of a response to the time for which its signed URL is valid, and signs the address that it
 /// redirects to until then.
 fn end_with_signature(access: &Access, end: u64, headers: &mut HeaderMap) {
     let end_time = UNIX_EPOCH.checked_add(Duration::from_secs(end)).unwrap_or_else(SystemTime::now);

@@ -166,14 +166,17 @@ pub(super) async fn show(
     id: JobId,
     query: Result<Query<Poll>, QueryRejection>,
 ) -> Result<Response, Problem> {
-    let Query(poll) = query.map_err(|e| Problem::new(Kind::BadParameter, e.body_text()).with("parameter", "wait"))?;
+    let expected = format!("a whole number of seconds up to {MAX_WAIT_S}");
+    let bad = |detail: String| {
+        Problem::new(Kind::BadParameter, detail).with("parameter", "wait").with("expected", expected.clone())
+    };
+    let poll = query
+        .map(|Query(poll)| poll)
+        .map_err(|_library_text| bad(format!("the only parameter of a job is `wait`, {expected}")))?;
     let wait = poll.wait();
     if wait > MAX_WAIT_S {
-        return Err(Problem::new(Kind::BadParameter, format!("parameter `wait`: {wait} is more than {MAX_WAIT_S} s"))
-            .with("parameter", "wait")
-            .with("value", wait)
-            .with("limit", MAX_WAIT_S)
-            .with("expected", format!("a whole number of seconds up to {MAX_WAIT_S}")));
+        let detail = format!("parameter `wait`: {wait} is more than {MAX_WAIT_S} s");
+        return Err(bad(detail).with("value", wait).with("limit", MAX_WAIT_S));
     }
     let mut watched = app.job_store.watch(&id).await?.ok_or_else(|| no_such_job(id.as_str()))?;
     let mut stopping = app.stopping.clone();

@@ -7,7 +7,7 @@
 //! 5. **CORS**: answers preflights and adds headers, also to errors of the layers below;
 //! 6. **panics**: a panic of a handler becomes a 500, and the connection stays open;
 //! 7. **origin**: rejects other hosts and pages of other sites;
-//! 8. **guard**: keys, signed addresses, quotas; removes keys and signatures from the request;
+//! 8. **guard**: keys, signed URLs, quotas; removes keys and signatures from the request;
 //! 9. **timeout**: a backstop above the body timeout and the job deadline;
 //! 10. the router. Limits of bodies, queue and memory apply where the resource is used.
 

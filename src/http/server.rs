@@ -253,7 +253,11 @@ async fn wind_down(
     };
     let (requests, jobs) = match served {
         Some(served) => (served.unwrap_or(false), app.pool.drain(cut).await),
-        None => (serving.await.unwrap_or(false), app.pool.drain(std::future::ready(())).await),
+        // Cancelled jobs end their requests, which respond before their connections are closed.
+        None => {
+            let (served, jobs) = tokio::join!(serving, app.pool.drain(std::future::ready(())));
+            (served.unwrap_or(false), jobs)
+        }
     };
     // Records of ended jobs and results that are being stored.
     let ends = async { tokio::join!(app.job_store.settled(), results::all_saved(app)) };

@@ -13,7 +13,7 @@ use crate::structure::strict_validator::{Diagnostic, Level};
 #[derive(Debug, Clone, PartialEq, Error)]
 pub(crate) enum Refusal {
     /// The queue is full.
-    #[error("{waiting} jobs are waiting and the limit is {limit}; the queue takes about {} s", wait.as_secs_f64().ceil())]
+    #[error("the queue is full: {waiting} waiting, limit {limit}; the jobs ahead take about {} s", wait.as_secs_f64().ceil())]
     QueueFull {
         waiting: usize,
         limit: usize,

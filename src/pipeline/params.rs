@@ -109,7 +109,7 @@ fn contradiction(name: &'static str, value: &str, other: &str) -> ParamError {
     ParamError::BadValue {
         name,
         value: format!("`{}`", value.chars().take(64).collect::<String>()),
-        expected: format!("nothing beside `{other}`: only one of {} sets the grid's spacing", SPACINGS.join(", ")),
+        expected: format!("no value beside `{other}`: only one of {} sets the grid spacing", SPACINGS.join(", ")),
     }
 }
 
@@ -123,8 +123,8 @@ pub fn set_format(job: &mut Job, format: Format) -> Result<(), ParamError> {
         let formats: Vec<_> = Format::ALL.into_iter().filter(|f| holds(*f)).map(Format::extension).collect();
         Err(ParamError::BadValue {
             name,
-            value: format!("`{value}` with {format}"),
-            expected: format!("{instead}, or one of the formats {}", formats.join(", ")),
+            value: format!("`{value}`"),
+            expected: format!("{instead} for {format}, or one of the formats {}", formats.join(", ")),
         })
     };
     if job.compress != Compress::None && !format.holds_quantized() {

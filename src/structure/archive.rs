@@ -17,7 +17,9 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub enum ArchiveError {
     /// The text is not an entry id.
-    #[error("`{id}` is not a PDB id; expected four characters such as 4pti, or pdb_ and eight such as pdb_00004pti")]
+    #[error(
+        "`{id}` is not a PDB id; expected a digit and three letters or digits such as 4pti, or pdb_ and eight such as pdb_00004pti"
+    )]
     BadId {
         /// The text that was given.
         id: String,

@@ -2,6 +2,8 @@
 
 use thiserror::Error;
 
+use super::params::MAX_RESOLUTION;
+
 /// Errors of the meshing core.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum SurfaceError {
@@ -30,14 +32,15 @@ pub enum SurfaceError {
         /// Description of valid values.
         expected: String,
     },
-    /// More grid samples than allowed would be needed.
+    /// More grid points than allowed would be needed.
     #[error(
-        "the grid would need {samples} samples at {resolution} Å, the limit is {limit}; {suggested_resolution} Å would fit"
+        "the grid would need about {samples} points at {resolution} Å, the limit is {limit}{}",
+        fitting(*suggested_resolution)
     )]
     GridTooLarge {
-        /// Samples needed (a lower bound: counting stops soon after the limit).
+        /// Estimated number of grid points.
         samples: u64,
-        /// Samples allowed.
+        /// Grid points allowed.
         limit: u64,
         /// The spacing asked for, in Å.
         resolution: f64,
@@ -61,9 +64,9 @@ pub enum SurfaceError {
         suggested_resolution: Option<f64>,
     },
     /// The mesh would take more bytes than allowed.
-    #[error("the mesh would take {bytes} bytes, the limit is {limit}; {suggested_resolution} Å would fit")]
+    #[error("the mesh would take about {bytes} bytes, the limit is {limit}{}", fitting(*suggested_resolution))]
     MeshTooLarge {
-        /// Bytes of vertices and triangles.
+        /// Estimated bytes of vertices and triangles.
         bytes: u64,
         /// Bytes allowed.
         limit: u64,
@@ -80,8 +83,8 @@ pub enum SurfaceError {
         /// Spacing with that number of triangles, Å.
         resolution: f64,
     },
-    /// No sample reaches the isovalue.
-    #[error("no sample of the grid reaches the isovalue {isovalue}: lower it, or refine the resolution")]
+    /// No grid point reaches the isovalue.
+    #[error("no grid point reaches the isovalue {isovalue}; a lower isovalue or a finer grid may have a surface")]
     NoSurface {
         /// The isovalue asked for.
         isovalue: f64,
@@ -90,7 +93,7 @@ pub enum SurfaceError {
     #[error("the mesh sink failed")]
     Sink,
     /// The device has too little memory for the mesh, even piece by piece.
-    #[error("the device would need {needed} bytes of memory, it has {available}; {suggested_resolution} Å would fit")]
+    #[error("the device would need {needed} bytes of memory, it has {available}{}", fitting(*suggested_resolution))]
     DeviceMemory {
         /// Bytes needed.
         needed: u64,
@@ -111,4 +114,28 @@ pub enum SurfaceError {
     /// The run was cancelled by its caller.
     #[error("cancelled")]
     Cancelled,
+}
+
+impl SurfaceError {
+    /// Returns a grid spacing at which the job would fit, Å, if the error is about a size and there is one.
+    #[must_use]
+    pub fn suggested_resolution(&self) -> Option<f64> {
+        let spacing = match self {
+            Self::GridTooLarge { suggested_resolution, .. }
+            | Self::MeshTooLarge { suggested_resolution, .. }
+            | Self::DeviceMemory { suggested_resolution, .. } => Some(*suggested_resolution),
+            Self::TooManyCandidates { suggested_resolution, .. } => *suggested_resolution,
+            _ => None,
+        };
+        spacing.filter(|spacing| *spacing <= MAX_RESOLUTION)
+    }
+}
+
+/// Describes a grid spacing at which a job would fit.
+fn fitting(spacing: f64) -> String {
+    if spacing <= MAX_RESOLUTION {
+        format!("; {spacing} Å would fit")
+    } else {
+        format!("; no grid spacing up to {MAX_RESOLUTION} Å would fit")
+    }
 }

@@ -113,7 +113,7 @@ fn invalid_structures_exit_with_4() {
 fn exceeded_limits_exit_with_5_and_are_named() {
     let message = fails(rod(), &["--max-atoms", "9"], 5);
     assert!(message.contains('9') && message.contains("hint: raise it with --max-atoms"), "{message}");
-    let message = fails(rod(), &["--max-samples", "100"], 5);
+    let message = fails(rod(), &["--max-grid-points", "100"], 5);
     assert!(message.contains("limit is 100") && message.contains("hint: try --resolution "), "{message}");
     let message = fails(rod(), &["--max-mesh-bytes", "1000"], 5);
     assert!(message.contains("limit is 1000") && message.contains("hint: try --resolution "), "{message}");
@@ -126,7 +126,7 @@ fn exceeded_limits_exit_with_5_and_are_named() {
 fn suggested_resolution_is_accepted() {
     let folder = Folder::new();
     let input = folder.file("in.pdb", rod());
-    let limit = ["--max-samples", "50000"];
+    let limit = ["--max-grid-points", "50000"];
     let done = mesh(&input, &folder.path("out.glb"), &[limit[0], limit[1], "--resolution", "0.1"]);
     assert_code(&done, 5);
     let message = stderr(&done);

@@ -32,7 +32,7 @@ fn interrupted_mesh_leaves_no_file() {
         let input = folder.file("block.pdb", block(20));
         let mut command = molmesh();
         command.arg("mesh").arg(&input).arg("-o").arg(folder.path("out.glb")).args(["--resolution", "0.03"]);
-        command.args(["--max-samples", "1000000000000", "--max-mesh-bytes", "1000000000000"]);
+        command.args(["--max-grid-points", "1000000000000", "--max-mesh-bytes", "1000000000000"]);
         let mut child = command.stderr(Stdio::piped()).spawn().unwrap();
         wait_for_work(&folder, &mut child);
         let start = Instant::now();

@@ -113,6 +113,34 @@ fn no_request_fails_under_load() {
 }
 
 #[test]
+fn requests_cut_off_by_the_drain_get_a_response() {
+    let folder = Folder::new();
+    let flags = ["--devices", "cpu", "--set", "server.drain_timeout_ms=200", "--set", "jobs.workers=1"];
+    let service = Service::start(&folder, &flags);
+    let addr = addr(&service);
+    let block = cli_support::block(30);
+    std::thread::scope(|scope| {
+        // One runs for long, the other one waits for the worker.
+        let clients = ["0.1", "0.11"].map(|resolution| {
+            let path = format!("/v1/meshes?resolution={resolution}");
+            let block = &block;
+            scope.spawn(move || send(addr, "POST", &path, &[], block.as_bytes()))
+        });
+        // Both requests are accepted long before that.
+        std::thread::sleep(Duration::from_secs(1));
+        service.signal("INT");
+        for client in clients {
+            let reply = client.join().unwrap();
+            let problem: serde_json::Value = serde_json::from_slice(&reply.body).unwrap();
+            assert_eq!((reply.status, problem["type"].as_str()), (503, Some("/problems/shutting-down")), "{problem}");
+        }
+    });
+    let (code, log) = service.wait();
+    assert_eq!(code, Some(1), "requests were cut off: {log}");
+    assert!(!log.contains("the client left"), "{log}");
+}
+
+#[test]
 fn second_signal_ends_the_drain() {
     for signals in [["TERM", "TERM"], ["INT", "TERM"], ["TERM", "INT"]] {
         let folder = Folder::new();

@@ -143,7 +143,7 @@ fn mesh(row: &Row) -> Output {
     let limits = [
         format!("--max-input-bytes={INFLATED_BYTES}"),
         format!("--max-atoms={ATOMS}"),
-        format!("--max-samples={}", 1 << 30),
+        format!("--max-grid-points={}", 1 << 30),
     ];
     command.args(["mesh", "-", "-o", "-", "--quiet"]).args(limits).args(flags(&row.query));
     let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();

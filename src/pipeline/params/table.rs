@@ -99,8 +99,9 @@ fn same_number<T: FromStr + PartialEq>(text: &str, default: &str) -> bool {
 /// Domain of a flag.
 pub(super) fn flag(text: &str) -> Option<bool> {
     match text {
-        "true" | "1" => Some(true),
-        "false" | "0" => Some(false),
+        // Python writes `True`.
+        "true" | "True" | "1" => Some(true),
+        "false" | "False" | "0" => Some(false),
         _ => None,
     }
 }
